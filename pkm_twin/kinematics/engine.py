@@ -37,7 +37,7 @@ from pkm_twin.kinematics.programs import (
     quick_inverse_program,
     walk_program,
 )
-from pkm_twin.kinematics.scheme import Branch, Closed, Scheme
+from pkm_twin.kinematics.scheme import Scheme, Start
 from pkm_twin.kinematics.traced import Traced
 from pkm_twin.machine.graph import Graph
 
@@ -124,6 +124,9 @@ class Engine(Scheme):
         :returns: its joint or rod, by how much it misses, m, and whether all closures are met in
             the pose: then a singularity ends the path from home to it.
         """
+        short = self.posed.find_shortfall(pose) if self.posed is not None else None
+        if short is not None:
+            return *short, not short[1] > MET * self.tree.size
         still = np.zeros(self.tree.unknown_rates + self.joints)
 
         def look(state: Array) -> tuple[Array, Array]:
@@ -211,14 +214,18 @@ class Engine(Scheme):
         """The machine with the platform before its limbs, if all limbs have closed forms so.
 
         Then Newton's method has the platform's coordinates alone, fewer than all coordinates, and a
-        scalar equation or two a limb. Machines with a closed form, branch rules or a virtual joint
-        keep their tree.
+        scalar equation or two a limb. Machines with a closed form or a virtual joint keep their
+        tree, and those whose platform has coordinates that follow from the pose: these could not be
+        found from a pose beyond a singularity of the coordinates, which only that tree notices.
         """
-        own = self.closed.start is not None or self.branch is not None
-        if own or not self.solved[1] or any(j.virtual for j in self.graph.joints.values()):
+        if self.start is not None or not self.solved[1]:
+            return None
+        if any(joint.virtual for joint in self.graph.joints.values()):
             return None
         try:
             scheme = CarriedScheme(self, by_pose=False)
+            if any(c.place is None and not c.held for c in scheme.chain.carriers):
+                return None
             fewer = len(scheme.solved[1]) < self.tree.unknown_rates
             return scheme if fewer and scheme.has_closed_limbs else None
         except (ParameterError, SingularityError):
@@ -297,20 +304,13 @@ _codes: Final[WeakValueDictionary[ProgramKey, Code]] = WeakValueDictionary()
 
 
 def engine_of(
-    graph: Graph,
-    coordinates: Sequence[Coordinate],
-    closed: Closed | None = None,
-    branch: Branch | None = None,
-    mark: ProgramKey = EMPTY,
+    graph: Graph, coordinates: Sequence[Coordinate], start: Start | None = None
 ) -> Engine:
-    """The engine of a geometry: machines that differ in inertia or limits alone share it.
-
-    :param mark: what tells closed forms and branch rules from others, and who writes them.
-    """
-    key = mark.also(f"{graph.key} {coordinates!r}")
+    """The engine of a geometry: machines that differ in inertia or limits alone share it."""
+    key = EMPTY.also(f"{graph.key} {coordinates!r} {start!r}")
     engine = _engines.get(key)
     if engine is None:
-        engine = _engines.setdefault(key, Engine(graph, coordinates, closed, branch, mark))
+        engine = _engines.setdefault(key, Engine(graph, coordinates, start=start))
         hold(engine)
     return engine
 

@@ -22,6 +22,8 @@ RANK: Final = 1e-9
 """Part of a matrix's largest singular value below which one counts as zero."""
 MAX_ITERATIONS: Final = 12
 DAMPING: Final = 1e-6
+ROUNDING: Final = 1e-14
+"""Part of a matrix's largest entry below which its pivots are rounding."""
 MAX_STEP: Final = 0.2
 
 
@@ -49,7 +51,11 @@ def least_squares(x: Array, look: Look, move: Move, iterations: int) -> Array | 
     for _ in range(iterations):
         if not (np.isfinite(values).all() and np.isfinite(table).all()):
             return None
-        damped = table.T @ table + DAMPING * np.eye(table.shape[1])
+        with np.errstate(over="ignore"):
+            damped = table.T @ table
+        if not np.isfinite(damped).all():
+            return None
+        damped += max(DAMPING, ROUNDING * float(damped.max())) * np.eye(table.shape[1])
         step = np.asarray(np.linalg.solve(damped, -table.T @ values), np.float64)
         step *= min(1.0, MAX_STEP / max(float(np.abs(step).max(initial=0.0)), 1e-300))
         x = move(x, step)

@@ -17,7 +17,7 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import Numbers, Objects, snapped, snapped_all
-from pkm_twin.codegen.operations import absolute, sqrt
+from pkm_twin.codegen.operations import absolute, maximum, sqrt
 from pkm_twin.kinematics.motion import Columns, Motion, Row, difference
 from pkm_twin.machine.graph import BASE
 from pkm_twin.machine.joints import UNITS
@@ -61,8 +61,9 @@ def chain_to_base(tree: Tree, body: str) -> list[str]:
 class LimbPose:
     """A limb solved for bodies at its ends that are placed, on numbers and expressions alike.
 
-    The limb's unknowns are written into ``x``, and its bodies are placed. C is the centre of the
-    turns, J the point of the joint that closes the limb.
+    Of a P-R-R-U limb these are equations 6 to 12 of the 3-PRRU paper: its points, the slider, the
+    limb's plane and its swing. The limb's unknowns are written into ``x``, and its bodies are
+    placed. C is the centre of the turns, J the point of the joint that closes the limb.
 
     * "rod": the reach brings one end of a rod to its length from the other.
     * "reach, turns": the reach brings C to its distance from J beyond; then the turns bring J.
@@ -72,15 +73,19 @@ class LimbPose:
 
     ``slopes``: factors of the limb in the determinant of the closures, above zero as at home, and
     what makes them of unit one. ``levers``: of turns, in the same way. ``rows``: the closures that
-    are left to other joints.
+    are left to other joints. ``miss``: by how much (m) a limb falls short that is brought as near
+    as it can be (``closest``, on numbers alone); otherwise such a limb is NaN.
     """
 
-    def __init__(self, motion: Motion, limb: Limb, x: Objects, q: Numbers) -> None:
+    def __init__(
+        self, motion: Motion, limb: Limb, x: Objects, q: Numbers, *, closest: bool = False
+    ) -> None:
         tree, graph = motion.tree, motion.graph
         self.motion, self.tree, self.x = motion, tree, x
         self.slopes: list[tuple[Any, Any]] = []
         self.levers: list[tuple[Any, Any]] = []
         self.rows: list[Row] = []
+        self.closest, self.miss = closest, 0.0
         self.normal: Any = None
         self.slope: Any = None
         self.ends: tuple[tuple[str, Any], tuple[str, Any]] = (BASE, UNITS[0]), (BASE, UNITS[0])
@@ -88,7 +93,7 @@ class LimbPose:
             rod = graph.rods[limb.part]
             at, end = rod.ends if rod.inner == limb.tip else rod.ends[::-1]
             target = motion.point(limb.beyond, end)
-            self._reach(tree.links[limb.reach], at, target, end, _square(end - at))
+            self._reach(tree.links[limb.reach], at, target, end, square_of(end - at))
             motion.place(limb.bodies, x, q)
             self._keep_ends(limb, at, limb.beyond, target)
             return
@@ -124,9 +129,9 @@ class LimbPose:
             between = Motion(tree, x, q, after[: after.index(link.body)], last.body)
             turned = between.rotation[link.parent]
             local = -(turned.T @ between.origin[link.parent]) - link.arm
-            square = _square(apart)
+            square = square_of(apart)
             if len(steps) == 1:
-                square = _square([*towards[:2], lever[2]])
+                square = square_of([*towards[:2], lever[2]])
             self._solve_reach(link, at, local, top.at, square)
             self.ends = (limb.beyond, target), (top.parent, centre)
         if limb.kind in ("turns", "turns, reach"):
@@ -147,7 +152,7 @@ class LimbPose:
         ends = (top.parent, limb.beyond), (apart, target)
         if limb.leaves and limb.kind == "turns":
             self.rows.append(
-                self._distance(limb, *ends, _square(lever[: 2 if len(steps) == 1 else 3]))
+                self._distance(limb, *ends, square_of(lever[: 2 if len(steps) == 1 else 3]))
             )
         if limb.leaves > len(self.rows):
             self.rows.append(self._plane(limb, *ends, lever[2]))
@@ -183,14 +188,14 @@ class LimbPose:
         A single turn keeps out of its plane what is there.
         """
         if len(steps) == 2:
-            return _square(lever)
+            return square_of(lever)
         tree, motion = self.tree, self.motion
         link = tree.links[limb.reach]
         turned = motion.rotation[link.parent]
         own = tree.axes[link.parent].T @ (moved - tree.at[link.parent])
         normal = turned @ snapped_all(tree.axes[link.parent].T @ steps[0].axis)
         gap = normal @ (np.asarray(target) - motion.origin[link.parent] - turned @ own)
-        return _square([*lever[:2], gap])
+        return square_of([*lever[:2], gap])
 
     def _reach(self, link: Link, point: Array, target: Numbers, goal: Array, square: Any) -> None:
         """Bring a body's point to a distance from a target; ``goal`` is the target at home."""
@@ -213,29 +218,48 @@ class LimbPose:
             w, w_home = step.before.T @ local, step.before.T @ home
             a, c = v[0] * w[0] + v[1] * w[1], v[0] * w[1] - v[1] * w[0]
             c_home = v[0] * w_home[1] - v[1] * w_home[0]
-            d = 0.5 * (_square(v[:2]) + _square(w[:2]) + (v[2] - w[2]) ** 2 - square)
+            d = 0.5 * (square_of(v[:2]) + square_of(w[:2]) + (v[2] - w[2]) ** 2 - square)
             n = a * a + c * c
-            root = sqrt(n - d * d)
-            side = -_sign(c_home) * root
+            d, root = self._meet(d, n, square)
+            side = -sign_of(c_home) * root
             self.x[step.position] = (a * d - c * side) / n
             self.x[step.position + 1] = step.sign * ((c * d + a * side) / n)
-            scale = sqrt(_square(v[:2]) * _square(w_home[:2]))
+            scale = sqrt(square_of(v[:2]) * square_of(w_home[:2]))
             self.slope = step.sign * side
         else:
             # |e t + d|^2 = square, of the slide t from home.
             own = parent.T @ link.axes @ v
             e = step.local * step.slide * step.sign
             d, d_home = own - local, own - home
-            length, h = _square(e), e @ d
-            root = sqrt(h * h - (_square(d) - square) * length)
-            self.slope = _sign(e @ d_home) * root
+            length, h = square_of(e), e @ d
+            free = h * h - (square_of(d) - square) * length
+            if self.closest and not free > 0.0:
+                self._fall_short(sqrt(square - free / length) - sqrt(square))
+                free = 0.0
+            root = sqrt(free)
+            self.slope = sign_of(e @ d_home) * root
             self.x[step.position] = (self.slope - h) / length
-            scale = sqrt(_square(d_home) * length)
+            scale = sqrt(square_of(d_home) * length)
         self.slopes.append((root, scale))
+
+    def _meet(self, d: Any, n: Any, square: Any) -> tuple[Any, Any]:
+        """Return d and sqrt(n - d^2), of a turn that is to bring a cos + c sin to d.
+
+        :param n: a^2 + c^2. ``square``: of the distance that falls by 2 d, 0: d is a length.
+        """
+        if self.closest and not n > d * d:
+            nearest = sqrt(n) * sign_of(d)
+            most = sqrt(maximum(square + 2.0 * (d - nearest), 0.0)) - sqrt(square)
+            self._fall_short(absolute(most if square else d - nearest))
+            return nearest, 0.0
+        return d, sqrt(n - d * d)
+
+    def _fall_short(self, miss: Any) -> None:
+        self.miss = max(self.miss, float(miss))
 
     def _turn(self, step: Step, towards: Numbers, lever: Numbers) -> None:
         """Turn a lever about an axis z into the direction of a vector."""
-        x, y, n = lever[0], lever[1], _square(lever[:2])
+        x, y, n = lever[0], lever[1], square_of(lever[:2])
         self.levers.append((sqrt(n), self.tree.size))
         self.x[step.position] = (x * towards[0] + y * towards[1]) / n
         self.x[step.position + 1] = step.sign * ((x * towards[1] - y * towards[0]) / n)
@@ -253,14 +277,14 @@ class LimbPose:
         a, b = m[0] * x + m[1] * y, m[1] * x - m[0] * y
         c = towards[2] - m[2] * z
         square = a * a + b * b
-        root = sqrt(square - c * c)
+        c, root = self._meet(c, square, 0.0)
         # At home the turn is none, and the root is the size of what stands here for b.
-        side = -_sign(m[1] * home[0] - m[0] * home[1]) * root
+        side = -sign_of(m[1] * home[0] - m[0] * home[1]) * root
         cosine, sine = (a * c - b * side) / square, (b * c + a * side) / square
         self.x[second.position], self.x[second.position + 1] = cosine, second.sign * sine
         turned = [cosine * x - sine * y, sine * x + cosine * y, z]
         self._turn(first, towards, second.before @ np.array(turned, dtype=object))
-        self.slopes.append((root, sqrt(_square(lever))))
+        self.slopes.append((root, sqrt(square_of(lever))))
 
     def _spin(self, limb: Limb) -> None:
         """Turn a body about its line to the closing joint, whose axes keep their angle."""
@@ -278,8 +302,8 @@ class LimbPose:
         a, b = v[0] * u[0] + v[1] * u[1], v[0] * u[1] - v[1] * u[0]
         d = snapped(mine @ other) - v[2] * u[2]
         n = a * a + b * b
-        root = sqrt(n - d * d)
-        side = -_sign(v[0] * home[1] - v[1] * home[0]) * root
+        d, root = self._meet(d, n, 0.0)
+        side = -sign_of(v[0] * home[1] - v[1] * home[0]) * root
         self.x[step.position] = (a * d - b * side) / n
         self.x[step.position + 1] = step.sign * ((b * d + a * side) / n)
         self.slopes.append((root, 1.0))
@@ -326,7 +350,7 @@ def _no_bias() -> Any:
     raise NotImplementedError("rates and accelerations come from the closures themselves")
 
 
-def _square(vector: Numbers) -> Any:
+def square_of(vector: Numbers) -> Any:
     """Return the sum of the squares of three numbers or fewer."""
     return sum((value * value for value in vector), 0.0)
 
@@ -337,19 +361,19 @@ def _across(vector: Objects, normal: Objects) -> Objects:
     return part
 
 
-def _sign(value: Any) -> Any:
+def sign_of(value: Any) -> Any:
     """Return 1 or -1 as the sign of a number that is not 0."""
     return value / absolute(value)
 
 
 def place_in_order(
-    tree: Tree, order: Sequence[str | Limb], x: Objects, q: Numbers
+    tree: Tree, order: Sequence[str | Limb], x: Objects, q: Numbers, *, closest: bool = False
 ) -> tuple[Motion, list[LimbPose]]:
     """Place all bodies; limbs in closed form write their unknowns into ``x``."""
     motion, limbs = Motion(tree, x, q, ()), []
     for entry in order:
         if isinstance(entry, Limb):
-            limbs.append(LimbPose(motion, entry, x, q))
+            limbs.append(LimbPose(motion, entry, x, q, closest=closest))
         else:
             motion.place((entry,), x, q)
     return motion, limbs

@@ -22,7 +22,8 @@ from pkm_twin.codegen.expressions import SNAP
 from pkm_twin.codegen.lu import Order, independent_rows, pivot_order
 from pkm_twin.kinematics import pose as poses
 from pkm_twin.kinematics.diagnosis import mobility_error
-from pkm_twin.kinematics.limb_pose import Limb, chain_to_base
+from pkm_twin.kinematics.iterations import newton
+from pkm_twin.kinematics.limb_pose import Limb, LimbPose, chain_to_base, place_in_order
 from pkm_twin.kinematics.limbs import order_closed
 from pkm_twin.kinematics.linkage import REACH
 from pkm_twin.kinematics.motion import Motion, numbers
@@ -74,7 +75,7 @@ class PoseChain:
         return tuple(f"pose {carrier.name}" for carrier in self.carriers)
 
     def attach(self, graph: Graph, *, by_pose: bool) -> Graph:
-        """Return the graph with the chain.
+        """Return the graph with the chain, of a rotation as 3-PRRU paper, equation 1.
 
         :param by_pose: whether the pose coordinates are actuated in place of the machine's joints.
         """
@@ -320,6 +321,38 @@ class CarriedScheme(Scheme):
         """Closures that no closed form meets by itself."""
         solved = {k for limb in self.limbs for k in limb.rows}
         return [k for k in range(len(self.parts)) if k not in solved]
+
+    def find_shortfall(self, pose: Array) -> tuple[str, float] | None:
+        """Return the joint or rod that closes the first limb which falls short, and the gap, m.
+
+        The machine is driven by its pose. None: not known, because a limb has no closed form. The
+        gap is 0 where the closures are met.
+        """
+        rates = self.solved[1]
+        inner = {step.rate for body in chain_to_base(self.tree, self.graph.platform)
+                 for step in self.tree.links[body].steps if not step.actuated}  # fmt: skip
+        if not set(rates) <= inner:
+            return None
+        limbs: list[LimbPose] = []
+
+        def look(x: Array) -> tuple[Array, Array]:
+            motion, limbs[:] = place_in_order(
+                self.tree, self.order, np.array(x, dtype=object), pose, closest=True
+            )
+            rows = self.solved_rows(motion.closures(), limbs)
+            values = [row.scale * float(row.value) for row in rows]
+            return np.array(values), self.scaled(rows)[0][:, rates]
+
+        def move(x: Array, step: Array) -> Array:
+            change = np.zeros(self.tree.unknown_rates)
+            change[rates] = step / np.array(self.tree.scales)[rates]
+            return np.array(Motion(self.tree, x, pose).retracted(x, change), float)
+
+        with np.errstate(all="ignore"):
+            if newton(np.array(self.tree.home, float), look, move) is None:
+                return None
+        misses = {limb.part: found.miss for limb, found in zip(self.limbs, limbs, strict=True)}
+        return next((short for short in misses.items() if short[1] > 0.0), (self.parts[0], 0.0))
 
     @cached_property
     def drive_pivots(self) -> Order:

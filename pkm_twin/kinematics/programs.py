@@ -162,7 +162,7 @@ def inverse_program(t: Traced, scheme: CarriedScheme | None) -> Program:
     same: list[Any] = []
     for c, scale, a, b in zip(t.scheme.coordinates, t.pose_scales, there, pose, strict=True):
         apart = a - b
-        if len(c.entries) == 2:
+        if c.axis is None:
             # A full turn makes no difference.
             same.append(cos(apart))
             apart = sin(apart)

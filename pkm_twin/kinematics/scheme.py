@@ -4,11 +4,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from itertools import combinations
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import numpy as np
 
@@ -26,6 +25,7 @@ from pkm_twin.kinematics.linkage import Linkage, rank_of
 from pkm_twin.kinematics.motion import Motion, Row, matrices, numbers
 from pkm_twin.kinematics.pose import Coordinate
 from pkm_twin.kinematics.spins import null
+from pkm_twin.kinematics.three_rods import find_three_rods
 from pkm_twin.machine.geometry import geometry_of, pattern_of
 from pkm_twin.machine.graph import BASE, Graph
 from pkm_twin.machine.tree import Step, Tree
@@ -38,51 +38,47 @@ POSE_MOVES: Final = (1e-3, 1e-6)
 or, where that leaves too few coordinates, more than the computer's."""
 
 
-@dataclass(frozen=True, eq=False)
-class Closed:
-    """What a mechanism's closed forms need in addition to the graph.
+class Start(Protocol):
+    """A closed form of the forward kinematics, that Newton's method starts from."""
 
-    ``numbers``: shape (k,). ``start``: where there is one, of such numbers and q to the values of
-    passive tree joints beside home, by name, from the inner to the outer body.
-    """
+    def place(self, tree: Tree, q: Numbers) -> list[Any]:
+        """Return the tree's unknowns at q, on numbers and expressions alike."""
 
-    numbers: Array
-    start: Callable[[Numbers, Objects], Mapping[str, Sequence[Any]]] | None = None
-
-
-Branch = Callable[[Motion], Sequence[Any]]
-"""A mechanism's numbers that are above zero in its own branch, of the motion."""
+    def find_miss(self, tree: Tree, q: Numbers) -> tuple[str, float] | None:
+        """Return the joint or rod that falls short at q, and by how much (m); None: not known."""
 
 
 class Scheme(Linkage):
-    """A linkage with pose coordinates and closed forms, and how its equations are solved."""
+    """A linkage with pose coordinates, and how its equations are solved."""
 
     def __init__(
         self,
         graph: Graph,
         coordinates: Sequence[Coordinate],
-        closed: Closed | None = None,
-        branch: Branch | None = None,
-        mark: ProgramKey = EMPTY,
         first: tuple[str, ...] = (),
+        start: Start | None = None,
     ) -> None:
         super().__init__(graph, first)
+        self._start = start
         self.coordinates = tuple(coordinates)
-        self.closed, self.branch, self._mark = closed or Closed(np.zeros(0)), branch, mark
 
     @cached_property
     def geometry(self) -> Array:
         """What programs take of the machine's geometry, shape (k,)."""
-        return np.concatenate([geometry_of(self.graph), self.closed.numbers])
+        return np.array(geometry_of(self.graph), np.float64)
 
     @cached_property
     def structure(self) -> ProgramKey:
         """All that programs depend on: machines of one structure share them."""
-        return self._mark.also(repr((
+        return EMPTY.also(repr((
             self.graph.topology, pattern_of(self.tree), self.coordinates,
-            self.closed.start is not None, self.branch is not None, self.independent, self.pivots,
-            self.order, self.solved_pivots,
-        )))  # fmt: skip
+            self.start, self.independent, self.pivots, self.order, self.solved_pivots,
+        )), type(self.start or self))  # fmt: skip
+
+    @cached_property
+    def start(self) -> Start | None:
+        """The closed form of all unknowns, None where there is none."""
+        return self._start or find_three_rods(self)
 
     @cached_property
     def independent(self) -> list[int]:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from copy import copy
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
@@ -21,7 +21,6 @@ from pkm_twin.codegen.expressions import (
     snapped_all,
 )
 from pkm_twin.codegen.lu import SparseLU
-from pkm_twin.codegen.operations import cos, sin
 from pkm_twin.codegen.program import AT, LEAST, STATE, UNKNOWNS, Equations, previous
 from pkm_twin.kinematics.drives import LEADS, TIME, Drives
 from pkm_twin.kinematics.limb_pose import LimbPose
@@ -71,11 +70,8 @@ class Traced:
         self.tape = Tape([*scheme.geometry.tolist(), *more.tolist()], free=free)
         given = self.tape.inputs(GEOMETRY, len(self.tape.reference))
         end = len(scheme.geometry)
-        own = end - len(scheme.closed.numbers)
         self.geometry = given[:end]
-        self.graph: Graph = graph_on(scheme.graph, given[:own])
-        self.closed = given[own:end]
-        """Numbers of the mechanism's closed forms."""
+        self.graph: Graph = graph_on(scheme.graph, self.geometry)
         self.more = given[end:]
         """Numbers beside the geometry's, see :meth:`.engine.Engine.kernel_with`."""
         self._span()
@@ -93,9 +89,7 @@ class Traced:
         other = copy(self)
         # No cached property of this tree is the other's.
         vars(other).clear()
-        vars(other).update(
-            tape=self.tape, geometry=self.geometry, closed=self.closed, more=self.more
-        )
+        vars(other).update(tape=self.tape, geometry=self.geometry, more=self.more)
         other.scheme, other.graph = scheme, scheme.carry(self.graph)
         if scheme.by_pose:
             other.unknowns_name, other.drives_name = POSED, "pose"
@@ -149,9 +143,9 @@ class Traced:
         return dict.fromkeys(names, self.drives.count) | more
 
     def equations(self, **more: Any) -> tuple[Equations, ...]:
-        """Newton's method for the unknowns at q, from home or the mechanism's closed form.
+        """Newton's method for the unknowns at q, from a guess or a closed form.
 
-        :param more: further fields of the equations; ``branch``: beside the mechanism's own.
+        :param more: further fields of the equations.
         """
         if self.drives.others and "goal" not in more:
             more["goal"] = self.lift(self.drives.given("q"))
@@ -166,11 +160,10 @@ class Traced:
         before = self.tape.inputs(previous(self.unknowns_name), len(places))
         state = self.tape.inputs(STATE, len(AT))
         onward = self.unknowns + state[AT.onward] * (self.unknowns - before)
-        branch = [] if scheme.branch is None else self.lift(scheme.branch(self.motion))
-        determinant = self.determinant
+        branch, determinant = [], self.determinant
         if not places:
             # Nothing is corrected: the result alone is judged.
-            branch, determinant = [*branch, *self.lift([determinant - LEAST])], 1.0
+            branch, determinant = self.lift([determinant - LEAST]), 1.0
         judged = [self.rows[k] for k in scheme.judged]
         solved = Equations(
             self.target, self.lift([tree.home[k] for k in places]), self.lift(self.graph.lead_home),
@@ -178,7 +171,7 @@ class Traced:
             self.lift([moved[k] for k in places]),
             self.square(step, [tree.scales[k] for k in rates]), self.tape.lift(determinant),
             self.square([r.value for r in judged], [r.scale for r in judged]),
-            scheme.closed.start is None, [*branch, *more.pop("branch", ())], self.unknowns_name,
+            scheme.start is None, [*branch, *more.pop("branch", ())], self.unknowns_name,
             **more,
         )  # fmt: skip
         return (solved,)
@@ -247,10 +240,10 @@ class Traced:
 
     def _start(self) -> Sequence[Any]:
         """Return the unknowns that Newton's method starts with: in closed form, or a guess."""
-        closed = self.scheme.closed.start
+        closed = self.scheme.start
         if not self.scheme.solved[0]:
             return []
-        return self._guess() if closed is None else self._ordered(closed(self.closed, self.q))
+        return self._guess() if closed is None else closed.place(self.tree, self.q)
 
     def place_start(self) -> Motion:
         """Place all bodies by the unknowns that Newton's method starts with."""
@@ -303,22 +296,6 @@ class Traced:
         motion, limbs, _ = self._placed(tangent)
         solved = scheme.solved_rows(motion.closures(), limbs)
         return self.retracted(tangent, -newton.solve([row.value for row in solved]))
-
-    def _ordered(self, values: Mapping[str, Sequence[Any]]) -> list[Any]:
-        """Unknowns of Newton's method by joints' values."""
-        result: list[Any] = list(self.tree.home)
-        for link in self.tree.links.values():
-            steps = link.steps
-            if steps and not steps[0].actuated:
-                given = list(values[str(link.joint)])
-                given = given if steps[0].sign > 0.0 else given[::-1]
-                for step, value in zip(steps, given, strict=True):
-                    k = step.position
-                    if step.circle:
-                        result[k : k + 2] = [cos(value), sin(value)]
-                    else:
-                        result[k] = value
-        return [result[k] for k in self.scheme.solved[0]]
 
     def lift(self, values: Numbers) -> list[Expression]:
         """Results as expressions."""

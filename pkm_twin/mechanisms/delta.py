@@ -11,27 +11,27 @@ the limb's radial direction. (The paper names the joint but not its second axis.
 forearm the constraint would be the forearm's torsion, which cannot hold the platform's rotation
 where tan of the forearms' slope is the root of 2: within a degree of the paper's home pose.)
 
-Branches: ``inverse`` takes the elbows outwards; ``forward`` takes the platform below the elbows.
+Home has the elbows outwards and the platform below them.
 
 Source: Delta-CU paper (table 1; equations 1 to 16 are computed by ``pkm_twin.kinematics``).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise
 from typing import Any, ClassVar, Final
 
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.expressions import Expression, Numbers, Objects, plain, reference
-from pkm_twin.codegen.operations import absolute, atan2, cos, maximum, minimum, sin, sqrt
+from pkm_twin.codegen.expressions import Expression, plain, reference
+from pkm_twin.codegen.operations import cos, sin
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.motion import cross
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate
+from pkm_twin.kinematics.three_rods import meet_spheres
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import BASE, PLATFORM, UP, Body, Direction, Graph, Joint, Rod, array
 from pkm_twin.machine.joints import unit
@@ -39,7 +39,7 @@ from pkm_twin.machine.members import Beam, Structure, Tube, axial, disc
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.sections import check_azimuths, length, mass, shared_middle
 from pkm_twin.mechanisms import TwinRobot
-from pkm_twin.robot.mechanism import Inverse, RigidError
+from pkm_twin.robot.mechanism import RigidError
 
 LIMBS: Final = ("I", "II", "III")
 MAX_ITERATIONS: Final = 12
@@ -119,7 +119,6 @@ class Delta(TwinRobot):
     mobility: ClassVar[str] = "3: translations x, y, z"
     coordinates: ClassVar[tuple[Coordinate, ...]] = tuple(COORDINATES[c] for c in "xyz")
     limb_names: ClassVar[tuple[str, ...]] = tuple(f"limb {limb}" for limb in LIMBS)
-    has_inverse: ClassVar[bool] = True
 
     @property
     def description(self) -> str:
@@ -131,28 +130,6 @@ class Delta(TwinRobot):
     def size(self) -> float:
         """The platform's radius, m."""
         return self.geometry.platform_radius
-
-    @property
-    def closed_key(self) -> str:
-        """The closures."""
-        return repr(self.geometry.closures)
-
-    @property
-    def closed_numbers(self) -> Sequence[float]:
-        """Lengths and azimuths, then the arms and the platform at home."""
-        g, (q, platform) = self.geometry, self._home
-        lengths = (g.base_radius, g.platform_radius, g.arm_length, g.forearm_length)
-        return *lengths, *g.azimuths, *q, *platform
-
-    def on(self, numbers: Numbers) -> Delta:
-        """The same on other numbers."""
-        parts = (plain(numbers[k:n]) for k, n in pairwise((0, 4, 7, 10, 13)))
-        lengths, azimuths, q, platform = parts
-        words = ("base_radius", "platform_radius", "arm_length", "forearm_length")
-        geometry = replace(
-            self.geometry, azimuths=azimuths, **dict(zip(words, lengths, strict=True))
-        )
-        return self._with(geometry=geometry, _home=(q, platform))
 
     @cached_property
     def _directions(self) -> list[tuple[Array, Array]]:
@@ -231,78 +208,12 @@ class Delta(TwinRobot):
         return None if x.dtype != object else x
 
     def _below(self, q: Any) -> Any:
-        """Where spheres about the elbows (the platform moved to one point) meet, the lower place.
-
-        Rods: the assembly. With an rcu a place to start from. Where the spheres do not meet, the
-        middle of their elbows' circle.
-        """
+        """Return the place of a platform on three rods, below the elbows; with an rcu a guess."""
         g = self.geometry
         centres = [
             self._elbow(i, q[i]) - g.platform_radius * self._directions[i][0] for i in range(3)
         ]
-        u, v = centres[1] - centres[0], centres[2] - centres[0]
-        n = cross(u, v)
-        square = n @ n
-        middle = cross((u @ u) * v - (v @ v) * u, n) * (0.5 / square)
-        rest = maximum((g.forearm_length**2 - middle @ middle) / square, 0.0)
-        # Below: against the normal's own z.
-        height = -sqrt(rest) * n[2] / maximum(absolute(n[2]), 1e-300)
-        return centres[0] + middle + height * n
-
-    @property
-    def has_start(self) -> bool:
-        """With rods alone: an rcu's slide makes the spheres' meeting point a guess."""
-        return "rcu" not in self.geometry.closures
-
-    def start(self, q: Objects) -> Mapping[str, Sequence[Any]]:
-        """The platform's place beside home."""
-        _, platform = self._home
-        return {"translation": self._below(q) - platform}
-
-    def solved(self, pose: Objects) -> Inverse:
-        """Arm angles, elbows outwards: a cos q - z sin q = g in each limb's plane."""
-        g = self.geometry
-        q, misses = [], []
-        for i in range(3):
-            out, along = self._directions[i]
-            a = pose @ out + (g.platform_radius - g.base_radius)
-            aside = pose @ along
-            z = pose[2]
-            rho, far = g.forearm_length, -1.0
-            if g.closures[i] == "rod":
-                far = absolute(aside) - g.forearm_length
-                rho = sqrt(maximum(rho * rho - aside * aside, 0.0))
-            reach = sqrt(a * a + z * z)
-            short = maximum(reach - g.arm_length - rho, absolute(g.arm_length - rho) - reach)
-            safe = maximum(reach, 1e-300)
-            c = (reach * reach + g.arm_length**2 - rho * rho) / (2.0 * g.arm_length * safe)
-            c = minimum(1.0, maximum(-1.0, c))
-            s = sqrt((1.0 - c) * (1.0 + c))
-            # The angle of (a, -z) less that of (c, s).
-            q.append(atan2(-z * c - a * s, a * c - z * s))
-            misses.append(maximum(short, far))
-        return Inverse(q, misses)
-
-    def unreachable_limb(self, q: Array, reached: float) -> tuple[int, float] | None:
-        """The limb that stands apart from the two closest elbows, of rods that do not meet."""
-        g = self.geometry
-        if "rcu" in g.closures:
-            # Its elbow slides: what the other limbs leave open, it has to close.
-            _, miss, measure = self.engine.ending(q, reached)
-            return (g.closures.index("rcu"), miss) if measure is None else None
-        centres = np.array(
-            [self._elbow(i, q[i]) - g.platform_radius * self._directions[i][0] for i in range(3)],
-            float,
-        )
-        u, v = centres[1] - centres[0], centres[2] - centres[0]
-        n = np.cross(u, v)
-        if not n @ n > 1e-18 * g.forearm_length**4:
-            return None
-        middle = np.cross((u @ u) * v - (v @ v) * u, n) / (2 * (n @ n))
-        miss = float(np.linalg.norm(middle)) - g.forearm_length
-        sides = [float(np.linalg.norm(centres[i] - centres[(i + 1) % 3])) for i in range(3)]
-        apart = (int(np.argmin(sides)) + 2) % 3
-        return (apart, miss) if miss > 0.0 else None
+        return meet_spheres(centres, [g.forearm_length**2] * 3, -UP)[0]
 
     def grid(self) -> PoseGrid:
         """Places about the vertical axis."""

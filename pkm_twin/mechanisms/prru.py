@@ -10,18 +10,8 @@ direction d_i = sin theta_i e_i + cos theta_i z with e_i = (cos phi_i, sin phi_i
 link turns in addition about d_i, so that the universal joint's platform-fixed axis, tangential,
 and its link-fixed axis stay at a right angle.
 
-Parasitic motions. t_i . U_i = 0 for three limbs is linear in x, y, cos gamma and sin gamma, so
-gamma, x and y have a closed form for any three different azimuths; at 120 degrees it is equation
-11 of the paper.
-
-Branches: ``below`` has every slider below its platform joint (the paper's equation 9), ``above``
-every slider above it. Of the assemblies that a set of slider heights allows, ``forward`` gives
-the one that is reached from equal heights (the level platform) when all sliders move straight to
-their places, without passing a singularity; its beta is within a quarter turn. ``inverse`` takes
-the poses on the same side of the singularities as the level one and refuses those beyond, where
-the measure is zero or negative. For limbs at 120 degrees and a platform no wider than the base,
-``forward`` undoes ``inverse`` up to the singularity; a platform much wider, or uneven limbs, can
-have further assemblies on that side in steep poses.
+At home every slider is ``below`` its platform joint (the paper's equation 9) or ``above`` it. The
+parasitic motions gamma, x and y follow from the planes of the limbs.
 
 Source: 3-PRRU paper (equations 1 to 17 geometry, 18 to 31 velocities, 32 to 41 virtual work). The
 paper has each link's mass at its slider joint, which ``link_com: 0`` gives.
@@ -29,7 +19,6 @@ paper has each link's mass at its slider joint, which ``link_com: 0`` gives.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar, Final
@@ -37,10 +26,8 @@ from typing import Any, ClassVar, Final
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.expressions import Numbers, Objects, plain, snapped
-from pkm_twin.codegen.operations import absolute, cos, maximum, minimum, sin, sqrt
+from pkm_twin.codegen.operations import sqrt
 from pkm_twin.errors import ParameterError
-from pkm_twin.kinematics.motion import Motion
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate, about_x, about_y
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import BASE, PLATFORM, UP, Body, Direction, Graph, Joint, array
@@ -48,8 +35,7 @@ from pkm_twin.machine.members import Beam, Structure, Tube, axial, disc
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.sections import check_azimuths, length, mass, shared_middle
 from pkm_twin.mechanisms import TwinRobot
-from pkm_twin.robot.mechanism import Inverse, RigidError
-from pkm_twin.robot.robot import SINGULARITY_BOUND
+from pkm_twin.robot.mechanism import RigidError
 
 LIMBS: Final = ("I", "II", "III")
 
@@ -133,33 +119,11 @@ class Prru(TwinRobot):
         COORDINATES["z"], about_x("alpha"), about_y("beta"),
     )  # fmt: skip
     limb_names: ClassVar[tuple[str, ...]] = tuple(f"limb {limb}" for limb in LIMBS)
-    has_inverse: ClassVar[bool] = True
-    has_branch: ClassVar[bool] = True
 
     @property
     def size(self) -> float:
         """The platform's radius, m."""
         return self.geometry.platform_radius
-
-    @property
-    def closed_key(self) -> str:
-        """The branch."""
-        return self.geometry.branch
-
-    @property
-    def closed_numbers(self) -> Sequence[float]:
-        """Lengths and azimuths."""
-        g = self.geometry
-        return g.base_radius, g.platform_radius, g.limb_length, *g.azimuths
-
-    def on(self, numbers: Numbers) -> Prru:
-        """The same on other numbers."""
-        base, platform, limb, *azimuths = numbers
-        geometry = replace(
-            self.geometry, base_radius=base, platform_radius=platform, limb_length=limb,
-            azimuths=plain(azimuths),
-        )  # fmt: skip
-        return self._with(geometry=geometry)
 
     def _directions(self, i: int) -> tuple[Array, Array]:
         """Return e and t of limb i, whose azimuth phi_i gives C_i (equations 2 and 3)."""
@@ -177,94 +141,6 @@ class Prru(TwinRobot):
         g = self.geometry
         aside = g.base_radius - g.platform_radius
         return self._sign * sqrt(g.limb_length**2 - aside**2)
-
-    def _corners(self, pose: Objects) -> tuple[Any, Any]:
-        """Return the platform joints U_i of a pose, (3, 3), and the norm that gamma is told by.
-
-        U_i by the rotation of equation 1 (equations 6 and 7), in the limbs' planes (equation 10).
-        With the upper left of Rx Ry = [[m, 0], [n, o]], sum w_i t_i . U_i = 0, where
-        sum w_i t_i = 0 and sum w_i = 1, reads a cos gamma + b sin gamma = 0; b > 0 in the level
-        pose. At 120 degrees it is equation 11: tan gamma = -n / (m + o). The centre's x and y are
-        the least squares of the three planes, which agree.
-        """
-        g = self.geometry
-        phi, r = g.azimuths, g.platform_radius
-        c, s = np.cos(phi), np.sin(phi)
-        weights = np.array([c[k - 2] * s[k - 1] - c[k - 1] * s[k - 2] for k in range(3)])
-        weights = weights * (1.0 / weights.sum())
-        ca, sa, cb, sb = cos(pose[1]), sin(pose[1]), cos(pose[2]), sin(pose[2])
-        n = sa * sb
-        sine, cosine = snapped(weights @ np.sin(2 * phi)), snapped(weights @ np.cos(2 * phi))
-        a = (ca - cb) * sine + n * (cosine + 1.0)
-        b = (ca - cb) * cosine - n * sine + ca + cb
-        norm = sqrt(a * a + b * b)
-        safe = maximum(norm, 1e-300)
-        cg, sg = b / safe, -a / safe
-        x = np.array([cb * cg, n * cg + ca * sg, sa * sg - ca * sb * cg], dtype=object)
-        y = np.array([-cb * sg, ca * cg - n * sg, sa * cg + ca * sb * sg], dtype=object)
-        arms = [-r * (x * c[i] + y * s[i]) for i in range(3)]
-        planes = np.array([self._directions(i)[1][:2] for i in range(3)])
-        (xx, xy), (_, yy) = planes.T @ planes
-        off = planes.T @ np.array([-(self._directions(i)[1] @ arms[i]) for i in range(3)])
-        inverse = 1.0 / (xx * yy - xy * xy)
-        centre = [(yy * off[0] - xy * off[1]) * inverse, (xx * off[1] - xy * off[0]) * inverse]
-        return [np.array([*centre, pose[0]], dtype=object) + arm for arm in arms], norm
-
-    def branch(self, motion: Motion) -> Sequence[Any]:
-        """Height of every platform joint over its slider, on the branch's side."""
-        rises = []
-        for limb in LIMBS:
-            joints = motion.graph.joints
-            foot, head = (joints[f"{w} joint {limb}"].at for w in ("slider", "platform"))
-            upper = f"upper link {limb}"
-            rises.append((motion.point(upper, head) - motion.point(upper, foot))[2] * self._sign)
-        return rises
-
-    def unreachable_limb(self, q: Array, reached: float) -> tuple[int, float] | None:
-        """The slider farthest from the mean height: it has to come back the most."""
-        way, x, _ = self.engine.reach(q, precision=1e-9)
-        if way < 1.0:
-            back = (1.0 - way) * np.abs(q - q.mean())
-            return int(back.argmax()), float(back.max())
-        del reached
-        rises = np.array([float(v) for v in self.branch(self.engine.at(x.tolist(), q)[0])])
-        # The first slider that has passed its platform joint, where inverse has another branch.
-        limb = int((rises <= 0.0).argmax())
-        return limb, float(-rises[limb])
-
-    def solved(self, pose: Objects) -> Inverse:
-        """Return the slider heights (equation 9), and the closure's determinant, 1 at level.
-
-        ``aside / l`` and ``rise / l`` are sine and cosine of the swing theta_i (equations 8, 12).
-        """
-        g = self.geometry
-        corners, norm = self._corners(pose)
-        l, sign = g.limb_length, self._sign  # noqa: E741
-        q, misses, out, up = [], [], [], []
-        # Where gamma is not told, nothing is: the pose is singular.
-        told = maximum(0.0, minimum(1.0, norm / SINGULARITY_BOUND - 1.0))
-        for i, corner in enumerate(corners):
-            e, _ = self._directions(i)
-            aside = corner @ e + g.base_radius
-            rise = sign * sqrt(maximum((l - aside) * (l + aside), 0.0))
-            out.append(aside)
-            up.append(rise)
-            q.append(corner[2] - rise)
-            misses.append((absolute(aside) - l) * told)
-        # Side k of the platform's triangle from joint k to k + 1: its change by both swings.
-        before: list[Any] = []
-        after: list[Any] = []
-        for k in range(3):
-            j = (k + 1) % 3
-            span = corners[k] - corners[j]
-            for index, table in ((k, before), (j, after)):
-                e, _ = self._directions(index)
-                table.append(up[index] * (span @ e) - out[index] * span[2])
-        determinant = before[0] * before[1] * before[2] - after[0] * after[1] * after[2]
-        sides = [np.cos(g.azimuths[k] - g.azimuths[(k + 1) % 3]) for k in range(3)]
-        scale = np.sqrt(np.prod([2 * g.platform_radius**2 * (1 - side) for side in sides]))
-        measure = determinant * (-sign / (2.0 * l**3 * scale))
-        return Inverse(q, misses, measure * told)
 
     def grid(self) -> PoseGrid:
         """Tilts about the vertical axis, in tilt-and-torsion angles without torsion."""

@@ -14,9 +14,8 @@ tau = X x y, with o = (0, 0, rho), rho = z / cos(beta), and
     L2^2 = (b - a cos gamma)^2 + (rho - a sin gamma)^2
     L3^2 = (b cos beta - a)^2 + (b sin beta + rho)^2
 
-Branch: ``forward`` gives the assembly that is connected to the home pose without a singularity:
-z < 0, rho^2 cos gamma > a b sin^2 gamma (limbs 1 and 2), z + a sin beta < 0 (A3 below the base).
-``inverse`` takes the poses of that branch.
+Between singularities are the poses with z < 0, rho^2 cos gamma > a b sin^2 gamma (limbs 1 and 2)
+and z + a sin beta < 0 (A3 below the base).
 
 Source: 2UPR-RPU paper (geometry of table 1; equations 1 to 37). Its sign conventions are kept;
 they matter only in the product of a limb's couple with its bending.
@@ -25,7 +24,7 @@ they matter only in the product of a limb's couple with its bending.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar, Final
@@ -34,7 +33,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.expressions import Numbers, Objects, norm, reference
+from pkm_twin.codegen.expressions import Numbers, norm, reference
 from pkm_twin.codegen.operations import absolute, atan2, cos, maximum, minimum, sin, sqrt
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.engine import Engine
@@ -44,11 +43,9 @@ from pkm_twin.machine.graph import BASE, MIN_LENGTH, PLATFORM, Body, Direction, 
 from pkm_twin.machine.members import Beam, Section, Structure, axial, compliances, disc, modulus
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.sections import length, mass, shared_middle
+from pkm_twin.machine.tree import Tree
 from pkm_twin.mechanisms import TwinRobot
-from pkm_twin.robot.mechanism import Inverse
 
-MAX_LIMB_RATIO: Final = 1e5
-"""Longest limb over the machine's size; beyond, rounding would lose the pose, or overflow."""
 LEVEL: Final = 1e-2
 """Least that a limb at home is longer than it is wide, as a part: else limbs lie in the base."""
 _PATTERN: Final = array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
@@ -166,6 +163,68 @@ class Limits:
         return None
 
 
+@dataclass(frozen=True)
+class LargestRoot:
+    """The home assembly: rho, beta and gamma by the largest root of a cubic.
+
+    The guess about home is too far from most states: limbs triple their length.
+    """
+
+    def place(self, tree: Tree, q: Numbers) -> list[Any]:
+        """Return cosine and sine of the turns of the passive joints from home.
+
+        With c = cos(gamma) = (P + K) / (2 a b), P = rho^2 and 4 a rho sin(gamma) = L1^2 - L2^2 = D,
+        c^2 + s^2 = 1 is the cubic P (P + K)^2 - 4 a^2 b^2 P + b^2 D^2 / 4 = 0 with
+        K = a^2 + b^2 - (L1^2 + L2^2) / 2. Its slope at a root is
+        4 a b (rho^2 cos(gamma) - a b sin^2(gamma)), so the largest root is the home branch until it
+        meets the middle one, which is the singularity. Limb 3:
+        a cos(beta) - rho sin(beta) = h cos(beta - atan2(-rho, a)).
+        """
+        joints, height = tree.graph.joints, tree.graph.origin[2]
+        a, b = joints["R joint 2"].at[0], joints["U joint 2"].at[0]
+        l1, l2, l3 = q
+        k = a * a + b * b - 0.5 * (l1 * l1 + l2 * l2)
+        ab = a * a * b * b
+        d = (l1 - l2) * (l1 + l2)
+        r = sqrt(k * k + 12.0 * ab)
+        c = k * (8.0 / 3.0 * ab - 2.0 / 27.0 * k * k) + 0.25 * b * b * d * d
+        g = minimum(1.0, maximum(-1.0, -13.5 * c / (r * r * r)))
+        third = atan2(sqrt((1.0 - g) * (1.0 + g)), g) * (1.0 / 3.0)
+        square = maximum(2.0 / 3.0 * (r * cos(third) - k), 1e-12 * a * b)
+        rho = -sqrt(square)
+        gamma = atan2(d / (4.0 * a * rho), (square + k) / (2.0 * a * b))
+        h = sqrt(a * a + square)
+        g = minimum(1.0, maximum(-1.0, (a * a + b * b + square - l3 * l3) / (2.0 * b * h)))
+        beta = atan2(-rho, a) - atan2(sqrt((1.0 - g) * (1.0 + g)), g)
+
+        def direct(i: int, rho: Any, beta: Any, gamma: Any) -> tuple[Any, Any]:
+            """Limb 0 or 1 from B to A along X and tau; limb 2 from A to B along y and tau."""
+            if i == 2:
+                return b * cos(beta) - a, -b * sin(beta) - rho
+            side = -1.0 if i == 0 else 1.0
+            return side * (a * cos(gamma) - b), rho - side * a * sin(gamma)
+
+        turns: dict[str, list[Any]] = {}
+        for i, limb in enumerate("123"):
+            (x, z), (x0, z0) = direct(i, rho, beta, gamma), direct(i, height, 0.0, 0.0)
+            turned = atan2(x * z0 - z * x0, x * x0 + z * z0)
+            if i < 2:
+                turns |= {f"U joint {limb}": [beta, turned], f"R joint {limb}": [gamma - turned]}
+            else:
+                # Limb 3's plane is told in axes that turn by beta.
+                turns[f"R joint {limb}"] = [beta - turned]
+        result = list(tree.home)
+        for link in tree.links.values():
+            passive = [step for step in link.steps if not step.actuated]
+            for step, angle in zip(passive, turns.get(str(link.joint), ()), strict=False):
+                result[step.position : step.position + 2] = [cos(angle), sin(angle)]
+        return result
+
+    def find_miss(self, tree: Tree, q: Numbers) -> None:
+        """Return None: a drive's way back tells the miss."""
+        del tree, q
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class UprRpu(TwinRobot):
     """A 2UPR-RPU machine with elastic bars and joints."""
@@ -181,6 +240,7 @@ class UprRpu(TwinRobot):
     description: ClassVar[str] = "2UPR-RPU head, three actuated telescopic limbs"
     mobility: ClassVar[str] = "3: translation along Oo, rotations beta, gamma"
     limb_names: ClassVar[tuple[str, ...]] = ("limb 1", "limb 2", "limb 3")
+    start: ClassVar[LargestRoot] = LargestRoot()
     coordinates: ClassVar[tuple[Coordinate, ...]] = (
         COORDINATES["z"], about_x("beta"), about_y("gamma"),
     )  # fmt: skip
@@ -188,25 +248,11 @@ class UprRpu(TwinRobot):
         "members", "joints_compliance", "limits", "payload", "friction", "gravity",
         "element_compliance", "modal_damping",
     )  # fmt: skip
-    has_start: ClassVar[bool] = True
-    has_inverse: ClassVar[bool] = True
 
     @property
     def size(self) -> float:
         """The platform's radius, m."""
         return self.geometry.platform_radius
-
-    @property
-    def closed_numbers(self) -> Sequence[float]:
-        """Radii, and the limbs' length at home."""
-        g = self.geometry
-        return g.base_radius, g.platform_radius, self._limb_at_home
-
-    def on(self, numbers: Numbers) -> UprRpu:
-        """The same on other numbers."""
-        base, platform, limb = numbers
-        geometry = replace(self.geometry, base_radius=base, platform_radius=platform)
-        return self._with(geometry=geometry, home_joint=limb)
 
     @property
     def _radii(self) -> tuple[float, float]:
@@ -243,123 +289,6 @@ class UprRpu(TwinRobot):
         if self.inertia is None:
             raise ParameterError("inertia", None, "a section with density, platform_mass and more")
         return super().massive()
-
-    def _limb(self, i: int, rho: Any, beta: Any, gamma: Any) -> tuple[Any, Any]:
-        """Limb 0 or 1 from B to A along X and tau; limb 2 from A to B along y and tau."""
-        a, b = self._radii
-        if i == 2:
-            return b * cos(beta) - a, -b * sin(beta) - rho
-        side = -1.0 if i == 0 else 1.0
-        return side * (a * cos(gamma) - b), rho - side * a * sin(gamma)
-
-    def solved(self, pose: Objects) -> Inverse:
-        """Limb lengths; limb 3 cannot turn the platform over or above the base."""
-        a, b = self._radii
-        z, beta, gamma = pose
-        cosine = cos(beta)
-        low = maximum(absolute(beta) - 0.5 * math.pi, z)
-        rho = z / maximum(cosine, 1e-100)
-        q = []
-        for i in range(3):
-            along, up = self._limb(i, rho, beta, gamma)
-            q.append(sqrt(minimum(along * along + up * up, 1e300)))
-        far = -rho - MAX_LIMB_RATIO * (a + b)
-        # At z = 0 the platform is in the base.
-        flat = -1.0 * (1.0 - maximum(minimum(-1e300 * z, 1.0), 0.0))
-        return Inverse(q, [0.0 * z, 0.0 * z, maximum(maximum(low, far), -flat)])
-
-    def _found(self, q: Any) -> tuple[Any, Any, Any]:
-        """rho, beta, gamma of the home branch.
-
-        With c = cos(gamma) = (P + K) / (2 a b), P = rho^2 and 4 a rho sin(gamma) = L1^2 - L2^2 = D,
-        c^2 + s^2 = 1 is the cubic P (P + K)^2 - 4 a^2 b^2 P + b^2 D^2 / 4 = 0 with
-        K = a^2 + b^2 - (L1^2 + L2^2) / 2. Its slope at a root is
-        4 a b (rho^2 cos(gamma) - a b sin^2(gamma)), so the largest root is the home branch until it
-        meets the middle one, which is the singularity. Limb 3:
-        a cos(beta) - rho sin(beta) = h cos(beta - atan2(-rho, a)).
-        """
-        a, b = self._radii
-        l1, l2, l3 = q
-        k = a * a + b * b - 0.5 * (l1 * l1 + l2 * l2)
-        ab = a * a * b * b
-        d = (l1 - l2) * (l1 + l2)
-        r = sqrt(k * k + 12.0 * ab)
-        c = k * (8.0 / 3.0 * ab - 2.0 / 27.0 * k * k) + 0.25 * b * b * d * d
-        g = minimum(1.0, maximum(-1.0, -13.5 * c / (r * r * r)))
-        third = atan2(sqrt((1.0 - g) * (1.0 + g)), g) * (1.0 / 3.0)
-        square = maximum(2.0 / 3.0 * (r * cos(third) - k), 1e-12 * a * b)
-        rho = -sqrt(square)
-        gamma = atan2(d / (4.0 * a * rho), (square + k) / (2.0 * a * b))
-        h = sqrt(a * a + square)
-        g = minimum(1.0, maximum(-1.0, (a * a + b * b + square - l3 * l3) / (2.0 * b * h)))
-        return rho, atan2(-rho, a) - atan2(sqrt((1.0 - g) * (1.0 + g)), g), gamma
-
-    def start(self, q: Objects) -> Mapping[str, Sequence[Any]]:
-        """Turns of the joints beside home."""
-        rho, beta, gamma = self._found(q)
-        home = (self._height, 0.0, 0.0)
-
-        def turned(i: int) -> Any:
-            """Angle of limb i beside home, from tau to X, or from y to tau of limb 3."""
-            x, z = self._limb(i, rho, beta, gamma)
-            x0, z0 = self._limb(i, *home)
-            return atan2(x * z0 - z * x0, x * x0 + z * z0)
-
-        values: dict[str, Sequence[Any]] = {}
-        for i, limb in enumerate("12"):
-            values[f"U joint {limb}"] = [beta, turned(i)]
-            values[f"R joint {limb}"] = [gamma - turned(i)]
-        # Limb 3's plane is told in axes that turn by beta.
-        values["R joint 3"] = [beta - turned(2)]
-        return values
-
-    def unreachable_limb(self, q: Array, reached: float) -> tuple[int, float] | None:
-        """The limb of the wrong length, and by how much."""
-        a, b = self._radii
-        for i in range(3):
-            if not q[i] > 0.0:
-                return i, float(-q[i])
-            if q[i] > MAX_LIMB_RATIO * (a + b):
-                return i, float(q[i]) - MAX_LIMB_RATIO * (a + b)
-        if not self._meets(q[0], q[1]):
-            return self._wrong_pair(float(q[0]), float(q[1]))
-        rho, _, _ = (float(v) for v in self._found(q))
-        low, high = abs(math.hypot(a, rho) - b), math.hypot(a, b - rho)
-        if q[2] < low:
-            return 2, low - float(q[2])
-        return (2, float(q[2]) - high) if q[2] >= high else None
-
-    def _meets(self, l1: float, l2: float) -> bool:
-        """Whether limbs 1 and 2 can be assembled."""
-        rho, _, gamma = (float(v) for v in self._found((l1, l2, 1.0)))
-        lengths = [math.hypot(*(float(v) for v in self._limb(i, rho, 0.0, gamma))) for i in (0, 1)]
-        return rho < -1e-5 * math.sqrt(math.prod(self._radii)) and np.allclose(
-            lengths, (l1, l2), rtol=1e-6
-        )
-
-    def _wrong_pair(self, l1: float, l2: float) -> tuple[int, float]:
-        """Which of limbs 1 and 2 is the wrong length beside the other, by the smaller correction.
-
-        Two limbs of one length are a pose with gamma = 0 if they are longer than |b - a|; between
-        that and the given lengths a bisection finds where the assembly begins.
-        """
-        a, b = self._radii
-        best = (0 if l1 < l2 else 1), abs(b - a) - min(l1, l2)
-        least = math.inf
-        for i, (given, other) in enumerate(((l1, l2), (l2, l1))):
-            good, bad = max(other, abs(b - a) * (1.0 + 1e-6)), given
-            if not self._meets(*((good, other) if i == 0 else (other, good))):
-                continue
-            for _ in range(60):
-                middle = 0.5 * (good + bad)
-                if self._meets(*((middle, other) if i == 0 else (other, middle))):
-                    good = middle
-                else:
-                    bad = middle
-            if abs(given - good) < least:
-                least = abs(given - good)
-                best = i, least
-        return best
 
     def limit_angles(self, pose: ArrayLike) -> Array:
         """Angle of each limb to the vertical, then to the platform's normal, (..., 6), rad."""

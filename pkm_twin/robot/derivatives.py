@@ -155,4 +155,4 @@ def _by_geometry(robot: Robot, q: ArrayLike, rows: Array) -> Array:
 
 def geometry_numbers(robot: Robot) -> list[Any]:
     """The geometry as ``Engine.geometry`` has it, of numbers or expressions."""
-    return [*geometry_of(robot.make_graph()), *robot.closed_numbers]
+    return list(geometry_of(robot.make_graph()))

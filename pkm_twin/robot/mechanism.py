@@ -1,8 +1,7 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What every robot has of its file: parameters, the graph that follows, names and units.
 
-A mechanism is a schema, a function from its parameters to a graph, and, where they exist, closed
-forms of the start and of the inverse with the branch rules.
+A mechanism is a schema and a function from its parameters to a graph.
 """
 
 from __future__ import annotations
@@ -17,14 +16,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.expressions import Numbers, Objects
 from pkm_twin.errors import ParameterError, UnknownNameError, unknown_number
-from pkm_twin.kinematics.motion import Motion
 from pkm_twin.kinematics.pose import Coordinate
+from pkm_twin.kinematics.scheme import Start
 from pkm_twin.machine import schema
 from pkm_twin.machine.formulas import Book
 from pkm_twin.machine.friction import compiled, law_names
-from pkm_twin.machine.graph import Graph
+from pkm_twin.machine.graph import Graph, limb_numbers
 from pkm_twin.machine.inertia import Coefficients
 from pkm_twin.machine.joint_map import JointMap, JointMapEntry
 from pkm_twin.machine.members import Beam, Structure
@@ -59,20 +57,6 @@ R = TypeVar("R", bound="Mechanism")
 
 class RigidError(ParameterError):
     """Raised for a robot whose file makes nothing elastic."""
-
-
-@dataclass(frozen=True)
-class Inverse:
-    """A mechanism's closed form of q by pose, as expressions.
-
-    ``q``: shape (n,), finite for every finite pose. ``misses``: by how much each limb falls short,
-    m, above zero where it does. ``measure``: the singularity's, above SINGULARITY_BOUND on the side
-    of the home pose; None where every pose that is reached is good.
-    """
-
-    q: Sequence[Any]
-    misses: Sequence[Any]
-    measure: Any | None = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -126,11 +110,11 @@ class Mechanism(Common):
     """Friction laws that a fit may find, although the file's parameters of them are zero."""
 
     coordinates: ClassVar[tuple[Coordinate, ...]]
+    start: ClassVar[Start | None] = None
+    """A closed form of the forward kinematics that no structure tells."""
     changeable: ClassVar[tuple[str, ...]] = (
         "payload", "friction", "gravity", "limits", "element_compliance", "modal_damping",
     )  # fmt: skip
-    has_inverse: ClassVar[bool] = False
-    has_branch: ClassVar[bool] = False
 
     @classmethod
     def from_data(cls: type[R], data: Mapping[str, Any], name: str) -> R:
@@ -165,6 +149,17 @@ class Mechanism(Common):
         """Names of the limbs, one an actuated joint."""
         raise NotImplementedError
 
+    def name_limb(self, part: str) -> str:
+        """Return the limb of a joint, rod or body, the part itself where limbs have no names."""
+        if self.limb_names == self.joint_names:
+            return part
+        ends = self.graph.rods.get(part) or self.graph.joints.get(part)
+        bodies = (part,) if ends is None else (ends.inner, ends.outer)
+        numbers = limb_numbers(self.graph)
+        found = (numbers[body] for body in bodies if numbers.get(body, -1) >= 0)
+        limb = next(found, None)
+        return part if limb is None else self.limb_names[limb]
+
     def chosen_home(self) -> float | None:
         """Value of every actuated joint at home, of a mechanism whose file does not give it.
 
@@ -176,34 +171,6 @@ class Mechanism(Common):
     def make_graph(self) -> Graph:
         """Bodies, joints and rods at home."""
         raise NotImplementedError
-
-    @property
-    def has_start(self) -> bool:
-        """Whether :meth:`start` gives the assembly itself; a guess may be nearer to another."""
-        return False
-
-    def start(self, q: Objects) -> Mapping[str, Sequence[Any]]:
-        """Values of passive tree joints by q in closed form, where ``has_start``.
-
-        By joint, from its inner to its outer body, relative to home.
-        """
-        raise NotImplementedError
-
-    def solved(self, pose: Objects) -> Inverse:
-        """Closed form of the inverse, where ``has_inverse``."""
-        raise NotImplementedError
-
-    def branch(self, motion: Motion) -> Sequence[Any]:
-        """Numbers that are above zero in the branch of ``forward``, where ``has_branch``."""
-        raise NotImplementedError
-
-    def unreachable_limb(self, q: Array, reached: float) -> tuple[int, float] | None:
-        """Limb and miss (m) of joint positions without an assembly, shape (n,); None: unknown.
-
-        :param reached: part of the straight way from home up to which there is one.
-        """
-        del q, reached
-        return None
 
     @cached_property
     def beams(self) -> tuple[Beam, ...]:
@@ -456,24 +423,6 @@ class Mechanism(Common):
     def body_names(self) -> tuple[str, ...]:
         """Bodies and rods, and the payload last."""
         return (*self.graph.bodies, *self.graph.rods, "payload")
-
-    @property
-    def closed_key(self) -> str:
-        """Cache key of the parameters of closed forms that are not numbers."""
-        return ""
-
-    @property
-    def closed_numbers(self) -> Sequence[float]:
-        """Numbers of the geometry that closed forms depend on."""
-        return ()
-
-    def on(self: R, numbers: Numbers) -> R:
-        """The robot for its closed forms alone, on other numbers or expressions of them.
-
-        :param numbers: as :attr:`closed_numbers`.
-        """
-        del numbers
-        return self
 
     def numbered(self: R, values: Mapping[str, Any]) -> R:
         """A copy with other numbers or expressions at dotted paths of its file; nothing is checked.

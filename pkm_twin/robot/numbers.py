@@ -105,4 +105,4 @@ def geometry_and_masses(robot: Robot) -> list[Any]:
     layout = Layout(Tree(graph))
     inertial = layout.pack(graph, robot.gravity, robot.friction)
     inertial = inertial + layout.payload(load.mass, load.com, load.inertia)
-    return [*geometry_of(graph), *robot.closed_numbers, *inertial]
+    return [*geometry_of(graph), *inertial]

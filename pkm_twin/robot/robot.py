@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.codegen.code import GOOD, NOT_FINITE, REFUSED
 from pkm_twin.codegen.kernels import Kernel
-from pkm_twin.codegen.key import EMPTY
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
 from pkm_twin.kinematics.drives import TIME
 from pkm_twin.kinematics.engine import Engine, engine_of
@@ -24,7 +23,6 @@ from pkm_twin.kinematics.passive import (
     passive_rates_program,
 )
 from pkm_twin.kinematics.programs import projection_program
-from pkm_twin.kinematics.scheme import Closed
 from pkm_twin.kinematics.singularity import singularity_kernel
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import Graph
@@ -75,11 +73,7 @@ class Robot(Mechanism):
         return self._engine_on(self.graph)
 
     def _engine_on(self, graph: Graph) -> Engine:
-        start = (lambda numbers, q: self.on(numbers).start(q)) if self.has_start else None
-        closed = Closed(np.array(self.closed_numbers, np.float64), start)
-        branch = self.branch if self.has_branch else None
-        mark = EMPTY.also(f"{self.mechanism} {self.closed_key}", type(self))
-        return engine_of(graph, self.coordinates, closed, branch, mark)
+        return engine_of(graph, self.coordinates, self.start)
 
     @cached_property
     def _massive(self) -> Engine:
@@ -210,30 +204,14 @@ class Robot(Mechanism):
         one = np.broadcast_to(place, (*status.shape[:-1], place.shape[-1]))[index]
         if code == NOT_FINITE or not np.isfinite(one).all():
             raise _not_finite("pose", index)
-        measure = 0.0
-        if self.has_inverse:
-            with np.errstate(all="ignore"):
-                found = self.solved(one)
-            misses = [float(miss) for miss in found.misses]
-            limb = next((k for k, miss in enumerate(misses) if miss > 0.0), None)
-            if limb is not None:
-                raise UnreachableError(
-                    "pose", self.limb_names[limb], index, misses[limb], question=self._slip(one)
-                )
-            if found.measure is not None and not found.measure > SINGULARITY_BOUND:
-                measure = max(float(found.measure), 0.0)
-        else:
-            part, miss, met = self.engine.shortest_pose(one)
-            slip = self._slip(one)
-            if not met:
-                reached = self._reached_fraction(one)
-                raise UnreachableError("pose", part, index, miss, reached, slip)
-            if reached < 1.0:
-                raise SingularityError(
-                    "pose", index, 0.0, SINGULARITY_BOUND, reached, question=slip
-                )
+        part, miss, met = self.engine.shortest_pose(one)
         slip = self._slip(one)
-        raise SingularityError("pose", index, measure, SINGULARITY_BOUND, None, True, slip)
+        if not met:
+            reached = self._reached_fraction(one)
+            raise UnreachableError("pose", self.name_limb(part), index, miss, reached, slip)
+        if reached < 1.0:
+            raise SingularityError("pose", index, 0.0, SINGULARITY_BOUND, reached, question=slip)
+        raise SingularityError("pose", index, 0.0, SINGULARITY_BOUND, None, True, slip)
 
     def _reached_fraction(self, pose: Array) -> float:
         """Return how much of the straight line from home to a rejected pose is reached."""
@@ -481,9 +459,13 @@ class Robot(Mechanism):
         if self.redundant:
             self._refuse_contradiction(given, index)
             sample = sample[self.graph.leading]
-        limb = self.unreachable_limb(sample, reached)
-        if limb is not None:
-            raise UnreachableError("joint state", self.limb_names[limb[0]], index, limb[1])
+        start = self.engine.start
+        short = start.find_miss(self.engine.tree, sample) if start is not None else None
+        if short is not None:
+            raise UnreachableError("joint state", self.name_limb(short[0]), index, short[1])
+        drive, change = self._find_correction(sample)
+        if change < np.inf and self.graph.joints[drive].slides:
+            raise UnreachableError("joint state", self.name_limb(drive), index, change)
         part, miss, measure = self.engine.ending(sample, reached)
         if measure is not None:
             question = ""
@@ -493,7 +475,28 @@ class Robot(Mechanism):
             raise SingularityError(
                 "joint state", index, measure, SINGULARITY_BOUND, reached, question=question
             )
-        raise UnreachableError("joint state", part, index, miss, reached)
+        limb = self.name_limb(drive if change < np.inf else part)
+        raise UnreachableError("joint state", limb, index, miss, reached)
+
+    def _find_correction(self, q: Array) -> tuple[str, float]:
+        """Return the drive that alone comes back by the least, and by how much.
+
+        It is infinite if there is none, or if the limbs have no names.
+        """
+        if self.limb_names == self.joint_names:
+            return "", np.inf
+        size = self.joints_count
+        span = 2.0 * float(np.abs(q - self.graph.home).max())
+        low, high = np.zeros(2 * size), np.full(2 * size, span)
+        ways = np.concatenate([np.eye(size), -np.eye(size)])
+        for _ in range(4):
+            changes = low + np.linspace(0.0, 1.0, 129)[:, None] * (high - low)
+            good = self.try_forward(q + changes[..., None] * ways)[1]
+            first, found = np.maximum(good.argmax(0), 1)[None], np.asarray(good.any(0))
+            high = np.where(found, np.take_along_axis(changes, first, 0)[0], span)
+            low = np.where(found, np.take_along_axis(changes, first - 1, 0)[0], span)
+        best = int(np.argmin(high))
+        return self.joint_names[best % size], float(high[best]) if found[best] else np.inf
 
     def _refuse_contradiction(self, given: Mapping[str, Array], index: tuple[int, ...]) -> None:
         """Raise the error of drives that do not follow those that lead: q, or else qd, or qdd."""

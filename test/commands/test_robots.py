@@ -127,7 +127,7 @@ class TestCompliance:
         ("arguments", "code", "text"),
         [
             (("upr_rpo", -0.6, 0, 0), 1, "did you mean 'upr_rpu'"),
-            (("upr_rpu", 0.6, 0, 0), 1, "unreachable: limb"),
+            (("upr_rpu", 0.6, 0, 0), 1, "beyond a singularity"),
             (("upr_rpu", -1e300, 0, 0), 1, ""),
             (("upr_rpu", -0.6, 0, 0, "--wrench", "1e300,0,0,0,0,0"), 1, "finite"),
             (("upr_rpu", -0.6, 0), 2, "z (m), beta (rad), gamma (rad)"),

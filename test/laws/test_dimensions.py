@@ -162,17 +162,19 @@ def test_permuting_limbs_permutes_torques(kind, rng):
 
 
 @pytest.mark.parametrize(
-    ("q", "limb"),
+    ("name", "q", "limb"),
     [
-        ((0.1, 0.6, 0.6), "limb 1"),
-        ((0.6, 0.1, 0.6), "limb 2"),
-        ((0.614, 0.614, 2.0), "limb 3"),
-        ((0.614, 0.614, 0.05), "limb 3"),
+        ("upr_rpu", (0.1, 0.6, 0.6), "limb 1"),
+        ("upr_rpu", (0.6, 0.1, 0.6), "limb 2"),
+        ("upr_rpu", (0.614, 0.614, 2.0), "limb 3"),
+        ("upr_rpu", (0.614, 0.614, 0.05), "limb 3"),
+        ("prru", (-0.35, 0.15, 0.1), "limb I"),
+        ("prru", (0.1, -0.35, 0.15), "limb II"),
     ],
 )
-def test_a_miss_is_what_the_named_limb_lacks(q, limb):
+def test_a_miss_is_what_the_named_limb_lacks(name, q, limb):
     """Moved by the miss and a hair more, the limb assembles; by a hair less, it does not."""
-    robot = load("upr_rpu")
+    robot = load(name)
     with pytest.raises(UnreachableError) as caught:
         robot.forward(q)
     assert caught.value.limb == limb and caught.value.miss > 0.0
@@ -188,19 +190,6 @@ def test_a_miss_is_what_the_named_limb_lacks(q, limb):
             # Another limb may be what fails next.
             mended.append(error.limb != limb)
     assert mended in ([False, True, False, False], [False, False, False, True])
-
-
-@pytest.mark.parametrize("away", [[0.5, -0.2, -0.3], [-0.4, 0.3, 0.1]])
-def test_a_miss_is_what_a_slider_has_to_come_back(away):
-    robot = machine("below")
-    level = robot.inverse([0.7, 0.0, 0.0])
-    with pytest.raises(UnreachableError) as caught:
-        robot.forward(level + away)
-    assert caught.value.limb == "limb I"
-    edge = 1.0 - caught.value.miss / abs(away[0])
-    robot.forward(level + np.array(away) * (edge - 1e-5))
-    with pytest.raises(UnreachableError):
-        robot.forward(level + np.array(away) * (edge + 1e-5))
 
 
 def test_misses_of_deltas_are_exact_geometry():
@@ -219,30 +208,27 @@ def test_misses_of_deltas_are_exact_geometry():
 
 
 @pytest.mark.parametrize(
-    ("kind", "pose", "error"),
+    ("kind", "pose"),
     [
-        ("below", (0.7, 0.0, 1.3), SingularityError),
-        ("below", (0.7, -1.3, 0.0), SingularityError),
-        ("below", (0.7, np.pi, 0.0), SingularityError),
-        ("upr_rpu", (0.0, 0, 0), UnreachableError),
-        ("upr_rpu", (0.3, 0, 0), UnreachableError),
-        ("upr_rpu", (-0.6, np.pi / 2, 0), UnreachableError),
-        ("upr_rpu", (-0.6, 7.0, 0), UnreachableError),
-        ("upr_rpu", (-1e9, 0, 0), UnreachableError),
+        ("below", (0.7, 0.0, 1.3)),
+        ("below", (0.7, -1.3, 0.0)),
+        ("below", (0.7, np.pi, 0.0)),
+        ("upr_rpu", (0.0, 0, 0)),
+        ("upr_rpu", (0.3, 0, 0)),
+        ("upr_rpu", (-0.6, np.pi / 2, 0)),
+        ("upr_rpu", (-0.6, 7.0, 0)),
+        ("upr_rpu", (-1e9, 0, 0)),
         # The third limb's end in the base plane: it cannot turn the platform.
-        ("upr_rpu", (-0.26 * np.sin(0.5), 0.5, 0.0), SingularityError),
+        ("upr_rpu", (-0.26 * np.sin(0.5), 0.5, 0.0)),
     ],
 )
-def test_what_is_no_pose_is_refused(kind, pose, error):
+def test_a_pose_beyond_a_singularity_is_refused(kind, pose):
     robot = machine(kind)
     for poses, index in ((pose, ()), ([robot.home(), pose], (1,))):
-        with pytest.raises(error) as caught:
+        with pytest.raises(SingularityError) as caught:
             robot.inverse(poses)
         assert caught.value.index == index
-        if error is SingularityError:
-            assert caught.value.measure < caught.value.bound
-        else:
-            assert caught.value.limb == "limb 3"
+        assert caught.value.measure < caught.value.bound
 
 
 @pytest.mark.parametrize("kind", ["below", "upr_rpu"])

@@ -94,10 +94,9 @@ def test_keys_follow_the_sources_that_write_a_program(tmp_path, monkeypatch, for
     for source in ("codegen/expressions.py", "codegen/llvm.py", "kinematics/motion.py"):
         assert changed(f"pkm_twin/{source}") == set(found)
     assert changed("pkm_twin/machine/joints.py") == set(found)
-    assert changed("pkm_twin/mechanisms/delta.py") == set(found)
     assert changed("delta_dynamics/torques/virtual_work.py") == rigid
     assert changed("stiffness_monitor/frame.py") == elastic
-    for source in ("apps/cli.py", "apps/fit.py", "ros/node.py", "mechanisms/prru.py"):
+    for source in ("apps/cli.py", "apps/fit.py", "ros/node.py", "mechanisms/delta.py"):
         assert not changed(f"pkm_twin/{source}")
     for source in ("delta_dynamics/nodes/twin.py", "stiffness_monitor/node.py"):
         assert not changed(source)

@@ -15,6 +15,8 @@ TEST: Final = "test/validation/test_prru_paper.py::"
 LAWS: Final = "test/laws/test_isotropy.py::"
 PRRU: Final = "pkm_twin.mechanisms.prru.Prru."
 MOTION: Final = "pkm_twin.kinematics.motion.Motion."
+LIMB: Final = "pkm_twin.kinematics.limb_pose.LimbPose"
+CHAIN: Final = "pkm_twin.kinematics.posed.PoseChain.attach"
 TORQUES: Final = "delta_dynamics.torques.virtual_work."
 GEOMETRY: Final = (TEST + "test_position",)
 LINK: Final = (TEST + "test_upper_link_follows_the_platform",)
@@ -36,7 +38,7 @@ def _equation(
 
 
 EQUATIONS: Final = (
-    _equation("1", "platform's pose by alpha, beta, gamma", (PRRU + "_corners",), GEOMETRY),
+    _equation("1", "platform's pose by alpha, beta, gamma", (CHAIN,), GEOMETRY),
     _equation("2-3", "lower link's frame at the slider joint", (PRRU + "_directions",), GEOMETRY),
     _equation(
         "4", "upper link's frame", (PRRU + "make_graph",),
@@ -48,19 +50,19 @@ EQUATIONS: Final = (
         "5", "pose rates, and their 3 x 9 arrangement", (), FORCES,
         "the arrangement is not needed: accelerations come without Hessians",
     ),
-    _equation("6-7", "loop closure; U_i from the platform", (PRRU + "_corners",), GEOMETRY),
-    _equation("8", "U_i from the limb", (PRRU + "solved",), GEOMETRY, "entry as in equation 4"),
-    _equation("9", "slider heights", (PRRU + "solved",), GEOMETRY),
+    _equation("6-7", "loop closure; U_i from the platform", (LIMB,), GEOMETRY),
+    _equation("8", "U_i from the limb", (LIMB,), GEOMETRY, "entry as in equation 4"),
+    _equation("9", "slider heights", (LIMB,), GEOMETRY),
     _equation(
-        "10", "U_i stays in the limb's plane", (PRRU + "_corners",), GEOMETRY,
+        "10", "U_i stays in the limb's plane", (LIMB,), GEOMETRY,
         "wrong in print: tan of the limb's rotation; of its azimuth φ",
     ),
     _equation(
-        "11", "parasitic gamma, x, y", (PRRU + "_corners",),
+        "11", "parasitic gamma, x, y", (LIMB, "pkm_twin.kinematics.programs.solve_pose"),
         (*GEOMETRY, TEST + "test_equation_11_holds_as_it_is_printed"),
     ),
     _equation(
-        "12", "swing θ of a limb", (PRRU + "solved",), GEOMETRY,
+        "12", "swing θ of a limb", (LIMB,), GEOMETRY,
         "wrong in print: acos loses the sign of an inward swing; asin of the horizontal distance",
     ),
     _equation("13-16", "upper link's rotation ψ", (PRRU + "make_graph",), LINK),

@@ -1,0 +1,114 @@
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
+"""Forward kinematics in closed form: three rods on a platform that only translates.
+
+The platform, moved to one point, is where three spheres about the driven ends of the rods meet. Of
+the two places it is the one on the side of the centres' plane where the platform is at home; turned
+over, the plane leaves none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pkm_twin.codegen.expressions import Numbers, Objects, snapped, snapped_all
+from pkm_twin.codegen.operations import absolute, maximum, sqrt
+from pkm_twin.kinematics.limb_pose import sign_of, square_of
+from pkm_twin.kinematics.limbs import Closures
+from pkm_twin.kinematics.motion import Motion, cross
+from pkm_twin.machine.graph import UP
+from pkm_twin.machine.tree import Tree
+
+
+def meet_spheres(
+    centres: Sequence[Any], squares: Sequence[Any], up: Numbers
+) -> tuple[Objects, Any, Any]:
+    """Return where three spheres meet.
+
+    :param centres: three points; ``squares``: of the radii. ``up``: a direction, shape (3,): the
+        point is on that side of the centres' plane.
+    :returns: the point, shape (3,), where the spheres do not meet the nearest one in the plane of
+        the centres; its distance from there, squared, below zero where they do not meet; and the
+        square of the distance of the first centre from the point in the plane.
+    """
+    u, v = centres[1] - centres[0], centres[2] - centres[0]
+    n = cross(u, v)
+    square = n @ n
+    a, b = (
+        w @ w + snapped(squares[0] - other)
+        for w, other in zip((u, v), squares[1:], strict=True)
+    )  # fmt: skip
+    middle = cross(a * v - b * u, n) * (0.5 / square)
+    apart = middle @ middle
+    left = squares[0] - apart
+    side = n @ up
+    side = side / maximum(absolute(side), 1e-300)
+    height = side * sqrt(maximum(left, 0.0) / square)
+    return centres[0] + middle + height * n, left, apart
+
+
+@dataclass(frozen=True)
+class ThreeRods:
+    """Three rods, by name, from driven bodies to a body that only translates."""
+
+    rods: tuple[str, ...]
+    body: str
+
+    def _spheres(self, tree: Tree, q: Numbers) -> tuple[list[Any], list[Any]]:
+        """Return centres of the spheres on which the body's displacement from home is, and squares
+        of their radii.
+        """
+        others = [name for name in tree.links if name != self.body]
+        motion = Motion(tree, np.array(tree.home, dtype=object), q, others)
+        centres, squares = [], []
+        for name in self.rods:
+            rod = tree.graph.rods[name]
+            near, (end, own) = rod.inner, rod.ends
+            if near == self.body:
+                near, end, own = rod.outer, own, end
+            centres.append(motion.point(near, end) - own)
+            squares.append(square_of(end - own))
+        return centres, squares
+
+    def place(self, tree: Tree, q: Numbers) -> list[Any]:
+        """Return the unknowns of the joint that carries the body, in closed form."""
+        c1, c2, c3 = self._spheres(tree, tree.graph.lead_home)[0]
+        n = cross(c2 - c1, c3 - c1)
+        up = snapped_all(n * sign_of(-(c1 @ n)))
+        point, _, _ = meet_spheres(*self._spheres(tree, q), up)
+        # Steps of the joint are along the base axes.
+        steps = tree.links[self.body].steps
+        x: list[Any] = [0.0] * len(steps)
+        for step in steps:
+            x[step.position] = (step.local @ point) * step.sign / step.slide
+        return x
+
+    def find_miss(self, tree: Tree, q: Numbers) -> tuple[str, float] | None:
+        """Return the rod farthest from the two nearest ones, and by how much (m) the spheres miss.
+
+        None where they meet, or where their centres are on one line.
+        """
+        centres, squares = self._spheres(tree, q)
+        with np.errstate(all="ignore"):
+            _, left, apart = meet_spheres([np.array(c, float) for c in centres], squares, UP)
+        miss = float(np.sqrt(apart) - np.sqrt(float(squares[0])))
+        sides = [float(square_of(centres[k] - centres[(k + 1) % 3])) for k in range(3)]
+        far = self.rods[(int(np.argmin(sides)) + 2) % 3]
+        return (far, miss) if left < 0.0 and np.isfinite(miss) else None
+
+
+def find_three_rods(scheme: Closures) -> ThreeRods | None:
+    """Find three rods that hold a body on three slides from the base, the only unknown ones."""
+    tree, rods = scheme.tree, [scheme.parts[k] for k in scheme.independent]
+    loose = [link for link in tree.links.values() if not all(s.actuated for s in link.steps)]
+    if len(loose) != 1 or len(set(rods)) != 3 or not set(rods) <= set(tree.graph.rods):
+        return None
+    (link,) = loose
+    slides = [step for step in link.steps if step.slide and not step.turns]
+    ends = [{tree.graph.rods[name].inner, tree.graph.rods[name].outer} for name in rods]
+    if len(slides) != 3 or len(link.steps) != 3 or not all(link.body in pair for pair in ends):
+        return None
+    return ThreeRods(tuple(rods), link.body)
