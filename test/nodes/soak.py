@@ -32,6 +32,7 @@ play({str(BAG)!r}, loop=True, clock=100.0, progress=False, topics=["/joint_state
 """
 PERIODS = {"parameters": 0.1, "trajectory": 0.5, "suspend": 7.0, "kill": 20.0}
 """Of what else happens, s."""
+SHOWN = ("50 %", "99 %", "greatest")
 QUANTILES = {"50 %": 50, "90 %": 90, "99 %": 99, "99.9 %": 99.9, "greatest": 100}
 
 
@@ -295,22 +296,17 @@ def write(folder, summary, watched, ages):
 
 TEXT = """## Long run
 
-Printed by `make soak MINUTES={minutes:g}`: two `delta_dynamics` (a player replays a looping bag to
-one), `stiffness_monitor` and `command_gate`; {sent:,} joint states, one in a hundred invalid;
+Printed by `make soak MINUTES={minutes:g}`: two `delta_dynamics` (one from a looping bag),
+`stiffness_monitor` and `command_gate`; {sent:,} joint states, one in a hundred invalid;
 {parameters:,} requests for parameters, {trajectory:,} trajectories of 500 points, {suspend:,}
-suspensions of a node, {kill:,} kills of the player. `stale_after` and `deadline` were {stale:g} s.
+suspensions of a node, {kill:,} kills of the player. Memory grew by {grown:.1f} MiB at most from the
+first to the last third of the time, descriptors and threads by {more:g}.
 
 ![Memory, descriptors, threads and ages of a long run](gallery/soak.png)
 
-Memory grew by {grown:.1f} MiB at most from the first to the last third of the time, descriptors and
-threads by {more:g}.
-
-Ages of answers at their publication, on two cores that did much other work:
-
-{ages}
-
-The node checks a torque's age just before publication. The computer delayed older torques after
-this check; the topic's deadline reports them.
+Ages of answers at their publication, on two cores that did much other work (`stale_after` and
+`deadline` {stale:g} s): {ages}. The computer delayed the older ones after the node's last check;
+the topic's deadline reports them.
 """
 
 
@@ -326,22 +322,18 @@ def growth(summary):
 def section(summary):
     """The figures as a part of the page on errors."""
     grown, more = growth(summary)
-    ages = [
-        f"| answers | count | {' | '.join(QUANTILES)} (ms) | older than {STALE:g} s |",
-        "|---" * (3 + len(QUANTILES)) + "|",
-    ]
-    for what, found in summary["ages, s"].items():
-        values = " | ".join(f"{1e3 * found[q]:.2f}" for q in QUANTILES)
-        ages.append(
-            f"| {what} | {found['count']:,} | {values} | {found['older than stale_after']} |"
-        )
+    ages = "; ".join(
+        f"{what}: {', '.join(f'{q} {1e3 * found[q]:.2f} ms' for q in SHOWN)}, "
+        f"{found['older than stale_after']} of {found['count']:,} older"
+        for what, found in summary["ages, s"].items()
+    )
     return TEXT.format(
         minutes=summary["minutes"],
         sent=summary["joint states sent"],
         stale=STALE,
         grown=grown,
         more=more,
-        ages="\n".join(ages),
+        ages=ages,
         **summary["happened"],
     )
 

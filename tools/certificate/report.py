@@ -48,12 +48,6 @@ BALANCES = {
     "energy": ("energy", "kinetic and potential, against Lagrange"),
 }
 
-TITLES = {
-    "delta": "Delta, three rods",
-    "delta_cu": "Delta, two rods and an R-C-U",
-    "prru": "3-PRRU",
-}
-
 PACKAGES = ("numpy", "llvmlite", "scipy", "pin", "mujoco", "mpmath")
 
 
@@ -109,13 +103,13 @@ Python {platform.python_version()}, {versions}.
 def _torques(figures: dict[str, Figures], judge: Judge) -> str:
     rows, counts, furthest = [], dict.fromkeys(ROUTES, 0), 0.0
     for name, found in figures.items():
-        cells = [TITLES[name]]
+        cells = [f"`{name}`"]
         for route in ROUTES:
             values, places = np.array(found.efforts[route]), np.array(found.places[route])
             if not len(values):
                 cells.append("")
                 continue
-            what = f"{TITLES[name]}, {route}"
+            what = f"{name}, {route}"
             counts[route] = len(values)
             cells.append(judge(float(values.max()), EFFORT_BOUND, f"{what}, torque"))
             judge(float(places.max()), PLACE_BOUND, f"{what}, place")
@@ -127,16 +121,15 @@ def _torques(figures: dict[str, Figures], judge: Judge) -> str:
     return f"""### Torques
 
 {count} machines per robot have random dimensions, azimuths, masses, inertias, payload, gravity and
-friction; states have random positions, rates, accelerations and a wrench. States with a condition
-number above {1 / LEAST_MEASURE:.0f} are left out.
+friction; states have random positions, rates, accelerations and a wrench, and a condition number up
+to {1 / LEAST_MEASURE:.0f}.
 
 - **Pinocchio**: a tree with loop constraints; recursive Newton-Euler sweeps and multipliers.
 - **MuJoCo**: another tree, as in `pkm-twin certify`; `mj_rne`, projected on the actuators.
 - **Lagrange**: energies as functions of points, derived by central differences in {DIGITS} digits.
 
-The table has the worst differences, relative to the largest effort (bound {EFFORT_BOUND:.0e}).
-States per robot: {states}. Positions of the platform differ by at most {furthest:.1e} m
-(bound {PLACE_BOUND:.0e}).
+Worst differences, relative to the largest effort (bound {EFFORT_BOUND:.0e}), of {states} states
+per robot. Positions of the platform differ by at most {furthest:.1e} m (bound {PLACE_BOUND:.0e}).
 
 | robot | {" | ".join(ROUTES)} |
 |---|{"---|" * len(ROUTES)}
@@ -157,8 +150,7 @@ def _balances(figures: dict[str, Figures], judge: Judge) -> str:
     table = "\n".join(rows)
     return f"""### Balances
 
-Worst relative differences of the three robots, at the states above; power and energy at those for
-Lagrange.
+Worst relative differences of the three robots; power and energy at the states for Lagrange.
 
 | balance | | worst | bound |
 |---|---|---|---|
@@ -168,7 +160,7 @@ Lagrange.
 
 def _swings(swings: list[Swing], judge: Judge) -> str:
     rows = []
-    twin = {swing.machine: swing for swing in swings if swing.route.startswith("twin")}
+    twin = {swing.machine: swing for swing in swings if swing.route.startswith("pkm_twin")}
     for swing in swings:
         what = f"swing of {swing.machine}, {swing.route}"
         drift = judge(swing.drift, SWING_BOUNDS["drift"], f"{what}, energy")
@@ -181,18 +173,17 @@ def _swings(swings: list[Swing], judge: Judge) -> str:
                 apart = float(np.abs(one[-1] - two[-1]).max())
                 ends.append(judge(apart, bound, f"{what}, {('position', 'rate')[k]} at the end"))
         rows.append(
-            f"| {TITLES[swing.machine]} | {swing.route} | {drift} | {closure} | {', '.join(ends)} |"
+            f"| `{swing.machine}` | {swing.route} | {drift} | {closure} | {', '.join(ends)} |"
         )
     table = "\n".join(rows)
     return f"""### Free swing of {DURATION:.0f} s
 
 Shipped robots without friction start away from a stable equilibrium; constant efforts balance the
 weight. DOP853 integrates `forward_dynamics` of both engines with tolerances of {TOLERANCE:.0e};
-Pinocchio's own step is RK4 at {1e3 * STEP:.0f} ms. The energy drift is relative to the largest
-kinetic energy (bound {SWING_BOUNDS["drift"]:.0e}); the closure is the largest opening of a loop
-(bound {SWING_BOUNDS["closure"]:.0e} m). The last column is the difference from the twin at the end,
-in rad or m, and per second (bound {SWING_BOUNDS["DOP853"]:.0e} with DOP853,
-{SWING_BOUNDS["its own step"]:.0e} with RK4).
+Pinocchio's own step is RK4 at {1e3 * STEP:.0f} ms. Energy drift: relative to the largest kinetic
+energy (bound {SWING_BOUNDS["drift"]:.0e}); closure: largest opening of a loop
+(bound {SWING_BOUNDS["closure"]:.0e} m); last column: difference from pkm_twin at the end, rad or m,
+and per second (bound {SWING_BOUNDS["DOP853"]:.0e}, RK4 {SWING_BOUNDS["its own step"]:.0e}).
 
 | robot | engine | energy drift | closure, m | difference of q, q' |
 |---|---|---|---|---|

@@ -119,7 +119,7 @@ def run(start: Start) -> list[Swing]:
     effort = inverse_dynamics(robot, start.rest, STILL, STILL)
     engine = engine_of(start.data)
     tree = engine.state(start.q, start.qd, STILL)
-    result = [_summary(start, "twin, DOP853", effort, *_twin(robot, start, effort))]
+    result = [_summary(start, "pkm_twin, DOP853", effort, *_twin(robot, start, effort))]
     for route, integrate in (("DOP853", _pinocchio), ("its own step", _pinocchio_steps)):
         states = integrate(engine, tree.q, tree.v, effort)
         result.append(_summary(start, f"Pinocchio, {route}", effort, *states))

@@ -22,7 +22,7 @@ GROUPS = {
 """An option, and the name of those that the same commands have."""
 PLAIN = ("", "TEXT", "NUMBER", "NUMBERS", "COUNT")
 """Kinds of values that an option's explanation makes clear."""
-USUAL = ("--platform", "--overwrite")
+USUAL = ("--platform", "--base", "--actuated", "--pose", "--carry", "--overwrite")
 """Options of every command that takes a robot, and of every command that writes a file."""
 
 

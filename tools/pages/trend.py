@@ -14,7 +14,7 @@ from typing import Final
 from examples.nights import record
 from pkm_twin.apps import cli
 
-SHOWN: Final = 5
+SHOWN: Final = 2
 """Lines of the output on the page, besides the first."""
 
 
