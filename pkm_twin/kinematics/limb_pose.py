@@ -341,13 +341,7 @@ class LimbPose:
         inner, outer = bodies
         moving = (self.motion.linear_jacobian(body, place) for body in (outer, inner))
         columns = {k: column @ along for k, column in difference(*moving).items()}
-        return Row(
-            limb.part, value, columns, _no_bias, scale, inner, outer, place, along, np.zeros(3)
-        )
-
-
-def _no_bias() -> Any:
-    raise NotImplementedError("rates and accelerations come from the closures themselves")
+        return Row(limb.part, value, columns, scale)
 
 
 def square_of(vector: Numbers) -> Any:

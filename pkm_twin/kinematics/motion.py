@@ -9,23 +9,23 @@ recursion of rigid bodies in base axes (Featherstone, Rigid Body Dynamics Algori
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.expressions import Numbers, Objects, snapped, snapped_all
+from pkm_twin.codegen.expressions import Numbers, Objects, snapped_all
 from pkm_twin.codegen.operations import cos, sin, sqrt
+from pkm_twin.kinematics.constraints import Equation, constraint_equations, keep_distance
 from pkm_twin.machine.graph import BASE, Direction, Joint, Rod
 from pkm_twin.machine.joints import UNITS, Constraint
 from pkm_twin.machine.tree import Link, Step, Tree
 
 Columns = dict[tuple[str, int], Any]
 """By rate ("u" or "q", index): a vector, or a number."""
-BodyPoint = tuple[str, Any]
-"""A body, and where a point of it is."""
 
 
 class BaseMotion(NamedTuple):
@@ -50,10 +50,6 @@ FIXED: Final = BaseMotion(_ZERO, _ZERO, _ZERO)
 """A base at rest, without gravity: the motion of all parts is relative to it."""
 
 
-def _none() -> Any:
-    raise NotImplementedError("the acceleration of this equation is not needed")
-
-
 def cross(a: Any, b: Any) -> Objects:
     """Vector product of three numbers each."""
     result = np.empty(3, dtype=object)
@@ -74,28 +70,25 @@ def difference(b: Columns, a: Columns) -> Columns:
     return {k: (b[k] - a[k] if k in a else b[k]) if k in b else -a[k] for k in keys}
 
 
+def _no_bias() -> Any:
+    raise NotImplementedError("the acceleration of this equation is not needed")
+
+
 @dataclass(frozen=True, eq=False)
 class Row:
-    """One scalar equation of a closure: ``value`` is zero, ``columns`` its derivatives by rates.
+    """Describe a scalar equation of a closure by the tree's rates: ``value`` is zero.
 
-    ``bias``: its second derivative in time at zero accelerations of the unknowns (Delta-CU paper,
-    equations 4 and 5). ``scale`` makes
-    it of unit one; ``angle``: it is about directions. ``part``: the joint or rod. A unit of its
-    multiplier is a force ``force`` and a moment ``moment`` on ``outer`` at ``point``, and the
-    opposite on ``inner``.
+    ``columns``: its derivatives by the rates. ``bias``: its second derivative in time at zero
+    accelerations of the unknowns (Delta-CU paper, equations 4 and 5). ``scale`` makes it of unit
+    one; ``angle``: it is about directions. ``part``: the joint or rod.
     """
 
     part: str
     value: Any
     columns: Columns
-    bias: Callable[[], Any]
-    scale: float
-    inner: str
-    outer: str
-    point: Any
-    force: Any
-    moment: Any
+    scale: Any
     angle: bool = False
+    bias: Callable[[], Any] = _no_bias
 
 
 class Motion:
@@ -234,104 +227,64 @@ class Motion:
     # Closures.
 
     def closures(self) -> list[Row]:
-        """The equations of all cut joints and rods."""
+        """Return the equations of all cut joints and rods."""
         rows: list[Row] = []
-        kinds = {"point": self._meeting, "plane": self._offset, "angle": self._angle}
-        for name in self.tree.cut:
-            joint = self.graph.joints[name]
-            for constraint in joint.constraints:
-                rows += kinds[constraint.kind](joint, constraint)
-        rows += [self._rod(rod) for rod in self.graph.rods.values()]
-        return rows
+        for joint in map(self.graph.joints.__getitem__, self.tree.cut):
+            a, b = joint.inner, joint.outer
+            points = self.point(a, joint.at), self.point(b, joint.at)
+            turns = partial(self.direction, a), partial(self.direction, b)
+            for held in joint.constraints:
+                found = constraint_equations(joint, held, points, turns, self.tree.size)
+                columns = self._differences(found[0])
+                rows += [
+                    self._row(one, columns, partial(self._bias, joint, held, one)) for one in found
+                ]
+        return rows + [self._rod(rod) for rod in self.graph.rods.values()]
 
-    def _meeting(self, joint: Joint, _: Constraint) -> list[Row]:
-        """Both bodies' points are at one place."""
+    def _differences(self, one: Equation) -> Columns:
+        """Return the outer body's velocity less the inner one's per rate, linear or angular."""
+        if one.angle:
+            return difference(*(self.angular_jacobian(body) for body in one.bodies[::-1]))
+        return difference(*map(self.linear_jacobian, one.bodies[::-1], one.points[::-1]))
+
+    def _row(self, one: Equation, columns: Columns, bias: Callable[[], Any] = _no_bias) -> Row:
+        """Return an equation with its derivatives by the rates."""
+        load = one.moment if one.angle else one.force
+        by_rates = {k: c @ load for k, c in columns.items()}
+        return Row(one.part, one.value, by_rates, one.scale, one.angle, bias)
+
+    def _bias(self, joint: Joint, held: Constraint, one: Equation) -> Any:
+        """Return an equation's second derivative, of velocities and given accelerations."""
         a, b, at = joint.inner, joint.outer, joint.at
-        xa, xb = self.point(a, at), self.point(b, at)
-        columns = difference(self.linear_jacobian(b, xb), self.linear_jacobian(a, xa))
-
-        def bias(i: int) -> Callable[[], Any]:
-            return lambda: self.acceleration(b, at)[i] - self.acceleration(a, at)[i]
-
-        return [
-            Row(
-                joint.name, xb[i] - xa[i], {k: c[i] for k, c in columns.items()}, bias(i),
-                1.0 / self.tree.size, a, b, xb, UNITS[i], np.zeros(3),
-            )
-            for i in range(3)
-        ]  # fmt: skip
-
-    def _angle(self, joint: Joint, held: Constraint) -> list[Row]:
-        """A vector of the inner body and one of the outer body keep their angle."""
-        a, b = joint.inner, joint.outer
-        ea, ub = self.direction(a, held.inner), self.direction(b, held.outer)
-        normal = cross(ub, ea)
-        columns = difference(self.angular_jacobian(b), self.angular_jacobian(a))
-
-        def bias() -> Any:
-            wa, wb = self.omega[a], self.omega[b]
-            va, vb = cross(wa, ea), cross(wb, ub)
-            turning = (self.alpha[b] - self.alpha[a]) @ normal
+        wa, wb = self.omega[a], self.omega[b]
+        if held.kind == "point":
+            return one.force @ (self.acceleration(b, at) - self.acceleration(a, at))
+        ea = self.direction(a, held.inner)
+        va = cross(wa, ea)
+        if held.kind == "angle":
+            ub = self.direction(b, held.outer)
+            vb = cross(wb, ub)
+            turning = (self.alpha[b] - self.alpha[a]) @ one.moment
             return turning + cross(wa, va) @ ub + cross(wb, vb) @ ea + 2.0 * (va @ vb)
-
-        return [
-            Row(
-                joint.name, ea @ ub - snapped(held.inner @ held.outer),
-                {k: c @ normal for k, c in columns.items()}, bias,
-                1.0, a, b, self.point(b, joint.at), np.zeros(3), normal, angle=True,
-            )
-        ]  # fmt: skip
-
-    def _offset(self, joint: Joint, held: Constraint) -> list[Row]:
-        """The outer body's point stays in the plane across a vector of the inner body."""
-        a, b, at = joint.inner, joint.outer, joint.at
-        ea, xa, xb = self.direction(a, held.inner), self.point(a, at), self.point(b, at)
-        apart = xb - xa
-        normal = cross(ea, apart)
-        linear = difference(self.linear_jacobian(b, xb), self.linear_jacobian(a, xa))
-        columns = {k: c @ ea for k, c in linear.items()}
-        for k, c in self.angular_jacobian(a).items():
-            columns[k] = columns[k] + c @ normal if k in columns else c @ normal
-
-        def bias() -> Any:
-            wa = self.omega[a]
-            turned = cross(wa, ea)
-            return (
-                ea @ (self.acceleration(b, at) - self.acceleration(a, at))
-                + 2.0 * (turned @ (self.velocity(b, at) - self.velocity(a, at)))
-                + (cross(self.alpha[a], ea) + cross(wa, turned)) @ apart
-            )
-
-        # The force acts on both bodies at the outer point, so no moment is left.
-        return [
-            Row(
-                joint.name, ea @ apart, columns, bias, 1.0 / self.tree.size, a, b, xb, ea,
-                np.zeros(3),
-            )
-        ]  # fmt: skip
+        return (
+            ea @ (self.acceleration(b, at) - self.acceleration(a, at))
+            + 2.0 * (va @ (self.velocity(b, at) - self.velocity(a, at)))
+            + (cross(self.alpha[a], ea) + cross(wa, va)) @ (self.point(b, at) - self.point(a, at))
+        )
 
     def _rod(self, rod: Rod) -> Row:
-        """The ends keep their distance."""
+        """Return the equation of a rod: the ends keep their distance."""
         a, b, (start, end) = rod.inner, rod.outer, rod.ends
-        xa, xb = self.point(a, start), self.point(b, end)
-        apart = xb - xa
+        points = self.point(a, start), self.point(b, end)
         square = (end - start) @ (end - start)
+        one = keep_distance(rod.name, (a, b), points, square, self.tree.size)
 
         def bias() -> Any:
             speed = self.velocity(b, end) - self.velocity(a, start)
             change = self.acceleration(b, end) - self.acceleration(a, start)
-            return apart @ change + speed @ speed
+            return one.force @ change + speed @ speed
 
-        return replace(self.distance(rod.name, (a, xa), (b, xb), square), bias=bias)
-
-    def distance(self, part: str, a: BodyPoint, b: BodyPoint, square: Any) -> Row:
-        """The points have a distance, m2; without a bias (Delta-CU paper, equations 1 and 2)."""
-        apart = b[1] - a[1]
-        columns = difference(self.linear_jacobian(*b), self.linear_jacobian(*a))
-        return Row(
-            part, 0.5 * (apart @ apart - square), {k: c @ apart for k, c in columns.items()},
-            _none, 1.0 / (self.tree.size * sqrt(square)), a[0], b[0], b[1], apart, np.zeros(3),
-        )  # fmt: skip
+        return self._row(one, self._differences(one), bias)
 
     # Velocities and accelerations.
 

@@ -40,6 +40,7 @@ from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.operations import maximum, minimum, sqrt
 from pkm_twin.codegen.program import Program
 from pkm_twin.errors import SingularityError
+from pkm_twin.kinematics.constraints import keep_pair
 from pkm_twin.kinematics.engine import Engine
 from pkm_twin.kinematics.gradients import gradient_program
 from pkm_twin.kinematics.linkage import Linkage
@@ -47,8 +48,6 @@ from pkm_twin.kinematics.motion import (
     Columns,
     Motion,
     Row,
-    cross,
-    difference,
     matrices,
     numbers,
 )
@@ -136,20 +135,13 @@ class Placed(Motion):
         return [*super().closures(), *pairs]
 
     def _couple(self, rod: Rod) -> Row:
-        """Both rods of a pair keep their lengths: no turn about their plane's normal, t x w."""
-        a, b, (start, end) = rod.inner, rod.outer, rod.ends
-        xa, xb = self.point(a, start), self.point(b, end)
-        length = norm(plain(end - start))
-        normal = cross(self.direction(b, np.asarray(rod.pair)), (xb - xa) * (1.0 / length))
-        columns = difference(self.angular_jacobian(b), self.angular_jacobian(a))
-
-        def bias() -> Any:
-            raise NotImplementedError("the acceleration of a couple is not needed")
-
-        return Row(
-            rod.name, 0.0, {k: c @ normal for k, c in columns.items()}, bias, 1.0, a, b, xb,
-            np.zeros(3), normal, angle=True,
-        )  # fmt: skip
+        """Return the equation of a pair's lengths: no turn about their plane's normal, t x w."""
+        bodies, (start, end) = (rod.inner, rod.outer), rod.ends
+        points = self.point(rod.inner, start), self.point(rod.outer, end)
+        pair = np.asarray(rod.pair)
+        vectors = self.direction(rod.inner, pair), self.direction(rod.outer, pair)
+        one = keep_pair(rod.name, bodies, points, vectors, norm(plain(end - start)))
+        return self._row(one, self._differences(one))
 
 
 def _singularity(t: Traced) -> Program:

@@ -39,6 +39,25 @@ def about(axis: Array, angle: ArrayLike) -> Array:
     return rotation
 
 
+def rotation_about(vectors: Array) -> Array:
+    """Return the rotations about vectors (..., 3) by their lengths, rad, shape (..., 3, 3)."""
+    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
+    across, half = skew(vectors), np.sinc(angle / (2.0 * np.pi))
+    rotation: Array = np.eye(3) + np.sinc(angle / np.pi) * across + 0.5 * half**2 * across @ across
+    return rotation
+
+
+def rotation_vector(rotation: Array) -> Array:
+    """Return the vector of :func:`rotation_about` for less than half a turn, (..., 3)."""
+    r = rotation
+    twice = np.stack(
+        [r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]], -1
+    )
+    sine = 0.5 * np.linalg.norm(twice, axis=-1)
+    angle = np.arctan2(sine, 0.5 * (np.trace(r, axis1=-2, axis2=-1) - 1.0))
+    return np.asarray(twice * 0.5 / np.sinc(angle / np.pi)[..., None], np.float64)
+
+
 def skew(vectors: Array) -> Array:
     """Matrices (..., 3, 3) that take the cross product of vectors (..., 3) with what follows."""
     x, y, z = np.moveaxis(vectors, -1, 0)

@@ -1,0 +1,207 @@
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
+"""Constraint equations of joints and rods between two bodies, from the joint types' constraints.
+
+Every closure of the package is one of these equations, on expressions and on arrays of numbers:
+with the tree's coordinates in :mod:`pkm_twin.kinematics.motion`, with six coordinates a body in
+:class:`Placement`. Vectors have three components on the last axis; leading axes are the batch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from pkm_twin.codegen.arrays import Array
+from pkm_twin.codegen.expressions import snapped
+from pkm_twin.codegen.operations import sqrt
+from pkm_twin.machine.graph import BASE, Graph, Joint
+from pkm_twin.machine.joints import UNITS, Constraint
+from pkm_twin.machine.rotations import rotation_about
+
+NONE: Final = np.zeros(3)
+Pair = tuple[Any, Any]
+"""Something of the inner body, and the same of the outer body."""
+Turns = tuple[Callable[[Array], Any], Callable[[Array], Any]]
+"""Functions from a vector fixed in the inner and in the outer body at home to the present one."""
+
+
+class Equation(NamedTuple):
+    """Describe one scalar equation between two bodies: ``value`` is zero where the parts fit.
+
+    A unit of its multiplier is a force ``force`` at ``points[1]`` and a moment ``moment`` on the
+    outer body, and the opposite on the inner body with the force at ``points[0]``. By virtual work
+    these are the derivatives of the value by the bodies' motions:
+
+        d value = force (v_outer - v_inner) + moment (w_outer - w_inner)
+
+    ``bodies``: names of the inner and of the outer body. ``scale`` makes the value of unit one.
+    """
+
+    part: str
+    bodies: tuple[str, str]
+    value: Any
+    points: Pair
+    force: Any
+    moment: Any
+    scale: Any
+
+    @property
+    def angle(self) -> bool:
+        """Whether it is about directions alone."""
+        return self.force is NONE
+
+
+def dot(a: Any, b: Any) -> Any:
+    """Return the scalar product over the last axis; of expressions in one order of operations."""
+    return a @ b if a.ndim == b.ndim == 1 else (a * b).sum(-1)
+
+
+def keep_angle(
+    part: str, bodies: tuple[str, str], points: Pair, vectors: Pair, known: Any
+) -> Equation:
+    """Return the equation of a constant angle between a vector of each body.
+
+    :param known: scalar product of the vectors.
+    """
+    inner, outer = vectors
+    return Equation(
+        part, bodies, dot(inner, outer) - known, points, NONE, np.cross(outer, inner), 1.0
+    )
+
+
+def keep_distance(
+    part: str, bodies: tuple[str, str], points: Pair, square: Any, size: Any
+) -> Equation:
+    """Return the equation of a rod (Delta-CU paper, equations 1 and 2).
+
+    :param square: of the rod's length, m2. ``size``: of the machine, m.
+    """
+    apart = points[1] - points[0]
+    value = 0.5 * (dot(apart, apart) - square)
+    return Equation(part, bodies, value, points, apart, NONE, 1.0 / (size * sqrt(square)))
+
+
+def keep_pair(
+    part: str, bodies: tuple[str, str], points: Pair, vectors: Pair, length: Any
+) -> Equation:
+    """Return the equation of two parallel rods of equal length.
+
+    Their middle line is perpendicular to the difference of ``vectors``, the directions from rod to
+    rod on both bodies.
+    """
+    along = (points[1] - points[0]) * (1.0 / length)
+    value = dot(along, vectors[1] - vectors[0])
+    return Equation(part, bodies, value, points, NONE, np.cross(vectors[1], along), 1.0)
+
+
+def constraint_equations(
+    joint: Joint, held: Constraint, points: Pair, turns: Turns, size: Any
+) -> list[Equation]:
+    """Return the equations of one constraint of a joint.
+
+    :param points: of the joint on both bodies, m. ``size``: of the machine, m.
+    """
+    bodies, apart, scale = (joint.inner, joint.outer), points[1] - points[0], 1.0 / size
+    if held.kind == "point":
+        return [
+            Equation(joint.name, bodies, apart[..., i], points, unit, NONE, scale)
+            for i, unit in enumerate(UNITS)
+        ]
+    inner = turns[0](held.inner)
+    if held.kind == "angle":
+        vectors = inner, turns[1](held.outer)
+        return [keep_angle(joint.name, bodies, points, vectors, snapped(held.inner @ held.outer))]
+    # The inner body bears the force where the outer body's point is.
+    there, along = (points[1], points[1]), dot(inner, apart)
+    if held.kind == "plane":
+        return [Equation(joint.name, bodies, along, there, inner, NONE, scale)]
+    mark = turns[1](held.outer)
+    sine, cosine = dot(inner, np.cross(turns[0](held.outer), mark)), dot(turns[0](held.outer), mark)
+    angle = np.arctan2(sine, cosine)
+    # The angle is known up to full revolutions.
+    angle = angle + 2.0 * np.pi * np.round((along / held.slide - angle) / (2.0 * np.pi))
+    value = along - held.slide * angle
+    return [Equation(joint.name, bodies, value, there, inner, -held.slide * inner, scale)]
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """Hold where all bodies of a graph are, with six coordinates a body.
+
+    A point of a body, given at home, is at ``rotation`` @ point + ``shift``; shapes (..., bodies +
+    1, 3, 3) and (..., bodies + 1, 3), m, the ground first. Coordinates are the displacement at
+    ``middle``, (3,) m, in parts of ``size``, m, and the rotation, of all bodies but the ground.
+    """
+
+    index: Mapping[str, int]
+    rotation: Array
+    shift: Array
+    middle: Array
+    size: float
+
+    @classmethod
+    def at_home(cls, graph: Graph, shape: tuple[int, ...] = ()) -> Placement:
+        """Return the bodies of a graph at home, in a batch of a shape."""
+        index = {name: k for k, name in enumerate((BASE, *graph.bodies))}
+        shape = (*shape, len(index))
+        return cls(
+            index, np.tile(np.eye(3), (*shape, 1, 1)), np.zeros((*shape, 3)), graph.origin,
+            graph.size,
+        )  # fmt: skip
+
+    def point(self, body: str, at: Array) -> Array:
+        """Return where a point of a body is, shape (..., 3); given at home, (3,) or (..., 3), m."""
+        k = self.index[body]
+        turned = (self.rotation[..., k, :, :] @ np.asarray(at)[..., None])[..., 0]
+        return np.asarray(turned + self.shift[..., k, :], np.float64)
+
+    def turn(self, body: str) -> Array:
+        """Return a body's rotation from home, shape (..., 3, 3)."""
+        return self.rotation[..., self.index[body], :, :]
+
+    def moved(self, step: Array) -> Placement:
+        """Return the bodies after a change of the coordinates, shape (..., 6 bodies)."""
+        each = step.reshape(*step.shape[:-1], -1, 6)
+        each = np.concatenate([np.zeros_like(each[..., :1, :]), each], -2)
+        turn = rotation_about(each[..., 3:])
+        shift = (turn @ (self.shift - self.middle)[..., None])[..., 0]
+        shift = shift + self.middle + self.size * each[..., :3]
+        return Placement(self.index, turn @ self.rotation, shift, self.middle, self.size)
+
+    def values(self, equations: Sequence[Equation]) -> Array:
+        """Return the scaled values of equations, shape (..., rows)."""
+        shape = self.shift.shape[:-2]
+        found = [np.broadcast_to(one.scale * one.value, shape) for one in equations]
+        return np.stack(found, -1) if found else np.zeros((*shape, 0))
+
+    def matrix(self, equations: Sequence[Equation]) -> Array:
+        """Return their derivatives by the coordinates, shape (..., rows, 6 bodies)."""
+        table = np.zeros((*self.shift.shape[:-2], len(equations), 6 * len(self.index)))
+        for i, one in enumerate(equations):
+            for body, place, sign in zip(one.bodies, one.points, (-1.0, 1.0), strict=True):
+                k, side = 6 * self.index[body], sign * one.scale
+                table[..., i, k : k + 3] += side * self.size * one.force
+                moment = np.cross(place - self.middle, one.force) + one.moment
+                table[..., i, k + 3 : k + 6] += side * moment
+        return table[..., 6:]
+
+
+def differentiate_by_frame(
+    one: Equation, side: int, point: Array, rotation: Array
+) -> tuple[Array, Array]:
+    """Return an equation's derivatives by an error of the part's frame on one of its bodies.
+
+    :param side: 0: the frame on the inner body, 1: on the outer body. ``point``: its origin,
+        (..., 3) m. ``rotation``: of that body from home, shape (..., 3, 3).
+    :returns: scaled, by a displacement of the origin, 1/m, and by a rotation about it, 1/rad, both
+        in base axes at home, shape (..., 3).
+    """
+    sign = (-1.0, 1.0)[side] * one.scale
+    moment = one.moment + np.cross(one.points[side] - point, one.force)
+    by_shift, by_tilt = (
+        (sign * vector[..., None, :] @ rotation)[..., 0, :] for vector in (one.force, moment)
+    )
+    return by_shift, by_tilt
