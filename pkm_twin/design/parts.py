@@ -16,9 +16,9 @@ import contextlib
 import copy
 import re
 from collections.abc import Container, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, Final, NamedTuple
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from typing import Final
 
 import numpy as np
 
@@ -30,9 +30,19 @@ from pkm_twin.errors import (
     UnknownNameError,
     unknown_number,
 )
-from pkm_twin.machine.graph import BASE, Graph, Joint, rotation_about_z
+from pkm_twin.kinematics.constraints import (
+    Equation,
+    Placement,
+    constraint_equations,
+    drive_equation,
+    keep_distance,
+    keep_pair,
+    rotate,
+)
+from pkm_twin.machine.graph import BASE, Graph, Joint, Rod, rotation_about_z
 from pkm_twin.machine.joints import across, unit
 from pkm_twin.machine.places import full_keys, keys_of, path_of
+from pkm_twin.machine.rotations import rotation_about, rotation_vector
 from pkm_twin.robot.robot import SINGULARITY_BOUND, Robot
 
 MAX_OPEN_FRACTION: Final = 1e-6
@@ -243,198 +253,80 @@ def _lengthen_body(robot: Robot, body: str, path: str) -> dict[Effect, Array]:
     return dict.fromkeys(moved, unit(line))
 
 
-class Row(NamedTuple):
-    """Describe a scalar equation between two bodies, of unit one; leading axes are the batch.
-
-    A unit of its multiplier is a force and a moment at ``point`` on ``outer``, the opposite on
-    ``inner``. ``part``: the joint or rod.
-    """
-
-    part: str
-    value: Array
-    inner: str
-    outer: str
-    point: Array
-    force: Array
-    moment: Array
-
-
-@dataclass(frozen=True)
-class Placed:
-    """Hold where bodies are: rotation from home (..., 3, 3) and origin (..., 3) by name."""
-
-    rotation: dict[str, Array]
-    origin: dict[str, Array]
-
-    def moved(self, twists: Mapping[str, Array]) -> Placed:
-        """Return the bodies after displacements of origins and small rotations, (..., 6) each."""
-        rotation = {n: rotation_about(v[..., 3:]) @ self.rotation[n] for n, v in twists.items()}
-        return Placed(rotation, {n: self.origin[n] + v[..., :3] for n, v in twists.items()})
-
-
-def rotation_about(vector: Array) -> Array:
-    """Return the rotation about a vector by its length, shape (..., 3, 3)."""
-    angle = np.linalg.norm(vector, axis=-1)[..., None, None]
-    x, y, z = np.moveaxis(vector, -1, 0)
-    o = np.zeros_like(x)
-    skew = np.moveaxis(np.array([[o, -z, y], [z, o, -x], [-y, x, o]]), (0, 1), (-2, -1))
-    half = np.sinc(angle / (2.0 * np.pi))
-    return np.asarray(np.eye(3) + np.sinc(angle / np.pi) * skew + 0.5 * half**2 * skew @ skew)
-
-
-def rotation_vector(rotation: Array) -> Array:
-    """Return the vector of :func:`rotation_about` for less than half a turn, (..., 3)."""
-    r = rotation
-    twice = np.stack(
-        [r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]], -1
-    )
-    sine = 0.5 * np.linalg.norm(twice, axis=-1)
-    angle = np.arctan2(sine, 0.5 * (np.trace(r, axis1=-2, axis2=-1) - 1.0))
-    return np.asarray(twice * 0.5 / np.sinc(angle / np.pi)[..., None], np.float64)
-
-
 class Assembly:
-    """Hold a machine's bodies and rows at joint positions, with errors of its parts.
+    """Hold a machine's bodies at joint positions, with errors of its parts.
 
     :param q: joint positions, shape (..., n). Errors as of :meth:`Robot.forward`.
     """
 
     def __init__(self, robot: Robot, q: Array) -> None:
-        self.robot, self.graph = robot, robot.graph
-        self.at, self.size = robot.engine.tree.at, float(robot.graph.size)
-        self.bodies = list(self.graph.bodies)
-        self.q, self.placed = q, Placed(*robot.placements(q))
+        self.robot, self.graph, self.q = robot, robot.graph, q
+        home = Placement.at_home(robot.graph, q.shape[:-1])
+        rotations, shifts = [home.turn(BASE)], [home.shift[..., 0, :]]
+        turned, origins = robot.placements(q)
+        for name, rotation in turned.items():
+            rotations.append(rotation)
+            shifts.append(origins[name] - rotation @ robot.engine.tree.at[name])
+        self.placed = replace(home, rotation=np.stack(rotations, -3), shift=np.stack(shifts, -2))
 
-    # Rows, on bodies anywhere and errors of any size.
+    # Equations, of bodies anywhere and errors of any size.
 
-    def rows(
-        self, placed: Placed, q: Array, errors: Mapping[Effect, Array],
-        only: Container[str] | None = None,
-    ) -> list[Row]:  # fmt: skip
+    def equations(
+        self, placed: Placement, errors: Mapping[Effect, Array], only: Container[str] | None = None
+    ) -> list[Equation]:
         """Return the equations of joints, rods and held drives.
 
         :param errors: by effect, shape (..., 3) or (..., 1); missing effects have no error.
         :param only: names of joints and rods; None for all.
         """
-        found: list[Row] = []
-        names = list(self.graph.actuated)
-        for joint in self.graph.joints.values():
+        found: list[Equation] = []
+        graph, size = self.graph, self.placed.size
+
+        def find_points(
+            part: Joint | Rod, kinds: tuple[str, str], ends: Sequence[Array]
+        ) -> tuple[Array, Array]:
+            inner, outer = (
+                placed.point(body, at + errors.get((kind, part.name), 0.0))
+                for kind, body, at in zip(kinds, (part.inner, part.outer), ends, strict=True)
+            )
+            return inner, outer
+
+        for joint in graph.joints.values():
             if joint.virtual or (only is not None and joint.name not in only):
                 continue
-            value = q[..., names.index(joint.name)] if joint.name in self.graph.leads else None
-            found += self._joint_rows(joint, placed, value, errors)
-        for rod in self.graph.rods.values():
+            points = find_points(joint, ("inner", "outer"), (joint.at, joint.at))
+            inner, outer = placed.turn(joint.inner), placed.turn(joint.outer)
+            if ("tilt", joint.name) in errors:
+                inner = inner @ rotation_about(errors["tilt", joint.name])
+            turns = partial(rotate, inner), partial(rotate, outer)
+            for held in joint.constraints:
+                found += constraint_equations(joint, held, points, turns, size)
+            if joint.name in graph.leads:
+                goal = self.q[..., graph.actuated.index(joint.name)] - joint.home
+                goal = goal + errors.get(("offset", joint.name), np.zeros(1))[..., 0]
+                found.append(drive_equation(joint, goal, points, turns, size))
+        for rod in graph.rods.values():
             if only is not None and rod.name not in only:
                 continue
-            start, end = (
-                self._point(placed, body, at, errors.get((side, rod.name)))
-                for side, body, at in zip(
-                    ("start", "end"), (rod.inner, rod.outer), rod.ends, strict=True
-                )
+            points, bodies = (
+                find_points(rod, ("start", "end"), (*rod.ends,)),
+                (rod.inner, rod.outer),
             )
-            apart = end - start
-            far = np.linalg.norm(apart, axis=-1)
-            longer = errors.get(("length", rod.name), np.zeros(1))[..., 0]
-            long = float(np.linalg.norm(rod.ends[1] - rod.ends[0])) + longer
-            along = apart / far[..., None]
-            found.append(
-                Row(
-                    rod.name, (far - long) / self.size, rod.inner, rod.outer, end,
-                    along / self.size, np.zeros(3),
-                )
-            )  # fmt: skip
+            length = errors.get(("length", rod.name), np.zeros(1))[..., 0]
+            length = length + np.linalg.norm(rod.ends[1] - rod.ends[0])
+            found.append(keep_distance(rod.name, bodies, points, length**2, size))
             if rod.pair is not None:
-                # Two rods of equal length: their middle line is perpendicular to the difference of
-                # the directions from rod to rod on both bodies.
-                first, second = (
-                    np.asarray((np.eye(3) if body == BASE else placed.rotation[body]) @ rod.pair)
-                    for body in (rod.inner, rod.outer)
-                )
-                value = (along * (second - first)).sum(-1)
-                found.append(
-                    Row(
-                        rod.name, value, rod.inner, rod.outer, end, np.zeros(3),
-                        np.cross(second, along),
-                    )
-                )  # fmt: skip
+                first, second = (rotate(placed.turn(body), np.asarray(rod.pair)) for body in bodies)
+                apart = np.linalg.norm(points[1] - points[0], axis=-1, keepdims=True)
+                found.append(keep_pair(rod.name, bodies, points, (first, second), apart))
         return found
-
-    def _point(self, placed: Placed, body: str, at: Array, error: Array | None) -> Array:
-        local = at if error is None else at + error
-        if body == BASE:
-            return np.asarray(local)
-        arm = (placed.rotation[body] @ (local - self.at[body])[..., None])[..., 0]
-        return np.asarray(placed.origin[body] + arm)
-
-    def _joint_rows(
-        self, joint: Joint, placed: Placed, value: Array | None, errors: Mapping[Effect, Array]
-    ) -> list[Row]:
-        a, b = joint.inner, joint.outer
-        first = self._point(placed, a, joint.at, errors.get(("inner", joint.name)))
-        point = self._point(placed, b, joint.at, errors.get(("outer", joint.name)))
-        apart, none = point - first, np.zeros(3)
-        inner, outer = (np.eye(3) if n == BASE else placed.rotation[n] for n in (a, b))
-        if ("tilt", joint.name) in errors:
-            inner = inner @ rotation_about(errors["tilt", joint.name])
-        rows: list[Row] = []
-
-        def add(value: Array, force: Array, moment: Array, scale: float) -> None:
-            rows.append(Row(joint.name, value * scale, a, b, point, force * scale, moment * scale))
-
-        def angle(one: Array, other: Array, known: float = 0.0) -> None:
-            """Add the equation of a constant angle between vectors of both frames."""
-            e, u = (inner @ one[..., None])[..., 0], outer @ other
-            add((e * u).sum(-1) - known, none, np.cross(u, e), 1.0)
-
-        scale = 1.0 / self.size
-        for held in joint.constraints:
-            e = inner @ held.inner
-            if held.kind == "point":
-                for k in range(3):
-                    add(apart[..., k], np.eye(3)[k], none, scale)
-            elif held.kind == "plane":
-                add((e * apart).sum(-1), e, none, scale)
-            elif held.kind == "angle":
-                angle(held.inner, held.outer, float(held.inner @ held.outer))
-            else:
-                way = (e * apart).sum(-1)
-                x, y = (
-                    ((inner @ one)[..., None, :] @ (outer @ held.outer)[..., None])[..., 0, 0]
-                    for one in (held.outer, np.cross(held.inner, held.outer))
-                )
-                turn = np.arctan2(y, x)
-                turn = turn + 2.0 * np.pi * np.round((way / held.slide - turn) / (2.0 * np.pi))
-                add(way - held.slide * turn, e, -held.slide * e, scale)
-        if value is not None:
-            (freedom,) = joint.freedoms
-            goal = value - joint.home + errors.get(("offset", joint.name), np.zeros(1))[..., 0]
-            if freedom.turns:
-                mark = across(joint.axes[0])
-                s, c = np.sin(goal)[..., None], np.cos(goal)[..., None]
-                angle(c * mark[1] - s * mark[0], mark[0])
-            else:
-                e = inner @ joint.axes[0]
-                add((e * apart).sum(-1) - goal, e, none, scale)
-        return rows
 
     # To first order.
 
-    def _matrix(self, rows: Sequence[Row]) -> Array:
-        """Return the rows' derivatives by the bodies' twists of unit one, (..., rows, 6 bodies)."""
-        table = np.zeros((*self.q.shape[:-1], len(rows), 6 * len(self.bodies)))
-        for i, row in enumerate(rows):
-            for body, side in ((row.outer, 1.0), (row.inner, -1.0)):
-                if body != BASE:
-                    k = 6 * self.bodies.index(body)
-                    arm = row.point - self.placed.origin[body]
-                    table[..., i, k : k + 3] += side * self.size * row.force
-                    table[..., i, k + 3 : k + 6] += side * (np.cross(arm, row.force) + row.moment)
-        return table
-
     @cached_property
-    def _rows(self) -> list[Row]:
-        """Rows without errors."""
-        return self.rows(self.placed, self.q, {})
+    def _equations(self) -> list[Equation]:
+        """Equations without errors."""
+        return self.equations(self.placed, {})
 
     @cached_property
     def _factors(self) -> tuple[Array, Array]:
@@ -442,7 +334,7 @@ class Assembly:
 
         :raises SingularityError: the rows do not determine the bodies.
         """
-        q, r = np.linalg.qr(self._matrix(self._rows))
+        q, r = np.linalg.qr(self.placed.matrix(self._equations))
         sizes = np.abs(np.diagonal(r, axis1=-2, axis2=-1))
         measure = sizes.min(-1) / sizes.max(-1)
         if not (measure > SINGULARITY_BOUND).all():
@@ -459,18 +351,16 @@ class Assembly:
 
     def _differentiate(self, part: Part) -> Array:
         """Return the rows' derivatives by an error, shape (..., rows, 1), by differences."""
-        scale = self.size if part.unit == "m" else 1.0
+        scale = self.placed.size if part.unit == "m" else 1.0
         moving, shape = {name for _, name in part.effects}, self.q.shape[:-1]
-        total: Any = 0.0
+        total = np.zeros((*shape, len(self._equations)))
         for point, weight in zip(STENCIL, STENCIL_WEIGHTS, strict=True):
             errors = {what: scale * point * vector for what, vector in part.effects.items()}
-            moved = iter(self.rows(self.placed, self.q, errors, moving))
-            values = [
-                np.broadcast_to(next(moved).value if row.part in moving else 0.0, shape)
-                for row in self._rows
-            ]
-            total = total + weight / scale * np.stack(values, -1)
-        return np.asarray(total[..., None], np.float64)
+            moved = iter(self.placed.values(self.equations(self.placed, errors, moving)).T)
+            for k, one in enumerate(self._equations):
+                if one.part in moving:
+                    total[..., k] += weight / scale * next(moved).T
+        return total[..., None]
 
     def platform(self, parts: Sequence[Part]) -> tuple[Array, Array]:
         """Return how errors move the platform, and the fraction of each that stays open, 0 to 1.
@@ -484,14 +374,14 @@ class Assembly:
         left = columns - self._factors[0] @ (self._factors[0].swapaxes(-1, -2) @ columns)
         whole = np.maximum(np.linalg.norm(columns, axis=-2), np.finfo(float).tiny)
         missed = (np.linalg.norm(left, axis=-2) / whole).reshape(-1, len(parts)).max(0, initial=0.0)
-        name = self.graph.platform
-        k, rotation = 6 * self.bodies.index(name), self.placed.rotation[name]
-        arm = self._point(self.placed, name, self.graph.origin, None) - self.placed.origin[name]
-        moved, turn = self.size * found[..., k : k + 3, :], found[..., k + 3 : k + 6, :]
+        name, placed = self.graph.platform, self.placed
+        k = 6 * (placed.index[name] - 1)
+        arm = placed.point(name, self.graph.origin) - placed.middle
+        moved, turn = placed.size * found[..., k : k + 3, :], found[..., k + 3 : k + 6, :]
         moved = moved + np.cross(turn, arm[..., None], axis=-2)
         for column, part in enumerate(parts):
             if ("origin", name) in part.effects:
-                moved[..., column] += rotation @ part.effects["origin", name]
+                moved[..., column] += placed.turn(name) @ part.effects["origin", name]
         return np.concatenate([moved, turn], -2), np.asarray(missed, np.float64)
 
     # Of any size.
@@ -513,19 +403,18 @@ class Assembly:
         :raises PkmTwinError: parts with these errors cannot be assembled.
         """
         count, inner = len(next(iter(errors.values()))), self.q.shape[:-1]
-        shape = (count, *inner)
         errors = {k: v.reshape(count, *(1 for _ in inner), -1) for k, v in errors.items()}
-        placed = Placed(
-            {n: np.broadcast_to(r, (*shape, 3, 3)) for n, r in self.placed.rotation.items()},
-            {n: np.broadcast_to(o, (*shape, 3)) for n, o in self.placed.origin.items()},
+        start = self.placed
+        placed = replace(
+            start,
+            rotation=np.broadcast_to(start.rotation, (count, *start.rotation.shape)),
+            shift=np.broadcast_to(start.shift, (count, *start.shift.shape)),
         )
         worst = 0
         for _ in range(MAX_ITERATIONS):
-            rows = self.rows(placed, self.q, errors)
-            values = np.stack([np.broadcast_to(row.value, shape) for row in rows], -1)
+            values = placed.values(self.equations(placed, errors))
             step = np.moveaxis(self._solve_twists(np.moveaxis(values, 0, -1)), -1, 0)
-            twists = step.reshape(*shape, -1, 6) * ([self.size] * 3 + [1.0] * 3)
-            placed = placed.moved({n: twists[..., k, :] for k, n in enumerate(self.bodies)})
+            placed = placed.moved(step)
             last = float(np.abs(step).max())
             worst = int(np.abs(values).max(-1).max(0).argmax())
             if not last < 1.0:
@@ -535,9 +424,9 @@ class Assembly:
                 if left > MAX_OPEN_FRACTION:
                     break
                 name, origin = self.graph.platform, self.graph.origin
-                there = self._point(placed, name, origin, errors.get(("origin", name)))
-                turn = placed.rotation[name] @ self.placed.rotation[name].swapaxes(-1, -2)
-                moved = there - self._point(self.placed, name, self.robot.graph.origin, None)
+                there = placed.point(name, origin + errors.get(("origin", name), 0.0))
+                turn = placed.turn(name) @ start.turn(name).swapaxes(-1, -2)
+                moved = there - start.point(name, self.robot.graph.origin)
                 return np.concatenate([moved, rotation_vector(turn)], -1)
         raise PkmTwinError(
             f"{self.robot.name}: rigid parts with errors of this size cannot be assembled at "

@@ -20,11 +20,11 @@ from pkm_twin.design.parts import (
     error_of,
     matching,
     part_of,
-    rotation_vector,
 )
 from pkm_twin.design.variants import variants
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.machine import schema
+from pkm_twin.machine.rotations import rotation_vector
 from pkm_twin.machine.uncertainty import Tolerance
 from pkm_twin.robot.derivatives import platform_derivatives
 from pkm_twin.robot.robot import Robot

@@ -8,7 +8,7 @@ with the tree's coordinates in :mod:`pkm_twin.kinematics.motion`, with six coord
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
@@ -18,7 +18,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import snapped
 from pkm_twin.codegen.operations import sqrt
 from pkm_twin.machine.graph import BASE, Graph, Joint
-from pkm_twin.machine.joints import UNITS, Constraint
+from pkm_twin.machine.joints import UNITS, Constraint, across
 from pkm_twin.machine.rotations import rotation_about
 
 NONE: Final = np.zeros(3)
@@ -106,8 +106,9 @@ def constraint_equations(
     """
     bodies, apart, scale = (joint.inner, joint.outer), points[1] - points[0], 1.0 / size
     if held.kind == "point":
+        # [()] makes an array of one expression that expression.
         return [
-            Equation(joint.name, bodies, apart[..., i], points, unit, NONE, scale)
+            Equation(joint.name, bodies, apart[..., i][()], points, unit, NONE, scale)
             for i, unit in enumerate(UNITS)
         ]
     inner = turns[0](held.inner)
@@ -125,6 +126,27 @@ def constraint_equations(
     angle = angle + 2.0 * np.pi * np.round((along / held.slide - angle) / (2.0 * np.pi))
     value = along - held.slide * angle
     return [Equation(joint.name, bodies, value, there, inner, -held.slide * inner, scale)]
+
+
+def drive_equation(joint: Joint, goal: Any, points: Pair, turns: Turns, size: Any) -> Equation:
+    """Return the equation of a joint of one freedom that is held.
+
+    :param goal: its motion from home, rad or m, shape (...).
+    """
+    bodies, (freedom,) = (joint.inner, joint.outer), joint.freedoms
+    if freedom.turns:
+        first, second = across(joint.axes[0])
+        goal = np.asarray(goal)[..., None]
+        inner = turns[0](np.cos(goal) * second - np.sin(goal) * first)
+        return keep_angle(joint.name, bodies, points, (inner, turns[1](first)), 0.0)
+    along = turns[0](joint.axes[0])
+    value = dot(along, points[1] - points[0]) - goal
+    return Equation(joint.name, bodies, value, (points[1], points[1]), along, NONE, 1.0 / size)
+
+
+def rotate(rotation: Array, vectors: Array) -> Array:
+    """Return vectors, (3,) or (..., 3), rotated by matrices, (..., 3, 3)."""
+    return np.asarray((rotation @ vectors[..., None])[..., 0], np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,8 +177,9 @@ class Placement:
     def point(self, body: str, at: Array) -> Array:
         """Return where a point of a body is, shape (..., 3); given at home, (3,) or (..., 3), m."""
         k = self.index[body]
-        turned = (self.rotation[..., k, :, :] @ np.asarray(at)[..., None])[..., 0]
-        return np.asarray(turned + self.shift[..., k, :], np.float64)
+        return np.asarray(
+            rotate(self.rotation[..., k, :, :], at) + self.shift[..., k, :], np.float64
+        )
 
     def turn(self, body: str) -> Array:
         """Return a body's rotation from home, shape (..., 3, 3)."""
@@ -164,11 +187,10 @@ class Placement:
 
     def moved(self, step: Array) -> Placement:
         """Return the bodies after a change of the coordinates, shape (..., 6 bodies)."""
-        each = step.reshape(*step.shape[:-1], -1, 6)
+        each = step.reshape(*step.shape[:-1], len(self.index) - 1, 6)
         each = np.concatenate([np.zeros_like(each[..., :1, :]), each], -2)
         turn = rotation_about(each[..., 3:])
-        shift = (turn @ (self.shift - self.middle)[..., None])[..., 0]
-        shift = shift + self.middle + self.size * each[..., :3]
+        shift = rotate(turn, self.shift - self.middle) + self.middle + self.size * each[..., :3]
         return Placement(self.index, turn @ self.rotation, shift, self.middle, self.size)
 
     def values(self, equations: Sequence[Equation]) -> Array:
@@ -179,14 +201,23 @@ class Placement:
 
     def matrix(self, equations: Sequence[Equation]) -> Array:
         """Return their derivatives by the coordinates, shape (..., rows, 6 bodies)."""
-        table = np.zeros((*self.shift.shape[:-2], len(equations), 6 * len(self.index)))
-        for i, one in enumerate(equations):
-            for body, place, sign in zip(one.bodies, one.points, (-1.0, 1.0), strict=True):
-                k, side = 6 * self.index[body], sign * one.scale
-                table[..., i, k : k + 3] += side * self.size * one.force
-                moment = np.cross(place - self.middle, one.force) + one.moment
-                table[..., i, k + 3 : k + 6] += side * moment
-        return table[..., 6:]
+        shape, rows = self.shift.shape[:-2], np.arange(len(equations))
+        table = np.zeros((*shape, len(equations), len(self.index), 6))
+        whole = (*shape, len(equations), 6 * len(self.index))
+        if not equations:
+            return table.reshape(whole)[..., 6:]
+
+        def stack(vectors: Iterable[Array]) -> Array:
+            return np.stack([np.broadcast_to(vector, (*shape, 3)) for vector in vectors], -2)
+
+        force = stack(one.scale * one.force for one in equations)
+        moment = stack(one.scale * one.moment for one in equations)
+        for side, sign in ((0, -1.0), (1, 1.0)):
+            bodies = [self.index[one.bodies[side]] for one in equations]
+            arm = stack(one.points[side] for one in equations) - self.middle
+            table[..., rows, bodies, :3] += sign * self.size * force
+            table[..., rows, bodies, 3:] += sign * (np.cross(arm, force) + moment)
+        return table.reshape(whole)[..., 6:]
 
 
 def differentiate_by_frame(
