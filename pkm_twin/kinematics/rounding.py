@@ -14,16 +14,24 @@ are parts of the machine's size, angles are in rad.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.machine.graph import BASE, Graph, Joint, Rod, array
-from pkm_twin.machine.joints import across
-from pkm_twin.machine.rotations import about, skew
+from pkm_twin.kinematics.constraints import (
+    Equation,
+    Placement,
+    constraint_equations,
+    differentiate_by_frame,
+    keep_distance,
+    rotate,
+)
+from pkm_twin.machine.graph import Graph, array
+from pkm_twin.machine.joints import HELD
 
 CHAIN: Final = 20.0
 """How far rounding may move a body or open a loop, rounding errors: a loop is a chain of places."""
@@ -60,16 +68,17 @@ Slot = tuple[str, str, int]
 """A vector of the graph: ``at`` or ``axis`` of a joint, or ``end`` of a rod, and which."""
 
 
-class _Equation(NamedTuple):
-    """Equations between two bodies in all positions, and their derivatives by what moves.
+class _Frame(NamedTuple):
+    """Describe a part's frame on one of its bodies by the vectors that place it.
 
-    ``value``: shape (k, m). ``bodies``: by body those by its translation and rotation, shape
-    (k, m, 3) each. ``slots``: those by vectors of the graph.
+    ``point``: its origin at home, the vector ``slot``. ``tilt``: the axis that tilts it, if one
+    does, and ``axis`` its value.
     """
 
-    value: Array
-    bodies: dict[int, tuple[Array, Array]]
-    slots: dict[Slot, Array]
+    slot: Slot
+    point: Array
+    tilt: Slot | None = None
+    axis: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +125,7 @@ def repair(graph: Graph, precision: float) -> Repair | None:
         where no small change gives the freedoms, or home is a singularity.
     """
     loops = _Loops(graph)
-    sizes = np.linalg.svd(loops.equations(*loops.home(1))[1][0], compute_uv=False)
+    sizes = np.linalg.svd(loops.equations(Placement.at_home(graph, (1,)))[1][0], compute_uv=False)
     rank = int((sizes > precision).sum())
     # Rounding may show at home or only beside it.
     if loops.are_exact(rank, loops.walk(rank, 2, 1)) and not (sizes[rank:] > EXACT).any():
@@ -146,7 +155,7 @@ def repair_few(graph: Graph, freedoms: int) -> Repair | None:
     """
     loops = _Loops(graph)
     rank = 6 * loops.bodies - freedoms
-    sizes = np.linalg.svd(loops.equations(*loops.home(1))[1][0], compute_uv=False)
+    sizes = np.linalg.svd(loops.equations(Placement.at_home(graph, (1,)))[1][0], compute_uv=False)
     if not 0 < rank < len(sizes) or sizes[rank] > MAX_DEVIATION:
         return None
     positions = loops.walk(rank, POSITIONS[1], STEPS)
@@ -184,244 +193,178 @@ def _least(table: Array, value: Array, rank: int) -> Array:
     return np.asarray(np.einsum("krj,kr->kj", rows[:, :rank], parts), np.float64)
 
 
-def _moved(rotation: Array, place: Array, change: Array) -> tuple[Array, Array]:
-    """Bodies after a small motion of each: of its points, and about the origin, (k, 6 bodies)."""
-    each = change.reshape(len(change), -1, 6)
-    angle = np.linalg.norm(each[..., 3:], axis=-1)
-    new, at = rotation.copy(), place.copy()
-    for k, j in np.ndindex(*angle.shape):
-        if angle[k, j] > 0.0:
-            turn = about(each[k, j, 3:] / angle[k, j], angle[k, j])
-            new[k, j + 1] = turn @ rotation[k, j + 1]
-            at[k, j + 1] = turn @ place[k, j + 1]
-        at[k, j + 1] += each[k, j, :3]
-    return new, at
-
-
 class _Loops:
-    """The joints and rods of a graph as equations between its bodies, in parts of its size."""
+    """A graph whose axes and points may move, with its joints' and rods' equations."""
 
     def __init__(self, graph: Graph) -> None:
-        self.graph = graph
-        self._number = {name: k for k, name in enumerate((BASE, *graph.bodies))}
+        self.first = self.graph = graph
         self.bodies = len(graph.bodies)
-        self._scale, self._middle = graph.size, graph.origin
-        self._vectors: dict[Slot, Array] = {}
+
+    @property
+    def slots(self) -> list[Slot]:
+        """The vectors of the graph."""
+        graph = self.graph
+        found: list[Slot] = []
         for joint in graph.joints.values():
-            self._vectors["at", joint.name, 0] = (joint.at - self._middle) / self._scale
-            for k, axis in enumerate(joint.axes):
-                self._vectors["axis", joint.name, k] = axis
-        for rod in graph.rods.values():
-            for k, end in enumerate(rod.ends):
-                self._vectors["end", rod.name, k] = (end - self._middle) / self._scale
-        self._first = dict(self._vectors)
+            found.append(("at", joint.name, 0))
+            found += [("axis", joint.name, k) for k in range(len(joint.axes))]
+        return found + [("end", name, k) for name in graph.rods for k in range(2)]
 
-    def home(self, count: int) -> tuple[Array, Array]:
-        """Rotations and places of all bodies at home, the ground too, ``count`` times."""
-        shape = (count, self.bodies + 1)
-        return np.tile(np.eye(3), (*shape, 1, 1)), np.zeros((*shape, 3))
-
-    def walk(self, rank: int, count: int, steps: int, seed: int = 0) -> tuple[Array, Array]:
+    def walk(self, rank: int, count: int, steps: int, seed: int = 0) -> Placement:
         """Rotations and places of all bodies in positions that the machine can move to from home.
 
         :param rank: of the equations; smaller singular values are no constraints. ``count``: of
             positions. ``steps``: towards each, of REACH in STEPS.
         """
-        rotation, place = self.home(count)
+        placed = Placement.at_home(self.graph, (count,))
         way: Array = np.random.default_rng(seed).normal(size=(count, 6 * self.bodies))
         for _ in range(steps):
-            free = np.linalg.svd(self.equations(rotation, place)[1])[2][:, rank:]
+            free = np.linalg.svd(self.equations(placed)[1])[2][:, rank:]
             way = np.einsum("kfi,kfj,kj->ki", free, free, way)
             way /= np.abs(way).max(axis=1, keepdims=True, initial=1e-300)
-            rotation, place = _moved(rotation, place, REACH / STEPS * way)
+            placed = placed.moved(REACH / STEPS * way)
             last = np.inf
             for _ in range(CORRECTIONS):
-                value, table, _ = self.equations(rotation, place)
+                value, table = self.equations(placed)
                 miss = float(np.abs(value).max(initial=0.0))
                 if miss < CLOSED or miss > 0.5 * last:
                     break
-                rotation, place = _moved(rotation, place, -_least(table, value, rank))
+                placed = placed.moved(-_least(table, value, rank))
                 last = miss
-        return rotation, place
+        return placed
 
-    def sizes(self, positions: tuple[Array, Array]) -> Array:
+    def sizes(self, positions: Placement) -> Array:
         """Singular values of the equations by the bodies' motions, shape (k, n)."""
-        table = self.equations(*positions)[1]
+        table = self.equations(positions)[1]
         return np.asarray(np.linalg.svd(table, compute_uv=False), np.float64)
 
-    def are_exact(self, rank: int, positions: tuple[Array, Array]) -> bool:
+    def are_exact(self, rank: int, positions: Placement) -> bool:
         """Return whether all loops are closed, and the equations have that rank."""
-        miss = np.abs(self.equations(*positions)[0]).max(initial=0.0)
+        miss = np.abs(self.equations(positions)[0]).max(initial=0.0)
         return bool(miss < CLOSED and (self.sizes(positions)[:, rank:] < EXACT).all())
 
-    def openings(
-        self, rank: int, positions: tuple[Array, Array]
-    ) -> tuple[Array, dict[Slot, Array], float]:
+    def openings(self, rank: int, positions: Placement) -> tuple[Array, dict[Slot, Array], float]:
         """Return how far loops stay open whatever the bodies do, and its change by the vectors.
 
         :returns: openings, shape (k,); derivatives by each vector, (k, 3); the bound below which
             a singular value of these is noise.
         """
-        value, table, by_numbers = self.equations(*positions)
+        value, table = self.equations(positions)
         left, sizes, _ = np.linalg.svd(table)
         left = left[:, :, rank:].transpose(0, 2, 1)
-        effect = (left @ by_numbers).reshape(-1, by_numbers.shape[2])
+        effect = (left @ self.by_vectors(positions)).reshape(-1, 3 * len(self.slots))
         gap = np.einsum("kfi,ki->kf", left, value).ravel()
         noise = min(MAX_NOISE, NOISE * max(EXACT, float(sizes[:, rank:].max(initial=0.0))))
-        return gap, {s: effect[:, 3 * k : 3 * k + 3] for k, s in enumerate(self._vectors)}, noise
+        return gap, {s: effect[:, 3 * k : 3 * k + 3] for k, s in enumerate(self.slots)}, noise
 
-    def close(
-        self, rank: int, positions: tuple[Array, Array], slots: Sequence[Slot] | None = None
-    ) -> bool:
+    def close(self, rank: int, positions: Placement, slots: Sequence[Slot] | None = None) -> bool:
         """Move vectors by least changes until all loops close in all positions, if they can.
 
         :param slots: the vectors that may move; by default all.
         """
-        rotation, place = positions
-        last = np.inf
+        placed, last = positions, np.inf
         for _ in range(ROUNDS):
-            value, table, by_numbers = self.equations(rotation, place)
+            value, table = self.equations(placed)
             miss = float(np.abs(value).max(initial=0.0))
             if miss < 0.1 * CLOSED or miss > 0.5 * last:
                 break
-            gap, effect, noise = self.openings(rank, (rotation, place))
+            by_vectors = self.by_vectors(placed)
+            gap, effect, noise = self.openings(rank, placed)
             allowed = [effect[s] * (slots is None or s in slots) for s in effect]
             step = np.linalg.lstsq(np.hstack(allowed), gap, rcond=noise)[0]
             change = np.asarray(-step, np.float64)
             self.change(change)
-            closing = _least(table, value + by_numbers @ change, rank)
-            rotation, place = _moved(rotation, place, -closing)
+            placed = placed.moved(-_least(table, value + by_vectors @ change, rank))
             last = miss
         return miss < CLOSED
 
     def change(self, change: Array) -> None:
-        """Move all vectors of the graph; axes stay of length one."""
-        for k, (slot, vector) in enumerate(self._vectors.items()):
-            moved = vector + change[3 * k : 3 * k + 3]
-            self._vectors[slot] = moved / np.linalg.norm(moved) if slot[0] == "axis" else moved
-
-    def repair(self) -> Repair:
-        """The graph with the vectors as they are, and how far they were moved."""
-        moves: dict[str, float] = {}
-        for slot, vector in self._vectors.items():
-            gone = float(np.linalg.norm(vector - self._first[slot]))
-            moves[slot[1]] = max(gone, moves.get(slot[1], 0.0))
-
-        def place(kind: str, name: str, count: int) -> Array:
-            found = [self._vectors[kind, name, k] for k in range(count)]
-            if kind == "axis":
-                return array(np.reshape(found, (-1, 3)))
-            return array(np.array(found) * self._scale + self._middle)
-
+        """Move all vectors of the graph, (3 vectors,); axes stay of length one."""
+        parts = dict(zip(self.slots, change.reshape(-1, 3), strict=True))
         graph = self.graph
+
+        def move(kind: str, name: str, vectors: Array) -> Array:
+            moves = [parts[kind, name, k] for k in range(len(vectors))]
+            moved = vectors + np.reshape(moves, vectors.shape) * (
+                1.0 if kind == "axis" else self.first.size
+            )
+            lengths = np.linalg.norm(moved, axis=-1, keepdims=True) if kind == "axis" else 1.0
+            return array(moved / lengths)
+
         joints = {
-            n: replace(j, at=place("at", n, 1)[0], axes=place("axis", n, len(j.axes)))
+            n: replace(j, at=move("at", n, j.at[None])[0], axes=move("axis", n, j.axes))
             for n, j in graph.joints.items()
         }
-        rods = {n: replace(r, ends=place("end", n, 2)) for n, r in graph.rods.items()}
-        return Repair(replace(graph, joints=joints, rods=rods), moves)
+        rods = {n: replace(r, ends=move("end", n, r.ends)) for n, r in graph.rods.items()}
+        self.graph = replace(graph, joints=joints, rods=rods)
 
-    def equations(self, rotation: Array, place: Array) -> tuple[Array, Array, Array]:
-        """Values of all equations, and derivatives by the bodies' motions and by the vectors.
+    def repair(self) -> Repair:
+        """Return the graph with its vectors as they are, and how far they were moved."""
+        first, size = self.first, self.first.size
+        moves: dict[str, float] = {}
+        for name, joint in self.graph.joints.items():
+            old = first.joints[name]
+            gone = np.array([*(joint.axes - old.axes), (joint.at - old.at) / size])
+            moves[name] = float(np.linalg.norm(gone, axis=-1).max())
+        for name, rod in self.graph.rods.items():
+            gone = (rod.ends - first.rods[name].ends) / size
+            moves[name] = max(float(np.linalg.norm(gone, axis=-1).max()), moves.get(name, 0.0))
+        return Repair(self.graph, moves)
 
-        Shapes (k, rows), (k, rows, 6 bodies) and (k, rows, 3 vectors).
+    def equations(self, placed: Placement) -> tuple[Array, Array]:
+        """Return the values of all equations, (k, rows), and derivatives by the coordinates."""
+        found = [one for _, one in self._equations(placed)]
+        return placed.values(found), placed.matrix(found)
+
+    def _equations(self, placed: Placement) -> list[tuple[list[_Frame], Equation]]:
+        """Return the equations in parts of the size, each with its frames on both bodies."""
+        found: list[tuple[list[_Frame], Equation]] = []
+        size = placed.size
+        for joint in self.graph.joints.values():
+            a, b, name = joint.inner, joint.outer, joint.name
+            points = placed.point(a, joint.at), placed.point(b, joint.at)
+            turns = partial(rotate, placed.turn(a)), partial(rotate, placed.turn(b))
+            for key in joint.type.holds:
+                for held in HELD[key](joint.axes, joint.pitch):
+                    frames = [_Frame(("at", name, 0), joint.at)] * 2
+                    if key not in ("point", "turns"):
+                        frames = [
+                            frame._replace(tilt=("axis", name, k), axis=joint.axes[k])
+                            for frame, k in zip(frames, held.axes, strict=True)
+                        ]
+                    for one in constraint_equations(joint, held, points, turns, size):
+                        found.append((frames, one))
+        for rod in self.graph.rods.values():
+            start, end = rod.ends
+            points = placed.point(rod.inner, start), placed.point(rod.outer, end)
+            square = float((end - start) @ (end - start))
+            frames = [_Frame(("end", rod.name, k), point) for k, point in enumerate(rod.ends)]
+            one = keep_distance(rod.name, (rod.inner, rod.outer), points, square, size)
+            found.append((frames, one))
+        return found
+
+    def by_vectors(self, placed: Placement) -> Array:
+        """Return derivatives of the equations' values by the vectors, (k, rows, 3 vectors).
+
+        A vector moves the part's frames on both bodies. At home it changes nothing, as equations
+        are relative to home: that much is subtracted.
         """
-        found = [
-            one
-            for joint in self.graph.joints.values()
-            for one in self._joint(joint, rotation, place)
-        ]
-        found += [self._rod(rod, rotation, place) for rod in self.graph.rods.values()]
-        value = np.concatenate([one.value for one in found], axis=1)
-        by_bodies = np.zeros((*value.shape, 6 * (self.bodies + 1)))
-        by_numbers = np.zeros((*value.shape, 3 * len(self._vectors)))
-        columns = {slot: 3 * k for k, slot in enumerate(self._vectors)}
-        row = 0
-        for one in found:
-            rows = slice(row, row := row + one.value.shape[1])
-            for body, (slide, turn) in one.bodies.items():
-                by_bodies[:, rows, 6 * body : 6 * body + 3] += slide
-                by_bodies[:, rows, 6 * body + 3 : 6 * body + 6] += turn
-            for slot, table in one.slots.items():
-                by_numbers[:, rows, columns[slot] : columns[slot] + 3] += table
-        return value, by_bodies[:, :, 6:], by_numbers
-
-    def _joint(self, joint: Joint, rotation: Array, place: Array) -> Iterator[_Equation]:
-        """What a joint holds."""
-        a, b = self._number[joint.inner], self._number[joint.outer]
-        turned, name = (rotation[:, a], rotation[:, b]), joint.name
-        at, slot = self._vectors["at", name, 0], ("at", name, 0)
-        xa, xb = turned[0] @ at + place[:, a], turned[1] @ at + place[:, b]
-        one = np.broadcast_to(np.eye(3), (len(rotation), 3, 3))
-        apart = _Equation(
-            xb - xa, {a: (-one, skew(xa)), b: (one, -skew(xb))}, {slot: turned[1] - turned[0]}
-        )
-
-        def same(vector: Array, slots: tuple[Slot, ...]) -> _Equation:
-            """A vector is the same one in both bodies."""
-            va, vb, none = turned[0] @ vector, turned[1] @ vector, 0.0 * one
-            by = dict.fromkeys(slots, turned[1] - turned[0])
-            return _Equation(vb - va, {a: (none, skew(va)), b: (none, -skew(vb))}, by)
-
-        axes = [self._vectors["axis", name, k] for k in range(len(joint.axes))]
-        first = ("axis", name, 0)
-        for held in joint.type.holds:
-            if held == "point":
-                yield apart
-            elif held == "turns":
-                yield from (same(vector, ()) for vector in np.eye(3)[:2])
-            elif held == "direction":
-                yield same(axes[0], (first,))
-            elif held == "crossing":
-                u, v = turned[0] @ axes[0], turned[1] @ axes[1]
-                turn, none = np.cross(u, v)[:, None], np.zeros((len(u), 1, 3))
-                yield _Equation(
-                    np.einsum("ki,ki->k", u, v)[:, None] - axes[0] @ axes[1],
-                    {a: (none, turn), b: (none, -turn)},
-                    {
-                        first: (v[:, None] @ turned[0]) - axes[1],
-                        ("axis", name, 1): (u[:, None] @ turned[1]) - axes[0],
-                    },
-                )  # fmt: skip
-            else:
-                yield self._along(joint, held, apart, turned, axes[0])
-
-    def _along(
-        self, joint: Joint, held: str, apart: _Equation, turned: tuple[Array, Array], axis: Array
-    ) -> _Equation:
-        """What a joint holds of how far its bodies are apart along or across its axis."""
-        a, b = self._number[joint.inner], self._number[joint.outer]
-        u, gap = turned[0] @ axis, apart.value
-        if held == "line":
-            value, by_gap, by_axis = np.cross(gap, u), -skew(u), skew(gap)
-        else:  # flat and thread
-            value = np.einsum("ki,ki->k", u, gap)[:, None]
-            by_gap, by_axis = u[:, None], gap[:, None]
-        bodies = {body: (by_gap @ s, by_gap @ w) for body, (s, w) in apart.bodies.items()}
-        bodies[a] = bodies[a][0], bodies[a][1] - by_axis @ skew(u)
-        slots = {slot: by_gap @ table for slot, table in apart.slots.items()}
-        slots["axis", joint.name, 0] = by_axis @ turned[0]
-        if held == "thread":
-            pitch = joint.pitch / self._scale
-            f, g = (part @ across(axis)[0] for part in turned)
-            angle = np.arctan2(
-                np.einsum("ki,ki->k", u, np.cross(f, g)), np.einsum("ki,ki->k", f, g)
-            )
-            value = value - pitch * angle[:, None]
-            bodies[a] = bodies[a][0], bodies[a][1] + pitch * u[:, None]
-            bodies[b] = bodies[b][0], bodies[b][1] - pitch * u[:, None]
-        return _Equation(value, bodies, slots)
-
-    def _rod(self, rod: Rod, rotation: Array, place: Array) -> _Equation:
-        """The ends keep their distance."""
-        a, b = self._number[rod.inner], self._number[rod.outer]
-        slots: list[Slot] = [("end", rod.name, k) for k in range(2)]
-        start, end = (self._vectors[slot] for slot in slots)
-        xa, xb = rotation[:, a] @ start + place[:, a], rotation[:, b] @ end + place[:, b]
-        gap, length = xb - xa, float(np.linalg.norm(end - start))
-        n, drawn = gap[:, None] / length, (end - start) / length
-        value = 0.5 * (np.einsum("ki,ki->k", gap, gap) - length**2)[:, None] / length
-        return _Equation(
-            value, {a: (-n, n @ skew(xa)), b: (n, -n @ skew(xb))},
-            {slots[0]: drawn - n @ rotation[:, a], slots[1]: n @ rotation[:, b] - drawn},
-        )  # fmt: skip
+        columns = {slot: 3 * k for k, slot in enumerate(self.slots)}
+        home = Placement.at_home(self.graph, (1,))
+        equations = self._equations(placed), self._equations(home)
+        total = np.zeros((len(placed.shift), len(equations[0]), 3 * len(columns)))
+        for where, found, sign in zip((placed, home), equations, (1.0, -1.0), strict=True):
+            for i, (frames, one) in enumerate(found):
+                for side, frame in enumerate(frames):
+                    turn, point = (
+                        where.turn(one.bodies[side]),
+                        where.point(one.bodies[side], frame.point),
+                    )
+                    shift, tilt = differentiate_by_frame(one, side, point, turn)
+                    k = columns[frame.slot]
+                    total[:, i, k : k + 3] += sign * where.size * shift
+                    if frame.tilt is not None and frame.axis is not None:
+                        # An axis that is moved by d is tilted by axis x d.
+                        k = columns[frame.tilt]
+                        total[:, i, k : k + 3] += sign * np.cross(tilt, frame.axis)
+        return total
