@@ -360,7 +360,9 @@ class Package:
         layout = Layout(self.robot.massive().tree)
         return np.asarray(self.robot.own_inertial + layout.payload(mass, com, inertia))
 
-    def _payload(self) -> list[float]:
+    @property
+    def payload_values(self) -> list[float]:
+        """Mass, centre of mass and inertia of the robot's payload."""
         load = self.robot.payload
         return [float(load.mass), *map(float, load.com), *np.ravel(load.inertia).tolist()]
 
@@ -368,7 +370,7 @@ class Package:
 
     def _write(self) -> None:
         unit = self.unit
-        own = self.fold(self.parameters, {PARAMETERS: self._payload()})
+        own = self.fold(self.parameters, {PARAMETERS: self.payload_values})
         unit.add(table("@_own", [e.value for e in own]))
         if self.massive:
             self._write_parameters()

@@ -104,6 +104,25 @@ def c(given: C) -> Report:
 
 
 @dataclass(frozen=True, kw_only=True)
+class PythonFile(ToFile):
+    """Write kinematics, torques and the transmission as one Python file.
+
+    For training and for GPUs: the file needs only the array library. jax and torch differentiate
+    its functions, and jax compiles and vectorises them. Each returns its results and a mask of
+    valid samples.
+    """
+
+    array: str = setting("numpy", "array library", choices=("numpy", "jax", "torch"))
+
+
+def python(given: PythonFile) -> Report:
+    """The text of a module."""
+    from pkm_twin.export.python_file import python_file
+
+    return given.write(python_file(given.machine(), given.array))
+
+
+@dataclass(frozen=True, kw_only=True)
 class Ros2Control(ToFolder):
     """Write a package of C++ plugins for ros2_control.
 
@@ -231,6 +250,7 @@ def printer(given: ToPrinter) -> Report:
 
 OWN: Final = {
     "c": command(c),
+    "python": command(python),
     "ros2-control": command(ros2_control),
     "fmu": command(fmu),
     "urdf": command(urdf),
