@@ -140,14 +140,14 @@ LEARNING: Final = 0.2
 CLIPPED: Final = 9.0
 """Ratio of a square to the average above which it is clipped, so that a contact is not learnt as
 noise."""
-SHARE: Final = 1e-3
+MIN_NOISE_FRACTION: Final = 1e-3
 """Smallest standard deviation of an effort, relative to the largest effort of the stream."""
 PLACED: Final = 0.004
 """Period of estimates of a contact's position, s, up to ``EARLY`` after its beginning."""
 EARLY: Final = 0.04
 LATER: Final = 0.01
 """Period after that: effort errors last longer, and so does the force."""
-MOST_DRAG: Final = 0.2
+MAX_LEARNT_FRICTION: Final = 0.2
 """Largest friction that may be learnt, relative to the largest effort of the motion."""
 ONSET: Final = 0.1
 """Time of motion in a direction before its friction is known, s."""
@@ -303,7 +303,7 @@ class ContactMonitor:
                 self._touching = False
             return self._verdict(q, external, idle)
         drag = self._drag.learn(step, external, np.where(still, 0.0, qd), touching=self._touching)
-        friction = np.minimum(drag, MOST_DRAG * self._greatest) + np.where(
+        friction = np.minimum(drag, MAX_LEARNT_FRICTION * self._greatest) + np.where(
             still, self._reach + holds, 0.0
         )
         self._follow(step, self._deviation(parts, q, sure, qdd, wrench), friction, doubt)
@@ -318,7 +318,7 @@ class ContactMonitor:
         else:
             verdict = None
         if not self._touching:
-            self._noise.learn(left, (SHARE * self._greatest) ** 2)
+            self._noise.learn(left, (MIN_NOISE_FRACTION * self._greatest) ** 2)
         return verdict
 
     def _locate(

@@ -42,7 +42,7 @@ CORRELATION: Final = 0.02
 """Correlation time of the efforts' errors, s."""
 MEMORY: Final = 0.1
 """Time after which a sample's weight has decayed to 1/e, s."""
-REACH: Final = 0.4
+MAX_CLAMP_DISTANCE: Final = 0.4
 """Largest distance of two bodies that clamp something, relative to the machine's size."""
 CLOSING: Final = 0.02
 """Smallest approach speed of two clamping bodies, relative to the largest in the machine."""
@@ -289,7 +289,7 @@ class ContactLocator:
         far = np.sqrt((apart * apart).sum(1))
         velocity = (qd @ jacobian.swapaxes(0, 1)).T
         rate = ((velocity[a] - velocity[b]) * apart).sum(1) / far
-        near = (far > 0.0) & (far < REACH * self.places.robot.graph.size)
+        near = (far > 0.0) & (far < MAX_CLAMP_DISTANCE * self.places.robot.graph.size)
         closing = near & (rate < -CLOSING * np.abs(rate[near]).max(initial=0.0))
         self._pairs, self._couple = (a[closing], b[closing]), self.places.couple_of[closing]
 

@@ -36,7 +36,7 @@ JUMP: Final = 0.06
 """Averaging time of the residual for detecting a jump, s."""
 THRESHOLD: Final = 6.0
 """Standard deviations of that average that indicate a jump."""
-SHARE: Final = 0.01
+MIN_NOISE_FRACTION: Final = 0.01
 """Smallest standard deviation of an effort, relative to the robot's largest effort at rest."""
 
 
@@ -86,7 +86,7 @@ class PayloadEstimator:
         still = np.zeros(robot.joints_count)
         rest = inverse_dynamics(robot, robot.inverse(robot.home()), still, still)
         # A machine that hangs in balance has no effort at rest.
-        self._least = SHARE * max(float(np.abs(rest).max()), 1e-3 * self._scale())
+        self._least = MIN_NOISE_FRACTION * max(float(np.abs(rest).max()), 1e-3 * self._scale())
         self._reach = friction_reach(robot)
         self.drives = DriveWatch()
         self._rest = VelocityErrorEstimator(0.0)

@@ -37,16 +37,16 @@ NAME = "~/follow_joint_trajectory"
 LOOK = 0.1
 """How often goals that are under way are looked at, s."""
 PING = 5
-GONE = 18
-"""Looks without a sign of life after which the controller is asked for one, and is gone."""
+MAX_SILENT_LOOKS = 18
+"""Checks without a status of the controller, after which its goals are aborted: 1.8 s."""
 MATCHING = 5.0
 """How long a goal waits for the controller's action to be found, s."""
 SETTLING = 3.0
 """How long after a stop the machine may move before it rests, s."""
 REST = 1e-3
 """Joint velocity below which the machine rests, rad/s or m/s."""
-APART = 1e-4
-"""How far from the hold point it may rest without another one, rad or m."""
+MAX_REST_OFFSET = 1e-4
+"""Distance of rest from the hold point, rad or m, beyond which another one is sent."""
 LAST_TURNS = 5
 """Turns of the executor that the last results take on their way."""
 
@@ -202,7 +202,7 @@ class EffortAction:
         """
         sent = [goal for goal in self._goals.values() if goal.sent]
         self._silent = self._silent + 1 if sent else 0
-        if self._silent >= GONE:
+        if self._silent >= MAX_SILENT_LOOKS:
             for goal in sent:
                 if goal.controller is not None:
                     goal.controller.cancel_goal_async()
@@ -396,7 +396,7 @@ class EffortAction:
         before = settling.speed
         # The first interval may be too short to tell rest.
         if before is not None and speed < REST:
-            if np.abs(np.subtract(place, settling.held)).max() > APART:
+            if np.abs(np.subtract(place, settling.held)).max() > MAX_REST_OFFSET:
                 self._send_point(settling.names, measured, lambda _: None)
         elif before is None or speed <= before + REST:
             self._settling = replace(settling, place=place, since=now, speed=speed)

@@ -27,8 +27,8 @@ from pkm_twin.streams.monitor import Pace
 
 PAYLOAD_RATE = 250.0
 """Samples a second that the payload is estimated from: errors last longer."""
-GAP = 0.1
-"""Silence after which a stream begins anew, s."""
+MAX_SILENCE = 0.1
+"""Longest gap in a stream, s; after it the estimates start again."""
 
 
 class Estimates:
@@ -142,7 +142,7 @@ class Estimates:
         # The estimates' models have friction without memory.
         effort = torques.measured - torques.memory
         # The stream may have begun anew at earlier stamps, as where a bag loops.
-        if not 0 < torques.stamp - self._last <= GAP * SECOND:
+        if not 0 < torques.stamp - self._last <= MAX_SILENCE * SECOND:
             self.reset()
         self._last = torques.stamp
         if self._contact is not None:

@@ -30,8 +30,8 @@ CHANGEABLE: Final = ("effort_limits", "payload.mass", "payload.com")
 TORQUES = "delta_dynamics/joint_torques"
 MAX_DEADLINE = 3600.0
 """Longest deadline that a node of the suite promises, s; the middleware's "none" is longer."""
-LAST_WORD = 0.5
-"""How long the end waits for the controller to acknowledge the last command, s."""
+MAX_ACKNOWLEDGE_TIME = 0.5
+"""Longest wait at the end for the controller's acknowledgement of the last command, s."""
 
 
 class CommandGate(TwinNode):
@@ -100,7 +100,7 @@ class CommandGate(TwinNode):
     def shutdown(self) -> None:
         """As deactivated; and the controller has it before the process ends."""
         super().shutdown()
-        self._commands.wait_for_controllers(LAST_WORD)
+        self._commands.wait_for_controllers(MAX_ACKNOWLEDGE_TIME)
 
     def reset_stop(self) -> str:
         """Open without waiting for good torques."""

@@ -35,8 +35,8 @@ from pkm_twin.streams.monitor import Pace
 from pkm_twin.streams.topics import topic_tokens
 from pkm_twin.streams.wrench import WrenchReader, WrenchSettings
 
-LAST_WORD: Final = 0.5
-"""How long the end waits for the controller to acknowledge the last command, s."""
+MAX_ACKNOWLEDGE_TIME: Final = 0.5
+"""Longest wait at the end for the controller's acknowledgement of the last command, s."""
 
 
 class DeltaDynamics(TwinNode):
@@ -132,7 +132,7 @@ class DeltaDynamics(TwinNode):
         if self._action is not None:
             self._action.shutdown()
         super().shutdown()
-        self._torques.wait_for_controllers(LAST_WORD)
+        self._torques.wait_for_controllers(MAX_ACKNOWLEDGE_TIME)
 
     @property
     def shutting_down(self) -> bool:

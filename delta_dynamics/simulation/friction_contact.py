@@ -139,7 +139,7 @@ def _turns(fall: float, square: float, cube: float) -> list[float]:
     return sorted(found)
 
 
-STILL: Final = 1e-12
+ZERO_VELOCITY: Final = 1e-12
 """Velocity that counts as zero, relative to the joints' contributions to it."""
 STIFF: Final = 0.1
 """Decay by viscous friction in a part of a step above which it is integrated exactly."""
@@ -302,7 +302,7 @@ class Resistance:
     def _anew(self, here: Terms) -> Terms:
         """Determine which rows move, and in which direction."""
         rates = self.rates(here)
-        self._still = np.abs(rates) <= STILL * np.abs(self.rows(here) * here.qd).max(1)
+        self._still = np.abs(rates) <= ZERO_VELOCITY * np.abs(self.rows(here) * here.qd).max(1)
         self._states = np.where(self._still, 0.0, np.sign(rates)).astype(np.int8)
         self._law = None
         return here
@@ -533,7 +533,7 @@ class Resistance:
         q = 1e-3 * np.abs(here.q[law.moves])
         force = np.maximum(np.abs(force), np.abs(law.force))
         rates = np.abs(rows) @ np.abs(here.qd) + span * own
-        return STILL * np.concatenate([q, q, rates, force, force])
+        return ZERO_VELOCITY * np.concatenate([q, q, rates, force, force])
 
     def settle(self, end: Terms, law: Law, hit: Mask | None, passed: bool) -> Terms:
         """Return the state at a part's end: stopped rows are still, joints at a stop rest there.

@@ -203,12 +203,12 @@ def transmission(
     return result.reshape(*batch, 6 * len(origin), len(names))
 
 
-SMALL: Final = 1e-6
-"""Part of the machine's size below which joints stand in one point."""
+POINT_FRACTION: Final = 1e-6
+"""Extent of all joints, relative to the machine's size, below which they count as one point."""
 RANK_BOUND: Final = SINGULARITY_BOUND
 """Singular values of the balance below this part of the largest count as zero."""
-CLEAR_RANK: Final = 1e-6
-"""Reciprocal condition above which no singular values are needed to tell the rank."""
+MIN_FULL_RANK_CONDITION: Final = 1e-6
+"""Reciprocal condition above which the rank is full without singular values."""
 DETERMINATE_BOUND: Final = 1e-6
 """A component is determinate where no unit vector of the null space reaches beyond this."""
 BALANCE_BOUND: Final = 1e-6
@@ -391,7 +391,7 @@ def balanced(robot: Robot, loads: Sequence[Array], *, strict: bool = True) -> Ba
     centred = points - points.mean(-2, keepdims=True)
     size = np.sqrt(np.mean(np.sum(centred**2, -1), -1))
     # Of joints that are all in one point the machine's own size is left.
-    size = np.where(size > SMALL * engine.graph.size, size, engine.graph.size)
+    size = np.where(size > POINT_FRACTION * engine.graph.size, size, engine.graph.size)
 
     origin, needed = needs(engine.graph, list(engine.tree.links), bodies, rods)
     batch = bodies.shape[:-1]
@@ -519,11 +519,11 @@ def _regular(matrix: Array, right: Array) -> tuple[Array, Mask]:
         return np.zeros((len(matrix), unknowns)), np.zeros(len(matrix), bool)
     q, r = np.linalg.qr(matrix)
     diagonal = np.abs(np.diagonal(r, axis1=-2, axis2=-1))
-    sound = diagonal.min(-1) > CLEAR_RANK * diagonal.max(-1)
+    sound = diagonal.min(-1) > MIN_FULL_RANK_CONDITION * diagonal.max(-1)
     inverse = np.linalg.inv(np.where(sound[:, None, None], r, np.eye(unknowns)))
     condition = np.linalg.norm(r, axis=(-2, -1)) * np.linalg.norm(inverse, axis=(-2, -1))
     value = np.einsum("nij,nj->ni", inverse, np.einsum("nrk,nr->nk", q, right))
-    return value, sound & (condition * CLEAR_RANK < 1.0)
+    return value, sound & (condition * MIN_FULL_RANK_CONDITION < 1.0)
 
 
 def _deficient(matrix: Array, right: Array) -> tuple[Array, Array]:

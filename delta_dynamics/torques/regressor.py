@@ -263,8 +263,8 @@ RANK: Final = 1e-8
 """Least pivot, of columns of norm one, that counts."""
 ABSENT: Final = 1e-10
 """Part of the largest column's norm below which a column is zero, all of them of unit kg."""
-SMALL: Final = 1e-7
-"""Coefficients below are zero: rounding's."""
+ROUNDING_COEFFICIENT: Final = 1e-7
+"""Coefficients below it are rounding errors and count as zero."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -351,7 +351,7 @@ def independent(table: Array, preference: ArrayLike = 1.0) -> tuple[tuple[int, .
     rest = np.linalg.solve(r[:rank, :rank], r[:rank])
     matrix = np.zeros((rank, table.shape[1]))
     matrix[:, seen[pivots]] = rest / norms[seen[pivots[:rank]]][:, None] * norms[seen[pivots]]
-    matrix[np.abs(matrix) < SMALL] = 0.0
+    matrix[np.abs(matrix) < ROUNDING_COEFFICIENT] = 0.0
     leading = seen[pivots[:rank]]
     order = np.argsort(leading)
     return tuple(int(k) for k in leading[order]), matrix[order]
@@ -374,6 +374,6 @@ def combination_name(row: Sequence[float] | Array, leading: int, names: Sequence
     for k, value in enumerate(row):
         if k == leading or value == 0.0:
             continue
-        size = "" if abs(abs(value) - 1.0) < SMALL else f"{abs(value):.4g} "
+        size = "" if abs(abs(value) - 1.0) < ROUNDING_COEFFICIENT else f"{abs(value):.4g} "
         text += f" {'-' if value < 0 else '+'} {size}{names[k]}"
     return text

@@ -16,8 +16,8 @@ from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.machine.friction import LoadDependent, friction_values, load_of, parts
 from pkm_twin.robot.robot import Robot
 
-SLOW: Final = 1e-6
-"""A rate that is of one sign and nothing else, rad/s or m/s."""
+SMALL_RATE: Final = 1e-6
+"""A rate that only determines the sign of dry friction, rad/s or m/s."""
 SEEN: Final = 1e-9
 """Share of the efforts at rest below which there is no friction."""
 
@@ -44,7 +44,7 @@ def friction_reach(robot: Robot) -> Array:
         return np.asarray(np.diag(ahead - back) / 2.0, np.float64)
 
     # Viscous friction doubles with the rates.
-    reach = 2.0 * odd_part(SLOW) - odd_part(2.0 * SLOW)
+    reach = 2.0 * odd_part(SMALL_RATE) - odd_part(2.0 * SMALL_RATE)
     return np.where(reach > SEEN * (1.0 + size), reach, 0.0)
 
 

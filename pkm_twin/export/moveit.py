@@ -36,7 +36,7 @@ GROUP: Final = "actuated"
 LIMB: Final = "limb"
 """The chain from the ground to the platform, for the numeric solver."""
 NUMERIC: Final = "kdl_kinematics_plugin/KDLKinematicsPlugin"
-SHARE: Final = 0.5
+ACCELERATION_FRACTION: Final = 0.5
 """Fraction of the effort left at home after gravity that a planner may use to accelerate."""
 POSITION: Final = 1e-4
 """Between a goal and the machine's pose, m: MoveIt's own tolerance of goals."""
@@ -129,7 +129,7 @@ def accelerations(robot: Robot) -> list[float]:
     weight = np.abs(inverse_dynamics(robot, q, 0.0 * q, 0.0 * q))
     inertia = np.diag(mass_matrix(robot, q))
     with np.errstate(divide="ignore"):
-        return list(SHARE * np.maximum(limits - weight, 0.0) / inertia)
+        return list(ACCELERATION_FRACTION * np.maximum(limits - weight, 0.0) / inertia)
 
 
 def write_srdf(robot: Robot) -> str:

@@ -30,7 +30,7 @@ from pkm_twin.robot.robot import Robot
 CONTROLLER: Final = "feedforward_controller"
 GRAVITY: Final = "gravity_controller"
 TRAJECTORIES: Final = "joint_trajectory_controller"
-STOP: Final = 0.1
+DAMPING_TIME: Final = 0.1
 """Time constant, s, of the damping of the gravity controller, by the masses at home."""
 SHARED: Final = {
     "none idle": "  (void)q;\n  (void)n;\n  return 0;",
@@ -53,9 +53,9 @@ SHARED: Final = {
   return status;""",
 }
 """Bodies of functions of the model: where drives share the effort, and where each has its own."""
-SHORTEST_PERIOD: Final = 1e-3
+LOOP_PERIOD: Final = 1e-3
 """Usual period of a fast control loop, s: rounding of positions over it is no motion."""
-CLEAR: Final = 0.05
+MIN_TEST_INDEX: Final = 0.05
 """Least singularity index of the motions that the package's own test makes."""
 
 
@@ -126,7 +126,7 @@ def _words(robot: Robot, package: str) -> dict[str, str]:
         + ", ".join([number(load.mass), _write_row(load.com), _write_row(np.ravel(load.inertia))])
         + "}",
         "DRIVES": _write_drives(robot),
-        "STOP": f"{STOP:g}",
+        "STOP": f"{DAMPING_TIME:g}",
         "MAXMASS": number(MAX_MASS),
         "MAXLENGTH": number(MAX_LENGTH),
         "START": _write_row(controller.controller_positions(home)),
@@ -179,7 +179,7 @@ def _write_drives(robot: Robot) -> str:
 def _damping(robot: Robot) -> Array:
     """Damping of the gravity controller in the controller's numbers, shape (n,)."""
     # Critical damping of a bandwidth f is 4 pi f times the mass.
-    _, damping = tuned(robot, 1.0 / (4.0 * np.pi * STOP))
+    _, damping = tuned(robot, 1.0 / (4.0 * np.pi * DAMPING_TIME))
     # Digits that other arithmetic does not change.
     return np.array([float(f"{d:.6g}") for d in damping / robot.controller.factors**2])
 
@@ -189,7 +189,7 @@ def _rounding_rates(robot: Robot) -> Array:
     controller = robot.controller
     units = np.array([1.0 if unit == "rad" else robot.graph.size for unit in robot.joint_units])
     largest = np.abs(controller.offsets) + np.abs(controller.factors) * units
-    return np.asarray(ROUNDING_NOISE * largest / SHORTEST_PERIOD, np.float64)
+    return np.asarray(ROUNDING_NOISE * largest / LOOP_PERIOD, np.float64)
 
 
 def _start(robot: Robot) -> Array:
@@ -214,7 +214,7 @@ def _range(robot: Robot, home: Array) -> Array:
     size = 0.2
     for _ in range(20):
         index, good = robot.try_singularity(home + size * units * signs)
-        if good.all() and (index > CLEAR).all():
+        if good.all() and (index > MIN_TEST_INDEX).all():
             break
         size /= 2.0
     return np.asarray(size * units, np.float64)

@@ -43,8 +43,8 @@ NO_STAMPS: Final = (
     "table with a column time"
 )
 """What to do with a bag whose publisher sets no stamps: its log times are when it was written."""
-APART: Final = 0.02
-"""Farthest that a wrench or a joint state may be from a deflection, s."""
+MAX_DEFLECTION_OFFSET: Final = 0.02
+"""Largest time from a deflection to its wrench and joint state, s."""
 
 
 def read_bag(
@@ -257,11 +257,11 @@ def _at_deflections(r: Recording, joints: Stamps, found: _Found, how: ReadOption
     stamps = np.array(sorted(moved), np.int64)
     times, wrench = _wrenches(found.wrenches)
     apart = [np.abs(at[_nearest(at, stamps)] - stamps) / SECOND for at in (times, joints)]
-    near = stamps[(np.array(apart) <= APART).all(0)]
+    near = stamps[(np.array(apart) <= MAX_DEFLECTION_OFFSET).all(0)]
     if not len(near):
         raise BagError(
             f"no deflection on {r.topics.deflection} has a wrench and a joint state within "
-            f"{APART:g} s",
+            f"{MAX_DEFLECTION_OFFSET:g} s",
             path=r.source, reason="no pairs",
         )  # fmt: skip
     q, wrench = _between(near, joints, r.q), _between(near, times, wrench)

@@ -65,16 +65,16 @@ SIZES: Final = dict(
     )
 )
 """Greatest values of a table's columns, as of messages: N, N m, m, rad."""
-LONGEST_STEP: Final = 0.2
-"""Between two samples of a motion, s, from which on the times look like milliseconds."""
-SHORTEST_STEP: Final = 1e-9
-"""Between two times, s: what a bag's stamps resolve."""
+MAX_STEP: Final = 0.2
+"""Largest mean step of a motion, s; above it the times look like milliseconds."""
+MIN_STEP: Final = 1e-9
+"""Smallest step between two times, s: the resolution of a bag's stamps."""
 SINCE_1970_NS: Final = 1e17
 """Times above this are nanoseconds since 1970: it is the year 1973."""
-LONGEST: Final = 1e6
-"""From the first time to the last, s; of a trajectory it is the same."""
-SOME: Final = 500
-"""Samples of a motion by which its units are judged."""
+MAX_DURATION: Final = 1e6
+"""Longest recording, s, as for trajectories."""
+MAX_UNIT_SAMPLES: Final = 500
+"""Largest number of samples from which units are judged."""
 DEFAULT: Final = ReadOptions()
 
 
@@ -304,12 +304,12 @@ def times_of(path: Path, values: Array) -> Array:
     # Between the greatest numbers there is none.
     with np.errstate(over="ignore"):
         time: Array = np.asarray(values - values[0], np.float64)
-        flat = np.flatnonzero(~(np.diff(values) >= SHORTEST_STEP))
+        flat = np.flatnonzero(~(np.diff(values) >= MIN_STEP))
     found = f"{values[flat[0]]}, then {values[flat[0] + 1]}" if len(flat) else ""
-    if found or not time[-1] <= LONGEST:
+    if found or not time[-1] <= MAX_DURATION:
         raise ParameterError(
             f"{path}: time", found or f"{values[0]:g} to {values[-1]:g}",
-            f"rising times, {SHORTEST_STEP:g} s or more apart, up to {LONGEST:g} s in all"
+            f"rising times, {MIN_STEP:g} s or more apart, up to {MAX_DURATION:g} s in all"
             + ("; are these nanoseconds? --units ns" if values[0] > SINCE_1970_NS else ""),
         )  # fmt: skip
     return time
@@ -363,7 +363,7 @@ def check_units(
                 f"seconds: velocities are {told / moved:.4g} times those of the positions, as with "
                 "times in milliseconds",
             )  # fmt: skip
-    if step > LONGEST_STEP:
+    if step > MAX_STEP:
         warn(path, f"time: steps of {step:g} s; expected seconds; are these milliseconds?")
 
 
@@ -375,7 +375,7 @@ def _in_degrees(robot: Robot, q: Array) -> bool:
     turns = np.array([unit == "rad" for unit in robot.joint_units])
     if not turns.any():
         return False
-    some = q[:: max(1, len(q) // SOME)]
+    some = q[:: max(1, len(q) // MAX_UNIT_SAMPLES)]
 
     def possible(states: Array) -> Mask:
         outside, _ = beyond_limits(robot, states)

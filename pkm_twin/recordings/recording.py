@@ -33,8 +33,8 @@ BY_SAMPLE: Final = (
 """Fields with a row for each sample."""
 MAPPED: Final = "tables use the model's joint values; joint_map applies to messages and bags only"
 """Printed for a robot that has a map."""
-SHOWN: Final = 4
-"""Jumps that are listed."""
+MAX_LISTED_JUMPS: Final = 4
+"""Largest number of listed jumps."""
 # Of the differentiator: degree of the velocity's polynomial, samples.
 _ORDER, _WINDOW = 3, 9
 
@@ -157,9 +157,9 @@ class Recording:
         names, units = self.robot.joint_names, self.robot.joint_units
         texts = [
             f"{names[j]} by {steps.sizes[k, j]:.3g} {units[j]} at {self.time[k + 1]:.3f} s"
-            for k, j in found[:SHOWN]
+            for k, j in found[:MAX_LISTED_JUMPS]
         ]
-        more = f" and {len(found) - SHOWN} more" if len(found) > SHOWN else ""
+        more = f" and {len(found) - MAX_LISTED_JUMPS} more" if len(found) > MAX_LISTED_JUMPS else ""
         return f"{len(found)} jumps: {', '.join(texts)}{more}" if found else ""
 
     @property

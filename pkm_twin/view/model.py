@@ -30,7 +30,7 @@ from stiffness_monitor.compliance import member_deflections
 Grade = Literal["good", "warn", "bad"]
 
 AXES: Final = ("fx", "fy", "fz", "mx", "my", "mz")
-NEAR: Final = 0.005
+CLOSE_CLEARANCE: Final = 0.005
 """Clearance below which limbs are shown as near each other, m."""
 SAMPLES: Final = 1000
 """Joint states of which the ranges of the pose sliders are made."""
@@ -38,7 +38,7 @@ SAME: Final = 1e-6
 """By how much a pose may miss itself, there and back, per 1 and its size; m and rad."""
 STEPS: Final = 6
 """Steps of Newton from one place of the platform to the next that is asked for."""
-VISIBLE: Final = 0.3
+MAX_SHOWN_DEFLECTION: Final = 0.3
 """Size that the greatest deflection may be enlarged to, per size of the machine."""
 
 
@@ -176,7 +176,7 @@ class Model:
         moved = platform_response(self.robot, self.start.q, full).deflection
         scale = np.repeat([1.0, self.robot.size], 3)
         largest = float(np.abs(moved * scale).max())
-        top = _round(VISIBLE * self.robot.graph.size / largest)
+        top = _round(MAX_SHOWN_DEFLECTION * self.robot.graph.size / largest)
         return Range("deflection enlarged", "times", 0.0, top, _step(top))
 
     def to_joints(self, state: State, q: ArrayLike) -> State:
@@ -324,7 +324,7 @@ class Model:
         position, rotation = robot.platform(state.q)
         return Numbers(
             position, rotation, measure, _grade(measure, stop, warn),
-            gap, "good" if gap is None else _grade(gap, 0.0, NEAR),
+            gap, "good" if gap is None else _grade(gap, 0.0, CLOSE_CLEARANCE),
             effort, self._overloaded(effort), energy, why,
         )  # fmt: skip
 

@@ -13,7 +13,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError, one_line
 from pkm_twin.view import texts
 from pkm_twin.view.live import SPAN, TOPICS, TRACES, Live
-from pkm_twin.view.model import VISIBLE, State
+from pkm_twin.view.model import MAX_SHOWN_DEFLECTION, State
 from pkm_twin.view.page import Page
 from pkm_twin.view.scene import Deflection
 from pkm_twin.view.timeline import Timeline
@@ -24,7 +24,7 @@ COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E
 SPEEDS: Final = ("0.25", "0.5", "1", "2", "4")
 MODES: Final = 6
 """Natural modes to choose from."""
-SLOWLY: Final = 1.5
+MODE_PERIOD: Final = 1.5
 """Period of an animated mode, s."""
 _MEASURED: Final = "measured"
 """A wide curve, on which the model's is seen."""
@@ -177,7 +177,7 @@ class ModePanel:
         if sizes[0] < 0.1 * sizes.max():
             told += f"; {names[int(sizes.argmax())]} moves most, the platform hardly"
         self._note.content = texts.note(told)
-        part = VISIBLE / 3 * self._page.model.robot.graph.size / sizes.max()
+        part = MAX_SHOWN_DEFLECTION / 3 * self._page.model.robot.graph.size / sizes.max()
         # A member's nodes have its name and their number.
         owners = [name.rpartition(" ")[0] for name in names[1:]]
         at, moved = self._modes.positions[1:], shape[1:, :3]
@@ -193,7 +193,7 @@ class ModePanel:
         if self._state is None or not np.array_equal(self._state.pose, state.pose):
             self._solve(state)
         if self._modes is not None:
-            swing = float(np.sin(2 * np.pi * time.monotonic() / SLOWLY))
+            swing = float(np.sin(2 * np.pi * time.monotonic() / MODE_PERIOD))
             most = max(self._shares, key=lambda name: self._shares[name])
             self._page.stage.draw(state.q, self._shape.times(swing), self._shares, most)
 

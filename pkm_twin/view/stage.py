@@ -39,7 +39,7 @@ TRAIL: Final = 1000
 """Places of the reference point that are kept."""
 LOOK: Final = np.array([0.62, -0.95, 0.42])
 """From where the machine is looked at, in its greatest extents from its middle."""
-SMALLEST: Final = 100
+MIN_SCENE_PIXELS: Final = 100
 """Width and height of a scene below which it is being laid out, and nothing is fitted, pixels."""
 
 
@@ -136,7 +136,7 @@ class Stage:
             with contextlib.suppress(ArithmeticError, TypeError, ValueError):
                 self._arrange(camera, labels)
                 width, height = camera.image_width, camera.image_height
-                if not min(width, height) >= SMALLEST:
+                if not min(width, height) >= MIN_SCENE_PIXELS:
                     return
                 way, factor = camera.position - camera.look_at, farther(width, height)
                 part = float(way @ begin / (begin @ begin))

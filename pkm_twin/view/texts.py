@@ -17,8 +17,8 @@ from pkm_twin.view.timeline import Instant, Timeline
 
 GRADES: Final[Mapping[Grade, str]] = {"good": "#009E73", "warn": "#B87800", "bad": "#D55E00"}
 """Colours of Okabe and Ito; the middle one darker, so that text in it is read on white."""
-SHOWN: Final = 8
-"""Elements that are listed; the rest is summed."""
+MAX_LISTED_ELEMENTS: Final = 8
+"""Largest number of listed elements; the shares of the others are summed."""
 SHEET: Final = """<style>
 .mantine-Slider-markLabel { font-size: 0.7rem !important; color: #343a40 !important; }
 .mantine-Flex-root > .mantine-NumberInput-root { width: 4.4rem !important; }
@@ -167,7 +167,7 @@ def bars(shares: Mapping[str, float]) -> str:
     colours = share_colours(shares)
     order = sorted(colours, key=lambda name: -shares[name])
     rows = []
-    for k, name in enumerate(order[:SHOWN]):
+    for k, name in enumerate(order[:MAX_LISTED_ELEMENTS]):
         part = 100 * shares[name]
         width = 100 * shares[name] / shares[order[0]]
         bar = (
@@ -180,8 +180,9 @@ def bars(shares: Mapping[str, float]) -> str:
             f'<td style="text-align:right"><span id="share_{k}">{part:.1f}</span>&nbsp;%</td>'
         )
         rows.append(f"<tr>{cells}</tr>")
-    rest = 100 * sum(shares[name] for name in order[SHOWN:])
-    more = f"<div>{len(order) - SHOWN} others: {rest:.1f} %</div>" if order[SHOWN:] else ""
+    rest = 100 * sum(shares[name] for name in order[MAX_LISTED_ELEMENTS:])
+    others = len(order) - MAX_LISTED_ELEMENTS
+    more = f"<div>{others} others: {rest:.1f} %</div>" if others > 0 else ""
     return _table(rows) + more
 
 

@@ -209,14 +209,14 @@ def test_a_goal_whose_controller_was_killed_is_aborted_within_two_seconds(action
     handle = action.controller.take() if answered else Accepted()
     feedback = told_of([], [])
     for _ in range(3):
-        action.node.look(action.code.GONE - 1)
+        action.node.look(action.code.MAX_SILENT_LOOKS - 1)
         # Feedback is a sign of life, and so is an answer to a question.
         action.controller.feedback(SimpleNamespace(feedback=feedback))
-        action.node.look(action.code.GONE - 1)
+        action.node.look(action.code.MAX_SILENT_LOOKS - 1)
         action.node.asked[-1].tell(None)
     assert not goal.ends
-    assert action.code.GONE * action.code.LOOK < 2.0
-    action.node.look(action.code.GONE)
+    assert action.code.MAX_SILENT_LOOKS * action.code.LOOK < 2.0
+    action.node.look(action.code.MAX_SILENT_LOOKS)
     (result,) = goal.ends
     assert goal.how == ABORTED
     assert "/controller" in result.error_string

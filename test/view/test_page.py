@@ -15,7 +15,7 @@ pytest.importorskip("websockets")
 import msgspec
 from websockets.asyncio.client import connect
 
-from pkm_twin.view.model import VISIBLE, Model
+from pkm_twin.view.model import MAX_SHOWN_DEFLECTION, Model
 from pkm_twin.view.page import Page, serving
 from pkm_twin.view.panels import BagPanel, ModePanel
 from pkm_twin.view.stage import farther
@@ -133,7 +133,9 @@ def test_a_mode_is_animated_at_the_pose_that_is_shown(page, monkeypatch):
     shape = found.shapes[1, 0]
     for _, moved, shares, most in drawn:
         np.testing.assert_allclose(np.outer(moved.platform, shape), np.outer(shape, moved.platform))
-        assert np.linalg.norm(moved.platform[:3]) <= VISIBLE * page.model.robot.graph.size
+        assert (
+            np.linalg.norm(moved.platform[:3]) <= MAX_SHOWN_DEFLECTION * page.model.robot.graph.size
+        )
         for name, (at, way) in moved.members.items():
             own = [k for k, node in enumerate(found.nodes) if node.startswith(f"{name} ")]
             np.testing.assert_array_equal(at, found.positions[own])
