@@ -464,12 +464,14 @@ def _warn_of_units(
 def visuals(
     path: Path, robot: ET.Element, places: Mapping[str, Pose], bodies: Mapping[str, str]
 ) -> Iterator[Visual]:
-    """Meshes of all links; an invalid one is left out with a warning.
+    """Meshes of a machine's links; an invalid one is left out with a warning.
 
     :param places: of the links at home, base axes; ``bodies``: the body of each link.
     """
     for link in robot.findall("link"):
         name = link.get("name", "")
+        if name not in bodies:
+            continue  # It is no part of the linkage that is cut out.
         for number, visual in enumerate(link.findall("visual")):
             mesh = visual.find("geometry/mesh")
             if mesh is None:

@@ -61,14 +61,15 @@ def read(path: Path, actuated: Sequence[str] | None = None) -> LoopTree:
 
 class _Reader:
     def __init__(self, stage: Any, path: Path) -> None:
-        from pxr import UsdGeom, UsdPhysics
+        from pxr import Usd, UsdGeom, UsdPhysics
 
         self.physics, self.path = UsdPhysics, path
         self.length = float(UsdGeom.GetStageMetersPerUnit(stage))
         self.kilogram = float(UsdPhysics.GetStageKilogramsPerUnit(stage))
         self.up = str(UsdGeom.GetStageUpAxis(stage))
         self.cache = UsdGeom.XformCache()
-        self.prims = list(stage.Traverse())
+        every = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
+        self.prims = list(Usd.PrimRange.Stage(stage, every))
         self.bodies = [p for p in self.prims if p.HasAPI(UsdPhysics.RigidBodyAPI)]
         self.bodies = [p for p in self.bodies if self._value(p, "physics:rigidBodyEnabled", True)]
         self.names = self._named()
@@ -82,7 +83,7 @@ class _Reader:
         if len(self.links) == 1:
             raise ParameterError(str(self.path), "no rigid body", "prims with PhysicsRigidBodyAPI")
         joints: dict[str, Joint] = {}
-        driven, excluded = list[str](), set[str]()
+        driven, rubbing, excluded = list[str](), list[str](), set[str]()
         for prim in self.prims:
             if not prim.IsA(self.physics.Joint):
                 continue
@@ -95,11 +96,15 @@ class _Reader:
             joints[joint.name] = joint
             if self._value(prim, "physics:excludeFromArticulation", False):
                 excluded.add(joint.name)
+            if self._value(prim, "physxJoint:jointFriction", 0.0):
+                rubbing.append(joint.name)
             if self._drives(prim):
                 driven.append(joint.name)
             if any(str(s).startswith(MIMIC) for s in prim.GetAppliedSchemas()):
                 error = ParameterError(str(prim.GetPath()), "a mimic joint", UNCOUPLED)
                 self.faults.append(((joint.name,), error))
+        if rubbing:
+            warn(self.path, f"jointFriction of PhysX is ignored, of {', '.join(rubbing)}")
         if not any(WORLD in (joint.inner, joint.outer) for joint in joints.values()):
             held = self.names[self.bodies[0].GetPath()]
             warn(self.path, f"no joint holds a body in the world: {held} is taken for the ground")
@@ -160,6 +165,10 @@ class _Reader:
         """
         where, (frame, scales) = str(prim.GetPath()), self._world(prim)
         name = self.names[prim.GetPath()]
+        if self._value(prim, "physics:kinematicEnabled", False):
+            raise ParameterError(
+                f"{where}.physics:kinematicEnabled", True, "a body that forces move"
+            )
         below = [p for p in self.prims if p.GetPath().HasPrefix(prim.GetPath()) and p != prim]
         shapes = [p for p in below if p.HasAPI(self.physics.CollisionAPI)]
         mass = self.kilogram * float(self._value(prim, "physics:mass", 0.0))
@@ -255,8 +264,6 @@ class _Reader:
             most = float(self._value(prim, name, math.inf)) * scale
             if 0.0 < most < 1e30:
                 limits[key] = most
-        if self._value(prim, "physxJoint:jointFriction", 0.0):
-            warn(self.path, f"physxJoint:jointFriction of {prim.GetPath()} is ignored")
         rotor = float(self._value(prim, "physxJoint:armature", 0.0))
         scale = self.kilogram * (self.length**2 if turns else 1.0)
         return {"limits": limits, "rotor_inertia": rotor * scale}

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import warnings
+import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import numpy as np
@@ -99,6 +100,30 @@ def test_options_of_the_command_line_are_those_of_load(twin, tmp_path):
     np.testing.assert_allclose(robot.inverse(x), same.inverse(x[::-1])[::-1], atol=1e-12)
     told = twin.told("info", HUMANOID, *given, "--pose", "x,roll")
     assert ["roll", "pitch"] in told["other_poses"] and list(told["pose"]) == ["x", "roll"]
+
+
+def test_a_urdf_with_meshes_and_an_arm_is_cut_too(tmp_path):
+    """The arm follows a joint of its own, which would be rejected in the machine."""
+    text = (HUMANOID.parents[1] / "test/machine/five_bar.urdf").read_text()
+    mesh = '<visual><geometry><mesh filename="a.stl"/></geometry></visual>'
+    arm = f"""<link name="arm">{mesh}</link><link name="hand"/>
+      <joint name="shoulder" type="revolute"><parent link="ROOT"/><child link="arm"/>
+        <axis xyz="0 0 1"/><limit effort="1" velocity="1" lower="-1" upper="1"/></joint>
+      <joint name="wrist" type="revolute"><parent link="arm"/><child link="hand"/>
+        <axis xyz="0 0 1"/><limit effort="1" velocity="1" lower="-1" upper="1"/>
+        <mimic joint="shoulder"/></joint></robot>"""
+    plain = tmp_path / "plain.urdf"
+    plain.write_text(text)
+    right = load(plain)
+    root = ET.fromstring(text).find("joint/parent").get("link")
+    path = tmp_path / "armed.urdf"
+    path.write_text(text.replace("</robot>", arm.replace("ROOT", root)))
+    with pytest.raises(ParameterError, match=r"wrist.mimic"):
+        load(path)
+    with pytest.warns(match="left out, on the base: arm, hand"):
+        robot = load(path, base=root)
+    x = right.home() + 0.01
+    np.testing.assert_allclose(robot.inverse(x), right.inverse(x), atol=1e-9)
 
 
 WRONG = {
