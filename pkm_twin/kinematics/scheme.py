@@ -225,11 +225,12 @@ class Scheme(Linkage):
             raise mobility_error(self)
         _ = self.independent
         if len(self.coordinates) != self.joints:
-            raise ParameterError(
-                "pose",
-                [c.name for c in self.coordinates],
-                f"{self.joints} coordinates, the mobility",
-            )
+            bound = f"{self.joints} coordinates, the mobility"
+            ways = choose_coordinates(self.graph)
+            if len(ways) < self.joints:
+                bound += f"; the platform moves in {', '.join(ways) or 'none'} alone: choose one "
+                bound += "that all actuated joints move"
+            raise ParameterError("pose", [c.name for c in self.coordinates], bound)
         motion, rows = self.at(*self.samples[0])
         matrix = self._inverse_matrix(motion, rows, self.home_pose.tolist())
         if rank_of(matrix) < len(matrix):

@@ -142,6 +142,10 @@ WRONG = {
         "equality.grip.*--base",
     ),
     "whole": ({}, ParameterError, "equality.grip.*--base"),
+    "idle motor": (
+        {"base": "shank", "platform": "ankle_cross"}, ParameterError,
+        "2 coordinates.*moves in pitch alone: choose one that all",
+    ),
     "pose": ({"base": "shank", "pose": ["x", "y"]}, ParameterError, "as roll, pitch"),
 }  # fmt: skip
 
