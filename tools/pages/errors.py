@@ -86,7 +86,7 @@ REASONS = {
     "missing joint": "check the names, or use `joint_map`",
     "no base motion": "no fresh `base_imu`, or none with gravity; check its stamps and driver",
     "no pose": "no joint state within `max_state_age` of the wrench; check `joint_states`",
-    "no velocities": "nor accelerations; set `acceleration` to `differentiate`",
+    "no velocities": "derivatives are missing; set `acceleration` to `differentiate`",
     "no wrench": "none fresh; check the topic `wrench` and its stamps",
     "non-finite result": "check the input and the robot file",
     "not finite": "NaN or infinity in the message; check the sensor",
