@@ -289,6 +289,28 @@ class _Reader:
             and m.actuator_trnid[i][0] == joint
         ]  # fmt: skip
 
+    def _acted(self, i: int) -> tuple[str, ...]:
+        """The joints on which an actuator of a tendon, a site or a body acts."""
+        m, index = self.model, int(self.model.actuator_trnid[i][0])
+        bodies = [index]
+        if int(m.actuator_trntype[i]) == int(self.mj.mjtTrn.mjTRN_TENDON):
+            first = int(m.tendon_adr[index])
+            wraps = range(first, first + int(m.tendon_num[index]))
+            kinds = {k: self.mj.mjtWrap(int(m.wrap_type[k])).name for k in wraps}
+            joints = [int(m.wrap_objid[k]) for k in wraps if kinds[k] == "mjWRAP_JOINT"]
+            if joints:
+                return tuple(self._name("JOINT", joint) for joint in joints)
+            bodies = [int(m.site_bodyid[m.wrap_objid[k]]) for k in wraps
+                      if kinds[k] == "mjWRAP_SITE"]  # fmt: skip
+        elif int(m.actuator_trntype[i]) != int(self.mj.mjtTrn.mjTRN_BODY):
+            bodies = [int(m.site_bodyid[index])]
+        moved: set[int] = set()
+        for body in bodies:
+            while body:
+                moved.add(body)
+                body = int(m.body_parentid[body])
+        return tuple(self._name("JOINT", k) for k in range(m.njnt) if int(m.jnt_bodyid[k]) in moved)
+
     def _strength(self, i: int) -> float:
         """The greatest force of an actuator; infinite without limits."""
         m, mj = self.model, self.mj
@@ -429,14 +451,16 @@ class _Reader:
             name = self._name("ACTUATOR", i)
             joint = int(self.model.actuator_trnid[i][0])
             if i not in self._drives(joint):
-                raise ParameterError(
+                error = ParameterError(
                     f"actuator.{name}", name, f"an actuator of a joint, or names with {CHOOSE}"
                 )
+                self.faults.append((self._acted(i), error))
+                continue
             own = self._name("JOINT", joint)
             if joint in self.locks or self.joints[own].kind not in ("revolute", "prismatic"):
-                raise ParameterError(
-                    f"actuator.{name}", own, "an actuator of a hinge or slide that can move"
-                )
+                bound = "an actuator of a hinge or slide that can move"
+                self.faults.append(((own,), ParameterError(f"actuator.{name}", own, bound)))
+                continue
             if own not in names:
                 names.append(own)
         if not names:

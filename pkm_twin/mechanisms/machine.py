@@ -96,7 +96,9 @@ class MachineFile(Common):
         3, unit="m", text="the platform's reference point at home; by default its com", default=None
     )
     pose: tuple[str, ...] | None = schema.words(
-        *COORDINATES, text="as many as the mobility; by default the first valid", default=None
+        *COORDINATES,
+        text="as many as the mobility; default: turns if they suffice, else the first valid",
+        default=None,
     )
     bodies: Mapping[str, BodySpec] = schema.mapping(BodySpec, default={})
     joints: Mapping[str, JointSpec] = schema.mapping(JointSpec, default={})

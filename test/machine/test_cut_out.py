@@ -126,6 +126,25 @@ def test_a_urdf_with_meshes_and_an_arm_is_cut_too(tmp_path):
     np.testing.assert_allclose(robot.inverse(x), right.inverse(x), atol=1e-9)
 
 
+def test_actuators_of_tendons_and_sites_matter_where_they_act(tmp_path):
+    """A tendon bends fingers; a thruster on the trunk pushes the pelvis."""
+    text = HUMANOID.read_text()
+    tendon = '<tendon><fixed name="grasp"><joint joint="finger" coef="1"/></fixed></tendon>'
+    motors = '<motor tendon="grasp" ctrlrange="-1 1"/><motor site="SITE" ctrlrange="-1 1"/>'
+    for site, ok in (("chest", True), ("sole", False)):
+        changed = text.replace("</actuator>", f"{motors}</actuator>{tendon}".replace("SITE", site))
+        changed = changed.replace('<body name="arm"', '<site name="chest"/><body name="arm"')
+        path = tmp_path / f"{site}.xml"
+        path.write_text(changed)
+        if ok:
+            assert linkage("ankle", path).joint_names == ("ankle_left", "ankle_right")
+            continue
+        with pytest.raises(ParameterError, match=r"actuator\..*--actuated"):
+            linkage("ankle", path)
+        motors_named = linkage("ankle", path, actuated=["ankle_left", "ankle_right"])
+        assert motors_named.joints_count == 2
+
+
 WRONG = {
     "unknown base": ({"base": "shnk"}, UnknownNameError, "did you mean 'shank'"),
     "same body": ({"base": "sole"}, ParameterError, "moves relative to base 'sole'"),
