@@ -14,7 +14,6 @@ from pkm_twin.codegen.operations import absolute, cos, sin
 from pkm_twin.codegen.program import (
     AT,
     LEAST,
-    MARGIN,
     STATE,
     UNKNOWNS,
     Equations,
@@ -28,9 +27,11 @@ from pkm_twin.kinematics.traced import POSED, Traced
 
 POSE_WEIGHT: Final = 100.0
 """What the pose weighs against closures where not all can be met: so a closure falls short."""
-CERTAIN: Final = 0.2
-"""Largest distance of the start of ``forward`` from a pose, of unit one, that is certainly the
-start of the way to it."""
+CERTAIN: Final = 0.4
+"""Largest distance from a pose, of unit one, of the poses that home's derivatives give for it."""
+CERTAIN_MARGIN: Final = 3.0
+"""Smallest ratio of the closures' determinant to that distance, from far poses of many machines: it
+is less than 2 where ``forward`` of the joints is not the pose."""
 SAME_POSE: Final = 1e-7
 """Largest difference of two poses that are one: rounding of the two solutions, of unit one. Another
 assembly is farther away unless a singularity is nearer than that."""
@@ -272,26 +273,35 @@ def pose_accelerations(t: Traced) -> list[Any]:
 def certify_assembly(
     t: Traced, scheme: CarriedScheme, posed: Traced, q: Sequence[Any]
 ) -> list[Any]:
-    """Return numbers that are above zero if ``forward`` of q is certainly the pose."""
+    """Return numbers that are above zero if ``forward`` of q is certainly the pose.
+
+    With x the pose and A = dq/dx, q - q0 = A0 (x - x0) + ... is read in two ways: the pose that A0
+    gives for q, and the pose for which A0 gives the joints that A gives. Both lie near x where the
+    line from home is nearly straight.
+    """
     names, order = t.graph.leads, scheme.drive_pivots
-    here, at_home = (
-        SparseLU(posed.rates_of_reaches(names, home=home), order) for home in (False, True)
-    )
-    t = t.ahead
-    t.q = np.array([q[k] for k in t.drives.leading], dtype=object)
-    position, rotation = t.place_start().platform()
-    goal, turned = posed.motion.platform()
-    apart = (position - goal) / t.tree.size
-    turns = np.ravel(rotation - turned)
-    # Of two rotations by an angle apart, these squares sum to 4 - 4 cos(angle).
-    distance = apart @ apart + 0.5 * (turns @ turns)
+    rates, rates_home = (posed.rates_of_reaches(names, home=home) for home in (False, True))
+    here, at_home = SparseLU(rates, order), SparseLU(rates_home, order)
+    lead = np.array([q[k] for k in t.drives.leading], dtype=object)
     drives = at_home.inverse_determinant / here.inverse_determinant
-    # Newton's method from that start needs a determinant above so many times its correction.
     closures = drives * posed.determinant
+    if t.scheme.start is not None:
+        t.q = lead
+        position, rotation = t.place_start().platform()
+        goal, turned = posed.motion.platform()
+        apart = (position - goal) / t.tree.size
+        turns = np.ravel(rotation - turned)
+        # Of two rotations by an angle apart, these squares sum to 4 - 4 cos(angle).
+        distance = apart @ apart + 0.5 * (turns @ turns)
+    else:
+        move = posed.q - posed.graph.lead_home
+        read = [at_home.solve(lead - t.graph.lead_home), at_home.solve(rates @ move)]
+        first, second = ((x - move) * np.array(t.pose_scales, dtype=object) for x in read)
+        distance = 0.5 * (first @ first) + 0.125 * (second @ second)
     return [
         drives - LEAST,
         CERTAIN * CERTAIN - distance,
-        closures * closures - MARGIN * MARGIN * distance,
+        closures * closures - CERTAIN_MARGIN * CERTAIN_MARGIN * distance,
     ]
 
 
