@@ -23,10 +23,10 @@ from test.support.robots import joint_range
 
 FLAGS = "-std=gnu99", "-O3", "-march=native", "-fPIC", "-shared"
 STATES, CHUNK, ROUNDS = 2000, 100, 9
-MACHINES = Path(__file__).parents[1] / "machine" / "machines"
+HERE = Path(__file__).parent
 ROBOTS = (
     "stewart", "delta", "delta_cu", "prru", "upr_rpu", "five_bar", "rps3", "linear_delta",
-    str(MACHINES / "ankle.yaml"), str(MACHINES / "skew3.yaml"),
+    str(HERE / "ankle.yaml"), str(HERE / "skew3.yaml"),
 )  # fmt: skip
 CALLS = {
     "torques": ("q", "qd", "qdd", "wrench", "tau"),
