@@ -114,7 +114,7 @@ class Settings:
 
     @property
     def stamp_rules(self) -> StampRules:
-        """What the stamp of a joint state has to keep to."""
+        """The rules for the stamp of a joint state."""
         return StampRules(
             accept_zero=self.accept_zero_stamp,
             future_tolerance=round(self.future_tolerance * SECOND),
@@ -142,7 +142,7 @@ class Torques(NamedTuple):
     effort: Array
     """Within the limits, shape (n,), N m or N."""
     sent: LimitedEfforts
-    """The same in the controller's numbers."""
+    """The efforts in the controller's values."""
     measured: Array | None
     saturated: bool
     wrench: Array | None = None
@@ -184,11 +184,11 @@ class Feedforward(Core):
         self._last_good: Array | None = None
         self.limits = EffortLimits(self.robot)
         self.pose: MeasuredPose | None = None
-        """Of the last accepted joint state."""
+        """Pose of the last accepted joint state."""
         self._pull: Array | None = None
         """Mean acceleration of the base less gravity there, shape (3,); None: at rest."""
         self._memory: Memory | None = None
-        """Of the drives' friction; None before the stream's first answer."""
+        """Memory of the drives' friction; None before the stream's first answer."""
         self.differentiator = _differentiator(s, self.robot)
         self._window = s.window
         self._rest = VelocityErrorEstimator(self.differentiator.slope_gain())
@@ -272,7 +272,7 @@ class Feedforward(Core):
     def trajectory_steps(
         self, message: Any, now: int, *, holding: bool = False
     ) -> Generator[None, None, LimitedEfforts]:
-        """As :meth:`trajectory`, some points at a time: it yields between them.
+        """Compute :meth:`trajectory` some points at a time, yielding between them.
 
         The robot and the settings are those of the beginning.
 

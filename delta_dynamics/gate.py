@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""What an effort controller gets: stamped torques while they come, zeros or gravity when not.
+"""Pass stamped torques to an effort controller while they come, else zeros or gravity.
 
 A command of plain numbers has no stamp, so a controller that takes it cannot distinguish a live
 torque from the last word of a dead process. This is the last place that can. Pure: times are

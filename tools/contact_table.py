@@ -43,7 +43,7 @@ def departed(robot: Robot, rng: np.random.Generator, motion: Any, hit: Strike | 
 
 
 def contact(robot: Robot, seed: int) -> dict[str, Any]:
-    """One contact: what came of it."""
+    """Simulate a contact, and return the estimates."""
     rng = np.random.default_rng([seed, *robot.name.encode()])
     kind = KINDS[seed % len(KINDS)]
     hit, tries = None, 0
@@ -94,7 +94,7 @@ def free(robot: Robot, seed: int) -> dict[str, Any]:
 
 
 def made(task: tuple[str, int, bool]) -> dict[str, Any]:
-    """One row, in a process of its own."""
+    """Compute one row, in a process of its own."""
     name, seed, without = task
     row = (free if without else contact)(load(name), seed)
     return row | {"seed": seed}
@@ -117,7 +117,7 @@ def collected(count: int, jobs: int | None) -> list[dict[str, Any]]:
 
 
 def line(name: str, rows: list[dict[str, Any]]) -> str:
-    """One robot's row of the table."""
+    """Write a robot's row of the table."""
     hits = [row for row in rows if row["kind"] != "free"]
     seen = [row for row in hits if row["delay"] is not None]
     delays = 1e3 * np.array([row["delay"] for row in seen])

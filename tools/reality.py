@@ -129,7 +129,7 @@ def _rolled(poses: Poses, by: int) -> Poses:
 
 
 def _row(name: str, errors: list[list[Errors]]) -> str:
-    """One fit's row: errors of the held-out poses, of positions and perhaps of rotations."""
+    """Write a fit's row: errors of the held-out poses, of positions and perhaps of rotations."""
     each = [one[0].rms for one in errors]
     angles = [one[1].rms for one in errors if len(one) > 1]
     worst = max(one[0].worst for one in errors)

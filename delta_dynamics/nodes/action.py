@@ -84,7 +84,7 @@ class _Settling:
     since: float
     """When that was, on the steady clock, s."""
     speed: float | None = None
-    """Of the fastest joint before that; None before the first look."""
+    """Previous speed of the fastest joint; None before the first check."""
 
 
 class EffortAction:

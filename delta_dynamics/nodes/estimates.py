@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""What measured efforts show in addition to the torques: the load, contacts and their place.
+"""Estimate payload, contacts and their places from measured efforts.
 
 Only the node ``delta_dynamics`` imports this module.
 """

@@ -26,7 +26,7 @@ from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.run import run
 
 CHANGEABLE: Final = ("effort_limits", "payload.mass", "payload.com")
-"""What may change while the gate runs; of the payload the part that has a weight."""
+"""Parameters that may change while the gate runs."""
 TORQUES = "delta_dynamics/joint_torques"
 MAX_DEADLINE = 3600.0
 """Longest deadline that a node of the suite promises, s; the middleware's "none" is longer."""
@@ -98,7 +98,7 @@ class CommandGate(TwinNode):
         self._send(self.core.stop_command(time.monotonic_ns()))
 
     def shutdown(self) -> None:
-        """As deactivated; and the controller has it before the process ends."""
+        """Send the last command, and wait until the controller has it."""
         super().shutdown()
         self._commands.wait_for_controllers(MAX_ACKNOWLEDGE_TIME)
 
@@ -154,7 +154,7 @@ class CommandGate(TwinNode):
 
     @contextmanager
     def _watching(self) -> Iterator[None]:
-        """Where torques close the gate, its command is sent at once."""
+        """Send the closed gate's command at once if torques close the gate."""
         running = not self.core.stream.stopped
         try:
             yield
@@ -183,7 +183,7 @@ class CommandGate(TwinNode):
             self._send(self.core.stop_command(steady))
 
     def _tell(self) -> None:
-        """One line each time that the gate opens or closes."""
+        """Log each opening and closing of the gate."""
         stream = self.core.stream
         if stream.stopped is self._closed:
             return
@@ -198,7 +198,7 @@ class CommandGate(TwinNode):
 
 
 NODE = CommandGate
-"""What a process of one or several nodes makes."""
+"""The node class, for a process of one or several nodes."""
 
 if __name__ == "__main__":
     sys.exit(run(NODE))

@@ -49,7 +49,7 @@ BUDGET: Final = 5e-3
 BEHIND: Final = 0.1
 """How far the machine may be behind the clock that it keeps, s; beyond, it stands still."""
 CLOCK_PERIOD: Final = 5_000_000
-"""Of /clock, ns of simulated time."""
+"""Period of /clock, ns of simulated time."""
 ALONE: Final = 1.0
 """In lockstep: how long an answer is waited for, s of the wall."""
 LOOK: Final = 0.05
@@ -318,7 +318,7 @@ class MachineSim(TwinNode):
         self.core.trajectory(raw.fields)
 
     def _catch_up(self) -> None:
-        """As many periods as are due, by the steady clock."""
+        """Simulate the periods that are due by the steady clock."""
         if not self.active:
             return
         period = self.core.settings.period
@@ -396,7 +396,7 @@ def _refuse_sim_time(changes: Sequence[Parameter]) -> SetParametersResult:
 
 
 NODE = MachineSim
-"""What a process of one or several nodes makes."""
+"""The node class, for a process of one or several nodes."""
 
 if __name__ == "__main__":
     sys.exit(run(NODE))

@@ -249,7 +249,7 @@ class DeltaDynamics(TwinNode):
         )
 
     def _place(self) -> dict[str, float] | None:
-        """Where the joints are, by the controller's names and numbers; None where not measured."""
+        """Return the joint positions by the controller's names and values; None if not measured."""
         pose, stale_after = self.core.pose, self.core.settings.stale_after
         if self._accepted is None or pose is None or pose.age(time.monotonic_ns()) > stale_after:
             return None
@@ -345,7 +345,7 @@ class DeltaDynamics(TwinNode):
 
     @contextmanager
     def _telling_stop(self) -> Iterator[None]:
-        """Where the core stops the stream in here: log it, and send what ``on_stop`` says."""
+        """Log a stop of the stream within the block, and send the command of ``on_stop``."""
         stream = self.core.stream
         running = not stream.stopped
         try:
@@ -459,7 +459,7 @@ class DeltaDynamics(TwinNode):
 
 
 NODE = DeltaDynamics
-"""What a process of one or several nodes makes."""
+"""The node class, for a process of one or several nodes."""
 
 if __name__ == "__main__":
     sys.exit(run(NODE))

@@ -173,12 +173,12 @@ class Law:
 
     given: Array = field(default_factory=lambda: _NONE)
     effort: Array = field(default_factory=lambda: _NONE)
-    """Of the drives, less their offset, shape (n,); and less their dry friction."""
+    """Efforts of the drives without offset and dry friction, shape (n,)."""
     wrench: Array | None = None
     first: Array = field(default_factory=lambda: _NONE)
     """Accelerations at the start, shape (n,)."""
     force: Array = field(default_factory=lambda: _NONE)
-    """What holds at the start, shape (h,)."""
+    """Holding forces at the start, shape (h,)."""
 
     @property
     def stands(self) -> bool:
@@ -223,7 +223,7 @@ class Resistance:
         self._drives = np.eye(n)
         self._still = np.zeros(len(self._dry), bool)
         self._states: States = np.zeros(len(self._dry), np.int8)
-        """Of a row that slides which way, of one that is still the state of its force."""
+        """State of each row: direction of sliding, or state of the force at rest."""
         self._law: Law | None = None
 
     def at(self, q: Array, qd: Array) -> Terms:

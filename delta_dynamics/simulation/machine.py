@@ -82,10 +82,10 @@ class MachineSettings:
     start: Array
     """Joint positions at the start, rad or m."""
     effort_limits: Array
-    """What the drives give at most, N m or N."""
+    """Largest efforts of the drives, N m or N."""
     stiffness: Array
     damping: Array
-    """Of the position control that goes trajectories, N m/rad and N m s/rad (N/m and N s/m)."""
+    """Gains of the position control of trajectories, N m/rad and N m s/rad (N/m, N s/m)."""
     period: float = setting(
         1e-3, "sampling period of sensors and position control", unit="s", low=1e-4, high=10.0
     )

@@ -30,7 +30,7 @@ SOFT: Final = 1e-9
 def elastic_reactions(
     robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None = None
 ) -> Reactions:
-    """As :func:`~delta_dynamics.reactions`, with indeterminate components by the elastic model.
+    """Compute :func:`~delta_dynamics.reactions`, with elasticity for indeterminate components.
 
     Components that store no energy in members or joints stay NaN; in a robot without elastic
     members these are all indeterminate ones. Rods that stand for a pair are not resolved.

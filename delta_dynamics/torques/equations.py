@@ -22,7 +22,7 @@ from pkm_twin.robot.robot import Robot
 
 
 class Terms(NamedTuple):
-    """Of M qdd + bias = effort + twists' wrench - friction, at one state; k passive joints.
+    """Terms of M qdd + bias = effort + twists' wrench - friction at a state; k passive joints.
 
     ``mass`` (n, n) and ``bias`` (n,): velocity terms and weight, without friction and offset.
     ``kinetic`` and ``potential`` energy, J, the latter zero at the base's origin. ``twists``

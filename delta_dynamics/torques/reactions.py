@@ -29,7 +29,7 @@ from pkm_twin.robot.robot import SINGULARITY_BOUND, Robot
 
 @dataclass(frozen=True)
 class Transmitter:
-    """One joint in every sample: what its inner body can transmit to the outer one.
+    """A joint in every sample: the wrenches that its inner body can transmit to the outer one.
 
     ``components`` names the columns of ``basis``, shape (..., 6, components): unit forces and
     unit couples at ``point``, shape (..., 3), m. A component of the same name at two joints is
@@ -316,7 +316,7 @@ class Balance:
     residual: Array
 
     def reactions(self, value: Array, null: Array) -> Reactions:
-        """Of a solution, and what may still be added to it."""
+        """Return the reactions of a solution and its null space."""
         # Moments and forces of the null space in one unit again, so that one bound holds.
         reach = np.einsum("...jik,...kn->...jin", self.spread, null * self.unit[..., None])
         reach[..., 3:, :] /= self.size[..., None, None, None]
@@ -338,7 +338,7 @@ class Balance:
 def least_norm_reactions(
     robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None = None
 ) -> Reactions:
-    """As :func:`reactions`, with indeterminate components filled by the least-norm solution.
+    """Compute :func:`reactions`, with the least-norm solution for indeterminate components.
 
     This is the solution of the balance with the smallest sum of squares, with moments divided by
     the mechanism's size (root mean square distance of the joints from their centre). In a real
@@ -424,7 +424,7 @@ def loads_kernel(robot: Robot) -> Kernel:
 
 
 def _loads(t: Traced) -> Program:
-    """Where bodies, rods and joints are, and what every body needs of its joints.
+    """Write the places of bodies, rods and joints, and the wrench that each body needs.
 
     A body: origin, force, moment about it. A rod: both ends, the forces they need, the direction of
     its pair. A joint: point, three directions, and the one across a universal joint's axes, or a

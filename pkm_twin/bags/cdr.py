@@ -29,7 +29,7 @@ _UNPACK = {
     order: {code: struct.Struct(f"{order}{code}").unpack_from for code in _SIZES} for order in "<>"
 }
 _ARRAY_CODES = {"?": "B"}
-"""Where an array knows no such code, the one of its bytes."""
+"""Codes of ``array`` for types that it lacks: those of their bytes."""
 _LITTLE_HEADER = b"\x00\x01\x00\x00"
 
 

@@ -62,7 +62,7 @@ _FOREIGN = {
 
 
 class FormatError(Exception):
-    """What is wrong and where, before the path is known; never leaves this folder's modules."""
+    """A fault with its place, before the path is known; never leaves this folder's modules."""
 
     def __init__(self, text: str, offset: int | None, reason: str = "damaged") -> None:
         super().__init__(text)
@@ -72,7 +72,7 @@ class FormatError(Exception):
 
 
 class Budget:
-    """What one file may cost, in bytes read and unpacked, whatever it says of itself.
+    """The bound on bytes read and unpacked of one file, whatever the file states.
 
     Without it a small file of many chunks, each within its own bounds, unpacks to gigabytes.
     """

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""What a bag says of its publishers: QoS and topic names, checked. Imports no ROS."""
+"""Check the QoS and topic names that a bag records. Imports no ROS."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _TOPIC = re.compile(r"(?:/[A-Za-z_][A-Za-z0-9_]*)+")
 
 @dataclass(frozen=True)
 class OfferedQos:
-    """What a recorded publisher offered, as far as a replay keeps it."""
+    """The recorded QoS of a publisher, as far as a replay uses it."""
 
     reliable: bool = True
     transient_local: bool = False

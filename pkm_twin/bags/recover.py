@@ -19,7 +19,7 @@ from pkm_twin.files import replacing
 
 @dataclass(frozen=True)
 class RecoverResult:
-    """What :func:`recover` saved and what it could not.
+    """The result of :func:`recover`: saved and lost messages.
 
     ``bytes_lost`` counts damaged and incomplete records of the source's data section; indexes and
     summary are made again. ``unverified`` messages were whole, but no CRC covered them. ``reason``

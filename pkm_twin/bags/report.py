@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""What is known of a bag once it has been checked. Imports no ROS."""
+"""The report of a checked bag. Imports no ROS."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ class TopicInfo:
     encoding: str
     """How messages are encoded, ``cdr`` in ROS 2."""
     schema_encoding: str
-    """What the definition is written in, ``ros2msg`` or ``ros2idl``; empty where there is none."""
+    """Language of the definition, ``ros2msg`` or ``ros2idl``; empty if there is none."""
 
 
 @dataclass(frozen=True)
 class BagReport:
-    """What a strict pass over a whole bag found. Times are log times in ns, 0 without messages."""
+    """The findings of a strict pass over a bag. Times are log times in ns, 0 without messages."""
 
     path: Path
     profile: str

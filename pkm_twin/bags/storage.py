@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Where a bag's bytes are: one MCAP file, or a folder that rosbag2 wrote. Imports no ROS.
+"""Find the files of a bag: one MCAP file, or a rosbag2 folder. Imports no ROS.
 
 rosbag2 writes a folder with ``metadata.yaml`` and one or more MCAP files (splits), each of which it
 may have packed with zstd as a whole (``.mcap.zstd``).
@@ -32,7 +32,7 @@ _BLOCK_BYTES = 1024**2
 
 
 class BagFile:
-    """One MCAP file; where it is packed as a whole, its unpacked bytes in a nameless file."""
+    """An MCAP file; if packed as a whole, its bytes are unpacked into a nameless file."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

@@ -85,7 +85,7 @@ class Segment:
 
 
 class TrustedSummary(NamedTuple):
-    """What a summary whose CRC holds says of damaged data; ``data_end``: where they end.
+    """The statements of a summary with a valid CRC on damaged data, which end at ``data_end``.
 
     ``chunks``: the length of each chunk record by its offset, in order and without overlap.
     """
@@ -180,7 +180,7 @@ class Check:
 
     @property
     def left_out(self) -> str:
-        """What :func:`recover` loses: the fault with its place, or records that it leaves out."""
+        """Losses of :func:`recover`: the fault with its place, or records that are left out."""
         if self.fault:
             at = self.fault.offset
             return self.fault.text if at is None else f"{self.fault.text} (byte {at})"

@@ -26,7 +26,7 @@ from pkm_twin.errors import BagError
 from pkm_twin.files import replacing, require_replaceable
 
 LIBRARY = "pkm_twin"
-"""What the header of our own bags says wrote them."""
+"""Name of the library in the header of own bags."""
 FLUSH_PERIOD = 0.05
 """How often a live recording reaches the operating system, s; half of what a kill may cost."""
 

@@ -22,7 +22,7 @@ PLAIN: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 @dataclass(frozen=True)
 class Variable:
-    """One variable; its value reference is its place.
+    """A variable; its value reference is its index.
 
     ``kind``: t time, i input, p parameter, s state, d derivative or event indicator, o output.
     ``start``: of what has one. ``derivative``: place of the state that it is the derivative of.
@@ -40,26 +40,26 @@ class Variable:
 
     @property
     def causality(self) -> str:
-        """As FMI has it; a state can be seen as an output."""
+        """The causality of FMI; states are outputs."""
         words = {"t": "independent", "i": "input", "p": "parameter", "d": "local"}
         return words.get(self.kind, "output")
 
     @property
     def variability(self) -> str:
-        """As FMI has it."""
+        """The variability of FMI."""
         if self.whole:
             return "discrete"
         return "tunable" if self.kind == "p" else "continuous"
 
     @property
     def initial(self) -> str:
-        """As FMI has it; of inputs and time nothing."""
+        """The attribute initial of FMI; none for inputs and time."""
         return {"p": "exact", "s": "exact", "d": "calculated", "o": "calculated"}.get(self.kind, "")
 
 
 @dataclass(frozen=True)
 class Description:
-    """What both versions of modelDescription.xml tell.
+    """The content of modelDescription.xml, for both versions.
 
     ``indicators``: places of the event indicators. ``resets``: whether events change rates.
     """

@@ -39,9 +39,9 @@ NUMERIC: Final = "kdl_kinematics_plugin/KDLKinematicsPlugin"
 ACCELERATION_FRACTION: Final = 0.5
 """Fraction of the effort left at home after gravity that a planner may use to accelerate."""
 POSITION: Final = 1e-4
-"""Between a goal and the machine's pose, m: MoveIt's own tolerance of goals."""
+"""Largest distance between a goal and the machine's pose, m: MoveIt's tolerance of goals."""
 ORIENTATION: Final = 1e-3
-"""The same of rotations, rad."""
+"""Largest rotation between a goal and the machine's pose, rad."""
 SINGULAR: Final = 0.01
 """Least singularity index of solutions, as of the controllers of ros2_control."""
 CONTROLLER: Final = "delta_dynamics"

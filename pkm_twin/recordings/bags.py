@@ -42,7 +42,7 @@ NO_STAMPS: Final = (
     "expected joint states with the time of each sample in header.stamp; without them, record a "
     "table with a column time"
 )
-"""What to do with a bag whose publisher sets no stamps: its log times are when it was written."""
+"""Error for a bag without stamps; log times are times of writing."""
 MAX_DEFLECTION_OFFSET: Final = 0.02
 """Largest time from a deflection to its wrench and joint state, s."""
 
@@ -236,7 +236,7 @@ def _wrenches(samples: list[WrenchSample]) -> tuple[Stamps, Array]:
 
 
 def _nearest(stamps: Stamps, others: Stamps) -> NDArray[np.intp]:
-    """Of sorted stamps the index of the nearest to each of the others."""
+    """Return the index of the sorted stamp nearest to each of the others."""
     right = np.minimum(np.searchsorted(stamps, others), len(stamps) - 1)
     left = np.maximum(right - 1, 0)
     before = np.abs(stamps[left] - others) <= np.abs(stamps[right] - others)

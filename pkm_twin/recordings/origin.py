@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""What the efforts of a file rest on: robot, gravity, wrench and payload.
+"""The origin of a file's efforts: robot, gravity, wrench and payload.
 
 A table has them as columns, so that every program reads it: those that do not vary by sample are
 constant. A bag has the robot, gravity and payload in its metadata.

@@ -45,7 +45,7 @@ class Load:
         cls, spans: Sequence[tuple[float, float, float]], source: str,
         com: tuple[float, float, float] | None = None,
     ) -> Load:  # fmt: skip
-        """Of intervals, each its begin, end (s) and mass (kg); beginning at 0 or before it is."""
+        """Build the load of intervals, each with begin, end (s) and mass (kg)."""
         masses = tuple(mass for *_, mass in spans)
         alike = len(set(masses)) == 1
         times = tuple((begin, end) for begin, end, _ in spans)
@@ -74,11 +74,11 @@ class Load:
         return np.isfinite(self.carried(time))
 
     def farthest(self, own: float) -> float:
-        """Of several masses the one that differs most from a robot's own, kg."""
+        """Return the mass that differs most from the robot's own, kg."""
         return max(self.masses or (self.mass,), key=lambda mass: abs(mass - own))
 
     def near_change(self, time: Array, within: float) -> Mask:
-        """Where a pick or release is less than ``within`` seconds away, shape (n,)."""
+        """Return whether a pick or release is less than ``within`` seconds away, shape (n,)."""
         edges = [edge for span in self.times for edge in span]
         if not edges:
             return np.zeros(len(time), np.bool_)
@@ -170,7 +170,7 @@ def load_of_table(robot: Robot, table: Table, time: Array) -> Load | None:
 MASS, PICKED, RELEASED, CENTRE = (
     "payload_mass_kg", "payload_picked_s", "payload_released_s", "payload_com_m"
 )  # fmt: skip
-"""What a bag's metadata tell of its payload; of several intervals with blanks between."""
+"""Keys of a bag's metadata on its payload; several intervals have blanks between."""
 
 
 def load_facts(carried: Load | None) -> dict[str, Any]:

@@ -96,10 +96,10 @@ class Recording:
     load: Load | None = None
     """A payload beside the robot's own."""
     still: Mask | None = None
-    """Where differentiation cannot tell a joint from one at rest, so that dry friction has no
-    direction, shape (samples, n); None is nowhere."""
+    """Samples at which differentiation cannot distinguish a joint from rest, so that dry friction
+    has no direction, shape (samples, n); None: no sample."""
     efforts: str = "measured"
-    """What the efforts are: ``measured``, the ``effort`` of a plan or of a table that does not
+    """Kind of the efforts: ``measured``, the ``effort`` of a plan or of a table that does not
     tell, the ``model``'s, which only a plan has, or a ``current``, A."""
     computed: Array | None = None
     """Efforts that the file says a model computed, shape (samples, n), beside what they rest on."""

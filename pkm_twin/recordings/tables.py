@@ -34,7 +34,7 @@ MAX_BYTES: Final = 1024**3
 MAX_LINE: Final = 1024**2
 """Longest line of it, characters."""
 ENDINGS: Final = (".csv", ".parquet", ".mat")
-"""Of tables that are written."""
+"""Name endings of tables that can be written."""
 NOT_READ: Final = {
     ".mat": "CSV or Parquet; in MATLAB: writetable(T, 'FILE.csv')",
     ".gz": "the unpacked table; gunzip -k FILE.csv.gz",
@@ -81,7 +81,7 @@ class Dialect:
         columns: str | Sequence[str] | None = None, units: str | None = None,
         time: str | None = None,
     ) -> Dialect:  # fmt: skip
-        """As options of a command tell it.
+        """Build the dialect from a command's options.
 
         :raises ParameterError: by the option.
         """
@@ -110,7 +110,7 @@ class Dialect:
         return cls(None if separator is None else SEPARATORS[separator], decimal, names, chosen)
 
     def size(self, kind: str) -> float:
-        """Of a number without a unit, in SI."""
+        """Return the size in SI of a number without a unit."""
         return UNITS[self.units[kind]][1] if kind in self.units else 1.0
 
 
@@ -133,7 +133,7 @@ class Table(dict[str, Array]):
         return len(next(iter(self.values()))) if self else 0
 
     def line(self, row: int) -> str:
-        """Where a row is, for people."""
+        """Return a row's place, as an error names it."""
         return f"{self.path}: line {self._first + row}"
 
     def require(self, names: Iterable[str]) -> None:
@@ -164,7 +164,7 @@ class Table(dict[str, Array]):
         return self.stack(names) if any(name in self for name in names) else None
 
     def fill(self, names: Sequence[str], missing: float = 0.0) -> Array | None:
-        """As :meth:`stack_if`, missing columns as a number."""
+        """Stack columns as :meth:`stack_if`, with a number for missing ones."""
         if not any(name in self for name in names):
             return None
         return np.stack([self.get(n, np.full(self.rows, missing)) for n in names], -1)

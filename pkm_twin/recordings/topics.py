@@ -31,7 +31,7 @@ TWIN_OUTPUTS: Final = (
 COMPUTED: Final = ["stiffness_monitor", "deflection"]
 """The end of the topic that the twin's own, computed, deflections come on."""
 COLUMNS: Final = "columns of the table"
-"""What a table has in place of topics."""
+"""Text in place of topics for a table."""
 TRUTHS: Final = ("ground_truth", "groundtruth")
 """Names in topics that a simulation publishes and no sensor does."""
 
@@ -70,7 +70,7 @@ DEFINITIONS: Final = {
         "trajectory_msgs/JointTrajectoryPoint", "builtin_interfaces/Duration",
     ),
 }  # fmt: skip
-"""Of the types that are read and written."""
+"""Definitions of the types that are read and written."""
 # How many messages of a topic are looked at for the robot's joints.
 _LOOK = 50
 
@@ -84,7 +84,7 @@ class Topics:
     deflection: str | None = None
     left_out: Mapping[str, str] = field(default_factory=dict)
     frame: str = ""
-    """Of the accepted wrenches."""
+    """Frame of the accepted wrenches."""
     turns: bool = False
     """Whether that frame turns with the platform."""
 

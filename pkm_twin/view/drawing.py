@@ -16,7 +16,7 @@ from pkm_twin.view.scene import ANCHORS, GROUND, PLATFORM, Scene, anchors
 from pkm_twin.view.stage import LETTER, LOOK
 
 PICTURES: Final = (".png", ".svg")
-"""What a picture's name may end in."""
+"""Name endings of pictures."""
 WIDTH, HEIGHT = 600, 480
 DPI: Final = 100
 FINE: Final = 2
@@ -24,7 +24,7 @@ FINE: Final = 2
 AXES: Final = ((213, 60, 40), (40, 140, 60), (40, 80, 200))
 """Colours of the base frame's x, y and z."""
 LIGHT: Final = np.array([-0.45, 0.65, -0.61])
-"""Where light comes from: right, up, and away from the eye."""
+"""Direction of the light: right, up, and away from the eye."""
 
 
 class Camera:

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""What running nodes say, message by message: the latest of each, and traces of the torques.
+"""The latest message of each running node, and traces of the torques.
 
 Messages are read by their attributes alone.
 """
@@ -33,7 +33,7 @@ TOPICS: Final = {
     "energy": ("diagnostic_msgs/msg/DiagnosticArray", "stiffness_monitor/strain_energy"),
     "deflection": ("geometry_msgs/msg/TransformStamped", "stiffness_monitor/deflection"),
 }
-"""What is listened to, by its name here: type, and topic in the robot's namespace."""
+"""Subscriptions by name: type, and topic in the robot's namespace."""
 TRACES: Final = ("torque", "residual")
 _ANY: Final = StampRules(accept_zero=True, future_tolerance=2**62)
 

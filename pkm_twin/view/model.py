@@ -44,7 +44,7 @@ MAX_SHOWN_DEFLECTION: Final = 0.3
 
 @dataclass(frozen=True)
 class Range:
-    """What a slider spans, in steps that are round numbers."""
+    """The range of a slider, in steps that are round numbers."""
 
     name: str
     unit: str
@@ -55,7 +55,7 @@ class Range:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """What is shown: q (n,), pose (m,), wrench (6,) on the platform in base axes, N and N m.
+    """The shown state: q (n,), pose (m,), wrench (6,) on the platform, base axes, N and N m.
 
     ``refusal``: why the last thing that was asked for is not shown; empty where it is.
     """
@@ -68,7 +68,7 @@ class State:
 
 @dataclass(frozen=True, eq=False)
 class Numbers:
-    """What is known of a state. ``None`` is not known, ``why`` says why, by name.
+    """The quantities of a state; ``None`` is unknown, with the reason in ``why``, by name.
 
     ``singularity``: 1 best, 0 singular; ``clearance``: of limbs, m; ``effort``: to hold the weight
     and the wrench at rest, shape (n,), N m or N; ``energy``: of the wrench.
@@ -111,7 +111,7 @@ class Model:
 
     @cached_property
     def joint_ranges(self) -> tuple[Range, ...]:
-        """Of q: the limits; where there are none, a turn, or the machine's size, about home."""
+        """Ranges of q: the limits, or without limits a turn or the machine's size about home."""
         robot, graph = self.robot, self.robot.graph
         free = {"rad": 3.15, "m": _round(graph.size) / 2}
         rows = []
@@ -129,7 +129,7 @@ class Model:
 
     @cached_property
     def pose_ranges(self) -> tuple[Range, ...]:
-        """Of the pose: what joint states all over their ranges reach, rounded outwards."""
+        """Ranges of the pose that joint states all over their ranges reach, rounded outwards."""
         robot = self.robot
         lows, highs = (np.array([getattr(r, end) for r in self.joint_ranges]) for end in _ENDS)
         random = np.random.default_rng(0).random((SAMPLES, robot.joints_count))
@@ -304,7 +304,7 @@ class Model:
         return worst.q, f"{told} along ({along})"
 
     def numbers(self, state: State) -> Numbers:
-        """All that is known of a state; what fails at this place is said in ``why``."""
+        """Compute the quantities of a state; the reasons of failures are in ``why``."""
         robot, why = self.robot, dict(self._why)
         measure = float(robot.singularity(state.q))
         stop, warn = self._settings.singularity_stop, self._settings.singularity_warn

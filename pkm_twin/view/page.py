@@ -63,7 +63,7 @@ def serving(port: int) -> Iterator[Any]:
 
 
 class Moving(Protocol):
-    """What moves the machine beside the sliders."""
+    """A panel that moves the machine, in addition to the sliders."""
 
     @property
     def busy(self) -> bool:
@@ -74,7 +74,7 @@ class Moving(Protocol):
 
 
 class Page:
-    """One robot on a server; all who look at it see and move the same."""
+    """A robot on a server; all connected browsers share it."""
 
     def __init__(self, server: Any, model: Model, first: str = "") -> None:
         """:param first: name of a tab before the others, ``self.first``, for a bag or nodes."""

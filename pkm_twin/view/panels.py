@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""What moves the machine of a page by itself: a bag's time line, and running nodes."""
+"""Panels that move the machine: a bag's timeline, a mode, and running nodes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from pkm_twin.view.timeline import Timeline
 from stiffness_monitor.modes import Modes, modes
 
 COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-"""Of the joints' curves (Okabe and Ito 2008)."""
+"""Colours of the joints' curves (Okabe and Ito 2008)."""
 SPEEDS: Final = ("0.25", "0.5", "1", "2", "4")
 MODES: Final = 6
 """Natural modes to choose from."""
@@ -199,7 +199,7 @@ class ModePanel:
 
 
 class LivePanel:
-    """What running nodes say: the machine follows their joint states, with traces of torques."""
+    """The panel of running nodes: joint states that the machine follows, and torques."""
 
     busy = True
 

@@ -62,7 +62,7 @@ def share_colours(shares: Mapping[str, float]) -> dict[str, Colour]:
 
 @dataclass(frozen=True, eq=False)
 class Shapes:
-    """What stands where: cylinders along their z at unit size, balls, and the platform.
+    """The places of the drawn shapes: unit cylinders along z, balls, and the platform.
 
     ``*_at``: (k, 3) m; ``cylinder_turns``: (k, 4) quaternions, w first; ``*_sizes``: (k, 3)
     scales in own axes; ``*_colours``: (k, 3) of 0 to 255. ``platform_at``, ``platform_turn``: of
@@ -83,7 +83,7 @@ class Shapes:
 
     @property
     def ends(self) -> Array:
-        """Of the cylinders' axes, (k, 2, 3) m."""
+        """The ends of the cylinders' axes, (k, 2, 3) m."""
         turns = Rotation.from_quat(np.roll(self.cylinder_turns, -1, axis=1))
         half = turns.apply([0.0, 0.0, 0.5]) * self.cylinder_sizes[:, 2:]
         return np.stack([self.cylinder_at - half, self.cylinder_at + half], axis=1)
@@ -176,7 +176,7 @@ class Scene:
         )
 
     def _radius(self, place: Place) -> float:
-        """Of the thickest bar that ends at a point, else of a body's bar, m."""
+        """Return the radius of the thickest bar at a point, else of a body's bar, m."""
         near = 1e-6 * self.size
         at_end = [
             bar.radius
@@ -257,7 +257,7 @@ class Scene:
         )
 
     def frames(self, q: Array, moved: Deflection) -> dict[str, tuple[Array, Array]]:
-        """Where points of each body that are given at home, base axes, now stand.
+        """Return the present places of each body's points, given at home in base axes.
 
         Position (3,), m, and quaternion (4,), w first; the platform's with its deflection.
         """
@@ -305,7 +305,7 @@ class Scene:
 
 
 def _along(points: Array, displacements: Array, at: Array) -> Array:
-    """Of displacements at points of a straight line, evenly apart, those at places, (n, 3)."""
+    """Interpolate displacements at equidistant points of a line at places, shape (n, 3)."""
     span = points[-1] - points[0]
     at = (at - points[0]) @ span / (span @ span) * (len(points) - 1)
     first = np.clip(at.astype(int), 0, len(points) - 2)
@@ -336,7 +336,7 @@ ANCHORS: Final = {
     "bottom-center": (0, -1), "top-center": (0, 1), "center-left": (1, 0), "center-right": (-1, 0),
     "bottom-left": (1, -1), "bottom-right": (-1, -1), "top-left": (1, 1), "top-right": (-1, 1),
 }  # fmt: skip
-"""Where a label is from the place that it names, right and down, in half its size."""
+"""Offset of a label from its place, right and down, in halves of its size."""
 
 
 def anchors(spots: Array, sizes: Array, window: tuple[float, float]) -> list[str]:

@@ -24,7 +24,7 @@ NODES: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "stiffness_monitor": (WRENCHES, "wrenches answered", ()),
     "machine_state": (STATES, "joint states answered", ("rate:=0.0",)),
 }
-"""What a node answers, the count of its diagnostics, and parameters."""
+"""A node's answers, the count in its diagnostics, and its parameters."""
 ROBOTS = {"delta_cu": ("delta_dynamics", "stiffness_monitor", "machine_state"),
           "prru": ("delta_dynamics", "stiffness_monitor", "machine_state"),
           "upr_rpu": ("stiffness_monitor", "machine_state")}  # fmt: skip
@@ -32,7 +32,7 @@ ROBOTS = {"delta_cu": ("delta_dynamics", "stiffness_monitor", "machine_state"),
 
 
 def folder() -> Path:
-    """Where the bags are: installed, or beside this folder."""
+    """Find the folder of bags: installed, or next to this folder."""
     for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep):
         if (path := Path(prefix, "share/pkm_twin/bags")).is_dir():
             return path

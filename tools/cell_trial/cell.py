@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""What the trials share: processes in sessions of their own, and a node that hears and sends."""
+"""Shared parts of the trials: processes in own sessions, and a node that receives and sends."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Process:
 
     @property
     def output(self) -> str:
-        """What it has said so far."""
+        """The process's output so far."""
         self._file.seek(0)
         return self._file.read()
 

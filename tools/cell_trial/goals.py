@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""What joint_trajectory_controller's effort does when goals end, and how long goals take to end.
+"""Measure joint_trajectory_controller's effort at the end of goals, and how long the end takes.
 
     python3 tools/cell_trial/goals.py [--robot delta_cu] [--update-rate 500] [CASE ...]
 

@@ -36,7 +36,7 @@ from pkm_twin import load
 ROBOT = "delta_cu"
 MOCK = "mock_components/GenericSystem"
 RATE = 250.0
-"""Of the joint states, Hz."""
+"""Rate of the joint states, Hz."""
 
 
 class Results:

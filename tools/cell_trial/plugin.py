@@ -363,7 +363,7 @@ def twin_s_efforts(other: Peer, robot: Robot, given: str, states: list[Any]) -> 
 
 
 def show(other: Peer, given: str, part: str, bandwidth: float) -> None:
-    """One part."""
+    """Run one part of the trial."""
     robot, simulated = load(given), []
     moves = HARDWARE[part] == TOPICS
     if moves:

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""One random machine through all routes, and the collected figures."""
+"""Compare a random machine by all routes, and collect the figures."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ BALANCE_BOUNDS = {"residual": 1e-10, "efforts": 1e-9, "power": 1e-9, "energy": 1
 
 @dataclass
 class Figures:
-    """What was found; lists with one number a state."""
+    """The figures found; lists with one number per state."""
 
     machines: int = 0
     efforts: dict[str, list[float]] = field(default_factory=lambda: {r: [] for r in ROUTES})
@@ -58,7 +58,7 @@ def compare(name: str, seed: tuple[int, ...], states: int, exact: int) -> Figure
 
 
 def compare_case(case: Case, exact: int) -> Figures:
-    """As :func:`compare`, for a machine that is there."""
+    """Compare a given machine, as :func:`compare`."""
     figures = Figures(machines=1)
     robot, data = case.robot, case.data
     got = inverse_dynamics(robot, case.q, case.qd, case.qdd, case.wrench)

@@ -29,7 +29,7 @@ Vector = list[Any]
 
 
 class Result(NamedTuple):
-    """What Euler and Lagrange's equations give for one state."""
+    """The solution of Lagrange's equations at a state."""
 
     effort: np.ndarray
     """Efforts without friction, shape (3,), N m or N."""
@@ -46,7 +46,7 @@ class Result(NamedTuple):
 
 
 class Shape(NamedTuple):
-    """All that the energies need of one assembled configuration."""
+    """An assembled configuration, with what the energies need."""
 
     points: list[Vector]
     """Points and directions whose velocities the kinetic energy is made of."""
@@ -151,7 +151,7 @@ class Energies:
         raise NotImplementedError
 
     def middles(self, q: np.ndarray) -> list[float]:
-        """Where the symmetric assemblies are that a walk to ``q`` may begin from."""
+        """Return the symmetric assemblies from which a path to ``q`` may start."""
         return [float(np.mean(q))]
 
     def shape(self, q: Vector, u: Vector) -> Shape:

@@ -61,7 +61,7 @@ def round_bar(robot: Robot) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Difference:
-    """Of one compliance from another, each relative.
+    """The relative differences of two compliances.
 
     ``entries``: the worst of all 36, over sqrt(C_ii C_jj). ``diagonal``: shape (6,).
     ``deflection``: under the load of table 1, shape (6,). Positive is softer than the other.
@@ -73,12 +73,12 @@ class Difference:
 
     @property
     def worst(self) -> float:
-        """Of entries and diagonal."""
+        """The largest difference of entries and diagonal."""
         return max(self.entries, float(np.abs(self.diagonal).max()))
 
 
 def difference(ours: np.ndarray, theirs: np.ndarray) -> Difference:
-    """Of two compliances, shape (6, 6) each, relative to ``theirs``."""
+    """Compare two compliances, shape (6, 6) each, relative to ``theirs``."""
     scale = np.sqrt(np.diag(theirs))
     return Difference(
         float(np.abs((ours - theirs) / np.outer(scale, scale)).max()),
@@ -89,7 +89,7 @@ def difference(ours: np.ndarray, theirs: np.ndarray) -> Difference:
 
 @dataclass(frozen=True, eq=False)
 class Links:
-    """One pose: the twin from solid bars, and what else may matter."""
+    """A pose's differences from solid bars, of the mesh, and of the shear factor."""
 
     shipped: Difference
     """With the shipped shear factor."""
@@ -147,7 +147,7 @@ class PaperRows:
 
 
 def paper_rows(factors: np.ndarray = FACTORS) -> PaperRows:
-    """Of the paper's configurations; ``factors`` are those that are tried."""
+    """Compare the paper's configurations; ``factors`` on the compliances are tried."""
     twin = deflections()
     robot = load("upr_rpu")
     best = []

@@ -246,7 +246,7 @@ def _paper_rows(rows: PaperRows, judge: Judge) -> str:
 
 
 def _filled(text: str) -> str:
-    """One paragraph, in lines as long as the page's."""
+    """Wrap a paragraph to the page's line length."""
     return textwrap.fill(" ".join(text.split()), 100)
 
 

@@ -42,14 +42,14 @@ PRRU_REST = 0.25
 PRRU_RATES = (0.4, -0.1, -0.3)
 """Slider rates that it begins with, m/s."""
 TOOL = {"mass": 10.0, "com": [0.02, 0.01, -0.4], "inertia": np.diag([0.2, 0.2, 0.05]).tolist()}
-"""What hangs from the PRRU's platform."""
+"""Tool on the PRRU's platform."""
 
 STILL = np.zeros(3)
 
 
 @dataclass(frozen=True)
 class Start:
-    """Where a machine is let go."""
+    """The start of a swing."""
 
     title: str
     data: dict[str, Any]
@@ -60,7 +60,7 @@ class Start:
 
 @dataclass(frozen=True)
 class Swing:
-    """What came out of one run; states at the samples, shape (samples + 1, 3)."""
+    """The result of a run; states at the samples, shape (samples + 1, 3)."""
 
     machine: str
     route: str

@@ -61,7 +61,7 @@ def arrows():
 
 
 def places():
-    """Where each folder stands: a row for each level, near what it has arrows to and from."""
+    """Place the folders: a row per level, near those with arrows to and from them."""
     rows = [[n for n in below() if row_of(n) == k] for k in range(max(map(row_of, below())) + 1)]
     x = {name: k - (len(row) - 1) / 2 for row in rows for k, name in enumerate(row)}
     for _ in range(50):

@@ -15,7 +15,7 @@ GALLERY = sorted(path for path in MACHINES.iterdir() if path.suffix in (".yaml",
 """Files of example machines."""
 _PAGE = (MACHINES.parents[1] / "docs/index.md").read_text(encoding="utf-8")
 PICTURED = [path for path in GALLERY if f"robot_{path.stem}.png" in _PAGE]
-"""Those of which the page of machines has a picture."""
+"""Machines with a picture on the page of machines."""
 
 
 if __name__ == "__main__":

@@ -21,9 +21,9 @@ REFERENCE = {"api", "commands", "errors", "parameters"}
 ROLE = re.compile(r":(?:attr|class|data|func|meth|mod):<code>(~?)([\w.]+)</code>")
 """A reference of a docstring, which Markdown does not know."""
 LARGEST = 300_000
-"""Of the index, bytes."""
+"""Largest size of the index, bytes."""
 SHIM = re.compile(r"https://[^\"' ]*/iframe-worker/shim")
-"""What the theme's search loads where pages are opened as files."""
+"""Script that the theme's search loads for pages opened as files."""
 OWN_SHIM = "assets/javascripts/iframe_worker.js"
 
 

@@ -65,7 +65,7 @@ PICTURES: dict[str, tuple[str, Callable[[Page], str]]] = {
     "view_upr_rpu": ("upr_rpu", milling),
 }
 SHOWN = ("view_load", "view_bag", "load")
-"""Those of the pages; `load` is the animation."""
+"""Pictures of the pages; `load` is the animation."""
 FRAMES = 10
 
 

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""What a paper's module yields: one row for each numbered equation, table and figure."""
+"""Rows of a paper: one per numbered equation, table and figure."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from tools.papers.rows import Comparison, Paper, Printed, Row
 
 TEST: Final = "test/validation/test_upr_rpu_paper.py::"
 LOAD: Final = (30.0, -50.0, -40.0, 10.0, -20.0, 50.0)
-"""Of table 1, N and N m."""
+"""Load of table 1, N and N m."""
 COMPONENTS: Final = ("x, µm", "y, µm", "z, µm", "rx, µrad", "ry, µrad", "rz, µrad")
 TABLE_1: Final = {
     "configuration 1": (
@@ -46,7 +46,7 @@ TABLE_2: Final = {
 }
 """Load, N and N m; global strain-energy factors of the elements."""
 HEIGHTS: Final = np.arange(-1.0, -0.24, 0.05)
-"""Of the circles of the prescribed workspace, m."""
+"""Heights of the circles of the prescribed workspace, m."""
 MAXIMA: Final = {"1R": "0.08", "1B": "0.45", "1U": "0.25", "3R": "0.02", "3B": "0.5", "3U": "0.07"}
 """Largest factors under P1 that section 4 states for figure 7."""
 FRAME: Final = "stiffness_monitor.frame."
@@ -61,7 +61,7 @@ LOADS: Final = " ".join(
     f"--wrench {name}={','.join(f'{x:g}' for x in wrench)}" for name, (wrench, _) in TABLE_2.items()
 )
 SHARES_DRAWN: Final = "map_upr_rpu_shares"
-"""What the names of the pictures of figures 6 to 10 begin with."""
+"""Prefix of the names of the pictures of figures 6 to 10."""
 
 
 def _equation(
