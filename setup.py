@@ -32,6 +32,8 @@ setup(
             "moveit_package/*/*.*",
             "ros2_control_package/*.*",
             "ros2_control_package/*/*.*",
+            "transmission_package/*.*",
+            "transmission_package/*/*.*",
         ],
         "delta_dynamics": ["py.typed"],
         "stiffness_monitor": ["py.typed"],

@@ -144,6 +144,22 @@ def ros2_control(given: Ros2Control) -> Report:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Transmission(ToFolder):
+    """Write a package with the linkage as a transmission of ros2_control, in C++.
+
+    The joint side has the pose coordinates, the actuator side the actuated joints in the
+    controller's names and numbers. Build the package with colcon; it needs nothing of pkm_twin.
+    """
+
+
+def transmission(given: Transmission) -> Report:
+    """A package of a transmission."""
+    from pkm_twin.export.transmission import transmission_package
+
+    return given.write(transmission_package(given.machine()))
+
+
+@dataclass(frozen=True, kw_only=True)
 class FunctionalMockupUnit(ToFile):
     """Write a Functional Mock-up Unit, for model exchange and co-simulation.
 
@@ -252,6 +268,7 @@ OWN: Final = {
     "c": command(c),
     "python": command(python),
     "ros2-control": command(ros2_control),
+    "transmission": command(transmission),
     "fmu": command(fmu),
     "urdf": command(urdf),
     "mjcf": command(mjcf),

@@ -1,0 +1,52 @@
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
+"""Write a linkage as a ROS package with a transmission of ros2_control, on its exported C.
+
+The sources stand in ``transmission_package``; words between two ``@`` stand for the robot's names
+and numbers.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+from xml.sax.saxutils import quoteattr
+
+from pkm_twin.export.c_package import Package
+from pkm_twin.export.ros2_control import fill_templates, literal, number, package_name, printable
+from pkm_twin.robot.robot import Robot
+
+FUNCTIONS: Final = ("inverse", "joint_to_actuator", "actuator_to_joint", "gains")
+
+
+def transmission_package(robot: Robot) -> dict[str, str]:
+    """Return the files of the package, text by path.
+
+    :raises ParameterError: a ratio of ``joint_map`` that changes with travel.
+    """
+    controller, package = robot.controller, package_name(robot, "transmission")
+    controller.check_even()
+    code, shown = Package(robot, FUNCTIONS), printable(robot)
+    drives = [
+        f"  {{{literal(name)}, {number(factor)}, {number(offset)}}},"
+        for name, factor, offset in zip(
+            controller.names, controller.factors, controller.offsets, strict=True
+        )
+    ]
+    words = {
+        "ROBOT": shown, "XMLROBOT": shown, "PACKAGE": package, "GUARD": package.upper(),
+        "PREFIX": code.prefix, "JOINTS": str(code.m), "ACTUATORS": str(code.n),
+        "ROLES": ", ".join(map(literal, robot.pose_names)), "DRIVES": "\n".join(drives),
+        "JOINTNAMES": ", ".join(f"`{name}`" for name in robot.pose_names),
+        "ACTUATORNAMES": ", ".join(f"`{name}`" for name in controller.names),
+        "JOINTROWS": _elements("joint", robot.pose_names),
+        "ACTUATORROWS": _elements("actuator", controller.names),
+    }  # fmt: skip
+    result = {f"c/{code.prefix}.h": code.header(), f"c/{code.prefix}.c": code.source()}
+    for path, text in fill_templates("transmission_package", words).items():
+        # Headers are included as PACKAGE/NAME.hpp.
+        result[path.replace("include/", f"include/{package}/")] = text
+    return dict(sorted(result.items()))
+
+
+def _elements(kind: str, names: tuple[str, ...]) -> str:
+    rows = [f"  <{kind} name={quoteattr(name)} role={quoteattr(name)}/>" for name in names]
+    return "\n".join(rows)
