@@ -25,8 +25,8 @@ HEAD = """# Robot files
 
 The keys of a robot's YAML with their valid values and defaults. SI units, angles in rad, z up.
 Anything else is rejected, with the name of the key. A unit such as `rad or m` is rad for joints
-that turn, m for joints that slide. Defaults are in brackets; `pkm-twin info ROBOT` prints all
-values.
+that turn, m for joints that slide. Bold keys are required, defaults are in brackets; `pkm-twin info
+ROBOT` prints all values.
 An inertia is three principal moments or a symmetric 3x3 matrix whose moments are not negative and
 keep the triangle rule.
 """
@@ -83,8 +83,11 @@ def rows(kind, without=(), prefix=""):
         unit, values = UNITS.get(row.unit, row.unit), "; ".join(filter(None, (bound, row.text)))
         if values != "a section":
             given = default(fields[own])
-            given = f"; {given}" if given == "required" else f" [{given}]" if given else ""
-            yield f"* `{prefix}{name}`{f' ({unit})' if unit else ''}: {values}{given}"
+            key = f"`{prefix}{name}`"
+            if given == "required":
+                key, given = f"**{key}**", ""
+            given = f" [{given}]" if given else ""
+            yield f"* {key}{f' ({unit})' if unit else ''}: {values}{given}"
         inner = row.section or row.entries
         if inner and not other:
             yield from rows(inner, (), f"{prefix}{name}.")
@@ -105,12 +108,12 @@ def page():
     for name, kind in ROBOTS.items():
         own = shared - {"limits"} if name == "upr_rpu" else shared
         flat = {key for key, (_, row) in settings_of(kind).items() if row.section is None}
-        keep = set(settings_of(kind)) - (flat - own)
+        keep = set(settings_of(kind)) - (flat - own) | {"mechanism"}
         parts.append(f"## `mechanism: {name}`\n\n" + "\n".join(rows(kind, keep)))
         for key, (_, row) in settings_of(kind).items():
             if row.section is not None and key not in own:
                 parts.append(f"### `{key}`\n\n{table(row.section)}")
-    parts.append(f"## `mechanism: machine`\n\n{table(machine.MachineFile, common)}")
+    parts.append(f"## `mechanism: machine`\n\n{table(machine.MachineFile, common | {'mechanism'})}")
     parts.append(f"### `limbs`\n\n{table(LimbFile, ('bodies', 'joints', 'rods'))}")
     for kind in (BodySpec, JointSpec, RodSpec):
         parts.append(f"### {TITLES[kind]}\n\n{table(kind)}")
