@@ -7,7 +7,7 @@ import json
 import os
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,40 +21,21 @@ from pkm_twin.files import STANDARD, parse_numbers, require_replaceable
 def progress(what: str, total: int | None) -> Iterator[Callable[[int], None]]:
     """Draw a progress bar on stderr, if that is a terminal; yield a function that takes the count.
 
-    It begins with the first count, so that the time left of work that is gone on with is that of
-    the rest.
+    The bar has what is left at the first count, so that it knows the time left of resumed work.
     """
-    # Here, as most commands show none.
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TaskID,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-    )
-    console = Console(stderr=True)
-    with Progress(
-        *columns, console=console, transient=True, disable=not console.is_terminal
-    ) as drawing:
-        task: TaskID | None = None
+    with ExitStack() as stack:
+        bar, first = None, 0
 
         def update(count: int) -> None:
-            nonlocal task
-            if task is None:
-                task = drawing.add_task(what, total=total, completed=count)
-            drawing.update(task, completed=count)
+            nonlocal bar, first
+            if bar is None and sys.stderr.isatty():
+                # Without a length click needs something to iterate over.
+                endless = iter(int, 1) if total is None else None
+                length, first = None if total is None else total - count, count
+                shown = click.progressbar(endless, length, what, show_pos=True, file=sys.stderr)
+                bar = stack.enter_context(shown)
+            if bar is not None:
+                bar.update(count - first - bar.pos)
 
         yield update
 

@@ -181,7 +181,10 @@ class Command(click.Command):
         :raises PkmTwinError: what else the command raises, or a file that may not be replaced.
         """
         given = self.given(**values)
-        overwrite, source = getattr(given, "overwrite", True), self._find_source(given)
+        overwrite = getattr(given, "overwrite", True)
+        read = (getattr(given, str(one.name)) for one in self.fields if not one.row.writes)
+        # The first file that the command reads, which it never replaces.
+        source = next((value for value in read if isinstance(value, Path)), None)
         self._check_targets(given, overwrite, source)
         drawing = given.drawing(self.name) if hasattr(given, "drawing") else None
         piped = any(str(path) == STANDARD for path in (getattr(given, "out", None), drawing))
@@ -211,6 +214,8 @@ class Command(click.Command):
     def _check_targets(self, given: Any, overwrite: bool, source: Path | None) -> None:
         """Check that the files of options and of ``given.files`` may be written.
 
+        Words, files to read and the robot are judged before an existing target is rejected.
+
         :raises PkmTwinError: a folder, a wrong ending, or a file that may not be replaced.
         """
         targets = []
@@ -225,32 +230,17 @@ class Command(click.Command):
                 ending = f"a name that ends in {' or '.join(row.endings)}"
                 raise ParameterError(spell(one), str(target), ending)
             targets.append(target)
-        targets += getattr(given, "files", {}).values()
-        for target in dict.fromkeys(filter(None, targets)):
-            if os.path.lexists(target) and not overwrite:
-                self._check_inputs(given)
+        targets += filter(None, getattr(given, "files", {}).values())
+        if not overwrite and any(map(os.path.lexists, targets)):
+            for one in self.fields:
+                value = getattr(given, str(one.name))
+                for path in value if isinstance(value, tuple) else (value,):
+                    if isinstance(one, Argument) and isinstance(path, Path) and not path.exists():
+                        raise FileError(path, FileNotFoundError(), "a file to read")
+            for check in ("words", "machine"):
+                getattr(given, check, lambda: None)()
+        for target in dict.fromkeys(targets):
             refuse_existing(target, overwrite, source)
-
-    def _check_inputs(self, given: Any) -> None:
-        """Judge words, files to read and the robot, before an existing target is rejected.
-
-        :raises PkmTwinError: one of them is wrong.
-        """
-        for one in self.fields:
-            value = getattr(given, str(one.name))
-            for path in value if isinstance(value, tuple) else (value,):
-                if isinstance(one, Argument) and isinstance(path, Path) and not path.exists():
-                    raise FileError(path, FileNotFoundError(), "a file to read")
-        for check in ("words", "machine"):
-            getattr(given, check, lambda: None)()
-
-    def _find_source(self, given: Any) -> Path | None:
-        """Return the first file that the command reads, which it never replaces."""
-        for one in self.fields:
-            value = getattr(given, str(one.name))
-            if isinstance(value, Path) and not one.row.writes:
-                return value
-        return None
 
 
 def command(run: Callable[[G], Report], task: str = "") -> Command:

@@ -58,30 +58,19 @@ LINES = {
 }  # fmt: skip
 
 
-def test_completion_is_installed_once_and_completes_in_bash(tmp_path):
+def test_words_are_completed_in_bash_by_the_line_of_the_help(tmp_path, twin):
     program = tmp_path / "bin" / "pkm-twin"
     program.parent.mkdir()
     program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m pkm_twin.apps.cli "$@"\n')
     program.chmod(0o755)
     path = os.pathsep.join([str(program.parent), os.environ["PATH"]])
-    root = {"PYTHONPATH": str(REPOSITORY), "HOME": str(tmp_path), "PATH": path}
-    (tmp_path / ".bashrc").write_text("set -u\n")
-
-    def run(*words, shell="/bin/bash"):
-        return subprocess.run(
-            words, env=os.environ | root | {"SHELL": shell}, capture_output=True, text=True
-        )
-
-    for _ in range(2):
-        assert run(program, "--install-completion").returncode == 0
-    source = (tmp_path / ".bashrc").read_text().splitlines()
-    assert (source[0], source.count(source[-1])) == ("set -u", 1)
-    script = (tmp_path / ".pkm-twin-complete.bash").read_text()
-    assert run(program, "--show-completion").stdout == f"{script}\n"
+    root = {"PYTHONPATH": str(REPOSITORY), "PATH": path}
+    (source,) = re.findall("eval .*", twin("--help").out)
     for line, word in LINES.items():
         count = len(line.split()) - 1
         typed = f"COMP_WORDS=({line}); COMP_CWORD={count}; _pkm_twin_completion pkm-twin"
-        done = run("bash", "-c", f'{source[-1]}; {typed}; echo "${{COMPREPLY[@]}}"')
+        done = subprocess.run(
+            ["bash", "-c", f'set -u; {source}; {typed}; echo "${{COMPREPLY[@]}}"'],
+            env=os.environ | root, capture_output=True, text=True,
+        )  # fmt: skip
         assert done.stdout.split() == [word], done.stderr
-    wrong = run(program, "--show-completion", shell="/bin/none")
-    assert wrong.returncode == 2 and "'none'; expected bash or zsh or fish" in wrong.stderr
