@@ -8,11 +8,13 @@ method for second-order equations.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
+import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
 
 from pkm_twin.codegen.arrays import Array
 
@@ -102,24 +104,10 @@ def _damped(h: float, decays: Array) -> Array:
     return np.array(rows)
 
 
-def _phi(z: Array) -> Array:
-    """Return the functions phi_0 = exp to phi_4 of non-positive numbers, shape (5, r).
+def _phi(z: Array) -> list[Array]:
+    """Return the functions phi_0 = exp to phi_4 of non-positive numbers, shape (r,) each.
 
-    phi_k(z) = z phi_(k+1)(z) + 1 / k!.
+    phi_k(z) = z phi_(k+1)(z) + 1 / k!, so k! phi_k is Kummer's function M(1, k + 1, z).
     """
-    factorials = np.array([1.0, 1.0, 2.0, 6.0, 24.0])
-    up = np.empty((5, len(z)))
-    up[0] = np.exp(z)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        for k in range(4):
-            up[k + 1] = (up[k] - 1.0 / factorials[k]) / z
-    # Near zero this recursion loses digits: use a series for phi_4, and recur downwards.
-    down = np.empty_like(up)
-    term = total = np.full_like(z, 1.0 / 24.0)
-    for k in range(5, 25):
-        term = term * z / k
-        total = total + term
-    down[4] = total
-    for k in reversed(range(4)):
-        down[k] = z * down[k + 1] + 1.0 / factorials[k]
-    return np.where(np.abs(z) < 1.0, down, up)
+    more = (scipy.special.hyp1f1(1.0, k + 1.0, z) / math.factorial(k) for k in range(1, 5))
+    return [np.exp(z), *(np.asarray(one, np.float64) for one in more)]

@@ -12,6 +12,8 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
+import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
+from numpy.polynomial.polynomial import polyroots
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv  # type: ignore[import-untyped]
 
@@ -115,28 +117,16 @@ def first_fall(before: float, fall: float, after: float, last: float, size: floa
     def value(x: float) -> float:
         return before + x * (fall + x * (square + x * cube))
 
+    roots = map(complex, polyroots([fall, 2.0 * square, 3.0 * cube]))
+    turns = sorted(x.real for x in roots if x.imag == 0.0 and 0.0 < x.real < 1.0)
     above = 0.0
-    for end in [*_turns(fall, square, cube), 1.0]:
+    for end in [*turns, 1.0]:
         if value(end) < -size:
-            below = end
-            while above < (middle := 0.5 * (above + below)) < below:
-                if value(middle) < 0.0:
-                    below = middle
-                else:
-                    above = middle
-            return above
+            if value(above) <= 0.0:
+                return above
+            return float(scipy.optimize.brentq(value, above, end, xtol=1e-15))
         above = end
     return math.inf
-
-
-def _turns(fall: float, square: float, cube: float) -> list[float]:
-    """Return the zeros of the slope fall + 2 square x + 3 cube x^2 in (0, 1)."""
-    inner = square * square - 3.0 * cube * fall
-    if inner < 0.0:
-        return []
-    big = -(square + math.copysign(math.sqrt(inner), square))
-    found = [x for a, b in ((big, 3.0 * cube), (fall, big)) if b for x in [a / b] if 0.0 < x < 1.0]
-    return sorted(found)
 
 
 ZERO_VELOCITY: Final = 1e-12

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
 
 from pkm_twin.certify.description import (
     POSE_NAMES,
@@ -25,7 +26,7 @@ from pkm_twin.certify.description import (
     cross,
     read,
 )
-from pkm_twin.certify.rows import SINGULAR, Frame, Moving, skewed
+from pkm_twin.certify.rows import SINGULAR, Frame, Moving
 
 FIRST_STEP: Final = 1.0 / 16.0
 """Length of the first step as a fraction of the line from home to the goal."""
@@ -72,18 +73,8 @@ class Home(NamedTuple):
 
 
 def rotation_of(turn: Array) -> Array:
-    """Return the rotation of a rotation vector (Rodrigues' formula), shape (3, 3)."""
-    angle = float(np.linalg.norm(turn))
-    skew = skewed(turn)
-    if angle < 1e-4:
-        # Taylor series; the next terms are below 1e-19.
-        return np.eye(3) + (1 - angle**2 / 6) * skew + (0.5 - angle**2 / 24) * skew @ skew
-    result: Array = (
-        np.eye(3)
-        + math.sin(angle) / angle * skew
-        + (2 * math.sin(angle / 2) ** 2 / angle**2) * skew @ skew
-    )
-    return result
+    """Return the rotations of rotation vectors (..., 3), shape (..., 3, 3)."""
+    return np.asarray(Rotation.from_rotvec(turn).as_matrix(), np.float64)
 
 
 class Maximal(Moving):
@@ -189,7 +180,7 @@ class Maximal(Moving):
 
     def _moved(self, state: State, change: Array) -> State:
         each = change.reshape(-1, 6)
-        turned = np.array([rotation_of(step[3:]) for step in each]) @ state.rotation
+        turned = rotation_of(each[:, 3:]) @ state.rotation
         # One Newton step of the polar decomposition restores orthogonality after rounding.
         turned = turned @ (1.5 * np.eye(3) - 0.5 * turned.transpose(0, 2, 1) @ turned)
         return replace(state, rotation=turned, com=state.com + each[:, :3])
