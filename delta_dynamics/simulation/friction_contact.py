@@ -12,8 +12,6 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
-import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
-from numpy.polynomial.polynomial import polyroots
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv  # type: ignore[import-untyped]
 
@@ -28,8 +26,7 @@ States = NDArray[np.int8]
 """By row: 0 a force that holds the row, 1 the greatest force, -1 the least one."""
 
 TOLERANCE: Final = 1e-7
-"""Tolerance of forces and motions, relative to the largest; larger than the accuracy of change
-times."""
+"""Tolerance of forces and motions, relative to the largest."""
 BLOCKS: Final = 10
 """Block pivoting sweeps; then one row changes at a time, which always terminates."""
 REGULAR: Final = 1e-11
@@ -101,32 +98,6 @@ def independent(rows: Array, inverse: Array) -> list[int]:
             kept.append(i)
             basis.append(left / np.sqrt(left @ inverse @ left))
     return kept
-
-
-def first_fall(before: float, fall: float, after: float, last: float, size: float) -> float:
-    """Return where in [0, 1] a cubic falls through zero; infinity if it does not.
-
-    :param fall: its slope at 0; ``last``: at 1.
-    :param size: how far below zero it has to come.
-    """
-    if before < -size:
-        return 0.0
-    square = 3.0 * (after - before) - 2.0 * fall - last
-    cube = 2.0 * (before - after) + fall + last
-
-    def value(x: float) -> float:
-        return before + x * (fall + x * (square + x * cube))
-
-    roots = map(complex, polyroots([fall, 2.0 * square, 3.0 * cube]))
-    turns = sorted(x.real for x in roots if x.imag == 0.0 and 0.0 < x.real < 1.0)
-    above = 0.0
-    for end in [*turns, 1.0]:
-        if value(end) < -size:
-            if value(above) <= 0.0:
-                return above
-            return float(scipy.optimize.brentq(value, above, end, xtol=1e-15))
-        above = end
-    return math.inf
 
 
 ZERO_VELOCITY: Final = 1e-12
@@ -465,102 +436,38 @@ class Resistance:
 
     # Changes.
 
-    def change(
-        self, here: Terms, end: Terms, law: Law, span: float, exact: float
-    ) -> tuple[float, Mask | None]:
-        """Return when a law ends, s after its start, and by which signals; None if it lasts.
+    def lasts(self, end: Terms, law: Law) -> bool:
+        """Return whether a law holds at the end of a part of a step.
 
-        Signals fall to zero where it ends: distances of joints to their stops above and below,
-        rates of rows that slide, and of forces that hold to their bounds.
-
-        :param exact: how exactly the time is found, part of the span; and signals, of their size.
+        Joints keep their stops, rows that slide their directions, and forces that hold their
+        bounds.
         """
-        moves = law.moves
-        force = self.accelerate(law, end)[1] if len(law.held) else _NONE
+        q = end.q[law.moves]
+        if (q > law.ceiling).any() or (q < law.floor).any():
+            return False
+        if len(law.slides):
+            rows = self.rows(end)[law.slides]
+            rounding = ZERO_VELOCITY * (np.abs(rows) @ np.abs(end.qd))
+            if (law.signs * (rows @ end.qd) < -rounding).any():
+                return False
+        if not len(law.held):
+            return True
+        force = self.accelerate(law, end)[1]
+        size = ZERO_VELOCITY * np.maximum(np.abs(force), np.abs(law.force))
+        return bool(((force <= law.high + size) & (force >= law.low - size)).all())
 
-        def signals(q: Array, rates: Array, force: Array) -> Array:
-            q = q[moves]
-            parts = [law.ceiling - q, q - law.floor]
-            if len(law.slides):
-                parts.append(law.signs * rates[law.slides])
-            if len(law.held):
-                parts += [law.high - force, force - law.low]
-            return np.concatenate(parts)
-
-        def slopes(qd: Array, seconds: Array) -> Array:
-            qd, change = qd[moves], (force - law.force) / span
-            return np.concatenate([-qd, qd, law.signs * seconds[law.slides], -change, change])
-
-        rates, seconds = self.rates(here), self.seconds(here, law.first)
-        after = signals(end.q, self.rates(end), force)
-        # A curve that bends up is above its tangent.
-        tangent = signals(here.q + span * here.qd, rates + span * seconds, force)
-        suspects = np.flatnonzero((after <= 0.0) | (tangent < 0.0))
-        if not len(suspects):
-            return span, None
-        before = signals(here.q, rates, law.force)
-        size = np.maximum(
-            exact * np.maximum(np.abs(before), np.abs(after)),
-            self._rounding(here, law, force, span),
-        )
-        fall = span * slopes(here.qd, seconds)
-        last = span * slopes(end.qd, self.seconds(end, self.accelerate(law, end)[0]))
-        # Joints without stops are infinitely far from them.
-        ends = np.isfinite(after) & (np.abs(after) <= size) & (after <= before)
-        times = np.where(ends, span, math.inf)
-        for i in suspects[times[suspects] > span]:
-            times[i] = span * first_fall(before[i], fall[i], after[i], last[i], size[i])
-        first = min(span, float(times.min()))
-        # Events closer than the accuracy are simultaneous, as joints that reach their stops.
-        hit = times <= first + exact * span
-        return first, hit if hit.any() else None
-
-    def _rounding(self, here: Terms, law: Law, force: Array, span: float) -> Array:
-        """Return the rounding errors of the signals of :meth:`change`."""
-        rows = self.rows(here)[law.slides]
-        own = np.einsum("ij,jk,ik->i", rows, _inverse(here.mass), rows)
-        own = own * np.abs(self._pull(law, here)[law.slides])
-        q = 1e-3 * np.abs(here.q[law.moves])
-        force = np.maximum(np.abs(force), np.abs(law.force))
-        rates = np.abs(rows) @ np.abs(here.qd) + span * own
-        return ZERO_VELOCITY * np.concatenate([q, q, rates, force, force])
-
-    def settle(self, end: Terms, law: Law, hit: Mask | None, passed: bool) -> Terms:
-        """Return the state at a part's end: stopped rows are still, joints at a stop rest there.
-
-        :param hit: the signals that have ended the law.
-        :param passed: whether time has passed under it: what it let go moves.
-        """
-        n, h, m = len(end.q), len(law.held), len(law.slides)
-        if passed:
-            self._still = law.still
-            self._states[law.still] = 0
-        if hit is None and not (self._passive and h):
-            return end
-        q, qd, held = end.q, end.qd, law.held
-        if hit is not None:
-            self._law = None
-            moves = law.moves
-            up, down, ends, most, least = np.split(hit, np.cumsum([len(moves), len(moves), m, h]))
-            stopped = law.slides[ends]
-            held = np.concatenate([held, stopped])
-            self._still = self._still.copy()
-            self._still[stopped] = True
-            self._states[stopped] = 0
-            self._states[law.held[most]] = 1
-            self._states[law.held[least]] = -1
-            q = q.copy()
-            q[moves[up]], q[moves[down]] = law.ceiling[up], law.floor[down]
-            # A joint may be back at its stop before it could leave it.
-            back = (up & (qd[moves] <= 0.0)) | (down & (qd[moves] >= 0.0))
-            held = np.concatenate([held, moves[back]])
-        # Rows of passive joints that are held would drift.
-        rows = self.rows(end)[held]
-        across = np.linalg.solve(end.mass, rows.T)
-        qd = qd - across @ np.linalg.lstsq(rows @ across, rows @ qd, rcond=RANK_TOLERANCE)[0]
-        qd[held[held < n]] = 0.0
-        if (q != end.q).any() or (qd != end.qd).any():
-            end = self.at(q, qd)
+    def settle(self, end: Terms, law: Law) -> Terms:
+        """Return the state at the end of a part under a law; rows that are held stay still."""
+        self._still = law.still
+        self._states[law.still] = 0
+        if self._passive and len(law.held):
+            # Rows of passive joints that are held would drift.
+            rows = self.rows(end)[law.held]
+            across = np.linalg.solve(end.mass, rows.T)
+            drift = np.linalg.lstsq(rows @ across, rows @ end.qd, rcond=RANK_TOLERANCE)[0]
+            qd = end.qd - across @ drift
+            qd[law.held[law.held < len(qd)]] = 0.0
+            end = end if (qd == end.qd).all() else self.at(end.q, qd)
         return self._struck(end)
 
 

@@ -6,6 +6,7 @@ Loops cannot drift open, because actuated joints are the coordinates.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import math
 from dataclasses import dataclass, field
@@ -20,14 +21,10 @@ from pkm_twin.errors import PkmTwinError
 from pkm_twin.machine.inertia import loaded_joints
 from pkm_twin.robot.robot import Robot
 
-CHANGES: Final = 60
-"""Changes between sticking and sliding in a step that are resolved one by one."""
-HALVINGS: Final = 12
-"""Largest number of times that a part of a step is halved if it fails or gains energy."""
-RESOLVED: Final = 1e-8
-"""Accuracy of the time of a change, as a fraction of a step."""
-CRAWL: Final = 1e-6
-"""First implicit part of a step where changes accumulate, as a fraction; later parts are longer."""
+PARTS: Final = 100
+"""Parts of a step from which on it is integrated implicitly, as changes accumulate."""
+HALVINGS: Final = 10
+"""Times that a part is halved in which what sticks or slides changes; the last is implicit."""
 GROWTH: Final = 1e-9
 """Energy that the method may add in a part, relative to the kinetic energy; it is removed
 afterwards."""
@@ -41,10 +38,11 @@ class Plant:
 
     Between changes a step is one of a Runge-Kutta method of order four that is exact in viscous
     friction, however stiff; efforts and wrench are constant in it. Dry friction of all joints and
-    stops obey Coulomb's law, and what sticks or slides changes at times that are found, not at
-    steps' ends: a joint sticks exactly and leaves only beyond its friction. Stops do not bounce: an
-    impact projects the rates, in the mass matrix, onto those that all stops allow. Energy grows by
-    what efforts and wrench do and by nothing else; a part of a step that gains some is divided.
+    stops obey Coulomb's law: a joint sticks exactly and leaves only beyond its friction. A part in
+    which what sticks or slides changes is halved down to 1/1024 of the step, which is integrated
+    implicitly. Stops do not bounce: an impact projects the rates, in the mass matrix, onto those
+    that all stops allow. Energy grows by what efforts and wrench do and by nothing else; a part
+    that gains some is halved, too.
     """
 
     robot: Robot
@@ -105,67 +103,51 @@ class Plant:
         q, qd = self.q[self._leading], self.qd[self._leading]
         if here is None or here.q.tobytes() + here.qd.tobytes() != q.tobytes() + qd.tobytes():
             here = self._resistance.arrive(q, qd)
-        at_once, crawled = 0, step * CRAWL
+        least, span = step * 0.5**HALVINGS, step
         for part in itertools.count():
-            law = self._resistance.law(here, effort, load)
-            taken = left
-            if at_once > 2 * len(law.pull) or (part > CHANGES and part % 4 == 0):
-                here, taken = self._crawl(here, law, min(left, crawled))
-                at_once, crawled = 0, 4.0 * crawled
-            elif not law.stands:
-                here, taken = self._follow(here, law, left, step * RESOLVED)
+            # Where changes accumulate, implicit parts get longer.
+            least *= 4.0 if part > PARTS else 1.0
+            law, taken = self._resistance.law(here, effort, load), left
+            if not law.stands:
+                here, taken, changed = self._follow(here, law, min(left, span), least)
+                # The law changes soon after a part that is not the whole rest of the step.
+                span = step if changed or taken <= least else 0.5 * taken
             self._resistance.passed(here)
             self._here, (self.q, self.qd) = here, self._all(here)
             left -= taken
             if left <= 0.0:
                 return
-            at_once = 0 if taken else at_once + 1
 
-    def _crawl(self, here: Terms, law: Law, span: float) -> tuple[Terms, float]:
-        """Integrate implicitly over a span without energy gain; return the state and the span."""
-        for _ in range(HALVINGS):
-            end = self._resistance.crawl(here, law, span)
-            growth = _growth(here, end, law, 0.0)
-            if growth <= end.kinetic + _rounding(here, end, law):
+    def _follow(
+        self, here: Terms, law: Law, span: float, least: float
+    ) -> tuple[Terms, float, bool]:
+        """Integrate at most ``span`` s under a law that lasts.
+
+        A span in which the law changes, or in which the method adds energy, is halved; one of
+        ``least`` is integrated implicitly.
+
+        :returns: the state, the time, and whether the law may have changed.
+        """
+        resistance = self._resistance
+        while True:
+            with contextlib.suppress(PkmTwinError, ValueError):  # the law may change before
+                end, work = self._flow(here, law, span)
+                growth = _growth(here, end, law, work)
+                most = GROWTH * (here.kinetic + end.kinetic) + _rounding(here, end, law)
+                if resistance.lasts(end, law) and growth <= most:
+                    settled = resistance.settle(end, law)
+                    if settled is not end or growth > 0.0:
+                        settled = _lessened(here, settled, law, work)
+                    return settled, span, False
+            if span <= least:
                 break
             span *= 0.5
-        return _lessened(here, end, law), span
-
-    def _follow(self, here: Terms, law: Law, left: float, instant: float) -> tuple[Terms, float]:
-        """Integrate under a law until it changes, at most ``left`` s; return state and time.
-
-        :param instant: time that counts as zero, s.
-        """
-        resistance, span, least, tries = self._resistance, left, left * 0.5**HALVINGS, 0
-        while True:
-            tries += 1
-            try:
-                end, work = self._flow(here, law, span)
-            except (PkmTwinError, ValueError):
-                # The law may change before.
-                if span <= least:
-                    raise
-                span *= 0.5
-                continue
-            time, hit = resistance.change(here, end, law, span, RESOLVED)
-            if time <= instant and hit is not None:
-                return resistance.settle(here, law, hit, passed=False), 0.0
-            if time < span - instant:
-                # Of what is no cubic a guess may hardly be better than the one before.
-                span = time if tries < 4 else min(time, 0.5 * span)
-                continue
-            growth = _growth(here, end, law, work)
-            if growth > 0.0 and growth > GROWTH * (here.kinetic + end.kinetic) + _rounding(
-                here, end, law
-            ):
-                if span <= least:
-                    raise ValueError(f"energy grows by {growth:.3g} J in {span:.3g} s")
-                span *= 0.5
-                continue
-            settled = resistance.settle(end, law, hit, passed=True)
-            if settled is end and growth <= 0.0:
-                return end, span
-            return _lessened(here, settled, law, work), span
+        for _ in range(HALVINGS):
+            end = resistance.crawl(here, law, span)
+            if _growth(here, end, law, 0.0) <= end.kinetic + _rounding(here, end, law):
+                break
+            span *= 0.5
+        return _lessened(here, end, law), span, True
 
     def _flow(self, here: Terms, law: Law, span: float) -> tuple[Terms, float]:
         """Return the state after a part, and the work of the wrench in it, J."""
