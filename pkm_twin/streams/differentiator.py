@@ -22,17 +22,17 @@ import numpy as np
 from numpy.polynomial import polynomial
 
 from pkm_twin.codegen.arrays import Array
+from pkm_twin.codegen.cholesky import SparseCholesky
 from pkm_twin.codegen.code import Code
 from pkm_twin.codegen.expressions import Objects, Tape
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.key import EMPTY
-from pkm_twin.codegen.operations import sqrt
 from pkm_twin.codegen.program import Program
 from pkm_twin.errors import MessageError
 from pkm_twin.messages.stamps import SECOND
 
-MIN_PIVOT: Final = 1e-4
-"""Smallest diagonal entry of the Cholesky factor; even stamps give 1e-2 or more."""
+MIN_PIVOT: Final = 1e-8
+"""Smallest pivot of the normal equations; even stamps give 1e-4 or more."""
 BLOCK_SAMPLES: Final = 32
 """Samples that one call of the program sums up; the default window, 25, fits in one block."""
 MIN_SAMPLES: Final = 5
@@ -305,11 +305,8 @@ def _solve_normal_equations(powers: list[Any], mixed: Objects, t: Any, rate: Any
     :param rate: change of t per second.
     """
     size, joints = mixed.shape
-    factor = np.zeros((size, size), dtype=object)
-    for j in range(size):
-        for i in range(j, size):
-            rest = powers[i + j] - factor[i, :j] @ factor[j, :j]
-            factor[i, j] = sqrt(rest) if i == j else rest / factor[j, j]
+    matrix = {(i, j): powers[i + j] for i in range(size) for j in range(i + 1)}
+    factors = SparseCholesky(matrix, [1.0] * size)
     here: list[Any] = [1.0]
     for _ in range(size):
         here.append(here[-1] * t)
@@ -319,12 +316,8 @@ def _solve_normal_equations(powers: list[Any], mixed: Objects, t: Any, rate: Any
         ([k * (k - 1) for k in range(size)], rate * rate),
     ):
         first = 1 if scale is rate else 2
-        # Solve V V' w = d with the Cholesky factor; the derivative is w' V y.
-        w = np.zeros(size, dtype=object)
-        for k in range(size):
-            d = float(slopes[k]) * here[k - first] if slopes[k] else 0.0
-            w[k] = (d - factor[k, :k] @ w[:k]) / factor[k, k]
-        for k in reversed(range(size)):
-            w[k] = (w[k] - factor[k + 1 :, k] @ w[k + 1 :]) / factor[k, k]
+        # The derivative is w' V y with V V' w = d.
+        d = [float(s) * here[k - first] if s else 0.0 for k, s in enumerate(slopes)]
+        w = np.array(factors.solve(d), dtype=object)
         results += [scale * (w @ mixed[:, j]) for j in range(joints)]
-    return [*results, *(factor[k, k] for k in range(size))]
+    return [*results, *factors.pivots]
