@@ -92,8 +92,8 @@ class Carries(OfRobot):
     )
 
     @property
-    def load(self) -> Any:
-        """The payload, None where none is given."""
+    def load(self) -> Load | None:
+        """The payload, None if none is given."""
         from pkm_twin.recordings.payload import Load, parse_payload, parse_times
 
         times = getattr(self, "load_times", None)

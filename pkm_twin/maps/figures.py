@@ -32,10 +32,9 @@ PANELS: Final = 3
 MIN_SHOWN: Final = 5e-5
 """Coordinate, m or rad, or component of a direction, below which zero is shown."""
 SCALE_QUANTILE: Final = 0.95
-"""Part of the values that has the whole scale where the largest is ``FAR`` times as large."""
+"""Quantile of the values that ends the colour scale if there are outliers."""
 OUTLIER_RATIO: Final = 2.0
-"""Quantile of the values that ends the colour scale if the largest value is ``OUTLIER_RATIO`` times
-it or more."""
+"""Largest value over that quantile from which on there are outliers."""
 CONTOUR_QUANTILES: Final = ((0.35, 0.85), (0.25, 0.6, 0.9))
 """Quantiles of a plane's contours: for panels in a full row, and for fewer panels."""
 
