@@ -39,17 +39,17 @@ def report_of(result: Result, marks: Sequence[str] = ()) -> tuple[Report, list[T
     own = tuple(units[channel.name] for channel in verdict.channels)
     shown = [n for n in result.numbers if n.status != "not excited"]
     idle = [label(n) for n in result.of("not excited")]
-    held = _held_out(result)
+    held = _find_held_out(result)
     if isinstance(result, Fit):
-        names, facts = result.problem.parameters.names, _effort_facts(result)
+        names, facts = result.problem.parameters.names, _report_efforts(result)
         blind = verdict.blind_lines(names, result.problem.parameters.units)
-        more = _delays(result)
+        more = _describe_delays(result)
         more += [f"efforts replaced as outliers: {result.outliers}"] if result.outliers else []
     elif isinstance(result, ElasticFit):
         names = tuple(map(_element, result.numbers))
         factors = tuple(f"the factor of {name}" for name in names)
-        blind, facts = verdict.blind_lines(factors, ("",) * len(names)), _elastic_facts(result)
-        more = list(map(_group_text, result.groups))
+        blind, facts = verdict.blind_lines(factors, ("",) * len(names)), _report_elastic(result)
+        more = list(map(_describe_group, result.groups))
     notes = [*marks, *verdict.lines(own), *more, *blind]
     if idle:
         notes.append(f"not excited, the file's value stays: {', '.join(idle)}")
@@ -62,7 +62,7 @@ def report_of(result: Result, marks: Sequence[str] = ()) -> tuple[Report, list[T
         notes.append(f"at a physical bound, without which the fit would give {what}: {which}")
     parameters = [
         {
-            "key": n.name, **_of_number(n, elastic), "before": n.before, "value": n.after,
+            "key": n.name, **_describe_number(n, elastic), "before": n.before, "value": n.after,
             "standard_deviation": n.deviation, "status": n.status,
         }
         for n in result.numbers
@@ -77,11 +77,11 @@ def report_of(result: Result, marks: Sequence[str] = ()) -> tuple[Report, list[T
             Fact("held_by_a_physical_bound", bool(e.bound)), Fact("samples_fitted", result.samples),
             Fact("parameters", parameters), Fact("not_excited", idle), *facts,
         ],
-        [_numbers({label(n): n for n in shown}), _residual_table(held)],
-        {"": partial(_changes, {label(n): n for n in shown})}
-        | {f"_{k}": partial(_residuals, one, units) for k, one in enumerate(result.judged)},
+        [_make_number_table({label(n): n for n in shown}), _make_residual_table(held)],
+        {"": partial(_draw_changes, {label(n): n for n in shown})}
+        | {f"_{k}": partial(_draw_residuals, one, units) for k, one in enumerate(result.judged)},
         notes,
-    ), [_channels(result, own)]  # fmt: skip
+    ), [_make_channel_table(result, own)]  # fmt: skip
 
 
 def _name(number: Number) -> str:
@@ -92,13 +92,13 @@ def _element(number: Number) -> str:
     return str(number.key[-1])
 
 
-def _of_number(number: Number, elastic: bool) -> dict[str, Any]:
+def _describe_number(number: Number, elastic: bool) -> dict[str, Any]:
     if not elastic:
         return {"unit": number.unit}
     return {"element": _element(number), "unit": "of the file's compliance"}
 
 
-def _held_out(result: Result) -> dict[str, tuple[float, float, float, str]]:
+def _find_held_out(result: Result) -> dict[str, tuple[float, float, float, str]]:
     """RMS residuals before and now, measured peak, unit: of the channels that were measured."""
     rows = {}
     for judged in result.judged:
@@ -122,7 +122,7 @@ def _answer(result: Result, held: Mapping[str, tuple[float, float, float, str]])
     )
 
 
-def _numbers(numbers: Mapping[str, Number]) -> Table:
+def _make_number_table(numbers: Mapping[str, Number]) -> Table:
     columns = [
         Column("", text="in the file", form=".6g"), Column("", text="fitted", form=".6g"),
         Column("", text="standard deviation"), Column("", text="unit"), Column("", text=" "),
@@ -134,7 +134,7 @@ def _numbers(numbers: Mapping[str, Number]) -> Table:
     return Table("", columns, rows, "parameters", "parameter")
 
 
-def _residual_table(held: Mapping[str, tuple[float, float, float, str]]) -> Table:
+def _make_residual_table(held: Mapping[str, tuple[float, float, float, str]]) -> Table:
     columns = [
         Column("", text="RMS with the file's values", form=".3g"),
         Column("", text="with the fitted ones", form=".3g"),
@@ -143,7 +143,7 @@ def _residual_table(held: Mapping[str, tuple[float, float, float, str]]) -> Tabl
     return Table("", columns, held, "residual of the last third, which was held out", "recording")
 
 
-def _channels(result: Result, units: Sequence[str]) -> Table:
+def _make_channel_table(result: Result, units: Sequence[str]) -> Table:
     """Return what the verdict says of each channel."""
     columns = [
         Column("", text=text)
@@ -157,7 +157,7 @@ def _channels(result: Result, units: Sequence[str]) -> Table:
     return Table("", columns, rows, "verdict", "channel")
 
 
-def _delays(result: Fit) -> list[str]:
+def _describe_delays(result: Fit) -> list[str]:
     """Describe how the signals of each recording were filtered."""
     lines = []
     for made, delay in zip(result.problem.whole, result.delays, strict=True):
@@ -171,7 +171,7 @@ def _delays(result: Fit) -> list[str]:
     return lines
 
 
-def _effort_facts(result: Fit) -> list[Fact]:
+def _report_efforts(result: Fit) -> list[Fact]:
     """Noise, delays, filters and what was held out."""
     joints, units = result.channels, result.units
     held = [
@@ -200,7 +200,7 @@ def _effort_facts(result: Fit) -> list[Fact]:
     ]  # fmt: skip
 
 
-def _elastic_facts(result: ElasticFit) -> list[Fact]:
+def _report_elastic(result: ElasticFit) -> list[Fact]:
     """Report groups, noise and held-out deflections; null for what was not measured."""
     groups = [
         {
@@ -230,18 +230,18 @@ def _elastic_facts(result: ElasticFit) -> list[Fact]:
     ]  # fmt: skip
 
 
-def _group_text(group: Group) -> str:
+def _describe_group(group: Group) -> str:
     """One line on elements that the loads do not distinguish."""
-    told = "; ".join(map(_sum_text, group.known)) or "nothing"
+    told = "; ".join(map(_write_sum, group.known)) or "nothing"
     return f"Loads do not distinguish {' and '.join(group.elements)}; they identify {told}"
 
 
-def _sum_text(one: Combination) -> str:
+def _write_sum(one: Combination) -> str:
     terms = " + ".join(f"{w:.2f} x {name}" for name, w in one.weights.items())
     return f"{terms.replace('+ -', '- ')} = {one.value:.4g} +- {one.deviation:.2g}"
 
 
-def _residuals(judged: Judged, units: Mapping[str, str]) -> Any:
+def _draw_residuals(judged: Judged, units: Mapping[str, str]) -> Any:
     """Residuals of each measured channel before and now, with the model's own deviation."""
     step = max(1, len(judged.time) // MOST_SAMPLES)
     rows: dict[str, list[Array]] = {}
@@ -268,7 +268,7 @@ def _residuals(judged: Judged, units: Mapping[str, str]) -> Any:
     return figure
 
 
-def _changes(shown: Mapping[str, Number]) -> Any:
+def _draw_changes(shown: Mapping[str, Number]) -> Any:
     """How far numbers moved, the furthest first; over standard deviations where known."""
     known = all(np.isfinite(n.deviation) and n.deviation > 0.0 for n in shown.values())
     moved = {
@@ -300,7 +300,7 @@ def _changes(shown: Mapping[str, Number]) -> Any:
     return figure
 
 
-def _terms(law: Law) -> str:
+def _write_terms(law: Law) -> str:
     """Write a drive's friction law with its values."""
     each = zip(law.terms, law.values, law.deviations, strict=True)
     return ", ".join(
@@ -321,7 +321,7 @@ def drive_report(found: DriveFriction) -> Report:
         }  # fmt: skip
     notes = []
     for law in found.laws:
-        line = f"{law.name}: {_terms(law)}; residual {law.residual:.3f} A"
+        line = f"{law.name}: {_write_terms(law)}; residual {law.residual:.3f} A"
         line += f", held-out runs {law.held_out:.3f} A"
         if np.isfinite(law.other_drives):
             line += f", held-out drives {law.other_drives:.3f} A"
@@ -335,7 +335,7 @@ def drive_report(found: DriveFriction) -> Report:
         notes.append(f"{simpler} alone: {verdict} (p = {found.chance:.2g})")
     return Report(
         f"torque constant {found.torque_constant:.4f} +- {found.torque_constant_deviation:.4f} "
-        f"N m/A; friction {_terms(found.chosen)}; zero current {found.zero:.3f} A",
+        f"N m/A; friction {_write_terms(found.chosen)}; zero current {found.zero:.3f} A",
         [
             Fact("torque_constant_nm_per_a", found.torque_constant),
             Fact("torque_constant_deviation_nm_per_a", found.torque_constant_deviation),

@@ -147,7 +147,7 @@ class Command(click.Command):
     def __init__(self, given: type[Any], run: Callable[[Any], Report], task: str = "") -> None:
         """``task``: the heading in the list of commands; empty for a command of a group."""
         self.given, self.run, self.task = given, run, task
-        self.fields = list(_parameters(given))
+        self.fields = list(_find_parameters(given))
         as_json = click.Option(["--json", "as_json"], is_flag=True, help="print JSON")
         super().__init__(
             run.__name__.replace("_", "-"), callback=self.execute, params=[*self.fields, as_json],
@@ -336,7 +336,7 @@ def _draw(report: Report, drawing: Path | None, overwrite: bool) -> Report:
     )  # fmt: skip
 
 
-def _parameters(given: type[Any]) -> Iterator[Argument | Option]:
+def _find_parameters(given: type[Any]) -> Iterator[Argument | Option]:
     """Yield the arguments and options of a class of settings, in the order of the help.
 
     Arguments come first, those of the classes below before the class's own; of options, the

@@ -59,7 +59,7 @@ def read_bag(
     :raises BagError: the bag is damaged, names no robot, or lacks what is asked for.
     """
     bag = open_bag(path)
-    machine = _robot_of(bag, robot)
+    machine = _find_robot(bag, robot)
     held = how.load or told_load(bag)
     kinds = {topic.type for topic in bag.report.topics.values()}
     if (how.trajectory or how.planned) and JOINT_STATE not in kinds and TRAJECTORY in kinds:
@@ -69,7 +69,7 @@ def read_bag(
             computed = None if origin is None else plan.effort
             return replace(plan, load=held, source=str(path), origin=origin, computed=computed)
     topics = choose_topics(bag, machine, how.topics, how.deflected)
-    found = _messages(bag, machine, topics, how, progress)
+    found = _read_messages(bag, machine, topics, how, progress)
     frame = found.wrenches[0].frame if found.wrenches else ""
     topics = replace(topics, frame=frame, turns=bool(frame) and frame != how.base_frame)
     notes = [str(topics)]
@@ -87,8 +87,8 @@ def read_bag(
         machine,
         (stamps - stamps[0]) / 1e9,
         np.array([s.q for s in found.samples]),
-        qd=_stacked([s.qd for s in found.samples]),
-        effort=_stacked([s.effort for s in found.samples]),
+        qd=_stack([s.qd for s in found.samples]),
+        effort=_stack([s.effort for s in found.samples]),
         load=held,
         source=str(path),
         notes=tuple(notes),
@@ -99,11 +99,11 @@ def read_bag(
         first_reject=found.first_reject,
     )
     if how.deflected:
-        return _at_deflections(r, stamps, found, how)
+        return _sample_deflections(r, stamps, found, how)
     if not found.wrenches:
         return r
-    at, wrench = _wrenches(found.wrenches)
-    wrench = wrench[_nearest(at, stamps)]
+    at, wrench = _sort_wrenches(found.wrenches)
+    wrench = wrench[_find_nearest(at, stamps)]
     if topics.turns:
         wrench = in_base_axes(wrench, machine.rotation(machine.forward(r.q)))
     return replace(r, wrench=wrench)
@@ -124,7 +124,7 @@ def is_collection(path: Path) -> bool:
     return bool(bags_of(path)) and not any(path.glob("*.db3"))
 
 
-def _robot_of(bag: Bag, name: str | Robot | None) -> Robot:
+def _find_robot(bag: Bag, name: str | Robot | None) -> Robot:
     """Return the robot, which may be a name; without one, the robot of the bag's metadata.
 
     :raises BagError: neither is given, or the bag names one that is not in ``config/``.
@@ -153,7 +153,7 @@ class _Found(NamedTuple):
     others: int = 0
 
 
-def _messages(
+def _read_messages(
     bag: Bag, robot: Robot, topics: Topics, how: ReadOptions,
     progress: Callable[[int], None] | None,
 ) -> _Found:  # fmt: skip
@@ -162,7 +162,7 @@ def _messages(
     :raises BagError: no joint state is accepted.
     """
     reader, rules = JointReader(robot, limited=how.limited), StampRules(future_tolerance=2**62)
-    wrench_of = _wrench_reader(how, rules)
+    wrench_of = _make_wrench_reader(how, rules)
     found, first = _Found([], [], [], Counter(), ""), ""
     names = [topics.joint_states, topics.wrench, topics.deflection]
     own, others = set(robot.controller.names), 0
@@ -201,7 +201,7 @@ def _messages(
     return found._replace(first_reject=first, others=others)
 
 
-def _wrench_reader(how: ReadOptions, rules: StampRules) -> Callable[[Any, int], WrenchSample]:
+def _make_wrench_reader(how: ReadOptions, rules: StampRules) -> Callable[[Any, int], WrenchSample]:
     """Return a reader of geometry_msgs/WrenchStamped (and log time, ns) of one frame."""
     accepted = how.wrench_frame
 
@@ -223,19 +223,19 @@ def _wrench_reader(how: ReadOptions, rules: StampRules) -> Callable[[Any, int], 
     return read
 
 
-def _stacked(values: list[Array | None]) -> Array | None:
+def _stack(values: list[Array | None]) -> Array | None:
     present = [v for v in values if v is not None]
     return np.array(present) if len(present) == len(values) else None
 
 
-def _wrenches(samples: list[WrenchSample]) -> tuple[Stamps, Array]:
+def _sort_wrenches(samples: list[WrenchSample]) -> tuple[Stamps, Array]:
     """Stamps and wrenches (k, 6) in the order of the stamps; of one stamp the last."""
     by_stamp = {one.stamp: one.wrench for one in samples}
     at = sorted(by_stamp)
     return np.array(at, np.int64), np.array([by_stamp[stamp] for stamp in at])
 
 
-def _nearest(stamps: Stamps, others: Stamps) -> NDArray[np.intp]:
+def _find_nearest(stamps: Stamps, others: Stamps) -> NDArray[np.intp]:
     """Return the index of the sorted stamp nearest to each of the others."""
     right = np.minimum(np.searchsorted(stamps, others), len(stamps) - 1)
     left = np.maximum(right - 1, 0)
@@ -243,7 +243,7 @@ def _nearest(stamps: Stamps, others: Stamps) -> NDArray[np.intp]:
     return np.where(before, left, right)
 
 
-def _at_deflections(r: Recording, joints: Stamps, found: _Found, how: ReadOptions) -> Recording:
+def _sample_deflections(r: Recording, joints: Stamps, found: _Found, how: ReadOptions) -> Recording:
     """Interpolate a recording linearly at the times of its deflections.
 
     :raises BagError: no deflection has both near it.
@@ -255,8 +255,8 @@ def _at_deflections(r: Recording, joints: Stamps, found: _Found, how: ReadOption
             raise BagError(text, path=r.source, reason="no messages")
     moved = {one.stamp: one for one in found.deflections}
     stamps = np.array(sorted(moved), np.int64)
-    times, wrench = _wrenches(found.wrenches)
-    apart = [np.abs(at[_nearest(at, stamps)] - stamps) / SECOND for at in (times, joints)]
+    times, wrench = _sort_wrenches(found.wrenches)
+    apart = [np.abs(at[_find_nearest(at, stamps)] - stamps) / SECOND for at in (times, joints)]
     near = stamps[(np.array(apart) <= MAX_DEFLECTION_OFFSET).all(0)]
     if not len(near):
         raise BagError(
@@ -264,7 +264,7 @@ def _at_deflections(r: Recording, joints: Stamps, found: _Found, how: ReadOption
             f"{MAX_DEFLECTION_OFFSET:g} s",
             path=r.source, reason="no pairs",
         )  # fmt: skip
-    q, wrench = _between(near, joints, r.q), _between(near, times, wrench)
+    q, wrench = _interpolate(near, joints, r.q), _interpolate(near, times, wrench)
     rotation = r.robot.platform(q)[1]
     values = np.array([moved[stamp].values for stamp in near.tolist()])
     fixed = np.array([moved[stamp].frame == how.base_frame for stamp in near.tolist()])
@@ -284,7 +284,7 @@ def _at_deflections(r: Recording, joints: Stamps, found: _Found, how: ReadOption
     )
 
 
-def _between(stamps: Stamps, others: Stamps, values: Array) -> Array:
+def _interpolate(stamps: Stamps, others: Stamps, values: Array) -> Array:
     """Values (k, n) at the stamps, linear between two."""
     at = (stamps - others[0]) / SECOND
     known = (others - others[0]) / SECOND

@@ -110,11 +110,11 @@ def read(
     elif how.topics:
         raise ParameterError("topic", how.topics[0], f"no --topic: {path} is a table")
     else:
-        r = _of_table(path, robot, how)
+        r = _read_table_recording(path, robot, how)
     return r if how.deflected else r.without_repeats
 
 
-def _of_table(path: Path, name: str | Robot | None, how: ReadOptions) -> Recording:
+def _read_table_recording(path: Path, name: str | Robot | None, how: ReadOptions) -> Recording:
     """Read a table as a recording; see :func:`read`."""
     if name is None:
         # A file that is no recording of any robot is rejected as such.
@@ -129,14 +129,17 @@ def _of_table(path: Path, name: str | Robot | None, how: ReadOptions) -> Recordi
             )
         raise ParameterError("--robot", None, "a robot, because a table does not name its robot")
     robot = name if isinstance(name, Robot) else load(name)
-    table, side = read_table(path, kinds_of(robot, how.side), how.dialect), _side(robot, how.side)
+    table, side = (
+        read_table(path, kinds_of(robot, how.side), how.dialect),
+        _find_map(robot, how.side),
+    )
     joints = robot.joint_names if side is None else side.names
     _refuse_misspelt(table, robot, joints, how)
 
     def stack(word: str) -> Array | None:
         values = table.stack_if([f"{joint}.{word}" for joint in joints])
         if values is not None and word in EFFORTS[:2] and "effort" in how.dialect.units:
-            values = values * _rated(robot, how.side)
+            values = values * _find_rated_torques(robot, how.side)
         return values if values is None or side is None else CONVERTED[word](side, values)
 
     q = stack("position")
@@ -163,7 +166,7 @@ def _of_table(path: Path, name: str | Robot | None, how: ReadOptions) -> Recordi
         _check_basis(table, robot, how)
     if posed:
         assert pose is not None  # noqa: S101  one of the two is there
-        q, qd, qdd = _of_pose(table, robot, pose)
+        q, qd, qdd = _invert_pose(table, robot, pose)
         rates = "" if qd is not None else "; velocities and accelerations differentiated"
         notes.append(f"joints computed from the pose, {', '.join(robot.pose_names)}{rates}")
     else:
@@ -212,7 +215,7 @@ def _of_table(path: Path, name: str | Robot | None, how: ReadOptions) -> Recordi
     )  # fmt: skip
 
 
-def _side(robot: Robot, side: str) -> JointMap | None:
+def _find_map(robot: Robot, side: str) -> JointMap | None:
     """Return the map from a table's joint values to the joints'; None if they are the joints' own.
 
     :raises ParameterError: motors of a robot without drives.
@@ -222,24 +225,24 @@ def _side(robot: Robot, side: str) -> JointMap | None:
     own = robot.controller
     if side != "motor":
         return own if side == "controller" else None
-    turns = np.array([drive.turns for drive in _drives(robot)])
+    turns = np.array([drive.turns for drive in _require_drives(robot)])
     zero = np.zeros(len(turns))
     factors = np.sign(own.factors) * turns
     return replace(own, factors=factors, offsets=zero, changes=zero, centres=zero)
 
 
-def _drives(robot: Robot) -> list[DriveSpec]:
+def _require_drives(robot: Robot) -> list[DriveSpec]:
     for joint, drive in zip(robot.joint_names, robot.drives, strict=True):
         if drive is None:
             raise ParameterError(f"{robot.name}: drive of {joint}", None, "a drive, for its motor")
     return [drive for drive in robot.drives if drive is not None]
 
 
-def _rated(robot: Robot, side: str) -> Array:
+def _find_rated_torques(robot: Robot, side: str) -> Array:
     """Return the motors' rated torques, shape (n,), N m."""
     if side != "motor":
         raise ParameterError("--units", "percent", "--side motor: it is the motor's rated torque")
-    rated = [drive.rated_torque for drive in _drives(robot)]
+    rated = [drive.rated_torque for drive in _require_drives(robot)]
     if None in rated:
         raise ParameterError(f"{robot.name}: drive.rated_torque", None, "N m, for per cent of it")
     return np.array(rated, np.float64)
@@ -284,7 +287,9 @@ def _check_basis(table: Table, robot: Robot, how: ReadOptions) -> None:
                 )  # fmt: skip
 
 
-def _of_pose(table: Table, robot: Robot, pose: Array) -> tuple[Array, Array | None, Array | None]:
+def _invert_pose(
+    table: Table, robot: Robot, pose: Array
+) -> tuple[Array, Array | None, Array | None]:
     """Joint positions of a pose, and their rates where the table has those of the pose."""
     q = robot.inverse(pose)
     # Joint rates in the table are those of the machine whose joint positions it has.
@@ -349,7 +354,7 @@ def check_units(
     :param time: shape (samples,); q and qd, shape (samples, n), qd where the file tells it.
     :raises ParameterError: velocities are a thousand times those of the positions.
     """
-    if "angle" not in dialect.units and _in_degrees(robot, q):
+    if "angle" not in dialect.units and _is_in_degrees(robot, q):
         most = float(np.abs(q).max())
         warn(path, f"positions up to {most:.4g}; expected rad; are these degrees? --units deg")
     step = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
@@ -367,7 +372,7 @@ def check_units(
         warn(path, f"time: steps of {step:g} s; expected seconds; are these milliseconds?")
 
 
-def _in_degrees(robot: Robot, q: Array) -> bool:
+def _is_in_degrees(robot: Robot, q: Array) -> bool:
     """Whether most joint states are none of the robot, and all are if they are in degrees.
 
     What is beyond a limit by a little is in rad: most have a joint more than half a turn from zero.

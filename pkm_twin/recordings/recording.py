@@ -280,17 +280,17 @@ class Recording:
                     f"{self.source}: too few joint states in a row to differentiate: "
                     f"{len(self.time)}"
                 )
-            return self._moving(qd, qdd, at_rest(self, qd), used)
+            return self._project_motion(qd, qdd, at_rest(self, qd), used)
         if len(self.time) < 3:
             raise PkmTwinError(f"{self.source}: {len(self.time)} rows; 3 or more to differentiate")
-        qd = _differences(self.q, self.time) if self.qd is None else self.qd
+        qd = _differentiate(self.q, self.time) if self.qd is None else self.qd
         rest = None
         if self.qd is None:
             rest = np.abs(qd) <= velocity_error_bound(self.time, self.q, gradient_gain(self.time))
-        qdd = _differences(qd, self.time) if self.qdd is None else self.qdd
-        return self._moving(qd, qdd, rest, slice(None))
+        qdd = _differentiate(qd, self.time) if self.qdd is None else self.qdd
+        return self._project_motion(qd, qdd, rest, slice(None))
 
-    def _moving(self, qd: Array, qdd: Array, still: Mask | None, rows: Any) -> Recording:
+    def _project_motion(self, qd: Array, qdd: Array, still: Mask | None, rows: Any) -> Recording:
         """Return some samples with these velocities and accelerations; measured ones are kept.
 
         What is differentiated becomes a motion of all drives: noise contradicts nothing.
@@ -301,7 +301,7 @@ class Recording:
         return r if self.qdd is not None else replace(r, qdd=change)
 
 
-def _differences(values: Array, time: Array) -> Array:
+def _differentiate(values: Array, time: Array) -> Array:
     """Second-order differences on uneven times, shape (samples, n)."""
     with np.errstate(all="ignore"):
         return np.gradient(values, time, axis=0, edge_order=2)

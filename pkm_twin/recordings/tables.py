@@ -221,11 +221,11 @@ def read_table(
             if size > MAX_BYTES:
                 raise ParameterError(str(path), f"{size} bytes", f"at most {MAX_BYTES}")
         with file as data:
-            read = _parquet if path.suffix == ".parquet" else _csv
+            read = _read_parquet if path.suffix == ".parquet" else _read_csv
             header, values, above = read(path, data, dialect, kinds)
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise FileError(path, error, "a table, CSV or Parquet") from None
-    names, sizes = _named(header, kinds or {}, dialect)
+    names, sizes = _name_columns(header, kinds or {}, dialect)
     if len(set(names)) != len(names):
         raise ParameterError(f"{path}: header row", ", ".join(names), "different names")
     table = Table(path, dict(zip(names, values, strict=True)), above)
@@ -244,7 +244,7 @@ def read_table(
     return table
 
 
-def _csv(
+def _read_csv(
     path: Path, data: BinaryIO, dialect: Dialect, kinds: Mapping[str, str] | None
 ) -> tuple[list[str], Array, int]:
     """Return header cells, numbers (columns, rows), and how many lines are above the header.
@@ -253,18 +253,18 @@ def _csv(
     """
     # Spreadsheets put a byte order mark before the header row.
     with io.TextIOWrapper(data, encoding="utf-8-sig", newline="") as text:
-        lines, above = _lines(text, path), 0
+        lines, above = _read_lines(text, path), 0
         while (first := next(lines, "")).startswith("#"):
             above += 1
-        rows = _cells(path, itertools.chain([first], lines), first, dialect)
+        rows = _split_rows(path, itertools.chain([first], lines), first, dialect)
         header = [name.strip() for name in next(rows, [])]
-        cells, number, read = array.array("d"), above + 1, _needed(header, kinds, dialect)
+        cells, number, read = array.array("d"), above + 1, _find_needed(header, kinds, dialect)
         for number, row in enumerate(rows, above + 2):
             if len(row) != len(header):
                 raise ParameterError(f"{path}: line {number}", len(row), f"{len(header)} values")
             for name, cell, needed in zip(header, row, read, strict=True):
                 try:
-                    cells.append(_number(cell))
+                    cells.append(_parse_number(cell))
                 except ValueError:
                     if not needed:
                         cells.append(math.nan)
@@ -277,15 +277,17 @@ def _csv(
     return header, np.ascontiguousarray(table.T), above
 
 
-def _needed(header: list[str], kinds: Mapping[str, str] | None, dialect: Dialect) -> list[bool]:
+def _find_needed(
+    header: list[str], kinds: Mapping[str, str] | None, dialect: Dialect
+) -> list[bool]:
     """Return which columns must have numbers: all, or where ``kinds`` are given those of them."""
-    return [not kinds or name in kinds for name in _named(header, kinds or {}, dialect)[0]]
+    return [not kinds or name in kinds for name in _name_columns(header, kinds or {}, dialect)[0]]
 
 
-def _parquet(
+def _read_parquet(
     path: Path, data: BinaryIO, dialect: Dialect, kinds: Mapping[str, str] | None
 ) -> tuple[list[str], Array, int]:
-    """Return what :func:`_csv` returns; a null is an empty cell."""
+    """Return what :func:`_read_csv` returns; a null is an empty cell."""
     require_pyarrow(path)
     import pyarrow
     from pyarrow import parquet
@@ -293,7 +295,7 @@ def _parquet(
     try:
         table = parquet.read_table(data)
         header, values = list(table.column_names), []
-        for column, needed in zip(table.columns, _needed(header, kinds, dialect), strict=True):
+        for column, needed in zip(table.columns, _find_needed(header, kinds, dialect), strict=True):
             try:
                 cells = column.cast("float64").to_numpy()
             except pyarrow.ArrowException:
@@ -313,7 +315,7 @@ def _parquet(
     return header, numbers, 0
 
 
-def _lines(text: TextIO, path: Path) -> Iterator[str]:
+def _read_lines(text: TextIO, path: Path) -> Iterator[str]:
     """Yield the lines of a file; a line that would take all memory is rejected."""
     while line := text.readline(MAX_LINE):
         if len(line) == MAX_LINE:
@@ -323,7 +325,9 @@ def _lines(text: TextIO, path: Path) -> Iterator[str]:
         yield line
 
 
-def _cells(path: Path, lines: Iterator[str], first: str, dialect: Dialect) -> Iterator[list[str]]:
+def _split_rows(
+    path: Path, lines: Iterator[str], first: str, dialect: Dialect
+) -> Iterator[list[str]]:
     """Rows with decimal points; what is found by itself is told."""
     separator = dialect.separator
     if separator is None:
@@ -344,7 +348,7 @@ def _cells(path: Path, lines: Iterator[str], first: str, dialect: Dialect) -> It
         yield [cell.replace(",", ".") for cell in row] if comma else row
 
 
-def _number(cell: str) -> float:
+def _parse_number(cell: str) -> float:
     """Return a cell's number, NaN for an empty cell.
 
     :raises ValueError: no finite number.
@@ -357,7 +361,7 @@ def _number(cell: str) -> float:
     return value
 
 
-def _named(
+def _name_columns(
     header: Sequence[str], kinds: Mapping[str, str], dialect: Dialect
 ) -> tuple[list[str], list[float]]:
     """Our names of a table's columns, and the sizes in SI of their numbers.

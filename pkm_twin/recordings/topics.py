@@ -49,7 +49,7 @@ _FIELDS: Final = {
 }  # fmt: skip
 
 
-def _definition(fields: Sequence[str], *held: str) -> str:
+def _write_definition(fields: Sequence[str], *held: str) -> str:
     """Return the ros2msg text of a type with a header, fields, and the types that they hold."""
     parts = ["\n".join(["std_msgs/Header header", *fields])]
     parts += ["\n".join([f"MSG: {name}", *_FIELDS[name]]) for name in ("std_msgs/Header", *held)]
@@ -57,15 +57,15 @@ def _definition(fields: Sequence[str], *held: str) -> str:
 
 
 DEFINITIONS: Final = {
-    JOINT_STATE: _definition(
+    JOINT_STATE: _write_definition(
         ["string[] name", "float64[] position", "float64[] velocity", "float64[] effort"]
     ),
-    WRENCH: _definition(["Wrench wrench"], "geometry_msgs/Wrench", "geometry_msgs/Vector3"),
-    TRANSFORM: _definition(
+    WRENCH: _write_definition(["Wrench wrench"], "geometry_msgs/Wrench", "geometry_msgs/Vector3"),
+    TRANSFORM: _write_definition(
         ["string child_frame_id", "Transform transform"],
         "geometry_msgs/Transform", "geometry_msgs/Vector3", "geometry_msgs/Quaternion",
     ),
-    TRAJECTORY: _definition(
+    TRAJECTORY: _write_definition(
         ["string[] joint_names", "JointTrajectoryPoint[] points"],
         "trajectory_msgs/JointTrajectoryPoint", "builtin_interfaces/Duration",
     ),
@@ -120,25 +120,25 @@ def choose_topics(
         if info is None or type_of(info) not in kinds:
             fit = [n for n, i in bag.report.topics.items() if type_of(i) in kinds]
             is_a = "is not in the bag" if info is None else f"is a {info.type}"
-            raise _choice_error(bag, f"topic {name} {is_a}; topics that fit: {', '.join(fit)}")
+            raise _make_choice_error(bag, f"topic {name} {is_a}; topics that fit: {', '.join(fit)}")
         kinds[type_of(info)].append(name)
     for kind, names in kinds.items():
         if len(set(names)) > 1:
-            raise _choice_error(
+            raise _make_choice_error(
                 bag, f"{' and '.join(names)} are both {kind}; choose one with --topic"
             )
     left_out: dict[str, str] = {}
     joints = _choose_joints(bag, robot, kinds[JOINT_STATE], left_out)
-    wrenches = _candidates(bag, WRENCH, kinds[WRENCH], left_out)
+    wrenches = _find_candidates(bag, WRENCH, kinds[WRENCH], left_out)
     if kinds[JOINT_STATE] and not kinds[WRENCH]:
         left_out.update({name: "not chosen" for name in wrenches})
         wrenches = []
-    wrench = _only(bag, "wrenches", wrenches, "wrench", left_out)
+    wrench = _pick_usual(bag, "wrenches", wrenches, "wrench", left_out)
     deflection = None
     if deflected:
-        fit = _candidates(bag, TRANSFORM, kinds[TRANSFORM], left_out)
+        fit = _find_candidates(bag, TRANSFORM, kinds[TRANSFORM], left_out)
         fit = [name for name in fit if bag.report.topics[name].count]
-        deflection = _only(bag, "deflections", fit, "measured_deflection", left_out)
+        deflection = _pick_usual(bag, "deflections", fit, "measured_deflection", left_out)
         missing = (
             (deflection, "deflection", f"no deflection in the bag: a topic of {TRANSFORM} from the "
              "platform to the deflected platform"),
@@ -146,14 +146,14 @@ def choose_topics(
         )  # fmt: skip
         for topic, what, text in missing:
             if topic is None:
-                raise _choice_error(bag, text, f"no {what}")
+                raise _make_choice_error(bag, text, f"no {what}")
     for name in filter(None, (joints, wrench, deflection)):
         require_definition(bag, name)
     return Topics(joints, wrench, deflection, left_out)
 
 
 def _choose_joints(bag: Bag, robot: Robot, wanted: list[str], left_out: dict[str, str]) -> str:
-    named = _candidates(bag, JOINT_STATE, wanted, left_out)
+    named = _find_candidates(bag, JOINT_STATE, wanted, left_out)
     filled = [name for name in named if bag.report.topics[name].count]
     if not filled:
         aside = "; ".join(f"{name} is there, but {why}" for name, why in left_out.items())
@@ -166,12 +166,12 @@ def _choose_joints(bag: Bag, robot: Robot, wanted: list[str], left_out: dict[str
                 f": {plans[0]} is a planned trajectory, which `pkm-twin torques` and `size` take; "
                 "record /joint_states while `pkm-twin play` sends it to the machine"
             )
-        raise _choice_error(bag, text, "no joint states")
+        raise _make_choice_error(bag, text, "no joint states")
     for name in filled:
         require_definition(bag, name)
     # As the controller calls them, which recorded them.
     joints = robot.controller.names
-    seen = _names_on(bag, filled, set(joints))
+    seen = _read_joint_names(bag, filled, set(joints))
     fit = [name for name in filled if set(joints) <= seen[name]]
     for name in filled:
         if name not in fit:
@@ -179,13 +179,13 @@ def _choose_joints(bag: Bag, robot: Robot, wanted: list[str], left_out: dict[str
     if not fit:
         name = filled[0]
         missing = next(joint for joint in joints if joint not in seen[name])
-        raise _choice_error(
+        raise _make_choice_error(
             bag,
             f"no topic has all joints of {robot.name}: on {name} joint {missing!r} is missing, "
             f"it has {', '.join(sorted(seen[name])) or 'none'}",
             "no joint states",
         )
-    return _only(bag, "joint states", fit, "joint_states", left_out) or fit[0]
+    return _pick_usual(bag, "joint states", fit, "joint_states", left_out) or fit[0]
 
 
 def is_output(topic: str) -> bool:
@@ -205,7 +205,7 @@ def type_of(info: TopicInfo) -> str:
     return info.type if "/" in name or not name else f"{package}/msg/{name}"
 
 
-def _candidates(bag: Bag, kind: str, wanted: list[str], left_out: dict[str, str]) -> list[str]:
+def _find_candidates(bag: Bag, kind: str, wanted: list[str], left_out: dict[str, str]) -> list[str]:
     """Topics of a type: the wanted ones, else all but the twin's own and a simulation's truths."""
     fit = []
     for name, info in bag.report.topics.items():
@@ -224,19 +224,21 @@ def _candidates(bag: Bag, kind: str, wanted: list[str], left_out: dict[str, str]
     return fit
 
 
-def _only(bag: Bag, what: str, fit: list[str], usual: str, left_out: dict[str, str]) -> str | None:
+def _pick_usual(
+    bag: Bag, what: str, fit: list[str], usual: str, left_out: dict[str, str]
+) -> str | None:
     """Return the topic with the usual name among several, None without any."""
     if not fit:
         return None
     preferred = [name for name in fit if name.split("/")[-1] == usual]
     if len(fit) > 1 and len(preferred) != 1:
-        raise _choice_error(bag, f"{what} on {', '.join(fit)}; choose one with --topic")
+        raise _make_choice_error(bag, f"{what} on {', '.join(fit)}; choose one with --topic")
     chosen = preferred[0] if preferred else fit[0]
     left_out.update({name: f"{chosen} is used" for name in fit if name != chosen})
     return chosen
 
 
-def _names_on(bag: Bag, topics: list[str], joints: set[str]) -> dict[str, set[str]]:
+def _read_joint_names(bag: Bag, topics: list[str], joints: set[str]) -> dict[str, set[str]]:
     """Joint names of the first message of each topic, or of one soon after that has all joints."""
     seen: dict[str, set[str]] = {}
     count: Counter[str] = Counter()
@@ -266,7 +268,7 @@ def require_definition(bag: Bag, topic: str) -> None:
     try:
         recorded = parse_definition(info.type, info.definition)
     except BagError as error:
-        raise _choice_error(bag, f"topic {topic}: {error}", error.reason) from None
+        raise _make_choice_error(bag, f"topic {topic}: {error}", error.reason) from None
     for held, fields in parse_definition(info.type, DEFINITIONS[info.type]).items():
         found = recorded.get(held, ())
         if found == fields:
@@ -281,5 +283,5 @@ def require_definition(bag: Bag, topic: str) -> None:
         )
 
 
-def _choice_error(bag: Bag, text: str, reason: str = "topic") -> BagError:
+def _make_choice_error(bag: Bag, text: str, reason: str = "topic") -> BagError:
     return BagError(text, path=bag.report.path, reason=reason)

@@ -58,7 +58,7 @@ class Camera:
         """Transform base coordinates, (..., 3), to those of the camera."""
         return np.asarray(points @ self.turn.T, np.float64)
 
-    def _window(self, points: Array, radius: float) -> tuple[Any, Array, Array]:
+    def _find_window(self, points: Array, radius: float) -> tuple[Any, Array, Array]:
         """Return the pixels around some points, and their coordinates."""
         (left, low), (right, high) = points[:, :2].min(0) - radius, points[:, :2].max(0) + radius
         columns = slice(*np.searchsorted(self.x, [left, right]))
@@ -79,7 +79,7 @@ class Camera:
     def ball(self, at: Array, radius: float, colour: Any) -> None:
         """Draw a ball around a point (3,) in base coordinates."""
         (middle,) = self.see(at[None])
-        window, x, y = self._window(middle[None], radius)
+        window, x, y = self._find_window(middle[None], radius)
         across = np.stack([x - middle[0], y - middle[1]], -1)
         with np.errstate(invalid="ignore"):
             towards = np.sqrt(radius**2 - (across**2).sum(-1))
@@ -93,7 +93,7 @@ class Camera:
         if not length > 0.0:
             return
         axis = (end - start) / length
-        window, x, y = self._window(np.array([start, end]), radius)
+        window, x, y = self._find_window(np.array([start, end]), radius)
         ray = np.stack([x, y, np.zeros_like(x)], -1) - start
         along = ray @ axis
         across = ray - along[..., None] * axis
@@ -118,7 +118,7 @@ class Camera:
         normal = normal * -np.sign(normal[2])
         if abs(normal[2]) < 1e-3:  # seen from its edge
             return
-        window, x, y = self._window(corners, 0.0)
+        window, x, y = self._find_window(corners, 0.0)
         inside = Outline(corners[:, :2]).contains_points(np.stack([x, y], -1).reshape(-1, 2))
         away = ((x - middle[0]) * normal[0] + (y - middle[1]) * normal[1]) / normal[2]
         depth = np.where(inside.reshape(x.shape), middle[2] - away, np.inf)
@@ -174,11 +174,11 @@ def draw(robot: Robot) -> Any:
         if anchor:
             at = point + camera.pixel * down * size / 2 * ANCHORS[anchor]
             ax.text(*at, name, va="center", **style)
-    _corners(ax, camera, style)
+    _draw_corners(ax, camera, style)
     return figure
 
 
-def _corners(ax: Any, camera: Camera, style: dict[str, Any]) -> None:
+def _draw_corners(ax: Any, camera: Camera, style: dict[str, Any]) -> None:
     """Directions of the base frame at the left, a length at the right."""
     start = camera.low + 45 * camera.pixel
     for name, colour, axis in zip("xyz", AXES, np.eye(3), strict=True):

@@ -141,7 +141,7 @@ class Model:
         kept = [
             pose
             for q, pose in zip(rows, poses[good], strict=True)
-            if not self._passive_beyond(q, pose)
+            if not self._describe_beyond_passive(q, pose)
         ]
         found = np.array([*kept, self.start.pose])
         ranges = []
@@ -190,7 +190,7 @@ class Model:
         try:
             q = self.robot.inverse(asked)
         except ValueError as error:
-            return _refused(state, str(error))
+            return _refuse(state, str(error))
         return self._moved(state, q, asked)
 
     def to_platform(self, state: State, position: Array, rotation: Array) -> State:
@@ -209,30 +209,30 @@ class Model:
                 twists = weights[:, None] * robot.platform_jacobian(q)
                 q = robot.project_redundant(q + np.linalg.lstsq(twists, missing, rcond=1e-9)[0])[0]
         except ValueError as error:
-            return _refused(state, str(error))
+            return _refuse(state, str(error))
         return self._moved(state, q, None)
 
     def _moved(self, state: State, q: Array, asked: Array | None) -> State:
         try:
             q = self.robot.project_redundant(q)[0]
         except ValueError as error:
-            return _refused(state, str(error))
+            return _refuse(state, str(error))
         _, found = beyond_limits(self.robot, q)
         if found:
             more = f" ({len(found) - 1} more)" if len(found) > 1 else ""
-            return _refused(state, f"{found[0]}{more}")
+            return _refuse(state, f"{found[0]}{more}")
         try:
             pose = self.robot.forward(q)
         except ValueError as error:
-            return _refused(state, str(error))
+            return _refuse(state, str(error))
         if asked is not None:
             if (np.abs(pose - asked) > SAME * (1.0 + np.abs(asked))).any():
-                return _refused(state, "the pose is in another assembly mode than home")
+                return _refuse(state, "the pose is in another assembly mode than home")
             pose = asked
-        beyond = self._passive_beyond(q, pose)
-        return _refused(state, beyond) if beyond else replace(state, q=q, pose=pose, refusal="")
+        beyond = self._describe_beyond_passive(q, pose)
+        return _refuse(state, beyond) if beyond else replace(state, q=q, pose=pose, refusal="")
 
-    def _passive_beyond(self, q: Array, pose: Array) -> str:
+    def _describe_beyond_passive(self, q: Array, pose: Array) -> str:
         """Describe which passive joint is beyond its limits; empty if none is."""
         robot, graph = self.robot, self.robot.graph
         bound = getattr(robot.limits, "joint_angle", None)
@@ -254,21 +254,21 @@ class Model:
         """Return the state under a wrench, (6,), N and N m; the old one if it is not finite."""
         values = np.array(wrench, np.float64)
         if not np.isfinite(values).all():
-            return _refused(state, "the wrench is not finite")
+            return _refuse(state, "the wrench is not finite")
         return replace(state, wrench=values, refusal="")
 
     def link(self, state: State) -> str:
         """Return the query of an address that carries robot, pose and load."""
-        parts = {"robot": self.robot.name, "pose": _listed(state.pose)}
+        parts = {"robot": self.robot.name, "pose": _write_numbers(state.pose)}
         if state.wrench.any():
-            parts["load"] = _listed(state.wrench)
+            parts["load"] = _write_numbers(state.wrench)
         return f"?{urlencode(parts, safe=',')}"
 
     def linked(self, state: State, link: str) -> State:
         """Return the state of such an address, or the old one with the reason why not."""
         parts = {name: given[-1] for name, given in parse_qs(link.rpartition("?")[2]).items()}
         if parts.get("robot") != self.robot.name:
-            return _refused(state, f"the link is not of the robot {self.robot.name}")
+            return _refuse(state, f"the link is not of the robot {self.robot.name}")
         rows = []
         for name, count in (("pose", len(state.pose)), ("load", 6)):
             try:
@@ -276,7 +276,7 @@ class Model:
             except ValueError:
                 row = []
             if len(row) != count or not np.isfinite(row).all() or "pose" not in parts:
-                return _refused(state, f"the link's {name} has not {count} numbers")
+                return _refuse(state, f"the link's {name} has not {count} numbers")
             rows.append(row)
         moved = self.to_pose(state, rows[0])
         return moved if moved.refusal else self.loaded(moved, rows[1])
@@ -325,7 +325,7 @@ class Model:
         return Numbers(
             position, rotation, measure, _grade(measure, stop, warn),
             gap, "good" if gap is None else _grade(gap, 0.0, CLOSE_CLEARANCE),
-            effort, self._overloaded(effort), energy, why,
+            effort, self._find_overloaded(effort), energy, why,
         )  # fmt: skip
 
     def deflected(self, state: State, deflection: Array) -> Deflection:
@@ -334,7 +334,7 @@ class Model:
         wrench = np.linalg.solve(platform_response(robot, q, np.zeros(6)).compliance, deflection)
         return Deflection(np.array(deflection), member_deflections(robot, q, wrench))
 
-    def _overloaded(self, effort: Array | None) -> tuple[str, ...]:
+    def _find_overloaded(self, effort: Array | None) -> tuple[str, ...]:
         limits = self.robot.limits.effort
         if effort is None or limits is None:
             return ()
@@ -345,11 +345,11 @@ class Model:
 _ENDS: Final = ("low", "high")
 
 
-def _listed(values: Array) -> str:
+def _write_numbers(values: Array) -> str:
     return ",".join(f"{value:.9g}" for value in np.round(values, 12) + 0.0)
 
 
-def _refused(state: State, reason: str) -> State:
+def _refuse(state: State, reason: str) -> State:
     return replace(state, refusal=one_line(reason))
 
 

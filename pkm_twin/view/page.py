@@ -104,9 +104,9 @@ class Page:
             self.first = tabs.add_tab(first)
         with tabs.add_tab("Move"):
             with gui.add_folder("Joints"):
-                self._joints = self._sliders(model.joint_ranges, "joint", self._move_joint)
+                self._joints = self._add_sliders(model.joint_ranges, "joint", self._move_joint)
             with gui.add_folder("Pose of the platform"):
-                self._pose = self._sliders(model.pose_ranges, "pose", self._move_pose)
+                self._pose = self._add_sliders(model.pose_ranges, "pose", self._move_pose)
             self.ask(gui.add_button("Home").on_click, "home", self._go_home)
             self._check("names of drives", True, self.stage.name_drives)
             self._check("drag platform", False, self.stage.show_gizmo)
@@ -117,7 +117,7 @@ class Page:
         self.load_tab = tabs.add_tab("Load")
         with self.load_tab:
             with gui.add_folder("Wrench on the platform, base axes"):
-                self._wrench = self._sliders(model.wrench_ranges, "wrench", self._load)
+                self._wrench = self._add_sliders(model.wrench_ranges, "wrench", self._load)
                 self.ask(gui.add_button("No wrench").on_click, "unload", self._unload)
             r = model.enlargement
             self._enlarge = gui.add_slider(
@@ -182,7 +182,7 @@ class Page:
         box = self.server.gui.add_checkbox(label, value)
         self.ask(box.on_update, label, lambda: call(box.value))
 
-    def _sliders(
+    def _add_sliders(
         self, ranges: Sequence[Range], kind: str, move: Callable[[int], None]
     ) -> list[Any]:
         handles = []

@@ -131,7 +131,7 @@ class Scene:
         self._thin = BAR * graph.size
         self._elements = {bar.element for bar in self.bars if bar.element}
         self._joints = [j for j in graph.joints.values() if j.kind not in ("translation", "fixed")]
-        self._drives = {j.name: self._motor(j) for j in self._joints if j.actuated}
+        self._drives = {j.name: self._make_motor(j) for j in self._joints if j.actuated}
         # Balls stand at joints that turn and at the ends of rods, by the joint's label.
         self._balls: list[tuple[str, Place]] = [
             (j.label or j.name, (j.outer, j.at)) for j in self._joints if j.kind != "prismatic"
@@ -144,7 +144,7 @@ class Scene:
                 self._balls += [(name, (body, end + aside)) for name, body, end in ends]
         self._members: dict[tuple[str, bytes], str] = {}
 
-    def _member(self, place: Place) -> str:
+    def _get_member(self, place: Place) -> str:
         """Return the member that ends at a point, else that it lies on; empty without one."""
         key = place[0], place[1].tobytes()
         if key not in self._members:
@@ -175,7 +175,7 @@ class Scene:
             for j in self._joints
         )
 
-    def _radius(self, place: Place) -> float:
+    def _find_radius(self, place: Place) -> float:
         """Return the radius of the thickest bar at a point, else of a body's bar, m."""
         near = 1e-6 * self.size
         at_end = [
@@ -205,8 +205,8 @@ class Scene:
                 return point
             if self._on_platform(spot):
                 return np.asarray(origin + shift + turn.apply(point - origin), np.float64)
-            member = moved.members.get(self._member(spot))
-            return point if member is None else point + _along(*member, point[None])[0]
+            member = moved.members.get(self._get_member(spot))
+            return point if member is None else point + _interpolate_along(*member, point[None])[0]
 
         def line(bar: Bar, pieces: int, name: str) -> Array:
             first, last = place(bar.start), place(bar.end)
@@ -214,7 +214,7 @@ class Scene:
             if (member := moved.members.get(name)) is None:
                 return np.asarray(first + shares * (last - first), np.float64)
             start, end = posture.place(*bar.start), posture.place(*bar.end)
-            ways = _along(*member, start + shares * (end - start))
+            ways = _interpolate_along(*member, start + shares * (end - start))
             bow = ways - ways[0] - shares * (ways[-1] - ways[0])
             return np.asarray(first + shares * (last - first) + bow, np.float64)
 
@@ -224,11 +224,11 @@ class Scene:
         motors = [line(bar, 1, "") for bar in self._drives.values()]
         ends = np.concatenate([np.stack([a[:-1], a[1:]], axis=1) for a in (*lines, *motors)])
         thick = np.array([bar.radius for bar in self.bars])
-        bar_colours = np.array([self._colour(bar, colours) for bar in self.bars])
+        bar_colours = np.array([self._choose_colour(bar, colours) for bar in self.bars])
         radii = [*np.repeat(thick, self.pieces), *(bar.radius for bar in self._drives.values())]
-        at, turns, sizes = _cylinders(ends, np.array(radii))
+        at, turns, sizes = _place_cylinders(ends, np.array(radii))
         balls = [place(spot) for _, spot in self._balls]
-        ball_radii = np.array([1.25 * self._radius(spot) for _, spot in self._balls])
+        ball_radii = np.array([1.25 * self._find_radius(spot) for _, spot in self._balls])
         # Round ends, so that bars of one body meet without gaps.
         tips = np.concatenate(lines)
         tip_radii = np.repeat(thick, self.pieces + 1)
@@ -251,7 +251,7 @@ class Scene:
             np.repeat(np.concatenate([ball_radii, tip_radii])[:, None], 3, axis=1),
             np.array([*ball_colours, *np.repeat(bar_colours, self.pieces + 1, axis=0)], np.uint8),
             origin + shift,
-            _quaternions(turn * whole),
+            _convert_to_quaternions(turn * whole),
             places,
             dict(zip(self._drives, drives, strict=True)),
         )
@@ -270,10 +270,10 @@ class Scene:
                 about = Rotation.from_rotvec(more)
                 at = origin + moved.platform[:3] + about.apply(at - origin)
                 turn = about * turn
-            result[body] = at, _quaternions(turn)
+            result[body] = at, _convert_to_quaternions(turn)
         return result
 
-    def _colour(self, bar: Bar, colours: Mapping[str, Colour]) -> Colour:
+    def _choose_colour(self, bar: Bar, colours: Mapping[str, Colour]) -> Colour:
         if bar.element in colours:
             return colours[bar.element]
         graph = self.robot.graph
@@ -283,10 +283,10 @@ class Scene:
             return PLATFORM
         return ROD if bar.part in graph.rods else BODY
 
-    def _motor(self, joint: Joint) -> Bar:
+    def _make_motor(self, joint: Joint) -> Bar:
         """Return the cylinder that stands for a drive, along its axis."""
         axis, body, middle = joint.axes[0], joint.inner, joint.at
-        radius = self._radius((joint.outer, joint.at))
+        radius = self._find_radius((joint.outer, joint.at))
         if telescope(joint):
             parts = {joint.inner, joint.outer}
             radius = max((bar.radius for bar in self.bars if bar.part in parts), default=radius)
@@ -304,7 +304,7 @@ class Scene:
         return points.min(0), points.max(0)
 
 
-def _along(points: Array, displacements: Array, at: Array) -> Array:
+def _interpolate_along(points: Array, displacements: Array, at: Array) -> Array:
     """Interpolate displacements at equidistant points of a line at places, shape (n, 3)."""
     span = points[-1] - points[0]
     at = (at - points[0]) @ span / (span @ span) * (len(points) - 1)
@@ -313,7 +313,7 @@ def _along(points: Array, displacements: Array, at: Array) -> Array:
     return np.asarray((1.0 - part) * displacements[first] + part * displacements[first + 1])
 
 
-def _cylinders(ends: Array, radii: Array) -> tuple[Array, Array, Array]:
+def _place_cylinders(ends: Array, radii: Array) -> tuple[Array, Array, Array]:
     """Middles, quaternions and sizes of cylinders between two points each, shape (k, 2, 3)."""
     along = ends[:, 1] - ends[:, 0]
     length = np.linalg.norm(along, axis=1)
@@ -324,10 +324,10 @@ def _cylinders(ends: Array, radii: Array) -> tuple[Array, Array, Array]:
     x = np.cross(least, z)
     x /= np.linalg.norm(x, axis=1, keepdims=True)
     turns = Rotation.from_matrix(np.stack([x, np.cross(z, x), z], axis=-1))
-    return ends.mean(1), _quaternions(turns), np.column_stack([radii, radii, length])
+    return ends.mean(1), _convert_to_quaternions(turns), np.column_stack([radii, radii, length])
 
 
-def _quaternions(turns: Rotation) -> Array:
+def _convert_to_quaternions(turns: Rotation) -> Array:
     """Quaternions with w first, shape (..., 4)."""
     return np.asarray(np.roll(turns.as_quat(), 1, axis=-1), np.float64)
 

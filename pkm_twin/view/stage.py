@@ -81,20 +81,20 @@ class Stage:
         camera.look_at = tuple(middle.tolist())
         camera.up = (0.0, 0.0, 1.0)
         draw.add_frame("/base", **_axes(0.12 * size, size))
-        self._plates()
+        self._add_plates()
         (cylinder, cylinder_faces), (ball, ball_faces) = round_mesh()
         self._cylinders = draw.add_batched_meshes_simple(
             "/machine/bars", cylinder, cylinder_faces, shapes.cylinder_turns, shapes.cylinder_at,
-            batched_scales=shapes.cylinder_sizes, batched_colors=_linear(shapes.cylinder_colours),
-            lod="off",
+            batched_scales=shapes.cylinder_sizes, lod="off",
+            batched_colors=_to_linear(shapes.cylinder_colours),
         )  # fmt: skip
         turns = np.tile([1.0, 0.0, 0.0, 0.0], (len(shapes.ball_at), 1))
         self._balls = draw.add_batched_meshes_simple(
             "/machine/balls", ball, ball_faces, turns, shapes.ball_at,
-            batched_scales=shapes.ball_sizes, batched_colors=_linear(shapes.ball_colours),
+            batched_scales=shapes.ball_sizes, batched_colors=_to_linear(shapes.ball_colours),
             lod="off",
         )  # fmt: skip
-        self._meshes = self._bodies()
+        self._meshes = self._add_bodies()
         self._passed: list[Array] = []
         rotates = any(unit == "rad" for unit in scene.robot.pose_units)
         self.gizmo = draw.add_transform_controls(
@@ -109,7 +109,7 @@ class Stage:
         self._labels: dict[int, tuple[Any, dict[str, Any]]] = {}
         server.on_client_disconnect(lambda client: self._labels.pop(client.client_id, None))
         self._arrows = draw.add_arrows(
-            "/wrench", np.zeros((2, 2, 3)), _linear(np.array([FORCE, MOMENT])),
+            "/wrench", np.zeros((2, 2, 3)), _to_linear(np.array([FORCE, MOMENT])),
             shaft_radius=0.008 * size, head_radius=0.02 * size, head_length=0.05 * size,
             visible=False,
         )  # fmt: skip
@@ -151,7 +151,7 @@ class Stage:
 
         client.camera.on_update(fit)
 
-    def _plates(self) -> None:
+    def _add_plates(self) -> None:
         draw, scene, size = self._server.scene, self._scene, self._scene.size
         graph = scene.robot.graph
         feet = [j.at for j in graph.joints.values() if BASE in (j.inner, j.outer)]
@@ -164,7 +164,7 @@ class Stage:
                 flat_shading=True,
             )
         self._platform = draw.add_frame("/platform", **_axes(0.1 * size, size))
-        self._tool(away)
+        self._add_tool(away)
         self._rest = draw.add_frame("/at_rest", show_axes=False, visible=False)
         self._rest_bars = draw.add_line_segments(
             "/bars_at_rest", np.zeros((1, 2, 3)), colors=GROUND, thickness=1.5,
@@ -176,7 +176,7 @@ class Stage:
             still = plate(scene.platform, 0.01 * size)
             draw.add_mesh_simple("/at_rest/plate", *still, color=(110, 110, 110), opacity=0.35)
 
-    def _tool(self, away: float) -> None:
+    def _add_tool(self, away: float) -> None:
         """Draw a flange and its axis on the platform; ``away``: 1 for a base below, -1 above."""
         (round_, faces), _ = round_mesh()
         size = self._scene.size
@@ -184,7 +184,7 @@ class Stage:
             shape = size * (round_ * [radius, radius, length] + [0.0, 0.0, away * length / 2])
             self._server.scene.add_mesh_simple(f"/platform/{name}", shape, faces, color=BODY)
 
-    def _bodies(self) -> dict[str, Any]:
+    def _add_bodies(self) -> dict[str, Any]:
         """Frames of the bodies that have meshes in the robot's file; bars are seen through them."""
         draw, platform = self._server.scene, self._scene.robot.graph.platform
         frames = {}
@@ -221,10 +221,10 @@ class Stage:
         bars, balls = self._cylinders, self._balls
         bars.batched_positions, bars.batched_wxyzs = shapes.cylinder_at, shapes.cylinder_turns
         bars.batched_scales = shapes.cylinder_sizes
-        bars.batched_colors = _linear(shapes.cylinder_colours)
+        bars.batched_colors = _to_linear(shapes.cylinder_colours)
         balls.batched_positions = shapes.ball_at
         balls.batched_scales = shapes.ball_sizes
-        balls.batched_colors = _linear(shapes.ball_colours)
+        balls.batched_colors = _to_linear(shapes.ball_colours)
         self._platform.position, self._platform.wxyz = shapes.platform_at, shapes.platform_turn
         if self._meshes:
             for body, (at, turn) in self._scene.frames(q, moved).items():
@@ -306,7 +306,7 @@ def _axes(length: float, size: float) -> dict[str, float]:
     }
 
 
-def _linear(colours: NDArray[Any]) -> NDArray[np.uint8]:
+def _to_linear(colours: NDArray[Any]) -> NDArray[np.uint8]:
     """Colours of a screen as amounts of light: viser takes those of batches so."""
     part = np.asarray(colours) / 255.0
     light = np.where(part <= 0.04045, part / 12.92, ((part + 0.055) / 1.055) ** 2.4)

@@ -113,7 +113,7 @@ def status(model: Model, state: State, numbers: Numbers) -> str:
         if state.refusal
         else '<div id="refusal"></div>'
     )
-    return f'<div style="{_STYLE}">{_table(rows)}{said}{_joints(model, state, numbers)}</div>'
+    return f'<div style="{_STYLE}">{_write_table(rows)}{said}{_joints(model, state, numbers)}</div>'
 
 
 def _joints(model: Model, state: State, numbers: Numbers) -> str:
@@ -121,19 +121,19 @@ def _joints(model: Model, state: State, numbers: Numbers) -> str:
     effort: Sequence[float | None] = [None] * len(state.q)
     if numbers.effort is not None:
         effort = numbers.effort.tolist()
-    rows = [_head("joint", "position", "effort at rest")]
+    rows = [_write_head("joint", "position", "effort at rest")]
     units = zip(robot.joint_names, robot.joint_units, robot.effort_units, strict=True)
     for k, (name, unit, effort_unit) in enumerate(units):
         colour = GRADES["bad"] if name in numbers.beyond_effort else "inherit"
         rows.append(
-            _row(
+            _write_row(
                 escape(name),
-                _value(f"q_{k}", float(state.q[k]), unit),
-                _value(f"effort_{k}", effort[k], effort_unit, colour),
+                _write_value(f"q_{k}", float(state.q[k]), unit),
+                _write_value(f"effort_{k}", effort[k], effort_unit, colour),
             )
         )
     why = numbers.why.get("effort", "")
-    return _table(rows) + (f"<div>efforts: {escape(why)}</div>" if why else "")
+    return _write_table(rows) + (f"<div>efforts: {escape(why)}</div>" if why else "")
 
 
 def load(numbers: Numbers) -> str:
@@ -142,21 +142,21 @@ def load(numbers: Numbers) -> str:
     if energy is None:
         why = numbers.why.get("energy", "")
         return f'<div style="{_STYLE}">no elasticity: {escape(why)}</div>'
-    rows = [_head("deflection", "along", "about")]
+    rows = [_write_head("deflection", "along", "about")]
     moved = 1e6 * np.asarray(energy.deflection)
     for k, axis in enumerate("xyz"):
         rows.append(
-            _row(
+            _write_row(
                 axis,
-                _value(f"deflection_{k}", float(moved[k]), "µm"),
-                _value(f"deflection_{k + 3}", float(moved[k + 3]), "µrad"),
+                _write_value(f"deflection_{k}", float(moved[k]), "µm"),
+                _write_value(f"deflection_{k + 3}", float(moved[k + 3]), "µrad"),
             )
         )
     tie = " (tie)" if energy.tie else ""
     shares = dict(zip(energy.elements, np.asarray(energy.factors).tolist(), strict=True))
+    total = _write_row("strain energy", _write_value("energy", float(energy.total), "J"))
     return (
-        f'<div style="{_STYLE}">{_table(rows)}'
-        f"{_table([_row('strain energy', _value('energy', float(energy.total), 'J'))])}"
+        f'<div style="{_STYLE}">{_write_table(rows)}{_write_table([total])}'
         f'<div>dominant element <b id="dominant">{escape(str(energy.dominant))}</b>{tie}</div>'
         f"{bars(shares)}</div>"
     )
@@ -183,35 +183,35 @@ def bars(shares: Mapping[str, float]) -> str:
     rest = 100 * sum(shares[name] for name in order[MAX_LISTED_ELEMENTS:])
     others = len(order) - MAX_LISTED_ELEMENTS
     more = f"<div>{others} others: {rest:.1f} %</div>" if others > 0 else ""
-    return _table(rows) + more
+    return _write_table(rows) + more
 
 
 def instant(robot: Robot, timeline: Timeline, at: Instant) -> str:
     """Describe the bag at one time: each joint's measured effort, the twin's, and the residual."""
-    rows = [_head("joint", "measured", "model", "residual")]
+    rows = [_write_head("joint", "measured", "model", "residual")]
     columns = (("measured", at.measured), ("twin", at.twin), ("residual", at.residual))
     for k, name in enumerate(robot.joint_names):
         unit = robot.effort_units[k]
         cells = [
-            _value(f"bag_{what}_{k}", None if v is None else float(v[k]), unit)
+            _write_value(f"bag_{what}_{k}", None if v is None else float(v[k]), unit)
             for what, v in columns
         ]
-        rows.append(_row(escape(name), *cells))
+        rows.append(_write_row(escape(name), *cells))
     why = f"<div>no torques: {escape(timeline.why)}</div>" if timeline.why else ""
-    time = _row("time", _value("bag_time", at.time, "s"))
-    return f'<div style="{_STYLE}">{_table([time])}{_table(rows)}{why}</div>'
+    time = _write_row("time", _write_value("bag_time", at.time, "s"))
+    return f'<div style="{_STYLE}">{_write_table([time])}{_write_table(rows)}{why}</div>'
 
 
 def heard(robot: Robot, live: Heard, waiting: str) -> str:
     """Describe what running nodes say: efforts, residuals, dominant element, rejections."""
-    rows = [_head("joint", "torque", "residual")]
+    rows = [_write_head("joint", "torque", "residual")]
     for k, name in enumerate(robot.joint_names):
         cells = []
         for what in ("torque", "residual"):
             trace = live.traces.get(what)
             value = None if trace is None else float(trace[1][-1, k])
-            cells.append(_value(f"live_{what}_{k}", value, robot.effort_units[k]))
-        rows.append(_row(escape(name), *cells))
+            cells.append(_write_value(f"live_{what}_{k}", value, robot.effort_units[k]))
+        rows.append(_write_row(escape(name), *cells))
     text = ""
     if waiting:
         text += f'<div id="waiting">waiting for {escape(waiting)}</div>'
@@ -222,7 +222,7 @@ def heard(robot: Robot, live: Heard, waiting: str) -> str:
         )
     if live.dominant:
         text += f'<div>dominant element <b id="live_dominant">{escape(live.dominant)}</b></div>'
-    return f'<div style="{_STYLE}">{_table(rows)}{text}{bars(live.shares)}</div>'
+    return f'<div style="{_STYLE}">{_write_table(rows)}{text}{bars(live.shares)}</div>'
 
 
 def _judged(key: str, what: str, value: float | None, unit: str, grade: Grade, hint: str) -> str:
@@ -230,12 +230,12 @@ def _judged(key: str, what: str, value: float | None, unit: str, grade: Grade, h
     words, colour = {"good": "", "warn": " low", "bad": " too low"}[grade], GRADES[grade]
     if value is None:
         words, colour = " unknown", "inherit"
-    cell = _value(key, value, unit, colour, bold=True)
+    cell = _write_value(key, value, unit, colour, bold=True)
     note = f'<span style="color:{colour}">{words}</span>' if words else ""
-    return _row(f'<span title="{escape(hint)}">{what}</span>', cell + note)
+    return _write_row(f'<span title="{escape(hint)}">{what}</span>', cell + note)
 
 
-def _value(
+def _write_value(
     key: str, value: float | None, unit: str, colour: str = "inherit", bold: bool = False
 ) -> str:
     if value is None:
@@ -245,18 +245,18 @@ def _value(
     return f"{shown}&nbsp;{escape(unit)}" if unit else shown
 
 
-def _row(first: str, *cells: str) -> str:
+def _write_row(first: str, *cells: str) -> str:
     rest = "".join(f'<td style="text-align:right">{cell}</td>' for cell in cells)
     return f'<tr><td style="padding-right:0.5em">{first}</td>{rest}</tr>'
 
 
-def _head(first: str, *cells: str) -> str:
+def _write_head(first: str, *cells: str) -> str:
     style = "font-weight:500;opacity:0.65"
     rest = "".join(f'<th style="text-align:right;{style}">{cell}</th>' for cell in cells)
     return f'<tr><th style="text-align:left;{style}">{first}</th>{rest}</tr>'
 
 
-def _table(rows: Iterable[str]) -> str:
+def _write_table(rows: Iterable[str]) -> str:
     return (
         '<table style="width:100%;border-collapse:collapse;font-variant-numeric:tabular-nums">'
         f"{''.join(rows)}</table>"

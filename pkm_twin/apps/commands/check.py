@@ -71,7 +71,7 @@ def check(given: Check) -> Report:
     from pkm_twin.recordings.bags import is_collection
 
     if is_collection(given.bag):
-        return _of_folder(given)
+        return _check_folder(given)
     try:
         with progress("reading", None) as update:
             return check_one(given, given.bag, update)
@@ -135,7 +135,7 @@ def check_one(given: Check, path: Path, update: Any = None, thorough: bool = Tru
     )  # fmt: skip
 
 
-def _facts(given: Check, path: Path) -> dict[str, Any]:
+def _check_safely(given: Check, path: Path) -> dict[str, Any]:
     """One recording of many, as plain data; a damaged one too."""
     try:
         return check_one(given, path, thorough=False).data
@@ -143,9 +143,9 @@ def _facts(given: Check, path: Path) -> dict[str, Any]:
         return {"bag": str(path), "good": False, "error": one_line(str(error))}
 
 
-def _judged_all(given: Check, paths: Sequence[Path]) -> Iterator[dict[str, Any]]:
+def _check_all(given: Check, paths: Sequence[Path]) -> Iterator[dict[str, Any]]:
     """Verdicts in the order of the recordings, as they come, on so many processes."""
-    each, jobs = partial(_facts, given), min(given.jobs, len(paths))
+    each, jobs = partial(_check_safely, given), min(given.jobs, len(paths))
     if jobs == 1:
         yield from map(each, paths)
         return
@@ -154,13 +154,13 @@ def _judged_all(given: Check, paths: Sequence[Path]) -> Iterator[dict[str, Any]]
         yield from pool.map(each, paths)
 
 
-def _of_folder(given: Check) -> Report:
+def _check_folder(given: Check) -> Report:
     """Judge all recordings of a folder."""
     from pkm_twin.recordings.bags import bags_of
 
     paths, results = bags_of(given.bag), list[dict[str, Any]]()
     with progress("checking", len(paths)) as update:
-        for result in _judged_all(given, paths):
+        for result in _check_all(given, paths):
             results.append(result)
             update(len(results))
     notes = []

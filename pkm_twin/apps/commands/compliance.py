@@ -80,7 +80,7 @@ def compliance(given: Compliance) -> Report:
         Fact("compliance", c),
         Fact("compliance_deviation", compliance_deviation(machine, given.pose)),
         Fact("deflection", moved, text="deflection (µm, µrad)",
-             shown=_micro(np.where(abs(moved) > least, moved, 0.0), ".4g")),
+             shown=_format_micro(np.where(abs(moved) > least, moved, 0.0), ".4g")),
         Fact("total_energy", energy.total, "J", text="strain energy"),
         Fact("factors", shares, text=None if energy.dominant == "none" else "shares",
              shown=", ".join(f"{name} {100 * part:.1f} %" for name, part in ordered)),
@@ -90,7 +90,7 @@ def compliance(given: Compliance) -> Report:
     ]  # fmt: skip
     if machine.uncertainty:
         doubt = deflection_deviation(machine, given.pose, given.wrench)
-        doubts = _micro(np.where(doubt > 1e-12 * doubt.max(), doubt, 0.0), ".2g")
+        doubts = _format_micro(np.where(doubt > 1e-12 * doubt.max(), doubt, 0.0), ".2g")
         label = "standard deviation (from the robot file's uncertainty)" if doubt.any() else None
         facts.insert(6, Fact("", doubts, text=label))
     size = np.sqrt(np.diag(c))
@@ -107,7 +107,7 @@ def compliance(given: Compliance) -> Report:
     )
 
 
-def _micro(values: object, form: str) -> str:
+def _format_micro(values: object, form: str) -> str:
     pairs = zip(AXES, values, strict=True)  # type: ignore[call-overload]
     return ", ".join(f"{name} {1e6 * value:{form}}" for name, value in pairs)
 

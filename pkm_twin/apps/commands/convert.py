@@ -61,7 +61,7 @@ def convert(given: Convert) -> Report:
     first = given.source[0]
     ending = Path(first).suffix
     if len(given.source) > 1 or (ending not in ROBOTS if ending else Path(first).is_file()):
-        return _of_printer(given)
+        return _convert_printer(given)
     if not ending and first not in robot_names():
         raise UnknownNameError("SOURCE", first, [*robot_names(), "a robot's or a printer's file"])
     from pkm_twin.machine.machine_yaml import describe_machine_yaml
@@ -85,7 +85,7 @@ def convert(given: Convert) -> Report:
     return Report(files={"out": given.out}, notes=notes)
 
 
-def _of_printer(given: Convert) -> Report:
+def _convert_printer(given: Convert) -> Report:
     """Write a printer's geometry and probings."""
     out, data = given.out or Path("printer.yaml"), given.data or Path("probes.csv")
     for target in (out, data):

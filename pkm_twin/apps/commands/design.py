@@ -222,7 +222,7 @@ def optimised(given: Design, path: Path) -> Report:
             Fact("subject_to", [str(bound) for bound in found.constraints]),
             Fact("numbers", dict(best.numbers)),
             Fact("before_feasible", before.feasible),
-            Fact("front", [_point(point) for point in found.front]),
+            Fact("front", [_describe_point(point) for point in found.front]),
             Fact("machines", found.machines),
             Fact("rejected_starts", found.rejected),
             Fact("beyond_position_limits", limits),
@@ -269,7 +269,7 @@ def at_bound(value: float, bound: tuple[float, float]) -> str:
     return "at its lower bound" if low else "at its upper bound" if high else ""
 
 
-def _point(point: DesignPoint) -> dict[str, Any]:
+def _describe_point(point: DesignPoint) -> dict[str, Any]:
     return {"variables": dict(point.variables), "quantities": dict(point.quantities)}
 
 
@@ -433,20 +433,20 @@ def budget(given: Design) -> Report:
         Fact("robot", robot.name),
         Fact("states", len(q)),
         Fact("path", None if given.path is None else str(given.path)),
-        _length("rms_position_m", rms(moves)),
-        _length("greatest_position_m", greatest(moves),
+        _report_length("rms_position_m", rms(moves)),
+        _report_length("greatest_position_m", greatest(moves),
                 None if turning else "largest standard deviation", at),
         Fact("rms_angle_rad", rms(turns), "rad", "RMS rotation",
              f"{1e3 * rms(turns):.4g} mrad"),
         Fact("greatest_angle_rad", most, "rad", "largest standard deviation" if turning else None,
              f"{1e3 * most:.4g} mrad{at}"),
         Fact("worst_pose", summary.worst_pose),
-        _length("bound_position_m", shift, None if turning else case, bound_at),
+        _report_length("bound_position_m", shift, None if turning else case, bound_at),
         Fact("bound_angle_rad", bound, "rad", case if turning else None,
              f"{1e3 * bound:.4g} mrad{bound_at}"),
         Fact("bound_pose", summary.bound_pose),
         Fact("bound_is_reached", found.is_exact),
-        _length("rms_calibrated_position_m", summary.calibrated_position,
+        _report_length("rms_calibrated_position_m", summary.calibrated_position,
                 "RMS after a calibration without noise"),
     ]  # fmt: skip
     if given.monte_carlo:
@@ -467,7 +467,7 @@ def budget(given: Design) -> Report:
     if found.deflection is not None:
         bent = rms(found.deflection[..., :3])
         label = "deflection under the wrench, not in the table: RMS"
-        facts.append(_length("rms_deflection_m", bent, label))
+        facts.append(_report_length("rms_deflection_m", bent, label))
     what = f"position {1e3 * rms(moves):.4g} mm"
     if turning:
         what = f"rotation {1e3 * rms(turns):.4g} mrad"
@@ -484,7 +484,7 @@ def _place(robot: Robot, pose: Any) -> str:
     return ", ".join(f"{n} {value:.4g}" for n, value in zip(robot.pose_names, pose, strict=True))
 
 
-def _length(name: str, value: float, text: str | None = None, more: str = "") -> Fact:
+def _report_length(name: str, value: float, text: str | None = None, more: str = "") -> Fact:
     return Fact(name, value, "m", text, f"{1e3 * value:.4g} mm{more}")
 
 

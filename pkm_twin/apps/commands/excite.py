@@ -79,7 +79,7 @@ def excite(given: Excite) -> Report:
 
     machine = given.machine()
     judge = Judge.of(machine, file_parameters(machine, kinds_of(given.what)))
-    other = None if given.compare is None else _condition_of(given.compare, judge)
+    other = None if given.compare is None else _find_condition(given.compare, judge)
     bounds = Bounds(given.share, given.acceleration, given.singularity, given.rate)
     best: Any
     if given.friction:
@@ -135,7 +135,7 @@ def _span(machine: Robot, speeds: Any) -> str:
     return " and ".join(f"{one.min():.2g} to {one.max():.2g} {u}/s" for u, one in rows.items())
 
 
-def _condition_of(path: Path, judge: Judge) -> float:
+def _find_condition(path: Path, judge: Judge) -> float:
     """Condition number of a recorded motion."""
     from pkm_twin.identification.samples import tracks
     from pkm_twin.recordings import read

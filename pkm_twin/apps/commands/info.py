@@ -39,7 +39,7 @@ class Info(OfRobot, Draws):
     """
 
 
-def _leading(robot: Robot) -> list[Fact]:
+def _report_leading(robot: Robot) -> list[Fact]:
     """Of more actuated joints than degrees of freedom those that lead."""
     leads = list(robot.graph.leads)
     return [Fact("leads", leads, text="joints that lead")] if robot.redundant else []
@@ -91,16 +91,17 @@ def info(given: Info) -> Report:
         Fact("rank", engine.rank),
         Fact("redundant_closures", engine.redundant),
         Fact("assumed_joints", assumed),
-        Fact("pose", pose_units, text="pose", shown=_named(pose_units)),
+        Fact("pose", pose_units, text="pose", shown=_list_units(pose_units)),
         *_other_poses(robot),
-        Fact("joints", list(robot.joint_names), text="actuated joints", shown=_named(joint_units)),
-        *_leading(robot),
+        Fact("joints", list(robot.joint_names), text="actuated joints",
+             shown=_list_units(joint_units)),
+        *_report_leading(robot),
         Fact("joint_unit", robot.joint_unit),
         Fact("joint_units", list(robot.joint_units)),
         Fact("effort_unit", None if why_no_torques(robot) else robot.effort_unit),
-        Fact("home_pose", home_pose, text="home pose", shown=_pairs(home_pose, pose_units)),
+        Fact("home_pose", home_pose, text="home pose", shown=_write_values(home_pose, pose_units)),
         Fact("home_joints", home_joints, text="home joints",
-             shown=_pairs(home_joints, joint_units)),
+             shown=_write_values(home_joints, joint_units)),
         Fact("singularity_at_home", value := float(robot.singularity(q)),
              text="singularity index at home", shown=f"{value:.3f} (0 singular, 1 best)"),
         Fact("clearance_at_home", gap, text=None if gap is None else "clearance at home",
@@ -124,14 +125,14 @@ def info(given: Info) -> Report:
     for section, value in sections.items():
         listed = section == "joints" and isinstance(value, list)
         if section not in ("mechanism", "name", PARAMETERS) and not listed:
-            facts += _parameters(section, value, units.get(section, ""))
+            facts += _report_parameters(section, value, units.get(section, ""))
     return Report(
-        f"{robot.name}: {robot.description}", facts, figures={"": lambda: _picture(robot)},
-        notes=_joints_at_one_point(robot) if given.picture else [],
+        f"{robot.name}: {robot.description}", facts, figures={"": lambda: _draw_robot(robot)},
+        notes=_note_joints_at_one_point(robot) if given.picture else [],
     )  # fmt: skip
 
 
-def _joints_at_one_point(robot: Robot) -> list[str]:
+def _note_joints_at_one_point(robot: Robot) -> list[str]:
     """Return a note on how to draw a machine apart whose drives' joints stand at one point."""
     places = np.array([robot.graph.joints[name].at for name in robot.joint_names])
     if len(places) < 2 or np.ptp(places, axis=0).max() > DRAWN_APART * robot.graph.size:
@@ -153,7 +154,7 @@ def members_fault(robot: Robot) -> str:
     return ""
 
 
-def _picture(robot: Robot) -> Any:
+def _draw_robot(robot: Robot) -> Any:
     from pkm_twin.view.drawing import draw
 
     return draw(robot)
@@ -189,7 +190,7 @@ def grouped_reactions(names: Sequence[str]) -> list[str]:
     for joint, kinds in joints.items():
         words = [f"{kind} {_directions(directions)}".strip() for kind, directions in kinds.items()]
         alike.setdefault(" and ".join(words), []).append(joint)
-    return [f"{_some(names)}: not determined: {what}" for what, names in alike.items()] + others
+    return [f"{_shorten(names)}: not determined: {what}" for what, names in alike.items()] + others
 
 
 def _directions(names: list[str]) -> str:
@@ -205,28 +206,28 @@ def _directions(names: list[str]) -> str:
     return " and ".join(words)
 
 
-def _some(names: list[str]) -> str:
+def _shorten(names: list[str]) -> str:
     """Names, of many the first."""
     if len(names) <= MOST_NAMES:
         return ", ".join(names)
     return f"{', '.join(names[:MOST_NAMES])} and {len(names) - MOST_NAMES} more"
 
 
-def _parameters(name: str, value: Any, unit: Any) -> Iterator[Fact]:
+def _report_parameters(name: str, value: Any, unit: Any) -> Iterator[Fact]:
     """Yield a parameter, or a section's parameters under its name."""
     if isinstance(value, dict):
         for key, item in value.items():
-            yield from _parameters(f"{name}: {key}", item, unit[key])
+            yield from _report_parameters(f"{name}: {key}", item, unit[key])
     else:
         shown = "none" if value is None else f"{number(value, '.6g')} {unit}".strip()
         yield Fact("", value, text=name, shown=shown)
 
 
-def _named(units: dict[str, str]) -> str:
+def _list_units(units: dict[str, str]) -> str:
     return ", ".join(f"{name} ({unit})" for name, unit in units.items())
 
 
-def _pairs(values: dict[str, float], units: dict[str, str]) -> str:
+def _write_values(values: dict[str, float], units: dict[str, str]) -> str:
     # Rounded first, so that nothing reads -0.0000.
     return ", ".join(f"{k} {round(v, 4) + 0.0:.4f} {units[k]}" for k, v in values.items())
 

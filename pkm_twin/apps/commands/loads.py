@@ -87,7 +87,7 @@ def loads(given: Loads) -> Report:
             Fact("exponent", given.exponent),
             Fact("joints", joints),
         ],
-        _tables(joints),
+        _make_tables(joints),
         figures={"": lambda: draw(motion, found, answer)},
         notes=[*motion.notes, *([UNDETERMINED] if open_ else []),
                *([f"{IDLE}: {', '.join(idle)}"] if idle else [])],
@@ -125,7 +125,7 @@ def of_joint(load: Summary, exponent: float, duration: float) -> dict[str, Any]:
     return entry
 
 
-def _tables(joints: dict[str, Any]) -> list[Table]:
+def _make_tables(joints: dict[str, Any]) -> list[Table]:
     """Peaks, ranges and lives, as the terminal shows them."""
     columns = [
         Column("bearing_force_peak_N", "N", "force peak"),

@@ -124,7 +124,7 @@ def monitor_torques(given: MonitorTorques) -> Report:
                 while time.monotonic() - began < given.wait or arrivals.count:
                     subscribed = subscribed or _subscribe(node, name, take)
                     spin(LOOK)
-                    offer = _offer(node, name) or offer
+                    offer = _find_offer(node, name) or offer
                     end = arrivals.first + given.duration * SECOND
                     if arrivals.count and time.monotonic_ns() > end:
                         break
@@ -158,7 +158,7 @@ def _subscribe(node: Any, topic: str, take: Any) -> bool:
     return True
 
 
-def _offer(node: Any, topic: str) -> Offer | None:
+def _find_offer(node: Any, topic: str) -> Offer | None:
     """Return the offered QoS of the present publishers; None without any."""
     profiles = [info.qos_profile for info in node.get_publishers_info_by_topic(topic)]
 

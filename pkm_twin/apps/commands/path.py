@@ -168,10 +168,10 @@ def path(given: Motion) -> Report:
     if given.slow_where_soft:
         cut = SoftCut(machine, given.force or 0.0, given.deflection or 0.0, given.speed or 0.0)
     bounds: dict[str, Any] = {
-        name: _limit(name, getattr(given, name), machine)
+        name: _check_limits(name, getattr(given, name), machine)
         for name in ("effort", "velocity", "acceleration", "jerk")
     }
-    way, payload = _way(given, machine)
+    way, payload = _read_way(given, machine)
     law = "fastest" if given.fastest or given.slow_where_soft else given.law
     motion = timed(
         machine, way, law, payload=payload, duration=given.duration, speed=given.speed,
@@ -227,21 +227,21 @@ def path(given: Motion) -> Report:
         facts.append(Fact("shaper", shaper, text="shaper", shown=words))
     draw: Any = draw_limits
     if cut is not None:
-        more, draw = _cut(cut, motion)
+        more, draw = _report_cut(cut, motion)
         facts += more
     return Report(
-        answer, facts, _tables(motion, given.slow_where_soft), {"": lambda: draw(motion, answer)},
+        answer, facts, _lay_out(motion, given.slow_where_soft), {"": lambda: draw(motion, answer)},
         files={"out": given.out},
     )  # fmt: skip
 
 
-def _way(given: Motion, machine: Robot) -> tuple[Way, Sequence[float | None] | None]:
+def _read_way(given: Motion, machine: Robot) -> tuple[Way, Sequence[float | None] | None]:
     """Return the path, and the payload from each of its waypoints on."""
     from pkm_twin.paths.waypoints import parse_loads
 
     if given.carries and given.payload is not None:
         raise click.UsageError("--payload is for the whole path; leave it out with --load")
-    way, masses = _unloaded(given, machine)
+    way, masses = _read_path(given, machine)
     option = "--load" if given.carries else "--payload" if given.payload is not None else ""
     same = not given.carries and set(masses or ()) <= {machine.payload.mass}
     if masses is not None and option and not same:
@@ -249,7 +249,7 @@ def _way(given: Motion, machine: Robot) -> tuple[Way, Sequence[float | None] | N
     return way, parse_loads(given.carries, len(way.marks)) if given.carries else masses
 
 
-def _unloaded(given: Motion, machine: Robot) -> tuple[Way, list[float] | None]:
+def _read_path(given: Motion, machine: Robot) -> tuple[Way, list[float] | None]:
     """Return the path, and the payload of a table's waypoints."""
     from pkm_twin import paths
     from pkm_twin.paths.waypoints import read_waypoints
@@ -282,7 +282,9 @@ def _unloaded(given: Motion, machine: Robot) -> tuple[Way, list[float] | None]:
     return made, None
 
 
-def _limit(name: str, values: tuple[float, ...] | None, machine: Robot) -> list[float] | None:
+def _check_limits(
+    name: str, values: tuple[float, ...] | None, machine: Robot
+) -> list[float] | None:
     n = machine.joints_count
     if values is not None and (len(values) not in (1, n) or min(values) <= 0.0):
         found = ",".join(f"{value:g}" for value in values)
@@ -290,7 +292,7 @@ def _limit(name: str, values: tuple[float, ...] | None, machine: Robot) -> list[
     return None if values is None else list(values)
 
 
-def _tables(motion: TimedPath, soft: bool) -> list[Table]:
+def _lay_out(motion: TimedPath, soft: bool) -> list[Table]:
     """Return tables of limits and peaks; with ``soft`` the tolerance bounds the speed, too."""
     rows: dict[str, list[Any]] = {}
     words_of = {"speed": "speed or tolerance"} if soft else {}
@@ -354,7 +356,7 @@ def draw_limits(motion: TimedPath, title: str) -> Any:
     return figure
 
 
-def _cut(cut: SoftCut, motion: TimedPath) -> tuple[list[Fact], Any]:
+def _report_cut(cut: SoftCut, motion: TimedPath) -> tuple[list[Fact], Any]:
     """Report feed and deflection of a cut with their bounds, and draw them."""
     from pkm_twin.paths.joint_path import reference_velocity
 

@@ -162,7 +162,7 @@ def size(given: Size) -> Report:
         best, words = smallest_motors(duties)
         facts, notes, title = facts + best, notes + words, f"{title}; {words[0]}"
     return Report(
-        answer, facts, _tables(duties), {"": lambda: draw(taken, duties, title)}, notes,
+        answer, facts, _make_tables(duties), {"": lambda: draw(taken, duties, title)}, notes,
     )  # fmt: skip
 
 
@@ -224,7 +224,7 @@ def smallest_motors(duties: Sequence[DriveDuty]) -> tuple[list[Fact], list[str]]
     return facts, [f"smallest motor for all drives: {words}", f"smallest for each drive: {own}"]
 
 
-def _tables(duties: Sequence[DriveDuty]) -> list[Table]:
+def _make_tables(duties: Sequence[DriveDuty]) -> list[Table]:
     """Joints, motors and the comparisons, as the terminal shows them."""
     tables = []
     sides = [("joint", True), ("joint", False), ("motor", False)]
@@ -256,8 +256,8 @@ def _tables(duties: Sequence[DriveDuty]) -> list[Table]:
         columns.append(Column("", "", "inertia ratio", form=".3g"))
         rows = {
             fit.name: [
-                fit.answer, "-" if fit.speed > 1.0 else _percent(fit.torque),
-                _percent(fit.thermal), _percent(fit.speed), fit.inertia_ratio,
+                fit.answer, "-" if fit.speed > 1.0 else _format_percent(fit.torque),
+                _format_percent(fit.thermal), _format_percent(fit.speed), fit.inertia_ratio,
             ]
             for fit in fits
         }  # fmt: skip
@@ -274,7 +274,7 @@ def _tables(duties: Sequence[DriveDuty]) -> list[Table]:
     return tables
 
 
-def _percent(part: float) -> str:
+def _format_percent(part: float) -> str:
     value = 100.0 * part
     return f"{value:.4g} %" if value <= MOST_PERCENT else f"over {MOST_PERCENT:.0f} %"
 
@@ -367,7 +367,7 @@ def draw(taken: EffortComparison, duties: Sequence[DriveDuty], answer: str) -> A
                 ("effort", own.effort, ax.axhline, torques),
             ):
                 if limits is not None and np.isfinite(limits[k]):
-                    used.append(f"{_percent(np.abs(values).max() / limits[k])} of {what}")
+                    used.append(f"{_format_percent(np.abs(values).max() / limits[k])} of {what}")
                     for sign in (1.0, -1.0):
                         draw(sign * limits[k], **dashed)
             words = f"uses {', '.join(used)} (dashed: limits of the file)" if used else "no limits"
@@ -387,7 +387,7 @@ def draw(taken: EffortComparison, duties: Sequence[DriveDuty], answer: str) -> A
                 ax.axhline(
                     level, color="0.5", ls="--", lw=1, label="continuous" if sign > 0 else None
                 )
-            parts = tuple(map(_percent, (fit.torque, fit.thermal, fit.speed)))
+            parts = tuple(map(_format_percent, (fit.torque, fit.thermal, fit.speed)))
             words = (
                 f"{fit} {'' if fit.good else 'is '}{fit.answer}: "
                 "torque {}, RMS torque {}, speed {}".format(*parts)

@@ -63,7 +63,7 @@ def view(given: View) -> Report:
 
     with ExitStack() as stack:
         machine = load(given.robot, **given.part)
-        timeline = None if bag is None else _timeline(bag, given)
+        timeline = None if bag is None else _read_timeline(bag, given)
         model = Model(machine)
         server = stack.enter_context(serving(given.port))
         page = Page(server, model, "Bag" if timeline is not None else "Live" if given.live else "")
@@ -80,7 +80,7 @@ def view(given: View) -> Report:
     return Report()
 
 
-def _timeline(bag: Path, given: View) -> Timeline:
+def _read_timeline(bag: Path, given: View) -> Timeline:
     from pkm_twin.view.timeline import Timeline
 
     with progress("reading", None) as update:
