@@ -300,7 +300,9 @@ class Assembly:
                 inner = inner @ rotation_about(errors["tilt", joint.name])
             turns = partial(rotate, inner), partial(rotate, outer)
             for held in joint.constraints:
-                found += constraint_equations(joint, held, points, turns, size)
+                found += constraint_equations(
+                    joint.name, (joint.inner, joint.outer), held, points, turns, size
+                )
             if joint.name in graph.leads:
                 goal = self.q[..., graph.actuated.index(joint.name)] - joint.home
                 goal = goal + errors.get(("offset", joint.name), np.zeros(1))[..., 0]

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import snapped
@@ -59,6 +60,15 @@ def dot(a: Any, b: Any) -> Any:
     return a @ b if a.ndim == b.ndim == 1 else (a * b).sum(-1)
 
 
+def cross(a: Any, b: Any) -> NDArray[Any]:
+    """Return the vector product over the last axis, of numbers or of three expressions each."""
+    if a.ndim != 1 or b.ndim != 1:
+        return np.asarray(np.cross(a, b), np.float64)
+    (ax, ay, az), (bx, by, bz) = a, b
+    product = [ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx]
+    return np.array(product, np.result_type(a, b))
+
+
 def keep_angle(
     part: str, bodies: tuple[str, str], points: Pair, vectors: Pair, known: Any
 ) -> Equation:
@@ -67,9 +77,7 @@ def keep_angle(
     :param known: scalar product of the vectors.
     """
     inner, outer = vectors
-    return Equation(
-        part, bodies, dot(inner, outer) - known, points, NONE, np.cross(outer, inner), 1.0
-    )
+    return Equation(part, bodies, dot(inner, outer) - known, points, NONE, cross(outer, inner), 1.0)
 
 
 def keep_distance(
@@ -94,38 +102,38 @@ def keep_pair(
     """
     along = (points[1] - points[0]) * (1.0 / length)
     value = dot(along, vectors[1] - vectors[0])
-    return Equation(part, bodies, value, points, NONE, np.cross(vectors[1], along), 1.0)
+    return Equation(part, bodies, value, points, NONE, cross(vectors[1], along), 1.0)
 
 
 def constraint_equations(
-    joint: Joint, held: Constraint, points: Pair, turns: Turns, size: Any
+    part: str, bodies: tuple[str, str], held: Constraint, points: Pair, turns: Turns, size: Any
 ) -> list[Equation]:
     """Return the equations of one constraint of a joint.
 
     :param points: of the joint on both bodies, m. ``size``: of the machine, m.
     """
-    bodies, apart, scale = (joint.inner, joint.outer), points[1] - points[0], 1.0 / size
+    apart, scale = points[1] - points[0], 1.0 / size
     if held.kind == "point":
         # [()] makes an array of one expression that expression.
         return [
-            Equation(joint.name, bodies, apart[..., i][()], points, unit, NONE, scale)
+            Equation(part, bodies, apart[..., i][()], points, unit, NONE, scale)
             for i, unit in enumerate(UNITS)
         ]
     inner = turns[0](held.inner)
     if held.kind == "angle":
         vectors = inner, turns[1](held.outer)
-        return [keep_angle(joint.name, bodies, points, vectors, snapped(held.inner @ held.outer))]
+        return [keep_angle(part, bodies, points, vectors, snapped(held.inner @ held.outer))]
     # The inner body bears the force where the outer body's point is.
     there, along = (points[1], points[1]), dot(inner, apart)
     if held.kind == "plane":
-        return [Equation(joint.name, bodies, along, there, inner, NONE, scale)]
+        return [Equation(part, bodies, along, there, inner, NONE, scale)]
     mark = turns[1](held.outer)
-    sine, cosine = dot(inner, np.cross(turns[0](held.outer), mark)), dot(turns[0](held.outer), mark)
+    sine, cosine = dot(inner, cross(turns[0](held.outer), mark)), dot(turns[0](held.outer), mark)
     angle = np.arctan2(sine, cosine)
     # The angle is known up to full revolutions.
     angle = angle + 2.0 * np.pi * np.round((along / held.slide - angle) / (2.0 * np.pi))
     value = along - held.slide * angle
-    return [Equation(joint.name, bodies, value, there, inner, -held.slide * inner, scale)]
+    return [Equation(part, bodies, value, there, inner, -held.slide * inner, scale)]
 
 
 def drive_equation(joint: Joint, goal: Any, points: Pair, turns: Turns, size: Any) -> Equation:

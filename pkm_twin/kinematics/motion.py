@@ -51,7 +51,7 @@ FIXED: Final = BaseMotion(_ZERO, _ZERO, _ZERO)
 
 
 def cross(a: Any, b: Any) -> Objects:
-    """Vector product of three numbers each."""
+    """Return the vector product of three numbers each."""
     result = np.empty(3, dtype=object)
     result[0] = a[1] * b[2] - a[2] * b[1]
     result[1] = a[2] * b[0] - a[0] * b[2]
@@ -234,7 +234,9 @@ class Motion:
             points = self.point(a, joint.at), self.point(b, joint.at)
             turns = partial(self.direction, a), partial(self.direction, b)
             for held in joint.constraints:
-                found = constraint_equations(joint, held, points, turns, self.tree.size)
+                found = constraint_equations(
+                    joint.name, (joint.inner, joint.outer), held, points, turns, self.tree.size
+                )
                 columns = self._differences(found[0])
                 rows += [
                     self._row(one, columns, partial(self._bias, joint, held, one)) for one in found

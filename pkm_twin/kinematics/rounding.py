@@ -332,7 +332,9 @@ class _Loops:
                             frame._replace(tilt=("axis", name, k), axis=joint.axes[k])
                             for frame, k in zip(frames, held.axes, strict=True)
                         ]
-                    for one in constraint_equations(joint, held, points, turns, size):
+                    for one in constraint_equations(
+                        joint.name, (joint.inner, joint.outer), held, points, turns, size
+                    ):
                         found.append((frames, one))
         for rod in self.graph.rods.values():
             start, end = rod.ends

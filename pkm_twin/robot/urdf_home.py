@@ -12,7 +12,7 @@ drawing: a graph of driven joints to the kinematics. A closure compares two fram
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -20,6 +20,7 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import ParameterError, SingularityError
+from pkm_twin.kinematics.constraints import Equation, constraint_equations, keep_angle
 from pkm_twin.kinematics.linkage import Linkage
 from pkm_twin.kinematics.motion import Motion, numbers
 from pkm_twin.kinematics.rounding import CHAIN, MAX_ROUNDING, Repair, repair_rounded
@@ -28,8 +29,9 @@ from pkm_twin.kinematics.singularity import singularity_at_home
 from pkm_twin.kinematics.spins import RANK, hold, null, without_spins
 from pkm_twin.machine import graph as graphs
 from pkm_twin.machine.graph import BASE, Graph
+from pkm_twin.machine.joints import HELD, Constraint
 from pkm_twin.machine.loop_tree import Joint, LoopTree
-from pkm_twin.machine.rotations import Pose, to_quaternion
+from pkm_twin.machine.rotations import Pose, rotation_about, rotation_vector
 from pkm_twin.machine.tree import Tree
 
 ROUNDS: Final = 100
@@ -103,6 +105,7 @@ class Assembly:
                 self.steps.append(joint.name)
             self._bodies[child] = body
         self.turns = np.array([joint.kind != "prismatic" for joint in joints.values()], bool)
+        self._constraints = {one.name: list(_list_constraints(one)) for one in tree.closures}
         bodies = {name: graphs.Body(name) for name in joints}
         self._chain = Tree(Graph(bodies, joints, {}, BASE, np.zeros(3)))
         self.place(np.zeros(len(joints)))
@@ -141,46 +144,43 @@ class Assembly:
             angular[:, k] = column
         return linear, angular
 
-    def _misses(self, closure: Joint, rates: bool) -> list[tuple[Array, Array]]:
-        """How far a closure is open, m and rad, and the rates of that, shape (rows, count)."""
-        a, b = self.frame(closure, 0), self.frame(closure, 1)
-        (va, wa), (vb, wb) = (
-            self.twist(link, pose.position) if rates else np.zeros((2, 3, 0))
-            for link, pose in ((closure.inner, a), (closure.outer, b))
-        )
-        apart, slip, turn = b.position - a.position, vb - va, wb - wa
-        across = np.eye(3)
-        if len(closure.axes):
-            first = self.move(closure.inner).rotation @ closure.axes[0]
-            second = self.move(closure.outer).rotation @ closure.axes[-1]
-            across = np.eye(3) - np.outer(first, first)
-        rows: list[tuple[Array, Array]] = []
-        for held in closure.type.holds:
-            if held == "point":
-                rows.append((apart, slip))
-            elif held in ("line", "flat"):
-                # It turns with the first link.
-                kept = across if held == "line" else first[None]
-                rows.append((kept @ apart, kept @ (slip - np.cross(wa.T, apart).T)))
-            elif held == "turns":
-                rows.append((_angle(a.rotation.T, b.rotation), turn))
-            elif held == "direction":
-                rows.append((_between(first, second), across @ turn))
-            elif held == "crossing":
-                normal = np.cross(second, first)
-                rows.append((np.array([first @ second - closure.cosine]), (normal @ turn)[None]))
+    def _equations(self, closure: Joint) -> list[Equation]:
+        """Return the equations of a closure at the placed values."""
+        name, bodies = closure.name, (closure.inner, closure.outer)
+        inner, outer = (self.move(link).rotation for link in bodies)
+        points = self.frame(closure, 0).position, self.frame(closure, 1).position
+        found: list[Equation] = []
+        for held, apart in self._constraints[name]:
+            if closure.type.count == 2 and held.kind == "angle":
+                axes = inner @ held.inner, outer @ held.outer
+                found.append(keep_angle(name, bodies, points, axes, closure.cosine))
             else:
-                raise NotImplementedError(f"a closure that holds {held!r}")
-        return rows
+                turns = inner.__matmul__, (outer @ apart).__matmul__
+                found += constraint_equations(name, bodies, held, points, turns, 1.0)
+        return found
 
     def residuals(self, rates: bool = True) -> tuple[Array, Array]:
-        """How far the closures are open, shape (rows,), m and rad, and the rates, (rows, count).
+        """Return how far the closures are open, shape (rows,), m and rad, and the rates of that.
 
-        :param rates: without them their count is zero.
+        :param rates: without them their shape is (rows, 0), else (rows, count).
         """
-        rows = [(np.zeros(0), np.zeros((0, len(self.steps) if rates else 0)))]
-        rows += [row for closure in self.tree.closures for row in self._misses(closure, rates)]
-        return np.concatenate([r for r, _ in rows]), np.vstack([j for _, j in rows])
+        closures = [self._equations(one) for one in self.tree.closures]
+        values = np.array([float(one.value) for found in closures for one in found])
+        if not rates:
+            return values, np.zeros((len(values), 0))
+        table = [np.zeros((0, len(self.steps)))]
+        for closure, found in zip(self.tree.closures, closures, strict=True):
+            force = np.array([one.force for one in found])
+            moment = np.array([one.moment for one in found])
+            part: Array = np.zeros((len(found), len(self.steps)))
+            for side, link in enumerate((closure.inner, closure.outer)):
+                point = self.frame(closure, side).position
+                linear, angular = self.twist(link, point)
+                arm = np.array([one.points[side] for one in found]) - point
+                rows = force @ linear + (moment + np.cross(arm, force)) @ angular
+                part = part + (rows if side else -rows)
+            table.append(part)
+        return values, np.vstack(table)
 
     def close(self, values: Array, held: Mask | bool = False) -> tuple[Array, float]:
         """Values that close the loops by least steps, and the greatest miss left.
@@ -279,11 +279,11 @@ class Assembly:
         """The error of loops that do not close, with the one that misses the most."""
         closure = max(
             self.tree.closures,
-            key=lambda one: max(float(np.abs(r).max()) for r, _ in self._misses(one, rates=False)),
+            key=lambda one: max(abs(float(e.value)) for e in self._equations(one)),
         )
         a, b = (self.frame(closure, end) for end in (0, 1))
         apart = 1e3 * float(np.linalg.norm(b.position - a.position))
-        turned = float(np.linalg.norm(_angle(a.rotation.T, b.rotation)))
+        turned = float(np.linalg.norm(rotation_vector(b.rotation @ a.rotation.T)))
         what = f"{apart:.3g} mm"
         if closure.kind == "fixed":
             what += f" and {turned:.3g} rad"
@@ -293,21 +293,28 @@ class Assembly:
         )  # fmt: skip
 
 
-def _between(first: Array, second: Array) -> Array:
-    """The rotation vector that turns one line into the other; a hinge's axis has no sign."""
-    side = float(first @ second)
-    normal = np.cross(first, second if side >= 0.0 else -second)
-    size = float(np.linalg.norm(normal))
-    scale = math.atan2(size, abs(side)) / size if size > 1e-12 else 1.0
-    return np.asarray(scale * normal, np.float64)
+def _list_constraints(closure: Joint) -> Iterator[tuple[Constraint, Array]]:
+    """Yield constraints of a closure with the rotation from inner to outer vectors.
+
+    Frames and axes may be drawn apart: the rotation takes a vector of the inner link, as drawn, to
+    that of the outer link.
+    """
+    for key in closure.type.holds:
+        apart = np.eye(3)
+        if key == "turns":
+            apart = closure.frames[1].rotation @ closure.frames[0].rotation.T
+            # Perpendicular vectors alone would let a frame be turned over.
+            yield from ((Constraint("angle", one, one), apart) for one in np.eye(3))
+        elif closure.type.count == 1:
+            apart = _align(closure.axes[0], closure.axes[-1])
+        yield from ((held, apart) for held in HELD[key](closure.axes, closure.pitch))
 
 
-def _angle(inverse: Array, rotation: Array) -> Array:
-    """The rotation vector from one frame to the other, in the axes both are given in."""
-    quaternion = to_quaternion(rotation @ inverse)
-    half = float(np.linalg.norm(quaternion[:3]))
-    scale = 2.0 * math.atan2(half, float(quaternion[3])) / half if half > 1e-12 else 2.0
-    return np.asarray(scale * quaternion[:3], np.float64)
+def _align(first: Array, second: Array) -> Array:
+    """Return the smallest rotation that turns a line into another; lines have no sign."""
+    normal = np.cross(first, second if float(first @ second) >= 0.0 else -second)
+    sine = float(np.linalg.norm(normal))
+    return rotation_about(normal * (math.asin(min(sine, 1.0)) / sine if sine > 0.0 else 1.0))
 
 
 @dataclass(frozen=True, eq=False)
