@@ -15,7 +15,7 @@ from test.support.command import SHELL, typed_line
 from test.support.pages import assert_output
 
 NOT_RUN = {
-    r"pkm-twin .*\b(my_delta|converted|mine)\..*": "of a page's own file: test/docs",
+    r"pkm-twin .*\b(my_delta|converted|mine|ankle)\..*": "of a page's own file: test/docs",
     r"pkm-twin view .*": "serves until a signal: test/view runs it in a browser",
     r"pkm-twin play .*": "needs ROS: test_player runs it over the real middleware",
     r"pkm-twin map .* --scheduler .*": "needs a Dask cluster: test/maps/test_run.py has one",

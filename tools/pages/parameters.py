@@ -108,12 +108,12 @@ def page():
     for name, kind in ROBOTS.items():
         own = shared - {"limits"} if name == "upr_rpu" else shared
         flat = {key for key, (_, row) in settings_of(kind).items() if row.section is None}
-        keep = set(settings_of(kind)) - (flat - own) | {"mechanism"}
+        keep = set(settings_of(kind)) - (flat - own)
         parts.append(f"## `mechanism: {name}`\n\n" + "\n".join(rows(kind, keep)))
         for key, (_, row) in settings_of(kind).items():
             if row.section is not None and key not in own:
                 parts.append(f"### `{key}`\n\n{table(row.section)}")
-    parts.append(f"## `mechanism: machine`\n\n{table(machine.MachineFile, common | {'mechanism'})}")
+    parts.append(f"## `mechanism: machine`\n\n{table(machine.MachineFile, common)}")
     parts.append(f"### `limbs`\n\n{table(LimbFile, ('bodies', 'joints', 'rods'))}")
     for kind in (BodySpec, JointSpec, RodSpec):
         parts.append(f"### {TITLES[kind]}\n\n{table(kind)}")

@@ -27,7 +27,7 @@ PAGES = {
     "parameters": ("file", ""),
 }
 """Pages of names: what a line of theirs begins with here, and headings above names."""
-ENTRY = re.compile(r"^\* (?:(?:in|out|service) )?`([^`]+)`", re.MULTILINE)
+ENTRY = re.compile(r"^\* (?:(?:in|out|service) |\*\*)?`([^`]+)`", re.MULTILINE)
 
 
 def groups() -> Iterator[tuple[str, list[str]]]:

@@ -305,7 +305,11 @@ def _find_equations() -> tuple[Row, ...]:
     return (
         Row(
             "equation", (1, 2), "closure of a limb, and its derivative",
-            ("pkm_twin.mechanisms.delta.Delta.make_graph", motion + "distance"), same,
+            (
+                "pkm_twin.mechanisms.delta.Delta.make_graph",
+                "pkm_twin.kinematics.constraints.keep_distance",
+            ),
+            same,
             "lost in the scan; equations 3 and 9 show what they are",
         ),
         Row(
