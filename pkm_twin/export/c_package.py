@@ -44,8 +44,8 @@ from pkm_twin.export.c_templates import (
 from pkm_twin.export.c_transmission import TransmissionTerms, directions
 from pkm_twin.kinematics.programs import actuator_program
 from pkm_twin.machine.inertia import Layout
+from pkm_twin.machine.members import RigidError
 from pkm_twin.machine.sections import MAX_LENGTH, MAX_MASS, payload_margins
-from pkm_twin.robot.mechanism import RigidError
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor.compliance import MIN_PIVOT_RATIO
 from stiffness_monitor.programs import Elastic

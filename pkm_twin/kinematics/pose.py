@@ -7,12 +7,13 @@ entries of the rotation matrix. Written on numbers and expressions alike.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from pkm_twin.codegen.expressions import Numbers
 from pkm_twin.codegen.operations import atan2, cos, sin, sqrt
+from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.motion import Columns, Motion, cross
 
 Entry = tuple[int, int, float]
@@ -59,14 +60,35 @@ TURNS: Final = {
 """Angles of R = Rz Ry Rx and of R = Rx Ry Rz, from the base to the platform."""
 
 
-def about_x(name: str) -> Coordinate:
-    """The first angle of R = Rx Ry Rz."""
-    return Coordinate(name, entries=TURNS["xyz"][0].entries)
+def name_angles(angles: Any) -> tuple[Coordinate, ...]:
+    """Return coordinates of a rotation by their names, each about an axis, from the base on.
+
+    ``{"alpha": "x", "beta": "y"}`` is R = Rx(alpha) Ry(beta) Rz.
+
+    :raises ParameterError: other axes than those of R = Rx Ry Rz or R = Rz Ry Rx, or a single one.
+    """
+    if not isinstance(angles, Mapping):
+        raise ParameterError("angles", angles, "a mapping of names to axes")
+    axes = "".join(map(str, angles.values()))
+    for sequence, turns in TURNS.items():
+        if len(axes) > 1 and sequence.startswith(axes):
+            return tuple(
+                replace(turn, name=str(name)) for name, turn in zip(angles, turns, strict=False)
+            )
+    raise ParameterError(
+        "angles", dict(angles), "two or three names, about x, y, z or about z, y, x in this order"
+    )
 
 
-def about_y(name: str) -> Coordinate:
-    """The second angle of R = Rx Ry Rz."""
-    return Coordinate(name, entries=TURNS["xyz"][1].entries)
+def describe_angles(coordinates: Sequence[Coordinate]) -> dict[str, str]:
+    """Return the argument of :func:`name_angles` that gives coordinates of a rotation."""
+    names = {c.entries: c.name for c in coordinates if c.entries}
+    for sequence, turns in TURNS.items():
+        if set(names) <= {turn.entries for turn in turns}:
+            last = max(k for k, turn in enumerate(turns) if turn.entries in names)
+            own = zip(sequence, turns[: max(last + 1, 2)], strict=False)
+            return {names.get(turn.entries, f"about_{axis}"): axis for axis, turn in own}
+    raise ValueError("the angles are of no one sequence")
 
 
 def _entry(matrix: Any, entry: Entry) -> Any:

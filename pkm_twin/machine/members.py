@@ -20,6 +20,10 @@ Place = tuple[str, Array]
 """A point of a body, given at home."""
 
 
+class RigidError(ParameterError):
+    """Raised for a robot whose file makes nothing elastic."""
+
+
 @dataclass(frozen=True)
 class Section:
     """A round section, hollow or not: moduli (Pa), diameters (m), mass per length (kg/m).

@@ -35,11 +35,10 @@ from pkm_twin.kinematics.three_rods import meet_spheres
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import BASE, PLATFORM, UP, Body, Direction, Graph, Joint, Rod, array
 from pkm_twin.machine.joints import unit
-from pkm_twin.machine.members import Beam, Structure, Tube, axial, disc
+from pkm_twin.machine.members import Beam, RigidError, Structure, Tube, axial, disc
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.sections import check_azimuths, length, mass, shared_middle
 from pkm_twin.mechanisms import TwinRobot
-from pkm_twin.robot.mechanism import RigidError
 
 LIMBS: Final = ("I", "II", "III")
 MAX_ITERATIONS: Final = 12

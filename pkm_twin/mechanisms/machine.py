@@ -19,18 +19,17 @@ from typing import Any, ClassVar, Final, TypeVar
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.expressions import norm, plain, reference
-from pkm_twin.errors import ParameterError, warn
-from pkm_twin.kinematics.pose import COORDINATES, Coordinate
+from pkm_twin.codegen.expressions import reference
+from pkm_twin.errors import ParameterError, UnknownNameError, warn
+from pkm_twin.kinematics.pose import COORDINATES, Coordinate, name_angles
 from pkm_twin.kinematics.rounding import repair_rounded
 from pkm_twin.kinematics.scheme import check_masses, choose_coordinates, choose_leads
 from pkm_twin.machine import schema
+from pkm_twin.machine.file_parts import find_beams, find_passive_limits, find_structure
 from pkm_twin.machine.formulas import PARAMETERS, Book
 from pkm_twin.machine.friction import not_shared
 from pkm_twin.machine.graph import (
-    BASE,
     Graph,
-    limb_numbers,
 )
 from pkm_twin.machine.graph_file import (
     KINDS,
@@ -38,7 +37,6 @@ from pkm_twin.machine.graph_file import (
     BodySpec,
     JointSpec,
     Limb,
-    LimitSpec,
     RodSpec,
     Source,
     driven,
@@ -50,7 +48,6 @@ from pkm_twin.machine.graph_file import (
     shared_by,
     written_out,
 )
-from pkm_twin.machine.joints import unit
 from pkm_twin.machine.members import Beam, Structure
 from pkm_twin.machine.places import (
     Keys,
@@ -67,7 +64,7 @@ from pkm_twin.machine.precision import rounding_error
 from pkm_twin.machine.reach import PassiveLimit
 from pkm_twin.machine.sections import DriveSpec, Redundancy
 from pkm_twin.mechanisms import TwinRobot
-from pkm_twin.robot.mechanism import Common, RigidError
+from pkm_twin.robot.mechanism import Common
 from pkm_twin.robot.robot_urdf import robot_description
 
 M = TypeVar("M", bound="Machine")
@@ -95,9 +92,14 @@ class MachineFile(Common):
     origin: Array | None = schema.vector(
         3, unit="m", text="the platform's reference point at home; by default its com", default=None
     )
+    angles: tuple[Coordinate, ...] = schema.key(
+        lambda _, value: name_angles(value), "names to axes",
+        text="in place of roll, pitch and yaw, about x, y, z or z, y, x in this order: "
+        "`{alpha: x, beta: y}` is R = Rx(alpha) Ry(beta) Rz", default=(),
+    )  # fmt: skip
     pose: tuple[str, ...] | None = schema.words(
-        *COORDINATES,
-        text="as many as the mobility; default: turns if they suffice, else the first valid",
+        text="of x, y, z, roll, pitch, yaw or `angles`, as many as the mobility; default: turns if "
+        "they suffice, else the first valid",
         default=None,
     )
     bodies: Mapping[str, BodySpec] = schema.mapping(BodySpec, default={})
@@ -119,7 +121,7 @@ class Machine(TwinRobot):
     specs: Mapping[str, Mapping[str, Any]]
     sources: Mapping[tuple[str, str], Source]
     """Where each entry stands in the file, by kind and name."""
-    pose: tuple[str, ...]
+    coordinates: tuple[Coordinate, ...]  # type: ignore[misc]
     redundancy: Redundancy = schema.section(Redundancy, default={})
 
     changeable: ClassVar = (*TwinRobot.changeable, "redundancy")
@@ -147,10 +149,19 @@ class Machine(TwinRobot):
         own = drives_of(graph, specs["joints"])
         leads = choose_leads(graph, file.redundancy.leads or (), len(file.pose or ()))
         graph = shared_by(graph, leads, file.redundancy, own["limits"].effort)
+        known = dict(COORDINATES)
+        if file.angles:
+            known = {name: known[name] for name in "xyz"}
+            known |= {turn.name: turn for turn in file.angles}
         pose = tuple(file.pose or choose_coordinates(graph))
+        for i, word in enumerate(pose):
+            if word not in known:
+                raise UnknownNameError(f"pose[{i}]", word, known)
+        coordinates = tuple(known[word] for word in pose)
         common = {field.name: getattr(file, field.name) for field in dataclasses.fields(Common)}
         robot = cls(
-            name=name, described=graph, specs=specs, sources=sources, pose=pose, book=book,
+            name=name, described=graph, specs=specs, sources=sources, coordinates=coordinates,
+            book=book,
             redundancy=file.redundancy, **common, **own,
         )  # fmt: skip
         robot = robot._with(uncertainty=robot.resolved(robot.uncertainty))
@@ -305,17 +316,12 @@ class Machine(TwinRobot):
                 yield kind, name, tuple(where), source.azimuth
 
     @property
-    def coordinates(self) -> tuple[Coordinate, ...]:  # type: ignore[override]
-        """The pose coordinates of the file."""
-        return tuple(COORDINATES[name] for name in self.pose)
-
-    @property
     def description(self) -> str:
         """How many of what."""
         g = self.graph
         counts = {"bodies": len(g.bodies), "joints": len(g.joints), "rods": len(g.rods)}
         parts = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
-        pose = ", ".join(self.pose)
+        pose = ", ".join(self.pose_names)
         drives = _counted(len(g.actuated), "actuated joint")
         if self.redundant:
             drives += f" for {_counted(len(g.leads), 'degree')} of freedom"
@@ -324,7 +330,7 @@ class Machine(TwinRobot):
     @property
     def mobility(self) -> str:
         """Number and the pose coordinates."""
-        return f"{self.engine.mobility.freedoms}: {', '.join(self.pose)}"
+        return f"{self.engine.mobility.freedoms}: {', '.join(self.pose_names)}"
 
     @property
     def limb_names(self) -> tuple[str, ...]:
@@ -419,21 +425,16 @@ class Machine(TwinRobot):
     @cached_property
     def beams(self) -> tuple[Beam, ...]:
         """Bodies with a member, and rods with a section or radius, limb by limb."""
-        limb = limb_numbers(self.graph)
-        beams = []
-        for name, body in self.specs["bodies"].items():
-            m = body.member
-            if m is not None:
-                beams.append(
-                    Beam(name, name, limb[name], (name, m.start), (name, m.end), (name,), m.outer)
-                )
-        for name, rod in self.specs["rods"].items():
-            radius = rod.section.outer_diameter / 2 if rod.section is not None else rod.radius
-            if radius is not None:
-                inner, outer = rod.between
-                ends = (inner, rod.ends[0]), (outer, rod.ends[1])
-                beams.append(Beam(name, name, limb[name], *ends, (name,), radius))
-        return tuple(beams)
+        return find_beams(self.graph, self.specs)
+
+    @cached_property
+    def passive_limits(self) -> tuple[PassiveLimit, ...]:
+        """Positions and swivels of joints that are not actuated, and of rods at both ends."""
+        return find_passive_limits(self.graph, self.specs)
+
+    def structure(self) -> Structure:
+        """Bars with sections, and the compliance of joints."""
+        return find_structure(self.graph, self.specs)
 
     def elastic_entries(self) -> dict[str, dict[str, dict[str, Any]]]:
         """Members of bodies, sections and radii of rods, compliances of joints."""
@@ -482,55 +483,6 @@ class Machine(TwinRobot):
         own = schema.plain(self.redundancy)
         return {"redundancy": {**own, "leads": list(self.graph.leads)}}
 
-    @cached_property
-    def passive_limits(self) -> tuple[PassiveLimit, ...]:
-        """Positions and swivels of joints that are not actuated, and of rods at both ends.
-
-        :raises ParameterError: a swivel without an axis.
-        """
-        found = []
-        for name, joint in self.graph.joints.items():
-            limits = self.specs["joints"][name].limits
-            ends = joint.inner, joint.outer, joint.at
-            if limits is None or joint.actuated:
-                continue
-            if limits.swivel is not None:
-                axis = unit(self._swivel_axis(name, limits))
-                found.append(PassiveLimit(name, "swivel", *ends, axis, 0.0, limits.swivel))
-            elif limits.position is not None:
-                kind = "slide" if joint.slides else "turn"
-                low, high = limits.position.tolist()
-                found.append(PassiveLimit(name, kind, *ends, joint.axes[0], low, high, joint.home))
-        for name, rod in self.specs["rods"].items():
-            if rod.swivel is not None:
-                for k, way in ((0, 1), (1, 0)):
-                    axis = unit(rod.ends[way] - rod.ends[k])
-                    body, other = rod.between[k], rod.between[way]
-                    found.append(
-                        PassiveLimit(
-                            name, "rod", body, other, rod.ends[k], axis, 0.0, rod.swivel,
-                            far=rod.ends[way],
-                        )
-                    )  # fmt: skip
-        return tuple(found)
-
-    def _swivel_axis(self, name: str, limits: LimitSpec) -> Array:
-        """The direction that a ball joint swivels from."""
-        joint = self.graph.joints[name]
-        if limits.axis is not None:
-            return limits.axis
-        if joint.kind == "universal":
-            return np.cross(*joint.axes)
-        for body in (joint.inner, joint.outer):
-            member = None if body == BASE else self.specs["bodies"][body].member
-            if member is not None and body != self.graph.platform:
-                return np.asarray(member.end - member.start, np.float64)
-        raise ParameterError(
-            f"joints.{name}.limits.axis",
-            None,
-            "the direction in the middle of its range, base axes",
-        )
-
     def passive_entries(self) -> dict[str, dict[str, dict[str, Any]]]:
         """Limits of passive joints, swivels of rods."""
         told: dict[str, dict[str, dict[str, Any]]] = {"joints": {}, "rods": {}}
@@ -543,50 +495,6 @@ class Machine(TwinRobot):
             else:
                 told["joints"][limit.joint] = {"limits": {"position": [limit.low, limit.high]}}
         return told
-
-    def structure(self) -> Structure:
-        """Bars with sections, and the compliance of joints.
-
-        :raises RigidError: no body and no joint is elastic.
-        :raises ParameterError: sections that no bar has, all named, or a rod without one.
-        """
-        bars = [
-            (name, m.section, body.mass, m.end - m.start, f"bodies.{name}.member.section")
-            for name, body in self.specs["bodies"].items()
-            if (m := body.member) is not None
-        ] + [
-            (name, rod.section, rod.mass, rod.ends[1] - rod.ends[0], f"rods.{name}.section")
-            for name, rod in self.specs["rods"].items()
-        ]
-        sections, faults = {}, []
-        for name, tube, mass, along, path in bars:
-            try:
-                if tube is not None:
-                    sections[name] = tube.section(mass / norm(plain(along)), path)
-            except ParameterError as error:
-                faults.append(error)
-        if faults:
-            first, *others = faults
-            more = "".join(f"; wrong too: {error.field}" for error in others)
-            raise ParameterError(first.field, first.value, f"{first.bound}{more}")
-        compliances = {
-            name: joint.compliance.tolist()
-            for name, joint in self.specs["joints"].items()
-            if joint.compliance is not None
-        }
-        if not sections and not compliances:
-            raise RigidError(
-                "bodies.NAME.member.section", None,
-                "a member's section, rods.NAME.section or joints.NAME.compliance: "
-                "nothing is elastic",
-            )  # fmt: skip
-        missing = [name for name in self.specs["rods"] if name not in sections]
-        if missing:
-            raise ParameterError(
-                f"rods.{missing[0]}.section", None, "a section, as rods carry load"
-            )
-        beams = tuple(beam for beam in self.beams if beam.name in sections)
-        return Structure(beams, sections, compliances)
 
 
 def _counted(count: int, name: str) -> str:

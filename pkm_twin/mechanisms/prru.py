@@ -28,14 +28,13 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.operations import sqrt
 from pkm_twin.errors import ParameterError
-from pkm_twin.kinematics.pose import COORDINATES, Coordinate, about_x, about_y
+from pkm_twin.kinematics.pose import COORDINATES, Coordinate, name_angles
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import BASE, PLATFORM, UP, Body, Direction, Graph, Joint, array
-from pkm_twin.machine.members import Beam, Structure, Tube, axial, disc
+from pkm_twin.machine.members import Beam, RigidError, Structure, Tube, axial, disc
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.sections import check_azimuths, length, mass, shared_middle
 from pkm_twin.mechanisms import TwinRobot
-from pkm_twin.robot.mechanism import RigidError
 
 LIMBS: Final = ("I", "II", "III")
 
@@ -116,7 +115,7 @@ class Prru(TwinRobot):
     description: ClassVar[str] = "3-PRRU head, three vertical sliders and two links per limb"
     mobility: ClassVar[str] = "3: translation z, rotations alpha, beta (x, y, gamma follow)"
     coordinates: ClassVar[tuple[Coordinate, ...]] = (
-        COORDINATES["z"], about_x("alpha"), about_y("beta"),
+        COORDINATES["z"], *name_angles({"alpha": "x", "beta": "y"}),
     )  # fmt: skip
     limb_names: ClassVar[tuple[str, ...]] = tuple(f"limb {limb}" for limb in LIMBS)
 

@@ -37,7 +37,7 @@ from pkm_twin.codegen.expressions import Numbers, norm, reference
 from pkm_twin.codegen.operations import absolute, atan2, cos, maximum, minimum, sin, sqrt
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.engine import Engine
-from pkm_twin.kinematics.pose import COORDINATES, Coordinate, about_x, about_y
+from pkm_twin.kinematics.pose import COORDINATES, Coordinate, name_angles
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import BASE, MIN_LENGTH, PLATFORM, Body, Direction, Graph, Joint, array
 from pkm_twin.machine.members import Beam, Section, Structure, axial, compliances, disc, modulus
@@ -242,7 +242,7 @@ class UprRpu(TwinRobot):
     limb_names: ClassVar[tuple[str, ...]] = ("limb 1", "limb 2", "limb 3")
     start: ClassVar[LargestRoot] = LargestRoot()
     coordinates: ClassVar[tuple[Coordinate, ...]] = (
-        COORDINATES["z"], about_x("beta"), about_y("gamma"),
+        COORDINATES["z"], *name_angles({"beta": "x", "gamma": "y"}),
     )  # fmt: skip
     changeable: ClassVar[tuple[str, ...]] = (
         "members", "joints_compliance", "limits", "payload", "friction", "gravity",

@@ -25,7 +25,7 @@ from pkm_twin.machine.friction import compiled, law_names
 from pkm_twin.machine.graph import Graph, limb_numbers
 from pkm_twin.machine.inertia import Coefficients
 from pkm_twin.machine.joint_map import JointMap, JointMapEntry
-from pkm_twin.machine.members import Beam, Structure
+from pkm_twin.machine.members import Beam, RigidError, Structure
 from pkm_twin.machine.places import (
     Key,
     Keys,
@@ -53,10 +53,6 @@ SHARED: Final = "a controller may share efforts in any way"
 FREE_FALL: Final = (0.0, 0.0, -9.81)
 """Of files without gravity, base axes, m/s2."""
 R = TypeVar("R", bound="Mechanism")
-
-
-class RigidError(ParameterError):
-    """Raised for a robot whose file makes nothing elastic."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -11,6 +11,7 @@ import numpy as np
 
 from pkm_twin.errors import warn
 from pkm_twin.kinematics.passive import rod_axes
+from pkm_twin.kinematics.pose import describe_angles
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import BASE, POSE
 from pkm_twin.machine.graph_description import graph_description
@@ -187,10 +188,9 @@ def robot_description(robot: Robot) -> dict[str, Any]:
     if elastic and robot.modal_damping.size:
         data["modal_damping"] = robot.modal_damping.tolist()
     data["gravity"] = robot.gravity.tolist()
-    pose = [coordinate.name for coordinate in robot.coordinates]
-    # A mechanism may have coordinates of its own.
-    if all(name in POSE for name in pose):
-        data["pose"] = pose
+    data["pose"] = list(robot.pose_names)
+    if not set(robot.pose_names) <= set(POSE):
+        data["angles"] = describe_angles(robot.coordinates)
     data |= robot.sharing_entries()
     load = robot.payload
     if load.mass > 0.0 or load.inertia.any():

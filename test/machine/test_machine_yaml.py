@@ -9,11 +9,14 @@ import numpy as np
 import pytest
 import yaml
 
+from delta_dynamics import inverse_dynamics
+from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.machine.machine_yaml import describe_machine_yaml
 from pkm_twin.machine.strict_yaml import read_yaml
 from pkm_twin.mechanisms.catalogue import robot_of_data
+from pkm_twin.robot.robot_urdf import robot_description
 from pkm_twin.robot.urdf_read import read_urdf
-from test.support.robots import partly_long
+from test.support.robots import load, partly_long, random_motion
 
 pytest.importorskip("pinocchio")
 
@@ -76,3 +79,30 @@ def test_units_and_meanings_are_told():
     for words in ("kg m2", "the body that carries the tool", "# pose:", "a ball joint"):
         assert words in content
     assert max(map(len, content.splitlines())) <= 120
+
+
+@pytest.mark.parametrize("name", ["prru", "upr_rpu"])
+def test_a_template_written_out_keeps_its_pose_and_torques(name, rng):
+    robot = load(name)
+    written = robot_of_data(robot_description(robot), "written")
+    assert written.pose_names == robot.pose_names
+    *motion, wrench = random_motion(robot, rng, 200)
+    np.testing.assert_allclose(written.forward(motion[0]), robot.forward(motion[0]), atol=1e-12)
+    tau = inverse_dynamics(robot, *motion, wrench)
+    found = inverse_dynamics(written, *motion, wrench)
+    np.testing.assert_allclose(found, tau, atol=1e-12 * np.abs(tau).max())
+
+
+@pytest.mark.parametrize(
+    ("angles", "pose", "text"),
+    [
+        ({"alpha": "y", "beta": "x"}, ["z", "alpha", "beta"], "x, y, z or about z, y, x"),
+        ({"alpha": "x"}, ["z", "alpha", "beta"], "two or three names"),
+        ([1], ["z", "alpha", "beta"], "a mapping"),
+        ({"alpha": "x", "beta": "y"}, ["z", "roll", "beta"], r"pose\[1\].*'roll'"),
+    ],
+)
+def test_angles_of_no_rotation_are_refused(angles, pose, text):
+    data = robot_description(load("prru")) | {"angles": angles, "pose": pose}
+    with pytest.raises((ParameterError, UnknownNameError), match=text):
+        robot_of_data(data, "wrong")

@@ -17,9 +17,9 @@ from pkm_twin.codegen.code import slowness
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.scheme import list_coordinates
 from pkm_twin.machine.formulas import PARAMETERS
+from pkm_twin.machine.members import RigidError
 from pkm_twin.report import Fact, Report, number
 from pkm_twin.robot.clearance import clearance, has_clearance
-from pkm_twin.robot.mechanism import RigidError
 from pkm_twin.robot.plausibility import findings, why_no_torques
 from pkm_twin.robot.robot import Robot
 
