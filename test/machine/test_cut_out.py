@@ -163,7 +163,7 @@ WRONG = {
     "whole": ({}, ParameterError, "equality.grip.*--base"),
     "idle motor": (
         {"base": "shank", "platform": "ankle_cross"}, ParameterError,
-        "2 coordinates.*moves in pitch alone: choose one that all",
+        "2 coordinates.*moves in pitch alone: choose another base",
     ),
     "pose": ({"base": "shank", "pose": ["x", "y"]}, ParameterError, "as roll, pitch"),
 }  # fmt: skip
