@@ -228,7 +228,9 @@ class Scheme(Linkage):
             bound = f"{self.joints} coordinates, the mobility"
             ways = choose_coordinates(self.graph)
             if len(ways) < self.joints:
-                bound += f"; the platform moves in {', '.join(ways) or 'none'} alone: choose another "
+                bound += (
+                    f"; the platform moves in {', '.join(ways) or 'none'} alone: choose another "
+                )
                 bound += "base or platform, so that each actuated joint moves it"
             raise ParameterError("pose", [c.name for c in self.coordinates], bound)
         motion, rows = self.at(*self.samples[0])

@@ -13,6 +13,7 @@ import pytest
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load, transmission
 from pkm_twin.errors import MobilityError, ParameterError, UnknownNameError
+from pkm_twin.machine.cut_out import find_circles
 from pkm_twin.machine.strict_yaml import read_yaml
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from test.support.mujoco_judge import Judge, mujoco
@@ -100,6 +101,26 @@ def test_options_of_the_command_line_are_those_of_load(twin, tmp_path):
     np.testing.assert_allclose(robot.inverse(x), same.inverse(x[::-1])[::-1], atol=1e-12)
     told = twin.told("info", HUMANOID, *given, "--pose", "x,roll")
     assert ["roll", "pitch"] in told["other_poses"] and list(told["pose"]) == ["x", "roll"]
+
+
+def ways(pairs, at, end, passed=()):
+    """Joints of every way from one body to another that passes no body twice."""
+    if at == end:
+        yield ()
+        return
+    for name, (a, b) in pairs.items():
+        if at in (a, b) and (new := b if at == a else a) not in (*passed, at):
+            yield from ((name, *rest) for rest in ways(pairs, new, end, (*passed, at)))
+
+
+def test_joints_on_circles_are_those_of_all_ways_from_base_to_platform():
+    rng = np.random.default_rng(0)
+    for _ in range(60):
+        count = int(rng.integers(4, 11))
+        pairs = {f"j{k}": tuple(rng.choice(list("abcdefg"), 2, replace=False).tolist())
+                 for k in range(count)}  # fmt: skip
+        expected = {name for way in ways(pairs, "a", "b") for name in way}
+        assert set(find_circles(pairs, "a", "b")) == expected
 
 
 def test_a_urdf_with_meshes_and_an_arm_is_cut_too(tmp_path):
