@@ -42,15 +42,13 @@ def report_of(result: Result, marks: Sequence[str] = ()) -> tuple[Report, list[T
     held = _find_held_out(result)
     if isinstance(result, Fit):
         names, facts = result.problem.parameters.names, _report_efforts(result)
-        blind = verdict.blind_lines(names, result.problem.parameters.units)
         more = _describe_delays(result)
         more += [f"efforts replaced as outliers: {result.outliers}"] if result.outliers else []
     elif isinstance(result, ElasticFit):
         names = tuple(map(_element, result.numbers))
-        factors = tuple(f"the factor of {name}" for name in names)
-        blind, facts = verdict.blind_lines(factors, ("",) * len(names)), _report_elastic(result)
+        facts = _report_elastic(result)
         more = list(map(_describe_group, result.groups))
-    notes = [*marks, *verdict.lines(own), *more, *blind]
+    notes = [*marks, *verdict.lines(own), *more]
     if idle:
         notes.append(f"not excited, the file's value stays: {', '.join(idle)}")
     if e.bound:
@@ -70,7 +68,7 @@ def report_of(result: Result, marks: Sequence[str] = ()) -> tuple[Report, list[T
     return Report(
         _answer(result, held),
         [
-            Fact("robot", result.robot.name), Fact("verdict", verdict.as_json(own, names)),
+            Fact("robot", result.robot.name), Fact("verdict", verdict.as_json(own)),
             Fact("accepted", result.accepted),
             Fact("condition", e.condition, text="condition number"),
             Fact("combinations_determined", result.combinations, text="combinations identified"),

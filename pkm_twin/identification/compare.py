@@ -19,7 +19,7 @@ from delta_dynamics.torques.virtual_work import inverse_dynamics, null_efforts
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.estimation import estimate
-from pkm_twin.identification.judge import HINT, LOUD
+from pkm_twin.identification.judge import LOUD
 from pkm_twin.identification.plausible import LATEST, late_text
 from pkm_twin.identification.rows import BLOCK
 from pkm_twin.identification.samples import (
@@ -63,6 +63,8 @@ NEAR: Final = 0.5
 """Around a pick or release the payload is neither held nor gone, s, at most;"""
 LENGTHS: Final = 4.0
 """and so many lengths of the filter, which follows the motion: a short cycle has fast ones."""
+DELAY_SIGMAS: Final = 3.0
+"""Standard deviations from which efforts are late."""
 CLEAR: Final = 4
 """Samples on each side of a jump that are left out: a gap that divides the recording."""
 PASSES: Final = 4
@@ -286,7 +288,7 @@ def _late(left: Array, change: Array, rubs: Array) -> float:
     sizes = np.sqrt(np.mean(rubs**2, (0, 1)))
     scales = max(float(rms(left).max()), 1e-12) / np.maximum(sizes, 1e-12)
     found = estimate(table, left, np.zeros(table.shape[-1]), np.array([LATEST, *scales]))
-    late, sure = float(found.values[0]), HINT * np.sqrt(found.covariance[0, 0])
+    late, sure = float(found.values[0]), DELAY_SIGMAS * np.sqrt(found.covariance[0, 0])
     # At the bound it is another error's.
     return late if sure < abs(late) < LATEST else 0.0
 

@@ -23,7 +23,7 @@ from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.estimation import Estimate, estimate
 from pkm_twin.identification.fit import Judged, Result, refuse_faults
 from pkm_twin.identification.identifiable import above_zero
-from pkm_twin.identification.judge import Evidence, Suspect, Verdict, judge
+from pkm_twin.identification.judge import Case, Suspect, Verdict, judge
 from pkm_twin.identification.parameters import FITTED_RATIO, Group, Number, groups_of, number_of
 from pkm_twin.identification.plausible import UNIT, Score, likeliest
 from pkm_twin.identification.rows import HELD_OUT
@@ -192,14 +192,14 @@ def fit_elements(
     refuse_faults(faults, accept)
     names = parts[0].response.names
     try:
-        found, table = _solve(parts, len(names))
+        found, _ = _solve(parts, len(names))
     except PkmTwinError as error:
         cause, _ = _best_repair(robot, parts[0], np.inf)
         raise PkmTwinError(f"{error}" + (f" ({cause}?)" if cause else "")) from None
     # What a bound holds at zero would be no compliance, and no file's.
     factors = np.maximum(found.values[: len(names)], STIFFEST)
     zeros = found.values[len(names) :].reshape(len(parts), 6)
-    verdict = _verdict(robot, parts, found, factors, zeros, table)
+    verdict = _verdict(robot, parts, found, factors, zeros)
     if not faults:
         odd = verdict.answer == "does not explain"
         faults = _unexplained(robot, parts, factors, zeros, odd)
@@ -208,7 +208,7 @@ def fit_elements(
     if all(number.status == "not excited" for number in numbers):
         raise PkmTwinError("no excitation: the loads identify no element's compliance")
     plain = found.covariance[: len(names), : len(names)]
-    found = replace(found, covariance=verdict.widened(found.covariance))
+    found = replace(found, covariance=verdict.covariance)
     own = found.covariance[: len(names), : len(names)]
     judged = tuple(
         _judged(part, factors, zero, own) for part, zero in zip(parts, zeros, strict=True)
@@ -228,8 +228,7 @@ def _numbers(
 ) -> tuple[Number, ...]:
     """Of the elements: known by the noise alone, their deviations by the verdict too."""
     own, wide = (
-        np.sqrt(np.diag(one)[: len(names)])
-        for one in (found.covariance, verdict.widened(found.covariance))
+        np.sqrt(np.diag(one)[: len(names)]) for one in (found.covariance, verdict.covariance)
     )
     wide = np.full_like(wide, np.nan) if verdict.deviations == "withheld" else wide
     numbers = []
@@ -404,16 +403,15 @@ def _judged(part: _Part, factors: Array, zero: Array, covariance: Array) -> Judg
 
 
 def _verdict(
-    robot: Robot, parts: Sequence[_Part], found: Estimate, factors: Array, zeros: Array,
-    table: Array,
-) -> Verdict:  # fmt: skip
+    robot: Robot, parts: Sequence[_Part], found: Estimate, factors: Array, zeros: Array
+) -> Verdict:
     """Judge the factors and zeros (recordings, 6) of a fit.
 
-    :param table: columns of factors, then zeros, the fitted samples of all recordings one after the
-        other, (samples, 6, e).
+    The factors are not those of the posterior, which is linear: the difference is uncertain.
     """
     measured = np.any([part.measured for part in parts], 0)
-    cases: list[Evidence] = []
+    change = np.concatenate([factors - 1.0, zeros.ravel()])
+    cases: list[Case] = []
     suspects: tuple[Suspect, ...] = ()
     for i, (part, zero) in enumerate(zip(parts, zeros, strict=True)):
         moved, slopes = part.moved(factors)
@@ -422,31 +420,20 @@ def _verdict(
         suspects, errors = zip(*_errors(robot, part, factors), strict=True)
         own = np.where(counts, moved, 0.0)
         columns = np.concatenate([slopes, _zeros(i, len(parts), np.ones_like(own))], -1)
+        target = np.where(counts, left + columns @ change, 0.0)
         cases.append(
-            Evidence(
-                np.where(counts, left, 0.0)[:, measured],
-                columns[:, measured], np.zeros((*own[:, measured].shape, 0)),
-                np.stack(errors, -1)[:, measured],
-                _noise(left, own, columns.shape[-1])[measured], 1.0,
-                counts[:, measured].astype(np.float64), part.split,
-                np.sqrt(np.mean(own**2, 0))[measured], np.std(own, 0)[measured],
+            Case(
+                target[:, measured], columns[:, measured],
+                np.zeros((*own[:, measured].shape, 0)), np.zeros(0),
+                np.stack(errors, -1)[:, measured], own[:, measured],
+                counts[:, measured].astype(np.float64),
+                _noise(left, own, columns.shape[-1])[measured], 1.0, part.split,
             )
         )  # fmt: skip
-
-    def respond(signals: Sequence[Array]) -> Array:
-        whole = []
-        for signal, part in zip(signals, parts, strict=True):
-            full = np.zeros((part.split, 6, signal.shape[-1]))
-            full[:, measured] = signal[: part.split]
-            whole.append(full)
-        return found.response(table, np.concatenate(whole))
-
-    change = np.concatenate([factors - 1.0, zeros.ravel()])
-    prior = change, found.prior, np.sqrt(np.diag(found.covariance))
     names = [name for name, good in zip(AXES, measured.tolist(), strict=True) if good]
-    verdict = judge(names, suspects, cases, prior, respond)
-    # Factors are not corrected: what the suspects probably changed is uncertain.
-    return replace(verdict, unseen=np.concatenate([verdict.unseen, verdict.shift[None]]))
+    verdict, _ = judge(names, suspects, cases, found.prior)
+    off = verdict.change - change
+    return replace(verdict, covariance=verdict.covariance + np.outer(off, off))
 
 
 def _zeros(recording: int, count: int, values: Array) -> Array:

@@ -46,8 +46,7 @@ class Estimate:
     ``noise``: deviation of the efforts' residual by joint, (n,). ``directions``: how many
     combinations the data told. ``condition``: of the weighted regressor over those, columns
     scaled by the prior. ``weights``: of the samples, shape (samples, n). ``bound``: columns of
-    the parameters that each physical bound holds. ``inverse``: of the information, over those
-    directions, (k, k).
+    the parameters that each physical bound holds.
     """
 
     values: Array
@@ -58,15 +57,6 @@ class Estimate:
     condition: float
     weights: Array
     bound: Bound
-    inverse: Array
-
-    def response(self, table: Array, signal: Array) -> Array:
-        """What signals (samples, n, m) beside the target change in the parameters, shape (k, m).
-
-        :param table: that was fitted, shape (samples, n, k).
-        """
-        weighted = table * (self.weights / self.noise**2)[..., None]
-        return np.asarray(self.inverse @ np.tensordot(weighted, signal, ((0, 1), (0, 1))))
 
 
 def estimate(
@@ -129,10 +119,9 @@ def estimate(
         moved = (fitted - start) / scales - z
         spread = spread + np.outer(moved, moved)
     condition = float(np.sqrt(values[kept].max() / values[kept].min())) if kept.any() else np.inf
-    inner = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T
     return Estimate(
         fitted, scales[:, None] * spread * scales, scales, noise, int(kept.sum()), condition,
-        weights, bound, scales[:, None] * inner * scales,
+        weights, bound,
     )  # fmt: skip
 
 

@@ -27,7 +27,7 @@ from pkm_twin.identification.parameters import (
     numbers_of_group,
 )
 from pkm_twin.identification.plausible import LATEST, late_text, recording_fault
-from pkm_twin.identification.rows import Problem, Rows, next_window
+from pkm_twin.identification.rows import Problem, Rows
 from pkm_twin.identification.samples import EXACT, Filtering
 from pkm_twin.identification.suspects import scaled_efforts, verdict_of
 from pkm_twin.recordings import Recording
@@ -133,7 +133,7 @@ def fit(
 
     :param what: of ``friction``, ``rotor``, ``payload``, ``inertia``.
     :param accept: fit recordings that this machine cannot have made, too.
-    :param progress: called with the number of recordings that are worked on, twice each.
+    :param progress: called with the number of recordings that are read.
     :param causes: what :func:`~pkm_twin.identification.causes.number_that_explains` says of each.
     :raises PkmTwinError: recordings that are too short, that show nothing, or that this machine
         cannot have made.
@@ -153,7 +153,7 @@ def fit(
     problem.check_count()
     faults = faults or _worse(problem, causes)
     refuse_faults(faults, accept)
-    result = fitted(problem, tuple(faults), progress)
+    result = fitted(problem, tuple(faults))
     scaled = None if faults else scaled_efforts(problem, result.verdict)
     if scaled is None:
         return result
@@ -216,30 +216,23 @@ def _searched(rows: Rows, late: float, noise: Array) -> float:
     return far if abs(far - late) > period else late
 
 
-def fitted(
-    problem: Problem, accepted: tuple[str, ...] = (), progress: Callable[[int], None] | None = None
-) -> Fit:
+def fitted(problem: Problem, accepted: tuple[str, ...] = ()) -> Fit:
     """The solution of a problem, judged.
 
     :param accepted: why the machine cannot have made the recordings, although they are fitted.
     :raises PkmTwinError: recordings that show nothing.
     """
-    parameters, result = problem.parameters, problem.estimate
-    other = problem.again([next_window(made.how.window) for made in problem.whole], progress)
-    # What another differentiation changes is uncertain too.
-    change = other.estimate.values - result.values
-    result = replace(result, covariance=result.covariance + np.outer(change, change))
-    verdict = verdict_of(problem)
+    parameters, verdict = problem.parameters, verdict_of(problem)
     if accepted:
         verdict = replace(verdict, answer="does not explain")
-    best = _corrected(parameters, result, verdict)
-    wide = verdict.widened(best.covariance)
+    best = _possible(parameters, problem.estimate, verdict)
+    wide = best.covariance
     told = np.full_like(wide, np.nan) if verdict.deviations == "withheld" else wide
     numbers: list[Number] = []
     for group, k in zip(parameters.groups, parameters.slices, strict=True):
-        both = best.covariance[k, k], told[k, k]
+        both = verdict.plain[k, k], told[k, k]
         numbers += numbers_of_group(group, best.values[k], best.prior[k], both)
-    if not result.directions or all(n.status == "not excited" for n in numbers):
+    if all(n.status == "not excited" for n in numbers):
         raise PkmTwinError(
             f"no excitation: the motion does not identify {', '.join(problem.what)}; pkm-twin "
             "excite designs a motion that does"
@@ -250,7 +243,7 @@ def fitted(
         spread = np.sqrt(np.sum((end.table @ wide) * end.table, -1).clip(0.0))
         judged.append(Judged(end.recording.name, end.time, end.effort, before, after, spread))
     return Fit(
-        robot=problem.robot, problem=problem, estimate=replace(result, bound=best.bound),
+        robot=problem.robot, problem=problem, estimate=best,
         numbers=tuple(numbers), judged=tuple(judged), verdict=verdict, accepted=accepted,
         samples=sum(made.held_from for made in problem.rows),
     )  # fmt: skip
@@ -350,22 +343,16 @@ def refuse_faults(faults: Sequence[str], accept: bool) -> None:
         raise PkmTwinError(f"{faults[0]}; --accept fits it nevertheless")
 
 
-def _corrected(parameters: FileParameters, result: Estimate, verdict: Verdict) -> Estimate:
-    """Without what the suspects probably changed, or the nearest possible machine to that.
-
-    Of recordings that the model does not explain nothing is known of what they changed.
-    """
-    if verdict.answer == "does not explain":
-        return result
-    aim, cones = result.values - verdict.shift, parameters.cones
+def _possible(parameters: FileParameters, first: Estimate, verdict: Verdict) -> Estimate:
+    """Return the posterior's numbers, or the nearest that a machine can have."""
+    start, cones = parameters.values, parameters.cones
+    aim = start + verdict.change
     bound = beyond(aim, cones)
     if not bound:
-        return replace(result, values=aim)
-    covariance = verdict.widened(result.covariance) / np.outer(result.prior, result.prior)
-    sizes, vectors = np.linalg.eigh(covariance)
+        return replace(first, values=aim, covariance=verdict.covariance, bound=bound)
+    sizes, vectors = np.linalg.eigh(verdict.covariance / np.outer(first.prior, first.prior))
     factor = vectors * np.sqrt(np.maximum(sizes, 1e-12 * sizes.max()))
-    start = parameters.values
-    near = nearest((aim - start) / result.prior, factor, start, result.prior, cones)
+    near = nearest((aim - start) / first.prior, factor, start, first.prior, cones)
     # How far a bound moves the numbers next to it is an estimate.
-    moved = result.covariance + np.outer(near - aim, near - aim)
-    return replace(result, values=near, bound=bound, covariance=moved)
+    covariance = verdict.covariance + np.outer(near - aim, near - aim)
+    return replace(first, values=near, covariance=covariance, bound=bound)

@@ -231,7 +231,7 @@ class Rows:
 
 
 def next_window(window: int) -> int:
-    """The window that is fitted next to it: the next shorter one, of the shortest the next."""
+    """Return the next shorter window of the differentiation, of the shortest the next longer."""
     k = WINDOWS.index(window)
     return WINDOWS[k - 1] if k else WINDOWS[1]
 
@@ -479,20 +479,10 @@ class Problem:
         problem = cls(robot, tuple(what), everything, tuple(whole))
         laws = (*compiled(robot.laws), *robot.open_laws)
         for _ in range(passes if not_shared(laws) else 0):
-            problem = replace(problem, everything=replace(everything, loads=problem.values))
-            problem = problem.again([made.how.window for made in problem.whole])
+            opened = replace(everything, loads=problem.values)
+            whole = [made.again(opened, made.how.window) for made in problem.whole]
+            problem = replace(problem, everything=opened, whole=tuple(whole))
         return problem
-
-    def again(
-        self, windows: Sequence[int], progress: Callable[[int], None] | None = None
-    ) -> Problem:
-        """The same recordings, differentiated with other windows."""
-        whole = []
-        for i, (made, window) in enumerate(zip(self.whole, windows, strict=True)):
-            whole.append(made.again(self.everything, window))
-            if progress is not None:
-                progress(len(self.whole) + i + 1)
-        return replace(self, whole=tuple(whole))
 
     @cached_property
     def parameters(self) -> FileParameters:
@@ -541,10 +531,7 @@ class Problem:
     def estimate(self) -> Estimate:
         """Of the parameters alone."""
         e, k = self.both, slice(0, -len(self.rows))
-        return replace(
-            e, values=e.values[k], covariance=e.covariance[k, k], prior=e.prior[k],
-            inverse=e.inverse[k, k],
-        )  # fmt: skip
+        return replace(e, values=e.values[k], covariance=e.covariance[k, k], prior=e.prior[k])
 
     @property
     def delays(self) -> tuple[float, ...]:
@@ -556,11 +543,6 @@ class Problem:
         """What is not fitted, without the delays."""
         pairs = zip(self.rows, self.delays, strict=True)
         return [made.held_out(late) for made, late in pairs]
-
-    def response(self, signals: Sequence[Array]) -> Array:
-        """What signals (k, n, m) added to the efforts change in the parameters, (p, m)."""
-        used = [one[: made.held_from] for one, made in zip(signals, self.rows, strict=True)]
-        return self.both.response(self.columns, np.concatenate(used))[: -len(self.rows)]
 
     @property
     def values(self) -> Array:

@@ -9,7 +9,8 @@ for certain.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -21,12 +22,13 @@ from pkm_twin.errors import ParameterError
 from pkm_twin.identification.identifiable import KINDS
 from pkm_twin.identification.judge import (
     ALL,
-    HINT,
-    NEAR,
+    ALTERNATIVE,
+    FOUND,
+    GEOMETRY,
     SIGMAS,
-    VALUES,
-    Evidence,
+    Case,
     Finding,
+    Fitted,
     Suspect,
     Verdict,
     basis_of,
@@ -35,7 +37,7 @@ from pkm_twin.identification.judge import (
 from pkm_twin.identification.parameters import FileParameters
 from pkm_twin.identification.plausible import MASSES, scale_text
 from pkm_twin.identification.rows import BLOCK, Problem, Rows
-from pkm_twin.identification.samples import Resonance, by_blocks
+from pkm_twin.identification.samples import EXACT, Resonance, by_blocks
 from pkm_twin.machine.friction import turning_keys
 from pkm_twin.machine.places import path_of
 from pkm_twin.machine.uncertainty import numbers_below
@@ -51,9 +53,10 @@ ELASTIC: Final = "elastic drive"
 SPEED: Final = "time at another rate"
 RESONANCE: Final = "drive resonance"
 INTERFERENCE: Final = "interference at one frequency"
-GEOMETRY: Final = "geometry"
 OFF: Final = 0.05
 """Usual size of a gain: constants of drives and current sensors are known to some per cent."""
+DELAY: Final = 0.02
+"""Usual delay of efforts, s: what buses and controllers buffer."""
 CLEAR: Final = 0.1
 """Standard deviation of a factor on the file's numbers from which it is known."""
 STEP: Final = 1e-4
@@ -116,7 +119,6 @@ def errors_of(rows: Rows, values: Array) -> tuple[Errors, Array]:
     fast, slow = (need(0.0, h * motion.qd, (2.0 * h + h**2) * motion.qdd) for h in (STEP, -STEP))
     found += [
         (Suspect(GAIN, ALL, usual=OFF), told),
-        (Suspect(LATE, ALL, "s"), -change),
         (Suspect(LOAD, ALL, usual=share), load),
         (Suspect(SPEED, ALL), (fast - slow) / (2.0 * STEP)),
     ]
@@ -249,27 +251,126 @@ sensors, within their priors, take up three quarters."""
 
 
 def verdict_of(problem: Problem) -> Verdict:
-    """Whether the fitted model explains its recordings."""
-    chosen, lengths = problem.chosen, Lengths.of(problem.robot)
-    court = _Court(problem, lengths)
-    verdict = court.judged(chosen)
-    masses = court.kinds == "inertia"
-    if (chosen & masses).any():
-        verdict = _simpler(verdict, court.judged(chosen & ~masses))
-    if (chosen & np.isin(court.kinds, OF_INERTIA)).any() and not court.inertia_shown():
-        answer = "explains partly" if verdict.answer == "explains" else verdict.answer
-        verdict = replace(verdict, answer=answer, slow=True)
-    named = {one.suspect.kind for one in verdict.findings}
-    either = None if named & {ELASTIC, LATE} else court.late_or_elastic(chosen)
-    if either is not None:
-        finding, change = either
-        unseen = np.concatenate([verdict.unseen, change[None]])
-        verdict = replace(verdict, hints=(*verdict.hints, finding), unseen=unseen)
+    """Fit the chosen numbers of a problem, and judge whether the model explains its recordings."""
+    robot, everything, values = problem.robot, problem.everything, problem.values
+    chosen, lengths = problem.chosen, Lengths.of(robot)
+    kinds = np.array([g.kind for g in everything.groups for _ in g.names])
+    cases, errors = list[Case](), list[Suspect]()
+    for rows in problem.whole:
+        usual, missed = errors_of(rows, values)
+        # The columns of numbers that are not fitted are those of a motion without noise; the sign
+        # of a velocity is filtered as the efforts are.
+        calm, _ = rows.model.columns(rows.signals.motion)
+        others = np.where(kinds == "friction", rows.table, calm)[..., ~chosen]
+        own = np.stack([column for _, column in usual], -1)
+        errors = [*(error for error, _ in usual), *lengths.suspects]
+        columns = np.concatenate([own, lengths.columns(rows, values), others], -1)
+        delay = np.concatenate([-rows.change[..., None], missed], -1)
+        sizes = np.append(DELAY, np.ones(missed.shape[-1]))
+        cases.append(
+            Case(
+                rows.effort - rows.rest - rows.table @ everything.values, rows.table[..., chosen],
+                delay, sizes, columns, rows.effort, rows.counts, rows.signals.noise,
+                rows.signals.band, rows.held_from,
+            )
+        )  # fmt: skip
+    errors += [
+        Suspect(OF_THE_FILE[kinds[k]], everything.names[k], everything.units[k])
+        for k in np.flatnonzero(~chosen)
+    ]
+    verdict, fitted = judge(robot.joint_names, errors, cases, problem.both.prior[: chosen.sum()])
+    slow = bool((chosen & np.isin(kinds, OF_INERTIA)).any()) and not _shows_inertia(
+        cases, errors, kinds[chosen] == "friction"
+    )
+    verdict = replace(verdict, slow=slow)
+    if (chosen & (kinds == "inertia")).any() and not verdict.findings:
+        verdict = _compare_file_masses(verdict, fitted, kinds[chosen] == "inertia")
+    if not {one.suspect.kind for one in verdict.findings} & {ELASTIC, LATE}:
+        verdict = _compare_elastic_drives(verdict, fitted)
     rings = _resonances(problem)
-    if rings:
-        answer = "explains partly" if verdict.answer == "explains" else verdict.answer
-        verdict = replace(verdict, answer=answer, findings=(*verdict.findings, *rings))
+    verdict = replace(verdict, findings=(*verdict.findings, *rings))
+    if (slow or rings) and verdict.answer == "explains":
+        verdict = replace(verdict, answer="explains partly")
     return verdict
+
+
+def _compare_file_masses(verdict: Verdict, fitted: Fitted, masses: Mask) -> Verdict:
+    """Name one error beside the fitted masses where it explains as much with the file's masses.
+
+    Any scale of the efforts is one of them.
+    """
+    certain = fitted.certain.copy()
+    certain[: fitted.count][masses] = False
+    other = copy(fitted)
+    scale = [one.kind == GAIN and one.where == ALL for one in fitted.errors].index(True)
+    factors = np.ones(len(certain))
+    factors[fitted.count + scale] = 1.0 / OFF
+    other.whole = fitted.whole.widened(factors)
+    selected, used = other.select(certain)
+    if len(selected) != 1 or selected[0].odds < FOUND:
+        return verdict
+    log = other.whole.log_evidence(used) - FOUND
+    if log < fitted.whole.log_evidence(fitted.used) - ALTERNATIVE:
+        return verdict
+    found = fitted.describe(other.whole.posterior(used), selected[0])
+    alike = Suspect("the masses that were fitted", "all of them")
+    change = fitted.model.posterior(used).mean[: fitted.count] - verdict.change
+    return replace(
+        verdict, answer="explains partly",
+        findings=(replace(found, others=(*found.others, alike)),),
+        covariance=verdict.covariance + np.outer(change, change),
+    )  # fmt: skip
+
+
+def _compare_elastic_drives(verdict: Verdict, fitted: Fitted) -> Verdict:
+    """Name elastic drives beside a delay of all efforts where they explain as much."""
+    delays = [place[fitted.count + len(fitted.errors)] for place in fitted.places]
+    elastic = [fitted.count + k for k, one in enumerate(fitted.errors) if one.kind == ELASTIC]
+    late = fitted.used
+    stiff = late.copy()
+    stiff[delays] = False
+    other = fitted.with_columns(stiff, elastic)
+    logs = [fitted.whole.log_evidence(one) for one in (late, other, stiff)]
+    if logs[1] < max(logs[0] - ALTERNATIVE, logs[2]):
+        return verdict
+    one, two = (fitted.whole.posterior(used) for used in (late, other))
+    gives, errors = two.mean[elastic], np.sqrt(np.diag(two.covariance)[elastic])
+    if (gives < -2.0 * errors).any():
+        return verdict
+    sizes = ", ".join(
+        f"{fitted.errors[k - fitted.count].where} {give:.2g} {fitted.errors[k - fitted.count].unit}"
+        for k, give in zip(elastic, gives.tolist(), strict=True)
+        if give > 0.0
+    )
+    place = max(delays, key=lambda k: abs(one.mean[k]))
+    size, deviation = float(one.mean[place]), float(np.sqrt(one.covariance[place, place]))
+    hint = Finding(
+        Suspect(LATE, ALL, "s"), size, deviation, abs(size) / deviation, (Suspect(ELASTIC, sizes),)
+    )
+    change = (two.mean - one.mean)[: fitted.count]
+    return replace(
+        verdict, hints=(*verdict.hints, hint),
+        covariance=verdict.covariance + np.outer(change, change),
+    )  # fmt: skip
+
+
+def _shows_inertia(cases: Sequence[Case], errors: Sequence[Suspect], friction: Mask) -> bool:
+    """Return whether the recordings show time at twice or half its rate, friction being any."""
+    which = [one.kind for one in errors].index(SPEED)
+    square, part, count = 0.0, 0.0, 0.0
+    for case in cases:
+        floor = np.maximum(case.noise, EXACT * np.sqrt(np.mean(case.measured**2, 0)))
+        weight = case.counts[..., None] / np.maximum(floor, 1e-300)[:, None]
+        table = np.concatenate([case.fitted[..., friction], case.own], -1) * weight
+        basis = basis_of(table.reshape(-1, table.shape[-1]))
+        column = (case.errors[..., which] * weight[..., 0]).ravel()
+        left = column - basis @ (basis.T @ column)
+        square += float(left @ left)
+        # The derivative by the rate is twice the efforts of inertia.
+        own = 0.5 * left.reshape(case.target.shape) * floor
+        part += float(np.sum((own / np.maximum(np.std(case.measured, 0), 1e-300)) ** 2))
+        count += float(case.counts.sum())
+    return square > RATE**2 and part > INERTIA**2 * count
 
 
 def _resonances(problem: Problem) -> tuple[Finding, ...]:
@@ -285,26 +386,6 @@ def _resonances(problem: Problem) -> tuple[Finding, ...]:
         suspect = Suspect(RESONANCE, where, "Hz")
         found.append(Finding(suspect, ring.frequency, ring.width, ring.sigmas, other))
     return tuple(found)
-
-
-def _simpler(verdict: Verdict, frozen: Verdict) -> Verdict:
-    """Other masses, or the file's and one error? What explains as much with less is a finding too.
-
-    :param frozen: with the file's masses.
-    """
-    kinds = {one.suspect.kind for one in frozen.findings}
-    if verdict.findings or OF_THE_FILE["inertia"] in kinds or len(kinds) != 1:
-        return verdict
-    if kinds == {GEOMETRY} and len(frozen.findings) > 1:
-        return verdict
-    if frozen.answer != "explains partly" or any(c.left_ratio > 1.0 for c in frozen.channels):
-        return verdict
-    other = Suspect("the masses that were fitted", "all of them")
-    findings = tuple(replace(one, others=(*one.others, other)) for one in frozen.findings)
-    return replace(
-        verdict, answer="explains partly", findings=findings,
-        unseen=np.concatenate([verdict.unseen, frozen.shift[None] - verdict.shift]),
-    )  # fmt: skip
 
 
 def scaled_efforts(problem: Problem, verdict: Verdict) -> str | None:
@@ -340,131 +421,3 @@ def _friction(problem: Problem) -> float | None:
     known = np.linalg.pinv(e.covariance[np.ix_(rows, rows)], hermitian=True) @ file[some]
     sure = float(known @ file[some])
     return float(known @ problem.values[some]) / sure if sure > CLEAR**-2 else None
-
-
-@dataclass(frozen=True, eq=False)
-class _Recording:
-    """A recording at its rows: (k, n, ...) each."""
-
-    rows: Rows
-    delay: float
-    columns: Array
-    """By the suspects' sizes."""
-    missed: Array
-    calm: Array
-    """All parameters' columns, without noise."""
-
-
-class _Court:
-    """All recordings of a fit, to be judged by several sets of parameters and suspects."""
-
-    def __init__(self, problem: Problem, lengths: Lengths) -> None:
-        self.problem, self.everything, self.values = problem, problem.everything, problem.values
-        self.kinds = np.array([g.kind for g in self.everything.groups for _ in g.names])
-        self.recordings: list[_Recording] = []
-        self.suspects: tuple[Suspect, ...] = ()
-        for rows, delay in zip(problem.whole, problem.delays, strict=True):
-            errors, missed = errors_of(rows, self.values)
-            own = np.stack([column for _, column in errors], -1)
-            columns = np.concatenate([own, lengths.columns(rows, self.values)], -1)
-            calm, _ = rows.model.columns(rows.signals.motion)
-            self.recordings.append(_Recording(rows, delay, columns, missed, calm))
-            self.suspects = (*(suspect for suspect, _ in errors), *lengths.suspects)
-
-    def judged(self, free: Mask) -> Verdict:
-        """With some parameters free to explain the residual, the others as the file has them."""
-        kinds, file = self.kinds, self.everything
-        suspects = [*self.suspects]
-        suspects += [
-            Suspect(OF_THE_FILE[kinds[k]], file.names[k], file.units[k])
-            for k in np.flatnonzero(~free)
-        ]
-        cases = [self._evidence(i, free) for i in range(len(self.recordings))]
-        e = self.problem.estimate
-        values = np.where(free, self.values, file.values)
-        prior = (
-            (values - file.values)[free], e.prior[free[self.problem.chosen]],
-            np.sqrt(np.diag(e.covariance)),
-        )  # fmt: skip
-        return judge(self.problem.robot.joint_names, suspects, cases, prior, self.problem.response)
-
-    def late_or_elastic(self, free: Mask) -> tuple[Finding, Array] | None:
-        """The delay of the efforts where elastic drives explain the residual nearly as well.
-
-        And what these change in the fitted parameters, (f,).
-        """
-        which = [k for k, one in enumerate(self.suspects) if one.kind == ELASTIC]
-        cases = [self._evidence(i, free) for i in range(len(self.recordings))]
-        step = -(-sum(case.residual.size for case in cases) // VALUES)
-        parts = []
-        for i, (case, one) in enumerate(zip(cases, self.recordings, strict=True)):
-            few = case.thinned(step)
-            weight, change = few.weight[..., None], few.nuisance[..., :1]
-            late = -change * (np.arange(len(cases)) == i)
-            late_by = one.delay + one.rows.recording.late
-            measured = few.residual[..., None] - late_by * change
-            columns = few.explained, few.nuisance[..., 1:], late, few.suspects[..., which], measured
-            whole = np.concatenate(columns, -1) * weight
-            parts.append(whole.reshape(-1, whole.shape[-1]))
-        fitted, width = cases[0].explained.shape[-1], parts[0].shape[1]
-        known = np.eye(width)[fitted : fitted + len(self.problem.robot.joint_names)]
-        table = np.concatenate([*parts, known])
-        split = table.shape[1] - len(cases) - len(which) - 1
-        basis = basis_of(table[:, :split])
-        left = table[:, split:] - basis @ (basis.T @ table[:, split:])
-        late, elastic, y = np.split(left, [len(cases), len(cases) + len(which)], 1)
-        delays, gives = (np.linalg.lstsq(one, y[:, 0], rcond=None)[0] for one in (late, elastic))
-        clear, other = np.linalg.norm(late @ delays), np.linalg.norm(elastic @ gives)
-        chance = np.sqrt(HINT**2 + len(which) - 1)
-        errors = np.linalg.norm(np.linalg.pinv(elastic), axis=1)
-        if other < max(chance, NEAR * clear) or (gives < -2.0 * errors).any():
-            return None
-        place = int(np.argmax(np.abs(delays)))
-        error = float(np.linalg.norm(np.linalg.pinv(late)[place]))
-        sizes = ", ".join(
-            f"{self.suspects[k].where} {give:.2g} {self.suspects[k].unit}"
-            for k, give in zip(which, gives.tolist(), strict=True)
-            if give > 0.0
-        )
-        finding = Finding(
-            Suspect(LATE, ALL, "s"), float(delays[place]), error, float(clear),
-            (Suspect(ELASTIC, sizes),),
-        )  # fmt: skip
-        signals = [case.suspects[..., which] @ gives.clip(0.0)[:, None] for case in cases]
-        return finding, self.problem.response(signals)[:, 0]
-
-    def inertia_shown(self) -> bool:
-        """Whether the recordings would show time at twice or half its rate, friction being any."""
-        friction = self.kinds == "friction"
-        which = [one.kind for one in self.suspects].index(SPEED)
-        square, part, count = 0.0, 0.0, 0.0
-        for i in range(len(self.recordings)):
-            case = self._evidence(i, friction)
-            weight = case.weight[..., None]
-            table = np.concatenate([case.explained, case.nuisance], -1) * weight
-            table = table.reshape(-1, table.shape[-1])
-            table = table / np.maximum(np.linalg.norm(table, axis=0), 1e-300)
-            column = (case.suspects[..., which] * weight[..., 0]).ravel()
-            left = column - table @ np.linalg.lstsq(table, column, rcond=None)[0]
-            square += float(left @ left)
-            # The derivative by the rate is twice the efforts of inertia.
-            own = 0.5 * left.reshape(case.residual.shape) * case.floor
-            part += float(np.sum((own / np.maximum(case.variation, 1e-300)) ** 2))
-            count += float(case.counts.sum())
-        return square > RATE**2 and part > INERTIA**2 * count
-
-    def _evidence(self, i: int, free: Mask) -> Evidence:
-        """Of one recording; the suspects' columns, then those of what is not free."""
-        one = self.recordings[i]
-        rows, effort = one.rows, one.rows.effort
-        values = np.where(free, self.values, self.everything.values)
-        # The sign of a rate is filtered as the efforts are.
-        others = np.where(self.kinds == "friction", rows.table, one.calm)[..., ~free]
-        return Evidence(
-            effort - rows.rest - rows.table @ values + one.delay * rows.change,
-            rows.table[..., free],
-            np.concatenate([rows.change[..., None], one.missed], -1),
-            np.concatenate([one.columns, others], -1),
-            rows.signals.noise, rows.signals.band, rows.counts, rows.held_from,
-            np.sqrt(np.mean(effort**2, 0)), np.std(effort, 0),
-        )  # fmt: skip

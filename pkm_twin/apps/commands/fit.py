@@ -162,7 +162,7 @@ def fit(given: Fit) -> Report:
     elastic, currents = kinds is None, given.torque_constant is not None
     if elastic:
         _ = machine.elastic
-    with progress("fit", 2 * len(given.recordings)) as update:
+    with progress("fit", len(given.recordings)) as update:
         read = [
             given.read(path, machine, deflected=elastic, currents=currents)
             for path in given.recordings

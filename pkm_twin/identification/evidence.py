@@ -1,0 +1,246 @@
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
+"""One Gaussian model of measured signals, with its posterior and its evidence in closed form.
+
+    y = X x + discrepancy + noise,    x ~ N(mean, deviation^2)
+
+The columns X are those of the numbers that are fitted and of usual errors. The likelihood is
+evaluated in the cosine transform along time, where stationary signals are independent (Whittle,
+1953). There the noise is white in the band of the motion, with a measured density, and the
+discrepancy, which stands for every error without a column, has a share s of the spectrum of the
+measured signal (Kennedy, O'Hagan, Bayesian calibration of computer models, 2001). The share is
+unknown, uniform in its logarithm. For each share the posterior of x is normal, and the evidence,
+the probability of the signals, is a determinant and a sum of squares (MacKay, 1992).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
+
+from pkm_twin.codegen.arrays import Array, Indices, Mask
+from pkm_twin.identification.samples import EXACT
+
+SHARES: Final = np.geomspace(1e-3, 0.5, 8)
+"""Shares of the measured spectrum that the discrepancy may have; below, it is rounding."""
+BANDS: Final = 12
+"""Bands of frequency, equally wide in the logarithm, in which the spectra are taken as flat."""
+PASSED: Final = 0.8
+"""Part of the filter's band in which it takes nothing away."""
+NEGLIGIBLE: Final = 6.0
+"""Log evidence below the best share's at which a share no longer counts: one in 400."""
+
+
+@dataclass(frozen=True, eq=False)
+class Signals:
+    """Rows of one recording: k samples of n channels.
+
+    ``certain``: what the model says at x = 0, (k, n). ``columns``: its derivatives by x, (k, n, c).
+    ``measured``: (k, n). ``counts``: 1 where a sample is used, else 0. ``noise``: standard
+    deviation of a row's noise as if rows were independent, (n,). ``band``: the part of the rows'
+    rate that the filter passes.
+    """
+
+    certain: Array
+    columns: Array
+    measured: Array
+    counts: Array
+    noise: Array
+    band: float
+
+
+Information = tuple[Array, Array, float, float]
+"""X'V^-1 X, X'V^-1 y, y'V^-1 y and -log det V / 2, of y less what is certain."""
+
+
+@dataclass(frozen=True, eq=False)
+class Spectra:
+    """Sufficient statistics of a recording, by channel and band of frequency.
+
+    ``grams``: inner products of what is certain, the columns, and the measured signals of all
+    channels, (n, bands, 1 + c + n, 1 + c + n). ``counts``: coefficients in each band. ``noise``:
+    variance of a coefficient's noise, (n, 1). ``power``: mean square of a coefficient of the
+    measured signal, smoothed over bands, (n, bands).
+    """
+
+    grams: Array
+    counts: Array
+    noise: Array
+    power: Array
+
+    @classmethod
+    def of(cls, s: Signals) -> Spectra:
+        """Transform the signals of a recording."""
+        k, n = s.measured.shape
+        table = np.concatenate([s.certain[..., None], s.columns], -1) * s.counts[..., None]
+        both = scipy.fft.dct(table, axis=0, norm="ortho")
+        seen = scipy.fft.dct(s.measured * s.counts, axis=0, norm="ortho")
+        last = max(min(BANDS + 2, k), round(PASSED * s.band * k) if s.band < 1.0 else k)
+        edges = np.unique(np.geomspace(1, last, BANDS + 1).astype(int))
+        edges[0] = 0
+        grams, power = [], []
+        for a, b in pairwise(edges.tolist()):
+            every = np.broadcast_to(seen[a:b, None], (b - a, n, n))
+            part = np.moveaxis(np.concatenate([both[a:b], every], -1), 1, 0)
+            grams.append(part.swapaxes(1, 2) @ part)
+            # Without the constant part of the signal.
+            power.append(np.mean(seen[max(a, 1) : max(b, 2)] ** 2, 0))
+        p = np.array(power)
+        wide = np.concatenate([p[:1], p, p[-1:]])
+        p = np.maximum((wide[:-2] + 2.0 * wide[1:-1] + wide[2:]) / 4.0, 1e-6 * p.max(0))
+        rms = np.sqrt(np.mean(s.measured**2, 0))
+        used = np.maximum(s.counts.mean(0), 1.0 / k)
+        noise = np.maximum(np.maximum(s.noise, EXACT * rms) ** 2 * used, 1e-300)
+        return cls(np.stack(grams, 1), np.diff(edges).astype(float), noise[:, None], p.T)
+
+    def information(
+        self, share: float, gains: Array | None = None, order: Sequence[int] | None = None
+    ) -> Information:
+        """Return what the measured signals tell of x with a share of discrepancy.
+
+        :param gains: factors on the model's signals by channel, (n,). ``order``: whose model is of
+            each channel.
+        """
+        n = len(self.noise)
+        count = self.grams.shape[-1] - n
+        weights = 1.0 / (self.noise + share**2 * self.power)
+        total, side, square = np.zeros((count, count)), np.zeros(count), 0.0
+        for j, i in enumerate(range(n) if order is None else order):
+            gram = np.tensordot(weights[j], self.grams[i], 1)
+            gain = 1.0 if gains is None else float(gains[j])
+            total += gain**2 * gram[:count, :count]
+            side += gain * gram[:count, count + j]
+            square += float(gram[count + j, count + j])
+        square += float(total[0, 0] - 2.0 * side[0])
+        log = 0.5 * float(np.sum(self.counts * np.log(weights)))
+        return total[1:, 1:], side[1:] - total[1:, 0], square, log
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """The posterior of x, normal: log evidence, share of the discrepancy, mean, covariance.
+
+    The mean and the covariance have the columns that are ``used`` only; others are zero.
+    """
+
+    log: float
+    share: float
+    mean: Array
+    covariance: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """Recordings and the prior of x: zero mean and ``deviation``, (c,).
+
+    ``parts``: by share of the discrepancy the information, its side, its square and its log
+    normalisation, all recordings together.
+    """
+
+    parts: tuple[Information, ...]
+    deviation: Array
+    shares: Array
+
+    @classmethod
+    def of(
+        cls, spectra: Sequence[Spectra], places: Sequence[Indices], deviation: Array,
+        shares: Array = SHARES, gains: Array | None = None, order: Sequence[int] | None = None,
+    ) -> Model:  # fmt: skip
+        """Sum the information of all recordings.
+
+        :param places: of each recording's columns among x. ``gains``, ``order``: of the channels,
+            as of :meth:`Spectra.information`.
+        """
+        count, parts = len(deviation), []
+        for share in shares:
+            total, side, square, log = np.zeros((count, count)), np.zeros(count), 0.0, 0.0
+            for one, place in zip(spectra, places, strict=True):
+                own = one.information(float(share), gains, order)
+                total[np.ix_(place, place)] += own[0]
+                side[place] += own[1]
+                square, log = square + own[2], log + own[3]
+            scaled = total * np.outer(deviation, deviation)
+            parts.append((scaled, side * deviation, square, log))
+        return cls(tuple(parts), deviation, shares)
+
+    def widened(self, factors: Array) -> Model:
+        """Return the model with other deviations of the prior, (c,) times these."""
+        parts = tuple(
+            (total * np.outer(factors, factors), side * factors, square, log)
+            for total, side, square, log in self.parts
+        )
+        return Model(parts, self.deviation * factors, self.shares)
+
+    def _solve(self, k: int, used: Mask) -> tuple[float, Array, Array]:
+        """Return the log evidence at the share k, the Cholesky factor, and L^-1 X'V^-1 y."""
+        total, side, square, log = self.parts[k]
+        a = total[np.ix_(used, used)]
+        a[np.diag_indices(len(a))] += 1.0 + 1e-10 * np.diag(a)
+        root = scipy.linalg.cholesky(a, lower=True, check_finite=False)
+        half = scipy.linalg.solve_triangular(root, side[used], lower=True, check_finite=False)
+        log = log - 0.5 * (square - half @ half) - float(np.log(np.diag(root)).sum())
+        return log, root, half
+
+    def logs(self, used: Mask) -> Array:
+        """Return the log evidence at each share, with some of the columns."""
+        return np.array([self._solve(k, used)[0] for k in range(len(self.parts))])
+
+    def log_evidence(self, used: Mask, near: Array | None = None) -> float:
+        """Return the log evidence over all shares, with some of the columns.
+
+        :param near: log weights of the shares: negligible ones are left out; default none.
+        """
+        keys = np.arange(len(self.parts))
+        if near is not None:
+            keys = keys[near > near.max() - NEGLIGIBLE]
+        return float(scipy.special.logsumexp([self._solve(int(k), used)[0] for k in keys]))
+
+    def posterior(self, used: Mask, shares: Array | None = None) -> Posterior:
+        """Return the posterior with some of the columns.
+
+        :param shares: log weights of the shares, default the evidence's.
+        """
+        logs = self.logs(used)
+        weights = logs if shares is None else shares
+        weights = np.exp(weights - weights.max())
+        weights = np.where(weights > np.exp(-NEGLIGIBLE), weights, 0.0)
+        weights /= weights.sum()
+        count, d = len(self.deviation), self.deviation[used]
+        means, inverses = [], []
+        for k in np.flatnonzero(weights):
+            _, root, half = self._solve(int(k), used)
+            means.append(scipy.linalg.solve_triangular(root.T, half, check_finite=False))
+            inverses.append(
+                scipy.linalg.cho_solve((root, True), np.eye(len(half)), check_finite=False)
+            )
+        each = weights[weights > 0.0]
+        mean = np.tensordot(each, means, 1)
+        away = (np.array(means) - mean) * np.sqrt(each)[:, None]
+        full, covariance = np.zeros(count), np.zeros((count, count))
+        full[used] = mean * d
+        own = np.tensordot(each, inverses, 1) + away.T @ away
+        covariance[np.ix_(used, used)] = own * np.outer(d, d)
+        return Posterior(
+            float(scipy.special.logsumexp(logs)), float(self.shares[int(np.argmax(weights))]), full,
+            covariance,
+        )  # fmt: skip
+
+    def gains(self, used: Mask, more: Mask) -> tuple[Array, Array]:
+        """Return what each column of ``more`` alone adds to the log evidence, and its size."""
+        logs, found = np.zeros(len(self.parts)), np.full((len(self.parts), len(more)), -np.inf)
+        sizes = np.zeros_like(found)
+        for k, (total, side, _, _) in enumerate(self.parts):
+            logs[k], root, half = self._solve(k, used)
+            cross = scipy.linalg.solve_triangular(
+                root, total[np.ix_(used, more)], lower=True, check_finite=False
+            )
+            seen = np.maximum(np.diag(total)[more] - np.sum(cross**2, 0), 0.0)
+            left = side[more] - cross.T @ half
+            sizes[k, more] = left / (1.0 + seen)
+            found[k, more] = logs[k] + 0.5 * left**2 / (1.0 + seen) - 0.5 * np.log1p(seen)
+        gains = scipy.special.logsumexp(found, axis=0) - scipy.special.logsumexp(logs)
+        return np.asarray(gains, np.float64), self.deviation * sizes[int(np.argmax(logs))]
