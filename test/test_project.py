@@ -1,13 +1,16 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What holds for the whole tree: licences, sizes, and that the README is true."""
 
+import json
 import os
 import re
 import subprocess
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+import yaml
 
 from pkm_twin import robot_names
 
@@ -73,6 +76,26 @@ def test_make_targets_exist():
         assert {word for pair in named for word in pair if word} <= targets, name
     assert {"demo", "test"} <= set(re.findall(r"^    make (\w+)", README, re.MULTILINE))
     assert set(re.findall(r'"make ([\w-]+)', makefile)) <= targets
+
+
+def test_hooks_workflow_and_container_call_what_exists():
+    read = {path: (REPOSITORY / path).read_text(encoding="utf-8") for path in (
+        ".github/workflows/ci.yml", ".pre-commit-config.yaml", "Dockerfile", "Makefile",
+        ".devcontainer/devcontainer.json",
+    )}  # fmt: skip
+    jobs = yaml.safe_load(read[".github/workflows/ci.yml"])["jobs"]
+    lines = [step.get("run", "") for job in jobs.values() for step in job["steps"]]
+    (hooks,) = yaml.safe_load(read[".pre-commit-config.yaml"])["repos"]
+    container = json.loads(read[".devcontainer/devcontainer.json"])
+    calls = [*lines, container["postCreateCommand"], *(hook["entry"] for hook in hooks["hooks"])]
+    targets = set(re.findall(r"\bmake ([\w-]+)", "\n".join(calls)))
+    assert targets and targets <= set(re.findall(r"^([\w-]+):", read["Makefile"], re.MULTILINE))
+    paths = re.findall(r"(?<![\w/])(?:\.ci|test|bags)/\w*", "\n".join([*calls, read["Dockerfile"]]))
+    assert {".ci/run", "test/nodes"} <= set(paths)
+    assert all((REPOSITORY / path).exists() for path in paths)
+    assert f" AS {container['build']['target']}\n" in read["Dockerfile"]
+    (module,) = re.findall(r"python3 -m ([\w.]+)", read["Dockerfile"])
+    assert find_spec(module)
 
 
 def test_the_page_of_commands_has_all():
