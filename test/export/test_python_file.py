@@ -18,7 +18,7 @@ LIBRARIES = ("numpy", "jax", "torch")
 COUNT = 300
 LIBRARY = pytest.mark.parametrize("library", LIBRARIES)
 ROBOT = pytest.mark.parametrize(
-    "name", partly_long(("five_bar", "delta_cu", "prru", "rps3", "rsur"), "five_bar")
+    "name", partly_long(("five_bar", "delta_cu", "prru", "rps3", "rsur", "gantry"), "five_bar")
 )
 
 
@@ -38,6 +38,9 @@ class Made:
         spec = importlib.util.spec_from_file_location(f"machine_{library}", path)
         self.module = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(self.module)
+        if library == "jax":
+            # Nine steps take ten times as long to trace; torch makes them.
+            self.module.MORE_STEPS = ()
 
     def call(self, name, *inputs, kind=np.float64):
         """Results side by side, and the mask, as arrays of numpy; nothing is compiled."""
@@ -67,10 +70,8 @@ def test_results_are_those_of_python(name, library, tmp_path):
     made = Made(robot, library, tmp_path)
     for function, inputs, right in cases(robot):
         found, valid = made.call(function, *inputs)
-        assert valid.mean() > 0.9, function
-        assert np.isnan(found[~valid]).all()
-        error = np.abs(found - right)[valid]
-        assert error.max() < 1e-12 * np.abs(right).max(), function
+        assert valid.all(), function
+        assert np.abs(found - right).max() < 1e-12 * np.abs(right).max(), function
 
 
 @LIBRARY
@@ -81,8 +82,8 @@ def test_single_precision_is_kept(library, tmp_path):
         if function not in ("inverse", "torques"):
             continue
         found, valid = made.call(function, *inputs, kind=np.float32)
-        assert valid.mean() > 0.9, function
-        assert np.abs(found - right)[valid].max() < 1e-4 * np.abs(right).max(), function
+        assert valid.all(), function
+        assert np.abs(found - right).max() < 1e-4 * np.abs(right).max(), function
 
 
 @LIBRARY
