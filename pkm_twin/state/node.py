@@ -167,7 +167,11 @@ class MachineStateNode(TwinNode):
         self._transforms = self._create_transforms()
         self._drawn = 0
         """Stamp of the state that was drawn last, ns."""
-        self._create_markers()
+        text = "largest rate of ~/markers; 0: none"
+        rate = self.declare("markers_rate", 20.0, text, unit="Hz", low=0.0, high=1000.0)
+        if rate > 0.0:
+            self._markers = self.create_guarded_publisher("~/markers")
+            self.create_guarded_timer(1.0 / rate, self._publish_markers)
         self.create_guarded_subscription(
             "joint_states",
             self._on_joint_state,
@@ -242,15 +246,6 @@ class MachineStateNode(TwinNode):
                 f"tf2_msgs is missing, so no transforms are published ({error})"
             )
             return None
-
-    def _create_markers(self) -> None:
-        rate = self.declare(
-            "markers_rate", 20.0, "largest rate of ~/markers; 0: "
-            "none", unit="Hz", low=0.0, high=1000.0
-        )  # fmt: skip
-        if rate > 0.0:
-            self._markers = self.create_guarded_publisher("~/markers")
-            self.create_guarded_timer(1.0 / rate, self._publish_markers)
 
     def _on_joint_state(self, message: JointStateView) -> None:
         state = self.core.joint_state(message, self.now())

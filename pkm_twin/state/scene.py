@@ -121,7 +121,12 @@ class Scene:
     def shapes(self, state: State, load: Load | None = None) -> list[Shape]:
         """Return the shapes of the machine in a state, and of the load's effects."""
         places = self.placed(state.q)
-        shares = _relative_energies(load)
+        # Energies relative to the largest one; nothing without energy.
+        factors = {} if load is None else load.factors
+        greatest = max(factors.values(), default=0.0)
+        shares = (
+            {name: value / greatest for name, value in factors.items()} if greatest > 0.0 else {}
+        )
         shapes = self._bars(places, shares)
         if load is None:
             return shapes
@@ -213,13 +218,6 @@ class Scene:
         height = LETTER_HEIGHT * self._size
         at = state.position + np.array([0.0, 0.0, 2.0 * height])
         return Shape("text", "dominant", 0, TEXT_COLOUR, (0.0, 0.0, height), at, text=name)
-
-
-def _relative_energies(load: Load | None) -> dict[str, float]:
-    """Return each element's energy relative to the largest one; nothing without energy."""
-    factors = {} if load is None else load.factors
-    greatest = max(factors.values(), default=0.0)
-    return {name: value / greatest for name, value in factors.items()} if greatest > 0.0 else {}
 
 
 def _joint_places(robot: Robot) -> dict[str, Place]:

@@ -24,7 +24,7 @@ from numpy.polynomial import polynomial
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.cholesky import SparseCholesky
 from pkm_twin.codegen.code import Code
-from pkm_twin.codegen.expressions import Objects, Tape
+from pkm_twin.codegen.expressions import Tape
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.key import EMPTY
 from pkm_twin.codegen.program import Program
@@ -154,16 +154,6 @@ class Differentiator:
         newest = self._stamps.item((self._count - 1) % self._places)
         return stamp - self._begin - newest > max(self._span, self.time * SECOND)
 
-    def _keep_time(self, end: int) -> None:
-        """Fit fewer samples if the window spans too long a time."""
-        held = min(self._count, self.window)
-        self._span = self._stamps.item(end - 1) - self._stamps.item(end - held)
-        least, time = max(MIN_SAMPLES, self.degree + 2), self.time * SECOND
-        # A full window may be too long for a moment because samples were lost.
-        filling = self._count <= self.window == self._most
-        if held > least and self._span > (FILLING_TOLERANCE if filling else 2.0) * time:
-            self._fit_samples(max(1 + round(time * (held - 1) / self._span), least))
-
     def _fit_samples(self, window: int) -> None:
         if window == self.window:
             return
@@ -200,7 +190,14 @@ class Differentiator:
         self._count += 1
         # The window ends at the newest sample's first copy if all blocks fit before it.
         end = (slot if slot + 1 >= self._held else twin) + 1
-        self._keep_time(end)
+        # Fit fewer samples if the window spans too long a time.
+        held = min(self._count, self.window)
+        self._span = self._stamps.item(end - 1) - self._stamps.item(end - held)
+        least, time = max(MIN_SAMPLES, self.degree + 2), self.time * SECOND
+        # A full window may be too long for a moment because samples were lost.
+        filling = self._count <= self.window == self._most
+        if held > least and self._span > (FILLING_TOLERANCE if filling else 2.0) * time:
+            self._fit_samples(max(1 + round(time * (held - 1) / self._span), least))
         if self._count < self.window:
             return None
         at = end - 1 - (self.window - 1 - self.window // 2 if self.middle else 0)
@@ -294,30 +291,22 @@ def _write_fit_program(degree: int, joints: int, solved: bool) -> Program:
     results = [*powers, *mixed.ravel()]
     if solved:
         t = (look - middle) * inverse
-        results = _solve_normal_equations(powers, mixed, t, float(SECOND) * inverse)
+        # The normal equations give first and second derivative at t, by seconds.
+        rate = float(SECOND) * inverse
+        matrix = {(i, j): powers[i + j] for i in range(size) for j in range(i + 1)}
+        factors = SparseCholesky(matrix, [1.0] * size)
+        here: list[Any] = [1.0]
+        for _ in range(size):
+            here.append(here[-1] * t)
+        results = []
+        for slopes, scale in (
+            ([0, *range(1, size)], rate),
+            ([k * (k - 1) for k in range(size)], rate * rate),
+        ):
+            first = 1 if scale is rate else 2
+            # The derivative is w' V y with V V' w = d.
+            d = [float(s) * here[k - first] if s else 0.0 for k, s in enumerate(slopes)]
+            w = np.array(factors.solve(d), dtype=object)
+            results += [scale * (w @ mixed[:, j]) for j in range(joints)]
+        results += factors.pivots
     return Program(sizes, 0, {"result": [tape.lift(value) for value in results]})
-
-
-def _solve_normal_equations(powers: list[Any], mixed: Objects, t: Any, rate: Any) -> list[Any]:
-    """Solve the normal equations; return first and second derivative at t, and the pivots.
-
-    :param powers: sums of t^k; ``mixed``: sums of t^k y, shape (degree + 1, n).
-    :param rate: change of t per second.
-    """
-    size, joints = mixed.shape
-    matrix = {(i, j): powers[i + j] for i in range(size) for j in range(i + 1)}
-    factors = SparseCholesky(matrix, [1.0] * size)
-    here: list[Any] = [1.0]
-    for _ in range(size):
-        here.append(here[-1] * t)
-    results: list[Any] = []
-    for slopes, scale in (
-        ([0, *range(1, size)], rate),
-        ([k * (k - 1) for k in range(size)], rate * rate),
-    ):
-        first = 1 if scale is rate else 2
-        # The derivative is w' V y with V V' w = d.
-        d = [float(s) * here[k - first] if s else 0.0 for k, s in enumerate(slopes)]
-        w = np.array(factors.solve(d), dtype=object)
-        results += [scale * (w @ mixed[:, j]) for j in range(joints)]
-    return [*results, *factors.pivots]

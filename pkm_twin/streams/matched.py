@@ -177,7 +177,13 @@ class WrenchWindow(Core):
         has none. The window must be full.
         """
         rows = list(self._rows)[-self.window :]
-        weights = self._window_weights(np.array([row.stamp for row in rows]))
+        # The weights are computed only if the intervals of the stamps changed.
+        stamps = np.array([row.stamp for row in rows])
+        key = np.diff(stamps).tobytes()
+        if key != self._weights[0]:
+            carries = bool(self._carries)
+            self._weights = key, window_weights(stamps, self.order, carries)
+        weights = self._weights[1]
         wrenches = np.array([row.wrench for row in rows])
         efforts = [row.effort for row in rows]
         wrench = weights @ (0.5 * (wrenches[1:] + wrenches[:-1]))
@@ -185,11 +191,3 @@ class WrenchWindow(Core):
             return wrench, None
         measured = np.array(efforts)
         return wrench, weights @ (0.5 * (measured[1:] + measured[:-1]))
-
-    def _window_weights(self, stamps: Array) -> Array:
-        """Return the window's weights; compute them only if the intervals of the stamps changed."""
-        key = np.diff(stamps).tobytes()
-        if key != self._weights[0]:
-            carries = bool(self._carries)
-            self._weights = key, window_weights(stamps, self.order, carries)
-        return self._weights[1]
