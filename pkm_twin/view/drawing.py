@@ -134,11 +134,13 @@ GROUND_BAR: Final = 0.015
 """Radius of the ground between a planar linkage's joints, of the machine's size."""
 
 
-def draw(robot: Robot) -> Any:
+def draw(robot: Robot, marked: bool = False) -> Any:
     """Draw the robot at home as a matplotlib figure.
 
     Colours are those of ``pkm-twin view``: drives blue, rods light blue, the platform orange. The
     names of the drives are next to them, the base frame and a scale in the corners.
+
+    :param marked: also draw the bodies' centres of mass and the reference point.
     """
     from matplotlib import patheffects
 
@@ -175,7 +177,21 @@ def draw(robot: Robot) -> Any:
             at = point + camera.pixel * down * size / 2 * ANCHORS[anchor]
             ax.text(*at, name, va="center", **style)
     _draw_corners(ax, camera, style)
+    if marked:
+        _draw_points(ax, camera, robot)
     return figure
+
+
+def _draw_points(ax: Any, camera: Camera, robot: Robot) -> None:
+    """Draw the centres of mass of bodies and the reference point at home, with a legend."""
+    masses = [body.com for body in robot.graph.bodies.values() if body.mass > 0.0]
+    for places, marker, name in (
+        (masses, "o", "centre of mass of a body"), ([robot.graph.origin], "X", "reference point"),
+    ):  # fmt: skip
+        seen = camera.see(np.reshape(places, (-1, 3)))[:, :2]
+        ax.plot(*seen.T, marker, label=name, color="w", markeredgecolor="k", markersize=8)
+    ax.legend(loc="upper left", fontsize=9, frameon=False)
+    ax.set(xlim=(camera.low[0], camera.high[0]), ylim=(camera.low[1], camera.high[1]))
 
 
 def _draw_corners(ax: Any, camera: Camera, style: dict[str, Any]) -> None:

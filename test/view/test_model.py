@@ -10,9 +10,11 @@ import pytest
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import robot_names
+from pkm_twin.report.plots import pyplot
 from pkm_twin.robot.clearance import clearance, has_clearance
 from pkm_twin.robot.outline import Posture, telescope
 from pkm_twin.view import texts
+from pkm_twin.view.drawing import draw
 from pkm_twin.view.model import Model, _round, _step
 from pkm_twin.view.scene import (
     ANCHORS,
@@ -379,3 +381,16 @@ def test_meshes_are_closed():
             (a, b) for row in corners.tolist() for a, b in zip(row, row[1:] + row[:1], strict=True)
         }
         assert {(b, a) for a, b in edges} == edges
+
+
+@pytest.mark.parametrize("name", ["five_bar", "delta_cu"])
+def test_a_picture_at_home_marks_the_bodies_centres_and_the_reference_point(name):
+    robot = load(name)
+    figure = draw(robot, marked=True)
+    ax = figure.axes[0]
+    centres, reference = (line for line in ax.lines if not line.get_label().startswith("_"))
+    assert len(centres.get_xdata()) == sum(b.mass > 0.0 for b in robot.graph.bodies.values())
+    assert len(reference.get_xdata()) == 1
+    inside = ax.viewLim.contains
+    assert all(inside(*at) for line in (centres, reference) for at in line.get_xydata())
+    pyplot().close(figure)

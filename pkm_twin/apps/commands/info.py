@@ -35,7 +35,7 @@ class Info(OfRobot, Draws):
 
     Prints dimensions, masses, limits, home pose and mobility. For an overconstrained mechanism it
     also lists the joint reactions that rigid-body equations do not determine. --picture draws the
-    robot at home.
+    robot at home, with the bodies' centres of mass and the reference point.
     """
 
 
@@ -157,7 +157,7 @@ def members_fault(robot: Robot) -> str:
 def _draw_robot(robot: Robot) -> Any:
     from pkm_twin.view.drawing import draw
 
-    return draw(robot)
+    return draw(robot, marked=True)
 
 
 def overconstraint(robot: Robot) -> list[str]:
