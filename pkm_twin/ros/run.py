@@ -141,7 +141,7 @@ def run(*factories: Callable[[], TwinNode], arguments: Sequence[str] | None = No
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except (PkmTwinError, ParameterException, RuntimeError) as error:
-        if len(nodes) == len(factories):
+        if executor is not None:
             raise
         if signals.came:
             return 0  # Where the interrupt was in an import, say, it may come out as another error.

@@ -150,6 +150,29 @@ def test_a_signal_in_an_import_ends_a_node_quietly(domain, case):
     assert (process.returncode, said) == (0, "")
 
 
+WRAPPED = """
+import os, signal
+from pkm_twin.apps.nodes import command_gate
+from pkm_twin.ros import run
+
+class Named:
+    def __set_name__(self, owner, name):
+        os.kill(os.getpid(), signal.SIGINT)
+
+# Python 3.11 wraps what is raised in __set_name__ into a RuntimeError.
+run.one_blas_thread = lambda: type("Owner", (), {"name": Named()})
+command_gate()
+"""
+
+
+def test_a_signal_that_comes_out_as_another_error_ends_a_node_quietly(domain):
+    """All nodes are made by then, and end as they do after a signal."""
+    done = subprocess.run(
+        [sys.executable, "-c", WRAPPED], capture_output=True, text=True, env=domain.environment()
+    )
+    assert done.returncode == 0 and "Traceback" not in done.stdout + done.stderr
+
+
 LAUNCH = """
 import os
 import signal
