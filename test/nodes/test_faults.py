@@ -59,14 +59,14 @@ import numpy as np
 import delta_dynamics.nodes.twin as node
 from delta_dynamics import feedforward
 solve = feedforward.inverse_dynamics
-def late(robot, q, *rest):
+def late(robot, q, *rest, **more):
     if q.ndim > 1:
         return np.full(q.shape, np.inf)
     if q[0] == 0.125:
         time.sleep(0.02)
     if q[0] == 0.1125:
         os.kill(os.getpid(), signal.SIGSTOP)
-    return solve(robot, q, *rest)
+    return solve(robot, q, *rest, **more)
 feedforward.inverse_dynamics = late
 raise SystemExit(node.run(node.NODE))
 """

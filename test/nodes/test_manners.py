@@ -331,13 +331,13 @@ from delta_dynamics import feedforward
 from delta_dynamics.nodes import twin as node
 solve = feedforward.inverse_dynamics
 answered = 0
-def slowly(robot, q, *rates):
+def slowly(robot, q, *rates, **more):
     global answered
     answered += q.ndim == 1
     if q.ndim > 1:
         time.sleep(0.05)
         print("answered", answered, flush=True)
-    return solve(robot, q, *rates)
+    return solve(robot, q, *rates, **more)
 feedforward.inverse_dynamics = slowly
 raise SystemExit(node.run(node.NODE))
 """
