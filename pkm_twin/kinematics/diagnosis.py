@@ -43,9 +43,9 @@ class Deviation(NamedTuple):
 
 
 def mobility_error(linkage: Linkage, causes: Sequence[Deviation] = ()) -> MobilityError:
-    """The error of a machine whose actuated joints do not determine it, with the causes.
+    """Return the error of a machine that its actuated joints do not determine, with the causes.
 
-    :param causes: what nearly holds; empty: looked for.
+    :param causes: deviations that take freedoms away; empty: they are looked for.
     """
     # What nearly holds takes freedoms away; where there are too many, none is lost.
     lost = linkage.mobility.freedoms < linkage.joints
@@ -59,7 +59,7 @@ def mobility_error(linkage: Linkage, causes: Sequence[Deviation] = ()) -> Mobili
 
 
 def singular_home(linkage: Linkage, rank: int, beside: int) -> ParameterError:
-    """The error of a machine whose home is a singularity, with what can move in it alone."""
+    """Return the error of a singular home, with the joints that can move in it alone."""
     motion, ju = linkage.regular_state()
     del motion
     here = null(linkage.scaled_at_home()[0], _NONE)
@@ -120,9 +120,9 @@ def _parallel_joint(graph: Graph, joint: Joint, axis: Array) -> str:
 
 
 def is_right(graph: Graph | None, freedoms: int = 0) -> bool:
-    """Whether at home the actuated joints determine the machine, and all can move.
+    """Return whether at home the actuated joints determine the machine and can all move.
 
-    :param freedoms: whether it has as many at least, in place of that.
+    :param freedoms: if given, return whether the machine has as many degrees of freedom instead.
     """
     if graph is None:
         return False
@@ -134,7 +134,7 @@ def is_right(graph: Graph | None, freedoms: int = 0) -> bool:
 
 
 def _loose(linkage: Linkage) -> list[str]:
-    """What moves while the actuated joints are held, in words."""
+    """Describe the motions that the held actuated joints leave free."""
     motion, ju = linkage.regular_state()
     free = null(ju, _NONE)
     if not free.shape[1]:
@@ -153,7 +153,7 @@ def _loose(linkage: Linkage) -> list[str]:
 
 
 def _locked(linkage: Linkage) -> list[str]:
-    """Actuated joints that cannot move, or only together."""
+    """Name actuated joints that cannot move, or only together."""
     ju, jq = linkage.scaled_at_home()
     unknown = ju.shape[1]
     moves = null(np.hstack([ju, jq]), _NONE)[unknown:]
@@ -171,7 +171,7 @@ def _locked(linkage: Linkage) -> list[str]:
 
 
 def _owners(linkage: Linkage, motions: Array) -> list[str]:
-    """Joints, and bodies that only rods hold, in motions of shape (unknown rates, count)."""
+    """List the joints, and bodies that only rods hold, of motions (unknown rates, count)."""
     parts = np.abs(motions).max(1, initial=0.0) > _NONE
     owners: Sequence[str] = linkage.tree.owners
     found = dict.fromkeys(o for o, part in zip(owners, parts, strict=True) if part)

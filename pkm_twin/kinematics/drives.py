@@ -40,13 +40,13 @@ class Drives:
         self._margins: list[Any] = []
 
     def given(self, name: str) -> Objects:
-        """Inputs of all drives: those of the leading ones, shape (m,); the others' are judged."""
+        """Return the inputs of the leading drives, shape (m,); those of the others are checked."""
         values = self.t.tape.inputs(name, self.count)
         _, leads = self._given.setdefault(name, (values, values[self.leading]))
         return leads
 
     def variables(self, name: str) -> list[Any]:
-        """Inputs of all drives, to read and to differentiate by, shape (n,)."""
+        """Return the inputs of all drives, to read and to differentiate by, shape (n,)."""
         values = list(self.t.tape.inputs(name, self.count))
         for k, lead in zip(self.leading, self.t.q, strict=True):
             values[k] = lead if name == "q" else values[k]

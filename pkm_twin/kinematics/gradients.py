@@ -16,7 +16,7 @@ from pkm_twin.kinematics.traced import Traced
 
 
 def gradient_program(t: Traced, program: Program, by: Mapping[str, Numbers]) -> Program:
-    """The gradient of a sum of a program's outputs times ``weights``, an input of their number.
+    """Return the gradient of the sum of a program's outputs times its input ``weights``.
 
     :param by: inputs by which, by name of the output.
     """

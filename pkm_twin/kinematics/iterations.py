@@ -28,7 +28,7 @@ MAX_STEP: Final = 0.2
 
 
 def newton(x: Array, look: Look, move: Move) -> Array | None:
-    """The state in which all values vanish; None unless every step is less than half the last."""
+    """Solve for the state where all values vanish; None unless each step halves the last one."""
     last = np.inf
     for _ in range(MAX_ITERATIONS):
         values, table = look(x)
@@ -46,7 +46,7 @@ def newton(x: Array, look: Look, move: Move) -> Array | None:
 
 
 def least_squares(x: Array, look: Look, move: Move, iterations: int) -> Array | None:
-    """Values where their squares' sum is least, after damped steps; None if one is not finite."""
+    """Return the values of least squares after damped steps; None if one is not finite."""
     values, table = look(x)
     for _ in range(iterations):
         if not (np.isfinite(values).all() and np.isfinite(table).all()):

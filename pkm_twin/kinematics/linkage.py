@@ -53,12 +53,12 @@ class Linkage:
         return len(self.graph.leads)
 
     def at(self, x: Numbers, q: Numbers) -> tuple[Motion, list[Row]]:
-        """Motion and closures in a state, on numbers."""
+        """Return the motion and the closures in a state, on numbers."""
         motion = Motion(self.tree, x, q)
         return motion, motion.closures()
 
     def scaled(self, rows: Sequence[Row]) -> tuple[Array, Array]:
-        """Derivatives by u and by qd, every row and column of unit one."""
+        """Return the derivatives of rows by u and by qd, every row and column of unit one."""
         ju, jq = (numbers(m) for m in matrices(self.tree, rows))
         left = np.array([row.scale for row in rows]).reshape(-1, 1)
         drives = np.array([self.drive_scale(name) for name in self.graph.leads])
@@ -69,7 +69,7 @@ class Linkage:
         return 1.0 / self.tree.size if self.graph.joints[name].slides else 1.0
 
     def close(self, q: Numbers, start: Numbers | None = None) -> Array | None:
-        """Unknowns of a state near a known one, on numbers; None where they are not found."""
+        """Solve for the unknowns of a state near a known one; None if they are not found."""
         scales = np.array(self.tree.scales)
 
         def look(x: Numbers) -> tuple[Array, Array]:
@@ -94,7 +94,7 @@ class Linkage:
         return self._near_home()
 
     def _near_home(self) -> list[tuple[Array, Array]]:
-        """The same in every run."""
+        """Sample states near home, the same ones in every run."""
         graph, home = self.graph, self.graph.lead_home
         states = [(np.array(self.tree.home, float), home)]
         random = np.random.default_rng(0)
@@ -125,11 +125,11 @@ class Linkage:
         return [row.part for row in self.at(self.tree.home, self.graph.lead_home)[1]]
 
     def scaled_at_home(self) -> tuple[Array, Array]:
-        """Derivatives of the closures at home by u and by qd, every row and column of unit one."""
+        """Return the scaled derivatives of the closures at home by u and by qd."""
         return self.scaled(self.at(self.tree.home, self.graph.lead_home)[1])
 
     def regular_state(self) -> tuple[Motion, Array]:
-        """The motion in a state of the highest rank at or beside home, and derivatives by u."""
+        """Return a sampled state of the highest rank, and the scaled derivatives by u there."""
         k = int(np.argmax([rank_of(ju) for ju in self._sampled[0]]))
         return self.at(*self.samples[k])[0], np.asarray(self._sampled[0][k], np.float64)
 
@@ -151,7 +151,7 @@ class Linkage:
 
 
 def rank_of(matrix: Array) -> int:
-    """Number of singular values above :data:`RANK`."""
+    """Return the number of singular values above :data:`RANK`."""
     if not matrix.size:
         return 0
     s = np.linalg.svd(matrix, compute_uv=False)

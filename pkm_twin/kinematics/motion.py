@@ -60,12 +60,12 @@ def cross(a: Any, b: Any) -> Objects:
 
 
 def numbers(values: Any) -> Array:
-    """An array of objects that are floats, as floats."""
+    """Convert an array of objects that are floats to floats."""
     return np.asarray(np.array(values, dtype=float), np.float64)
 
 
 def difference(b: Columns, a: Columns) -> Columns:
-    """Columns of b less those of a, by rate."""
+    """Subtract the columns of a from those of b, by rate."""
     keys = dict.fromkeys([*b, *a])
     return {k: (b[k] - a[k] if k in a else b[k]) if k in b else -a[k] for k in keys}
 
@@ -154,20 +154,20 @@ class Motion:
     # Points and directions that are fixed in a body, given at home.
 
     def arm(self, body: str, point: Array) -> Any:
-        """From the body's origin to a point of it."""
+        """Return the vector from a body's origin to a point of it."""
         tree = self.tree
         return self.rotation[body] @ snapped_all(tree.axes[body].T @ (point - tree.at[body]))
 
     def point(self, body: str, point: Array) -> Any:
-        """Where a point of a body is."""
+        """Return where a point of a body is."""
         return self.origin[body] + self.arm(body, point)
 
     def direction(self, body: str, vector: Array) -> Any:
-        """Where a vector of a body points."""
+        """Return where a vector of a body points."""
         return self.rotation[body] @ snapped_all(self.tree.axes[body].T @ vector)
 
     def turned(self, body: str) -> Any:
-        """Rotation of a body relative to home, shape (3, 3)."""
+        """Return the rotation of a body relative to home, shape (3, 3)."""
         return self.rotation[body] @ self.tree.axes[body].T
 
     def platform(self) -> tuple[Any, Any]:
@@ -364,11 +364,11 @@ class Motion:
         return self.change[body] + self._spin[body] @ self.arm(body, point)
 
     def spin(self, body: str) -> Any:
-        """The matrix that takes a lever to the acceleration across it, shape (3, 3)."""
+        """Return the matrix from a lever to the acceleration across it, shape (3, 3)."""
         return self._spin[body]
 
     def retracted(self, x: Numbers, du: Numbers) -> list[Any]:
-        """Unknowns, moved by small rates."""
+        """Return the unknowns after a step of small rates."""
         new = list(x)
         for link in self.tree.links.values():
             for step in link.steps:
@@ -405,7 +405,7 @@ def reaction_directions(joint: Joint) -> tuple[Direction, ...]:
 
 
 def matrices(tree: Tree, rows: Sequence[Row]) -> tuple[Objects, Objects]:
-    """Derivatives of the closures by u, shape (rows, unknown rates), and by qd, (rows, n)."""
+    """Return the derivatives of closures by u, shape (rows, unknown rates), and qd, (rows, n)."""
     n = len(tree.graph.leads)
 
     def block(letter: str, size: int) -> NDArray[Any]:

@@ -28,12 +28,12 @@ from pkm_twin.machine.tree import Link
 
 
 def rod_axes(rod: Rod) -> tuple[Array, Array]:
-    """The two axes that a rod turns about at its inner end, at home."""
+    """Return the two axes that a rod turns about at its inner end, at home."""
     return across(unit(rod.ends[1] - rod.ends[0]))
 
 
 def passive_names(engine: Engine) -> tuple[str, ...]:
-    """Names of all passive numbers: of the tree from the ground outwards, then of the rods."""
+    """Name all passive numbers: of the tree from the ground outwards, then of the rods."""
     names: list[str] = []
     labels = joint_labels(engine.tree)
     for link in engine.tree.links.values():
@@ -47,13 +47,13 @@ def passive_names(engine: Engine) -> tuple[str, ...]:
 
 
 def passive_program(t: Traced) -> Program:
-    """Q to all passive numbers."""
+    """Write the program from q to all passive numbers."""
     t.solve()
     return Program(t.inputs("q"), 0, {"passive": t.lift(_values(t))}, t.equations())
 
 
 def passive_rates_program(t: Traced) -> Program:
-    """Q and qd to the rates of all passive numbers."""
+    """Write the program from q and qd to the rates of all passive numbers."""
     t.solve()
     qd = t.drives.given("qd")
     rates = t.lift(_rates(t, qd, t.set_rates(qd)))
@@ -61,13 +61,13 @@ def passive_rates_program(t: Traced) -> Program:
 
 
 def state_program(t: Traced) -> Program:
-    """Q to position (3) and rotation (9) of the platform, and all passive numbers."""
+    """Write the program from q to the platform's position (3), rotation (9) and passive numbers."""
     t.solve()
     return Program(t.inputs("q"), 0, _state(t), t.equations())
 
 
 def moving_state_program(t: Traced) -> Program:
-    """The same of q and qd; then the rates of all passive numbers, and the platform's twist (6)."""
+    """Write the program of q and qd: the state, rates of passive numbers, platform's twist (6)."""
     t.solve()
     qd = t.drives.given("qd")
     u, motion, graph = t.set_rates(qd), t.motion, t.graph
@@ -145,19 +145,19 @@ def _rates(t: Traced, qd: Numbers, u: Numbers) -> list[Any]:
 
 
 def _relative(t: Traced, link: Link) -> Objects:
-    """Rotation of a link as its parent sees it."""
+    """Return the rotation of a link relative to its parent."""
     turned: Objects = t.motion.turned(link.parent).T @ t.motion.turned(link.body)
     return turned
 
 
 def _across_ends(t: Traced, rod: Rod) -> Any:
-    """From a rod's inner end to its outer one, base axes."""
+    """Return the vector from a rod's inner end to its outer one, base axes."""
     start, end = rod.ends
     return t.motion.point(rod.outer, end) - t.motion.point(rod.inner, start)
 
 
 def _rod_sides(rod: Rod, vector: Any) -> tuple[Any, Any, Any]:
-    """A vector of the inner body by what turns a rod: second axis, first axis, along at home.
+    """Resolve a vector of the inner body along a rod's second axis, first axis and direction.
 
     Turned by b about the second axis, then by a about the first, along becomes
     (cos b) (cos a along + sin a (first x along)) + sin b (second x along).
@@ -169,7 +169,7 @@ def _rod_sides(rod: Rod, vector: Any) -> tuple[Any, Any, Any]:
 
 
 def _three_angles(matrix: Objects) -> list[Any]:
-    """a, b, c of Rx(a) Ry(b) Rz(c)."""
+    """Return the angles a, b, c of Rx(a) Ry(b) Rz(c)."""
     root = sqrt(matrix[0][0] * matrix[0][0] + matrix[0][1] * matrix[0][1])
     return [
         atan2(-matrix[1][2], matrix[2][2]),

@@ -104,7 +104,7 @@ def _root(matrix: Any, entry: Entry) -> Any:
 
 
 def values(coordinates: Sequence[Coordinate], position: Any, rotation: Any) -> list[Any]:
-    """The pose of a platform."""
+    """Return the pose coordinates of a platform."""
     result = []
     for c in coordinates:
         if c.axis is not None:

@@ -202,7 +202,7 @@ class _Loops:
 
     @property
     def slots(self) -> list[Slot]:
-        """The vectors of the graph."""
+        """All vectors of the graph."""
         graph = self.graph
         found: list[Slot] = []
         for joint in graph.joints.values():
@@ -211,7 +211,7 @@ class _Loops:
         return found + [("end", name, k) for name in graph.rods for k in range(2)]
 
     def walk(self, rank: int, count: int, steps: int, seed: int = 0) -> Placement:
-        """Rotations and places of all bodies in positions that the machine can move to from home.
+        """Return positions that the machine can move to from home.
 
         :param rank: of the equations; smaller singular values are no constraints. ``count``: of
             positions. ``steps``: towards each, of REACH in STEPS.
@@ -234,7 +234,7 @@ class _Loops:
         return placed
 
     def sizes(self, positions: Placement) -> Array:
-        """Singular values of the equations by the bodies' motions, shape (k, n)."""
+        """Return the singular values of the equations by the bodies' motions, shape (k, n)."""
         table = self.equations(positions)[1]
         return np.asarray(np.linalg.svd(table, compute_uv=False), np.float64)
 

@@ -263,7 +263,7 @@ class Scheme(Linkage):
         return [1.0 / self.tree.size if c.axis is not None else 1.0 for c in self.coordinates]
 
     def pose_rows(self, motion: Motion, pose: Numbers) -> Objects:
-        """Derivatives of the pose equations by the unknown rates and qd."""
+        """Return the derivatives of the pose equations by the unknown rates and qd."""
         n = self.tree.unknown_rates
         table = np.zeros((len(self.coordinates), n + self.joints), dtype=object)
         for i, (_, columns) in enumerate(poses.rows(self.coordinates, motion, pose)):
@@ -273,7 +273,7 @@ class Scheme(Linkage):
 
 
 def choose_leads(graph: Graph, wanted: Sequence[str] = (), pose: int = 0) -> tuple[str, ...]:
-    """The drives that lead: all, or of more than there are freedoms the most independent ones.
+    """Choose the drives that lead: all, or the most independent ones of redundant drives.
 
     :param wanted: names, in place of that choice. ``pose``: number of pose coordinates, 0: any.
     :raises MobilityError: there are more for a deviation alone, or one of them cannot move.
@@ -405,6 +405,6 @@ def check_masses(scheme: Scheme, graph: Graph) -> None:
 
 
 def _root(inertia: Array) -> Array:
-    """A matrix whose square is a symmetric one."""
+    """Return a matrix R whose product R' R is the symmetric matrix."""
     values, vectors = np.linalg.eigh(inertia)
     return np.asarray(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T, np.float64)

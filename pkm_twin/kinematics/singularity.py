@@ -57,12 +57,12 @@ from pkm_twin.machine.tree import Tree
 
 
 def singularity_kernel(engine: Engine) -> Kernel:
-    """The compiled program, q to the measure (1)."""
+    """Compile the program from q to the measure (1)."""
     return engine.kernel("singularity", _singularity)
 
 
 def singularity_gradient(engine: Engine) -> Kernel:
-    """The program of its derivatives: q and a weight (1) to those by q and by the geometry."""
+    """Compile the program from q and a weight (1) to derivatives by q and by the geometry."""
     return engine.kernel("singularity gradient", _gradient, free=True)
 
 
@@ -122,15 +122,15 @@ class Placed(Motion):
                     self.axis[id(step)] = motion.direction(body, step.axis)
 
     def point(self, body: str, point: Array) -> Any:
-        """Where a point of a body is."""
+        """Return where a point of a body is."""
         return self._found.point(body, point)
 
     def direction(self, body: str, vector: Array) -> Any:
-        """Where a vector of a body points."""
+        """Return where a vector of a body points."""
         return self._found.direction(body, vector)
 
     def closures(self) -> list[Row]:
-        """The equations of all cut joints and rods, and the couples of pairs of rods."""
+        """Return the equations of all cut joints and rods, and the couples of pairs of rods."""
         pairs = [self._couple(rod) for rod in self.graph.rods.values() if rod.pair is not None]
         return [*super().closures(), *pairs]
 
@@ -156,7 +156,7 @@ def _gradient(t: Traced) -> Program:
 
 
 def singularity_measure(t: Traced) -> Any:
-    """The measure of a solved motion, to write other programs with; rates are overwritten."""
+    """Return the measure of a solved motion for other programs; rates are overwritten."""
     point = all(c.axis is not None for c in t.scheme.coordinates)
     return minimum(_held(t), _moved(t, point))
 
@@ -240,8 +240,9 @@ def _moved(t: Traced | _Numbers, point: bool) -> Any:
 
 
 class _Rates:
-    """Motion of bodies by the joint rates: D = S U, S by the rates on a body's way from the base,
-    U these by the joint rates.
+    """Hold the motion of bodies by the joint rates, D = S U.
+
+    S: a body's motion by the rates between the base and the body. U: these by the joint rates.
     """
 
     def __init__(self, t: Traced | _Numbers) -> None:
@@ -294,7 +295,7 @@ class _Rates:
         return total
 
     def _product(self, a: tuple[str, int], b: tuple[str, int], root: SparseCholesky) -> Any:
-        """An entry of U (T'T)^-1 U'."""
+        """Return an entry of U (T'T)^-1 U'."""
         pair = (min(a, b), max(a, b))
         if pair not in self._products:
             for key in pair:

@@ -29,7 +29,7 @@ _NONE: Final = 1e-6
 
 
 def without_spins(graph: Graph) -> tuple[Graph, dict[str, float]]:
-    """The graph with every spin of a part held, and the joints that hold them.
+    """Hold every spin of a part; return the graph and the joints that hold them.
 
     Of each joint the greatest mass times distance of its centre from the spin's axis, kg m: where
     it is not zero, efforts depend on the angle at which the part is held.
@@ -66,14 +66,14 @@ def without_spins(graph: Graph) -> tuple[Graph, dict[str, float]]:
 
 
 def _imbalance(motion: Motion, body: Body, way: Array) -> float:
-    """Mass times the distance of a body's centre from the axis of a motion, kg m."""
+    """Return mass times the distance of a body's centre from a motion's axis, kg m."""
     rates = twist(motion, body.name, body.com) @ way
     turn = float(np.linalg.norm(rates[3:]))
     return body.mass * float(np.linalg.norm(rates[:3])) / turn if turn > _NONE else 0.0
 
 
 def _looped(tree: Tree) -> set[str]:
-    """The tree's joints and free bodies that a closure passes through, as owners of rates."""
+    """Return the tree's joints and free bodies in a loop, as owners of rates."""
     ways: dict[str, set[str]] = {BASE: set()}
     for link in tree.links.values():
         ways[link.body] = ways[link.parent] | {link.joint or f"free body {link.body}"}
@@ -84,13 +84,13 @@ def _looped(tree: Tree) -> set[str]:
 
 
 def hold(graph: Graph, hinges: Sequence[str]) -> Graph:
-    """The graph with some of its hinges fixed."""
+    """Fix some hinges of a graph."""
     fixed = {name: _held(graph.joints[name], np.zeros((0, 3))) for name in hinges}
     return replace(graph, joints={**graph.joints, **fixed})
 
 
 def _held(joint: Joint, axes: Array) -> Joint:
-    """A hinge without axes, thus fixed, or a ball joint on two axes."""
+    """Return a hinge made fixed, without axes, or a ball joint made universal, on two."""
     return replace(
         joint, kind="universal" if len(axes) else "fixed", axes=array(axes), home=0.0, viscous=0.0,
         coulomb=0.0, rotor_inertia=0.0,
@@ -98,7 +98,7 @@ def _held(joint: Joint, axes: Array) -> Joint:
 
 
 def idle_bodies(graph: Graph, motion: Motion, free: Array) -> list[tuple[list[str], Array, Array]]:
-    """Bodies that can move alone: those that fixed joints make one, their axis, and the motion.
+    """Find bodies that can move alone, those united by fixed joints as one, and their motion.
 
     :param free: motions with the actuated joints at rest, shape (unknown rates, count).
     :returns: names of the bodies, the axis at home (unit vector), and the motion in ``free``.
@@ -123,7 +123,7 @@ def idle_bodies(graph: Graph, motion: Motion, free: Array) -> list[tuple[list[st
 
 
 def twist(motion: Motion, body: str, point: Array) -> Array:
-    """Velocity of a body's point and its angular velocity per rate of unit one, (6, rates)."""
+    """Return the velocity of a point and the angular velocity per scaled rate, (6, rates)."""
     tree = motion.tree
     at = np.asarray(motion.point(body, point), float)
     table = np.zeros((6, tree.unknown_rates))
@@ -138,7 +138,7 @@ def twist(motion: Motion, body: str, point: Array) -> Array:
 
 
 def null(matrix: Array, bound: float, absolute: bool = False) -> Array:
-    """Columns that span what the matrix maps to (nearly) zero, shape (count, free)."""
+    """Return an orthonormal basis of the null space, shape (columns, free)."""
     if not matrix.size:
         return np.eye(matrix.shape[1])
     _, values, rows = np.linalg.svd(matrix)
@@ -152,7 +152,7 @@ _Found = tuple[str, Array, Array, Array]
 
 
 def _hinge(linkage: Linkage, spins: Array) -> _Found | None:
-    """The hinge that takes the largest part in a spin, to be fixed."""
+    """Find the hinge that takes the largest part in a spin, to be fixed."""
     joints, owners = linkage.graph.joints, linkage.tree.owners
     parts = [
         float(np.linalg.norm(row)) if joint is not None and joint.kind == "revolute" else 0.0
@@ -167,7 +167,7 @@ def _hinge(linkage: Linkage, spins: Array) -> _Found | None:
 
 
 def _ball(linkage: Linkage, motion: Motion, spins: Array) -> _Found | None:
-    """A ball joint of a part that spins alone, to be a universal joint across the spin."""
+    """Find a ball joint of a part that spins alone, to be universal across the spin."""
     graph = linkage.graph
     for bodies, axis, way in idle_bodies(graph, motion, spins):
         for joint in graph.joints.values():

@@ -59,7 +59,7 @@ def _stream(t: Traced) -> Program:
 
 
 def following(t: Traced, program: Program) -> Program:
-    """A program of motion that starts from the sample before: input and output ``last``.
+    """Make a program of motion start from the sample before: input and output ``last``.
 
     The row has 1 where the sample is valid, the joints that were solved from home last, q, qd, and
     of the unknowns the values, rates, accelerations and their change. Newton's method starts from

@@ -102,7 +102,7 @@ class Traced:
         return self if self.scheme.ahead is None else self.carried(self.scheme.ahead)
 
     def _placed(self, unknowns: Numbers) -> tuple[Motion, list[LimbPose], Objects]:
-        """The motion and the limbs by the unknowns of Newton's method, and all unknowns."""
+        """Return the motion, the limbs and all unknowns for the unknowns of Newton's method."""
         # Coordinates that are held have their values at home.
         x = np.array(self.tree.home, dtype=object)
         x[self.scheme.solved[0]] = unknowns
@@ -123,7 +123,7 @@ class Traced:
             self.newton = SparseLU(self._table(self.solved), scheme.solved_pivots)
 
     def _table(self, solved: Sequence[Row]) -> Objects:
-        """Derivatives of Newton's equations by the rates of its unknowns."""
+        """Return the derivatives of Newton's equations by the rates of its unknowns."""
         return matrices(self.tree, solved)[0][:, self.scheme.solved[1]]
 
     @property
@@ -310,7 +310,7 @@ class Traced:
         return self.tape.lift(total)
 
     def gradient(self, sums: Sequence[tuple[Any, Any]], by: Sequence[Expression]) -> list[Any]:
-        """Derivatives by inputs of a sum of results times factors, the closures held closed.
+        """Differentiate a sum of results times factors by inputs, the closures held closed.
 
         The unknowns x follow from f(x, q, g) = 0: with J' m = ds/du, J = df/du, the derivative is
         ds - m df (adjoint of the implicit function theorem).
@@ -328,7 +328,7 @@ class Traced:
         return [a - b for a, b in zip(direct, through, strict=True)]
 
     def _by_rates(self, by_x: Sequence[Any]) -> list[Any]:
-        """Derivatives by the unknown rates, of those by the unknowns: see ``Motion.retracted``."""
+        """Convert derivatives by the unknowns to those by their rates: see ``Motion.retracted``."""
         result: list[Any] = [0.0] * self.tree.unknown_rates
         for link in self.tree.links.values():
             for step in link.steps:

@@ -73,7 +73,7 @@ def has_clearance(robot: Robot) -> bool:
 
 
 def joint_clearance(robot: Robot, q: ArrayLike, refuse: bool = True) -> Array:
-    """The same by joint positions, shape (..., n).
+    """Return the clearance at joint positions, shape (..., n).
 
     :param refuse: False gives NaN where there is no assembly, instead of an error.
     """
@@ -81,7 +81,7 @@ def joint_clearance(robot: Robot, q: ArrayLike, refuse: bool = True) -> Array:
 
 
 def member_gaps(robot: Robot, q: ArrayLike, refuse: bool = True) -> Array:
-    """The distances of all :func:`member_pairs`, shape (..., pairs), m."""
+    """Return the distances of all :func:`member_pairs`, shape (..., pairs), m."""
     (gaps,), status = _kernel(robot)(_radii(robot), q)
     if status is not None and refuse:
         robot.refuse_joints(status, q)
@@ -89,7 +89,7 @@ def member_gaps(robot: Robot, q: ArrayLike, refuse: bool = True) -> Array:
 
 
 def member_pairs(robot: Robot) -> list[tuple[Beam, Beam]]:
-    """The members of different limbs, two by two."""
+    """Return all pairs of members of different limbs."""
     return [pair for pair in combinations(robot.beams, 2) if pair[0].limb != pair[1].limb]
 
 

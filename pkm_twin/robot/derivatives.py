@@ -67,7 +67,7 @@ def nearest_motion(robot: Robot, q: Array, qd: Array, qdd: Array) -> tuple[Array
 
 
 def forward_derivatives(robot: Robot, q: ArrayLike, by: Sequence[str] = ()) -> Derivatives:
-    """Derivatives of :meth:`Robot.forward`: ``state`` by q (..., m, n), ``by[path]`` (..., m).
+    """Differentiate :meth:`Robot.forward`: ``state`` by q (..., m, n), ``by[path]`` (..., m).
 
     Exact to rounding, by the implicit function theorem. Where a number of the file changes, the
     leading actuated joints are held. In an overconstrained machine only the closures that determine
@@ -82,7 +82,7 @@ def forward_derivatives(robot: Robot, q: ArrayLike, by: Sequence[str] = ()) -> D
 
 
 def inverse_derivatives(robot: Robot, pose: ArrayLike, by: Sequence[str] = ()) -> Derivatives:
-    """Derivatives of :meth:`Robot.inverse`: ``state`` by the pose (..., n, m), ``by`` (..., n).
+    """Differentiate :meth:`Robot.inverse`: ``state`` by the pose (..., n, m), ``by`` (..., n).
 
     The pose is held where a number of the file changes.
 
@@ -125,7 +125,7 @@ def twist_rows(m: int, rotation: Array) -> Array:
 
 
 def _by_numbers(robot: Robot, q: ArrayLike, rows: Array, by: Sequence[str]) -> dict[str, Array]:
-    """Sums of rows over pose, position and rotation, by numbers of the file."""
+    """Differentiate sums over pose, position and rotation by numbers of the file."""
     if not by:
         return {}
     slopes = robot.cached(FileNumbers, tuple(by), geometry_numbers).slopes
@@ -139,7 +139,7 @@ def pose_by_geometry(robot: Robot, q: ArrayLike) -> Array:
 
 
 def position_effects(robot: Robot, q: ArrayLike) -> Array:
-    """What one standard deviation of each of the file's causes moves the platform, joints held.
+    """Return the platform's motion by one standard deviation of each cause, joints held.
 
     :returns: translations of the reference point, shape (..., 3, causes), m.
     """
@@ -154,5 +154,5 @@ def _by_geometry(robot: Robot, q: ArrayLike, rows: Array) -> Array:
 
 
 def geometry_numbers(robot: Robot) -> list[Any]:
-    """The geometry as ``Engine.geometry`` has it, of numbers or expressions."""
+    """Return the geometry as ``Engine.geometry`` has it, of numbers or expressions."""
     return list(geometry_of(robot.make_graph()))

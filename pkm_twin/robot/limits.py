@@ -86,7 +86,7 @@ def beyond_limits(
 
 
 def first_beyond(robot: Robot, q: Array, *, actuated: bool = True) -> Beyond | None:
-    """The first of positions (p, n) where a joint is beyond its limit, a passive one too.
+    """Find the first of positions (p, n) where a joint, passive or not, is beyond its limit.
 
     Errors as ``robot.forward``.
 
@@ -106,7 +106,7 @@ def first_beyond(robot: Robot, q: Array, *, actuated: bool = True) -> Beyond | N
 def _bounded(
     robot: Robot, q: Array, actuated: bool
 ) -> Iterator[tuple[Sequence[str], Array, Array, Sequence[str]]]:
-    """What a file bounds at joint positions (p, n): names, values (p, k), bounds (k, 2), units."""
+    """Yield what a file bounds at q (p, n): names, values (p, k), bounds (k, 2), units."""
     if actuated and robot.limits.position is not None:
         yield robot.joint_names, q, robot.limits.position, robot.joint_units
     most = getattr(robot.limits, "joint_angle", None)

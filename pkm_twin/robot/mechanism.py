@@ -114,7 +114,7 @@ class Mechanism(Common):
 
     @classmethod
     def from_data(cls: type[R], data: Mapping[str, Any], name: str) -> R:
-        """A robot of a parameter file's data.
+        """Make a robot of a parameter file's data.
 
         :raises ParameterError: by the field.
         """
@@ -204,7 +204,7 @@ class Mechanism(Common):
         raise RigidError("members", None, "a section with the elastic members")
 
     def elastic_entries(self) -> dict[str, dict[str, dict[str, Any]]]:
-        """The elastic numbers of its file at bodies, joints and rods: plain data, kind and name.
+        """Return the elastic entries of bodies, joints and rods as plain data, by kind and name.
 
         Empty where the file has other words for it, which a file of those has not.
         """
@@ -282,7 +282,7 @@ class Mechanism(Common):
         return law_names(self.friction, self.open_laws)
 
     def with_laws(self, graph: Graph) -> Graph:
-        """A graph of this robot with its friction laws: what programs of efforts are made from."""
+        """Add the robot's friction laws to a graph; programs of efforts are made from it."""
         laws = compiled(self.laws)
         return dataclasses.replace(graph, laws=laws) if laws else graph
 
@@ -292,7 +292,7 @@ class Mechanism(Common):
         return causes_of(self.uncertainty, self.file_numbers())
 
     def __getstate__(self) -> dict[str, Any]:
-        """What a copy in another process is made from: all but what is derived and kept."""
+        """Return the state for a copy in another process, without derived values."""
         derived = {
             name
             for part in type(self).__mro__
@@ -328,7 +328,7 @@ class Mechanism(Common):
         return _common(self.effort_units)
 
     def parameter_sections(self) -> dict[str, Any]:
-        """The parameters by section, as plain data."""
+        """Return the parameters by section, as plain data."""
         return {name: schema.plain(getattr(self, name)) for name in settings_of(type(self))}
 
     def parameter_units(self) -> dict[str, Any]:
@@ -337,7 +337,7 @@ class Mechanism(Common):
         return schema.units(type(self), self.parameter_sections(), words)
 
     def file_numbers(self) -> dict[str, tuple[float, str]]:
-        """Every number that the file gives, by dotted path, with its unit.
+        """List every number that the file gives, by dotted path, with its unit.
 
         Of a machine with a ``drive``, ``inertia.rotor_inertia`` is none: only 0 is valid.
         """
@@ -421,7 +421,7 @@ class Mechanism(Common):
         return (*self.graph.bodies, *self.graph.rods, "payload")
 
     def numbered(self: R, values: Mapping[str, Any]) -> R:
-        """A copy with other numbers or expressions at dotted paths of its file; nothing is checked.
+        """Copy the robot with other numbers or expressions at dotted paths; nothing is checked.
 
         :raises ParameterError: an unknown path.
         """
@@ -449,7 +449,7 @@ class Mechanism(Common):
         return found
 
     def number(self, path: str) -> float:
-        """The number of the robot's file at a dotted path, as :meth:`numbered` takes it.
+        """Return the number at a dotted path of the robot's file, as :meth:`numbered` takes it.
 
         :raises ParameterError: an unknown path.
         """
@@ -459,7 +459,7 @@ class Mechanism(Common):
         return number_in(schema.plain(getattr(self, str(keys[0]))), keys[1:], path)
 
     def with_file_values(self: R, values: Mapping[str, Any]) -> R:
-        """The robot of the same file with other numbers at dotted paths.
+        """Return the robot of the same file with other numbers at dotted paths.
 
         :raises ParameterError: an unknown path, or a value that the file may not have.
         """
@@ -474,7 +474,7 @@ class Mechanism(Common):
         check_number(self, full_keys(path), path)
 
     def _with(self: R, **values: Any) -> R:
-        """A copy with other fields, or other values that are derived; nothing is checked."""
+        """Copy the robot with other fields or derived values; nothing is checked."""
         made = object.__new__(type(self))
         vars(made).update(self.__getstate__() | values)
         return made
@@ -491,11 +491,11 @@ class Mechanism(Common):
         return np.array([self.size if mixed and u == "rad" else 1.0 for u in self.joint_units])
 
     def grid(self) -> PoseGrid:
-        """The grid of poses of a workspace map; a box for a machine without an axis."""
+        """Return the grid of poses of a workspace map; a box for a machine without an axis."""
         return PoseGrid("box", self.pose_names)
 
     def search_box(self) -> Array:
-        """A box that contains all poses of the workspace, shape (m, 2), m and rad.
+        """Return a box that contains all poses of the workspace, shape (m, 2), m and rad.
 
         :raises ParameterError: a limit that would bound the workspace is missing.
         """
@@ -510,7 +510,7 @@ class Mechanism(Common):
         return np.array(rows)
 
     def changed(self: R, **sections: Mapping[str, object] | object) -> R:
-        """A copy with new values, e.g. ``payload={"mass": 0.2}, geometry={"arm_length": 0.3}``.
+        """Copy with new values: ``payload={"mass": 0.2}, geometry={"arm_length": 0.3}``.
 
         All values are checked as in a file; one invalid value rejects all. A change of geometry,
         masses or members is like a new file: the home is chosen again.

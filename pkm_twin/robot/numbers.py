@@ -63,7 +63,7 @@ class FileNumbers:
         return [(i, k) for i, k, _ in found], run
 
     def slopes_at(self, values: Array) -> Array:
-        """The same at values, shape (k, paths): (k, row, paths)."""
+        """Return the slopes at values, shape (k, paths): (k, row, paths)."""
         places, run = self._slopes_run
         table = np.zeros((len(values), len(self._results), len(self._given)))
         with np.errstate(all="ignore"):
@@ -100,7 +100,7 @@ class CauseSlopes:
 
 
 def geometry_and_masses(robot: Robot) -> list[Any]:
-    """The geometry as ``Engine.geometry`` has it, then the masses as ``Robot.inertial``."""
+    """Return the geometry as ``Engine.geometry``, then the masses as ``Robot.inertial``."""
     graph, load = robot.with_laws(robot.make_graph()), robot.payload
     layout = Layout(Tree(graph))
     inertial = layout.pack(graph, robot.gravity, robot.friction)

@@ -52,11 +52,11 @@ class Posture:
         }
 
     def place(self, body: str, point: Array) -> Array:
-        """A point of a body, given at home, (3,) m: where it is now, (..., 3)."""
+        """Return where a point of a body, given at home, (3,) m, is now, (..., 3)."""
         return np.asarray(self.rotations[body] @ point + self._shifts[body], np.float64)
 
     def turn(self, body: str, vector: Array) -> Array:
-        """A direction of a body, given at home, (3,): where it points now, (..., 3)."""
+        """Return where a direction of a body, given at home, (3,), points now, (..., 3)."""
         return np.asarray(self.rotations[body] @ vector, np.float64)
 
 
@@ -120,7 +120,7 @@ def bars(graph: Graph) -> tuple[Bar, ...]:
 
 
 def robot_bars(robot: Robot) -> tuple[Bar, ...]:
-    """The same with what the robot's file knows: members with their diameters, rails' lengths."""
+    """Return the bars of a robot, with the members' diameters and the rails' lengths."""
     known = {part for beam in robot.beams for part in (*beam.parts, *beam.carries)}
     members = [
         Bar(beam.parts[0], beam.inner, beam.outer, beam.radius, beam.element)
@@ -218,7 +218,7 @@ def crosspieces(graph: Graph) -> Iterable[Bar]:
 
 
 def _rails(robot: Robot) -> Iterable[Bar]:
-    """What slides on the base run on, from limit to limit."""
+    """Yield the rails of slides on the base, from limit to limit."""
     graph, limits = robot.graph, robot.limits.position
     if limits is None:
         return

@@ -74,7 +74,7 @@ class Finding:
 
 
 def findings(robot: Robot) -> tuple[Finding, ...]:
-    """What is implausible in a robot's numbers; empty where nothing is."""
+    """Return the implausible numbers of a robot."""
     graph = robot.graph
     found = [
         *_size(graph), *_masses(robot, graph), *_bodies(robot, graph), *_drives(robot, graph),
@@ -99,7 +99,7 @@ def _outside(
     field: str, quantity: str, value: float, bounds: tuple[float, float], unit: str,
     likely: tuple[str, str],
 ) -> Iterator[Finding]:  # fmt: skip
-    """A quantity below or above two bounds; zero is none.
+    """Yield a finding if a quantity is out of its bounds; zero counts as absent.
 
     :param likely: what it means below and above them.
     """
@@ -150,7 +150,7 @@ def _masses(robot: Robot, graph: Graph) -> Iterator[Finding]:
 
 
 def payload_findings(robot: Robot) -> Iterator[Finding]:
-    """A payload that is too heavy for the machine that moves it."""
+    """Yield a finding if the payload is too heavy for the machine."""
     total, mass = _total(robot.graph), robot.payload.mass
     if total > 0.0:
         likely = f"{total:.4g} kg move it; a mass in grams?"

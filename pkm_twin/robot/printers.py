@@ -91,7 +91,7 @@ class Printer:
 
 
 def printer_of(robot: Robot) -> Printer:
-    """The printer that a robot file describes, turned so that its third tower is at 90 degrees.
+    """Return the printer of a robot file, turned so that its third tower is at 90 degrees.
 
     :raises ParameterError: no linear Delta, leaning towers, or joints with a ratio.
     """
@@ -115,7 +115,7 @@ def printer_of(robot: Robot) -> Printer:
 
 
 def written(printer: Printer, firmware: Firmware) -> str:
-    """The lines of a firmware's configuration."""
+    """Write the lines of a firmware's configuration."""
     radius, arms = printer.radius, printer.arms
     above = printer.ends - _rise(arms, radius, "geometry.arm_lengths")
     if firmware is Firmware.KLIPPER:
@@ -144,7 +144,7 @@ def written(printer: Printer, firmware: Firmware) -> str:
 
 
 def read_printer(text: str, firmware: Firmware | None, probe_radius: float | None) -> Printer:
-    """A printer of its configuration and probe tables, in one text.
+    """Read a printer from its configuration and probe tables, in one text.
 
     :param probe_radius: of G33's points, mm, where no M665 B gives it.
     :raises ParameterError: the geometry or the probings are missing.

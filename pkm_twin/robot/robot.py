@@ -89,7 +89,7 @@ class Robot(Mechanism):
         return {}
 
     def cached(self, make: Callable[..., T], *options: Hashable) -> T:
-        """What a function makes of this robot and other arguments, made once."""
+        """Return what a function makes of this robot and other arguments, made once."""
         found: T | None = self._cached.get((make, *options))
         if found is None:
             found = self._cached[make, *options] = make(self, *options)
@@ -101,7 +101,7 @@ class Robot(Mechanism):
         p: Array = _NONE,
         otherwise: Callable[..., Array] | None = None,
     ) -> Callable[..., Array]:
-        """A robot's program as a function of its inputs to its first output, made once.
+        """Return a robot's program as a function of its inputs to its first output, made once.
 
         One sample takes the fastest way, any other input that of :meth:`evaluate`.
 
@@ -119,7 +119,7 @@ class Robot(Mechanism):
         return call
 
     def evaluate(self, kernel: Kernel, p: Array, q: ArrayLike, *inputs: ArrayLike) -> list[Array]:
-        """Outputs of a program of joint positions and other inputs.
+        """Evaluate a program of joint positions and other inputs.
 
         :raises UnreachableError: a joint state without an assembly, by limb, sample and miss.
         :raises SingularityError: a singularity on the way from home.
@@ -149,7 +149,7 @@ class Robot(Mechanism):
         return Layout(self._massive.tree)
 
     def massive(self) -> Engine:
-        """The engine of a robot with masses; its programs have the friction laws.
+        """Return the engine of a robot with masses; its programs have the friction laws.
 
         :raises ParameterError: the robot's file gives none.
         """
@@ -282,7 +282,7 @@ class Robot(Mechanism):
         return self.platform(self.inverse(pose))[1]
 
     def home(self) -> Array:
-        """The home pose (not joint positions), shape (m,), in which the file has the machine."""
+        """Return the pose (not joint positions) of the machine in its file, shape (m,)."""
         return self.engine.home_pose.copy()
 
     def jacobian(self, q: ArrayLike) -> Array:
@@ -369,7 +369,7 @@ class Robot(Mechanism):
         return first, second, third
 
     def try_project_redundant(self, q: Array) -> Array:
-        """The positions alone, NaN where there is no assembly."""
+        """Project positions alone; NaN where there is no assembly."""
         if not self.redundant:
             return q
         still = np.zeros(self.joints_count)
@@ -385,7 +385,7 @@ class Robot(Mechanism):
         return self.evaluate(self.engine.acceleration, _NONE, q, qd, qdd)[0]
 
     def singularity(self, q: ArrayLike) -> Array:
-        """The singularity index of joint positions: 0 in a singularity, 1 at best, shape (...).
+        """Return the singularity index of joint positions: 0 in a singularity, 1 at best, (...).
 
         It includes singularities of any kind: the platform or another body can move with locked
         actuators (constraint singularities included), or joints can move without the platform (the
@@ -395,11 +395,11 @@ class Robot(Mechanism):
         return np.asarray(self.bound(Robot.singularity_kernel)(q)[..., 0])
 
     def singularity_kernel(self) -> Kernel:
-        """The same as a program, q to the measure (1)."""
+        """Compile the program from q to the singularity index (1)."""
         return singularity_kernel(self.engine)
 
     def try_singularity(self, q: ArrayLike) -> tuple[Array, Mask]:
-        """The singularity index (...), 0 where there is no assembly; which q are valid, (...)."""
+        """Return the singularity index (...), 0 without an assembly; and which q are valid."""
         measure, good = _tried(self.singularity_kernel(), q)
         return np.where(good, measure[..., 0], 0.0), good
 

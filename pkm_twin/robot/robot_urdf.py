@@ -33,7 +33,7 @@ PAYLOAD: Final = "payload"
 
 
 def robot_urdf(robot: Robot, hardware: str = MOCK, prefix: str = "") -> str:
-    """The robot as a URDF that parsers of trees read, see docs/urdf.md.
+    """Write the robot as a URDF that parsers of trees read, see docs/urdf.md.
 
     Its joints are ``robot.joint_names`` and ``robot.passive_joints``; with their values the link
     ``platform`` stands where ``robot.platform`` says, and the masses sum to the robot's. Rotors and
@@ -54,7 +54,7 @@ def robot_urdf(robot: Robot, hardware: str = MOCK, prefix: str = "") -> str:
 
 
 def joint_names(robot: Robot, hardware: str) -> tuple[str, ...]:
-    """What :func:`robot_urdf` calls the actuated and the passive joints of the tree."""
+    """Return the names that :func:`robot_urdf` gives actuated and passive joints of the tree."""
     names = (*robot.joint_names, *robot.passive_joints)
     return tuple(tree_names(names, _controls(robot) if hardware else ()).values())
 
@@ -66,7 +66,7 @@ def _controls(robot: Robot) -> list[Control]:
 
 
 def robot_mjcf(robot: Robot, efforts: Sequence[float] | None = None) -> str:
-    """The robot as an MJCF file, see docs/simulators.md.
+    """Write the robot as an MJCF file, see docs/simulators.md.
 
     Its joints are ``robot.joint_names`` and ``robot.passive_joints``, and those that close loops.
 
@@ -77,7 +77,7 @@ def robot_mjcf(robot: Robot, efforts: Sequence[float] | None = None) -> str:
 
 
 def robot_sdf(robot: Robot) -> str:
-    """The robot as an SDF model, see docs/simulators.md; gravity is the world's."""
+    """Write the robot as an SDF model, see docs/simulators.md; gravity is the world's."""
     _warn_of_losses(robot, "SDF")
     return write_sdf(robot_tree(robot))
 
@@ -103,7 +103,7 @@ def _warn_of_losses(robot: Robot, where: str) -> None:
 
 
 def robot_tree(robot: Robot) -> LoopTree:
-    """The robot as description formats have it, drawn at home, with bars to look at."""
+    """Return the robot as description formats have it, drawn at home, with bars to look at."""
     graph, tree, load = robot.graph, robot.engine.tree, robot.payload
     names = _link_names([BASE, *graph.bodies, *graph.rods])
     labels = joint_labels(tree)
@@ -171,7 +171,7 @@ def _link_names(names: Sequence[str]) -> dict[str, str]:
 
 
 def robot_description(robot: Robot) -> dict[str, Any]:
-    """The robot as a description of ``mechanism: machine``, limits and payload included.
+    """Return the robot as a description of ``mechanism: machine``, with limits and payload.
 
     Members and compliances stay where the robot has them as such a description tells them.
     """

@@ -34,43 +34,43 @@ from pkm_twin.machine.loop_tree import Joint, LoopTree
 from pkm_twin.machine.rotations import Pose, rotation_about, rotation_vector
 from pkm_twin.machine.tree import Tree
 
-ROUNDS: Final = 100
-"""Corrections of one closing, and steps towards the zeros."""
-SLOW: Final = 10
+MAX_ITERATIONS: Final = 100
+"""Most corrections of one closing, and most steps towards the zeros."""
+MAX_SLOW_STEPS: Final = 10
 """Corrections in a row that gain less than 2 %: a minimum that is not zero."""
-STEP: Final = 0.5
+MAX_STEP: Final = 0.5
 """Largest change of a joint in one correction, rad or m."""
-RANKS: Final = (1e-4, 1e-6, 1e-8)
-"""Singular values below this share of the greatest are none; where that does not close, less."""
-MAX_MISS: Final = 1e-2
-"""A miss that no choice of directions makes good, m or rad."""
+RANK_BOUNDS: Final = (1e-4, 1e-6, 1e-8)
+"""Singular values below this part of the largest count as zero; the next one if loops stay open."""
+MAX_REDUNDANT_MISS: Final = 1e-2
+"""Loops that miss by more do not close with another bound of RANK_BOUNDS, m or rad."""
 EXACT: Final = 1e-9
 """Loops that miss by less are closed for all purposes, m or rad."""
 CLOSED: Final = 1e-5
 """A loop that misses by more is open, m or rad, unless the file's rounding is coarser."""
-SLIGHT: Final = 1e-2
+MAX_SLIGHT_MOTION: Final = 1e-2
 """Largest motion of a joint, rad or m, that closes a loop which is closed but for rounding."""
-DRAWN: Final = 0.1
+MAX_DRAWN_DISTANCE: Final = 0.1
 """A closed assembly is as drawn where no joint is farther from zero, rad or parts of the size."""
-SMALL: Final = 0.01
-"""Singularity index below which a home is not taken for its nearness alone."""
-SINGULAR: Final = 1e-4
-"""Singularity index below which a home is no home: hardly a way leads away from it."""
-BETTER: Final = 1.05
+MIN_GOOD_INDEX: Final = 0.01
+"""Least singularity index of a home that is taken as drawn."""
+MIN_HOME_INDEX: Final = 1e-4
+"""Least singularity index of a home: below, the machine can hardly move from it."""
+SAME_INDEX_RATIO: Final = 1.05
 """Of assemblies whose indices differ by less than this factor the nearest to zero is taken."""
-SAME: Final = 1e-4
+SAME_PLACE_DISTANCE: Final = 1e-4
 """Assemblies are one where no link is farther apart, parts of the size."""
 STARTS: Final = 12
 """Random starts from which other assemblies are looked for."""
 REACHES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)
 """How far from the wanted values the actuated joints may be, rad or parts of the size."""
-TRIES: Final = 6
+STARTS_PER_REACH: Final = 6
 """Random starts within each."""
 LEAST_ROUNDING: Final = 1e-6
 """Deviation of axes and points that is rounding in any file, rad or parts of the size."""
-TURNING: Final = 8
+UNSPIN_STEPS: Final = 8
 """Steps in which a part that only spins is turned back to zero."""
-WORDS: Final = {
+HOME_TEXTS: Final = {
     "drawn": "as drawn, the actuated joints at {place}",
     "wanted": "the actuated joints at {place}, not as drawn",
     "near": "the best conditioned assembly near {place}, as there is none at it",
@@ -118,7 +118,7 @@ class Assembly:
         self._moves: dict[str, Pose] = {}
 
     def move(self, link: str) -> Pose:
-        """How a link has moved since it was drawn, in the root's axes."""
+        """Return how a link has moved since it was drawn, in the root's axes."""
         if link not in self._moves:
             turn = numbers(self._motion.turned(self._bodies[link]))
             at = numbers(self._motion.point(self._bodies[link], np.zeros(3)))
@@ -126,16 +126,16 @@ class Assembly:
         return self._moves[link]
 
     def places(self) -> Array:
-        """Where the links are, shape (links, 3), m."""
+        """Return where the links are, shape (links, 3), m."""
         at, links = self._motion.point, self.tree.links
         return numbers([at(body, links[n].frame.position) for n, body in self._bodies.items()])
 
     def frame(self, joint: Joint, end: int) -> Pose:
-        """A joint's frame on one of its links."""
+        """Return a joint's frame on one of its links."""
         return self.move((joint.inner, joint.outer)[end]) @ joint.frames[end]
 
     def twist(self, link: str, point: Array) -> tuple[Array, Array]:
-        """Velocity of a link's point and its angular velocity per step's rate, (3, count) each."""
+        """Return a point's velocity and the angular velocity per step's rate, (3, count) each."""
         linear, angular = np.zeros((2, 3, len(self.steps)))
         motion, body = self._motion, self._bodies[link]
         for (_, k), column in motion.linear_jacobian(body, point).items():
@@ -183,7 +183,7 @@ class Assembly:
         return values, np.vstack(table)
 
     def close(self, values: Array, held: Mask | bool = False) -> tuple[Array, float]:
-        """Values that close the loops by least steps, and the greatest miss left.
+        """Close the loops by least steps; return the values and the greatest miss left.
 
         Redundant closures of a rounded file contradict each other by that rounding: directions that
         only they have are left alone at first, as steps along them lead anywhere, and are not taken
@@ -192,12 +192,12 @@ class Assembly:
         :param held: steps that keep their values, shape (count,); by default none does.
         """
         best, miss = values, math.inf
-        for rank in RANKS:
+        for rank in RANK_BOUNDS:
             new, left = self._close(best, rank, held)
             gone = float(np.abs(new - best).max(initial=0.0))
-            if left < 0.5 * miss and (miss > self.closed or gone < SLIGHT):
+            if left < 0.5 * miss and (miss > self.closed or gone < MAX_SLIGHT_MOTION):
                 best, miss = new, left
-            if miss < max(1e-14, self.rounding) or miss > MAX_MISS:
+            if miss < max(1e-14, self.rounding) or miss > MAX_REDUNDANT_MISS:
                 break
         self.place(best)
         return best, miss
@@ -206,13 +206,13 @@ class Assembly:
         self.place(values)
         residual, _ = self.residuals(rates=False)
         slow = 0
-        for _ in range(ROUNDS):
+        for _ in range(MAX_ITERATIONS):
             miss = float(np.linalg.norm(residual))
-            if miss < 1e-15 or slow > SLOW:
+            if miss < 1e-15 or slow > MAX_SLOW_STEPS:
                 break
             rates = np.where(held, 0.0, self.residuals()[1])
             step = np.where(held, 0.0, -np.linalg.lstsq(rates, residual, rcond=rank)[0])
-            step *= min(1.0, STEP / max(float(np.abs(step).max(initial=0.0)), 1e-300))
+            step *= min(1.0, MAX_STEP / max(float(np.abs(step).max(initial=0.0)), 1e-300))
             for _ in range(12):
                 self.place(values + step)
                 residual, _ = self.residuals(rates=False)
@@ -228,11 +228,11 @@ class Assembly:
         return values, self.miss()
 
     def miss(self) -> float:
-        """How far the loops are open at the placed values, m or rad."""
+        """Return how far the loops are open at the placed values, m or rad."""
         return float(np.abs(self.residuals(rates=False)[0]).max(initial=0.0))
 
     def anywhere(self) -> tuple[Array, float]:
-        """Values that close the loops, the nearest to the drawing found at once, and their miss.
+        """Close the loops near the drawing; return the values and their miss.
 
         :raises ParameterError: a loop that does not close, by how much.
         """
@@ -252,15 +252,15 @@ class Assembly:
         return values, miss
 
     def relaxed(self, values: Array, held: Mask | bool = False) -> Array:
-        """The values nearest to the drawing that closed loops can move to from these; place them.
+        """Place and return the values nearest to the drawing that closed loops can move to.
 
         :param held: steps that keep their values, shape (count,); by default none does.
         """
         self.place(values)
         miss = max(self.miss(), 1e-12)
-        for _ in range(ROUNDS):
+        for _ in range(MAX_ITERATIONS):
             rates, own = (np.where(held, 0.0, table) for table in (self.residuals()[1], values))
-            slope = own - np.linalg.lstsq(rates, rates @ own, rcond=RANKS[0])[0]
+            slope = own - np.linalg.lstsq(rates, rates @ own, rcond=RANK_BOUNDS[0])[0]
             if float(np.abs(slope).max(initial=0.0)) < 1e-12:
                 break
             size = float(values @ values)
@@ -276,7 +276,7 @@ class Assembly:
         return values
 
     def _open(self) -> ParameterError:
-        """The error of loops that do not close, with the one that misses the most."""
+        """Return the error of loops that do not close, with the one that misses the most."""
         closure = max(
             self.tree.closures,
             key=lambda one: max(abs(float(e.value)) for e in self._equations(one)),
@@ -321,10 +321,10 @@ def _align(first: Array, second: Array) -> Array:
 class Home:
     """An assembly: the steps' ``values``, and how far the loops ``miss`` (m or rad).
 
-    ``how``: of WORDS; ``place``: where the actuated joints were wanted. ``graph``: idealised, with
-    spins held by the joints ``held`` (each with the greatest mass times offset of what it holds,
-    kg m); None where its mobility is not right. ``repair``: of the file's rounding. ``index``: the
-    singularity index.
+    ``how``: key of HOME_TEXTS; ``place``: where the actuated joints were wanted. ``graph``:
+    idealised, with spins held by the joints ``held`` (each with the greatest mass times offset of
+    what it holds, kg m); None if its mobility is wrong. ``repair``: of the file's rounding.
+    ``index``: the singularity index.
     """
 
     values: Array
@@ -339,11 +339,11 @@ class Home:
     @property
     def text(self) -> str:
         """How it was chosen, in words."""
-        return WORDS[self.how].format(place=self.place)
+        return HOME_TEXTS[self.how].format(place=self.place)
 
 
 class HomeSearch:
-    """Looks for the home of an assembly.
+    """Search for the home of an assembly.
 
     :param graph: gives the machine at the assembly's placed values, no spin held.
     """
@@ -376,14 +376,14 @@ class HomeSearch:
         """The joints that hold the spins of an assembly, which hold those of others too."""
 
     def home(self) -> Home:
-        """The home, with the parts that only spin at the file's zero where they can be.
+        """Find the home, with parts that only spin at the file's zero where they can be.
 
         :raises ParameterError: the loops close nowhere, by how much they are open.
         """
         return self._unspun(self._best())
 
     def _unspun(self, home: Home) -> Home:
-        """The same, with parts that only spin turned back towards zero.
+        """Turn parts that only spin back towards zero.
 
         Where they stand is left to chance by the search, and where their masses are off the axis it
         counts.
@@ -393,24 +393,24 @@ class HomeSearch:
         values = self.assembly.relaxed(home.values, self.held)
         steps = list(self.assembly.steps)
         zero = np.array([name in home.held and steps.count(name) == 1 for name in steps], bool)
-        for left in range(TURNING, 0, -1):
+        for left in range(UNSPIN_STEPS, 0, -1):
             values = np.where(zero, values * (left - 1) / left, values)
             values, miss = self.assembly.close(values, self.held | zero)
         if miss > max(home.miss, EXACT):
             return home
         turned = self._home(self._wrapped(values), miss, home.how)
-        return turned if turned.index >= SINGULAR else home
+        return turned if turned.index >= MIN_HOME_INDEX else home
 
     def _best(self) -> Home:
-        """The home as it is found."""
+        """Find the home, with parts that only spin wherever they are."""
         drawn = self._drawn()
-        if drawn is not None and drawn.how == "drawn" and drawn.index >= SMALL:
+        if drawn is not None and drawn.how == "drawn" and drawn.index >= MIN_GOOD_INDEX:
             return drawn
         if drawn is None:
             # What closes nowhere is rejected before much is tried.
             closed = self.assembly.anywhere()[0]
         chosen = self._chosen([home for home in (drawn, *self._others()) if home is not None])
-        if chosen is not None and chosen.index >= SINGULAR:
+        if chosen is not None and chosen.index >= MIN_HOME_INDEX:
             return chosen
         near = self._near()
         if near is not None:
@@ -422,7 +422,7 @@ class HomeSearch:
         return self._home(values, self.assembly.miss(), "near")
 
     def _drawn(self) -> Home | None:
-        """The assembly that the drawing leads to, with the actuated joints where they should be."""
+        """Close the drawing with the actuated joints where they should be."""
         values = self.wanted.copy()
         self.assembly.place(values)
         miss = self.assembly.miss()
@@ -432,14 +432,14 @@ class HomeSearch:
             return None
         self._known.append(self.assembly.places())
         far = float((np.abs(values) / self.units)[~self.held].max(initial=0.0))
-        return self._home(values, miss, "drawn" if far <= DRAWN else "wanted")
+        return self._home(values, miss, "drawn" if far <= MAX_DRAWN_DISTANCE else "wanted")
 
     def _reached(self, start: Array, how: str) -> Home | None:
-        """The assembly that a start leads to; None where loops stay open, or it is known."""
+        """Close the loops from a start; None if they stay open or the assembly is known."""
         values, miss = self.assembly.close(start, self.held)
         if miss > self.assembly.closed and how == "near":
             values, miss = self.assembly.close(values)
-        places, apart = self.assembly.places(), SAME * self.assembly.size
+        places, apart = self.assembly.places(), SAME_PLACE_DISTANCE * self.assembly.size
         known = any(float(np.abs(places - other).max()) <= apart for other in self._known)
         if miss > self.assembly.closed or known:
             return None
@@ -447,49 +447,51 @@ class HomeSearch:
         return self._home(self._wrapped(values), miss, how)
 
     def _others(self) -> list[Home | None]:
-        """Assemblies with the actuated joints at the same values, from random starts."""
+        """Find assemblies with the actuated joints at the same values, from random starts."""
         rng, reach = np.random.default_rng(0), np.where(self.turns, math.pi, self.units / 2)
         starts = rng.uniform(-reach, reach, (0 if self.held.all() else STARTS, len(reach)))
         return [self._reached(np.where(self.held, self.wanted, s), "wanted") for s in starts]
 
     def _wrapped(self, values: Array) -> Array:
-        """The same with no turn of more than half a circle."""
+        """Wrap passive turns to at most half a revolution."""
         turned = (values + math.pi) % (2 * math.pi) - math.pi
         return np.where(self.turns & ~self.held, turned, values)
 
     def _chosen(self, found: list[Home]) -> Home | None:
-        """The best conditioned, of equal ones the nearest to the zeros of all joints."""
+        """Choose the best conditioned home; of equal ones the nearest to all joints' zeros."""
         inside = [home for home in found if self._inside(home.values)] or found
         if not inside:
             return None
         best = max(home.index for home in inside)
-        good = [home for home in inside if home.index * BETTER >= best]
+        good = [home for home in inside if home.index * SAME_INDEX_RATIO >= best]
         return min(good, key=lambda home: float(np.linalg.norm(home.values / self.units)))
 
     def _inside(self, values: Array) -> bool:
-        """Whether all joints are inside the limits that the file states, the passive ones too."""
+        """Return whether all joints, passive ones too, are inside the file's limits."""
         return bool(((values >= self.low - 1e-6) & (values <= self.high + 1e-6)).all())
 
     def _near(self) -> Home | None:
-        """Return the best conditioned assembly of the least reach that has one far from the edge of
-        the workspace: its index is at least half of the best that any reach has.
+        """Return the best conditioned assembly of the least reach that has a good one.
+
+        Its index is at least half of the best that any reach has: it is far from the edge of the
+        workspace.
         """
         rng = np.random.default_rng(1)
         tried: list[Home] = []
         best: list[Home] = []
         for reach in REACHES:
-            for _ in range(TRIES):
+            for _ in range(STARTS_PER_REACH):
                 start = self.wanted + rng.uniform(-reach, reach, len(self.wanted)) * self.units
                 start = np.where(self.held, np.clip(start, self.low, self.high), start)
                 home = self._reached(start, "near")
                 tried += [] if home is None else [home]
             good = [h for h in tried if self._inside(np.where(self.held, h.values, self.low))]
             best += [max(good, key=lambda home: home.index)] if good else []
-            if tried and (not best or best[-1].index < SINGULAR):
+            if tried and (not best or best[-1].index < MIN_HOME_INDEX):
                 # All that close are singular, and not for where they are.
                 break
         most = best[-1].index if best else 0.0
-        return next((home for home in best if home.index >= max(0.5 * most, SINGULAR)), None)
+        return next((home for home in best if home.index >= max(0.5 * most, MIN_HOME_INDEX)), None)
 
     def _home(self, values: Array, miss: float, how: str) -> Home:
         self.assembly.place(values)
@@ -503,8 +505,10 @@ class HomeSearch:
         return Home(values, miss, how, self.place, sound, held, repaired, index)
 
     def _settle(self, graph: Graph, miss: float) -> tuple[Graph, dict[str, float], Repair] | None:
-        """Return the graph without a file's rounding and spins, the joints that hold spins, and the
-        repair; None where the actuated joints do not determine the machine.
+        """Remove a file's rounding and hold spins.
+
+        :returns: the graph, the joints that hold spins, and the repair; None if the actuated joints
+            do not determine the machine.
         """
         rounding = max(self.assembly.tree.rounding, miss)
         repaired = repair_rounded(graph, rounding, LEAST_ROUNDING)
@@ -530,7 +534,7 @@ def _is_driven(graph: Graph) -> bool:
 
 
 def _led(graph: Graph) -> Graph:
-    """The graph whose redundant drives follow those that lead."""
+    """Return the graph whose redundant drives follow those that lead."""
     leads = choose_leads(graph)
     joints = {
         name: replace(joint, follows=joint.actuated and name not in leads)

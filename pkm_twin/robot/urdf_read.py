@@ -91,7 +91,7 @@ class Part:
 
 
 def read_urdf(path: str | Path, **part: Any) -> dict[str, Any]:
-    """A URDF file as a description of ``mechanism: machine``, every vector in base axes at home.
+    """Read a URDF file as a ``mechanism: machine`` description, vectors in base axes at home.
 
     As :func:`read_tree`, whose notes are given as warnings.
 
@@ -104,7 +104,7 @@ def read_urdf(path: str | Path, **part: Any) -> dict[str, Any]:
 
 
 def read_tree(path: str | Path, part: Part = Part()) -> UrdfReading:
-    """A URDF file as a description of ``mechanism: machine``, every vector in base axes at home.
+    """Read a URDF file as a ``mechanism: machine`` description, vectors in base axes at home.
 
     A file whose top element is ``<mujoco>`` is read as MJCF, with the mujoco package, and one of
     ``<sdf>`` as SDF; a file whose name ends in .usd, .usda or .usdc as USD, with usd-core.
@@ -261,13 +261,13 @@ def _left_out(tree: LoopTree) -> list[str]:
 
 
 def _seen(assembly: Assembly, ground: str) -> dict[str, Pose]:
-    """What moves each link from where it is drawn to its place in the base's axes."""
+    """Return each link's motion from where it is drawn to its place in the base's axes."""
     view = (assembly.move(ground) @ assembly.tree.links[ground].frame).inverse()
     return {name: view @ assembly.move(name) for name in assembly.tree.links}
 
 
 def _description(assembly: Assembly, graph: Graph, ground: str) -> dict[str, Any]:
-    """The graph of the placed machine with what the file tells beside."""
+    """Describe the placed machine's graph, with the file's gravity, limits and friction."""
     tree = assembly.tree
     data = graph_description(graph)
     if tree.gravity is not None:
@@ -288,7 +288,7 @@ def _description(assembly: Assembly, graph: Graph, ground: str) -> dict[str, Any
 
 
 def _graph(assembly: Assembly, bodies: dict[str, str], tool: str, ground: str) -> Graph:
-    """The machine at the placed values."""
+    """Return the graph of the machine at the placed values."""
     tree, moves = assembly.tree, _seen(assembly, ground)
     home = dict(zip(assembly.steps, assembly.values.tolist(), strict=True))
     passive = [n for n, j in tree.joints.items() if j.kind != "fixed" and n not in tree.actuated]
@@ -382,5 +382,5 @@ def _sum_masses(links: Sequence[Link]) -> tuple[float, Array, Array]:
 
 
 def _snapped(vector: Array) -> Array:
-    """A vector without what rotations leave in the sixteenth digit."""
+    """Round a vector to 14 decimals, which removes the rounding of rotations."""
     return np.array([round(float(x), 14) + 0.0 for x in vector])

@@ -57,7 +57,7 @@ class _Number:
 def varied(
     robot: Robot, spread: Mapping[str, float], seed: int, distribution: Distribution = "normal"
 ) -> Variation:
-    """The robot with masses, inertias, friction and lengths of its file drawn anew.
+    """Draw a robot with other masses, inertias, friction and lengths.
 
     Every number gets a factor 1 + s d of its own, an inertia one for all entries, with d
     standard normal within three deviations or uniform between -1 and 1. The joints and rods of a
@@ -117,7 +117,7 @@ def _built(robot: Robot, data: dict[str, Any], spread: Mapping[str, float]) -> R
 
 
 def _numbers(data: Any, units: Any, path: tuple[str, ...]) -> Iterator[_Number]:
-    """What is varied, in the order of the file."""
+    """Yield the numbers that are varied, in the order of the file."""
     for key, value in data.items():
         here = (*path, key)
         unit = units.get(key, "") if isinstance(units, Mapping) else ""

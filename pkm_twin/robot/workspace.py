@@ -19,7 +19,7 @@ from pkm_twin.robot.robot import Robot
 
 
 def passive_values(robot: Robot, q: ArrayLike) -> Array:
-    """What ``robot.passive_limits`` bound, shape (..., k), rad or m.
+    """Return the values that ``robot.passive_limits`` bound, shape (..., k), rad or m.
 
     :param q: joint positions, shape (..., n); errors as ``robot.forward``.
     """
@@ -182,7 +182,7 @@ def counts(
 
 
 def distance_unit(robot: Robot) -> str:
-    """Unit of the distance from the axis of a cylinder of poses: ``m`` or ``rad``."""
+    """Return the unit of the distance from a pose cylinder's axis: ``m`` or ``rad``."""
     return robot.pose_units[robot.pose_names.index(robot.grid().lateral[0])]
 
 
@@ -308,7 +308,7 @@ def passing_singularity(index: float, bound: str = "--singularity ") -> str:
 def causes(
     robot: Robot, q: Array, pose: Array, known: Mask, least: float, least_clearance: float
 ) -> str:
-    """What keeps joint positions (k, n) from counting in a workspace, most frequent first, as text.
+    """Describe why joint positions (k, n) are outside a workspace, the most frequent first.
 
     Each is counted for the first of these that it fails: assembly, actuator limits, limits of
     passive joints, singularity index, clearance.
