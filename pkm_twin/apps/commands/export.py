@@ -116,7 +116,7 @@ class PythonFile(ToFile):
 
 
 def python(given: PythonFile) -> Report:
-    """The text of a module."""
+    """Write a Python module."""
     from pkm_twin.export.python_file import python_file
 
     return given.write(python_file(given.machine(), given.array))
@@ -153,7 +153,7 @@ class Transmission(ToFolder):
 
 
 def transmission(given: Transmission) -> Report:
-    """A package of a transmission."""
+    """Write a package with a transmission of ros2_control."""
     from pkm_twin.export.transmission import transmission_package
 
     return given.write(transmission_package(given.machine()))
