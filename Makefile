@@ -81,6 +81,7 @@ bench: $(VENV)/bench.stamp
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest test/benchmarks -m benchmark_run --benchmark-disable-gc --benchmark-json=out/benchmarks.json
 	$(BIN)/python -m test.benchmarks.report out/benchmarks.json docs/benchmarks.md
 	OMP_NUM_THREADS=1 $(BIN)/python -m test.benchmarks.pinocchio_c docs/export_c.md
+	OMP_NUM_THREADS=1 $(BIN)/python -m test.benchmarks.kinematics_c docs/benchmarks.md
 	OMP_NUM_THREADS=1 $(BIN)/python -m test.export.c_table docs/export_c.md
 
 certificate: $(VENV)/certificate.stamp
@@ -132,6 +133,7 @@ papers: $(VENV)/test.stamp
 pictures: $(VENV)/test.stamp
 	$(BIN)/python -m tools.pages.pictures docs/gallery
 	$(BIN)/python -m tools.pages.architecture docs/gallery/architecture.png
+	$(BIN)/python -m tools.pages.limbs docs/gallery/limbs.png
 	$(BIN)/python -m tools.pages.robots docs/gallery
 	$(BIN)/python -m tools.pages.view docs/gallery
 

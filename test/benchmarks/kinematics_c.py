@@ -39,6 +39,7 @@ CALLS = {
 """Arguments of each function: a row of an input for each state, or one output."""
 TABLES = "q", "qd", "qdd", "pose"
 LOOP = r"""
+#include <math.h>
 #include <time.h>
 #include "@.h"
 static double now(void)
