@@ -1,9 +1,10 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Why a machine's mobility is not the number of its actuated joints.
+"""Explain why a machine's mobility is not the number of its actuated joints.
 
-Conditions that hold nearly are made to hold exactly, from the least deviations on: where that gives
-the right mobility, those of them without which it does not are the cause, by name and deviation.
-Else what moves although the actuated joints are held is named, or which of them cannot move.
+Too few degrees of freedom: the fewest axes and points are named whose change gives the machine its
+freedoms in all positions (:func:`~pkm_twin.kinematics.rounding.repair_few`). Too many: the null
+space of the constraint matrix tells what moves although the actuated joints are held, or which of
+them cannot move.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ EVERYWHERE: Final = "where all loops close in every position"
 MAX_CAUSES: Final = 5
 """Most causes that an error names."""
 _NONE: Final = 1e-6
-"""Motions that are less are none."""
+"""Motions of unit one below this count as zero."""
 
 
 class Deviation(NamedTuple):
@@ -47,7 +48,7 @@ def mobility_error(linkage: Linkage, causes: Sequence[Deviation] = ()) -> Mobili
 
     :param causes: deviations that take freedoms away; empty: they are looked for.
     """
-    # What nearly holds takes freedoms away; where there are too many, none is lost.
+    # Deviations take freedoms away; a machine with too many has lost none.
     lost = linkage.mobility.freedoms < linkage.joints
     causes = causes or (near_conditions(linkage.graph) if lost else [])
     texts = [c.text for c in causes[:MAX_CAUSES]]
