@@ -241,8 +241,9 @@ def read(description: Description) -> Machine:
         vector(data.get("gravity", STANDARD_GRAVITY)),
         platform,
         origin,
-        # Without pose coordinates of its own only positions and rotations are compared.
-        tuple(data.get("pose", ())),
+        # Without pose coordinates, or with angles of other names, only positions and rotations are
+        # compared.
+        () if "angles" in data else tuple(data.get("pose", ())),
         bodies,
         joints,
         rods,
