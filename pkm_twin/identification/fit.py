@@ -350,7 +350,7 @@ def _possible(parameters: FileParameters, first: Estimate, verdict: Verdict) -> 
     bound = beyond(aim, cones)
     if not bound:
         return replace(first, values=aim, covariance=verdict.covariance, bound=bound)
-    sizes, vectors = np.linalg.eigh(verdict.covariance / np.outer(first.prior, first.prior))
+    sizes, vectors = np.linalg.eigh(verdict.plain / np.outer(first.prior, first.prior))
     factor = vectors * np.sqrt(np.maximum(sizes, 1e-12 * sizes.max()))
     near = nearest((aim - start) / first.prior, factor, start, first.prior, cones)
     # How far a bound moves the numbers next to it is an estimate.

@@ -49,6 +49,9 @@ RARE_SHARE: Final = 0.03
 """Prior standard deviation of an error without a usual size, as a part of the efforts."""
 MAX_RARE: Final = 3
 """Found errors without a usual size that may be absent; more are taken for certain."""
+MAX_VARIANCE: Final = 1.0 / 26.0
+"""Variance over the prior's up to which a combination of numbers is the recordings': known by noise
+five times better than before."""
 MIN_WEIGHT: Final = 1e-3
 """Probability, over that of the likeliest set of errors, below which a set does not count."""
 LOUD: Final = 1.5
@@ -365,8 +368,9 @@ class Fitted:
         return chosen, used
 
     def average(self, used: Mask, chosen: Sequence[Selected]) -> tuple[Array, Array]:
-        """Average the numbers' mean and covariance over all sets of kinds of errors.
+        """Return the numbers' mean, and their covariance about it over all sets of kinds of errors.
 
+        The mean is that of the found errors: numbers that are used without the others predict best.
         Errors that are known to be there, such as those of lengths, are in all sets.
 
 
@@ -394,13 +398,19 @@ class Fitted:
         weights[weights < MIN_WEIGHT] = 0.0
         weights /= weights.sum()
         some = slice(0, self.count)
-        mean, square = np.zeros(self.count), np.zeros((self.count, self.count))
+        mean = self.model.posterior(used).mean[some]
+        covariance = np.zeros((self.count, self.count))
         for k in np.flatnonzero(weights):
             one = self.model.posterior(masks[k], shares)
-            own = one.mean[some]
-            mean += weights[k] * own
-            square += weights[k] * (one.covariance[some, some] + np.outer(own, own))
-        return mean, square - np.outer(mean, mean)
+            away = one.mean[some] - mean
+            covariance += weights[k] * (one.covariance[some, some] + np.outer(away, away))
+        # What the recordings hardly tell keeps the file's values.
+        plain = self.model.posterior(used).covariance[some, some]
+        sizes = self.model.deviation[some]
+        values, vectors = np.linalg.eigh(plain / np.outer(sizes, sizes))
+        told = vectors[:, values < MAX_VARIANCE]
+        change = sizes * (told @ (told.T @ (mean / sizes)))
+        return change, covariance + np.outer(mean - change, mean - change)
 
     def name(self, places: Sequence[int]) -> Suspect:
         """Return the error of some columns; that of several joints is of all."""
