@@ -14,6 +14,7 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
 
 from pkm_twin.machine.joints import TYPES, JointType
 
@@ -23,7 +24,8 @@ Description = Mapping[str, Any]
 BASE: Final = "base"
 STANDARD_GRAVITY: Final = (0.0, 0.0, -9.81)
 """Gravity of a description without gravity, m/s2."""
-POSE_NAMES: Final = ("x", "y", "z", "roll", "pitch", "yaw")
+DEFAULT_ANGLES: Final = {"yaw": "z", "pitch": "y", "roll": "x"}
+"""Names and axes of the platform's angles, R = Rz(yaw) Ry(pitch) Rx(roll)."""
 
 
 class UnfitError(ValueError):
@@ -111,6 +113,8 @@ class Machine:
     origin: Array
     """The platform's reference point at home, shape (3,), m."""
     pose: tuple[str, ...]
+    angles: Mapping[str, str]
+    """Names and axes of the platform's angles, from the base on."""
     bodies: Mapping[str, Body]
     joints: tuple[Joint, ...]
     rods: tuple[Rod, ...]
@@ -127,17 +131,17 @@ class Machine:
 
     def of(self, rotation: Array, position: Array) -> Array:
         """Return the pose coordinates of a rotation and a position, shape (m,), m and rad."""
-        full = dict(zip(POSE_NAMES, (*position, *angles(rotation)), strict=True))
-        return np.array([full[name] for name in self.pose])
+        return self.select(position, Rotation.from_matrix(rotation).as_euler(self.sequence))
 
+    @property
+    def sequence(self) -> str:
+        """Axes of all three angles, as scipy names those of turned frames."""
+        return "XYZ" if next(iter(self.angles.values())) == "x" else "ZYX"
 
-def angles(rotation: Array) -> tuple[float, float, float]:
-    """Return roll, pitch and yaw of R = Rz(yaw) Ry(pitch) Rx(roll), rad."""
-    return (
-        math.atan2(rotation[2, 1], rotation[2, 2]),
-        math.atan2(-rotation[2, 0], math.hypot(rotation[2, 1], rotation[2, 2])),
-        math.atan2(rotation[1, 0], rotation[0, 0]),
-    )
+    def select(self, places: Array, turns: Array) -> Array:
+        """Return the rows of the pose, (m, ...), among those of position and angles, (3, ...)."""
+        rows = dict(zip("xyz", places, strict=True)) | dict(zip(self.angles, turns, strict=False))
+        return np.array([rows[name] for name in self.pose])
 
 
 def vector(value: Any) -> Array:
@@ -241,9 +245,9 @@ def read(description: Description) -> Machine:
         vector(data.get("gravity", STANDARD_GRAVITY)),
         platform,
         origin,
-        # Without pose coordinates, or with angles of other names, only positions and rotations are
-        # compared.
-        () if "angles" in data else tuple(data.get("pose", ())),
+        # Without pose coordinates of its own only positions and rotations are compared.
+        tuple(data.get("pose", ())),
+        data.get("angles") or DEFAULT_ANGLES,
         bodies,
         joints,
         rods,

@@ -18,11 +18,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
 
 from pkm_twin.certify.description import (
-    POSE_NAMES,
     Array,
     Description,
     UnfitError,
-    angles,
     cross,
     read,
 )
@@ -165,18 +163,14 @@ class Maximal(Moving):
             return 1.0
         twist = self.twist_columns() @ tangent
         _, rotation = self._placed()
-        _, pitch, yaw = angles(rotation)
-        c, s = math.cos(yaw), math.sin(yaw)
-        # Angular velocity per rate of roll, pitch and yaw.
-        spin = np.array(
-            [
-                [c * math.cos(pitch), -s, 0.0],
-                [s * math.cos(pitch), c, 0.0],
-                [-math.sin(pitch), 0.0, 1.0],
-            ]
-        )
-        full = np.vstack([twist[:3], np.linalg.solve(spin, twist[3:])])
-        return float(np.linalg.det(full[[POSE_NAMES.index(name) for name in machine.pose]]))
+        sequence = machine.sequence
+        turns = Rotation.from_matrix(rotation).as_euler(sequence)
+        first = Rotation.from_euler(sequence[0], turns[0]).as_matrix()
+        second = Rotation.from_euler(sequence[:2], turns[:2]).as_matrix()
+        a, b, c = (np.eye(3)["XYZ".index(axis)] for axis in sequence)
+        # Angular velocity per rate of each angle.
+        spin = np.stack([a, first @ b, second @ c], -1)
+        return float(np.linalg.det(machine.select(twist[:3], np.linalg.solve(spin, twist[3:]))))
 
     def _moved(self, state: State, change: Array) -> State:
         each = change.reshape(-1, 6)
