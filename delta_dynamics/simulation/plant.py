@@ -23,7 +23,7 @@ from pkm_twin.robot.robot import Robot
 
 PARTS: Final = 100
 """Parts of a step from which on it is integrated implicitly, as changes accumulate."""
-HALVINGS: Final = 10
+HALVINGS: Final = 12
 """Times that a part is halved in which what sticks or slides changes; the last is implicit."""
 GROWTH: Final = 1e-9
 """Energy that the method may add in a part, relative to the kinetic energy; it is removed
@@ -39,7 +39,7 @@ class Plant:
     Between changes a step is one of a Runge-Kutta method of order four that is exact in viscous
     friction, however stiff; efforts and wrench are constant in it. Dry friction of all joints and
     stops obey Coulomb's law: a joint sticks exactly and leaves only beyond its friction. A part in
-    which what sticks or slides changes is halved down to 1/1024 of the step, which is integrated
+    which what sticks or slides changes is halved down to 1/4096 of the step, which is integrated
     implicitly. Stops do not bounce: an impact projects the rates, in the mass matrix, onto those
     that all stops allow. Energy grows by what efforts and wrench do and by nothing else; a part
     that gains some is halved, too.
