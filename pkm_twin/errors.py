@@ -82,7 +82,7 @@ class UnknownNameError(ParameterError):
 
 
 def unknown_number(path: str, names: Iterable[str]) -> ParameterError:
-    """The error of a path where the file has no number, with the closest of some paths."""
+    """Return the error for a path without a number in the file; it names the closest paths."""
     known = list(names)
     # What has the path's words in a row, first at the end; else what is spelt alike.
     close = [n for n in known if f".{path}.".replace("[", ".[") in f".{n}.".replace("[", ".[")]
@@ -273,7 +273,7 @@ class BagError(PkmTwinError):
 
 
 def one_line(text: str, limit: int = 400) -> str:
-    """A text for one line: unprintable characters escaped, the middle cut.
+    """Shorten a text to one line: escape unprintable characters, cut the middle.
 
     ``limit`` is the largest number of characters of the result.
     """
@@ -286,7 +286,7 @@ def one_line(text: str, limit: int = 400) -> str:
 
 
 def short(value: object, limit: int = 80) -> str:
-    """A value for an error message, its end cut; numbers of numpy as plain ones, errors whole."""
+    """Write a value for an error message: its end is cut, numpy's types are left out."""
     if isinstance(value, Exception):
         return str(value)
     text = repr(_plain(value))
@@ -294,7 +294,7 @@ def short(value: object, limit: int = 80) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """The value without numpy's types, whose representation names them."""
+    """Convert numpy's types, which ``repr`` would name, to Python's."""
     if type(value).__module__ == "numpy" and hasattr(value, "tolist"):
         return value.tolist()
     if type(value) in (list, tuple):
@@ -305,7 +305,7 @@ def _plain(value: Any) -> Any:
 
 
 def install(extra: str) -> str:
-    """The command that installs an extra, from a clone, because no package index has pkm_twin."""
+    """Return the command that installs an extra from a clone; no package index has pkm_twin."""
     return f"pip install '.[{extra}]' in a clone of pkm_twin"
 
 

@@ -49,7 +49,7 @@ def open_regular(path: Path) -> BinaryIO:
 
 
 def read_bounded(path: Path, most: int, what: str) -> bytes:
-    """The content of a regular file.
+    """Read a regular file of bounded size.
 
     :param most: bytes. ``what``: such a file in words, for the error.
     :raises ParameterError: not readable, or larger.
@@ -71,7 +71,7 @@ def _require_regular(mode: int, path: Path) -> None:
 
 
 def decimal(text: str) -> float:
-    """A number as files have it: ``1_0`` and digits of other scripts are Python's own.
+    """Parse a decimal number; reject Python's own forms, ``1_0`` and digits of other scripts.
 
     :raises ValueError: no number.
     """
@@ -102,11 +102,11 @@ def require_replaceable(path: Path) -> None:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A name of this process's own beside ``path``, which takes its place at a good end.
+    """Yield a temporary path beside ``path``, and move it to ``path`` if no error is raised.
 
-    Of :data:`STANDARD` what is there at the end goes to stdout.
+    For :data:`STANDARD` the content is written to stdout instead.
 
-    The name is short, whatever the target's is: one that the file system takes is not refused.
+    The temporary name is short, so that any target name that the file system takes works.
 
     :raises OSError: the target is no regular file, or cannot be written.
     """

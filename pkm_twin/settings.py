@@ -68,13 +68,13 @@ class Setting:
         return low <= number <= high and (self.above is None or number > self.above)
 
     def value(self, given: Any) -> Any:
-        """The field's value for a parameter's."""
+        """Convert a parameter's value to the field's."""
         if isinstance(self.choices, Mapping):
             return self.choices[given]
         return tuple(given) if hasattr(given, "__iter__") and not isinstance(given, str) else given
 
     def parameter(self, value: Any) -> Any:
-        """The parameter's value for a field's."""
+        """Convert a field's value to the parameter's."""
         if isinstance(self.choices, Mapping):
             return next(word for word, own in self.choices.items() if own == value)
         return list(value) if isinstance(value, tuple) else value
@@ -91,7 +91,7 @@ ZERO_STAMP: Final = "accept a zero stamp, as the arrival time"
 
 
 def setting(default: Any, text: str, **more: Any) -> Any:
-    """A field that is a parameter or an option.
+    """Declare a field that is a node parameter or a command option.
 
     :param default: ``...`` for none: it has to be given.
     :param more: further attributes of :class:`Setting`.
@@ -102,7 +102,7 @@ def setting(default: Any, text: str, **more: Any) -> Any:
 
 
 def settings_of(kind: Any) -> Mapping[str, tuple[str, Any]]:
-    """By the parameter's name: the field's name, and its setting."""
+    """Return the field's name and its setting by parameter name."""
     return _settings_of(kind)
 
 
@@ -113,12 +113,12 @@ def _settings_of(kind: Any) -> Mapping[str, tuple[str, Any]]:
 
 
 def changeable(kind: type[DataclassInstance]) -> list[str]:
-    """The parameters that may change while the node runs."""
+    """List the parameters that may change while the node runs."""
     return [name for name, (_, row) in settings_of(kind).items() if not row.fixed]
 
 
 def with_parameters(settings: S, values: Mapping[str, Any]) -> S:
-    """Settings with new values of their parameters; of other parameters nothing is taken.
+    """Return the settings with new parameter values; names that are no settings are ignored.
 
     :raises ParameterError: what the settings reject.
     """

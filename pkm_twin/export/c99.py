@@ -50,7 +50,7 @@ LONGEST: Final = 44
 
 
 def table(name: str, values: Sequence[float]) -> str:
-    """A constant table, four numbers a line."""
+    """Write a constant table, four numbers a line."""
     texts = [c_number(value).strip("()") for value in values]
     rows = [", ".join(texts[k : k + 4]) for k in range(0, len(texts), 4)]
     return f"static const double {name}[{len(texts)}] = {{\n    " + ",\n    ".join(rows) + "\n};\n"
@@ -173,7 +173,7 @@ class Folding:
     def __call__(
         self, results: Iterable[Expression], given: Mapping[str, Sequence[Any]]
     ) -> list[Expression]:
-        """The results with numbers, or expressions of this tape, for the inputs that are given."""
+        """Substitute numbers, or expressions of this tape, for the given inputs."""
         results = list(results)
         made: dict[int, Expression] = {}
         for e in ordered(results):
@@ -187,7 +187,7 @@ class Folding:
         return [made[e.number] for e in results]
 
     def equations(self, q: Equations, given: Mapping[str, Sequence[Any]]) -> Equations:
-        """The same of equations; the known state is constant then."""
+        """Substitute in equations; their known state is constant then."""
         rows = {name: getattr(q, name) for name in ROWS}
         folded: dict[str, Any] = {name: row and self(row, given) for name, row in rows.items()}
         for name in NUMBERS:
@@ -350,7 +350,7 @@ static const int @_steps[{len(LADDER)}] = {{{steps}}};
         return "\n".join(parts).replace("@", self.prefix)
 
     def add(self, text: str) -> None:
-        """A part as it is; ``@`` stands for the prefix."""
+        """Append a text; ``@`` stands for the prefix."""
         self._parts.append(text)
 
     def function(
@@ -360,9 +360,9 @@ static const int @_steps[{len(LADDER)}] = {{{steps}}};
         known: Mapping[int, str],
         called: Mapping[str, str] | None = None,
     ) -> str:
-        """A static function of what the results hang on; how to call it, ``%s`` for its target.
+        """Write a static function that computes the results; return its call, with ``%s``.
 
-        Of two functions with the same text the first one serves.
+        ``%s`` is for its target. Functions with the same text are written once.
 
         :param known: texts of expressions that stand in tables of its arguments.
         :param called: what callers give for an argument of another name.
@@ -471,7 +471,7 @@ static int @_{name}({more}const double *{q.target}, int steps, double *h, double
         return f"int @_{routine.name}{'_with' if given else ''}({', '.join(first + arguments)})"
 
     def routine(self, routine: Routine, kind: str = "") -> None:
-        """A function with parameters.
+        """Write a function with parameters.
 
         :param kind: what stands before it: ``static`` or :data:`HOT`.
         """
@@ -541,7 +541,7 @@ static int @_{name}({more}const double *{q.target}, int steps, double *h, double
         self.add(f"{kind}{self.signature(routine, given=True)}\n{{\n" + "\n".join(lines) + "\n}\n")
 
     def own(self, routine: Routine) -> None:
-        """The same function with this machine's own parameters."""
+        """Write the function that calls a routine with this machine's own parameters."""
         first = ["@_own", "state"] if routine.state else ["@_own"]
         names = ", ".join([*first, *routine.inputs, *routine.outputs])
         self.add(
@@ -551,7 +551,7 @@ static int @_{name}({more}const double *{q.target}, int steps, double *h, double
 
 
 def _read_of(body: Sequence[Expression], above: Iterable[Sequence[Expression]]) -> list[Expression]:
-    """What a body computes on the way and others, that go on from it, read."""
+    """Find intermediate values of a body that other results, computed after it, read."""
     inner = {e.number for e in ordered(body) if e.op is not None and e.level == SAMPLE}
     known = {e.number for e in body}
     found: dict[int, Expression] = {}
@@ -563,7 +563,7 @@ def _read_of(body: Sequence[Expression], above: Iterable[Sequence[Expression]]) 
 
 
 def _without(names: Container[str], results: Sequence[Expression]) -> list[Expression]:
-    """What hangs on other inputs alone, and what hangs on these reads."""
+    """Find values that do not depend on the named inputs, but are read by values that do."""
     moved: set[int] = set()
     found: dict[int, Expression] = {}
     for e in ordered(results):

@@ -65,7 +65,7 @@ class Engine(Scheme):
         return values[:k], table.reshape(len(values), -1)[:k, : self.tree.unknown_rates]
 
     def _moved(self, q: Array, x: Array, step: Array) -> Array:
-        """The unknowns after a step of their rates, of unit one."""
+        """Return the unknowns after a step along their rates for a time of one."""
         steps = np.concatenate([step, np.zeros(self.joints)])
         return self._walk(self.home_pose, np.concatenate([x, q]), steps)[2][: len(x)]
 
@@ -111,7 +111,7 @@ class Engine(Scheme):
         return float(np.linalg.slogdet(matrix)[0]), _reciprocal(matrix)
 
     def _shortest(self, x: Array, q: Array) -> tuple[str, float]:
-        """The closure that misses the most where all together miss the least, and by how much."""
+        """Return the closure with the largest miss at the least-squares point, and its miss, m."""
         values = least_squares(x, partial(self._look, q), partial(self._moved, q), 20)
         if values is None:
             return self.parts[0], math.inf
@@ -119,7 +119,7 @@ class Engine(Scheme):
         return self.parts[worst], float(abs(values[worst])) * self.tree.size
 
     def shortest_pose(self, pose: Array) -> tuple[str, float, bool]:
-        """The closure that misses the most where the platform is held in a pose.
+        """Return the closure with the largest miss while the platform is held in a pose.
 
         :returns: its joint or rod, by how much it misses, m, and whether all closures are met in
             the pose: then a singularity ends the path from home to it.
@@ -152,7 +152,7 @@ class Engine(Scheme):
     def kernel(
         self, name: str, write: Callable[[Traced], Program], extra: str = "", *, free: bool = False
     ) -> Kernel:
-        """The compiled program of that name on this geometry, the same object every time.
+        """Return the compiled program of a name on this geometry, the same object every time.
 
         :param extra: text of what the program hangs on beside the machine's structure.
         :param free: the program takes no number of the geometry for constant.
@@ -172,7 +172,7 @@ class Engine(Scheme):
         *,
         free: bool = False,
     ) -> Kernel:
-        """A program with numbers beside the geometry's, which are :attr:`Traced.more` there.
+        """Return a program with more numbers than the geometry's: :attr:`Traced.more` there.
 
         :param extra: as of :meth:`kernel`, and ``free``.
         """
@@ -233,7 +233,7 @@ class Engine(Scheme):
             return None
 
     def posed_kernel(self, name: str, write: Callable[..., Program]) -> Kernel:
-        """The compiled program of that name, which solves the machine that its pose drives.
+        """Return the compiled program of a name that solves the machine driven by its pose.
 
         :param write: writes it, of a :class:`Traced` and ``scheme``, :attr:`posed` or None.
         """
@@ -306,7 +306,7 @@ _codes: Final[WeakValueDictionary[ProgramKey, Code]] = WeakValueDictionary()
 def engine_of(
     graph: Graph, coordinates: Sequence[Coordinate], start: Start | None = None
 ) -> Engine:
-    """The engine of a geometry: machines that differ in inertia or limits alone share it."""
+    """Return the engine of a geometry; machines that differ in inertia or limits alone share it."""
     key = EMPTY.also(f"{graph.key} {coordinates!r} {start!r}")
     engine = _engines.get(key)
     if engine is None:
@@ -323,7 +323,7 @@ def _code(
     *,
     free: bool = False,
 ) -> Code:
-    """The program of a key, written on an engine if nobody has it."""
+    """Return the program of a key; write it on an engine if it is not cached."""
     code = _codes.get(key)
     if code is None:
         code = _codes.setdefault(key, Code(lambda: write(Traced(engine, more, free=free)), key))

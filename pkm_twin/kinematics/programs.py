@@ -67,7 +67,7 @@ def walk_program(t: Traced) -> Program:
 
 
 def forward_program(t: Traced) -> Program:
-    """The program of :attr:`.engine.Engine.forward`, to write others with."""
+    """Write the program of :attr:`.engine.Engine.forward`."""
     t.solve()
     position, rotation = t.motion.platform()
     values = poses.values(t.scheme.coordinates, position, rotation)
@@ -80,7 +80,7 @@ def forward_program(t: Traced) -> Program:
 
 
 def jacobian_program(t: Traced) -> Program:
-    """The program of :attr:`.engine.Engine.jacobian`."""
+    """Write the program of :attr:`.engine.Engine.jacobian`."""
     t.solve()
     position, rotation = t.motion.platform()
     twists = t.twists(t.graph.platform, position, t.rate_columns())
@@ -94,7 +94,7 @@ def jacobian_program(t: Traced) -> Program:
 
 
 def placement_program(t: Traced) -> Program:
-    """The program of :attr:`.engine.Engine.placement`."""
+    """Write the program of :attr:`.engine.Engine.placement`."""
     t.solve()
     rows: list[Any] = []
     for body in t.graph.bodies:
@@ -103,7 +103,7 @@ def placement_program(t: Traced) -> Program:
 
 
 def body_jacobian_program(t: Traced) -> Program:
-    """The program of :attr:`.engine.Engine.body_jacobian`."""
+    """Write the program of :attr:`.engine.Engine.body_jacobian`."""
     t.solve()
     columns, values = t.rate_columns(), []
     for body in t.graph.bodies:
@@ -113,7 +113,7 @@ def body_jacobian_program(t: Traced) -> Program:
 
 
 def acceleration_program(t: Traced) -> Program:
-    """The program of :attr:`.engine.Engine.acceleration`."""
+    """Write the program of :attr:`.engine.Engine.acceleration`."""
     t.solve()
     qd, qdd = t.drives.given("qd"), t.drives.given("qdd")
     t.set_rates(qd)

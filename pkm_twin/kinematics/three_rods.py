@@ -58,9 +58,7 @@ class ThreeRods:
     body: str
 
     def _spheres(self, tree: Tree, q: Numbers) -> tuple[list[Any], list[Any]]:
-        """Return centres of the spheres on which the body's displacement from home is, and squares
-        of their radii.
-        """
+        """Return centres and squared radii of the spheres of the body's displacement from home."""
         others = [name for name in tree.links if name != self.body]
         motion = Motion(tree, np.array(tree.home, dtype=object), q, others)
         centres, squares = [], []

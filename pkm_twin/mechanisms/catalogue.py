@@ -29,7 +29,7 @@ TREES: Final = (".urdf", ".xml", ".mjcf", ".sdf", ".world", *usd_file.SUFFIXES)
 
 
 def config_folder() -> Path:
-    """The folder of the shipped parameter files, inside the package in every installation."""
+    """Return the folder of the shipped robot files, inside the package in every installation."""
     packed = Path(__file__).resolve().parent.parent / "config"
     return packed if packed.is_dir() else packed.parent.parent / "config"
 
@@ -40,7 +40,7 @@ def robot_names() -> list[str]:
 
 
 def robot_path(robot: str | Path) -> Path:
-    """The file of a robot's name or path.
+    """Return the file of a robot's name or path.
 
     :raises UnknownNameError: no such name; the closest one is named.
     :raises ParameterError: a xacro file, which is a program that writes a URDF.
@@ -66,7 +66,7 @@ def load(
     robot: str | Path, *, platform: str | None = None, base: str | None = None,
     actuated: Sequence[str] | None = None, pose: Sequence[str] | None = None, carry: bool = False,
 ) -> Robot:  # fmt: skip
-    """A robot by its name in ``config/``, from a parameter file, or from a URDF with its loops.
+    """Load a robot by its name in ``config/`` or from a YAML, URDF, MJCF, SDF or USD file.
 
     Changes that the import made to a user's file, and implausible numbers in it, give warnings
     (:class:`pkm_twin.errors.RobotWarning`), each once.
@@ -118,7 +118,7 @@ def _with_warnings(path: Path, robot: Robot) -> Robot:
 
 
 def robot_of_data(data: Mapping[str, Any], name: str) -> Robot:
-    """A robot of what a parameter file says.
+    """Create a robot from the content of a robot file.
 
     :raises UnknownNameError: no such mechanism; the closest one is named.
     :raises ParameterError: a key, type or value that is refused, by its dotted name.

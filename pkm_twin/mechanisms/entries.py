@@ -47,7 +47,7 @@ class Fitted:
 
 
 def edited_yaml(robot: Robot, source: str, values: Mapping[str, Fitted | Chosen]) -> str:
-    """The text of a robot's file with other numbers, each with its comment.
+    """Write the text of a robot's file with other numbers, each with its comment.
 
     Where the file writes a number once for several limbs, or is no YAML, the text is a new one with
     every body, joint and rod written out.
@@ -100,7 +100,7 @@ def write_edited(path: Path, head: Sequence[str], text: str, before: Robot) -> l
 
 
 def robot_text(name: str, *, per_copy: bool = False, **part: Any) -> tuple[str, Robot]:
-    """A robot and the text of its file; of a URDF, or with ``per_copy``, as a machine's YAML.
+    """Load a robot and the text of its file; a URDF, or with ``per_copy``, as a machine's YAML.
 
     :param part: what of a file is the robot, as :func:`load` takes it.
     :raises ParameterError: the file is refused; or it is to be written out, and would lose what it

@@ -128,7 +128,7 @@ class Machine(TwinRobot):
 
     @classmethod
     def from_data(cls, data: Mapping[str, Any], name: str) -> Machine:
-        """Checked as a file is, then as a machine.
+        """Create a machine from the content of a file, and check both.
 
         :raises ParameterError: by the field.
         """
@@ -358,11 +358,11 @@ class Machine(TwinRobot):
         return tuple(self.specs["joints"][name].drive for name in self.joint_names)
 
     def make_graph(self) -> Graph:
-        """The graph of the file."""
+        """Return the graph that the file describes."""
         return self.described
 
     def parameter_sections(self) -> dict[str, Any]:
-        """The machine written out, limbs turned, with what is elastic."""
+        """Return the machine's sections written out, copies of limbs and elasticity included."""
         return robot_description(self)
 
     def parameter_units(self) -> dict[str, Any]:
@@ -386,7 +386,7 @@ class Machine(TwinRobot):
         return super().file_numbers() | own
 
     def _unit_of(self, path: str, units: Any) -> str:
-        """Unit of a number of the file."""
+        """Return the unit of a number of the file."""
         keys = full_keys(path)
         for kind, name, where, _ in self.named(keys):
             keys = [kind, name, *where]

@@ -282,7 +282,7 @@ class UprRpu(TwinRobot):
         return -sqrt((limb - absolute(b - a)) * (limb + absolute(b - a)))
 
     def massive(self) -> Engine:
-        """The engine of a robot with masses.
+        """Return the engine of a robot with masses.
 
         :raises ParameterError: the file has no inertia.
         """
@@ -418,7 +418,7 @@ class UprRpu(TwinRobot):
         return self._with(inertia=replace(m, platform_inertia=usual))
 
     def _tube(self, name: str, i: int, reach: float, d: Array, com: Array) -> Body:
-        """A round bar of half the limb."""
+        """Return a round bar of half the limb."""
         if self.inertia is None:
             return Body(name, 0.0, array(com))
         radius = self.members.diameter[i] / 2
