@@ -83,7 +83,7 @@ def gravity_of(
     path: Path, weight: Mapping[str, bool], links: Mapping[str, Link], root: str,
     joints: Iterable[Joint], stated: list[float] | None,
 ) -> list[float] | None:  # fmt: skip
-    """The file's gravity, or none where no link that can move has weight.
+    """Return the file's gravity, or None where no link that can move has weight.
 
     :param weight: by link whether gravity acts on it. ``root``: the ground.
     :raises ParameterError: only some links have weight.
@@ -101,7 +101,7 @@ def gravity_of(
 
 
 def flag(element: ET.Element, tag: str, default: bool) -> bool:
-    """A truth value in an element of its own."""
+    """Read a truth value in an element of its own."""
     text = element.findtext(tag)
     where = element.get("name") or element.get("reference")
     return default if text is None else urdf_xml.boolean(text, f"{where}.{tag}")

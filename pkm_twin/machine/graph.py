@@ -34,7 +34,7 @@ _PARALLEL: Final = 1e-3
 
 
 def array(values: ArrayLike) -> Array:
-    """A read-only array of floats, or of expressions and floats."""
+    """Return a read-only array of floats, or of expressions and floats."""
     result = plain(values).copy()
     result.setflags(write=False)
     return result
@@ -354,7 +354,7 @@ def rotation_about_z(angle: Any) -> Array:
 
 
 def groups(things: Iterable[T], pairs: Iterable[tuple[T, T]]) -> list[list[T]]:
-    """What pairs connect, each group in the order of the things; of others pairs say nothing."""
+    """Group the things that pairs connect, in the order of the things; ignore other pairs."""
     own = {thing: [thing] for thing in things}
     place = {thing: k for k, thing in enumerate(own)}
     for pair in pairs:
@@ -370,7 +370,7 @@ def merged(graph: Graph) -> dict[str, str]:
 
 
 def spanning(things: Iterable[T], pairs: Mapping[K, tuple[T, T]]) -> list[K]:
-    """The pairs that make trees: each that joins what no earlier ones do."""
+    """Choose the pairs of a spanning forest: each joins what no earlier pair does."""
     own = {thing: [thing] for thing in things}
     return [key for key, pair in pairs.items() if _join(own, *pair)]
 

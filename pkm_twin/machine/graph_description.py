@@ -69,6 +69,6 @@ def _joint_entry(joint: Joint) -> dict[str, Any]:
 
 
 def _numbers(values: Array) -> list[float]:
-    """A list without what rotations leave in the sixteenth digit of a place of a few metres."""
+    """List numbers without the rounding that rotations leave in their sixteenth digit."""
     least = 1e-15 * max(1.0, float(np.abs(values).max(initial=0.0)))
     return [0.0 if abs(x) < least else float(x) for x in values]

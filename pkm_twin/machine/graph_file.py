@@ -59,7 +59,7 @@ class MemberSpec:
     radius: float | None = length(default=None)
 
     def verify(self, path: str) -> None:
-        """A length, and a radius from somewhere."""
+        """Check the length, and that a radius is stated somewhere."""
         if not float(np.linalg.norm(self.end - self.start)) > 1e-9:
             raise ParameterError(f"{path}.to", self.end.tolist(), "a point apart from `from`")
         if self.section is None and self.radius is None:
@@ -83,7 +83,7 @@ class BodySpec:
     member: MemberSpec | None = schema.section(MemberSpec, default=None)
 
     def verify(self, path: str) -> None:
-        """A mass needs a place."""
+        """Check that a mass has a place."""
         if self.com is None and (self.mass > 0.0 or self.inertia.any()):
             raise ParameterError(f"{path}.com", None, "the centre of mass of a body with mass, m")
 
@@ -102,7 +102,7 @@ class FrictionSpec(_Laws):  # type: ignore[misc]  # its fields are those of the 
     """
 
     def verify(self, path: str) -> None:
-        """A law has all of its parameters."""
+        """Check that a law has all of its parameters."""
         check_laws(self, path)
 
 
@@ -123,7 +123,7 @@ class LimitSpec:
     )  # fmt: skip
 
     def verify(self, path: str) -> None:
-        """An axis has a length, and is a swivel's."""
+        """Check that an axis has a length, and belongs to a swivel."""
         if self.axis is not None and self.swivel is None:
             raise ParameterError(f"{path}.axis", self.axis.tolist(), "none without swivel")
         if self.axis is not None and not float(np.linalg.norm(self.axis)) > 1e-9:
@@ -163,7 +163,7 @@ class JointSpec:
     compliance: Array | None = compliances(default=None)
 
     def verify(self, path: str) -> None:
-        """The axes that its type has, and a point where there has to be one."""
+        """Check that the axes and the point that the joint type needs are there."""
         kind = TYPES[self.type]
         count = kind.count
         for key, wanted in (("axis", count == 1), ("axes", count == 2)):
@@ -372,7 +372,7 @@ def written_out(
 
 
 def _copies(entry: Any, count: int, path: str) -> list[Any]:
-    """A limb's entry for each azimuth: drives' numbers may be lists, one number a copy."""
+    """Return a limb's entry for each azimuth: drives' numbers may be lists, one number a copy."""
     result = [entry] * count
     if not isinstance(entry, Mapping):
         return result
@@ -396,7 +396,7 @@ def _copies(entry: Any, count: int, path: str) -> list[Any]:
 
 
 def _turned(entry: Any, azimuth: Any, own: set[str], number: int) -> Any:
-    """A copy of a limb's entry, turned about base z, its own bodies' names with their number."""
+    """Turn a copy of a limb's entry about base z, and number the names of its own bodies."""
     rotation = rotation_about_z(azimuth)
     new: dict[str, Any] = {}
     for key in _TURNED:
@@ -419,7 +419,7 @@ def _turned(entry: Any, azimuth: Any, own: set[str], number: int) -> Any:
 
 
 def numbered_entry(entry: T, values: Mapping[Keys, Any], azimuth: float, path: str) -> T:
-    """An entry with other numbers or expressions; nothing is checked.
+    """Return an entry with other numbers or expressions; nothing is checked.
 
     :param values: by keys of the number in the entry; ``azimuth`` alone: the limb's own, by which
         it is turned on.
@@ -444,7 +444,7 @@ def numbered_entry(entry: T, values: Mapping[Keys, Any], azimuth: float, path: s
 
 
 def number_of_entry(entry: Any, keys: tuple[str | int, ...], azimuth: float, path: str) -> float:
-    """The number that :func:`numbered_entry` replaces.
+    """Return the number that :func:`numbered_entry` replaces.
 
     :raises ParameterError: there is none.
     """
@@ -456,7 +456,7 @@ def number_of_entry(entry: Any, keys: tuple[str | int, ...], azimuth: float, pat
 
 
 def _spelled(entry: T, places: Iterable[Keys]) -> T:
-    """An entry with the zeros at some keys that a joint's may leave out."""
+    """Return an entry with the zeros at some keys that a joint's entry may leave out."""
     if not isinstance(entry, JointSpec):
         return entry
     zeros: dict[str, Any] = {"home": 0.0}
@@ -469,7 +469,7 @@ def _spelled(entry: T, places: Iterable[Keys]) -> T:
 def graph_of_entries(
     platform: str, specs: Mapping[str, Mapping[str, Any]], origin: Array | None = None
 ) -> Graph:
-    """The graph of a file's entries, as :func:`written_out` gives them.
+    """Return the graph of a file's entries, as :func:`written_out` gives them.
 
     :param origin: the platform's reference point, default its centre of mass.
     :raises ParameterError: no bodies, or a platform that is none of them.
@@ -489,7 +489,7 @@ def graph_of_entries(
 
 
 def shared_by(graph: Graph, leads: Sequence[str], how: Redundancy, effort: Any) -> Graph:
-    """The graph whose other actuated joints follow of those that lead, and how all share efforts.
+    """Return the graph whose other actuated joints follow from the leading ones, and share efforts.
 
     :param effort: limits of all actuated joints, shape (n,); None, or all infinite: none has one.
     :raises ParameterError: limits of some alone, or a preload of another number of joints.
@@ -556,7 +556,7 @@ def drive_numbers(friction: Any, limits: Any, k: int) -> tuple[dict[str, float],
 
 
 def driven(joint: JointSpec, friction: Any, limits: Any, k: int) -> JointSpec:
-    """The entry of the actuated joint k with other friction and limits."""
+    """Return the entry of the actuated joint k with other friction and limits."""
     rub, bounds = drive_numbers(friction, limits, k)
     if "position" in bounds:
         bounds["position"] = array(bounds["position"])

@@ -52,7 +52,7 @@ class JointMapEntry:
     unit: str | None = schema.text(default=None)
 
     def verify(self, path: str) -> None:
-        """A sign is 1 or -1."""
+        """Check that a sign is 1 or -1."""
         if abs(self.sign) != 1.0:
             raise ParameterError(f"{path}.sign", self.sign, "1 or -1")
 
@@ -74,7 +74,7 @@ class JointMap:
 
     @classmethod
     def of(cls, joints: Sequence[str], entries: Mapping[str, JointMapEntry]) -> JointMap:
-        """The map of a robot's joints; what has no entry is the same on both sides.
+        """Return the map of a robot's joints; joints without an entry are the same on both sides.
 
         :raises ParameterError: an entry of a joint that there is not, or two joints of one name.
         """
@@ -133,7 +133,7 @@ class JointMap:
         return found, min(ends), max(ends)
 
     def positions(self, controller: Array) -> Array:
-        """The model's positions of the controller's, shape (..., n).
+        """Convert the controller's positions to the model's, shape (..., n).
 
         NaN beyond the position where a changing ratio falls to zero.
         """
@@ -146,32 +146,32 @@ class JointMap:
         return np.asarray(self.centres + 2.0 * away / (1.0 + root), np.float64)
 
     def slopes(self, model: Array) -> Array:
-        """The controller's units per the model's at the model's positions, shape (..., n)."""
+        """Return the controller's units per the model's at these positions, shape (..., n)."""
         return np.asarray(self.factors * (1.0 + self.changes * (model - self.centres)), np.float64)
 
     def rates(self, controller: Array) -> Array:
-        """The model's velocities or accelerations of the controller's, shape (..., n)."""
+        """Convert the controller's velocities or accelerations to the model's, shape (..., n)."""
         self.check_even()
         return np.asarray(controller / self.factors, np.float64)
 
     def efforts(self, controller: Array) -> Array:
-        """The model's efforts of the controller's, shape (..., n)."""
+        """Convert the controller's efforts to the model's, shape (..., n)."""
         self.check_even()
         return np.asarray(controller * self.factors, np.float64)
 
     def controller_positions(self, model: Array) -> ControllerNumbers:
-        """The controller's positions of the model's, shape (..., n)."""
+        """Convert the model's positions to the controller's, shape (..., n)."""
         away = model - self.centres
         return ControllerNumbers(
             self.offsets + self.factors * (model + 0.5 * self.changes * away * away)
         )
 
     def controller_rates(self, model: Array) -> ControllerNumbers:
-        """The controller's velocities, accelerations or position differences, shape (..., n)."""
+        """Convert rates or position differences to the controller's, shape (..., n)."""
         self.check_even()
         return ControllerNumbers(self.factors * model)
 
     def controller_efforts(self, model: Array) -> ControllerNumbers:
-        """The controller's efforts of the model's, shape (..., n)."""
+        """Convert the model's efforts to the controller's, shape (..., n)."""
         self.check_even()
         return ControllerNumbers(model / self.factors)

@@ -48,7 +48,7 @@ class Link:
     inertia: Array = _zeros(3, 3)
 
     def moved(self, pose: Pose) -> Link:
-        """The same, in another place."""
+        """Return the same link in another place."""
         inertia = pose.rotation @ self.inertia @ pose.rotation.T
         return Link(self.name, pose @ self.frame, self.mass, pose.point(self.com), inertia)
 
@@ -56,7 +56,7 @@ class Link:
 def link_of(
     name: str, mass: float, pose: Pose, moment: Callable[[str], float], rounding: float
 ) -> Link:
-    """A link of its mass, kg, and its moments of inertia in the frame of its centre, ``ixx`` on.
+    """Return a link of a mass, kg, and moments of inertia in the frame of its centre, ``ixx`` on.
 
     ``rounding``: the largest rounding error of the file's moments of inertia, kg m2.
     """
@@ -124,7 +124,7 @@ class Joint:
         return tuple(replace(one, axis=-one.axis) for one in found[::-1])
 
     def placed(self, inner: Pose, outer: Pose) -> Joint:
-        """The same where frames are given in those of the links, and axes in those of the joint."""
+        """Return the joint in the links' frames, from frames in those and axes in its own frame."""
         first, second = inner @ self.frames[0], outer @ self.frames[1]
         axes = [f.rotation @ a for f, a in zip((first, second), self.axes, strict=False)]
         return replace(self, frames=(first, second), axes=np.reshape(axes, (-1, 3)))
@@ -229,7 +229,7 @@ def hung(root: str, joints: Iterable[Joint]) -> list[Hung]:
 
 
 def singles(joint: Joint, parent: str, child: str, taken: set[str]) -> list[Single]:
-    """A joint as single joints in a row outwards; links between them are named for them.
+    """Replace a joint by single joints in a row outwards, with links between named for them.
 
     :param taken: names of links; those of these are added.
     """

@@ -50,7 +50,7 @@ SECTIONS: Final = {
 
 
 def describe_machine_yaml(data: Mapping[str, Any], parameters: Sequence[str] = ()) -> str:
-    """The description as YAML with units and meanings in comments.
+    """Write the description as YAML with units and meanings in comments.
 
     Reading it gives the same numbers to the last bit.
 
@@ -110,7 +110,7 @@ def _plain(value: Any) -> Any:
 
 
 def edit_yaml(text: str, values: Mapping[Path, Any], notes: Mapping[Path, str]) -> str:
-    """A file's text with values set, and a comment above each that has a note.
+    """Set values in a file's text, and write a comment above each that has a note.
 
     :param values: by path (keys, and places in lists) numbers or lists of them; a key that is not
         there is added to the deepest section that is.
@@ -130,7 +130,7 @@ def edit_yaml(text: str, values: Mapping[Path, Any], notes: Mapping[Path, str]) 
 
 
 def _own_line(lines: Sequence[str], number: int) -> int:
-    """The line that a note may stand above: never inside a number's list."""
+    """Find the line that a note may stand above: never inside a number's list."""
     while number and lines[number].lstrip().startswith(("[", "]", ",")):
         number -= 1
     return number
@@ -179,7 +179,7 @@ def _set(text: str, path: Path, value: Any) -> str:
 
 
 def _add(text: str, node: Any, rest: Path, value: Any) -> str:
-    """A key that the mapping ``node`` does not have."""
+    """Add a key that the mapping ``node`` does not have."""
     for key in reversed(rest[1:]):
         value = {str(key): value}
     entry = f"{rest[0]}: {flow(value)}"
@@ -204,7 +204,7 @@ def _add(text: str, node: Any, rest: Path, value: Any) -> str:
 
 
 def flow(value: Any) -> str:
-    """A number, a list or a mapping in one line; numbers with twelve digits."""
+    """Write a number, a list or a mapping in one line; numbers with twelve digits."""
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{key}: {flow(item)}" for key, item in value.items()) + "}"
     if isinstance(value, Sequence) and not isinstance(value, str):

@@ -63,7 +63,7 @@ class Section:
 
 
 def cowper(ratio: float) -> float:
-    """A / A_shear of a tube by its inner over outer diameter: 7/6 solid, 2 thin.
+    """Return A / A_shear of a tube by its inner over outer diameter: 7/6 solid, 2 thin.
 
     Cowper 1966, table 1, hollow circle, for a Poisson's ratio of 0: a laminate's moduli are
     independent of each other and give no ratio that could stand in.
@@ -110,7 +110,7 @@ class Tube:
             )
 
     def section(self, mass_per_length: float, path: str) -> Section:
-        """The section of a tube with this mass per length, kg/m.
+        """Return the section of a tube with this mass per length, kg/m.
 
         Of expressions one that cannot be is NaN where its numbers are.
 
@@ -184,7 +184,7 @@ class Structure:
         return tuple(dict.fromkeys([*(beam.element for beam in self.beams), *soft]))
 
     def scaled(self, factors: Mapping[str, float]) -> Structure:
-        """The same with the compliance of some elements multiplied, by name."""
+        """Return the structure with the compliance of some elements multiplied, by name."""
         if not factors:
             return self
         moduli = {beam.name: 1.0 / factors.get(beam.element, 1.0) for beam in self.beams}

@@ -79,7 +79,7 @@ def read(path: Path, top: ET.Element, actuated: Sequence[str] | None = None) -> 
 
 
 def _without_meshes(mujoco: Any, path: Path) -> Any:
-    """The model without meshes, textures and height fields; None where they are needed."""
+    """Load the model without meshes, textures and height fields; None where they are needed."""
     try:
         spec = mujoco.MjSpec.from_file(str(path))
         derived = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
@@ -172,7 +172,7 @@ class _Reader:
         mujoco.mj_kinematics(model, self.data)
 
     def tree(self, rounding: float, chosen: Sequence[str] | None) -> LoopTree:
-        """The machine; ``rounding``: the largest rounding error of the file's numbers.
+        """Return the machine; ``rounding``: the largest rounding error of the file's numbers.
 
         :param chosen: actuated joints in place of those that the file's actuators drive.
         """
@@ -234,7 +234,7 @@ class _Reader:
         return own or f"{kind.lower()}_{index}"
 
     def _body(self, body: int) -> None:
-        """A body on its joints, one after another, each in the body's frame."""
+        """Add a body on its joints, one after another, each in the body's frame."""
         m, name = self.model, self._name("BODY", body)
         place = _pose(self.data.xmat[body], self.data.xpos[body])
         turn = self.data.ximat[body].reshape(3, 3)
@@ -280,7 +280,7 @@ class _Reader:
         return limits
 
     def _drives(self, joint: int) -> list[int]:
-        """The actuators of a joint."""
+        """Find the actuators of a joint."""
         m, kinds = self.model, self.mj.mjtTrn
         own = int(kinds.mjTRN_JOINT), int(kinds.mjTRN_JOINTINPARENT)
         return [
@@ -290,7 +290,7 @@ class _Reader:
         ]  # fmt: skip
 
     def _acted(self, i: int) -> tuple[str, ...]:
-        """The joints on which an actuator of a tendon, a site or a body acts."""
+        """Find the joints on which an actuator of a tendon, a site or a body acts."""
         m, index = self.model, int(self.model.actuator_trnid[i][0])
         bodies = [index]
         if int(m.actuator_trntype[i]) == int(self.mj.mjtTrn.mjTRN_TENDON):
@@ -312,7 +312,7 @@ class _Reader:
         return tuple(self._name("JOINT", k) for k in range(m.njnt) if int(m.jnt_bodyid[k]) in moved)
 
     def _strength(self, i: int) -> float:
-        """The greatest force of an actuator; infinite without limits."""
+        """Return the greatest force of an actuator; infinite without limits."""
         m, mj = self.model, self.mj
         most = math.inf
         if m.actuator_forcelimited[i]:
@@ -470,11 +470,11 @@ class _Reader:
 
 
 def _pose(rotation: Array, position: Array) -> Pose:
-    """A frame of MuJoCo's."""
+    """Convert a frame of MuJoCo's."""
     return Pose(rotation.reshape(3, 3).copy(), position.copy())
 
 
 def _rotation(quaternion: Array) -> Array:
-    """The rotation of a unit quaternion w, x, y, z."""
+    """Return the rotation of a unit quaternion w, x, y, z."""
     w, x, y, z = quaternion.tolist()
     return from_quaternion(x, y, z, w)

@@ -40,7 +40,7 @@ def write_mjcf(
     gravity: Array,
     efforts: Sequence[float] | None = None,
 ) -> str:
-    """The MJCF of a tree.
+    """Write the MJCF of a tree.
 
     Actuators are motors named as their joints, in the robot's order; the site ``platform`` stands
     on the reference point.
@@ -126,7 +126,7 @@ def rows(tree: LoopTree) -> list[tuple[str, str, list[Single]]]:
 
 
 def _split(tree: LoopTree) -> tuple[LoopTree, list[tuple[str, str]]]:
-    """The tree with its closures but balls and fixed joints as joints of the tree; what to weld.
+    """Make closures tree joints, but balls and fixed ones; return the tree and what to weld.
 
     Such a joint leads to a part of the outer body, or of the inner one, that is welded to the rest
     of it: mass and inertia are shared out evenly, so that their sums stay.
@@ -151,13 +151,13 @@ def _split(tree: LoopTree) -> tuple[LoopTree, list[tuple[str, str]]]:
 
 
 def _owner(closure: Joint, tree: LoopTree) -> str:
-    """The end that is split: the outer body, unless it has no mass and the other one has some."""
+    """Choose the body to split: the outer one, unless only the inner one has a mass."""
     ends = [end for end in (closure.outer, closure.inner) if end != tree.root]
     return max(ends, key=lambda end: tree.links[end].mass > 0.0)
 
 
 def _body(parent: ET.Element, link: Link, place: Array, before: Array) -> ET.Element:
-    """A body with some mass, and some inertia about every axis.
+    """Write a body with some mass, and some inertia about every axis.
 
     What is added is below the twelfth digit: a thin bar's inertia about itself is none.
     """

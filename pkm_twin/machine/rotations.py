@@ -23,11 +23,11 @@ class Pose:
         return Pose(self.rotation @ other.rotation, self.point(other.position))
 
     def point(self, at: Array) -> Array:
-        """A point of this frame in the other one, (3,) m."""
+        """Transform a point of this frame into the other one, (3,) m."""
         return np.asarray(self.rotation @ at + self.position, np.float64)
 
     def inverse(self) -> Pose:
-        """The other frame in this one."""
+        """Return the other frame in this one."""
         return Pose(self.rotation.T, -self.rotation.T @ self.position)
 
 
@@ -67,7 +67,7 @@ def skew(vectors: Array) -> Array:
 
 
 def from_rpy(angles: Array) -> Array:
-    """The rotation of roll, pitch and yaw (3,), rad."""
+    """Return the rotation of roll, pitch and yaw (3,), rad."""
     roll, pitch, yaw = angles
     x, y, z = np.eye(3)
     rotation: Array = about(z, yaw) @ about(y, pitch) @ about(x, roll)
@@ -85,7 +85,7 @@ def to_rpy(rotation: Array) -> Array:
 
 
 def from_quaternion(x: float, y: float, z: float, w: float) -> Array:
-    """The rotation of a quaternion, of unit length or not."""
+    """Return the rotation of a quaternion, of unit length or not."""
     n = x * x + y * y + z * z + w * w
     v = np.array([x, y, z])
     skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
@@ -94,7 +94,7 @@ def from_quaternion(x: float, y: float, z: float, w: float) -> Array:
 
 
 def to_quaternion(rotation: Array) -> Array:
-    """Unit quaternion x, y, z, w (4,) of a rotation, w zero or more (Bar-Itzhack 2000, version 1).
+    """Return the unit quaternion x, y, z, w (4,) of a rotation, w >= 0 (Bar-Itzhack 2000, 1).
 
     The eigenvector of the greatest eigenvalue: no case is near-singular.
     """

@@ -122,7 +122,7 @@ def _fixed(name: str, inner: str, outer: str, place: Pose) -> Joint:
 
 
 def closing(joint: Joint) -> Joint:
-    """A joint as one that closes a loop.
+    """Convert a joint to one that closes a loop.
 
     :raises ParameterError: a screw.
     """
@@ -141,7 +141,7 @@ def _version(top: ET.Element) -> tuple[int, int]:
 
 
 def _model(path: Path, top: ET.Element) -> tuple[ET.Element, ET.Element, list[float] | None]:
-    """The only model that can move, after what it stands in, and a world's gravity if stated."""
+    """Find the only model that can move, after its parents, and a world's gravity if stated."""
     worlds = top.findall("world")
     gravity = None
     for world in worlds:
@@ -198,7 +198,7 @@ class Model:
             yield from one.all(tag)
 
     def _in(self, name: str, where: str) -> tuple[Model, str]:
-        """The nested model that a scoped name leads to, and the rest of the name."""
+        """Find the nested model that a scoped name leads to, and the rest of the name."""
         first, _, rest = name.partition("::")
         if rest and first in self.models:
             return self.models[first]._in(rest, where)
@@ -207,7 +207,7 @@ class Model:
         return self, name
 
     def place(self, name: str, where: str = "relative_to") -> Pose:
-        """A frame as drawn, in the world.
+        """Return a frame as drawn, in the world.
 
         :raises ParameterError: no such frame, or one that leads back to itself.
         """
@@ -217,13 +217,13 @@ class Model:
         return found
 
     def pose(self) -> Pose:
-        """The model's frame in the outer model's."""
+        """Return the model's frame in the outer model's."""
         found = self._posed(self.element, MODEL, self.outer)
         placed = self.element.get("placement_frame")
         return found @ self.local(placed, "placement_frame").inverse() if placed else found
 
     def local(self, name: str, where: str) -> Pose:
-        """A frame in this model's."""
+        """Return a frame in this model's."""
         if name not in self._known:
             self._known[name] = None
             self._known[name] = self._local(name, where)
@@ -265,7 +265,7 @@ class Model:
         return (Pose() if scope is None else scope.local(name, where)) @ pose(stated, where)
 
     def link(self, name: str, where: str = "attached_to") -> str:
-        """The link that a frame is attached to.
+        """Find the link that a frame is attached to.
 
         :raises ParameterError: none is found.
         """
@@ -289,13 +289,13 @@ class Model:
         raise ParameterError(where, name, "frames that do not lead back to themselves")
 
     def joints(self, path: Path) -> Iterator[Joint]:
-        """The joints, nested models' too; the path is for warnings."""
+        """Read the joints, nested models' too; the path is for warnings."""
         yield from self.own_joints(path)
         for one in self.models.values():
             yield from () if one.static else one.joints(path)
 
     def own_joints(self, path: Path) -> Iterator[Joint]:
-        """The same, of no nested model."""
+        """Read the model's own joints, without nested models'."""
         for part in self.element.findall("joint"):
             yield _joint(path, part, self)
 
@@ -308,7 +308,7 @@ def _end(joint: ET.Element, tag: str) -> str:
 
 
 def pose(element: ET.Element | None, where: str) -> Pose:
-    """What a ``<pose>`` says; an empty one is the identity."""
+    """Read a ``<pose>``; an empty one is the identity."""
     text = "" if element is None else (element.text or "").strip()
     if element is None or not text:
         return Pose()
@@ -323,7 +323,7 @@ def pose(element: ET.Element | None, where: str) -> Pose:
 
 
 def _text(element: ET.Element | None, tag: str, where: str, default: float) -> float:
-    """A number that stands in an element of its own."""
+    """Read a number that stands in an element of its own."""
     stated = None if element is None else urdf_xml.single(element, tag, where)
     if stated is None:
         return default
@@ -350,7 +350,7 @@ def _link(path: Path, element: ET.Element, name: str, rounding: float) -> Link:
 
 
 def _joint(path: Path, part: ET.Element, model: Model) -> Joint:
-    """A joint with its frame in the world."""
+    """Read a joint with its frame in the world."""
     name = model.prefix + urdf_xml.name(part, ())
     where = f"joint.{name}"
     place = partial(model.place, where=where)
@@ -380,7 +380,7 @@ def joint_of(
     turn: Callable[[str], Array],
     version: tuple[int, int] = NEWEST,
 ) -> Joint:
-    """A ``<joint>`` whose frame is known.
+    """Read a ``<joint>`` whose frame is known.
 
     :param turn: gives the rotation of a frame in the world by its name.
     :raises ParameterError: what is not supported, by name.
@@ -435,7 +435,7 @@ def _axis(
     turn: Callable[[str], Array],
     version: tuple[int, int],
 ) -> Array:
-    """A unit vector, in the world."""
+    """Read a unit vector, in the world."""
     stated = None if element is None else urdf_xml.single(element, "xyz", where)
     text = "0 0 1" if stated is None else stated.text
     value = urdf_xml.vector(text, f"{where}.xyz", 3)
@@ -452,7 +452,7 @@ def _axis(
 def welds(
     path: Path, top: ET.Element, model: str, places: Mapping[str, Pose], taken: set[str]
 ) -> Iterator[Joint]:
-    """What Gazebo's plugins hold together: two links of this model, as they are drawn.
+    """Read the pairs of links that Gazebo's plugins hold together, as they are drawn.
 
     :param taken: names of joints and closures; the welds' own are added.
     :raises UnknownNameError: a parent link that is not there.

@@ -37,7 +37,7 @@ KINDS: Final = {
 
 
 def write_sdf(tree: LoopTree) -> str:
-    """The SDF of a tree with its closures as joints.
+    """Write the SDF of a tree with its closures as joints.
 
     ``base_link`` is fixed to the world; the frame ``platform`` stands on the reference point.
     """
@@ -73,7 +73,7 @@ class _Writer:
             self.joints.append((part.name, part.kind, *part[3:5], joint.at, [part]))
 
     def text(self) -> str:
-        """The file."""
+        """Return the file's text."""
         for link in self.links.values():
             self._link(link)
         frame = ET.SubElement(

@@ -82,7 +82,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def parse_yaml(text: str, name: str) -> dict[str, Any]:
-    """What a parameter file of this text says.
+    """Parse the text of a parameter file.
 
     :param name: the file's.
     :raises ParameterError: not plain YAML, or not a mapping.

@@ -44,7 +44,7 @@ UNCOUPLED: Final = "joints without coupling; a base and a platform (--base) can 
 
 
 def read_beside(path: Path) -> dict[str, Any]:
-    """The YAML file of the same name, if it speaks of closures or motors, else nothing."""
+    """Read the YAML file of the same name, if it has closures or motors, else nothing."""
     for suffix in (".yaml", ".yml"):
         other = path.with_suffix(suffix)
         # An empty one is the target of a conversion that reads this very URDF.
@@ -113,7 +113,7 @@ def actuated_joints(
     others: Sequence[str] | None = None,
     chosen: Sequence[str] | None = None,
 ) -> tuple[tuple[str, ...], str]:
-    """The actuated joints in the order in which the file marks them, and what marks them.
+    """List the actuated joints in the order in which the file marks them, and what marks them.
 
     :param beside: the YAML file's entries. ``types``: of all joints, by name.
     :param faults: takes the error of a file that marks none.
@@ -169,14 +169,14 @@ class Control:
         return self == Control(self.joint, self.joint, factor=1.0, offset=0.0)
 
     def value(self, key: str, model: float) -> float:
-        """The controller's number of a parameter of a joint in ``<ros2_control>``."""
+        """Return the controller's number of a parameter of a joint in ``<ros2_control>``."""
         power = {"rotor_inertia": 2, "friction_offset": 1}
         if key in power:
             return model / self.factor ** power[key]
         return self.offset + self.factor * model
 
     def limits(self, model: Mapping[str, Any], kind: str) -> dict[str, Any]:
-        """The controller's limits of a joint, every one of them, of the model's."""
+        """Convert all limits of a joint to the controller's."""
         size, most = abs(self.factor), UNLIMITED[kind]
         velocity, effort = (model.get(key, UNLIMITED[key]) for key in ("velocity", "effort"))
         ends = [self.value("", end) for end in model.get("position", (-most, most))]
@@ -188,7 +188,7 @@ class Control:
 
 
 def tree_names(joints: Iterable[str], controls: Iterable[Control]) -> dict[str, str]:
-    """What the joints of the tree are called in a URDF with these drives."""
+    """Return the names that joints of the tree have in a URDF with these drives."""
     names = list(joints)
     drives = {control.name for control in controls if not control.same}
     taken = drives.union(names)

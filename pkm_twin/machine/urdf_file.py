@@ -75,7 +75,7 @@ class Visual:
 
 
 def read(path: Path, robot: ET.Element, actuated: Sequence[str] | None = None) -> LoopTree:
-    """The links, joints and closures of a URDF file.
+    """Read the links, joints and closures of a URDF file.
 
     :param robot: the file's top element; the path is for what stands beside the file.
     :param actuated: the actuated joints, in place of those that the file marks.
@@ -368,7 +368,7 @@ def _loop(element: ET.Element, name: str, links: Collection[str]) -> Joint:
 
 
 def _loop_joint(element: ET.Element, name: str, links: Collection[str]) -> Joint:
-    """A closure between two frames, as Isaac Sim and Drake write it."""
+    """Read a closure between two frames, as Isaac Sim and Drake write it."""
     where, kind = f"loop_joint.{name}", element.get("type")
     if kind not in LOOPS:
         raise UnknownNameError(f"{where}.type", kind, LOOPS)
@@ -384,7 +384,7 @@ def _loop_joint(element: ET.Element, name: str, links: Collection[str]) -> Joint
 def _pairs(
     beside: Mapping[str, Any], links: Collection[str], joints: Mapping[str, str]
 ) -> list[Joint]:
-    """The closures of the YAML file: two frames that meet whole (6d) or in their origins (3d)."""
+    """Read closures of the YAML file: two frames that meet whole (6d) or in their origins (3d)."""
     pairs = beside.get("closed_loop", [])
     kinds = beside.get("type", ["6d"] * len(pairs))
     if len(kinds) != len(pairs):
@@ -420,7 +420,7 @@ def _closure(
 
 
 def _parameters(robot: ET.Element, actuated: tuple[str, ...], key: str) -> dict[str, float]:
-    """A parameter of the actuated joints, or of their position, in ``<ros2_control>`` elements."""
+    """Read a parameter of the actuated joints, or of their position, in ``<ros2_control>``."""
     found: dict[str, float] = {}
     for joint in robot.findall("ros2_control/joint"):
         name = joint.get("name", "")

@@ -38,7 +38,7 @@ NAMED: Final = ("link", "joint", "constraint", "ros2_control")
 def write_urdf(
     tree: LoopTree, hardware: str = MOCK, prefix: str = "", controls: Iterable[Control] = ()
 ) -> str:
-    """The URDF of a tree.
+    """Write the URDF of a tree.
 
     The root is ``base_link``; ``platform`` is a link without mass on the reference point, fixed
     to the platform's body.
@@ -82,7 +82,7 @@ def write_urdf(
 
 
 def parts_of(tree: LoopTree) -> list[Single]:
-    """The joints of the URDF, from the ground outwards; the last one leads to ``platform``."""
+    """List the joints of the URDF, from the ground outwards; the last leads to ``platform``."""
     place, taken = Pose(position=tree.origin), {PLATFORM, *tree.links}
     tool = Joint(f"{PLATFORM}_frame", "fixed", tree.platform, PLATFORM, (place, place))
     hung = (*tree.hung, (tool, tree.platform, PLATFORM))
@@ -164,7 +164,7 @@ def _drive(
     robot: ET.Element, part: Single, control: Control, places: dict[str, Array],
     follower: ET.Element,
 ) -> None:  # fmt: skip
-    """The joint of a controller, with a link without mass, and the joint that follows it."""
+    """Write the joint of a controller, with a link without mass, and the joint that follows it."""
     link = urdf_xml.free_name(control.name + DRIVE, {PLATFORM, *places})
     places[link] = part.joint.at
     # A motor that turns, or a slide where the controller counts the metres of one.

@@ -33,7 +33,7 @@ UNLIMITED: Final = {
 
 
 def elements(path: Path) -> ET.Element:
-    """The file's top element; no document types and thus no entities, no namespaces needed.
+    """Parse the file's top element; no document types, thus no entities, no namespaces needed.
 
     :raises ParameterError: not readable, too large, too deep, or not well-formed.
     """
@@ -73,7 +73,7 @@ def elements(path: Path) -> ET.Element:
 
 
 def name(element: ET.Element, taken: Container[str]) -> str:
-    """An element's name, one of its own."""
+    """Read an element's name, which has to be unique."""
     own = element.get("name")
     kind = element.tag
     if not own:
@@ -84,7 +84,7 @@ def name(element: ET.Element, taken: Container[str]) -> str:
 
 
 def free_name(name: str, taken: set[str], more: str = "_") -> str:
-    """A name for a part that the file does not name: a free one, which is taken from now on."""
+    """Choose a free name for a part that the file does not name, and mark it as taken."""
     while name in taken:
         name += more
     taken.add(name)
@@ -102,7 +102,7 @@ def only(element: ET.Element | None, where: str, tags: Collection[str]) -> None:
 
 
 def single(element: ET.Element, tag: str, where: str) -> ET.Element | None:
-    """The child element of that tag, None where there is none.
+    """Find the only child element of a tag, None where there is none.
 
     :raises ParameterError: there are several, of which a parser may take any.
     """
@@ -113,7 +113,7 @@ def single(element: ET.Element, tag: str, where: str) -> ET.Element | None:
 
 
 def known_link(where: str, name: str, links: Collection[str]) -> str:
-    """A link by its name, or by the name of a robot's part that it is written out for.
+    """Find a link by its name, or by the name of a robot's part that it is written out for.
 
     :raises UnknownNameError: there is none.
     """
@@ -124,7 +124,7 @@ def known_link(where: str, name: str, links: Collection[str]) -> str:
 
 
 def reference(element: ET.Element | None, where: str, links: Collection[str]) -> str:
-    """The link that an element names."""
+    """Find the link that an element names."""
     link = None if element is None else element.get("link", element.get("name"))
     if link is None:
         raise ParameterError(where, None, "the name of a link")
@@ -134,7 +134,7 @@ def reference(element: ET.Element | None, where: str, links: Collection[str]) ->
 
 
 def axis(element: ET.Element, tag: str, where: str) -> Array:
-    """A unit vector; a missing one is x, as in every URDF."""
+    """Read a unit vector; a missing one is x, as in every URDF."""
     stated = single(element, tag, where)
     value = vector("1 0 0" if stated is None else stated.get("xyz"), f"{where}.{tag}", 3)
     size = float(np.linalg.norm(value))
@@ -144,7 +144,7 @@ def axis(element: ET.Element, tag: str, where: str) -> Array:
 
 
 def origin(element: ET.Element | None, where: str) -> Pose:
-    """The frame of an ``<origin>`` or its like; without one the identity."""
+    """Read the frame of an ``<origin>`` or its like; without one the identity."""
     if element is None:
         return Pose()
     position = vector(element.get("xyz", "0 0 0"), f"{where}.xyz", 3)
@@ -156,7 +156,7 @@ def origin(element: ET.Element | None, where: str) -> Pose:
 
 
 def quaternion(values: Array, where: str) -> Array:
-    """The rotation of a quaternion x, y, z, w of any length but zero, shape (3, 3)."""
+    """Return the rotation of a quaternion x, y, z, w of any length but zero, shape (3, 3)."""
     size = float(np.linalg.norm(values))
     if not size > 1e-9:
         raise ParameterError(f"{where}.quat_xyzw", values.tolist(), "a quaternion that is not zero")
@@ -172,7 +172,7 @@ def vector(text: str | None, where: str, size: int) -> Array:
 
 
 def positive(text: str | None, where: str) -> float:
-    """A finite number that is not negative."""
+    """Parse a finite number that is not negative."""
     value = number(text, where)
     if value < 0.0:
         raise ParameterError(where, value, "zero or more")
@@ -180,7 +180,7 @@ def positive(text: str | None, where: str) -> float:
 
 
 def number(text: str | None, where: str) -> float:
-    """A finite number."""
+    """Parse a finite number."""
     try:
         value = decimal(text or "")
     except (TypeError, ValueError):
@@ -203,7 +203,7 @@ def friction(element: ET.Element, where: str) -> tuple[float, float]:
 
 
 def boolean(text: str, where: str) -> bool:
-    """A truth value, in the spellings of XML schemas and of Python."""
+    """Parse a truth value, in the spellings of XML schemas and of Python."""
     value = {"true": True, "1": True, "false": False, "0": False}.get(text.strip().lower())
     if value is None:
         raise ParameterError(where, text, "true or false")
@@ -211,7 +211,7 @@ def boolean(text: str, where: str) -> bool:
 
 
 def limits(limit: Mapping[str, str], where: str, kind: str) -> dict[str, Any]:
-    """What is stated; no width and zero are empty entries, what is far off is no limit either."""
+    """Read the stated limits; zero and no width mean none, and so does what is far off."""
     found: dict[str, Any] = {}
     if kind in UNLIMITED and (limit.get("lower") or limit.get("upper")):
         low, high = (
@@ -232,6 +232,6 @@ def limits(limit: Mapping[str, str], where: str, kind: str) -> dict[str, Any]:
 
 
 def _bound(text: str, where: str) -> float:
-    """A limit, which alone of all numbers may be infinite."""
+    """Parse a limit, which alone of all numbers may be infinite."""
     endless = text.strip().lower().lstrip("+-") in ("inf", "infinity")
     return float(text) if endless else number(text, where)
