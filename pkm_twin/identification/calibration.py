@@ -281,7 +281,7 @@ def geometric(robot: Robot, q: Array, only: Sequence[str] = ()) -> tuple[str, ..
 def left_by_calibration(
     robot: Robot, errors: Callable[[Array], Array], states: Array, q: Array
 ) -> Array:
-    """What a calibration without noise leaves of errors of the platform, shape (k, 6, p).
+    """Return what a calibration without noise leaves of errors of the platform, shape (k, 6, p).
 
     :param errors: of joint states (k, n) the twists by each error, shape (k, 6, p).
     :param states: with measured poses, shape (s, n); ``q``: where the errors count, shape (k, n).
@@ -333,7 +333,7 @@ def calibrated_errors(robot: Robot, found: Tolerances, q: Array) -> dict[str, Ar
 
 
 def unknowns(robot: Robot, measured: Measured, paths: Sequence[str], free: Free) -> list[Parameter]:
-    """What is fitted, as it is before: the machine's numbers, the instrument's, the kinds' own."""
+    """List what is fitted, with its present values: numbers of machine, instrument and kinds."""
     robot.check_independent("calibrations", "a pose does not give the others' zeros")
     known, prior = robot.file_numbers(), free.prior
     angle = prior / robot.size
@@ -356,7 +356,7 @@ def unknowns(robot: Robot, measured: Measured, paths: Sequence[str], free: Free)
 
 
 def placed(robot: Robot, measured: Measured, paths: Sequence[str], frame: bool = False) -> State:
-    """The machine at the measured poses, with a first guess of the instrument and the target."""
+    """Place the machine at the measured poses, with a first guess of instrument and target."""
     state = start_of(robot, measured.joints, paths)
     state.instrument.own = dict.fromkeys(measured.own, 0.0)
     for one in measured.readings:
@@ -397,7 +397,7 @@ def calibrate(
     fit_of = partial(_calibrated, robot, learnt, apart, paths, progress)
 
     def other_place() -> Calibration | None:
-        """The same with the instrument's frame; None where that is no machine either."""
+        """Return the machine with the instrument's frame; None where that is no machine either."""
         if free.frame or apart is None:
             return None
         try:
@@ -432,7 +432,7 @@ def _calibrated(
     robot: Robot, learnt: Measured, apart: Measured | None, paths: Sequence[str],
     progress: Callable[[int], None], free: Free,
 ) -> Calibration:  # fmt: skip
-    """The fit with its faults.
+    """Return the fit with its faults.
 
     :param apart: whole poses that are not learnt from.
     """
@@ -503,7 +503,7 @@ def _compared(
     robot: Robot, built: Robot, learnt: Measured, apart: Measured | None, before: State,
     found: Fitted, parameters: Sequence[Parameter],
 ) -> tuple[tuple[Agreement, ...], tuple[Outlier, ...]]:  # fmt: skip
-    """What the measurements differ by from the machines, and what does not fit the others."""
+    """Compare the measurements with the machines, and find what does not fit the others."""
     noise, old, new = found.weights.noise, learnt.parts(before), learnt.parts(found.state)
     readings, parts = learnt.readings, new
     if apart is None:

@@ -138,7 +138,7 @@ def fit(
 
 
 def _move(left: Array, right: Array, damping: Array) -> Array:
-    """A step of Gauss and Newton's method, damped where that is not zero (Levenberg, Marquardt).
+    """Compute a Gauss-Newton step, damped where damping is not zero (Levenberg, Marquardt).
 
     Along a direction that the poses tell badly the machine may turn away from its tangent: without
     damping a step then goes beyond, and back, for ever.
@@ -273,7 +273,7 @@ def cost_of(changes: Sequence[Parameter]) -> float:
 
 
 def place_fault(instrument: Instrument) -> Fault:
-    """The poses fit where the instrument stands elsewhere."""
+    """Return the fault that the instrument stands elsewhere."""
     shift, angles = (
         ", ".join(f"{value + 0.0:.4f}" for value in np.round(one, 4))
         for one in (instrument.place, instrument.frame.as_rotvec())

@@ -46,7 +46,7 @@ class Poses:
     rotation: Array | None = None
 
     def part(self, rows: Mask) -> Poses:
-        """Some of them."""
+        """Return some of the measurements."""
         turned = None if self.rotation is None else self.rotation[rows]
         return Poses(self.joints[rows], self.position[rows], turned)
 
@@ -63,7 +63,7 @@ class Instrument:
     """Numbers of single measurements, such as a plane's height, by name."""
 
     def seen(self, position: Array, rotation: Array) -> tuple[Array, Array]:
-        """What it should see of the platform: positions and rotations in its own frame."""
+        """Compute what the instrument should see: positions and rotations in its own frame."""
         turn = self.frame.as_matrix()
         return self.place + (position + rotation @ self.target) @ turn.T, turn @ rotation
 
@@ -82,7 +82,7 @@ class State:
     instrument: Instrument
 
     def at(self, robot: Robot, joints: Array) -> State:
-        """The same at other measurements, of a loaded robot with these numbers."""
+        """Return the state at other measurements, of a loaded robot with these numbers."""
         q = self.instrument.map.positions(joints)
         return replace(self, q=q, platform=robot.platform(q))
 
@@ -103,7 +103,7 @@ class State:
 
 
 def start_of(robot: Robot, joints: Array, paths: Sequence[str]) -> State:
-    """The robot as it is, with numbers that may change, an instrument at its base.
+    """Return the state of the robot as it is, with an instrument at its base.
 
     :param joints: of the measurements, in the controller's numbers, (k, n).
     :raises UnreachableError: a joint state without an assembly, by limb, sample and miss.
@@ -115,7 +115,7 @@ def start_of(robot: Robot, joints: Array, paths: Sequence[str]) -> State:
 
 
 def place_frame(state: State, position: Array) -> None:
-    """A first guess of the instrument's frame: the best rigid motion to measured positions."""
+    """Guess the instrument's frame: the best rigid motion to measured positions."""
     tool, model = state.instrument, state.platform[0]
     centres = position.mean(0), model.mean(0)
     tool.frame, _ = rotations().align_vectors(position - centres[0], model - centres[1])
@@ -123,7 +123,7 @@ def place_frame(state: State, position: Array) -> None:
 
 
 def value_of(state: State, name: str, otherwise: float) -> float:
-    """A number of the instrument's as it is now, of any other name the given one."""
+    """Return a number of the instrument as it is now, of any other name the given one."""
     tool = state.instrument
     if name in FRAME[:3]:
         return float(tool.place[FRAME.index(name)])
@@ -135,7 +135,7 @@ def value_of(state: State, name: str, otherwise: float) -> float:
 def moved(
     robot: Robot, state: State, joints: Array, values: Mapping[str, float], turn: Array
 ) -> State:
-    """The machine with new numbers.
+    """Return the machine with new numbers.
 
     :param joints: of the measurements, in the controller's numbers, (k, n).
     :param values: of all that is fitted, by name.
@@ -238,14 +238,14 @@ def unit_of(robot: Robot, joint: int) -> str:
 
 
 def per(controller: str, model: str) -> str:
-    """The unit of a ratio."""
+    """Return the unit of a ratio."""
     return f"{controller} per {model}" if " " in controller else f"{controller}/{model}"
 
 
 def numbers(
     robot: Robot, q: Array, how: Transmission, offsets: bool, prior: float, angle: float
 ) -> list[Parameter]:
-    """What is fitted of the joint map.
+    """List what is fitted of the joint map.
 
     :param q: the poses' joints, (k, n). ``prior``, ``angle``: standard deviations of lengths, m,
         and angles, rad.
@@ -281,14 +281,14 @@ def numbers(
 
 
 def centred(robot: Robot, q: Array) -> JointMap:
-    """The file's map with the middle of the poses' travel as the place of every even ratio."""
+    """Return the file's map with the middle of the poses' travel as the place of even ratios."""
     own = robot.controller
     middle = np.round(0.5 * (q.max(0) + q.min(0)), 3)
     return replace(own, centres=np.where(own.changes == 0.0, middle, own.centres))
 
 
 def changed(robot: Robot, own: JointMap, values: Mapping[str, float]) -> JointMap:
-    """A map with other numbers, by the names above.
+    """Return a map with other numbers, by the names above.
 
     :raises ParameterError: a ratio that is not positive.
     """
@@ -305,7 +305,7 @@ def changed(robot: Robot, own: JointMap, values: Mapping[str, float]) -> JointMa
 
 
 def by_map(robot: Robot, own: JointMap, q: Array, twists: Array) -> dict[str, Array]:
-    """Derivatives of the platform by the map's numbers at the controller's positions held.
+    """Differentiate the platform's pose by the map's numbers at fixed controller positions.
 
     :param q: the model's, (k, n). ``twists``: of the platform by q, (k, 6, n).
     :returns: (k, 6) by name.
@@ -327,7 +327,7 @@ def by_map(robot: Robot, own: JointMap, q: Array, twists: Array) -> dict[str, Ar
 def written(
     robot: Robot, own: JointMap, values: Mapping[str, tuple[float, float]]
 ) -> dict[str, tuple[float, float, str]]:
-    """What a file says of a fitted joint map: value, standard deviation and unit by path.
+    """Return value, standard deviation and unit of a fitted joint map by path in the file.
 
     :param values: of what was fitted of the map, value and deviation by the names above.
     """

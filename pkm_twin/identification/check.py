@@ -131,7 +131,7 @@ class Checked:
         }
 
     def named(self, verdict: Verdict) -> list[str]:
-        """What got this verdict."""
+        """List what got this verdict."""
         return [str(item.text) for item in self.items if item.verdict is verdict]
 
 
@@ -208,7 +208,7 @@ def _file(r: Recording) -> list[Fact]:
 
 
 def _motion(r: Recording) -> list[Fact]:
-    """The items on time stamps, steps and velocities."""
+    """Judge time stamps, steps and velocities."""
     if len(r.time) < 3:
         return [judged("rate", f"{len(r.time)} joint states", "3 or more", None)]
     periods = np.diff(r.time)
@@ -234,7 +234,7 @@ def _motion(r: Recording) -> list[Fact]:
 
 
 def stuck_from(time: Array, values: Array, told: Array, count: int = 1) -> tuple[int, int] | None:
-    """The first and last sample between which a signal stays the same and should not; or None.
+    """Find the first and last sample of a signal that is stuck; None where it is not.
 
     :param values: shape (k,); ``told``: what it should be but for a constant, NaN where that is not
         known. ``count``: samples of it at least.
@@ -460,7 +460,7 @@ Explained = tuple[tuple[str, ...], tuple[str, ...]]
 
 
 def _causes_of(found: Checked, thorough: bool) -> Explained:
-    """The first cause that makes the efforts agree."""
+    """Find the first cause that makes the efforts agree."""
     c, r, bad = found.compared, found.recording, found.named(Verdict.BAD)
     # Of positions that are none the efforts say nothing.
     if {POSITION_STEPS, VELOCITIES, MEASURED} & set(bad) or c is None:
@@ -546,6 +546,6 @@ def _of_fit(found: Checked, bound: float) -> Explained:
 
 
 def _fitted(what: str, made: Fit) -> str:
-    """What explains the efforts, and how late they are then."""
+    """Find what explains the efforts, and how late they are then."""
     late = lateness(made.delays[0], made.problem.whole[0].period)
     return f"{what} the efforts" + (f", which are {late}" if late else "") + ": `pkm-twin fit`"

@@ -138,7 +138,7 @@ class Compared:
         return np.maximum(self.bound * self.peak, LOUD * self.noise)
 
     def local(self) -> tuple[Array, Array]:
-        """The largest RMS over a short time, and the time of its middle, s, shape (n,) each."""
+        """Return the largest RMS over a short time and the time of its middle, s, (n,) each."""
         n = self.residual.shape[1]
         worst, at = np.zeros(n), np.full(n, self.time[0])
         width = max(1, round(LOCAL / self.period))
@@ -184,7 +184,7 @@ def by_held(r: Recording, function: Callable[..., Array], time: Array, *motion: 
 
 
 def moving(robot: Robot, q: Array) -> Array:
-    """What takes efforts to the least ones that move the machine alike, shape (k, n, n).
+    """Return the matrix from efforts to the least efforts with the same motion, shape (k, n, n).
 
     Least over their limits. Drives that share may do so otherwise than the model says: what they
     give against each other moves nothing. One where no drives share.
@@ -317,7 +317,7 @@ def missing_samples(time: Array) -> Fact:
 
 
 def near_jumps(steps: Steps, count: int) -> Mask:
-    """Samples so near to a jump that no derivative holds there, shape (count,)."""
+    """Find samples so near to a jump that no derivative holds there, shape (count,)."""
     found = np.zeros(count, np.bool_)
     for k in np.flatnonzero(steps.jumps.any(1)):
         found[max(k - CLEAR, 0) : k + CLEAR + 2] = True
@@ -325,7 +325,7 @@ def near_jumps(steps: Steps, count: int) -> Mask:
 
 
 def recorded_of(r: Recording, leave_out: Mask | None = None) -> Recording:
-    """A recording without samples around a pick or release, near steps, and of idle drives.
+    """Remove samples near a pick, a release or a step, and those of idle drives.
 
     :param leave_out: the latter two, (samples,), where they are known. A gap divides the recording.
     """
@@ -340,7 +340,7 @@ def recorded_of(r: Recording, leave_out: Mask | None = None) -> Recording:
 
 
 def near_change(r: Recording, load: Load | None = None) -> tuple[Mask, float]:
-    """Samples next to a pick or release, shape (samples,), and how near they are, s."""
+    """Find samples next to a pick or release, shape (samples,), and how near they are, s."""
     load, within = load or r.load, NEAR
     if load is None or not load.times:
         return np.zeros(len(r.time), np.bool_), within
@@ -356,13 +356,13 @@ def near_change(r: Recording, load: Load | None = None) -> tuple[Mask, float]:
 
 
 def compared_of(r: Recording, idle: Mask, bound: float = MAX_RESIDUAL) -> Compared | None:
-    """The efforts in the band of the motion, without samples whose drives are idle."""
+    """Filter efforts to the band of the motion, without samples whose drives are idle."""
     part = recorded_of(r, idle)
     return None if len(part.time) < 3 else compare(part, bound)
 
 
 def idle_of(r: Recording) -> Mask:
-    """Samples whose efforts are zero, or constant at standstill, against the model, (samples,)."""
+    """Find samples with zero efforts, or constant ones at standstill, against the model."""
     assert r.effort is not None  # noqa: S101
     still = np.zeros_like(r.q)
     wrench = np.zeros((len(r.time), 6)) if r.wrench is None else r.wrench

@@ -106,7 +106,7 @@ class _Part:
 
     @classmethod
     def of(cls, robot: Robot, r: Recording) -> _Part:
-        """A recording that a fit can begin with.
+        """Return a recording that a fit can begin with.
 
         :raises PkmTwinError: it is too short, or has no loads or deflections.
         """
@@ -291,7 +291,7 @@ def _scale_faults(parts: Sequence[_Part]) -> list[str]:
 
 
 def _part_left(part: _Part, factors: Array, zero: Array) -> float:
-    """The part of the fitted deflections' variation that is left, beside noise between neighbours.
+    """Return the unexplained part of the deflections' variation, beside neighbours' noise.
 
     Over all measured directions that vary by more than their noise or would by the robot's file,
     each by its own variation; zero where none does.
@@ -312,7 +312,7 @@ def _part_left(part: _Part, factors: Array, zero: Array) -> float:
 def _unexplained(
     robot: Robot, parts: Sequence[_Part], factors: Array, zeros: Array, odd: bool
 ) -> list[str]:
-    """Recordings that no compliance of this robot explains, each with the likely fault.
+    """List recordings that no compliance of this robot explains, each with the likely fault.
 
     A direction of noise alone is no fault where others are explained.
 
@@ -338,7 +338,7 @@ def _unexplained(
 
 
 def _best_repair(robot: Robot, part: _Part, most: float) -> tuple[str, float]:
-    """The fault without which a recording is the likeliest, and how much is left of it then."""
+    """Find the fault without which a recording is likeliest, and how much is left of it then."""
     repairs = ((text, other.judged, UNIT) for text, other in _repairs(robot, part))
     cause, best, _ = likeliest(Score.of(most), repairs)
     return cause, best.left
@@ -374,7 +374,7 @@ def _solve(parts: Sequence[_Part], count: int) -> tuple[Estimate, Array]:
 
 
 def _level(table: Array, change: Array, judged: Array) -> Array | None:
-    """What all factors and zeros together leave of a change, by direction (6,).
+    """Return what all factors and zeros together leave of a change, by direction (6,).
 
     None where there are hardly more equations than those.
     """
@@ -393,7 +393,7 @@ def _level(table: Array, change: Array, judged: Array) -> Array | None:
 
 
 def _judged(part: _Part, factors: Array, zero: Array, covariance: Array) -> Judged:
-    """What is held out, without the instrument's zero."""
+    """Judge the held-out part, without the instrument's zero."""
     end = slice(part.split, None)
     before, _ = part.moved(np.ones(len(factors)))
     after, slopes = part.moved(factors)

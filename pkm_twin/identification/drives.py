@@ -51,7 +51,7 @@ class TorqueConstants:
     deviations: Array
 
     def applied(self, recorded: Recording) -> Recording:
-        """A recording whose efforts are currents, A, with efforts."""
+        """Convert a recording whose efforts are currents, A, to efforts."""
         return replace(recorded, effort=recorded.measured * self.values)
 
     def lines(self, robot: Robot) -> list[str]:

@@ -197,7 +197,7 @@ def possible(values: Array, cones: Cones) -> bool:
 
 
 def _equilibrated(block: Array) -> Array:
-    """A matrix scaled to a diagonal of ones, where that is above zero."""
+    """Scale a matrix to a diagonal of ones, where that is above zero."""
     diagonal = np.abs(np.diag(block))
     most = float(diagonal.max(initial=0.0))
     if most == 0.0:
@@ -207,7 +207,7 @@ def _equilibrated(block: Array) -> Array:
 
 
 def nearest(z: Array, factor: Array, start: Array, scales: Array, cones: Cones) -> Array:
-    """The possible parameters nearest to a solution, in its standard deviations.
+    """Return the possible parameters nearest to a solution, in its standard deviations.
 
     :param factor: of the scaled parameters' covariance, shape (k, k).
     """
@@ -271,7 +271,7 @@ def _bounded(root: Array, aim: Array, start: Array, scales: Array, cones: Cones)
 
 
 def _inside(values: Array, start: Array, cones: Cones) -> Array:
-    """A solver's result moved inwards by what it is beyond the edge, towards the file's values."""
+    """Move a solver's result inwards by its excess, towards the file's values."""
     for share in (0.0, 1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3):
         moved = values + share * (start - values)
         if possible(moved, cones):

@@ -165,7 +165,7 @@ def excite(
     seed: int = 0,
     progress: Callable[[int], None] | None = None,
 ) -> Excitation:
-    """The best of many trajectories.
+    """Choose the best of many trajectories.
 
     :param duration: s. ``terms``: harmonics of each joint, at least 3.
     :param trials: how many trajectories are looked at; ``progress`` is called with the number.
@@ -274,7 +274,7 @@ class _Fine:
         return cls(time, float(np.cos(np.pi * harmonics[-1] / count)), (q, qd, qdd))
 
     def scaled(self, robot: Robot, keep: Bounds, reach: Array, pair: Array) -> Array:
-        """A series (2, n, h) as large as limits of position, rate and acceleration allow."""
+        """Scale the series (2, n, h) to the limits of position, rate and acceleration."""
         values = np.moveaxis(pair, 0, 1).reshape(pair.shape[1], -1)
         peak = [np.abs(basis @ values.T).max(0) / self.margin for basis in self.bases]
         use = [peak[0] / reach]
@@ -289,7 +289,7 @@ def _clear_of(
     robot: Robot, keep: Bounds, duration: float, harmonics: Array, centre: Array, pair: Array,
     time: Array, margin: float = 1.0,
 ) -> Array | None:  # fmt: skip
-    """The series made smaller until it keeps clear of everything; None where it never does."""
+    """Shrink the series until it keeps clear of everything; None where it never does."""
     for _ in range(20):
         blocks = (time[k : k + BLOCK] for k in range(0, len(time), BLOCK))
         if all(

@@ -94,7 +94,7 @@ class Result:
         return self.estimate.directions
 
     def of(self, status: Status) -> tuple[Number, ...]:
-        """The numbers of a status."""
+        """List the numbers of a status."""
         return tuple(number for number in self.numbers if number.status == status)
 
 
@@ -168,7 +168,7 @@ def delays(problem: Problem) -> tuple[float, ...]:
 
 
 def on_time(problem: Problem) -> Problem:
-    """The problem with late efforts put on time, where that leaves less of them unexplained.
+    """Put late efforts on time, where that leaves less of them unexplained.
 
     Its delays are to the first order, good for a sample or so.
     """
@@ -217,7 +217,7 @@ def _searched(rows: Rows, late: float, noise: Array) -> float:
 
 
 def fitted(problem: Problem, accepted: tuple[str, ...] = ()) -> Fit:
-    """The solution of a problem, judged.
+    """Solve a problem and judge the solution.
 
     :param accepted: why the machine cannot have made the recordings, although they are fitted.
     :raises PkmTwinError: recordings that show nothing.
@@ -283,7 +283,7 @@ def _faults(made: Rows, cause: Cause | None) -> list[str]:
 
 
 def _worse(problem: Problem, causes: Sequence[Cause | None]) -> list[str]:
-    """Recordings whose held-out part the fitted values predict worse than the file's.
+    """List recordings whose held-out part the fitted values predict worse than the file's.
 
     Where the file's explain it, the fitted follow noise: the machine is not at fault.
     """

@@ -107,7 +107,7 @@ def fit_with_laws(
     laws: Sequence[str] | None = None,
     **options: Any,
 ) -> tuple[Fit, tuple[Choice, ...]]:
-    """A fit with the friction laws that the recordings show beside the file's.
+    """Fit with the friction laws that the recordings show beside the file's.
 
     :param laws: names; None: those that the held-out parts say.
     :param options: and errors as of :func:`~pkm_twin.identification.fit.fit`.
@@ -242,7 +242,7 @@ def fit_recordings(
 
 
 def _beside(file: Robot, result: Fit) -> Fit:
-    """A fit that started with another payload than the file's, compared with the file's."""
+    """Compare a fit that started with another payload with a fit from the file's."""
     problem = result.problem
     own = file_parameters(replace(problem.robot, payload=file.payload), problem.what)
     change = own.values - problem.parameters.values
@@ -292,7 +292,7 @@ def _compared(name: str, verdict: Verdict, before: Problem, after: Problem) -> C
 
 
 def _remembering(robot: Robot, recordings: Sequence[Recording], what: Sequence[Kind]) -> Robot:
-    """The robot with Dahl's law, open to a fit, about what the recordings show of its distance.
+    """Return the robot with Dahl's law, near what the recordings show of its distance.
 
     :raises PkmTwinError: their motion does not show it.
     """
@@ -306,12 +306,12 @@ def _remembering(robot: Robot, recordings: Sequence[Recording], what: Sequence[K
 
 
 def _changed(robot: Robot, found: dict[str, Searched]) -> Robot:
-    """The robot with what was found."""
+    """Return the robot with what was found."""
     return robot.changed(friction={key: one.value.tolist() for key, one in found.items()})
 
 
 def _opened(before: Problem, name: str) -> tuple[dict[str, Searched], Robot]:
-    """The robot with one law more, and what was found of its parameters that are not linear.
+    """Add one law to the robot, with its nonlinear parameters as found.
 
     :raises PkmTwinError: the motion does not show it.
     """
@@ -322,7 +322,7 @@ def _opened(before: Problem, name: str) -> tuple[dict[str, Searched], Robot]:
 
 
 def _searched(robot: Robot, result: Fit, name: str, found: dict[str, Searched]) -> list[Number]:
-    """What was found of a law's parameters that are not linear, as numbers of the file.
+    """Write what was found of a law's nonlinear parameters as numbers of the file.
 
     :param robot: before.
     """
@@ -353,7 +353,7 @@ def _widened(result: Fit, found: dict[str, Searched]) -> dict[tuple[str | int, .
 
 
 def _joint_of(robot: Robot, key: tuple[str | int, ...]) -> int:
-    """The actuated joint of a number of friction: by its group, in order."""
+    """Return the actuated joint of a number of friction: by its group, in order."""
     groups = [g for g in of_drives(robot) if g.kind == "friction"]
     for group in groups:
         if key in group.keys(group.values):
@@ -459,7 +459,7 @@ class _Search:
         return np.asarray(np.maximum(self._travel, 1e-12) / waves[:, None])
 
     def _gains(self, key: str, grid: Array) -> tuple[Array, Array]:
-        """What values (g, n) of a parameter explain of the residual: fall of chi square, (g, n).
+        """Return how far chi square falls for values (g, n) of a parameter, (g, n).
 
         And the other parameters of the law with each, (g, n, others).
         """

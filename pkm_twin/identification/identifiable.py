@@ -58,12 +58,12 @@ class Identifiable:
 
 
 def above_zero(k: int, count: int) -> Array:
-    """The cone of a parameter that is not negative."""
+    """Return the cone of a parameter that is not negative."""
     return np.asarray(np.eye(count)[k].reshape(1, 1, -1), np.float64)
 
 
 def pseudo_inertia() -> Array:
-    """The cone of ten numbers that a body can have, shape (4, 4, 10).
+    """Return the cone of ten numbers that a body can have, shape (4, 4, 10).
 
     Wensing, Kim, Slotine, Linear matrix inequalities for physically consistent inertial parameter
     identification, 2018, doi:10.1109/LRA.2017.2729659.
@@ -221,7 +221,7 @@ class _Group:
         return result
 
     def numbers(self, new: Array) -> Mapping[Keys, float]:
-        """The file's numbers by parameters: masses and inertias, and centres times the mass."""
+        """Return the file's numbers: masses and inertias, and centres times the mass."""
         result, whole = new.copy(), float(new[self.masses].sum())
         before = float(self.reference[self.masses].sum())
         change = new[self.coms] * (before / whole if whole > 0.0 else 0.0)
@@ -260,7 +260,7 @@ class _Group:
 
 
 def possible_inertia(inertia: Array) -> Array:
-    """The inertia (6,) without second moments below zero, or principal ones (k,) not below it.
+    """Return the nearest inertia (6,), or principal ones (k,), without negative second moments.
 
     A solver stops beside the edge of what a body can be.
     """
@@ -277,7 +277,7 @@ def possible_inertia(inertia: Array) -> Array:
 
 
 def _length(robot: Robot, name: str) -> float:
-    """A body's extent: greatest distance of its joints and rods from its centre, m."""
+    """Return a body's extent: greatest distance of its joints and rods from its centre, m."""
     graph = robot.graph
     if name == LOAD:
         return LONG * graph.size
@@ -287,7 +287,7 @@ def _length(robot: Robot, name: str) -> float:
 
 
 def _mirrored(key: Keys) -> Keys:
-    """The other entry of an inertia matrix that is the same; else the key."""
+    """Return the key of the equal entry of an inertia matrix; else the key itself."""
     return (*key[:-2], key[-1], key[-2]) if isinstance(key[-2], int) else key
 
 

@@ -163,7 +163,7 @@ class Verdict:
         return f"the model {SENTENCE[self.answer]} the recordings"
 
     def lines(self, units: tuple[str, ...]) -> list[str]:
-        """What it says beyond its answer, in plain sentences.
+        """Write what it says beyond its answer, in plain sentences.
 
         :param units: of the channels' measurements.
         """

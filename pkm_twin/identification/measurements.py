@@ -63,7 +63,7 @@ class Kind:
         return {}
 
     def begin(self, p: Array, values: Array) -> dict[str, float]:
-        """A first guess of its own numbers by positions (m, 3) and values (m,)."""
+        """Guess its own numbers from positions (m, 3) and values (m,)."""
         del p, values
         return {}
 
@@ -156,7 +156,7 @@ class _Ball(_Distance):
         return {name: unit[:, k] for k, name in enumerate(list(own)[:3])}
 
     def begin(self, p: Array, values: Array) -> dict[str, float]:
-        """The difference of |p - c|^2 = r^2 of every two is linear in c."""
+        """Guess the centre: the difference of |p - c|^2 = r^2 of every two is linear in c."""
         middle = p.mean(0)
         away = p - middle
         right = np.sum(away**2, 1) - values**2
@@ -170,7 +170,7 @@ class _Ball(_Distance):
         return dict(zip(self.own, (middle + centre).tolist(), strict=False))
 
     def likely(self, p: Array) -> Array:
-        """A ball below the positions."""
+        """Guess a ball below the positions."""
         below = p.mean(0) - [0.0, 0.0, float(np.ptp(p, axis=0).max())]
         return np.asarray(np.linalg.norm(p - below, axis=1, keepdims=True))
 
@@ -290,11 +290,11 @@ class Readings:
         return (p if self.second is None else p - position[self.second]), rotation[self.first]
 
     def own(self, state: State) -> dict[str, float]:
-        """The kind's own numbers as they are now."""
+        """Return the kind's own numbers as they are now."""
         return {name: state.instrument.own[name] for name in self.kind.own}
 
     def slopes(self, state: State, columns: Array, names: Sequence[str]) -> Array:
-        """Derivatives of what is computed, (m, a, p), by those of the poses, (k, 6, p)."""
+        """Differentiate what is computed, (m, a, p), from derivatives of the poses, (k, 6, p)."""
         (p, r), own = self.seen(state), self.own(state)
         moved = columns[self.first]
         if self.second is not None:
@@ -344,7 +344,7 @@ class Measured:
         ]
 
     def slopes(self, robot: Robot, state: State, names: Sequence[str]) -> list[Array]:
-        """Derivatives of what is computed by named parameters, (m, a, p) a kind."""
+        """Differentiate what is computed by named parameters, (m, a, p) a kind."""
         columns = derivatives(robot, state, names)
         return [one.slopes(state, columns, names) for one in self.readings]
 
@@ -391,7 +391,7 @@ def left_over(slopes: Sequence[Array], noise: Sequence[float], prior: Array) -> 
 
 
 def whole_of(poses: Poses, rows: Indices) -> Measured:
-    """Some of the whole poses, or of their positions, as measurements."""
+    """Return some of the whole poses, or of their positions, as measurements."""
     every, lines = np.arange(len(rows)), rows + 2
     readings = [Readings(PLACE, every, None, poses.position[rows], lines)]
     if poses.rotation is not None:

@@ -95,7 +95,7 @@ class FileParameters:
 
 
 def _scaled(group: Identifiable, robot: Robot) -> Identifiable:
-    """A rotor may weigh as much as all that the joints move at home."""
+    """Scale a rotor: it may weigh as much as all that the joints move at home."""
     if group.kind != "rotor":
         return group
     moved = float(np.diag(mass_matrix(robot, robot.graph.home)).max())
@@ -103,7 +103,7 @@ def _scaled(group: Identifiable, robot: Robot) -> Identifiable:
 
 
 def file_parameters(robot: Robot, what: Sequence[Kind] = KINDS) -> FileParameters:
-    """The parameters of some kinds.
+    """List the parameters of some kinds.
 
     :raises ParameterError: the robot's file gives no masses.
     """
@@ -124,7 +124,7 @@ def file_parameters(robot: Robot, what: Sequence[Kind] = KINDS) -> FileParameter
 
 
 def kinds_of(what: str) -> tuple[Kind, ...]:
-    """The kinds of numbers in words with commas between.
+    """Write the kinds of numbers in words with commas between.
 
     :raises UnknownNameError: another word.
     """
@@ -166,7 +166,7 @@ class Number:
 def number_of(
     key: Keys, unit: str, before: float, value: float, deviations: tuple[float, float], prior: float
 ) -> Number:
-    """A number with how well it is known: by the noise alone.
+    """Return a number with its standard deviation by the noise alone.
 
     :param deviations: by the noise alone, and with what the model does not explain.
     :param prior: its standard deviation before.
@@ -182,7 +182,7 @@ def number_of(
 def numbers_of_group(
     group: Identifiable, values: Array, prior: Array, covariances: tuple[Array, Array]
 ) -> list[Number]:
-    """A group's numbers of the file, their standard deviations by the derivatives of its keys.
+    """Return a group's numbers of the file, their deviations by the derivatives of its keys.
 
     An inertia that no body has with the file's value of what is not excited is fitted as a whole.
 
@@ -277,7 +277,7 @@ def _group(
 
 
 def fitted_yaml(text: str, fitted: Sequence[Number], recordings: Sequence[str]) -> str:
-    """The robot's file with what was fitted, each number's deviation and source in a comment.
+    """Write the robot's file with the fitted numbers, each with deviation and source.
 
     :param text: of the file before.
     """
@@ -312,7 +312,7 @@ def _base(key: Keys) -> Keys:
 
 
 def _value(base: Keys, numbers: Sequence[Number]) -> Any:
-    """A number, a list, or a matrix of what stands below one key."""
+    """Return a number, a list, or a matrix from what stands below one key."""
     tails = {n.key[len(base) :]: n.after for n in numbers}
     if () in tails:
         return tails[()]

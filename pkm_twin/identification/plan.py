@@ -67,7 +67,7 @@ class Plan:
     known: Estimate
 
     def table(self, robot: Robot) -> str:
-        """A CSV of joints, poses and an empty column for each quantity."""
+        """Write a CSV of joints, poses and an empty column for each quantity."""
         names = [f"{name}.position" for name in robot.controller.names]
         columns = [self.joints]
         if self.second is not None:
@@ -185,7 +185,7 @@ def _variances(rows: Array, covariance: Array) -> Array:
 
 
 def _over(parts: Sequence[Array], prior: Array, noise: Sequence[float]) -> list[Array]:
-    """Derivatives (m, p) of each kind over its noise, in units of the priors."""
+    """Divide derivatives (m, p) of each kind by its noise, in units of the priors."""
     return [part[:, 0] * prior / size for part, size in zip(parts, noise, strict=True)]
 
 

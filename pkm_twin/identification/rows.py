@@ -83,7 +83,7 @@ class Model:
         return np.array([joint in drives and key in keys for joint, key in pairs])
 
     def columns(self, motion: Motion, memory: Memory | None = None) -> tuple[Array, Array]:
-        """The parameters' columns, (k, n, p), and what the others need, (k, n).
+        """Return the parameters' columns, (k, n, p), and the efforts of all else, (k, n).
 
         :param memory: of the drives' friction along the motion, (k, n); None: without.
         """
@@ -104,7 +104,7 @@ class Model:
         return both[..., :-1], both[..., -1]
 
     def _drives(self, key: str) -> Array:
-        """A number of the drives' friction about which efforts are made linear, shape (n,)."""
+        """Return a number of the drives' friction at which efforts are linearised, shape (n,)."""
         p = self.parameters
         known = {} if p.loads is None else dict(zip(p.names, p.loads.tolist(), strict=True))
         own = zip(self.robot.joint_names, getattr(self.robot.friction, key), strict=True)
@@ -210,7 +210,7 @@ class Rows:
         return self._part(slice(0, self.held_from))
 
     def held_out(self, late: float) -> Rows:
-        """The others, by which a fit is judged; efforts that are so late, s, are put on time."""
+        """Return the held-out rows, which judge a fit, with efforts put on time by a delay, s."""
         end = self._part(slice(self.held_from, None))
         return replace(end, target=end.target + late * end.change)
 
@@ -226,7 +226,7 @@ class Rows:
         )
 
     def again(self, parameters: FileParameters, window: int) -> Rows:
-        """The recording with other parameters or another window of the differentiation."""
+        """Read the recording again with other parameters or another window of differentiation."""
         return rows_of(self.model.robot, parameters, self.recording, window)
 
 
@@ -239,7 +239,7 @@ def next_window(window: int) -> int:
 def rows_of(
     robot: Robot, parameters: FileParameters, recording: Recording, window: int | None = None
 ) -> Rows:
-    """A recording's filtered rows.
+    """Return a recording's filtered rows.
 
     :param window: of the differentiation, samples; None chooses it.
     :raises PkmTwinError: it is too short, its joints stand still, or its efforts are none.
@@ -281,7 +281,7 @@ def rows_of(
 def _signals(
     r: Recording, model: Model, how: Filtering, told: Sequence[_Told], first: Array
 ) -> Signals:
-    """The signals of a recording's rows.
+    """Return the signals of a recording's rows.
 
     :param told: by piece. ``first``: parameters of a first fit.
     """
@@ -327,7 +327,7 @@ class _Piece:
         return cls(track, table, track.effort - rest, rest, moves.astype(np.float64))
 
     def columns(self, told: _Told) -> dict[str, Array]:
-        """What rows are made of, by name, (samples, ...) each."""
+        """Return what rows are made of, by name, (samples, ...) each."""
         return {
             "time": self.track.time, "table": self.table, "target": self.target, "rest": self.rest,
             "moves": self.moves, "doubt": (1.0 - self.moves) * np.abs(told.efforts - told.load),
@@ -335,7 +335,7 @@ class _Piece:
         }  # fmt: skip
 
     def told(self, model: Model, first: Array) -> _Told:
-        """What a first fit says of it."""
+        """Take over what a first fit says of it."""
         told, rubs = self.rest + self.table @ first, model.of_drives
         load = told - self.table[..., rubs] @ first[rubs]
         return _Told(self.track, told, load, self.target - self.table @ first, self.moves)
@@ -355,7 +355,7 @@ class _Told:
     moves: Array
 
     def columns(self, speed: Array, how: Filtering) -> dict[str, Array]:
-        """What signals are made of, by name, (samples, ...) each.
+        """Return what signals are made of, by name, (samples, ...) each.
 
         Motion and load are those in the motion's own band, where nearly no noise is: noise in both
         of two columns would look like something in common.
@@ -421,7 +421,7 @@ def _drop_outliers(
 
 
 def prior_scales(parameters: FileParameters, table: Array, effort: Array) -> Array:
-    """The prior's deviations; of friction and rotors what would be all of the joints' efforts."""
+    """Return the prior's deviations; friction and rotors may be all of the joints' efforts."""
     scales = parameters.scales.copy()
     size = np.sqrt(np.mean(effort**2, 0))
     columns = np.sqrt(np.mean(table**2, 0))

@@ -63,7 +63,7 @@ class Motion:
         return self.q, self.qd, self.qdd
 
     def part(self, rows: slice | Mask) -> Motion:
-        """Some of the rows."""
+        """Return some of the rows."""
         return Motion(*(one[rows] for one in (*self.joints, self.wrench, self.held)))
 
 
@@ -102,13 +102,13 @@ class Filtering:
 
 
 def rate_noise(how: Filtering, period: float) -> Array:
-    """Standard deviation that the positions' noise leaves in the differentiated rates, (n,)."""
+    """Return the standard deviation that position noise leaves in differentiated rates, (n,)."""
     weights = scipy.signal.savgol_coeffs(how.window, DEGREE, 1, period)
     return np.asarray(np.array(how.position_noise) * np.linalg.norm(weights), np.float64)
 
 
 def choose_window(pieces: list[Array], period: float, noise: Array) -> int:
-    """The window whose accelerations have the least expected error, all joints together."""
+    """Choose the window whose accelerations have the least expected error, over all joints."""
     best, least = WINDOWS[0], np.inf
     for window in WINDOWS:
         if window > min(len(q) for q in pieces) // 4:
@@ -193,7 +193,7 @@ def tracks(
     window: int | None = None, rates: tuple[Array, Array] | None = None,
     least: int = LEAST // 2,
 ) -> tuple[list[Track], Filtering]:  # fmt: skip
-    """A recording as evenly sampled motion, the ends of each piece left out.
+    """Return a recording as evenly sampled motion, without the ends of each piece.
 
     :param wrench: (k, 6), none by default; ``held``: (k,), throughout by default.
     :param window: of the polynomial, samples; None chooses it.
@@ -238,7 +238,7 @@ def tracks(
 
 
 def kept_rows(count: int, period: float, how: Filtering) -> slice:
-    """The samples of so many that are left by :func:`low_pass`."""
+    """Return the slice of samples that :func:`low_pass` keeps."""
     # What the filter makes up at the ends dies out in a period of its cut-off.
     edge = 0 if how.cutoff is None else min(int(1.0 / (how.cutoff * period)), count // 4)
     return slice(edge, count - edge, how.keep_every)
@@ -311,7 +311,7 @@ def huber(away: Array, bound: float = HUBER) -> Array:
 
 
 def passed_band(how: Filtering, rate: float) -> float:
-    """The part of white noise, sampled so many times a second, that the filter passes."""
+    """Return the part of white noise at a sampling rate that the filter passes."""
     return 1.0 if how.cutoff is None else min(1.0, 2.0 * NOISE_BAND * how.cutoff / rate)
 
 
@@ -461,7 +461,7 @@ SHAKEN: Final = 3000
 def shaken_efforts(
     r: Recording, track: Track, how: Filtering, efforts: Callable[[Track], Array]
 ) -> Array:
-    """What noise of the positions, as large as theirs, changes in the efforts, (samples, n).
+    """Return how much noise of the positions changes the efforts, (samples, n).
 
     :param efforts: of a motion, shape (samples, n).
     """
@@ -493,7 +493,7 @@ BLOCKS: Final = 400
 def held_payload(
     time: Array, column: Array, residual: Array, weight: Array
 ) -> tuple[float, list[tuple[float, float]], Mask]:
-    """The mass that explains most of a residual while it is held, and when that is.
+    """Find the mass that explains most of a residual while it is held, and when that is.
 
     The block of times that explains most gives the mass; it is held where more than half of it is
     seen, and from the samples on, and until those, that separate both best.

@@ -73,7 +73,7 @@ Errors = list[tuple[Suspect, Array]]
 
 
 def errors_of(rows: Rows, values: Array) -> tuple[Errors, Array]:
-    """The errors that every robot and recording may have, at a recording's rows.
+    """List the errors that every robot and recording may have, at a recording's rows.
 
     And what the differentiation misses, joint by joint, (k, n, n).
 
@@ -126,7 +126,7 @@ def errors_of(rows: Rows, values: Array) -> tuple[Errors, Array]:
 
 
 def lengths_of(robot: Robot) -> Array:
-    """A radian of the joints that turn, the machine's size of those that slide, (n,)."""
+    """Return a radian for joints that turn, the machine's size for those that slide, (n,)."""
     return np.array([robot.size if unit == "m" else 1.0 for unit in robot.joint_units])
 
 
@@ -174,7 +174,7 @@ class Lengths:
         return cls(tuple(one for one, _ in causes), paths, mixing)
 
     def columns(self, rows: Rows, values: Array) -> Array:
-        """Derivatives of the measured efforts at a recording's rows, shape (k, n, suspects).
+        """Differentiate the measured efforts at a recording's rows, shape (k, n, suspects).
 
         :param values: of all parameters of the file.
         """
@@ -202,7 +202,7 @@ class Lengths:
 
 
 def _weighing(robot: Robot, parameters: FileParameters, values: Array, loaded: bool) -> Robot:
-    """The robot with fitted masses, its geometry as it is."""
+    """Return the robot with fitted masses, its geometry as it is."""
     numbers: dict[str, float] = {}
     for where, group in zip(parameters.slices, parameters.groups, strict=True):
         if group.kind == "inertia" or (loaded and group.kind == "payload"):

@@ -123,7 +123,7 @@ class _Numbers:
         return cls(graph, names, scales, points, axes, origin)
 
     def vector(self, moves: Sequence[tuple[NDArray[np.int64], Array]]) -> Array:
-        """Changes (3,) of numbers at places (3,), over their scales; zero where one is missing."""
+        """Return changes (3,) of numbers over their scales; zero where one is missing."""
         found = np.zeros(len(self.names))
         for places, change in moves:
             for place, value in zip(places.tolist(), change.tolist(), strict=True):
@@ -132,7 +132,7 @@ class _Numbers:
         return found
 
     def bodies(self, point: tuple[str, int]) -> tuple[str, ...]:
-        """That a point belongs to: both of a joint's, one of a rod's end."""
+        """List the bodies a point belongs to: both of a joint's, one of a rod's end."""
         name, end = point
         if name in self.graph.joints:
             joint = self.graph.joints[name]
@@ -246,7 +246,7 @@ def undetermined(graph: Graph, names: Sequence[str], scales: Array, directions: 
 
 
 def _joined(found: dict[tuple[str, str], list[str]]) -> Iterator[str]:
-    """A sentence for each kind; such as differ by the axis alone are one."""
+    """Write a sentence for each kind; those that differ by the axis alone are one."""
     merged: dict[tuple[str, tuple[str, ...]], list[str]] = {}
     for (kind, axis), items in found.items():
         merged.setdefault((kind, tuple(dict.fromkeys(items))), []).append(axis)
@@ -255,7 +255,7 @@ def _joined(found: dict[tuple[str, str], list[str]]) -> Iterator[str]:
 
 
 def _combinations(names: Sequence[str], left: Array) -> Iterator[str]:
-    """What no change names."""
+    """Describe combinations of numbers that no named change explains."""
     for vector in left.T:
         shown = _greatest(names, np.abs(vector))
         if len(shown) > FEW:
