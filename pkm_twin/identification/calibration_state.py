@@ -37,8 +37,10 @@ def rotations() -> Any:
 
 @dataclass(frozen=True)
 class Poses:
-    """Measured poses: joints (k, n) in the controller's numbers; positions (k, 3), m; rotations
-    from home (k, 3, 3), None where only positions were measured.
+    """Measured poses.
+
+    Joints (k, n) in the controller's numbers; positions (k, 3), m; rotations from home (k, 3, 3),
+    None where only positions were measured.
     """
 
     joints: Array

@@ -99,14 +99,14 @@ def agrees(r: Recording, without: Mask, bound: float) -> bool:
 
 
 def cause_of(r: Recording, c: Compared, left_out: Mask) -> Cause | None:
-    """The first thing that makes the efforts agree; None where there is none."""
+    """Find the first cause that makes the efforts agree; None where there is none."""
     turned = (Cause(text, replace(r, wrench=w), left_out, 1.0) for text, w in wrenches(r))
     found = chain(turned, _of_efforts(r, c, left_out))
     return next((cause for cause in found if cause.agrees(c.bound)), None)
 
 
 def payload_hint(r: Recording, c: Compared) -> str:
-    """The payload that most of a residual within its bound is of, in words; empty: none is."""
+    """Describe the payload behind most of a residual within its bound; empty: there is none."""
     if r.load is not None or r.robot.redundant:
         return ""
     numbers = _Numbers(r, c)
@@ -119,7 +119,7 @@ def payload_hint(r: Recording, c: Compared) -> str:
 
 
 def number_that_explains(r: Recording) -> Cause | None:
-    """What `cause_of` finds of efforts alone; without words where they agree as they are.
+    """Find what `cause_of` finds from efforts alone; no words where they agree as they are.
 
     None where nothing makes them agree.
     """
@@ -137,7 +137,7 @@ def number_that_explains(r: Recording) -> Cause | None:
 
 
 def _of_efforts(r: Recording, c: Compared, left_out: Mask) -> Iterator[Cause]:
-    """The signs of efforts that oppose the expected ones, one number or two; or both."""
+    """Find signs of efforts that oppose the expected ones, one or two numbers; or both."""
     opposed = ~c.good & (np.sum(c.measured * c.expected, 0) < 0.0)
     if not opposed.any():
         yield from _number_of(r, c, left_out)
@@ -154,7 +154,7 @@ def _of_efforts(r: Recording, c: Compared, left_out: Mask) -> Iterator[Cause]:
 
 
 def _number_of(r: Recording, c: Compared, left_out: Mask) -> Iterator[Cause]:
-    """The number that leaves least of the residual: a scale or a payload; then both together.
+    """Find the number that leaves least of the residual: scale or payload; then both together.
 
     Two, or a payload with its times, come first where they leave clearly less.
     """
@@ -215,7 +215,7 @@ class _Numbers:
         return other - least > chance and other - noise > times * (least - noise)
 
     def solved(self, *columns: Array, some: Mask | None = None) -> tuple[list[float], float]:
-        """The factors on columns (k, n), then the delay, s; the mean square that remains."""
+        """Return the factors of columns (k, n), then the delay, s; also the mean square left."""
         used = self.used if some is None else self.used & some[:, None]
         table = np.stack([*columns, self.c.change, self.c.residual], -1) / self.c.limit[:, None]
         table = table[used]
@@ -224,18 +224,18 @@ class _Numbers:
         return sizes.tolist(), float(left) / max(len(table), 1)
 
     def efforts(self, function: Callable[..., Array]) -> Array:
-        """A function of the robot and the recorded motion, in its band, (k, n)."""
+        """Evaluate a function of the robot and the recorded motion, in its band, (k, n)."""
         r, tracks = self.r, self.c.tracks
         return self.c.filtered([by_held(r, function, t.time, *t.joints, t.wrench) for t in tracks])
 
     def scales(self) -> Iterator[_Found]:
-        """The scale of the efforts of all drives, and of each."""
+        """Estimate the scale of the efforts of all drives, and of each."""
         for names, which in self.drives:
             (size, _), left = self.solved(which * self.c.expected)
             yield _Found(left, names, which, 1.0 + size)
 
     def payloads(self) -> Iterator[_Found]:
-        """A payload, throughout or at times, alone and with a scale that is not usual."""
+        """Estimate a payload, throughout or at times, alone and with an unusual scale."""
         c, kilogram = self.c, self.efforts(_kilogram)
         alone = ("", 0.0 * self.drives[0][1])
         mass = size = late = left = 0.0
@@ -260,7 +260,7 @@ class _Numbers:
                 yield _Found(left, names, which, scale, mass, spans)
 
     def causes(self, one: _Found, found: Sequence[_Found], left_out: Mask) -> Iterator[Cause]:
-        """What was found, in words; with a scale of all drives also what explains as much."""
+        """Describe what was found; with a scale of all drives also what explains as much."""
         r, whole, others = self.r, found[0], list[str]()
         load = next((each for each in found if each.mass and each.count == 1), None)
         if one is load and not usual(whole.scale) and not self.clear(one.left, whole.left, ALIKE):
@@ -295,14 +295,14 @@ def _kilogram(robot: Robot, *motion: Array) -> Array:
 
 
 def _payload_text(robot: Robot, more: float) -> str:
-    """The file's payload with so many kilograms more; the estimate assumes its centre."""
+    """Describe the file's payload with more mass, kg; the estimate assumes its centre."""
     com = robot.payload.com
     at = ", ".join(f"{v:g}" for v in com) + " m" if np.any(com) else "the reference point"
     return f"a payload of {robot.payload.mass + more:.3g} kg with its centre at {at}"
 
 
 def _payload(r: Recording, c: Compared, left_out: Mask, found: _Found) -> Iterator[Cause]:
-    """A payload that is held at some times, or all the time."""
+    """Describe a payload that is held at some times, or all the time."""
     if len(found.spans) > SPANS:
         return
     times = found.spans

@@ -313,7 +313,7 @@ def _singularity(r: Recording) -> Fact:
 
 
 def _shares(r: Recording, idle: Mask, compared: Compared | None) -> tuple[list[Fact], str]:
-    """What is left out, and why there is no verdict, if there is none."""
+    """State what is left out, and why there is no verdict, if there is none."""
     items, total = [], max(float(r.time[-1]), 1e-9)
     used = 0 if compared is None else sum(len(track.time) for track in compared.tracks)
     share = used / len(r.time)

@@ -178,7 +178,7 @@ class Compared:
 
 
 def by_held(r: Recording, function: Callable[..., Array], time: Array, *motion: Array) -> Array:
-    """A function of the robot, with its payload while it is held, and of a motion, shape (k, n)."""
+    """Evaluate a function of the robot, loaded while it holds its payload, and a motion, (k, n)."""
     parts = by_load(r.robot, r.load, time, BLOCK)
     return np.concatenate([function(robot, *(v[rows] for v in motion)) for robot, rows in parts])
 

@@ -149,8 +149,9 @@ def _factor(
     scaled: Array, residual: Array, counts: Array, noise: Array, values: Array, vectors: Array,
     kept: Any,
 ) -> Array:  # fmt: skip
-    """Of the scaled parameters' covariance F F^T: the data's, by the residual's own
-    autocorrelation, then the prior's, shape (k, k).
+    """Return the factor F of the scaled parameters' covariance F F^T, shape (k, k).
+
+    It holds the data's part, by the residual's own autocorrelation, then the prior's.
 
     Filtered samples are not independent: the residual's covariance over time, also of two joints,
     stands between the two halves of the sandwich.

@@ -23,8 +23,10 @@ MIN_SINE: Final = 0.5
 
 
 class LineSlopes(NamedTuple):
-    """Derivatives of distances of poses, over their length, (d, p), and of angles at one pose
-    between the lines to two others, rad, (a, p).
+    """Derivatives of distances and angles between poses by parameters.
+
+    Distances of two poses, over their length, (d, p); angles at one pose between the lines to two
+    others, rad, (a, p).
     """
 
     distances: Array

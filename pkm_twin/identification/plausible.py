@@ -129,11 +129,11 @@ class Case:
         return float(np.median(np.diff(self.time)))
 
     def backwards(self) -> Case:
-        """The same with time reversed: friction helps the motion."""
+        """Return the case with time reversed: friction helps the motion."""
         return replace(self, columns=np.where(self.friction, -1.0, 1.0) * self.columns)
 
     def faster(self, rate: float) -> Case:
-        """The same where time runs so many times as fast as recorded."""
+        """Return the case with time that runs faster than recorded by a factor."""
         extra = 0.0 if self.inertial is None else (rate**2 - 1.0) * self.inertial
         return replace(self, columns=self.columns + extra)
 
@@ -155,7 +155,7 @@ class Case:
         )  # fmt: skip
 
     def scaled(self, factors: Array) -> Case:
-        """The same with each joint's efforts times a factor, (n,)."""
+        """Return the case with each joint's efforts times a factor, (n,)."""
         r, size = self.reduced, np.abs(factors) * self.variation
         return replace(r, effort=factors * r.effort, late=factors * r.late, variation=size)
 
@@ -169,13 +169,13 @@ class Case:
         return self._solved(none, self.effort, self.variation)
 
     def missed(self) -> Array:
-        """What the best of these machines leaves of the efforts, by their variation, (k, n)."""
+        """Return the efforts the best machine does not explain, over their variation, (k, n)."""
         x = self._best[1]
         told = self.rest + self.columns @ x[:-1] - x[-1] * self.late
         return np.asarray(self.counts * (self.effort - told) / self.variation, np.float64)
 
     def loaded_in_part(self) -> tuple[str, Case]:
-        """The same with the payload on the platform only while the efforts ask for one; in words.
+        """Return the case loaded only while the efforts ask for it, and those times in words.
 
         Of the best machine's numbers those of the payload are left out.
         """
@@ -254,7 +254,7 @@ class Score:
 
     @classmethod
     def of(cls, left: float) -> Score:
-        """The score of a residual, without a price."""
+        """Return the score of a residual, without a price."""
         return cls(left, float(INDEPENDENT * np.log(left**2 + GOOD**2)))
 
 
@@ -387,7 +387,7 @@ def _repaired(rows: Rows, some: slice, wide: bool) -> Iterator[tuple[str, Case |
 
 
 def _again(rows: Rows, some: slice, **changes: Any) -> Case | None:
-    """Some samples of a recording with changes; None where the machine cannot move so."""
+    """Return some samples of a changed recording; None where the machine cannot move so."""
     model = rows.model
     try:
         made = rows_of(model.robot, model.parameters, replace(rows.recording, **changes).part(some))
@@ -405,7 +405,7 @@ def _worst(case: Case, duration: float) -> float:
 
 
 def case_of(rows: Rows, inertial: Array | None = None) -> Case:
-    """The machines that may have made a recording, around the robot's file.
+    """Return the machines that may have made a recording, around the robot's file.
 
     :param inertial: the part of the rows' table that grows with the square of the rate of time.
     """
@@ -457,7 +457,7 @@ def case_of(rows: Rows, inertial: Array | None = None) -> Case:
 
 
 def _variation(effort: Array) -> Array:
-    """Standard deviation of efforts, shape (n,)."""
+    """Return the standard deviation of efforts, shape (n,)."""
     return np.asarray(np.maximum(np.std(effort, 0), 1e-300), np.float64)
 
 

@@ -36,7 +36,7 @@ def name(ax, place, text, side):
 
 
 def draw(path):
-    """The pose places the platform; the reach meets its distance; then the turn brings J."""
+    """Draw three steps: the pose places the platform, the reach meets its distance, J follows."""
     robot = load("five_bar")
     joints, plane = robot.graph.joints, np.array([0, 2])
     motor, elbow, tip = (joints[n].at[plane] for n in ("left", "elbow_left", "tip"))
