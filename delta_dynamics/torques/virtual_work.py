@@ -17,6 +17,7 @@ from pkm_twin.codegen.expressions import PARAMETERS, Numbers, Objects
 from pkm_twin.codegen.kernels import BoundCall, Kernel
 from pkm_twin.codegen.operations import absolute, maximum, minimum, sign
 from pkm_twin.codegen.program import Program
+from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.motion import BaseMotion, Motion, cross
 from pkm_twin.kinematics.stream import following
 from pkm_twin.kinematics.traced import Traced
@@ -38,7 +39,7 @@ def inverse_dynamics(
     wrench: ArrayLike | None = None,
     base: ArrayLike | None = None,
 ) -> Array:
-    """Actuator efforts for a motion, exact rigid-body dynamics.
+    """Compute the actuator efforts of a motion by exact rigid-body dynamics.
 
     tau = sum over bodies of Jv' m (a - g) + Jw' (I alpha + omega x I omega), less J' wrench, plus
     friction: the principle of virtual work (Delta-CU paper, step 4, equations 22 and 23).
@@ -61,6 +62,8 @@ def inverse_dynamics(
     """
     load = _NO_WRENCH if wrench is None else wrench
     if base is not None:
+        if not np.isfinite(base).all():
+            raise ParameterError("base", "a value that is not finite", "finite numbers")
         return robot.bound(moving_torques, robot.inertial)(q, qd, qdd, load, base)
     # Without a call where it is made: a stream's sample takes a microsecond or two.
     call = robot.calls.get(torques) or robot.bound(torques, robot.inertial)

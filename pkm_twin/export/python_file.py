@@ -58,7 +58,8 @@ Joints: {joints}.
 Pose: {pose}.
 SI units, base axes, z up. Where the mask is false, results are NaN: there is no assembly, or a
 singularity, an input is not finite, or the state is farther from home than MORE_STEPS reach.
-Inputs are float64 or float32 arrays of one type.
+Inputs are float64 or float32 arrays of one type. In float32 the mask of `inverse` and of
+`joint_to_actuator` is false at some reachable poses far from home: they are confirmed to 1e-7.
 """
 
 {imports}

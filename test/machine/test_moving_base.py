@@ -10,6 +10,7 @@ import pytest
 from delta_dynamics import inverse_dynamics
 from pkm_twin.certify.description import expand
 from pkm_twin.certify.maximal import Maximal, random_states, rotation_of
+from pkm_twin.errors import ParameterError
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from test.machine.random_machines import plain, variant
 from test.support.robots import load
@@ -107,3 +108,12 @@ def test_a_tilted_base_at_rest_is_tilted_gravity():
     )
     with pytest.raises(ValueError, match="9"):
         inverse_dynamics(robot, q, still, still, base=base[:6])
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_motion_of_the_base_that_is_not_finite_is_rejected_by_name(value):
+    robot = load("delta")
+    still = np.zeros(3)
+    with pytest.raises(ParameterError) as error:
+        inverse_dynamics(robot, still, still, still, base=[0.0] * 8 + [value])
+    assert error.value.field == "base"
