@@ -29,6 +29,7 @@ from pkm_twin.codegen.program import (
 )
 from pkm_twin.export.c99 import Folding, Routine
 from pkm_twin.export.c_package import Package
+from pkm_twin.kinematics.programs import SAME_POSE
 from pkm_twin.robot.robot import Robot
 
 FUNCTIONS: Final = (
@@ -58,8 +59,7 @@ Joints: {joints}.
 Pose: {pose}.
 SI units, base axes, z up. Where the mask is false, results are NaN: there is no assembly, or a
 singularity, an input is not finite, or the state is farther from home than MORE_STEPS reach.
-Inputs are float64 or float32 arrays of one type. In float32 the mask of `inverse` and of
-`joint_to_actuator` is false at some reachable poses far from home: they are confirmed to 1e-7.
+Inputs are float64 or float32 arrays of one type.
 """
 
 {imports}
@@ -143,6 +143,8 @@ def _call(inputs, equations, results, sizes):
         name: [row[..., k] + zero for k in range(row.shape[-1])] for name, row in inputs.items()
     }}
     rounding = float(xp.finfo(zero.dtype).eps)
+    # Rounding of two solutions of one state may be larger than the margins in double precision.
+    margin = min(0.0, {SAME_POSE!r} - 1e2 * rounding)
     closed, residual = max({CLOSED!r}, rounding**0.5) ** 2, max({RESIDUAL!r}, 1e3 * rounding) ** 2
     for target, goal, unknowns, home, origin, start, onward, correct, certain in equations:
         if goal is not None:
@@ -197,7 +199,7 @@ def _call(inputs, equations, results, sizes):
     for value in judged[: len(equations)]:
         valid = valid & (value < residual)
     for value in judged[len(equations) :]:
-        valid = valid & (value > 0.0)
+        valid = valid & (value > margin)
     valid = valid & (0.0 * sum(found) == 0.0)
     rows = []
     for size in sizes:

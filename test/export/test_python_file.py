@@ -86,6 +86,20 @@ def test_single_precision_is_kept(library, tmp_path):
         assert np.abs(found - right).max() < 1e-4 * np.abs(right).max(), function
 
 
+def test_single_precision_confirms_the_poses_of_double_precision(tmp_path):
+    robot = load("examples/humanoid.xml", base="shank", platform="foot")
+    made = Made(robot, "numpy", tmp_path)
+    rng = np.random.default_rng(3)
+    poses = rng.uniform([-0.8, -1.0], [0.8, 1.0], (1000, 2)).astype(np.float32)
+    right, reached = made.call("inverse", poses)
+    found, valid = made.call("inverse", poses, kind=np.float32)
+    assert np.sum(~reached) > 0
+    assert np.mean(valid[reached]) > 0.995
+    assert np.mean(valid[~reached]) < 0.005
+    both = valid & reached
+    assert np.median(np.abs(found - right)[both]) < 1e-5
+
+
 @LIBRARY
 def test_what_is_out_of_reach_or_not_finite_is_masked(library, tmp_path):
     robot = robot_of("five_bar")
