@@ -214,16 +214,11 @@ class LimbPose:
         v = snapped_all(link.axes.T @ (point - link.at))
         home = snapped_all(parent.T @ (goal - link.at))
         if step.circle:
-            # a cos + c sin = d, of the turn from home.
             w, w_home = step.before.T @ local, step.before.T @ home
             a, c = v[0] * w[0] + v[1] * w[1], v[0] * w[1] - v[1] * w[0]
             c_home = v[0] * w_home[1] - v[1] * w_home[0]
             d = 0.5 * (square_of(v[:2]) + square_of(w[:2]) + (v[2] - w[2]) ** 2 - square)
-            n = a * a + c * c
-            d, root = self._meet(d, n, square)
-            side = -sign_of(c_home) * root
-            self.x[step.position] = (a * d - c * side) / n
-            self.x[step.position + 1] = step.sign * ((c * d + a * side) / n)
+            root, side = self._turn_to(step, a, c, d, c_home, square)
             scale = sqrt(square_of(v[:2]) * square_of(w_home[:2]))
             self.slope = step.sign * side
         else:
@@ -241,6 +236,21 @@ class LimbPose:
             self.x[step.position] = (self.slope - h) / length
             scale = sqrt(square_of(d_home) * length)
         self.slopes.append((root, scale))
+
+    def _turn_to(
+        self, step: Step, a: Any, b: Any, d: Any, b_home: Any, square: Any
+    ) -> tuple[Any, Any]:
+        """Turn a step from home until a cos + b sin = d, on the side where home is.
+
+        :param b_home: b at home, where the turn is none. ``square``: as of :meth:`_meet`.
+        :returns: the root sqrt(a^2 + b^2 - d^2), and a sin - b cos: the root with its sign.
+        """
+        n = a * a + b * b
+        d, root = self._meet(d, n, square)
+        side = -sign_of(b_home) * root
+        self.x[step.position] = (a * d - b * side) / n
+        self.x[step.position + 1] = step.sign * ((b * d + a * side) / n)
+        return root, side
 
     def _meet(self, d: Any, n: Any, square: Any) -> tuple[Any, Any]:
         """Return d and sqrt(n - d^2), of a turn that is to bring a cos + c sin to d.
@@ -276,12 +286,9 @@ class LimbPose:
         m = second.before[2]
         a, b = m[0] * x + m[1] * y, m[1] * x - m[0] * y
         c = towards[2] - m[2] * z
-        square = a * a + b * b
-        c, root = self._meet(c, square, 0.0)
-        # At home the turn is none, and the root is the size of what stands here for b.
-        side = -sign_of(m[1] * home[0] - m[0] * home[1]) * root
-        cosine, sine = (a * c - b * side) / square, (b * c + a * side) / square
-        self.x[second.position], self.x[second.position + 1] = cosine, second.sign * sine
+        root, _ = self._turn_to(second, a, b, c, m[1] * home[0] - m[0] * home[1], 0.0)
+        cosine = self.x[second.position]
+        sine = second.sign * self.x[second.position + 1]
         turned = [cosine * x - sine * y, sine * x + cosine * y, z]
         self._turn(first, towards, second.before @ np.array(turned, dtype=object))
         self.slopes.append((root, sqrt(square_of(lever))))
@@ -293,7 +300,6 @@ class LimbPose:
         mine, other = held.inner, held.outer
         if limb.tip == joint.outer:
             mine, other = other, mine
-        # a cos + b sin = d, of the turn from home.
         v = snapped_all(link.axes.T @ mine)
         u = step.before.T @ (
             self.motion.rotation[link.parent].T @ self.motion.direction(limb.beyond, other)
@@ -301,11 +307,7 @@ class LimbPose:
         home = snapped_all(step.before.T @ (self.tree.axes[link.parent].T @ other))
         a, b = v[0] * u[0] + v[1] * u[1], v[0] * u[1] - v[1] * u[0]
         d = snapped(mine @ other) - v[2] * u[2]
-        n = a * a + b * b
-        d, root = self._meet(d, n, 0.0)
-        side = -sign_of(v[0] * home[1] - v[1] * home[0]) * root
-        self.x[step.position] = (a * d - b * side) / n
-        self.x[step.position + 1] = step.sign * ((b * d + a * side) / n)
+        root, _ = self._turn_to(step, a, b, d, v[0] * home[1] - v[1] * home[0], 0.0)
         self.slopes.append((root, 1.0))
 
     def _distance(
