@@ -17,7 +17,6 @@ from pkm_twin.codegen.expressions import PARAMETERS, Numbers, Objects
 from pkm_twin.codegen.kernels import BoundCall, Kernel
 from pkm_twin.codegen.operations import absolute, maximum, minimum, sign
 from pkm_twin.codegen.program import Program
-from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.motion import BaseMotion, Motion, cross
 from pkm_twin.kinematics.stream import following
 from pkm_twin.kinematics.traced import Traced
@@ -62,8 +61,6 @@ def inverse_dynamics(
     """
     load = _NO_WRENCH if wrench is None else wrench
     if base is not None:
-        if not np.isfinite(base).all():
-            raise ParameterError("base", "a value that is not finite", "finite numbers")
         return robot.bound(moving_torques, robot.inertial)(q, qd, qdd, load, base)
     # Without a call where it is made: a stream's sample takes a microsecond or two.
     call = robot.calls.get(torques) or robot.bound(torques, robot.inertial)

@@ -36,6 +36,9 @@ FAR: Final = 10.0
 SINGULARITY_BOUND: Final = 1e-9
 """Least singularity index (0 singular, 1 best) at which a Jacobian is inverted."""
 
+JOINT_STATE: Final = ("q", "qd", "qdd")
+"""Inputs of programs that are a joint state; others are named in errors."""
+
 _NONE: Final = np.zeros(0)
 
 
@@ -451,7 +454,10 @@ class Robot(Mechanism):
             array = np.asarray(value, float)
             given[name] = np.broadcast_to(array, (*batch, array.shape[-1]))[index]
             if not np.isfinite(given[name]).all():
-                raise _not_finite("joint state", index)
+                if name in JOINT_STATE:
+                    raise _not_finite("joint state", index)
+                field = f"{name}{_at_sample(index)}"
+                raise ParameterError(field, given[name].tolist(), "finite numbers")
         code, reached = status[index].tolist()
         if code == NOT_FINITE:
             raise _not_finite("joint state", index)
@@ -543,5 +549,9 @@ def _first(codes: Array) -> tuple[int, ...] | None:
 
 
 def _not_finite(what: str, index: tuple[int, ...]) -> ValueError:
-    where = f" at sample {index}" if index else ""
-    return ValueError(f"{what}{where} is not finite, or leads to a result that is not")
+    text = f"{what}{_at_sample(index)} is not finite, or leads to a result that is not"
+    return ValueError(text)
+
+
+def _at_sample(index: tuple[int, ...]) -> str:
+    return f" at sample {index}" if index else ""
