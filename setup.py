@@ -48,9 +48,7 @@ setup(
         (f"share/{NAME}/config/drives", sorted(glob("config/drives/*.yaml"))),
         (
             f"share/{NAME}/examples",
-            sorted(
-                n for end in ("py", "md", "ipynb", "cfg", "xml") for n in glob(f"examples/*.{end}")
-            ),
+            sorted(n for end in ("py", "md", "ipynb", "cfg", "xml") for n in glob(f"examples/*.{end}")),
         ),
         (f"share/{NAME}/examples/machines", sorted(glob("examples/machines/*.*"))),
         (f"share/{NAME}/examples/machines/hexapod", sorted(glob("examples/machines/hexapod/*"))),

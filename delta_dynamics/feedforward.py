@@ -51,13 +51,12 @@ class Settings:
     """How the node answers; the robot's own values are in the robot."""
 
     differentiate: bool = setting(
-        False, "for messages without velocities or accelerations: trajectory rejects them, "
-        "differentiate computes them",
-        name="acceleration", choices={"trajectory": False, "differentiate": True},
-    )  # fmt: skip
-    order: int = setting(
-        2, "polynomial degree of the velocity", name="differentiator.order", low=1, high=4
+        False,
+        "for messages without velocities or accelerations: trajectory rejects them, differentiate computes them",
+        name="acceleration",
+        choices={"trajectory": False, "differentiate": True},
     )
+    order: int = setting(2, "polynomial degree of the velocity", name="differentiator.order", low=1, high=4)
     window: int = setting(
         25,
         "samples in the window; below 1 kHz fewer, so that it spans at most this number of ms (24 "
@@ -67,9 +66,10 @@ class Settings:
         high=1000,
     )
     limit_policy: LimitPolicy = setting(
-        "warn", "efforts beyond effort_limits: warn publishes, reject rejects, clamp limits them",
+        "warn",
+        "efforts beyond effort_limits: warn publishes, reject rejects, clamp limits them",
         choices=("warn", "reject", "clamp"),
-    )  # fmt: skip
+    )
     stale_after: float = setting(
         0.1,
         "largest age of a joint state, and longest gap before the stream stops; also lifespan and "
@@ -81,10 +81,10 @@ class Settings:
     trip_count: int = setting(5, "rejected joint states in a row that stop the stream", **COUNT)
     recovery_count: int = setting(5, "accepted joint states in a row that restart it", **COUNT)
     extra_joints: ExtraJoints = setting(
-        "refuse", "joints of a trajectory that the model does not have: reject the trajectory, or "
-        "give them zero effort",
+        "refuse",
+        "joints of a trajectory that the model does not have: reject the trajectory, or give them zero effort",
         choices=("refuse", "zero"),
-    )  # fmt: skip
+    )
     on_stop: OnStop = setting(
         "nothing",
         "command sent once when the stream stops: nothing, zeros, or gravity (the effort against "
@@ -103,9 +103,7 @@ class Settings:
                 f"at least singularity_stop, {self.singularity_stop:g}",
             )
         if not self.order + 2 <= self.window:
-            raise ParameterError(
-                "differentiator.window", self.window, f"at least order + 2, {self.order + 2}"
-            )
+            raise ParameterError("differentiator.window", self.window, f"at least order + 2, {self.order + 2}")
 
     @property
     def window_time(self) -> float:
@@ -196,9 +194,7 @@ class Feedforward(Core):
         self._reach = friction_reach(self.robot)
         self._take_rules(s)
         self._reader = JointReader(self.robot, extra_joints=s.extra_joints)
-        self._continuity = Continuity(
-            self.robot, s.singularity_warn, s.singularity_stop, self._reader.highest_velocity
-        )
+        self._continuity = Continuity(self.robot, s.singularity_warn, s.singularity_stop, self._reader.highest_velocity)
 
     def change_robot(self, robot: Robot) -> None:
         """Take a robot with another payload, gravity, friction or limits, between two samples."""
@@ -339,15 +335,12 @@ class Feedforward(Core):
         pose = self.pose if self.settings.on_stop == "gravity" else None
         return find_holding_effort(self.limits, pose, steady, self.settings.stale_after, self._pull)
 
-    def _trajectory_steps(
-        self, message: Any, now: int, holding: bool
-    ) -> Generator[None, None, LimitedEfforts]:
+    def _trajectory_steps(self, message: Any, now: int, holding: bool) -> Generator[None, None, LimitedEfforts]:
         robot, settings, reader, limits = self.robot, self.settings, self._reader, self.limits
         if self.base is not None:
             raise MessageError(
                 "base motion",
-                "the motion of the base during a trajectory is unknown; with base_imu only joint "
-                "states are answered",
+                "the motion of the base during a trajectory is unknown; with base_imu only joint states are answered",
             )
         t = reader.trajectory(message, now)
         yield
@@ -365,9 +358,7 @@ class Feedforward(Core):
             beyond = _evaluate_points(first, partial(first_beyond, actuated=False), robot, q)
             if beyond is not None:
                 where = f"point {first + (beyond.index or 0)}: {beyond.joint}"
-                text = (
-                    f"is {beyond.value:g} {beyond.unit}, allowed {beyond.low:g} to {beyond.high:g}"
-                )
+                text = f"is {beyond.value:g} {beyond.unit}, allowed {beyond.low:g} to {beyond.high:g}"
                 raise MessageError("limit", f"{where} {text}")
             self._check_singularity(_evaluate_points(first, robot.singularity, q), first)
             solved = _evaluate_points(first, inverse_dynamics, robot, q, qd[part], qdd[part])
@@ -430,9 +421,7 @@ class Feedforward(Core):
         silence = sample.stamp - self._last_stamp
         if silence <= 0:
             self.dropped += 1
-            raise MessageError(
-                "stamp order", f"the stamp is {-silence / SECOND:.6f} s before the last"
-            )
+            raise MessageError("stamp order", f"the stamp is {-silence / SECOND:.6f} s before the last")
         if sample.qd is None and not self.settings.differentiate:
             raise MessageError(
                 "no velocities",
@@ -464,14 +453,10 @@ class Feedforward(Core):
                 if self.wrenches is not None:
                     external, measured = self.wrenches.through()
                 motion, sure, change = as_message_error(self._resolve_motion, sample, rates, doubt)
-                solved = as_message_error(
-                    inverse_dynamics, self.robot, sample.q, sure, change, external, base
-                )
+                solved = as_message_error(inverse_dynamics, self.robot, sample.q, sure, change, external, base)
                 memory, added = self._remembered(sample.q, sure)
                 controller, effort = self.robot.controller, solved + added
-                sent, saturated = self.limits.apply(
-                    controller.controller_efforts(effort), self.settings.limit_policy
-                )
+                sent, saturated = self.limits.apply(controller.controller_efforts(effort), self.settings.limit_policy)
                 if saturated:
                     effort = controller.efforts(sent)
         except MessageError:
@@ -491,9 +476,7 @@ class Feedforward(Core):
         if rates is None:
             return None
         self._last_good, self._memory = sample.q, memory
-        return Torques(
-            sample.stamp, motion, effort, sent, measured, saturated, external, doubt, added
-        )
+        return Torques(sample.stamp, motion, effort, sent, measured, saturated, external, doubt, added)
 
     def _remembered(self, q: Array, rates: Array) -> tuple[Memory | None, Array | float]:
         """Friction's memory with a sample more, and what it adds to the efforts, (n,)."""
@@ -584,9 +567,7 @@ def _derivatives(t: Trajectory, differentiate: bool) -> tuple[Array, Array]:
     """
     for what, values in (("velocities", t.qd), ("accelerations", t.qdd)):
         if values is None and not differentiate:
-            raise MessageError(
-                f"no {what}", f"the points carry no {what}; set acceleration to differentiate"
-            )
+            raise MessageError(f"no {what}", f"the points carry no {what}; set acceleration to differentiate")
     if (t.qd is None or t.qdd is None) and len(t.times) < 3:
         raise MessageError("too short", f"{len(t.times)} points; 3 to differentiate")
     qd = np.gradient(t.q, t.times, axis=0, edge_order=2) if t.qd is None else t.qd

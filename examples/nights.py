@@ -51,8 +51,7 @@ def night(
     time, q, qd, qdd = motion()
     real = robot.changed(payload={"mass": mass}, friction={"viscous": viscous, "coulomb": coulomb})
     effort = inverse_dynamics(real, q, qd, qdd) + rng.normal(0.0, 0.02, q.shape)
-    names = [f"{j}.{w}" for w in ("position", "velocity", "acceleration", "measured")
-             for j in robot.joint_names]  # fmt: skip
+    names = [f"{j}.{w}" for w in ("position", "velocity", "acceleration", "measured") for j in robot.joint_names]
     table = np.column_stack([time, q, qd, qdd, effort])
     np.savetxt(path, table, delimiter=",", header=",".join(["time", *names]), comments="")
     return path

@@ -77,9 +77,7 @@ class RailDelta(Robot):
         g, m = self.geometry, self.inertia
         drop = np.sqrt(g.rod_length**2 - (g.carriage_radius - g.platform_radius) ** 2)
         platform = -drop * UP
-        bodies = {
-            "platform": Body("platform", m.platform_mass, array(platform), m.platform_inertia)
-        }
+        bodies = {"platform": Body("platform", m.platform_mass, array(platform), m.platform_inertia)}
         joints, rods = {}, {}
         for i, (out, along) in enumerate(self.limbs(), 1):
             ball = g.carriage_radius * out

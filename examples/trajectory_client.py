@@ -36,9 +36,7 @@ def trajectory(names, times, q, qd, qdd):
     """A message with a zero stamp: it starts on receipt."""
     rows = zip(times, q.tolist(), qd.tolist(), qdd.tolist(), strict=True)
     points = [
-        JointTrajectoryPoint(
-            positions=p, velocities=v, accelerations=a, time_from_start=Duration(seconds=t).to_msg()
-        )
+        JointTrajectoryPoint(positions=p, velocities=v, accelerations=a, time_from_start=Duration(seconds=t).to_msg())
         for t, p, v, a in rows
     ]
     return JointTrajectory(joint_names=list(names), points=points)
@@ -90,8 +88,7 @@ class Client(Node):
             return False
         q, first = (positions(self.states[i], names) for i in (-1, 0))
         return abs(q - goal).max() < 0.01 * max(abs(goal - first).max(), 1e-6) and (
-            len(self.states) > 20
-            and abs(q - positions(self.states[-20], names)).max() < 1e-4 * abs(goal - first).max()
+            len(self.states) > 20 and abs(q - positions(self.states[-20], names)).max() < 1e-4 * abs(goal - first).max()
         )
 
     def until(self, condition, patience, what, again=None):

@@ -125,8 +125,7 @@ def control(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     gains = settings.get("gains", {})
     loose = [joint for joint, gain in gains.items() if not gain.get("p")]
     warning = (
-        f"{holding} has no gain for {', '.join(loose)}: the machine is carried and not held in "
-        "place; see bandwidth:=HZ"
+        f"{holding} has no gain for {', '.join(loose)}: the machine is carried and not held in place; see bandwidth:=HZ"
     )
     known = sections.get(f"{space}/controller_manager", {}).get("ros__parameters", {})
     # A controller is not activated before what it falls back to is configured.
@@ -152,10 +151,7 @@ def control(context: LaunchContext) -> list[LaunchDescriptionEntity]:
             output="screen",
             on_exit=_end_launch,
         ),
-        *(
-            RegisterEventHandler(OnProcessExit(target_action=one, on_exit=[after]))
-            for one, after in pairwise(spawners)
-        ),
+        *(RegisterEventHandler(OnProcessExit(target_action=one, on_exit=[after])) for one, after in pairwise(spawners)),
         spawners[0],
         *([] if plugin else _twin(given, controller)),
     ]
@@ -231,8 +227,7 @@ def _controllers(given: dict[str, str], space: str) -> dict[str, dict[str, dict[
         raise RuntimeError(f"bandwidth {given['bandwidth']!r}: {error}") from None
     path = Path(given["controllers"] or _settings_file(given, robot))
     sections = {
-        name.removeprefix("/**/"): section
-        for name, section in yaml.safe_load(path.read_text(encoding="utf-8")).items()
+        name.removeprefix("/**/"): section for name, section in yaml.safe_load(path.read_text(encoding="utf-8")).items()
     }
     joints = list(robot.controller.names)
     # Efforts of the controller's numbers per the controller's numbers.
@@ -251,9 +246,7 @@ def _controllers(given: dict[str, str], space: str) -> dict[str, dict[str, dict[
             # Copies: the middleware's reader takes no YAML with references.
             parameters["gains"] = {joint: dict(gains.get(joint, each)) for joint in joints}
         if given["bandwidth"] and name == FEEDFORWARD:
-            parameters["gains"] = {
-                joint: {key: gain[key] for key in ("p", "d")} for joint, gain in tuned_gains.items()
-            }
+            parameters["gains"] = {joint: {key: gain[key] for key in ("p", "d")} for joint, gain in tuned_gains.items()}
         elif given["bandwidth"] and name == TRAJECTORIES and FEEDFORWARD not in sections:
             parameters["gains"] = tuned_gains
     return {f"{space}/{name}": section for name, section in sections.items()}

@@ -242,9 +242,7 @@ class _Again:
         self._names, self._given, self._tries = names, given, tries
         self._began = time.monotonic()
 
-    def __call__(
-        self, event: ProcessExited, context: LaunchContext
-    ) -> list[LaunchDescriptionEntity]:
+    def __call__(self, event: ProcessExited, context: LaunchContext) -> list[LaunchDescriptionEntity]:
         names, given = self._names, self._given
         gate = names == [GATE]
         if context.is_shutdown or not (gate or read_flag(given, "respawn")):

@@ -69,9 +69,7 @@ def view(context: LaunchContext) -> list[LaunchDescriptionEntity]:
         raise RuntimeError(f"params_file: {given['params_file']!r} is no file")
     robot = load_robot(given["robot"])
     programs = {"robot_state_publisher": links, "rviz2": rviz}
-    check_executables(
-        [("pkm_twin", "machine_state"), *((name, name) for name, on in programs.items() if on)]
-    )
+    check_executables([("pkm_twin", "machine_state"), *((name, name) for name, on in programs.items() if on)])
     actions: list[LaunchDescriptionEntity] = [
         Node(
             package="pkm_twin",

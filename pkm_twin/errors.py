@@ -119,9 +119,7 @@ MOST_LIMIT: Final = 1e12
 """Least and greatest limit that a machine can have, in any unit."""
 
 
-def check_limit(
-    field: str, value: float, unit: str = "", least: float = LEAST_LIMIT, most: float = MOST_LIMIT
-) -> None:
+def check_limit(field: str, value: float, unit: str = "", least: float = LEAST_LIMIT, most: float = MOST_LIMIT) -> None:
     """Reject a value that no machine has: NaN, or one out of range; by default zero and below too.
 
     :raises ParameterError: by the field.
@@ -142,9 +140,13 @@ def plain_warnings() -> Iterator[None]:
     usual = warnings.showwarning
 
     def show(
-        message: Warning | str, category: type[Warning], filename: str, lineno: int,
-        file: TextIO | None = None, line: str | None = None,
-    ) -> None:  # fmt: skip
+        message: Warning | str,
+        category: type[Warning],
+        filename: str,
+        lineno: int,
+        file: TextIO | None = None,
+        line: str | None = None,
+    ) -> None:
         if issubclass(category, RobotWarning):
             print(one_line(f"warning: {filename}: {message}", 2000), file=file or sys.stderr)
         else:
@@ -218,10 +220,7 @@ class SingularityError(PkmTwinError, ValueError):
         elif reached is None:
             text = f" is singular: reciprocal condition {measure:.3g} is below {bound:.3g}"
         else:
-            text = (
-                " lies beyond a singularity, which the straight path from home meets at "
-                f"{100 * reached:.3g} %"
-            )
+            text = f" lies beyond a singularity, which the straight path from home meets at {100 * reached:.3g} %"
         super().__init__(f"{what}{where}{text}")
         self.reached, self.beyond = reached, beyond
         self.index = index

@@ -43,9 +43,7 @@ class Extensible(Mapping[str, T], Generic[T]):
         """The entry points of other packages."""
         from importlib.metadata import entry_points
 
-        return {
-            one.name: one for one in entry_points(group=self.group) if one.name not in self._own
-        }
+        return {one.name: one for one in entry_points(group=self.group) if one.name not in self._own}
 
     def __getitem__(self, name: str) -> T:
         """Load the object of a name.
@@ -63,9 +61,7 @@ class Extensible(Mapping[str, T], Generic[T]):
         except Exception as error:
             fault = f"{type(error).__name__}: {error}"
         else:
-            if isinstance(found, self.kind) or (
-                isinstance(found, type) and issubclass(found, self.kind)
-            ):
+            if isinstance(found, self.kind) or (isinstance(found, type) and issubclass(found, self.kind)):
                 return self._convert(found)
             fault = f"is a {type(found).__name__}"
         what = f"entry point {self.group}: {point.name} = {point.value}"

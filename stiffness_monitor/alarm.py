@@ -75,17 +75,27 @@ class AlarmSettings:
     """
 
     sigmas: float = setting(
-        6.0, "alarm threshold in standard deviations of model and noise together",
-        name="alarm.sigmas", low=1.0, high=1e3,
-    )  # fmt: skip
+        6.0,
+        "alarm threshold in standard deviations of model and noise together",
+        name="alarm.sigmas",
+        low=1.0,
+        high=1e3,
+    )
     min_departure: float = setting(
-        0.1, "smallest change of an element's compliance factor that raises an alarm",
-        name="alarm.min_departure", low=0.0, high=10.0,
-    )  # fmt: skip
+        0.1,
+        "smallest change of an element's compliance factor that raises an alarm",
+        name="alarm.min_departure",
+        low=0.0,
+        high=10.0,
+    )
     window: float = setting(
-        20.0, "time span of the deflections that are evaluated together",
-        name="alarm.window", unit="s", low=1.0, high=3600.0,
-    )  # fmt: skip
+        20.0,
+        "time span of the deflections that are evaluated together",
+        name="alarm.window",
+        unit="s",
+        low=1.0,
+        high=3600.0,
+    )
     directions: tuple[bool, ...] = (True,) * 6
 
 
@@ -248,10 +258,15 @@ class StiffnessAlarm:
         effects = np.einsum("ijk,j->ik", compliance_effects(self.robot, pose), wrench)
         self._samples.append(
             _Sample(
-                time, response.compliance @ wrench, response.reach, response.rest,
-                response.reach.T @ wrench, effects, deflection,
+                time,
+                response.compliance @ wrench,
+                response.reach,
+                response.rest,
+                response.reach.T @ wrench,
+                effects,
+                deflection,
             )
-        )  # fmt: skip
+        )
         while time - self._samples[0].time > self.settings.window:
             self._samples.popleft()
 
@@ -264,10 +279,7 @@ class StiffnessAlarm:
         if not self._samples:
             return None
         sizes = np.array([np.linalg.norm(sample.moved[:3]) for sample in self._samples])
-        if (
-            int((sizes > LOADED_FRACTION * sizes.max()).sum()) < MIN_SAMPLES
-            or not sizes.max() > 0.0
-        ):
+        if int((sizes > LOADED_FRACTION * sizes.max()).sum()) < MIN_SAMPLES or not sizes.max() > 0.0:
             return None
         window, alike, loudest = self._build_window()
         if loudest < MIN_SIGNAL_TO_NOISE:
@@ -285,9 +297,7 @@ class StiffnessAlarm:
         """Return the differences from 1 of the factors that give no alarm."""
         s = self.settings
         doubts = self._file_deviations[list(elements)]
-        return np.asarray(
-            np.maximum(s.min_departure, s.sigmas * np.hypot(deviations, doubts)), np.float64
-        )
+        return np.asarray(np.maximum(s.min_departure, s.sigmas * np.hypot(deviations, doubts)), np.float64)
 
     def _relative_departures(self, fit: _Fit, alike: float, elements: Sequence[int]) -> Array:
         """Return the factors' differences from 1 over their bounds, (elements,)."""
@@ -343,10 +353,13 @@ class StiffnessAlarm:
                     others.append((other.squares, self.names[k], float(other.factors[at])))
             found.append(
                 Departure(
-                    self.names[chosen[at]], float(fit.factors[at]), float(deviations[at]),
-                    float(bounds[at]), tuple((name, value) for _, name, value in sorted(others)),
+                    self.names[chosen[at]],
+                    float(fit.factors[at]),
+                    float(deviations[at]),
+                    float(bounds[at]),
+                    tuple((name, value) for _, name, value in sorted(others)),
                 )
-            )  # fmt: skip
+            )
         return tuple(found)
 
     def _build_window(self) -> tuple[_Window, float, float]:
@@ -367,14 +380,10 @@ class StiffnessAlarm:
         plain = _Window(self._owner, reach, rest, carried, common, residual, prior)
         _, slopes = plain.predict_change(range(len(self.names)), np.ones(len(self.names)))
         size = np.std(measured[:, kept], 0)
-        noise, alike = _estimate_noise(
-            residual, np.concatenate([slopes, common], -1), MIN_NOISE_FRACTION * size
-        )
+        noise, alike = _estimate_noise(residual, np.concatenate([slopes, common], -1), MIN_NOISE_FRACTION * size)
         loudest = float((size / noise).max())
         over = noise[:, None]
-        scaled = _Window(
-            self._owner, reach / over, rest, carried, common / over, residual / noise, prior
-        )
+        scaled = _Window(self._owner, reach / over, rest, carried, common / over, residual / noise, prior)
         return scaled, alike, loudest
 
 
@@ -559,7 +568,6 @@ class StiffnessWatch(Core):
         if age > self.max_age:
             raise MessageError(
                 "no wrench",
-                f"the wrench next to the deflection is {age:.3f} s away, allowed "
-                f"{self.max_age:g} s",
+                f"the wrench next to the deflection is {age:.3f} s away, allowed {self.max_age:g} s",
             )
         return found[0][1], found[1][1]

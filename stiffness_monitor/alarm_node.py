@@ -30,9 +30,7 @@ DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
 class StiffnessAlarmTopics:
     """Subscribe to ``measured_deflection`` and publish ``~/stiffness_alarm``."""
 
-    def __init__(
-        self, node: TwinNode, robot: Robot, rules: StampRules, frames: tuple[str, str]
-    ) -> None:
+    def __init__(self, node: TwinNode, robot: Robot, rules: StampRules, frames: tuple[str, str]) -> None:
         """Declare the parameters and create the topics that they ask for.
 
         :param rules: for the stamps of deflections.
@@ -49,13 +47,12 @@ class StiffnessAlarmTopics:
         )
         settings = self._declare_settings()
         age = node.declare(
-            "alarm.wrench_age", 0.02, "largest time between a deflection and the wrenches before "
-            "and after it",
-            **SECONDS
-        )  # fmt: skip
-        period = node.declare(
-            "alarm.period", 0.1, "shortest time between two deflections that are used", **SECONDS
+            "alarm.wrench_age",
+            0.02,
+            "largest time between a deflection and the wrenches before and after it",
+            **SECONDS,
         )
+        period = node.declare("alarm.period", 0.1, "shortest time between two deflections that are used", **SECONDS)
         if not wanted:
             return
         self._core = StiffnessWatch(robot, rules, frames, settings, age, period)
@@ -65,9 +62,7 @@ class StiffnessAlarmTopics:
 
     def _declare_settings(self) -> AlarmSettings:
         node = self._node
-        words = node.declare(
-            "alarm.directions", list(DIRECTIONS), "measured directions, of x y z rx ry rz"
-        )  # fmt: skip
+        words = node.declare("alarm.directions", list(DIRECTIONS), "measured directions, of x y z rx ry rz")
         for word in words:
             if word not in DIRECTIONS:
                 raise UnknownNameError("alarm.directions", word, DIRECTIONS)
@@ -143,11 +138,7 @@ class StiffnessAlarmTopics:
         """Return one WARN status per departure, or one OK status without any."""
         name, hardware = f"{self._node.get_name()}: stiffness", self._robot.name
         if not found:
-            return [
-                DiagnosticStatus(
-                    level=health.OK, name=name, message="none", hardware_id=hardware, values=[]
-                )
-            ]
+            return [DiagnosticStatus(level=health.OK, name=name, message="none", hardware_id=hardware, values=[])]
         statuses = []
         for departure in found:
             pairs = {

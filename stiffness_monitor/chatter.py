@@ -179,9 +179,7 @@ class Lobes:
         lowest = falls & np.append(np.diff(depth) >= 0.0, True)
         unsure = lowest & (np.maximum(before, after) > MAX_MINIMUM_RATIO)
         split = (ratio > MAX_LIMIT_RATIO) | unsure[1:] | unsure[:-1]
-        split = (split & (np.diff(n) > MIN_SPEED_STEP * n[1:])) | (
-            waves[:-1] - waves[1:] > MAX_WAVE_STEP
-        )
+        split = (split & (np.diff(n) > MIN_SPEED_STEP * n[1:])) | (waves[:-1] - waves[1:] > MAX_WAVE_STEP)
         if not split.any():
             best = self.steady()[0]
             near = (n[1:] > (1.0 - SPEED_MARGIN) * best) & (n[:-1] < (1.0 + SPEED_MARGIN) * best)
@@ -276,9 +274,7 @@ class _CuttingPlane:
         # Only displacements at which a tooth cuts come back. They are smooth: polynomials of time.
         cut = np.flatnonzero(np.abs(force).max((1, 2)) > 1e-12 * milling.tangential)
         parts = np.split(cut, np.flatnonzero(np.diff(cut) > 1) + 1)
-        basis = scipy.linalg.block_diag(
-            *(_chebyshev_basis(len(part), waves / count) for part in parts)
-        )
+        basis = scipy.linalg.block_diag(*(_chebyshev_basis(len(part), waves / count) for part in parts))
         own = 2 * len(self.turn)
         n, b = own + 2 * basis.shape[1], depths[:, None, None]
         before = np.zeros((count, 2, n))
@@ -318,9 +314,7 @@ class _CuttingPlane:
             bad = self.spectral_radius(milling, speed, tried[part]) >= 1.0
             if bad.any():
                 k = int(part[bad.argmax()])
-                return float(
-                    scipy.optimize.brentq(margin, tried[k - 1], tried[k], rtol=DEPTH_TOLERANCE)
-                )
+                return float(scipy.optimize.brentq(margin, tried[k - 1], tried[k], rtol=DEPTH_TOLERANCE))
         return np.inf
 
 
@@ -359,9 +353,7 @@ def stability_lobes(
     return lobes_of(tool_modes(robot, pose, damping=damping, tool=tool), milling, speeds, deepest)
 
 
-def lobes_of(
-    modes: ToolModes, milling: Milling, speeds: ArrayLike, deepest: float | None = None
-) -> Lobes:
+def lobes_of(modes: ToolModes, milling: Milling, speeds: ArrayLike, deepest: float | None = None) -> Lobes:
     """Find limit depths as :func:`stability_lobes`, from the tool point's modes."""
     plane = _CuttingPlane.of(modes, milling)
     at = np.atleast_1d(np.asarray(speeds, np.float64))
@@ -403,13 +395,12 @@ def lobes_between(
         found = Lobes(
             np.concatenate([n, more.speeds])[order],
             np.concatenate([depth, more.depths])[order],
-            np.concatenate([found.open, more.open])[order], safe,
-        )  # fmt: skip
+            np.concatenate([found.open, more.open])[order],
+            safe,
+        )
 
 
-def _check_range(
-    plane: _CuttingPlane, milling: Milling, at: Array, deepest: float | None
-) -> tuple[float, float]:
+def _check_range(plane: _CuttingPlane, milling: Milling, at: Array, deepest: float | None) -> tuple[float, float]:
     """Return the deepest depth to try and the zero-order depth, m; errors as :func:`lobes_of`."""
     if at.ndim != 1:
         raise ParameterError("speeds", at.shape, "one speed after another")
@@ -417,9 +408,7 @@ def _check_range(
         check_limit("speeds", float(speed), "rpm", 1e-3, MAX_SPINDLE_SPEED)
     waves = plane.waves(milling, at)
     if len(at) and waves.max() > MAX_WAVES * (1.0 + 1e-12):
-        bound = (
-            f"{at.min() * waves.max() / MAX_WAVES:.4g} rpm or more: process damping governs below"
-        )
+        bound = f"{at.min() * waves.max() / MAX_WAVES:.4g} rpm or more: process damping governs below"
         raise ParameterError("speeds", at.min(), bound)
     safe, _ = plane.stable_depth(milling)
     if deepest is None and not np.isfinite(safe):
@@ -430,9 +419,7 @@ def _check_range(
     return float(deepest), safe
 
 
-def _find_limits(
-    plane: _CuttingPlane, milling: Milling, at: Array, last: float, safe: float
-) -> Lobes:
+def _find_limits(plane: _CuttingPlane, milling: Milling, at: Array, last: float, safe: float) -> Lobes:
     low = min(FIRST_DEPTH_RATIO * safe, 0.5 * last)
     found = np.array([plane.find_limit(milling, float(speed), low, last) for speed in at])
     return Lobes(at, np.minimum(found, last), found > last, safe)

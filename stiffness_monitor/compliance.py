@@ -87,16 +87,28 @@ def platform_response(robot: Robot, q: ArrayLike, wrench: ArrayLike) -> Platform
         close = [k for k, share in enumerate(shares) if share > bound]
         dominant = names[close[0]] if close else "none"
         return PlatformResponse(
-            names, matrix, factors, energies, float(row[2 * n + 6]), deflection, dominant,
+            names,
+            matrix,
+            factors,
+            energies,
+            float(row[2 * n + 6]),
+            deflection,
+            dominant,
             len(close) > 1,
-        )  # fmt: skip
+        )
     near = factors > factors.max(-1, keepdims=True) * (1.0 - TIE_TOLERANCE)
     # Index -1, without load, is the last name.
     first = np.where(near.any(-1), near.argmax(-1), -1)
     return PlatformResponse(
-        names, matrix, factors, energies, np.ascontiguousarray(row[..., 2 * n + 6]), deflection,
-        _dominant_names(names)[first], near.sum(-1) > 1,
-    )  # fmt: skip
+        names,
+        matrix,
+        factors,
+        energies,
+        np.ascontiguousarray(row[..., 2 * n + 6]),
+        deflection,
+        _dominant_names(names)[first],
+        near.sum(-1) > 1,
+    )
 
 
 def _evaluate(robot: Robot, q: ArrayLike, wrench: ArrayLike) -> Array:
@@ -117,9 +129,7 @@ def _evaluate_checked(robot: Robot, q: ArrayLike, wrench: ArrayLike) -> Array:
     return rows
 
 
-def check(
-    robot: Robot, q: ArrayLike, wrench: ArrayLike, measure: Array, status: Array | None
-) -> None:
+def check(robot: Robot, q: ArrayLike, wrench: ArrayLike, measure: Array, status: Array | None) -> None:
     """Raise the typed error of the first rejected sample, if there is one.
 
     :param measure: smallest pivot ratio of the frame, 0 if it is a mechanism. ``status``: the
@@ -136,9 +146,7 @@ def check(
                 robot.refuse_joints(status, q)
             if not math.isfinite(sum(x * x for x in load.tolist())):
                 where = f" at sample {index}" if index else ""
-                raise ValueError(
-                    f"wrench, or its energy,{where} is not finite, or leads to a result that is not"
-                )
+                raise ValueError(f"wrench, or its energy,{where} is not finite, or leads to a result that is not")
         found = 0.0 if codes[index] else float(measure[index])
         if not found > MIN_PIVOT_RATIO:
             frame = "the elastic frame of the pose"
@@ -174,9 +182,7 @@ def strain_energy(robot: Robot, pose: ArrayLike, wrench: ArrayLike) -> PlatformR
     return platform_response(robot, robot.inverse(pose), wrench)
 
 
-def member_deflections(
-    robot: Robot, q: ArrayLike, wrench: ArrayLike
-) -> dict[str, tuple[Array, Array]]:
+def member_deflections(robot: Robot, q: ArrayLike, wrench: ArrayLike) -> dict[str, tuple[Array, Array]]:
     """Return points along every member and their displacements under a wrench, by member.
 
     :param q, wrench: as in :func:`platform_response`; so are errors.

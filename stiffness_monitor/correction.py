@@ -62,9 +62,7 @@ def setpoint_correction(
     robot.check_independent("corrections of joints", "the others cannot be set")
     limit = doubles(bound, "the bound")
     if limit.shape not in ((), (robot.joints_count,)) or not (limit >= 0.0).all():
-        raise ValueError(
-            f"bound is {limit.tolist()}; expected 0 or more, one number or one per joint"
-        )
+        raise ValueError(f"bound is {limit.tolist()}; expected 0 or more, one number or one per joint")
     moved = vectors(deflection, 6, "the deflection")
     if rotation is None:
         _, rotation = robot.platform(q)
@@ -83,9 +81,7 @@ def setpoint_correction(
     both = np.concatenate((place, np.broadcast_to(turn, place.shape)), -2)
     left = before + _multiply(both, offset * share[..., None])
     cause = "the deflection or the tool point"
-    return Correction(
-        finite(given * share[..., None], cause), before, finite(left, cause), excess > 1.0
-    )
+    return Correction(finite(given * share[..., None], cause), before, finite(left, cause), excess > 1.0)
 
 
 @dataclass

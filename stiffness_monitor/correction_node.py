@@ -74,8 +74,7 @@ class SetpointCorrection(Core):
         self._age = node.declare(
             "correction_age",
             0.1,
-            "largest time from a wrench to the setpoint that it corrects, and largest age of "
-            "setpoints and torques",
+            "largest time from a wrench to the setpoint that it corrects, and largest age of setpoints and torques",
             unit="s",
             low=0.0,
             high=3600.0,
@@ -112,9 +111,7 @@ class SetpointCorrection(Core):
         fields = ("position",)
         self._offsets = JointPublisher(node, robot, "~/setpoint_offset", fields)
         self._corrected = JointPublisher(node, robot, "~/corrected_setpoint", fields)
-        node.create_guarded_subscription(
-            "setpoint", self._on_setpoint, refuse=partial(self.refuse, self.setpoints)
-        )
+        node.create_guarded_subscription("setpoint", self._on_setpoint, refuse=partial(self.refuse, self.setpoints))
         if paired:
             both = ("position", "effort")
             self._both = JointPublisher(node, robot, "~/setpoint_with_torques", both)

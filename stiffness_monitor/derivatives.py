@@ -60,9 +60,7 @@ def energy_effects(robot: Robot, pose: ArrayLike, wrench: ArrayLike) -> Array:
 
     :param wrench: shape (..., 6).
     """
-    return _cause_effects(
-        robot, pose, _write_energies, np.asarray(wrench, np.float64)[..., None, :]
-    )
+    return _cause_effects(robot, pose, _write_energies, np.asarray(wrench, np.float64)[..., None, :])
 
 
 def _cause_effects(robot: Robot, pose: ArrayLike, write: Write, *loads: Array) -> Array:

@@ -91,9 +91,7 @@ def sum_forms(*terms: tuple[Iterable[int], Iterable[Any]]) -> Row:
     return row
 
 
-def deformations(
-    length: Any, stretch: Any, twist: Any, bend: Any, shear: Any
-) -> list[tuple[dict[int, Any], Any]]:
+def deformations(length: Any, stretch: Any, twist: Any, bend: Any, shear: Any) -> list[tuple[dict[int, Any], Any]]:
     """Return the deformation modes of a beam along x: 12 end factors, and rigidity, each.
 
     The modes are stretch, twist, then in both planes a circle and an S. With phi = 12 E I / (G
@@ -190,10 +188,7 @@ class Frame:
         )
         own, lets = self._add_joint(support)
         minus, plus = (turned(support.axes.T, node.map) for node in (first, second))
-        self.held += [
-            sum_forms((first.own, -minus[k]), (second.own, plus[k]), (own, -lets[k]))
-            for k in range(6)
-        ]
+        self.held += [sum_forms((first.own, -minus[k]), (second.own, plus[k]), (own, -lets[k])) for k in range(6)]
 
     def _add_member(self, member: Member) -> None:
         """Add a member with its supports at both ends."""
@@ -220,9 +215,7 @@ class Frame:
         return [
             Column(
                 member.body,
-                sum_forms(
-                    *((ends[k // 6].own, f * ends[k // 6].map[k % 6]) for k, f in form.items())
-                ),
+                sum_forms(*((ends[k // 6].own, f * ends[k // 6].map[k % 6]) for k, f in form.items())),
                 rigidity,
             )
             for form, rigidity in (ways[:1] if self.static and member.strut else ways)
@@ -247,11 +240,12 @@ class Frame:
         if len(independent_rows(tables)) > len(rows):
             chain = self.rigid_chain
             raise ParameterError(
-                f"joints.{chain[0]}.compliance" if chain else "joints", None,
+                f"joints.{chain[0]}.compliance" if chain else "joints",
+                None,
                 f"a compliance of {', '.join(chain) or 'what closes the loops'}, because these "
                 "hold the platform rigidly in some directions; in a direction that a joint holds, "
                 "for example 1e-9 m/N or 1e-7 rad/(N m)",
-            )  # fmt: skip
+            )
         # Prefer the closures' own coordinates: each is in one or two equations only.
         weight = np.where(np.arange(PLATFORM, self.size) < self.last, 1.0, 10.0)
         chosen = independent_rows((tables[:, rows, PLATFORM:] * weight).swapaxes(-1, -2))

@@ -70,9 +70,7 @@ def member_matrices(section: Section, length: float, elements: int) -> tuple[Arr
 
 
 @lru_cache(maxsize=64)
-def _member_basis(
-    section: Section, length: float, elements: int, kept: int | None
-) -> tuple[Array, Array, Array]:
+def _member_basis(section: Section, length: float, elements: int, kept: int | None) -> tuple[Array, Array, Array]:
     """Return basis, stiffness and mass of a member on its own coordinates.
 
     Coordinates: six displacements of the start, six of the end, then those inside. ``basis``,
@@ -264,9 +262,7 @@ class Modes:
     energies: Energies
 
 
-def natural_frequencies(
-    robot: Robot, pose: ArrayLike, count: int = 6, *, elements: int = ELEMENTS
-) -> Array:
+def natural_frequencies(robot: Robot, pose: ArrayLike, count: int = 6, *, elements: int = ELEMENTS) -> Array:
     """Return the lowest natural frequencies with locked actuators, (..., count), Hz.
 
     :param pose: shape (..., m), the mechanism's pose coordinates, m and rad.
@@ -373,9 +369,7 @@ def stiffness_root(system: System, index: tuple[int, ...]) -> Array:
     return root
 
 
-def solve_modes(
-    system: System, count: int, index: tuple[int, ...], *, vectors: bool
-) -> tuple[Array, Array]:
+def solve_modes(system: System, count: int, index: tuple[int, ...], *, vectors: bool) -> tuple[Array, Array]:
     """Return frequencies (count,), Hz, and vectors (n, count) of unit generalised mass.
 
     Solves the inverse problem L^-1 M L^-T y = y / omega^2 with K = L L': its largest values are the
@@ -389,13 +383,9 @@ def solve_modes(
     matrix = scipy.linalg.solve_triangular(root, half.T, lower=True, check_finite=False)
     chosen = (size - count, size - 1)
     if not vectors:
-        values = scipy.linalg.eigh(
-            matrix, eigvals_only=True, subset_by_index=chosen, check_finite=False, driver="evr"
-        )
+        values = scipy.linalg.eigh(matrix, eigvals_only=True, subset_by_index=chosen, check_finite=False, driver="evr")
         return _to_frequencies(values), np.empty((size, 0))
-    values, own = scipy.linalg.eigh(
-        matrix, subset_by_index=chosen, check_finite=False, driver="evr"
-    )
+    values, own = scipy.linalg.eigh(matrix, subset_by_index=chosen, check_finite=False, driver="evr")
     found = scipy.linalg.solve_triangular(root, own, lower=True, trans=1, check_finite=False)
     return _to_frequencies(values), (found / np.sqrt(np.maximum(values, 1e-300)))[:, ::-1]
 

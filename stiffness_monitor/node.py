@@ -63,16 +63,21 @@ class StiffnessMonitor(TwinNode):
         self.core = Monitor(robot, settings, mounts)
         self.core.pace = Pace(
             self.declare(
-                "rate", 0.0, "largest rate of messages, by the stamps of the wrenches; 0: one for "
-                "each wrench",
-                unit="Hz", low=0.0, high=1e4
+                "rate",
+                0.0,
+                "largest rate of messages, by the stamps of the wrenches; 0: one for each wrench",
+                unit="Hz",
+                low=0.0,
+                high=1e4,
             )
-        )  # fmt: skip
+        )
         self._correction = SetpointCorrection(self, robot, settings.stamp_rules)
         self._alarm = StiffnessAlarmTopics(
-            self, robot, settings.stamp_rules,
+            self,
+            robot,
+            settings.stamp_rules,
             (settings.base_frame, self._platform_frame or settings.platform_frame),
-        )  # fmt: skip
+        )
         # Messages without stamp or with text values have a second topic that plots can draw.
         self._outputs = [
             (self.create_guarded_publisher(topic), make)
@@ -88,16 +93,13 @@ class StiffnessMonitor(TwinNode):
         self._published_stamp = 0
         """Stamp of the joint state whose frequencies were published last."""
         rate = self.declare(
-            "frequencies_rate", 10.0, "largest rate of ~/natural_frequencies; 0: none",
-            unit="Hz", low=0.0, high=1000.0
-        )  # fmt: skip
+            "frequencies_rate", 10.0, "largest rate of ~/natural_frequencies; 0: none", unit="Hz", low=0.0, high=1000.0
+        )
         if rate > 0.0 and has_modes(robot):
             # Compile now: the first call would block a callback.
             natural_frequencies(robot, robot.home())
             self._frequencies = self.create_guarded_publisher("~/natural_frequencies")
-            self._frequencies_stamped = self.create_guarded_publisher(
-                "~/natural_frequencies_stamped"
-            )
+            self._frequencies_stamped = self.create_guarded_publisher("~/natural_frequencies_stamped")
             self.create_guarded_timer(1.0 / rate, self._publish_frequencies)
         self.create_guarded_subscription(
             "joint_states",
@@ -184,14 +186,10 @@ class StiffnessMonitor(TwinNode):
             self.log_throttled("natural frequencies", f"no natural frequencies: {error}")
             return
         message = Float64MultiArray(data=array("d", values))
-        message.layout.dim = [
-            MultiArrayDimension(label="frequency", size=len(values), stride=len(values))
-        ]
+        message.layout.dim = [MultiArrayDimension(label="frequency", size=len(values), stride=len(values))]
         self._frequencies.publish(message)
         names = [f"mode_{k + 1}" for k in range(len(values))]
-        self._frequencies_stamped.publish(
-            named(header(self._published_stamp, ""), names, values.tolist())
-        )
+        self._frequencies_stamped.publish(named(header(self._published_stamp, ""), names, values.tolist()))
 
     def _in_base(self, answer: Answer) -> Header:
         return header(answer.stamp, self.core.settings.base_frame)
@@ -233,9 +231,7 @@ class StiffnessMonitor(TwinNode):
         # sin(x/2)/x goes to 1/2: deflections are so small that the quotient would lose digits.
         scale = 0.5 if angle < 1e-6 else math.sin(angle / 2) / angle
         frame = self._platform_frame or self.core.settings.platform_frame
-        message = TransformStamped(
-            header=header(answer.stamp, frame), child_frame_id=f"{frame}_deflected"
-        )
+        message = TransformStamped(header=header(answer.stamp, frame), child_frame_id=f"{frame}_deflected")
         message.transform.translation = xyz(Vector3, shift)
         message.transform.rotation = xyz(Quaternion, (*(scale * turn), math.cos(angle / 2)))
         return message

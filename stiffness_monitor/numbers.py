@@ -34,9 +34,7 @@ def list_numbers(structure: Structure) -> list[Any]:
     return row
 
 
-def substitute_numbers(
-    structure: Structure, graph: Graph, numbers: Numbers
-) -> tuple[Structure, Rigidities]:
+def substitute_numbers(structure: Structure, graph: Graph, numbers: Numbers) -> tuple[Structure, Rigidities]:
     """Return beams and compliances with other numbers, in the order of :func:`list_numbers`.
 
     Properties of the known case are kept as assumptions: that a beam ends at a joint, and which
@@ -60,9 +58,7 @@ def substitute_numbers(
     for beam in structure.beams:
         beams.append(replace(beam, inner=end(beam.inner), outer=end(beam.outer)))
         rigidities[beam.name] = [next(left) for _ in range(4)]
-    compliances = {
-        name: [next(left) for _ in values] for name, values in structure.compliances.items()
-    }
+    compliances = {name: [next(left) for _ in values] for name, values in structure.compliances.items()}
     for value in (v for values in compliances.values() for v in values):
         finite = _is_finite(value)
         value.tape.assumed.append((finite, finite.value))
@@ -75,9 +71,7 @@ def constant_pattern(structure: Structure, tree: Tree) -> str:
     for beam in structure.beams:
         for body, at in (beam.inner, beam.outer):
             local = marks(tree.axes[body].T @ (at - tree.at[body]))
-            parts.append(
-                (beam.name, beam.element, beam.parts, body, _find_point(places, at), local)
-            )
+            parts.append((beam.name, beam.element, beam.parts, body, _find_point(places, at), local))
     flags = {n: [float(_is_finite(v)) for v in row] for n, row in structure.compliances.items()}
     return repr((parts, flags, structure.order))
 

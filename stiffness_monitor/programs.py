@@ -90,9 +90,7 @@ class Elastic:
 
     def _frame(self, motion: Motion) -> Frame:
         """Return the frame in a numeric state, every rigidity and compliance one."""
-        model = place_plan(
-            self.plan, motion.point, motion.direction, lambda _: [1.0] * 4, lambda *_: 1.0
-        )
+        model = place_plan(self.plan, motion.point, motion.direction, lambda _: [1.0] * 4, lambda *_: 1.0)
         return Frame(model, static=True)
 
     @cached_property
@@ -102,9 +100,7 @@ class Elastic:
         own = self.robot.graph.key if followers is not None and followers.sample else ""
         return repr((_plain_data(self.plan), pattern, self.names, followers, own))
 
-    def kernel(
-        self, name: str, write: Callable[[SymbolicFrame], Program], *, free: bool = False
-    ) -> Kernel:
+    def kernel(self, name: str, write: Callable[[SymbolicFrame], Program], *, free: bool = False) -> Kernel:
         """Return the compiled program of all numbers of the machine, as :meth:`Engine.kernel`."""
         known = self._kernels.get(name)
         if known is None:
@@ -181,9 +177,12 @@ class SymbolicFrame:
     def _frame(self, motion: Motion) -> Frame:
         compliances = self.structure.compliances
         model = place_plan(
-            self.plan, motion.point, motion.direction, self.rigidities.__getitem__,
+            self.plan,
+            motion.point,
+            motion.direction,
+            self.rigidities.__getitem__,
             lambda joint, k: compliances[joint][k],
-        )  # fmt: skip
+        )
         return Frame(model, static=True)
 
     def _solve_closures(self, chosen: DependentCoordinates) -> dict[int, Row]:
@@ -269,9 +268,7 @@ class SymbolicFrame:
         return Program(sizes, 0, rows, t.equations())
 
 
-def solve_dependents(
-    frame: Frame, chosen: DependentCoordinates
-) -> tuple[dict[int, Row], Any, list[Any]]:
+def solve_dependents(frame: Frame, chosen: DependentCoordinates) -> tuple[dict[int, Row], Any, list[Any]]:
     """Solve the closures for the chosen coordinates.
 
     :returns: their rows of the other coordinates, the reciprocal determinant of the system, and the
@@ -311,9 +308,7 @@ def _write_response(s: SymbolicFrame) -> Program:
     row = [value / maximum(total, 1e-300) for value in energies]
     row += [value * square for value in energies]
     row += [s.x[k] * size for k in range(PLATFORM)]
-    return s.program(
-        {"wrench": 6}, {"row": [*row, total * square, *s.compliance.ravel(), s.measure]}
-    )
+    return s.program({"wrench": 6}, {"row": [*row, total * square, *s.compliance.ravel(), s.measure]})
 
 
 def _write_deflections(s: SymbolicFrame) -> Program:
@@ -324,10 +319,7 @@ def _write_deflections(s: SymbolicFrame) -> Program:
         member = bar.member
         bends = [next(amounts) for _ in s.frame.columns(bar)][2:]
         phi = member.section[3] / (member.length * member.length)
-        moved = [
-            member.axes @ (node.map[:3] @ np.array([s.x[k] for k in node.own], dtype=object))
-            for node in bar.ends
-        ]
+        moved = [member.axes @ (node.map[:3] @ np.array([s.x[k] for k in node.own], dtype=object)) for node in bar.ends]
         shares = np.arange(DEFLECTION_PARTS + 1) / DEFLECTION_PARTS
         rows += [member.start + (member.end - member.start) * share for share in shares]
         for share in shares:
@@ -339,9 +331,7 @@ def _write_deflections(s: SymbolicFrame) -> Program:
 
 def _write_columns(s: SymbolicFrame) -> Program:
     entries = [
-        (sqrt(column.rigidity) * value, i, j)
-        for j, column in enumerate(s.columns)
-        for i, value in column.row.items()
+        (sqrt(column.rigidity) * value, i, j) for j, column in enumerate(s.columns) for i, value in column.row.items()
     ]
     values, rows, columns = zip(*entries, strict=True)
     owners = [s.elastic.names.index(column.element) for column in s.columns]

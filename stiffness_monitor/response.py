@@ -106,9 +106,12 @@ def element_response(robot: Robot, pose: ArrayLike) -> ElementResponse:
     platform, elements = (np.linalg.solve(root, side) for side in (unit, own))
     turned = np.swapaxes(elements, -1, -2)
     return ElementResponse(
-        robot.cached(Elastic).names, owner, whole, np.swapaxes(platform, -1, -2) @ elements,
+        robot.cached(Elastic).names,
+        owner,
+        whole,
+        np.swapaxes(platform, -1, -2) @ elements,
         np.eye(len(owner)) - turned @ elements,
-    )  # fmt: skip
+    )
 
 
 def elastic_columns(robot: Robot, q: Array) -> tuple[Array, Indices]:

@@ -61,9 +61,7 @@ def local_axes(along: Any) -> Any:
     side = 1.0 - 2.0 * maximum(0.0, -1.0 * sign(z))
     a = -1.0 / (side + z)
     b = x * y * a
-    return np.array(
-        [[x, 1.0 + side * (x * x * a), b], [y, side * b, side + y * y * a], [z, -side * x, -y]]
-    )
+    return np.array([[x, 1.0 + side * (x * x * a), b], [y, side * b, side + y * y * a], [z, -side * x, -y]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,9 +197,12 @@ def structural_model(robot: Robot, q: ArrayLike) -> StructuralModel:
     """
     structure, posture = robot.elastic, Posture(robot, q)
     model = place_plan(
-        plan_structure(robot.graph, structure), posture.place, posture.turn,
-        structure.sections.__getitem__, lambda joint, k: float(structure.compliances[joint][k]),
-    )  # fmt: skip
+        plan_structure(robot.graph, structure),
+        posture.place,
+        posture.turn,
+        structure.sections.__getitem__,
+        lambda joint, k: float(structure.compliances[joint][k]),
+    )
     return replace(model, bodies=tuple(_lumped_masses(robot, posture.place, posture.turn)))
 
 
@@ -227,9 +228,7 @@ def place_plan(
     def part_of(part: Member | Carried) -> Member | Carried:
         if isinstance(part, Carried):
             return replace(part, at=place(*part.at), support=stood(part.support))
-        made = replace(
-            part, start=place(*part.start), end=place(*part.end), section=section(part.section)
-        )
+        made = replace(part, start=place(*part.start), end=place(*part.end), section=section(part.section))
         outer = None if made.outer is None else stood(made.outer, made.axes)
         return replace(made, inner=stood(made.inner, made.axes), outer=outer)
 
@@ -237,9 +236,7 @@ def place_plan(
         plan,
         origin=place(*plan.origin),
         parts=tuple(part_of(part) for part in plan.parts),
-        closures=tuple(
-            replace(c, at=place(*c.at), support=stood(c.support)) for c in plan.closures
-        ),
+        closures=tuple(replace(c, at=place(*c.at), support=stood(c.support)) for c in plan.closures),
     )
 
 
@@ -289,12 +286,13 @@ class _Planner:
                     self._add_rod(beam)
         closures = tuple(
             Closure(
-                (joint.outer, joint.at), self._find_support(joint.inner, joint.at),
+                (joint.outer, joint.at),
+                self._find_support(joint.inner, joint.at),
                 self._joint_support(joint, joint.outer, joint.at),
             )
             for joint in left
             if not self._is_inside_beam(joint)
-        )  # fmt: skip
+        )
         for beam in rods:
             self._add_rod(beam)
         graph = self.graph
@@ -365,9 +363,7 @@ class _Planner:
             known, new = new, known
         beam = self.beam_of.get(new)
         if beam is None:
-            self.parts.append(
-                Carried(new, (new, joint.at), self._joint_support(joint, known, joint.at))
-            )
+            self.parts.append(Carried(new, (new, joint.at), self._joint_support(joint, known, joint.at)))
             self.points[new] = [joint.at]
             return
         ends = [beam.inner, beam.outer]
@@ -390,9 +386,7 @@ class _Planner:
             outer = self._member_support(*closing, ends[1])
         self._add_member(beam, ends, support, outer)
 
-    def _add_member(
-        self, beam: Beam, ends: list[Any], inner: Support, outer: Support | None
-    ) -> None:
+    def _add_member(self, beam: Beam, ends: list[Any], inner: Support, outer: Support | None) -> None:
         strut = beam.parts[0] in self.graph.rods
         length = size(ends[1][1] - ends[0][1])
         if not reference(length) > 0.0:
@@ -401,18 +395,23 @@ class _Planner:
         known = strut or ends[0][0] == ends[1][0]
         self.parts.append(
             Member(
-                beam.name, beam.element, beam.name, ends[0], ends[1], inner, outer, strut,
+                beam.name,
+                beam.element,
+                beam.name,
+                ends[0],
+                ends[1],
+                inner,
+                outer,
+                strut,
                 length if known else None,
             )
-        )  # fmt: skip
+        )
 
     def _add_rod(self, beam: Beam) -> None:
         """Add a rod with a ball joint at each end; the inner one holds the rod's idle spin."""
         rod = self.graph.rods[beam.parts[0]]
         supports = []
-        for name, (body, at), spin in zip(
-            rod.joint_names, (beam.inner, beam.outer), (0.0, FREE), strict=True
-        ):
+        for name, (body, at), spin in zip(rod.joint_names, (beam.inner, beam.outer), (0.0, FREE), strict=True):
             values = (*self._joint_compliance(name)[:3], spin, FREE, FREE)
             part, end = self._find_support(body, at)
             supports.append(Support(name, part, None, values, end))
@@ -424,16 +423,12 @@ def _is_nearer(at: Array, first: Array, second: Array) -> bool:
     return reference(size(at - first)) < reference(size(at - second))
 
 
-def _lumped_masses(
-    robot: Robot, place: Callable[[str, Array], Array], turn: Turn
-) -> list[RigidBody]:
+def _lumped_masses(robot: Robot, place: Callable[[str, Array], Array], turn: Turn) -> list[RigidBody]:
     """Return the rigid bodies (not modelled as beams) and the payload, with their inertia."""
     graph, load = robot.graph, robot.payload
     beams = {n for beam in robot.elastic.beams for n in (*beam.parts, *beam.carries)}
     found = [
-        (name, body.mass, body.com, body.inertia, name)
-        for name, body in graph.bodies.items()
-        if name not in beams
+        (name, body.mass, body.com, body.inertia, name) for name, body in graph.bodies.items() if name not in beams
     ]
     found.append(("payload", load.mass, graph.origin + load.com, load.inertia, graph.platform))
     return [

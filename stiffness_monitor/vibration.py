@@ -142,8 +142,7 @@ def frequency_response(
     poses = np.asarray(pose, np.float64)
     at = np.atleast_1d(doubles(frequencies, "frequencies"))
     found = [
-        tool_modes(robot, one, damping=damping, tool=tool).receptance(at)
-        for one in poses.reshape(-1, poses.shape[-1])
+        tool_modes(robot, one, damping=damping, tool=tool).receptance(at) for one in poses.reshape(-1, poses.shape[-1])
     ]
     return np.array(found).reshape(*poses.shape[:-1], len(at), 6, 6)
 
@@ -153,9 +152,7 @@ def damping_ratios(robot: Robot, given: ArrayLike | None, count: int) -> Array:
     field = "modal_damping" if given is None else "damping"
     values = np.atleast_1d(doubles(robot.modal_damping if given is None else given, field))
     if not values.size:
-        raise ParameterError(
-            field, None, "damping ratios of the modes, in the robot's file or with --damping"
-        )
+        raise ParameterError(field, None, "damping ratios of the modes, in the robot's file or with --damping")
     if values.ndim != 1:
         raise ParameterError(field, values.shape, "one damping ratio after another")
     for value in values.tolist():

@@ -16,9 +16,12 @@ from test.support.sources import ROOT, arrows, imports, nodes, room, sources, wi
 from tools.pages import architecture
 
 OWN = {
-    "pkm_twin.errors", "pkm_twin.extensions", "pkm_twin.files", "pkm_twin.threads",
+    "pkm_twin.errors",
+    "pkm_twin.extensions",
+    "pkm_twin.files",
+    "pkm_twin.threads",
     "pkm_twin.settings",
-}  # fmt: skip
+}
 """Modules without a folder that all may import."""
 GRAPH = {"pkm_twin.codegen", "pkm_twin.machine", "pkm_twin.kinematics"}
 CORE = GRAPH | {"pkm_twin.robot"}
@@ -43,9 +46,7 @@ MAY = {
     "pkm_twin.mechanisms": CORE | {"delta_dynamics"},
     "pkm_twin.export": CORE | TWINS,
     "pkm_twin.design": CORE | TWINS,
-    "pkm_twin.identification": RECORDINGS
-    | TWINS
-    | {"pkm_twin.design", "pkm_twin.recordings", "pkm_twin.report"},
+    "pkm_twin.identification": RECORDINGS | TWINS | {"pkm_twin.design", "pkm_twin.recordings", "pkm_twin.report"},
     "pkm_twin.messages": CORE | {"pkm_twin.bags"},
     "pkm_twin.streams": CORE | {"pkm_twin.messages"},
     "pkm_twin.recordings": RECORDINGS,
@@ -59,9 +60,7 @@ MAY = {
     "pkm_twin.state.node": NODE | {"pkm_twin.state", "stiffness_monitor"},
     "pkm_twin.maps": NODE | TWINS | {"pkm_twin.console", "pkm_twin.report"},
     "pkm_twin.certify": CORE | {"delta_dynamics"},
-    "pkm_twin.view": NODE
-    | TWINS
-    | {"pkm_twin.recordings", "pkm_twin.maps", "pkm_twin.report", "pkm_twin.paths"},
+    "pkm_twin.view": NODE | TWINS | {"pkm_twin.recordings", "pkm_twin.maps", "pkm_twin.report", "pkm_twin.paths"},
     "pkm_twin.demo": NODE | TWINS | {"pkm_twin.recordings", "pkm_twin.report"},
     "pkm_twin.apps": NODE
     | TWINS
@@ -74,9 +73,11 @@ ROS = re.compile(r"rclpy|\w+_(msgs|interfaces|srvs)")
 WITHOUT_ROS = {"pkm_twin.ros.arguments", "pkm_twin.ros.signals"}
 """Of the folder that is about ROS."""
 WITH_ROS = {
-    "pkm_twin.demo.run", "pkm_twin.demo.recorder", "pkm_twin.demo.tracking",
+    "pkm_twin.demo.run",
+    "pkm_twin.demo.recorder",
+    "pkm_twin.demo.tracking",
     "pkm_twin.apps.commands.monitor_torques",
-}  # fmt: skip
+}
 
 
 def test_every_room_has_its_row():
@@ -164,9 +165,7 @@ def loaded_by(code):
 def test_a_command_and_a_node_start_without_what_they_may_never_need():
     """Parts of scipy take longer to load than all the rest of a command."""
     modules = set(map(module_of, commands()))
-    loaded = loaded_by(
-        f"import {', '.join(modules)}, delta_dynamics, stiffness_monitor, pkm_twin.state"
-    )
+    loaded = loaded_by(f"import {', '.join(modules)}, delta_dynamics, stiffness_monitor, pkm_twin.state")
     parts = ("linalg", "optimize", "signal", "special", "stats")
     assert not {f"scipy.{part}" for part in parts} & loaded
     # A command is loaded when it is asked for.

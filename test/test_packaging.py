@@ -25,13 +25,16 @@ from tools.distribution import bill
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 EXECUTABLES = {
-    "delta_dynamics", "stiffness_monitor", "command_gate", "machine_state", "machine_sim",
-    "composed", "pkm-twin",
-}  # fmt: skip
+    "delta_dynamics",
+    "stiffness_monitor",
+    "command_gate",
+    "machine_state",
+    "machine_sim",
+    "composed",
+    "pkm-twin",
+}
 COLCON = Path(sys.executable).with_name("colcon")
-needs_colcon = pytest.mark.skipif(
-    not COLCON.exists(), reason="colcon is not installed beside this Python"
-)
+needs_colcon = pytest.mark.skipif(not COLCON.exists(), reason="colcon is not installed beside this Python")
 
 
 @cache
@@ -281,9 +284,14 @@ class TestColcon:
             nodes = [start.with_name(node) for node in sorted(EXECUTABLES - {"pkm-twin"})]
             environment = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_DOMAIN_ID": "87"}
             run(
-                sys.executable, "-c", STARTED, *nodes, cwd=tmp_path,
-                PYTHONPATH=str(site), **environment,
-            )  # fmt: skip
+                sys.executable,
+                "-c",
+                STARTED,
+                *nodes,
+                cwd=tmp_path,
+                PYTHONPATH=str(site),
+                **environment,
+            )
 
 
 @pytest.fixture(scope="module")
@@ -312,9 +320,23 @@ class TestManifest:
 
 
 DECLARED = {
-    "hypothesis", "matplotlib", "numpy", "pkm_twin", "delta_dynamics", "stiffness_monitor",
-    "pytest", "rich", "scipy", "setuptools", "support", "test", "tools", "bags", "click", "yaml",
-}  # fmt: skip
+    "hypothesis",
+    "matplotlib",
+    "numpy",
+    "pkm_twin",
+    "delta_dynamics",
+    "stiffness_monitor",
+    "pytest",
+    "rich",
+    "scipy",
+    "setuptools",
+    "support",
+    "test",
+    "tools",
+    "bags",
+    "click",
+    "yaml",
+}
 """What package.xml's dependencies bring, and this package."""
 
 
@@ -342,6 +364,4 @@ def test_a_workspace_with_the_declared_dependencies_collects_every_module():
     """What else a module needs it asks for by name, so that it is skipped where that is missing."""
     paths = [REPOSITORY / name for name in tracked() if name.match("test/**/test_*.py")]
     assert len(paths) > 100
-    assert {
-        path.name: list(foreign_imports(path)) for path in paths if any(foreign_imports(path))
-    } == {}
+    assert {path.name: list(foreign_imports(path)) for path in paths if any(foreign_imports(path))} == {}

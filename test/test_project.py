@@ -22,9 +22,7 @@ README = (REPOSITORY / "README.md").read_text(encoding="utf-8")
 def files():
     """Names of the files that a clone has."""
     try:
-        listed = subprocess.run(
-            ["git", "ls-files", "-z"], cwd=REPOSITORY, capture_output=True, check=True
-        ).stdout
+        listed = subprocess.run(["git", "ls-files", "-z"], cwd=REPOSITORY, capture_output=True, check=True).stdout
     except (OSError, subprocess.CalledProcessError):
         pytest.skip("not a git checkout")
     names = [Path(name) for name in listed.decode().split("\0") if name]
@@ -79,10 +77,16 @@ def test_make_targets_exist():
 
 
 def test_hooks_workflow_and_container_call_what_exists():
-    read = {path: (REPOSITORY / path).read_text(encoding="utf-8") for path in (
-        ".github/workflows/ci.yml", ".pre-commit-config.yaml", "Dockerfile", "Makefile",
-        ".devcontainer/devcontainer.json",
-    )}  # fmt: skip
+    read = {
+        path: (REPOSITORY / path).read_text(encoding="utf-8")
+        for path in (
+            ".github/workflows/ci.yml",
+            ".pre-commit-config.yaml",
+            "Dockerfile",
+            "Makefile",
+            ".devcontainer/devcontainer.json",
+        )
+    }
     jobs = yaml.safe_load(read[".github/workflows/ci.yml"])["jobs"]
     lines = [step.get("run", "") for job in jobs.values() for step in job["steps"]]
     (hooks,) = yaml.safe_load(read[".pre-commit-config.yaml"])["repos"]
@@ -130,8 +134,7 @@ def anchor(title):
 def test_links_lead_somewhere():
     found = pages()
     anchors = {
-        name: {anchor(title) for title in re.findall(r"^#+ (.+)$", text, re.MULTILINE)}
-        for name, text in found.items()
+        name: {anchor(title) for title in re.findall(r"^#+ (.+)$", text, re.MULTILINE)} for name, text in found.items()
     }
     for name, text in found.items():
         for link in re.findall(r"\]\(([^)\s]+)\)", text):
@@ -151,9 +154,7 @@ def test_the_readme_lists_every_robot_and_every_page():
 
 
 @pytest.mark.parametrize(("failing", "again", "code"), [(0, 0, 0), (2, 0, 0), (2, 1, 1), (3, 0, 1)])
-def test_the_run_names_tests_that_failed_once_and_fails_for_more_than_two(
-    failing, again, code, tmp_path
-):
+def test_the_run_names_tests_that_failed_once_and_fails_for_more_than_two(failing, again, code, tmp_path):
     """With programs in place of make and pytest that fail so many tests."""
     names = [f"test/test_x.py::test_{k}" for k in range(failing)]
     first = [f"FAILED {name} - assert 0" for name in names]
@@ -164,8 +165,9 @@ def test_the_run_names_tests_that_failed_once_and_fails_for_more_than_two(
     stubs = {
         "bin/make": (first, failing and '[ "$1" != test ] || exit 2'),
         ".venv/bin/python": (second, again and "exit 1"),
-        "bin/ccx": ([], ""), "bin/chromium": ([], ""),
-    }  # fmt: skip
+        "bin/ccx": ([], ""),
+        "bin/chromium": ([], ""),
+    }
     for path, (lines, end) in stubs.items():
         stub = tmp_path / path
         stub.parent.mkdir(parents=True, exist_ok=True)
@@ -175,9 +177,7 @@ def test_the_run_names_tests_that_failed_once_and_fails_for_more_than_two(
     (tmp_path / ".ci").mkdir()
     (tmp_path / ".ci/run").write_text((REPOSITORY / ".ci/run").read_text())
     environment = os.environ | {"PATH": f"{tmp_path / 'bin'}:{os.environ['PATH']}"}
-    done = subprocess.run(
-        ["bash", tmp_path / ".ci/run"], env=environment, capture_output=True, text=True, check=False
-    )
+    done = subprocess.run(["bash", tmp_path / ".ci/run"], env=environment, capture_output=True, text=True, check=False)
     lines = done.stdout.splitlines()
     assert done.returncode == code, done.stderr
     tried = 0 < failing <= 2

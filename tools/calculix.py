@@ -172,9 +172,7 @@ class Deck:
         radius = np.sqrt(4 * body.inertia[0, 0] / body.mass) / np.sqrt(2)
         assert np.allclose(body.inertia, body.inertia[0, 0] * np.diag([1, 1, 2]))
         assert np.allclose(body.at, origin, rtol=0.0, atol=1e-12)
-        for k, place in enumerate(
-            radius * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
-        ):
+        for k, place in enumerate(radius * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])):
             node = self.node(origin + place)
             self.elements.append(f"*ELEMENT, TYPE=MASS, ELSET=P{k}\n{k + 1}, {node}")
             self.sections.append(f"*MASS, ELSET=P{k}\n{body.mass / 4:.12e}")

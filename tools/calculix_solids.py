@@ -244,8 +244,7 @@ class Solids:
         for node in self.platform:
             for k in (1, 2, 3):
                 steps.append(
-                    f"*STEP\n*STATIC\n*CLOAD, OP=NEW\n{node}, {k}, 1.0\n"
-                    "*NODE PRINT, NSET=PLATFORM\nU\n*END STEP"
+                    f"*STEP\n*STATIC\n*CLOAD, OP=NEW\n{node}, {k}, 1.0\n*NODE PRINT, NSET=PLATFORM\nU\n*END STEP"
                 )
         return "\n".join(
             [

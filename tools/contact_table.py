@@ -76,11 +76,13 @@ def contact(robot: Robot, seed: int) -> dict[str, Any]:
     if first is not None:
         named = CLAMPING if place.where.startswith(CLAMPING) else place.where
         row |= {
-            "named": named, "confidence": place.confidence,
+            "named": named,
+            "confidence": place.confidence,
             "body": sorted(place.body.split(" and ")) == sorted(hit.bodies),
             "miss": float(np.linalg.norm(place.point - hit.point[k])),
-            "deviation": place.deviation, "size": robot.graph.size,
-        }  # fmt: skip
+            "deviation": place.deviation,
+            "size": robot.graph.size,
+        }
     return row
 
 

@@ -12,10 +12,15 @@ from pathlib import Path
 from typing import Any
 
 CORES = (
-    "delta_dynamics", "pkm_twin/bags", "pkm_twin/codegen", "pkm_twin/kinematics",
+    "delta_dynamics",
+    "pkm_twin/bags",
+    "pkm_twin/codegen",
+    "pkm_twin/kinematics",
     "pkm_twin/machine",
-    "pkm_twin/messages", "pkm_twin/streams", "stiffness_monitor",
-)  # fmt: skip
+    "pkm_twin/messages",
+    "pkm_twin/streams",
+    "stiffness_monitor",
+)
 BOUND = 95.0
 """Per cent of a folder."""
 

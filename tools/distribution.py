@@ -26,17 +26,20 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 NAME = "pkm_twin"
 CLASSIFIED = {
-    "BSD": "BSD-3-Clause", "MIT": "MIT", "Apache": "Apache-2.0", "MPL": "MPL-2.0",
-    "Python Software": "PSF-2.0", "ISC": "ISC", "Historical": "HPND",
-}  # fmt: skip
+    "BSD": "BSD-3-Clause",
+    "MIT": "MIT",
+    "Apache": "Apache-2.0",
+    "MPL": "MPL-2.0",
+    "Python Software": "PSF-2.0",
+    "ISC": "ISC",
+    "Historical": "HPND",
+}
 """Words of a licence's text or classifier, and its SPDX name."""
 
 
 def build(target: Path) -> dict[str, str]:
     """Build both archives into a folder: SHA-256 by file name."""
-    git = subprocess.run(
-        ["git", "log", "-1", "--format=%ct"], cwd=ROOT, capture_output=True, text=True
-    )
+    git = subprocess.run(["git", "log", "-1", "--format=%ct"], cwd=ROOT, capture_output=True, text=True)
     # Without git, the first time that a zip file can have.
     epoch = os.environ.get("SOURCE_DATE_EPOCH") or git.stdout.strip() or "315532800"
     # Modes are in the archives.
@@ -60,9 +63,7 @@ def build(target: Path) -> dict[str, str]:
 
 def _python(*words: str, epoch: str, cwd: Path = ROOT) -> str:
     environment = {**os.environ, "SOURCE_DATE_EPOCH": epoch, "PYTHONHASHSEED": "0"}
-    done = subprocess.run(
-        [sys.executable, *words], cwd=cwd, env=environment, capture_output=True, text=True
-    )
+    done = subprocess.run([sys.executable, *words], cwd=cwd, env=environment, capture_output=True, text=True)
     if done.returncode:
         raise SystemExit(done.stdout + done.stderr)
     return done.stdout
@@ -114,20 +115,25 @@ def bill() -> dict[str, Any]:
     def component(name: str, package: metadata.Distribution) -> dict[str, Any]:
         reference = f"pkg:pypi/{name}@{package.version}"
         return {
-            "type": "library", "bom-ref": reference, "name": name, "version": package.version,
-            "purl": reference, "licenses": [{"expression": licence(package)}],
-        }  # fmt: skip
+            "type": "library",
+            "bom-ref": reference,
+            "name": name,
+            "version": package.version,
+            "purl": reference,
+            "licenses": [{"expression": licence(package)}],
+        }
 
     packages = needed()
-    own = component("pkm-twin", metadata.distribution(NAME)) | {
-        "licenses": [{"expression": "Apache-2.0"}]
-    }
+    own = component("pkm-twin", metadata.distribution(NAME)) | {"licenses": [{"expression": "Apache-2.0"}]}
     parts = [component(name, package) for name, package in packages.items()]
     return {
-        "bomFormat": "CycloneDX", "specVersion": "1.5", "version": 1,
-        "metadata": {"component": own}, "components": parts,
+        "bomFormat": "CycloneDX",
+        "specVersion": "1.5",
+        "version": 1,
+        "metadata": {"component": own},
+        "components": parts,
         "dependencies": [{"ref": own["bom-ref"], "dependsOn": [p["bom-ref"] for p in parts]}],
-    }  # fmt: skip
+    }
 
 
 def main() -> None:

@@ -52,39 +52,85 @@ MACHINES: Final = (*SHIPPED, "stewart", "machines/rsur", "machines/prru3", "mach
 FIVE: Final = ("delta", "five_bar", "linear_delta", "prru", "upr_rpu")
 POOR: Final = ("noise of 5 %", "coarse encoder", "repeated samples", "slow motion")
 ONE_CAUSE: Final = {
-    "all negated": (-1.0, "all"), "one negated": (-1.0, "one"), "half": (0.5, "all"),
-    "one at 0.8": (0.8, "one"), "all at 1.25": (1.25, "all"), "one doubled": (2.0, "one"),
-}  # fmt: skip
+    "all negated": (-1.0, "all"),
+    "one negated": (-1.0, "one"),
+    "half": (0.5, "all"),
+    "one at 0.8": (0.8, "one"),
+    "all at 1.25": (1.25, "all"),
+    "one doubled": (2.0, "one"),
+}
 Case = tuple[str, str, str]
 
 TRUTHS: Final = {
-    "efforts_negated": "sign", "one_effort_negated": "sign", "positions_negated": "positions",
-    "one_position_negated": "positions", "one_joint_negated": "positions",
-    "time_reversed": "unknown", "efforts_reversed": "unknown",
-    "effort_columns_swapped": "exchanged", "effort_columns_rolled": "exchanged",
-    "position_columns_swapped": "exchanged", "columns_taken_for_each_other": "unknown",
-    "milliseconds": "time", "seconds_for_milliseconds": "time", "half_speed": "time",
-    "kgf_cm": "scale", "newton_millimetres": "scale", "kilogram_force": "scale",
-    "three_times": "scale", "a_third": "scale", "motor_side": "scale", "degrees": "positions",
-    "radians_for_degrees": "positions", "millimetres": "positions", "efforts_late": "delay",
-    "one_effort_late": "delay", "efforts_shuffled": "unknown", "noise_for_efforts": "unknown",
-    "all negated": "sign", "one negated": "sign", "half": "scale", "one at 0.8": "scale",
-    "all at 1.25": "scale", "one doubled": "scale", "picked payload": "payload",
-    "scale and payload": "scale", "wrench turned": "force", "unknown push": "unknown",
-    "late": "delay", "one late": "delay", "another machine": "unknown", "play": "play",
-}  # fmt: skip
+    "efforts_negated": "sign",
+    "one_effort_negated": "sign",
+    "positions_negated": "positions",
+    "one_position_negated": "positions",
+    "one_joint_negated": "positions",
+    "time_reversed": "unknown",
+    "efforts_reversed": "unknown",
+    "effort_columns_swapped": "exchanged",
+    "effort_columns_rolled": "exchanged",
+    "position_columns_swapped": "exchanged",
+    "columns_taken_for_each_other": "unknown",
+    "milliseconds": "time",
+    "seconds_for_milliseconds": "time",
+    "half_speed": "time",
+    "kgf_cm": "scale",
+    "newton_millimetres": "scale",
+    "kilogram_force": "scale",
+    "three_times": "scale",
+    "a_third": "scale",
+    "motor_side": "scale",
+    "degrees": "positions",
+    "radians_for_degrees": "positions",
+    "millimetres": "positions",
+    "efforts_late": "delay",
+    "one_effort_late": "delay",
+    "efforts_shuffled": "unknown",
+    "noise_for_efforts": "unknown",
+    "all negated": "sign",
+    "one negated": "sign",
+    "half": "scale",
+    "one at 0.8": "scale",
+    "all at 1.25": "scale",
+    "one doubled": "scale",
+    "picked payload": "payload",
+    "scale and payload": "scale",
+    "wrench turned": "force",
+    "unknown push": "unknown",
+    "late": "delay",
+    "one late": "delay",
+    "another machine": "unknown",
+    "play": "play",
+}
 """The cause that a case has; all others are sound."""
 SAID: Final = (
-    ("play between the joint", "play"), ("positions of this machine", "positions"),
-    ("positions and efforts of", "positions"), ("positions of", "positions"),
-    ("positions are", "positions"), ("have the wrong sign", "sign"),
-    ("are exchanged", "exchanged"), ("another order", "exchanged"), (" times what", "scale"),
-    (" s late", "delay"), (" s early", "delay"), ("time runs backwards", "unknown"),
-    ("the motion was", "time"), ("the time is", "time"), ("show no motion", "time"),
-    ("wrench", "force"), ("payload of", "payload"), ("no machine like", "unknown"),
-    ("something else", "force"), ("predict the held-out", "no gain"), ("held-out", "no gain"),
-    ("too few samples", "too little"), ("too short", "too little"), ("no excitation", "too little"),
-)  # fmt: skip
+    ("play between the joint", "play"),
+    ("positions of this machine", "positions"),
+    ("positions and efforts of", "positions"),
+    ("positions of", "positions"),
+    ("positions are", "positions"),
+    ("have the wrong sign", "sign"),
+    ("are exchanged", "exchanged"),
+    ("another order", "exchanged"),
+    (" times what", "scale"),
+    (" s late", "delay"),
+    (" s early", "delay"),
+    ("time runs backwards", "unknown"),
+    ("the motion was", "time"),
+    ("the time is", "time"),
+    ("show no motion", "time"),
+    ("wrench", "force"),
+    ("payload of", "payload"),
+    ("no machine like", "unknown"),
+    ("something else", "force"),
+    ("predict the held-out", "no gain"),
+    ("held-out", "no gain"),
+    ("too few samples", "too little"),
+    ("too short", "too little"),
+    ("no excitation", "too little"),
+)
 """Words of an answer, and the cause that they name."""
 
 
@@ -106,8 +152,7 @@ def draw(name: str, seed: int, seconds: float = 12.0) -> Drawn:
 def slow_down(m: Drawn, factor: float) -> Drawn:
     """Return the motion that takes so many times as long."""
     qd, qdd = m.qd / factor, m.qdd / factor**2
-    return Drawn(m.robot, m.truth, factor * m.time, m.q, qd, qdd,
-                 inverse_dynamics(m.truth, m.q, qd, qdd))  # fmt: skip
+    return Drawn(m.robot, m.truth, factor * m.time, m.q, qd, qdd, inverse_dynamics(m.truth, m.q, qd, qdd))
 
 
 def repeat_samples(r: Recording, every: int) -> Recording:
@@ -166,8 +211,7 @@ def make_drawn(name: str, what: str) -> tuple[Robot, Recording, Robot]:
     made, robot = m.recorded(), m.robot
     if cause == "another machine":
         others = (find_robot(one) for one in ("linear_delta", "delta", "prru", "five_bar"))
-        robot = next(one for one in others if one.joints_count == len(m.size)
-                     and one.name != robot.name)  # fmt: skip
+        robot = next(one for one in others if one.joints_count == len(m.size) and one.name != robot.name)
     elif cause == "play":
         # Backlash at the encoder: the position follows one flank or the other.
         gap = 5e-3 * unit_of(robot)
@@ -213,16 +257,20 @@ def make_poor(name: str, what: str) -> tuple[Robot, Recording, Robot]:
     m, rng = draw(name, 6), np.random.default_rng([6, 17])
     m = slow_down(m, 4.0) if how == "slow motion" else m
     made = WRONG[cause](m, rng) if cause in WRONG else m.recorded()
-    made = noisy(made, rng, 0.05 if how.startswith("noise") else 0.01,
-                 4e3 if how.startswith("coarse") else 1e5)  # fmt: skip
+    made = noisy(made, rng, 0.05 if how.startswith("noise") else 0.01, 4e3 if how.startswith("coarse") else 1e5)
     made = IMPOSSIBLE[cause](made, rng) if cause in IMPOSSIBLE else made
     return m.robot, repeat_samples(made, 25) if how.startswith("repeated") else made, m.truth
 
 
 MAKERS: Final[dict[str, Callable[[str, str], tuple[Robot, Recording, Robot]]]] = {
-    "tests": make_tested, "single": make_single, "event": make_event, "poor": make_poor,
-    "drawn": make_drawn, "lengths": make_lengths, "usual": make_usual,
-}  # fmt: skip
+    "tests": make_tested,
+    "single": make_single,
+    "event": make_event,
+    "poor": make_poor,
+    "drawn": make_drawn,
+    "lengths": make_lengths,
+    "usual": make_usual,
+}
 
 
 def list_cases() -> Iterator[Case]:
@@ -230,12 +278,17 @@ def list_cases() -> Iterator[Case]:
     tests = [(n, w) for n in MACHINES for w in ("sound",)]
     tests += [(n, w) for n in FIVE for w in (*WRONG, *IMPOSSIBLE)]
     single = [(n, w) for n in MACHINES for w in (*ONE_CAUSE, "payload 0.2", "payload 5")]
-    event = [(n, w) for n in ("delta", "five_bar", "prru", "delta_cu") for w in
-             ("picked payload", "scale and payload", "wrench turned", "unknown push", "late",
-              "one late")]  # fmt: skip
-    poor = [(n, f"{q}: {w}") for n in ("delta", "five_bar", "linear_delta") for q in POOR for w in
-            ("sound", "one_effort_negated", "half_speed", "three_times",
-             "effort_columns_swapped", "gain")]  # fmt: skip
+    event = [
+        (n, w)
+        for n in ("delta", "five_bar", "prru", "delta_cu")
+        for w in ("picked payload", "scale and payload", "wrench turned", "unknown push", "late", "one late")
+    ]
+    poor = [
+        (n, f"{q}: {w}")
+        for n in ("delta", "five_bar", "linear_delta")
+        for q in POOR
+        for w in ("sound", "one_effort_negated", "half_speed", "three_times", "effort_columns_swapped", "gain")
+    ]
     drawn = list[tuple[str, str]]()
     names = ("delta_cu", "five_bar", "linear_delta", "prru", "upr_rpu", "random five_bar")
     causes = (
@@ -253,8 +306,15 @@ def list_cases() -> Iterator[Case]:
     drawn = [(n, f"{6 * i + k} {c}") for i, c in enumerate(causes) for k, n in enumerate(names)]
     lengths = [(n, str(s)) for s in range(4) for n in MACHINES]
     usual = [(n, str(s)) for s in range(4) for n in MACHINES]
-    groups = {"lengths": lengths, "drawn": drawn, "tests": tests, "usual": usual,
-              "single": single, "event": event, "poor": poor}  # fmt: skip
+    groups = {
+        "lengths": lengths,
+        "drawn": drawn,
+        "tests": tests,
+        "usual": usual,
+        "single": single,
+        "event": event,
+        "poor": poor,
+    }
     yield from ((group, *one) for group, cases in groups.items() for one in cases)
 
 
@@ -276,17 +336,16 @@ def answer_case(case: Case) -> dict[str, Any]:
         result, _, notes = fit_recordings(robot, [r], KINDS, ())
         true = truths(truth, KINDS) if truth.name == robot.name else {}
         found |= {
-            "fit": result.verdict.answer, "notes": notes,
+            "fit": result.verdict.answer,
+            "notes": notes,
             "findings": [str(one) for one in result.verdict.findings],
             "numbers": [
                 (n.name, n.before, n.after, n.deviation, true[n.name], n.status)
-                for n in result.numbers if n.name in true
+                for n in result.numbers
+                if n.name in true
             ],
-            "held out": [
-                [one.rms(one.before).tolist(), one.rms(one.after).tolist()]
-                for one in result.judged
-            ],
-        }  # fmt: skip
+            "held out": [[one.rms(one.before).tolist(), one.rms(one.after).tolist()] for one in result.judged],
+        }
     except PkmTwinError as error:
         found |= {"fit": "rejected", "notes": [str(error)]}
     middle = time.process_time()
@@ -326,10 +385,9 @@ def judge_case(found: dict[str, Any]) -> tuple[str, str, str, str]:
 def print_tables(paths: list[str]) -> None:
     """Print confusion and coverage of each file, of the cases that all of them have."""
     files = [
-        {tuple(one["case"]): one for one in map(json.loads, Path(p).read_text().splitlines())
-         if "skipped" not in one}
+        {tuple(one["case"]): one for one in map(json.loads, Path(p).read_text().splitlines()) if "skipped" not in one}
         for p in paths
-    ]  # fmt: skip
+    ]
     common = sorted(set.intersection(*(set(one) for one in files)))
     judged = [{c: judge_case(one[c]) for c in common} for one in files]
     for path, one, marks in zip(paths, files, judged, strict=True):
@@ -344,13 +402,18 @@ def print_tables(paths: list[str]) -> None:
             confusion[marks[c][0]][marks[c][1]] += 1
         for true, counter in sorted(confusion.items()):
             print(f"  truth {true:10}", dict(counter.most_common()))
-        apart = [c for c in common if (found := marks[c])[1] != found[2] and
-                 not {"no gain", "too little", "not judged"} & set(found[1:3])]  # fmt: skip
+        apart = [
+            c
+            for c in common
+            if (found := marks[c])[1] != found[2] and not {"no gain", "too little", "not judged"} & set(found[1:3])
+        ]
         print(f"  fit and check differ: {len(apart)}")
         print_coverage({c: one[c] for c in common})
         times = np.array([one[c]["seconds"] for c in common])
-        print(f"  CPU seconds, median: fit {np.median(times[:, 0]):.2f}, "
-              f"check {np.median(times[:, 1]):.2f}; sum {times.sum():.0f}")  # fmt: skip
+        print(
+            f"  CPU seconds, median: fit {np.median(times[:, 0]):.2f}, "
+            f"check {np.median(times[:, 1]):.2f}; sum {times.sum():.0f}"
+        )
     for c in common:
         if any(marks[c][3] != "right" for marks in judged):
             print(c, *(f"| {m[c][3]}: {m[c][1]} / {m[c][2]}" for m in judged))
@@ -369,10 +432,12 @@ def print_coverage(found: dict[Any, dict[str, Any]]) -> None:
                     size.append(abs(after - true) / max(abs(before - true), 1e-12))
         if z:
             inside = [f"{100 * np.mean(np.abs(z) <= k):.1f}" for k in (1, 2, 3)]
-            print(f"  {' and '.join(groups):18} {len(z):4} numbers, within 1, 2, 3 deviations "
-                  f"{', '.join(inside)} %; RMS z {np.sqrt(np.mean(np.square(z))):.2f}, largest "
-                  f"{np.abs(z).max():.1f}; median error over the file's "
-                  f"{np.median(size):.3f}")  # fmt: skip
+            print(
+                f"  {' and '.join(groups):18} {len(z):4} numbers, within 1, 2, 3 deviations "
+                f"{', '.join(inside)} %; RMS z {np.sqrt(np.mean(np.square(z))):.2f}, largest "
+                f"{np.abs(z).max():.1f}; median error over the file's "
+                f"{np.median(size):.3f}"
+            )
 
 
 def main(args: list[str]) -> None:

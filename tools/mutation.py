@@ -27,17 +27,29 @@ TARGETS = {
     "pkm_twin/messages/stamps.py": "nodes:messages nodes:gate nodes:feedforward",
     "pkm_twin/messages/reading.py": "nodes:messages nodes:gate nodes:joint_map nodes:wrenches "
     "nodes:fast_decoder nodes:stiffness_watch nodes:feedforward",
-    "pkm_twin/codegen/program.py": "laws:newton laws:assemblies "
-    "nodes:feedforward_singularities docs:constants",
+    "pkm_twin/codegen/program.py": "laws:newton laws:assemblies nodes:feedforward_singularities docs:constants",
 }
 """Module, and the tests that judge it."""
 SWAPS: dict[type, type] = {
-    ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt,
-    ast.Eq: ast.NotEq, ast.NotEq: ast.Eq, ast.Is: ast.IsNot, ast.IsNot: ast.Is,
-    ast.In: ast.NotIn, ast.NotIn: ast.In, ast.And: ast.Or, ast.Or: ast.And,
-    ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult,
-    ast.BitAnd: ast.BitOr, ast.BitOr: ast.BitAnd,
-}  # fmt: skip
+    ast.Lt: ast.LtE,
+    ast.LtE: ast.Lt,
+    ast.Gt: ast.GtE,
+    ast.GtE: ast.Gt,
+    ast.Eq: ast.NotEq,
+    ast.NotEq: ast.Eq,
+    ast.Is: ast.IsNot,
+    ast.IsNot: ast.Is,
+    ast.In: ast.NotIn,
+    ast.NotIn: ast.In,
+    ast.And: ast.Or,
+    ast.Or: ast.And,
+    ast.Add: ast.Sub,
+    ast.Sub: ast.Add,
+    ast.Mult: ast.Div,
+    ast.Div: ast.Mult,
+    ast.BitAnd: ast.BitOr,
+    ast.BitOr: ast.BitAnd,
+}
 PLAIN = (ast.Expr, ast.Assign, ast.AugAssign, ast.Raise)
 """Statements that are left out."""
 
@@ -98,9 +110,7 @@ class Walk(ast.NodeTransformer):
 
     def visit_Call(self, node: ast.Call) -> ast.AST:
         # The tests of the pages hold the settings, in processes of their own.
-        return (
-            node if ast.unparse(node.func) in ("setting", "TypeVar") else self.generic_visit(node)
-        )
+        return node if ast.unparse(node.func) in ("setting", "TypeVar") else self.generic_visit(node)
 
 
 def survives(path: str, chosen: int, tests: list[str]) -> bool:

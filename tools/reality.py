@@ -116,9 +116,7 @@ def section() -> str:
     table = "\n".join(_row(name, own) for name, own in rows.items())
     halves = _transfer(robot, poses)
     columns = read_table(DATA / "leg_currents.csv")
-    drive = drive_friction(
-        GRAVITY * SPOOL * columns["mass_kg"], columns["iq_up_A"], columns["iq_down_A"]
-    )
+    drive = drive_friction(GRAVITY * SPOOL * columns["mass_kg"], columns["iq_up_A"], columns["iq_down_A"])
     told = text_of(drive_report(drive))
     return SECTION.format(count=count, table=table, halves=halves, drive=told)
 

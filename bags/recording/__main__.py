@@ -72,12 +72,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         tasks = {name: bars.add_task(name, total=1.0) for name in options.names or RECORDERS}
         for name, task in tasks.items():
             path = options.out / (name + ENDINGS.get(name, ".mcap"))
-            RECORDERS[name](
-                path, progress=lambda done, task=task: bars.update(task, completed=done)
-            )
-            bars.update(
-                task, completed=1.0, description=f"{path} {path.stat().st_size / 1e6:.2f} MB"
-            )
+            RECORDERS[name](path, progress=lambda done, task=task: bars.update(task, completed=done))
+            bars.update(task, completed=1.0, description=f"{path} {path.stat().st_size / 1e6:.2f} MB")
     return 0
 
 

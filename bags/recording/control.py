@@ -94,8 +94,6 @@ def simulate(
         effort = np.clip(effort, -peak, peak)
         for _ in range(SUBSTEPS):
             wrench = push(k * period, configuration, velocity)
-            configuration, velocity = engine.step(
-                configuration, velocity, effort, wrench, period / SUBSTEPS
-            )
+            configuration, velocity = engine.step(configuration, velocity, effort, wrench, period / SUBSTEPS)
         if progress is not None and k % 100 == 99:
             progress((k + 1) / count)

@@ -99,10 +99,7 @@ class UprRpuFrame:
         self.shear_modulus = float(members["shear_modulus"])
         self.diameter = np.broadcast_to(np.asarray(members["diameter"], dtype=float), (3,))
         self.shear_factor = float(members.get("shear_factor", 1.0))
-        self.joints = {
-            name: np.asarray(values, dtype=float)
-            for name, values in params["joints_compliance"].items()
-        }
+        self.joints = {name: np.asarray(values, dtype=float) for name, values in params["joints_compliance"].items()}
         given = params.get("element_compliance") or {}
         self.factors = {name: float(given.get(name, 1.0)) for name in ELEMENTS}
 
@@ -203,9 +200,14 @@ class UprRpuFrame:
                 (head_joint, head, "o", upper[limb], None),
             ):
                 model.springs[name] = _JointSpring(
-                    name, model.nodes[i_node], model.nodes[j_node], point, frame,
-                    self.factors[name] * values, extra,
-                )  # fmt: skip
+                    name,
+                    model.nodes[i_node],
+                    model.nodes[j_node],
+                    point,
+                    frame,
+                    self.factors[name] * values,
+                    extra,
+                )
         return model
 
 
@@ -222,9 +224,7 @@ def _rigid(node: Any, at: Array) -> Array:
 
 
 def _moved(node: Any, combo: str) -> Array:
-    return np.array(
-        [float(getattr(node, name)[combo]) for name in ("DX", "DY", "DZ", "RX", "RY", "RZ")]
-    )
+    return np.array([float(getattr(node, name)[combo]) for name in ("DX", "DY", "DZ", "RX", "RY", "RZ")])
 
 
 def _displacement(i_node: Any, j_node: Any, combo: str) -> Array:

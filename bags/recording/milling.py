@@ -39,10 +39,7 @@ class Milling:
 
     def engagement(self, time: float) -> float:
         """Return how deep the cutter is in the work, 0 to 1."""
-        return sum(
-            smooth((time - enter) / 0.4)[0] - smooth((time - leave) / 0.4)[0]
-            for enter, leave in self.passes
-        )
+        return sum(smooth((time - enter) / 0.4)[0] - smooth((time - leave) / 0.4)[0] for enter, leave in self.passes)
 
     def wrench(self, time: float) -> Array:
         """Return the load on the platform at its origin, platform axes, N and N m, shape (6,).

@@ -47,9 +47,7 @@ class DeltaEngine(LoopEngine):
         self._body(joint, float(inertia["platform_mass"]), np.zeros(3), np.zeros((3, 3)))
         self._payload(joint)
 
-        for limb, (azimuth, closure) in enumerate(
-            zip(geometry["azimuths"], closures, strict=True), start=1
-        ):
+        for limb, (azimuth, closure) in enumerate(zip(geometry["azimuths"], closures, strict=True), start=1):
             turn = pin.utils.rpyToMatrix(0.0, 0.0, float(azimuth))
             base = pin.SE3(turn, turn @ np.array([float(geometry["base_radius"]), 0.0, 0.0]))
             arm = self.model.addJoint(0, pin.JointModelRY(), base, f"arm_{limb}")
@@ -64,14 +62,10 @@ class DeltaEngine(LoopEngine):
             elbow = pin.SE3(np.eye(3), np.array([arm_length, 0.0, 0.0]))
             if closure == "rod":
                 first = self.model.addJoint(arm, pin.JointModelRY(), elbow, f"elbow_{limb}_swing")
-                forearm = self.model.addJoint(
-                    first, pin.JointModelRX(), pin.SE3.Identity(), f"elbow_{limb}_lean"
-                )
+                forearm = self.model.addJoint(first, pin.JointModelRX(), pin.SE3.Identity(), f"elbow_{limb}_lean")
             elif closure == "rcu":
                 first = self.model.addJoint(arm, pin.JointModelPY(), elbow, f"elbow_{limb}_slide")
-                forearm = self.model.addJoint(
-                    first, pin.JointModelRY(), pin.SE3.Identity(), f"elbow_{limb}_swing"
-                )
+                forearm = self.model.addJoint(first, pin.JointModelRY(), pin.SE3.Identity(), f"elbow_{limb}_swing")
             else:
                 raise ValueError(f"closure {closure!r} is neither 'rod' nor 'rcu'")
             self._body(
@@ -105,9 +99,7 @@ class DeltaEngine(LoopEngine):
         side, other = centres[1] - centres[0], centres[2] - centres[0]
         normal = cross(side, other)
         scale = normal @ normal
-        offset = ((other @ other) * cross(normal, -side) + (side @ side) * cross(normal, other)) / (
-            -2.0 * scale
-        )
+        offset = ((other @ other) * cross(normal, -side) + (side @ side) * cross(normal, other)) / (-2.0 * scale)
         height = length**2 - offset @ offset
         if height <= 0.0:
             raise AssemblyError(f"the forearms do not reach each other at arm angles {q}")
@@ -117,9 +109,7 @@ class DeltaEngine(LoopEngine):
         configuration: Array = pin.neutral(self.model)
         configuration[:3] = position
         for limb, azimuth in enumerate(azimuths):
-            to_arm = pin.utils.rpyToMatrix(0.0, -q[limb], 0.0) @ pin.utils.rpyToMatrix(
-                0.0, 0.0, -azimuth
-            )
+            to_arm = pin.utils.rpyToMatrix(0.0, -q[limb], 0.0) @ pin.utils.rpyToMatrix(0.0, 0.0, -azimuth)
             local = to_arm @ (position - centres[limb]) / length
             swing = math.atan2(-local[0], -local[2])
             joint = self._actuated_joints[limb] + 1

@@ -154,9 +154,7 @@ class LoopEngine:
 
     def constraint_drift(self, configuration: Array, velocity: Array) -> Array:
         """Return the loops' second derivative at zero tree acceleration, shape (constraints,)."""
-        pin.forwardKinematics(
-            self.model, self.data, configuration, velocity, np.zeros(self.model.nv)
-        )
+        pin.forwardKinematics(self.model, self.data, configuration, velocity, np.zeros(self.model.nv))
         pin.updateFramePlacements(self.model, self.data)
         drift = []
         for a, b in self._points:
@@ -174,9 +172,7 @@ class LoopEngine:
         return np.concatenate(drift)
 
     def _point_acceleration(self, frame: int) -> Array:
-        acceleration: Array = pin.getFrameClassicalAcceleration(
-            self.model, self.data, frame, _WORLD
-        ).linear
+        acceleration: Array = pin.getFrameClassicalAcceleration(self.model, self.data, frame, _WORLD).linear
         return acceleration
 
     # Kinematics
@@ -235,18 +231,14 @@ class LoopEngine:
         jacobian = self.constraint_jacobian(configuration)
         return self._complete(jacobian, self.actuated, qd, 0.0)
 
-    def _complete(
-        self, jacobian: Array, held: Array, values: ArrayLike, drift: Array | float
-    ) -> Array:
+    def _complete(self, jacobian: Array, held: Array, values: ArrayLike, drift: Array | float) -> Array:
         free = self._others(held)
         full = np.empty(self.model.nv)
         full[held] = values
         full[free] = np.linalg.solve(jacobian[:, free], -(jacobian[:, held] @ full[held]) - drift)
         return full
 
-    def state(
-        self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, near: Array | None = None
-    ) -> TreeState:
+    def state(self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, near: Array | None = None) -> TreeState:
         """Return the whole tree's motion for the actuators' motion, consistent with the loops.
 
         :param q: actuator positions, shape (3,), rad or m; ``qd``, ``qdd`` their derivatives.
@@ -254,18 +246,14 @@ class LoopEngine:
         """
         return self._motion(self.assemble(q, near), self.actuated, qd, qdd)
 
-    def pose_state(
-        self, pose: ArrayLike, rate: ArrayLike, second: ArrayLike, near: Array | None = None
-    ) -> TreeState:
+    def pose_state(self, pose: ArrayLike, rate: ArrayLike, second: ArrayLike, near: Array | None = None) -> TreeState:
         """Return the whole tree's motion for the platform's motion; else as `state`.
 
         :param pose: the platform's three coordinates; ``rate``, ``second`` their derivatives.
         """
         return self._motion(self.assemble_pose(pose, near), self.pose_places, rate, second)
 
-    def _motion(
-        self, configuration: Array, held: Array, rate: ArrayLike, second: ArrayLike
-    ) -> TreeState:
+    def _motion(self, configuration: Array, held: Array, rate: ArrayLike, second: ArrayLike) -> TreeState:
         jacobian = self.constraint_jacobian(configuration)
         velocity = self._complete(jacobian, held, rate, 0.0)
         drift = self.constraint_drift(configuration, velocity)
@@ -300,9 +288,7 @@ class LoopEngine:
         effort: Array = pin.rnea(self.model, self.data, tree.q, tree.v, tree.a, forces)
         return effort.copy()
 
-    def actuator_effort(
-        self, tree: TreeState, wrench: ArrayLike | None = None
-    ) -> tuple[Array, Array]:
+    def actuator_effort(self, tree: TreeState, wrench: ArrayLike | None = None) -> tuple[Array, Array]:
         """Split the tree's generalised forces into actuator efforts and loop multipliers.
 
         Solves ``rnea = B tau + Jc^T lambda``: as many equations as unknowns.
@@ -315,9 +301,7 @@ class LoopEngine:
         effort = generalised[self.actuated] - jacobian[:, self.actuated].T @ multipliers
         return effort, multipliers
 
-    def transmitted(
-        self, tree: TreeState, wrench: ArrayLike | None = None
-    ) -> tuple[dict[str, Array], list[Array]]:
+    def transmitted(self, tree: TreeState, wrench: ArrayLike | None = None) -> tuple[dict[str, Array], list[Array]]:
         """What the joints transmit: the recursive sweep with the loops' multipliers as loads.
 
         :returns: for every tree joint, by name, the wrench that its parent applies to its body, at
@@ -331,29 +315,21 @@ class LoopEngine:
         pin.updateFramePlacements(self.model, self.data)
         count = len(self._points)
         ends = {pair: k for k, pair in enumerate(self._points)}
-        loops = [
-            np.concatenate((part, np.zeros(3))) for part in multipliers[: 3 * count].reshape(-1, 3)
-        ]
-        for (a, x, b, y), couple in zip(
-            self._perpendiculars, multipliers[3 * count :].tolist(), strict=True
-        ):
+        loops = [np.concatenate((part, np.zeros(3))) for part in multipliers[: 3 * count].reshape(-1, 3)]
+        for (a, x, b, y), couple in zip(self._perpendiculars, multipliers[3 * count :].tolist(), strict=True):
             normal = cross(self.data.oMf[a].rotation @ x, self.data.oMf[b].rotation @ y)
             loops[ends[PointLoop(a, b)]][3:] += couple * normal
         for (a, b), load in zip(self._points, loops, strict=True):
             for frame, sign in ((a, 1.0), (b, -1.0)):
                 joint = self.model.frames[frame].parentJoint
                 lever = self.data.oMf[frame].translation
-                about_origin = pin.Force(
-                    sign * load[:3], sign * (load[3:] + cross(lever, load[:3]))
-                )
+                about_origin = pin.Force(sign * load[:3], sign * (load[3:] + cross(lever, load[:3])))
                 forces[joint] = forces[joint] + self.data.oMi[joint].actInv(about_origin)
         pin.rnea(self.model, self.data, tree.q, tree.v, tree.a, forces)
         found = {}
         for joint in range(1, self.model.njoints):
             turn, force = self.data.oMi[joint].rotation, self.data.f[joint]
-            found[self.model.names[joint]] = np.concatenate(
-                (turn @ force.linear, turn @ force.angular)
-            )
+            found[self.model.names[joint]] = np.concatenate((turn @ force.linear, turn @ force.angular))
         return found, loops
 
     def inverse_dynamics(
@@ -400,9 +376,7 @@ class LoopEngine:
         system[nv:, :nv] = jacobian
         right = np.empty(nv + nc)
         right[:nv] = -bias
-        right[self.actuated] += np.asarray(effort, dtype=float) - self.friction(
-            velocity[self.actuated]
-        )
+        right[self.actuated] += np.asarray(effort, dtype=float) - self.friction(velocity[self.actuated])
         right[nv:] = -drift
         if stabilisation:
             right[nv:] -= 2.0 * stabilisation * (jacobian @ velocity) + stabilisation**2 * error

@@ -81,14 +81,10 @@ class PrruEngine(LoopEngine):
                 across, about = inertia.get(f"{link}_link_inertia") or rod
                 self._body(joint, mass, centre, np.diag((across, across, about)))
             end = self._frame(f"limb_{limb}_end", joint, (0.0, 0.0, self._limb_length))
-            corner = self._frame(
-                f"platform_{limb}", self._platform_joint, -self._platform_radius * inward
-            )
+            corner = self._frame(f"platform_{limb}", self._platform_joint, -self._platform_radius * inward)
             tangent = np.array([-inward[1], inward[0], 0.0])
             self._points.append(PointLoop(end, corner))
-            self._perpendiculars.append(
-                PerpendicularLoop(end, np.array([1.0, 0.0, 0.0]), corner, tangent)
-            )
+            self._perpendiculars.append(PerpendicularLoop(end, np.array([1.0, 0.0, 0.0]), corner, tangent))
 
     def _guess(self, q: Array) -> Array:
         """Lay a plane through the limbs' ends as if all limbs leaned as at rest."""
@@ -96,9 +92,7 @@ class PrruEngine(LoopEngine):
         height = math.sqrt(max(self._limb_length**2 - reach**2, 0.0))
         ends = q + self._rise * height
         radius = self._platform_radius
-        plane = np.column_stack(
-            (np.ones(3), -radius * np.sin(self._azimuths), radius * np.cos(self._azimuths))
-        )
+        plane = np.column_stack((np.ones(3), -radius * np.sin(self._azimuths), radius * np.cos(self._azimuths)))
         z, alpha, beta = np.linalg.solve(plane, ends)
         configuration = self._home(np.array([z, *np.clip((alpha, beta), -0.9, 0.9)]))
         configuration[self.actuated] = q

@@ -99,9 +99,7 @@ def record(path: Path, seed: int = 20250104, progress: Progress | None = None) -
     limits = parameters.get("limits") or {}
     require_within(motion[0], limits.get("position"), "the arms' path")
     topics = ("/joint_states", "/ground_truth/wrench")
-    capture = Capture(
-        "record_collision", "delta_cu", parameters, ENGINE, seed, DURATION, topics, {}
-    )
+    capture = Capture("record_collision", "delta_cu", parameters, ENGINE, seed, DURATION, topics, {})
     wall, rng = Obstacle(engine, capture), np.random.default_rng(seed)
     simulate(capture, motion, lambda _: engine, DRIVES, known, rng, wall, progress)
     facts = {

@@ -127,9 +127,7 @@ def platform_motion(move: Move, time: float) -> tuple[Array, Array, Array]:
     return position, velocity, acceleration
 
 
-def reference(
-    engine: DeltaEngine, moves: list[Move], duration: float = DURATION
-) -> tuple[Array, Array, Array]:
+def reference(engine: DeltaEngine, moves: list[Move], duration: float = DURATION) -> tuple[Array, Array, Array]:
     """Return commanded arm angles, rates and accelerations, each of shape (samples, 3)."""
     count = round(duration * 1e9) // PERIOD_NS
     q, qd, qdd = (np.zeros((count, 3)) for _ in range(3))
@@ -179,9 +177,7 @@ def record(path: Path, seed: int = 20250101, progress: Progress | None = None) -
         "payload_released_s": f"{release:.3f}",
     }
     topics = ("/joint_states", "/delta_dynamics/joint_trajectory")
-    capture = Capture(
-        "record_delta_cu", "delta_cu", parameters, ENGINE, seed, DURATION, topics, facts | SENSORS
-    )
+    capture = Capture("record_delta_cu", "delta_cu", parameters, ENGINE, seed, DURATION, topics, facts | SENSORS)
     for move in moves:
         first, length = (round(t * 1e9) // PERIOD_NS for t in (move.start, move.duration))
         picked = slice(first, first + length + 1, TRAJECTORY_STRIDE)

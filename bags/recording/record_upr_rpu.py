@@ -162,7 +162,5 @@ def record(path: Path, seed: int = 20250102, progress: Progress | None = None) -
     """Simulate and write the bag."""
     topics = ("/ground_truth/deflection", "/ground_truth/strain_energy")
     facts = {"spindle_Hz": CUTTER.spindle_hz, "tooth_passing_Hz": CUTTER.tooth_hz}
-    capture = mill(
-        "record_upr_rpu", topics, seed, PERIOD_NS, TRUTH_STRIDE, truth, {}, facts, {}, progress
-    )
+    capture = mill("record_upr_rpu", topics, seed, PERIOD_NS, TRUTH_STRIDE, truth, {}, facts, {}, progress)
     capture.save(path)

@@ -92,9 +92,7 @@ def pick_and_place() -> str:
 def lifts() -> str:
     """How many of the commanded moves go up on their way."""
     r = recorded("delta_cu_pick_and_place")
-    moves = read_messages(
-        BAGS / "delta_cu_pick_and_place.mcap", ["/delta_dynamics/joint_trajectory"]
-    )
+    moves = read_messages(BAGS / "delta_cu_pick_and_place.mcap", ["/delta_dynamics/joint_trajectory"])
     heights = []
     for move in moves:
         z = r.robot.forward(np.array([p.positions for p in move.message.points]))[:, 2]

@@ -72,9 +72,14 @@ class MomentumObserver:
         self.jump = np.zeros_like(self._still)
 
     def push(
-        self, time: float, q: Array, qd: Array, effort: Array, wrench: Array | None = None,
+        self,
+        time: float,
+        q: Array,
+        qd: Array,
+        effort: Array,
+        wrench: Array | None = None,
         known: tuple[Array, Array] | None = None,
-    ) -> Array | None:  # fmt: skip
+    ) -> Array | None:
         """Add a sample; return external efforts (n,), N m or N, or None for the first sample.
 
         :param time: of the sample, s, later than the last one's.
@@ -258,9 +263,13 @@ class ContactMonitor:
         self._reach = friction_reach(robot)
 
     def push(
-        self, time: float, motion: tuple[Array, Array, Array], effort: Array,
-        wrench: Array | None = None, doubt: Array | None = None,
-    ) -> Contact | None:  # fmt: skip
+        self,
+        time: float,
+        motion: tuple[Array, Array, Array],
+        effort: Array,
+        wrench: Array | None = None,
+        doubt: Array | None = None,
+    ) -> Contact | None:
         """Add a sample; return the contact state, or None until the noise is known.
 
         :param time: of the sample, s, later than the last one's.
@@ -303,9 +312,7 @@ class ContactMonitor:
                 self._touching = False
             return self._verdict(q, external, idle)
         drag = self._drag.learn(step, external, np.where(still, 0.0, qd), touching=self._touching)
-        friction = np.minimum(drag, MAX_LEARNT_FRICTION * self._greatest) + np.where(
-            still, self._reach + holds, 0.0
-        )
+        friction = np.minimum(drag, MAX_LEARNT_FRICTION * self._greatest) + np.where(still, self._reach + holds, 0.0)
         self._follow(step, self._deviation(parts, q, sure, qdd, wrench), friction, doubt)
         self._noise.advance(step)
         left = np.maximum(np.abs(external) - self._slack - self._impulse, 0.0)
@@ -321,9 +328,7 @@ class ContactMonitor:
             self._noise.learn(left, (MIN_NOISE_FRACTION * self._greatest) ** 2)
         return verdict
 
-    def _locate(
-        self, time: float, step: float, q: Array, qd: Array, external: Array, *, begins: bool
-    ) -> None:
+    def _locate(self, time: float, step: float, q: Array, qd: Array, external: Array, *, begins: bool) -> None:
         """Locate the contact of the present sample."""
         locator = self.prepare()
         if begins:

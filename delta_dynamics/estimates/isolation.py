@@ -169,9 +169,7 @@ class Places:
         joined = {*joined_bodies(graph)}
         # A force on the platform explains three efforts and fewer as well as any clamping.
         apart = (owners[one] != owners[other]) & (robot.joints_count > 3)
-        apart &= [
-            (self.parts[a], self.parts[b]) not in joined for a, b in zip(one, other, strict=True)
-        ]
+        apart &= [(self.parts[a], self.parts[b]) not in joined for a, b in zip(one, other, strict=True)]
         self.pairs = one[apart], other[apart]
         self.classes = (PLATFORM, *self.names)
         self.of_class = np.array([owners == name for name in self.classes], float)
@@ -215,9 +213,7 @@ class Places:
 def _blocks(graph: Graph) -> set[str]:
     """Return bodies that are not thin bars: the platform, and what slides on the base."""
     return {graph.platform} | {
-        joint.outer
-        for joint in graph.joints.values()
-        if joint.kind == "prismatic" and joint.inner == BASE
+        joint.outer for joint in graph.joints.values() if joint.kind == "prismatic" and joint.inner == BASE
     }
 
 
@@ -269,10 +265,14 @@ class ContactLocator:
         pair = sure[:, None] * self._approach(jacobian)
         free = sure * self._usual
         sums = (
-            np.array([len(q), y @ y]), np.einsum("nip,njp->ijp", one, one).ravel(),
-            np.einsum("n,nip->ip", y, one).ravel(), np.einsum("np,np->p", pair, pair), y @ pair,
-            free * free, free * y,
-        )  # fmt: skip
+            np.array([len(q), y @ y]),
+            np.einsum("nip,njp->ijp", one, one).ravel(),
+            np.einsum("n,nip->ip", y, one).ravel(),
+            np.einsum("np,np->p", pair, pair),
+            y @ pair,
+            free * free,
+            free * y,
+        )
         new = weight * np.concatenate(sums)
         self._sums = new if self._sums is None else fade * self._sums + new
 
@@ -405,9 +405,7 @@ def _of_force(matrix: Array, vector: Array, precision: Array) -> Array:
     return np.asarray(0.5 * (square - np.log(size)), np.float64)
 
 
-def _of_numbers(
-    squares: Array, parts: Array, precision: Array, *, one_sided: bool = False
-) -> Array:
+def _of_numbers(squares: Array, parts: Array, precision: Array, *, one_sided: bool = False) -> Array:
     """Return log marginal likelihoods of forces with one component, (sizes, hypotheses).
 
     :param squares: B' B, (hypotheses,); ``parts``: B' y.

@@ -121,9 +121,15 @@ class PayloadEstimator:
         self._rest.reset()
 
     def push(
-        self, time: float, q: Array, qd: Array, qdd: Array, effort: Array,
-        wrench: Array | None = None, doubt: Array | None = None,
-    ) -> PayloadEstimate | None:  # fmt: skip
+        self,
+        time: float,
+        q: Array,
+        qd: Array,
+        qdd: Array,
+        effort: Array,
+        wrench: Array | None = None,
+        doubt: Array | None = None,
+    ) -> PayloadEstimate | None:
         """Add a sample; return None for the first one, and while efforts are uninformative.
 
         :param time: of the sample, s, later than the last one's.
@@ -205,10 +211,12 @@ class PayloadEstimator:
         if mass < 0.0:
             # A negative mass means that no payload was found; its centre is undefined.
             nowhere = np.full(3, np.inf)
-            return PayloadEstimate(
-                0.0, own.copy(), math.hypot(deviation, mass), nowhere, self.resets, mass
-            )
+            return PayloadEstimate(0.0, own.copy(), math.hypot(deviation, mass), nowhere, self.resets, mass)
         return PayloadEstimate(
-            mass, np.where(known, com, own), deviation, np.where(known, spread, np.inf),
-            self.resets, mass,
-        )  # fmt: skip
+            mass,
+            np.where(known, com, own),
+            deviation,
+            np.where(known, spread, np.inf),
+            self.resets,
+            mass,
+        )

@@ -272,9 +272,9 @@ class EffortAction:
             if _key(goal.handle) in self._goals:
                 goal.handle.publish_feedback(told)
 
-        self._client.send_goal_async(
-            goal.handle.request, feedback_callback=feedback
-        ).add_done_callback(lambda future: self._answered(goal, future.result()))
+        self._client.send_goal_async(goal.handle.request, feedback_callback=feedback).add_done_callback(
+            lambda future: self._answered(goal, future.result())
+        )
 
     def _answered(self, goal: _Goal, handle: Any) -> None:
         self._lives()
@@ -295,9 +295,7 @@ class EffortAction:
         self._await_result(goal)
 
     def _await_result(self, goal: _Goal) -> None:
-        goal.controller.get_result_async().add_done_callback(
-            lambda future: self._ended(goal, future.result())
-        )
+        goal.controller.get_result_async().add_done_callback(lambda future: self._ended(goal, future.result()))
 
     def _ended(self, goal: _Goal, end: Any) -> None:
         self._lives()
@@ -349,9 +347,7 @@ class EffortAction:
         place = {**(goal.actual if fresh else {}), **(self._place() or {})}
         return self._send_point(names, place, then)
 
-    def _send_point(
-        self, names: Sequence[str], place: Mapping[str, float], then: Callable[[Any], None]
-    ) -> bool:
+    def _send_point(self, names: Sequence[str], place: Mapping[str, float], then: Callable[[Any], None]) -> bool:
         if not self._hold:
             return False
         try:

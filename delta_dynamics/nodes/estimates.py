@@ -183,9 +183,7 @@ class Estimates:
         return values
 
     def _take_contact(self, core: ContactMonitor, torques: Torques, effort: Any) -> None:
-        found = core.push(
-            torques.stamp / SECOND, torques.motion, effort, torques.wrench, torques.doubt
-        )
+        found = core.push(torques.stamp / SECOND, torques.motion, effort, torques.wrench, torques.doubt)
         if found is None:
             return
         if not found.idle:
@@ -212,9 +210,7 @@ class Estimates:
         self._effort.publish(stamp, own.controller_efforts(found.external))
 
     def _take_payload(self, core: PayloadEstimator, torques: Torques, effort: Any) -> None:
-        found = core.push(
-            torques.stamp / SECOND, *torques.motion, effort, torques.wrench, torques.doubt
-        )
+        found = core.push(torques.stamp / SECOND, *torques.motion, effort, torques.wrench, torques.doubt)
         if found is None:
             return
         pairs = (

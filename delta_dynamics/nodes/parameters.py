@@ -15,28 +15,37 @@ from pkm_twin.ros.node import TwinNode
 CHANGES: Final = {
     "payload.mass": ("payload", "mass", "kg", "mass of the payload"),
     "payload.com": (
-        "payload", "com", "m", "centre of mass of the payload, from the platform's reference point",
+        "payload",
+        "com",
+        "m",
+        "centre of mass of the payload, from the platform's reference point",
     ),
     "payload.inertia": (
-        "payload", "inertia", "kg m2", "inertia of the payload about its com, 3 or 9 numbers",
+        "payload",
+        "inertia",
+        "kg m2",
+        "inertia of the payload about its com, 3 or 9 numbers",
     ),
     "friction.viscous": (
-        "friction", "viscous", "N m s or N s/m", "viscous friction, one per joint",
+        "friction",
+        "viscous",
+        "N m s or N s/m",
+        "viscous friction, one per joint",
     ),
     "friction.coulomb": ("friction", "coulomb", "N m or N", "Coulomb friction, one per joint"),
     "friction.offset": ("friction", "offset", "N m or N", "constant effort, one per joint"),
     "gravity": ("gravity", "", "m/s2", "gravity in base axes"),
     "effort_limits": (
-        "limits", "effort", "N m or N", "largest effort of each joint; efforts beyond it are "
-        "rejected, or as limit_policy says",
+        "limits",
+        "effort",
+        "N m or N",
+        "largest effort of each joint; efforts beyond it are rejected, or as limit_policy says",
     ),
-}  # fmt: skip
+}
 """Their section, key, unit and meaning."""
 
 
-def declare_changes(
-    node: TwinNode, robot: Robot, names: Collection[str] = CHANGES
-) -> dict[str, Any]:
+def declare_changes(node: TwinNode, robot: Robot, names: Collection[str] = CHANGES) -> dict[str, Any]:
     """Declare these parameters; what is given in addition to the robot's file."""
     changes = {}
     for name in names:
@@ -49,9 +58,7 @@ def declare_changes(
         bounds: dict[str, Any] = {}
         if name == "payload.mass":
             bounds = {"low": 0.0, "high": MAX_MASS}
-        given = node.declare(
-            name, default, text, unit=unit, usual="the robot file's", changeable=True, **bounds
-        )
+        given = node.declare(name, default, text, unit=unit, usual="the robot file's", changeable=True, **bounds)
         if name in node.given:
             changes[name] = given
     return changes

@@ -75,9 +75,7 @@ class MachineSim(TwinNode):
         self._skipped = 0
         # Compiled before there is a topic to be found by.
         warm_up(self._variation.robot)
-        self.core.plant.advance(
-            np.zeros_like(settings.start), np.zeros(6), settings.period / settings.substeps
-        )
+        self.core.plant.advance(np.zeros_like(settings.start), np.zeros(6), settings.period / settings.substeps)
         self.core.restart()
         self._frame = self.declare("wrench_frame", "platform", "frame id of wrench")
         self._base = self.declare("base_frame", "base_link", "frame of ~/applied_wrench")
@@ -135,30 +133,29 @@ class MachineSim(TwinNode):
 
     def _declare_spread(self, robot: Robot) -> Variation:
         size = self.declare(
-            "spread", 0.0, "relative perturbation of the robot file's parameters",
-            low=0.0, high=MAX_SPREAD
-        )  # fmt: skip
-        kinds = self.declare(
-            "spread_kinds", list(KINDS), f"parameters to perturb: {', '.join(KINDS)}"
+            "spread", 0.0, "relative perturbation of the robot file's parameters", low=0.0, high=MAX_SPREAD
         )
+        kinds = self.declare("spread_kinds", list(KINDS), f"parameters to perturb: {', '.join(KINDS)}")
         seed = self.declare("seed", 1, "seed of the perturbation", low=0, high=2**31 - 1)
         distribution = self.declare(
-            "distribution", "normal", "normal: spread is the standard deviation; uniform: the "
-            "bound",
-            choices=("normal", "uniform")
-        )  # fmt: skip
+            "distribution",
+            "normal",
+            "normal: spread is the standard deviation; uniform: the bound",
+            choices=("normal", "uniform"),
+        )
         return varied(robot, dict.fromkeys(kinds, size), seed, distribution)
 
     def _declare_clock(self) -> None:
         self._clock_kind = self.declare(
-            "clock", "wall", "wall: the computer's clock; simulated: publishes /clock at "
+            "clock",
+            "wall",
+            "wall: the computer's clock; simulated: publishes /clock at "
             "real_time_factor; lockstep: publishes /clock, one period per effort command",
-            choices=("wall", "simulated", "lockstep")
-        )  # fmt: skip
+            choices=("wall", "simulated", "lockstep"),
+        )
         self._factor = self.declare(
-            "real_time_factor", 1.0, "speed of the simulated clock; 0: as fast as possible",
-            low=0.0, high=1000.0
-        )  # fmt: skip
+            "real_time_factor", 1.0, "speed of the simulated clock; 0: as fast as possible", low=0.0, high=1000.0
+        )
         self._simulated = self._clock_kind != "wall"
         self._lockstep = self._clock_kind == "lockstep"
         if self.get_parameter("use_sim_time").value:
@@ -170,9 +167,8 @@ class MachineSim(TwinNode):
     def _declare_settings(self, robot: Robot) -> MachineSettings:
         """Drives and sensors by the model: who tunes them does not know what was drawn."""
         bandwidth = self.declare(
-            "bandwidth", 10.0, "bandwidth of the position control, critically damped", unit="Hz",
-            low=0.01, high=1000.0
-        )  # fmt: skip
+            "bandwidth", 10.0, "bandwidth of the position control, critically damped", unit="Hz", low=0.01, high=1000.0
+        )
         stiffness, damping = tuned(robot, bandwidth)
         home = robot.inverse(robot.home())
         return self.declare_settings(
@@ -182,33 +178,23 @@ class MachineSim(TwinNode):
                 "start", home, "joint positions at the start, rad or m", usual="the robot's home"
             ),
             effort_limits=self._declare_array(
-                "effort_limits", effort_limits(robot), "largest effort of the drives, N m or N",
-                0.0, "the robot's"
+                "effort_limits", effort_limits(robot), "largest effort of the drives, N m or N", 0.0, "the robot's"
             ),
-            stiffness=self._declare_array(
-                "stiffness", stiffness, "of the position control", 0.0, "from bandwidth"
-            ),
-            damping=self._declare_array(
-                "damping", damping, "of the position control", 0.0, "from bandwidth"
-            ),
+            stiffness=self._declare_array("stiffness", stiffness, "of the position control", 0.0, "from bandwidth"),
+            damping=self._declare_array("damping", damping, "of the position control", 0.0, "from bandwidth"),
             resolution=self._declare_array(
-                "encoder_resolution", np.zeros(len(home)), "resolution of the encoders, rad or "
-                "m; velocities are then differences of steps; 0: exact", 0.0
+                "encoder_resolution",
+                np.zeros(len(home)),
+                "resolution of the encoders, rad or m; velocities are then differences of steps; 0: exact",
+                0.0,
             ),
             payloads=self._declare_payloads(robot),
             wrench=WrenchSignal(
-                self._declare_array(
-                    "wrench.constant", np.zeros(6), "wrench on the platform, N and N m, base axes"
-                ),
-                self._declare_array(
-                    "wrench.amplitude", np.zeros(6), "amplitude of a sine added to wrench.constant"
-                ),
-                self.declare(
-                    "wrench.frequency", 1.0, "frequency of the "
-                    "sine", unit="Hz", low=0.0, high=1e4
-                ),
+                self._declare_array("wrench.constant", np.zeros(6), "wrench on the platform, N and N m, base axes"),
+                self._declare_array("wrench.amplitude", np.zeros(6), "amplitude of a sine added to wrench.constant"),
+                self.declare("wrench.frequency", 1.0, "frequency of the sine", unit="Hz", low=0.0, high=1e4),
             ),
-        )  # fmt: skip
+        )
 
     def _check_control(self) -> None:
         """Efforts alone need no position control: a default that is too fast only warns.
@@ -239,16 +225,20 @@ class MachineSim(TwinNode):
             self.declare(name, default, text, usual=usual)
             for name, default, text, usual in (
                 (
-                    "payload.times", [0.0], "times at which the payload changes, s after the "
-                    "start", "",
+                    "payload.times",
+                    [0.0],
+                    "times at which the payload changes, s after the start",
+                    "",
                 ),
                 ("payload.masses", [own.mass], "payload from each time on, kg", "the robot's"),
                 (
-                    "payload.coms", own.com.tolist(), "centre of mass of the payload, m from the "
-                    "platform's reference point, three numbers per time", "the robot's",
+                    "payload.coms",
+                    own.com.tolist(),
+                    "centre of mass of the payload, m from the platform's reference point, three numbers per time",
+                    "the robot's",
                 ),
             )
-        )  # fmt: skip
+        )
         if len(masses) != len(times) or len(coms) != 3 * len(times):
             raise ParameterError(
                 "payload.masses",
@@ -265,18 +255,14 @@ class MachineSim(TwinNode):
             robot.changed(payload=event.load)
         return events
 
-    def _declare_array(
-        self, name: str, default: Array, text: str, low: float | None = None, usual: str = ""
-    ) -> Array:
+    def _declare_array(self, name: str, default: Array, text: str, low: float | None = None, usual: str = "") -> Array:
         """Declare a parameter with one number per joint or component; one number stands for all."""
         given = self.declare(name, default.tolist(), text, usual=usual)
         values = np.asarray(given, np.float64)
         if len(values) not in (1, len(default)):
             raise ParameterError(name, list(given), f"{len(default)} numbers, or one for all")
         if np.isnan(values).any() or (low is not None and (values < low).any()):
-            raise ParameterError(
-                name, list(given), "numbers" if low is None else f"{low:g} or more"
-            )
+            raise ParameterError(name, list(given), "numbers" if low is None else f"{low:g} or more")
         return np.broadcast_to(values, default.shape).copy()
 
     def _create_topics(self) -> None:
@@ -295,13 +281,9 @@ class MachineSim(TwinNode):
         self._clock_topic = self.create_publisher(Clock, "/clock", 10) if self._simulated else None
         self._clock_due = 0
         # In lockstep each command is a step.
-        self.create_guarded_subscription(
-            "~/commands", self._on_commands, droppable=not self._lockstep
-        )
+        self.create_guarded_subscription("~/commands", self._on_commands, droppable=not self._lockstep)
         self.create_guarded_subscription("~/joint_trajectory", self._on_trajectory, raw=True)
-        self.create_guarded_subscription(
-            "~/applied_wrench", lambda m: self.core.push(m, self._base)
-        )
+        self.create_guarded_subscription("~/applied_wrench", lambda m: self.core.push(m, self._base))
 
     def _on_commands(self, message: Float64MultiArray) -> None:
         self.core.commands(message)

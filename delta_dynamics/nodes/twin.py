@@ -217,8 +217,7 @@ class DeltaDynamics(TwinNode):
         controller = self.declare(
             "controller_action",
             "",
-            "FollowJointTrajectory action of the controller that ~/follow_joint_trajectory "
-            "forwards to; empty: none",
+            "FollowJointTrajectory action of the controller that ~/follow_joint_trajectory forwards to; empty: none",
         )
         hold = self.declare(
             "on_cancel",
@@ -232,18 +231,14 @@ class DeltaDynamics(TwinNode):
         try:
             from delta_dynamics.nodes.action import EffortAction
         except ImportError as error:
-            raise ParameterError(
-                "controller_action", controller, f"empty without control_msgs ({error})"
-            ) from error
+            raise ParameterError("controller_action", controller, f"empty without control_msgs ({error})") from error
         return EffortAction(
             self,
             controller,
             lambda trajectory: self.core.trajectory_steps(trajectory, self.now()),
             self._place,
             hold == "hold",
-            hold_efforts=lambda trajectory: self.core.trajectory_steps(
-                trajectory, self.now(), holding=True
-            ),
+            hold_efforts=lambda trajectory: self.core.trajectory_steps(trajectory, self.now(), holding=True),
             max_age=lambda: self.core.settings.stale_after,
             check=self.core.check_shape,
         )
@@ -269,14 +264,13 @@ class DeltaDynamics(TwinNode):
             False,
             "include the measured wrench in torques and residual of joint states",
         )
-        age = self.declare(
-            "max_wrench_age", 0.1, "largest time between a joint state and its wrench", **SECONDS
-        )
+        age = self.declare("max_wrench_age", 0.1, "largest time between a joint state and its wrench", **SECONDS)
         policy = self.declare(
-            "missing_wrench_policy", "ignore", "without a fresh wrench: ignore computes without "
-            "one, stop stops the stream",
-            choices=("ignore", "stop")
-        )  # fmt: skip
+            "missing_wrench_policy",
+            "ignore",
+            "without a fresh wrench: ignore computes without one, stop stops the stream",
+            choices=("ignore", "stop"),
+        )
         wrench = self.declare_settings(
             WrenchSettings,
             fixed=True,
@@ -300,9 +294,10 @@ class DeltaDynamics(TwinNode):
     def _create_base(self) -> BaseImu | None:
         """Return what measures the motion of the base, where the parameter asks for it."""
         wanted = self.declare(
-            "base_imu", False, "take the motion of the base from base_imu, else it is at rest; "
-            "only joint states are answered then"
-        )  # fmt: skip
+            "base_imu",
+            False,
+            "take the motion of the base from base_imu, else it is at rest; only joint states are answered then",
+        )
         settings = self.declare_settings(ImuSettings, fixed=True)
         return BaseImu(settings) if wanted else None
 
@@ -330,9 +325,7 @@ class DeltaDynamics(TwinNode):
     def _create_reaction_publishers(self, robot: Robot) -> dict[str, Any]:
         """Create a publisher for each joint's reaction if ``publish_reactions`` is set."""
         wanted = self.declare("publish_reactions", False, "publish ~/reactions/*")
-        rate = self.declare(
-            "reactions_rate", 50.0, "rate of ~/reactions/*", unit="Hz", low=1e-3, high=1e4
-        )
+        rate = self.declare("reactions_rate", 50.0, "rate of ~/reactions/*", unit="Hz", low=1e-3, high=1e4)
         self._reactions_pace = Pace(rate)
         if not wanted:
             return {}

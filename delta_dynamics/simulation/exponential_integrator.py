@@ -30,9 +30,7 @@ class Stepper:
         self._weights, self._damping = weights, damping
         self._on: Callable[..., Any] = np.multiply if damping is None else np.matmul
 
-    def run(
-        self, q: Array, v: Array, accelerations: Callable[[Array, Array], Array]
-    ) -> tuple[Array, Array]:
+    def run(self, q: Array, v: Array, accelerations: Callable[[Array, Array], Array]) -> tuple[Array, Array]:
         """Return positions and velocities at the end, shape (n,) each.
 
         :param accelerations: called four times with positions and velocities; includes damping.

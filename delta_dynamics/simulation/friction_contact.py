@@ -36,9 +36,7 @@ DEPENDENT: Final = 1e-7
 """Length of a row's independent part, relative to the row, below which it is dependent."""
 
 
-def resisting(
-    matrix: Array, motion: Array, low: Array, high: Array, states: States
-) -> tuple[Array, States]:
+def resisting(matrix: Array, motion: Array, low: Array, high: Array, states: States) -> tuple[Array, States]:
     """Solve for forces that resist motions: a bounded linear complementarity problem.
 
     What is left of the motion, w = motion - matrix force, is zero where the force is between its
@@ -155,9 +153,7 @@ class Resistance:
     ``memory``: of the drives' friction, at the start of the part of a step that goes on.
     """
 
-    def __init__(
-        self, robot: Robot, pushed: Sequence[int] = (), memory: Memory | None = None
-    ) -> None:
+    def __init__(self, robot: Robot, pushed: Sequence[int] = (), memory: Memory | None = None) -> None:
         self._pushed = list(pushed)
         n = robot.joints_count
         friction, passive = robot.friction, loaded_joints(robot.graph)
@@ -372,10 +368,7 @@ class Resistance:
         matrix[:n, :n] = here.mass
         matrix[:n, n:] = rows.T
         matrix[n:, :n] = rows
-        if self._passive:
-            drift = np.concatenate([np.zeros(n), here.drift])[law.held]
-        else:
-            drift = np.zeros(h)
+        drift = np.concatenate([np.zeros(n), here.drift])[law.held] if self._passive else np.zeros(h)
         result = np.linalg.solve(matrix, np.concatenate([rest, -drift]))
         result[law.held[law.held < n]] = 0.0
         return result[:n], result[n:]
@@ -422,9 +415,7 @@ class Resistance:
         rows = self.rows(here)[z]
         states = np.zeros(len(z), np.int8)
         if len(z):
-            force, states = resisting(
-                rows @ inverse @ rows.T, rows @ rates, low[z], high[z], states
-            )
+            force, states = resisting(rows @ inverse @ rows.T, rows @ rates, low[z], high[z], states)
             rates = rates - inverse @ (rows.T @ force)
             rates[z[(states == 0) & (z < n)]] = 0.0
         self._law = None

@@ -86,9 +86,7 @@ class MachineSettings:
     stiffness: Array
     damping: Array
     """Gains of the position control of trajectories, N m/rad and N m s/rad (N/m, N s/m)."""
-    period: float = setting(
-        1e-3, "sampling period of sensors and position control", unit="s", low=1e-4, high=10.0
-    )
+    period: float = setting(1e-3, "sampling period of sensors and position control", unit="s", low=1e-4, high=10.0)
     substeps: int = setting(1, "integration steps per period", low=1, high=100)
     resolution: Array = field(default_factory=lambda: np.zeros(1))
     """Encoder step, rad or m; 0 is none."""
@@ -100,9 +98,7 @@ class MachineSettings:
         low=0.0,
         high=10.0,
     )
-    deadline: float = setting(
-        0.1, "longest gap between effort commands", unit="s", low=1e-3, high=10.0
-    )
+    deadline: float = setting(0.1, "longest gap between effort commands", unit="s", low=1e-3, high=10.0)
     timeout_action: TimeoutAction = setting(
         "zeros",
         "efforts of the drives after deadline without commands: zeros, or hold (the last effort, "
@@ -163,9 +159,12 @@ def stable_share(robot: Robot, settings: MachineSettings) -> float:
 
 
 def error_growth(
-    inertia: Array, settings: MachineSettings, stiffness: float = 1.0, damping: float = 1.0,
+    inertia: Array,
+    settings: MachineSettings,
+    stiffness: float = 1.0,
+    damping: float = 1.0,
     follow: Array | None = None,
-) -> float:  # fmt: skip
+) -> float:
     """Return the largest factor by which a position control error grows in a period.
 
     The spectral radius of the loop that :meth:`Simulation.advance` closes: positions, rates, the
@@ -233,9 +232,7 @@ class Simulation(Core):
         s = self.settings
         self.braked, self.failure = True, ""
         self.plant = Plant(self.robot, s.start)
-        self._continuity = Continuity(
-            self.robot, SINGULAR, SINGULAR, [MAX_RATE] * self.robot.joints_count
-        )
+        self._continuity = Continuity(self.robot, SINGULAR, SINGULAR, [MAX_RATE] * self.robot.joints_count)
         self._begun = self.now
         self._payloads = deque(sorted(s.payloads, key=lambda event: event.time))
         self._coming: deque[tuple[int, Array]] = deque()
@@ -376,9 +373,7 @@ class Simulation(Core):
         before, self._seen = self._seen, self._encoder()
         self._seen_rate = self.plant.qd
         if s.resolution.any():
-            self._seen_rate = np.where(
-                s.resolution > 0.0, (self._seen - before) / s.period, self.plant.qd
-            )
+            self._seen_rate = np.where(s.resolution > 0.0, (self._seen - before) / s.period, self.plant.qd)
 
     def _encoder(self) -> Array:
         q, step = self.plant.q, self.settings.resolution

@@ -118,9 +118,7 @@ class Plant:
             if left <= 0.0:
                 return
 
-    def _follow(
-        self, here: Terms, law: Law, span: float, least: float
-    ) -> tuple[Terms, float, bool]:
+    def _follow(self, here: Terms, law: Law, span: float, least: float) -> tuple[Terms, float, bool]:
         """Integrate at most ``span`` s under a law that lasts.
 
         A span in which the law changes, or in which the method adds energy, is halved; one of
@@ -159,9 +157,7 @@ class Plant:
                 powers.append(float(law.wrench @ (t.twists @ qd)))
             return law.first if t is here else resistance.accelerate(law, t)[0]
 
-        end = resistance.at(
-            *resistance.stepper(here, law, span).run(here.q, here.qd, accelerations)
-        )
+        end = resistance.at(*resistance.stepper(here, law, span).run(here.q, here.qd, accelerations))
         if not powers:
             return end, 0.0
         return end, span / 6.0 * (powers[0] + 2.0 * (powers[1] + powers[2]) + powers[3])

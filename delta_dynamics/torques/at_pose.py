@@ -156,9 +156,12 @@ def _pose_torques(t: Traced, scheme: CarriedScheme, *, certified: bool) -> Progr
     branch = certify_assembly(t, scheme, posed, q) if certified else []
     outputs = {"q": t.lift(q), "qd": t.lift(rates), "qdd": t.lift(changes), "tau": t.lift(efforts)}
     return Program(
-        {"pose": m, "rate": m, "acceleration": m, "wrench": 6}, layout.size, outputs,
-        posed.equations(branch=t.lift(branch)), single=certified,
-    )  # fmt: skip
+        {"pose": m, "rate": m, "acceleration": m, "wrench": 6},
+        layout.size,
+        outputs,
+        posed.equations(branch=t.lift(branch)),
+        single=certified,
+    )
 
 
 def _followed_pose_torques(t: Traced, scheme: None) -> Program:
@@ -176,10 +179,11 @@ def _followed_pose_torques(t: Traced, scheme: None) -> Program:
     qdd = lu.solve(acceleration - np.array(pose_accelerations(t), dtype=object))
     efforts, _ = efforts_of_motion(t, parts, qd, qdd)
     outputs = {
-        "q": t.lift(t.tree.values_of_drives(q, t.x)), "qd": t.lift(t.tree.of_drives(qd, t.u)),
+        "q": t.lift(t.tree.values_of_drives(q, t.x)),
+        "qd": t.lift(t.tree.of_drives(qd, t.u)),
         "qdd": t.lift(t.tree.of_drives(qdd, t.du)),
         "tau": t.lift(t.drives.shared(efforts, preload=True)),
-    }  # fmt: skip
+    }
     inputs = {"pose": m, "rate": m, "acceleration": m, "wrench": 6}
     return Program(inputs, layout.size, outputs, first + equations)
 

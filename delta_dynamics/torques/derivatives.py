@@ -40,9 +40,13 @@ class TorqueDerivatives:
 
 
 def torque_derivatives(
-    robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None = None,
+    robot: Robot,
+    q: ArrayLike,
+    qd: ArrayLike,
+    qdd: ArrayLike,
+    wrench: ArrayLike | None = None,
     by: Sequence[str] = (),
-) -> TorqueDerivatives:  # fmt: skip
+) -> TorqueDerivatives:
     """Compute the derivatives of :func:`delta_dynamics.inverse_dynamics`, wrench constant.
 
     Exact to rounding, by differentiation of the program and the implicit function theorem. Dry
@@ -57,9 +61,14 @@ def torque_derivatives(
 
 
 def torque_gradient(
-    robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, weights: ArrayLike,
-    wrench: ArrayLike | None = None, by: Sequence[str] = (),
-) -> TorqueDerivatives:  # fmt: skip
+    robot: Robot,
+    q: ArrayLike,
+    qd: ArrayLike,
+    qdd: ArrayLike,
+    weights: ArrayLike,
+    wrench: ArrayLike | None = None,
+    by: Sequence[str] = (),
+) -> TorqueDerivatives:
     """Compute the derivatives of the sum of weights times efforts, in reverse mode.
 
     :param weights: shape (..., n). Others and errors as of :func:`torque_derivatives`.
@@ -70,17 +79,20 @@ def torque_gradient(
 
 
 def _derivatives(
-    robot: Robot, motion: Sequence[ArrayLike], wrench: ArrayLike | None, weights: Array,
-    by: Sequence[str], *, rows: bool,
-) -> TorqueDerivatives:  # fmt: skip
+    robot: Robot,
+    motion: Sequence[ArrayLike],
+    wrench: ArrayLike | None,
+    weights: Array,
+    by: Sequence[str],
+    *,
+    rows: bool,
+) -> TorqueDerivatives:
     inputs = _inputs(motion, wrench, weights, rows=rows)
     by_q, by_qd, by_qdd = robot.evaluate(motion_gradient(robot), robot.inertial, *inputs)
     return TorqueDerivatives(by_q, by_qd, by_qdd, _by_paths(robot, inputs, by))
 
 
-def torque_effects(
-    robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None
-) -> Array:
+def torque_effects(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None) -> Array:
     """Return the change of efforts per standard deviation of each cause, (..., n, causes)."""
     causes = robot.cached(CauseSlopes, geometry_and_masses)
     kernel = robot.cached(_effects)
@@ -91,14 +103,10 @@ def torque_effects(
 
 def _effects(robot: Robot) -> Kernel:
     chosen = robot.cached(CauseSlopes, geometry_and_masses).chosen
-    return robot.massive().kernel(
-        f"torque gradient by {chosen}", partial(_by_chosen, chosen), free=True
-    )
+    return robot.massive().kernel(f"torque gradient by {chosen}", partial(_by_chosen, chosen), free=True)
 
 
-def _inputs(
-    motion: Sequence[ArrayLike], wrench: ArrayLike | None, weights: Array, *, rows: bool
-) -> list[Array]:
+def _inputs(motion: Sequence[ArrayLike], wrench: ArrayLike | None, weights: Array, *, rows: bool) -> list[Array]:
     load = np.zeros(6) if wrench is None else wrench
     inputs = [doubles(value) for value in (*motion, load)]
     if rows:

@@ -92,9 +92,7 @@ def _matrices(robot: Robot, q: Array, found: Balance) -> dict[str, Array]:
             normal = np.cross(world[..., 0], world[..., 1])
             normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
             world = np.stack([world[..., 0], np.cross(normal, world[..., 0]), normal], -1)
-        amounts = np.concatenate(
-            [world.swapaxes(-1, -2) @ found.spread[..., k, part, :] for part in (_F, _M)], -2
-        )
+        amounts = np.concatenate([world.swapaxes(-1, -2) @ found.spread[..., k, part, :] for part in (_F, _M)], -2)
         matrix = amounts.swapaxes(-1, -2) @ (weights[:, None] * amounts)
         result[joint.name] = result.get(joint.name, 0.0) + matrix
     return result
@@ -119,9 +117,7 @@ def _along(joint: Joint, values: list[float]) -> tuple[Array, list[tuple[str, Ar
     return weights, axes
 
 
-def _of_beam(
-    robot: Robot, beam: Beam, section: Section, ends: list[Array], found: Balance
-) -> Array:
+def _of_beam(robot: Robot, beam: Beam, section: Section, ends: list[Array], found: Balance) -> Array:
     """Twice a member's energy, (..., unknowns, unknowns)."""
     along = ends[1] - ends[0]
     length = np.linalg.norm(along, axis=-1)[..., None, None]

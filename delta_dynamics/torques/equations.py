@@ -103,9 +103,7 @@ def _motion(t: Traced) -> Program:
     rows: list[Any] = []
 
     def visit(forces: Forces) -> None:
-        twists.append(
-            [*motion.velocity(graph.platform, graph.origin), *motion.omega[graph.platform]]
-        )
+        twists.append([*motion.velocity(graph.platform, graph.origin), *motion.omega[graph.platform]])
         rows.append([forces.relative(j, accelerated=False)[0] for j in loaded_joints(graph)])
 
     mass = mass_entries(t, parts, visit)

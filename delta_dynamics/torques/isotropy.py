@@ -190,9 +190,7 @@ class Extremes(NamedTuple):
         return self.greatest - self.least
 
 
-def joint_motion(
-    robot: Robot, pose: ArrayLike, rates: ArrayLike, accelerations: ArrayLike = 0.0
-) -> JointMotion:
+def joint_motion(robot: Robot, pose: ArrayLike, rates: ArrayLike, accelerations: ArrayLike = 0.0) -> JointMotion:
     """Joint motion of a pose motion: qd = J^-1 Xdot, qdd = J^-1 (Xddot - Jdot qd).
 
     Exact: Jdot qd is the pose's acceleration at qdd = 0, computed from the bodies' motion (3-PRRU
@@ -316,9 +314,7 @@ def driving_force_peak(
     return greatest, _directions(np.einsum("...ij,...j->...i", back, y)), joint
 
 
-def _driving_forms(
-    robot: Robot, pose: ArrayLike, energy: float, acceleration: ArrayLike
-) -> tuple[Array, Array]:
+def _driving_forms(robot: Robot, pose: ArrayLike, energy: float, acceleration: ArrayLike) -> tuple[Array, Array]:
     """Pose rates of unit vectors y, (..., m, m), and F_d of y as forms, (..., actuators, m, m)."""
     where = doubles(pose, "poses")
     platform, _ = energy_matrices(robot, where)

@@ -89,9 +89,14 @@ def _graph_joint(joint: Joint, vectors: Array) -> Transmitter:
         normal = vectors[..., 4, :]
         moments[joint.normal] = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
     return _make_transmitter(
-        name, (joint.inner, joint.outer), vectors[..., 0, :], forces, moments, effort,
+        name,
+        (joint.inner, joint.outer),
+        vectors[..., 0, :],
+        forces,
+        moments,
+        effort,
         threads=threads,
-    )  # fmt: skip
+    )
 
 
 def _rod_joints(rod: Rod, vectors: Array) -> list[Transmitter]:
@@ -147,9 +152,7 @@ def _make_transmitter(
     return Transmitter(name, *bodies, point, tuple(names), basis, effort)
 
 
-def needs(
-    graph: Graph, names: Sequence[str], bodies: Array, rods: Array
-) -> tuple[dict[str, Array], dict[str, Array]]:
+def needs(graph: Graph, names: Sequence[str], bodies: Array, rods: Array) -> tuple[dict[str, Array], dict[str, Array]]:
     """Return a point of each body and rod, and the wrench about it that its joints apply."""
     origin: dict[str, Array] = {}
     needed: dict[str, Array] = {}
@@ -265,9 +268,7 @@ class Reactions:
         return self.wrenches[..., self.names.index(name), :]
 
 
-def reactions(
-    robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None = None
-) -> Reactions:
+def reactions(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None = None) -> Reactions:
     """Constraint forces and moments at every joint, for a motion.
 
     Force and moment balance of each body (d'Alembert's principle; Delta-CU paper, equations 17 to
@@ -348,9 +349,7 @@ def least_norm_reactions(
     return found.reactions(found.value, found.null)
 
 
-def balance(
-    robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None = None
-) -> Balance:
+def balance(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None = None) -> Balance:
     """Solve the balances of a motion; arguments and errors as :func:`reactions`."""
     load = np.zeros(6) if wrench is None else wrench
     loads = robot.evaluate(loads_kernel(robot), robot.inertial, q, qd, qdd, load)
@@ -449,8 +448,7 @@ def _loads(t: Traced) -> Program:
     for mass, rod in zip(rods, graph.rods.values(), strict=True):
         start, end = motion.point(rod.inner, rod.ends[0]), motion.point(rod.outer, rod.ends[1])
         a, b = (
-            motion.acceleration(body, point)
-            for body, point in ((rod.inner, rod.ends[0]), (rod.outer, rod.ends[1]))
+            motion.acceleration(body, point) for body, point in ((rod.inner, rod.ends[0]), (rod.outer, rod.ends[1]))
         )
         pair = np.zeros(3) if rod.pair is None else motion.direction(rod.outer, rod.pair)
         sixth = mass * (1.0 / 6.0)
@@ -478,9 +476,7 @@ def _scale_unknowns(moment: Mask, size: Array) -> Array:
     return np.where(moment, size[..., None], 1.0)
 
 
-def _solve(
-    a: Array, b: Array, moment: Mask, size: Array, *, strict: bool
-) -> tuple[Array, Array, Array]:
+def _solve(a: Array, b: Array, moment: Mask, size: Array, *, strict: bool) -> tuple[Array, Array, Array]:
     """Least-norm solution, orthonormal null space and relative imbalance.
 
     Moments and lengths are divided by the mechanism's size, so that all numbers are forces. The

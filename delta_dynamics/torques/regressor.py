@@ -84,9 +84,7 @@ def parameter_values(robot: Robot) -> Array:
     return np.array([*values, 1.0])
 
 
-def regressor(
-    robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None = None
-) -> Array:
+def regressor(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None = None) -> Array:
     """Compute the regressor Y of a motion's efforts: Y pi = inverse_dynamics, exactly.
 
     It depends only on the robot's geometry, gravity and the set of loaded passive joints, and on
@@ -170,10 +168,12 @@ def _body_columns(motion: Array, n: int) -> Array:
     turning = np.cross(w, omega)
     diagonal = w * alpha + turning * omega
     pairs = [
-        w[..., i] * alpha[..., j] + w[..., j] * alpha[..., i]
-        + turning[..., i] * omega[..., j] + turning[..., j] * omega[..., i]
+        w[..., i] * alpha[..., j]
+        + w[..., j] * alpha[..., i]
+        + turning[..., i] * omega[..., j]
+        + turning[..., j] * omega[..., i]
         for i, j in ((0, 1), (0, 2), (1, 2))
-    ]  # fmt: skip
+    ]
     return np.concatenate([mass, first, diagonal, np.stack(pairs, -1)], -1)
 
 
@@ -202,12 +202,7 @@ def _columns(robot: Robot) -> list[tuple[str, str]]:
     result += [(f"{name}.mass", "kg") for name in graph.rods]
     result += ten(PAYLOAD)
     result += [column for name in graph.actuated for column in joint(name, DRIVE)]
-    result += [
-        column
-        for key in law_keys(robot)
-        for name in graph.actuated
-        for column in joint(name, [key])
-    ]
+    result += [column for key in law_keys(robot) for name in graph.actuated for column in joint(name, [key])]
     passive = tuple(what for what in DRIVE if what != "offset")
     result += [column for j in loaded_joints(graph) for column in joint(j.name, passive)]
     return [*result, (WRENCH, "1")]
@@ -235,16 +230,11 @@ def _regressor(t: Traced) -> Program:
     def powers(write: Callable[[Forces], None], *names: str) -> list[Any]:
         forces = Forces(motion)
         write(forces)
-        return [
-            sum(speed[b] @ forces.force[b] + omega[b] @ forces.moment[b] for b in names)
-            for speed, omega in twists
-        ]
+        return [sum(speed[b] @ forces.force[b] + omega[b] @ forces.moment[b] for b in names) for speed, omega in twists]
 
     columns = [powers(partial(_rod, rod), rod.inner, rod.outer) for rod in graph.rods.values()]
     for joint in loaded_joints(graph):
-        columns += [
-            powers(partial(_joint, joint, three), joint.inner, joint.outer) for three in np.eye(3)
-        ]
+        columns += [powers(partial(_joint, joint, three), joint.inner, joint.outer) for three in np.eye(3)]
     columns.append(powers(lambda forces: forces.wrench(wrench), graph.platform))
     others = [column[j] for j in range(n) for column in columns]
     sizes = {"q": n, "qd": n, "qdd": n, "wrench": 6}
@@ -305,9 +295,7 @@ def base_parameters(robot: Robot, *, seed: int = 0) -> BaseParameters:
     matrix = matrix * units / units[list(columns)][:, None]
     led = [combination_name(row, k, names) for k, row in zip(columns, matrix, strict=True)]
     unseen = [name for k, name in enumerate(names[:-1]) if not matrix[:, k].any()]
-    return BaseParameters(
-        tuple(led), names, columns, frozen(matrix), frozen(matrix @ pi), tuple(unseen)
-    )
+    return BaseParameters(tuple(led), names, columns, frozen(matrix), frozen(matrix @ pi), tuple(unseen))
 
 
 def random_states(robot: Robot, count: int, seed: int) -> tuple[Array, Array, Array]:

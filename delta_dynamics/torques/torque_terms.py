@@ -40,9 +40,7 @@ class Terms:
         return own + self.payload + self.friction + self.external + self.preload
 
 
-def frictionless(
-    robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, *, weight: bool = True
-) -> Array:
+def frictionless(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, *, weight: bool = True) -> Array:
     """Actuator efforts without friction of any joint, shape (..., n), N m or N.
 
     :param weight: False leaves gravity out, too.
@@ -61,9 +59,7 @@ def _set_zero(p: Array, part: slice | Indices) -> Array:
     return result
 
 
-def dynamics_terms(
-    robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None = None
-) -> Terms:
+def dynamics_terms(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None = None) -> Terms:
     """Split the actuator efforts of a motion by cause, exactly.
 
     Each term is the inverse dynamics (virtual work; Delta-CU paper, equation 23; 3-PRRU paper,

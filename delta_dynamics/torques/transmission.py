@@ -52,10 +52,7 @@ def transmission_kernel(robot: Robot, *, certified: bool, curved: bool) -> Kerne
 
 
 _CERTIFIED, _ACCEPTED = (
-    {
-        curved: partial(transmission_kernel, certified=certified, curved=curved)
-        for curved in (False, True)
-    }
+    {curved: partial(transmission_kernel, certified=certified, curved=curved) for curved in (False, True)}
     for certified in (True, False)
 )
 
@@ -82,9 +79,11 @@ class Transmission:
         return self.robot.controller.names
 
     def joint_to_actuator(
-        self, position: ArrayLike, velocity: ArrayLike | None = None,
+        self,
+        position: ArrayLike,
+        velocity: ArrayLike | None = None,
         effort: ArrayLike | None = None,
-    ) -> TransmissionState:  # fmt: skip
+    ) -> TransmissionState:
         """Convert joint states to actuator states.
 
         :param position: pose coordinates, shape (..., m), rad or m.
@@ -99,9 +98,11 @@ class Transmission:
         return TransmissionState(self.robot.controller.controller_positions(q), moved, given)
 
     def actuator_to_joint(
-        self, position: ArrayLike, velocity: ArrayLike | None = None,
+        self,
+        position: ArrayLike,
+        velocity: ArrayLike | None = None,
         effort: ArrayLike | None = None,
-    ) -> TransmissionState:  # fmt: skip
+    ) -> TransmissionState:
         """Convert actuator states to joint states, as ``robot.forward`` finds the assembly.
 
         :param position: actuator positions, shape (..., n), in the controller's units.
@@ -125,9 +126,12 @@ class Transmission:
         return self._solve(position)[1]
 
     def gains(
-        self, position: ArrayLike, stiffness: ArrayLike, damping: ArrayLike,
+        self,
+        position: ArrayLike,
+        stiffness: ArrayLike,
+        damping: ArrayLike,
         effort: ArrayLike | None = None,
-    ) -> tuple[Array, Array]:  # fmt: skip
+    ) -> tuple[Array, Array]:
         """Return the actuators' gains that give the joint a stiffness K and a damping D.
 
         Actuators with t = effort - Ka (a - a0) - Da da/dt give the joint, at a position a0(x), the
@@ -156,9 +160,7 @@ class Transmission:
         # The second derivative along a + b, less those along a and b, is twice that by a and b.
         pairs = [(j, k) for j in range(m) for k in range(j)]
         ways = np.array([*np.eye(m), *(np.eye(m)[j] + np.eye(m)[k] for j, k in pairs)])
-        q, flat, change = evaluate_at_pose(
-            self.robot, _CERTIFIED[True], _ACCEPTED[True], _NO_PARAMETERS, place, ways
-        )
+        q, flat, change = evaluate_at_pose(self.robot, _CERTIFIED[True], _ACCEPTED[True], _NO_PARAMETERS, place, ways)
         found = np.empty((*change.shape[:-2], change.shape[-1], m, m))
         for j in range(m):
             found[..., j, j] = change[..., j, :]
@@ -238,9 +240,7 @@ class Transmission:
     def _solve(self, position: ArrayLike) -> tuple[Array, Array]:
         """Return the model's q, shape (..., n), and the ratio, shape (..., n, m)."""
         place = self._joint(position, "position")
-        q, flat = evaluate_at_pose(
-            self.robot, _CERTIFIED[False], _ACCEPTED[False], _NO_PARAMETERS, place
-        )
+        q, flat = evaluate_at_pose(self.robot, _CERTIFIED[False], _ACCEPTED[False], _NO_PARAMETERS, place)
         ratio = flat.reshape(*q.shape, len(self.joints))
         return q, ratio * self.robot.controller.slopes(q)[..., None]
 
@@ -265,9 +265,7 @@ class Transmission:
         """Return the actuators' limits in the controller's numbers at positions q, (..., n)."""
         limits = getattr(self.robot.limits, name)
         if limits is None:
-            raise ParameterError(
-                f"limits.{name}", None, f"{name} limits of {', '.join(self.robot.joint_names)}"
-            )
+            raise ParameterError(f"limits.{name}", None, f"{name} limits of {', '.join(self.robot.joint_names)}")
         slopes = np.abs(self.robot.controller.slopes(q))
         return np.asarray(limits / slopes if name == "effort" else limits * slopes)
 

@@ -41,9 +41,7 @@ class EffortParts(NamedTuple):
         return np.asarray(np.hypot(MASSES * sizes, FRICTION * greatest), np.float64)
 
 
-def effort_parts(
-    robot: Robot, q: Array, qd: Array, qdd: Array, wrench: Array | None, mass: Array
-) -> EffortParts:
+def effort_parts(robot: Robot, q: Array, qd: Array, qdd: Array, wrench: Array | None, mass: Array) -> EffortParts:
     """Split the efforts of one sample into rest, rates and accelerations, see ``EffortParts``.
 
     :param robot: without friction that grows with the load, so that efforts are linear in qdd.

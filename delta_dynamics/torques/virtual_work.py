@@ -391,9 +391,7 @@ def _laws_of(t: Traced, parts: list[Objects]) -> list[dict[str, Any]]:
     return [{key: v[k] for key, v in laws.items()} for k in range(t.drives.count if laws else 0)]
 
 
-def _loads(
-    t: Traced, parts: list[Objects], qd: Objects, qdd: Objects, base: Objects | None = None
-) -> list[Any]:
+def _loads(t: Traced, parts: list[Objects], qd: Objects, qdd: Objects, base: Objects | None = None) -> list[Any]:
     """Return the efforts without the drives' friction and rotors.
 
     :param base: its motion, shape (9,); None: at rest.
@@ -468,9 +466,7 @@ def _accelerations(t: Traced) -> Program:
     return Program(sizes, layout.size, outputs, t.equations())
 
 
-def mass_entries(
-    t: Traced, parts: list[Objects], visit: Callable[[Forces], None] | None = None
-) -> list[Any]:
+def mass_entries(t: Traced, parts: list[Objects], visit: Callable[[Forces], None] | None = None) -> list[Any]:
     """Entries of the mass matrix of the drives that lead, row by row.
 
     :param visit: called once a joint, while that joint alone moves, at rate one.

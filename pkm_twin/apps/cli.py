@@ -49,11 +49,15 @@ app = Tasks(
     metavar="COMMAND [ARGS]...",
     params=[
         click.Option(
-            ["--version"], is_flag=True, is_eager=True, expose_value=False,
-            callback=_print_version, help="Show the version and exit.",
+            ["--version"],
+            is_flag=True,
+            is_eager=True,
+            expose_value=False,
+            callback=_print_version,
+            help="Show the version and exit.",
         )
     ],
-)  # fmt: skip
+)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

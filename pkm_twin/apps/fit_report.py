@@ -54,32 +54,38 @@ def report_of(result: Result, marks: Sequence[str] = ()) -> tuple[Report, list[T
     if e.bound:
         what = "a negative compliance" if elastic else "negative friction or an impossible body"
         # Of a body, which several numbers give, its name.
-        which = ", ".join(dict.fromkeys(
-            names[k] if not more else names[k].rpartition(".")[0] for k, *more in e.bound
-        ))  # fmt: skip
+        which = ", ".join(dict.fromkeys(names[k] if not more else names[k].rpartition(".")[0] for k, *more in e.bound))
         notes.append(f"at a physical bound, without which the fit would give {what}: {which}")
     parameters = [
         {
-            "key": n.name, **_describe_number(n, elastic), "before": n.before, "value": n.after,
-            "standard_deviation": n.deviation, "status": n.status,
+            "key": n.name,
+            **_describe_number(n, elastic),
+            "before": n.before,
+            "value": n.after,
+            "standard_deviation": n.deviation,
+            "status": n.status,
         }
         for n in result.numbers
-    ]  # fmt: skip
+    ]
     return Report(
         _answer(result, held),
         [
-            Fact("robot", result.robot.name), Fact("verdict", verdict.as_json(own)),
+            Fact("robot", result.robot.name),
+            Fact("verdict", verdict.as_json(own)),
             Fact("accepted", result.accepted),
             Fact("condition", e.condition, text="condition number"),
             Fact("combinations_determined", result.combinations, text="combinations identified"),
-            Fact("held_by_a_physical_bound", bool(e.bound)), Fact("samples_fitted", result.samples),
-            Fact("parameters", parameters), Fact("not_excited", idle), *facts,
+            Fact("held_by_a_physical_bound", bool(e.bound)),
+            Fact("samples_fitted", result.samples),
+            Fact("parameters", parameters),
+            Fact("not_excited", idle),
+            *facts,
         ],
         [_make_number_table({label(n): n for n in shown}), _make_residual_table(held)],
         {"": partial(_draw_changes, {label(n): n for n in shown})}
         | {f"_{k}": partial(_draw_residuals, one, units) for k, one in enumerate(result.judged)},
         notes,
-    ), [_make_channel_table(result, own)]  # fmt: skip
+    ), [_make_channel_table(result, own)]
 
 
 def _name(number: Number) -> str:
@@ -110,9 +116,7 @@ def _find_held_out(result: Result) -> dict[str, tuple[float, float, float, str]]
 
 def _answer(result: Result, held: Mapping[str, tuple[float, float, float, str]]) -> str:
     """Whether the model explains the recordings, and the worst held-out channel."""
-    name, (before, after, peak, unit) = max(
-        held.items(), key=lambda row: row[1][1] / max(row[1][2], 1e-300)
-    )
+    name, (before, after, peak, unit) = max(held.items(), key=lambda row: row[1][1] / max(row[1][2], 1e-300))
     return (
         f"{result.robot.name}: {result.verdict}; the worst held-out residual is "
         f"{after:.3g} {unit} ({name}), {100 * after / peak:.2g} % of the peak ({before:.3g} {unit} "
@@ -122,9 +126,12 @@ def _answer(result: Result, held: Mapping[str, tuple[float, float, float, str]])
 
 def _make_number_table(numbers: Mapping[str, Number]) -> Table:
     columns = [
-        Column("", text="in the file", form=".6g"), Column("", text="fitted", form=".6g"),
-        Column("", text="standard deviation"), Column("", text="unit"), Column("", text=" "),
-    ]  # fmt: skip
+        Column("", text="in the file", form=".6g"),
+        Column("", text="fitted", form=".6g"),
+        Column("", text="standard deviation"),
+        Column("", text="unit"),
+        Column("", text=" "),
+    ]
     rows = {
         name: (n.before, n.after, n.spread, n.unit, COMBINED if n.status == "combination" else "")
         for name, n in numbers.items()
@@ -136,8 +143,9 @@ def _make_residual_table(held: Mapping[str, tuple[float, float, float, str]]) ->
     columns = [
         Column("", text="RMS with the file's values", form=".3g"),
         Column("", text="with the fitted ones", form=".3g"),
-        Column("", text="measured peak", form=".3g"), Column("", text="unit"),
-    ]  # fmt: skip
+        Column("", text="measured peak", form=".3g"),
+        Column("", text="unit"),
+    ]
     return Table("", columns, held, "residual of the last third, which was held out", "recording")
 
 
@@ -145,9 +153,14 @@ def _make_channel_table(result: Result, units: Sequence[str]) -> Table:
     """Return what the verdict says of each channel."""
     columns = [
         Column("", text=text)
-        for text in ("RMS residual in the band of the motion", "RMS noise there", "unit",
-                     "variation without a known cause (%)", "held out over fitted")
-    ]  # fmt: skip
+        for text in (
+            "RMS residual in the band of the motion",
+            "RMS noise there",
+            "unit",
+            "variation without a known cause (%)",
+            "held out over fitted",
+        )
+    ]
     rows = {
         c.name: (c.residual, c.noise, unit, 100.0 * c.left, c.held_out)
         for c, unit in zip(result.verdict.channels, units, strict=True)
@@ -175,27 +188,32 @@ def _report_efforts(result: Fit) -> list[Fact]:
     held = [
         {
             "recording": judged.name,
-            "from_s": judged.time[0], "to_s": judged.time[-1],
+            "from_s": judged.time[0],
+            "to_s": judged.time[-1],
             "residual_rms_before": judged.rms(judged.before),
             "residual_rms_after": judged.rms(judged.after),
             "effort_deviation_rms_after": np.sqrt(np.mean(judged.deviation**2, 0)),
             "peak_effort": np.abs(judged.measured).max(0),
         }
         for judged in result.judged
-    ]  # fmt: skip
+    ]
     filters = [
         {
-            "window_samples": how.window, "cutoff_Hz": how.cutoff,
-            "kept_every": how.keep_every, "position_noise": how.position_noise,
+            "window_samples": how.window,
+            "cutoff_Hz": how.cutoff,
+            "kept_every": how.keep_every,
+            "position_noise": how.position_noise,
         }
         for how in result.filtering
-    ]  # fmt: skip
+    ]
     return [
-        Fact("outliers_replaced", result.outliers), Fact("efforts_late_s", result.delays),
+        Fact("outliers_replaced", result.outliers),
+        Fact("efforts_late_s", result.delays),
         Fact("effort_noise", dict(zip(joints, result.estimate.noise, strict=True))),
         Fact("effort_units", dict(zip(joints, units, strict=True))),
-        Fact("held_out", held), Fact("filtering", filters),
-    ]  # fmt: skip
+        Fact("held_out", held),
+        Fact("filtering", filters),
+    ]
 
 
 def _report_elastic(result: ElasticFit) -> list[Fact]:
@@ -203,10 +221,7 @@ def _report_elastic(result: ElasticFit) -> list[Fact]:
     groups = [
         {
             "elements": group.elements,
-            "known": [
-                {"weights": c.weights, "value": c.value, "standard_deviation": c.deviation}
-                for c in group.known
-            ],
+            "known": [{"weights": c.weights, "value": c.value, "standard_deviation": c.deviation} for c in group.known],
         }
         for group in result.groups
     ]
@@ -214,18 +229,20 @@ def _report_elastic(result: ElasticFit) -> list[Fact]:
     held = [
         {
             "recording": judged.name,
-            "from_s": judged.time[0], "to_s": judged.time[-1],
+            "from_s": judged.time[0],
+            "to_s": judged.time[-1],
             f"zero_{BY_AXIS}": np.where(measured, zero, np.nan),
             f"residual_rms_before_{BY_AXIS}": judged.rms(judged.before),
             f"residual_rms_after_{BY_AXIS}": judged.rms(judged.after),
         }
         for judged, zero, measured in each
-    ]  # fmt: skip
+    ]
     noise = np.where(result.measured.any(0), result.estimate.noise, np.nan)
     return [
-        Fact("not_told_apart", groups), Fact(f"deflection_noise_{BY_AXIS}", noise),
+        Fact("not_told_apart", groups),
+        Fact(f"deflection_noise_{BY_AXIS}", noise),
         Fact("held_out", held),
-    ]  # fmt: skip
+    ]
 
 
 def _describe_group(group: Group) -> str:
@@ -270,8 +287,7 @@ def _draw_changes(shown: Mapping[str, Number]) -> Any:
     """How far numbers moved, the furthest first; over standard deviations where known."""
     known = all(np.isfinite(n.deviation) and n.deviation > 0.0 for n in shown.values())
     moved = {
-        name: (n.after - n.before)
-        / (n.deviation if known else max(abs(n.before), abs(n.after), 1e-300))
+        name: (n.after - n.before) / (n.deviation if known else max(abs(n.before), abs(n.after), 1e-300))
         for name, n in shown.items()
     }
     order = sorted(moved, key=lambda name: -abs(moved[name]))[:MOST_NUMBERS]
@@ -279,10 +295,7 @@ def _draw_changes(shown: Mapping[str, Number]) -> Any:
     places = np.arange(len(order))[::-1]
     colours = [plots.COLOURS[0 if shown[name].status == "fitted" else 4] for name in order]
     ax.barh(places, [moved[name] for name in order], 0.6, color=colours)
-    texts = [
-        f"{name}: {shown[name].before:.3g} to {shown[name].after:.3g} {shown[name].unit}"
-        for name in order
-    ]
+    texts = [f"{name}: {shown[name].before:.3g} to {shown[name].after:.3g} {shown[name].unit}" for name in order]
     ax.set_yticks(places, texts, fontsize=9)
     if known:
         ax.axvspan(-2.0, 2.0, color="0.9", zorder=0)
@@ -314,9 +327,10 @@ def drive_report(found: DriveFriction) -> Report:
         each = zip(law.terms, law.values, law.deviations, strict=True)
         rows[law.name] = {term: {"value": v, "standard_deviation": d} for term, v, d in each}
         rows[law.name] |= {
-            "residual_a": law.residual, "held_out_a": law.held_out,
+            "residual_a": law.residual,
+            "held_out_a": law.held_out,
             "held_out_drive_a": law.other_drives,
-        }  # fmt: skip
+        }
     notes = []
     for law in found.laws:
         line = f"{law.name}: {_write_terms(law)}; residual {law.residual:.3f} A"
@@ -337,9 +351,11 @@ def drive_report(found: DriveFriction) -> Report:
         [
             Fact("torque_constant_nm_per_a", found.torque_constant),
             Fact("torque_constant_deviation_nm_per_a", found.torque_constant_deviation),
-            Fact("zero_current_a", found.zero), Fact("chosen", found.chosen.name),
-            Fact("chance", found.chance), Fact("viscous_distinguished", found.viscous_told),
+            Fact("zero_current_a", found.zero),
+            Fact("chosen", found.chosen.name),
+            Fact("chance", found.chance),
+            Fact("viscous_distinguished", found.viscous_told),
             Fact("laws", rows),
         ],
         notes=notes,
-    )  # fmt: skip
+    )

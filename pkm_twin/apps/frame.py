@@ -74,9 +74,7 @@ class Value(click.ParamType):  # type: ignore[type-arg]
             raise click.UsageError(f"{name}: {word.strip()!r}; expected {what}{row.span}")
         return number
 
-    def shell_complete(
-        self, ctx: click.Context, param: click.Parameter, incomplete: str
-    ) -> list[CompletionItem]:
+    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
         """Return the choices that begin with a word; the shell completes names of files."""
         if self.kind is Path:
             return [CompletionItem(incomplete, type="file")]
@@ -107,9 +105,15 @@ class Option(click.Option):
         if row.alone is not None:
             known |= {"is_flag": False, "flag_value": row.alone}
         super().__init__(
-            [name, field], type=Value(kind, row), metavar=row.metavar or metavar, help=text,
-            multiple=repeated, required=default is MISSING, show_default=bool(self.shown), **known,
-        )  # fmt: skip
+            [name, field],
+            type=Value(kind, row),
+            metavar=row.metavar or metavar,
+            help=text,
+            multiple=repeated,
+            required=default is MISSING,
+            show_default=bool(self.shown),
+            **known,
+        )
 
     def add_to_parser(self, parser: Any, ctx: click.Context) -> None:
         """Accept spellings that help does not list."""
@@ -130,9 +134,12 @@ class Argument(click.Argument):
         kind, repeated = _read_type(kind, row)
         self.shown, known = _write_default(row, default)
         super().__init__(
-            [field], type=Value(kind, row), required=default is MISSING,
-            nargs=-1 if repeated else 1, **known,
-        )  # fmt: skip
+            [field],
+            type=Value(kind, row),
+            required=default is MISSING,
+            nargs=-1 if repeated else 1,
+            **known,
+        )
         self.row = row
 
     def get_help_record(self, ctx: click.Context) -> tuple[str, str]:
@@ -150,9 +157,11 @@ class Command(click.Command):
         self.fields = list(_find_parameters(given))
         as_json = click.Option(["--json", "as_json"], is_flag=True, help="print JSON")
         super().__init__(
-            run.__name__.replace("_", "-"), callback=self.execute, params=[*self.fields, as_json],
+            run.__name__.replace("_", "-"),
+            callback=self.execute,
+            params=[*self.fields, as_json],
             help=inspect.cleandoc(given.__doc__ or ""),
-        )  # fmt: skip
+        )
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Read the words; a negative number is not an option."""
@@ -199,9 +208,10 @@ class Command(click.Command):
             # cannot meet is not.
             find_source, word = click.get_current_context().get_parameter_source, error.field
             texts = [
-                spell(one) for one in self.fields if getattr(one.type, "kind", bool) is str
-                and find_source(str(one.name)) is ParameterSource.COMMANDLINE
-            ]  # fmt: skip
+                spell(one)
+                for one in self.fields
+                if getattr(one.type, "kind", bool) is str and find_source(str(one.name)) is ParameterSource.COMMANDLINE
+            ]
             if not word or f"--{word.split()[0].removeprefix('--')}" not in texts:
                 raise
             raise click.UsageError(f"--{str(error).removeprefix('--')}") from None
@@ -259,14 +269,21 @@ class Group(click.Group):
     """What its commands are, in errors; by default the group's name."""
 
     def __init__(
-        self, text: str, commands: Mapping[str, click.Command], task: str = "",
-        metavar: str = "COMMAND [OPTIONS]", **more: Any,
-    ) -> None:  # fmt: skip
+        self,
+        text: str,
+        commands: Mapping[str, click.Command],
+        task: str = "",
+        metavar: str = "COMMAND [OPTIONS]",
+        **more: Any,
+    ) -> None:
         """``commands``: in the order of the help. ``metavar``: what follows the name, in help."""
         super().__init__(
-            help=inspect.cleandoc(text), subcommand_metavar=metavar, no_args_is_help=False,
-            options_metavar="[OPTIONS]" if "params" in more else None, **more,
-        )  # fmt: skip
+            help=inspect.cleandoc(text),
+            subcommand_metavar=metavar,
+            no_args_is_help=False,
+            options_metavar="[OPTIONS]" if "params" in more else None,
+            **more,
+        )
         self.commands: Any = commands
         self.task = task
 
@@ -330,10 +347,13 @@ def _draw(report: Report, drawing: Path | None, overwrite: bool) -> Report:
     files = [*written, *(path for name, path in report.files.items() if name == "page" and path)]
     return dataclasses.replace(
         report,
-        facts=[*report.facts, Fact("picture", str(written[0]) if written else None),
-               Fact("pictures", list(map(str, files)))],
+        facts=[
+            *report.facts,
+            Fact("picture", str(written[0]) if written else None),
+            Fact("pictures", list(map(str, files))),
+        ],
         notes=[*report.notes, *(text for text in map(str, written) if text != STANDARD)],
-    )  # fmt: skip
+    )
 
 
 def _find_parameters(given: type[Any]) -> Iterator[Argument | Option]:
@@ -343,8 +363,7 @@ def _find_parameters(given: type[Any]) -> Iterator[Argument | Option]:
     class's own come first.
     """
     hints, order = hints_of(given), list(given.__mro__)
-    rank = {name: k for k, one in reversed([*enumerate(order)])
-            for name in vars(one).get("__annotations__", {})}  # fmt: skip
+    rank = {name: k for k, one in reversed([*enumerate(order)]) for name in vars(one).get("__annotations__", {})}
     found = [one for one in dataclasses.fields(given) if "setting" in one.metadata]
     for kind in (Argument, Option):
         sign = -1 if kind is Argument else 1

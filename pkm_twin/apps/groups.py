@@ -22,14 +22,22 @@ WIDE: Final = 200
 """Characters of a command's purpose, never cut."""
 
 TASKS: Final = (
-    "Robots", "Torques, paths and drives", "Stiffness, workspace and vibration", "Recordings",
-    "Identification and calibration", "Design and export",
-)  # fmt: skip
+    "Robots",
+    "Torques, paths and drives",
+    "Stiffness, workspace and vibration",
+    "Recordings",
+    "Identification and calibration",
+    "Design and export",
+)
 """Headings of the list of commands: each command names one of them, or its own."""
 OLDER: Final[Mapping[str, tuple[str, ...]]] = {
-    "atlas": ("map",), "feed": ("path", "--slow-where-soft"), "guard-check": ("monitor-torques",),
-    "printer": ("convert",), "urdf": ("export", "urdf"), "drive-friction": ("fit", "--drive"),
-}  # fmt: skip
+    "atlas": ("map",),
+    "feed": ("path", "--slow-where-soft"),
+    "guard-check": ("monitor-torques",),
+    "printer": ("convert",),
+    "urdf": ("export", "urdf"),
+    "drive-friction": ("fit", "--drive"),
+}
 """Older names of commands, which help does not list, with the words in their place."""
 GREETING: Final = """pkm-twin: torques, stiffness and recordings of parallel robots. Try
 

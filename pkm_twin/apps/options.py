@@ -38,23 +38,22 @@ ROBOT_HELP = "a robot's name (see `pkm-twin robots`), or its YAML, URDF, MJCF, S
 class OfPlatform:
     """The platform of a description that names none, and what of a larger robot is the machine."""
 
-    platform: str | None = setting(
-        None, "for a URDF, MJCF, SDF or USD: the link that carries the tool"
-    )
+    platform: str | None = setting(None, "for a URDF, MJCF, SDF or USD: the link that carries the tool")
     base: str | None = setting(
-        None, "for such a file: the link that is the ground; what is neither between base and "
+        None,
+        "for such a file: the link that is the ground; what is neither between base and "
         "platform nor in a loop with that is left out; default: the root, nothing left out",
-    )  # fmt: skip
+    )
     actuated: tuple[str, ...] = setting(
         (), "for such a file: joints with motors, NAME,NAME,...; default: as the file marks them"
     )
     pose_names: tuple[str, ...] = setting(
-        (), "names of the pose coordinates, of x y z roll pitch yaw; default: see `pkm-twin info`",
-        name="pose", metavar="NAMES",
-    )  # fmt: skip
-    carry: bool = setting(
-        False, "with --base: parts beyond the platform are its payload, fixed as drawn"
+        (),
+        "names of the pose coordinates, of x y z roll pitch yaw; default: see `pkm-twin info`",
+        name="pose",
+        metavar="NAMES",
     )
+    carry: bool = setting(False, "with --base: parts beyond the platform are its payload, fixed as drawn")
 
     @property
     def part(self) -> dict[str, Any]:
@@ -118,8 +117,7 @@ class CarriesAtTimes(Carries):
 
     load_times: str | None = setting(
         None,
-        "intervals in which --payload is held: FROM,TO[,FROM,TO...], s from the start; "
-        "default: always",
+        "intervals in which --payload is held: FROM,TO[,FROM,TO...], s from the start; default: always",
     )
 
     def machine(self) -> Robot:
@@ -131,12 +129,8 @@ class CarriesAtTimes(Carries):
 class ReadsTables:
     """How tables are written."""
 
-    separator: str | None = setting(
-        None, "separator of a table's columns: , ; or tab; default: detected"
-    )
-    decimal: str | None = setting(
-        None, "decimal mark of a table's numbers: . or ,; default: detected"
-    )
+    separator: str | None = setting(None, "separator of a table's columns: , ; or tab; default: detected")
+    decimal: str | None = setting(None, "decimal mark of a table's numbers: . or ,; default: detected")
     columns: tuple[str, ...] = setting(
         (),
         "names of a table's columns, OURS=THEIRS,...: 'leg_*.position=motor_*, x=pos_x [mm]'; * in "
@@ -169,9 +163,10 @@ class ReadsRecordings(ReadsTables):
         (), "topic of joint states or wrenches; default: detected by the robot's joint names"
     )
     side: str = setting(
-        "joint", "whose values a table's joints have: the joint's, the controller's (joint_map) or "
-        "the motor's (drive)", choices=("joint", "controller", "motor"),
-    )  # fmt: skip
+        "joint",
+        "whose values a table's joints have: the joint's, the controller's (joint_map) or the motor's (drive)",
+        choices=("joint", "controller", "motor"),
+    )
     wrench_frame: str | None = setting(
         None,
         "frame of a bag's wrenches, if it turns with the platform; default: platform or "
@@ -180,9 +175,12 @@ class ReadsRecordings(ReadsTables):
     base_frame: str = setting("base_link", "frame of a bag's wrenches with base axes")
 
     def read(
-        self, path: Path, robot: Robot | str | None, progress: Callable[[int], None] | None = None,
+        self,
+        path: Path,
+        robot: Robot | str | None,
+        progress: Callable[[int], None] | None = None,
         **more: Any,
-    ) -> Recording:  # fmt: skip
+    ) -> Recording:
         """Read a recording; ``more``: other fields of ``ReadOptions``."""
         from pkm_twin.bags.storage import is_bag
         from pkm_twin.recordings import read
@@ -227,13 +225,9 @@ class ReadsMotions(ReadsRecordings):
 class BeyondLimitsToo:
     """Work outside the joint limits."""
 
-    beyond_limits: bool = setting(
-        False, "also compute outside the joint limits, and mark these results"
-    )
+    beyond_limits: bool = setting(False, "also compute outside the joint limits, and mark these results")
 
-    def admitted(
-        self, machine: Robot, q: Array, qd: Array | None = None, where: str = ""
-    ) -> list[Beyond]:
+    def admitted(self, machine: Robot, q: Array, qd: Array | None = None, where: str = "") -> list[Beyond]:
         """Describe what joint states (..., n) have beyond the joint limits.
 
         :param where: the recording, where there may be several.
@@ -272,13 +266,14 @@ class OfTool:
     """The modes of the tool point."""
 
     tool: tuple[float, ...] = setting(
-        (0.0, 0.0, 0.0), "tool point from the platform's reference point, platform axes, m",
-        count=3, metavar="x,y,z",
-    )  # fmt: skip
+        (0.0, 0.0, 0.0),
+        "tool point from the platform's reference point, platform axes, m",
+        count=3,
+        metavar="x,y,z",
+    )
     damping: tuple[float, ...] | None = setting(
         None,
-        "damping ratio of each mode from the lowest on; the last one holds for all others; "
-        "default: the robot file's",
+        "damping ratio of each mode from the lowest on; the last one holds for all others; default: the robot file's",
         count=0,
     )
 
@@ -288,15 +283,11 @@ class OfMilling:
     """A milling process."""
 
     teeth: int = setting(..., "teeth of the tool")
-    tangential: float = setting(
-        ..., "tangential cutting coefficient Kt, N/m2, e.g. 600e6 for 600 MPa"
-    )
+    tangential: float = setting(..., "tangential cutting coefficient Kt, N/m2, e.g. 600e6 for 600 MPa")
     radial: float = setting(..., "ratio of radial to tangential cutting force, Kr")
     immersion: float = setting(1.0, "radial depth of cut over tool diameter, 1 is a slot")
     up: bool = setting(False, "up-milling instead of down-milling")
-    feed: float = setting(
-        0.0, "direction of the feed in the platform's xy plane, degrees from x towards y"
-    )
+    feed: float = setting(0.0, "direction of the feed in the platform's xy plane, degrees from x towards y")
 
     @property
     def milling(self) -> Milling:
@@ -307,18 +298,20 @@ class OfMilling:
         from stiffness_monitor.chatter import Milling
 
         return Milling(
-            self.teeth, self.tangential, self.radial, self.immersion, self.up,
+            self.teeth,
+            self.tangential,
+            self.radial,
+            self.immersion,
+            self.up,
             math.radians(self.feed),
-        )  # fmt: skip
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Accepts:
     """Data that the machine cannot have produced."""
 
-    accept: bool = setting(
-        False, "also use a recording that contradicts the machine, and mark the results"
-    )
+    accept: bool = setting(False, "also use a recording that contradicts the machine, and mark the results")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -342,8 +335,9 @@ class Draws(Overwrites):
     picture: str | None = setting(
         None,
         "draw the result: .png, .svg or .pdf, or - for a PNG to stdout; default: next to --out",
-        metavar="[FILE]", alone=BESIDE,
-    )  # fmt: skip
+        metavar="[FILE]",
+        alone=BESIDE,
+    )
     no_picture: bool = setting(False, "draw nothing next to --out")
 
     def drawing(self, command: str) -> Path | None:
@@ -373,9 +367,7 @@ class Draws(Overwrites):
 class Parallel:
     """Processes that work at the same time."""
 
-    jobs: int | None = setting(
-        None, "processes on this computer; default: one per core", low=1, high=10**4
-    )
+    jobs: int | None = setting(None, "processes on this computer; default: one per core", low=1, high=10**4)
 
 
 @dataclass(frozen=True, kw_only=True)

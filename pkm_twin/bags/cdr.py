@@ -25,9 +25,7 @@ from pkm_twin.errors import BagError
 _ENDIANNESS = {b"\x00\x00": ">", b"\x00\x01": "<"}
 _NATIVE = "<" if sys.byteorder == "little" else ">"
 _SIZES = {code: struct.calcsize(f"={code}") for code in CODES.values()}
-_UNPACK = {
-    order: {code: struct.Struct(f"{order}{code}").unpack_from for code in _SIZES} for order in "<>"
-}
+_UNPACK = {order: {code: struct.Struct(f"{order}{code}").unpack_from for code in _SIZES} for order in "<>"}
 _ARRAY_CODES = {"?": "B"}
 """Codes of ``array`` for types that it lacks: those of their bytes."""
 _LITTLE_HEADER = b"\x00\x01\x00\x00"
@@ -42,17 +40,14 @@ class MessageCodec:
         self._name = next(iter(self.definition))
         try:
             self._classes: dict[str, Any] = {
-                name: dataclasses.make_dataclass(
-                    name.split("/")[1], [f.name for f in fields], slots=True
-                )
+                name: dataclasses.make_dataclass(name.split("/")[1], [f.name for f in fields], slots=True)
                 for name, fields in self.definition.items()
             }
         except TypeError as error:
             text = f"fields of {type_name} cannot be attributes: {error}"
             raise BagError(text, reason="schema") from error
         self._readers = {
-            name: [self._choose_decoder(field) for field in fields]
-            for name, fields in self.definition.items()
+            name: [self._choose_decoder(field) for field in fields] for name, fields in self.definition.items()
         }
 
     def decode(self, data: bytes) -> Any:
@@ -129,9 +124,7 @@ class MessageCodec:
 
     def _encode_field(self, field: Field, value: Any, out: bytearray, where: str) -> None:
         if field.size is None:
-            self._encode_items(
-                field, [self._default(field) if value is None else value], out, where
-            )
+            self._encode_items(field, [self._default(field) if value is None else value], out, where)
             return
         if value is None:
             value = [self._default(field)] * (field.size if field.fixed else 0)
@@ -146,14 +139,10 @@ class MessageCodec:
         if count:
             self._encode_items(field, value, out, where)
 
-    def _encode_items(
-        self, field: Field, values: Sequence[Any], out: bytearray, where: str
-    ) -> None:
+    def _encode_items(self, field: Field, values: Sequence[Any], out: bytearray, where: str) -> None:
         code = CODES.get(field.base)
         if field.base == "byte":
-            values = [
-                item[0] if isinstance(item, bytes) and len(item) == 1 else item for item in values
-            ]
+            values = [item[0] if isinstance(item, bytes) and len(item) == 1 else item for item in values]
         if code is not None:
             _put(out, code, values, where)
         elif field.base == "string":

@@ -187,9 +187,7 @@ def parse_definition(type_name: str, text: str) -> Definition:
     return {own: definition.pop(own), **definition}
 
 
-def _resolve(
-    name: str, texts: Mapping[str, str], definition: Definition, holders: tuple[str, ...]
-) -> None:
+def _resolve(name: str, texts: Mapping[str, str], definition: Definition, holders: tuple[str, ...]) -> None:
     """Add ``name`` and the types it holds to ``definition``; ``holders`` are those above it."""
     if name in holders:
         raise BagError(f"message type {name} contains itself", reason="schema")

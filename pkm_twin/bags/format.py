@@ -51,9 +51,7 @@ FOOTER_BYTES = FRAME.size + 20
 CRC_BYTES = 4
 _BLOCK_BYTES = 1024**2
 _MESSAGE = struct.Struct("<HIQQ")
-_KINDS: dict[int, Any] = {
-    op: getattr(mcap, op.name.title().replace("_", "")) for op in Op if op != Op.MESSAGE
-}
+_KINDS: dict[int, Any] = {op: getattr(mcap, op.name.title().replace("_", "")) for op in Op if op != Op.MESSAGE}
 NAMES = {int(op): op.name.lower().replace("_", " ") for op in Op}
 _FOREIGN = {
     b"#ROSBAG V2.0": "a ROS 1 bag, not MCAP",
@@ -239,9 +237,7 @@ def pack_record(record: mcap.McapRecord) -> bytes:
     return bytes(builder.end())
 
 
-def iterate_records(
-    data: bytes, offset: int, budget: Budget | None = None
-) -> Iterator[tuple[int, int, int]]:
+def iterate_records(data: bytes, offset: int, budget: Budget | None = None) -> Iterator[tuple[int, int, int]]:
     """Yield opcode, start and end of each record in unpacked data of the chunk at ``offset``."""
     position, size = 0, len(data)
     while position < size:

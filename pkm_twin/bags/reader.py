@@ -57,9 +57,7 @@ _MESSAGE_COST = 512
 class DamagedBagError(BagError):
     """A damaged or truncated bag; ``salvageable`` is the number of intact messages in it."""
 
-    def __init__(
-        self, message: str, *, path: Path, reason: str, offset: int | None, salvageable: int
-    ) -> None:
+    def __init__(self, message: str, *, path: Path, reason: str, offset: int | None, salvageable: int) -> None:
         text = f"{message}; {salvageable} intact messages can be recovered"
         super().__init__(text, path=path, reason=reason, offset=offset)
         self.salvageable = salvageable
@@ -142,9 +140,7 @@ class _Part:
             for number, channel in check.records.channels.items()
         }
 
-    def parse(
-        self, segment: Segment, reader: RecordReader, topics: Container[str]
-    ) -> Iterator[BagMessage]:
+    def parse(self, segment: Segment, reader: RecordReader, topics: Container[str]) -> Iterator[BagMessage]:
         """Yield the messages of the topics in a segment, in the order of the file."""
         records, at = self.records, segment.offset
         try:
@@ -193,9 +189,7 @@ class Bag:
         if order not in ("log_time", "file"):
             raise ValueError(f"order is {order!r}; expected 'log_time' or 'file'")
         known = self.report.topics
-        wanted = (
-            set(known) if topics is None else {topics} if isinstance(topics, str) else set(topics)
-        )
+        wanted = set(known) if topics is None else {topics} if isinstance(topics, str) else set(topics)
         unknown = sorted(wanted - known.keys())
         if unknown:
             text = f"no topic {', '.join(unknown)}; topics: {', '.join(sorted(known))}"

@@ -218,10 +218,11 @@ def _described(folder: Path, root: _Field) -> Storage:
         for name in (entry.get("path").text(),)
     }
     return Storage(
-        tuple(files), facts.get("message_count").count(),
+        tuple(files),
+        facts.get("message_count").count(),
         {name: count for name, count in topics.items() if count is not None},
         {name: count for name, count in parts.items() if count is not None},
-    )  # fmt: skip
+    )
 
 
 def _load(path: Path) -> object:

@@ -351,15 +351,18 @@ class Check:
         if stated != (span.start, span.end):
             text = f"the chunk's messages span {span.start} to {span.end} ns"
             self._note(FormatError(f"{text}; the file says {stated[0]} to {stated[1]}", at))
-        self.segments.append(
-            Segment(at, length, span, is_chunk=True, has_crc=chunk.uncompressed_crc != 0)
-        )
+        self.segments.append(Segment(at, length, span, is_chunk=True, has_crc=chunk.uncompressed_crc != 0))
         self._chunk = mcap.ChunkIndex(
-            chunk_start_offset=at, chunk_length=length, compression=chunk.compression,
-            compressed_size=len(chunk.data), uncompressed_size=len(data),
-            message_start_time=span.start, message_end_time=span.end,
-            message_index_offsets={}, message_index_length=0,
-        )  # fmt: skip
+            chunk_start_offset=at,
+            chunk_length=length,
+            compression=chunk.compression,
+            compressed_size=len(chunk.data),
+            uncompressed_size=len(data),
+            message_start_time=span.start,
+            message_end_time=span.end,
+            message_index_offsets={},
+            message_index_length=0,
+        )
 
     def _take_index(self, at: int, index: mcap.MessageIndex, length: int) -> None:
         number = index.channel_id

@@ -58,9 +58,7 @@ def write_error(error: OSError, path: Path) -> BagError:
 def offered_qos(reliability: str, durability: str, depth: int) -> str:
     """Return a publisher's QoS as rosbag2 of Jazzy (bag format 9) writes it: a YAML sequence."""
     allowed = {"reliable", "best_effort"}, {"volatile", "transient_local"}
-    for what, value, names in zip(
-        ("reliability", "durability"), (reliability, durability), allowed, strict=True
-    ):
+    for what, value, names in zip(("reliability", "durability"), (reliability, durability), allowed, strict=True):
         if value not in names:
             text = f"{what} is {value!r}; expected {' or '.join(sorted(names))}"
             raise BagError(text, reason="qos")
@@ -339,9 +337,7 @@ class BagWriter:
 
 
 @contextmanager
-def whole_bag(
-    path: Path, overwrite: bool, metadata: Mapping[str, Mapping[str, str]]
-) -> Iterator[BagWriter]:
+def whole_bag(path: Path, overwrite: bool, metadata: Mapping[str, Mapping[str, str]]) -> Iterator[BagWriter]:
     """Write a bag that is made at once: it has its name only when it is complete.
 
     :raises BagError: the file exists and ``overwrite`` is false, or it cannot be written.

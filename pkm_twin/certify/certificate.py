@@ -166,9 +166,7 @@ def certify(
             continue
         module, kind = ENGINES[name][0].split(":")
         try:
-            maker: Callable[[Mapping[str, Any]], Judge] = getattr(
-                importlib.import_module(module), kind
-            )
+            maker: Callable[[Mapping[str, Any]], Judge] = getattr(importlib.import_module(module), kind)
             judges[name] = maker(description)
         except ImportError as error:
             if error.name is None or error.name.startswith("pkm_twin"):
@@ -210,27 +208,22 @@ def certify_variants(
     for k in range(count + 1):
         machine = robot if k == 0 else drawn(robot, seed + k)
         done = sum(one.states for one in found)
-        found.append(
-            certificate_of(
-                machine, seed=seed, progress=lambda n, done=done: progress(done + n), **options
-            )
-        )
+        found.append(certificate_of(machine, seed=seed, progress=lambda n, done=done: progress(done + n), **options))
     by_name: dict[tuple[str, str], list[Item]] = {}
     for item in (item for one in found for item in one.items):
         by_name.setdefault((item.engine, item.what), []).append(item)
     items = [
         replace(
-            same[0], worst=max(item.worst for item in same),
+            same[0],
+            worst=max(item.worst for item in same),
             median=float(np.median([item.median for item in same])),
         )
         for same in by_name.values()
-    ]  # fmt: skip
+    ]
     missing = {name: reason for one in found for name, reason in one.missing.items()}
     states = sum(one.drawn for one in found)
     skipped = sum(one.skipped for one in found)
-    return replace(
-        found[0], items=items, missing=missing, drawn=states, skipped=skipped, variants=count
-    )
+    return replace(found[0], items=items, missing=missing, drawn=states, skipped=skipped, variants=count)
 
 
 def drawn(robot: Robot, seed: int) -> Robot:
@@ -319,9 +312,7 @@ def _compare_engines(
     for name in judges:
         expected = np.array(efforts[name])
         items.append(_make_item(name, "torques", effort_differences(tau, expected)))
-        items += [
-            _make_item(name, what, found[name, what]) for owner, what in found if owner == name
-        ]
+        items += [_make_item(name, what, found[name, what]) for owner, what in found if owner == name]
     return items
 
 

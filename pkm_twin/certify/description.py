@@ -171,9 +171,7 @@ def expand(description: Description) -> dict[str, Any]:
     """
     result = {key: value for key, value in description.items() if key != "limbs"}
     for kind in ("bodies", "joints", "rods"):
-        result[kind] = {
-            name: dict(entry or {}) for name, entry in _section_items(description, kind)
-        }
+        result[kind] = {name: dict(entry or {}) for name, entry in _section_items(description, kind)}
     sections = description.get("limbs") or []
     if isinstance(sections, Mapping):
         sections = [sections]
@@ -211,13 +209,10 @@ def _rotate_entry(entry: dict[str, Any], turn: Array, own: set[str], number: int
         entry["rotor_inertia"] = entry["rotor_inertia"][number - 1]
     if entry.get("friction"):
         entry["friction"] = {
-            key: value[number - 1] if isinstance(value, list) else value
-            for key, value in entry["friction"].items()
+            key: value[number - 1] if isinstance(value, list) else value for key, value in entry["friction"].items()
         }
     if "between" in entry:
-        entry["between"] = [
-            f"{name}_{number}" if name in own else name for name in entry["between"]
-        ]
+        entry["between"] = [f"{name}_{number}" if name in own else name for name in entry["between"]]
     return entry
 
 

@@ -108,9 +108,7 @@ class Maximal(Moving):
         """Return a body's frame at its centre of mass."""
         k, state = self.names.index(body), self._state
         columns = self._columns[k]
-        return Frame(
-            self._coms[k], state.com[k], state.rotation[k], columns, state.velocity[k], np.zeros(6)
-        )
+        return Frame(self._coms[k], state.com[k], state.rotation[k], columns, state.velocity[k], np.zeros(6))
 
     # Positions
 
@@ -218,9 +216,7 @@ class Maximal(Moving):
             for name, body in self.machine.bodies.items()
         ]
         for rod in self.machine.rods:
-            ends = (
-                self.point(rod.inner, rod.ends[0]).value + self.point(rod.outer, rod.ends[1]).value
-            )
+            ends = self.point(rod.inner, rod.ends[0]).value + self.point(rod.outer, rod.ends[1]).value
             weights.append(rod.mass * ends @ self.machine.gravity / 2)
         return kinetic, -float(sum(weights))
 

@@ -65,9 +65,7 @@ class MujocoTree(Tree):
         elif [kind for kind, _ in kinds] == ["hinge"] * 3:
             kinds = [("ball", np.zeros(3))]
         for kind, axis in kinds:
-            Xml.SubElement(
-                element, "joint", type=kind, pos=_format_numbers(at), axis=_format_numbers(axis)
-            )
+            Xml.SubElement(element, "joint", type=kind, pos=_format_numbers(at), axis=_format_numbers(axis))
 
     def finish(self) -> int:
         """Compile the model."""
@@ -109,9 +107,7 @@ class MujocoTree(Tree):
             mujoco.mj_jac(model, data, columns[:3], columns[3:], place, number)
             mujoco.mj_jacDot(model, data, change[:3], change[3:], place, number)
             rotation = data.xmat[number].reshape(3, 3).copy()
-            self._frames[body] = Frame(
-                np.zeros(3), place, rotation, columns, columns @ data.qvel, change @ data.qvel
-            )
+            self._frames[body] = Frame(np.zeros(3), place, rotation, columns, columns @ data.qvel, change @ data.qvel)
         return self._frames[body]
 
     def forces(self, change: Array) -> Array:

@@ -44,9 +44,7 @@ class PinocchioTree(Tree):
                 for turns, a in steps
             ]
         for number, model in enumerate(models):
-            carrier = self.model.addJoint(
-                carrier, model, _translation(at - origin), f"{name}.{number}"
-            )
+            carrier = self.model.addJoint(carrier, model, _translation(at - origin), f"{name}.{number}")
             origin = at
         self._carriers[name] = carrier, origin
         if carrier:
@@ -84,9 +82,13 @@ class PinocchioTree(Tree):
             columns = np.array(pin.getJointJacobian(*given, world))
             bias = pin.getClassicalAcceleration(*given, world).vector
             self._frames[body] = Frame(
-                origin, place.translation.copy(), place.rotation.copy(), columns,
-                columns @ self._state[1], bias,
-            )  # fmt: skip
+                origin,
+                place.translation.copy(),
+                place.rotation.copy(),
+                columns,
+                columns @ self._state[1],
+                bias,
+            )
         return self._frames[body]
 
     def forces(self, change: Array) -> Array:

@@ -166,9 +166,7 @@ class Moving(ABC):
                 gone = slide.value - turned * turn.value
                 # The angle is known up to full revolutions.
                 gone = np.array([math.remainder(gone[0], 2.0 * math.pi * turned)])
-                rows.append(
-                    Rows(gone, *(a - turned * b for a, b in zip(slide[1:], turn[1:], strict=True)))
-                )
+                rows.append(Rows(gone, *(a - turned * b for a, b in zip(slide[1:], turn[1:], strict=True))))
             else:
                 raise UnfitError(f"joints.{joint.name}: no judge knows how to hold {held!r}")
         return rows
@@ -258,9 +256,7 @@ class Moving(ABC):
         self.assemble(q)
         return self.twist_columns() @ self.tangent()
 
-    def inverse_dynamics(
-        self, q: Array, qd: Array, qdd: Array, wrench: Array | None = None
-    ) -> Array:
+    def inverse_dynamics(self, q: Array, qd: Array, qdd: Array, wrench: Array | None = None) -> Array:
         """Compute the efforts of the actuated joints, shape (n,), N m or N.
 
         :param q: positions, shape (n,), rad or m; ``qd``, ``qdd``: their derivatives.

@@ -54,9 +54,7 @@ def whole(value: int, kind: str = INT64) -> Value:
 
 def every(value: Value, lanes: int) -> Value:
     """Return a vector constant with the same value in every lane."""
-    return Value(
-        vector(value.kind, lanes), f"<{', '.join([f'{value.kind} {value.name}'] * lanes)}>"
-    )
+    return Value(vector(value.kind, lanes), f"<{', '.join([f'{value.kind} {value.name}'] * lanes)}>")
 
 
 def undefined(kind: str) -> Value:
@@ -212,9 +210,7 @@ class Function:
 
     def insert_element(self, x: Value, value: Value, lane: int) -> Value:
         """Replace one lane of a vector."""
-        return self.new(
-            x.kind, f"insertelement {x.kind} {x.name}, {value.kind} {value.name}, {INT32} {lane}"
-        )
+        return self.new(x.kind, f"insertelement {x.kind} {x.name}, {value.kind} {value.name}, {INT32} {lane}")
 
     def splat(self, value: Value, lanes: int) -> Value:
         """Copy a value into every lane of a vector."""

@@ -91,10 +91,7 @@ def read(name: str) -> tuple[dict[str, Any], bytes] | None:
     except OSError:
         return None
     seal = len(_MARK) + 32
-    if (
-        not data.startswith(_MARK)
-        or hashlib.sha256(data[seal:]).digest() != data[len(_MARK) : seal]
-    ):
+    if not data.startswith(_MARK) or hashlib.sha256(data[seal:]).digest() != data[len(_MARK) : seal]:
         return None
     head, _, code = data[seal:].partition(b"\n")
     try:
@@ -108,11 +105,7 @@ def read(name: str) -> tuple[dict[str, Any], bytes] | None:
 
 def _own(status: os.stat_result) -> bool:
     """Return whether a file is a regular file that only this user can have written."""
-    return (
-        stat.S_ISREG(status.st_mode)
-        and status.st_uid == os.geteuid()
-        and not status.st_mode & 0o022
-    )
+    return stat.S_ISREG(status.st_mode) and status.st_uid == os.geteuid() and not status.st_mode & 0o022
 
 
 def is_object(code: bytes, symbol: str) -> bool:

@@ -132,8 +132,7 @@ def caller(inputs: int, outputs: int) -> Callable[..., Any]:
         "    take, give = free.pop, free.append",
         f"    def call({given}):",
         # Masked arrays are excluded: their buffer does not show the mask.
-        f"        if not ({' is '.join(['array', *(f'type({name})' for name in names)])})"
-        " or a0.ndim != 1:",
+        f"        if not ({' is '.join(['array', *(f'type({name})' for name in names)])}) or a0.ndim != 1:",
         f"            return otherwise({given})",
         "        try:",
         "            place = take()",
@@ -274,10 +273,7 @@ class Code:
         if shape and not all([a.ndim == 1 or a.shape[:-1] == shape for a in arrays]):
             shape = np.broadcast_shapes(*(a.shape[:-1] for a in arrays))
             arrays = [
-                a.reshape(-1)
-                if a.size == a.shape[-1]
-                else np.broadcast_to(a, (*shape, a.shape[-1]))
-                for a in arrays
+                a.reshape(-1) if a.size == a.shape[-1] else np.broadcast_to(a, (*shape, a.shape[-1])) for a in arrays
             ]
         count = math.prod(shape)
         if count == 0:
@@ -350,9 +346,7 @@ class Code:
                 raise ValueError(f"the last axis has to be {size}, the shape is {array.shape}")
         return arrays
 
-    def bound(
-        self, prepared: Array, otherwise: Callable[..., Any], outputs: int = 0
-    ) -> Callable[..., Any]:
+    def bound(self, prepared: Array, otherwise: Callable[..., Any], outputs: int = 0) -> Callable[..., Any]:
         """Return a fast function of the inputs for one machine.
 
         It is fast for a single sample that is good in the first attempt, with arrays of doubles of
@@ -396,10 +390,7 @@ class Code:
             for machine in np.unique(machines) if len(prepared) > 1 else [0]:
                 own = left[machines == machine] if len(prepared) > 1 else left
                 at = samples[machines == machine] if len(prepared) > 1 else samples
-                picked = [
-                    row[machine if len(row) > 1 else 0][at if row.shape[1] > 1 else [0]][None]
-                    for row in rows
-                ]
+                picked = [row[machine if len(row) > 1 else 0][at if row.shape[1] > 1 else [0]][None] for row in rows]
                 alone = prepared[machine : machine + 1]
                 found, again = self._run(alone, picked, len(own), steps)
                 for output, values in zip(outputs, found, strict=True):
@@ -407,9 +398,7 @@ class Code:
                 status[own] = np.array([GOOD, 1.0]) if again is None else again
         return status if status[:, 0].any() else None
 
-    def _run(
-        self, prepared: Array, rows: Sequence[Array], count: int, steps: int
-    ) -> tuple[list[Array], Array | None]:
+    def _run(self, prepared: Array, rows: Sequence[Array], count: int, steps: int) -> tuple[list[Array], Array | None]:
         header, _, code, locked = self._loaded
         machines = len(prepared)
         if locked is None:
@@ -418,10 +407,7 @@ class Code:
                 for k, one in enumerate(prepared)
             ]
             status = np.concatenate([part[1] for part in parts])
-            outputs = [
-                np.concatenate([part[0][k] for part in parts])
-                for k in range(len(header["outputs"]))
-            ]
+            outputs = [np.concatenate([part[0][k] for part in parts]) for k in range(len(header["outputs"]))]
             return outputs, status if status[:, 0].any() else None
         outputs = [np.empty((machines * count, size)) for size in header["outputs"]]
         status = np.empty((machines * count, 2))
@@ -450,9 +436,7 @@ class Code:
 
 def _rows(arrays: Sequence[Array], count: int) -> list[Array]:
     """Convert arrays to contiguous rows, shape (1, 1 or count, size)."""
-    return [
-        np.ascontiguousarray(a).reshape(1, 1 if a.ndim == 1 else count, a.shape[-1]) for a in arrays
-    ]
+    return [np.ascontiguousarray(a).reshape(1, 1 if a.ndim == 1 else count, a.shape[-1]) for a in arrays]
 
 
 def _header(program: Program, lanes: int) -> dict[str, Any]:

@@ -123,9 +123,14 @@ class Expression:
     __slots__ = ("args", "level", "number", "op", "source", "tape", "value")
 
     def __init__(
-        self, tape: Tape, op: Operation | None, args: tuple[Expression, ...], number: int,
-        level: int, value: float,
-    ) -> None:  # fmt: skip
+        self,
+        tape: Tape,
+        op: Operation | None,
+        args: tuple[Expression, ...],
+        number: int,
+        level: int,
+        value: float,
+    ) -> None:
         self.tape, self.op, self.args = tape, op, args
         self.number, self.level, self.value = number, level, value
         self.source: tuple[str, int] | None = None
@@ -141,11 +146,7 @@ class Expression:
                 return NotImplemented
             other = self.tape.lift(other)
         a, b = (other, self) if after else (self, other)
-        return (
-            op.fold(a, b)
-            if a.level or b.level
-            else self.tape.constant(op.numbers(a.value, b.value))
-        )
+        return op.fold(a, b) if a.level or b.level else self.tape.constant(op.numbers(a.value, b.value))
 
     def __add__(self, other: Any) -> Any:
         return self._with(add, other)

@@ -41,9 +41,7 @@ class Kernel:
     def holds(self) -> bool:
         """Whether the geometry agrees with the constants that the program assumes."""
         p = np.zeros(self.code.parameters - len(self.geometry))
-        return bool(
-            self.code.prepare(np.concatenate([p, self.geometry]))[-1] <= MAX_GEOMETRY_MISMATCH
-        )
+        return bool(self.code.prepare(np.concatenate([p, self.geometry]))[-1] <= MAX_GEOMETRY_MISMATCH)
 
     def prepared(self, p: Array) -> Array:
         """Compute the expressions of parameters and geometry alone, for all samples to use."""
@@ -75,9 +73,7 @@ class Kernel:
         :param otherwise: function for all but good single samples; default: the program, without
             a check of its status.
         """
-        return self.code.bound(
-            self.prepared(p), otherwise or (lambda *inputs: self(p, *inputs)[0][0])
-        )
+        return self.code.bound(self.prepared(p), otherwise or (lambda *inputs: self(p, *inputs)[0][0]))
 
 
 class BoundCall:

@@ -46,12 +46,8 @@ class ProgramKey:
 
     def digest(self, *more: str) -> str:
         """Return the cache name of the program; it changes with the content and any source file."""
-        writers = [
-            name if _source_file(name) else f"{name} {_UNSAVED}" for name in sorted(self.writers)
-        ]
-        return digest(
-            self.text, *writers, *sorted(_read_source(file)[0] for file in self.sources), *more
-        )
+        writers = [name if _source_file(name) else f"{name} {_UNSAVED}" for name in sorted(self.writers)]
+        return digest(self.text, *writers, *sorted(_read_source(file)[0] for file in self.sources), *more)
 
 
 EMPTY: Final = ProgramKey()
@@ -76,9 +72,7 @@ def _source_file(module: str) -> str:
 
 @cache
 def _find_sources(writers: frozenset[str]) -> frozenset[str]:
-    todo: list[Module] = [
-        (name, _source_file(name)) for name in {*writers, _COMPILER} if _source_file(name)
-    ]
+    todo: list[Module] = [(name, _source_file(name)) for name in {*writers, _COMPILER} if _source_file(name)]
     found = set(todo)
     while todo:
         new = _find_imports(*todo.pop()) - found
@@ -103,9 +97,7 @@ def _find_imports(module: str, file: str) -> frozenset[Module]:
             place = _module_file(home, name)
             found.add((name, place))
             if place.endswith(_PACKAGE):
-                found |= {
-                    (f"{name}.{part}", _module_file(home, f"{name}.{part}")) for part in names
-                }
+                found |= {(f"{name}.{part}", _module_file(home, f"{name}.{part}")) for part in names}
     return frozenset(one for one in found if one[1])
 
 

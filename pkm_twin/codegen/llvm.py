@@ -65,9 +65,7 @@ class Emitter(Lanes):
     :param base: address of the prepared values; None for scalar code.
     """
 
-    def __init__(
-        self, b: Function, used: Mapping[int, int], prepared: Mapping[int, int], base: Value | None
-    ) -> None:
+    def __init__(self, b: Function, used: Mapping[int, int], prepared: Mapping[int, int], base: Value | None) -> None:
         super().__init__(b, wide=base is not None)
         self._used, self._prepared, self._base = used, prepared, base
         self._known: dict[int, Value] = {}
@@ -95,9 +93,7 @@ class Emitter(Lanes):
             x, z = (x, self.b.fneg(z)) if first else (self.b.fneg(x), z)
         return self.fused(x, y, z)
 
-    def run(
-        self, results: Sequence[Expression], inputs: Mapping[str, Sequence[Value]]
-    ) -> list[Value]:
+    def run(self, results: Sequence[Expression], inputs: Mapping[str, Sequence[Value]]) -> list[Value]:
         """Compute the results, every shared expression once."""
         for e in ordered(results, {**self._known, **self._prepared}):
             self._known[e.number] = self.value(e, inputs)

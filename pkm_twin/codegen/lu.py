@@ -133,9 +133,7 @@ class SparseLU:
         for (row, _, _), lower in zip(self._pivots, self._lower, strict=True):
             for r, factor in lower.items():
                 b[r] = b[r] - factor * b[row]
-        for (row, column, inverse), upper in zip(
-            reversed(self._pivots), reversed(self._upper), strict=True
-        ):
+        for (row, column, inverse), upper in zip(reversed(self._pivots), reversed(self._upper), strict=True):
             value = b[row]
             for c, factor in upper.items():
                 value = value - factor * x[c]

@@ -71,9 +71,7 @@ def load_object(code: bytes) -> tuple[Any, Any]:
 
 def _make_target_machine(level: int = OPTIMISATION) -> Any:
     target = binding.Target.from_default_triple()
-    return target.create_target_machine(
-        cpu=CPU, features=FEATURES, opt=level, jit=True, reloc="pic"
-    )
+    return target.create_target_machine(cpu=CPU, features=FEATURES, opt=level, jit=True, reloc="pic")
 
 
 PROTOTYPE: Final = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_void_p)

@@ -31,30 +31,48 @@ MAX_QUARTER: Final = 1048576
 # Minimax polynomials of sine and cosine up to a quarter turn, and pi / 2 in three parts
 # (Cody and Waite 1980; coefficients of this file as in Cephes, public domain).
 SINE: Final = (
-    1.58962301576546568060e-10, -2.50507477628578072866e-8, 2.75573136213857245213e-6,
-    -1.98412698295895385996e-4, 8.33333333332211858878e-3, -1.66666666666666307295e-1,
-)  # fmt: skip
+    1.58962301576546568060e-10,
+    -2.50507477628578072866e-8,
+    2.75573136213857245213e-6,
+    -1.98412698295895385996e-4,
+    8.33333333332211858878e-3,
+    -1.66666666666666307295e-1,
+)
 COSINE: Final = (
-    -1.13585365213876817300e-11, 2.08757008419747316778e-9, -2.75573141792967388112e-7,
-    2.48015872888517045348e-5, -1.38888888888730564116e-3, 4.16666666666665929218e-2,
-)  # fmt: skip
+    -1.13585365213876817300e-11,
+    2.08757008419747316778e-9,
+    -2.75573141792967388112e-7,
+    2.48015872888517045348e-5,
+    -1.38888888888730564116e-3,
+    4.16666666666665929218e-2,
+)
 HALF_PI: Final = (1.5707963267341256e00, 6.0771005065061922e-11, 2.0222662487959506e-21)
 # Arctangent up to 0.66 as x + x z P(z) / Q(z), z = x^2.
 ATAN_P: Final = (
-    -8.750608600031904122785e-1, -1.615753718733365076637e1, -7.500855792314704667340e1,
-    -1.228866684490136173410e2, -6.485021904942025371773e1,
-)  # fmt: skip
+    -8.750608600031904122785e-1,
+    -1.615753718733365076637e1,
+    -7.500855792314704667340e1,
+    -1.228866684490136173410e2,
+    -6.485021904942025371773e1,
+)
 ATAN_Q: Final = (
-    1.0, 2.485846490142306297962e1, 1.650270098316988542046e2, 4.328810604912902668951e2,
-    4.853903996359136964868e2, 1.945506571482613964425e2,
-)  # fmt: skip
+    1.0,
+    2.485846490142306297962e1,
+    1.650270098316988542046e2,
+    4.328810604912902668951e2,
+    4.853903996359136964868e2,
+    1.945506571482613964425e2,
+)
 HALF_PI_REMAINDER: Final = 6.123233995736765886130e-17
 """Difference between pi / 2 and its nearest double."""
 # The exponential function up to ln(2) / 2 as 1 + 2 x P(z) / (Q(z) - x P(z)), ln(2) in two parts.
 EXP_P: Final = (1.26177193074810590878e-4, 3.02994407707441961300e-2, 9.99999999999999999910e-1)
 EXP_Q: Final = (
-    3.00198505138664455042e-6, 2.52448340349684104192e-3, 2.27265548208155028766e-1, 2.0,
-)  # fmt: skip
+    3.00198505138664455042e-6,
+    2.52448340349684104192e-3,
+    2.27265548208155028766e-1,
+    2.0,
+)
 LN2: Final = (6.93145751953125e-1, 1.42860682030941723212e-6)
 MAX_EXPONENT: Final = 745.2
 """Beyond this exponent (ln of the smallest double) the result is infinite, or zero if negative."""
@@ -197,9 +215,7 @@ def _fold_product(a: Any, b: Any) -> Any:
             return u if u.value == 0.0 else v if u.value > 0.0 else _fold_negation(v)
     if a.op is neg:
         both = b.op is neg
-        return (
-            _fold_product(*a.args, *b.args) if both else _fold_negation(_fold_product(a.args[0], b))
-        )
+        return _fold_product(*a.args, *b.args) if both else _fold_negation(_fold_product(a.args[0], b))
     return _fold_negation(_fold_product(a, *b.args)) if b.op is neg else a.tape.make(mul, a, b)
 
 
@@ -252,11 +268,15 @@ def _define_angle_function(name: str, index: int, slope: Callable[[Any], Any]) -
         return to.turned[number][index]
 
     turn = Operation(
-        name, numbers, lanes, lambda e, x: (slope(x),),
+        name,
+        numbers,
+        lanes,
+        lambda e, x: (slope(x),),
         lambda x: within(x) if abs(x) < MAX_ANGLE else math.nan,
         lambda x: numbers(np.where(np.abs(x) < MAX_ANGLE, x, np.nan)),
-        folds=folds, helper=SINE_COSINE_C,
-    )  # fmt: skip
+        folds=folds,
+        helper=SINE_COSINE_C,
+    )
     return turn
 
 
@@ -380,9 +400,14 @@ def _sqrt_derivative(e: Any, x: Any) -> tuple[Any, ...]:
 
 
 add: Final = Operation(
-    "add", operator.add, "fadd", lambda e, a, b: (1.0, 1.0),
-    infix="({} + {})", folds=_fold_sum, commutes=True,
-)  # fmt: skip
+    "add",
+    operator.add,
+    "fadd",
+    lambda e, a, b: (1.0, 1.0),
+    infix="({} + {})",
+    folds=_fold_sum,
+    commutes=True,
+)
 sub: Final = Operation(
     "sub",
     operator.sub,
@@ -392,22 +417,26 @@ sub: Final = Operation(
     folds=_fold_difference,
 )
 mul: Final = Operation(
-    "mul", operator.mul, "fmul", lambda e, a, b: (b, a),
-    infix="({} * {})", folds=_fold_product, commutes=True,
-)  # fmt: skip
-neg: Final = Operation(
-    "neg", operator.neg, "fneg", lambda e, x: (-1.0,), infix="(-{})", folds=_fold_negation
+    "mul",
+    operator.mul,
+    "fmul",
+    lambda e, a, b: (b, a),
+    infix="({} * {})",
+    folds=_fold_product,
+    commutes=True,
 )
+neg: Final = Operation("neg", operator.neg, "fneg", lambda e, x: (-1.0,), infix="(-{})", folds=_fold_negation)
 inv: Final[Operation] = Operation(
-    "inv", lambda x: 1.0 / x, lambda to, e, x: to.b.fdiv(to.number(1.0), x),
-    lambda e, x: (-(e * e),), lambda x: 1.0 / x if x else math.copysign(math.inf, x),
+    "inv",
+    lambda x: 1.0 / x,
+    lambda to, e, x: to.b.fdiv(to.number(1.0), x),
+    lambda e, x: (-(e * e),),
+    lambda x: 1.0 / x if x else math.copysign(math.inf, x),
     c="(1.0 / {})",
     folds=lambda x: _fold_negation(inv(*x.args)) if x.op is neg else x.tape.make(inv, x),
-)  # fmt: skip
-divide: Final = Operation("divide", lambda a, b: a * (1.0 / b), "", folds=_fold_quotient)
-sqrt: Final = Operation(
-    "sqrt", np.sqrt, "sqrt", _sqrt_derivative, lambda x: math.sqrt(x) if x >= 0.0 else math.nan
 )
+divide: Final = Operation("divide", lambda a, b: a * (1.0 / b), "", folds=_fold_quotient)
+sqrt: Final = Operation("sqrt", np.sqrt, "sqrt", _sqrt_derivative, lambda x: math.sqrt(x) if x >= 0.0 else math.nan)
 sin: Final = _define_angle_function("sin", 1, lambda x: cos(x))
 cos: Final[Operation] = _define_angle_function("cos", 0, lambda x: -sin(x))
 exp: Final = Operation(
@@ -420,39 +449,75 @@ exp: Final = Operation(
 tanh: Final = Operation("tanh", np.tanh, _write_tanh, lambda e, x: (1.0 - e * e,), math.tanh)
 absolute: Final = Operation("abs", np.abs, "fabs", lambda e, x: (sign(x),), abs, c="fabs")
 sign: Final[Operation] = Operation(
-    "sign", np.sign, _write_sign, one=lambda x: 1.0 if x > 0.0 else -1.0 if x < 0.0 else x * 0.0,
+    "sign",
+    np.sign,
+    _write_sign,
+    one=lambda x: 1.0 if x > 0.0 else -1.0 if x < 0.0 else x * 0.0,
     body="(x > 0.0) ? 1.0 : ((x < 0.0) ? -1.0 : x * 0.0)",
-)  # fmt: skip
+)
 """-1, 0 or 1."""
 atan2: Final = Operation(
-    "atan2", np.arctan2, _write_atan2,
-    lambda e, y, x: (x / (y * y + x * x), -y / (y * y + x * x)), math.atan2,
-)  # fmt: skip
+    "atan2",
+    np.arctan2,
+    _write_atan2,
+    lambda e, y, x: (x / (y * y + x * x), -y / (y * y + x * x)),
+    math.atan2,
+)
 minimum: Final = Operation(
-    "min", np.minimum, lambda to, e, x, y: to.b.select(to.b.fcmp("olt", x, y), x, y),
-    lambda e, x, y: (_step_weight(y, x), _step_weight(x, y)), lambda x, y: x if x < y else y,
-    body="(x < y) ? x : y", commutes=True,
-)  # fmt: skip
+    "min",
+    np.minimum,
+    lambda to, e, x, y: to.b.select(to.b.fcmp("olt", x, y), x, y),
+    lambda e, x, y: (_step_weight(y, x), _step_weight(x, y)),
+    lambda x, y: x if x < y else y,
+    body="(x < y) ? x : y",
+    commutes=True,
+)
 maximum: Final = Operation(
-    "max", np.maximum, lambda to, e, x, y: to.b.select(to.b.fcmp("ogt", x, y), x, y),
-    lambda e, x, y: (_step_weight(x, y), _step_weight(y, x)), lambda x, y: x if x > y else y,
-    body="(x > y) ? x : y", commutes=True,
-)  # fmt: skip
+    "max",
+    np.maximum,
+    lambda to, e, x, y: to.b.select(to.b.fcmp("ogt", x, y), x, y),
+    lambda e, x, y: (_step_weight(x, y), _step_weight(y, x)),
+    lambda x, y: x if x > y else y,
+    body="(x > y) ? x : y",
+    commutes=True,
+)
 less: Final = Operation(
-    "less", lambda x, y: np.where(x < y, 1.0, 0.0), _write_less,
-    one=lambda x, y: 1.0 if x < y else 0.0, body="(x < y) ? 1.0 : 0.0",
-)  # fmt: skip
+    "less",
+    lambda x, y: np.where(x < y, 1.0, 0.0),
+    _write_less,
+    one=lambda x, y: 1.0 if x < y else 0.0,
+    body="(x < y) ? 1.0 : 0.0",
+)
 """1 where x < y, else 0, also if one of them is NaN."""
 select: Final[Operation] = Operation(
-    "select", lambda x, y, z: np.where(x > 0.0, y, z), _write_select,
+    "select",
+    lambda x, y, z: np.where(x > 0.0, y, z),
+    _write_select,
     lambda e, x, y, z: (0.0, select(x, 1.0, 0.0), select(x, 0.0, 1.0)),
-    lambda x, y, z: y if x > 0.0 else z, body="(x > 0.0) ? y : z", folds=_fold_select,
-)  # fmt: skip
+    lambda x, y, z: y if x > 0.0 else z,
+    body="(x > 0.0) ? y : z",
+    folds=_fold_select,
+)
 """y where x > 0, else z."""
 OPERATIONS: Final = (
-    add, sub, mul, neg, inv, sqrt, sin, cos, exp, tanh, absolute, sign, atan2, minimum, maximum,
-    less, select,
-)  # fmt: skip
+    add,
+    sub,
+    mul,
+    neg,
+    inv,
+    sqrt,
+    sin,
+    cos,
+    exp,
+    tanh,
+    absolute,
+    sign,
+    atan2,
+    minimum,
+    maximum,
+    less,
+    select,
+)
 
 
 def both(x: Any, y: Any) -> Any:

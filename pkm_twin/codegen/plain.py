@@ -35,12 +35,8 @@ _MAX_INLINE: Final = 200
 
 
 _NUMBERS: Final = {"inf": math.inf, "nan": math.nan}
-_SCALAR_FUNCTIONS: Final[dict[str, Any]] = {
-    op.name: op.one or op.numbers for op in OPERATIONS
-} | _NUMBERS
-_ARRAY_FUNCTIONS: Final[dict[str, Any]] = {
-    op.name: op.many or op.numbers for op in OPERATIONS
-} | _NUMBERS
+_SCALAR_FUNCTIONS: Final[dict[str, Any]] = {op.name: op.one or op.numbers for op in OPERATIONS} | _NUMBERS
+_ARRAY_FUNCTIONS: Final[dict[str, Any]] = {op.name: op.many or op.numbers for op in OPERATIONS} | _NUMBERS
 
 
 def source(
@@ -117,9 +113,7 @@ class PlainCode:
         rows = [self._prepare(**{PARAMETERS: row[:own], GEOMETRY: row[own:]}) for row in p.tolist()]
         return np.array(rows, np.float64).reshape(len(p), -1)
 
-    def run(
-        self, p: Array, inputs: Sequence[Array], count: int, steps: int
-    ) -> tuple[list[Array], Array]:
+    def run(self, p: Array, inputs: Sequence[Array], count: int, steps: int) -> tuple[list[Array], Array]:
         """Return outputs (count, size) and status (count, 2), as the compiled code gives them.
 
         :param inputs: shape (count, size), or (1, size) for all samples.
@@ -153,9 +147,7 @@ class PlainCode:
     def _call(self, part: Any, named: dict[str, Any], *, many: bool) -> list[Any]:
         return list(self._parts[part][many](**named))
 
-    def _solve(
-        self, q: Equations, named: dict[str, Any], n: list[Any], steps: int, *, many: bool
-    ) -> None:
+    def _solve(self, q: Equations, named: dict[str, Any], n: list[Any], steps: int, *, many: bool) -> None:
         """Solve equations by Newton's method from state n; store the unknowns in ``named``."""
         named[STATE] = n
         some: Callable[[Any], Any] = np.any if many else bool

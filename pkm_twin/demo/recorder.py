@@ -109,9 +109,7 @@ class Lockstep:
         self._first = self._last = self._now = self._heard = 0
         self._node = executor.get_nodes()[0]
         self._clock = self._node.create_publisher(Clock, "/clock", 10)
-        self._answers = self._node.create_subscription(
-            DiagnosticArray, "/diagnostics", self._hear, 10
-        )
+        self._answers = self._node.create_subscription(DiagnosticArray, "/diagnostics", self._hear, 10)
 
     def close(self) -> None:
         """Stop the clock."""
@@ -210,10 +208,7 @@ def wait_for(
         if child.poll() is not None:
             raise PkmTwinError(f"waiting for {what}: it ended with code {child.returncode}")
         if time.monotonic() > deadline:
-            raise PkmTwinError(
-                f"waiting for {what}: nothing for {PATIENCE:g} s; "
-                "this machine is too slow or too busy"
-            )
+            raise PkmTwinError(f"waiting for {what}: nothing for {PATIENCE:g} s; this machine is too slow or too busy")
 
 
 def drain(

@@ -64,12 +64,13 @@ def report_dynamics(bag: Path, recording: Path, prefix: str) -> tuple[list[Fact]
     near = _select_window(time, 2.0, time)
     rms = f", residual RMS {_rms(residual[near])[0]:.2g} {unit}" if near.any() else ""
     panel = Panel(
-        f"{prefix}:\neffort of {robot.joint_names[0]}{rms}", f"effort ({unit})",
+        f"{prefix}:\neffort of {robot.joint_names[0]}{rms}",
+        f"effort ({unit})",
         [
             (time[near], measured[near, 0], {"color": "0.6", "lw": 2.5, "label": "recorded"}),
             (time[near], predicted[near, 0], {"color": plots.COLOURS[1], "lw": 1, "label": "twin"}),
         ],
-    )  # fmt: skip
+    )
     sent = sum(1 for _ in read_messages(bag, ["/delta_dynamics/joint_trajectory"]))
     filled = read_messages(recording, [f"/{prefix}/delta_dynamics/joint_trajectory_ff"])
     findings = [
@@ -82,9 +83,11 @@ def report_dynamics(bag: Path, recording: Path, prefix: str) -> tuple[list[Fact]
     def left(what: str, rows: Mask, bound: float) -> Fact:
         part = _rms(residual[rows]) / np.abs(measured).max(0)
         return judge(
-            f"{prefix}: residual RMS {what}", _format_list(100 * part, "% of peak"),
-            f"below {100 * bound:g} %", bool((part < bound).all()),
-        )  # fmt: skip
+            f"{prefix}: residual RMS {what}",
+            _format_list(100 * part, "% of peak"),
+            f"below {100 * bound:g} %",
+            bool((part < bound).all()),
+        )
 
     free = _find_unloaded(r)[answered]
     findings += [
@@ -125,9 +128,7 @@ def _find_unloaded(r: Recording) -> Mask:
     return np.asarray(nearest > 0.5, np.bool_)
 
 
-def _judge_payload(
-    prefix: str, r: Recording, residual: Array, free: Mask, answered: Indices, held: Mask
-) -> list[Fact]:
+def _judge_payload(prefix: str, r: Recording, residual: Array, free: Mask, answered: Indices, held: Mask) -> list[Fact]:
     """Judge the payload's step in the residual and the mass estimated from it."""
     assert r.load is not None  # noqa: S101
     change = residual[held] - residual[free].mean(0)
@@ -142,8 +143,7 @@ def _judge_payload(
     return [
         judge(
             f"{prefix}: step of the residual at the pick",
-            f"{step:.3f} {' or '.join(dict.fromkeys(r.robot.effort_units))}, "
-            f"{step / scatter:.1f} times its scatter",
+            f"{step:.3f} {' or '.join(dict.fromkeys(r.robot.effort_units))}, {step / scatter:.1f} times its scatter",
             "above 3 times",
             bool(step > 3 * scatter),
         ),
@@ -198,9 +198,7 @@ def report_stiffness(bag: Path, recording: Path, prefix: str) -> tuple[list[Fact
     if judged:
         place = np.searchsorted(common, judged)
         greatest = 1e6 * np.linalg.norm(true, axis=1).max()
-        error = np.sqrt(
-            np.mean(np.sum((fixed[place] - true) ** 2, 1)) / np.mean(np.sum(true**2, 1))
-        )
+        error = np.sqrt(np.mean(np.sum((fixed[place] - true) ** 2, 1)) / np.mean(np.sum(true**2, 1)))
         findings.append(
             judge(
                 f"{prefix}: RMS difference to the frame's deflection",

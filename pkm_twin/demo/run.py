@@ -120,9 +120,7 @@ STAGES = (
 )
 
 
-def run_stage(
-    stage: Stage, bag: Path, recorder: Recorder, executor: SingleThreadedExecutor, console: Console
-) -> None:
+def run_stage(stage: Stage, bag: Path, recorder: Recorder, executor: SingleThreadedExecutor, console: Console) -> None:
     """Start the node, play the bag as fast as it is answered, and record the answers."""
     node = executor.get_nodes()[0]
     recorder.listen(stage.bag, stage.outputs, stage.answer)

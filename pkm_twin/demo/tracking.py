@@ -81,9 +81,7 @@ class _Watch:
         self._since = None
 
 
-def run(
-    spread: float, recorder: Recorder, executor: SingleThreadedExecutor, console: Console
-) -> None:
+def run(spread: float, recorder: Recorder, executor: SingleThreadedExecutor, console: Console) -> None:
     """Record a run without and a run with feedforward on a machine with this perturbation."""
     node = executor.get_nodes()[0]
     recorder.listen(prefix(spread), {"/joint_states": STATE, INPUT_TOPIC: TRAJECTORY})
@@ -92,9 +90,7 @@ def run(
     answers: list[JointTrajectory] = []
     heard = node.create_subscription(JointTrajectory, f"{TWIN_TOPIC}_ff", answers.append, 10)
     depth = QoSProfile(depth=1)
-    twin, machine = (
-        node.create_publisher(JointTrajectory, t, depth) for t in (TWIN_TOPIC, INPUT_TOPIC)
-    )
+    twin, machine = (node.create_publisher(JointTrajectory, t, depth) for t in (TWIN_TOPIC, INPUT_TOPIC))
     reset = node.create_client(Trigger, "/machine_sim/reset")
     module = [sys.executable, "-m"]
     # The twin only answers trajectories: its joint states come from an empty topic.
@@ -147,9 +143,7 @@ def _make_trajectory() -> JointTrajectory:
     x = np.linspace(0.0, 1.0, POINTS)
     # 64 (x - x^2)^3 is 1 at x = 1/2, and its first two derivatives vanish at both ends.
     blend = 64.0 * np.array([-1.0, 3.0, -3.0, 1.0, 0.0, 0.0, 0.0])
-    rows = [
-        np.outer(np.polyval(np.polyder(blend, k), x) / DURATION**k, AMPLITUDES) for k in range(3)
-    ]
+    rows = [np.outer(np.polyval(np.polyder(blend, k), x) / DURATION**k, AMPLITUDES) for k in range(3)]
     message = JointTrajectory(joint_names=list(robot.joint_names))
     for k in range(POINTS):
         point = JointTrajectoryPoint(

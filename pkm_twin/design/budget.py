@@ -63,12 +63,16 @@ class ErrorBudget:
         for name, paths in found.together.items():
             shift, turn = np.split(found.effect(name).round(DECIMALS), 2, -1)
             result[name] = Contribution(
-                found.sigma[paths[0]], found.bounds[paths[0]], found.units[paths[0]],
-                (rms(shift), greatest(shift)), (rms(turn), greatest(turn)),
+                found.sigma[paths[0]],
+                found.bounds[paths[0]],
+                found.units[paths[0]],
+                (rms(shift), greatest(shift)),
+                (rms(turn), greatest(turn)),
                 rms(self.calibrated[name].round(DECIMALS)),
-                sum(found.variance[path] for path in paths), found.texts[paths[0]],
+                sum(found.variance[path] for path in paths),
+                found.texts[paths[0]],
                 any(np.any(np.abs(found.sensitivity[path]) > MOTIONLESS) for path in paths),
-            )  # fmt: skip
+            )
         return dict(sorted(result.items(), key=lambda item: -item[1].share))
 
     @cached_property

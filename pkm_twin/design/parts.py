@@ -57,10 +57,10 @@ STENCIL_WEIGHTS: Final = np.array([1.0, -8.0, 8.0, -1.0]) / 12e-3
 CLEARANCE: Final = ("clearance[0]", "clearance[1]", "clearance[2]")
 """Keys of a joint's clearance along the base axes at home."""
 ERROR_KEYS: Final = {
-    "bodies": ["length"], "rods": ["length"],
-    "joints": ["at[0]", "at[1]", "at[2]", "axis[0]", "axis[1]", "offset", "backlash",
-               *CLEARANCE],
-}  # fmt: skip
+    "bodies": ["length"],
+    "rods": ["length"],
+    "joints": ["at[0]", "at[1]", "at[2]", "axis[0]", "axis[1]", "offset", "backlash", *CLEARANCE],
+}
 """Keys at the end of an error's path, by the kind of the part."""
 
 Effect = tuple[str, str]
@@ -225,9 +225,10 @@ def _lengthen_body(robot: Robot, body: str, path: str) -> dict[Effect, Array]:
     towards = [j for j in own if min(far.get(b, 0) for b in (j.inner, j.outer)) < far.get(body, 0)]
     if len(towards) != 1:
         raise ParameterError(
-            path, ", ".join(j.name for j in towards) or None,
+            path,
+            ", ".join(j.name for j in towards) or None,
             "a body with one joint towards the base; move the joints of others by joints.NAME.at",
-        )  # fmt: skip
+        )
     start = towards[0]
     if start.name in robot.without_point:
         raise ParameterError(f"joints.{start.name}.at", None, f"the point where {body} begins")
@@ -282,9 +283,7 @@ class Assembly:
         found: list[Equation] = []
         graph, size = self.graph, self.placed.size
 
-        def find_points(
-            part: Joint | Rod, kinds: tuple[str, str], ends: Sequence[Array]
-        ) -> tuple[Array, Array]:
+        def find_points(part: Joint | Rod, kinds: tuple[str, str], ends: Sequence[Array]) -> tuple[Array, Array]:
             inner, outer = (
                 placed.point(body, at + errors.get((kind, part.name), 0.0))
                 for kind, body, at in zip(kinds, (part.inner, part.outer), ends, strict=True)
@@ -300,9 +299,7 @@ class Assembly:
                 inner = inner @ rotation_about(errors["tilt", joint.name])
             turns = partial(rotate, inner), partial(rotate, outer)
             for held in joint.constraints:
-                found += constraint_equations(
-                    joint.name, (joint.inner, joint.outer), held, points, turns, size
-                )
+                found += constraint_equations(joint.name, (joint.inner, joint.outer), held, points, turns, size)
             if joint.name in graph.leads:
                 goal = self.q[..., graph.actuated.index(joint.name)] - joint.home
                 goal = goal + errors.get(("offset", joint.name), np.zeros(1))[..., 0]

@@ -49,9 +49,14 @@ class PosePath:
 
     @classmethod
     def of_joints(
-        cls, robot: Robot, time: ArrayLike, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike,
+        cls,
+        robot: Robot,
+        time: ArrayLike,
+        q: ArrayLike,
+        qd: ArrayLike,
+        qdd: ArrayLike,
         wrench: ArrayLike | None = None,
-    ) -> PosePath:  # fmt: skip
+    ) -> PosePath:
         """Return the path of a robot's platform during a joint motion.
 
         :param time: shape (t,), s; ``q``, ``qd``, ``qdd``: shape (t, n).
@@ -65,9 +70,12 @@ class PosePath:
         rate = (robot.jacobian(q) @ np.asarray(qd, np.float64)[..., None])[..., 0]
         load = np.zeros(6) if wrench is None else np.asarray(wrench, np.float64)
         return cls(
-            times, robot.forward(q), rate, robot.pose_acceleration(q, qd, qdd),
+            times,
+            robot.forward(q),
+            rate,
+            robot.pose_acceleration(q, qd, qdd),
             np.array(np.broadcast_to(load, (len(times), 6))),
-        )  # fmt: skip
+        )
 
     def at(self, rows: Index) -> PosePath:
         """Return some samples of the path, in any order."""
@@ -122,9 +130,7 @@ class PathMotion:
     @cached_property
     def qd(self) -> Array:
         """Joint velocities, shape (k, t, n)."""
-        return np.where(
-            np.isfinite(self.q), self._solve_jacobian(self._for_machines(self.path.rate)), np.nan
-        )
+        return np.where(np.isfinite(self.q), self._solve_jacobian(self._for_machines(self.path.rate)), np.nan)
 
     @cached_property
     def qdd(self) -> Array:
@@ -158,9 +164,7 @@ class PathMotion:
 
     # Derivatives by the numbers, of one machine.
 
-    def effort_slopes(
-        self, weights: Array, rates: Array | None = None, changes: Array | None = None
-    ) -> Array:
+    def effort_slopes(self, weights: Array, rates: Array | None = None, changes: Array | None = None) -> Array:
         """Return the derivatives of each sample's w . tau + r . qd + c . qdd, shape (t, d).
 
         :param weights: w, shape (t, n); ``rates``: r, ``changes``: c, shape (t, n), None for zero.

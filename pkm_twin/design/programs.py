@@ -118,7 +118,5 @@ pose_motion: Final = asks(lambda robot: pose_motion_gradient(robot.engine))
 """Derivatives of pose, rate and acceleration by q, qd and geometry."""
 singularity_slopes: Final = asks(lambda robot: singularity_gradient(robot.engine))
 """Derivatives of the index by q and geometry."""
-compliance_slopes: Final = asks(
-    lambda robot: compliance_gradient(robot.cached(Elastic)), of_elasticity
-)
+compliance_slopes: Final = asks(lambda robot: compliance_gradient(robot.cached(Elastic)), of_elasticity)
 """Derivatives of the compliance by q and all numbers."""

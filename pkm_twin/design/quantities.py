@@ -170,9 +170,7 @@ def _motor_torques(f: PathMotion) -> tuple[Array, Array, Array, Array, Array]:
 
     Torques as in :mod:`pkm_twin.paths.sizing`, shape (k, t, n); numbers, shape (k, 1, n).
     """
-    turns, inertia, share = np.split(
-        _cached_numbers(f, _list_gear_numbers)(f.many.values)[:, None], 3, -1
-    )
+    turns, inertia, share = np.split(_cached_numbers(f, _list_gear_numbers)(f.many.values)[:, None], 3, -1)
     through = f.efforts - inertia * turns**2 * f.qdd
     losses = np.where(through * f.qd < 0.0, share, 1.0 / share)
     return inertia * turns * f.qdd + through * losses / turns, losses, turns, inertia, share
@@ -189,21 +187,13 @@ def _motor_slopes(f: PathMotion, places: Index) -> Array:
         turns * qdd * (1.0 - loss),
         through / turns * np.where(through * f.qd[0] < 0.0, 1.0, -1.0 / share**2),
     )
-    slopes = (
-        _cached_numbers(f, _list_gear_numbers)
-        .slopes_at(f.many.values)[0]
-        .reshape(3, len(turns[0]), -1)
-    )
+    slopes = _cached_numbers(f, _list_gear_numbers).slopes_at(f.many.values)[0].reshape(3, len(turns[0]), -1)
     rows = []
     for place in places:
         weights = np.zeros(tau.shape)
         weights[:, place] = _rms_gradient(f, torques, place)
-        along = f.effort_slopes(
-            weights * loss / turns, None, weights * inertia * turns * (1.0 - loss)
-        )
-        direct = sum(
-            (weights * by).sum(0)[place] * s[place] for by, s in zip(own, slopes, strict=True)
-        )
+        along = f.effort_slopes(weights * loss / turns, None, weights * inertia * turns * (1.0 - loss))
+        direct = sum((weights * by).sum(0)[place] * s[place] for by, s in zip(own, slopes, strict=True))
         rows.append(along.sum(0) + direct)
     return np.array(rows)
 
@@ -262,18 +252,31 @@ QUANTITIES: Final = {
     for quantity in (
         Quantity("peak-effort", "greatest effort of any joint", _peak_efforts, _peak_slopes, True),
         Quantity("rms-effort", "greatest RMS effort of a joint", _rms_efforts, _rms_slopes),
-        Quantity("motor-torque", "greatest RMS torque of a motor, of files with drives",
-                 lambda f: _rms_over_time(f, _motor_torques(f)[0]), _motor_slopes),
-        Quantity("energy", "energy that the drives give, nothing regenerated", _energy,
-                 _energy_slopes),
-        Quantity("deflection", "greatest translation of the reference point under the wrench",
-                 _deflection, _deflection_slopes, True),
+        Quantity(
+            "motor-torque",
+            "greatest RMS torque of a motor, of files with drives",
+            lambda f: _rms_over_time(f, _motor_torques(f)[0]),
+            _motor_slopes,
+        ),
+        Quantity("energy", "energy that the drives give, nothing regenerated", _energy, _energy_slopes),
+        Quantity(
+            "deflection",
+            "greatest translation of the reference point under the wrench",
+            _deflection,
+            _deflection_slopes,
+            True,
+        ),
         Quantity("mass", "mass of all bodies and rods without payload", _mass, _mass_slopes),
-        Quantity("singularity", "least singularity index",
-                 lambda f: f.singularity[..., None], lambda f, _: f.singularity_slopes(), True,
-                 True),
+        Quantity(
+            "singularity",
+            "least singularity index",
+            lambda f: f.singularity[..., None],
+            lambda f, _: f.singularity_slopes(),
+            True,
+            True,
+        ),
     )
-}  # fmt: skip
+}
 
 
 def find_quantity(name: str, field: str) -> Quantity:

@@ -118,8 +118,9 @@ class Problem:
         return DesignPoint(
             dict(zip(self.variables.names, self.variables.named(y), strict=True)),
             dict(zip(self.variables.paths, values.tolist(), strict=True)),
-            found, max([0.0, *map(float, misses)]) if follows else np.inf,
-        )  # fmt: skip
+            found,
+            max([0.0, *map(float, misses)]) if follows else np.inf,
+        )
 
 
 class Search:
@@ -195,9 +196,7 @@ class Search:
         padded = np.pad(table, ((1, 1), (0, 0)), constant_values=-np.inf)
         peaks = (table >= padded[:-2]) & (table >= padded[2:])
         worst = float(table.max())
-        reach = worst - (1.0 - NEAR_WORST_FRACTION) * max(
-            abs(worst), 0.3 if quantity.least else 0.0
-        )
+        reach = worst - (1.0 - NEAR_WORST_FRACTION) * max(abs(worst), 0.3 if quantity.least else 0.0)
         flat = table.ravel()
         order = np.flatnonzero(peaks.ravel() & (flat >= reach))
         return order[np.argsort(-flat[order], kind="stable")][:MAX_PIECES]
@@ -214,9 +213,14 @@ class _Run:
     """Run SLSQP on chosen pieces, in a box around a machine: variables y, aim's bound s."""
 
     def __init__(
-        self, search: Search, chosen: Sequence[Index], scale: float, centre: Array, aim: float,
+        self,
+        search: Search,
+        chosen: Sequence[Index],
+        scale: float,
+        centre: Array,
+        aim: float,
         radius: float,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.search, self.chosen, self.scale = search, chosen, scale
         self.centre, self.aim, self.radius = centre, aim, radius
         self._known: dict[bytes, tuple[Array, Array]] = {}
@@ -232,14 +236,18 @@ class _Run:
         unit = np.append(np.zeros(d), 1.0)
         try:
             result = minimize(
-                lambda z: z[-1], np.append(self.centre, self.aim / self.scale), method="SLSQP",
-                jac=lambda z: unit, bounds=[*zip(low, high, strict=True), (None, None)],
+                lambda z: z[-1],
+                np.append(self.centre, self.aim / self.scale),
+                method="SLSQP",
+                jac=lambda z: unit,
+                bounds=[*zip(low, high, strict=True), (None, None)],
                 constraints={
-                    "type": "ineq", "fun": lambda z: self._margins(z)[0],
+                    "type": "ineq",
+                    "fun": lambda z: self._margins(z)[0],
                     "jac": lambda z: self._margins(z)[1],
                 },
                 options={"maxiter": 60, "ftol": 0.1 * GAIN_TOLERANCE},
-            )  # fmt: skip
+            )
         except _OutsideError:
             return self._best[2], True
         y = np.clip(result.x[:d], low, high)
@@ -334,11 +342,17 @@ class Design:
 
 
 def design(
-    robot: Robot, vary: Mapping[str, tuple[float, float]], path: PosePath,
-    minimise: str | Sequence[str], subject_to: Sequence[str] = (), *, starts: int = DEFAULT_STARTS,
-    points: int = DEFAULT_FRONT_POINTS, seed: int = 0,
+    robot: Robot,
+    vary: Mapping[str, tuple[float, float]],
+    path: PosePath,
+    minimise: str | Sequence[str],
+    subject_to: Sequence[str] = (),
+    *,
+    starts: int = DEFAULT_STARTS,
+    points: int = DEFAULT_FRONT_POINTS,
+    seed: int = 0,
     progress: Callable[[int], None] = lambda _: None,
-) -> Design:  # fmt: skip
+) -> Design:
     """Optimise numbers of a robot's file, for the least value of a quantity on a path.
 
     The platform's path stays the same; the joints follow it. Machines that cannot follow it are
@@ -378,9 +392,7 @@ def design(
         search = Search(problem, aim, bounds)
         values, misses, _ = search.evaluate(tries)
         rejected = max(rejected, int(np.isinf(misses).sum()))
-        order = sorted(
-            np.flatnonzero(np.isfinite(misses)).tolist(), key=lambda k: _ranking(values, misses, k)
-        )
+        order = sorted(np.flatnonzero(np.isfinite(misses)).tolist(), key=lambda k: _ranking(values, misses, k))
         found: tuple[Array, float, float] | None = None
         for k in order[: LOCAL_SEARCHES + 1]:
             result = search.descend(tries[k])
@@ -404,9 +416,15 @@ def design(
         best = _choose_middle(told, names)
     before = problem.point(problem.variables.start, constraints)
     return Design(
-        robot.with_file_values(best.numbers), best, before, tuple(told) if len(aims) > 1 else (),
-        tuple(names), constraints, problem.count, rejected,
-    )  # fmt: skip
+        robot.with_file_values(best.numbers),
+        best,
+        before,
+        tuple(told) if len(aims) > 1 else (),
+        tuple(names),
+        constraints,
+        problem.count,
+        rejected,
+    )
 
 
 def searches(aims: int, points: int = DEFAULT_FRONT_POINTS) -> int:
@@ -437,10 +455,13 @@ def sobol(dimensions: int, count: int, seed: int) -> Array:
 
 
 def _trace_front(
-    problem: Problem, aims: Sequence[Quantity], constraints: Sequence[Constraint],
-    ends: tuple[Array, Array], points: int,
+    problem: Problem,
+    aims: Sequence[Quantity],
+    constraints: Sequence[Constraint],
+    ends: tuple[Array, Array],
+    points: int,
     search_from: Callable[[Quantity, Sequence[Constraint], Array], Array | None],
-) -> list[Array]:  # fmt: skip
+) -> list[Array]:
     """Return machines between the front's ends: smallest first aim for bounds of the second."""
     first, second = aims
     rows = problem.pieces(np.array(ends), [second])[0]
@@ -463,9 +484,7 @@ def _choose_middle(front: Sequence[DesignPoint], names: Sequence[str]) -> Design
     return front[int(np.argmin((near**2).sum(1)))]
 
 
-def _explain_failure(
-    problem: Problem, constraints: Sequence[Constraint], starts: Array, rejected: int
-) -> PkmTwinError:
+def _explain_failure(problem: Problem, constraints: Sequence[Constraint], starts: Array, rejected: int) -> PkmTwinError:
     name = problem.robot.name
     if rejected >= len(starts):
         return PkmTwinError(f"{name}: none of {len(starts)} machines tried can follow the path")

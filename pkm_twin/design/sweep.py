@@ -52,10 +52,9 @@ class Sweep:
             along = np.moveaxis(values, k, 0).reshape(len(values), -1)[:, 0]
             coordinates[name] = ((name,), along, units) if kind == "grid" else (dims, values, units)
         fields = {
-            name: (dims, values, {"units": QUANTITIES[name].unit(robot) or "1",
-                                  "long_name": QUANTITIES[name].meaning})
+            name: (dims, values, {"units": QUANTITIES[name].unit(robot) or "1", "long_name": QUANTITIES[name].meaning})
             for name, values in self.quantities.items()
-        }  # fmt: skip
+        }
         return Dataset(fields, coordinates, {"robot": robot.name, "path": path, "sweep": kind})
 
 
@@ -107,11 +106,17 @@ def compute_serially(box: Box, work: Work) -> Iterator[tuple[int, dict[str, Arra
 
 
 def sweep(
-    robot: Robot, vary: Mapping[str, tuple[float, float]], path: PosePath,
-    quantities: Sequence[str] | None, samples: int, kind: Literal["grid", "sobol"] = "grid", *,
-    seed: int = 0, progress: Callable[[int], None] = lambda _: None,
+    robot: Robot,
+    vary: Mapping[str, tuple[float, float]],
+    path: PosePath,
+    quantities: Sequence[str] | None,
+    samples: int,
+    kind: Literal["grid", "sobol"] = "grid",
+    *,
+    seed: int = 0,
+    progress: Callable[[int], None] = lambda _: None,
     compute: Callable[[Box, Work], Iterable[tuple[int, Mapping[str, Array]]]] = compute_serially,
-) -> Sweep:  # fmt: skip
+) -> Sweep:
     """Compute quantities of many machines whose numbers are within bounds.
 
     :param vary, path: as of :func:`pkm_twin.design.design`.
@@ -128,9 +133,7 @@ def sweep(
     d = len(variables)
     count = samples**d if kind == "grid" else samples
     if samples < 1 or count > MAX_MACHINES:
-        raise ParameterError(
-            "samples", samples, f"1 or more, at most {MAX_MACHINES} machines in all"
-        )
+        raise ParameterError("samples", samples, f"1 or more, at most {MAX_MACHINES} machines in all")
     if kind == "grid":
         axes = np.meshgrid(*[np.linspace(0.0, 1.0, samples)] * d, indexing="ij")
         shape: tuple[int, ...] = (samples,) * d

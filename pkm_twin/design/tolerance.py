@@ -100,12 +100,11 @@ class Tolerances:
         if not self.is_exact:
             lengths = [
                 np.linalg.norm(
-                    np.reshape([self.bounds[p] * self.sensitivity[p] for p in paths],
-                               (len(paths), *shape, 2, 3)),
+                    np.reshape([self.bounds[p] * self.sensitivity[p] for p in paths], (len(paths), *shape, 2, 3)),
                     axis=(0, -1),
                 )
                 for paths in self.together.values()
-            ]  # fmt: skip
+            ]
             apart = np.linalg.norm(self.worst.reshape(*shape, 2, 3), axis=-1)
             return np.asarray(np.minimum(sum(lengths), apart), np.float64)
         each = np.array([self.bounds[path] * self.sensitivity[path] for path in self.sigma])
@@ -161,9 +160,7 @@ def is_play(path: str) -> bool:
     return error_of(path).endswith((".backlash", ".clearance"))
 
 
-def expand_patterns(
-    robot: Robot, given: Mapping[str, float | Tolerance]
-) -> dict[str, float | Tolerance]:
+def expand_patterns(robot: Robot, given: Mapping[str, float | Tolerance]) -> dict[str, float | Tolerance]:
     """Return errors by single path: expand patterns to parts, a clearance to its three axes.
 
     :raises ParameterError: a pattern that matches nothing, or a play without a bound.
@@ -231,8 +228,7 @@ def tolerances(
     slopes = dict(platform_derivatives(robot, states, numbers).by)
     given = robot.file_numbers() if numbers else {}
     units = {
-        path: (given[path][1] if path in given else "") if part is None else part.unit
-        for path, part in parts.items()
+        path: (given[path][1] if path in given else "") if part is None else part.unit for path, part in parts.items()
     }
     sizes: dict[str, Tolerance] = {}
     for path, value in given_sizes.items():
@@ -259,18 +255,20 @@ def tolerances(
             missed = max(float(part_missed[k]) for _, part_missed in found)
             if missed > MAX_OPEN_FRACTION:
                 raise ParameterError(
-                    f"tolerance {path}", part.text,
+                    f"tolerance {path}",
+                    part.text,
                     f"errors after which the closed loops of {robot.name} still assemble (this one "
                     f"alone leaves {100 * missed:.2g} % of it open); parts with commas between "
                     f"share an error: {path},OTHER_PART=SIZE",
-                )  # fmt: skip
+                )
     return Tolerances(
-        {path: size.sigma for path, size in sizes.items()}, {path: slopes[path] for path in sizes},
+        {path: size.sigma for path, size in sizes.items()},
+        {path: slopes[path] for path in sizes},
         {path: "number of the file" if part is None else part.text for path, part in parts.items()},
         units,
         None if wrench is None else _deflection(robot, states, wrench),
         {path: size.most for path, size in sizes.items()},
-    )  # fmt: skip
+    )
 
 
 def _deflection(robot: Robot, q: Array, wrench: ArrayLike) -> Array | None:
@@ -282,9 +280,7 @@ def _deflection(robot: Robot, q: Array, wrench: ArrayLike) -> Array | None:
     return platform_response(robot, q, wrench).deflection
 
 
-def drawn(
-    robot: Robot, sigma: Mapping[str, float | Tolerance], q: ArrayLike, count: int, seed: int = 0
-) -> Array:
+def drawn(robot: Robot, sigma: Mapping[str, float | Tolerance], q: ArrayLike, count: int, seed: int = 0) -> Array:
     """Draw machines with random errors; return the platform's errors by exact assembly.
 
     :func:`tolerances` gives them to first order.
@@ -304,8 +300,7 @@ def drawn(
         else:
             # The parts of a clearance touch: any direction, with the bound's length.
             way = rng.normal(size=(len(paths), count)) if len(paths) > 1 else None
-            unit = rng.uniform(-1.0, 1.0, (1, count)) if way is None else (
-                way / np.linalg.norm(way, axis=0))  # fmt: skip
+            unit = rng.uniform(-1.0, 1.0, (1, count)) if way is None else (way / np.linalg.norm(way, axis=0))
             errors |= {one: known.bounds[one] * row for one, row in zip(paths, unit, strict=True)}
     parts = [path for path in errors if part_of(robot, path) is not None]
     assembly = Assembly(robot, states)
@@ -315,12 +310,14 @@ def drawn(
     machines = variants(robot, own)
     if parts:
         # Each machine has its own numbers and its own part errors.
-        found = np.concatenate([
-            assembly.like(machine.graph).displaced(
-                _add_effects(robot, {path: errors[path][k : k + 1] for path in parts})
-            )
-            for k, machine in enumerate(machines)
-        ])  # fmt: skip
+        found = np.concatenate(
+            [
+                assembly.like(machine.graph).displaced(
+                    _add_effects(robot, {path: errors[path][k : k + 1] for path in parts})
+                )
+                for k, machine in enumerate(machines)
+            ]
+        )
     else:
         each = np.broadcast_to(states, (count, *states.shape))
         if robot.redundant:

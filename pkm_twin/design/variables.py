@@ -72,10 +72,10 @@ class Variables:
             widest = MAX_RANGE * max(own_value, robot.graph.size if unit == "m" else 1.0)
             if not high - low <= widest:
                 raise ParameterError(
-                    f"vary {text}", f"{low:g}:{high:g}",
-                    f"a range of at most {widest:.3g} {unit}; the file has "
-                    f"{robot.number(parts[0]):g}",
-                )  # fmt: skip
+                    f"vary {text}",
+                    f"{low:g}:{high:g}",
+                    f"a range of at most {widest:.3g} {unit}; the file has {robot.number(parts[0]):g}",
+                )
             names.append(parts[0])
             lows.append(low)
             highs.append(high)
@@ -86,9 +86,14 @@ class Variables:
         for row, (column, side) in enumerate(paths.values()):
             slopes[row, column] = side * (greatest - least)[column]
         return cls(
-            tuple(names), tuple(paths), own, slopes, least, greatest,
+            tuple(names),
+            tuple(paths),
+            own,
+            slopes,
+            least,
+            greatest,
             (np.array(starts) - least) / (greatest - least),
-        )  # fmt: skip
+        )
 
     def values(self, y: Array) -> Array:
         """Return the numbers of the file for points (k, d), shape (k, p)."""
@@ -123,9 +128,7 @@ def parse_tolerances(texts: Sequence[str]) -> dict[str, Tolerance]:
     return found
 
 
-def _parse_numbers(
-    field: str, texts: Sequence[str], form: str, count: int
-) -> dict[str, list[float]]:
+def _parse_numbers(field: str, texts: Sequence[str], form: str, count: int) -> dict[str, list[float]]:
     """Parse texts ``NAME=NUMBERS``, numbers separated by colons, by name."""
     found: dict[str, list[float]] = {}
     for text in texts:

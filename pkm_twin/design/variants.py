@@ -41,8 +41,13 @@ MAX_CORNER_NUMBERS: Final = 5
 SAMPLES_PER_BALANCE: Final = 2048
 """Samples whose joint loads are solved at a time: each has large tables."""
 REACTION_ARRAYS: Final = (
-    "points", "wrenches", "determinate", "values", "determinate_components", "residual",
-)  # fmt: skip
+    "points",
+    "wrenches",
+    "determinate",
+    "values",
+    "determinate_components",
+    "residual",
+)
 """Names of the arrays of reactions."""
 HOME_NEIGHBOURHOOD: Final = 1e-3
 """Distance from home at which a machine must be assembled too, rad, or over the machine's size."""
@@ -130,16 +135,12 @@ class Variants:
             return "a number that follows from these is not finite"
         return "no assembly at home, or none beside it"
 
-    def inverse_dynamics(
-        self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None = None
-    ) -> Array:
+    def inverse_dynamics(self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None = None) -> Array:
         """Return efforts, shape (k, ..., n), see :func:`delta_dynamics.inverse_dynamics`."""
         load = np.zeros(6) if wrench is None else wrench
         return self.run(programs.torques, q, qd, qdd, load)[0][0]
 
-    def reactions(
-        self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None = None
-    ) -> Reactions:
+    def reactions(self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None = None) -> Reactions:
         """Return reactions with arrays (k, ..., joints, 6), see :func:`delta_dynamics.reactions`.
 
         Nothing is determinate for a machine without assembly or equilibrium. Components along
@@ -173,9 +174,7 @@ class Variants:
         n = self.robot.joints_count
         return flat.reshape(*flat.shape[:-1], n, n)
 
-    def project_redundant(
-        self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike
-    ) -> tuple[Array, Array, Array]:
+    def project_redundant(self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike) -> tuple[Array, Array, Array]:
         """Return the motion of all drives, as :meth:`Robot.project_redundant`, (k, ..., n) each."""
         first, second, third = self.run(programs.project_redundant, q, qd, qdd)[0]
         return first, second, third
@@ -291,9 +290,7 @@ class Variants:
     @property
     def whole_box_fits(self) -> bool:
         """Whether a file may have all numbers between each path's smallest and largest value."""
-        return all(
-            self._is_box_valid(columns, self.values[:, columns]) for columns in self._sections
-        )
+        return all(self._is_box_valid(columns, self.values[:, columns]) for columns in self._sections)
 
     @property
     def _sections(self) -> list[list[int]]:
@@ -308,9 +305,7 @@ class Variants:
         Numbers that depend on a parameter may be any function of it.
         """
         paths = [self.paths[column] for column in columns]
-        if len(columns) > MAX_CORNER_NUMBERS or any(
-            keys_of(path)[0] == PARAMETERS for path in paths
-        ):
+        if len(columns) > MAX_CORNER_NUMBERS or any(keys_of(path)[0] == PARAMETERS for path in paths):
             return False
         ends = zip(rows.min(0).tolist(), rows.max(0).tolist(), strict=True)
         return all(self._is_valid(paths, row) for row in set(itertools.product(*ends)))
@@ -357,9 +352,7 @@ class Variants:
         shaped = [values.reshape(k, *batch, values.shape[-1]) for values in outputs]
         return shaped, np.asarray(good).reshape(k, *batch, 1)
 
-    def _arrange_inputs(
-        self, code: Code, inputs: Sequence[ArrayLike]
-    ) -> tuple[list[Array], tuple[int, ...]]:
+    def _arrange_inputs(self, code: Code, inputs: Sequence[ArrayLike]) -> tuple[list[Array], tuple[int, ...]]:
         """Return inputs as :meth:`Code.run_each` takes them, and the batch axes."""
         k = len(self)
         arrays, shapes = code.checked(inputs), []
@@ -378,9 +371,7 @@ class Variants:
             rows.append(np.ascontiguousarray(values))
         return rows, batch
 
-    def _programs_by_structure(
-        self, ask: programs.Ask
-    ) -> Iterator[tuple[Code, Array, NDArray[np.intp]]]:
+    def _programs_by_structure(self, ask: programs.Ask) -> Iterator[tuple[Code, Array, NDArray[np.intp]]]:
         """Yield each structure's program with the machines that it is valid for."""
         # Without an assembly at home there are no inputs for any program.
         left = np.asarray(~np.isnan(ask(self.robot)[1](self)).any(1))

@@ -144,9 +144,7 @@ class Lines:
         return f"PKM_FMA({x}, {y}, {z})"
 
 
-def _angles(
-    results: Sequence[Expression], known: Mapping[int, str]
-) -> list[dict[int, list[Expression]]]:
+def _angles(results: Sequence[Expression], known: Mapping[int, str]) -> list[dict[int, list[Expression]]]:
     """Sines and cosines by their angle, those first whose angles need no others."""
     depth: dict[int, int] = {}
     groups: dict[int, dict[int, list[Expression]]] = {}
@@ -170,9 +168,7 @@ class Folding:
     def __init__(self) -> None:
         self.tape = Tape()
 
-    def __call__(
-        self, results: Iterable[Expression], given: Mapping[str, Sequence[Any]]
-    ) -> list[Expression]:
+    def __call__(self, results: Iterable[Expression], given: Mapping[str, Sequence[Any]]) -> list[Expression]:
         """Substitute numbers, or expressions of this tape, for the given inputs."""
         results = list(results)
         made: dict[int, Expression] = {}
@@ -238,9 +234,7 @@ class Routine:
         A stream's sample has one attempt more, from the sample before.
         """
         solved = [q for q in self.equations if q.home]
-        step = sum(
-            MAX_ITERATIONS * count(q.correct) + count([*q.begin, *q.onward, *q.aim]) for q in solved
-        )
+        step = sum(MAX_ITERATIONS * count(q.correct) + count([*q.begin, *q.onward, *q.aim]) for q in solved)
         rest = count([*self.results, *(e for q in self.equations for e in (*q.goal, q.held))])
         more = len(self.state) > 1
         tried = solved and not self.single
@@ -314,9 +308,7 @@ class Unit:
     :param parameters: expressions of the tape that a caller gives as a table of numbers.
     """
 
-    def __init__(
-        self, prefix: str, parameters: Sequence[Expression], routines: Sequence[Routine]
-    ) -> None:
+    def __init__(self, prefix: str, parameters: Sequence[Expression], routines: Sequence[Routine]) -> None:
         self.prefix = prefix
         self._known = {e.number: f"p[{k}]" for k, e in enumerate(parameters)}
         self._needed: set[Operation] = set()
@@ -504,9 +496,7 @@ static int @_{name}({more}const double *{q.target}, int steps, double *h, double
         call = self.function(f"{routine.name}_of", body, known, given)
         self._bodies[routine.name] = call, body
         rooms["r"] = len(body)
-        work = "\n".join(
-            [*solving, f"{call % 'r'};", f"status = @_judged(r, {len(routine.results)});"]
-        )
+        work = "\n".join([*solving, f"{call % 'r'};", f"status = @_judged(r, {len(routine.results)});"])
         # Results of functions in its place that it does not give.
         left = {name: len(row) for o in routine.otherwise for name, row in o.outputs.items()}
         left = {name: size for name, size in left.items() if name not in routine.outputs}
@@ -544,10 +534,7 @@ static int @_{name}({more}const double *{q.target}, int steps, double *h, double
         """Write the function that calls a routine with this machine's own parameters."""
         first = ["@_own", "state"] if routine.state else ["@_own"]
         names = ", ".join([*first, *routine.inputs, *routine.outputs])
-        self.add(
-            f"{self.signature(routine, given=False)}\n{{\n"
-            f"    return @_{routine.name}_with({names});\n}}\n"
-        )
+        self.add(f"{self.signature(routine, given=False)}\n{{\n    return @_{routine.name}_with({names});\n}}\n")
 
 
 def _read_of(body: Sequence[Expression], above: Iterable[Sequence[Expression]]) -> list[Expression]:

@@ -104,9 +104,7 @@ class Package:
         self.payload = self.fold.tape.inputs(PARAMETERS, 13)
         self.hidden: list[Routine] = []
         self.routines = self._routines()
-        rows = [
-            [e for row in r.outputs.values() for e in row] for r in (*self.hidden, *self.routines)
-        ]
+        rows = [[e for row in r.outputs.values() for e in row] for r in (*self.hidden, *self.routines)]
         # A table of no numbers is none in C.
         edges = {e.number: e for row in rows for e in edge(row)}
         self.parameters = [*edges.values()] or [self.payload[0]]
@@ -152,42 +150,65 @@ class Package:
                 base = next((r for r in result if r.name == upon), None)
                 result.append(
                     Routine(
-                        name, inputs, made, equations, summary, last, base, bool(otherwise),
+                        name,
+                        inputs,
+                        made,
+                        equations,
+                        summary,
+                        last,
+                        base,
+                        bool(otherwise),
                         otherwise,
                     )
-                )  # fmt: skip
+                )
 
         engine, p = robot.engine, self._inertial() if self.massive else ()
         if self.massive:
             add(
-                "torques", "Actuator efforts tau (N m or N) for a motion.",
-                rates | {"qdd": n} | wrench, lambda: torques(robot), p, tau="efforts",
-            )  # fmt: skip
+                "torques",
+                "Actuator efforts tau (N m or N) for a motion.",
+                rates | {"qdd": n} | wrench,
+                lambda: torques(robot),
+                p,
+                tau="efforts",
+            )
             add(
                 "torques_moving",
                 "The efforts of _torques on a base that moves. base, in its own axes: angular "
                 "velocity, angular acceleration, and acceleration of its origin less gravity.",
                 rates | {"qdd": n} | wrench | {"base": 9},
-                lambda: moving_torques(robot), p, tau="efforts",
-            )  # fmt: skip
+                lambda: moving_torques(robot),
+                p,
+                tau="efforts",
+            )
             add(
                 "torques_and_singularity",
                 "Both for the time of one: actuator efforts tau, and the singularity index.",
                 rates | {"qdd": n} | wrench,
-                [lambda: torques(robot), robot.singularity_kernel], p,
-                tau="efforts", index="measure",
-            )  # fmt: skip
-            add(
-                "torques_next", "The efforts of _torques",
-                rates | {"qdd": n} | wrench, lambda: stream_torques(robot), p, "torques",
+                [lambda: torques(robot), robot.singularity_kernel],
+                p,
                 tau="efforts",
-            )  # fmt: skip
+                index="measure",
+            )
             add(
-                "torques_and_singularity_next", "The results of _torques_and_singularity",
+                "torques_next",
+                "The efforts of _torques",
                 rates | {"qdd": n} | wrench,
-                [lambda: stream_torques(robot), robot.singularity_kernel], p,
-                "torques_and_singularity", tau="efforts", index="measure",
-            )  # fmt: skip
+                lambda: stream_torques(robot),
+                p,
+                "torques",
+                tau="efforts",
+            )
+            add(
+                "torques_and_singularity_next",
+                "The results of _torques_and_singularity",
+                rates | {"qdd": n} | wrench,
+                [lambda: stream_torques(robot), robot.singularity_kernel],
+                p,
+                "torques_and_singularity",
+                tau="efforts",
+                index="measure",
+            )
         add("forward", "Pose of joint positions.", q, lambda: engine.forward, pose="pose")
         if self._wants("inverse"):
             quick: tuple[Routine, ...] = ()
@@ -195,55 +216,84 @@ class Package:
                 whole = self._hidden("inverse_confirmed", {"pose": self.m}, engine.inverse, q="q")
                 quick = (whole,)
             add(
-                "inverse", "Joint positions of a pose, accepted only if _forward of them is the "
-                "pose.", {"pose": self.m}, lambda: engine.quick_inverse, otherwise=quick, q="q",
-            )  # fmt: skip
+                "inverse",
+                "Joint positions of a pose, accepted only if _forward of them is the pose.",
+                {"pose": self.m},
+                lambda: engine.quick_inverse,
+                otherwise=quick,
+                q="q",
+            )
             if self.massive and self._wants("torques_at_pose"):
                 motion = {"pose": self.m, "rate": self.m, "acceleration": self.m} | wrench
                 names = {name: name for name in ("q", "qd", "qdd", "tau")}
                 if quick:
-                    again = self._hidden(
-                        "torques_at_accepted_pose", motion, unjudged_pose_torques(robot), p, **names
-                    )
+                    again = self._hidden("torques_at_accepted_pose", motion, unjudged_pose_torques(robot), p, **names)
                     quick = (result[-1], again)
                 add(
-                    "torques_at_pose", "Joint motion q, qd, qdd and efforts tau for a motion of "
+                    "torques_at_pose",
+                    "Joint motion q, qd, qdd and efforts tau for a motion of "
                     "the pose: its rate and acceleration are those of the pose's coordinates.",
-                    motion, lambda: pose_torques(robot), p, otherwise=quick, **names,
-                )  # fmt: skip
+                    motion,
+                    lambda: pose_torques(robot),
+                    p,
+                    otherwise=quick,
+                    **names,
+                )
         add(
             "platform",
             "Position (m) of the platform's reference point in base axes, and the platform's "
             "rotation from home, row by row.",
-            q, lambda: engine.forward, position="position", rotation="rotation",
-        )  # fmt: skip
+            q,
+            lambda: engine.forward,
+            position="position",
+            rotation="rotation",
+        )
         if self.massive:
             add(
-                "mass_matrix", "Mass matrix of the actuated joints, row by row.",
-                q, lambda: masses_kernel(robot), p, m="matrix",
-            )  # fmt: skip
+                "mass_matrix",
+                "Mass matrix of the actuated joints, row by row.",
+                q,
+                lambda: masses_kernel(robot),
+                p,
+                m="matrix",
+            )
             add(
-                "accelerations", "Joint accelerations that efforts tau cause.",
-                rates | {"tau": n} | wrench, lambda: accelerations(robot), p, "mass_matrix",
+                "accelerations",
+                "Joint accelerations that efforts tau cause.",
+                rates | {"tau": n} | wrench,
+                lambda: accelerations(robot),
+                p,
+                "mass_matrix",
                 qdd="accelerations",
-            )  # fmt: skip
+            )
         if robot.redundant:
             add(
-                "null_efforts", "Efforts that move nothing, of unit length over their limits, "
-                "row by row.", q, lambda: null_kernel(robot), n="efforts",
-            )  # fmt: skip
+                "null_efforts",
+                "Efforts that move nothing, of unit length over their limits, row by row.",
+                q,
+                lambda: null_kernel(robot),
+                n="efforts",
+            )
             add(
                 "project_redundant",
                 "Positions, rates and accelerations of all joints, by those that lead: "
-                f"{', '.join(robot.graph.leads)}.", rates | {"qdd": n},
-                lambda: robot.projection_kernel, positions="q", rates="qd", changes="qdd",
-            )  # fmt: skip
+                f"{', '.join(robot.graph.leads)}.",
+                rates | {"qdd": n},
+                lambda: robot.projection_kernel,
+                positions="q",
+                rates="qd",
+                changes="qdd",
+            )
         if "terms" in self._names:
             add(
-                "terms", "Terms of the equations of motion: mass matrix, bias, energies, twists of "
+                "terms",
+                "Terms of the equations of motion: mass matrix, bias, energies, twists of "
                 "the platform, rates and drift of passive joints with friction.",
-                rates, lambda: motion_kernel(robot), p, terms="terms",
-            )  # fmt: skip
+                rates,
+                lambda: motion_kernel(robot),
+                p,
+                terms="terms",
+            )
         add(
             "jacobian",
             "Pose rates per joint rate, row by row.",
@@ -253,14 +303,18 @@ class Package:
         )
         add(
             "platform_jacobian",
-            "Velocity of the platform's reference point and angular velocity, base axes, per "
-            "joint rate, row by row.",
-            q, lambda: engine.jacobian, j="twist",
-        )  # fmt: skip
+            "Velocity of the platform's reference point and angular velocity, base axes, per joint rate, row by row.",
+            q,
+            lambda: engine.jacobian,
+            j="twist",
+        )
         add(
-            "singularity", "Singularity index: 0 in a singularity, 1 at best.",
-            q, robot.singularity_kernel, index="measure",
-        )  # fmt: skip
+            "singularity",
+            "Singularity index: 0 in a singularity, 1 at best.",
+            q,
+            robot.singularity_kernel,
+            index="measure",
+        )
         self._add_transmission(result)
         if self.elastic is not None:
             self._add_elastic(self.elastic, result)
@@ -290,16 +344,21 @@ class Package:
         inverse = next((r for r in result if r.name == "inverse"), None)
         for curved, name, summary, inputs in (
             (
-                False, "joint_to_actuator", "The machine as a transmission: joint positions, rates "
+                False,
+                "joint_to_actuator",
+                "The machine as a transmission: joint positions, rates "
                 "and efforts of a pose, its rate, and efforts on its coordinates.",
                 {"pose": m, "velocity": m, "effort": m},
             ),
             (
-                True, "gains", "Stiffness and damping of the actuated joints, row by row, which "
+                True,
+                "gains",
+                "Stiffness and damping of the actuated joints, row by row, which "
                 "give the pose coordinates a stiffness and damping while the joints have efforts "
-                "tau.", {"pose": m, "stiffness": m * m, "damping": m * m, "tau": n},
+                "tau.",
+                {"pose": m, "stiffness": m * m, "damping": m * m, "tau": n},
             ),
-        ):  # fmt: skip
+        ):
             if not self._wants(name):
                 continue
             made: list[Routine] = []
@@ -318,10 +377,15 @@ class Package:
                 otherwise = (inverse, made[0]) if made and inverse is not None else ()
                 made.append(
                     Routine(
-                        full, inputs, outputs, equations, summary, single=bool(otherwise),
+                        full,
+                        inputs,
+                        outputs,
+                        equations,
+                        summary,
+                        single=bool(otherwise),
                         otherwise=otherwise,
                     )
-                )  # fmt: skip
+                )
             self.hidden += made[:-1]
             result.append(made[-1])
         if self._wants("actuator_to_joint"):
@@ -329,11 +393,14 @@ class Package:
             rows, equations = self._read(kernel)
             result.append(
                 Routine(
-                    "actuator_to_joint", {"q": n, "qd": n, "tau": n}, rows, equations,
+                    "actuator_to_joint",
+                    {"q": n, "qd": n, "tau": n},
+                    rows,
+                    equations,
                     "The machine as a transmission: pose, its rate, and efforts on its "
                     "coordinates, of joint positions, rates and efforts.",
                 )
-            )  # fmt: skip
+            )
 
     def _add_elastic(self, elastic: Elastic, result: list[Routine]) -> None:
         rows, equations = self._read(elastic.response)
@@ -343,15 +410,20 @@ class Package:
         sound = self.fold.tape.lift(row[-1] - MIN_PIVOT_RATIO)
         equations = [replace(q, branch=[*q.branch, sound]) for q in equations]
         compliance = Routine(
-            "compliance", {"q": self.n}, {"c": row[2 * k + 7 : 2 * k + 43]}, equations,
-            "Compliance of the platform at its reference point, joints locked: x y z rx ry rz, "
-            "base axes, row by row.",
-        )  # fmt: skip
+            "compliance",
+            {"q": self.n},
+            {"c": row[2 * k + 7 : 2 * k + 43]},
+            equations,
+            "Compliance of the platform at its reference point, joints locked: x y z rx ry rz, base axes, row by row.",
+        )
         energy = Routine(
-            "strain_energy", {"q": self.n, "wrench": 6}, {"energies": row[k : 2 * k]}, equations,
+            "strain_energy",
+            {"q": self.n, "wrench": 6},
+            {"energies": row[k : 2 * k]},
+            equations,
             f"Strain energy (J) of each element: {', '.join(elastic.names)}.",
             upon=compliance if self._wants("compliance") else None,
-        )  # fmt: skip
+        )
         result += [routine for routine in (compliance, energy) if self._wants(routine.name)]
 
     def _inertial(self) -> Array:
@@ -451,16 +523,29 @@ int @_parameters(double mass, const double *com, const double *inertia, double *
         if self.massive:
             what = _write_comment(PARAMETERS_OF.format(size=size, mass=MAX_MASS, reach=MAX_LENGTH))
             parts.append(
-                f"{what}\nint @_parameters(double mass, const double *com, "
-                "const double *inertia, double *out);\n"
+                f"{what}\nint @_parameters(double mass, const double *com, const double *inertia, double *out);\n"
             )
         about = _write_comment(ABOUT.format(joints=joints, pose=pose) + self._stateless)
-        text = "\n".join([
-            "/* SPDX-License-Identifier: Apache-2.0 */", f"/* {self._title} */", f"#ifndef {guard}",
-            f"#define {guard}", "", about, "", *lines, "",
-            '#ifdef __cplusplus\nextern "C" {\n#endif', "", *parts,
-            "#ifdef __cplusplus\n}\n#endif", "", f"#endif /* {guard} */", "",
-        ])  # fmt: skip
+        text = "\n".join(
+            [
+                "/* SPDX-License-Identifier: Apache-2.0 */",
+                f"/* {self._title} */",
+                f"#ifndef {guard}",
+                f"#define {guard}",
+                "",
+                about,
+                "",
+                *lines,
+                "",
+                '#ifdef __cplusplus\nextern "C" {\n#endif',
+                "",
+                *parts,
+                "#ifdef __cplusplus\n}\n#endif",
+                "",
+                f"#endif /* {guard} */",
+                "",
+            ]
+        )
         return text.replace("@", self.prefix)
 
     # Beside it.
@@ -480,9 +565,7 @@ int @_parameters(double mass, const double *com, const double *inertia, double *
             given |= {"rates": rates, "changes": changes, "wrench": np.zeros(6)}
         for name, (_, values) in tests.items():
             given[f"right_{name}"] = np.round(values, 9) + 0.0
-        rows = [
-            table(name, values.tolist()).removeprefix("static ") for name, values in given.items()
-        ]
+        rows = [table(name, values.tolist()).removeprefix("static ") for name, values in given.items()]
         sizes = ", ".join(f"{name}[{len(values)}]" for name, (_, values) in tests.items())
         calls = [
             f'bad |= differs("{name}", @_{call}, {name}, right_{name}, {len(values)});\n'
@@ -490,9 +573,11 @@ int @_parameters(double mass, const double *com, const double *inertia, double *
         ]
         declared = textwrap.indent("".join(rows) + f"double {sizes};", "    ")
         return EXAMPLE.format(
-            title=self._title, name=self.prefix, declared=declared,
+            title=self._title,
+            name=self.prefix,
+            declared=declared,
             calls=textwrap.indent("".join(calls), "    ").rstrip().replace("@", self.prefix),
-        )  # fmt: skip
+        )
 
     def cmake(self) -> str:
         """Write the CMake file: a static library, and the example as a test."""
@@ -503,12 +588,16 @@ int @_parameters(double mass, const double *com, const double *inertia, double *
         largest = (self.unit.rooms + max(self.unit.doubles.values())) * 8
         names = list(self.robot.joint_names)
         return README.format(
-            name=self.prefix, robot=self.prefix.removeprefix("pkm_"), joints=", ".join(names),
-            corrections=f"{CORRECTIONS:,}", attempts=len(LADDER),
-            turns=MAX_ITERATIONS, stack=largest // 1000 + 3,
+            name=self.prefix,
+            robot=self.prefix.removeprefix("pkm_"),
+            joints=", ".join(names),
+            corrections=f"{CORRECTIONS:,}",
+            attempts=len(LADDER),
+            turns=MAX_ITERATIONS,
+            stack=largest // 1000 + 3,
             dynamics="" if self.massive else MASSLESS,
             payload=PAYLOAD.format(name=self.prefix, macro=self.macro) if self.massive else "",
-        )  # fmt: skip
+        )
 
 
 def _has(ask: Callable[[], object]) -> bool:

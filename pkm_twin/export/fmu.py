@@ -44,9 +44,11 @@ CONSTANTS: Final = f"""\
 """
 COMPILERS: Final = ("cc", "gcc", "clang")
 _FOLDERS: Final = {
-    ("x86_64", 2): "linux64", ("x86_64", 3): "x86_64-linux",
-    ("aarch64", 2): "aarch64-linux", ("aarch64", 3): "aarch64-linux",
-}  # fmt: skip
+    ("x86_64", 2): "linux64",
+    ("x86_64", 3): "x86_64-linux",
+    ("aarch64", 2): "aarch64-linux",
+    ("aarch64", 3): "aarch64-linux",
+}
 _ZIPPED: Final = (1980, 1, 1, 0, 0, 0)
 
 
@@ -64,9 +66,8 @@ class Fmu:
         if robot.laws and kind == "dynamics":
             law = robot.laws[0]
             raise ParameterError(
-                "friction", law, "viscous, coulomb and offset in an FMU of kind dynamics; "
-                "--kind torques has every law"
-            )  # fmt: skip
+                "friction", law, "viscous, coulomb and offset in an FMU of kind dynamics; --kind torques has every law"
+            )
         if kind == "dynamics":
             robot.check_independent("an FMU's dynamics", "each joint is a state")
         self.robot, self.version, self.kind = robot, version, kind
@@ -107,9 +108,7 @@ class Fmu:
             begin = [None] * n if start is None else [float(x) for x in start]
             return [
                 Variable(f"{what}.{name}", kind, unit, f"{text} of {joint}", value)
-                for name, joint, unit, value in zip(
-                    names, robot.joint_names, own, begin, strict=True
-                )
+                for name, joint, unit, value in zip(names, robot.joint_names, own, begin, strict=True)
             ]
 
         still = [0.0] * n
@@ -121,53 +120,70 @@ class Fmu:
             # A state that can be seen is an output that depends on itself.
             for k in (*q, *qd):
                 found[k] = replace(found[k], needs=[k])
-            add("DQ", [
-                replace(v, name=f"der({found[k].name})", derivative=k, needs=[j])
-                for k, j, v in zip(q, qd, joints("qd", "velocity", "d", "/s"), strict=True)
-            ])  # fmt: skip
-            accelerations = add("DQD", [
-                replace(v, name=f"der({found[k].name})", derivative=k)
-                for k, v in zip(qd, joints("qdd", "acceleration", "d", "/s2"), strict=True)
-            ])  # fmt: skip
+            add(
+                "DQ",
+                [
+                    replace(v, name=f"der({found[k].name})", derivative=k, needs=[j])
+                    for k, j, v in zip(q, qd, joints("qd", "velocity", "d", "/s"), strict=True)
+                ],
+            )
+            accelerations = add(
+                "DQD",
+                [
+                    replace(v, name=f"der({found[k].name})", derivative=k)
+                    for k, v in zip(qd, joints("qdd", "acceleration", "d", "/s2"), strict=True)
+                ],
+            )
             moved = add("TAU", joints("tau", "effort", "i", start=still))
         else:
             moved = add("QDD", joints("qdd", "acceleration", "i", "/s2", still))
-        wrench = add("WRENCH", [
-            Variable(
-                f"wrench.{axis}", "i", unit, "what the surroundings apply to the platform at its "
-                "reference point, base axes", 0.0,
-            )
-            for unit, axes in (("N", ("fx", "fy", "fz")), ("N.m", ("mx", "my", "mz")))
-            for axis in axes
-        ])  # fmt: skip
+        wrench = add(
+            "WRENCH",
+            [
+                Variable(
+                    f"wrench.{axis}",
+                    "i",
+                    unit,
+                    "what the surroundings apply to the platform at its reference point, base axes",
+                    0.0,
+                )
+                for unit, axes in (("N", ("fx", "fy", "fz")), ("N.m", ("mx", "my", "mz")))
+                for axis in axes
+            ],
+        )
         every = [*q, *qd, *moved, *wrench]
         add("PAYLOAD", self._payload())
         if self.dynamic:
             for k in accelerations:
                 found[k] = replace(found[k], needs=every)
-            add("STEP", [
-                Variable("step", "p", "s", "longest internal step of co-simulation", INTERNAL)
-            ])  # fmt: skip
+            add("STEP", [Variable("step", "p", "s", "longest internal step of co-simulation", INTERNAL)])
         else:
             efforts_at = joints("tau", "effort that the motion needs", "o")
             add("TAU", [replace(v, needs=every) for v in efforts_at])
-        add("POSE", [
-            Variable(f"pose.{name}", "o", unit, "pose of the platform", needs=q)
-            for name, unit in zip(map(quoted, robot.pose_names), robot.pose_units, strict=True)
-        ])  # fmt: skip
+        add(
+            "POSE",
+            [
+                Variable(f"pose.{name}", "o", unit, "pose of the platform", needs=q)
+                for name, unit in zip(map(quoted, robot.pose_names), robot.pose_units, strict=True)
+            ],
+        )
         if not self.dynamic:
-            add("SINGULARITY", [
-                Variable("singularity", "o", "", "0 in a singularity, 1 at best", needs=q)
-            ])  # fmt: skip
+            add("SINGULARITY", [Variable("singularity", "o", "", "0 in a singularity, 1 at best", needs=q)])
         text = "0 valid, 1 no assembly or a singularity, 2 not finite"
         add("STATUS", [Variable("status", "o", "", text, needs=every, whole=True)])
-        add("INDICATORS", [
-            Variable(
-                f"stick_slip.{quoted(self._row_names[row])}", "d", "",
-                "falls through zero where the joint begins to stick or to slide", needs=every,
-            )
-            for row in self._rows
-        ])  # fmt: skip
+        add(
+            "INDICATORS",
+            [
+                Variable(
+                    f"stick_slip.{quoted(self._row_names[row])}",
+                    "d",
+                    "",
+                    "falls through zero where the joint begins to stick or to slide",
+                    needs=every,
+                )
+                for row in self._rows
+            ],
+        )
         return found
 
     def _payload(self) -> list[Variable]:
@@ -189,10 +205,14 @@ class Fmu:
         """Write the wrapper's source, with ``TOKEN`` in place of its token."""
         robot, size = self.robot, len(self.variables)
         defined = {
-            "N": self.n, "COUNT": size, "DRY": len(self._rows), "PASSIVE": len(self._passive),
-            "STATES": 2 * self.n if self.dynamic else 0, "STATUS_AT": self._starts["STATUS"],
+            "N": self.n,
+            "COUNT": size,
+            "DRY": len(self._rows),
+            "PASSIVE": len(self._passive),
+            "STATES": 2 * self.n if self.dynamic else 0,
+            "STATUS_AT": self._starts["STATUS"],
             **self._starts,
-        }  # fmt: skip
+        }
         lines = [f"#define {name} {value}" for name, value in defined.items()]
         lines.append(f"#define PARAMETERS {self._package.macro}_PARAMETERS")
         tables = {"START": [v.start or 0.0 for v in self.variables]}
@@ -214,10 +234,13 @@ class Fmu:
             model = ["dynamics", *friction, "steps"]
         title = f"/* {self.identifier}: written by pkm-twin export fmu. */\n"
         parts = [
-            f"/* SPDX-License-Identifier: Apache-2.0 */\n{title}", read_source("head"),
+            f"/* SPDX-License-Identifier: Apache-2.0 */\n{title}",
+            read_source("head"),
             "\n".join(lines) + "\n",
-            *constants, *map(read_source, ["model", *model]), write_interface(self.version),
-        ]  # fmt: skip
+            *constants,
+            *map(read_source, ["model", *model]),
+            write_interface(self.version),
+        ]
         return "\n".join(parts).replace("@", self.identifier)
 
     def _files(self) -> dict[str, str]:
@@ -228,18 +251,21 @@ class Fmu:
             MODEL: self._write_model(),
         }
         described = Description(
-            self.robot.name or prefix, prefix, "", self._text, self.variables,
+            self.robot.name or prefix,
+            prefix,
+            "",
+            self._text,
+            self.variables,
             [k for k, v in enumerate(self.variables) if v.name.startswith("stick_slip.")],
-            bool(self._rows), [name for name in sources if name.endswith(".c")],
-        )  # fmt: skip
+            bool(self._rows),
+            [name for name in sources if name.endswith(".c")],
+        )
         first = text_of(described, self.version)
         digest = hashlib.sha256("".join([first, *sources.values()]).encode()).hexdigest()
         token = "-".join(digest[a:b] for a, b in ((0, 8), (8, 12), (12, 16), (16, 20), (20, 32)))
         token = f"{{{token}}}"
         described = replace(described, token=token)
-        sources[MODEL] = sources[MODEL].replace(
-            "#define COUNT", f'#define TOKEN "{token}"\n#define COUNT', 1
-        )
+        sources[MODEL] = sources[MODEL].replace("#define COUNT", f'#define TOKEN "{token}"\n#define COUNT', 1)
         if self.version == 3:
             sources["buildDescription.xml"] = build_of(described)
         return {
@@ -282,9 +308,18 @@ class Fmu:
                     (Path(folder) / names[-1]).write_text(text, encoding="utf-8")
             code = [name for name in names if name.endswith(".c")]
             command = [
-                compiler, "-std=c99", "-O2", "-fPIC", "-shared", "-fvisibility=hidden",
-                "-ffp-contract=off", *code, "-o", "model.so", "-lm",
-            ]  # fmt: skip
+                compiler,
+                "-std=c99",
+                "-O2",
+                "-fPIC",
+                "-shared",
+                "-fvisibility=hidden",
+                "-ffp-contract=off",
+                *code,
+                "-o",
+                "model.so",
+                "-lm",
+            ]
             done = subprocess.run(  # noqa: S603  a compiler of this machine, without a shell
                 command, cwd=folder, capture_output=True, text=True, check=False
             )

@@ -27,25 +27,29 @@ _MODES: Final[Functions] = {
     "ExitInitializationMode": ("", "int changed; return update(c, &changed);"),
     "SetTime": ("double time", "c->model.v[0] = time; return STATUS_OK;"),
     "GetNominalsOfContinuousStates": (
-        "double *values, size_t count", "return nominals(values, count);",
+        "double *values, size_t count",
+        "return nominals(values, count);",
     ),
     "SetContinuousStates": ("const double *x, size_t count", "return set_states(c, x, count);"),
     "GetContinuousStates": ("double *x, size_t count", "return get_states(c, x, count);"),
     "GetEventIndicators": (
-        "double *values, size_t count", "return get_indicators(c, values, count);",
+        "double *values, size_t count",
+        "return get_indicators(c, values, count);",
     ),
-}  # fmt: skip
+}
 _STATE: Final[Functions] = {
     "GetFMU{state}": ("void **state", "return copy_state(c, state);"),
     "SetFMU{state}": ("void *state", "return restore(c, state, sizeof c->model);"),
     "FreeFMU{state}": ("void **state", "return forget(state);"),
     "SerializedFMU{state}Size": (
-        "void *state, size_t *size", "*size = sizeof c->model; return STATUS_OK;",
+        "void *state, size_t *size",
+        "*size = sizeof c->model; return STATUS_OK;",
     ),
     "SerializeFMU{state}": (
-        "void *state, unsigned char *bytes, size_t size", "return save(c, state, bytes, size);",
+        "void *state, unsigned char *bytes, size_t size",
+        "return save(c, state, bytes, size);",
     ),
-}  # fmt: skip
+}
 _SECOND: Final[Functions] = {
     "SetDebugLogging": ("int on, size_t count, const char *const *categories", "return STATUS_OK;"),
     "SetupExperiment": (
@@ -61,9 +65,7 @@ _SECOND: Final[Functions] = {
         "const Reference *vr, size_t count, const double *values",
         "return set_reals(c, vr, count, values);",
     ),
-    "GetInteger": (
-        "const Reference *vr, size_t count, int *values", "return get_status(c, vr, count, values);"
-    ),
+    "GetInteger": ("const Reference *vr, size_t count, int *values", "return get_status(c, vr, count, values);"),
     **{
         f"{what}{kind}": (
             f"const Reference *vr, size_t count, {const}{kinds} *values",
@@ -81,7 +83,8 @@ _SECOND: Final[Functions] = {
     ),
     "GetDirectionalDerivative": (
         "const Reference *unknowns, size_t count, const Reference *knowns, size_t n, "
-        "const double *seed, double *values", "return unsupported(c, 1);",
+        "const double *seed, double *values",
+        "return unsupported(c, 1);",
     ),
     "NewDiscreteStates": (
         "EventInfo *info",
@@ -111,20 +114,27 @@ _SECOND: Final[Functions] = {
     "GetIntegerStatus": ("int kind, int *value", "return unsupported(c, 1);"),
     "GetBooleanStatus": (
         "int kind, int *value",
-        "if (kind != 3) {\n        return unsupported(c, 1);\n    }\n"
-        "    *value = 0;\n    return STATUS_OK;",
+        "if (kind != 3) {\n        return unsupported(c, 1);\n    }\n    *value = 0;\n    return STATUS_OK;",
     ),
     "GetStringStatus": ("int kind, const char **value", "return unsupported(c, 1);"),
-}  # fmt: skip
+}
 _NUMBERS: Final = {
-    "Float32": "float", "Int8": "int8_t", "UInt8": "uint8_t", "Int16": "int16_t",
-    "UInt16": "uint16_t", "UInt32": "uint32_t", "Int64": "int64_t", "UInt64": "uint64_t",
-    "Boolean": "bool", "String": "char *",
-}  # fmt: skip
+    "Float32": "float",
+    "Int8": "int8_t",
+    "UInt8": "uint8_t",
+    "Int16": "int16_t",
+    "UInt16": "uint16_t",
+    "UInt32": "uint32_t",
+    "Int64": "int64_t",
+    "UInt64": "uint64_t",
+    "Boolean": "bool",
+    "String": "char *",
+}
 _MANY: Final = "const Reference *vr, size_t count, "
 _THIRD: Final[Functions] = {
     "SetDebugLogging": (
-        "bool on, size_t count, const char *const *categories", "return STATUS_OK;",
+        "bool on, size_t count, const char *const *categories",
+        "return STATUS_OK;",
     ),
     "EnterInitializationMode": (
         "bool tolerant, double tolerance, double start, bool stops, double stop",
@@ -132,23 +142,21 @@ _THIRD: Final[Functions] = {
     ),
     "GetFloat64": (
         _MANY + "double *values, size_t size",
-        "if (size != count) {\n        return unsupported(c, 1);\n    }\n"
-        "    return get_reals(c, vr, count, values);",
+        "if (size != count) {\n        return unsupported(c, 1);\n    }\n    return get_reals(c, vr, count, values);",
     ),
     "SetFloat64": (
         _MANY + "const double *values, size_t size",
-        "if (size != count) {\n        return unsupported(c, 1);\n    }\n"
-        "    return set_reals(c, vr, count, values);",
+        "if (size != count) {\n        return unsupported(c, 1);\n    }\n    return set_reals(c, vr, count, values);",
     ),
     "GetInt32": (
         _MANY + "int32_t *values, size_t size",
-        "if (size != count) {\n        return unsupported(c, 1);\n    }\n"
-        "    return get_status(c, vr, count, values);",
+        "if (size != count) {\n        return unsupported(c, 1);\n    }\n    return get_status(c, vr, count, values);",
     ),
     "SetInt32": (_MANY + "const int32_t *values, size_t size", "return unsupported(c, count);"),
     **{
         f"{what}{kind}": (
-            f"{_MANY}{const}{kinds} *values, size_t size", "return unsupported(c, count);",
+            f"{_MANY}{const}{kinds} *values, size_t size",
+            "return unsupported(c, count);",
         )
         for what, const in (("Get", ""), ("Set", "const "))
         for kind, kinds in _NUMBERS.items()
@@ -165,8 +173,8 @@ _THIRD: Final[Functions] = {
     "SetClock": (_MANY + "const bool *values", "return unsupported(c, count);"),
     "GetNumberOfVariableDependencies": ("Reference vr, size_t *count", "return unsupported(c, 1);"),
     "GetVariableDependencies": (
-        "Reference vr, size_t *elements, Reference *independents, size_t *others, int *kinds, "
-        "size_t count", "return unsupported(c, 1);",
+        "Reference vr, size_t *elements, Reference *independents, size_t *others, int *kinds, size_t count",
+        "return unsupported(c, 1);",
     ),
     "DeserializeFMUState": _SECOND["DeSerializeFMUstate"],
     **{
@@ -186,7 +194,8 @@ _THIRD: Final[Functions] = {
     ),
     "GetShiftDecimal": (_MANY + "double *values", "return unsupported(c, count);"),
     "GetShiftFraction": (
-        _MANY + "uint64_t *counters, uint64_t *resolutions", "return unsupported(c, count);",
+        _MANY + "uint64_t *counters, uint64_t *resolutions",
+        "return unsupported(c, count);",
     ),
     "SetIntervalDecimal": (_MANY + "const double *values", "return unsupported(c, count);"),
     "SetShiftDecimal": (_MANY + "const double *values", "return unsupported(c, count);"),
@@ -218,14 +227,13 @@ _THIRD: Final[Functions] = {
         "return unsupported(c, count);",
     ),
     "DoStep": (
-        "double time, double span, bool kept, bool *event_needed, bool *terminate, bool *early, "
-        "double *last",
+        "double time, double span, bool kept, bool *event_needed, bool *terminate, bool *early, double *last",
         "const Status status = do_step(c, time, span);\n"
         "    *event_needed = *terminate = *early = false;\n"
         "    *last = (status == STATUS_OK) ? (time + span) : time;\n    return status;",
     ),
     "ActivateModelPartition": ("Reference clock, double time", "return unsupported(c, 1);"),
-}  # fmt: skip
+}
 
 
 def read_source(name: str) -> str:
@@ -263,9 +271,17 @@ def _function(name: str, arguments: str, body: str) -> str:
     head = ", ".join(["void *instance", *([arguments] if arguments else [])])
     first = ["    Instance *c = (Instance *)instance;"] if "c" in words else ["    (void)instance;"]
     lines = [line if line.startswith(" ") else f"    {line}" for line in _lines(body)]
-    return "\n".join([
-        f"EXPORT Status FMI({name})({head})", "{", *first, *unused, *lines, "}", "",
-    ])  # fmt: skip
+    return "\n".join(
+        [
+            f"EXPORT Status FMI({name})({head})",
+            "{",
+            *first,
+            *unused,
+            *lines,
+            "}",
+            "",
+        ]
+    )
 
 
 def _words(body: str) -> Sequence[str]:

@@ -11,11 +11,18 @@ from typing import Final
 
 TOOL: Final = "pkm_twin"
 UNITS: Final[dict[str, dict[str, int]]] = {
-    "s": {"s": 1}, "m": {"m": 1}, "rad": {"rad": 1}, "m/s": {"m": 1, "s": -1},
-    "rad/s": {"rad": 1, "s": -1}, "m/s2": {"m": 1, "s": -2}, "rad/s2": {"rad": 1, "s": -2},
-    "kg": {"kg": 1}, "kg.m2": {"kg": 1, "m": 2}, "N": {"kg": 1, "m": 1, "s": -2},
+    "s": {"s": 1},
+    "m": {"m": 1},
+    "rad": {"rad": 1},
+    "m/s": {"m": 1, "s": -1},
+    "rad/s": {"rad": 1, "s": -1},
+    "m/s2": {"m": 1, "s": -2},
+    "rad/s2": {"rad": 1, "s": -2},
+    "kg": {"kg": 1},
+    "kg.m2": {"kg": 1, "m": 2},
+    "N": {"kg": 1, "m": 1, "s": -2},
     "N.m": {"kg": 1, "m": 2, "s": -2},
-}  # fmt: skip
+}
 """Units by their base units' exponents."""
 PLAIN: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
@@ -79,11 +86,7 @@ class Description:
 
     def unknowns(self, kinds: str) -> list[tuple[int, Variable]]:
         """List the variables of kinds, outputs (``so``) or derivatives (``d``), with indices."""
-        return [
-            (k, v)
-            for k, v in enumerate(self.variables)
-            if v.kind in kinds and k not in self.indicators
-        ]
+        return [(k, v) for k, v in enumerate(self.variables) if v.kind in kinds and k not in self.indicators]
 
 
 def quoted(name: str) -> str:
@@ -133,10 +136,15 @@ def _attributes(d: Description, v: Variable) -> dict[str, str]:
 
 def _second(d: Description) -> ET.Element:
     top = ET.Element(
-        "fmiModelDescription", fmiVersion="2.0", modelName=d.name, guid=d.token,
-        description=d.text, generationTool=TOOL, variableNamingConvention="structured",
+        "fmiModelDescription",
+        fmiVersion="2.0",
+        modelName=d.name,
+        guid=d.token,
+        description=d.text,
+        generationTool=TOOL,
+        variableNamingConvention="structured",
         numberOfEventIndicators=str(len(d.indicators)),
-    )  # fmt: skip
+    )
     for kind, more in (
         ("ModelExchange", {"completedIntegratorStepNotNeeded": "true"}),
         ("CoSimulation", {"canHandleVariableCommunicationStepSize": "true"}),
@@ -151,9 +159,13 @@ def _second(d: Description) -> ET.Element:
     variables = ET.SubElement(top, "ModelVariables")
     for k, v in enumerate(d.variables):
         entry = {
-            "name": v.name, "valueReference": str(k), "description": v.description,
-            "causality": v.causality, "variability": v.variability, "initial": v.initial,
-        }  # fmt: skip
+            "name": v.name,
+            "valueReference": str(k),
+            "description": v.description,
+            "causality": v.causality,
+            "variability": v.variability,
+            "initial": v.initial,
+        }
         scalar = ET.SubElement(variables, "ScalarVariable", {a: b for a, b in entry.items() if b})
         more = _attributes(d, v)
         if v.derivative is not None:
@@ -177,9 +189,14 @@ def _second(d: Description) -> ET.Element:
 
 def _third(d: Description) -> ET.Element:
     top = ET.Element(
-        "fmiModelDescription", fmiVersion="3.0", modelName=d.name, instantiationToken=d.token,
-        description=d.text, generationTool=TOOL, variableNamingConvention="structured",
-    )  # fmt: skip
+        "fmiModelDescription",
+        fmiVersion="3.0",
+        modelName=d.name,
+        instantiationToken=d.token,
+        description=d.text,
+        generationTool=TOOL,
+        variableNamingConvention="structured",
+    )
     for kind, more in (
         ("ModelExchange", {"needsCompletedIntegratorStep": "false"}),
         ("CoSimulation", {"canHandleVariableCommunicationStepSize": "true"}),
@@ -191,18 +208,24 @@ def _third(d: Description) -> ET.Element:
     variables = ET.SubElement(top, "ModelVariables")
     for k, v in enumerate(d.variables):
         entry = {
-            "name": v.name, "valueReference": str(k), "description": v.description,
-            "causality": v.causality, "variability": v.variability, "initial": v.initial,
+            "name": v.name,
+            "valueReference": str(k),
+            "description": v.description,
+            "causality": v.causality,
+            "variability": v.variability,
+            "initial": v.initial,
             **_attributes(d, v),
-        }  # fmt: skip
+        }
         if v.derivative is not None:
             entry["derivative"] = str(v.derivative)
         kind = "Int32" if v.whole else "Float64"
         ET.SubElement(variables, kind, {a: b for a, b in entry.items() if b})
     structure = ET.SubElement(top, "ModelStructure")
     for tag, kinds in (
-        ("Output", "so"), ("ContinuousStateDerivative", "d"), ("InitialUnknown", "od"),
-    ):  # fmt: skip
+        ("Output", "so"),
+        ("ContinuousStateDerivative", "d"),
+        ("InitialUnknown", "od"),
+    ):
         for k, v in d.unknowns(kinds):
             needs = " ".join(map(str, v.needs))
             ET.SubElement(structure, tag, valueReference=str(k), dependencies=needs)

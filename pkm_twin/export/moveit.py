@@ -56,9 +56,7 @@ def moveit_package(robot: Robot, kinematics: str = "") -> dict[str, str]:
     """
     robot.check_independent("plans of MoveIt", "it moves each joint by itself")
     if not robot.controller.plain or robot.controller.names != tuple(robot.joint_names):
-        raise ParameterError(
-            "joint_map", list(robot.controller.names), "none: MoveIt plans in the URDF's numbers"
-        )
+        raise ParameterError("joint_map", list(robot.controller.names), "none: MoveIt plans in the URDF's numbers")
     name = re.sub(r"\W", "_", robot.name or robot.mechanism)
     groups = write_srdf(robot)
     package = package_name(robot, "moveit_config")
@@ -91,10 +89,7 @@ def _words(robot: Robot, package: str) -> dict[str, str]:
         "JOINTNAMES": ", ".join(f"`{joint}`" for joint in robot.joint_names),
         "POSENAMES": ", ".join(robot.pose_names),
         "POSE": ", ".join(map(_write_coordinate, robot.coordinates)),
-        "DRIVES": "\n".join(
-            f"  {{{literal(joint)}, {number(low)}, {number(high)}}},"
-            for joint, (low, high) in drives
-        ),
+        "DRIVES": "\n".join(f"  {{{literal(joint)}, {number(low)}, {number(high)}}}," for joint, (low, high) in drives),
         "POSITION": f"{POSITION:g}",
         "ORIENTATION": f"{ORIENTATION:g}",
         "SINGULARITY": f"{SINGULAR:g}",
@@ -147,9 +142,7 @@ def write_srdf(robot: Robot) -> str:
     home = ET.SubElement(root, "group_state", name="home", group=GROUP)
     for joint, value in zip(joints, robot.inverse(robot.home()).tolist(), strict=True):
         ET.SubElement(home, "joint", name=joint, value=f"{value:.12g}")
-    ET.SubElement(
-        root, "virtual_joint", name="ground", type="fixed", parent_frame="world", child_link=GROUND
-    )
+    ET.SubElement(root, "virtual_joint", name="ground", type="fixed", parent_frame="world", child_link=GROUND)
     for joint in robot.passive_joints:
         ET.SubElement(root, "passive_joint", name=joint)
     touching = dict.fromkeys(_touching(tree), "Default")
@@ -222,9 +215,7 @@ def _kinematics(plugin: str, numeric: bool) -> dict[str, Any]:
 
 def _controllers(robot: Robot) -> dict[str, Any]:
     return {
-        "moveit_controller_manager": (
-            "moveit_simple_controller_manager/MoveItSimpleControllerManager"
-        ),
+        "moveit_controller_manager": ("moveit_simple_controller_manager/MoveItSimpleControllerManager"),
         "moveit_simple_controller_manager": {
             "controller_names": [CONTROLLER],
             CONTROLLER: {

@@ -33,8 +33,14 @@ from pkm_twin.kinematics.programs import SAME_POSE
 from pkm_twin.robot.robot import Robot
 
 FUNCTIONS: Final = (
-    "forward", "inverse", "jacobian", "torques", "joint_to_actuator", "actuator_to_joint", "gains",
-)  # fmt: skip
+    "forward",
+    "inverse",
+    "jacobian",
+    "torques",
+    "joint_to_actuator",
+    "actuator_to_joint",
+    "gains",
+)
 CORRECTIONS: Final = 6
 """Corrections of a call. Of 10,000 states each of delta_cu, prru, rps3 and five_bar, 5 reach all
 that 12 reach; one more makes the derivatives exact."""
@@ -229,15 +235,17 @@ def python_file(robot: Robot, library: str) -> str:
     payload = {PARAMETERS: package.payload_values}
     joints, pose = (
         ", ".join(f"{name} ({unit})" for name, unit in zip(*pair, strict=True))
-        for pair in (
-            (robot.joint_names, robot.joint_units), (robot.pose_names, robot.pose_units)
-        )
-    )  # fmt: skip
+        for pair in ((robot.joint_names, robot.joint_units), (robot.pose_names, robot.pose_units))
+    )
     head = _HEAD.format(
-        name=_UNSAFE.sub("?", robot.name), library=library, imports=LIBRARIES[library],
-        corrections=CORRECTIONS, steps=MORE_STEPS,
-        joints=_UNSAFE.sub("?", joints), pose=_UNSAFE.sub("?", pose),
-    )  # fmt: skip
+        name=_UNSAFE.sub("?", robot.name),
+        library=library,
+        imports=LIBRARIES[library],
+        corrections=CORRECTIONS,
+        steps=MORE_STEPS,
+        joints=_UNSAFE.sub("?", joints),
+        pose=_UNSAFE.sub("?", pose),
+    )
     parts = [head, _EAGER if library == "numpy" else _TRACED]
     parts += [_SCAN if library == "jax" else _LOOP, _RUNTIME]
     if library == "numpy":
@@ -248,9 +256,7 @@ def python_file(robot: Robot, library: str) -> str:
     return "".join(parts)
 
 
-def _write_function(
-    routine: Routine, payload: Mapping[str, Sequence[Any]], prefix: str = ""
-) -> str:
+def _write_function(routine: Routine, payload: Mapping[str, Sequence[Any]], prefix: str = "") -> str:
     """Return the text of a function and of its parts.
 
     :param prefix: of the name of a function that others call.
@@ -280,8 +286,7 @@ def _write_function(
         home, origin = (tuple(e.value for e in row) for row in (q.home, q.origin))
         certain = q.start is not None and not q.guessed
         rows.append(
-            f"({q.target!r}, {goal}, {q.unknowns!r}, {home}, {origin}, {start}, {onward}, "
-            f"{correct}, {certain}),"
+            f"({q.target!r}, {goal}, {q.unknowns!r}, {home}, {origin}, {start}, {onward}, {correct}, {certain}),"
         )
         judged.append(q.residual)
         branches += q.branch

@@ -122,9 +122,7 @@ def _words(robot: Robot, package: str) -> dict[str, str]:
         "JOINTNAMES": ", ".join(f"`{name}`" for name in controller.names),
         "POSENAMES": ", ".join(POSE[k] for k in directions),
         "POSE": _write_row(directions),
-        "PAYLOAD": "{"
-        + ", ".join([number(load.mass), _write_row(load.com), _write_row(np.ravel(load.inertia))])
-        + "}",
+        "PAYLOAD": "{" + ", ".join([number(load.mass), _write_row(load.com), _write_row(np.ravel(load.inertia))]) + "}",
         "DRIVES": _write_drives(robot),
         "STOP": f"{DAMPING_TIME:g}",
         "MAXMASS": number(MAX_MASS),
@@ -149,10 +147,7 @@ def _directions(robot: Robot) -> list[int]:
     twist /= np.linalg.norm(twist, axis=0)
     choices = list(combinations(range(len(POSE)), len(names)))
     # Rounded: equals stay in their order, whatever the arithmetic.
-    sizes = [
-        round(float(np.prod(np.linalg.svd(twist[list(rows)], compute_uv=False))), 6)
-        for rows in choices
-    ]
+    sizes = [round(float(np.prod(np.linalg.svd(twist[list(rows)], compute_uv=False))), 6) for rows in choices]
     return list(choices[int(np.argmax(sizes))])
 
 
@@ -165,10 +160,16 @@ def _write_drives(robot: Robot) -> str:
     ends = np.sort(controller.offsets[:, None] + controller.factors[:, None] * position, axis=1)
     effort = np.full(n, np.inf) if limits.effort is None else np.asarray(limits.effort)
     columns = (
-        controller.factors, controller.offsets, ends[:, 0], ends[:, 1],
-        effort / np.abs(controller.factors), friction.viscous, friction.coulomb, _damping(robot),
+        controller.factors,
+        controller.offsets,
+        ends[:, 0],
+        ends[:, 1],
+        effort / np.abs(controller.factors),
+        friction.viscous,
+        friction.coulomb,
+        _damping(robot),
         _rounding_rates(robot),
-    )  # fmt: skip
+    )
     lines = [
         f"  {{{literal(name)}, {', '.join(number(column[k]) for column in columns)}}},"
         for k, name in enumerate(controller.names)
@@ -246,9 +247,7 @@ def _controllers(robot: Robot, package: str, bandwidth: float) -> str:
         },
         CONTROLLER: own,
         GRAVITY: {
-            "gains": {
-                name: {"d": float(d)} for name, d in zip(joints, _damping(robot), strict=True)
-            },
+            "gains": {name: {"d": float(d)} for name, d in zip(joints, _damping(robot), strict=True)},
         },
         TRAJECTORIES: {
             "joints": joints,
@@ -281,6 +280,4 @@ def _write_row(values: Iterable[Any]) -> str:
 def literal(text: str) -> str:
     """Write a C++ string literal; special characters are octal."""
     plain = re.compile(rb"[A-Za-z0-9 _./:+-]")
-    return '"' + "".join(
-        chr(byte) if plain.match(bytes([byte])) else f"\\{byte:03o}" for byte in text.encode()
-    ) + '"'  # fmt: skip
+    return '"' + "".join(chr(byte) if plain.match(bytes([byte])) else f"\\{byte:03o}" for byte in text.encode()) + '"'

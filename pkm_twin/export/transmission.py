@@ -27,19 +27,23 @@ def transmission_package(robot: Robot) -> dict[str, str]:
     code, shown = Package(robot, FUNCTIONS), printable(robot)
     drives = [
         f"  {{{literal(name)}, {number(factor)}, {number(offset)}}},"
-        for name, factor, offset in zip(
-            controller.names, controller.factors, controller.offsets, strict=True
-        )
+        for name, factor, offset in zip(controller.names, controller.factors, controller.offsets, strict=True)
     ]
     words = {
-        "ROBOT": shown, "XMLROBOT": shown, "PACKAGE": package, "GUARD": package.upper(),
-        "PREFIX": code.prefix, "JOINTS": str(code.m), "ACTUATORS": str(code.n),
-        "ROLES": ", ".join(map(literal, robot.pose_names)), "DRIVES": "\n".join(drives),
+        "ROBOT": shown,
+        "XMLROBOT": shown,
+        "PACKAGE": package,
+        "GUARD": package.upper(),
+        "PREFIX": code.prefix,
+        "JOINTS": str(code.m),
+        "ACTUATORS": str(code.n),
+        "ROLES": ", ".join(map(literal, robot.pose_names)),
+        "DRIVES": "\n".join(drives),
         "JOINTNAMES": ", ".join(f"`{name}`" for name in robot.pose_names),
         "ACTUATORNAMES": ", ".join(f"`{name}`" for name in controller.names),
         "JOINTROWS": _elements("joint", robot.pose_names),
         "ACTUATORROWS": _elements("actuator", controller.names),
-    }  # fmt: skip
+    }
     result = {f"c/{code.prefix}.h": code.header(), f"c/{code.prefix}.c": code.source()}
     for path, text in fill_templates("transmission_package", words).items():
         # Headers are included as PACKAGE/NAME.hpp.

@@ -190,10 +190,7 @@ class Scale(NamedTuple):
         if np.isfinite(self.angle):
             ends = f"{ends}, angles to {1e3 * self.angle:.2g} mrad"
         if self.determined:
-            return (
-                f"scale: determined; distances between new poses are known to {ends} (standard "
-                "deviations)"
-            )
+            return f"scale: determined; distances between new poses are known to {ends} (standard deviations)"
         return (
             f"the scale is not determined (standard deviation {100.0 * self.after:.2g} mm in 100 "
             f"mm, {100.0 * self.before:.2g} mm before): distances between new poses are known to "
@@ -278,9 +275,7 @@ def geometric(robot: Robot, q: Array, only: Sequence[str] = ()) -> tuple[str, ..
     return tuple(found)
 
 
-def left_by_calibration(
-    robot: Robot, errors: Callable[[Array], Array], states: Array, q: Array
-) -> Array:
+def left_by_calibration(robot: Robot, errors: Callable[[Array], Array], states: Array, q: Array) -> Array:
     """Return what a calibration without noise leaves of errors of the platform, shape (k, 6, p).
 
     :param errors: of joint states (k, n) the twists by each error, shape (k, 6, p).
@@ -342,10 +337,7 @@ def unknowns(robot: Robot, measured: Measured, paths: Sequence[str], free: Free)
     own = {one.name for one in mapped}
     homes = {f"joints.{j}.home" for j in robot.joint_names if f"joint_map.{j}.offset" in own}
     fitted = [(path, *known[path]) for path in paths if path not in homes]
-    parameters = [
-        Parameter(path, unit, value, prior if unit == "m" else angle)
-        for path, value, unit in fitted
-    ]
+    parameters = [Parameter(path, unit, value, prior if unit == "m" else angle) for path, value, unit in fitted]
     parameters += mapped
     # Where the instrument stands is not known at all.
     far = 100.0 * robot.engine.tree.size
@@ -421,7 +413,7 @@ def calibrate(
             result.faults
             or (result.cost - other.cost > saved and other.cost < HALF * result.cost)
             or other.agreements[0].noise < 0.5 * result.agreements[0].noise
-        ):  # fmt: skip
+        ):
             result = replace(result, faults=(place_fault(other.instrument), *result.faults))
     if result.faults and not accept:
         raise RejectedPosesError(result.faults[0])
@@ -429,9 +421,13 @@ def calibrate(
 
 
 def _calibrated(
-    robot: Robot, learnt: Measured, apart: Measured | None, paths: Sequence[str],
-    progress: Callable[[int], None], free: Free,
-) -> Calibration:  # fmt: skip
+    robot: Robot,
+    learnt: Measured,
+    apart: Measured | None,
+    paths: Sequence[str],
+    progress: Callable[[int], None],
+    free: Free,
+) -> Calibration:
     """Return the fit with its faults.
 
     :param apart: whole poses that are not learnt from.
@@ -467,22 +463,29 @@ def _calibrated(
     faults = faults_of(left, outliers, count, changes, free.prior, robot.engine.tree.size)
     good = np.array([p.observed for p in told])
     if apart is not None and not good.any() and not faults:
-        raise ParameterError(
-            "poses", count, "poses farther apart: these determine none of the numbers"
-        )
+        raise ParameterError("poses", count, "poses farther apart: these determine none of the numbers")
     pairs = find_determined_pairs(
         [k for k in np.flatnonzero(~good).tolist() if told[k].name not in learnt.own],
-        [p.unit for p in told], covariance, row,
-    )  # fmt: skip
+        [p.unit for p in told],
+        covariance,
+        row,
+    )
     singular = np.linalg.svd(found.table[:, good], compute_uv=False)
     return Calibration(
-        robot=built, parameters=tuple(told), covariance=covariance, agreements=agreements,
-        condition=float(singular[0] / singular[-1]) if good.any() else None, scale=scale,
+        robot=built,
+        parameters=tuple(told),
+        covariance=covariance,
+        agreements=agreements,
+        condition=float(singular[0] / singular[-1]) if good.any() else None,
+        scale=scale,
         pairs=tuple(pairs),
-        outliers=outliers, steps=steps, faults=tuple(faults), cost=cost_of(changes),
+        outliers=outliers,
+        steps=steps,
+        faults=tuple(faults),
+        cost=cost_of(changes),
         placed=apart is not None and not free.frame and _looks_placed(robot, learnt, found, told),
         instrument=found.state.instrument,
-    )  # fmt: skip
+    )
 
 
 def _enough(learnt: Measured, apart: Measured, count: int) -> None:
@@ -494,15 +497,21 @@ def _enough(learnt: Measured, apart: Measured, count: int) -> None:
     different = len(np.unique(np.round(learnt.joints / SAME), axis=0))
     if 3 * different * len(learnt.readings) < count + 6 or not len(apart.joints):
         raise ParameterError(
-            "poses", f"{different} different ones to learn from",
+            "poses",
+            f"{different} different ones to learn from",
             f"enough for {count} numbers to be fitted",
-        )  # fmt: skip
+        )
 
 
 def _compared(
-    robot: Robot, built: Robot, learnt: Measured, apart: Measured | None, before: State,
-    found: Fitted, parameters: Sequence[Parameter],
-) -> tuple[tuple[Agreement, ...], tuple[Outlier, ...]]:  # fmt: skip
+    robot: Robot,
+    built: Robot,
+    learnt: Measured,
+    apart: Measured | None,
+    before: State,
+    found: Fitted,
+    parameters: Sequence[Parameter],
+) -> tuple[tuple[Agreement, ...], tuple[Outlier, ...]]:
     """Compare the measurements with the machines, and find what does not fit the others."""
     noise, old, new = found.weights.noise, learnt.parts(before), learnt.parts(found.state)
     readings, parts = learnt.readings, new
@@ -528,15 +537,11 @@ def _compared(
         fitted = errors(old[k], one.lines), errors(new[k], one.lines)
         left_out = errors(held[0][k], lines), errors(held[1][k], lines)
         kind = one.kind
-        agreements.append(
-            Agreement(kind.name, kind.unit, len(one.lines), noise[k], fitted, left_out)
-        )
+        agreements.append(Agreement(kind.name, kind.unit, len(one.lines), noise[k], fitted, left_out))
     return tuple(agreements), outliers
 
 
-def _looks_placed(
-    robot: Robot, measured: Measured, found: Fitted, told: Sequence[Parameter]
-) -> bool:
+def _looks_placed(robot: Robot, measured: Measured, found: Fitted, told: Sequence[Parameter]) -> bool:
     """Whether another place of the instrument would explain a part of what a fit leaves."""
     over, asked = found.weights.over, [(p.before - p.value) / p.prior for p in told]
     target = np.append(over(measured.parts(found.state)), asked)

@@ -77,9 +77,12 @@ class Fitted(NamedTuple):
 
 
 def fit(
-    robot: Robot, start: State, measured: Measured, parameters: Sequence[Parameter],
+    robot: Robot,
+    start: State,
+    measured: Measured,
+    parameters: Sequence[Parameter],
     progress: Callable[[int], None],
-) -> Fitted:  # fmt: skip
+) -> Fitted:
     """Robust least squares over all parameters, the noise found with them.
 
     :raises ParameterError: it does not settle.
@@ -132,9 +135,7 @@ def fit(
         problem = f"{steps} steps, {', '.join(names[k] for k in order)} still move"
         if gained > GOOD:
             damping = 0.1 * damping if damping > LIGHT else 0.0
-    raise UnsettledError(
-        "poses", problem, "poses for which the fit converges: measure more, or fit less (--only)"
-    )
+    raise UnsettledError("poses", problem, "poses for which the fit converges: measure more, or fit less (--only)")
 
 
 def _move(left: Array, right: Array, damping: Array) -> Array:
@@ -150,9 +151,7 @@ def _move(left: Array, right: Array, damping: Array) -> Array:
     return np.asarray(np.linalg.lstsq(rows, end, rcond=None)[0], np.float64)
 
 
-def _stepped(
-    robot: Robot, state: State, measured: Measured, names: Sequence[str], values: Array, move: Array
-) -> State:
+def _stepped(robot: Robot, state: State, measured: Measured, names: Sequence[str], values: Array, move: Array) -> State:
     by = dict(zip(names, move.tolist(), strict=True))
     turn = np.array([by.get(name, 0.0) for name in FRAME[3:]])
     new = dict(zip(names, (values + move).tolist(), strict=True))
@@ -207,9 +206,7 @@ class Outlier:
         return f"line {self.line} is off: {sizes}; {self.worst.sigmas:.3g} sigma"
 
 
-def outliers_of(
-    readings: Sequence[Readings], parts: Sequence[Array], noise: Sequence[float]
-) -> tuple[Outlier, ...]:
+def outliers_of(readings: Sequence[Readings], parts: Sequence[Array], noise: Sequence[float]) -> tuple[Outlier, ...]:
     """Outliers among residuals (m, a) of readings, the worst first."""
     lines: dict[int, list[Away]] = {}
     for one, part, sigma in zip(readings, parts, noise, strict=True):
@@ -223,9 +220,13 @@ def outliers_of(
 
 
 def faults_of(
-    left: Sequence[tuple[str, float]], outliers: Sequence[Outlier], count: int,
-    changes: Sequence[Parameter], prior: float, size: float,
-) -> list[Fault]:  # fmt: skip
+    left: Sequence[tuple[str, float]],
+    outliers: Sequence[Outlier],
+    count: int,
+    changes: Sequence[Parameter],
+    prior: float,
+    size: float,
+) -> list[Fault]:
     """Why a machine like the file's was not in so many poses.
 
     :param left: unit and noise an axis of each kind of measurement. ``changes``: the
@@ -236,10 +237,9 @@ def faults_of(
         "m": (max(prior, WRONG * size), "poses of this machine in m and rad"),
         "rad": (
             max(prior / size, TWISTED),
-            "rotations of this machine from its home, in rad and in the order and axes of the "
-            "columns",
+            "rotations of this machine from its home, in rad and in the order and axes of the columns",
         ),
-    }  # fmt: skip
+    }
     for unit, (most, right) in bounds.items():
         noise = max((one for its, one in left if its == unit), default=0.0)
         if noise > most:
@@ -279,7 +279,6 @@ def place_fault(instrument: Instrument) -> Fault:
         for one in (instrument.place, instrument.frame.as_rotvec())
     )
     return Fault(
-        f"they fit in an instrument's frame at ({shift}) m, turned by ({angles}) rad, and not in "
-        "the base's",
+        f"they fit in an instrument's frame at ({shift}) m, turned by ({angles}) rad, and not in the base's",
         "use --frame to fit the instrument's frame",
     )

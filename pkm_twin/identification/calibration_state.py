@@ -134,9 +134,7 @@ def value_of(state: State, name: str, otherwise: float) -> float:
     return tool.own.get(name, otherwise)
 
 
-def moved(
-    robot: Robot, state: State, joints: Array, values: Mapping[str, float], turn: Array
-) -> State:
+def moved(robot: Robot, state: State, joints: Array, values: Mapping[str, float], turn: Array) -> State:
     """Return the machine with new numbers.
 
     :param joints: of the measurements, in the controller's numbers, (k, n).
@@ -244,9 +242,7 @@ def per(controller: str, model: str) -> str:
     return f"{controller} per {model}" if " " in controller else f"{controller}/{model}"
 
 
-def numbers(
-    robot: Robot, q: Array, how: Transmission, offsets: bool, prior: float, angle: float
-) -> list[Parameter]:
+def numbers(robot: Robot, q: Array, how: Transmission, offsets: bool, prior: float, angle: float) -> list[Parameter]:
     """List what is fitted of the joint map.
 
     :param q: the poses' joints, (k, n). ``prior``, ``angle``: standard deviations of lengths, m,
@@ -274,9 +270,7 @@ def numbers(
             found.append(Parameter(f"{path}.ratio", its, ratio, RATIO_DEVIATION * ratio))
         if how is Transmission.TRAVEL:
             change, prior_change = float(own.changes[i]), 2.0 * RATIO_DEVIATION / float(travel[i])
-            found.append(
-                Parameter(f"{path}.ratio_change", f"1/{robot.joint_units[i]}", change, prior_change)
-            )
+            found.append(Parameter(f"{path}.ratio_change", f"1/{robot.joint_units[i]}", change, prior_change))
     if how is Transmission.SHARED:
         found.append(Parameter(SHARED, "", 1.0, RATIO_DEVIATION))
     return found

@@ -125,9 +125,7 @@ class Checked:
         values = {"rms": c.rms, "limit": c.limit, "noise": c.noise, "peak": c.peak}
         return {
             joint: {name: float(each[j]) for name, each in values.items()} | {"unit": unit}
-            for j, (joint, unit) in enumerate(
-                zip(robot.joint_names, robot.effort_units, strict=True)
-            )
+            for j, (joint, unit) in enumerate(zip(robot.joint_names, robot.effort_units, strict=True))
         }
 
     def named(self, verdict: Verdict) -> list[str]:
@@ -373,9 +371,7 @@ def _stuck_efforts(r: Recording, c: Compared) -> str:
     return "; ".join(texts)
 
 
-def _residuals(
-    r: Recording, c: Compared, bands: Mapping[str, Mapping[str, Any]], bound: str
-) -> list[Fact]:
+def _residuals(r: Recording, c: Compared, bands: Mapping[str, Mapping[str, Any]], bound: str) -> list[Fact]:
     good, begins, (worst, at) = c.good, c.begins(), c.local()
     items = []
     for i, (name, unit) in enumerate(zip(r.robot.joint_names, r.robot.effort_units, strict=True)):
@@ -510,9 +506,7 @@ def _saturated(r: Recording, c: Compared) -> tuple[str, ...]:
         usual = float(estimate_deviation(less)) if len(less) else 0.0
         slack = limit[j] + 4.0 * usual
         enough = (
-            full.mean() > FULL
-            and full.sum() >= TENS
-            and (np.abs(expected[full, j]) > most - slack).mean() > 1.0 - FULL
+            full.mean() > FULL and full.sum() >= TENS and (np.abs(expected[full, j]) > most - slack).mean() > 1.0 - FULL
         )
         if not enough or (len(less) and rms(less) > slack):
             return ()

@@ -272,11 +272,23 @@ def _compared(r: Recording, bound: float) -> Compared | None:
     residual = left + late * change
     noise = density * np.sqrt(passed_band(how, 1.0 / period) / period)
     return Compared(
-        time, expected + residual, expected, change, residual,
-        cut["left"] + late * cut["change"], noise, np.maximum(size, LIGHT * greatest(size)),
-        LOUD * noise > HIDES * greatest(rms(expected + residual)), r.late + late, period,
-        tuple(starts), tuple(pieces), tuple(inside), how, bound,
-    )  # fmt: skip
+        time,
+        expected + residual,
+        expected,
+        change,
+        residual,
+        cut["left"] + late * cut["change"],
+        noise,
+        np.maximum(size, LIGHT * greatest(size)),
+        LOUD * noise > HIDES * greatest(rms(expected + residual)),
+        r.late + late,
+        period,
+        tuple(starts),
+        tuple(pieces),
+        tuple(inside),
+        how,
+        bound,
+    )
 
 
 def _late(left: Array, change: Array, rubs: Array) -> float:

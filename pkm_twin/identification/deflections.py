@@ -114,9 +114,7 @@ class _Part:
             raise PkmTwinError(f"{r.name}: no wrench or no deflection")
         count = int(np.isfinite(r.deflection).any(1).sum())
         if count < LEAST_SAMPLES:
-            raise PkmTwinError(
-                f"{r.name}: too short to fit, {count} deflections; {LEAST_SAMPLES} or more"
-            )
+            raise PkmTwinError(f"{r.name}: too short to fit, {count} deflections; {LEAST_SAMPLES} or more")
         if not r.wrench.any():
             raise PkmTwinError(f"{r.name}: no load, every wrench is zero")
         values = r.deflection[:, np.isfinite(r.deflection).any(0)]
@@ -125,9 +123,13 @@ class _Part:
         few = slice(None, None, -(-len(r.time) // MOST_SAMPLES))
         q = r.q[few]
         return cls(
-            r.name, r.time[few], q, r.wrench[few], r.deflection[few],
+            r.name,
+            r.time[few],
+            q,
+            r.wrench[few],
+            r.deflection[few],
             element_response(robot, robot.forward(q)),
-        )  # fmt: skip
+        )
 
     @cached_property
     def measured(self) -> Mask:
@@ -210,26 +212,27 @@ def fit_elements(
     plain = found.covariance[: len(names), : len(names)]
     found = replace(found, covariance=verdict.covariance)
     own = found.covariance[: len(names), : len(names)]
-    judged = tuple(
-        _judged(part, factors, zero, own) for part, zero in zip(parts, zeros, strict=True)
-    )
+    judged = tuple(_judged(part, factors, zero, own) for part, zero in zip(parts, zeros, strict=True))
     return ElasticFit(
-        robot=robot, estimate=found, numbers=numbers, judged=judged, zeros=zeros, verdict=verdict,
+        robot=robot,
+        estimate=found,
+        numbers=numbers,
+        judged=judged,
+        zeros=zeros,
+        verdict=verdict,
         groups=groups_of(names, factors, plain, own),
         measured=np.array([part.measured for part in parts]),
         samples=sum(part.split for part in parts),
         told=int(np.sum(np.linalg.eigvalsh(plain / PRIOR**2) < FITTED_RATIO**2)),
         accepted=tuple(faults),
-    )  # fmt: skip
+    )
 
 
 def _numbers(
     robot: Robot, names: Sequence[str], factors: Array, found: Estimate, verdict: Verdict
 ) -> tuple[Number, ...]:
     """Of the elements: known by the noise alone, their deviations by the verdict too."""
-    own, wide = (
-        np.sqrt(np.diag(one)[: len(names)]) for one in (found.covariance, verdict.covariance)
-    )
+    own, wide = (np.sqrt(np.diag(one)[: len(names)]) for one in (found.covariance, verdict.covariance))
     wide = np.full_like(wide, np.nan) if verdict.deviations == "withheld" else wide
     numbers = []
     for name, factor, *deviations in zip(names, factors, own, wide, strict=True):
@@ -256,8 +259,7 @@ def _check_loads(parts: Sequence[_Part], robot: Robot) -> None:
     apart = float(np.ptp(q, axis=0).max())
     if singular[1:].max(initial=0.0) < ALIKE * singular[0] and apart < ALIKE * robot.size:
         raise PkmTwinError(
-            "no excitation: one load direction in one pose; use other directions or other poses to "
-            "distinguish elements"
+            "no excitation: one load direction in one pose; use other directions or other poses to distinguish elements"
         )
 
 
@@ -279,9 +281,7 @@ def _scale_faults(parts: Sequence[_Part]) -> list[str]:
         if abs(like) < LIKE:
             continue
         if both < 0.0:
-            faults.append(
-                f"{part.name}: the platform moves against its loads: signs, or the axes of either"
-            )
+            faults.append(f"{part.name}: the platform moves against its loads: signs, or the axes of either")
         elif not 1.0 / SCALE <= both / own <= SCALE:
             faults.append(
                 f"{part.name}: deflections are {both / own:.3g} times what the robot's file makes "
@@ -309,9 +309,7 @@ def _part_left(part: _Part, factors: Array, zero: Array) -> float:
     return float(np.sqrt(np.mean(np.nanmean(left**2, 0)[good] / size[good])))
 
 
-def _unexplained(
-    robot: Robot, parts: Sequence[_Part], factors: Array, zeros: Array, odd: bool
-) -> list[str]:
+def _unexplained(robot: Robot, parts: Sequence[_Part], factors: Array, zeros: Array, odd: bool) -> list[str]:
     """List recordings that no compliance of this robot explains, each with the likely fault.
 
     A direction of noise alone is no fault where others are explained.
@@ -347,16 +345,13 @@ def _best_repair(robot: Robot, part: _Part, most: float) -> tuple[str, float]:
 def _solve(parts: Sequence[_Part], count: int) -> tuple[Estimate, Array]:
     """Of the factors and the zeros, by steps of linear least squares; and the columns of both."""
     factors = np.ones(count)
-    scales = np.concatenate(
-        [np.full(count, PRIOR), *(np.maximum(part.size, 1e-12) for part in parts)]
-    )
+    scales = np.concatenate([np.full(count, PRIOR), *(np.maximum(part.size, 1e-12) for part in parts)])
     start = np.concatenate([factors, np.zeros(6 * len(parts))])
     cones = [(slice(k, k + 1), above_zero(0, 1)) for k in range(count)]
     for _ in range(STEPS):
         rows = [part.rows(factors) for part in parts]
         tables = [
-            np.concatenate([slopes, _zeros(i, len(parts), counts)], -1)
-            for i, (slopes, _, counts) in enumerate(rows)
+            np.concatenate([slopes, _zeros(i, len(parts), counts)], -1) for i, (slopes, _, counts) in enumerate(rows)
         ]
         target, judged = (np.concatenate([one[k] for one in rows]) for k in (1, 2))
         table = np.concatenate(tables)
@@ -387,9 +382,7 @@ def _level(table: Array, change: Array, judged: Array) -> Array | None:
     found = np.linalg.lstsq(rows, (change * weights).ravel(), rcond=1e-9)[0]
     left = (change - table @ found) * judged
     free = 1.0 - unknowns / equations
-    return np.asarray(
-        np.sqrt(np.sum(left**2, 0) / np.maximum(free * np.sum(judged, 0), 1.0)), np.float64
-    )
+    return np.asarray(np.sqrt(np.sum(left**2, 0) / np.maximum(free * np.sum(judged, 0), 1.0)), np.float64)
 
 
 def _judged(part: _Part, factors: Array, zero: Array, covariance: Array) -> Judged:
@@ -402,9 +395,7 @@ def _judged(part: _Part, factors: Array, zero: Array, covariance: Array) -> Judg
     return Judged(part.name, part.time[end], measured, before[end], after[end], spread[end])
 
 
-def _verdict(
-    robot: Robot, parts: Sequence[_Part], found: Estimate, factors: Array, zeros: Array
-) -> Verdict:
+def _verdict(robot: Robot, parts: Sequence[_Part], found: Estimate, factors: Array, zeros: Array) -> Verdict:
     """Judge the factors and zeros (recordings, 6) of a fit.
 
     The factors are not those of the posterior, which is linear: the difference is uncertain.
@@ -423,13 +414,18 @@ def _verdict(
         target = np.where(counts, left + columns @ change, 0.0)
         cases.append(
             Case(
-                target[:, measured], columns[:, measured],
-                np.zeros((*own[:, measured].shape, 0)), np.zeros(0),
-                np.stack(errors, -1)[:, measured], own[:, measured],
+                target[:, measured],
+                columns[:, measured],
+                np.zeros((*own[:, measured].shape, 0)),
+                np.zeros(0),
+                np.stack(errors, -1)[:, measured],
+                own[:, measured],
                 counts[:, measured].astype(np.float64),
-                _noise(left, own, columns.shape[-1])[measured], 1.0, part.split,
+                _noise(left, own, columns.shape[-1])[measured],
+                1.0,
+                part.split,
             )
-        )  # fmt: skip
+        )
     names = [name for name, good in zip(AXES, measured.tolist(), strict=True) if good]
     verdict, _ = judge(names, suspects, cases, found.prior)
     off = verdict.change - change

@@ -58,8 +58,7 @@ class TorqueConstants:
         """In words, of those that were fitted."""
         rows = zip(robot.joint_names, self.values, self.deviations, robot.effort_units, strict=True)
         return [
-            f"torque constant of {joint}: {value:.4g} +- {deviation:.2g} {unit}/A, from the masses "
-            "of the file"
+            f"torque constant of {joint}: {value:.4g} +- {deviation:.2g} {unit}/A, from the masses of the file"
             for joint, value, deviation, unit in rows
             if deviation
         ]
@@ -199,9 +198,12 @@ def runs_of(table: Table, lever: float | None = None) -> Runs:
 
 
 def drive_friction(
-    torque: ArrayLike, up: ArrayLike, down: ArrayLike, speed: ArrayLike | None = None,
+    torque: ArrayLike,
+    up: ArrayLike,
+    down: ArrayLike,
+    speed: ArrayLike | None = None,
     drive: ArrayLike | None = None,
-) -> DriveFriction:  # fmt: skip
+) -> DriveFriction:
     """Torque constant and friction law of a drive, or of several alike.
 
     :param torque: of the weights at the motor, N m, shape (k,), at least two different ones.
@@ -225,9 +227,10 @@ def drive_friction(
     (slope, zero), covariance = _line(both, middle)
     if not abs(slope) > 3.0 * np.sqrt(covariance[0, 0]):
         raise ParameterError(
-            "torque constant", f"{slope:.3g} +- {np.sqrt(covariance[0, 0]):.2g} A/(N m)",
+            "torque constant",
+            f"{slope:.3g} +- {np.sqrt(covariance[0, 0]):.2g} A/(N m)",
             "currents that grow with the weights: are the columns up and down of the same run?",
-        )  # fmt: skip
+        )
     constant = 1.0 / slope
     # A drive whose current falls with the load counts it the other way round.
     friction = half * np.sign(np.mean(half))
@@ -251,9 +254,7 @@ def drive_friction(
             break
         chosen, terms = law, {name: columns.get(name, terms["Coulomb"]) for name in law.terms}
     deviation = float(np.sqrt(covariance[0, 0]) * constant**2)
-    return DriveFriction(
-        float(abs(constant)), deviation, float(zero), tuple(laws), chosen, float(chance), told
-    )
+    return DriveFriction(float(abs(constant)), deviation, float(zero), tuple(laws), chosen, float(chance), told)
 
 
 def _determined(table: Array) -> bool:
@@ -288,10 +289,14 @@ def _law(terms: dict[str, Array], friction: Array, drive: Array, told: bool) -> 
 
     names = ["Coulomb" if told else "Coulomb or viscous", *list(terms)[1:]]
     return Law(
-        ", ".join(names), tuple(terms), found, np.sqrt(np.diag(covariance)),
-        float(np.sqrt(np.mean((friction - table @ found) ** 2))), missed(np.arange(len(friction))),
+        ", ".join(names),
+        tuple(terms),
+        found,
+        np.sqrt(np.diag(covariance)),
+        float(np.sqrt(np.mean((friction - table @ found) ** 2))),
+        missed(np.arange(len(friction))),
         missed(drive),
-    )  # fmt: skip
+    )
 
 
 def _chance(simple: Law, richer: Law, count: int) -> float:

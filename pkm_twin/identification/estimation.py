@@ -120,9 +120,15 @@ def estimate(
         spread = spread + np.outer(moved, moved)
     condition = float(np.sqrt(values[kept].max() / values[kept].min())) if kept.any() else np.inf
     return Estimate(
-        fitted, scales[:, None] * spread * scales, scales, noise, int(kept.sum()), condition,
-        weights, bound,
-    )  # fmt: skip
+        fitted,
+        scales[:, None] * spread * scales,
+        scales,
+        noise,
+        int(kept.sum()),
+        condition,
+        weights,
+        bound,
+    )
 
 
 def _mean(values: Array, counts: Array) -> Array:
@@ -146,9 +152,14 @@ def _directions(gram: Array, side: Array, least: float) -> tuple[Array, Array, A
 
 
 def _factor(
-    scaled: Array, residual: Array, counts: Array, noise: Array, values: Array, vectors: Array,
+    scaled: Array,
+    residual: Array,
+    counts: Array,
+    noise: Array,
+    values: Array,
+    vectors: Array,
     kept: Any,
-) -> Array:  # fmt: skip
+) -> Array:
     """Return the factor F of the scaled parameters' covariance F F^T, shape (k, k).
 
     It holds the data's part, by the residual's own autocorrelation, then the prior's.
@@ -167,9 +178,7 @@ def _factor(
         taper = min(1.0, 2.0 * (1.0 - lag / (lags + 1.0)))
         ahead, behind = residual[lag:], residual[: samples - lag]
         cross = taper * (behind.T @ ahead) / pairs
-        part = np.einsum(
-            "sia,ij,sjb->ab", modes[: samples - lag], cross, modes[lag:], optimize=True
-        )
+        part = np.einsum("sia,ij,sjb->ab", modes[: samples - lag], cross, modes[lag:], optimize=True)
         meat += part if lag == 0 else part + part.T
     meat *= WIDEN**2 * samples * n / max(samples * n - int(np.sum(kept)), 1)
     inverse = 1.0 / values[kept]
@@ -234,10 +243,7 @@ def nearest(z: Array, factor: Array, start: Array, scales: Array, cones: Cones) 
             row = np.einsum("ia,ijk,jb->k", basis, cone, basis)
             limits.append(row @ physical[where] >= 0.0)
             continue
-        block = sum(
-            (basis.T @ cone[..., k] @ basis) * physical[where.start + k]
-            for k in range(cone.shape[-1])
-        )
+        block = sum((basis.T @ cone[..., k] @ basis) * physical[where.start + k] for k in range(cone.shape[-1]))
         limits.append((block + block.T) / 2 >> 0)
     problem = cvxpy.Problem(cvxpy.Minimize(cvxpy.sum_squares(unknown)), limits)
     with warnings.catch_warnings():

@@ -97,9 +97,7 @@ class Spectra:
         noise = np.maximum(np.maximum(s.noise, EXACT * rms) ** 2 * used, 1e-300)
         return cls(np.stack(grams, 1), np.diff(edges).astype(float), noise[:, None], p.T)
 
-    def information(
-        self, share: float, gains: Array | None = None, order: Sequence[int] | None = None
-    ) -> Information:
+    def information(self, share: float, gains: Array | None = None, order: Sequence[int] | None = None) -> Information:
         """Return what the measured signals tell of x with a share of discrepancy.
 
         :param gains: factors on the model's signals by channel, (n,). ``order``: whose model is of
@@ -147,9 +145,14 @@ class Model:
 
     @classmethod
     def of(
-        cls, spectra: Sequence[Spectra], places: Sequence[Indices], deviation: Array,
-        shares: Array = SHARES, gains: Array | None = None, order: Sequence[int] | None = None,
-    ) -> Model:  # fmt: skip
+        cls,
+        spectra: Sequence[Spectra],
+        places: Sequence[Indices],
+        deviation: Array,
+        shares: Array = SHARES,
+        gains: Array | None = None,
+        order: Sequence[int] | None = None,
+    ) -> Model:
         """Sum the information of all recordings.
 
         :param places: of each recording's columns among x. ``gains``, ``order``: of the channels,
@@ -170,8 +173,7 @@ class Model:
     def widened(self, factors: Array) -> Model:
         """Return the model with other deviations of the prior, (c,) times these."""
         parts = tuple(
-            (total * np.outer(factors, factors), side * factors, square, log)
-            for total, side, square, log in self.parts
+            (total * np.outer(factors, factors), side * factors, square, log) for total, side, square, log in self.parts
         )
         return Model(parts, self.deviation * factors, self.shares)
 
@@ -214,9 +216,7 @@ class Model:
         for k in np.flatnonzero(weights):
             _, root, half = self._solve(int(k), used)
             means.append(scipy.linalg.solve_triangular(root.T, half, check_finite=False))
-            inverses.append(
-                scipy.linalg.cho_solve((root, True), np.eye(len(half)), check_finite=False)
-            )
+            inverses.append(scipy.linalg.cho_solve((root, True), np.eye(len(half)), check_finite=False))
         each = weights[weights > 0.0]
         mean = np.tensordot(each, means, 1)
         away = (np.array(means) - mean) * np.sqrt(each)[:, None]
@@ -225,9 +225,11 @@ class Model:
         own = np.tensordot(each, inverses, 1) + away.T @ away
         covariance[np.ix_(used, used)] = own * np.outer(d, d)
         return Posterior(
-            float(scipy.special.logsumexp(logs)), float(self.shares[int(np.argmax(weights))]), full,
+            float(scipy.special.logsumexp(logs)),
+            float(self.shares[int(np.argmax(weights))]),
+            full,
             covariance,
-        )  # fmt: skip
+        )
 
     def gains(self, used: Mask, more: Mask) -> tuple[Array, Array]:
         """Return what each column of ``more`` alone adds to the log evidence, and its size."""
@@ -235,9 +237,7 @@ class Model:
         sizes = np.zeros_like(found)
         for k, (total, side, _, _) in enumerate(self.parts):
             logs[k], root, half = self._solve(k, used)
-            cross = scipy.linalg.solve_triangular(
-                root, total[np.ix_(used, more)], lower=True, check_finite=False
-            )
+            cross = scipy.linalg.solve_triangular(root, total[np.ix_(used, more)], lower=True, check_finite=False)
             seen = np.maximum(np.diag(total)[more] - np.sum(cross**2, 0), 0.0)
             left = side[more] - cross.T @ half
             sizes[k, more] = left / (1.0 + seen)

@@ -97,14 +97,10 @@ class Excitation:
 
     def at(self, time: Array) -> tuple[Array, Array, Array]:
         """Positions, rates and accelerations, shape (k, n) each."""
-        return _series(
-            time, self.duration, self.harmonics, self.centre, np.stack([self.sines, self.cosines])
-        )
+        return _series(time, self.duration, self.harmonics, self.centre, np.stack([self.sines, self.cosines]))
 
 
-def _series(
-    time: Array, duration: float, harmonics: Array, centre: Array, pair: Array
-) -> tuple[Array, Array, Array]:
+def _series(time: Array, duration: float, harmonics: Array, centre: Array, pair: Array) -> tuple[Array, Array, Array]:
     w = 2 * np.pi * harmonics / duration
     s, c = np.sin(np.outer(time, w)), np.cos(np.outer(time, w))
     a, b = pair[0].T, pair[1].T
@@ -286,16 +282,19 @@ class _Fine:
 
 
 def _clear_of(
-    robot: Robot, keep: Bounds, duration: float, harmonics: Array, centre: Array, pair: Array,
-    time: Array, margin: float = 1.0,
-) -> Array | None:  # fmt: skip
+    robot: Robot,
+    keep: Bounds,
+    duration: float,
+    harmonics: Array,
+    centre: Array,
+    pair: Array,
+    time: Array,
+    margin: float = 1.0,
+) -> Array | None:
     """Shrink the series until it keeps clear of everything; None where it never does."""
     for _ in range(20):
         blocks = (time[k : k + BLOCK] for k in range(0, len(time), BLOCK))
-        if all(
-            clear(robot, keep, *_series(some, duration, harmonics, centre, pair), margin)
-            for some in blocks
-        ):
+        if all(clear(robot, keep, *_series(some, duration, harmonics, centre, pair), margin) for some in blocks):
             return pair
         pair = SHRINK * pair
     return None
@@ -365,9 +364,7 @@ class Sweeps:
         for way, (k, j) in product((1.0, -1.0), np.ndindex(self.speeds.T.shape)):
             length = float(self.lengths[j, k])
             inside = (time >= start) & (time <= start + length)
-            place, rate, change = way * _sweep(
-                time[inside] - start, float(self.reach[j]), float(self.speeds[j, k])
-            )
+            place, rate, change = way * _sweep(time[inside] - start, float(self.reach[j]), float(self.speeds[j, k]))
             q[inside, j] = self.centre[j] + place
             qd[inside, j], qdd[inside, j] = rate, change
             start += length
@@ -430,8 +427,7 @@ def sweeps(judge: Judge, duration: float, bounds: Bounds | None = None) -> Sweep
             reach[j] *= SHRINK
         else:
             raise PkmTwinError(
-                f"{robot.joint_names[j]} cannot move alone inside the limits; "
-                f"{_remedy(robot, keep, centre)}"
+                f"{robot.joint_names[j]} cannot move alone inside the limits; {_remedy(robot, keep, centre)}"
             )
     found = Sweeps(centre, reach, np.array([speeds(j) for j in range(n)]))
     motion = found.at(np.linspace(0.0, found.duration, 3 * n * STATES))

@@ -172,10 +172,7 @@ def on_time(problem: Problem) -> Problem:
 
     Its delays are to the first order, good for a sample or so.
     """
-    found = [
-        _searched(made, late, problem.both.noise)
-        for made, late in zip(problem.rows, problem.delays, strict=True)
-    ]
+    found = [_searched(made, late, problem.both.noise) for made, late in zip(problem.rows, problem.delays, strict=True)]
     for _ in range(PASSES):
         moved = [
             made.recording.on_time(late) if abs(late) > made.period else made.recording
@@ -243,10 +240,15 @@ def fitted(problem: Problem, accepted: tuple[str, ...] = ()) -> Fit:
         spread = np.sqrt(np.sum((end.table @ wide) * end.table, -1).clip(0.0))
         judged.append(Judged(end.recording.name, end.time, end.effort, before, after, spread))
     return Fit(
-        robot=problem.robot, problem=problem, estimate=best,
-        numbers=tuple(numbers), judged=tuple(judged), verdict=verdict, accepted=accepted,
+        robot=problem.robot,
+        problem=problem,
+        estimate=best,
+        numbers=tuple(numbers),
+        judged=tuple(judged),
+        verdict=verdict,
+        accepted=accepted,
         samples=sum(made.held_from for made in problem.rows),
-    )  # fmt: skip
+    )
 
 
 def _faults_of(problem: Problem, causes: Sequence[Cause | None]) -> list[str]:
@@ -290,9 +292,7 @@ def _worse(problem: Problem, causes: Sequence[Cause | None]) -> list[str]:
     robot, told = problem.robot, []
     values = problem.parameters.values, problem.estimate.values
     for end, cause in zip(problem.held_out, causes, strict=True):
-        old, new = (
-            np.sqrt(np.mean(end.counts * (end.target - end.table @ v) ** 2, 0)) for v in values
-        )
+        old, new = (np.sqrt(np.mean(end.counts * (end.target - end.table @ v) ** 2, 0)) for v in values)
         j = int(np.argmax(new / np.maximum(old, 1e-300)))
         if new[j] > WORSE * old[j] and new[j] > EXACT * np.std(end.effort[:, j]):
             named = cause.text if cause is not None else ""

@@ -155,22 +155,26 @@ def fit_with_laws(
         result = fitted(problem, best.accepted)
         more += _searched(best.robot, result, choice.law, found)
         wider |= _widened(result, found)
-        own = (
-            replace(n, deviation=float(np.hypot(n.deviation, wider.get(n.key, 0.0))))
-            for n in result.numbers
-        )
+        own = (replace(n, deviation=float(np.hypot(n.deviation, wider.get(n.key, 0.0)))) for n in result.numbers)
         best = replace(result, numbers=(*own, *more))
-    file = {robot.friction_key(joint, "presliding"): float(value) for joint, value in
-            zip(robot.joint_names, robot.friction.presliding, strict=True)}  # fmt: skip
+    file = {
+        robot.friction_key(joint, "presliding"): float(value)
+        for joint, value in zip(robot.joint_names, robot.friction.presliding, strict=True)
+    }
     numbers = tuple(replace(n, before=file.get(n.key, n.before)) for n in best.numbers)
     return replace(best, numbers=numbers), tuple(choices)
 
 
 def fit_recordings(
-    robot: Robot, recordings: Sequence[Recording], what: Sequence[Kind] = KINDS,
-    laws: Sequence[str] | None = None, *, constant: str | None = None, accept: bool = False,
+    robot: Robot,
+    recordings: Sequence[Recording],
+    what: Sequence[Kind] = KINDS,
+    laws: Sequence[str] | None = None,
+    *,
+    constant: str | None = None,
+    accept: bool = False,
     progress: Callable[[int], None] | None = None,
-) -> tuple[Fit, tuple[Choice, ...], list[str]]:  # fmt: skip
+) -> tuple[Fit, tuple[Choice, ...], list[str]]:
     """Fit recordings as they are read, as ``check`` takes them.
 
     Where a payload is fitted, that of the recordings is the one to start from, and says when it is
@@ -185,12 +189,11 @@ def fit_recordings(
         if r.measured is not None and r.topics.wrench is not None and r.wrench is None:
             raise BagError(
                 f"no wrench on {r.topics.wrench} is accepted: {r.first_reject}",
-                path=Path(r.source), reason="frames",
-            )  # fmt: skip
+                path=Path(r.source),
+                reason="frames",
+            )
     file, found = robot, ((r.name, r.step_fault) for r in recordings)
-    faults = [
-        f"{name}: position steps that are no motion: {fault}" for name, fault in found if fault
-    ]
+    faults = [f"{name}: position steps that are no motion: {fault}" for name, fault in found if fault]
     refuse_faults(faults, accept)
     notes = [f"accepted by --accept: {fault}" for fault in faults]
     for r in recordings:
@@ -221,9 +224,7 @@ def fit_recordings(
             masses = ", ".join(f"{load.mass:g}" for load in loads)
             raise PkmTwinError(f"recordings with payloads of {masses} kg: fit one at a time")
         robot = loads[0].on(robot) if loads else robot
-        made = [
-            r if r.load is None else replace(r, load=replace(r.load, sought=True)) for r in made
-        ]
+        made = [r if r.load is None else replace(r, load=replace(r.load, sought=True)) for r in made]
     if constant is not None:
         if constant != FIT:
             constants = given_constants(robot, constant)
@@ -264,9 +265,7 @@ def _unexplained(result: Fit) -> bool:
         return False
     verdict = result.verdict
     kinds = {one.suspect.kind for one in verdict.findings}
-    return bool(kinds - {RESONANCE}) or any(
-        channel.left_ratio > 1.0 for channel in verdict.channels
-    )
+    return bool(kinds - {RESONANCE}) or any(channel.left_ratio > 1.0 for channel in verdict.channels)
 
 
 def _compared(name: str, verdict: Verdict, before: Problem, after: Problem) -> Choice:
@@ -276,8 +275,7 @@ def _compared(name: str, verdict: Verdict, before: Problem, after: Problem) -> C
     for end, other in zip(before.held_out, after.held_out, strict=True):
         noise = np.maximum(end.signals.noise, EXACT * np.sqrt(np.mean(end.effort**2, 0)))
         old, new = (
-            rows.target - rows.table @ problem.estimate.values
-            for rows, problem in ((end, before), (other, after))
+            rows.target - rows.table @ problem.estimate.values for rows, problem in ((end, before), (other, after))
         )
         change = old - new
         each = (old / band) ** 2, (new / band) ** 2
@@ -411,9 +409,7 @@ class _Search:
             return {}
         (key,) = keys
         grid = self._grid(key)
-        gains = np.concatenate(
-            [self._gains(key, grid[a : a + CHUNK])[0] for a in range(0, len(grid), CHUNK)]
-        )
+        gains = np.concatenate([self._gains(key, grid[a : a + CHUNK])[0] for a in range(0, len(grid), CHUNK)])
         best = gains.argmax(0)
         joints = np.arange(gains.shape[1])
         seen = gains[best, joints] > 0.0
@@ -463,9 +459,7 @@ class _Search:
 
         And the other parameters of the law with each, (g, n, others).
         """
-        n, linear = self.robot.joints_count, [
-            (word, one) for word, one in self.law.parameters.items() if one.linear
-        ]  # fmt: skip
+        n, linear = self.robot.joints_count, [(word, one) for word, one in self.law.parameters.items() if one.linear]
 
         def columns(q: Array, rates: Array) -> Array:
             made = []
@@ -484,8 +478,7 @@ class _Search:
             for g in range(len(grid)):
                 own = table[:, j, g] - basis @ (basis.T @ table[:, j, g])
                 size, *_ = np.linalg.lstsq(own, left, rcond=1e-9)
-                good = all(one.low is None or s >= 0.0
-                           for s, (_, one) in zip(size, linear, strict=True))  # fmt: skip
+                good = all(one.low is None or s >= 0.0 for s, (_, one) in zip(size, linear, strict=True))
                 sizes[g, j] = size
                 gains[g, j] = float(left @ (own @ size)) if good else 0.0
         return gains, sizes

@@ -138,9 +138,7 @@ def _elasticity(r: Recording) -> list[Measured]:
     except PkmTwinError:
         return []
     known = fit.of("fitted")
-    found = [
-        Measured("compliance factor", str(n.key[-1]), n.after, n.deviation, "1") for n in known
-    ]
+    found = [Measured("compliance factor", str(n.key[-1]), n.after, n.deviation, "1") for n in known]
     if known and has_modes(r.robot):
         softer = {str(n.key[-1]): n.after for n in fit.numbers}
         changed = r.robot.changed(element_compliance=softer)
@@ -187,9 +185,10 @@ def _check_row(where: str, time: Any, value: Any, deviation: Any) -> None:
     """
     known = None if deviation is None or deviation != deviation else deviation
     for what, number, low, high in (
-        ("time", time, 0.0, MAX_TIME), ("value", value, -MAX_NUMBER, MAX_NUMBER),
+        ("time", time, 0.0, MAX_TIME),
+        ("value", value, -MAX_NUMBER, MAX_NUMBER),
         ("deviation", 0.0 if known is None else known, 0.0, MAX_NUMBER),
-    ):  # fmt: skip
+    ):
         if not isinstance(number, (int, float)) or not low <= number <= high:
             shown = one_line(str(number), 40)
             raise ParameterError(f"{where}: {what}", shown, f"a number, {low:g} to {high:g}")
@@ -223,8 +222,7 @@ def append(
         for statement in _TABLES.split(";")[:-1]:
             base.execute(statement)
         key = base.execute(
-            "INSERT OR REPLACE INTO checks (recorded, judged, machine, robot, file, good) "
-            "VALUES (?, ?, ?, ?, ?, ?)",
+            "INSERT OR REPLACE INTO checks (recorded, judged, machine, robot, file, good) VALUES (?, ?, ?, ?, ?, ?)",
             row,
         ).lastrowid
         # SQLite stores NaN as NULL.
@@ -289,11 +287,7 @@ class Judged:
     @property
     def changed(self) -> str | None:
         """When the mean changed; None where it did not."""
-        return (
-            None
-            if self.change is None
-            else self.series.days[self.change].isoformat(timespec="minutes")
-        )
+        return None if self.change is None else self.series.days[self.change].isoformat(timespec="minutes")
 
     @property
     def line(self) -> str:
@@ -312,12 +306,23 @@ class Judged:
         """Plain data for a script; NaN is not known."""
         s = self.series
         return {
-            "machine": s.machine, "quantity": s.quantity, "part": s.part, "unit": s.unit,
-            "recordings": len(s.value), "last": s.value[-1], "centre": self.centre,
-            "low": self.low, "high": self.high, "beyond": int(self.beyond.sum()),
-            "last_beyond": bool(self.beyond[-1]), "changed": self.changed, "chance": self.chance,
-            "before": self.before, "after": self.after, "drifts": self.drifts,
-        }  # fmt: skip
+            "machine": s.machine,
+            "quantity": s.quantity,
+            "part": s.part,
+            "unit": s.unit,
+            "recordings": len(s.value),
+            "last": s.value[-1],
+            "centre": self.centre,
+            "low": self.low,
+            "high": self.high,
+            "beyond": int(self.beyond.sum()),
+            "last_beyond": bool(self.beyond[-1]),
+            "changed": self.changed,
+            "chance": self.chance,
+            "before": self.before,
+            "after": self.after,
+            "drifts": self.drifts,
+        }
 
 
 def judged(series: Series, baseline: int, alarm: float) -> Judged:
@@ -355,6 +360,14 @@ def judged(series: Series, baseline: int, alarm: float) -> Judged:
     chance = min(1.0, 2.0 * float(stats.t.sf(scores[best], k - 2)) * len(splits))
     change = int(splits[best]) if chance < alarm else None
     return Judged(
-        series, first, mean, mean - reach, mean + reach, beyond, change, chance,
-        float(mean + left[best]), float(mean + right[best]),
-    )  # fmt: skip
+        series,
+        first,
+        mean,
+        mean - reach,
+        mean + reach,
+        beyond,
+        change,
+        chance,
+        float(mean + left[best]),
+        float(mean + right[best]),
+    )

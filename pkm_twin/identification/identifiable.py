@@ -94,8 +94,7 @@ def of_drives(robot: Robot) -> tuple[Identifiable, ...]:
     graph, friction = robot.graph, robot.friction
     found, rotors = [], dict[Keys, list[str]]()
     # A memory that is open to a fit has columns along a motion, which a regressor has not.
-    open_keys = [key for name in robot.open_laws if LAWS[name].memory
-                 for key in LAWS[name].parameters]  # fmt: skip
+    open_keys = [key for name in robot.open_laws if LAWS[name].memory for key in LAWS[name].parameters]
     words = dict.fromkeys((*linear_keys(robot.laws), *open_keys))
 
     def number(kind: Kind, name: str, value: float, key: Keys, joints: Sequence[str]) -> None:
@@ -107,12 +106,16 @@ def of_drives(robot: Robot) -> tuple[Identifiable, ...]:
         less = drive.turns**-2 if drive is not None and kind == "rotor" else 1.0
         found.append(
             Identifiable(
-                kind, (name,), (drive_units(graph, joints[0])[word],), np.array([value]),
-                np.array([math.nan]), lambda new: {key: less * float(new[0])},
+                kind,
+                (name,),
+                (drive_units(graph, joints[0])[word],),
+                np.array([value]),
+                np.array([math.nan]),
+                lambda new: {key: less * float(new[0])},
                 others={f"{joint}.{word}": np.ones(1) for joint in joints if linear},
                 cones=() if signed else (above_zero(0, 1),),
             )
-        )  # fmt: skip
+        )
 
     for name, joint in graph.joints.items():
         if joint.actuated:
@@ -136,9 +139,7 @@ def of_drives(robot: Robot) -> tuple[Identifiable, ...]:
 def _tens(robot: Robot) -> list[Any]:
     """Ten numbers of each body and of the payload about the base's origin, masses of rods."""
     graph, load = robot.make_graph(), robot.payload
-    tens = [
-        standard_parameters(body.mass, body.com, body.inertia) for body in graph.bodies.values()
-    ]
+    tens = [standard_parameters(body.mass, body.com, body.inertia) for body in graph.bodies.values()]
     tens.append(standard_parameters(load.mass, graph.origin + load.com, load.inertia))
     return [*(value for ten in tens for value in ten), *(rod.mass for rod in graph.rods.values())]
 
@@ -178,18 +179,19 @@ def of_masses(robot: Robot) -> Iterator[Identifiable]:
         inside = [b for b in range(len(names)) if own[b][:, part].any()]
         if not touched[:, part].any():
             continue
-        group = _Group(
-            [keys[k] for k in part], values[part], reference[part], own[inside][:, :, part]
-        )
+        group = _Group([keys[k] for k in part], values[part], reference[part], own[inside][:, :, part])
         payload = keys[part[0]][0] == LOAD
         yield Identifiable(
-            "payload" if payload else "inertia", tuple(map(path_of, group.keys)),
-            tuple(_unit(key) for key in group.keys), group.begin,
-            group.scales([_length(robot, names[b]) for b in inside]), group.numbers,
+            "payload" if payload else "inertia",
+            tuple(map(path_of, group.keys)),
+            tuple(_unit(key) for key in group.keys),
+            group.begin,
+            group.scales([_length(robot, names[b]) for b in inside]),
+            group.numbers,
             {graph.platform if payload else names[b]: tens[b][:, part] for b in inside},
             {f"{rod}.mass": row[part] for rod, row in rods.items() if row[part].any()},
             tuple(group.cones()),
-        )  # fmt: skip
+        )
 
 
 class _Group:

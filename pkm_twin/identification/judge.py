@@ -28,9 +28,10 @@ from pkm_twin.identification.samples import EXACT
 Answer = Literal["explains", "explains partly", "does not explain"]
 Deviations = Literal["as estimated", "widened", "withheld"]
 SENTENCE: Final[dict[Answer, str]] = {
-    "explains": "explains", "explains partly": "partly explains",
+    "explains": "explains",
+    "explains partly": "partly explains",
     "does not explain": "does not explain",
-}  # fmt: skip
+}
 SIGMAS: Final = 4.5
 """Standard deviations beyond which no normal error of usual size is: one in 150,000."""
 PRESENT: Final = 0.2
@@ -198,13 +199,16 @@ class Verdict:
             "not_excluded": [_as_json(one) for one in self.hints],
             "channels": [
                 {
-                    "name": channel.name, "unit": unit, "residual_in_band": channel.residual,
-                    "noise_in_band": channel.noise, "unexplained_part": channel.left,
+                    "name": channel.name,
+                    "unit": unit,
+                    "residual_in_band": channel.residual,
+                    "noise_in_band": channel.noise,
+                    "unexplained_part": channel.left,
                     "held_out_over_fitted": channel.held_out,
                 }
                 for channel, unit in zip(self.channels, units, strict=True)
             ],
-        }  # fmt: skip
+        }
 
 
 def _sized(size: float, unit: str) -> str:
@@ -213,10 +217,14 @@ def _sized(size: float, unit: str) -> str:
 
 def _as_json(one: Finding) -> dict[str, Any]:
     return {
-        "kind": one.suspect.kind, "where": one.suspect.where, "size": one.size,
-        "unit": one.suspect.unit, "standard_deviation": one.deviation, "sigmas": one.sigmas,
+        "kind": one.suspect.kind,
+        "where": one.suspect.where,
+        "size": one.size,
+        "unit": one.suspect.unit,
+        "standard_deviation": one.deviation,
+        "sigmas": one.sigmas,
         "or": [{"kind": other.kind, "where": other.where} for other in one.others],
-    }  # fmt: skip
+    }
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,10 +259,14 @@ class Case:
         some = slice(0, count)
         return Spectra.of(
             Signals(
-                (self.measured - self.target)[some], self.columns[some], self.measured[some],
-                self.counts[some], self.noise, self.band,
+                (self.measured - self.target)[some],
+                self.columns[some],
+                self.measured[some],
+                self.counts[some],
+                self.noise,
+                self.band,
             )
-        )  # fmt: skip
+        )
 
 
 @dataclass(frozen=True)
@@ -283,10 +295,11 @@ class Fitted:
             deviations.append(case.own_sizes)
             first = last
         self.model, self.whole = (
-            Model.of([c.spectra(k) for c, k in zip(cases, counts, strict=True)], self.places,
-                     np.concatenate(deviations))
+            Model.of(
+                [c.spectra(k) for c, k in zip(cases, counts, strict=True)], self.places, np.concatenate(deviations)
+            )
             for counts in ([c.split for c in cases], [len(c.target) for c in cases])
-        )  # fmt: skip
+        )
         self.certain = np.ones(first, np.bool_)
         self.certain[self.count : self.count + len(errors)] = False
         self.used = self.certain
@@ -320,12 +333,14 @@ class Fitted:
         for k, one in enumerate(self.errors):
             alike.setdefault((one.kind, one.where == ALL), []).append(self.count + k)
         odds = float(np.log(PRESENT / (1.0 - PRESENT)))
-        found = [([k], odds - float(np.log(len(own))))
-                 for (kind, _), own in alike.items() for k in own if kind != GEOMETRY]  # fmt: skip
+        found = [
+            ([k], odds - float(np.log(len(own)))) for (kind, _), own in alike.items() for k in own if kind != GEOMETRY
+        ]
         found += [
             (own, odds - (0.0 if kind == GEOMETRY else float(np.log(2.0 * len(own)))))
-            for (kind, _), own in alike.items() if len(own) > 1
-        ]  # fmt: skip
+            for (kind, _), own in alike.items()
+            if len(own) > 1
+        ]
         return found
 
     def select(self, certain: Mask) -> tuple[list[Selected], Mask]:
@@ -355,10 +370,12 @@ class Fitted:
             if not odds[best] > POSSIBLE:
                 break
             near = [
-                k for k in np.argsort(-np.array(odds)).tolist()
-                if odds[k] > odds[best] - ALTERNATIVE and possible[k]
+                k
+                for k in np.argsort(-np.array(odds)).tolist()
+                if odds[k] > odds[best] - ALTERNATIVE
+                and possible[k]
                 and not {*self.candidates[best][0]} & {*self.candidates[k][0]}
-            ]  # fmt: skip
+            ]
             places = self.candidates[best][0]
             others = tuple(self.candidates[k][0] for k in near[:ALTERNATIVES])
             chosen.append(Selected(places, odds[best], others))
@@ -464,9 +481,8 @@ def judge(
     both = [fitted.residuals(one) for one in (first, last)]
     told = tuple(_channel(name, k, cases, both, taken) for k, name in enumerate(channels))
     absurd = [
-        one for one in found[:sure]
-        if abs(one.size) - SIGMAS * one.deviation > ABSURD * (one.suspect.usual or np.inf)
-    ]  # fmt: skip
+        one for one in found[:sure] if abs(one.size) - SIGMAS * one.deviation > ABSURD * (one.suspect.usual or np.inf)
+    ]
     answer: Answer = "explains"
     if absurd or max(channel.left for channel in told) > MAX_UNEXPLAINED:
         answer = "does not explain"
@@ -476,9 +492,15 @@ def judge(
     some = slice(0, fitted.count)
     fitted.used = used
     return Verdict(
-        answer, told, tuple(found[:sure]), tuple(found[sure:]), mean, last.covariance[some, some],
-        covariance, own,
-    ), fitted  # fmt: skip
+        answer,
+        told,
+        tuple(found[:sure]),
+        tuple(found[sure:]),
+        mean,
+        last.covariance[some, some],
+        covariance,
+        own,
+    ), fitted
 
 
 def basis_of(table: Array) -> Array:
@@ -488,9 +510,7 @@ def basis_of(table: Array) -> Array:
     return np.asarray(vectors[:, sizes > RANK * sizes.max(initial=0.0)], np.float64)
 
 
-def _channel(
-    name: str, j: int, cases: Sequence[Case], both: Sequence[Sequence[Array]], taken: int
-) -> Channel:
+def _channel(name: str, j: int, cases: Sequence[Case], both: Sequence[Sequence[Array]], taken: int) -> Channel:
     """Compare a channel's residual with its noise, over all recordings.
 
     :param both: residuals before and after the found errors, (k, n) of each recording.
@@ -526,7 +546,10 @@ def _channel(
         halves.append(np.sqrt(square / max(count, 1.0)))
     fitted, held = halves
     return Channel(
-        name, float(np.sqrt(mean(before) / (1.0 - share))), float(np.sqrt(level)), float(left),
+        name,
+        float(np.sqrt(mean(before) / (1.0 - share))),
+        float(np.sqrt(level)),
+        float(left),
         float(np.sqrt(now / max(level * sure, 1e-300))),
         float(held / max(fitted, np.sqrt(level), 1e-300)),
-    )  # fmt: skip
+    )

@@ -43,9 +43,7 @@ class LineSlopes(NamedTuple):
         Root mean square over all lines, so that shear and distortion count, not only the scale.
         """
         variances = (np.sum((rows @ covariance) * rows, -1) for rows in self)
-        distance, angle = (
-            float(np.sqrt(max(one.mean(), 0.0))) if one.size else np.nan for one in variances
-        )
+        distance, angle = (float(np.sqrt(max(one.mean(), 0.0))) if one.size else np.nan for one in variances)
         return distance, angle
 
 
@@ -57,8 +55,9 @@ def line_slopes(robot: Robot, state: State, names: Sequence[str]) -> LineSlopes 
     """
     some = np.unique(np.linspace(0, len(state.q) - 1, LINE_ENDS).astype(int))
     position = state.instrument.seen(*state.platform)[0][some]
-    columns = derivatives(robot, replace(state, q=state.q[some], platform=(
-        state.platform[0][some], state.platform[1][some])), names)[:, :3]  # fmt: skip
+    columns = derivatives(
+        robot, replace(state, q=state.q[some], platform=(state.platform[0][some], state.platform[1][some])), names
+    )[:, :3]
     ways = position[:, None] - position
     lengths = np.linalg.norm(ways, axis=-1)
     far = lengths > max(SHORT_LINE * float(lengths.max(initial=0.0)), 1e-6)
@@ -68,9 +67,7 @@ def line_slopes(robot: Robot, state: State, names: Sequence[str]) -> LineSlopes 
     units = ways / np.where(far, lengths, 1.0)[..., None]
     rates = (columns[:, None] - columns) / np.where(far, lengths, 1.0)[..., None, None]
     distances = np.einsum("ma,map->mp", units[first, second], rates[first, second])
-    corners = [
-        (k, i, j) for k in range(len(some)) for i, j in combinations(np.flatnonzero(far[k]), 2)
-    ]
+    corners = [(k, i, j) for k in range(len(some)) for i, j in combinations(np.flatnonzero(far[k]), 2)]
     k, i, j = np.array(corners, np.intp).reshape(-1, 3).T
     cosine = np.sum(units[k, i] * units[k, j], -1)
     wide = np.sqrt(np.maximum(1.0 - cosine**2, 0.0)) > MIN_SINE

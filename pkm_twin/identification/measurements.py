@@ -189,9 +189,7 @@ class _Range(_Ball):
         away = np.ptp(p, axis=0).max() * 2.0 ** np.arange(-1, 6)
         zeros = [0.0, *(values.mean() - away).tolist()]
         found = [_Ball.begin(self, p, values - z) | {"range.zero": z} for z in zeros]
-        return min(
-            found, key=lambda own: float(np.sum((values - self.value(p, p, own)[:, 0]) ** 2))
-        )
+        return min(found, key=lambda own: float(np.sum((values - self.value(p, p, own)[:, 0]) ** 2)))
 
 
 PLACE: Final = Kind("position", "m", FINEST, (0, 1, 2), length=True, believed=0.0)
@@ -200,28 +198,35 @@ TURN: Final = _Rotation("rotation", "rad", FINEST, (3, 4, 5), believed=0.0)
 KINDS: Final = {
     kind.name: kind
     for kind in (
-        *(
-            Kind(name, "m", 5e-5, (k,), length=k < 2)
-            for k, name in enumerate(COORDINATES[:3])
-        ),
+        *(Kind(name, "m", 5e-5, (k,), length=k < 2) for k, name in enumerate(COORDINATES[:3])),
         *(_Angle(name, "rad", 5e-4, (k,)) for k, name in enumerate(COORDINATES[3:])),
         Kind("height", "m", 3e-5, (2,)),
         _Plane(
-            "plane", "m", 3e-5,
-            own={f"plane.{name}": (unit, UNKNOWN_DEVIATION) for name, unit in
-                 (("z", "m"), ("slope_x", "rad"), ("slope_y", "rad"))},
+            "plane",
+            "m",
+            3e-5,
+            own={
+                f"plane.{name}": (unit, UNKNOWN_DEVIATION)
+                for name, unit in (("z", "m"), ("slope_x", "rad"), ("slope_y", "rad"))
+            },
         ),
         _Ball(
-            "radius", "m", 1e-5, length=True,
+            "radius",
+            "m",
+            1e-5,
+            length=True,
             own={f"ball.{axis}": ("m", UNKNOWN_DEVIATION) for axis in "xyz"},
         ),
         _Range(
-            "range", "m", 1e-5, length=True,
+            "range",
+            "m",
+            1e-5,
+            length=True,
             own={f"range.{name}": ("m", UNKNOWN_DEVIATION) for name in ("x", "y", "z", "zero")},
         ),
         _Distance("distance", "m", 6e-5, length=True, pair=True),
     )
-}  # fmt: skip
+}
 GROUPS: Final = {"tilt": ("roll", "pitch"), "position": COORDINATES[:3], "pose": COORDINATES}
 
 
@@ -339,9 +344,7 @@ class Measured:
 
     def parts(self, state: State) -> list[Array]:
         """Measured less computed, (m, a) a kind."""
-        return [
-            one.kind.residual(one.values, *one.seen(state), one.own(state)) for one in self.readings
-        ]
+        return [one.kind.residual(one.values, *one.seen(state), one.own(state)) for one in self.readings]
 
     def slopes(self, robot: Robot, state: State, names: Sequence[str]) -> list[Array]:
         """Differentiate what is computed by named parameters, (m, a, p) a kind."""
@@ -357,9 +360,7 @@ class Measured:
         usual = [self.noise.get(kind.name, kind.noise) for kind in kinds]
         sizes = [np.sqrt(np.mean(part**2, 1)) for part in parts]
         noise = [
-            s
-            if kind.name in self.noise
-            else max(s, float(np.median(size)) / MEDIANS[part.shape[1]])
+            s if kind.name in self.noise else max(s, float(np.median(size)) / MEDIANS[part.shape[1]])
             for kind, s, size, part in zip(kinds, usual, sizes, parts, strict=True)
         ]
         weights = [np.ones(len(part)) for part in parts]
@@ -379,9 +380,7 @@ class Measured:
 
 def left_over(slopes: Sequence[Array], noise: Sequence[float], prior: Array) -> list[Array]:
     """Part of each measurement that the others and the priors decide, 0 to 1, (m,) a kind."""
-    rows = [
-        (table * prior / s).reshape(-1, len(prior)) for table, s in zip(slopes, noise, strict=True)
-    ]
+    rows = [(table * prior / s).reshape(-1, len(prior)) for table, s in zip(slopes, noise, strict=True)]
     whole = np.concatenate(rows)
     both = np.vstack([whole, np.eye(len(prior))])
     base = np.linalg.qr(both)[0][: len(whole)]
@@ -400,9 +399,12 @@ def whole_of(poses: Poses, rows: Indices) -> Measured:
 
 
 def measured_of(
-    joints: Array, second: Array | None, values: Mapping[str, Array], lines: Indices,
+    joints: Array,
+    second: Array | None,
+    values: Mapping[str, Array],
+    lines: Indices,
     noise: Mapping[str, float],
-) -> Measured:  # fmt: skip
+) -> Measured:
     """Measurements of a table: a value that is NaN was not measured.
 
     :param joints: of the rows, (k, n); ``second``: of a pair's other pose, (k, n), NaN where none.
@@ -418,20 +420,21 @@ def measured_of(
             raise ParameterError(name, "no value", "a measured value in at least one row")
         pair = KINDS[name].pair
         if pair and (second is None or not np.isfinite(second[rows]).all()):
-            raise ParameterError(
-                name, "one pose", "two in each row: JOINT.position and JOINT.position_2 columns"
-            )
+            raise ParameterError(name, "one pose", "two in each row: JOINT.position and JOINT.position_2 columns")
         used[rows] = True
         used[rows + count * pair] = True
         found.append((KINDS[name], rows, rows + count if pair else None))
     place = np.cumsum(used) - 1
     readings = (
         Readings(
-            kind, place[first], None if other is None else place[other],
-            values[kind.name][first, None], lines[first],
+            kind,
+            place[first],
+            None if other is None else place[other],
+            values[kind.name][first, None],
+            lines[first],
         )
         for kind, first, other in found
-    )  # fmt: skip
+    )
     return Measured(both[used], tuple(readings), noise)
 
 
@@ -479,9 +482,12 @@ def read_poses(path: Path, robot: Robot, dialect: Dialect = PLAIN) -> Poses:
 
 
 def read_measured(
-    path: Path, robot: Robot, kinds: Sequence[Kind], noise: Mapping[str, float],
+    path: Path,
+    robot: Robot,
+    kinds: Sequence[Kind],
+    noise: Mapping[str, float],
     dialect: Dialect = PLAIN,
-) -> Measured:  # fmt: skip
+) -> Measured:
     """Measurements of some quantities; cells may be empty.
 
     Columns: ``JOINT.position`` of every joint, and one by the name of each kind. ``z`` stands for a
@@ -516,9 +522,13 @@ def read_measured(
 
 
 def _read(
-    path: Path, joints: Sequence[str], others: Sequence[str], dialect: Dialect, *,
+    path: Path,
+    joints: Sequence[str],
+    others: Sequence[str],
+    dialect: Dialect,
+    *,
     blank: bool = False,
-) -> Table:  # fmt: skip
+) -> Table:
     """Columns by name in SI units; joints in the controller's.
 
     :raises ParameterError: a joint that the robot has not.
@@ -556,9 +566,7 @@ def _find(table: Table, joints: Sequence[str], dialect: Dialect) -> None:
             table |= {joint: table[header] for joint, header in zip(joints, whole[0], strict=True)}
 
 
-def _set(
-    columns: Mapping[str, Array], pattern: re.Pattern[str], letters: str, prefix: str
-) -> dict[str, str]:
+def _set(columns: Mapping[str, Array], pattern: re.Pattern[str], letters: str, prefix: str) -> dict[str, str]:
     """Columns by letter of the only whole set, of several the only measured one."""
     sets: dict[str, dict[str, str]] = {}
     for name in columns:

@@ -229,9 +229,7 @@ class Group:
     known: tuple[Combination, ...]
 
 
-def groups_of(
-    names: Sequence[str], factors: Array, covariance: Array, wide: Array | None = None
-) -> tuple[Group, ...]:
+def groups_of(names: Sequence[str], factors: Array, covariance: Array, wide: Array | None = None) -> tuple[Group, ...]:
     """Elements that share a direction that is not known, and the directions that are.
 
     :param factors: shape (elements,), known to 1 before. ``covariance``: of them, and of more
@@ -257,9 +255,7 @@ def weights_of(names: Sequence[T], vector: Array) -> dict[T, float]:
     return {n: w for n, w in zip(names, vector.tolist(), strict=True) if abs(w) > least}
 
 
-def _group(
-    members: list[int], names: Sequence[str], factors: Array, covariances: tuple[Array, Array]
-) -> Group:
+def _group(members: list[int], names: Sequence[str], factors: Array, covariances: tuple[Array, Array]) -> Group:
     own, wide = covariances
     values, vectors = np.linalg.eigh(own[np.ix_(members, members)])
     told = []

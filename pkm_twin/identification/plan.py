@@ -117,9 +117,7 @@ def plan(
     second = np.roll(first, len(q) // 2) if pair == {True} else None
     noise = dict(noise or {})
     position = robot.platform(q)[0]
-    all_poses = Measured(
-        joints, tuple(Readings(k, first, second, k.likely(position), first) for k in kinds), noise
-    )
+    all_poses = Measured(joints, tuple(Readings(k, first, second, k.likely(position), first) for k in kinds), noise)
     parameters = unknowns(robot, all_poses, paths, free)
     names = [p.name for p in parameters]
     prior = np.array([p.prior for p in parameters])
@@ -136,9 +134,7 @@ def plan(
     rows = np.stack(_over(all_poses.slopes(robot, state, names), prior, usual), 1)
     places = derivatives(robot, state, names)[:, :3] * prior
     # A motion of the whole workspace is where the instrument stands, not an error of the machine.
-    rigid = np.concatenate(
-        [np.broadcast_to(np.eye(3), (len(q), 3, 3)), -skew(state.platform[0])], -1
-    ).reshape(-1, 6)
+    rigid = np.concatenate([np.broadcast_to(np.eye(3), (len(q), 3, 3)), -skew(state.platform[0])], -1).reshape(-1, 6)
     flat = places.reshape(len(rigid), -1)
     places = (flat - rigid @ np.linalg.lstsq(rigid, flat, rcond=1e-9)[0]).reshape(places.shape)
     lines = line_slopes(robot, state, names)
@@ -148,9 +144,7 @@ def plan(
     while True:
         axes = np.sqrt(np.mean(_variances(places, covariance), 0))
         seen = np.sqrt(np.mean(_variances(rows, covariance), 0))
-        apart = (0.0, 0.0) if lines is None else lines.deviations(
-            covariance * np.outer(prior, prior)
-        )  # fmt: skip
+        apart = (0.0, 0.0) if lines is None else lines.deviations(covariance * np.outer(prior, prior))
         told.append((float(axes.max()), *apart, seen))
         if len(order) == most or (accuracy and not count and told[-1][0] <= accuracy):
             break
@@ -166,18 +160,17 @@ def plan(
     seen_by = zip(kinds, usual, np.array(seen_all).T, strict=True)
     quantity = {kind.name: size * seen for kind, size, seen in seen_by}
     deviations = prior * np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    numbers = tuple(
-        replace(p, value=p.before, deviation=float(d))
-        for p, d in zip(parameters, deviations, strict=True)
-    )
+    numbers = tuple(replace(p, value=p.before, deviation=float(d)) for p, d in zip(parameters, deviations, strict=True))
     return Plan(
-        joints=joints[order], second=None if second is None else joints[second[order]],
-        poses=robot.forward(q[order]), position=np.array(axis), quantity=quantity,
-        distance=np.array(distance), angle=np.array(angle),
-        known=Estimate(
-            robot=robot, parameters=numbers, covariance=covariance * np.outer(prior, prior)
-        ),
-    )  # fmt: skip
+        joints=joints[order],
+        second=None if second is None else joints[second[order]],
+        poses=robot.forward(q[order]),
+        position=np.array(axis),
+        quantity=quantity,
+        distance=np.array(distance),
+        angle=np.array(angle),
+        known=Estimate(robot=robot, parameters=numbers, covariance=covariance * np.outer(prior, prior)),
+    )
 
 
 def _variances(rows: Array, covariance: Array) -> Array:
@@ -190,9 +183,11 @@ def _over(parts: Sequence[Array], prior: Array, noise: Sequence[float]) -> list[
 
 
 def _candidates(
-    robot: Robot, measured: Measured | None, within: dict[str, tuple[float, float]],
+    robot: Robot,
+    measured: Measured | None,
+    within: dict[str, tuple[float, float]],
     kinds: Sequence[Kind],
-) -> Array:  # fmt: skip
+) -> Array:
     """Joint states (k, n) from which poses are chosen.
 
     :raises ParameterError: the workspace is not known, or none of it can be reached.
@@ -218,9 +213,10 @@ def _candidates(
     if not np.isfinite(box).all():
         missing = names[int(np.flatnonzero(~np.isfinite(box).all(1))[0])]
         raise ParameterError(
-            "--within", None,
+            "--within",
+            None,
             f"the range of {missing}, as {missing}=-0.1:0.1: the file has no joint limits",
-        )  # fmt: skip
+        )
     poses = rng.uniform(box[:, 0], box[:, 1], (DRAWN * CANDIDATES, len(box)))
     q, good = robot.try_inverse(poses)
     good &= within_limits(robot, q)

@@ -38,14 +38,18 @@ REACH: Final = 1.5
 SOME: Final = 2000
 """Samples by which other positions and times are judged: those that are explained worst."""
 TIMES: Final = {
-    "the time is in ms, not in s": 1e-3, "the time is in us, not in s": 1e-6,
-    "the time is in ns, not in s": 1e-9, "the time is in minutes, not in s": 60.0,
+    "the time is in ms, not in s": 1e-3,
+    "the time is in us, not in s": 1e-6,
+    "the time is in ns, not in s": 1e-9,
+    "the time is in minutes, not in s": 60.0,
     "the time is in s, and was taken for ms": 1e3,
-}  # fmt: skip
+}
 ANGLES: Final = {
-    "positions are in degrees": np.pi / 180.0, "positions are in rad, and were taken for degrees":
-    180.0 / np.pi, "positions are in mm": 1e-3, "positions are in turns": 2.0 * np.pi,
-}  # fmt: skip
+    "positions are in degrees": np.pi / 180.0,
+    "positions are in rad, and were taken for degrees": 180.0 / np.pi,
+    "positions are in mm": 1e-3,
+    "positions are in turns": 2.0 * np.pi,
+}
 GOOD: Final = 0.015
 """Part of the efforts' variation that a sound model may leave."""
 INDEPENDENT: Final = 15.0
@@ -76,10 +80,14 @@ SEARCHED: Final = 1.5
 SLOWEST: Final = 1.0
 """Time between samples of a recording from which no motion can be differentiated, s."""
 UNITS: Final = {
-    "N mm or mN m": 1e3, "kgf cm": 100.0 / 9.80665, "kgf or kgf m": 1.0 / 9.80665,
-    "lbf": 1.0 / 4.4482216, "lbf in": 1.0 / 0.112984829, "ozf in": 1.0 / 0.00706155183,
+    "N mm or mN m": 1e3,
+    "kgf cm": 100.0 / 9.80665,
+    "kgf or kgf m": 1.0 / 9.80665,
+    "lbf": 1.0 / 4.4482216,
+    "lbf in": 1.0 / 0.112984829,
+    "ozf in": 1.0 / 0.00706155183,
     "kN or kN m": 1e-3,
-}  # fmt: skip
+}
 """Units that efforts come in, by how many are a newton or a newton metre."""
 SCALES: Final = tuple(2.0 ** (k / 4.0) for k in range(-6, 7))
 """Around the scale of least squares."""
@@ -144,15 +152,18 @@ class Case:
         parts += [] if self.inertial is None else [self.inertial]
         table = np.concatenate(parts, -1) * self.counts[..., None]
         rows = np.asarray(np.linalg.qr(table.swapaxes(0, 1), mode="r"), np.float64).swapaxes(0, 1)
-        columns, effort, late, rest, inertial = np.split(
-            rows, len(self.low) + np.arange(4), axis=-1
-        )
+        columns, effort, late, rest, inertial = np.split(rows, len(self.low) + np.arange(4), axis=-1)
         # Together they count as those that they stand for.
         counts = np.full(effort.shape[:2], effort.size / max(float(self.counts.sum()), 1.0))
         return replace(
-            self, columns=columns, effort=effort[..., 0], late=late[..., 0], rest=rest[..., 0],
-            counts=counts, inertial=None if self.inertial is None else inertial,
-        )  # fmt: skip
+            self,
+            columns=columns,
+            effort=effort[..., 0],
+            late=late[..., 0],
+            rest=rest[..., 0],
+            counts=counts,
+            inertial=None if self.inertial is None else inertial,
+        )
 
     def scaled(self, factors: Array) -> Case:
         """Return the case with each joint's efforts times a factor, (n,)."""
@@ -186,9 +197,10 @@ class Case:
         _, spans, held = held_payload(self.time, mass, self.effort - told, weight)
         share = np.where(self.payload, held[:, None, None], 1.0)
         part = replace(
-            self, columns=share * self.columns,
+            self,
+            columns=share * self.columns,
             inertial=None if self.inertial is None else share * self.inertial,
-        )  # fmt: skip
+        )
         times = [f"{begin:.4g} to {end:.4g} s" for begin, end in spans[:SPANS]]
         times += ["..."] if len(spans) > SPANS else []
         kilograms = float(part._best[1][:-1][self.payload].sum())
@@ -329,10 +341,7 @@ def recording_fault(rows: Rows) -> str | None:
         own = here.judged()
         again = likeliest(
             own,
-            (
-                (t, None if made is None else made.judged, RARE)
-                for t, made in _repaired(rows, some, wide)
-            ),
+            ((t, None if made is None else made.judged, RARE) for t, made in _repaired(rows, some, wide)),
         )
         if again[2] > gain:
             told, (cause, best, _) = own, again
@@ -449,11 +458,21 @@ def case_of(rows: Rows, inertial: Array | None = None) -> Case:
     low, high = np.array(bounds).T
     wholes = [np.concatenate(each, -1) for each in zip(*parts, strict=True)]
     return Case(
-        rows.effort, rows.change, _variation(rows.effort), rows.rest, wholes[0], low, high,
-        rows_of_prior, np.array([value / spread for _, value, spread in prior]),
-        np.array(friction), rows.counts, rows.time, np.array(payload),
+        rows.effort,
+        rows.change,
+        _variation(rows.effort),
+        rows.rest,
+        wholes[0],
+        low,
+        high,
+        rows_of_prior,
+        np.array([value / spread for _, value, spread in prior]),
+        np.array(friction),
+        rows.counts,
+        rows.time,
+        np.array(payload),
         None if inertial is None else wholes[1],
-    )  # fmt: skip
+    )
 
 
 def _variation(effort: Array) -> Array:
@@ -463,9 +482,7 @@ def _variation(effort: Array) -> Array:
 
 def _points(reach: float) -> Array:
     """Ten numbers of a kilogram at the platform's point and around it, shape (10, points)."""
-    corners = (
-        reach / np.sqrt(3.0) * np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
-    )
+    corners = reach / np.sqrt(3.0) * np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
     places = [np.zeros(3), *(reach * np.eye(3)), *(-reach * np.eye(3)), *corners]
     return np.stack([standard_parameters(1.0, place, np.zeros((3, 3))) for place in places], -1)
 
@@ -487,11 +504,11 @@ def _efforts(case: Case, joints: Sequence[str]) -> Iterator[tuple[str, Case, flo
             names = listed([j for j, one in zip(joints, which, strict=True) if one > 0.0], n)
             price = UNIT if factor > 0.0 else RARE + UNIT
             yield scale_text(names, 1.0 / factor), case.scaled(likely), price
-    orders = [(f"efforts of {joints[i]} and {joints[k]} are exchanged", _swap(n, i, k))
-              for i, k in combinations(range(n), 2)]  # fmt: skip
+    orders = [
+        (f"efforts of {joints[i]} and {joints[k]} are exchanged", _swap(n, i, k)) for i, k in combinations(range(n), 2)
+    ]
     if n > 2:
-        orders += [("columns of the efforts are in another order", np.roll(np.arange(n), s))
-                   for s in (1, n - 1)]  # fmt: skip
+        orders += [("columns of the efforts are in another order", np.roll(np.arange(n), s)) for s in (1, n - 1)]
         orders.append(("columns of the efforts are in another order", np.arange(n)[::-1]))
     for text, order in orders:
         effort, late = case.effort[:, order], case.late[:, order]

@@ -221,9 +221,7 @@ class Rows:
     def only(self, columns: Mask, values: Array) -> Rows:
         """With some of the parameters, the others at these values, (parameters,)."""
         stay = self.table[..., ~columns] @ values[~columns]
-        return replace(
-            self, table=self.table[..., columns], target=self.target - stay, rest=self.rest + stay
-        )
+        return replace(self, table=self.table[..., columns], target=self.target - stay, rest=self.rest + stay)
 
     def again(self, parameters: FileParameters, window: int) -> Rows:
         """Read the recording again with other parameters or another window of differentiation."""
@@ -236,9 +234,7 @@ def next_window(window: int) -> int:
     return WINDOWS[k - 1] if k else WINDOWS[1]
 
 
-def rows_of(
-    robot: Robot, parameters: FileParameters, recording: Recording, window: int | None = None
-) -> Rows:
+def rows_of(robot: Robot, parameters: FileParameters, recording: Recording, window: int | None = None) -> Rows:
     """Return a recording's filtered rows.
 
     :param window: of the differentiation, samples; None chooses it.
@@ -246,9 +242,7 @@ def rows_of(
     """
     r = recording
     if len(r.time) < LEAST:
-        raise PkmTwinError(
-            f"{r.name}: too short to fit, {len(r.time)} samples; {LEAST} or more in a row"
-        )
+        raise PkmTwinError(f"{r.name}: too short to fit, {len(r.time)} samples; {LEAST} or more in a row")
     _check_efforts(robot, r)
     pieces, how = tracks(r.time, r.q, r.measured, r.wrench, r.held, window)
     if not pieces:
@@ -266,21 +260,28 @@ def rows_of(
     # Where standing still is in the filter's reach, friction's sign is not known.
     moves, left = f["moves"] > 0.8, f["target"] - f["table"] @ first
     usual = [
-        float(estimate_deviation(one[some])) if some.any() else 0.0
-        for one, some in zip(left.T, moves.T, strict=True)
+        float(estimate_deviation(one[some])) if some.any() else 0.0 for one, some in zip(left.T, moves.T, strict=True)
     ]
     # And what it may add is below what else is left.
     least = np.maximum(usual, EXACT * np.sqrt(np.mean(f["target"] ** 2, 0)))
     counts = (moves & (np.abs(f["doubt"]) < least)).astype(np.float64)
     return Rows(
-        r, model, how, tuple(pieces), f["time"], f["table"], f["target"], f["rest"], counts,
-        f["change"], outliers, cache(lambda: _signals(r, model, how, told, first)),
-    )  # fmt: skip
+        r,
+        model,
+        how,
+        tuple(pieces),
+        f["time"],
+        f["table"],
+        f["target"],
+        f["rest"],
+        counts,
+        f["change"],
+        outliers,
+        cache(lambda: _signals(r, model, how, told, first)),
+    )
 
 
-def _signals(
-    r: Recording, model: Model, how: Filtering, told: Sequence[_Told], first: Array
-) -> Signals:
+def _signals(r: Recording, model: Model, how: Filtering, told: Sequence[_Told], first: Array) -> Signals:
     """Return the signals of a recording's rows.
 
     :param told: by piece. ``first``: parameters of a first fit.
@@ -290,18 +291,22 @@ def _signals(
     longest = max(tracks, key=lambda t: len(t.time))
     speed = np.sqrt(np.mean(np.concatenate([track.qd for track in tracks]) ** 2, 0))
     f = filtered([one.columns(speed, how) for one in told], longest.period, how)
-    shaken = shaken_efforts(
-        r, longest, how, lambda track: model.efforts(track, first, model.memory(track, how))
-    )
+    shaken = shaken_efforts(r, longest, how, lambda track: model.efforts(track, first, model.memory(track, how)))
     noise = noise_of(left, shaken, longest.period, how)
     size = np.sqrt(np.mean(np.concatenate([track.effort for track in tracks]) ** 2, 0))
     rings = resonances_of(left, longest.period, how, size, longest.wrench)
     rate = 1.0 / (longest.period * how.keep_every)
     missed, load = (np.moveaxis(f[name], -1, 0) for name in ("missed", "load"))
     return Signals(
-        Motion(f["q"], f["qd"], f["qdd"], f["wrench"], f["held"]), missed, load, f["effort"],
-        f["own"], noise * np.sqrt(rate), passed_band(how, rate), rings,
-    )  # fmt: skip
+        Motion(f["q"], f["qd"], f["qdd"], f["wrench"], f["held"]),
+        missed,
+        load,
+        f["effort"],
+        f["own"],
+        noise * np.sqrt(rate),
+        passed_band(how, rate),
+        rings,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -321,18 +326,20 @@ class _Piece:
         memory, moves = model.memory(track, how), track.moves(how)
         table, rest = model.columns(track, memory)
         if memory is not None:
-            moves = np.where(
-                model.robot.friction.presliding > 0.0, memory.unknown < KNOWN_FRACTION, moves
-            )
+            moves = np.where(model.robot.friction.presliding > 0.0, memory.unknown < KNOWN_FRACTION, moves)
         return cls(track, table, track.effort - rest, rest, moves.astype(np.float64))
 
     def columns(self, told: _Told) -> dict[str, Array]:
         """Return what rows are made of, by name, (samples, ...) each."""
         return {
-            "time": self.track.time, "table": self.table, "target": self.target, "rest": self.rest,
-            "moves": self.moves, "doubt": (1.0 - self.moves) * np.abs(told.efforts - told.load),
+            "time": self.track.time,
+            "table": self.table,
+            "target": self.target,
+            "rest": self.rest,
+            "moves": self.moves,
+            "doubt": (1.0 - self.moves) * np.abs(told.efforts - told.load),
             "change": np.gradient(told.efforts, self.track.period, axis=0),
-        }  # fmt: skip
+        }
 
     def told(self, model: Model, first: Array) -> _Told:
         """Take over what a first fit says of it."""
@@ -369,29 +376,29 @@ class _Told:
         cutoff = None if how.cutoff is None else MOTION * how.cutoff
         motion, force = (calm(values, track.period, cutoff) for values in (track.q, load))
         return {
-            "effort": self.efforts, "q": motion[0], "qd": motion[1], "qdd": motion[2],
-            "missed": track.missed, "load": np.stack(force, -1), "own": np.stack(laws, -1),
-            "wrench": track.wrench, "held": track.held,
-        }  # fmt: skip
+            "effort": self.efforts,
+            "q": motion[0],
+            "qd": motion[1],
+            "qdd": motion[2],
+            "missed": track.missed,
+            "load": np.stack(force, -1),
+            "own": np.stack(laws, -1),
+            "wrench": track.wrench,
+            "held": track.held,
+        }
 
 
 def _check_efforts(robot: Robot, r: Recording) -> None:
     for joint, effort in zip(robot.joint_names, r.measured.T, strict=True):
         worst = float(effort[np.argmax(~(np.abs(effort) < LARGEST))])
         if not abs(worst) < LARGEST:
-            raise PkmTwinError(
-                f"{r.name}: effort of {joint} is {worst:g}; below {LARGEST:g} is what a drive has"
-            )
+            raise PkmTwinError(f"{r.name}: effort of {joint} is {worst:g}; below {LARGEST:g} is what a drive has")
         if len(effort) and np.ptp(effort) < LEAST_EFFORT:
             only = effort[0] + 0.0  # no minus before zero
-            raise PkmTwinError(
-                f"{r.name}: effort of {joint} is {only:g} throughout: nothing was measured"
-            )
+            raise PkmTwinError(f"{r.name}: effort of {joint} is {only:g} throughout: nothing was measured")
 
 
-def _drop_outliers(
-    parts: list[_Piece], parameters: FileParameters, every: int
-) -> tuple[Array, int]:
+def _drop_outliers(parts: list[_Piece], parameters: FileParameters, every: int) -> tuple[Array, int]:
     """Efforts far from a first robust fit take its values, but not many of them or in a row.
 
     :returns: that fit's parameters, and how many efforts.
@@ -408,9 +415,7 @@ def _drop_outliers(
         away = np.abs(part.target - told)
         bound = OUTLIER * estimate_deviation(part.target - told)
         # Where friction turns over, an effort that is some samples late is no outlier.
-        near = scipy.ndimage.maximum_filter1d(
-            np.abs(np.diff(told, axis=0, prepend=told[:1])), 7, axis=0
-        )
+        near = scipy.ndimage.maximum_filter1d(np.abs(np.diff(told, axis=0, prepend=told[:1])), 7, axis=0)
         far = (away > bound + LATE * near) & (bound > 1e-6 * np.abs(part.target).max(0))
         far &= ~scipy.ndimage.binary_opening(far, np.ones((IN_A_ROW, 1)))
         if far.mean() > 0.05:
@@ -457,9 +462,13 @@ class Problem:
 
     @classmethod
     def of(
-        cls, robot: Robot, recordings: Sequence[Recording], what: Sequence[Kind],
-        passes: int = LOAD_PASSES, progress: Callable[[int], None] | None = None,
-    ) -> Problem:  # fmt: skip
+        cls,
+        robot: Robot,
+        recordings: Sequence[Recording],
+        what: Sequence[Kind],
+        passes: int = LOAD_PASSES,
+        progress: Callable[[int], None] | None = None,
+    ) -> Problem:
         """Filter recordings.
 
         :param passes: in which friction that grows with the load, or a memory that is open, is
@@ -471,9 +480,7 @@ class Problem:
             try:
                 whole.append(rows_of(robot, everything, recording))
             except (UnreachableError, SingularityError) as error:
-                raise PkmTwinError(
-                    f"{recording.name}: {error} (positions of this machine, in rad and m?)"
-                ) from None
+                raise PkmTwinError(f"{recording.name}: {error} (positions of this machine, in rad and m?)") from None
             if progress is not None:
                 progress(i + 1)
         problem = cls(robot, tuple(what), everything, tuple(whole))
@@ -505,10 +512,7 @@ class Problem:
         """Of parameters and delays, (samples, n, both): the fitted rows one after the other."""
         used = [made.fitted for made in self.rows]
         # Late by a delay is less the delay times the change.
-        late = [
-            np.concatenate([-made.change * (i == j) for j, made in enumerate(used)])
-            for i in range(len(used))
-        ]
+        late = [np.concatenate([-made.change * (i == j) for j, made in enumerate(used)]) for i in range(len(used))]
         table = np.concatenate([made.table for made in used])
         return np.concatenate([table, np.stack(late, -1)], -1)
 
@@ -517,15 +521,18 @@ class Problem:
         """The parameters by least squares, then how late the efforts of each recording are, s."""
         used, count = [made.fitted for made in self.rows], len(self.rows)
         target, effort, counts = (
-            np.concatenate([getattr(made, name) for made in used])
-            for name in ("target", "effort", "counts")
+            np.concatenate([getattr(made, name) for made in used]) for name in ("target", "effort", "counts")
         )
         p, table = self.parameters, self.columns
         scales = prior_scales(p, table[..., :-count], effort)
         return estimate(
-            table, target, np.append(p.values, np.zeros(count)),
-            np.append(scales, [LATE * made.period for made in used]), p.cones, counts,
-        )  # fmt: skip
+            table,
+            target,
+            np.append(p.values, np.zeros(count)),
+            np.append(scales, [LATE * made.period for made in used]),
+            p.cones,
+            counts,
+        )
 
     @cached_property
     def estimate(self) -> Estimate:

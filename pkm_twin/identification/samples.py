@@ -158,16 +158,12 @@ def calm(values: Array, period: float, cutoff: float | None) -> list[Array]:
 
 def derivative(values: Array, order: int, period: float) -> Array:
     """Along the first axis: central differences of sixth order, polynomials at the ends."""
-    inner, ends = (
-        local_fit(values, points, degree, order, period) for points, degree in (CENTRAL, ENDS)
-    )
+    inner, ends = (local_fit(values, points, degree, order, period) for points, degree in (CENTRAL, ENDS))
     beside = CENTRAL[0] // 2
     return np.concatenate([ends[:beside], inner[beside:-beside], ends[-beside:]])
 
 
-def even_pieces(
-    time: Array, columns: list[Array], least: int = LEAST // 2
-) -> list[tuple[Array, list[Array]]]:
+def even_pieces(time: Array, columns: list[Array], least: int = LEAST // 2) -> list[tuple[Array, list[Array]]]:
     """Pieces without gaps, on even stamps, interpolated by cubic splines where they are not.
 
     :param least: samples that a piece needs.
@@ -189,10 +185,15 @@ def even_pieces(
 
 
 def tracks(
-    time: Array, q: Array, effort: Array, wrench: Array | None = None, held: Array | None = None,
-    window: int | None = None, rates: tuple[Array, Array] | None = None,
+    time: Array,
+    q: Array,
+    effort: Array,
+    wrench: Array | None = None,
+    held: Array | None = None,
+    window: int | None = None,
+    rates: tuple[Array, Array] | None = None,
     least: int = LEAST // 2,
-) -> tuple[list[Track], Filtering]:  # fmt: skip
+) -> tuple[list[Track], Filtering]:
     """Return a recording as evenly sampled motion, without the ends of each piece.
 
     :param wrench: (k, 6), none by default; ``held``: (k,), throughout by default.
@@ -210,22 +211,18 @@ def tracks(
         return [], Filtering(0, (), None, 1)
     positions = [own[0] for _, own in pieces]
     # Each piece by its length.
-    noise = np.average(
-        [estimate_noise(t, own[0]) for t, own in pieces], 0, [len(t) for t, _ in pieces]
-    )
+    noise = np.average([estimate_noise(t, own[0]) for t, own in pieces], 0, [len(t) for t, _ in pieces])
     width = window or choose_window(positions, period, noise)
     result = []
     for t, (place, force, load, carried, *known) in pieces:
         rough, fine = (
-            known or [local_fit(place, width, degree, k, period) for k in (1, 2)]
-            for degree in (DEGREE, DEGREE + 2)
+            known or [local_fit(place, width, degree, k, period) for k in (1, 2)] for degree in (DEGREE, DEGREE + 2)
         )
         cut = slice(width // 2, len(t) - width // 2)
         smooth = place if known else local_fit(place, width, DEGREE, 0, period)
         motion = Motion(smooth, rough[0], rough[1], load, carried).part(cut)
         missed = np.stack(rough, -1)[cut] - np.stack(fine, -1)[cut]
-        result.append(Track(**vars(motion), time=t[cut], effort=force[cut], period=period,
-                            missed=missed))  # fmt: skip
+        result.append(Track(**vars(motion), time=t[cut], effort=force[cut], period=period, missed=missed))
     speed = np.sqrt(np.mean(np.concatenate([p.qd for p in result]) ** 2, 0))
     change = np.sqrt(np.mean(np.concatenate([p.qdd for p in result]) ** 2, 0))
     moving = speed > 0.0
@@ -253,16 +250,11 @@ def low_pass(values: Array, period: float, how: Filtering) -> Array:
     return np.asarray(smooth[kept_rows(len(values), period, how)], np.float64)
 
 
-def filtered(
-    pieces: Sequence[Mapping[str, Array]], period: float, how: Filtering
-) -> dict[str, Array]:
+def filtered(pieces: Sequence[Mapping[str, Array]], period: float, how: Filtering) -> dict[str, Array]:
     """Signals of pieces by name, (samples, ...) each, filtered alike, one piece after the other."""
     shapes = {name: values.shape[1:] for name, values in pieces[0].items()}
     ends = np.cumsum([int(np.prod(shape)) for shape in shapes.values()])[:-1]
-    smooth = [
-        low_pass(np.concatenate([v.reshape(len(v), -1) for v in one.values()], 1), period, how)
-        for one in pieces
-    ]
+    smooth = [low_pass(np.concatenate([v.reshape(len(v), -1) for v in one.values()], 1), period, how) for one in pieces]
     parts = np.split(np.concatenate(smooth), ends, 1)
     named = zip(shapes.items(), parts, strict=True)
     return {name: part.reshape(len(part), *shape) for (name, shape), part in named}
@@ -447,9 +439,7 @@ def _spectrum(pieces: Sequence[Array], rate: float, segment: int) -> tuple[Array
     Of the pieces that are as long as a segment, each by its length.
     """
     used = [piece for piece in pieces if len(piece) >= segment]
-    both = [
-        scipy.signal.welch(piece, rate, nperseg=segment, axis=0, detrend="linear") for piece in used
-    ]
+    both = [scipy.signal.welch(piece, rate, nperseg=segment, axis=0, detrend="linear") for piece in used]
     density = np.average([own for _, own in both], 0, [len(piece) for piece in used])
     return np.asarray(both[0][0], np.float64), np.asarray(0.5 * density, np.float64)
 
@@ -458,9 +448,7 @@ SHAKEN: Final = 3000
 """Samples that show what the positions' noise does."""
 
 
-def shaken_efforts(
-    r: Recording, track: Track, how: Filtering, efforts: Callable[[Track], Array]
-) -> Array:
+def shaken_efforts(r: Recording, track: Track, how: Filtering, efforts: Callable[[Track], Array]) -> Array:
     """Return how much noise of the positions changes the efforts, (samples, n).
 
     :param efforts: of a motion, shape (samples, n).

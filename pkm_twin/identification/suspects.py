@@ -99,11 +99,12 @@ def errors_of(rows: Rows, values: Array) -> tuple[Errors, Array]:
     share = None if "load-dependent" in robot.laws else 0.05
     found: Errors = []
     for kind, units, usual, column in (
-        (GAIN, [""] * len(names), OFF, told), (LATE, ["s"] * len(names), 2e-3, -change),
+        (GAIN, [""] * len(names), OFF, told),
+        (LATE, ["s"] * len(names), 2e-3, -change),
         (LOAD, [""] * len(names), share, load),
         (SQUARE, [f"{e} s2/{u}2" for u, e in pairs], None, square),
         *((STATIC, efforts, None, law) for law in static),
-    ):  # fmt: skip
+    ):
         each = zip(names, units, eye, strict=True)
         found += [(Suspect(kind, name, unit, usual), column * e) for name, unit, e in each]
     for name, (unit, _), length, e in zip(names, pairs, lengths, eye, strict=True):
@@ -164,9 +165,7 @@ class Lengths:
         for path in paths:
             if path not in told:
                 usual = USUAL * (extent if units[path] == "m" else 1.0)
-                causes.append(
-                    (Suspect(GEOMETRY, path, units[path], usual, known=True), {path: 1.0})
-                )
+                causes.append((Suspect(GEOMETRY, path, units[path], usual, known=True), {path: 1.0}))
         mixing = np.zeros((len(paths), len(causes)))
         for k, (_, weights) in enumerate(causes):
             for path, weight in weights.items():
@@ -269,14 +268,20 @@ def verdict_of(problem: Problem) -> Verdict:
         sizes = np.append(DELAY, np.ones(missed.shape[-1]))
         cases.append(
             Case(
-                rows.effort - rows.rest - rows.table @ everything.values, rows.table[..., chosen],
-                delay, sizes, columns, rows.effort, rows.counts, rows.signals.noise,
-                rows.signals.band, rows.held_from,
+                rows.effort - rows.rest - rows.table @ everything.values,
+                rows.table[..., chosen],
+                delay,
+                sizes,
+                columns,
+                rows.effort,
+                rows.counts,
+                rows.signals.noise,
+                rows.signals.band,
+                rows.held_from,
             )
-        )  # fmt: skip
+        )
     errors += [
-        Suspect(OF_THE_FILE[kinds[k]], everything.names[k], everything.units[k])
-        for k in np.flatnonzero(~chosen)
+        Suspect(OF_THE_FILE[kinds[k]], everything.names[k], everything.units[k]) for k in np.flatnonzero(~chosen)
     ]
     verdict, fitted = judge(robot.joint_names, errors, cases, problem.both.prior[: chosen.sum()])
     slow = bool((chosen & np.isin(kinds, OF_INERTIA)).any()) and not _shows_inertia(
@@ -316,10 +321,11 @@ def _compare_file_masses(verdict: Verdict, fitted: Fitted, masses: Mask) -> Verd
     alike = Suspect("the masses that were fitted", "all of them")
     change = fitted.model.posterior(used).mean[: fitted.count] - verdict.change
     return replace(
-        verdict, answer="explains partly",
+        verdict,
+        answer="explains partly",
         findings=(replace(found, others=(*found.others, alike)),),
         covariance=verdict.covariance + np.outer(change, change),
-    )  # fmt: skip
+    )
 
 
 def _compare_elastic_drives(verdict: Verdict, fitted: Fitted) -> Verdict:
@@ -344,14 +350,13 @@ def _compare_elastic_drives(verdict: Verdict, fitted: Fitted) -> Verdict:
     )
     place = max(delays, key=lambda k: abs(one.mean[k]))
     size, deviation = float(one.mean[place]), float(np.sqrt(one.covariance[place, place]))
-    hint = Finding(
-        Suspect(LATE, ALL, "s"), size, deviation, abs(size) / deviation, (Suspect(ELASTIC, sizes),)
-    )
+    hint = Finding(Suspect(LATE, ALL, "s"), size, deviation, abs(size) / deviation, (Suspect(ELASTIC, sizes),))
     change = (two.mean - one.mean)[: fitted.count]
     return replace(
-        verdict, hints=(*verdict.hints, hint),
+        verdict,
+        hints=(*verdict.hints, hint),
         covariance=verdict.covariance + np.outer(change, change),
-    )  # fmt: skip
+    )
 
 
 def _shows_inertia(cases: Sequence[Case], errors: Sequence[Suspect], friction: Mask) -> bool:

@@ -142,10 +142,7 @@ class _Numbers:
 
     def limbs(self) -> list[list[tuple[str, int]]]:
         """Points by the limb they are on: what hangs together without base and platform."""
-        found = [
-            [point for point in self.points if set(self.bodies(point)) & set(limb)]
-            for limb in limbs(self.graph)
-        ]
+        found = [[point for point in self.points if set(self.bodies(point)) & set(limb)] for limb in limbs(self.graph)]
         return [one for one in found if one]
 
     def point(self, point: tuple[str, int]) -> Array:
@@ -183,10 +180,12 @@ def _changes(n: _Numbers) -> Iterator[Change]:
     reference = "the reference point"
     groups = [
         ([*platform], True, f"{of_platform} and {reference}"),
-        ([*platform], False, of_platform), ([*base], False, of_base),
+        ([*platform], False, of_platform),
+        ([*base], False, of_base),
         ([*platform, *base], False, f"{of_platform} and {of_base}"),
-        ([*n.points], False, "all joints"), ([*n.points], True, f"all joints and {reference}"),
-    ]  # fmt: skip
+        ([*n.points], False, "all joints"),
+        ([*n.points], True, f"all joints and {reference}"),
+    ]
     for points, with_origin, label in groups:
         own = [n.points[point] for point in dict.fromkeys(points)]
         at = [n.point(point) for point in dict.fromkeys(points)]

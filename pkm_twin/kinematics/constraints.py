@@ -69,9 +69,7 @@ def cross(a: Any, b: Any) -> NDArray[Any]:
     return np.array(product, np.result_type(a, b))
 
 
-def keep_angle(
-    part: str, bodies: tuple[str, str], points: Pair, vectors: Pair, known: Any
-) -> Equation:
+def keep_angle(part: str, bodies: tuple[str, str], points: Pair, vectors: Pair, known: Any) -> Equation:
     """Return the equation of a constant angle between a vector of each body.
 
     :param known: scalar product of the vectors.
@@ -80,9 +78,7 @@ def keep_angle(
     return Equation(part, bodies, dot(inner, outer) - known, points, NONE, cross(outer, inner), 1.0)
 
 
-def keep_distance(
-    part: str, bodies: tuple[str, str], points: Pair, square: Any, size: Any
-) -> Equation:
+def keep_distance(part: str, bodies: tuple[str, str], points: Pair, square: Any, size: Any) -> Equation:
     """Return the equation of a rod (Delta-CU paper, equations 1 and 2).
 
     :param square: of the rod's length, m2. ``size``: of the machine, m.
@@ -92,9 +88,7 @@ def keep_distance(
     return Equation(part, bodies, value, points, apart, NONE, 1.0 / (size * sqrt(square)))
 
 
-def keep_pair(
-    part: str, bodies: tuple[str, str], points: Pair, vectors: Pair, length: Any
-) -> Equation:
+def keep_pair(part: str, bodies: tuple[str, str], points: Pair, vectors: Pair, length: Any) -> Equation:
     """Return the equation of two parallel rods of equal length.
 
     Their middle line is perpendicular to the difference of ``vectors``, the directions from rod to
@@ -115,10 +109,7 @@ def constraint_equations(
     apart, scale = points[1] - points[0], 1.0 / size
     if held.kind == "point":
         # [()] makes an array of one expression that expression.
-        return [
-            Equation(part, bodies, apart[..., i][()], points, unit, NONE, scale)
-            for i, unit in enumerate(UNITS)
-        ]
+        return [Equation(part, bodies, apart[..., i][()], points, unit, NONE, scale) for i, unit in enumerate(UNITS)]
     inner = turns[0](held.inner)
     if held.kind == "angle":
         vectors = inner, turns[1](held.outer)
@@ -178,16 +169,17 @@ class Placement:
         index = {name: k for k, name in enumerate((BASE, *graph.bodies))}
         shape = (*shape, len(index))
         return cls(
-            index, np.tile(np.eye(3), (*shape, 1, 1)), np.zeros((*shape, 3)), graph.origin,
+            index,
+            np.tile(np.eye(3), (*shape, 1, 1)),
+            np.zeros((*shape, 3)),
+            graph.origin,
             graph.size,
-        )  # fmt: skip
+        )
 
     def point(self, body: str, at: Array) -> Array:
         """Return where a point of a body is, shape (..., 3); given at home, (3,) or (..., 3), m."""
         k = self.index[body]
-        return np.asarray(
-            rotate(self.rotation[..., k, :, :], at) + self.shift[..., k, :], np.float64
-        )
+        return np.asarray(rotate(self.rotation[..., k, :, :], at) + self.shift[..., k, :], np.float64)
 
     def turn(self, body: str) -> Array:
         """Return a body's rotation from home, shape (..., 3, 3)."""
@@ -228,9 +220,7 @@ class Placement:
         return table.reshape(whole)[..., 6:]
 
 
-def differentiate_by_frame(
-    one: Equation, side: int, point: Array, rotation: Array
-) -> tuple[Array, Array]:
+def differentiate_by_frame(one: Equation, side: int, point: Array, rotation: Array) -> tuple[Array, Array]:
     """Return an equation's derivatives by an error of the part's frame on one of its bodies.
 
     :param side: 0: the frame on the inner body, 1: on the outer body. ``point``: its origin,
@@ -240,7 +230,5 @@ def differentiate_by_frame(
     """
     sign = (-1.0, 1.0)[side] * one.scale
     moment = one.moment + np.cross(one.points[side] - point, one.force)
-    by_shift, by_tilt = (
-        (sign * vector[..., None, :] @ rotation)[..., 0, :] for vector in (one.force, moment)
-    )
+    by_shift, by_tilt = ((sign * vector[..., None, :] @ rotation)[..., 0, :] for vector in (one.force, moment))
     return by_shift, by_tilt

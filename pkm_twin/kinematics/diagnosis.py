@@ -69,10 +69,11 @@ def singular_home(linkage: Linkage, rank: int, beside: int) -> ParameterError:
     extra = here - there @ (there.T @ here)
     names = _owners(linkage, extra) if here.shape[1] > there.shape[1] else list(linkage.graph.leads)
     return ParameterError(
-        "joints", f"rank {rank} of the closures at home, {beside} near it",
+        "joints",
+        f"rank {rank} of the closures at home, {beside} near it",
         f"a home that is not a singularity; at this home {', '.join(names[:8])} can move without "
         "the others, so choose another pose",
-    )  # fmt: skip
+    )
 
 
 def near_conditions(graph: Graph, freedoms: int = 0) -> list[Deviation]:
@@ -98,8 +99,9 @@ def near_conditions(graph: Graph, freedoms: int = 0) -> list[Deviation]:
     points = [(f"{n}", n, new.joints[n].at - j.at) for n, j in graph.joints.items()]
     points += [
         (f"the {side} of {n}", n, new.rods[n].ends[k] - rod.ends[k])
-        for n, rod in graph.rods.items() for k, side in enumerate(("start", "end"))
-    ]  # fmt: skip
+        for n, rod in graph.rods.items()
+        for k, side in enumerate(("start", "end"))
+    ]
     for which, name, change in points:
         gap = float(np.linalg.norm(change))
         text = f"{which} is {1e3 * gap:.3g} mm from {EVERYWHERE}"
@@ -110,9 +112,7 @@ def near_conditions(graph: Graph, freedoms: int = 0) -> list[Deviation]:
 
 def _parallel_joint(graph: Graph, joint: Joint, axis: Array) -> str:
     """Return the first joint of one axis parallel to an axis of a joint, if it can be one's own."""
-    others = [
-        other for other in graph.joints.values() if other is not joint and len(other.axes) == 1
-    ]
+    others = [other for other in graph.joints.values() if other is not joint and len(other.axes) == 1]
     others.sort(key=lambda other: not {joint.inner, joint.outer} & {other.inner, other.outer})
     for other in others:
         if float(np.linalg.norm(np.cross(axis, other.axes[0]))) < EXACT:

@@ -158,7 +158,4 @@ class Drives:
         if not self.others:
             return []
         columns = [self._root.forward(list(column)) for column in zip(*self.null_rows, strict=True)]
-        return [
-            [column[i] * sqrt(inverse) for column in columns]
-            for i, inverse in enumerate(self._root.inverses)
-        ]
+        return [[column[i] * sqrt(inverse) for column in columns] for i, inverse in enumerate(self._root.inverses)]

@@ -69,9 +69,7 @@ class Engine(Scheme):
         steps = np.concatenate([step, np.zeros(self.joints)])
         return self._walk(self.home_pose, np.concatenate([x, q]), steps)[2][: len(x)]
 
-    def reach(
-        self, q: Array, limit: float = 1.0, precision: float = 1e-4
-    ) -> tuple[float, Array, float]:
+    def reach(self, q: Array, limit: float = 1.0, precision: float = 1e-4) -> tuple[float, Array, float]:
         """How far the straight way from home to q leads without passing a singularity.
 
         :param limit: part of the way beyond which nothing is looked for.
@@ -149,9 +147,7 @@ class Engine(Scheme):
 
     # As programs.
 
-    def kernel(
-        self, name: str, write: Callable[[Traced], Program], extra: str = "", *, free: bool = False
-    ) -> Kernel:
+    def kernel(self, name: str, write: Callable[[Traced], Program], extra: str = "", *, free: bool = False) -> Kernel:
         """Return the compiled program of a name on this geometry, the same object every time.
 
         :param extra: text of what the program hangs on beside the machine's structure.
@@ -303,9 +299,7 @@ _codes: Final[WeakValueDictionary[ProgramKey, Code]] = WeakValueDictionary()
 """Programs that something still holds: machines of one structure share them."""
 
 
-def engine_of(
-    graph: Graph, coordinates: Sequence[Coordinate], start: Start | None = None
-) -> Engine:
+def engine_of(graph: Graph, coordinates: Sequence[Coordinate], start: Start | None = None) -> Engine:
     """Return the engine of a geometry; machines that differ in inertia or limits alone share it."""
     key = EMPTY.also(f"{graph.key} {coordinates!r} {start!r}")
     engine = _engines.get(key)

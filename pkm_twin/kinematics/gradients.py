@@ -44,9 +44,7 @@ def pose_motion_gradient(engine: Engine) -> Kernel:
 
 def free_forward(engine: Engine) -> Kernel:
     """As :attr:`Engine.forward`, for machines of every structure."""
-    return engine.kernel(
-        "free forward", lambda t: replace(forward_program(t), quick=True), free=True
-    )
+    return engine.kernel("free forward", lambda t: replace(forward_program(t), quick=True), free=True)
 
 
 def _by_geometry(t: Traced) -> Program:
@@ -62,9 +60,7 @@ def _pose_motion(t: Traced) -> Program:
     position, rotation = motion.platform()
     body, omega = graph.platform, motion.omega[graph.platform]
     velocity = motion.velocity(body, graph.origin)
-    second = poses.accelerations(
-        of, rotation, omega, motion.acceleration(body, graph.origin), motion.alpha[body]
-    )
+    second = poses.accelerations(of, rotation, omega, motion.acceleration(body, graph.origin), motion.alpha[body])
     outputs = {
         "pose": t.lift(poses.values(of, position, rotation)),
         "rates": t.lift(poses.rates(of, rotation, velocity, omega)),

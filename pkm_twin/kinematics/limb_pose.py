@@ -77,9 +77,7 @@ class LimbPose:
     as it can be (``closest``, on numbers alone); otherwise such a limb is NaN.
     """
 
-    def __init__(
-        self, motion: Motion, limb: Limb, x: Objects, q: Numbers, *, closest: bool = False
-    ) -> None:
+    def __init__(self, motion: Motion, limb: Limb, x: Objects, q: Numbers, *, closest: bool = False) -> None:
         tree, graph = motion.tree, motion.graph
         self.motion, self.tree, self.x = motion, tree, x
         self.slopes: list[tuple[Any, Any]] = []
@@ -151,9 +149,7 @@ class LimbPose:
         motion.place(beyond[-1:] if limb.spin else beyond, x, q)
         ends = (top.parent, limb.beyond), (apart, target)
         if limb.leaves and limb.kind == "turns":
-            self.rows.append(
-                self._distance(limb, *ends, square_of(lever[: 2 if len(steps) == 1 else 3]))
-            )
+            self.rows.append(self._distance(limb, *ends, square_of(lever[: 2 if len(steps) == 1 else 3])))
         if limb.leaves > len(self.rows):
             self.rows.append(self._plane(limb, *ends, lever[2]))
 
@@ -180,9 +176,7 @@ class LimbPose:
         )
         return {key: column @ vector for key, column in difference(*moving).items()}
 
-    def _square_between(
-        self, limb: Limb, steps: Sequence[Step], lever: Numbers, moved: Array, target: Numbers
-    ) -> Any:
+    def _square_between(self, limb: Limb, steps: Sequence[Step], lever: Numbers, moved: Array, target: Numbers) -> Any:
         """Return the square of the distance that the reach has to set.
 
         A single turn keeps out of its plane what is there.
@@ -203,9 +197,7 @@ class LimbPose:
         local = turned.T @ (np.asarray(target) - origin) - link.arm
         self._solve_reach(link, point, local, goal, square)
 
-    def _solve_reach(
-        self, link: Link, point: Array, local: Numbers, goal: Array, square: Any
-    ) -> None:
+    def _solve_reach(self, link: Link, point: Array, local: Numbers, goal: Array, square: Any) -> None:
         """Find the one step of a body by |point - target|^2 = square.
 
         :param local: the target from the joint, in axes of the parent. ``goal``: it at home.
@@ -237,9 +229,7 @@ class LimbPose:
             scale = sqrt(square_of(d_home) * length)
         self.slopes.append((root, scale))
 
-    def _turn_to(
-        self, step: Step, a: Any, b: Any, d: Any, b_home: Any, square: Any
-    ) -> tuple[Any, Any]:
+    def _turn_to(self, step: Step, a: Any, b: Any, d: Any, b_home: Any, square: Any) -> tuple[Any, Any]:
         """Turn a step from home until a cos + b sin = d, on the side where home is.
 
         :param b_home: b at home, where the turn is none. ``square``: as of :meth:`_meet`.
@@ -274,9 +264,7 @@ class LimbPose:
         self.x[step.position] = (x * towards[0] + y * towards[1]) / n
         self.x[step.position + 1] = step.sign * ((x * towards[1] - y * towards[0]) / n)
 
-    def _turn_twice(
-        self, steps: Sequence[Step], towards: Numbers, lever: Numbers, home: Numbers
-    ) -> None:
+    def _turn_twice(self, steps: Sequence[Step], towards: Numbers, lever: Numbers, home: Numbers) -> None:
         """Turn a lever about two axes that cross to a vector of its length.
 
         :param towards: the vector in axes of the first turn. ``home``: the lever at home.
@@ -301,18 +289,14 @@ class LimbPose:
         if limb.tip == joint.outer:
             mine, other = other, mine
         v = snapped_all(link.axes.T @ mine)
-        u = step.before.T @ (
-            self.motion.rotation[link.parent].T @ self.motion.direction(limb.beyond, other)
-        )
+        u = step.before.T @ (self.motion.rotation[link.parent].T @ self.motion.direction(limb.beyond, other))
         home = snapped_all(step.before.T @ (self.tree.axes[link.parent].T @ other))
         a, b = v[0] * u[0] + v[1] * u[1], v[0] * u[1] - v[1] * u[0]
         d = snapped(mine @ other) - v[2] * u[2]
         root, _ = self._turn_to(step, a, b, d, v[0] * home[1] - v[1] * home[0], 0.0)
         self.slopes.append((root, 1.0))
 
-    def _distance(
-        self, limb: Limb, bodies: tuple[str, str], ends: tuple[Objects, Objects], square: Any
-    ) -> Row:
+    def _distance(self, limb: Limb, bodies: tuple[str, str], ends: tuple[Objects, Objects], square: Any) -> Row:
         """Return the closure by which a point keeps its distance from the turns' centre.
 
         Of a single turn, in its plane.
@@ -325,9 +309,7 @@ class LimbPose:
         value = 0.5 * (apart @ apart - square)
         return self._row(limb, bodies, ends[1], apart, value, scale)
 
-    def _plane(
-        self, limb: Limb, bodies: tuple[str, str], ends: tuple[Objects, Objects], height: Any
-    ) -> Row:
+    def _plane(self, limb: Limb, bodies: tuple[str, str], ends: tuple[Objects, Objects], height: Any) -> Row:
         """Return the closure by which a point stays in the plane of a turn; see above.
 
         :param height: of the plane above the centre.
@@ -336,9 +318,14 @@ class LimbPose:
         return self._row(limb, bodies, ends[1], self.normal, value, 1.0 / self.tree.size)
 
     def _row(
-        self, limb: Limb, bodies: tuple[str, str], place: Objects, along: Objects, value: Any,
+        self,
+        limb: Limb,
+        bodies: tuple[str, str],
+        place: Objects,
+        along: Objects,
+        value: Any,
         scale: Any,
-    ) -> Row:  # fmt: skip
+    ) -> Row:
         """Return a closure along a vector fixed in the turns' parent, at a point's place."""
         inner, outer = bodies
         moving = (self.motion.linear_jacobian(body, place) for body in (outer, inner))

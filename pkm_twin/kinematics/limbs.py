@@ -146,12 +146,11 @@ def order_closed(scheme: Closures) -> tuple[str | Limb, ...]:
         limbs = [entry for entry in order if isinstance(entry, Limb)]
         rates = _rates_of_newton(scheme, order)
         faulty = {
-            limb for limb in limbs
+            limb
+            for limb in limbs
             if varying & set(limb.bodies)
-            and rates.intersection(
-                step.rate for body in limb.bodies for step in links[body].steps if not step.actuated
-            )
-        }  # fmt: skip
+            and rates.intersection(step.rate for body in limb.bodies for step in links[body].steps if not step.actuated)
+        }
         if not faulty and not _is_regular_for_newton(scheme, order):
             # What these limbs leave to other joints does not determine them.
             faulty = {limb for limb in limbs if limb.leaves}
@@ -165,10 +164,7 @@ def _is_regular_for_newton(scheme: Closures, order: Sequence[str | Limb]) -> boo
     x, q = scheme.samples[0]
     limbs = [entry for entry in order if isinstance(entry, Limb)]
     rows, links = _rows_of_newton(scheme, order, x, q), scheme.tree.links
-    found = {
-        step.rate for limb in limbs for body in limb.bodies for step in links[body].steps
-        if not step.actuated
-    }  # fmt: skip
+    found = {step.rate for limb in limbs for body in limb.bodies for step in links[body].steps if not step.actuated}
     rates = [rate for rate in scheme.varying if rate not in found]
     table = scheme.scaled(rows)[0][:, rates]
     sizes = np.linalg.svd(table, compute_uv=False)
@@ -181,15 +177,14 @@ def _rates_of_newton(scheme: Closures, order: Sequence[str | Limb]) -> set[int]:
     for x, q in scheme.samples:
         for row in _rows_of_newton(scheme, order, x, q):
             found |= {
-                rate for (kind, rate), value in row.columns.items()
+                rate
+                for (kind, rate), value in row.columns.items()
                 if kind == "u" and abs(value) * row.scale > SAME_STATE * scheme.tree.scales[rate]
-            }  # fmt: skip
+            }
     return found
 
 
-def _rows_of_newton(
-    scheme: Closures, order: Sequence[str | Limb], x: Numbers, q: Numbers
-) -> list[Row]:
+def _rows_of_newton(scheme: Closures, order: Sequence[str | Limb], x: Numbers, q: Numbers) -> list[Row]:
     """Return the closures that no limb solves, and those that limbs leave, in a state."""
     solved = {k for entry in order if isinstance(entry, Limb) for k in entry.rows}
     motion, poses = place_in_order(scheme.tree, order, np.array(x, dtype=object), q)
@@ -198,9 +193,7 @@ def _rows_of_newton(
     return rows + [row for pose in poses for row in pose.rows]
 
 
-def _order_once(
-    scheme: Closures, barred: Collection[Limb]
-) -> tuple[tuple[str | Limb, ...], set[str]]:
+def _order_once(scheme: Closures, barred: Collection[Limb]) -> tuple[tuple[str | Limb, ...], set[str]]:
     """Return an order of placing without some limbs, and the bodies that vary with x."""
     tree = scheme.tree
     order: list[str | Limb] = []
@@ -210,10 +203,7 @@ def _order_once(
     while len(placed) <= len(tree.links):
         ready = [b for b in wanted if b not in placed and tree.links[b].parent in placed]
         driven = [b for b in ready if not any(scheme.varies(step) for step in tree.links[b].steps)]
-        found = (
-            limb for limb in _find_candidates(scheme, placed)
-            if limb not in barred and _is_closed(scheme, limb)
-        )  # fmt: skip
+        found = (limb for limb in _find_candidates(scheme, placed) if limb not in barred and _is_closed(scheme, limb))
         limb = None if driven else next(found, None)
         if limb is None:
             body = (driven or ready)[0]
@@ -241,16 +231,13 @@ def _find_candidates(scheme: Closures, placed: Collection[str]) -> Iterator[Limb
         rows = tuple(k for k in scheme.independent if scheme.parts[k] == part)
         for tip, beyond in ((cut.inner, cut.outer), (cut.outer, cut.inner)):
             low, high = (
-                [body for body in chain_to_base(tree, end)[::-1] if body not in placed]
-                for end in (tip, beyond)
+                [body for body in chain_to_base(tree, end)[::-1] if body not in placed] for end in (tip, beyond)
             )
             links = [tree.links[body] for body in (*low, *high)]
             if any(scheme.holds(step) for link in links for step in link.steps):
                 continue
             bodies = tuple(body for body in tree.links if body in (*low, *high))
-            steps, tops = (
-                [s for b in ends for s in _main_steps(tree.links[b])] for ends in (low, high)
-            )
+            steps, tops = ([s for b in ends for s in _main_steps(tree.links[b])] for ends in (low, high))
             passive = [step for link in links for step in link.steps if not step.actuated]
             left = len(rows) - len(passive)
             if not bodies or not all(s.circle or (s.slide and not s.turns) for s in steps + tops):
@@ -258,9 +245,7 @@ def _find_candidates(scheme: Closures, placed: Collection[str]) -> Iterator[Limb
             drives = any(step.actuated for link in links for step in link.steps)
             owner = {id(step): link.body for link in links for step in link.steps}
             for kind, reach, turns, spins in _split(steps, tops, rod=rod):
-                spins_alone = (
-                    len(links[len(low) - 1].steps) == 1 and not rod and cut.kind == "universal"
-                )
+                spins_alone = len(links[len(low) - 1].steps) == 1 and not rod and cut.kind == "universal"
                 if reach is not None and len(tree.links[owner[id(reach)]].steps) > 1:
                     continue
                 if spins and not spins_alone:
@@ -273,9 +258,17 @@ def _find_candidates(scheme: Closures, placed: Collection[str]) -> Iterator[Limb
                 # A single turn leaves its plane; what has no reach leaves the distance.
                 if 0 <= left <= (len(turns) == 1) + (reach is None):
                     yield Limb(
-                        kind, part, tip, beyond, bodies, owner[id(reach)] if reach else "",
-                        ways, rows, left, owner[id(steps[-1])] if spins else "",
-                    )  # fmt: skip
+                        kind,
+                        part,
+                        tip,
+                        beyond,
+                        bodies,
+                        owner[id(reach)] if reach else "",
+                        ways,
+                        rows,
+                        left,
+                        owner[id(steps[-1])] if spins else "",
+                    )
 
 
 def _main_steps(link: Link) -> Sequence[Step]:

@@ -145,9 +145,7 @@ class Linkage:
             used = np.abs(left).max(1) > 1e-6
             parts = tuple(dict.fromkeys(r.part for r, u in zip(rows, used, strict=True) if u))
         unknowns = self.tree.unknown_rates
-        return Mobility(
-            unknowns + self.joints - rank, len(rows), rank, len(rows) - rank, parts, unknowns
-        )
+        return Mobility(unknowns + self.joints - rank, len(rows), rank, len(rows) - rank, parts, unknowns)
 
 
 def rank_of(matrix: Array) -> int:

@@ -101,9 +101,13 @@ class Motion:
     """
 
     def __init__(
-        self, tree: Tree, x: Numbers, q: Numbers, bodies: Iterable[str] | None = None,
+        self,
+        tree: Tree,
+        x: Numbers,
+        q: Numbers,
+        bodies: Iterable[str] | None = None,
         start: str = BASE,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.tree, self.graph = tree, tree.graph
         self.rotation: dict[str, Any] = {start: UNITS}
         self.origin: dict[str, Any] = {start: np.zeros(3)}
@@ -238,9 +242,7 @@ class Motion:
                     joint.name, (joint.inner, joint.outer), held, points, turns, self.tree.size
                 )
                 columns = self._differences(found[0])
-                rows += [
-                    self._row(one, columns, partial(self._bias, joint, held, one)) for one in found
-                ]
+                rows += [self._row(one, columns, partial(self._bias, joint, held, one)) for one in found]
         return rows + [self._rod(rod) for rod in self.graph.rods.values()]
 
     def _differences(self, one: Equation) -> Columns:

@@ -130,10 +130,7 @@ def _rates(t: Traced, qd: Numbers, u: Numbers) -> list[Any]:
             rates += [step.slide * rate] if step.turns and step.slide else []
     for rod in t.graph.rods.values():
         inner, apart = motion.turned(rod.inner), _across_ends(t, rod)
-        ends = [
-            motion.velocity(body, end)
-            for body, end in zip((rod.inner, rod.outer), rod.ends, strict=True)
-        ]
+        ends = [motion.velocity(body, end) for body, end in zip((rod.inner, rod.outer), rod.ends, strict=True)]
         # As the inner body sees it.
         slip = inner.T @ (ends[1] - ends[0] - cross(motion.omega[rod.inner], apart))
         (b, a, x), (vb, va, vx) = _rod_sides(rod, inner.T @ apart), _rod_sides(rod, slip)

@@ -72,12 +72,8 @@ def name_angles(angles: Any) -> tuple[Coordinate, ...]:
     axes = "".join(map(str, angles.values()))
     for sequence, turns in TURNS.items():
         if len(axes) > 1 and sequence.startswith(axes):
-            return tuple(
-                replace(turn, name=str(name)) for name, turn in zip(angles, turns, strict=False)
-            )
-    raise ParameterError(
-        "angles", dict(angles), "two or three names, about x, y, z or about z, y, x in this order"
-    )
+            return tuple(replace(turn, name=str(name)) for name, turn in zip(angles, turns, strict=False))
+    raise ParameterError("angles", dict(angles), "two or three names, about x, y, z or about z, y, x in this order")
 
 
 def describe_angles(coordinates: Sequence[Coordinate]) -> dict[str, str]:
@@ -170,9 +166,7 @@ def accelerations(
     return result
 
 
-def rows(
-    coordinates: Sequence[Coordinate], motion: Motion, pose: Numbers
-) -> list[tuple[Any, Columns]]:
+def rows(coordinates: Sequence[Coordinate], motion: Motion, pose: Numbers) -> list[tuple[Any, Columns]]:
     """Equations of a pose, zero where the platform is there, and their derivatives by rates."""
     body = motion.graph.platform
     position, rotation = motion.platform()

@@ -90,9 +90,15 @@ class PoseChain:
             home = graph.origin[carrier.axis] if given and not carrier.turns else 0.0
             at = graph.joints[carrier.joint].at if carrier.joint else graph.origin
             joint = Joint(
-                name, "revolute" if carrier.turns else "prismatic", start, end, at,
-                array(UNITS[carrier.axis : carrier.axis + 1]), actuated=given, home=home,
-            )  # fmt: skip
+                name,
+                "revolute" if carrier.turns else "prismatic",
+                start,
+                end,
+                at,
+                array(UNITS[carrier.axis : carrier.axis + 1]),
+                actuated=given,
+                home=home,
+            )
             chain.append((len(self.carriers) if carrier.place is None else carrier.place, joint))
         # Actuated joints have the order of the pose.
         joints = {joint.name: joint for _, joint in sorted(chain, key=lambda pair: pair[0])}
@@ -101,9 +107,13 @@ class PoseChain:
                 joints[name] = joint
             elif name not in replaced:
                 passive = replace(
-                    joint, actuated=False, follows=False, viscous=0.0, coulomb=0.0,
+                    joint,
+                    actuated=False,
+                    follows=False,
+                    viscous=0.0,
+                    coulomb=0.0,
                     rotor_inertia=0.0,
-                )  # fmt: skip
+                )
                 joints[name] = passive if joint.actuated else joint
         graph = replace(graph, bodies={**graph.bodies, **massless}, joints=joints)
         return replace(graph, laws=(), sharing=array([])) if by_pose else graph
@@ -141,9 +151,7 @@ def find_pose_chain(scheme: Scheme) -> PoseChain:
     return PoseChain((*carriers[:-1], replace(carriers[-1], end=graph.platform)))
 
 
-def _vary(
-    scheme: Scheme, coordinates: Sequence[Coordinate], states: Sequence[tuple[Array, Array]]
-) -> list[bool]:
+def _vary(scheme: Scheme, coordinates: Sequence[Coordinate], states: Sequence[tuple[Array, Array]]) -> list[bool]:
     """Return which coordinates of the platform vary over states (x, q) of a machine."""
     placed = [tuple(numbers(part) for part in scheme.at(x, q)[0].platform()) for x, q in states]
     table = np.array([poses.values(coordinates, *state) for state in placed], float)
@@ -196,12 +204,7 @@ def _replace_joints(
         end = joint.outer if body == joint.inner else joint.inner
         freedoms = joint.freedoms if body == joint.inner else joint.freedoms[::-1]
         mine, rest = carriers[: len(freedoms)], carriers[len(freedoms) :]
-        if (
-            not freedoms
-            or len(mine) < len(freedoms)
-            or joint.actuated
-            or bool(rest) == (end == graph.platform)
-        ):
+        if not freedoms or len(mine) < len(freedoms) or joint.actuated or bool(rest) == (end == graph.platform):
             continue
         if not all(_is_along(f, c) for f, c in zip(freedoms, mine, strict=True)):
             continue
@@ -329,16 +332,18 @@ class CarriedScheme(Scheme):
         gap is 0 where the closures are met.
         """
         rates = self.solved[1]
-        inner = {step.rate for body in chain_to_base(self.tree, self.graph.platform)
-                 for step in self.tree.links[body].steps if not step.actuated}  # fmt: skip
+        inner = {
+            step.rate
+            for body in chain_to_base(self.tree, self.graph.platform)
+            for step in self.tree.links[body].steps
+            if not step.actuated
+        }
         if not set(rates) <= inner:
             return None
         limbs: list[LimbPose] = []
 
         def look(x: Array) -> tuple[Array, Array]:
-            motion, limbs[:] = place_in_order(
-                self.tree, self.order, np.array(x, dtype=object), pose, closest=True
-            )
+            motion, limbs[:] = place_in_order(self.tree, self.order, np.array(x, dtype=object), pose, closest=True)
             rows = self.solved_rows(motion.closures(), limbs)
             values = [row.scale * float(row.value) for row in rows]
             return np.array(values), self.scaled(rows)[0][:, rates]
@@ -382,18 +387,17 @@ def _set_joint(tree: Tree, link: Link, motion: Motion, x: Array) -> None:
             w = 0.5 * math.sqrt(max(1.0 + float(np.trace(outer)), 1e-12))
             x[k] = w
             x[k + 1 : k + 4] = [
-                (outer[2, 1] - outer[1, 2]) / (4 * w), (outer[0, 2] - outer[2, 0]) / (4 * w),
+                (outer[2, 1] - outer[1, 2]) / (4 * w),
+                (outer[0, 2] - outer[2, 0]) / (4 * w),
                 (outer[1, 0] - outer[0, 1]) / (4 * w),
-            ]  # fmt: skip
+            ]
             if step.free:
                 x[k + 4 : k + 7] = numbers(motion.point(link.body, link.at)) - link.at
     turns = [step for step in steps if step.turns]
     for step in steps:
         if step.slide and not step.turns:
             apart = numbers(motion.point(link.body, link.at))
-            apart = apart - (
-                numbers(motion.point(link.parent, link.at)) if link.parent != BASE else link.at
-            )
+            apart = apart - (numbers(motion.point(link.parent, link.at)) if link.parent != BASE else link.at)
             x[step.position] = step.sign * ((inner.T @ apart) @ step.axis) / step.slide
     if len(turns) == 1:
         (step,) = turns

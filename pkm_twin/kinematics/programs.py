@@ -19,7 +19,7 @@ from pkm_twin.codegen.program import (
     Equations,
     Program,
     previous,
-)  # fmt: skip
+)
 from pkm_twin.kinematics import pose as poses
 from pkm_twin.kinematics.motion import Motion, Row, matrices
 from pkm_twin.kinematics.posed import CarriedScheme
@@ -125,9 +125,7 @@ def acceleration_program(t: Traced) -> Program:
 def projection_program(t: Traced) -> Program:
     """Positions, rates and accelerations of all drives, by those of the drives that lead."""
     t.solve()
-    q, qd, qdd = (
-        t.tape.inputs(name, t.drives.count)[t.drives.leading] for name in ("q", "qd", "qdd")
-    )
+    q, qd, qdd = (t.tape.inputs(name, t.drives.count)[t.drives.leading] for name in ("q", "qd", "qdd"))
     t.set_rates(qd)
     t.set_accelerations(qdd)
     outputs = {
@@ -192,9 +190,7 @@ def solve_pose(t: Traced, scheme: CarriedScheme) -> tuple[Traced, list[Any]]:
     return posed, posed.tree.values_of_joints(t.graph.actuated, posed.x)
 
 
-def transmission_program(
-    t: Traced, scheme: CarriedScheme | None, *, certified: bool, curved: bool
-) -> Program:
+def transmission_program(t: Traced, scheme: CarriedScheme | None, *, certified: bool, curved: bool) -> Program:
     """Write the program from a pose to the drives' positions and their rates per pose rate.
 
     :param certified: whether poses are accepted as by :func:`quick_inverse_program`; else all are.
@@ -245,8 +241,9 @@ def actuator_program(t: Traced) -> Program:
     effort = pose_factors(t).solve_transposed(t.drives.on_leads([*tau]))
     outputs = {
         "pose": t.lift(poses.values(t.scheme.coordinates, position, rotation)),
-        "velocity": t.lift(velocity), "effort": t.lift(effort),
-    }  # fmt: skip
+        "velocity": t.lift(velocity),
+        "effort": t.lift(effort),
+    }
     return Program(t.inputs("q", "qd", "tau"), 0, outputs, t.equations())
 
 
@@ -265,14 +262,15 @@ def pose_accelerations(t: Traced) -> list[Any]:
     """Return the second derivatives of the pose in time, after rates and accelerations are set."""
     motion, body = t.motion, t.graph.platform
     return poses.accelerations(
-        t.scheme.coordinates, motion.turned(body), motion.omega[body],
-        motion.acceleration(body, t.graph.origin), motion.alpha[body],
-    )  # fmt: skip
+        t.scheme.coordinates,
+        motion.turned(body),
+        motion.omega[body],
+        motion.acceleration(body, t.graph.origin),
+        motion.alpha[body],
+    )
 
 
-def certify_assembly(
-    t: Traced, scheme: CarriedScheme, posed: Traced, q: Sequence[Any]
-) -> list[Any]:
+def certify_assembly(t: Traced, scheme: CarriedScheme, posed: Traced, q: Sequence[Any]) -> list[Any]:
     """Return numbers that are above zero if ``forward`` of q is certainly the pose.
 
     With x the pose and A = dq/dx, q - q0 = A0 (x - x0) + ... is read in two ways: the pose that A0
@@ -333,11 +331,15 @@ def follow_pose(t: Traced) -> tuple[tuple[Equations, ...], Objects]:
     onward = tape.inputs(STATE, len(AT))[AT.onward]
     way = onward * (everything - tape.inputs(previous(POSED), len(home)))
     solved = Equations(
-        "pose", t.lift(home), t.lift(origin), None,
-        moved(everything + way, np.zeros(len(step))), moved(everything, step),
+        "pose",
+        t.lift(home),
+        t.lift(origin),
+        None,
+        moved(everything + way, np.zeros(len(step))),
+        moved(everything, step),
         t.square(step, [*tree.scales, *t.drive_scales]),
         tape.lift(system(home, origin)[3].inverse_determinant / lu.inverse_determinant),
         t.square([r.value for r in rows] + equations, [r.scale for r in rows] + t.pose_scales),
         unknowns=POSED,
-    )  # fmt: skip
+    )
     return (solved,), everything[size:]

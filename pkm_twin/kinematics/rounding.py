@@ -177,9 +177,7 @@ def repair_few(graph: Graph, freedoms: int) -> Repair | None:
         chosen.append(best)
         gap, basis = remaining, np.hstack([basis, added])
         trial = _Loops(graph)
-        if trial.close(rank, positions, chosen) and trial.are_exact(
-            rank, trial.walk(rank, CHECKED, STEPS, seed=1)
-        ):
+        if trial.close(rank, positions, chosen) and trial.are_exact(rank, trial.walk(rank, CHECKED, STEPS, seed=1)):
             found = trial.repair()
             return found if found.largest < MAX_DEVIATION else None
     all_moved = repair(graph, 2.0 * float(sizes[rank]))
@@ -285,9 +283,7 @@ class _Loops:
 
         def move(kind: str, name: str, vectors: Array) -> Array:
             moves = [parts[kind, name, k] for k in range(len(vectors))]
-            moved = vectors + np.reshape(moves, vectors.shape) * (
-                1.0 if kind == "axis" else self.first.size
-            )
+            moved = vectors + np.reshape(moves, vectors.shape) * (1.0 if kind == "axis" else self.first.size)
             lengths = np.linalg.norm(moved, axis=-1, keepdims=True) if kind == "axis" else 1.0
             return array(moved / lengths)
 
@@ -332,9 +328,7 @@ class _Loops:
                             frame._replace(tilt=("axis", name, k), axis=joint.axes[k])
                             for frame, k in zip(frames, held.axes, strict=True)
                         ]
-                    for one in constraint_equations(
-                        joint.name, (joint.inner, joint.outer), held, points, turns, size
-                    ):
+                    for one in constraint_equations(joint.name, (joint.inner, joint.outer), held, points, turns, size):
                         found.append((frames, one))
         for rod in self.graph.rods.values():
             start, end = rod.ends

@@ -70,10 +70,21 @@ class Scheme(Linkage):
     @cached_property
     def structure(self) -> ProgramKey:
         """All that programs depend on: machines of one structure share them."""
-        return EMPTY.also(repr((
-            self.graph.topology, pattern_of(self.tree), self.coordinates,
-            self.start, self.independent, self.pivots, self.order, self.solved_pivots,
-        )), type(self.start or self))  # fmt: skip
+        return EMPTY.also(
+            repr(
+                (
+                    self.graph.topology,
+                    pattern_of(self.tree),
+                    self.coordinates,
+                    self.start,
+                    self.independent,
+                    self.pivots,
+                    self.order,
+                    self.solved_pivots,
+                )
+            ),
+            type(self.start or self),
+        )
 
     @cached_property
     def start(self) -> Start | None:
@@ -170,9 +181,7 @@ class Scheme(Linkage):
     def solved_rows(self, rows: Sequence[Row], poses: Sequence[LimbPose]) -> list[Row]:
         """Of the independent closures those of no limb; and what limbs leave to other joints."""
         limbs = {k for limb in self.limbs for k in limb.rows}
-        return [rows[k] for k in self.independent if k not in limbs] + [
-            row for pose in poses for row in pose.rows
-        ]
+        return [rows[k] for k in self.independent if k not in limbs] + [row for pose in poses for row in pose.rows]
 
     @cached_property
     def solved_pivots(self) -> Order:
@@ -228,19 +237,18 @@ class Scheme(Linkage):
             bound = f"{self.joints} coordinates, the mobility"
             ways = choose_coordinates(self.graph)
             if len(ways) < self.joints:
-                bound += (
-                    f"; the platform moves in {', '.join(ways) or 'none'} alone: choose another "
-                )
+                bound += f"; the platform moves in {', '.join(ways) or 'none'} alone: choose another "
                 bound += "base or platform, so that each actuated joint moves it"
             raise ParameterError("pose", [c.name for c in self.coordinates], bound)
         motion, rows = self.at(*self.samples[0])
         matrix = self._inverse_matrix(motion, rows, self.home_pose.tolist())
         if rank_of(matrix) < len(matrix):
             raise ParameterError(
-                "pose", [c.name for c in self.coordinates],
+                "pose",
+                [c.name for c in self.coordinates],
                 "coordinates that determine the platform's pose at home, as "
                 f"{', '.join(choose_coordinates(self.graph))}",
-            )  # fmt: skip
+            )
 
     @cached_property
     def home_pose(self) -> Array:
@@ -291,17 +299,17 @@ def choose_leads(graph: Graph, wanted: Sequence[str] = (), pose: int = 0) -> tup
     if causes or (np.abs(rates).max(1) < MOVES).any():
         raise mobility_error(linkage, causes)
     sizes = {
-        chosen: abs(float(np.linalg.det(rates[list(chosen)])))
-        for chosen in combinations(range(len(names)), freedoms)
+        chosen: abs(float(np.linalg.det(rates[list(chosen)]))) for chosen in combinations(range(len(names)), freedoms)
     }
     best = max(sizes.values())
     if wanted:
         places = tuple(sorted(names.index(name) for name in wanted if name in names))
         if len(places) != len(wanted) or not sizes.get(places, 0.0) > MOVES * best:
             raise ParameterError(
-                "redundancy.leads", list(wanted),
+                "redundancy.leads",
+                list(wanted),
                 f"{freedoms} of {', '.join(names)} that determine the machine at home",
-            )  # fmt: skip
+            )
         return tuple(names[k] for k in places)
     # Rounding does not choose among those that are alike.
     return tuple(names[k] for k in next(c for c, size in sizes.items() if size > 0.999 * best))
@@ -335,9 +343,8 @@ def list_coordinates(graph: Graph) -> list[tuple[str, ...]]:
     rates = _pose_rates(graph)
     count = len(graph.leads)
     return [
-        names for names in combinations(rates, count)
-        if len(_pick_independent(rates, names, POSE_MOVES[0])) == count
-    ]  # fmt: skip
+        names for names in combinations(rates, count) if len(_pick_independent(rates, names, POSE_MOVES[0])) == count
+    ]
 
 
 def _pick_independent(rates: Mapping[str, Array], names: Sequence[str], least: float) -> list[str]:
@@ -380,8 +387,7 @@ def check_masses(scheme: Scheme, graph: Graph) -> None:
         motion.set_rates(moved[:, j], np.eye(n)[j])
         rates = scheme.tree.of_drives(np.eye(n)[j], moved[:, j])
         column = [
-            np.sqrt(graph.joints[name].rotor_inertia) * rate
-            for name, rate in zip(graph.actuated, rates, strict=True)
+            np.sqrt(graph.joints[name].rotor_inertia) * rate for name, rate in zip(graph.actuated, rates, strict=True)
         ]
         for body in graph.bodies.values():
             root = _root(body.inertia)
@@ -399,9 +405,10 @@ def check_masses(scheme: Scheme, graph: Graph) -> None:
     joint = graph.joints[graph.leads[int(np.argmin(size))]]
     idle = next((b for b in (joint.outer, joint.inner) if b != BASE), graph.platform)
     raise ParameterError(
-        f"bodies.{idle}.mass", graph.bodies[idle].mass,
+        f"bodies.{idle}.mass",
+        graph.bodies[idle].mass,
         f"mass or rotor_inertia that resists {joint.name}: no massless body can move alone",
-    )  # fmt: skip
+    )
 
 
 def _root(inertia: Array) -> Array:

@@ -283,9 +283,7 @@ class _Rates:
         if len(columns) > self.n:
             for row in self.motion_of(name, frame):
                 half = root.forward(row)
-                total = total + sum(
-                    (v * v * e for v, e in zip(half, root.inverses, strict=True)), 0.0
-                )
+                total = total + sum((v * v * e for v, e in zip(half, root.inverses, strict=True)), 0.0)
             return total
         for k, (key, six) in enumerate(columns):
             for other, others in columns[: k + 1]:

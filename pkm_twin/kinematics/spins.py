@@ -46,11 +46,8 @@ def without_spins(graph: Graph) -> tuple[Graph, dict[str, float]]:
     spins = spins @ null(spins[[o not in looped for o in linkage.tree.owners]], RANK, absolute=True)
     for body, point, rows, most in (
         (graph.platform, graph.origin, slice(6), RANK),
-        *(
-            (body.name, body.com, slice(3), SPIN * graph.size)
-            for body in graph.bodies.values() if body.mass > 0.0
-        ),
-    ):  # fmt: skip
+        *((body.name, body.com, slice(3), SPIN * graph.size) for body in graph.bodies.values() if body.mass > 0.0),
+    ):
         spins = spins @ null(twist(motion, body, point)[rows] @ spins, most, absolute=True)
     joints, held = dict(graph.joints), dict[str, float]()
     while spins.shape[1]:
@@ -59,9 +56,7 @@ def without_spins(graph: Graph) -> tuple[Graph, dict[str, float]]:
             break
         name, axes, spins, way = found
         joints[name] = _held(joints[name], axes)
-        held[name] = max(
-            (_imbalance(motion, body, way) for body in graph.bodies.values()), default=0.0
-        )
+        held[name] = max((_imbalance(motion, body, way) for body in graph.bodies.values()), default=0.0)
     return replace(graph, joints=joints), held
 
 
@@ -92,9 +87,14 @@ def hold(graph: Graph, hinges: Sequence[str]) -> Graph:
 def _held(joint: Joint, axes: Array) -> Joint:
     """Return a hinge made fixed, without axes, or a ball joint made universal, on two."""
     return replace(
-        joint, kind="universal" if len(axes) else "fixed", axes=array(axes), home=0.0, viscous=0.0,
-        coulomb=0.0, rotor_inertia=0.0,
-    )  # fmt: skip
+        joint,
+        kind="universal" if len(axes) else "fixed",
+        axes=array(axes),
+        home=0.0,
+        viscous=0.0,
+        coulomb=0.0,
+        rotor_inertia=0.0,
+    )
 
 
 def idle_bodies(graph: Graph, motion: Motion, free: Array) -> list[tuple[list[str], Array, Array]]:
@@ -106,9 +106,7 @@ def idle_bodies(graph: Graph, motion: Motion, free: Array) -> list[tuple[list[st
     groups: dict[str, list[str]] = {}
     for body, lead in merged(graph).items():
         groups.setdefault(lead, []).append(body)
-    moved = {
-        body: twist(motion, body, graph.bodies[body].com) @ free for body in graph.bodies
-    }  # fmt: skip
+    moved = {body: twist(motion, body, graph.bodies[body].com) @ free for body in graph.bodies}
     found = []
     for names in groups.values():
         others = [rows for body, rows in moved.items() if body not in names]

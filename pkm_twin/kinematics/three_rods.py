@@ -23,9 +23,7 @@ from pkm_twin.machine.graph import UP
 from pkm_twin.machine.tree import Tree
 
 
-def meet_spheres(
-    centres: Sequence[Any], squares: Sequence[Any], up: Numbers
-) -> tuple[Objects, Any, Any]:
+def meet_spheres(centres: Sequence[Any], squares: Sequence[Any], up: Numbers) -> tuple[Objects, Any, Any]:
     """Return where three spheres meet.
 
     :param centres: three points; ``squares``: of the radii. ``up``: a direction, shape (3,): the
@@ -37,10 +35,7 @@ def meet_spheres(
     u, v = centres[1] - centres[0], centres[2] - centres[0]
     n = cross(u, v)
     square = n @ n
-    a, b = (
-        w @ w + snapped(squares[0] - other)
-        for w, other in zip((u, v), squares[1:], strict=True)
-    )  # fmt: skip
+    a, b = (w @ w + snapped(squares[0] - other) for w, other in zip((u, v), squares[1:], strict=True))
     middle = cross(a * v - b * u, n) * (0.5 / square)
     apart = middle @ middle
     left = squares[0] - apart

@@ -166,14 +166,20 @@ class Traced:
             branch, determinant = self.lift([determinant - LEAST]), 1.0
         judged = [self.rows[k] for k in scheme.judged]
         solved = Equations(
-            self.target, self.lift([tree.home[k] for k in places]), self.lift(self.graph.lead_home),
-            self.lift(self._start()), self.retracted(onward),
+            self.target,
+            self.lift([tree.home[k] for k in places]),
+            self.lift(self.graph.lead_home),
+            self.lift(self._start()),
+            self.retracted(onward),
             self.lift([moved[k] for k in places]),
-            self.square(step, [tree.scales[k] for k in rates]), self.tape.lift(determinant),
+            self.square(step, [tree.scales[k] for k in rates]),
+            self.tape.lift(determinant),
             self.square([r.value for r in judged], [r.scale for r in judged]),
-            scheme.start is None, [*branch, *more.pop("branch", ())], self.unknowns_name,
+            scheme.start is None,
+            [*branch, *more.pop("branch", ())],
+            self.unknowns_name,
             **more,
-        )  # fmt: skip
+        )
         return (solved,)
 
     def retracted(self, values: Numbers, rates: Numbers = ()) -> list[Expression]:

@@ -34,9 +34,7 @@ class CutOut:
     carried: tuple[Link, ...]
 
 
-def find_circles(
-    pairs: Mapping[str, tuple[str, str]], base: str, platform: str
-) -> dict[str, tuple[str, str]]:
+def find_circles(pairs: Mapping[str, tuple[str, str]], base: str, platform: str) -> dict[str, tuple[str, str]]:
     """Find the joints that are on a circle through the base and the platform, in their order.
 
     :param pairs: bodies of each joint and closure; no joint has the same body at both ends.
@@ -60,9 +58,7 @@ def cut_out(tree: LoopTree, base: str, platform: str, *, carry: bool = False) ->
     """
     fixed = [joint for joint in tree.joints.values() if joint.kind == "fixed"]
     bodies = {
-        link: part[0]
-        for part in groups(tree.links, [(joint.inner, joint.outer) for joint in fixed])
-        for link in part
+        link: part[0] for part in groups(tree.links, [(joint.inner, joint.outer) for joint in fixed]) for link in part
     }
     ground, tool = bodies[base], bodies[platform]
     if ground == tool:
@@ -70,14 +66,14 @@ def cut_out(tree: LoopTree, base: str, platform: str, *, carry: bool = False) ->
     joints = [joint for joint in tree.joints.values() if joint.kind != "free"]
     pairs = {j.name: (bodies[j.inner], bodies[j.outer]) for j in (*joints, *tree.closures)}
     pairs = {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
-    part = next(part for part in groups(dict.fromkeys(bodies.values()), pairs.values())
-                if tool in part)  # fmt: skip
+    part = next(part for part in groups(dict.fromkeys(bodies.values()), pairs.values()) if tool in part)
     if ground not in part:
         near = [link for link in tree.links if bodies[link] in part and link != platform]
         raise ParameterError(
-            "base", base, f"a link that joints connect to platform {platform!r}, as "
-            f"{', '.join(near[:MAX_NAMES])}",
-        )  # fmt: skip
+            "base",
+            base,
+            f"a link that joints connect to platform {platform!r}, as {', '.join(near[:MAX_NAMES])}",
+        )
     circles = find_circles(pairs, ground, tool)
     kept = {body for pair in circles.values() for body in pair}
     links = {name: link for name, link in tree.links.items() if bodies[name] in kept}
@@ -92,8 +88,7 @@ def cut_out(tree: LoopTree, base: str, platform: str, *, carry: bool = False) ->
         # What hangs on a body is connected to it without the linkage.
         away = [body for body in dict.fromkeys(bodies.values()) if body not in kept or body == host]
         hanging = next(group for group in groups(away, bridges) if host in group)
-        own = [link for name, link in tree.links.items()
-               if bodies[name] in hanging and bodies[name] != host]  # fmt: skip
+        own = [link for name, link in tree.links.items() if bodies[name] in hanging and bodies[name] != host]
         if not own:
             continue
         names = ", ".join(link.name for link in own[:MAX_NAMES])
@@ -127,9 +122,7 @@ def cut_out(tree: LoopTree, base: str, platform: str, *, carry: bool = False) ->
             reached |= {name, *(one.child for one in hung(name, spanned.values()))}
     closures = tuple(joint for joint in tree.closures if joint.name in circles)
     actuated = tuple(name for name in tree.actuated if name in circles)
-    made = replace(
-        tree, root=base, links=links, joints=spanned, closures=closures, actuated=actuated
-    )
+    made = replace(tree, root=base, links=links, joints=spanned, closures=closures, actuated=actuated)
     return CutOut(made, tuple(notes), tuple(carried))
 
 

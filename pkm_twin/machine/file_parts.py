@@ -28,9 +28,7 @@ def find_beams(graph: Graph, specs: Specs) -> tuple[Beam, ...]:
     for name, body in specs["bodies"].items():
         m = body.member
         if m is not None:
-            beams.append(
-                Beam(name, name, limb[name], (name, m.start), (name, m.end), (name,), m.outer)
-            )
+            beams.append(Beam(name, name, limb[name], (name, m.start), (name, m.end), (name,), m.outer))
     for name, rod in specs["rods"].items():
         radius = rod.section.outer_diameter / 2 if rod.section is not None else rod.radius
         if radius is not None:
@@ -65,10 +63,17 @@ def find_passive_limits(graph: Graph, specs: Specs) -> tuple[PassiveLimit, ...]:
                 body, other = rod.between[k], rod.between[way]
                 found.append(
                     PassiveLimit(
-                        name, "rod", body, other, rod.ends[k], axis, 0.0, rod.swivel,
+                        name,
+                        "rod",
+                        body,
+                        other,
+                        rod.ends[k],
+                        axis,
+                        0.0,
+                        rod.swivel,
                         far=rod.ends[way],
                     )
-                )  # fmt: skip
+                )
     return tuple(found)
 
 
@@ -116,16 +121,14 @@ def find_structure(graph: Graph, specs: Specs) -> Structure:
         more = "".join(f"; wrong too: {error.field}" for error in others)
         raise ParameterError(first.field, first.value, f"{first.bound}{more}")
     compliances = {
-        name: joint.compliance.tolist()
-        for name, joint in specs["joints"].items()
-        if joint.compliance is not None
+        name: joint.compliance.tolist() for name, joint in specs["joints"].items() if joint.compliance is not None
     }
     if not sections and not compliances:
         raise RigidError(
-            "bodies.NAME.member.section", None,
-            "a member's section, rods.NAME.section or joints.NAME.compliance: "
-            "nothing is elastic",
-        )  # fmt: skip
+            "bodies.NAME.member.section",
+            None,
+            "a member's section, rods.NAME.section or joints.NAME.compliance: nothing is elastic",
+        )
     missing = [name for name in specs["rods"] if name not in sections]
     if missing:
         raise ParameterError(f"rods.{missing[0]}.section", None, "a section, as rods carry load")

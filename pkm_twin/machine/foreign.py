@@ -19,23 +19,27 @@ from pkm_twin.machine.graph import groups
 from pkm_twin.machine.loop_tree import Joint, Link
 
 IGNORED: Final = {
-    "spring_stiffness": "the spring", "springStiffness": "the spring",
-    "velocity_decay": "damping by the link's velocity", "dampingFactor": "damping by velocity",
-    "enable_wind": "wind", "drake:rotor_inertia": "the rotor inertia",
+    "spring_stiffness": "the spring",
+    "springStiffness": "the spring",
+    "velocity_decay": "damping by the link's velocity",
+    "dampingFactor": "damping by velocity",
+    "enable_wind": "wind",
+    "drake:rotor_inertia": "the rotor inertia",
     "drake:gear_ratio": "the gear of the rotor",
-}  # fmt: skip
+}
 """Elements that are left out with a warning where they are neither zero nor false."""
 REJECTED: Final = {
     "kinematic": "links that forces move",
     "coupling": "a machine without coupled joints",
     "force_element": "a machine without springs and dampers beside its joints",
-    "gearbox_ratio": "joints without coupling", "mimic": "joints without coupling",
+    "gearbox_ratio": "joints without coupling",
+    "mimic": "joints without coupling",
     "drake:mimic": "joints without coupling",
     "drake:joint": "joints and closures of the format alone",
     "drake:ball_constraint": "joints and closures of the format alone",
     "drake:distance_constraint": "joints and closures of the format alone",
     "drake:linear_bushing_rpy": "joints and closures of the format alone",
-}  # fmt: skip
+}
 """Elements that make another machine, and what is expected in their place."""
 COUPLING: Final = re.compile(r"mimic", re.IGNORECASE)
 """Names of plugins that couple joints."""
@@ -80,9 +84,13 @@ def _acts(part: ET.Element) -> bool:
 
 
 def gravity_of(
-    path: Path, weight: Mapping[str, bool], links: Mapping[str, Link], root: str,
-    joints: Iterable[Joint], stated: list[float] | None,
-) -> list[float] | None:  # fmt: skip
+    path: Path,
+    weight: Mapping[str, bool],
+    links: Mapping[str, Link],
+    root: str,
+    joints: Iterable[Joint],
+    stated: list[float] | None,
+) -> list[float] | None:
     """Return the file's gravity, or None where no link that can move has weight.
 
     :param weight: by link whether gravity acts on it. ``root``: the ground.

@@ -86,10 +86,14 @@ FUNCTIONS: Final[Mapping[str, tuple[int, Callable[..., Any]]]] = {
 }
 """Functions of expressions: number of arguments, and implementation."""
 _OPERATORS: Final[Mapping[type, Callable[..., Any]]] = {
-    ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv,
-    ast.Pow: _dispatch(operator.pow, _raise_expression), ast.USub: operator.neg,
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+    ast.Pow: _dispatch(operator.pow, _raise_expression),
+    ast.USub: operator.neg,
     ast.UAdd: lambda x: x,
-}  # fmt: skip
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,23 +224,12 @@ def _evaluate(node: ast.expr, given: Mapping[str, Any]) -> Any:
 
 
 def _derive_units(node: ast.expr, unit: str) -> Iterator[tuple[str, str]]:
-    if (
-        isinstance(node, ast.Name)
-        and node.id != "pi"
-        and unit
-        and not unit.endswith(_SQUARED_SUFFIX)
-    ):
+    if isinstance(node, ast.Name) and node.id != "pi" and unit and not unit.endswith(_SQUARED_SUFFIX):
         yield node.id, unit
     parts = _child_nodes(node)
     if isinstance(node, ast.Call):
         called = node.func.id  # type: ignore[attr-defined]
-        inner = (
-            "rad"
-            if called in _ANGLE_FUNCTIONS
-            else unit + _SQUARED_SUFFIX
-            if called == "sqrt" and unit
-            else ""
-        )
+        inner = "rad" if called in _ANGLE_FUNCTIONS else unit + _SQUARED_SUFFIX if called == "sqrt" and unit else ""
         for part in parts:
             yield from _derive_units(part, inner)
     elif isinstance(node, ast.BinOp) and isinstance(node.op, ast.Pow):
@@ -246,9 +239,7 @@ def _derive_units(node: ast.expr, unit: str) -> Iterator[tuple[str, str]]:
         # A factor has the unit of the product if the other factor has none.
         bare = [_has_no_unit(part) for part in parts]
         yield from _derive_units(parts[0], unit if bare[1] else "")
-        yield from _derive_units(
-            parts[1], unit if isinstance(node.op, ast.Mult) and bare[0] else ""
-        )
+        yield from _derive_units(parts[1], unit if isinstance(node.op, ast.Mult) and bare[0] else "")
     else:
         for part in parts:
             yield from _derive_units(part, unit)
@@ -393,11 +384,7 @@ class Book:
 
     def lost(self, other: Book) -> list[str]:
         """Describe the expressions and dependences that another book lacks, in up to two lines."""
-        texts = [
-            f"{path} was {formula.text}"
-            for path, formula in self.formulas.items()
-            if path not in other.formulas
-        ]
+        texts = [f"{path} was {formula.text}" for path, formula in self.formulas.items() if path not in other.formulas]
         kept = other.values.keys() - other.unused
         dead = [name for name in self.values if name not in kept and name not in self.unused]
         lines = [f"numbers replace expressions: {', '.join(texts)}"] if texts else []

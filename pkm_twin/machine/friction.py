@@ -337,9 +337,7 @@ def check_laws(friction: Any, path: str) -> None:
         for key, one in law.parameters.items():
             missing = used & ~(references(getattr(friction, key)) > 0.0)
             if not one.linear and np.any(missing):
-                raise ParameterError(
-                    f"{path}.{key}", 0.0, f"above zero where {' or '.join(linear)} is given"
-                )
+                raise ParameterError(f"{path}.{key}", 0.0, f"above zero where {' or '.join(linear)} is given")
 
 
 def taken(names: Sequence[str], values: Values, q: Any, rate: Any, load: Any) -> Any:

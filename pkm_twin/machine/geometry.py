@@ -69,18 +69,14 @@ def graph_on(graph: Graph, numbers: Numbers) -> SizedGraph:
         at, axes, home = take(joint.at), take(joint.axes), snapped(next(left))
         pitch = next(left) if joint.type.threaded() else 0.0
         directions = tuple(replace(d, vector=take(d.vector)) for d in joint.directions)
-        joints[name] = replace(
-            joint, at=at, axes=axes, home=home, pitch=pitch, directions=directions
-        )
+        joints[name] = replace(joint, at=at, axes=axes, home=home, pitch=pitch, directions=directions)
     rods = {}
     for name, rod in graph.rods.items():
         ends = take(rod.ends)
         rods[name] = replace(rod, ends=ends, pair=None if rod.pair is None else take(rod.pair))
     origin = take(graph.origin)
     sharing = take(graph.sharing)
-    return SizedGraph(
-        graph.bodies, joints, rods, graph.platform, origin, graph.laws, sharing, list(left)
-    )
+    return SizedGraph(graph.bodies, joints, rods, graph.platform, origin, graph.laws, sharing, list(left))
 
 
 def pattern_of(tree: Tree) -> str:

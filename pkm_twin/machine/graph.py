@@ -257,11 +257,18 @@ class Graph:
         """Text of what bodies, joints and rods there are, and how they meet: no number."""
         joints = [
             (
-                j.name, j.kind, j.inner, j.outer, j.actuated, j.virtual, j.loaded,
-                *["follows"] * j.follows, [d.body for d in j.directions],
+                j.name,
+                j.kind,
+                j.inner,
+                j.outer,
+                j.actuated,
+                j.virtual,
+                j.loaded,
+                *["follows"] * j.follows,
+                [d.body for d in j.directions],
             )
             for j in self.joints.values()
-        ]  # fmt: skip
+        ]
         rods = [(r.name, r.inner, r.outer, r.pair is not None) for r in self.rods.values()]
         return repr((list(self.bodies), joints, rods, self.platform, *self.laws))
 
@@ -322,13 +329,9 @@ class Graph:
             name = "axes" if count == 2 else "axis"
             raise ParameterError(f"{path}.{name}", joint.axes.tolist(), f"{count} for {joint.kind}")
         if count == 2 and float(np.linalg.norm(np.cross(*joint.axes))) < _PARALLEL:
-            raise ParameterError(
-                f"{path}.axes", joint.axes.tolist(), "two axes that are not parallel"
-            )
+            raise ParameterError(f"{path}.axes", joint.axes.tolist(), "two axes that are not parallel")
         if joint.actuated and len(joint.freedoms) != 1:
-            raise ParameterError(
-                f"{path}.actuated", joint.kind, "a joint with one degree of freedom"
-            )
+            raise ParameterError(f"{path}.actuated", joint.kind, "a joint with one degree of freedom")
 
     def _check_connection(self) -> None:
         pairs = [(joint.inner, joint.outer) for joint in self.joints.values()]
@@ -336,9 +339,7 @@ class Graph:
         reached = groups([BASE, *self.bodies], pairs)[0]
         for name in self.bodies:
             if name not in reached:
-                raise ParameterError(
-                    f"bodies.{name}", name, "a body that joints or rods connect to the base"
-                )
+                raise ParameterError(f"bodies.{name}", name, "a body that joints or rods connect to the base")
 
 
 def _extent(points: Sequence[Array]) -> tuple[Array, Any]:

@@ -68,9 +68,7 @@ class MemberSpec:
     @property
     def outer(self) -> float:
         """Outer radius, m."""
-        return (
-            self.section.outer_diameter / 2 if self.section is not None else float(self.radius or 0)
-        )
+        return self.section.outer_diameter / 2 if self.section is not None else float(self.radius or 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,9 +86,7 @@ class BodySpec:
             raise ParameterError(f"{path}.com", None, "the centre of mass of a body with mass, m")
 
 
-_Laws: Any = dataclasses.make_dataclass(
-    "_Laws", friction_fields(schema.number, default=0.0), frozen=True, eq=False
-)
+_Laws: Any = dataclasses.make_dataclass("_Laws", friction_fields(schema.number, default=0.0), frozen=True, eq=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,13 +110,17 @@ class LimitSpec:
     velocity: float | None = schema.number(above=0.0, high=math.inf, unit="{joint}/s", default=None)
     effort: float | None = schema.number(above=0.0, high=math.inf, unit="{effort}", default=None)
     swivel: float | None = schema.number(
-        above=0.0, high=np.pi, unit="rad", default=None,
-        text="largest angle of `axis` from its direction at home, in the other body's frame",
-    )  # fmt: skip
-    axis: Array | None = schema.vector(
-        3, text="base axes; default: the attached bar; of a universal joint the normal of its axes",
+        above=0.0,
+        high=np.pi,
+        unit="rad",
         default=None,
-    )  # fmt: skip
+        text="largest angle of `axis` from its direction at home, in the other body's frame",
+    )
+    axis: Array | None = schema.vector(
+        3,
+        text="base axes; default: the attached bar; of a universal joint the normal of its axes",
+        default=None,
+    )
 
     def verify(self, path: str) -> None:
         """Check that an axis has a length, and belongs to a swivel."""
@@ -171,9 +171,7 @@ class JointSpec:
             if wanted and value is None:
                 raise ParameterError(f"{path}.{key}", None, f"required for a {self.type} joint")
             if value is not None and not wanted:
-                raise ParameterError(
-                    f"{path}.{key}", value.tolist(), f"none for a {self.type} joint"
-                )
+                raise ParameterError(f"{path}.{key}", value.tolist(), f"none for a {self.type} joint")
             for row in [] if value is None else np.atleast_2d(value):
                 if not float(np.linalg.norm(row)) > 1e-9:
                     raise ParameterError(f"{path}.{key}", row.tolist(), "a vector with a length")
@@ -188,28 +186,20 @@ class JointSpec:
         for key in all_keys():
             value = getattr(self.friction, key, 0.0)
             if value and not self.actuated and key not in ("viscous", "coulomb"):
-                raise ParameterError(
-                    f"{path}.friction.{key}", value, "0 at a joint that is not actuated"
-                )
+                raise ParameterError(f"{path}.friction.{key}", value, "0 at a joint that is not actuated")
         if self.rotor_inertia and self.drive is not None:
             raise ParameterError(f"{path}.drive", "given", "either drive or rotor_inertia")
         swivels = self.limits is not None and self.limits.swivel is not None
         if swivels and self.type not in ("spherical", "universal"):
-            raise ParameterError(
-                f"{path}.limits.swivel", self.type, "a spherical or universal joint"
-            )
-        if swivels and any(
-            getattr(self.limits, key) is not None for key in ("position", "velocity", "effort")
-        ):
+            raise ParameterError(f"{path}.limits.swivel", self.type, "a spherical or universal joint")
+        if swivels and any(getattr(self.limits, key) is not None for key in ("position", "velocity", "effort")):
             raise ParameterError(f"{path}.limits", self.type, "swivel alone")
         for key in ("limits", "friction", "rotor_inertia", "drive", "home"):
             if getattr(self, key) and len(freedoms) != 1 and not (key == "limits" and swivels):
                 raise ParameterError(f"{path}.{key}", self.type, "a joint of one freedom")
         if self.compliance is not None:
             for k in np.flatnonzero(np.isinf(self.compliance) & ~self._free()):
-                raise ParameterError(
-                    f"{path}.compliance[{k}]", math.inf, "a finite number: the joint holds there"
-                )
+                raise ParameterError(f"{path}.compliance[{k}]", math.inf, "a finite number: the joint holds there")
         if len(freedoms) == 1 and freedoms[0].turns:
             check_angles(self.home or 0.0, f"{path}.home")
 
@@ -249,10 +239,19 @@ class JointSpec:
         inner, outer = self.between
         at = np.zeros(3) if self.at is None else self.at
         return Joint(
-            name, self.type, inner, outer, array(at), array(self._unit_axes()), self.actuated,
-            self.home or 0.0, rub.viscous, rub.coulomb, rotor,
+            name,
+            self.type,
+            inner,
+            outer,
+            array(at),
+            array(self._unit_axes()),
+            self.actuated,
+            self.home or 0.0,
+            rub.viscous,
+            rub.coulomb,
+            rotor,
             pitch=0.0 if self.lead is None else self.lead / TURN,
-        )  # fmt: skip
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,8 +281,9 @@ class Source:
 
 
 PER_COPY: Final = (
-    ["rotor_inertia"], *(["friction", key] for key in all_keys()),
-)  # fmt: skip
+    ["rotor_inertia"],
+    *(["friction", key] for key in all_keys()),
+)
 """Keys of a limb's numbers that may be lists, one number a copy."""
 KINDS: Final[Mapping[str, type]] = {"bodies": BodySpec, "joints": JointSpec, "rods": RodSpec}
 """The three mappings of a graph, and the schema of their entries."""
@@ -363,9 +363,11 @@ def written_out(
             if full in result[kind]:
                 where = path_of(sources[kind, full].path)
                 raise ParameterError(
-                    path_of(place), full, f"a name of its own for each copy: {full} stands for "
+                    path_of(place),
+                    full,
+                    f"a name of its own for each copy: {full} stands for "
                     f"{where} already, so rename one of the two, for example {name}_b",
-                )  # fmt: skip
+                )
             result[kind][full] = _turned(entry, azimuth, own, number + 1)
             sources[kind, full] = Source(place, name, number, len(limb.azimuths), azimuth)
     return result, sources
@@ -383,9 +385,7 @@ def _copies(entry: Any, count: int, path: str) -> list[Any]:
         if not isinstance(value, list):
             continue
         if len(value) != count:
-            raise ParameterError(
-                f"{path}.{'.'.join(keys)}", value, f"one number, or {count}, one per copy"
-            )
+            raise ParameterError(f"{path}.{'.'.join(keys)}", value, f"one number, or {count}, one per copy")
         for k in range(count):
             one = value[k]
             one = Written.of(one, one.book, f"[{k}]") if isinstance(one, Written) else one
@@ -407,9 +407,7 @@ def _turned(entry: Any, azimuth: Any, own: set[str], number: int) -> Any:
         new["inertia"] = array(rotation @ entry.inertia @ rotation.T)
         m = entry.member
         if m is not None:
-            new["member"] = dataclasses.replace(
-                m, start=array(rotation @ m.start), end=array(rotation @ m.end)
-            )
+            new["member"] = dataclasses.replace(m, start=array(rotation @ m.start), end=array(rotation @ m.end))
     else:
         new["between"] = tuple(f"{b}_{number}" if b in own else b for b in entry.between)
         limits = getattr(entry, "limits", None)
@@ -466,9 +464,7 @@ def _spelled(entry: T, places: Iterable[Keys]) -> T:
     return dataclasses.replace(entry, **zeros) if zeros else entry
 
 
-def graph_of_entries(
-    platform: str, specs: Mapping[str, Mapping[str, Any]], origin: Array | None = None
-) -> Graph:
+def graph_of_entries(platform: str, specs: Mapping[str, Mapping[str, Any]], origin: Array | None = None) -> Graph:
     """Return the graph of a file's entries, as :func:`written_out` gives them.
 
     :param origin: the platform's reference point, default its centre of mass.
@@ -498,9 +494,10 @@ def shared_by(graph: Graph, leads: Sequence[str], how: Redundancy, effort: Any) 
     if len(leads) == len(names):
         if how.preload.size:
             raise ParameterError(
-                "redundancy.preload", how.preload.tolist(),
+                "redundancy.preload",
+                how.preload.tolist(),
                 "none where there are no more actuated joints than degrees of freedom",
-            )  # fmt: skip
+            )
         return graph
     n = len(names)
     preload: Any = how.preload if how.preload.size else np.zeros(n)
@@ -511,9 +508,10 @@ def shared_by(graph: Graph, leads: Sequence[str], how: Redundancy, effort: Any) 
     for name, limit in zip(names, references(limits), strict=True):
         if not np.isfinite(limit):
             raise ParameterError(
-                f"joints.{name}.limits.effort", float(limit),
+                f"joints.{name}.limits.effort",
+                float(limit),
                 "a finite limit of every actuated joint, or of none: they share the effort by it",
-            )  # fmt: skip
+            )
     joints = {
         name: dataclasses.replace(joint, follows=joint.actuated and name not in leads)
         for name, joint in graph.joints.items()
@@ -529,9 +527,7 @@ def drives_of(graph: Graph, joints: Mapping[str, JointSpec]) -> dict[str, Any]:
     rubs = [joints[j].friction or FrictionSpec() for j in drives]
     n = len(drives)
     return {
-        "friction": friction_of(n)(
-            **{key: array([getattr(rub, key) for rub in rubs]) for key in all_keys()}
-        ),
+        "friction": friction_of(n)(**{key: array([getattr(rub, key) for rub in rubs]) for key in all_keys()}),
         "limits": limits_of(n)(
             position=_together([v.position for v in limits], [-math.inf, math.inf]),
             velocity=_together([v.velocity for v in limits], math.inf),

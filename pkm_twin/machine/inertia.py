@@ -24,8 +24,16 @@ TEN: Final = ("mass", "mx", "my", "mz", "ixx", "iyy", "izz", "ixy", "ixz", "iyz"
 """A body's ten standard inertial parameters: mass, kg; first moments, kg m; inertia, kg m2."""
 TEN_UNITS: Final = ("kg", *["kg m"] * 3, *["kg m2"] * 6)
 PARTS: Final = (
-    "bodies", "rods", "gravity", "viscous", "coulomb", "offset", "laws", "rotors", "passive",
-)  # fmt: skip
+    "bodies",
+    "rods",
+    "gravity",
+    "viscous",
+    "coulomb",
+    "offset",
+    "laws",
+    "rotors",
+    "passive",
+)
 """Parts of the parameter vector, in order."""
 GRAVITY: Final = 2
 LAW_VALUES: Final = 6
@@ -202,11 +210,7 @@ class Layout:
                     friction.offset,
                     *(getattr(friction, key) for key in keys_of(self.tree.graph.laws)),
                     [j.rotor_inertia for j in drives],
-                    [
-                        value
-                        for j in loaded_joints(graph)
-                        for value in (j.viscous, j.coulomb, j.rotor_inertia)
-                    ],
+                    [value for j in loaded_joints(graph) for value in (j.viscous, j.coulomb, j.rotor_inertia)],
                 ]
             )
         )

@@ -44,9 +44,7 @@ class JointMapEntry:
     name: str | None = schema.text(default=None)
     sign: float = schema.number(text="1 or -1", default=1.0)
     offset: float = schema.number(unit="controller units", default=0.0)
-    ratio: float = schema.number(
-        low=1e-6, high=1e6, unit="controller units per rad or m of the model", default=1.0
-    )
+    ratio: float = schema.number(low=1e-6, high=1e6, unit="controller units per rad or m of the model", default=1.0)
     ratio_change: float = schema.number(low=-1e3, high=1e3, unit="per rad or m", default=0.0)
     ratio_at: float = schema.number(unit="rad or m of the model", default=0.0)
     unit: str | None = schema.text(default=None)
@@ -112,13 +110,12 @@ class JointMap:
         if not self.even:
             worst = int(np.abs(self.changes).argmax())
             raise ParameterError(
-                f"joint_map.{self.names[worst]}.ratio_change", float(self.changes[worst]),
+                f"joint_map.{self.names[worst]}.ratio_change",
+                float(self.changes[worst]),
                 "0: only positions can be converted where the ratio changes with travel",
-            )  # fmt: skip
+            )
 
-    def shown(
-        self, joint: int, quantity: str, value: float, low: float, high: float
-    ) -> tuple[float, float, float]:
+    def shown(self, joint: int, quantity: str, value: float, low: float, high: float) -> tuple[float, float, float]:
         """Return a model's value and its bounds as the controller has them, for a message.
 
         :param quantity: position, velocity, acceleration or effort.
@@ -162,9 +159,7 @@ class JointMap:
     def controller_positions(self, model: Array) -> ControllerNumbers:
         """Convert the model's positions to the controller's, shape (..., n)."""
         away = model - self.centres
-        return ControllerNumbers(
-            self.offsets + self.factors * (model + 0.5 * self.changes * away * away)
-        )
+        return ControllerNumbers(self.offsets + self.factors * (model + 0.5 * self.changes * away * away))
 
     def controller_rates(self, model: Array) -> ControllerNumbers:
         """Convert rates or position differences to the controller's, shape (..., n)."""

@@ -134,17 +134,13 @@ class JointType:
 
 HELD: Final[dict[str, Callable[[Array, float], Sequence[Constraint]]]] = {
     "point": lambda _, __: [Constraint("point")],
-    "turns": lambda _, __: [
-        Constraint("angle", UNITS[i], UNITS[(i + 1) % 3]) for i in range(3)
-    ],
+    "turns": lambda _, __: [Constraint("angle", UNITS[i], UNITS[(i + 1) % 3]) for i in range(3)],
     "line": lambda axes, _: [Constraint("plane", e) for e in across(axes[0])],
     "flat": lambda axes, _: [Constraint("plane", axes[0])],
     "direction": lambda axes, _: [Constraint("angle", e, axes[0]) for e in across(axes[0])],
     "crossing": lambda axes, _: [Constraint("angle", axes[0], axes[1], axes=(0, 1))],
-    "thread": lambda axes, pitch: [
-        Constraint("screw", axes[0], across(axes[0])[0], slide=pitch)
-    ],
-}  # fmt: skip
+    "thread": lambda axes, pitch: [Constraint("screw", axes[0], across(axes[0])[0], slide=pitch)],
+}
 """Constraints as functions of a joint's axes and pitch, by name."""
 
 
@@ -232,9 +228,17 @@ class Free(JointType):
 TYPES: Final = {
     kind.name: kind
     for kind in (
-        Fixed, Revolute, Prismatic, Cylindrical, Universal, Spherical, Translation, Helical, Planar,
+        Fixed,
+        Revolute,
+        Prismatic,
+        Cylindrical,
+        Universal,
+        Spherical,
+        Translation,
+        Helical,
+        Planar,
     )
-}  # fmt: skip
+}
 """Joint types by name."""
 
 TURN: Final = 2.0 * math.pi

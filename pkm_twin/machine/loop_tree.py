@@ -53,9 +53,7 @@ class Link:
         return Link(self.name, pose @ self.frame, self.mass, pose.point(self.com), inertia)
 
 
-def link_of(
-    name: str, mass: float, pose: Pose, moment: Callable[[str], float], rounding: float
-) -> Link:
+def link_of(name: str, mass: float, pose: Pose, moment: Callable[[str], float], rounding: float) -> Link:
     """Return a link of a mass, kg, and moments of inertia in the frame of its centre, ``ixx`` on.
 
     ``rounding``: the largest rounding error of the file's moments of inertia, kg m2.

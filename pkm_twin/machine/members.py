@@ -105,9 +105,7 @@ class Tube:
             raise ParameterError(path, given, "one of density and inner_diameter")
         inner = self.inner_diameter
         if inner is not None and not inner < self.outer_diameter * (1 - 1e-6):
-            raise ParameterError(
-                f"{path}.inner_diameter", inner, f"below outer_diameter = {self.outer_diameter:g} m"
-            )
+            raise ParameterError(f"{path}.inner_diameter", inner, f"below outer_diameter = {self.outer_diameter:g} m")
 
     def section(self, mass_per_length: float, path: str) -> Section:
         """Return the section of a tube with this mass per length, kg/m.
@@ -176,11 +174,7 @@ class Structure:
         """Names of what is elastic: bars, then joints."""
         if self.order:
             return self.order
-        soft = [
-            name
-            for name, values in self.compliances.items()
-            if any(0.0 < value < math.inf for value in values)
-        ]
+        soft = [name for name, values in self.compliances.items() if any(0.0 < value < math.inf for value in values)]
         return tuple(dict.fromkeys([*(beam.element for beam in self.beams), *soft]))
 
     def scaled(self, factors: Mapping[str, float]) -> Structure:
@@ -197,8 +191,7 @@ class Structure:
             for name, section in self.sections.items()
         }
         compliances = {
-            name: [factors.get(name, 1.0) * value for value in values]
-            for name, values in self.compliances.items()
+            name: [factors.get(name, 1.0) * value for value in values] for name, values in self.compliances.items()
         }
         return replace(self, sections=sections, compliances=compliances)
 

@@ -25,9 +25,7 @@ from pkm_twin.machine.precision import rounding_error
 from pkm_twin.machine.rotations import Pose, from_quaternion
 from pkm_twin.machine.urdf_control import CHOOSE, UNCOUPLED, require_single
 
-_ENDLESS: Final = re.compile(
-    r"(?:^|\s)[-+]?(?:nan(?:\(\S*\))?|inf|infinity)(?:\s|$)", re.IGNORECASE
-)
+_ENDLESS: Final = re.compile(r"(?:^|\s)[-+]?(?:nan(?:\(\S*\))?|inf|infinity)(?:\s|$)", re.IGNORECASE)
 WORLD: Final = "world"
 """The root's name."""
 MAX_INCLUDES: Final = 8
@@ -61,9 +59,7 @@ def read(path: Path, top: ET.Element, actuated: Sequence[str] | None = None) -> 
     try:
         import mujoco
     except ImportError:
-        raise ParameterError(
-            str(path), "an MJCF file without the mujoco package", install("mjcf")
-        ) from None
+        raise ParameterError(str(path), "an MJCF file without the mujoco package", install("mjcf")) from None
     words = _require_bounded(path, top, path.parent)
     try:
         model = mujoco.MjModel.from_xml_path(str(path))
@@ -71,9 +67,7 @@ def read(path: Path, top: ET.Element, actuated: Sequence[str] | None = None) -> 
         text = " ".join(str(error).split())
         model = _without_meshes(mujoco, path)
         if model is None:
-            raise ParameterError(
-                str(path), ValueError(text), "a model that MuJoCo compiles"
-            ) from None
+            raise ParameterError(str(path), ValueError(text), "a model that MuJoCo compiles") from None
         warn(path, f"read without its meshes, as its bodies have inertias: {text}")
     return _Reader(mujoco, model, path).tree(rounding_error(words), actuated)
 
@@ -283,11 +277,7 @@ class _Reader:
         """Find the actuators of a joint."""
         m, kinds = self.model, self.mj.mjtTrn
         own = int(kinds.mjTRN_JOINT), int(kinds.mjTRN_JOINTINPARENT)
-        return [
-            i for i in range(m.nu)
-            if int(m.actuator_trntype[i]) in own
-            and m.actuator_trnid[i][0] == joint
-        ]  # fmt: skip
+        return [i for i in range(m.nu) if int(m.actuator_trntype[i]) in own and m.actuator_trnid[i][0] == joint]
 
     def _acted(self, i: int) -> tuple[str, ...]:
         """Find the joints on which an actuator of a tendon, a site or a body acts."""
@@ -300,8 +290,7 @@ class _Reader:
             joints = [int(m.wrap_objid[k]) for k in wraps if kinds[k] == "mjWRAP_JOINT"]
             if joints:
                 return tuple(self._name("JOINT", joint) for joint in joints)
-            bodies = [int(m.site_bodyid[m.wrap_objid[k]]) for k in wraps
-                      if kinds[k] == "mjWRAP_SITE"]  # fmt: skip
+            bodies = [int(m.site_bodyid[m.wrap_objid[k]]) for k in wraps if kinds[k] == "mjWRAP_SITE"]
         elif int(m.actuator_trntype[i]) != int(self.mj.mjtTrn.mjTRN_BODY):
             bodies = [int(m.site_bodyid[index])]
         moved: set[int] = set()
@@ -366,8 +355,7 @@ class _Reader:
             warn(self.path, "forces of plugins are ignored")
         held = {("JOINT", joint) for joint in self.locks}
         for what, kind, arrays in IGNORED:
-            values = [np.abs(array) for name in arrays
-                      if (array := getattr(self.model, name, None)) is not None]  # fmt: skip
+            values = [np.abs(array) for name in arrays if (array := getattr(self.model, name, None)) is not None]
             names = [
                 self._name(kind, i)
                 for i in range(len(values[0]) if values else 0)
@@ -377,12 +365,11 @@ class _Reader:
                 warn(self.path, f"{what} of {kind.lower()} {', '.join(names)} is ignored")
         geared = [
             f"{self._name('ACTUATOR', i)} ({self.model.actuator_gear[i][0]:g})"
-            for i in range(self.model.nu) if self.model.actuator_gear[i][0] != 1.0
-        ]  # fmt: skip
+            for i in range(self.model.nu)
+            if self.model.actuator_gear[i][0] != 1.0
+        ]
         if geared:
-            warn(
-                self.path, f"efforts are at the joints, not before the gear of {', '.join(geared)}"
-            )
+            warn(self.path, f"efforts are at the joints, not before the gear of {', '.join(geared)}")
         option = self.model.opt
         if option.density or option.viscosity:
             warn(self.path, "the fluid of density and viscosity is ignored")
@@ -451,9 +438,7 @@ class _Reader:
             name = self._name("ACTUATOR", i)
             joint = int(self.model.actuator_trnid[i][0])
             if i not in self._drives(joint):
-                error = ParameterError(
-                    f"actuator.{name}", name, f"an actuator of a joint, or names with {CHOOSE}"
-                )
+                error = ParameterError(f"actuator.{name}", name, f"an actuator of a joint, or names with {CHOOSE}")
                 self.faults.append((self._acted(i), error))
                 continue
             own = self._name("JOINT", joint)

@@ -52,9 +52,12 @@ def write_mjcf(
     top = ET.Element("mujoco", model=tree.name)
     ET.SubElement(top, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
     ET.SubElement(
-        top, "option", gravity=number_text(gravity), timestep=number_text([TIMESTEP]),
+        top,
+        "option",
+        gravity=number_text(gravity),
+        timestep=number_text([TIMESTEP]),
         integrator="RK4",
-    )  # fmt: skip
+    )
     default = ET.SubElement(top, "default")
     ET.SubElement(default, "geom", contype="0", conaffinity="0", group="1", rgba="0.6 0.65 0.7 1")
     ET.SubElement(default, "equality", solref=number_text(SOLREF), solimp=number_text(SOLIMP))
@@ -165,10 +168,12 @@ def _body(parent: ET.Element, link: Link, place: Array, before: Array) -> ET.Ele
     inertia = link.inertia + np.eye(3) * max(SPECK * float(np.trace(link.inertia)), LEAST)
     order = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
     ET.SubElement(
-        element, "inertial", pos=number_text(link.com - place),
+        element,
+        "inertial",
+        pos=number_text(link.com - place),
         mass=f"{link.mass or SPECK_MASS:.15g}",
         fullinertia=" ".join(f"{inertia[i, k]:.15g}" for i, k in order),
-    )  # fmt: skip
+    )
     return element
 
 

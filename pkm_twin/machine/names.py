@@ -37,11 +37,7 @@ def joint_labels(tree: Tree) -> dict[tuple[str, str], str]:
         if link.joint is None:
             wanted["bodies", link.body] = f"{link.body}_free", FREE
     labels = {("joints", name): name for name in graph.actuated}
-    taken = {
-        single
-        for name in graph.actuated
-        for single in single_names(name, graph.joints[name].freedoms)
-    }
+    taken = {single for name in graph.actuated for single in single_names(name, graph.joints[name].freedoms)}
     # Names that need no change come first and stay.
     changes = {key: plain_name(name) != name for key, (name, _) in wanted.items()}
     for key in sorted(wanted.keys() - labels.keys(), key=lambda key: (changes[key], key)):

@@ -41,9 +41,7 @@ class PoseGrid:
         """
         if self.kind != "cylinder":
             raise ValueError("a box of poses has no height, distance and azimuth")
-        z, r, a = np.broadcast_arrays(
-            *(np.asarray(v, np.float64) for v in (height, distance, azimuth))
-        )
+        z, r, a = np.broadcast_arrays(*(np.asarray(v, np.float64) for v in (height, distance, azimuth)))
         across = zero_torsion(r, a) if self.zero_torsion else (r * np.cos(a), r * np.sin(a))
         parts = dict(zip(self.lateral, across, strict=True)) | {self.height: z}
         return np.stack([parts[name] for name in self.names], -1)

@@ -79,9 +79,10 @@ def position_box(graph: Graph, limits: Array | None, passive: Sequence[PassiveLi
         # A screw goes as far as its slide.
         first = min(free, key=lambda joint: (len(joint.freedoms), joint.freedoms[0].turns))
         raise ParameterError(
-            f"joints.{first.name}.limits.position", None,
+            f"joints.{first.name}.limits.position",
+            None,
             "limits of the slides; without them the workspace is unbounded",
-        )  # fmt: skip
+        )
     return box
 
 

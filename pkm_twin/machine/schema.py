@@ -149,9 +149,7 @@ def flag(*, default: Any = MISSING, **more: Any) -> Any:
     return key(check, "true or false", default, **more)
 
 
-def words(
-    *allowed: str, size: int = 0, distinct: bool = True, default: Any = MISSING, **more: Any
-) -> Any:
+def words(*allowed: str, size: int = 0, distinct: bool = True, default: Any = MISSING, **more: Any) -> Any:
     """Make a field of ``size`` words (0: one or more), each one of ``allowed`` if there are any."""
 
     def check(field: str, value: Any) -> tuple[str, ...]:
@@ -165,11 +163,7 @@ def words(
             raise ParameterError(field, list(value), "different names")
         return tuple(map(str, items))
 
-    bound = (
-        f"different ones of {', '.join(allowed)}"
-        if allowed
-        else f"{size or ''} different names".strip()
-    )
+    bound = f"different ones of {', '.join(allowed)}" if allowed else f"{size or ''} different names".strip()
     if not distinct:
         bound = f"{size} words, each {' or '.join(allowed)}"
     return key(check, bound, default, **more)
@@ -224,9 +218,7 @@ def inertia(*, positive: bool, default: Any = MISSING, **more: Any) -> Any:
             bound = "above zero" if positive else "zero or more"
             raise ParameterError(field, value, f"principal moments {bound}; the least is {a:.6g}")
         if not triangle >= 0.0:
-            raise ParameterError(
-                field, value, f"triangle rule: {c:.6g} at most {a:.6g} + {b:.6g} (principal)"
-            )
+            raise ParameterError(field, value, f"triangle rule: {c:.6g} at most {a:.6g} + {b:.6g} (principal)")
         return frozen((matrix + matrix.T) / 2)
 
     bound = "3 numbers or 3x3" + (", moments above zero" if positive else "")

@@ -37,13 +37,17 @@ OLDEST: Final = (1, 4)
 NEAR: Final = 1e-6
 """Distance of two points that are one, m."""
 KINDS: Final = {
-    "fixed": "fixed", "revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic",
-    "screw": "helical", "universal": "universal", "revolute2": "universal", "ball": "spherical",
-}  # fmt: skip
+    "fixed": "fixed",
+    "revolute": "revolute",
+    "continuous": "revolute",
+    "prismatic": "prismatic",
+    "screw": "helical",
+    "universal": "universal",
+    "revolute2": "universal",
+    "ball": "spherical",
+}
 """SDF's joint types and ours."""
-WELDS: Final = {
-    "DetachableJoint": ("parent_link", "child_link"), "AttachLinks": ("parent", "child")
-}  # fmt: skip
+WELDS: Final = {"DetachableJoint": ("parent_link", "child_link"), "AttachLinks": ("parent", "child")}
 """Gazebo's plugins that hold two links together as they are drawn, and where they name them."""
 
 
@@ -94,9 +98,7 @@ def read(path: Path, top: ET.Element, actuated: Sequence[str] | None = None) -> 
     # Where only some joints have an effort limit, these are motors.
     limited = [name for name, joint in joints.items() if "effort" in joint.limits]
     faults: list[Fault] = []
-    motors, marked = actuated_joints(
-        path, top, read_beside(path), types, faults, others=limited, chosen=actuated
-    )
+    motors, marked = actuated_joints(path, top, read_beside(path), types, faults, others=limited, chosen=actuated)
 
     def rank(joint: Joint) -> tuple[bool, bool, int]:
         return joint.kind != "fixed", joint.name not in motors, joint.type.cost
@@ -108,13 +110,19 @@ def read(path: Path, top: ET.Element, actuated: Sequence[str] | None = None) -> 
     for name in [name for name in links if name not in reached]:
         raise ParameterError(f"link.{name}", None, "a joint that connects it")
     return LoopTree(
-        title, WORLD, links, spanned,
-        tuple(closing(joint) for name, joint in joints.items() if name not in tree), motors,
-        gravity_of(path, weight, links, WORLD, joints.values(), gravity), rounding=rounding_error(
-            word for part in element.iter() if part.tag in ("pose", "xyz")
-            for word in (part.text or "").split()
-        ), marked=marked, faults=tuple(faults),
-    )  # fmt: skip
+        title,
+        WORLD,
+        links,
+        spanned,
+        tuple(closing(joint) for name, joint in joints.items() if name not in tree),
+        motors,
+        gravity_of(path, weight, links, WORLD, joints.values(), gravity),
+        rounding=rounding_error(
+            word for part in element.iter() if part.tag in ("pose", "xyz") for word in (part.text or "").split()
+        ),
+        marked=marked,
+        faults=tuple(faults),
+    )
 
 
 def _fixed(name: str, inner: str, outer: str, place: Pose) -> Joint:
@@ -229,9 +237,7 @@ class Model:
             self._known[name] = self._local(name, where)
         found = self._known[name]
         if found is None:
-            raise ParameterError(
-                f"{self.prefix}{name}.pose", where, "frames that do not lead back to themselves"
-            )
+            raise ParameterError(f"{self.prefix}{name}.pose", where, "frames that do not lead back to themselves")
         return found
 
     def _local(self, name: str, where: str) -> Pose:
@@ -344,9 +350,12 @@ def _link(path: Path, element: ET.Element, name: str, rounding: float) -> Link:
     moments = None if inertial is None else urdf_xml.single(inertial, "inertia", where)
     at = pose(None if inertial is None else urdf_xml.single(inertial, "pose", where), where)
     return link_of(
-        name, _text(inertial, "mass", where, 1.0), at,
-        lambda key: _text(moments, key, f"{where}.inertia", float(key[1] == key[2])), rounding,
-    )  # fmt: skip
+        name,
+        _text(inertial, "mass", where, 1.0),
+        at,
+        lambda key: _text(moments, key, f"{where}.inertia", float(key[1] == key[2])),
+        rounding,
+    )
 
 
 def _joint(path: Path, part: ET.Element, model: Model) -> Joint:
@@ -365,10 +374,12 @@ def _joint(path: Path, part: ET.Element, model: Model) -> Joint:
     if frame is not None and frame.tag == "frame":
         far = float(np.linalg.norm(place(ends[0]).position - at.position))
         if far > NEAR:
-            warn(path, f"{where}: the frame {ends[0]} is drawn {far:.3g} m from the joint; "
-                 "a joint of SDF holds its links as they are drawn")  # fmt: skip
-    return joint_of(path, part, name, links, at, lambda frame: place(frame).rotation,
-                    model.version)  # fmt: skip
+            warn(
+                path,
+                f"{where}: the frame {ends[0]} is drawn {far:.3g} m from the joint; "
+                "a joint of SDF holds its links as they are drawn",
+            )
+    return joint_of(path, part, name, links, at, lambda frame: place(frame).rotation, model.version)
 
 
 def joint_of(
@@ -413,9 +424,16 @@ def joint_of(
             limits = urdf_xml.limits(stated, where, turns)
     pitch = _pitch(part, where) if kind == "helical" else 0.0
     return Joint(
-        name, kind, *links, (place, place), np.reshape(axes, (-1, 3)), limits=limits,
-        viscous=max(viscous), coulomb=max(coulomb), pitch=pitch,
-    )  # fmt: skip
+        name,
+        kind,
+        *links,
+        (place, place),
+        np.reshape(axes, (-1, 3)),
+        limits=limits,
+        viscous=max(viscous),
+        coulomb=max(coulomb),
+        pitch=pitch,
+    )
 
 
 def _pitch(part: ET.Element, where: str) -> float:
@@ -449,9 +467,7 @@ def _axis(
     return np.asarray((turn(frame) if frame else place.rotation) @ value / size)
 
 
-def welds(
-    path: Path, top: ET.Element, model: str, places: Mapping[str, Pose], taken: set[str]
-) -> Iterator[Joint]:
+def welds(path: Path, top: ET.Element, model: str, places: Mapping[str, Pose], taken: set[str]) -> Iterator[Joint]:
     """Read the pairs of links that Gazebo's plugins hold together, as they are drawn.
 
     :param taken: names of joints and closures; the welds' own are added.

@@ -25,14 +25,16 @@ SMALL: Final = 1e-6
 body's. SDF takes no zeros, and simulators nothing much smaller."""
 ENDLESS: Final = 1e16
 """A limit that is none."""
-MOTOR: Final = {
-    "filename": "gz-sim-apply-joint-force-system", "name": "gz::sim::systems::ApplyJointForce"
-}  # fmt: skip
+MOTOR: Final = {"filename": "gz-sim-apply-joint-force-system", "name": "gz::sim::systems::ApplyJointForce"}
 """The plugin that lets a joint be driven, and marks it as actuated."""
 KINDS: Final = {
-    "fixed": "fixed", "revolute": "revolute", "prismatic": "prismatic", "universal": "universal",
-    "spherical": "ball", "helical": "screw",
-}  # fmt: skip
+    "fixed": "fixed",
+    "revolute": "revolute",
+    "prismatic": "prismatic",
+    "universal": "universal",
+    "spherical": "ball",
+    "helical": "screw",
+}
 """Types of joints that SDF has; the others are several, with small links between them."""
 
 
@@ -67,18 +69,14 @@ class _Writer:
             self.joints.append((joint.name, KINDS[joint.kind], parent, child, joint.at, row))
             return
         for part in row:
-            self.links.setdefault(
-                part.child, Link(part.child, Pose(position=joint.at), com=joint.at)
-            )
+            self.links.setdefault(part.child, Link(part.child, Pose(position=joint.at), com=joint.at))
             self.joints.append((part.name, part.kind, *part[3:5], joint.at, [part]))
 
     def text(self) -> str:
         """Return the file's text."""
         for link in self.links.values():
             self._link(link)
-        frame = ET.SubElement(
-            self.model, "frame", name=PLATFORM, attached_to=self.names[self.tree.platform]
-        )
+        frame = ET.SubElement(self.model, "frame", name=PLATFORM, attached_to=self.names[self.tree.platform])
         _pose(frame, self.tree.origin)
         hold = ET.SubElement(self.model, "joint", name="world_fixed", type="fixed")
         ET.SubElement(hold, "parent").text = "world"
@@ -109,9 +107,7 @@ class _Writer:
         for k, bar in enumerate(bars):
             _visual(link, f"bar_{k}", bar, place)
 
-    def _joint(
-        self, name: str, kind: str, parent: str, child: str, at: Array, row: Sequence[Single]
-    ) -> None:
+    def _joint(self, name: str, kind: str, parent: str, child: str, at: Array, row: Sequence[Single]) -> None:
         element = ET.SubElement(self.model, "joint", name=name, type=kind)
         _pose(element, at)
         ET.SubElement(element, "parent").text = self.names[parent]

@@ -113,9 +113,7 @@ class DriveSpec:
     def verify(self, path: str) -> None:
         """Check that exactly one of ``ratio`` and ``lead`` is given."""
         if (self.ratio is None) == (self.lead is None):
-            raise ParameterError(
-                path, None, "either `ratio` (turns per turn) or `lead` (m per turn)"
-            )
+            raise ParameterError(path, None, "either `ratio` (turns per turn) or `lead` (m per turn)")
 
     @property
     def turns(self) -> float:
@@ -139,14 +137,19 @@ class Redundancy:
         text="joints that determine the pose; default: the most independent", default=None
     )
     tolerance: float = schema.number(
-        above=0.0, high=0.1, unit="rad", default=1e-3,
+        above=0.0,
+        high=0.1,
+        unit="rad",
+        default=1e-3,
         text="how far other joints may be from where the leading ones put them; sliding joints: "
         "times the machine's size; rates: this in 10 ms",
-    )  # fmt: skip
+    )
     preload: Array = schema.vector(
-        0, unit="{effort}", default=[],
+        0,
+        unit="{effort}",
+        default=[],
         text="one effort per joint: the efforts of a motion are those nearest to these",
-    )  # fmt: skip
+    )
 
 
 @remembered
@@ -162,10 +165,9 @@ def friction_of(joints: int) -> Any:
 def friction_fields(kind: Any, *size: int, **options: Any) -> list[tuple[str, Any, Any]]:
     """Return names, types and fields of friction; only the basic law's zeros are written out."""
     return [
-        (key, Any, kind(*size, unit=one.unit, low=one.low, high=one.high,
-                        rare=key not in BASIC.parameters, **options))
+        (key, Any, kind(*size, unit=one.unit, low=one.low, high=one.high, rare=key not in BASIC.parameters, **options))
         for key, one in all_keys().items()
-    ]  # fmt: skip
+    ]
 
 
 @remembered
@@ -180,17 +182,13 @@ def limits_of(joints: int) -> Any:
     return _make_section("Limits", entries, joints)
 
 
-def _make_section(
-    name: str, entries: list[tuple[str, Any, Any]], joints: int, more: Mapping[str, Any] = {}
-) -> Any:
+def _make_section(name: str, entries: list[tuple[str, Any, Any]], joints: int, more: Mapping[str, Any] = {}) -> Any:
     """Make a section's class for this number of joints; its instances can be pickled."""
 
     def reduce(self: Any) -> tuple[Any, ...]:
         return _rebuild_section, (name, joints, [getattr(self, entry[0]) for entry in entries])
 
-    return dataclasses.make_dataclass(
-        name, entries, frozen=True, eq=False, namespace={"__reduce__": reduce, **more}
-    )
+    return dataclasses.make_dataclass(name, entries, frozen=True, eq=False, namespace={"__reduce__": reduce, **more})
 
 
 def _rebuild_section(name: str, joints: int, values: list[Any]) -> Any:

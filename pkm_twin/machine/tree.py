@@ -147,9 +147,7 @@ class Tree:
 
     def values_of_drives(self, leads: Any, x: Any) -> list[Any]:
         """Positions of all drives of those that lead; turns within half a turn of home."""
-        return [
-            leads[step.position] if step.actuated else self._value(step, x) for step in self.drives
-        ]
+        return [leads[step.position] if step.actuated else self._value(step, x) for step in self.drives]
 
     def values_of_joints(self, names: Sequence[str], x: Any) -> list[Any]:
         """Positions of passive joints of one freedom; turns within half a turn of home."""
@@ -187,14 +185,9 @@ class Tree:
         for name in self.cut:
             if graph.joints[name].type.threaded():
                 # Its turn is known but for whole ones.
-                raise ParameterError(
-                    f"joints.{name}.type", "helical", "a loop that has other joints too"
-                )
+                raise ParameterError(f"joints.{name}.type", "helical", "a loop that has other joints too")
             if graph.joints[name].actuated:
-                raise ParameterError(
-                    f"joints.{name}.actuated", True, "actuated joints that close no loop "
-                    "of their own"
-                )  # fmt: skip
+                raise ParameterError(f"joints.{name}.actuated", True, "actuated joints that close no loop of their own")
         return neighbours
 
     def _hang(self, parent: str, body: str, name: str | None) -> None:
@@ -219,10 +212,20 @@ class Tree:
             none = np.zeros(3)
             steps.append(
                 Step(
-                    none, False, 0.0, False, position, rate, sign, np.eye(3), none, name or body,
-                    ball=start == BALL, free=start == FREE,
+                    none,
+                    False,
+                    0.0,
+                    False,
+                    position,
+                    rate,
+                    sign,
+                    np.eye(3),
+                    none,
+                    name or body,
+                    ball=start == BALL,
+                    free=start == FREE,
                 )
-            )  # fmt: skip
+            )
             freedoms, frame = (), np.eye(3)
         turns = [freedom.axis for freedom in freedoms if freedom.turns]
         for freedom in freedoms:
@@ -243,10 +246,21 @@ class Tree:
                 self.scales.append(1.0 if freedom.turns else 1.0 / graph.size)
             steps.append(
                 Step(
-                    axis, freedom.turns, freedom.slide, actuated, position, rate, sign, before,
-                    local, str(name), freedom.outer != backwards, offset, circle=circle,
+                    axis,
+                    freedom.turns,
+                    freedom.slide,
+                    actuated,
+                    position,
+                    rate,
+                    sign,
+                    before,
+                    local,
+                    str(name),
+                    freedom.outer != backwards,
+                    offset,
+                    circle=circle,
                 )
-            )  # fmt: skip
+            )
         self.axes[body], self.at[body] = frame, at
         arm = snapped_all(self.axes[parent].T @ (at - self.at[parent]))
         self.links[body] = Link(body, parent, name, tuple(steps), at, frame, arm)

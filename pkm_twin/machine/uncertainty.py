@@ -80,9 +80,7 @@ def causes_of(
     return found
 
 
-def numbers_below(
-    name: str, entry: UncertaintyEntry, numbers: Mapping[str, tuple[float, str]]
-) -> dict[str, float]:
+def numbers_below(name: str, entry: UncertaintyEntry, numbers: Mapping[str, tuple[float, str]]) -> dict[str, float]:
     """Return the numbers that an entry's path covers; errors as of :func:`causes_of`."""
     parts = (f"{name}.", f"{name}[")
     below = {path: v for path, (v, _) in numbers.items() if path == name or path.startswith(parts)}
@@ -90,7 +88,5 @@ def numbers_below(
     if not below:
         raise unknown_number(field, (f"uncertainty.{path}" for path in numbers))
     if entry.deviation is not None and len(below) > 1:
-        raise ParameterError(
-            field, entry.deviation, "relative, because the path names several numbers"
-        )
+        raise ParameterError(field, entry.deviation, "relative, because the path names several numbers")
     return below

@@ -78,9 +78,7 @@ def _independent(top: ET.Element) -> list[str]:
     return [
         urdf_xml.name(joint, ())
         for joint in top.findall("joint")
-        if urdf_xml.boolean(
-            joint.get("independent", "false"), f"joint.{joint.get('name')}.independent"
-        )
+        if urdf_xml.boolean(joint.get("independent", "false"), f"joint.{joint.get('name')}.independent")
     ]
 
 
@@ -137,9 +135,7 @@ def actuated_joints(
     return require_single(names, types, source), source
 
 
-def require_single(
-    names: Sequence[str], types: Mapping[str, str], source: str = "actuated"
-) -> tuple[str, ...]:
+def require_single(names: Sequence[str], types: Mapping[str, str], source: str = "actuated") -> tuple[str, ...]:
     """Return names of joints that can be actuated: of one axis, each once.
 
     :raises ParameterError: by the name.
@@ -192,10 +188,7 @@ def tree_names(joints: Iterable[str], controls: Iterable[Control]) -> dict[str, 
     names = list(joints)
     drives = {control.name for control in controls if not control.same}
     taken = drives.union(names)
-    return {
-        name: urdf_xml.free_name(name + MODEL, taken, MODEL) if name in drives else name
-        for name in names
-    }
+    return {name: urdf_xml.free_name(name + MODEL, taken, MODEL) if name in drives else name for name in names}
 
 
 def take_drives(robot: ET.Element) -> dict[str, dict[str, Any]]:
@@ -242,9 +235,7 @@ def take_drives(robot: ET.Element) -> dict[str, dict[str, Any]]:
         for parameter in joint.iter("param") if name in found else ():
             key = parameter.get("name", "")
             if key in ("initial_value", "rotor_inertia", "friction_offset"):
-                value = urdf_xml.number(
-                    (parameter.text or "").strip(), f"ros2_control.{name}.{key}"
-                )
+                value = urdf_xml.number((parameter.text or "").strip(), f"ros2_control.{name}.{key}")
                 parameter.text = f"{found[name].value(key, value):.14g}"
         joint.set("name", own.get(name, name))
     entries = {}

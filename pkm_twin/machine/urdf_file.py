@@ -41,9 +41,17 @@ CONSTRAINTS: Final = {
     "link": "fixed",  # a link that was cut in two
 }
 READ: Final = (
-    "link", "joint", "constraint", "loop", "loop_joint", "gazebo", "ros2_control", "transmission",
-    "material", "sensor",
-)  # fmt: skip
+    "link",
+    "joint",
+    "constraint",
+    "loop",
+    "loop_joint",
+    "gazebo",
+    "ros2_control",
+    "transmission",
+    "material",
+    "sensor",
+)
 """Elements of a robot that are read, or do not act on its motion."""
 PARTS: Final = (
     "parent",
@@ -54,10 +62,7 @@ PARTS: Final = (
     "child_axis",
     "dynamics",
 )
-LOOPS: Final = {
-    name: CONSTRAINTS[name]
-    for name in ("revolute", "continuous", "prismatic", "fixed", "spherical")
-}
+LOOPS: Final = {name: CONSTRAINTS[name] for name in ("revolute", "continuous", "prismatic", "fixed", "spherical")}
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,8 +122,7 @@ def read(path: Path, robot: ET.Element, actuated: Sequence[str] | None = None) -
         frames[child] = frames[parent] @ joint.frames[0]
     links = {n: link.moved(frames[n]) for n, link in links.items()}
     joints, closures = (
-        {n: one.placed(frames[one.inner], frames[one.outer]) for n, one in some.items()}
-        for some in (joints, closures)
+        {n: one.placed(frames[one.inner], frames[one.outer]) for n, one in some.items()} for some in (joints, closures)
     )
     closures |= _of_gazebo(path, robot, frames, {*joints, *closures})
     types = {n: joint.kind for n, joint in joints.items()}
@@ -141,17 +145,27 @@ def read(path: Path, robot: ET.Element, actuated: Sequence[str] | None = None) -
             weight[link] = foreign.flag(element, "gravity", not off)
     gravity = foreign.gravity_of(path, weight, links, root, joints.values(), None)
     return LoopTree(
-        name, root, links, joints, tuple(closures.values()), motors, gravity, initial=initial,
+        name,
+        root,
+        links,
+        joints,
+        tuple(closures.values()),
+        motors,
+        gravity,
+        initial=initial,
         rounding=rounding_error(
-            word for e in robot.iter() if e.tag in _PLACES or "origin" in e.tag
-            for key in ("xyz", "rpy") for word in e.get(key, "").split()
-        ), marked=marked, faults=tuple(faults),
-    )  # fmt: skip
+            word
+            for e in robot.iter()
+            if e.tag in _PLACES or "origin" in e.tag
+            for key in ("xyz", "rpy")
+            for word in e.get(key, "").split()
+        ),
+        marked=marked,
+        faults=tuple(faults),
+    )
 
 
-def _of_gazebo(
-    path: Path, robot: ET.Element, frames: Mapping[str, Pose], taken: set[str]
-) -> dict[str, Joint]:
+def _of_gazebo(path: Path, robot: ET.Element, frames: Mapping[str, Pose], taken: set[str]) -> dict[str, Joint]:
     """Joints of SDF inside ``<gazebo>``, and links that its plugins hold together, by name.
 
     :param frames: of the links. ``taken``: names of joints and closures; those of these are added.
@@ -204,8 +218,7 @@ def _joint(element: ET.Element, name: str, links: dict[str, Link]) -> Joint:
     if kind not in JOINTS:
         raise UnknownNameError(f"{where}.type", kind, JOINTS)
     parent, child = (
-        urdf_xml.reference(urdf_xml.single(element, end, where), f"{where}.{end}", links)
-        for end in ("parent", "child")
+        urdf_xml.reference(urdf_xml.single(element, end, where), f"{where}.{end}", links) for end in ("parent", "child")
     )
     origin = urdf_xml.origin(urdf_xml.single(element, "origin", where), where)
     bare = kind in ("fixed", "spherical")
@@ -217,9 +230,16 @@ def _joint(element: ET.Element, name: str, links: dict[str, Link]) -> Joint:
     viscous, coulomb = urdf_xml.friction(element, where)
     kind = "revolute" if kind == "continuous" else kind
     return Joint(
-        name, kind, parent, child, (origin, Pose()), np.reshape(axes, (-1, 3)), limits=limits,
-        viscous=viscous, coulomb=coulomb,
-    )  # fmt: skip
+        name,
+        kind,
+        parent,
+        child,
+        (origin, Pose()),
+        np.reshape(axes, (-1, 3)),
+        limits=limits,
+        viscous=viscous,
+        coulomb=coulomb,
+    )
 
 
 def _take_screw(element: ET.Element, joints: dict[str, Joint], links: dict[str, Link]) -> None:
@@ -245,9 +265,12 @@ def _take_screw(element: ET.Element, joints: dict[str, Joint], links: dict[str, 
         raise ParameterError(where, "<mimic>", UNCOUPLED)
     along = Pose(position=pose.position + offset * slide.axes[0])
     joints[turn.name] = replace(
-        turn, kind="helical", outer=slide.outer, frames=(turn.frames[0] @ along, Pose()),
+        turn,
+        kind="helical",
+        outer=slide.outer,
+        frames=(turn.frames[0] @ along, Pose()),
         pitch=pitch,
-    )  # fmt: skip
+    )
     del joints[slide.name], links[slide.inner]
 
 
@@ -329,9 +352,7 @@ def _constraint(element: ET.Element, name: str, links: Collection[str]) -> Joint
     urdf_xml.only(element, where, PARTS)
     for end in ("parent", "child"):
         urdf_xml.only(urdf_xml.single(element, end, where), f"{where}.{end}", ())
-    ends = tuple(
-        urdf_xml.reference(element.find(e), f"{where}.{e}", links) for e in ("parent", "child")
-    )
+    ends = tuple(urdf_xml.reference(element.find(e), f"{where}.{e}", links) for e in ("parent", "child"))
     frames = tuple(
         urdf_xml.origin(urdf_xml.single(element, f"{e}_origin", where), f"{where}.{e}_origin")
         for e in ("parent", "child")
@@ -381,9 +402,7 @@ def _loop_joint(element: ET.Element, name: str, links: Collection[str]) -> Joint
     return _closure(name, LOOPS[kind], ends, frames, (axis, axis))
 
 
-def _pairs(
-    beside: Mapping[str, Any], links: Collection[str], joints: Mapping[str, str]
-) -> list[Joint]:
+def _pairs(beside: Mapping[str, Any], links: Collection[str], joints: Mapping[str, str]) -> list[Joint]:
     """Read closures of the YAML file: two frames that meet whole (6d) or in their origins (3d)."""
     pairs = beside.get("closed_loop", [])
     kinds = beside.get("type", ["6d"] * len(pairs))
@@ -400,9 +419,7 @@ def _pairs(
         known = [*links, *joints]
         found = [urdf_xml.known_link(f"closed_loop[{i}]", name, known) for name in pair]
         ends = [joints.get(name, name) for name in found]
-        closures.append(
-            _closure("_".join(pair), types[str(kind).lower()], ends, (Pose(), Pose()), ())
-        )
+        closures.append(_closure("_".join(pair), types[str(kind).lower()], ends, (Pose(), Pose()), ()))
     return closures
 
 
@@ -434,9 +451,7 @@ def _parameters(robot: ET.Element, actuated: tuple[str, ...], key: str) -> dict[
     return found
 
 
-def _warn_of_units(
-    path: Path, robot: ET.Element, joints: dict[str, Joint], closures: dict[str, Joint]
-) -> None:
+def _warn_of_units(path: Path, robot: ET.Element, joints: dict[str, Joint], closures: dict[str, Joint]) -> None:
     offsets = {f"joint.{n}.origin": j.frames[0] for n, j in joints.items()}
     offsets |= {f"{n}.{i}": f for n, c in closures.items() for i, f in enumerate(c.frames)}
     where, pose = max(
@@ -456,14 +471,11 @@ def _warn_of_units(
         if largest > 2.0 * math.pi + 1e-6:
             warn(
                 path,
-                f"{top.tag}.{top.get('name')}.rpy: {largest:g} rad; a URDF uses radians; "
-                "are these degrees?",
+                f"{top.tag}.{top.get('name')}.rpy: {largest:g} rad; a URDF uses radians; are these degrees?",
             )
 
 
-def visuals(
-    path: Path, robot: ET.Element, places: Mapping[str, Pose], bodies: Mapping[str, str]
-) -> Iterator[Visual]:
+def visuals(path: Path, robot: ET.Element, places: Mapping[str, Pose], bodies: Mapping[str, str]) -> Iterator[Visual]:
     """Meshes of a machine's links; an invalid one is left out with a warning.
 
     :param places: of the links at home, base axes; ``bodies``: the body of each link.

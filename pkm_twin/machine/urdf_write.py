@@ -35,9 +35,7 @@ NAMED: Final = ("link", "joint", "constraint", "ros2_control")
 """Elements whose name is of one machine; those of interfaces and parameters are not."""
 
 
-def write_urdf(
-    tree: LoopTree, hardware: str = MOCK, prefix: str = "", controls: Iterable[Control] = ()
-) -> str:
+def write_urdf(tree: LoopTree, hardware: str = MOCK, prefix: str = "", controls: Iterable[Control] = ()) -> str:
     """Write the URDF of a tree.
 
     The root is ``base_link``; ``platform`` is a link without mass on the reference point, fixed
@@ -161,18 +159,25 @@ def _joint(robot: ET.Element, part: Single, places: Mapping[str, Array]) -> ET.E
 
 
 def _drive(
-    robot: ET.Element, part: Single, control: Control, places: dict[str, Array],
+    robot: ET.Element,
+    part: Single,
+    control: Control,
+    places: dict[str, Array],
     follower: ET.Element,
-) -> None:  # fmt: skip
+) -> None:
     """Write the joint of a controller, with a link without mass, and the joint that follows it."""
     link = urdf_xml.free_name(control.name + DRIVE, {PLATFORM, *places})
     places[link] = part.joint.at
     # A motor that turns, or a slide where the controller counts the metres of one.
     slides = part.kind == "prismatic" and abs(control.factor) == 1.0
     joint = replace(
-        part.joint, name=control.name, drawn=0.0, viscous=0.0, coulomb=0.0,
+        part.joint,
+        name=control.name,
+        drawn=0.0,
+        viscous=0.0,
+        coulomb=0.0,
         limits=control.limits(part.joint.limits, part.kind),
-    )  # fmt: skip
+    )
     kind = "prismatic" if slides else "revolute"
     _joint(robot, Single(control.name, kind, part.axis, part.parent, link, joint), places)
     ET.SubElement(robot, "link", name=link)
@@ -222,9 +227,7 @@ def _control(robot: ET.Element, tree: LoopTree, plugin: str, drives: Mapping[str
         ET.SubElement(position, "param", name="initial_value").text = start
         for interface in ("velocity", "effort"):
             ET.SubElement(element, "state_interface", name=interface)
-        for key, value in (
-            ("rotor_inertia", joint.rotor_inertia), ("friction_offset", joint.offset)
-        ):  # fmt: skip
+        for key, value in (("rotor_inertia", joint.rotor_inertia), ("friction_offset", joint.offset)):
             if value:
                 text = number_text([control.value(key, value)])
                 ET.SubElement(element, "param", name=key).text = text

@@ -45,9 +45,7 @@ def elements(path: Path) -> ET.Element:
         nonlocal depth
         depth += 1
         if depth > MAX_DEPTH:
-            raise ParameterError(
-                str(path), "deeply nested elements", f"a nesting of at most {MAX_DEPTH}"
-            )
+            raise ParameterError(str(path), "deeply nested elements", f"a nesting of at most {MAX_DEPTH}")
         builder.start(tag, attributes)
 
     def end(tag: str) -> None:
@@ -214,9 +212,7 @@ def limits(limit: Mapping[str, str], where: str, kind: str) -> dict[str, Any]:
     """Read the stated limits; zero and no width mean none, and so does what is far off."""
     found: dict[str, Any] = {}
     if kind in UNLIMITED and (limit.get("lower") or limit.get("upper")):
-        low, high = (
-            _bound(limit.get(end, "0"), f"{where}.limit.{end}") for end in ("lower", "upper")
-        )
+        low, high = (_bound(limit.get(end, "0"), f"{where}.limit.{end}") for end in ("lower", "upper"))
         if low > high:
             raise ParameterError(f"{where}.limit", [low, high], "lower below upper")
         far = UNLIMITED[kind]

@@ -47,9 +47,7 @@ def read(path: Path, actuated: Sequence[str] | None = None) -> LoopTree:
     try:
         from pxr import Tf, Usd
     except ImportError:
-        raise ParameterError(
-            str(path), "a USD file without the usd-core package", install("usd")
-        ) from None
+        raise ParameterError(str(path), "a USD file without the usd-core package", install("usd")) from None
     if not path.is_file():
         raise ParameterError(str(path), "no regular file", "a USD file")
     try:
@@ -126,10 +124,17 @@ class _Reader:
         closures = [self._closure(joint) for name, joint in joints.items() if name not in tree]
         size = max(1.0, *(float(np.abs(link.frame.position).max()) for link in self.links.values()))
         return LoopTree(
-            self.path.stem, WORLD, self.links, placed, tuple(closures), motors, self._gravity(),
-            rounding=SINGLE_PRECISION * size, marked="a drive" if chosen is None else "actuated",
+            self.path.stem,
+            WORLD,
+            self.links,
+            placed,
+            tuple(closures),
+            motors,
+            self._gravity(),
+            rounding=SINGLE_PRECISION * size,
+            marked="a drive" if chosen is None else "actuated",
             faults=tuple(self.faults),
-        )  # fmt: skip
+        )
 
     def _named(self) -> dict[Any, str]:
         """Name bodies and joints by their prims: the prim's name, or its path if others have it."""
@@ -166,17 +171,13 @@ class _Reader:
         where, (frame, scales) = str(prim.GetPath()), self._world(prim)
         name = self.names[prim.GetPath()]
         if self._value(prim, "physics:kinematicEnabled", False):
-            raise ParameterError(
-                f"{where}.physics:kinematicEnabled", True, "a body that forces move"
-            )
+            raise ParameterError(f"{where}.physics:kinematicEnabled", True, "a body that forces move")
         below = [p for p in self.prims if p.GetPath().HasPrefix(prim.GetPath()) and p != prim]
         shapes = [p for p in below if p.HasAPI(self.physics.CollisionAPI)]
         mass = self.kilogram * float(self._value(prim, "physics:mass", 0.0))
         for part in below:
             if part not in self.bodies and float(self._value(part, "physics:mass", 0.0)) > 0.0:
-                raise ParameterError(
-                    f"{part.GetPath()}.physics:mass", "a shape's", f"one of {where}"
-                )
+                raise ParameterError(f"{part.GetPath()}.physics:mass", "a shape's", f"one of {where}")
         if mass <= 0.0:
             if shapes:
                 raise ParameterError(f"{where}.physics:mass", None, "kg, not only shapes")
@@ -224,16 +225,21 @@ class _Reader:
 
         :raises ParameterError: a type that is not read.
         """
-        types = {"PhysicsRevoluteJoint": "revolute", "PhysicsPrismaticJoint": "prismatic",
-                 "PhysicsSphericalJoint": "spherical", "PhysicsFixedJoint": "fixed"}  # fmt: skip
+        types = {
+            "PhysicsRevoluteJoint": "revolute",
+            "PhysicsPrismaticJoint": "prismatic",
+            "PhysicsSphericalJoint": "spherical",
+            "PhysicsFixedJoint": "fixed",
+        }
         kind = str(prim.GetTypeName())
         if kind in types:
             return types[kind], str(self._value(prim, "physics:axis", "X"))
         free = [
-            freedom for freedom in FREEDOMS
+            freedom
+            for freedom in FREEDOMS
             if self._value(prim, f"limit:{freedom}:physics:low", -math.inf)
             <= self._value(prim, f"limit:{freedom}:physics:high", math.inf)
-        ]  # fmt: skip
+        ]
         if kind == "PhysicsJoint":
             if not free or free == ["rotX", "rotY", "rotZ"]:
                 return ("spherical" if free else "fixed"), ""
@@ -252,8 +258,10 @@ class _Reader:
         unit = math.radians(1.0) if turns else self.length
         force = self.kilogram * self.length ** (2 if turns else 1)
         limits: dict[str, Any] = {}
-        ends = [float(self._value(prim, f"physics:{end}Limit", sign * math.inf)) * unit
-                for end, sign in (("lower", -1), ("upper", 1))]  # fmt: skip
+        ends = [
+            float(self._value(prim, f"physics:{end}Limit", sign * math.inf)) * unit
+            for end, sign in (("lower", -1), ("upper", 1))
+        ]
         if np.isfinite(ends).any():
             limits["position"] = ends
         drive = f"drive:{'angular' if turns else 'linear'}:physics"
@@ -271,10 +279,9 @@ class _Reader:
     def _drives(self, prim: Any) -> bool:
         return any(
             prim.HasAPI(self.physics.DriveAPI, name)
-            and any(self._value(prim, f"drive:{name}:physics:{gain}", 0.0) > 0.0
-                    for gain in ("stiffness", "damping"))
+            and any(self._value(prim, f"drive:{name}:physics:{gain}", 0.0) > 0.0 for gain in ("stiffness", "damping"))
             for name in ("angular", "linear")
-        )  # fmt: skip
+        )
 
     def _placed(self, joints: dict[str, Joint]) -> dict[str, Joint]:
         """Place all links from the world on, so that the joints of the tree meet exactly.
@@ -302,14 +309,17 @@ class _Reader:
             turned = np.abs(target.rotation - second.rotation).max()
             if max(miss, turned) > ALIKE:
                 raise ParameterError(
-                    f"joint.{joint.name}", f"frames {miss:.3g} m and {turned:.3g} rad apart",
+                    f"joint.{joint.name}",
+                    f"frames {miss:.3g} m and {turned:.3g} rad apart",
                     f"frames on {parent} and {child} that meet",
-                )  # fmt: skip
+                )
             moves[child] = meant @ apart @ second.inverse()
-            axes = moves[parent].rotation @ joint.axes[0 if parent == joint.inner else 1] if len(
-                joint.axes) else np.zeros((0, 3))  # fmt: skip
-            at = Pose(meant.rotation, (meant @ apart).position if joint.kind == "prismatic"
-                      else meant.position)  # fmt: skip
+            axes = (
+                moves[parent].rotation @ joint.axes[0 if parent == joint.inner else 1]
+                if len(joint.axes)
+                else np.zeros((0, 3))
+            )
+            at = Pose(meant.rotation, (meant @ apart).position if joint.kind == "prismatic" else meant.position)
             placed[joint.name] = replace(joint, frames=(at, at), axes=np.reshape(axes, (-1, 3)))
         for name in [name for name in self.links if name not in moves]:
             raise ParameterError(f"link.{name}", None, "a joint that connects it")

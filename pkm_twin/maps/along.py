@@ -47,11 +47,15 @@ class Along:
         for case, one in zip(self.cases, self.found, strict=True):
             k = int(np.nanargmax(one.value if case.largest else -one.value))
             answer: dict[str, Any] = {
-                "case": case.name, "what": case.what, "answer": case.answer,
-                "value": float(one.value[k]), "unit": case.unit, "time_s": float(self.time[k]),
+                "case": case.name,
+                "what": case.what,
+                "answer": case.answer,
+                "value": float(one.value[k]),
+                "unit": case.unit,
+                "time_s": float(self.time[k]),
                 "pose": dict(zip(self.robot.pose_names, self.pose[k].tolist(), strict=True)),
                 "pose_units": dict(zip(self.robot.pose_names, self.robot.pose_units, strict=True)),
-            }  # fmt: skip
+            }
             if one.direction is not None and axes:
                 answer |= {"direction": one.direction[k].tolist(), "axes": list(axes)}
             if one.element is not None and self.elements:
@@ -63,17 +67,14 @@ class Along:
     def sentences(self) -> list[str]:
         """Worst sample of each case in words."""
         return [
-            ("" if len(self.cases) == 1 else f"{one['case']}: ")
-            + f"{figures.sentence(one)}; at {one['time_s']:.4g} s"
+            ("" if len(self.cases) == 1 else f"{one['case']}: ") + f"{figures.sentence(one)}; at {one['time_s']:.4g} s"
             for one in self.worst
         ]
 
     def table(self) -> str:
         """Return a CSV of each case's value, direction and element over time."""
         header = ["time", *self.robot.pose_names, "counts"]
-        columns: list[list[Any]] = [
-            self.time.tolist(), *self.pose.T.tolist(), self.counted.astype(int).tolist()
-        ]  # fmt: skip
+        columns: list[list[Any]] = [self.time.tolist(), *self.pose.T.tolist(), self.counted.astype(int).tolist()]
         for case, one in zip(self.cases, self.found, strict=True):
             before = "" if len(self.cases) == 1 else f"{case.name}."
             header.append(f"{before}value")
@@ -112,10 +113,17 @@ class Along:
 
 
 def along(
-    kind: Kind, robot: Robot, time: Array, q: Array, *, cases: Sequence[Case] = (),
-    least: float | None = None, least_clearance: float = 0.0,
-    parts: Iterable[tuple[Robot, slice]] = (), wrench: Array | None = None,
-) -> Along:  # fmt: skip
+    kind: Kind,
+    robot: Robot,
+    time: Array,
+    q: Array,
+    *,
+    cases: Sequence[Case] = (),
+    least: float | None = None,
+    least_clearance: float = 0.0,
+    parts: Iterable[tuple[Robot, slice]] = (),
+    wrench: Array | None = None,
+) -> Along:
     """Evaluate a kind at joint positions q (k, n) at times (k,), s.
 
     :param cases: load cases; by default the kind's own.
@@ -145,9 +153,6 @@ def along(
                 load = tuple(wrench[begin].tolist())
                 under = tuple(replace(case, wrench=load) for case in chosen)
             values = evaluate_kind(kind, loaded, q[begin:end], under)
-            pieces.append([
-                one if one.element is None else one._replace(element=index[one.element])
-                for one in values
-            ])  # fmt: skip
+            pieces.append([one if one.element is None else one._replace(element=index[one.element]) for one in values])
     found = [concatenate_found(each) for each in zip(*pieces, strict=True)]
     return Along(robot, kind, chosen, time, pose, least, counted, found, tuple(elements))

@@ -170,10 +170,7 @@ def limits(values: Array, worst: float) -> tuple[float, float]:
     known = values[np.isfinite(values)]
     every = np.append(known, worst) if math.isfinite(worst) else known
     low, high = (float(every.min()), float(every.max())) if len(every) else (0.0, 1.0)
-    if (
-        len(known)
-        and high > OUTLIER_RATIO * (most := float(np.quantile(known, SCALE_QUANTILE))) > 0.0
-    ):
+    if len(known) and high > OUTLIER_RATIO * (most := float(np.quantile(known, SCALE_QUANTILE))) > 0.0:
         high = most
     if 0.0 <= low <= 0.5 * high:
         low = 0.0
@@ -229,22 +226,16 @@ def planes(data: Dataset, case: int) -> Figure:
     with plots.pyplot().rc_context({"font.size": 9}):
         high_of = plots.WIDTH / PANELS + 0.9 if count == PANELS else _height(drawn[0], count)
         figure: Figure
-        figure, columns = plots.columns(
-            count, 1, high_of, gridspec_kw={"width_ratios": _widths(drawn)}
-        )
+        figure, columns = plots.columns(count, 1, high_of, gridspec_kw={"width_ratios": _widths(drawn)})
         axes, over = [column[0] for column in columns], ""
         for one, ax in zip(drawn, axes, strict=True):
             if len(one["names"]) == 1:
                 _draw_line(one, ax, scale, label)
                 continue
-            mesh = draw_panel(
-                one, ax, scale, scale * low, scale * high, CONTOUR_QUANTILES[count < PANELS]
-            )
+            mesh = draw_panel(one, ax, scale, scale * low, scale * high, CONTOUR_QUANTILES[count < PANELS])
             over = kind.overlay(data, one["names"], one["through"], ax)
         if len(drawn[0]["names"]) > 1:
-            bar = figure.colorbar(
-                mesh, ax=axes, aspect=25, pad=0.01, extend="max" if beyond else "neither"
-            )
+            bar = figure.colorbar(mesh, ax=axes, aspect=25, pad=0.01, extend="max" if beyond else "neither")
             bar.set_label(label)
         rows = plots.head(figure, "\n".join(title(data, case)), 10)
         figure.set_figheight(high_of + 0.2 * rows)
@@ -282,16 +273,20 @@ def _draw_line(one: dict[str, Any], ax: Axes, scale: float, label: str) -> None:
         ax.plot(one["star"][0], scale * one["values"][k, 0], "*", color="red", ms=12)
 
 
-def draw_panel(
-    one: dict[str, Any], ax: Axes, scale: float, low: float, high: float, shares: Sequence[float]
-) -> Any:
+def draw_panel(one: dict[str, Any], ax: Axes, scale: float, low: float, high: float, shares: Sequence[float]) -> Any:
     """Draw a plane of :func:`plane_of`, with contours at quantiles of its values."""
     x, y = one["ticks"]
     values = scale * one["values"].T
     mesh = ax.pcolormesh(
-        x, y, np.ma.masked_invalid(values), shading="nearest", cmap=COLOUR_MAP, vmin=low, vmax=high,
+        x,
+        y,
+        np.ma.masked_invalid(values),
+        shading="nearest",
+        cmap=COLOUR_MAP,
+        vmin=low,
+        vmax=high,
         rasterized=True,
-    )  # fmt: skip
+    )
     if one["reach"].any() and not one["reach"].all():
         ax.contour(x, y, one["reach"].T, [0.5], colors="0.2", linewidths=1.2)
     known = values[np.isfinite(values)]
@@ -302,10 +297,7 @@ def draw_panel(
             text.set_bbox({"facecolor": "0.25", "edgecolor": "none", "alpha": 0.55, "pad": 0.6})
     if one["star"]:
         # The star has the colour of the cell that it covers.
-        at = [
-            int(np.abs(side - place).argmin())
-            for side, place in zip((x, y), one["star"], strict=True)
-        ]
+        at = [int(np.abs(side - place).argmin()) for side, place in zip((x, y), one["star"], strict=True)]
         face = mesh.to_rgba(values[at[1], at[0]])
         ax.plot(*one["star"], "*", color=face, mec="red", mew=1.2, ms=14, zorder=5)
     ax.set_xlabel(f"{one['names'][0]} ({one['units'][0]})")

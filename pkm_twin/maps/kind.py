@@ -59,9 +59,7 @@ class Field:
     dtype: str = "f8"
 
 
-def scalar(
-    value: Any, what: str, units: str = "", bounds: Mapping[str, Any] = NO_BOUNDS
-) -> Variable:
+def scalar(value: Any, what: str, units: str = "", bounds: Mapping[str, Any] = NO_BOUNDS) -> Variable:
     """Return a single number as a variable."""
     return Variable((), np.array(value), describe(what, units, bounds))
 
@@ -193,9 +191,7 @@ class Kind:
         return []
 
     @classmethod
-    def overlay(
-        cls, data: Dataset, names: tuple[str, ...], through: Mapping[str, float], ax: Axes
-    ) -> str:
+    def overlay(cls, data: Dataset, names: tuple[str, ...], through: Mapping[str, float], ax: Axes) -> str:
         """Draw over a plane of two pose coordinates; return an explanation for the caption."""
         return ""
 

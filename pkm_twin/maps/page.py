@@ -34,10 +34,8 @@ MARGIN: Final = {"l": 20, "r": 20, "t": 60, "b": 20}
 MAX_SAMPLES: Final = (15, 61)
 """Largest number of layers, and of samples along the sides of a layer."""
 STAR: Final = {"color": "red", "line": {"color": "white", "width": 1}}
-HELP: Final = (
-    "Coloured poses count: joints within limits, limbs apart, clear of singularities. The \
+HELP: Final = "Coloured poses count: joints within limits, limbs apart, clear of singularities. The \
 menu chooses the case and plane, a slider one layer alone."
-)
 
 
 def write_page(data: Dataset, path: Path) -> Path:
@@ -53,11 +51,15 @@ def write_page(data: Dataset, path: Path) -> Path:
     parts = [drawn, *([] if more is None else [more])]
     shown = [
         one.to_html(
-            include_plotlyjs=k == 0, full_html=False, config=CONFIG, default_width="100%",
-            default_height="100%", auto_play=False,
+            include_plotlyjs=k == 0,
+            full_html=False,
+            config=CONFIG,
+            default_width="100%",
+            default_height="100%",
+            auto_play=False,
         )
         for k, one in enumerate(parts)
-    ]  # fmt: skip
+    ]
     report = Report(first, notes=[*rest, HELP, *([kind.page_help] if kind.page_help else [])])
     text = of_report(str(data.attrs["title"]), report, figures=shown)
     with writing(path):
@@ -91,10 +93,7 @@ def _layers(data: Dataset) -> Any:
     dims = list(units)
     upwards = data.attrs["height"] or dims[2]
     flat = [name for name in dims if name != upwards]
-    steps = {
-        n: math.ceil(data.sizes[n] / (MAX_SAMPLES[0] if n == upwards else MAX_SAMPLES[1]))
-        for n in dims
-    }
+    steps = {n: math.ceil(data.sizes[n] / (MAX_SAMPLES[0] if n == upwards else MAX_SAMPLES[1])) for n in dims}
     part = data.value.isel({n: slice(None, None, step) for n, step in steps.items()})
     values = part.transpose("case", upwards, *flat).values
     x, y, heights = (part[n].values for n in (*flat, upwards))
@@ -104,9 +103,14 @@ def _layers(data: Dataset) -> Any:
     figure = graph.Figure()
     for z, seen in zip(heights.tolist(), kept, strict=True):
         figure.add_mesh3d(
-            x=np.float32(x[seen]), y=np.float32(y[seen]), z=np.float32(np.full(seen.sum(), z)),
-            **grid_triangles(seen), coloraxis="coloraxis", flatshading=True, lighting=FLAT_LIGHT,
-        )  # fmt: skip
+            x=np.float32(x[seen]),
+            y=np.float32(y[seen]),
+            z=np.float32(np.full(seen.sum(), z)),
+            **grid_triangles(seen),
+            coloraxis="coloraxis",
+            flatshading=True,
+            lighting=FLAT_LIGHT,
+        )
     figure.add_scatter3d(mode="markers", marker=STAR | {"size": 7, "symbol": "diamond"})
     where = "".join(f"{n} %{{{axis}:.4~f}}<br>" for n, axis in zip(names, "xyz", strict=True))
     buttons = []
@@ -120,30 +124,39 @@ def _layers(data: Dataset) -> Any:
         worst = figures.shown(float(data.worst_value[k]), str(data.case_unit.values[k]))
         change = {
             "intensity": [
-                *(round_digits(scale * v[s]) for v, s in zip(values[k], kept, strict=True)), None,
+                *(round_digits(scale * v[s]) for v, s in zip(values[k], kept, strict=True)),
+                None,
             ],
             "hovertemplate": [*[said] * len(kept), f"{where}worst {worst}<extra></extra>"],
-            **{axis: [*(t[axis] for t in figure.data[:-1]), place]
-               for axis, place in zip("xyz", star, strict=True)},
-        }  # fmt: skip
+            **{axis: [*(t[axis] for t in figure.data[:-1]), place] for axis, place in zip("xyz", star, strict=True)},
+        }
         buttons.append(button(str(case), change, layout))
     count = len(kept)
     every = {"label": "all", "method": "restyle", "args": [{"visible": [True] * (count + 1)}]}
     slices = [
-        {"label": f"{z:.3f}", "method": "restyle",
-         "args": [{"visible": [*(n == k for n in range(count)), True]}]}
+        {"label": f"{z:.3f}", "method": "restyle", "args": [{"visible": [*(n == k for n in range(count)), True]}]}
         for k, z in enumerate(heights.tolist())
-    ]  # fmt: skip
+    ]
     figure.update_layout(
         scene={
-            **{f"{axis}axis": {"title": name, "range": axis_range(ends)}
-               for axis, name, ends in zip("xyz", names, (x, y, heights), strict=True)},
-            "aspectmode": "cube", "camera": CAMERA,
+            **{
+                f"{axis}axis": {"title": name, "range": axis_range(ends)}
+                for axis, name, ends in zip("xyz", names, (x, y, heights), strict=True)
+            },
+            "aspectmode": "cube",
+            "camera": CAMERA,
         },
         margin=MARGIN,
-        sliders=[{"steps": [every, *slices], "currentvalue": {"prefix": f"{names[2]}: "},
-                  "len": 0.9, "x": 0.05, "pad": {"t": 10, "b": 10}}],
-    )  # fmt: skip
+        sliders=[
+            {
+                "steps": [every, *slices],
+                "currentvalue": {"prefix": f"{names[2]}: "},
+                "len": 0.9,
+                "x": 0.05,
+                "pad": {"t": 10, "b": 10},
+            }
+        ],
+    )
     return _show_first(figure, buttons)
 
 
@@ -161,18 +174,25 @@ def _planes(data: Dataset) -> Any:
         said = f"{where}{what} %{{{'z' if y else 'y'}:.4~g}} {unit}<extra></extra>"
         if y:
             figure.add_heatmap(
-                x=axes[0], y=axes[1], z=round_digits(values.T), coloraxis="coloraxis",
-                hoverongaps=False, hovertemplate=said,
-            )  # fmt: skip
+                x=axes[0],
+                y=axes[1],
+                z=round_digits(values.T),
+                coloraxis="coloraxis",
+                hoverongaps=False,
+                hovertemplate=said,
+            )
         else:
             figure.add_scatter(x=axes[0], y=round_digits(values[:, 0]), hovertemplate=said)
         star = one["star"] if one["star"] and y else [None, None]
         worst = figures.shown(float(data.worst_value[k]), str(data.case_unit.values[k]))
         figure.add_scatter(
-            x=star[:1], y=star[1:2], mode="markers", showlegend=False,
+            x=star[:1],
+            y=star[1:2],
+            mode="markers",
+            showlegend=False,
             marker=STAR | {"symbol": "star", "size": 16},
             hovertemplate=f"worst {worst}<extra></extra>",
-        )  # fmt: skip
+        )
         layout |= {"xaxis.title.text": named[0], "yaxis.title.text": named[1] if y else what}
         text = ", ".join([x, *y]) + ("" if len(data.case) == 1 else f": {data.case.values[k]}")
         buttons.append((text, layout))
@@ -180,10 +200,9 @@ def _planes(data: Dataset) -> Any:
     for trace, seen in zip(figure.data, visible[0], strict=True):
         trace.visible = seen
     figure.update_layout(margin={**MARGIN, "l": 70, "b": 60})
-    return _show_first(figure, [
-        button(text, {"visible": seen}, layout)
-        for (text, layout), seen in zip(buttons, visible, strict=True)
-    ])  # fmt: skip
+    return _show_first(
+        figure, [button(text, {"visible": seen}, layout) for (text, layout), seen in zip(buttons, visible, strict=True)]
+    )
 
 
 def _show_first(figure: Any, buttons: list[dict[str, Any]]) -> Any:
@@ -201,9 +220,7 @@ def _show_first(figure: Any, buttons: list[dict[str, Any]]) -> Any:
     return figure
 
 
-def button(
-    label: str, data: dict[str, Any], layout: dict[str, Any], traces: list[int] | None = None
-) -> dict[str, Any]:
+def button(label: str, data: dict[str, Any], layout: dict[str, Any], traces: list[int] | None = None) -> dict[str, Any]:
     """Return a menu entry that changes data and layout."""
     args: list[Any] = [data, layout]
     return {"label": label, "method": "update", "args": args if traces is None else [*args, traces]}
@@ -228,9 +245,7 @@ def grid_triangles(shown: NDArray[np.bool_]) -> dict[str, NDArray[np.int64]]:
     number = np.full(shown.shape, -1)
     number[shown] = np.arange(shown.sum())
     a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]
-    corners = np.concatenate(
-        [np.stack(three, -1).reshape(-1, 3) for three in ((a, b, c), (a, c, d))]
-    )
+    corners = np.concatenate([np.stack(three, -1).reshape(-1, 3) for three in ((a, b, c), (a, c, d))])
     whole = (corners >= 0).all(1)
     # A cell with one missing corner gives one triangle.
     three = np.concatenate([np.stack(t, -1).reshape(-1, 3) for t in ((a, b, d), (b, c, d))])

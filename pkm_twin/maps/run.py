@@ -129,11 +129,7 @@ def _compute_pending(
     else:
         count = workers or os.cpu_count() or 1
         alone = count == 1 or len(work) <= MAX_SERIAL_CHUNKS
-        results = (
-            compute_serially(sweep, work)
-            if alone
-            else compute_on_cores(sweep, work, count, parts.folder)
-        )
+        results = compute_serially(sweep, work) if alone else compute_on_cores(sweep, work, count, parts.folder)
     for index, values in results:
         if values is not None:
             parts.save(index, values)
@@ -147,9 +143,7 @@ def compute_serially(sweep: Map, work: Work) -> Iterator[tuple[int, Values]]:
         yield index, sweep.evaluate(chunk)
 
 
-def compute_on_cores(
-    sweep: Map, work: Work, workers: int, folder: Path
-) -> Iterator[tuple[int, Values | None]]:
+def compute_on_cores(sweep: Map, work: Work, workers: int, folder: Path) -> Iterator[tuple[int, Values | None]]:
     """Compute chunks on processes of this machine, in the order of completion.
 
     The processes save their chunks themselves (None here): only a number goes through the pipe,
@@ -169,9 +163,7 @@ def compute_on_cores(
         except BrokenProcessPool:
             broken += 1
             if broken == MAX_POOL_FAILURES:
-                raise ClusterError(
-                    f"processes died {MAX_POOL_FAILURES} times in this sweep"
-                ) from None
+                raise ClusterError(f"processes died {MAX_POOL_FAILURES} times in this sweep") from None
 
 
 def _run_pool(sweep: Map, work: Work, workers: int, folder: Path) -> Iterator[int]:
@@ -237,9 +229,7 @@ def _collect_results(
 ) -> Iterator[tuple[int, Values]]:
     def submit(index: int, chunk: Any) -> Any:
         key = f"map-{sweep.fingerprint[:16]}-{index}"
-        return client.submit(
-            evaluate_chunk, sweep, chunk, pkm_twin.__version__, key=key, pure=False
-        )
+        return client.submit(evaluate_chunk, sweep, chunk, pkm_twin.__version__, key=key, pure=False)
 
     queue = itertools.starmap(submit, work)
     flying = list(itertools.islice(queue, CHUNKS_PER_WORKER * threads))

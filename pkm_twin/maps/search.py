@@ -39,9 +39,7 @@ LIMIT_MARGIN: Final = 1e-9
 """Fraction of a joint's range that the search keeps away from its ends."""
 
 
-def find_worst(
-    space: Space, case: Case, starts: Array, tell: Callable[[float], object] = abs
-) -> Worst:
+def find_worst(space: Space, case: Case, starts: Array, tell: Callable[[float], object] = abs) -> Worst:
     """Find the worst pose of the workspace.
 
     Search joint positions between finite limits, otherwise poses in the map's box.
@@ -90,12 +88,12 @@ def find_worst(
         if without.any() and not inside(tried).any():
             best = float(robot.try_singularity(space.state(tried)[0][without])[0].max())
             raise ParameterError(
-                "singularity", space.least, f"{passing_singularity(best, '')} or less: "
+                "singularity",
+                space.least,
+                f"{passing_singularity(best, '')} or less: "
                 f"no pose has a singularity index of {space.least:g} or more (best: {best:.3g})",
-            )  # fmt: skip
-        why = "" if inside(tried).any() else causes(
-            robot, *space.state(tried), space.least, space.least_clearance
-        )  # fmt: skip
+            )
+        why = "" if inside(tried).any() else causes(robot, *space.state(tried), space.least, space.least_clearance)
         bound = "a workspace in which some pose counts"
         raise ParameterError("robot", robot.name, f"{bound}: {why}" if why else bound)
     q, pose, _ = space.state(x[None])

@@ -104,9 +104,7 @@ def find_spheres(space: Space, energy: float) -> dict[str, Variable]:
             share,
             describe("eta_KE, share of the kinetic energy in the platform", "", UNIT_INTERVAL),
         ),
-        "sphere_force": Variable(
-            sphere, force, describe("F_max, largest effort of the drives", unit, NON_NEGATIVE)
-        ),
+        "sphere_force": Variable(sphere, force, describe("F_max, largest effort of the drives", unit, NON_NEGATIVE)),
         "sphere_inside": Variable(
             sphere[:2], inside.astype(np.int8), describe("1 where all limits are kept", "", FLAG)
         ),
@@ -210,9 +208,16 @@ def _draw(data: Dataset, index: str) -> Figure:
     for a, t, centre in _sphere_centres(data):
         x, y = (centre + RADIUS * flat).T
         mesh = ax.tripcolor(
-            x, y, front, values[a, t], shading="gouraud", cmap=COLOUR_MAP, vmin=low, vmax=high,
+            x,
+            y,
+            front,
+            values[a, t],
+            shading="gouraud",
+            cmap=COLOUR_MAP,
+            vmin=low,
+            vmax=high,
             rasterized=True,
-        )  # fmt: skip
+        )
         rim: dict[str, Any] = {"ec": "0.3", "lw": 0.6}
         if not inside[a, t]:
             rim = {"ec": OUTSIDE_COLOUR, "lw": 1.6, "ls": "--"}
@@ -227,15 +232,25 @@ def _draw(data: Dataset, index: str) -> Figure:
         # Where no sphere is: on the first ring, inside the others.
         at, angle = (tilt, math.pi / 6) if k == 0 else (tilt - 1.25 * RADIUS, math.pi / 12)
         ax.text(
-            at * math.cos(angle), at * math.sin(angle), f"{math.degrees(tilt):.0f}°",
-            ha="center", va="center", fontsize=9, color="0.3", zorder=4,
+            at * math.cos(angle),
+            at * math.sin(angle),
+            f"{math.degrees(tilt):.0f}°",
+            ha="center",
+            va="center",
+            fontsize=9,
+            color="0.3",
+            zorder=4,
             bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 0.6},
-        )  # fmt: skip
+        )
     for azimuth in data.azimuth.values.tolist():
         ax.text(
-            far * math.cos(azimuth), far * math.sin(azimuth), f"{math.degrees(azimuth):.0f}°",
-            ha="center", va="center", fontsize=10,
-        )  # fmt: skip
+            far * math.cos(azimuth),
+            far * math.sin(azimuth),
+            f"{math.degrees(azimuth):.0f}°",
+            ha="center",
+            va="center",
+            fontsize=10,
+        )
     ax.set(xlim=(-1.06 * far, 1.06 * far), ylim=(-1.06 * far, 1.06 * far), xticks=[], yticks=[])
     ax.set_aspect("equal")
     ax.set_axis_off()
@@ -257,8 +272,9 @@ def _draw(data: Dataset, index: str) -> Figure:
     figure.supxlabel(
         "a sphere is a pose: azimuth of the tilt around, tilt outwards; a point of it is a "
         f"direction of motion{dashed}",
-        fontsize=8.5, color="0.3",
-    )  # fmt: skip
+        fontsize=8.5,
+        color="0.3",
+    )
     return figure
 
 
@@ -280,16 +296,17 @@ def make_page(data: Dataset) -> Any:
     figure.add_mesh3d(
         **{axis: np.float32(vertices[:, k]) for k, axis in enumerate("xyz")},
         **{corner: np.int32(every[:, k]) for k, corner in enumerate("ijk")},
-        customdata=np.float32(named), coloraxis="coloraxis", lighting=FLAT_LIGHT,
-    )  # fmt: skip
+        customdata=np.float32(named),
+        coloraxis="coloraxis",
+        lighting=FLAT_LIGHT,
+    )
     buttons = []
     for index, (_, label) in questions(data).items():
         values = data[f"sphere_{index}"].values
         low, high = _limits(values)
         shown = np.concatenate([round_digits(values[a, t]) for a, t, _ in places])
         said = f"{where}{label.partition(':')[0]} %{{intensity:.4~g}}<extra></extra>"
-        layout = {"coloraxis.cmin": low, "coloraxis.cmax": high,
-                  "coloraxis.colorbar.title.text": label}  # fmt: skip
+        layout = {"coloraxis.cmin": low, "coloraxis.cmax": high, "coloraxis.colorbar.title.text": label}
         change = {"intensity": [shown.tolist()], "hovertemplate": [said]}
         buttons.append(button(label.partition(":")[0], change, layout, [0]))
     first, layout = buttons[0]["args"][:2]
@@ -298,16 +315,19 @@ def make_page(data: Dataset) -> Any:
     figure.add_scatter3d(
         x=[edge * math.cos(a) for a in data.azimuth.values],
         y=[edge * math.sin(a) for a in data.azimuth.values],
-        z=[0.0] * len(data.azimuth), mode="text", hoverinfo="skip", showlegend=False,
+        z=[0.0] * len(data.azimuth),
+        mode="text",
+        hoverinfo="skip",
+        showlegend=False,
         text=[f"{math.degrees(a):.0f}°" for a in data.azimuth.values],
-    )  # fmt: skip
+    )
     hidden = {"visible": False}
     figure.update_layout(
-        coloraxis={"colorscale": "Viridis", "colorbar": BAR}, margin=MARGIN,
+        coloraxis={"colorscale": "Viridis", "colorbar": BAR},
+        margin=MARGIN,
         updatemenus=[{"buttons": buttons, **MENU}],
-        scene={"xaxis": hidden, "yaxis": hidden, "zaxis": hidden, "aspectmode": "data",
-               "camera": TOP_CAMERA},
-    )  # fmt: skip
+        scene={"xaxis": hidden, "yaxis": hidden, "zaxis": hidden, "aspectmode": "data", "camera": TOP_CAMERA},
+    )
     figure.update_layout(layout)
     return figure
 

@@ -132,9 +132,7 @@ class Parts:
             self.folder.mkdir(parents=True, exist_ok=True)
             foreign = [name for name in self._names() if not _OWN_NAMES.fullmatch(name)]
             if foreign:
-                raise MapError(
-                    self.folder, f"holds {foreign[0]!r}, which no map wrote; move it elsewhere"
-                )
+                raise MapError(self.folder, f"holds {foreign[0]!r}, which no map wrote; move it elsewhere")
             self._lock = self._acquire_lock()
         mark = self.folder / _INFO_FILE
         try:
@@ -363,10 +361,7 @@ def _write_variable(file: Any, name: str, dims: tuple[str, ...], values: Any, at
 
 def _convert_bounds(attrs: Mapping[str, Any], dtype: Any) -> dict[str, Any]:
     """Convert bounds among the attributes to their variable's type, as CF requires."""
-    return {
-        key: np.asarray(value, dtype)[()] if key.startswith("valid_") else value
-        for key, value in attrs.items()
-    }
+    return {key: np.asarray(value, dtype)[()] if key.startswith("valid_") else value for key, value in attrs.items()}
 
 
 def _open_dataset(xarray: Any, path: Path) -> Dataset:
@@ -471,8 +466,7 @@ def find_invalid_number(data: Dataset) -> str:
         if variable.dtype.kind not in "fiu" or not variable.size:
             continue
         low, high = (
-            float(variable.attrs.get(f"valid_{end}", bound))
-            for end, bound in (("min", -math.inf), ("max", math.inf))
+            float(variable.attrs.get(f"valid_{end}", bound)) for end, bound in (("min", -math.inf), ("max", math.inf))
         )
         for values in _slabs(variable):
             if name in data.coords and np.isnan(values).any():

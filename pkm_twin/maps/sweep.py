@@ -133,9 +133,7 @@ class Map(Space):
         if self.kind.has_shares:
             fields["factor"] = Field((*grid, "element"), share)
         if not self.ticks:
-            fields["pose"] = Field(
-                ("sample", "coordinate"), describe("pose of a sample, m and rad")
-            )
+            fields["pose"] = Field(("sample", "coordinate"), describe("pose of a sample, m and rad"))
         fields["plane_value"] = Field(plane, value)
         if elements:
             fields["plane_dominant"] = Field(plane, blame, "i2")
@@ -153,9 +151,11 @@ class Map(Space):
             name: Variable((name,), ticks, describe(f"pose coordinate {name}", unit))
             for (name, unit), ticks in zip(named, self.ticks, strict=False)
         }
-        result |= {"coordinate": name_labels("coordinate", robot.pose_names),
-                   "unit": name_labels("coordinate", robot.pose_units),
-                   "case": name_labels("case", [case.name for case in cases])}  # fmt: skip
+        result |= {
+            "coordinate": name_labels("coordinate", robot.pose_names),
+            "unit": name_labels("coordinate", robot.pose_units),
+            "case": name_labels("case", [case.name for case in cases]),
+        }
         for word in ("what", "unit", "answer"):
             result[f"case_{word}"] = name_labels("case", [getattr(case, word) for case in cases])
         for k, dim in enumerate(("row", "column")):
@@ -254,9 +254,7 @@ class Map(Space):
         box = bounds = self.bounds[shown]
         least, most = np.minimum(bounds[:, 0], pose[shown]), np.maximum(bounds[:, 1], pose[shown])
         for _ in range(ZOOMS):
-            ticks = [
-                _make_ticks(ends, pose[k], GRID_SIDE) for k, ends in zip(shown, box, strict=True)
-            ]
+            ticks = [_make_ticks(ends, pose[k], GRID_SIDE) for k, ends in zip(shown, box, strict=True)]
             poses = self._plane_poses(plane, case, ticks)
             q, _, known = self.of_poses(poses)
             reach = keeps_limits(self.robot, q, poses, -math.inf, known)
@@ -417,9 +415,7 @@ class Map(Space):
         if self.kind.axes(self.robot):
             none_of = np.full((1, len(self.kind.axes(self.robot))), np.nan)
             ways = [none_of if (d := one.found.direction) is None else d for one in worst]
-            result["worst_direction"] = Variable(
-                ("case", "axis"), np.concatenate(ways), describe(f"of {what}")
-            )
+            result["worst_direction"] = Variable(("case", "axis"), np.concatenate(ways), describe(f"of {what}"))
         if self.elements:
             names = describe(f"index of the {self.kind.element}", "", {"valid_min": -1})
             blame = np.array([-1 if (e := one.found.element) is None else e[0] for one in worst])
@@ -514,9 +510,18 @@ def map_of(
     side = round(math.sqrt(total / (3 if count > 2 else 1))) if count > 1 else total
     fewest, most = PLANE_SIDE_RANGE
     return Map(
-        robot, kind, cases, bounds, ticks, total, min(max(side, fewest), most), least,
-        least_clearance, None if at is None else np.array(at, np.float64), circles=stack,
-    )  # fmt: skip
+        robot,
+        kind,
+        cases,
+        bounds,
+        ticks,
+        total,
+        min(max(side, fewest), most),
+        least,
+        least_clearance,
+        None if at is None else np.array(at, np.float64),
+        circles=stack,
+    )
 
 
 def find_circles(robot: Robot, bounds: Array, least: float, least_clearance: float) -> Array:

@@ -63,9 +63,14 @@ def robot_path(robot: str | Path) -> Path:
 
 
 def load(
-    robot: str | Path, *, platform: str | None = None, base: str | None = None,
-    actuated: Sequence[str] | None = None, pose: Sequence[str] | None = None, carry: bool = False,
-) -> Robot:  # fmt: skip
+    robot: str | Path,
+    *,
+    platform: str | None = None,
+    base: str | None = None,
+    actuated: Sequence[str] | None = None,
+    pose: Sequence[str] | None = None,
+    carry: bool = False,
+) -> Robot:
     """Load a robot by its name in ``config/`` or from a YAML, URDF, MJCF, SDF or USD file.
 
     Changes that the import made to a user's file, and implausible numbers in it, give warnings
@@ -91,15 +96,14 @@ def load(
         if robot_read.redundant:
             follows = [name for name in graph.actuated if name not in graph.leads]
             warn(
-                path, f"{len(graph.actuated)} actuated joints ({reading.marked}) for "
+                path,
+                f"{len(graph.actuated)} actuated joints ({reading.marked}) for "
                 f"{len(graph.leads)} degrees of freedom: the positions of {', '.join(follows)} "
                 f"follow from {', '.join(graph.leads)}",
-            )  # fmt: skip
+            )
         for note in reading.notes:
             warn(path, note)
-        return _with_warnings(
-            path, replace(robot_read, home_choice=reading.home, visuals=reading.visuals)
-        )
+        return _with_warnings(path, replace(robot_read, home_choice=reading.home, visuals=reading.visuals))
     for key in ("platform", "base", "actuated", "carry"):
         if getattr(part, key):
             raise ParameterError(key, getattr(part, key), f"none, because the file has its {key}")

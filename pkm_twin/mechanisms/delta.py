@@ -74,9 +74,7 @@ class Inertia:
     platform_mass: float = mass()
     arm_mass: float = mass()
     forearm_mass: float = mass()
-    arm_com: float = schema.number(
-        low=0.0, high=1.0, unit="of the arm, from its pivot", default=0.5
-    )
+    arm_com: float = schema.number(low=0.0, high=1.0, unit="of the arm, from its pivot", default=0.5)
     arm_inertia: float | None = schema.number(low=0.0, unit="kg m2", default=None)
     rotor_inertia: float = schema.number(low=0.0, unit="kg m2", default=0.0)
 
@@ -209,9 +207,7 @@ class Delta(TwinRobot):
     def _below(self, q: Any) -> Any:
         """Return the place of a platform on three rods, below the elbows; with an rcu a guess."""
         g = self.geometry
-        centres = [
-            self._elbow(i, q[i]) - g.platform_radius * self._directions[i][0] for i in range(3)
-        ]
+        centres = [self._elbow(i, q[i]) - g.platform_radius * self._directions[i][0] for i in range(3)]
         return meet_spheres(centres, [g.forearm_length**2] * 3, -UP)[0]
 
     def grid(self) -> PoseGrid:
@@ -249,46 +245,58 @@ class Delta(TwinRobot):
             arm, forearm = f"arm {limb}", f"forearm {limb}"
             pivot = array(g.base_radius * out)
             lever = plain(self._elbow(i, q[i])) - pivot
-            bodies[arm] = Body(
-                arm, m.arm_mass, array(pivot + m.arm_com * lever), _thin(m.arm_inertia, lever)
-            )
-            fixed = tuple(
-                Direction(name, BASE, array(v)) for name, v in (("r", out), ("t", along), ("z", UP))
-            )
+            bodies[arm] = Body(arm, m.arm_mass, array(pivot + m.arm_com * lever), _thin(m.arm_inertia, lever))
+            fixed = tuple(Direction(name, BASE, array(v)) for name, v in (("r", out), ("t", along), ("z", UP)))
             joints[self.joints[i]] = Joint(
-                self.joints[i], "revolute", BASE, arm, pivot, array([along]), actuated=True,
-                home=q[i], rotor_inertia=rotor, directions=fixed,
+                self.joints[i],
+                "revolute",
+                BASE,
+                arm,
+                pivot,
+                array([along]),
+                actuated=True,
+                home=q[i],
+                rotor_inertia=rotor,
+                directions=fixed,
                 label=f"base joint {limb}",
-            )  # fmt: skip
+            )
             corner = array(platform + g.platform_radius * out)
             span = plain(self._forearm(i, q[i], platform))
             foot = array(corner - span)
             names = f"elbow {limb}", f"platform joint {limb}"
             if g.closures[i] == "rod":
                 rods[forearm] = Rod(
-                    forearm, arm, PLATFORM, array([foot, corner]), m.forearm_mass, array(along),
+                    forearm,
+                    arm,
+                    PLATFORM,
+                    array([foot, corner]),
+                    m.forearm_mass,
+                    array(along),
                     0.0 if self.members is None else self.members.parallelogram_width,
-                    joints=names, label=f"limb {limb}",
-                )  # fmt: skip
+                    joints=names,
+                    label=f"limb {limb}",
+                )
                 continue
             middle = array((foot + corner) / 2)
             rod = _thin(m.forearm_mass * g.forearm_length**2 / 12, span)
             bodies[forearm] = Body(forearm, m.forearm_mass, middle, rod)
-            sliding[names[0]] = Joint(
-                names[0], "cylindrical", arm, forearm, foot, array([along]), directions=fixed
-            )
+            sliding[names[0]] = Joint(names[0], "cylindrical", arm, forearm, foot, array([along]), directions=fixed)
             sliding[names[1]] = Joint(
-                names[1], "universal", forearm, PLATFORM, corner, array([along, out]),
-                directions=fixed, normal="z",
-            )  # fmt: skip
+                names[1],
+                "universal",
+                forearm,
+                PLATFORM,
+                corner,
+                array([along, out]),
+                directions=fixed,
+                normal="z",
+            )
         turning = None if self.members is None else self.members.platform_inertia
         if turning is None:
             turning = disc(m.platform_mass, g.platform_radius)
         bodies[PLATFORM] = Body(PLATFORM, m.platform_mass, array(platform), array(turning))
         # What the parallelograms hold is taken as given, so that three slides carry the platform.
-        joints["translation"] = Joint(
-            "translation", "translation", BASE, PLATFORM, array(platform), virtual=True
-        )
+        joints["translation"] = Joint("translation", "translation", BASE, PLATFORM, array(platform), virtual=True)
         return Graph(bodies, {**joints, **sliding}, rods, PLATFORM, array(platform))
 
     @property
@@ -312,9 +320,7 @@ class Delta(TwinRobot):
             arm, forearm = f"arm {limb}", f"forearm {limb}"
             pivot = g.base_radius * out
             tip = plain(self._elbow(i, q[i]))
-            beams.append(
-                Beam(arm, arm, i, (arm, pivot), (arm, tip), (arm,), members.arm.outer_diameter / 2)
-            )
+            beams.append(Beam(arm, arm, i, (arm, pivot), (arm, tip), (arm,), members.arm.outer_diameter / 2))
             corner = platform + g.platform_radius * out
             if g.closures[i] == "rcu":
                 foot = corner - plain(self._forearm(i, q[i], platform))
@@ -337,9 +343,7 @@ class Delta(TwinRobot):
         """
         g, m, members = self.geometry, self.inertia, self.members
         if members is None:
-            raise RigidError(
-                "members", None, "a section with the elastic members, arms and forearms"
-            )
+            raise RigidError("members", None, "a section with the elastic members, arms and forearms")
         if "rcu" in g.closures and members.rcu_forearm is None:
             raise ParameterError("members.rcu_forearm", None, "required for the rcu limb")
         spread = m.forearm_mass / g.forearm_length
@@ -349,8 +353,7 @@ class Delta(TwinRobot):
         if members.rcu_forearm is not None and "rcu" in g.closures:
             kinds["rcu"] = members.rcu_forearm.section(spread, "members.rcu_forearm")
         sections = {
-            beam.name: kinds["arm" if beam.element.startswith("arm") else g.closures[beam.limb]]
-            for beam in self.beams
+            beam.name: kinds["arm" if beam.element.startswith("arm") else g.closures[beam.limb]] for beam in self.beams
         }
         compliances: dict[str, Sequence[float]] = {}
         for limb, closure in zip(LIMBS, g.closures, strict=True):

@@ -86,9 +86,7 @@ def write_edited(path: Path, head: Sequence[str], text: str, before: Robot) -> l
     try:
         after = robot_of_data(parse_yaml(text, str(path)), path.stem)
     except ValueError as error:
-        raise PkmTwinError(
-            f"the values are not a valid robot, so {path} is not written: {error}"
-        ) from None
+        raise PkmTwinError(f"the values are not a valid robot, so {path} is not written: {error}") from None
     # A name in it may have anything in it, a new line too.
     lost = before.book.lost(after.book)
     whole = "".join(f"# {one_line(line, 2000)}\n" for line in (*head, *lost)) + text

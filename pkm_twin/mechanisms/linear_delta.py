@@ -112,17 +112,26 @@ class LinearDelta(TwinRobot):
             carriage = f"carriage {limb}"
             bodies[carriage] = Body(carriage, m.carriage_mass, array(top), np.zeros((3, 3)))
             joints[self.joints[i]] = Joint(
-                self.joints[i], "prismatic", BASE, carriage, array(top), array([axis]),
-                actuated=True, home=top[2], rotor_inertia=rotor,
-            )  # fmt: skip
+                self.joints[i],
+                "prismatic",
+                BASE,
+                carriage,
+                array(top),
+                array([axis]),
+                actuated=True,
+                home=top[2],
+                rotor_inertia=rotor,
+            )
             rods[f"rods {limb}"] = Rod(
-                f"rods {limb}", carriage, PLATFORM, array([top, np.zeros(3)]), m.rod_mass,
+                f"rods {limb}",
+                carriage,
+                PLATFORM,
+                array([top, np.zeros(3)]),
+                m.rod_mass,
                 array(np.cross(UP, out)),
-            )  # fmt: skip
+            )
         turning = disc(m.platform_mass, 0.3 * self.geometry.radius)
         bodies[PLATFORM] = Body(PLATFORM, m.platform_mass, array(np.zeros(3)), array(turning))
         # What the rod pairs hold is taken as given, so that three slides carry the platform.
-        joints["translation"] = Joint(
-            "translation", "translation", BASE, PLATFORM, array(np.zeros(3)), virtual=True
-        )
+        joints["translation"] = Joint("translation", "translation", BASE, PLATFORM, array(np.zeros(3)), virtual=True)
         return Graph(bodies, joints, rods, PLATFORM, array(np.zeros(3)))

@@ -76,8 +76,11 @@ MOST_JOINTS: Final = 12
 
 
 _ELASTIC: Final = (
-    ("bodies", "member"), ("joints", "compliance"), ("rods", "section"), ("rods", "radius"),
-)  # fmt: skip
+    ("bodies", "member"),
+    ("joints", "compliance"),
+    ("rods", "section"),
+    ("rods", "radius"),
+)
 """What a graph has no place for, by the kind of its entry."""
 _TURNING: Final = {"joint": "rad", "effort": "N m", "rotor": "kg m2"}
 _SLIDING: Final = {"joint": "m", "effort": "N", "rotor": "kg"}
@@ -93,10 +96,12 @@ class MachineFile(Common):
         3, unit="m", text="the platform's reference point at home; by default its com", default=None
     )
     angles: tuple[Coordinate, ...] = schema.key(
-        lambda _, value: name_angles(value), "names to axes",
+        lambda _, value: name_angles(value),
+        "names to axes",
         text="in place of roll, pitch and yaw, about x, y, z or z, y, x in this order: "
-        "`{alpha: x, beta: y}` is R = Rx(alpha) Ry(beta) Rz", default=(),
-    )  # fmt: skip
+        "`{alpha: x, beta: y}` is R = Rx(alpha) Ry(beta) Rz",
+        default=(),
+    )
     pose: tuple[str, ...] | None = schema.words(
         text="of x, y, z, roll, pitch, yaw or `angles`, as many as the mobility; default: turns if "
         "they suffice, else the first valid",
@@ -108,9 +113,10 @@ class MachineFile(Common):
     redundancy: Redundancy = schema.section(Redundancy, default={})
     limbs: Sequence[Limb] = schema.key(limbs_of, "a section or a list of them", default=[])
     parameters: Mapping[str, Any] = schema.key(
-        lambda _, value: value, "names to numbers or [expressions](new_machine.md#parameters)",
+        lambda _, value: value,
+        "names to numbers or [expressions](new_machine.md#parameters)",
         default={},
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -143,9 +149,7 @@ class Machine(TwinRobot):
             specs = _without_rounding(data, graph, specs, name)
             graph = graph_of_entries(file.platform, specs, file.origin)
         if len(graph.actuated) > MOST_JOINTS:
-            raise ParameterError(
-                "joints", len(graph.actuated), f"at most {MOST_JOINTS} actuated joints"
-            )
+            raise ParameterError("joints", len(graph.actuated), f"at most {MOST_JOINTS} actuated joints")
         own = drives_of(graph, specs["joints"])
         leads = choose_leads(graph, file.redundancy.leads or (), len(file.pose or ()))
         graph = shared_by(graph, leads, file.redundancy, own["limits"].effort)
@@ -160,10 +164,16 @@ class Machine(TwinRobot):
         coordinates = tuple(known[word] for word in pose)
         common = {field.name: getattr(file, field.name) for field in dataclasses.fields(Common)}
         robot = cls(
-            name=name, described=graph, specs=specs, sources=sources, coordinates=coordinates,
+            name=name,
+            described=graph,
+            specs=specs,
+            sources=sources,
+            coordinates=coordinates,
             book=book,
-            redundancy=file.redundancy, **common, **own,
-        )  # fmt: skip
+            redundancy=file.redundancy,
+            **common,
+            **own,
+        )
         robot = robot._with(uncertainty=robot.resolved(robot.uncertainty))
         robot.check_laws()
         _ = robot.controller
@@ -181,9 +191,7 @@ class Machine(TwinRobot):
         """
         parameters = sections.pop(PARAMETERS, {})
         if isinstance(parameters, Mapping) and parameters:
-            self = self.with_file_values(
-                {f"{PARAMETERS}.{name}": v for name, v in parameters.items()}
-            )
+            self = self.with_file_values({f"{PARAMETERS}.{name}": v for name, v in parameters.items()})
         made = super().changed(**sections)
         if not sections or not set(sections) <= set(self.changeable):
             return made
@@ -210,10 +218,11 @@ class Machine(TwinRobot):
         """
         if self.redundant and (bad := not_shared(self.laws)):
             raise ParameterError(
-                "friction", bad[0],
+                "friction",
+                bad[0],
                 f"a law of position and rate alone: {self.joints_count} actuated joints "
                 f"share the effort of {len(self.graph.leads)} degrees of freedom",
-            )  # fmt: skip
+            )
 
     def numbered(self, values: Mapping[str, Any]) -> Machine:
         """Paths of entries, ``joints.ball_1.at[0]``, or of a limb's, ``limbs.joints.ball.at[0]``.
@@ -304,9 +313,7 @@ class Machine(TwinRobot):
             own = len(source.path)
             if source.path[0] != "limbs":
                 continue
-            if keys[: own - 2] == list(source.path[:-2]) and keys[own - 2 :] == [
-                "azimuths", source.copy
-            ]:  # fmt: skip
+            if keys[: own - 2] == list(source.path[:-2]) and keys[own - 2 :] == ["azimuths", source.copy]:
                 yield kind, name, ("azimuth",), source.azimuth
             if keys[:own] == list(source.path):
                 where = keys[own:]
@@ -404,9 +411,7 @@ class Machine(TwinRobot):
 
     def rotor_key(self, joint: str) -> Keys:
         """Of a limb's joint once for all copies."""
-        tail = (
-            ["rotor_inertia"] if self.specs["joints"][joint].drive is None else ["drive", "inertia"]
-        )
+        tail = ["rotor_inertia"] if self.specs["joints"][joint].drive is None else ["drive", "inertia"]
         return (*self.sources["joints", joint].path, *tail)
 
     def mass_keys(self) -> Iterator[Keys]:
@@ -525,9 +530,7 @@ def _without_rounding(
             yield repr(part)
 
     parts = [data.get(key) for key in ("joints", "rods", "limbs")]
-    repaired = repair_rounded(
-        graph, rounding_error(word for part in parts for word in written(part))
-    )
+    repaired = repair_rounded(graph, rounding_error(word for part in parts for word in written(part)))
     if repaired is None or not repaired.moves:
         return specs
     warn(name, repaired.text)

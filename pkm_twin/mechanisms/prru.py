@@ -76,9 +76,7 @@ class Inertia:
     lower_link_mass: float = mass()
     upper_link_mass: float = mass()
     platform_mass: float = mass()
-    link_com: float = schema.number(
-        low=0.0, high=1.0, unit="of the link, from the slider's joint", default=0.5
-    )
+    link_com: float = schema.number(low=0.0, high=1.0, unit="of the link, from the slider's joint", default=0.5)
     lower_link_inertia: Array | None = schema.vector(2, low=0.0, unit="kg m2", default=None)
     upper_link_inertia: Array | None = schema.vector(2, low=0.0, unit="kg m2", default=None)
     platform_com: Array = schema.vector(3, unit="m", default=[0, 0, 0])
@@ -90,9 +88,7 @@ class Inertia:
         for key in ("lower_link_inertia", "upper_link_inertia"):
             value = getattr(self, key)
             if value is not None and value[1] > 2 * value[0] * (1 + 1e-9):
-                raise ParameterError(
-                    f"{path}.{key}", value.tolist(), "triangle rule: axial at most twice across"
-                )
+                raise ParameterError(f"{path}.{key}", value.tolist(), "triangle rule: axial at most twice across")
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,8 +111,9 @@ class Prru(TwinRobot):
     description: ClassVar[str] = "3-PRRU head, three vertical sliders and two links per limb"
     mobility: ClassVar[str] = "3: translation z, rotations alpha, beta (x, y, gamma follow)"
     coordinates: ClassVar[tuple[Coordinate, ...]] = (
-        COORDINATES["z"], *name_angles({"alpha": "x", "beta": "y"}),
-    )  # fmt: skip
+        COORDINATES["z"],
+        *name_angles({"alpha": "x", "beta": "y"}),
+    )
     limb_names: ClassVar[tuple[str, ...]] = tuple(f"limb {limb}" for limb in LIMBS)
 
     @property
@@ -194,9 +191,18 @@ class Prru(TwinRobot):
             along = _named(low, **{"d": d, "t": t, "t x d": np.cross(t, d)})
             name = self.joints[i]
             joints[name] = Joint(
-                name, "prismatic", BASE, slider, foot, array([UP]), actuated=True, home=height,
-                rotor_inertia=rotor, directions=fixed, label=f"guide {limb}",
-            )  # fmt: skip
+                name,
+                "prismatic",
+                BASE,
+                slider,
+                foot,
+                array([UP]),
+                actuated=True,
+                home=height,
+                rotor_inertia=rotor,
+                directions=fixed,
+                label=f"guide {limb}",
+            )
             for label, kind, pair, at, axes in (
                 ("slider joint", "revolute", (slider, low), foot, [t]),
                 ("link joint", "revolute", (low, high), foot, [d]),
@@ -204,9 +210,7 @@ class Prru(TwinRobot):
             ):
                 full = f"{label} {limb}"
                 joints[full] = Joint(full, kind, *pair, at, array(axes), directions=along)
-        bodies[PLATFORM] = Body(
-            PLATFORM, m.platform_mass, array(origin + m.platform_com), array(m.platform_inertia)
-        )
+        bodies[PLATFORM] = Body(PLATFORM, m.platform_mass, array(origin + m.platform_com), array(m.platform_inertia))
         return Graph(bodies, joints, {}, PLATFORM, origin)
 
     @property

@@ -113,9 +113,7 @@ class JointsCompliance:
                 if i in free and value != math.inf:
                     raise ParameterError(field, value, f".inf: the joint turns {_ENTRIES[i]}")
                 if i not in free and not value <= 1.0:
-                    raise ParameterError(
-                        field, value, f"0 to 1: the joint carries load {_ENTRIES[i]}"
-                    )
+                    raise ParameterError(field, value, f"0 to 1: the joint carries load {_ENTRIES[i]}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,12 +240,19 @@ class UprRpu(TwinRobot):
     limb_names: ClassVar[tuple[str, ...]] = ("limb 1", "limb 2", "limb 3")
     start: ClassVar[LargestRoot] = LargestRoot()
     coordinates: ClassVar[tuple[Coordinate, ...]] = (
-        COORDINATES["z"], *name_angles({"beta": "x", "gamma": "y"}),
-    )  # fmt: skip
+        COORDINATES["z"],
+        *name_angles({"beta": "x", "gamma": "y"}),
+    )
     changeable: ClassVar[tuple[str, ...]] = (
-        "members", "joints_compliance", "limits", "payload", "friction", "gravity",
-        "element_compliance", "modal_damping",
-    )  # fmt: skip
+        "members",
+        "joints_compliance",
+        "limits",
+        "payload",
+        "friction",
+        "gravity",
+        "element_compliance",
+        "modal_damping",
+    )
 
     @property
     def size(self) -> float:
@@ -310,9 +315,7 @@ class UprRpu(TwinRobot):
         z, beta, gamma = np.moveaxis(np.asarray(pose, np.float64), -1, 0)
         zero = np.zeros_like(z)
         origin = np.stack([zero, -z * np.tan(beta), z], -1)
-        x = np.stack(
-            [np.cos(gamma), np.sin(beta) * np.sin(gamma), -np.cos(beta) * np.sin(gamma)], -1
-        )
+        x = np.stack([np.cos(gamma), np.sin(beta) * np.sin(gamma), -np.cos(beta) * np.sin(gamma)], -1)
         return origin, x, np.stack([zero, np.cos(beta), np.sin(beta)], -1)
 
     def limb_wrenches(self, pose: ArrayLike) -> Array:
@@ -382,10 +385,17 @@ class UprRpu(TwinRobot):
             revolute = _named((turning, u), (turning, v), (turning, -d))
             universal = _named((BASE if i < 2 else high, _X), (low if i < 2 else PLATFORM, _Y))
             drive = Joint(
-                self.joints[i], "prismatic", low, high, foot, array([d]), actuated=True, home=reach,
+                self.joints[i],
+                "prismatic",
+                low,
+                high,
+                foot,
+                array([d]),
+                actuated=True,
+                home=reach,
                 rotor_inertia=rotor,
                 label=f"P joint {limb}",
-            )  # fmt: skip
+            )
             if i < 2:
                 chain = [
                     _joint(f"U joint {limb}", (BASE, low), foot, [_X, _Y], universal, f"{limb}U"),
@@ -396,9 +406,7 @@ class UprRpu(TwinRobot):
                 chain = [
                     _joint(f"R joint {limb}", (BASE, low), foot, [_X], revolute, f"{limb}R"),
                     drive,
-                    _joint(
-                        f"U joint {limb}", (high, PLATFORM), head, [_X, _Y], universal, f"{limb}U"
-                    ),
+                    _joint(f"U joint {limb}", (high, PLATFORM), head, [_X, _Y], universal, f"{limb}U"),
                 ]
             joints |= {joint.name: joint for joint in chain}
         if inertia is None:
@@ -450,11 +458,15 @@ class UprRpu(TwinRobot):
         density = 0.0 if self.inertia is None else self.inertia.density
         sections = {
             beam.name: Section(
-                m.youngs_modulus, m.shear_modulus, d, 0.0,
-                density * math.pi / 4 * d**2, m.shear_factor,
+                m.youngs_modulus,
+                m.shear_modulus,
+                d,
+                0.0,
+                density * math.pi / 4 * d**2,
+                m.shear_factor,
             )
             for beam, d in zip(self.beams, m.diameter.tolist(), strict=True)
-        }  # fmt: skip
+        }
         compliances = {"3U": j.rpu_universal.tolist(), "3R": j.rpu_revolute.tolist()}
         for limb in "12":
             compliances[f"{limb}U"] = j.upr_universal.tolist()
@@ -464,9 +476,13 @@ class UprRpu(TwinRobot):
 
 
 def _joint(
-    name: str, pair: tuple[str, str], at: Array, axes: Sequence[Array],
-    directions: tuple[Direction, ...], label: str,
-) -> Joint:  # fmt: skip
+    name: str,
+    pair: tuple[str, str],
+    at: Array,
+    axes: Sequence[Array],
+    directions: tuple[Direction, ...],
+    label: str,
+) -> Joint:
     kind = "universal" if len(axes) == 2 else "revolute"
     return Joint(name, kind, *pair, at, array(axes), directions=directions, label=label)
 

@@ -175,9 +175,7 @@ class DoublesTemplate:
     :param stamped: whether the message begins with a header.
     """
 
-    def __init__(
-        self, type_name: str, definition: str, message: dict[str, Any], *, stamped: bool
-    ) -> None:
+    def __init__(self, type_name: str, definition: str, message: dict[str, Any], *, stamped: bool) -> None:
         codec = MessageCodec(type_name, definition)
         arrays = {name: count for name, v in message.items() if (count := _count_doubles(v))}
         # Each field is filled with eight equal bytes that never occur in UTF-8 text, to find it.
@@ -315,9 +313,7 @@ class _Points:
         last = start + stride * (len(range(*which.indices(points))) - 1)
         self.end = _find_end(last, lengths)
 
-    def read(
-        self, data: Any, array: int, kind: str, columns: int, *, of_length: bool = False
-    ) -> NDArray[Any]:
+    def read(self, data: Any, array: int, kind: str, columns: int, *, of_length: bool = False) -> NDArray[Any]:
         """Read an array (or :data:`TIME_INDEX`) of all points, shape (points, columns)."""
         values = np.empty((self.points, columns), np.dtype(kind).newbyteorder("="))
         for which, view in self._views(data, array, kind, columns, of_length):
@@ -356,9 +352,7 @@ class _Points:
                 f"point {point}: {length} {POINT_ARRAYS[i]}, the first point has {self.lengths[i]}",
             )
         if self.end > len(data):
-            raise MessageError(
-                "cdr", f"{self.points} points take {self.end} bytes, {len(data)} are given"
-            )
+            raise MessageError("cdr", f"{self.points} points take {self.end} bytes, {len(data)} are given")
 
     def _views(
         self, data: Any, array: int, kind: str, columns: int, of_length: bool

@@ -114,10 +114,7 @@ class TrajectoryFields:
             message.header,
             names,
             np.array([[d.sec for d in durations], [d.nanosec for d in durations]], np.int64),
-            {
-                what: _stack_rows([getattr(point, what) for point in points], len(names))
-                for what in COLUMNS
-            },
+            {what: _stack_rows([getattr(point, what) for point in points], len(names)) for what in COLUMNS},
         )
 
 
@@ -175,9 +172,7 @@ class JointReader:
         self._map = None if self.robot.controller.plain else self.robot.controller
         self._names = self.robot.controller.names
         self._limited = {"position": position is not None, "velocity": velocity is not None}
-        self._position = (
-            [(-r, r) for r in reach] if position is None else list(map(tuple, position.tolist()))
-        )
+        self._position = [(-r, r) for r in reach] if position is None else list(map(tuple, position.tolist()))
         rates = [MAX_RATE] * joints if velocity is None else velocity.tolist()
         if self._map is not None:
             # A value at its limit must still be accepted after the rounding of the conversion.
@@ -327,9 +322,7 @@ class JointReader:
                 worst = tuple(np.argwhere(~good)[0])
                 joint = int(worst[-1])
                 bounds = self._velocity if what == "velocity" else self._acceleration
-                raise self._refusal(
-                    f"differentiated {what}", joint, float(values[worst]), *bounds[joint]
-                )
+                raise self._refusal(f"differentiated {what}", joint, float(values[worst]), *bounds[joint])
 
     def _match(self, names: Sequence[str]) -> list[int]:
         """Return the index of each of the robot's joints among the names."""
@@ -386,12 +379,8 @@ class JointReader:
         if given is None:
             return None
         if isinstance(given, Ragged) or given.shape[1] != len(fields.names):
-            point, length = (
-                (given.point, given.length) if isinstance(given, Ragged) else (0, given.shape[1])
-            )
-            raise MessageError(
-                "length", f"point {point}: {length} {what} for {len(fields.names)} joint names"
-            )
+            point, length = (given.point, given.length) if isinstance(given, Ragged) else (0, given.shape[1])
+            raise MessageError("length", f"point {point}: {length} {what} for {len(fields.names)} joint names")
         values = given[:, index]
         if self._map is not None:
             values = _TO_MODEL[COLUMNS[what]](self._map, values)
@@ -406,9 +395,7 @@ class JointReader:
             raise MessageError(error.reason, f"point {row}: {error}")
         return np.ascontiguousarray(values)
 
-    def _refusal(
-        self, what: str, joint: int, value: float, low: float, high: float
-    ) -> MessageError:
+    def _refusal(self, what: str, joint: int, value: float, low: float, high: float) -> MessageError:
         # The sender knows the controller's names and units.
         name, quantity = self._names[joint], what.split()[-1]
         value, low, high = self.robot.controller.shown(joint, quantity, value, low, high)
@@ -444,9 +431,7 @@ def _times_from_start(times: NDArray[np.int64]) -> NDArray[np.int64]:
     """Convert seconds and nanoseconds (2, p) to nanoseconds; check that they rise from zero."""
     bad = (times[1] < 0) | (times[1] >= SECOND)
     if bad.any():
-        raise MessageError(
-            "time", f"nanosec is {times[1, bad.argmax()]}, allowed 0 to {SECOND - 1}"
-        )
+        raise MessageError("time", f"nanosec is {times[1, bad.argmax()]}, allowed 0 to {SECOND - 1}")
     nanoseconds: NDArray[np.int64] = times[0] * SECOND + times[1]
     if nanoseconds[0] < 0:
         raise MessageError("time", f"time_from_start begins at {nanoseconds[0] / SECOND:g} s")
@@ -454,8 +439,7 @@ def _times_from_start(times: NDArray[np.int64]) -> NDArray[np.int64]:
     if nanoseconds[-1] > MAX_DURATION:
         raise MessageError(
             "bounds",
-            f"time_from_start ends at {nanoseconds[-1] / SECOND:g} s, "
-            f"at most {MAX_DURATION / SECOND:g} s",
+            f"time_from_start ends at {nanoseconds[-1] / SECOND:g} s, at most {MAX_DURATION / SECOND:g} s",
         )
     falls = np.diff(nanoseconds) <= 0
     if falls.any():
@@ -492,9 +476,7 @@ def _check_numbers(labels: Sequence[str], values: Sequence[float], bound: float)
             raise MessageError("bounds", f"{label} is {value:g}, a denormal number")
 
 
-def read_wrench(
-    message: Any, now: int, rules: StampRules, frame: str, accept_empty: bool
-) -> WrenchSample:
+def read_wrench(message: Any, now: int, rules: StampRules, frame: str, accept_empty: bool) -> WrenchSample:
     """Read a geometry_msgs/WrenchStamped and check its frame; it may be empty only if allowed."""
     given = message.header.frame_id
     if given != frame and not (given == "" and accept_empty):
@@ -542,9 +524,7 @@ def read_imu(message: Any, now: int, rules: StampRules, frame: str) -> ImuSample
     ):
         vector = getattr(message, name)
         if float(getattr(message, f"{name}_covariance")[0]) == NOT_MEASURED:
-            raise MessageError(
-                "not measured", f"{name}_covariance[0] is -1: the sensor does not measure it"
-            )
+            raise MessageError("not measured", f"{name}_covariance[0] is -1: the sensor does not measure it")
         values = [vector.x, vector.y, vector.z]
         _check_numbers([f"{name}.{axis}" for axis in "xyz"], values, bound)
         parts.append(np.array(values, np.float64))

@@ -50,8 +50,7 @@ class StampRules:
             )
             raise MessageError(
                 "stale stamp",
-                f"the stamp is {age / SECOND:.3f} s old, allowed {self.max_age / SECOND:g} s; "
-                f"{cause}",
+                f"the stamp is {age / SECOND:.3f} s old, allowed {self.max_age / SECOND:g} s; {cause}",
             )
         return stamp
 

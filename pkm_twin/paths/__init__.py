@@ -10,6 +10,20 @@ from pkm_twin.paths.sizing import Motor, size_drives
 from pkm_twin.paths.worst import worst_over_workspace
 
 __all__ = [
-    "Bound", "Limits", "Motor", "Path", "Samples", "ShapedPath", "TimedPath", "circle", "cycle",
-    "fastest", "lines", "shaped", "size_drives", "through", "timed", "worst_over_workspace",
-]  # fmt: skip
+    "Bound",
+    "Limits",
+    "Motor",
+    "Path",
+    "Samples",
+    "ShapedPath",
+    "TimedPath",
+    "circle",
+    "cycle",
+    "fastest",
+    "lines",
+    "shaped",
+    "size_drives",
+    "through",
+    "timed",
+    "worst_over_workspace",
+]

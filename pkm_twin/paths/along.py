@@ -89,8 +89,7 @@ def check_computed(motion: Recording) -> Recording:
     raise ParameterError(
         f"{motion.source}: efforts of {motion.robot.joint_names[worst]}",
         f"{100 * away[worst]:.3g} % RMS from those that {motion.robot.name} computes",
-        "a file with the wrench (fx ... mz) and payload that its efforts were computed with, or "
-        "without efforts",
+        "a file with the wrench (fx ... mz) and payload that its efforts were computed with, or without efforts",
     )
 
 

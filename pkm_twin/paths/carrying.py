@@ -88,15 +88,18 @@ def _split_piece(stretch: Stretch, way: float) -> tuple[Stretch, int]:
 def loaded_robots(carried: Sequence[PayloadChange], stretch: int, pieces: int) -> tuple[Robot, ...]:
     """Return the robot with its payload for each piece of a stretch."""
     return tuple(
-        next(c.robot for c in reversed(carried) if (c.stretch, c.piece) <= (stretch, k))
-        for k in range(pieces)
+        next(c.robot for c in reversed(carried) if (c.stretch, c.piece) <= (stretch, k)) for k in range(pieces)
     )
 
 
 def compute_efforts(
-    robots: Sequence[Robot], which: NDArray[np.int64], q: Array, qd: Array, qdd: Array,
+    robots: Sequence[Robot],
+    which: NDArray[np.int64],
+    q: Array,
+    qd: Array,
+    qdd: Array,
     wrench: Array | None,
-) -> Array:  # fmt: skip
+) -> Array:
     """Return efforts of samples, (k, n), each with its own robot by number ``which`` (k,)."""
     if all(robot is robots[0] for robot in robots):
         return inverse_dynamics(robots[0], q, qd, qdd, wrench)

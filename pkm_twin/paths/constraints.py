@@ -77,16 +77,22 @@ class Limits:
         if most != np.inf:
             check_limit("speed", most, "m/s")
         return cls(
-            of("effort", effort, own.effort), of("velocity", velocity, own.velocity),
-            of("acceleration", acceleration, None), of("jerk", jerk, None), most,
-        )  # fmt: skip
+            of("effort", effort, own.effort),
+            of("velocity", velocity, own.velocity),
+            of("acceleration", acceleration, None),
+            of("jerk", jerk, None),
+            most,
+        )
 
     def part(self, share: float) -> Limits:
         """Return the limits times ``share``."""
         return Limits(
-            share * self.effort, share * self.velocity, share * self.acceleration,
-            share * self.jerk, share * self.speed,
-        )  # fmt: skip
+            share * self.effort,
+            share * self.velocity,
+            share * self.acceleration,
+            share * self.jerk,
+            share * self.speed,
+        )
 
     def check(self) -> None:
         """Reject limits that do not bound the speed.
@@ -96,9 +102,10 @@ class Limits:
         bounds = (self.effort, self.velocity, self.acceleration, self.jerk)
         if not (np.isfinite(self.speed) or any(np.isfinite(b).any() for b in bounds)):
             raise ParameterError(
-                "limits", "none",
+                "limits",
+                "none",
                 "a limit of effort, velocity, acceleration or speed, in the robot's file or given",
-            )  # fmt: skip
+            )
 
 
 @dataclass(frozen=True)
@@ -113,9 +120,14 @@ class Forces:
 
     @classmethod
     def of(
-        cls, part: JointPath, points: Index, q: Array, first: Array, second: Array,
+        cls,
+        part: JointPath,
+        points: Index,
+        q: Array,
+        first: Array,
+        second: Array,
         wrench: Array | None = None,
-    ) -> Forces:  # fmt: skip
+    ) -> Forces:
         """Compute the five from the inverse dynamics at q with derivatives by s, (p, n) each.
 
         :param points: of the stretch, whose payloads are carried, (p,).
@@ -132,9 +144,12 @@ class Forces:
         rates = (zero, zero, first, -first, 2.0 * first)
         changes = (zero, first, second, second, 4.0 * second)
         efforts = part.efforts(
-            np.tile(points, 5), np.tile(q, (5, 1)), np.concatenate(rates),
-            np.concatenate(changes), wrench,
-        )  # fmt: skip
+            np.tile(points, 5),
+            np.tile(q, (5, 1)),
+            np.concatenate(rates),
+            np.concatenate(changes),
+            wrench,
+        )
         g, a, ahead, back, twice = efforts.reshape(5, *q.shape)
         b = 0.5 * (ahead + back) - g
         odd = 0.5 * (ahead - back)
@@ -221,18 +236,18 @@ def limit_names(robot: Robot) -> list[str]:
     return [f"{word} {joint}" for word in words for joint in joints] + ["speed"]
 
 
-def limit_usage(
-    limits: Limits, effort: Array | None, qd: Array, qdd: Array, qddd: Array, speed: Array
-) -> Array:
+def limit_usage(limits: Limits, effort: Array | None, qd: Array, qdd: Array, qddd: Array, speed: Array) -> Array:
     """Return the signed used fraction of each limit, (k, 4 n + 1), 1 at the limit, 0 without."""
     zero = np.zeros_like(qd)
     parts = [
         values / bound
         for values, bound in (
-            (zero if effort is None else effort, limits.effort), (qd, limits.velocity),
-            (qdd, limits.acceleration), (qddd, limits.jerk),
+            (zero if effort is None else effort, limits.effort),
+            (qd, limits.velocity),
+            (qdd, limits.acceleration),
+            (qddd, limits.jerk),
         )
-    ]  # fmt: skip
+    ]
     return np.concatenate([*parts, (np.asarray(speed) / limits.speed)[:, None]], 1)
 
 
@@ -253,4 +268,4 @@ def check_rest(part: JointPath, rows: Rows, limits: Limits) -> None:
         f"path: effort of {name} at rest {where}",
         f"{100 * float(size[row, column]):.4g} % of its limit",
         "less than 100 %: the drive cannot hold the machine there",
-    )  # fmt: skip
+    )

@@ -57,9 +57,7 @@ def s_curve(cruise: float, smooth: float) -> Law:
     for h, j in zip(steps, jerk, strict=True):
         s, v, a = state
         rows.append((s, v, a / 2, j / 6))
-        state = np.array(
-            [s + v * h + a * h**2 / 2 + j * h**3 / 6, v + a * h + j * h**2 / 2, a + j * h]
-        )
+        state = np.array([s + v * h + a * h**2 / 2 + j * h**3 / 6, v + a * h + j * h**2 / 2, a + j * h])
     return Law(np.concatenate([[0.0], np.cumsum(steps)]), np.array(rows).T)
 
 
@@ -68,9 +66,7 @@ MIN_DURATION: Final = 1e-6
 LAWS: Final[Mapping[str, Sequence[Law]]] = {
     "quintic": (QUINTIC,),
     "s-curve": tuple(
-        s_curve(cruise, smooth)
-        for cruise in (0.0, 0.15, 0.3, 0.45, 0.6, 0.75)
-        for smooth in (0.3, 0.5, 0.75, 1.0)
+        s_curve(cruise, smooth) for cruise in (0.0, 0.15, 0.3, 0.45, 0.6, 0.75) for smooth in (0.3, 0.5, 0.75, 1.0)
     ),
 }
 """Laws by name; the one that is fastest within the limits is used."""
@@ -100,8 +96,9 @@ def run_by_law(part: JointPath, law: Law, limits: Limits, wrench: Array | None) 
                 row, column = np.argwhere(rest <= 0.0)[0]
                 raise ParameterError(
                     f"path: effort of {part.curve.robot.joint_names[column]} at rest",
-                    float(fixed[row, column]), f"below {limits.effort[column]:g}",
-                )  # fmt: skip
+                    float(fixed[row, column]),
+                    f"below {limits.effort[column]:g}",
+                )
             # square y^2 + linear y <= rest, y = 1 / duration.
             root = np.sqrt(np.maximum((sign * linear) ** 2 + 4.0 * sign * square * rest, 0.0))
             hits = (sign * linear) ** 2 + 4.0 * sign * square * rest >= 0.0
@@ -189,10 +186,21 @@ def fastest(
         to a singularity, or a drive that cannot hold the machine; or no limit bounds the speed.
     """
     return timed(
-        robot, path, "fastest", effort=effort, velocity=velocity, acceleration=acceleration,
-        jerk=jerk, speed=speed, share=share, singularity=singularity, wrench=wrench, points=points,
-        slowdown=slowdown, payload=payload,
-    )  # fmt: skip
+        robot,
+        path,
+        "fastest",
+        effort=effort,
+        velocity=velocity,
+        acceleration=acceleration,
+        jerk=jerk,
+        speed=speed,
+        share=share,
+        singularity=singularity,
+        wrench=wrench,
+        points=points,
+        slowdown=slowdown,
+        payload=payload,
+    )
 
 
 def timed(
@@ -242,9 +250,7 @@ def timed(
     moving = sum(run.duration for run in result.runs)
     least = moving + sum(result.rests)
     if not (np.isfinite(duration) and duration >= least * (1.0 - 1e-9)):
-        raise ParameterError(
-            "duration", duration, f"{least:.6g} s or more, within the limits by law {law}"
-        )
+        raise ParameterError("duration", duration, f"{least:.6g} s or more, within the limits by law {law}")
     factor = (duration - sum(result.rests)) / moving
     result = replace(result, runs=tuple(run.slower(factor) for run in result.runs))
     over = max(result.worst.values(), default=0.0)
@@ -326,8 +332,7 @@ def _solve_with_jerk(part: JointPath, limits: Limits, wrench: Array | None) -> R
             parts[steep & long & (over.max(0) > 1.0 + REFINEMENT_EXCESS)] = MAX_PARTS
         divided = bool((parts > 1).any())
         share, jerks = (
-            np.repeat(np.where(parts > 1, 1.0, old / own), parts)
-            for old, own in zip((share, jerks), over, strict=True)
+            np.repeat(np.where(parts > 1, 1.0, old / own), parts) for old, own in zip((share, jerks), over, strict=True)
         )
         programs = MAX_PROGRAMS if divided else 1
         if divided:
@@ -353,9 +358,7 @@ def _check_no_stop(part: JointPath, x: Array) -> None:
     slow = (x[:-1] + x[1:]) <= 0.0
     if slow.any():
         way = part.curve.begin + float(part.s[part.left[int(slow.argmax())]])
-        raise ParameterError(
-            "path", f"no motion after {way:.4g} m", "limits that let the machine pass"
-        )
+        raise ParameterError("path", f"no motion after {way:.4g} m", "limits that let the machine pass")
 
 
 def slowdown_factor(used: Array) -> float:
@@ -369,9 +372,7 @@ def slowdown_factor(used: Array) -> float:
     return float((used ** (1.0 / powers)).max())
 
 
-def slow_within_limits(
-    run: Run, limits: Limits, wrench: Array | None, used: Array | None = None
-) -> Run:
+def slow_within_limits(run: Run, limits: Limits, wrench: Array | None, used: Array | None = None) -> Run:
     """Slow a run down as much as its limits need.
 
     :param used: largest used fraction of each limit if known, shape (4 n + 1,).

@@ -91,9 +91,7 @@ def _check_waypoints(robot: Robot, points: ArrayLike, space: Space) -> tuple[Arr
     values = np.asarray(points, np.float64)
     names = robot.pose_names if space == "pose" else robot.joint_names
     if values.ndim != 2 or values.shape[1] != len(names) or len(values) < 2:
-        raise ParameterError(
-            "waypoints", f"shape {values.shape}", f"2 or more rows of {', '.join(names)}"
-        )
+        raise ParameterError("waypoints", f"shape {values.shape}", f"2 or more rows of {', '.join(names)}")
     if not np.isfinite(values).all():
         row = int(np.argwhere(~np.isfinite(values))[0, 0])
         raise ParameterError(f"waypoint {row}", values[row].tolist(), "finite numbers")
@@ -167,9 +165,14 @@ class _Lines:
     """Build the pieces between waypoints that differ."""
 
     def __init__(
-        self, robot: Robot, space: Space, points: Array, blends: Array, dwells: Array,
+        self,
+        robot: Robot,
+        space: Space,
+        points: Array,
+        blends: Array,
+        dwells: Array,
         arcs: Mask,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.robot, self.space = robot, space
         self.points, self.blends, self.dwells, self.arcs = points, blends, dwells, arcs
         self.scales = scales_of(robot, space)
@@ -206,15 +209,11 @@ class _Lines:
         result: list[tuple[Piece, int]] = []
         k, last = 0, len(self.points) - 1
         if self.arcs[0] or self.arcs[last]:
-            raise ParameterError(
-                "waypoints: arc", "the first or last", "waypoints between two others"
-            )
+            raise ParameterError("waypoints: arc", "the first or last", "waypoints between two others")
         while k < last:
             if self.arcs[k + 1]:
                 if self.arcs[k + 2]:
-                    raise ParameterError(
-                        f"waypoint {k + 2}: arc", 1, "only one point between the ends of an arc"
-                    )
+                    raise ParameterError(f"waypoint {k + 2}: arc", 1, "only one point between the ends of an arc")
                 result.append((self._make_arc(k), k + 2))
                 k += 2
                 continue
@@ -230,9 +229,7 @@ class _Lines:
         if wanted == 0.0 or self.dwells[k] > 0.0:
             return 0.0
         if not (isinstance(piece, Line) and isinstance(following, Line)):
-            raise ParameterError(
-                f"waypoint {k}: blend", wanted, "0 where an arc begins or ends (make it tangent)"
-            )
+            raise ParameterError(f"waypoint {k}: blend", wanted, "0 where an arc begins or ends (make it tangent)")
         turn = float(np.sum(piece.slope * following.slope * self.scales**2))
         if turn <= REVERSAL_COSINE or turn >= 1.0 - TANGENT_TOLERANCE**2:
             return 0.0
@@ -243,9 +240,7 @@ class _Lines:
         names = self.robot.pose_names if self.space == "pose" else ()
         places = [i for i, name in enumerate(names) if name in ("x", "y", "z")]
         if len(places) < 2:
-            raise ParameterError(
-                f"waypoint {k + 1}: arc", 1, "poses with two or more of x, y, z among them"
-            )
+            raise ParameterError(f"waypoint {k + 1}: arc", 1, "poses with two or more of x, y, z among them")
         return arc_through(*self.points[k : k + 3], places=places, where=f"waypoint {k + 1}")
 
 

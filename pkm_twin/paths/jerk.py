@@ -63,9 +63,14 @@ def _boundary_derivatives(part: JointPath) -> tuple[Array, Array, tuple[Array, A
 
 
 def smooth_profile(
-    part: JointPath, rows: Rows, limits: Limits, start: Array, share: Array, jerks: Array,
+    part: JointPath,
+    rows: Rows,
+    limits: Limits,
+    start: Array,
+    share: Array,
+    jerks: Array,
     programs: int = MAX_PROGRAMS,
-) -> Array | None:  # fmt: skip
+) -> Array | None:
     """Find the largest x at the intervals' ends, (i + 1,), within the joints' jerk limits.
 
     Returns None if no program has a solution.
@@ -78,9 +83,13 @@ def smooth_profile(
     unit = float(start.max())
     jerk = limits.jerk / unit**1.5
     rows = Rows(
-        rows.alpha * unit, rows.beta * unit, rows.drag * np.sqrt(unit), rows.fixed, rows.dry,
+        rows.alpha * unit,
+        rows.beta * unit,
+        rows.drag * np.sqrt(unit),
+        rows.fixed,
+        rows.dry,
         rows.most / unit,
-    )  # fmt: skip
+    )
     h = part.steps
     best, x = np.inf, start / unit
     count = slower = 0
@@ -95,10 +104,11 @@ def smooth_profile(
         weight[1:] += way / v[1:]
         answer = scipy.optimize.linprog(
             -weight / weight[1:-1].max(),
-            A_ub=scipy.sparse.vstack([own, more]).tocsr(), b_ub=np.concatenate([bound, top]),
+            A_ub=scipy.sparse.vstack([own, more]).tocsr(),
+            b_ub=np.concatenate([bound, top]),
             bounds=np.stack([np.zeros(len(x)), _bound_from_rest(part, jerk, most)], 1),
             method="highs",
-        )  # fmt: skip
+        )
         if answer.status != 0 and count == 0 and slower < MAX_SLOWDOWNS:
             # A slower motion has smaller jerks, so that the bounds' tangents there are feasible.
             x, slower = 0.25 * x, slower + 1
@@ -131,17 +141,13 @@ def _bound_from_rest(part: JointPath, jerk: Array, most: Array) -> Array:
     return most
 
 
-def _sparse_matrix(
-    rows: list[tuple[Any, Any, Any]], shape: tuple[int, int]
-) -> scipy.sparse.csr_matrix:
+def _sparse_matrix(rows: list[tuple[Any, Any, Any]], shape: tuple[int, int]) -> scipy.sparse.csr_matrix:
     """Return the sparse matrix of triplets (values, rows, columns)."""
     values, row, column = (np.concatenate([np.ravel(r[k]) for r in rows]) for k in range(3))
     return scipy.sparse.coo_matrix((values, (row, column)), shape=shape).tocsr()
 
 
-def _program_rows(
-    p: Array, q: Array, least: Array, greatest: Array
-) -> tuple[scipy.sparse.csr_matrix, Array]:
+def _program_rows(p: Array, q: Array, least: Array, greatest: Array) -> tuple[scipy.sparse.csr_matrix, Array]:
     """Write least <= p x + q x' <= greatest of all intervals, (i, r), as A x <= b."""
     count, width = p.shape
     number, column = np.arange(p.size), np.repeat(np.arange(count), width)
@@ -149,9 +155,7 @@ def _program_rows(
     return scipy.sparse.vstack([made, -made]), np.concatenate([greatest.ravel(), -least.ravel()])
 
 
-def _jerk_rows(
-    part: JointPath, jerk: Array, h: Array, x: Array, share: Array
-) -> tuple[scipy.sparse.csr_matrix, Array]:
+def _jerk_rows(part: JointPath, jerk: Array, h: Array, x: Array, share: Array) -> tuple[scipy.sparse.csr_matrix, Array]:
     """Write the jerk limits at points between two intervals, linearised about a profile."""
     used = np.isfinite(jerk)
     first, second, sides = _boundary_derivatives(part)

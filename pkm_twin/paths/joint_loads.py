@@ -127,9 +127,13 @@ class Life:
 
 
 def bearing_life(
-    load: ArrayLike, moved: ArrayLike, duration: float, rating: float, exponent: float = 3.0,
+    load: ArrayLike,
+    moved: ArrayLike,
+    duration: float,
+    rating: float,
+    exponent: float = 3.0,
     slides: bool = False,
-) -> Life:  # fmt: skip
+) -> Life:
     """Compute the L10 life of a rolling bearing under a load that varies with its motion.
 
     P = (sum F^p dphi / sum dphi)^(1/p), L10 = (C / P)^p million turns (ISO 281), or times 100 km of
@@ -213,9 +217,7 @@ def joint_loads(motion: Recording) -> Iterator[list[JointLoad]]:
         for k, (name, (inner, outer)) in enumerate(zip(found.names, found.bodies, strict=True)):
             back = turn[inner].swapaxes(-1, -2)
             wrench = found.wrenches[:, k]
-            own = np.concatenate(
-                [_multiply(back, wrench[:, :3]), _multiply(back, wrench[:, 3:])], -1
-            )
+            own = np.concatenate([_multiply(back, wrench[:, :3]), _multiply(back, wrench[:, 3:])], -1)
             place = np.zeros(len(q))
             if name in slides:
                 joint, at = slides[name], motion.robot.engine.tree.at
@@ -329,9 +331,7 @@ def read_bearings(path: Path, names: tuple[str, ...], robot: Robot) -> dict[str,
     for pattern, entry in read_entries(path, "bearings", "joints").items():
         fitting = fnmatch.filter(names, str(pattern))
         if not fitting:
-            raise ParameterError(
-                f"{path}: bearings", f"{pattern} matches no joint", f"of {', '.join(names)}"
-            )
+            raise ParameterError(f"{path}: bearings", f"{pattern} matches no joint", f"of {', '.join(names)}")
         spec = schema.build(BearingSpec, entry, f"{path}: bearings.{pattern}")
         left = {}
         for name in fitting:
@@ -410,9 +410,11 @@ def format_spectra(loads: Sequence[Summary]) -> str:
 
 
 def summarise_loads(
-    motion: Recording, bearings: Path | None, out: Path | None,
+    motion: Recording,
+    bearings: Path | None,
+    out: Path | None,
     progress: Callable[[int], None] | None = None,
-) -> list[Summary]:  # fmt: skip
+) -> list[Summary]:
     """Compute the loads of all joints along a motion, and write them block by block.
 
     :raises ParameterError: fewer than two samples, or by the field of a bearing.

@@ -136,9 +136,7 @@ class JointPath:
         """Piece of each point, shape (p,)."""
         return np.repeat(np.arange(len(self.grid)), [len(own) for own in self.grid])
 
-    def efforts(
-        self, points: Index, q: Array, qd: Array, qdd: Array, wrench: Array | None
-    ) -> Array:
+    def efforts(self, points: Index, q: Array, qd: Array, qdd: Array, wrench: Array | None) -> Array:
         """Return efforts with the payloads of the points' pieces, points (k,): shape (k, n)."""
         return compute_efforts(self.curve.robots, self.piece[points], q, qd, qdd, wrench)
 
@@ -277,9 +275,10 @@ def check_positions(robot: Robot, s: Array, q: Array, begin: float) -> None:
         row = beyond.index or 0
         where = describe_place(robot, q[row], begin + float(s[row]))
         raise ParameterError(
-            f"path: {beyond.joint} {where}", round(beyond.value, 6),
+            f"path: {beyond.joint} {where}",
+            round(beyond.value, 6),
             f"{beyond.low:g} to {beyond.high:g} {beyond.unit}",
-        )  # fmt: skip
+        )
 
 
 def check_singularity(robot: Robot, way: Array, q: Array, singularity: float) -> None:
@@ -297,14 +296,18 @@ def check_singularity(robot: Robot, way: Array, q: Array, singularity: float) ->
         least = float(index[row])
         raise ParameterError(
             f"path: singularity index {describe_place(robot, q[row], float(way[row]))}",
-            round(least, 6), f"{singularity:g} or more; {passing_singularity(least)} passes",
-        )  # fmt: skip
+            round(least, 6),
+            f"{singularity:g} or more; {passing_singularity(least)} passes",
+        )
 
 
 def joint_paths(
-    path: Path, carried: Sequence[PayloadChange], points: int, singularity: float,
+    path: Path,
+    carried: Sequence[PayloadChange],
+    points: int,
+    singularity: float,
     slowdown: Slowdown | None = None,
-) -> list[JointPath]:  # fmt: skip
+) -> list[JointPath]:
     """All stretches of a path, checked; ``points`` shared by their lengths.
 
     :param carried: by :func:`~pkm_twin.paths.carrying.carry`.

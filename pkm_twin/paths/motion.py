@@ -57,8 +57,11 @@ class Bound:
     def as_json(self) -> dict[str, Any]:
         """Return plain data, units in the keys."""
         return {
-            "from_s": self.begin, "to_s": self.end, "limit": self.what or None, "used": self.used,
-        }  # fmt: skip
+            "from_s": self.begin,
+            "to_s": self.end,
+            "limit": self.what or None,
+            "used": self.used,
+        }
 
 
 @dataclass(frozen=True)
@@ -242,9 +245,11 @@ class TimedPath:
         """
         if not self.duration * rate <= MAX_SAMPLES:
             raise ParameterError(
-                "rate", rate, f"{MAX_SAMPLES / self.duration:.4g} or less, for "
+                "rate",
+                rate,
+                f"{MAX_SAMPLES / self.duration:.4g} or less, for "
                 f"{MAX_SAMPLES} samples of a motion of {self.duration:.4g} s",
-            )  # fmt: skip
+            )
         count = max(1, round(self.duration * rate))
         return self.sample(np.append(np.arange(count) / rate, self.duration))
 
@@ -297,9 +302,7 @@ class TimedPath:
             values = [("velocity", fine.qd, f"{unit}/s"), ("acceleration", fine.qdd, f"{unit}/s2")]
             if fine.effort is not None:
                 values.append(("effort", fine.effort, robot.effort_units[i]))
-            peaks[joint] = {
-                word: {"value": float(np.abs(v[:, i]).max()), "unit": u} for word, v, u in values
-            }
+            peaks[joint] = {word: {"value": float(np.abs(v[:, i]).max()), "unit": u} for word, v, u in values}
         return peaks
 
     @cached_property
@@ -314,9 +317,7 @@ class TimedPath:
     @cached_property
     def bounds(self) -> list[Bound]:
         """Intervals with the limit that binds, in order."""
-        return merge_bounds(
-            self.fine.time, find_binding(self.used), limit_names(self.robot), self.used
-        )
+        return merge_bounds(self.fine.time, find_binding(self.used), limit_names(self.robot), self.used)
 
     def check_rests(self) -> None:
         """Reject payloads that the drives cannot hold while the machine rests.
@@ -330,7 +331,7 @@ class TimedPath:
                 f"path: {limit_names(self.robot)[column]} at rest at {times[row]:.4g} s",
                 f"{100 * used[row, column]:.4g} % of its limit",
                 "a payload that the drives can hold there",
-            )  # fmt: skip
+            )
 
     @property
     def _rest_usage(self) -> tuple[Array, Array]:
@@ -499,11 +500,13 @@ def merge_bounds(time: Array, columns: list[int], names: list[str], used: Array)
             result.append((b, e, column))
     return [
         Bound(
-            float(time[b]), float(time[e]), "" if column < 0 else names[column],
+            float(time[b]),
+            float(time[e]),
+            "" if column < 0 else names[column],
             float(used[b : e + (e == len(time) - 1 or column >= 0)].max()),
         )
         for b, e, column in result
-    ]  # fmt: skip
+    ]
 
 
 def needs_forces(part: JointPath, limits: Limits) -> bool:

@@ -158,9 +158,7 @@ class Smooth:
         return self.spline(s), self.spline(s, 1), self.spline(s, 2)
 
 
-def arc_through(
-    begin: Array, middle: Array, end: Array, *, places: Sequence[int], where: str = "arc"
-) -> Arc:
+def arc_through(begin: Array, middle: Array, end: Array, *, places: Sequence[int], where: str = "arc") -> Arc:
     """Return the arc through three points; ``places`` are the coordinates that are lengths.
 
     :raises ParameterError: three points on a line.

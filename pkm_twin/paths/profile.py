@@ -70,9 +70,7 @@ class IntervalPrograms:
         reachable = [0.0] * (count + 1)
         value = 0.0
         for i in range(count - 1, -1, -1):
-            value = reachable[i] = _largest_start(
-                self.low[i], self.high[i], self.slope[i], self.most[i], value
-            )
+            value = reachable[i] = _largest_start(self.low[i], self.high[i], self.slope[i], self.most[i], value)
         result = [0.0] * (count + 1)
         value = 0.0
         for i in range(count):
@@ -147,14 +145,15 @@ def interval_rows(
     most[1:] *= part**2
     (a, a2), (b, b2) = alphas, betas
     return (
-        np.concatenate([b - a, -a2], 1), np.concatenate([a, b2 + a2], 1),
-        np.concatenate(lows, 1), np.concatenate(highs, 1), most,
-    )  # fmt: skip
+        np.concatenate([b - a, -a2], 1),
+        np.concatenate([a, b2 + a2], 1),
+        np.concatenate(lows, 1),
+        np.concatenate(highs, 1),
+        most,
+    )
 
 
-def fastest_profile(
-    rows: Rows, left: Index, steps: Array, part: Array, about: Array | None = None
-) -> Array:
+def fastest_profile(rows: Rows, left: Index, steps: Array, part: Array, about: Array | None = None) -> Array:
     """Find the largest x = v^2 at the intervals' ends, (i + 1,), at rest at both ends.
 
     :param part: of each interval's limits that is used, shape (i,).

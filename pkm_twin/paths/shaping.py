@@ -103,9 +103,7 @@ class ShapedPath(TimedPath):
     def _peak_usage(self) -> Array:
         """Greatest used part of each limit at all times, shape (4 n + 1,)."""
         assert self.phase is not None  # noqa: S101  shaped() gives it
-        plain = np.concatenate(
-            [begin + run.times for begin, run in zip(self.begins, self.runs, strict=True)]
-        )
+        plain = np.concatenate([begin + run.times for begin, run in zip(self.begins, self.runs, strict=True)])
         # Each delayed copy jumps where the unshaped motion does, later.
         late = [self.phase.earlier(plain, -k * np.pi)[0] for k in range(len(self.amplitudes))]
         even = np.linspace(0.0, self.duration, POSES_PER_STRETCH)
@@ -193,10 +191,7 @@ def shaped(
             # The shaped motion passes its poses later, which changes the frequencies over time.
             spans = zip(looked.begins, looked.runs, tails, strict=True)
             times = np.concatenate(
-                [
-                    begin + np.linspace(0.0, run.duration + tail, POSES_PER_STRETCH)
-                    for begin, run, tail in spans
-                ]
+                [begin + np.linspace(0.0, run.duration + tail, POSES_PER_STRETCH) for begin, run, tail in spans]
             )
             times = times[np.diff(times, prepend=-1.0) > MIN_TIME_STEP]
             rate = _damped_frequencies(looked, times, frequency, root)
@@ -206,10 +201,12 @@ def shaped(
             low, high = float(rate.min()), float(rate.max())
             looked = shaped_path = ShapedPath(
                 **{field.name: getattr(base, field.name) for field in fields(TimedPath)},
-                phase=phase, amplitudes=amplitudes, shaper=shaper,
+                phase=phase,
+                amplitudes=amplitudes,
+                shaper=shaper,
                 frequencies=(low / root / (2.0 * np.pi), high / root / (2.0 * np.pi)),
                 added=base.duration - motion.duration,
-            )  # fmt: skip
+            )
         return shaped_path
 
     plain = motion
@@ -226,9 +223,7 @@ def shaped(
     raise ParameterError("motion", f"{shaper} passes its limits", "wider limits, or no shaper")
 
 
-def _damped_frequencies(
-    motion: TimedPath, times: Array, frequency: Callable[[Array], Array], root: float
-) -> Array:
+def _damped_frequencies(motion: TimedPath, times: Array, frequency: Callable[[Array], Array], root: float) -> Array:
     """Return the damped angular frequency of the first mode along a motion, rad/s."""
     found = np.asarray(frequency(motion.sample(times).pose), np.float64)
     if not (np.isfinite(found).all() and (found > 0.0).all()):

@@ -86,21 +86,30 @@ class Duty:
             np.where(less, np.maximum(back, -net), np.maximum(given - net, 0.0)),
         )
         return cls(
-            float(np.abs(effort).max()), rms(time, effort),
-            float(np.abs(rate).max()), integral(time, np.abs(rate)) / whole,
-            max(0.0, float(power.max())), max(0.0, -float(power.min())),
-            float(given.sum()), float(back.sum()),
-        )  # fmt: skip
+            float(np.abs(effort).max()),
+            rms(time, effort),
+            float(np.abs(rate).max()),
+            integral(time, np.abs(rate)) / whole,
+            max(0.0, float(power.max())),
+            max(0.0, -float(power.min())),
+            float(given.sum()),
+            float(back.sum()),
+        )
 
     def as_json(self, slides: bool) -> dict[str, float]:
         """Return plain data, units in the keys."""
         force, rate = ("N", "m_s") if slides else ("N_m", "rad_s")
         return {
-            f"peak_effort_{force}": self.peak, f"rms_effort_{force}": self.rms,
-            f"peak_speed_{rate}": self.speed, f"mean_speed_{rate}": self.mean_speed,
-            "peak_power_W": self.power, "peak_regenerated_power_W": self.braking,
-            "work_J": self.work, "regenerated_J": self.returned, "energy_J": self.energy,
-        }  # fmt: skip
+            f"peak_effort_{force}": self.peak,
+            f"rms_effort_{force}": self.rms,
+            f"peak_speed_{rate}": self.speed,
+            f"mean_speed_{rate}": self.mean_speed,
+            "peak_power_W": self.power,
+            "peak_regenerated_power_W": self.braking,
+            "work_J": self.work,
+            "regenerated_J": self.returned,
+            "energy_J": self.energy,
+        }
 
 
 def integral(time: Array, values: Array) -> float:
@@ -128,9 +137,7 @@ class Motor:
     max_speed: float = schema.number(low=1e-3, high=1e7, unit="1/min")
     cost: float | None = schema.number(low=0.0, default=None)
     source: str = schema.text(default="")
-    curve: Any = schema.key(
-        lambda field, value: _read_curve(field, value), "rows of speed and torque", default=None
-    )
+    curve: Any = schema.key(lambda field, value: _read_curve(field, value), "rows of speed and torque", default=None)
 
     def verify(self, path: str) -> None:
         """Check that the data sheet's values are consistent."""
@@ -150,9 +157,12 @@ class Motor:
         rows = self.curve
         if rows is None:
             rows = np.array(
-                [[0.0, self.peak_torque], [self.rated_speed, self.peak_torque],
-                 [self.max_speed, self.continuous_torque]]
-            )  # fmt: skip
+                [
+                    [0.0, self.peak_torque],
+                    [self.rated_speed, self.peak_torque],
+                    [self.max_speed, self.continuous_torque],
+                ]
+            )
         return RPM * rows[:, 0], rows[:, 1]
 
     def most(self, speed: Array) -> Array:
@@ -168,12 +178,13 @@ def _read_curve(field: str, value: Any) -> Array:
         rows = np.zeros(0)
     pairs = rows.ndim == 2 and rows.shape[1:] == (2,) and len(rows) > 1
     if not (
-        pairs and rows[0, 0] == 0.0 and (np.diff(rows[:, 0]) > 0.0).all()
-        and ((rows >= 0.0) & (rows <= 1e7)).all() and rows[:, 1].any()
-    ):  # fmt: skip
-        raise ParameterError(
-            field, value, "rows of speed (1/min, rising from 0) and torque (N m), up to 1e+07"
-        )
+        pairs
+        and rows[0, 0] == 0.0
+        and (np.diff(rows[:, 0]) > 0.0).all()
+        and ((rows >= 0.0) & (rows <= 1e7)).all()
+        and rows[:, 1].any()
+    ):
+        raise ParameterError(field, value, "rows of speed (1/min, rising from 0) and torque (N m), up to 1e+07")
     return rows
 
 
@@ -358,23 +369,31 @@ class Fit:
     def as_json(self) -> dict[str, Any]:
         """Return plain data; fractions are 1 at the bound."""
         return {
-            "good": self.good, "used_torque": _none_if_infinite(self.torque),
-            "used_continuous_torque": self.thermal, "used_speed": self.speed,
-            "inertia_ratio": _none_if_infinite(self.inertia_ratio), "source": self.motor.source,
-            **self.choice, "used_gear_torque": self.geared, "rms_torque_N_m": self.rms,
+            "good": self.good,
+            "used_torque": _none_if_infinite(self.torque),
+            "used_continuous_torque": self.thermal,
+            "used_speed": self.speed,
+            "inertia_ratio": _none_if_infinite(self.inertia_ratio),
+            "source": self.motor.source,
+            **self.choice,
+            "used_gear_torque": self.geared,
+            "rms_torque_N_m": self.rms,
             "peak_torque_N_m": float(np.abs(self.torques).max()),
-            "peak_speed_rad_s": float(np.abs(self.speeds).max()), "cost": self.cost,
+            "peak_speed_rad_s": float(np.abs(self.speeds).max()),
+            "cost": self.cost,
             "backlash": self.gear.backlash,
-        }  # fmt: skip
+        }
 
     @property
     def choice(self) -> dict[str, Any]:
         """Motor and gear as plain data."""
         gear = self.gear
         return {
-            "motor": self.name, "gear": gear.name or None, "ratio": gear.ratio,
+            "motor": self.name,
+            "gear": gear.name or None,
+            "ratio": gear.ratio,
             "lead_m": gear.lead,
-        }  # fmt: skip
+        }
 
     def __str__(self) -> str:
         return f"{self.name} with {self.gear}"
@@ -417,9 +436,12 @@ class DriveDuty:
 
 
 def size_drives(
-    motion: Recording, effort: Array, motors: Mapping[str, Motor] | None = None,
-    given: Sequence[Gear] = (), choices: Sequence[Gears] = (),
-) -> list[DriveDuty]:  # fmt: skip
+    motion: Recording,
+    effort: Array,
+    motors: Mapping[str, Motor] | None = None,
+    given: Sequence[Gear] = (),
+    choices: Sequence[Gears] = (),
+) -> list[DriveDuty]:
     """Compute what each drive must supply for a motion.
 
     :param motion: with rates and accelerations; ``effort``: the joints' efforts, shape (k, n).
@@ -462,10 +484,13 @@ def size_drives(
             own_net = own_net + (net[:, i] - rotor * turning) * losses
             ratio = span[1] / drive.turns**2 / drive.inertia if drive.inertia > 0.0 else None
             duty = replace(
-                duty, drive=drive, at_motor=Duty.of(time, torques, speeds, own_net),
+                duty,
+                drive=drive,
+                at_motor=Duty.of(time, torques, speeds, own_net),
                 inertia_ratio=ratio,
-                torques=torques, speeds=speeds,
-            )  # fmt: skip
+                torques=torques,
+                speeds=speeds,
+            )
         duties.append(duty)
         axes.append(axis)
     if not motors:
@@ -478,16 +503,12 @@ def size_drives(
             shared = tuple(row[column] for row in alike)
             own_fits = shared
             if len(choice.gears) > 1 and len(rows) > 1:
-                own_fits = tuple(
-                    _fit_best_gear([axes[i]], n, m, choice)[0] for n, m in motors.items()
-                )
+                own_fits = tuple(_fit_best_gear([axes[i]], n, m, choice)[0] for n, m in motors.items())
             duties[i] = replace(duties[i], fits=own_fits, alike=shared)
     return duties
 
 
-def _drive_with_gear(
-    joint: str, slides: bool, rotor: float, own: DriveSpec | None, given: Sequence[Gear]
-) -> DriveSpec:
+def _drive_with_gear(joint: str, slides: bool, rotor: float, own: DriveSpec | None, given: Sequence[Gear]) -> DriveSpec:
     """Return the drive of a joint with a rotor inertia at the joint, kg m2 or kg."""
     if own is not None:
         raise ParameterError(f"drive of {joint}", "in the file", "no ratio or lead; or --ratios")
@@ -507,9 +528,10 @@ def _allowed_gears(robot: str, duty: DriveDuty, choices: Sequence[Gears]) -> Gea
     if drive is None or choices:
         need = "lead, m per turn of the motor" if duty.slides else "ratio, turns of the motor"
         raise ParameterError(
-            f"{robot}: drive of {duty.joint}", f"no {'lead' if duty.slides else 'ratio'}",
+            f"{robot}: drive of {duty.joint}",
+            f"no {'lead' if duty.slides else 'ratio'}",
             f"--{need}, or a section drive in the file, to compare motors",
-        )  # fmt: skip
+        )
     return Gears((Gear(drive.ratio, drive.lead, drive.efficiency),))
 
 
@@ -548,10 +570,18 @@ class _Axis:
         root = rms(self.time, torques)
         seen = self.load / drive.turns**2 + gear.inertia
         return Fit(
-            name, motor, gear, float(parts.max()), root / motor.continuous_torque,
+            name,
+            motor,
+            gear,
+            float(parts.max()),
+            root / motor.continuous_torque,
             float(np.abs(speeds).max()) / float(motor.limits[0][-1]),
-            gear.used(self.time, self.through), seen / motor.inertia, root, torques, speeds,
-        )  # fmt: skip
+            gear.used(self.time, self.through),
+            seen / motor.inertia,
+            root,
+            torques,
+            speeds,
+        )
 
 
 def _fit_best_gear(axes: Sequence[_Axis], name: str, motor: Motor, choice: Gears) -> list[Fit]:

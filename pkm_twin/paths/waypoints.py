@@ -52,15 +52,11 @@ def read_waypoints(
         known = f"{', '.join(robot.pose_names)} or {', '.join(joints)}"
         raise ParameterError(f"{file}: columns", ", ".join(table), known)
     points = table.stack(list(robot.pose_names) if space == "pose" else joints)
-    names, units = (
-        (robot.pose_names, robot.pose_units) if space == "pose" else (joints, robot.joint_units)
-    )
+    names, units = (robot.pose_names, robot.pose_units) if space == "pose" else (joints, robot.joint_units)
     for name, unit, values in zip(names, units, points.T, strict=True):
         if unit == "rad" and "angle" not in dialect.units and np.abs(values).max() > 2.0 * np.pi:
             most = float(np.abs(values).max())
-            warn(
-                file, f"{name} up to {most:.4g} rad, beyond a turn; degrees? a header {name} [deg]"
-            )
+            warn(file, f"{name} up to {most:.4g} rad, beyond a turn; degrees? a header {name} [deg]")
     other = {*WRENCH, *(name for name in kinds if name.rpartition(".")[2] in EFFORTS[1:])}
     for name in (*table, *table.left_out):
         if (name not in kinds and not states_origin(name)) or name in other:
@@ -81,9 +77,7 @@ def read_waypoints(
         near = arc | np.roll(arc, 1) | np.roll(arc, -1)
         rounded = np.where(near, 0.0, rounded)
     try:
-        made = lines(
-            robot, points, blend=rounded, dwell=given.get("dwell", 0.0), arc=arc, space=space
-        )
+        made = lines(robot, points, blend=rounded, dwell=given.get("dwell", 0.0), arc=arc, space=space)
     except ParameterError as error:
         raise ParameterError(f"{file}: {error.field}", error.value, error.bound) from None
     return made, masses
@@ -102,9 +96,10 @@ def _read_payloads(table: Table, robot: Robot) -> list[float] | None:
             raise ParameterError(where, error.value, error.bound) from None
     if centre is not None and (centre != robot.payload.com)[masses > 0.0].any():
         raise ParameterError(
-            f"{table.path}: {', '.join(PAYLOAD[1:])}", "a centre of mass",
+            f"{table.path}: {', '.join(PAYLOAD[1:])}",
+            "a centre of mass",
             "that of the robot's file; without the columns, --payload MASS,x,y,z carries another",
-        )  # fmt: skip
+        )
     return list(masses.tolist())
 
 
@@ -121,9 +116,7 @@ def parse_loads(texts: Sequence[str], waypoints: int) -> list[float | None]:
             raise ParameterError("load", text, "MASS@FROM:TO, kg and two waypoints, as in 0.5@2:4")
         begin, end = int(match[2]), int(match[3])
         if not begin < end < waypoints:
-            raise ParameterError(
-                "load", text, f"two waypoints of 0 to {waypoints - 1}, the second one later"
-            )
+            raise ParameterError("load", text, f"two waypoints of 0 to {waypoints - 1}, the second one later")
         if any(mass is not None for mass in result[begin:end]):
             raise ParameterError("load", text, "waypoints on which no other payload is carried")
         result[begin:end] = masses * (end - begin)

@@ -70,18 +70,18 @@ def workspace_poses(
     """
     least = np.zeros(robot.joints_count)
     if lever > 0.0:
-        largest = levers(robot, robot.inverse(_poses_on_rays(robot, rays, singularity, least))).max(
-            0
-        )
+        largest = levers(robot, robot.inverse(_poses_on_rays(robot, rays, singularity, least))).max(0)
         home = robot.home()
         share = levers(robot, robot.inverse(home[None]))[0] / largest
         if share.min() < lever:
             joint = robot.joint_names[int(share.argmin())]
             raise ParameterError(
-                "lever", lever, f"{math.floor(100.0 * share.min()) / 100.0:g} or less: at home "
+                "lever",
+                lever,
+                f"{math.floor(100.0 * share.min()) / 100.0:g} or less: at home "
                 f"({_named(robot, home)}) the lever of {joint} is {share.min():.3g} of its largest "
                 "in the workspace",
-            )  # fmt: skip
+            )
         least = lever * largest
     return _poses_on_rays(robot, rays, singularity, least)
 
@@ -188,9 +188,7 @@ def worst_over_workspace(
     greatest = _efforts_by_direction(robot, q, back, speed, acceleration, COARSE_DIRECTIONS).max(1)
     for joint in range(n):
         close = np.argsort(-greatest[:, joint])[:REFINED_POSES]
-        finer = _efforts_by_direction(
-            robot, q[close], back[close], speed, acceleration, FINE_DIRECTIONS
-        ).max(1)
+        finer = _efforts_by_direction(robot, q[close], back[close], speed, acceleration, FINE_DIRECTIONS).max(1)
         greatest[close] = np.maximum(greatest[close], finer)
     rates = speed * np.linalg.norm(back, axis=-1)
 
@@ -201,9 +199,7 @@ def worst_over_workspace(
     return Worst(*pick(greatest), *pick(holding), *pick(rates), poses=k)
 
 
-def _efforts_by_direction(
-    robot: Robot, q: Array, back: Array, speed: float, acceleration: float, count: int
-) -> Array:
+def _efforts_by_direction(robot: Robot, q: Array, back: Array, speed: float, acceleration: float, count: int) -> Array:
     """Return the largest efforts by direction of the speed, (k, count + 1, n); the last is rest.
 
     :param back: joint rates per velocity of the position, shape (k, n, size).

@@ -48,9 +48,11 @@ MAX_DEFLECTION_OFFSET: Final = 0.02
 
 
 def read_bag(
-    path: Path, robot: str | Robot | None, how: ReadOptions,
+    path: Path,
+    robot: str | Robot | None,
+    how: ReadOptions,
     progress: Callable[[int], None] | None = None,
-) -> Recording:  # fmt: skip
+) -> Recording:
     """Read a bag's joint states and its other measurements; messages are checked as by a node.
 
     Of a bag without joint states, where ``how`` takes it, the motion of its JointTrajectory.
@@ -77,9 +79,7 @@ def read_bag(
         refused = ", ".join(f"{reason}: {count}" for reason, count in found.rejected.items())
         notes.append(f"rejected messages, left out: {refused}; first: {found.first_reject}")
     if found.others:
-        notes.append(
-            f"left alone: {found.others} messages of other joints on {topics.joint_states}"
-        )
+        notes.append(f"left alone: {found.others} messages of other joints on {topics.joint_states}")
     if not machine.controller.plain:
         notes.append(MAPPED)
     stamps = np.array([s.stamp for s in found.samples], np.int64)
@@ -133,14 +133,10 @@ def _find_robot(bag: Bag, name: str | Robot | None) -> Robot:
         return name if isinstance(name, Robot) else load(name)
     recorded = bag.report.metadata.get("pkm_twin", {}).get("robot")
     if recorded is None:
-        raise BagError(
-            "the bag names no robot; use --robot", path=bag.report.path, reason="no robot"
-        )
+        raise BagError("the bag names no robot; use --robot", path=bag.report.path, reason="no robot")
     # Not a path: a bag does not choose which files are opened.
     if recorded not in robot_names():
-        raise metadata_error(
-            bag, "robot", recorded, f"one of {', '.join(robot_names())}; or give --robot"
-        )
+        raise metadata_error(bag, "robot", recorded, f"one of {', '.join(robot_names())}; or give --robot")
     return load(recorded)
 
 
@@ -154,9 +150,12 @@ class _Found(NamedTuple):
 
 
 def _read_messages(
-    bag: Bag, robot: Robot, topics: Topics, how: ReadOptions,
+    bag: Bag,
+    robot: Robot,
+    topics: Topics,
+    how: ReadOptions,
     progress: Callable[[int], None] | None,
-) -> _Found:  # fmt: skip
+) -> _Found:
     """Yield the accepted messages of the chosen topics, joint states in the order of their stamps.
 
     :raises BagError: no joint state is accepted.
@@ -216,9 +215,10 @@ def _make_wrench_reader(how: ReadOptions, rules: StampRules) -> Callable[[Any, i
             if error.reason != "frame" or not given:
                 raise
             raise MessageError(
-                "frame", f"{error}; --wrench-frame accepts a frame that turns with the platform, "
-                "--base-frame one with base axes"
-            ) from None  # fmt: skip
+                "frame",
+                f"{error}; --wrench-frame accepts a frame that turns with the platform, "
+                "--base-frame one with base axes",
+            ) from None
 
     return read
 
@@ -260,10 +260,10 @@ def _sample_deflections(r: Recording, joints: Stamps, found: _Found, how: ReadOp
     near = stamps[(np.array(apart) <= MAX_DEFLECTION_OFFSET).all(0)]
     if not len(near):
         raise BagError(
-            f"no deflection on {r.topics.deflection} has a wrench and a joint state within "
-            f"{MAX_DEFLECTION_OFFSET:g} s",
-            path=r.source, reason="no pairs",
-        )  # fmt: skip
+            f"no deflection on {r.topics.deflection} has a wrench and a joint state within {MAX_DEFLECTION_OFFSET:g} s",
+            path=r.source,
+            reason="no pairs",
+        )
     q, wrench = _interpolate(near, joints, r.q), _interpolate(near, times, wrench)
     rotation = r.robot.platform(q)[1]
     values = np.array([moved[stamp].values for stamp in near.tolist()])
@@ -294,9 +294,7 @@ def _interpolate(stamps: Stamps, others: Stamps, values: Array) -> Array:
 TOPIC: Final = "/delta_dynamics/joint_trajectory"
 
 
-def write_motion(
-    path: Path, r: Recording, facts: Mapping[str, Any], overwrite: bool = False
-) -> None:
+def write_motion(path: Path, r: Recording, facts: Mapping[str, Any], overwrite: bool = False) -> None:
     """Write a planned motion: a bag with one JointTrajectory, FILE.mcap, or a table.
 
     A table has time, the joints' motion and efforts, the pose with its rates, and what the efforts
@@ -317,18 +315,25 @@ def write_motion(
     empty: list[list[float]] = [[]] * len(r.time)
     efforts = empty if r.effort is None else own.controller_efforts(r.effort).tolist()
     rows = zip(
-        r.time.tolist(), own.controller_positions(q).tolist(), own.controller_rates(qd).tolist(),
-        own.controller_rates(qdd).tolist(), efforts, strict=True,
-    )  # fmt: skip
+        r.time.tolist(),
+        own.controller_positions(q).tolist(),
+        own.controller_rates(qd).tolist(),
+        own.controller_rates(qdd).tolist(),
+        efforts,
+        strict=True,
+    )
     points = []
     for t, position, rate, change, force in rows:
         whole = round(t * SECOND)
         points.append(
             {
-                "positions": position, "velocities": rate, "accelerations": change, "effort": force,
+                "positions": position,
+                "velocities": rate,
+                "accelerations": change,
+                "effort": force,
                 "time_from_start": {"sec": whole // SECOND, "nanosec": whole % SECOND},
             }
-        )  # fmt: skip
+        )
     message = {
         "header": {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""},
         "joint_names": list(own.names),
@@ -382,6 +387,13 @@ def read_trajectory(bag: Bag, robot: Robot) -> Recording | None:
     if plan.qd is None or plan.qdd is None or len(plan.times) < 2:
         return None
     return Recording(
-        robot, plan.times, plan.q, plan.qd, plan.qdd, plan.effort, efforts="effort", bag=bag,
+        robot,
+        plan.times,
+        plan.q,
+        plan.qd,
+        plan.qdd,
+        plan.effort,
+        efforts="effort",
+        bag=bag,
         topics=Topics(names[0]),
-    )  # fmt: skip
+    )

@@ -59,9 +59,7 @@ class Origin:
             return None
         values = table.stack([*names, *GRAVITY])
         if len(names) > 1 or (values != values[0]).any():
-            raise ParameterError(
-                f"{table.path}: {', '.join([*names, *GRAVITY])}", "several values", "one robot"
-            )
+            raise ParameterError(f"{table.path}: {', '.join([*names, *GRAVITY])}", "several values", "one robot")
         digest, *gravity = values[0].tolist()
         return cls(names[0].removeprefix(MARK), int(digest), tuple(gravity))
 
@@ -98,9 +96,7 @@ def states_origin(name: str) -> bool:
     return name in GRAVITY or name.startswith(MARK)
 
 
-def origin_columns(
-    robot: Robot, load: Load | None, wrench: Array | None, time: Array
-) -> dict[str, Array]:
+def origin_columns(robot: Robot, load: Load | None, wrench: Array | None, time: Array) -> dict[str, Array]:
     """Return a table's columns of what efforts rest on, shape (samples,) each.
 
     :param wrench: shape (samples, 6); ``time``: (samples,), s.
@@ -116,6 +112,8 @@ def origin_facts(robot: Robot, load: Load | None) -> dict[str, Any]:
     """Return a bag's metadata of what efforts without a wrench rest on."""
     own = Origin.of(robot)
     facts = {
-        "robot": own.robot, COMPUTED_WITH: own.digest, "gravity": " ".join(map(repr, own.gravity)),
-    }  # fmt: skip
+        "robot": own.robot,
+        COMPUTED_WITH: own.digest,
+        "gravity": " ".join(map(repr, own.gravity)),
+    }
     return facts | load_facts(load)

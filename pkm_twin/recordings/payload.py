@@ -42,9 +42,11 @@ class Load:
 
     @classmethod
     def of(
-        cls, spans: Sequence[tuple[float, float, float]], source: str,
+        cls,
+        spans: Sequence[tuple[float, float, float]],
+        source: str,
         com: tuple[float, float, float] | None = None,
-    ) -> Load:  # fmt: skip
+    ) -> Load:
         """Build the load of intervals, each with begin, end (s) and mass (kg)."""
         masses = tuple(mass for *_, mass in spans)
         alike = len(set(masses)) == 1
@@ -97,9 +99,7 @@ class Load:
             changes["com"] = list(self.com)
         loaded = robot.changed(payload=changes)
         for finding in payload_findings(loaded):
-            raise ParameterError(
-                finding.field, finding.value, f"{finding.bound:.4g} kg or less: {finding.likely}"
-            )
+            raise ParameterError(finding.field, finding.value, f"{finding.bound:.4g} kg or less: {finding.likely}")
         return loaded
 
     def as_json(self) -> dict[str, Any]:
@@ -150,26 +150,19 @@ def load_of_table(robot: Robot, table: Table, time: Array) -> Load | None:
         raise ParameterError(
             f"{table.path}: payload",
             f"columns {', '.join(there)}, {mass.min():g} to {mass.max():g} kg",
-            f"masses of 0 kg or more in {PAYLOAD[0]}, and one centre, in all of "
-            f"{', '.join(PAYLOAD[1:])}, or none",
+            f"masses of 0 kg or more in {PAYLOAD[0]}, and one centre, in all of {', '.join(PAYLOAD[1:])}, or none",
         )
     if not held.any():
         return None
     step = (np.diff(held) != 0) | (np.diff(mass) != 0.0)
     edges = [0, *(np.flatnonzero(step) + 1).tolist(), len(held)]
     ends = [*time[edges[1:-1]].tolist(), math.inf]
-    spans = [
-        (float(time[b]), end, float(mass[b]))
-        for b, end in zip(edges[:-1], ends, strict=True)
-        if held[b]
-    ]
+    spans = [(float(time[b]), end, float(mass[b])) for b, end in zip(edges[:-1], ends, strict=True) if held[b]]
     com = centred[0].tolist() if centred.size else None
     return Load.of(spans, "table", None if com is None else (com[0], com[1], com[2]))
 
 
-MASS, PICKED, RELEASED, CENTRE = (
-    "payload_mass_kg", "payload_picked_s", "payload_released_s", "payload_com_m"
-)  # fmt: skip
+MASS, PICKED, RELEASED, CENTRE = ("payload_mass_kg", "payload_picked_s", "payload_released_s", "payload_com_m")
 """Keys of a bag's metadata on its payload; several intervals have blanks between."""
 
 
@@ -180,9 +173,7 @@ def load_facts(carried: Load | None) -> dict[str, Any]:
     rows = list(zip(*carried.spans, strict=True))
     stamped = [[round(1e9 * t) / 1e9 if math.isfinite(t) else t for t in row] for row in rows[:2]]
     values = [*stamped, [carried.mass] if not carried.masses else carried.masses]
-    facts = dict(
-        zip((PICKED, RELEASED, MASS), (" ".join(map(repr, v)) for v in values), strict=True)
-    )
+    facts = dict(zip((PICKED, RELEASED, MASS), (" ".join(map(repr, v)) for v in values), strict=True))
     com = {} if carried.com is None else {CENTRE: " ".join(map(repr, carried.com))}
     return facts | com
 
@@ -260,9 +251,7 @@ def parse_times(text: str) -> tuple[tuple[float, float], ...]:
     return tuple(zip(numbers[::2], numbers[1::2], strict=True))
 
 
-def by_load(
-    robot: Robot, carried: Load | None, time: Array, longest: int
-) -> Iterator[tuple[Robot, slice]]:
+def by_load(robot: Robot, carried: Load | None, time: Array, longest: int) -> Iterator[tuple[Robot, slice]]:
     """Yield the loaded robot and the consecutive samples (at most ``longest``) that have its load.
 
     A payload that is sought is the robot's own.

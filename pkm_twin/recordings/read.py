@@ -37,17 +37,18 @@ from pkm_twin.robot.derivatives import joint_rates
 from pkm_twin.robot.limits import beyond_limits
 from pkm_twin.robot.robot import Robot
 
-RECORDING: Final = (
-    "an MCAP file, a rosbag2 folder, or a table with columns time, JOINT.position ..."
-)
+RECORDING: Final = "an MCAP file, a rosbag2 folder, or a table with columns time, JOINT.position ..."
 FOLLOW: Final = ("joints", "pose")
 SIDES: Final = ("joint", "controller", "motor")
 CONVERTED: Final[Mapping[str, Callable[[JointMap, Array], Array]]] = {
-    "position": JointMap.positions, "velocity": JointMap.rates, "acceleration": JointMap.rates,
-    "effort": JointMap.efforts, "measured": JointMap.efforts,
+    "position": JointMap.positions,
+    "velocity": JointMap.rates,
+    "acceleration": JointMap.rates,
+    "effort": JointMap.efforts,
+    "measured": JointMap.efforts,
     # A current is made an effort at the joint by one factor, which has the gear.
     "current": lambda own, values: values * np.sign(own.factors),
-}  # fmt: skip
+}
 """The joints' values of a controller's or motor's, by the column's word."""
 TERM: Final = "effort_gravity"
 """In every table that `torques` writes."""
@@ -79,9 +80,11 @@ DEFAULT: Final = ReadOptions()
 
 
 def read(
-    path: str | Path, robot: str | Robot | None = None, how: ReadOptions = DEFAULT,
+    path: str | Path,
+    robot: str | Robot | None = None,
+    how: ReadOptions = DEFAULT,
     progress: Callable[[int], None] | None = None,
-) -> Recording:  # fmt: skip
+) -> Recording:
     """Read a recording of a robot; without one, of the robot that the file names.
 
     Columns of a table, in any order: ``time``; for every joint NAME ``NAME.position``, or in their
@@ -124,9 +127,7 @@ def _read_table_recording(path: Path, name: str | Robot | None, how: ReadOptions
             expected = f"{RECORDING} ({error})"
             raise ParameterError(str(path), "neither a bag nor a table", expected) from None
         if "time" not in columns or not any(name.endswith(".position") for name in columns):
-            raise ParameterError(
-                str(path), f"columns {one_line(', '.join(columns), 80)}", RECORDING
-            )
+            raise ParameterError(str(path), f"columns {one_line(', '.join(columns), 80)}", RECORDING)
         raise ParameterError("--robot", None, "a robot, because a table does not name its robot")
     robot = name if isinstance(name, Robot) else load(name)
     table, side = (
@@ -184,13 +185,9 @@ def _read_table_recording(path: Path, name: str | Robot | None, how: ReadOptions
     check_units(path, robot, time, q, qd, how.dialect)
     wrench = table.fill(WRENCH)
     if how.deflected:
-        for what, values, axes in (
-            ("wrench", wrench, WRENCH), ("deflection", deflection, DEFLECTION)
-        ):  # fmt: skip
+        for what, values, axes in (("wrench", wrench, WRENCH), ("deflection", deflection, DEFLECTION)):
             if values is None:
-                raise ParameterError(
-                    str(path), f"no {what}", f"a column {axes[0]} or more of {', '.join(axes)}"
-                )
+                raise ParameterError(str(path), f"no {what}", f"a column {axes[0]} or more of {', '.join(axes)}")
     efforts = (f"{joint}.{what}" for joint in joints for what in EFFORTS)
     # As for messages: impossible numbers, and numbers below every measurement, are rejected.
     for name, bound in (SIZES | dict.fromkeys(efforts, MAX_EFFORT)).items():
@@ -198,21 +195,33 @@ def _read_table_recording(path: Path, name: str | Robot | None, how: ReadOptions
         bad = np.flatnonzero((sizes > bound) | ((sizes < TINY) & (sizes > 0.0)))
         if len(bad):
             raise ParameterError(
-                f"{table.line(bad[0])}: {name}", float(table[name][bad[0]]),
+                f"{table.line(bad[0])}: {name}",
+                float(table[name][bad[0]]),
                 f"0, or {TINY:g} to {bound:g} in size",
-            )  # fmt: skip
+            )
     held = how.load or load_of_table(robot, table, time)
     return Recording(
-        robot, time, q, qd, qdd, effort, wrench, deflection, pose, held,
+        robot,
+        time,
+        q,
+        qd,
+        qdd,
+        effort,
+        wrench,
+        deflection,
+        pose,
+        held,
         efforts="model" if computed and word == "effort" else word,
         computed=stack("effort") if (computed or origin is not None) and not posed else None,
-        origin=origin, source=str(path), notes=(
+        origin=origin,
+        source=str(path),
+        notes=(
             *notes,
             *([] if side is None else [f"values read as the {how.side}'s; results: the model's"]),
             *([] if robot.controller.plain or side is not None else [MAPPED]),
         ),
         start=round(1e9 * float(times[0])),
-    )  # fmt: skip
+    )
 
 
 def _find_map(robot: Robot, side: str) -> JointMap | None:
@@ -282,20 +291,17 @@ def _check_basis(table: Table, robot: Robot, how: ReadOptions) -> None:
             most = np.abs(table.get(f"{joint}.{term}", np.zeros(1))).max()
             if most > 0.0:
                 raise ParameterError(
-                    f"{table.path}: {joint}.{term}", float(most),
+                    f"{table.path}: {joint}.{term}",
+                    float(most),
                     f"{what} that the efforts were computed with: columns {', '.join(columns)}",
-                )  # fmt: skip
+                )
 
 
-def _invert_pose(
-    table: Table, robot: Robot, pose: Array
-) -> tuple[Array, Array | None, Array | None]:
+def _invert_pose(table: Table, robot: Robot, pose: Array) -> tuple[Array, Array | None, Array | None]:
     """Joint positions of a pose, and their rates where the table has those of the pose."""
     q = robot.inverse(pose)
     # Joint rates in the table are those of the machine whose joint positions it has.
-    qd, qdd = (
-        table.stack_if([f"{name}.{what}" for name in robot.pose_names]) for what in RATES[1:]
-    )
+    qd, qdd = (table.stack_if([f"{name}.{what}" for name in robot.pose_names]) for what in RATES[1:])
     if set(robot.joint_names) & set(robot.pose_names) or qd is None or qdd is None:
         return q, None, None
     return q, *joint_rates(robot, q, qd, qdd)
@@ -313,10 +319,11 @@ def times_of(path: Path, values: Array) -> Array:
     found = f"{values[flat[0]]}, then {values[flat[0] + 1]}" if len(flat) else ""
     if found or not time[-1] <= MAX_DURATION:
         raise ParameterError(
-            f"{path}: time", found or f"{values[0]:g} to {values[-1]:g}",
+            f"{path}: time",
+            found or f"{values[0]:g} to {values[-1]:g}",
             f"rising times, {MIN_STEP:g} s or more apart, up to {MAX_DURATION:g} s in all"
             + ("; are these nanoseconds? --units ns" if values[0] > SINCE_1970_NS else ""),
-        )  # fmt: skip
+        )
     return time
 
 
@@ -344,9 +351,7 @@ def check_pose(path: Path, robot: Robot, q: Array, pose: Array, how: str = "") -
             )
 
 
-def check_units(
-    path: Path, robot: Robot, time: Array, q: Array, qd: Array | None, dialect: Dialect
-) -> None:
+def check_units(path: Path, robot: Robot, time: Array, q: Array, qd: Array | None, dialect: Dialect) -> None:
     """Units of a motion: the steps of its times are short, its velocities those of its positions.
 
     Positions that may be in degrees give a warning.
@@ -364,10 +369,11 @@ def check_units(
             told = float(np.sqrt(np.mean(qd**2)))
         if moved > 0.0 and 300.0 < told / moved < 3000.0:
             raise ParameterError(
-                f"{path}: time", f"steps of {step:g} s",
+                f"{path}: time",
+                f"steps of {step:g} s",
                 f"seconds: velocities are {told / moved:.4g} times those of the positions, as with "
                 "times in milliseconds",
-            )  # fmt: skip
+            )
     if step > MAX_STEP:
         warn(path, f"time: steps of {step:g} s; expected seconds; are these milliseconds?")
 

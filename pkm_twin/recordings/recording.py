@@ -27,9 +27,7 @@ from pkm_twin.streams.rest import gradient_gain, velocity_error_bound
 from pkm_twin.streams.steps import MAX_GAP_PERIODS, Steps, repeats_of, steps_of
 from pkm_twin.streams.wrench import WrenchSettings
 
-BY_SAMPLE: Final = (
-    "time", "q", "qd", "qdd", "effort", "wrench", "deflection", "pose", "still", "computed"
-)  # fmt: skip
+BY_SAMPLE: Final = ("time", "q", "qd", "qdd", "effort", "wrench", "deflection", "pose", "still", "computed")
 """Fields with a row for each sample."""
 MAPPED: Final = "tables use the model's joint values; joint_map applies to messages and bags only"
 """Printed for a robot that has a map."""
@@ -200,14 +198,16 @@ class Recording:
         if self.effort is None and self.bag is None:
             joint = self.robot.joint_names[0]
             raise ParameterError(
-                self.source, "no efforts", f"columns {joint}.effort ... of the drives, or "
-                f"{joint}.current ... with --torque-constant"
-            )  # fmt: skip
+                self.source,
+                "no efforts",
+                f"columns {joint}.effort ... of the drives, or {joint}.current ... with --torque-constant",
+            )
         if self.effort is None:
             raise BagError(
                 f"no efforts on {self.topics.joint_states}, which are those of the drives",
-                path=Path(self.source), reason="no efforts",
-            )  # fmt: skip
+                path=Path(self.source),
+                reason="no efforts",
+            )
         return self.effort
 
     @property
@@ -276,10 +276,7 @@ class Recording:
         if self.bag is not None:
             qd, qdd, used = differentiated(self)
             if not used.any():
-                raise PkmTwinError(
-                    f"{self.source}: too few joint states in a row to differentiate: "
-                    f"{len(self.time)}"
-                )
+                raise PkmTwinError(f"{self.source}: too few joint states in a row to differentiate: {len(self.time)}")
             return self._project_motion(qd, qdd, at_rest(self, qd), used)
         if len(self.time) < 3:
             raise PkmTwinError(f"{self.source}: {len(self.time)} rows; 3 or more to differentiate")

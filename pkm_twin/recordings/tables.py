@@ -43,11 +43,21 @@ NOT_READ: Final = {
 """Endings of tables that are rejected, and what is read in their place."""
 SEPARATORS: Final = {",": ",", ";": ";", "tab": "\t", "\t": "\t"}
 UNITS: Final = {
-    "rad": ("angle", 1.0), "mrad": ("angle", 1e-3), "deg": ("angle", math.pi / 180.0),
-    "rev": ("angle", math.tau), "m": ("length", 1.0), "cm": ("length", 1e-2),
-    "mm": ("length", 1e-3), "µm": ("length", 1e-6), "um": ("length", 1e-6), "s": ("time", 1.0),
-    "ms": ("time", 1e-3), "us": ("time", 1e-6), "ns": ("time", 1e-9), "percent": ("effort", 1e-2),
-}  # fmt: skip
+    "rad": ("angle", 1.0),
+    "mrad": ("angle", 1e-3),
+    "deg": ("angle", math.pi / 180.0),
+    "rev": ("angle", math.tau),
+    "m": ("length", 1.0),
+    "cm": ("length", 1e-2),
+    "mm": ("length", 1e-3),
+    "µm": ("length", 1e-6),
+    "um": ("length", 1e-6),
+    "s": ("time", 1.0),
+    "ms": ("time", 1e-3),
+    "us": ("time", 1e-6),
+    "ns": ("time", 1e-9),
+    "percent": ("effort", 1e-2),
+}
 """Units of a table: what they are of, and their size in SI."""
 RATES: Final = ("position", "velocity", "acceleration")
 EFFORTS: Final = ("effort", "measured", "current")
@@ -57,9 +67,7 @@ PAYLOAD: Final = ("payload.mass", "payload.x", "payload.y", "payload.z")
 """Mass (kg) and centre (m) of what the platform holds."""
 OTHERS: Final = {"payload": PAYLOAD[0]}
 """Other names of columns."""
-_UNIT: Final = re.compile(
-    r"(.*?)(?:\s*[\[(]\s*(\w+)(?:/s2?)?\s*[\])]|_(mm|cm|[uµ]m|deg|mrad|ms|us|ns))"
-)
+_UNIT: Final = re.compile(r"(.*?)(?:\s*[\[(]\s*(\w+)(?:/s2?)?\s*[\])]|_(mm|cm|[uµ]m|deg|mrad|ms|us|ns))")
 
 
 @dataclass(frozen=True)
@@ -77,10 +85,13 @@ class Dialect:
 
     @classmethod
     def of(
-        cls, separator: str | None = None, decimal: str | None = None,
-        columns: str | Sequence[str] | None = None, units: str | None = None,
+        cls,
+        separator: str | None = None,
+        decimal: str | None = None,
+        columns: str | Sequence[str] | None = None,
+        units: str | None = None,
         time: str | None = None,
-    ) -> Dialect:  # fmt: skip
+    ) -> Dialect:
         """Build the dialect from a command's options.
 
         :raises ParameterError: by the option.
@@ -144,9 +155,10 @@ class Table(dict[str, Array]):
         for name in names:
             if name not in self:
                 raise ParameterError(
-                    str(self.path), ", ".join(self),
+                    str(self.path),
+                    ", ".join(self),
                     f"a column {name!r}; --columns {name}=HEADER names another",
-                )  # fmt: skip
+                )
 
     def stack(self, names: Sequence[str]) -> Array:
         """Columns side by side, shape (rows, names).
@@ -193,9 +205,12 @@ def kinds_of(robot: Robot, side: str = "joint") -> dict[str, str]:
 
 
 def read_table(
-    path: Path, kinds: Mapping[str, str] | None = None, dialect: Dialect = PLAIN, *,
+    path: Path,
+    kinds: Mapping[str, str] | None = None,
+    dialect: Dialect = PLAIN,
+    *,
     blank: bool = False,
-) -> Table:  # fmt: skip
+) -> Table:
     """Columns of a CSV or, by its ending, Parquet file with a header row, in SI units.
 
     Lines above the header row that begin with # are comments. Left out are columns without any
@@ -277,9 +292,7 @@ def _read_csv(
     return header, np.ascontiguousarray(table.T), above
 
 
-def _find_needed(
-    header: list[str], kinds: Mapping[str, str] | None, dialect: Dialect
-) -> list[bool]:
+def _find_needed(header: list[str], kinds: Mapping[str, str] | None, dialect: Dialect) -> list[bool]:
     """Return which columns must have numbers: all, or where ``kinds`` are given those of them."""
     return [not kinds or name in kinds for name in _name_columns(header, kinds or {}, dialect)[0]]
 
@@ -319,15 +332,11 @@ def _read_lines(text: TextIO, path: Path) -> Iterator[str]:
     """Yield the lines of a file; a line that would take all memory is rejected."""
     while line := text.readline(MAX_LINE):
         if len(line) == MAX_LINE:
-            raise ParameterError(
-                f"{path}: a line", f"{line[:40]}...", f"at most {MAX_LINE} characters"
-            )
+            raise ParameterError(f"{path}: a line", f"{line[:40]}...", f"at most {MAX_LINE} characters")
         yield line
 
 
-def _split_rows(
-    path: Path, lines: Iterator[str], first: str, dialect: Dialect
-) -> Iterator[list[str]]:
+def _split_rows(path: Path, lines: Iterator[str], first: str, dialect: Dialect) -> Iterator[list[str]]:
     """Rows with decimal points; what is found by itself is told."""
     separator = dialect.separator
     if separator is None:
@@ -361,9 +370,7 @@ def _parse_number(cell: str) -> float:
     return value
 
 
-def _name_columns(
-    header: Sequence[str], kinds: Mapping[str, str], dialect: Dialect
-) -> tuple[list[str], list[float]]:
+def _name_columns(header: Sequence[str], kinds: Mapping[str, str], dialect: Dialect) -> tuple[list[str], list[float]]:
     """Our names of a table's columns, and the sizes in SI of their numbers.
 
     :raises ParameterError: a unit of another kind.
@@ -428,9 +435,7 @@ def write_table(columns: Mapping[str, Array], path: Path) -> None:
     """
     check_target(path)
     with replacing(path) as hidden:
-        {".parquet": _write_parquet, ".mat": _write_mat}.get(path.suffix, _write_csv)(
-            columns, hidden
-        )
+        {".parquet": _write_parquet, ".mat": _write_mat}.get(path.suffix, _write_csv)(columns, hidden)
 
 
 def _write_csv(columns: Mapping[str, Array], path: Path) -> None:

@@ -43,10 +43,13 @@ _FIELDS: Final = {
     "geometry_msgs/Transform": ("Vector3 translation", "Quaternion rotation"),
     "geometry_msgs/Wrench": ("Vector3 force", "Vector3 torque"),
     "trajectory_msgs/JointTrajectoryPoint": (
-        "float64[] positions", "float64[] velocities", "float64[] accelerations",
-        "float64[] effort", "builtin_interfaces/Duration time_from_start",
+        "float64[] positions",
+        "float64[] velocities",
+        "float64[] accelerations",
+        "float64[] effort",
+        "builtin_interfaces/Duration time_from_start",
     ),
-}  # fmt: skip
+}
 
 
 def _write_definition(fields: Sequence[str], *held: str) -> str:
@@ -57,19 +60,20 @@ def _write_definition(fields: Sequence[str], *held: str) -> str:
 
 
 DEFINITIONS: Final = {
-    JOINT_STATE: _write_definition(
-        ["string[] name", "float64[] position", "float64[] velocity", "float64[] effort"]
-    ),
+    JOINT_STATE: _write_definition(["string[] name", "float64[] position", "float64[] velocity", "float64[] effort"]),
     WRENCH: _write_definition(["Wrench wrench"], "geometry_msgs/Wrench", "geometry_msgs/Vector3"),
     TRANSFORM: _write_definition(
         ["string child_frame_id", "Transform transform"],
-        "geometry_msgs/Transform", "geometry_msgs/Vector3", "geometry_msgs/Quaternion",
+        "geometry_msgs/Transform",
+        "geometry_msgs/Vector3",
+        "geometry_msgs/Quaternion",
     ),
     TRAJECTORY: _write_definition(
         ["string[] joint_names", "JointTrajectoryPoint[] points"],
-        "trajectory_msgs/JointTrajectoryPoint", "builtin_interfaces/Duration",
+        "trajectory_msgs/JointTrajectoryPoint",
+        "builtin_interfaces/Duration",
     ),
-}  # fmt: skip
+}
 """Definitions of the types that are read and written."""
 # How many messages of a topic are looked at for the robot's joints.
 _LOOK = 50
@@ -99,9 +103,7 @@ class Topics:
         return one_line(text, 1000)
 
 
-def choose_topics(
-    bag: Bag, robot: Robot, wanted: Sequence[str] = (), deflected: bool = False
-) -> Topics:
+def choose_topics(bag: Bag, robot: Robot, wanted: Sequence[str] = (), deflected: bool = False) -> Topics:
     """Find the joint-state topic that carries the robot's joints, and the wrench topic.
 
     The twin's own outputs, and what no sensor publishes, are left out. Of several that fit,
@@ -124,9 +126,7 @@ def choose_topics(
         kinds[type_of(info)].append(name)
     for kind, names in kinds.items():
         if len(set(names)) > 1:
-            raise _make_choice_error(
-                bag, f"{' and '.join(names)} are both {kind}; choose one with --topic"
-            )
+            raise _make_choice_error(bag, f"{' and '.join(names)} are both {kind}; choose one with --topic")
     left_out: dict[str, str] = {}
     joints = _choose_joints(bag, robot, kinds[JOINT_STATE], left_out)
     wrenches = _find_candidates(bag, WRENCH, kinds[WRENCH], left_out)
@@ -140,10 +140,13 @@ def choose_topics(
         fit = [name for name in fit if bag.report.topics[name].count]
         deflection = _pick_usual(bag, "deflections", fit, "measured_deflection", left_out)
         missing = (
-            (deflection, "deflection", f"no deflection in the bag: a topic of {TRANSFORM} from the "
-             "platform to the deflected platform"),
+            (
+                deflection,
+                "deflection",
+                f"no deflection in the bag: a topic of {TRANSFORM} from the platform to the deflected platform",
+            ),
             (wrench, "wrench", "no wrench in the bag; compliance needs the applied wrench"),
-        )  # fmt: skip
+        )
         for topic, what, text in missing:
             if topic is None:
                 raise _make_choice_error(bag, text, f"no {what}")
@@ -157,9 +160,7 @@ def _choose_joints(bag: Bag, robot: Robot, wanted: list[str], left_out: dict[str
     filled = [name for name in named if bag.report.topics[name].count]
     if not filled:
         aside = "; ".join(f"{name} is there, but {why}" for name, why in left_out.items())
-        text = (
-            f"no joint states that can be read: {aside}" if aside else "no joint states in the bag"
-        )
+        text = f"no joint states that can be read: {aside}" if aside else "no joint states in the bag"
         plans = [n for n, i in bag.report.topics.items() if type_of(i) == TRAJECTORY and i.count]
         if plans and not aside:
             text += (
@@ -224,9 +225,7 @@ def _find_candidates(bag: Bag, kind: str, wanted: list[str], left_out: dict[str,
     return fit
 
 
-def _pick_usual(
-    bag: Bag, what: str, fit: list[str], usual: str, left_out: dict[str, str]
-) -> str | None:
+def _pick_usual(bag: Bag, what: str, fit: list[str], usual: str, left_out: dict[str, str]) -> str | None:
     """Return the topic with the usual name among several, None without any."""
     if not fit:
         return None

@@ -35,9 +35,7 @@ DPI: Final = 100
 """Resolution of the page's pictures, dots per inch: 900 pixels wide."""
 
 
-def page(
-    title: str, report: Report, more: Sequence[Table] = (), figures: Sequence[str] = ()
-) -> str:
+def page(title: str, report: Report, more: Sequence[Table] = (), figures: Sequence[str] = ()) -> str:
     """Return the whole page as HTML.
 
     :param more: tables that the terminal does not show.

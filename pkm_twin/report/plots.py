@@ -28,8 +28,11 @@ WIDTH: Final = 9.0
 """Of every figure, inches: letters of 8 points are 11 pixels high where it is 900 pixels wide."""
 DPI: Final = 200
 STYLE: Final[Any] = {
-    "font.size": 10, "axes.titlesize": 11, "legend.fontsize": 9, "figure.titlesize": 12,
-}  # fmt: skip
+    "font.size": 10,
+    "axes.titlesize": 11,
+    "legend.fontsize": 9,
+    "figure.titlesize": 12,
+}
 
 
 def pyplot() -> Any:
@@ -43,14 +46,16 @@ def pyplot() -> Any:
     return pyplot
 
 
-def columns(
-    count: int, rows: int, height: float | None = None, **options: Any
-) -> tuple[Any, list[Any]]:
+def columns(count: int, rows: int, height: float | None = None, **options: Any) -> tuple[Any, list[Any]]:
     """Make a figure of ``count`` columns with ``rows`` axes each; ``height`` in inches."""
     figure, axes = pyplot().subplots(
-        rows, count, figsize=(WIDTH, height or max(3 * rows, 4.2)), squeeze=False,
-        layout="constrained", **options,
-    )  # fmt: skip
+        rows,
+        count,
+        figsize=(WIDTH, height or max(3 * rows, 4.2)),
+        squeeze=False,
+        layout="constrained",
+        **options,
+    )
     return figure, list(axes.T)
 
 
@@ -152,6 +157,12 @@ def _draw_efforts(ax: Any, joint: str, table: Mapping[str, Any], terms: bool) ->
             ax.plot(time, values, color=colour, lw=0.8, label=term)
     if "beyond_limits" in table:
         ax.fill_between(
-            time, 0, 1, where=np.asarray(table["beyond_limits"]) > 0, color="0.85", zorder=0,
-            transform=ax.get_xaxis_transform(), label="beyond limits",
-        )  # fmt: skip
+            time,
+            0,
+            1,
+            where=np.asarray(table["beyond_limits"]) > 0,
+            color="0.85",
+            zorder=0,
+            transform=ax.get_xaxis_transform(),
+            label="beyond limits",
+        )

@@ -112,10 +112,7 @@ class Table:
         shown = [(k, column) for k, column in enumerate(self.columns) if column.text is not None]
         rows = self.rows.items()
         # Only numbers of the same unit can be compared with the largest.
-        least = [
-            ROUNDING * _largest_size(values[k] for _, values in rows) * bool(column.unit)
-            for k, column in shown
-        ]
+        least = [ROUNDING * _largest_size(values[k] for _, values in rows) * bool(column.unit) for k, column in shown]
         return [
             (self.head, *(column.heading for _, column in shown)),
             *(

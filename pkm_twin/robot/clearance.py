@@ -100,10 +100,7 @@ def _radii(robot: Robot) -> Array:
 def _kernel(robot: Robot) -> Kernel:
     if not has_clearance(robot):
         raise ParameterError("members", None, "a section that gives the members' outer diameters")
-    ends = [
-        (beam.limb, *((body, point.tolist()) for body, point in (beam.inner, beam.outer)))
-        for beam in robot.beams
-    ]
+    ends = [(beam.limb, *((body, point.tolist()) for body, point in (beam.inner, beam.outer))) for beam in robot.beams]
 
     def write(t: Traced) -> Program:
         t.solve()

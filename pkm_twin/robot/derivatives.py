@@ -38,9 +38,7 @@ def joint_rates(robot: Robot, q: Array, rate: Array, change: Array) -> tuple[Arr
     return first, joint_changes(robot, q, first, back, change)
 
 
-def joint_changes(
-    robot: Robot, q: Array, qd: Array, back: Array, change: Array | float = 0.0
-) -> Array:
+def joint_changes(robot: Robot, q: Array, qd: Array, back: Array, change: Array | float = 0.0) -> Array:
     """Second derivatives of joints (k, n) by those of the pose, at joint rates (k, n).
 
     :param back: of :meth:`Robot.inverse_jacobian`, shape (k, n, m).
@@ -93,9 +91,7 @@ def inverse_derivatives(robot: Robot, pose: ArrayLike, by: Sequence[str] = ()) -
         robot.check_independent("derivatives by numbers of the file with the pose held")
     found = forward_derivatives(robot, robot.inverse(pose), by)
     back = robot.inverse_jacobian(robot.inverse(pose))
-    return Derivatives(
-        back, {path: -(back @ row[..., None])[..., 0] for path, row in found.by.items()}
-    )
+    return Derivatives(back, {path: -(back @ row[..., None])[..., 0] for path, row in found.by.items()})
 
 
 def platform_derivatives(robot: Robot, q: ArrayLike, by: Sequence[str] = ()) -> Derivatives:

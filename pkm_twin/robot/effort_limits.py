@@ -42,9 +42,7 @@ class EffortLimits:
         self._limits = np.abs(robot.controller.controller_efforts(effort_limits(robot)))
         self._listed = self._limits.tolist()
 
-    def apply(
-        self, efforts: ControllerNumbers, policy: LimitPolicy | Literal["zeros"]
-    ) -> tuple[LimitedEfforts, bool]:
+    def apply(self, efforts: ControllerNumbers, policy: LimitPolicy | Literal["zeros"]) -> tuple[LimitedEfforts, bool]:
         """Return the efforts that may leave, and whether a limit was exceeded.
 
         :param efforts: shape (..., n), in the controller's numbers.

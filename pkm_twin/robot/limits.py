@@ -38,8 +38,7 @@ class Beyond:
     def __str__(self) -> str:
         where = "" if self.index is None else f" at sample {self.index}"
         return (
-            f"{self.joint}.{self.quantity} is {self.value:.6g} {self.unit}{where}, "
-            f"limits {self.low:g} to {self.high:g}"
+            f"{self.joint}.{self.quantity} is {self.value:.6g} {self.unit}{where}, limits {self.low:g} to {self.high:g}"
         )
 
 
@@ -103,9 +102,7 @@ def first_beyond(robot: Robot, q: Array, *, actuated: bool = True) -> Beyond | N
     return None
 
 
-def _bounded(
-    robot: Robot, q: Array, actuated: bool
-) -> Iterator[tuple[Sequence[str], Array, Array, Sequence[str]]]:
+def _bounded(robot: Robot, q: Array, actuated: bool) -> Iterator[tuple[Sequence[str], Array, Array, Sequence[str]]]:
     """Yield what a file bounds at q (p, n): names, values (p, k), bounds (k, 2), units."""
     if actuated and robot.limits.position is not None:
         yield robot.joint_names, q, robot.limits.position, robot.joint_units

@@ -61,20 +61,22 @@ class Common:
 
     mechanism: str
     payload: Payload = schema.section(Payload, default={})
-    gravity: Array = schema.vector(
-        3, unit="m/s2", text="free fall, base axes", default=list(FREE_FALL)
-    )
+    gravity: Array = schema.vector(3, unit="m/s2", text="free fall, base axes", default=list(FREE_FALL))
     joint_map: Mapping[str, JointMapEntry] = schema.mapping(JointMapEntry, default={})
     uncertainty: Mapping[str, UncertaintyEntry] = schema.mapping(UncertaintyEntry, default={})
     tolerances: Mapping[str, Tolerance] = schema.mapping(Tolerance, default={})
     element_compliance: Mapping[str, float] = schema.mapping(
-        schema.number(low=1e-6, high=1e6), default={},
+        schema.number(low=1e-6, high=1e6),
+        default={},
         text="factors on the compliance of elements, named as in `shares` of `compliance`; else 1",
-    )  # fmt: skip
+    )
     modal_damping: Array = schema.vector(
-        0, above=0.0, high=0.99, default=[],
+        0,
+        above=0.0,
+        high=0.99,
+        default=[],
         text="damping ratios of modes from the lowest, for `frf`, `lobes`; the last: all higher",
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -109,8 +111,13 @@ class Mechanism(Common):
     start: ClassVar[Start | None] = None
     """A closed form of the forward kinematics that no structure tells."""
     changeable: ClassVar[tuple[str, ...]] = (
-        "payload", "friction", "gravity", "limits", "element_compliance", "modal_damping",
-    )  # fmt: skip
+        "payload",
+        "friction",
+        "gravity",
+        "limits",
+        "element_compliance",
+        "modal_damping",
+    )
 
     @classmethod
     def from_data(cls: type[R], data: Mapping[str, Any], name: str) -> R:
@@ -266,9 +273,7 @@ class Mechanism(Common):
         if self.drive is None:
             return given
         if given:
-            raise ParameterError(
-                "inertia.rotor_inertia", given, "0, because the section drive has the rotor"
-            )
+            raise ParameterError("inertia.rotor_inertia", given, "0, because the section drive has the rotor")
         return self.drive.reflected(slides, "drive")
 
     @cached_property
@@ -399,11 +404,12 @@ class Mechanism(Common):
         """
         if self.redundant:
             raise ParameterError(
-                "joints", self.joints_count,
+                "joints",
+                self.joints_count,
                 f"{len(self.graph.leads)} actuated joints, the degrees of freedom, for {what}: "
                 f"{why}; leave out `actuated` of "
                 f"{', '.join(n for n in self.joint_names if n not in self.graph.leads)}",
-            )  # fmt: skip
+            )
 
     @property
     def pose_names(self) -> tuple[str, ...]:

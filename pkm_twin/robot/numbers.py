@@ -30,9 +30,7 @@ class FileNumbers:
     :raises ParameterError: an unknown path.
     """
 
-    def __init__(
-        self, robot: Robot, paths: Sequence[str], of: Callable[[Robot], Sequence[Any]]
-    ) -> None:
+    def __init__(self, robot: Robot, paths: Sequence[str], of: Callable[[Robot], Sequence[Any]]) -> None:
         tape = Tape([robot.number(path) for path in paths])
         given = tape.inputs(GEOMETRY, len(paths))
         made = robot.numbered(dict(zip(paths, given, strict=True)))

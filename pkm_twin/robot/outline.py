@@ -109,9 +109,7 @@ def bars(graph: Graph) -> tuple[Bar, ...]:
         # A body with one joint reaches from there to its centre of mass: else nothing is seen.
         if not _apart(found, radius) and graph.bodies[body].mass > 0.0:
             found = [*found[:1], graph.bodies[body].com]
-        result += [
-            Bar(body, (body, found[0]), (body, point), radius) for point in _others(found, radius)
-        ]
+        result += [Bar(body, (body, found[0]), (body, point), radius) for point in _others(found, radius)]
     for rod in graph.rods.values():
         for shift in (0.0,) if rod.pair is None else (-rod.width / 2, rod.width / 2):
             ends = rod.ends if rod.pair is None else rod.ends + shift * rod.pair
@@ -122,10 +120,7 @@ def bars(graph: Graph) -> tuple[Bar, ...]:
 def robot_bars(robot: Robot) -> tuple[Bar, ...]:
     """Return the bars of a robot, with the members' diameters and the rails' lengths."""
     known = {part for beam in robot.beams for part in (*beam.parts, *beam.carries)}
-    members = [
-        Bar(beam.parts[0], beam.inner, beam.outer, beam.radius, beam.element)
-        for beam in robot.beams
-    ]
+    members = [Bar(beam.parts[0], beam.inner, beam.outer, beam.radius, beam.element) for beam in robot.beams]
     rest = [bar for bar in bars(robot.graph) if bar.part not in known]
     hidden = [bar for bar in crosspieces(robot.graph) if bar.part in known]
     return (*members, *rest, *hidden, *_rails(robot))

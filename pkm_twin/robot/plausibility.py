@@ -77,9 +77,14 @@ def findings(robot: Robot) -> tuple[Finding, ...]:
     """Return the implausible numbers of a robot."""
     graph = robot.graph
     found = [
-        *_size(graph), *_masses(robot, graph), *_bodies(robot, graph), *_drives(robot, graph),
-        *_gravity(robot), *_members(robot, graph), *_home(graph),
-    ]  # fmt: skip
+        *_size(graph),
+        *_masses(robot, graph),
+        *_bodies(robot, graph),
+        *_drives(robot, graph),
+        *_gravity(robot),
+        *_members(robot, graph),
+        *_home(graph),
+    ]
     # Copies of a limb say the same.
     alike: dict[tuple[Any, ...], list[Finding]] = {}
     for one in found:
@@ -90,15 +95,17 @@ def findings(robot: Robot) -> tuple[Finding, ...]:
 def _joined(group: list[Finding]) -> Finding:
     first = group[0]
     others = "" if len(group) == 1 else f" (and {len(group) - 1} more)"
-    return Finding(
-        f"{first.field}{others}", first.quantity, first.value, first.bound, first.unit, first.likely
-    )
+    return Finding(f"{first.field}{others}", first.quantity, first.value, first.bound, first.unit, first.likely)
 
 
 def _outside(
-    field: str, quantity: str, value: float, bounds: tuple[float, float], unit: str,
+    field: str,
+    quantity: str,
+    value: float,
+    bounds: tuple[float, float],
+    unit: str,
     likely: tuple[str, str],
-) -> Iterator[Finding]:  # fmt: skip
+) -> Iterator[Finding]:
     """Yield a finding if a quantity is out of its bounds; zero counts as absent.
 
     :param likely: what it means below and above them.
@@ -109,17 +116,19 @@ def _outside(
         yield Finding(field, quantity, value, bounds[0], unit, likely[0])
 
 
-def _above(
-    field: str, quantity: str, value: float, most: float, unit: str, likely: str
-) -> Iterator[Finding]:
+def _above(field: str, quantity: str, value: float, most: float, unit: str, likely: str) -> Iterator[Finding]:
     yield from _outside(field, quantity, value, (0.0, most), unit, ("", likely))
 
 
 def _size(graph: Graph) -> Iterator[Finding]:
     yield from _outside(
-        "geometry", "extent of the machine", _extent(graph), (SMALLEST, LARGEST), "m",
+        "geometry",
+        "extent of the machine",
+        _extent(graph),
+        (SMALLEST, LARGEST),
+        "m",
         ("lengths in another unit than metres?", "lengths in millimetres?"),
-    )  # fmt: skip
+    )
 
 
 def _masses(robot: Robot, graph: Graph) -> Iterator[Finding]:
@@ -132,9 +141,13 @@ def _masses(robot: Robot, graph: Graph) -> Iterator[Finding]:
     density = total / extent**3 if SMALLEST <= extent <= LARGEST else 0.0
     whole = f"{total:.4g} kg in all; masses in"
     yield from _outside(
-        "masses", "all that moves over the cube of the extent", density, (LIGHTEST, DENSEST),
-        "kg/m3", (f"{whole} tonnes?", f"{whole} grams?"),
-    )  # fmt: skip
+        "masses",
+        "all that moves over the cube of the extent",
+        density,
+        (LIGHTEST, DENSEST),
+        "kg/m3",
+        (f"{whole} tonnes?", f"{whole} grams?"),
+    )
     lead = merged(graph)
     with_platform = [b for b in graph.bodies if lead[b] == lead[graph.platform]]
     if not any(graph.bodies[b].mass for b in with_platform) and not robot.payload.mass:
@@ -160,9 +173,7 @@ def payload_findings(robot: Robot) -> Iterator[Finding]:
 def _bodies(robot: Robot, graph: Graph) -> Iterator[Finding]:
     extent = _extent(graph) or graph.size
     load = robot.payload
-    parts = [
-        (name, b.mass, b.inertia, _nearest(graph, name, b.com)) for name, b in graph.bodies.items()
-    ]
+    parts = [(name, b.mass, b.inertia, _nearest(graph, name, b.com)) for name, b in graph.bodies.items()]
     parts.append(("payload", load.mass, load.inertia, float(np.linalg.norm(load.com))))
     for name, mass, inertia, far in parts:
         if not mass > 0.0:

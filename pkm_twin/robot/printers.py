@@ -62,11 +62,16 @@ class Printer:
         numbers = [f"{value:.9g}" for value in np.radians(self.angles)]
         arms = [f"{value / 1e3:.9g}" for value in self.arms]
         lines = [
-            f"# {head}", "# Masses are not the printer's: set them before computing forces.",
-            "mechanism: linear_delta", "geometry:", f"  radius: {self.radius / 1e3:.9g}",
-            f"  angles: [{', '.join(numbers)}]", f"  arm_lengths: [{', '.join(arms)}]",
-            "inertia: {platform_mass: 0.3, carriage_mass: 0.2, rod_mass: 0.02}", "joint_map:",
-        ]  # fmt: skip
+            f"# {head}",
+            "# Masses are not the printer's: set them before computing forces.",
+            "mechanism: linear_delta",
+            "geometry:",
+            f"  radius: {self.radius / 1e3:.9g}",
+            f"  angles: [{', '.join(numbers)}]",
+            f"  arm_lengths: [{', '.join(arms)}]",
+            "inertia: {platform_mass: 0.3, carriage_mass: 0.2, rod_mass: 0.02}",
+            "joint_map:",
+        ]
         ends = zip("abc", self.ends, strict=True)
         lines += [f"  stepper_{limb}: {{offset: {-end / 1e3:.9g}}}" for limb, end in ends]
         return "\n".join([*lines, ""])
@@ -97,15 +102,14 @@ def printer_of(robot: Robot) -> Printer:
     """
     if robot.mechanism != "linear_delta":
         raise ParameterError(
-            f"{robot.name}: mechanism", robot.mechanism,
+            f"{robot.name}: mechanism",
+            robot.mechanism,
             "linear_delta, as in a file that `pkm-twin convert` writes",
-        )  # fmt: skip
+        )
     g: Any = vars(robot)["geometry"]
     own = robot.controller
     if g.leans is not None and np.any(g.leans):
-        raise ParameterError(
-            "geometry.leans", g.leans.tolist(), "0, because no firmware supports them"
-        )
+        raise ParameterError("geometry.leans", g.leans.tolist(), "0, because no firmware supports them")
     if not (own.factors == 1.0).all():
         raise ParameterError("joint_map", own.factors.tolist(), "ratios and signs of 1")
     angles = np.degrees(g.angles)
@@ -122,9 +126,12 @@ def written(printer: Printer, firmware: Firmware) -> str:
         lines = ["[printer]", f"delta_radius: {radius:.6f}"]
         for k, limb in enumerate("abc"):
             lines += [
-                "", f"[stepper_{limb}]", f"angle: {printer.angles[k]:.6f}",
-                f"arm_length: {arms[k]:.6f}", f"position_endstop: {above[k]:.6f}",
-            ]  # fmt: skip
+                "",
+                f"[stepper_{limb}]",
+                f"angle: {printer.angles[k]:.6f}",
+                f"arm_length: {arms[k]:.6f}",
+                f"position_endstop: {above[k]:.6f}",
+            ]
         return "\n".join([*lines, ""])
     trims = (printer.angles - ANGLES + 180.0) % 360.0 - 180.0
     turned = " ".join(f"{axis}{trim:.4f}" for axis, trim in zip("XYZ", trims, strict=True))
@@ -236,9 +243,7 @@ def _points(text: str, firmware: Firmware, radius: float) -> Array:
     elif heights:
         places, values = _G30.findall(text), heights[0].split()
         if len(places) < len(values):
-            raise ParameterError(
-                "G30 P", len(places), f"a line `G30 Pn Xx Yy` for each of {len(values)} heights"
-            )
+            raise ParameterError("G30 P", len(places), f"a line `G30 Pn Xx Yy` for each of {len(values)} heights")
         found = [(float(x), float(y), float(z)) for (x, y), z in zip(places, values, strict=False)]
     elif rows:
         found = rows
@@ -303,9 +308,8 @@ def _klipper(text: str) -> Printer:
     radius = _number(sections["printer"]["delta_radius"], "delta_radius")
     arms = np.array([number(k, "arm_length") for k in range(3)])
     angles = np.array(
-        [_number(s["angle"], "angle") if "angle" in s else a
-         for s, a in zip(steppers, ANGLES, strict=True)]
-    )  # fmt: skip
+        [_number(s["angle"], "angle") if "angle" in s else a for s, a in zip(steppers, ANGLES, strict=True)]
+    )
     ends = np.array([number(k, "position_endstop") for k in range(3)])
     ends = ends + _rise(arms, radius, "arm_length")
     steps = np.array([_step(number, steppers, k) for k in range(3)])
@@ -328,9 +332,7 @@ def _klipper(text: str) -> Printer:
         if re.fullmatch(r"distance\d+", key) and f"{key}_pos1" in stored
     ]
     if not heights and not distances:
-        raise ParameterError(
-            "[delta_calibrate]", None, "height0, height0_pos ...: run DELTA_CALIBRATE, SAVE_CONFIG"
-        )
+        raise ParameterError("[delta_calibrate]", None, "height0, height0_pos ...: run DELTA_CALIBRATE, SAVE_CONFIG")
     shapes = np.array(heights).reshape(-1, 4), np.array(distances).reshape(-1, 7)
     return Printer(radius, angles, arms, ends, *shapes)
 

@@ -138,9 +138,7 @@ class Robot(Mechanism):
     def inertial(self) -> Array:
         """Run-time inputs of the dynamics, payload included, see ``machine.inertia``."""
         load = self.payload
-        return schema.frozen(
-            self.own_inertial + self._layout.payload(load.mass, load.com, load.inertia)
-        )
+        return schema.frozen(self.own_inertial + self._layout.payload(load.mass, load.com, load.inertia))
 
     @cached_property
     def own_inertial(self) -> Array:
@@ -437,9 +435,7 @@ class Robot(Mechanism):
         kernel = self.engine.kernel("passive rates", passive_rates_program)
         return self.evaluate(kernel, _NONE, q, qd)[0]
 
-    def refuse_joints(
-        self, status: Array, q: ArrayLike, inputs: Mapping[str, ArrayLike] | None = None
-    ) -> None:
+    def refuse_joints(self, status: Array, q: ArrayLike, inputs: Mapping[str, ArrayLike] | None = None) -> None:
         """Raise the typed error of the first rejected sample, if there is one.
 
         :param status: of a kernel, shape (..., 2).
@@ -478,9 +474,7 @@ class Robot(Mechanism):
             if self.redundant:
                 leads = ", ".join(self.graph.leads)
                 question = f"; it is one of {leads} alone, others may lead (redundancy.leads)"
-            raise SingularityError(
-                "joint state", index, measure, SINGULARITY_BOUND, reached, question=question
-            )
+            raise SingularityError("joint state", index, measure, SINGULARITY_BOUND, reached, question=question)
         limb = self.name_limb(drive if change < np.inf else part)
         raise UnreachableError("joint state", limb, index, miss, reached)
 
@@ -516,9 +510,7 @@ class Robot(Mechanism):
             ("has an acceleration of {:.4g} {}, ", "what {} make it", "/s2"),
         )
         found = self.projection_kernel(_NONE, *state)[0]
-        for k, (own, follows, (has, whence, per)) in enumerate(
-            zip(state, found, ways, strict=True)
-        ):
+        for k, (own, follows, (has, whence, per)) in enumerate(zip(state, found, ways, strict=True)):
             apart = np.abs(own - follows)
             worst = int(np.argmax(apart / scales))
             bound = float(graph.sharing[0] * scales[worst]) / TIME**k

@@ -117,10 +117,20 @@ def robot_tree(robot: Robot) -> LoopTree:
             k = graph.actuated.index(source)
             rub, limits = drive_numbers(robot.friction, robot.limits, k)
         return Joint(
-            labels["joints", source], one.kind, names[one.inner], names[one.outer], (at, at),
-            one.axes, one.home, limits, rub["viscous"], rub["coulomb"], one.rotor_inertia,
-            rub["offset"], one.pitch,
-        )  # fmt: skip
+            labels["joints", source],
+            one.kind,
+            names[one.inner],
+            names[one.outer],
+            (at, at),
+            one.axes,
+            one.home,
+            limits,
+            rub["viscous"],
+            rub["coulomb"],
+            one.rotor_inertia,
+            rub["offset"],
+            one.pitch,
+        )
 
     for link in tree.links.values():
         body, at = graph.bodies[link.body], Pose(position=link.at)
@@ -149,13 +159,18 @@ def robot_tree(robot: Robot) -> LoopTree:
         links[PAYLOAD] = Link(PAYLOAD, at, load.mass, at.position, load.inertia)
         label = f"{PAYLOAD}_frame"
         joints[label] = Joint(label, "fixed", platform, PAYLOAD, (at, at))
-    capsules = (
-        Capsule(names[bar.part], bar.start[1], bar.end[1], bar.radius) for bar in bars(graph)
-    )
+    capsules = (Capsule(names[bar.part], bar.start[1], bar.end[1], bar.radius) for bar in bars(graph))
     return LoopTree(
-        robot.name or robot.mechanism, GROUND, links, joints, tuple(closures), graph.actuated,
-        capsules=tuple(capsules), platform=platform, origin=graph.origin,
-    )  # fmt: skip
+        robot.name or robot.mechanism,
+        GROUND,
+        links,
+        joints,
+        tuple(closures),
+        graph.actuated,
+        capsules=tuple(capsules),
+        platform=platform,
+        origin=graph.origin,
+    )
 
 
 def _link_names(names: Sequence[str]) -> dict[str, str]:
@@ -194,9 +209,7 @@ def robot_description(robot: Robot) -> dict[str, Any]:
     data |= robot.sharing_entries()
     load = robot.payload
     if load.mass > 0.0 or load.inertia.any():
-        data["payload"] = {
-            "mass": load.mass, "com": load.com.tolist(), "inertia": load.inertia.tolist()
-        }  # fmt: skip
+        data["payload"] = {"mass": load.mass, "com": load.com.tolist(), "inertia": load.inertia.tolist()}
     for name, gear in zip(robot.joint_names, robot.drives, strict=True):
         if gear is not None:
             own = {key: value for key, value in schema.plain(gear).items() if value is not None}

@@ -99,9 +99,15 @@ class Assembly:
                 inner, body = body, f"{joint.name} {k}"
                 kinds = ("revolute", "helical") if freedom.turns else ("", "prismatic")
                 joints[body] = graphs.Joint(
-                    body, kinds[bool(freedom.slide)], inner, body, joint.at, freedom.axis[None],
-                    actuated=True, pitch=freedom.slide,
-                )  # fmt: skip
+                    body,
+                    kinds[bool(freedom.slide)],
+                    inner,
+                    body,
+                    joint.at,
+                    freedom.axis[None],
+                    actuated=True,
+                    pitch=freedom.slide,
+                )
                 self.steps.append(joint.name)
             self._bodies[child] = body
         self.turns = np.array([joint.kind != "prismatic" for joint in joints.values()], bool)
@@ -288,9 +294,10 @@ class Assembly:
         if closure.kind == "fixed":
             what += f" and {turned:.3g} rad"
         return ParameterError(
-            closure.name, f"open by {what} between {closure.inner} and {closure.outer}",
+            closure.name,
+            f"open by {what} between {closure.inner} and {closure.outer}",
             f"loops that close within {self.closed:g} (m or rad)",
-        )  # fmt: skip
+        )
 
 
 def _list_constraints(closure: Joint) -> Iterator[tuple[Constraint, Array]]:
@@ -537,7 +544,6 @@ def _led(graph: Graph) -> Graph:
     """Return the graph whose redundant drives follow those that lead."""
     leads = choose_leads(graph)
     joints = {
-        name: replace(joint, follows=joint.actuated and name not in leads)
-        for name, joint in graph.joints.items()
+        name: replace(joint, follows=joint.actuated and name not in leads) for name, joint in graph.joints.items()
     }
     return replace(graph, joints=joints)

@@ -200,9 +200,10 @@ def _require_motors(part: Part, whole: LoopTree, tree: LoopTree, base: str, tool
     away = [name for name in whole.actuated if name not in tree.joints]
     if not tree.actuated or (part.actuated is not None and away):
         raise ParameterError(
-            "actuated", ", ".join(away) or None, f"{way}, of which these can be driven: "
-            f"{', '.join(drivable)}",
-        )  # fmt: skip
+            "actuated",
+            ", ".join(away) or None,
+            f"{way}, of which these can be driven: {', '.join(drivable)}",
+        )
 
 
 def _require_open(tree: LoopTree, bodies: dict[str, str], tool: str, ground: str) -> None:
@@ -216,10 +217,11 @@ def _require_open(tree: LoopTree, bodies: dict[str, str], tool: str, ground: str
     repaired = repair_rounded(graph, tree.rounding, LEAST_ROUNDING)
     freedoms = Linkage(graph if repaired is None else repaired.graph).mobility.freedoms
     raise ParameterError(
-        tree.marked, f"{len(tree.actuated)} actuated joints: {', '.join(tree.actuated)}",
+        tree.marked,
+        f"{len(tree.actuated)} actuated joints: {', '.join(tree.actuated)}",
         f"at most one a degree of freedom ({freedoms}), and in every loop a joint without a motor; "
         "which of these are motors?",
-    )  # fmt: skip
+    )
 
 
 def _require_moving(tree: LoopTree, bodies: dict[str, str], tool: str) -> None:
@@ -238,10 +240,12 @@ def _require_moving(tree: LoopTree, bodies: dict[str, str], tool: str) -> None:
     whole = {end for name in moving for end in pairs[name]} | target
     cuts = [name for name, pair in pairs.items() if name not in moving and whole & set(pair)]
     raise ParameterError(
-        "actuated", f"{', '.join(apart)}", f"joints that move the platform {tool!r}: close a "
+        "actuated",
+        f"{', '.join(apart)}",
+        f"joints that move the platform {tool!r}: close a "
         f"missing loop, or leave out the other parts, at {', '.join(cuts)}, with their motors "
-        "(`base=LINK` or --base)"
-    )  # fmt: skip
+        "(`base=LINK` or --base)",
+    )
 
 
 def _left_out(tree: LoopTree) -> list[str]:
@@ -305,10 +309,15 @@ def _graph(assembly: Assembly, bodies: dict[str, str], tool: str, ground: str) -
             own = {key: getattr(joint, key) for key in ("viscous", "coulomb", "rotor_inertia")}
             own |= {"home": value, "pitch": joint.pitch}
         return graphs.Joint(
-            joint.name, joint.kind, bodies[joint.inner], bodies[joint.outer],
-            _snapped(ends[0].point(joint.at)), np.reshape([_snapped(a) for a in axes], (-1, 3)),
-            joint.name in tree.actuated, **own,
-        )  # fmt: skip
+            joint.name,
+            joint.kind,
+            bodies[joint.inner],
+            bodies[joint.outer],
+            _snapped(ends[0].point(joint.at)),
+            np.reshape([_snapped(a) for a in axes], (-1, 3)),
+            joint.name in tree.actuated,
+            **own,
+        )
 
     return Graph(
         _masses(tree, bodies, moves),
@@ -326,9 +335,7 @@ def _platform(tree: LoopTree, asked: str | None) -> str:
     for name in PLATFORMS:
         if name in lower:
             return lower[name]
-    raise ParameterError(
-        "platform", None, f"the link that carries the tool, one of {', '.join(sorted(tree.links))}"
-    )
+    raise ParameterError("platform", None, f"the link that carries the tool, one of {', '.join(sorted(tree.links))}")
 
 
 def _bodies(tree: LoopTree, tool: str, ground: str) -> dict[str, str]:
@@ -350,15 +357,11 @@ def _bodies(tree: LoopTree, tool: str, ground: str) -> dict[str, str]:
     return {link: names[first] for link, first in group.items()}
 
 
-def _masses(
-    tree: LoopTree, bodies: dict[str, str], moves: dict[str, Pose]
-) -> dict[str, graphs.Body]:
+def _masses(tree: LoopTree, bodies: dict[str, str], moves: dict[str, Pose]) -> dict[str, graphs.Body]:
     """All bodies but the ground, base axes."""
     result: dict[str, graphs.Body] = {}
     for body in dict.fromkeys(body for body in bodies.values() if body != GROUND):
-        links = [
-            link.moved(moves[name]) for name, link in tree.links.items() if bodies[name] == body
-        ]
+        links = [link.moved(moves[name]) for name, link in tree.links.items() if bodies[name] == body]
         mass, com, inertia = _sum_masses(links)
         result[body] = graphs.Body(body, mass, _snapped(com), inertia)
     return result

@@ -54,9 +54,7 @@ class _Number:
     value: Any
 
 
-def varied(
-    robot: Robot, spread: Mapping[str, float], seed: int, distribution: Distribution = "normal"
-) -> Variation:
+def varied(robot: Robot, spread: Mapping[str, float], seed: int, distribution: Distribution = "normal") -> Variation:
     """Draw a robot with other masses, inertias, friction and lengths.
 
     Every number gets a factor 1 + s d of its own, an inertia one for all entries, with d
@@ -92,9 +90,7 @@ def varied(
             each = np.shape(number.value) if number.kind == "friction" else ()
             factors = 1.0 + size * _draw(rng, distribution, each)
             value = (np.asarray(number.value) * factors).tolist()
-            told = {
-                path + "".join(f"[{i}]" for i in k): float(f) for k, f in np.ndenumerate(factors)
-            }
+            told = {path + "".join(f"[{i}]" for i in k): float(f) for k, f in np.ndenumerate(factors)}
         if size > 0.0:
             _section_of(data, number.path)[number.path[-1]] = value
             drawn |= told

@@ -168,9 +168,7 @@ def keeps_limits(
     return inside
 
 
-def counts(
-    robot: Robot, q: Array, pose: Array, known: Mask, least: float, least_clearance: float
-) -> Mask:
+def counts(robot: Robot, q: Array, pose: Array, known: Mask, least: float, least_clearance: float) -> Mask:
     """Which joint positions (k, n) and poses (k, m) count in a workspace, shape (k,).
 
     :param known: where there is an assembly.
@@ -213,9 +211,7 @@ def regular_workspace(
     """
     grid = robot.grid()
     if grid.kind == "box" or grid.zero_torsion or distance_unit(robot) != "rad":
-        raise ParameterError(
-            "mechanism", robot.mechanism, "a height and two tilts side by side (as upr_rpu)"
-        )
+        raise ParameterError("mechanism", robot.mechanism, "a height and two tilts side by side (as upr_rpu)")
     heights = np.atleast_1d(doubles(z, "heights"))
     steps = math.ceil(math.pi / 2 / step) - 1
     radius = circle_radii(robot, heights, step, steps, directions)
@@ -305,9 +301,7 @@ def passing_singularity(index: float, bound: str = "--singularity ") -> str:
     return f"{bound}{math.floor(index * 10**digits) / 10**digits:g}"
 
 
-def causes(
-    robot: Robot, q: Array, pose: Array, known: Mask, least: float, least_clearance: float
-) -> str:
+def causes(robot: Robot, q: Array, pose: Array, known: Mask, least: float, least_clearance: float) -> str:
     """Describe why joint positions (k, n) are outside a workspace, the most frequent first.
 
     Each is counted for the first of these that it fails: assembly, actuator limits, limits of
@@ -332,9 +326,7 @@ def causes(
     if has_clearance(robot):
         gap = joint_clearance(robot, q, refuse=False)
         home = float(joint_clearance(robot, robot.graph.home))
-        what = (
-            "limbs interfere" if least_clearance == 0.0 else f"limbs within {least_clearance:g} m"
-        )
+        what = "limbs interfere" if least_clearance == 0.0 else f"limbs within {least_clearance:g} m"
         judged(f"{what} (clearance {home:.3g} m at home)", np.asarray(gap > least_clearance))
     shares = {what: 100.0 * float(out.mean()) for what, out in found.items()}
     ranked = sorted(shares.items(), key=lambda item: -item[1])

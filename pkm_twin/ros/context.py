@@ -35,9 +35,7 @@ def middleware_arguments(arguments: Sequence[str]) -> list[str]:
 
 
 @contextmanager
-def own_node(
-    name: str, needs: str, *, sim_time: bool = False, namespace: str = ""
-) -> Iterator[Any]:
+def own_node(name: str, needs: str, *, sim_time: bool = False, namespace: str = "") -> Iterator[Any]:
     """Yield a node in its own context, which handles no signals; both end with the block.
 
     It has no parameter services.
@@ -53,9 +51,7 @@ def own_node(
         from rclpy.parameter import Parameter
         from rclpy.signals import SignalHandlerOptions
     except ImportError as error:
-        raise PkmTwinError(
-            f"{needs} needs ROS 2: source its setup, or {install('jazzy')} ({error})"
-        ) from error
+        raise PkmTwinError(f"{needs} needs ROS 2: source its setup, or {install('jazzy')} ({error})") from error
     context = rclpy.Context()
     rclpy.init(
         args=middleware_arguments([]),
@@ -67,9 +63,12 @@ def own_node(
         clock = Parameter("use_sim_time", value=sim_time)
         try:
             node = Node(
-                name, context=context, namespace=namespace, parameter_overrides=[clock],
+                name,
+                context=context,
+                namespace=namespace,
+                parameter_overrides=[clock],
                 start_parameter_services=False,
-            )  # fmt: skip
+            )
         except InvalidNamespaceException as error:
             first = str(error).splitlines()[0]
             raise PkmTwinError(f"--namespace {namespace!r} is invalid: {first}") from None

@@ -81,9 +81,7 @@ class Health:
     def __init__(self, node: LifecycleNode, now: Callable[[], int]) -> None:
         """Store the node; nothing of it is used before it is constructed."""
         self._node, self._now = node, now
-        self.seen = dict.fromkeys(
-            ("messages", "exceptions", "requests rejected", "clock messages rejected"), 0
-        )
+        self.seen = dict.fromkeys(("messages", "exceptions", "requests rejected", "clock messages rejected"), 0)
         self.statistics: dict[str, TopicStatistics] = {}
         self.backlogs: dict[str, Backlog] = {}
         self.expected: list[str] = []
@@ -106,9 +104,7 @@ class Health:
         text = traceback.format_exc()
         if text != self._last_exception:
             self._last_exception = text
-            self._node.get_logger().error(
-                f"{where}: exception in the callback\n{text[-10 * MAX_TEXT :]}"
-            )
+            self._node.get_logger().error(f"{where}: exception in the callback\n{text[-10 * MAX_TEXT :]}")
 
     def log_throttled(self, reason: str, text: str) -> None:
         """Log a line of a reason; the pauses between lines of a reason double."""
@@ -131,9 +127,7 @@ class Health:
             self._incompatible_ends[topic] = now
             for end in now.keys() - before.keys():
                 self._incompatible += now[end].kind == QOS
-                self.log_throttled(
-                    f"{topic} {now[end]}", f"another node on {topic} has an incompatible {now[end]}"
-                )
+                self.log_throttled(f"{topic} {now[end]}", f"another node on {topic} has an incompatible {now[end]}")
                 for tell in listeners:
                     tell(now[end])
 
@@ -183,18 +177,12 @@ class Health:
         overruns = sum(topic.overruns for topic in self.statistics.values())
         dropped = sum(backlog.dropped for backlog in self.backlogs.values())
         before, self._reported = self._reported, (taken, lost, overruns, clocks, dropped)
-        taken, lost, overruns, clocks, dropped = (
-            a - b for a, b in zip(self._reported, before, strict=True)
-        )
+        taken, lost, overruns, clocks, dropped = (a - b for a, b in zip(self._reported, before, strict=True))
         if dropped:
-            found.append(
-                (WARN, f"the node is overloaded: {dropped} messages dropped in the last second")
-            )
+            found.append((WARN, f"the node is overloaded: {dropped} messages dropped in the last second"))
             self.log_throttled("overloaded", found[-1][1])
         if clocks:
-            found.append(
-                (WARN, f"{clocks} messages of /clock had an invalid time in the last second")
-            )
+            found.append((WARN, f"{clocks} messages of /clock had an invalid time in the last second"))
         if lost:
             found.append((WARN, f"{lost} messages lost in the last second"))
         # Single late callbacks are normal on a machine that runs other programs too.
@@ -202,9 +190,7 @@ class Health:
             found.append((WARN, f"{overruns} of {taken} callbacks took longer than their period"))
         return found
 
-    def report(
-        self, level: bytes, message: str, values: dict[str, object], *, active: bool
-    ) -> DiagnosticArray:
+    def report(self, level: bytes, message: str, values: dict[str, object], *, active: bool) -> DiagnosticArray:
         """Return the diagnostics of the last second.
 
         :param values: the node's values, which are extended.
@@ -231,9 +217,7 @@ class Health:
             values[f"longest callback (ms): {topic}"] = f"{1e3 * statistics.longest:.3f}"
         return self.array(max(level for level, _ in troubles), troubles[0][1], **values)
 
-    def array(
-        self, level: bytes, message: str, *, robot: object = "", **values: object
-    ) -> DiagnosticArray:
+    def array(self, level: bytes, message: str, *, robot: object = "", **values: object) -> DiagnosticArray:
         """Return the node's status as a message, stamped now; ``robot`` is its hardware."""
         status = DiagnosticStatus(
             level=level,
@@ -247,9 +231,7 @@ class Health:
         return array
 
 
-def find_incompatibility(
-    speaker: TopicEndpointInfo, listener: TopicEndpointInfo
-) -> Incompatibility | None:
+def find_incompatibility(speaker: TopicEndpointInfo, listener: TopicEndpointInfo) -> Incompatibility | None:
     """Return why a publisher's messages do not reach a subscriber; None if they do."""
     if speaker.topic_type != listener.topic_type:
         return Incompatibility("message type", f"{speaker.topic_type} for {listener.topic_type}")

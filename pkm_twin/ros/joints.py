@@ -60,9 +60,7 @@ def named(
 ) -> JointState:
     """Return values by name as a joint state, which plotting tools can show."""
     position, velocity, effort = (array("d", row) for row in (values, rates, efforts))
-    return JointState(
-        header=header, name=list(names), position=position, velocity=velocity, effort=effort
-    )
+    return JointState(header=header, name=list(names), position=position, velocity=velocity, effort=effort)
 
 
 class JointPublisher:
@@ -85,9 +83,7 @@ class JointPublisher:
         names = list(robot.controller.names)
         arrays = {what: [0.0] * len(names) if what in fields else [] for what in FIELDS}
         definition = message_definition(JOINT_STATE)
-        self._template = DoublesTemplate(
-            JOINT_STATE, definition, {"name": names, **arrays}, stamped=True
-        )
+        self._template = DoublesTemplate(JOINT_STATE, definition, {"name": names, **arrays}, stamped=True)
 
     def publish(self, stamp: int, *values: ControllerNumbers) -> None:
         """Publish the values of the fields, shape (n,) each; the stamp in ns."""
@@ -121,9 +117,7 @@ class EffortPublisher:
         self._stamped = JointPublisher(node, robot, stamped, expiry=expiry)
         self._plain = node.create_guarded_publisher(plain, expiry) if with_plain else None
         message = {"data": [0.0] * robot.joints_count}
-        self._template = DoublesTemplate(
-            NUMBERS, message_definition(NUMBERS), message, stamped=False
-        )
+        self._template = DoublesTemplate(NUMBERS, message_definition(NUMBERS), message, stamped=False)
 
     @property
     def controllers(self) -> int:

@@ -94,9 +94,7 @@ class GuardedNode(ParameterNode):
         self.active_since = 0
         self.low_rate = LowRateGroup()
         super().__init__(name)
-        self.autostart: bool = self.declare(
-            "autostart", True, "configure and activate the node at start"
-        )
+        self.autostart: bool = self.declare("autostart", True, "configure and activate the node at start")
         self.executor_kind: str = self.declare(
             "executor",
             "events",
@@ -104,20 +102,24 @@ class GuardedNode(ParameterNode):
             choices=("single", "events"),
         )
         self.queue_depth: int = self.declare(
-            "queue_depth", 1000, "messages of a topic that can wait for the node",
-            low=1, high=100_000
-        )  # fmt: skip
+            "queue_depth", 1000, "messages of a topic that can wait for the node", low=1, high=100_000
+        )
         self.max_wait: float = self.declare(
-            "max_wait", 0.05,
+            "max_wait",
+            0.05,
             "longest time that a message of a stream may wait for the node: then waiting messages "
-            "are dropped, and counted, until the node has caught up", unit="s", low=1e-3,
-            high=3600.0
-        )  # fmt: skip
+            "are dropped, and counted, until the node has caught up",
+            unit="s",
+            low=1e-3,
+            high=3600.0,
+        )
         self.thread_priority: int = self.declare(
-            "thread_priority", 0,
+            "thread_priority",
+            0,
             "real-time priority (SCHED_FIFO) of the process, with its memory locked; 0: none",
-            low=0, high=99
-        )  # fmt: skip
+            low=0,
+            high=99,
+        )
         # The diagnostics run on the steady clock: they report a ROS clock that stands still.
         self.steady = Clock(clock_type=ClockType.STEADY_TIME)
 
@@ -165,15 +167,11 @@ class GuardedNode(ParameterNode):
         options.setdefault("event_callbacks", NO_PUBLISHER_EVENTS)
         return super().create_publisher(*arguments, **options)
 
-    def create_guarded_subscription(
-        self, topic: str, callback: Callable[[Any], None], **options: Any
-    ) -> None:
+    def create_guarded_subscription(self, topic: str, callback: Callable[[Any], None], **options: Any) -> None:
         """Subscribe to a topic of the node's table; see :class:`GuardedSubscription`."""
         GuardedSubscription(self, topic, callback, **options)
 
-    def create_guarded_publisher(
-        self, topic: str, expiry: float | None = None, *, joint: str = ""
-    ) -> Any:
+    def create_guarded_publisher(self, topic: str, expiry: float | None = None, *, joint: str = "") -> Any:
         """Create a publisher of the node's table, with QoS overrides by parameter.
 
         :param expiry: lifespan and deadline that the topic offers, s; None for none. ``joint``:
@@ -188,18 +186,13 @@ class GuardedNode(ParameterNode):
             qos.lifespan = qos.deadline = Duration(seconds=expiry)
             overrides = (*overrides, *EXPIRY)
             for policy in EXPIRY:
-                override = (
-                    f"qos_overrides.{self.resolve_topic_name(topic)}.publisher."
-                    f"{policy.name.lower()}"
-                )
+                override = f"qos_overrides.{self.resolve_topic_name(topic)}.publisher.{policy.name.lower()}"
                 given = self.given.get(override)
                 # The middleware treats zero as no limit.
                 if given is not None and not (isinstance(given.value, int) and given.value > 0):
                     raise ParameterError(override, given.value, "1 ns or more")
         self.health.watch(topic)
-        return self.create_publisher(
-            row.message, topic, qos, qos_overriding_options=QoSOverridingOptions(overrides)
-        )
+        return self.create_publisher(row.message, topic, qos, qos_overriding_options=QoSOverridingOptions(overrides))
 
     def create_guarded_timer(self, period: float, callback: Callable[[], None]) -> Any:
         """Create a timer on the steady clock, with a guarded callback; period in s."""
@@ -336,9 +329,7 @@ class GuardedSubscription:
         self._relaxed, node = True, self._node
         node.destroy_subscription(self._subscription)
         self._subscription = self._subscribe()
-        node.log_throttled(
-            "qos", f"{self._topic}: best effort from now on, as its publisher offers it"
-        )
+        node.log_throttled("qos", f"{self._topic}: best effort from now on, as its publisher offers it")
 
 
 COMPILING: Final = "loading or compiling the robot's programs: the node does not answer yet"
@@ -386,9 +377,7 @@ class TwinNode(GuardedNode):
         self.create_guarded_timer(1.0, self._publish_diagnostics)
         self.create_service(Trigger, "~/reset", self._on_reset)
         for service in self.services:
-            service.callback = guarded_service(
-                service.srv_type, service.callback, self.health, lambda: self.declared
-            )
+            service.callback = guarded_service(service.srv_type, service.callback, self.health, lambda: self.declared)
             service.callback_group = self.low_rate
             self.low_rate.add_entity(service)
         if self.executor_kind == "single":
@@ -570,11 +559,7 @@ def guarded_service(
 
 def _select_changes(asked: Sequence[Any], declared: Mapping[str, Parameter]) -> list[Any]:
     """Return the parameters of a request that differ from the node's."""
-    return [
-        one
-        for one in asked
-        if one.name not in declared or declared[one.name].get_parameter_value() != one.value
-    ]
+    return [one for one in asked if one.name not in declared or declared[one.name].get_parameter_value() != one.value]
 
 
 def _check_size(request: Any, parameters: int) -> None:

@@ -69,9 +69,7 @@ class ParameterNode(LifecycleNode):
         found: dict[str, Parameter] = self.get_parameters_by_prefix("")
         return found
 
-    def declare(
-        self, name: str, default: Any, text: str, *, changeable: bool = False, **row: Any
-    ) -> Any:
+    def declare(self, name: str, default: Any, text: str, *, changeable: bool = False, **row: Any) -> Any:
         """Declare a parameter and return its value; integers are converted to floats.
 
         :param row: of a :class:`~pkm_twin.settings.Setting`: ``unit``, ``low``, ``high``,
@@ -101,9 +99,7 @@ class ParameterNode(LifecycleNode):
         )
         if low is not None and high is not None:
             if isinstance(default, float):
-                descriptor.floating_point_range = [
-                    FloatingPointRange(from_value=float(low), to_value=float(high))
-                ]
+                descriptor.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high))]
             else:
                 descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
             constraints = f"{low:g} to {high:g} {unit}".strip()
@@ -201,9 +197,7 @@ class ParameterNode(LifecycleNode):
     def _convert_to_floats(self, changes: list[Parameter]) -> list[Parameter]:
         """Convert integers to floats where the declaration has floats."""
         return [
-            _as_float(change, self.get_parameter(change.name).value)
-            if self.has_parameter(change.name)
-            else change
+            _as_float(change, self.get_parameter(change.name).value) if self.has_parameter(change.name) else change
             for change in changes
         ]
 
@@ -219,12 +213,7 @@ def _as_float(given: Parameter, like: Any) -> Parameter:
     if isinstance(like, float) and given.type_ == Parameter.Type.INTEGER:
         return Parameter(given.name, value=float(given.value))
     many = not isinstance(like, str) and hasattr(like, "__len__")
-    if (
-        many
-        and len(like)
-        and isinstance(like[0], float)
-        and given.type_ == Parameter.Type.INTEGER_ARRAY
-    ):
+    if many and len(like) and isinstance(like[0], float) and given.type_ == Parameter.Type.INTEGER_ARRAY:
         return Parameter(given.name, value=[float(value) for value in given.value])
     return given
 

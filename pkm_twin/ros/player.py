@@ -100,9 +100,7 @@ def play(
     """
     _check_number("rate", rate, rate > 0, "a finite number above 0")
     _check_number("clock", clock or 0.0, (clock or 0.0) >= 0, "0 or more, Hz")
-    _check_number(
-        "wait_for_subscribers", wait_for_subscribers, wait_for_subscribers >= 0, "0 or more, s"
-    )
+    _check_number("wait_for_subscribers", wait_for_subscribers, wait_for_subscribers >= 0, "0 or more, s")
     bag = open_bag(path)
     if clock:
         _check_log_times(bag)
@@ -135,8 +133,7 @@ def _check_log_times(bag: Bag) -> None:
     end = bag.report.start_time * 1e-9 + bag.report.duration
     if not end < MAX_CLOCK:
         raise BagError(
-            f"log times up to {end:.0f} s do not fit a /clock, which ends at {MAX_CLOCK} s; play "
-            "without a clock",
+            f"log times up to {end:.0f} s do not fit a /clock, which ends at {MAX_CLOCK} s; play without a clock",
             path=bag.report.path,
             reason="time",
         )
@@ -216,9 +213,7 @@ def _stop_on_signals(stop: _Stop) -> Iterator[None]:
 
 
 @contextmanager
-def _create_publishers(
-    bag: Bag, targets: Mapping[str, str], with_clock: bool
-) -> Iterator[tuple[dict[str, Any], Any]]:
+def _create_publishers(bag: Bag, targets: Mapping[str, str], with_clock: bool) -> Iterator[tuple[dict[str, Any], Any]]:
     """Yield a publisher for each recorded topic, and one for the clock or None."""
     with own_node("pkm_twin_player", "playing") as node:
         from rclpy.qos import QoSProfile
@@ -291,9 +286,7 @@ def _progress_bar(bag: Bag, shown: bool) -> Iterator[Callable[[float, int], None
     columns = (
         TextColumn(bag.report.path.name),
         BarColumn(),
-        TextColumn(
-            "{task.completed:.1f} of {task.total:.1f} s, {task.fields[speed]:.0f} messages/s"
-        ),
+        TextColumn("{task.completed:.1f} of {task.total:.1f} s, {task.fields[speed]:.0f} messages/s"),
     )
     with Progress(*columns, console=Console(stderr=True)) as drawing:
         task = drawing.add_task("", total=total, speed=0.0)

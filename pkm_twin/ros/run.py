@@ -156,9 +156,7 @@ def run(*factories: Callable[[], TwinNode], arguments: Sequence[str] | None = No
             node.shutdown()
         end = time.monotonic() + MAX_SHUTDOWN_TIME
         if executor is not None:
-            executor.spin(
-                lambda: not any([n.shutting_down for n in nodes]) or time.monotonic() > end
-            )
+            executor.spin(lambda: not any([n.shutting_down for n in nodes]) or time.monotonic() > end)
         # A thread without Python's lock ends the process if it hangs, and prints where.
         faulthandler.dump_traceback_later(MAX_TEARDOWN_TIME, exit=True)
         if executor is not None:

@@ -41,9 +41,7 @@ def ignore_signals() -> None:
 
 
 @contextmanager
-def first_signal(
-    raising: Callable[[], BaseException], numbers: Sequence[signal.Signals] = SIGNALS
-) -> Iterator[None]:
+def first_signal(raising: Callable[[], BaseException], numbers: Sequence[signal.Signals] = SIGNALS) -> Iterator[None]:
     """Raise on the first signal and ignore the next ones; restore handlers if none came.
 
     After a signal the process is ending when the block is left, and signals stay ignored. Only the

@@ -22,9 +22,11 @@ def declare_mounts(node: TwinNode, platform_frame: str = PLATFORM) -> Mounts | N
     :raises ParameterError: transforms are wanted and tf2_ros is not installed.
     """
     wanted = node.declare(
-        "use_tf", False, "take the sensor's pose from /tf in place of sensor.xyz and sensor.rpy, "
-        "between wrench_frame and platform_frame at the wrench's stamp; needs tf2_ros"
-    )  # fmt: skip
+        "use_tf",
+        False,
+        "take the sensor's pose from /tf in place of sensor.xyz and sensor.rpy, "
+        "between wrench_frame and platform_frame at the wrench's stamp; needs tf2_ros",
+    )
     if not wanted:
         return None
     return TransformMounts(node, platform_frame)

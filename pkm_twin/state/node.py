@@ -51,9 +51,7 @@ KINDS: Final = {
 }
 
 
-def transform(
-    stamp: int, frame: str, child: str, position: NDArray[Any], turn: NDArray[Any]
-) -> TransformStamped:
+def transform(stamp: int, frame: str, child: str, position: NDArray[Any], turn: NDArray[Any]) -> TransformStamped:
     """Make the message of a frame's transform to its child: position (3,), quaternion x y z w."""
     moved = Transform(translation=xyz(Vector3, position), rotation=xyz(Quaternion, turn))
     return TransformStamped(header=header(stamp, frame), child_frame_id=child, transform=moved)
@@ -85,9 +83,7 @@ class Transforms:
     :raises ImportError: tf2_msgs is not installed.
     """
 
-    def __init__(
-        self, node: TwinNode, base: str, frames: Mapping[str, str], tool: Mount, platform: bool
-    ) -> None:
+    def __init__(self, node: TwinNode, base: str, frames: Mapping[str, str], tool: Mount, platform: bool) -> None:
         from tf2_msgs.msg import TFMessage
 
         self._message = TFMessage
@@ -124,9 +120,7 @@ class MachineStateNode(TwinNode):
         robot = self.declare_robot()
         settings = self.declare_settings(WrenchSettings)
         self._frames = {
-            "platform": self._declare_frame(
-                "platform_frame", PLATFORM, "of the platform, at its reference point"
-            ),
+            "platform": self._declare_frame("platform_frame", PLATFORM, "of the platform, at its reference point"),
             "tool": self._declare_frame("tool_frame", "tool0", "of the tool"),
         }
         self._tool = Mount.of(
@@ -136,19 +130,20 @@ class MachineStateNode(TwinNode):
                 "position of the tool from the platform's reference point, platform axes",
                 "m",
             ),
-            triple(
-                self, "tool.rpy", "roll, pitch and yaw of the tool relative to the platform", "rad"
-            ),
+            triple(self, "tool.rpy", "roll, pitch and yaw of the tool relative to the platform", "rad"),
         )
         mounts = declare_mounts(self, self._frames["platform"])
         self.core = MachineState(robot, settings, mounts)
         self.core.pace = Pace(
             self.declare(
-                "rate", 100.0, "largest rate of ~/joint_states, ~/pose and ~/twist; 0: every "
-                "sample",
-                unit="Hz", low=0.0, high=1e4
+                "rate",
+                100.0,
+                "largest rate of ~/joint_states, ~/pose and ~/twist; 0: every sample",
+                unit="Hz",
+                low=0.0,
+                high=1e4,
             )
-        )  # fmt: skip
+        )
         self._scene = Scene(robot, self.declare_settings(Scales, fixed=True))
         self._elastic = _is_elastic(robot)
         _warm_up(robot, self._elastic)
@@ -158,10 +153,10 @@ class MachineStateNode(TwinNode):
         self._description = self.create_guarded_publisher("robot_description")
         # Only on request: a controller_manager that reads the description loads this hardware.
         hardware = self.declare(
-            "hardware_plugin", "", "hardware plugin in the ros2_control element of "
-            "robot_description; "
-            "empty: no such element"
-        )  # fmt: skip
+            "hardware_plugin",
+            "",
+            "hardware plugin in the ros2_control element of robot_description; empty: no such element",
+        )
         self._urdf = robot_urdf(robot, hardware)
         self._names = joint_names(robot, hardware)
         self._transforms = self._create_transforms()
@@ -231,20 +226,15 @@ class MachineStateNode(TwinNode):
             choices=("all", "tool", "none"),
         )
         rate = self.declare(
-            "tf_rate", 100.0, "largest rate of the transform from base to "
-            "platform", unit="Hz", low=0.1, high=1e4
-        )  # fmt: skip
+            "tf_rate", 100.0, "largest rate of the transform from base to platform", unit="Hz", low=0.1, high=1e4
+        )
         self._transforms_pace = Pace(rate)
         if wanted == "none":
             return None
         try:
-            return Transforms(
-                self, self.core.settings.base_frame, self._frames, self._tool, wanted == "all"
-            )
+            return Transforms(self, self.core.settings.base_frame, self._frames, self._tool, wanted == "all")
         except ImportError as error:
-            self.get_logger().warning(
-                f"tf2_msgs is missing, so no transforms are published ({error})"
-            )
+            self.get_logger().warning(f"tf2_msgs is missing, so no transforms are published ({error})")
             return None
 
     def _on_joint_state(self, message: JointStateView) -> None:

@@ -63,16 +63,10 @@ class Scales:
     N.
     """
 
-    deflection: float = setting(
-        1000.0, "factor by which deflections are enlarged", name="deflection_scale", **LARGE
-    )
+    deflection: float = setting(1000.0, "factor by which deflections are enlarged", name="deflection_scale", **LARGE)
     force: float = setting(1e-3, "length of force arrows", name="force_scale", unit="m/N", **LARGE)
-    moment: float = setting(
-        1e-2, "length of moment arrows", name="moment_scale", unit="m/(N m)", **LARGE
-    )
-    ellipsoid_force: float = setting(
-        100.0, "force whose deflections the compliance ellipsoid shows", unit="N", **LARGE
-    )
+    moment: float = setting(1e-2, "length of moment arrows", name="moment_scale", unit="m/(N m)", **LARGE)
+    ellipsoid_force: float = setting(100.0, "force whose deflections the compliance ellipsoid shows", unit="N", **LARGE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,9 +108,7 @@ class Scene:
         self.bars = robot_bars(robot)
         self._size = robot.graph.size
         bodies = {bar.element for bar in self.bars}
-        self.joints = {
-            name: place for name, place in _joint_places(robot).items() if name not in bodies
-        }
+        self.joints = {name: place for name, place in _joint_places(robot).items() if name not in bodies}
 
     def shapes(self, state: State, load: Load | None = None) -> list[Shape]:
         """Return the shapes of the machine in a state, and of the load's effects."""
@@ -124,9 +116,7 @@ class Scene:
         # Energies relative to the largest one; nothing without energy.
         factors = {} if load is None else load.factors
         greatest = max(factors.values(), default=0.0)
-        shares = (
-            {name: value / greatest for name, value in factors.items()} if greatest > 0.0 else {}
-        )
+        shares = {name: value / greatest for name, value in factors.items()} if greatest > 0.0 else {}
         shapes = self._bars(places, shares)
         if load is None:
             return shapes
@@ -157,10 +147,17 @@ class Scene:
             width = 2.0 * bar.radius
             shapes.append(
                 Shape(
-                    "cylinder", "bars", k, colour, (width, width, length), (start + end) / 2.0,
-                    _rotate_z_to(span), text=bar.part, lasting=True,
+                    "cylinder",
+                    "bars",
+                    k,
+                    colour,
+                    (width, width, length),
+                    (start + end) / 2.0,
+                    _rotate_z_to(span),
+                    text=bar.part,
+                    lasting=True,
                 )
-            )  # fmt: skip
+            )
         return shapes
 
     def _joints(self, q: Array, shares: Mapping[str, float]) -> list[Shape]:
@@ -207,12 +204,16 @@ class Scene:
         )
         return [
             Shape(
-                "arrow", "wrench", k, colour, size,
+                "arrow",
+                "wrench",
+                k,
+                colour,
+                size,
                 points=np.array([state.position, state.position + scale * vector]),
             )
             for k, (vector, scale, colour) in enumerate(parts)
             if vector.any()
-        ]  # fmt: skip
+        ]
 
     def _text(self, state: State, name: str) -> Shape:
         height = LETTER_HEIGHT * self._size

@@ -34,16 +34,14 @@ class ImuSettings:
     """Settings of the IMU: its frame, its :class:`Mount` on the base, and its age."""
 
     frame: str = setting("imu_link", "the only accepted frame of base_imu", name="imu.frame")
-    xyz: Triple = setting(
-        ZERO, "position of the IMU from the base's origin, base axes", name="imu.xyz", unit="m"
-    )
-    rpy: Triple = setting(
-        ZERO, "roll, pitch and yaw of the IMU relative to the base", name="imu.rpy", unit="rad"
-    )
+    xyz: Triple = setting(ZERO, "position of the IMU from the base's origin, base axes", name="imu.xyz", unit="m")
+    rpy: Triple = setting(ZERO, "roll, pitch and yaw of the IMU relative to the base", name="imu.rpy", unit="rad")
     max_age: float = setting(
-        0.02, "largest time between a joint state and the nearest message of base_imu",
-        name="imu.max_age", **LATE,
-    )  # fmt: skip
+        0.02,
+        "largest time between a joint state and the nearest message of base_imu",
+        name="imu.max_age",
+        **LATE,
+    )
 
     def __post_init__(self) -> None:
         check_mount({"imu.xyz": self.xyz, "imu.rpy": self.rpy})

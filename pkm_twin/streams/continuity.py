@@ -102,8 +102,7 @@ class Continuity:
                 moved, _, most = controller.shown(joint, "velocity", now - before, -bound, bound)
                 raise MessageError(
                     "jump",
-                    f"{controller.names[joint]} moved by {moved:g} {unit} in "
-                    f"{period:g} s, allowed {most:g}",
+                    f"{controller.names[joint]} moved by {moved:g} {unit} in {period:g} s, allowed {most:g}",
                 )
         worst = max(beyond)
         if not worst <= self._largest:

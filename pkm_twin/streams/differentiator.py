@@ -137,9 +137,7 @@ class Differentiator:
     def slope_gain(self) -> float:
         """Return the noise of velocities from positions, relative to theirs, times the period."""
         at = self.window // 2 if self.middle else self.window - 1
-        return float(
-            np.linalg.norm(fit_weights(np.arange(float(self.window)), self.order + 1, 1, at))
-        )
+        return float(np.linalg.norm(fit_weights(np.arange(float(self.window)), self.order + 1, 1, at)))
 
     def _weights(self) -> tuple[int, Array, Array]:
         """Return the order of derivative, the samples' times in periods, and their weights."""
@@ -242,17 +240,13 @@ class _Fit:
         for block in range(self._blocks - 1, 0, -1):
             last = end - block * BLOCK_SAMPLES
             part = slice(last - BLOCK_SAMPLES, last), slice((last - BLOCK_SAMPLES) * n, last * n)
-            (sums,), _ = self._sums(
-                _NO_PARAMETERS, sums, stamps[part[0]], values[part[1]], weights, place
-            )
+            (sums,), _ = self._sums(_NO_PARAMETERS, sums, stamps[part[0]], values[part[1]], weights, place)
             weights = self._all
         first = end - BLOCK_SAMPLES
         inputs = sums, stamps[first:end], values[first * n : end * n], weights, place
         result: Array = self._call(*inputs)
         if not min(result[2 * n :].tolist()) > MIN_PIVOT:
-            raise MessageError(
-                "uneven stamps", "the stamps of the window are too uneven to differentiate"
-            )
+            raise MessageError("uneven stamps", "the stamps of the window are too uneven to differentiate")
         return result[:n], result[n : 2 * n]
 
 
@@ -271,13 +265,13 @@ def _make_fit_kernel(degree: int, joints: int, *, solved: bool) -> Kernel:
 def _write_fit_program(degree: int, joints: int, solved: bool) -> Program:
     tape, size = Tape(), degree + 1
     sizes = {
-        "before": 2 * degree + 1 + size * joints, "stamps": BLOCK_SAMPLES,
+        "before": 2 * degree + 1 + size * joints,
+        "stamps": BLOCK_SAMPLES,
         "values": BLOCK_SAMPLES * joints,
-        "weights": BLOCK_SAMPLES, "place": 3,
-    }  # fmt: skip
-    before, stamps, values, weights, (middle, half, look) = (
-        tape.inputs(name, count) for name, count in sizes.items()
-    )
+        "weights": BLOCK_SAMPLES,
+        "place": 3,
+    }
+    before, stamps, values, weights, (middle, half, look) = (tape.inputs(name, count) for name, count in sizes.items())
     inverse = 1.0 / half
     powers = list(before[: 2 * degree + 1])
     mixed = before[2 * degree + 1 :].reshape(size, joints)

@@ -142,14 +142,11 @@ class WrenchWindow(Core):
         far = (
             "no wrench has arrived"
             if age is None
-            else f"the nearest wrench is {age / SECOND:.3f} s away, allowed "
-            f"{self.max_age / SECOND:g} s"
+            else f"the nearest wrench is {age / SECOND:.3f} s away, allowed {self.max_age / SECOND:g} s"
         )
         raise MessageError("no wrench", f"no wrench: {far}")
 
-    def push(
-        self, sample: JointSample, rotation: Array, given: tuple[WrenchSample, Mount] | None
-    ) -> None:
+    def push(self, sample: JointSample, rotation: Array, given: tuple[WrenchSample, Mount] | None) -> None:
         """Add a joint state that the differentiator has taken.
 
         :param rotation: rotation of the platform, shape (3, 3).

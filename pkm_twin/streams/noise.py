@@ -42,8 +42,7 @@ def difference_weights(times: Sequence[Times]) -> list[Times]:
     # Times in units of the mean step keep the products within the range of doubles.
     step = (times[-1] - times[0]) / (len(times) - 1)
     weights = [
-        1.0 / math.prod((t - other) / step for j, other in enumerate(times) if j != i)
-        for i, t in enumerate(times)
+        1.0 / math.prod((t - other) / step for j, other in enumerate(times) if j != i) for i, t in enumerate(times)
     ]
     length = sum(map(mul, weights, weights)) ** 0.5
     return [weight / length for weight in weights]

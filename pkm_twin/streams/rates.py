@@ -127,8 +127,7 @@ class RateAgreement:
         if error[j] > MAX_LIVE_ERROR:
             cause = find_likely_cause(moved[:, j], told[:, j])
             self.fault = (
-                f"{self._names[j]}: velocities differ from the rate of the positions by "
-                f"{100 * error[j]:.2g} %{cause}"
+                f"{self._names[j]}: velocities differ from the rate of the positions by {100 * error[j]:.2g} %{cause}"
             )
 
 
@@ -167,6 +166,5 @@ def rate_faults(
     part = size / np.maximum(np.maximum(most, floor), 1e-300)
     bad = (part > MAX_RATE) & (size > SIGMAS * noisy)
     return part, [
-        f"{names[j]} {100 * part[j]:.3g} %{find_likely_cause(moved[:, j], told[:, j])}"
-        for j in np.flatnonzero(bad)
+        f"{names[j]} {100 * part[j]:.3g} %{find_likely_cause(moved[:, j], told[:, j])}" for j in np.flatnonzero(bad)
     ]

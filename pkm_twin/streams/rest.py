@@ -101,9 +101,7 @@ class VelocityErrorEstimator:
         return np.array(bounds)
 
 
-def _backward_slope_weights(
-    first: float, second: float, third: float
-) -> tuple[float, float, float]:
+def _backward_slope_weights(first: float, second: float, third: float) -> tuple[float, float, float]:
     """Return the weights of a parabola's slope at the third of three times."""
     a, b = third - second, third - first
     return a / (b * (b - a)), -b / (a * (b - a)), (a + b) / (a * b)

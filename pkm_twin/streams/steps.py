@@ -95,9 +95,7 @@ class Steps:
         return [(int(k), int(np.argmax(self.jumps[k] * self.sizes[k]))) for k in rows]
 
 
-def steps_of(
-    time: Array, q: Array, qd: Array | None, limit: Sequence[float] | Array | None
-) -> Steps:
+def steps_of(time: Array, q: Array, qd: Array | None, limit: Sequence[float] | Array | None) -> Steps:
     """Find the steps of a recording that are not motions of the machine.
 
     :param time: rising, shape (k,), s; q and qd (None if not measured), shape (k, n).
@@ -152,9 +150,7 @@ def repeats_of(time: Array, q: Array) -> Mask:
     apart = np.concatenate([np.ones_like(q[:1], np.bool_), move != 0.0])
     if apart.all():
         return found
-    own = [
-        estimate_noise(time[new], one[new, None])[0] for one, new in zip(q.T, apart.T, strict=True)
-    ]
+    own = [estimate_noise(time[new], one[new, None])[0] for one, new in zip(q.T, apart.T, strict=True)]
     floor = 2.0 * SIGMAS * np.array(own) + 2.0 * _find_resolution(np.abs(move))
     period = np.median(np.diff(time))
     for count in range(1, min(MAX_REPEATS, len(move) - 3) + 1):
@@ -288,11 +284,7 @@ def _count_publisher_samples(q: Array, slack: Array) -> tuple[int, ...]:
         current = nearest
         last[nearest], seen[nearest] = row, k
         counts[nearest] += 1
-    if (
-        len(counts) < 2
-        or min(counts) < MIN_PUBLISHER_FRACTION * len(rows)
-        or jumps > MIN_JUMPING_FRACTION * len(rows)
-    ):
+    if len(counts) < 2 or min(counts) < MIN_PUBLISHER_FRACTION * len(rows) or jumps > MIN_JUMPING_FRACTION * len(rows):
         return ()
     # Few changes between the tracks mean a single publisher with an offset for some time.
     if turns < min(counts) / LOOKBACK_SAMPLES:

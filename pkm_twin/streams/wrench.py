@@ -73,26 +73,26 @@ class WrenchSettings:
 
     wrench_frame: str = setting(
         PLATFORM,
-        "the only accepted frame of the wrench; it is taken to move with the platform, unless it "
-        "is base_frame",
+        "the only accepted frame of the wrench; it is taken to move with the platform, unless it is base_frame",
         fixed=True,
     )
     base_frame: str = setting("base_link", "frame id of the base", fixed=True)
     accept_empty_frame: bool = setting(False, "accept an empty frame id as wrench_frame")
-    max_state_age: float = setting(
-        0.1, "largest time between a wrench and the nearest joint state", **SECONDS
-    )
+    max_state_age: float = setting(0.1, "largest time between a wrench and the nearest joint state", **SECONDS)
     future_tolerance: float = setting(0.1, FUTURE, **SECONDS)
     accept_zero_stamp: bool = setting(False, ZERO_STAMP)
     sensor_xyz: Triple = setting(
-        ZERO, "position of the sensor from the platform's reference point, platform axes",
-        name="sensor.xyz", unit="m",
-    )  # fmt: skip
+        ZERO,
+        "position of the sensor from the platform's reference point, platform axes",
+        name="sensor.xyz",
+        unit="m",
+    )
     sensor_rpy: Triple = setting(
-        ZERO, "roll, pitch and yaw of the sensor relative to the platform; must be zeros for a "
-        "wrench in base_frame",
-        name="sensor.rpy", unit="rad",
-    )  # fmt: skip
+        ZERO,
+        "roll, pitch and yaw of the sensor relative to the platform; must be zeros for a wrench in base_frame",
+        name="sensor.rpy",
+        unit="rad",
+    )
 
     def __post_init__(self) -> None:
         for name in ("wrench_frame", "base_frame"):

@@ -46,10 +46,7 @@ class Camera:
         size = np.array([WIDTH, HEIGHT])
         self.pixel = float((np.ptp(seen, axis=0) / (0.86 * size)).max())
         self.low, self.high = middle - self.pixel * size / 2, middle + self.pixel * size / 2
-        x, y = (
-            np.linspace(a, b, FINE * n)
-            for a, b, n in zip(self.low, self.high, (WIDTH, HEIGHT), strict=True)
-        )
+        x, y = (np.linspace(a, b, FINE * n) for a, b, n in zip(self.low, self.high, (WIDTH, HEIGHT), strict=True))
         self.x, self.y = x, y
         self.depth = np.full((len(y), len(x)), np.inf)
         self.image = np.ones((len(y), len(x), 3))
@@ -66,9 +63,7 @@ class Camera:
         x, y = np.meshgrid(self.x[columns], self.y[rows])
         return (rows, columns), x, y
 
-    def _paint(
-        self, window: Any, depth: Array, normal: Array, colour: Any, opacity: float = 1.0
-    ) -> None:
+    def _paint(self, window: Any, depth: Array, normal: Array, colour: Any, opacity: float = 1.0) -> None:
         bright = 0.5 + 0.5 * np.clip(normal @ LIGHT, 0.0, 1.0)
         nearer = depth < self.depth[window]
         lit = bright[..., None] * np.asarray(colour) / 255.0
@@ -150,9 +145,7 @@ def draw(robot: Robot, marked: bool = False) -> Any:
     sizes = shapes.cylinder_sizes[:, 0]
     for pair, radius, colour in zip(shapes.ends, sizes, shapes.cylinder_colours, strict=True):
         camera.cylinder(pair, float(radius), colour)
-    for at, radius, colour in zip(
-        shapes.ball_at, shapes.ball_sizes[:, 0], shapes.ball_colours, strict=True
-    ):
+    for at, radius, colour in zip(shapes.ball_at, shapes.ball_sizes[:, 0], shapes.ball_colours, strict=True):
         camera.ball(at, float(radius), colour)
     if len(scene.platform):
         camera.plate(scene.platform + shapes.platform_at, PLATFORM)
@@ -186,8 +179,9 @@ def _draw_points(ax: Any, camera: Camera, robot: Robot) -> None:
     """Draw the centres of mass of bodies and the reference point at home, with a legend."""
     masses = [body.com for body in robot.graph.bodies.values() if body.mass > 0.0]
     for places, marker, name in (
-        (masses, "o", "centre of mass of a body"), ([robot.graph.origin], "X", "reference point"),
-    ):  # fmt: skip
+        (masses, "o", "centre of mass of a body"),
+        ([robot.graph.origin], "X", "reference point"),
+    ):
         seen = camera.see(np.reshape(places, (-1, 3)))[:, :2]
         ax.plot(*seen.T, marker, label=name, color="w", markeredgecolor="k", markersize=8)
     ax.legend(loc="upper left", fontsize=9, frameon=False)
@@ -200,9 +194,11 @@ def _draw_corners(ax: Any, camera: Camera, style: dict[str, Any]) -> None:
     for name, colour, axis in zip("xyz", AXES, np.eye(3), strict=True):
         tip = start + 32 * camera.pixel * camera.see(axis)[:2]
         ax.annotate(
-            "", tip, start,
+            "",
+            tip,
+            start,
             arrowprops={"arrowstyle": "-|>", "color": np.array(colour) / 255, "linewidth": 1.5},
-        )  # fmt: skip
+        )
         at = start + 42 * camera.pixel * camera.see(axis)[:2]
         ax.text(*at, name, va="center", **style)
     reach = 0.25 * (camera.high[0] - camera.low[0])

@@ -138,11 +138,7 @@ class Model:
         states = robot.try_project_redundant(lows + (highs - lows) * parts)
         poses, good = robot.try_forward(states)
         rows = states[good]
-        kept = [
-            pose
-            for q, pose in zip(rows, poses[good], strict=True)
-            if not self._describe_beyond_passive(q, pose)
-        ]
+        kept = [pose for q, pose in zip(rows, poses[good], strict=True) if not self._describe_beyond_passive(q, pose)]
         found = np.array([*kept, self.start.pose])
         ranges = []
         for k, (name, unit) in enumerate(zip(robot.pose_names, robot.pose_units, strict=True)):
@@ -162,10 +158,7 @@ class Model:
             force = float(np.median(held[np.isfinite(held)]))
         force, moment = _round(force), _round(force * robot.size)
         tops = [("N", force)] * 3 + [("N m", moment)] * 3
-        return tuple(
-            Range(name, unit, -top, top, _step(2 * top))
-            for name, (unit, top) in zip(AXES, tops, strict=True)
-        )
+        return tuple(Range(name, unit, -top, top, _step(2 * top)) for name, (unit, top) in zip(AXES, tops, strict=True))
 
     @cached_property
     def enlargement(self) -> Range:
@@ -323,10 +316,17 @@ class Model:
             why["energy"] = one_line(str(error))
         position, rotation = robot.platform(state.q)
         return Numbers(
-            position, rotation, measure, _grade(measure, stop, warn),
-            gap, "good" if gap is None else _grade(gap, 0.0, CLOSE_CLEARANCE),
-            effort, self._find_overloaded(effort), energy, why,
-        )  # fmt: skip
+            position,
+            rotation,
+            measure,
+            _grade(measure, stop, warn),
+            gap,
+            "good" if gap is None else _grade(gap, 0.0, CLOSE_CLEARANCE),
+            effort,
+            self._find_overloaded(effort),
+            energy,
+            why,
+        )
 
     def deflected(self, state: State, deflection: Array) -> Deflection:
         """Return the members' displacements for the platform's, (6,), m and rad, base axes."""

@@ -120,9 +120,7 @@ class Page:
                 self._wrench = self._add_sliders(model.wrench_ranges, "wrench", self._load)
                 self.ask(gui.add_button("No wrench").on_click, "unload", self._unload)
             r = model.enlargement
-            self._enlarge = gui.add_slider(
-                "deflection magnified, times", r.low, r.high, r.step, r.high / 2
-            )
+            self._enlarge = gui.add_slider("deflection magnified, times", r.low, r.high, r.step, r.high / 2)
             self.ask(self._enlarge.on_update, "enlarge", self._show)
             self._loads = gui.add_html("")
             if "energy" not in model.numbers(self.state).why:
@@ -182,9 +180,7 @@ class Page:
         box = self.server.gui.add_checkbox(label, value)
         self.ask(box.on_update, label, lambda: call(box.value))
 
-    def _add_sliders(
-        self, ranges: Sequence[Range], kind: str, move: Callable[[int], None]
-    ) -> list[Any]:
+    def _add_sliders(self, ranges: Sequence[Range], kind: str, move: Callable[[int], None]) -> list[Any]:
         handles = []
         for k, r in enumerate(ranges):
             amid = min(max(0.0, r.low), r.high)

@@ -212,9 +212,7 @@ class LivePanel:
             joints = _coloured(page.model.robot.joint_names)
             nothing = np.zeros((2, len(joints)))
             self._charts = {
-                name: _chart(
-                    page, f"{name}, the last {SPAN:g} s", np.array([-SPAN, 0.0]), nothing, joints
-                )
+                name: _chart(page, f"{name}, the last {SPAN:g} s", np.array([-SPAN, 0.0]), nothing, joints)
                 for name in TRACES
             }
         page.moving.append(self)
@@ -260,9 +258,7 @@ def _chart(
     points = uplot.Series_Points(show=False)
     series = [uplot.Series(label="t, s")]
     series += [
-        uplot.Series(
-            label=name, stroke=colour, width=4.0 if name == _MEASURED else 1.5, points=points
-        )
+        uplot.Series(label=name, stroke=colour, width=4.0 if name == _MEASURED else 1.5, points=points)
         for name, colour in colours.items()
     ]
     curves = list(map(np.ascontiguousarray, values.T))

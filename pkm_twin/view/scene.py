@@ -53,9 +53,7 @@ def share_colours(shares: Mapping[str, float]) -> dict[str, Colour]:
     result = {}
     for name, share in shares.items():
         at = np.clip(share / most, 0.0, 1.0) * (len(SCALE) - 1)
-        red, green, blue = (
-            round(float(np.interp(at, range(len(SCALE)), channel))) for channel in SCALE.T
-        )
+        red, green, blue = (round(float(np.interp(at, range(len(SCALE)), channel))) for channel in SCALE.T)
         result[name] = (red, green, blue)
     return result
 
@@ -170,8 +168,7 @@ class Scene:
             return True
         near = 1e-6 * self.size
         return any(
-            {j.inner, j.outer} == {body, graph.platform}
-            and float(np.linalg.norm(j.at - point)) < near
+            {j.inner, j.outer} == {body, graph.platform} and float(np.linalg.norm(j.at - point)) < near
             for j in self._joints
         )
 
@@ -186,9 +183,7 @@ class Scene:
         ]
         return max(at_end, default=self._thin)
 
-    def shapes(
-        self, q: Array, moved: Deflection = RIGID, shares: Mapping[str, float] | None = None
-    ) -> Shapes:
+    def shapes(self, q: Array, moved: Deflection = RIGID, shares: Mapping[str, float] | None = None) -> Shapes:
         """Shapes at joint positions, shape (n,).
 
         :param moved: the deflection as it is to be drawn, already enlarged.
@@ -333,9 +328,15 @@ def _convert_to_quaternions(turns: Rotation) -> Array:
 
 
 ANCHORS: Final = {
-    "bottom-center": (0, -1), "top-center": (0, 1), "center-left": (1, 0), "center-right": (-1, 0),
-    "bottom-left": (1, -1), "bottom-right": (-1, -1), "top-left": (1, 1), "top-right": (-1, 1),
-}  # fmt: skip
+    "bottom-center": (0, -1),
+    "top-center": (0, 1),
+    "center-left": (1, 0),
+    "center-right": (-1, 0),
+    "bottom-left": (1, -1),
+    "bottom-right": (-1, -1),
+    "top-left": (1, 1),
+    "top-right": (-1, 1),
+}
 """Offset of a label from its place, right and down, in halves of its size."""
 
 

@@ -63,18 +63,28 @@ class Stage:
         for name, place in (("key", LOOK * [-0.3, 0.5, 3.0]), ("back", -LOOK)):
             bright = 1.7 if name == "key" else 0.4
             draw.add_light_directional(
-                f"/lights/{name}", intensity=bright, position=tuple(place.tolist()),
+                f"/lights/{name}",
+                intensity=bright,
+                position=tuple(place.tolist()),
                 cast_shadow=name == "key",
-            )  # fmt: skip
+            )
         low, high = scene.box()
         middle, reach = (low + high) / 2, float((high - low).max())
         cell = 10.0 ** np.floor(np.log10(reach))
         draw.add_grid(
-            "/grid", width=6 * reach, height=6 * reach, cell_size=cell / 2, section_size=cell,
-            cell_color=(222, 225, 229), section_color=(186, 192, 200), fade_distance=7 * reach,
+            "/grid",
+            width=6 * reach,
+            height=6 * reach,
+            cell_size=cell / 2,
+            section_size=cell,
+            cell_color=(222, 225, 229),
+            section_color=(186, 192, 200),
+            fade_distance=7 * reach,
             position=(0.0, 0.0, float(min(low[2], 0.0, lowest)) - 0.06 * size),
-            plane_color=(248, 249, 250), plane_opacity=1.0, shadow_opacity=0.35,
-        )  # fmt: skip
+            plane_color=(248, 249, 250),
+            plane_opacity=1.0,
+            shadow_opacity=0.35,
+        )
         self._server.on_client_connect(self._frame)
         camera = self._server.initial_camera
         camera.position = tuple((middle + 1.15 * reach * LOOK).tolist())
@@ -84,16 +94,26 @@ class Stage:
         self._add_plates()
         (cylinder, cylinder_faces), (ball, ball_faces) = round_mesh()
         self._cylinders = draw.add_batched_meshes_simple(
-            "/machine/bars", cylinder, cylinder_faces, shapes.cylinder_turns, shapes.cylinder_at,
-            batched_scales=shapes.cylinder_sizes, lod="off",
+            "/machine/bars",
+            cylinder,
+            cylinder_faces,
+            shapes.cylinder_turns,
+            shapes.cylinder_at,
+            batched_scales=shapes.cylinder_sizes,
+            lod="off",
             batched_colors=_to_linear(shapes.cylinder_colours),
-        )  # fmt: skip
+        )
         turns = np.tile([1.0, 0.0, 0.0, 0.0], (len(shapes.ball_at), 1))
         self._balls = draw.add_batched_meshes_simple(
-            "/machine/balls", ball, ball_faces, turns, shapes.ball_at,
-            batched_scales=shapes.ball_sizes, batched_colors=_to_linear(shapes.ball_colours),
+            "/machine/balls",
+            ball,
+            ball_faces,
+            turns,
+            shapes.ball_at,
+            batched_scales=shapes.ball_sizes,
+            batched_colors=_to_linear(shapes.ball_colours),
             lod="off",
-        )  # fmt: skip
+        )
         self._meshes = self._add_bodies()
         self._passed: list[Array] = []
         rotates = any(unit == "rad" for unit in scene.robot.pose_units)
@@ -109,10 +129,14 @@ class Stage:
         self._labels: dict[int, tuple[Any, dict[str, Any]]] = {}
         server.on_client_disconnect(lambda client: self._labels.pop(client.client_id, None))
         self._arrows = draw.add_arrows(
-            "/wrench", np.zeros((2, 2, 3)), _to_linear(np.array([FORCE, MOMENT])),
-            shaft_radius=0.008 * size, head_radius=0.02 * size, head_length=0.05 * size,
+            "/wrench",
+            np.zeros((2, 2, 3)),
+            _to_linear(np.array([FORCE, MOMENT])),
+            shaft_radius=0.008 * size,
+            head_radius=0.02 * size,
+            head_length=0.05 * size,
             visible=False,
-        )  # fmt: skip
+        )
 
     async def _frame(self, client: Any) -> None:
         """Let the machine be seen whole in this window, and after its size has changed.
@@ -167,9 +191,13 @@ class Stage:
         self._add_tool(away)
         self._rest = draw.add_frame("/at_rest", show_axes=False, visible=False)
         self._rest_bars = draw.add_line_segments(
-            "/bars_at_rest", np.zeros((1, 2, 3)), colors=GROUND, thickness=1.5,
-            thickness_units="screen", visible=False,
-        )  # fmt: skip
+            "/bars_at_rest",
+            np.zeros((1, 2, 3)),
+            colors=GROUND,
+            thickness=1.5,
+            thickness_units="screen",
+            visible=False,
+        )
         if len(scene.platform):
             moving = plate(scene.platform, 0.016 * size)
             draw.add_mesh_simple("/platform/plate", *moving, color=PLATFORM, flat_shading=True)
@@ -283,9 +311,7 @@ class Stage:
     def extend_trail(self, at: Array) -> None:
         """Extend the trail to the reference point's present position, (3,) m."""
         passed = self._passed
-        if not self._trail.visible or (
-            passed and np.linalg.norm(at - passed[-1]) < 1e-3 * self._scene.size
-        ):
+        if not self._trail.visible or (passed and np.linalg.norm(at - passed[-1]) < 1e-3 * self._scene.size):
             return
         passed.append(at)
         del passed[:-TRAIL]

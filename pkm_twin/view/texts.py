@@ -102,11 +102,13 @@ def status(model: Model, state: State, numbers: Numbers) -> str:
     """Singularity measure, clearance, joints with their efforts at rest, and a refusal in words."""
     gap = None if numbers.clearance is None else 1e3 * numbers.clearance
     rows = [
-        _judged("singularity", "singularity index", numbers.singularity, "",
-                numbers.singularity_grade, "1 best, 0 singular"),
-        _judged("clearance", "clearance between limbs", gap, "mm", numbers.clearance_grade,
-                numbers.why.get("clearance", "")),
-    ]  # fmt: skip
+        _judged(
+            "singularity", "singularity index", numbers.singularity, "", numbers.singularity_grade, "1 best, 0 singular"
+        ),
+        _judged(
+            "clearance", "clearance between limbs", gap, "mm", numbers.clearance_grade, numbers.why.get("clearance", "")
+        ),
+    ]
     said = (
         f'<div id="refusal" style="color:#fff;background:{GRADES["bad"]};border-radius:4px;'
         f'padding:0.2em 0.6em;margin:0.3em 0">{escape(state.refusal)}</div>'
@@ -170,10 +172,7 @@ def bars(shares: Mapping[str, float]) -> str:
     for k, name in enumerate(order[:MAX_LISTED_ELEMENTS]):
         part = 100 * shares[name]
         width = 100 * shares[name] / shares[order[0]]
-        bar = (
-            f'<div style="height:0.75em;width:{width:.1f}%;border-radius:2px;'
-            f'background:rgb{colours[name]}"></div>'
-        )
+        bar = f'<div style="height:0.75em;width:{width:.1f}%;border-radius:2px;background:rgb{colours[name]}"></div>'
         cells = (
             f'<td style="white-space:nowrap">{escape(name)}</td>'
             f'<td style="width:55%;padding:0 0.5em">{bar}</td>'
@@ -192,10 +191,7 @@ def instant(robot: Robot, timeline: Timeline, at: Instant) -> str:
     columns = (("measured", at.measured), ("twin", at.twin), ("residual", at.residual))
     for k, name in enumerate(robot.joint_names):
         unit = robot.effort_units[k]
-        cells = [
-            _write_value(f"bag_{what}_{k}", None if v is None else float(v[k]), unit)
-            for what, v in columns
-        ]
+        cells = [_write_value(f"bag_{what}_{k}", None if v is None else float(v[k]), unit) for what, v in columns]
         rows.append(_write_row(escape(name), *cells))
     why = f"<div>no torques: {escape(timeline.why)}</div>" if timeline.why else ""
     time = _write_row("time", _write_value("bag_time", at.time, "s"))
@@ -235,9 +231,7 @@ def _judged(key: str, what: str, value: float | None, unit: str, grade: Grade, h
     return _write_row(f'<span title="{escape(hint)}">{what}</span>', cell + note)
 
 
-def _write_value(
-    key: str, value: float | None, unit: str, colour: str = "inherit", bold: bool = False
-) -> str:
+def _write_value(key: str, value: float | None, unit: str, colour: str = "inherit", bold: bool = False) -> str:
     if value is None:
         return f'<span id="{key}">{_MISSING}</span>'
     weight = ";font-weight:700" if bold else ""
@@ -258,6 +252,5 @@ def _write_head(first: str, *cells: str) -> str:
 
 def _write_table(rows: Iterable[str]) -> str:
     return (
-        '<table style="width:100%;border-collapse:collapse;font-variant-numeric:tabular-nums">'
-        f"{''.join(rows)}</table>"
+        f'<table style="width:100%;border-collapse:collapse;font-variant-numeric:tabular-nums">{"".join(rows)}</table>'
     )

@@ -33,9 +33,7 @@ def definitions() -> dict[str, str]:
 @pytest.fixture(scope="session")
 def rows() -> Callable[[list[BagMessage]], list[Row]]:
     """All that a message says, as something to compare."""
-    return lambda messages: [
-        (m.topic, m.type, m.log_time, m.publish_time, m.sequence, m.data) for m in messages
-    ]
+    return lambda messages: [(m.topic, m.type, m.log_time, m.publish_time, m.sequence, m.data) for m in messages]
 
 
 @pytest.fixture(scope="session")

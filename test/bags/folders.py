@@ -19,9 +19,7 @@ from pkm_twin.bags.reader import inspect, read_messages
 NANOSECONDS = {"nanoseconds_since_epoch": 0}
 
 
-def write_split(
-    path: Path, source: Path, rows: list[Any], each: bool = False, **options: Any
-) -> None:
+def write_split(path: Path, source: Path, rows: list[Any], each: bool = False, **options: Any) -> None:
     """One MCAP file of some messages, without CRCs, as rosbag2 has them by default."""
     settings = {"compression": CompressionType.NONE, "enable_crcs": False} | options
     with path.open("wb") as file:
@@ -30,9 +28,7 @@ def write_split(
         channels = {}
         for topic, info in inspect(source).topics.items():
             schema = writer.register_schema(info.type, "ros2msg", info.definition.encode())
-            channels[topic] = writer.register_channel(
-                topic, "cdr", schema, {"offered_qos_profiles": info.offered_qos}
-            )
+            channels[topic] = writer.register_channel(topic, "cdr", schema, {"offered_qos_profiles": info.offered_qos})
         for m in rows:
             data = zstandard.compress(m.data) if each else m.data
             writer.add_message(channels[m.topic], m.log_time, data, m.publish_time, m.sequence)
@@ -40,9 +36,7 @@ def write_split(
         writer.finish()
 
 
-def make_folder(
-    folder: Path, source: Path, splits: int = 3, mode: str = "", **options: Any
-) -> Path:
+def make_folder(folder: Path, source: Path, splits: int = 3, mode: str = "", **options: Any) -> Path:
     """A rosbag2 folder; ``mode`` as rosbag2 calls it: MESSAGE, FILE or none."""
     folder.mkdir()
     rows = list(read_messages(source, order="file"))

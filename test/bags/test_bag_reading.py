@@ -67,9 +67,7 @@ def test_topics_are_filtered_and_unknown_ones_named(bag: Path) -> None:
 
 @pytest.mark.parametrize("every", often(False, True))
 @pytest.mark.timeout(3600)
-def test_every_bit_is_covered_by_a_check(
-    bag: Path, tmp_path: Path, rows: Rows, every: bool
-) -> None:
+def test_every_bit_is_covered_by_a_check(bag: Path, tmp_path: Path, rows: Rows, every: bool) -> None:
     """Flip one bit at a time: nothing may be handed out that differs from what was recorded."""
     sound = bag.read_bytes()
     expected = rows(read_messages(bag))
@@ -106,9 +104,7 @@ def test_zeroed_bytes(bag: Path, tmp_path: Path, rows: Rows, length: int, step: 
         assert found == expected
 
 
-def test_foreign_bag_without_crcs_gives_no_wrong_times_or_counts(
-    tmp_path: Path, rows: Rows
-) -> None:
+def test_foreign_bag_without_crcs_gives_no_wrong_times_or_counts(tmp_path: Path, rows: Rows) -> None:
     """Without CRCs, damage to values goes unseen, but not to what the indexes repeat."""
     times = [10**9 + 7 * i for i in range(40)]
     plain = {"compression": CompressionType.NONE, "enable_crcs": False}
@@ -189,9 +185,7 @@ def test_bytes_after_the_end(bag: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("use_chunking", [True, False])
 def test_foreign_layouts(tmp_path: Path, compression: CompressionType, use_chunking: bool) -> None:
     times = [5, 6, 7, 8]
-    path = foreign_bag(
-        tmp_path / "f.mcap", times, compression=compression, use_chunking=use_chunking
-    )
+    path = foreign_bag(tmp_path / "f.mcap", times, compression=compression, use_chunking=use_chunking)
     assert [m.log_time for m in read_messages(path)] == times
     assert inspect(path).has_crc is use_chunking
 
@@ -254,9 +248,7 @@ def test_decompression_bomb(tmp_path: Path, declared: int) -> None:
     ("cap", "text"),
     [("MAX_CHUNK_BYTES", "unpacks to 5000 bytes; at most 100"), ("MAX_RATIO", "at most 100 to 1")],
 )
-def test_each_cap_holds_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cap: str, text: str
-) -> None:
+def test_each_cap_holds_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cap: str, text: str) -> None:
     monkeypatch.setattr(mcap_format, cap, 100)
     monkeypatch.setattr(mcap_format, "FREE_BYTES", 1000 if cap == "MAX_RATIO" else 10**6)
     packed = zstandard.compress(bytes(5000))
@@ -336,9 +328,7 @@ def test_a_bag_is_read_again_without_a_second_check(bag: Path) -> None:
     assert [m.data for m in opened.messages()] == [m.data for m in first]
 
 
-def test_change_after_the_check_is_seen(
-    bag: Path, tmp_path: Path, make_bag: Callable[..., Path]
-) -> None:
+def test_change_after_the_check_is_seen(bag: Path, tmp_path: Path, make_bag: Callable[..., Path]) -> None:
     path = tmp_path / "changed.mcap"
     path.write_bytes(bag.read_bytes())
     messages = read_messages(path)

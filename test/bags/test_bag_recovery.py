@@ -46,9 +46,7 @@ def test_sound_bag_is_copied(bag: Path, tmp_path: Path, rows: Rows) -> None:
 
 
 @pytest.mark.parametrize("step", often(29, 3))
-def test_cut_at_every_byte_keeps_the_whole_prefix(
-    bag: Path, tmp_path: Path, rows: Rows, step: int
-) -> None:
+def test_cut_at_every_byte_keeps_the_whole_prefix(bag: Path, tmp_path: Path, rows: Rows, step: int) -> None:
     sound = bag.read_bytes()
     everything = rows(read_messages(bag, order="file"))
     ends = [offset + length for offset, length in chunks(sound)]

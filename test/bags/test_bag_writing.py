@@ -85,9 +85,7 @@ def lost_by_kill(folder: Path) -> int:
     assert code == -signal.SIGKILL
     result = recover(folder / "r.mcap", folder / "saved.mcap")
     saved = list(read_messages(folder / "saved.mcap"))
-    assert result.messages == len(saved) and [m.sequence for m in saved] == list(
-        range(1, len(saved) + 1)
-    )
+    assert result.messages == len(saved) and [m.sequence for m in saved] == list(range(1, len(saved) + 1))
     lost = accepted[len(saved) :]
     return lost[-1][1] - saved[-1].log_time if lost else 0
 
@@ -121,9 +119,7 @@ def test_full_disk(tmp_path: Path) -> None:
         "except BagError as error:\n    print(error.reason, error)\n    sys.exit(1)\n"
     )
     path = tmp_path / "full.mcap"
-    done = subprocess.run(
-        [sys.executable, "-c", program, str(path)], capture_output=True, text=True, check=False
-    )
+    done = subprocess.run([sys.executable, "-c", program, str(path)], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (1, "")
     assert done.stdout.startswith(f"disk_full {path}: cannot be written")
     result = recover(path, tmp_path / "saved.mcap")
@@ -176,9 +172,13 @@ def test_target_that_exists(tmp_path: Path) -> None:
 def test_offered_qos_is_what_rosbag2_reads(tmp_path: Path) -> None:
     with BagWriter(tmp_path / "q.mcap") as writer:
         writer.add_topic(
-            "/a", TEXT, reliability="best_effort", durability="transient_local", depth=3,
+            "/a",
+            TEXT,
+            reliability="best_effort",
+            durability="transient_local",
+            depth=3,
             definition="string data",
-        )  # fmt: skip
+        )
     (profile,) = yaml.safe_load(inspect(tmp_path / "q.mcap").topics["/a"].offered_qos)
     infinite = {"sec": 9223372036, "nsec": 854775807}
     assert profile == {
@@ -269,9 +269,7 @@ def test_no_threads_or_descriptors_are_left(tmp_path: Path) -> None:
     assert after[0] <= before[0] and after[1] <= before[1]
 
 
-def test_a_bag_has_the_bytes_of_the_format_s_own_library(
-    tmp_path: Path, make_bag: Callable[..., Path]
-) -> None:
+def test_a_bag_has_the_bytes_of_the_format_s_own_library(tmp_path: Path, make_bag: Callable[..., Path]) -> None:
     mcap = pytest.importorskip("mcap.writer")
     path = make_bag(tmp_path / "own.mcap")
     report = inspect(path)

@@ -49,9 +49,7 @@ VALUES: dict[str, dict[str, Any]] = {
     },
     "diagnostic_msgs/msg/DiagnosticArray": {
         "header": HEADER,
-        "status": [
-            {"level": b"\x02", "name": "n", "message": "m", "values": [{"key": "k", "value": "v"}]}
-        ],
+        "status": [{"level": b"\x02", "name": "n", "message": "m", "values": [{"key": "k", "value": "v"}]}],
     },
     "std_msgs/msg/String": {"data": "text"},
     "geometry_msgs/msg/TransformStamped": {
@@ -130,9 +128,7 @@ class TestAgainstOtherReaders:
         assert plain(dynamic.generate_dynamic(kind, text)[kind](data)) == plain(codec.decode(data))
         if "Byte" in kind or "Diagnostic" in kind:
             return  # mcap_ros2 does not write single octets
-        assert codec.decode(dynamic.serialize_dynamic(kind, text)[kind](VALUES[kind])) == (
-            codec.decode(data)
-        )
+        assert codec.decode(dynamic.serialize_dynamic(kind, text)[kind](VALUES[kind])) == (codec.decode(data))
 
     def test_truncation_is_an_error_at_every_length(self, codec: MessageCodec, kind: str) -> None:
         data = codec.encode(VALUES[kind])
@@ -165,9 +161,7 @@ numbers = st.integers(0, 2**32 - 1)
     number=numbers,
     flag=st.booleans(),
 )
-def test_what_is_encoded_is_decoded(
-    texts: list[str], reals: list[float], number: int, flag: bool
-) -> None:
+def test_what_is_encoded_is_decoded(texts: list[str], reals: list[float], number: int, flag: bool) -> None:
     codec = MessageCodec("a/msg/T", "bool flag\nstring[] texts\nuint32 number\nfloat64[] reals")
     values = {"flag": flag, "texts": texts, "number": number, "reals": reals}
     found = codec.decode(codec.encode(values))

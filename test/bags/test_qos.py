@@ -66,9 +66,7 @@ def test_topic_names_that_ros_takes(name: str) -> None:
     assert require_topic(name) == name
 
 
-@pytest.mark.parametrize(
-    "name", ["", "/", "a", "/a/", "//a", "/1a", "/a b", "/\u00e4", "/a\n", "~/a", "/{a}", "/a-b"]
-)
+@pytest.mark.parametrize("name", ["", "/", "a", "/a/", "//a", "/1a", "/a b", "/\u00e4", "/a\n", "~/a", "/{a}", "/a-b"])
 def test_topic_names_that_it_does_not(name: str) -> None:
     with pytest.raises(BagError, match="is no topic name"):
         require_topic(name)

@@ -97,9 +97,7 @@ class TestFile:
         for info in bags[name].report.topics.values():
             profiles = yaml.safe_load(info.offered_qos)
             assert isinstance(profiles, list)
-            assert [(p["history"], p["depth"], p["reliability"]) for p in profiles] == [
-                ("keep_last", 10, "reliable")
-            ]
+            assert [(p["history"], p["depth"], p["reliability"]) for p in profiles] == [("keep_last", 10, "reliable")]
             assert profiles[0]["durability"] == "volatile"
 
     def test_joints_stamps_and_log_times(self, bags, name):

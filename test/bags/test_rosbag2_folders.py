@@ -59,15 +59,11 @@ def test_folders_of_another_writer(bag: Path, tmp_path: Path, rows: Rows, mode: 
         writer.set_compression(kind, rosbag2.CompressionFormat.ZSTD)
     with writer:
         topics = inspect(bag).topics
-        connections = {
-            t: writer.add_connection(t, i.type, typestore=store) for t, i in topics.items()
-        }
+        connections = {t: writer.add_connection(t, i.type, typestore=store) for t, i in topics.items()}
         for m in messages:
             writer.write(connections[m.topic], m.log_time, m.data)
     found = list(read_messages(folder, order="file"))
-    assert [(m.topic, m.log_time, m.data) for m in found] == [
-        (m.topic, m.log_time, m.data) for m in messages
-    ]
+    assert [(m.topic, m.log_time, m.data) for m in found] == [(m.topic, m.log_time, m.data) for m in messages]
     assert [repr(m.message) for m in found] == [repr(m.message) for m in messages]
 
 
@@ -127,9 +123,7 @@ def test_sqlite_is_refused_with_the_command_that_converts_it(bag: Path, tmp_path
         ({"message_count": "many"}, "message_count is 'many'"),
     ],
 )
-def test_metadata_are_checked(
-    bag: Path, tmp_path: Path, changes: dict[str, Any], text: str
-) -> None:
+def test_metadata_are_checked(bag: Path, tmp_path: Path, changes: dict[str, Any], text: str) -> None:
     folder = make_folder(tmp_path / "rec", bag, splits=1)
     describe(folder, ["rec_0.mcap"], 72, **changes)
     with pytest.raises(BagError, match=text) as caught:

@@ -25,9 +25,17 @@ FLAGS = "-std=gnu99", "-O3", "-march=native", "-fPIC", "-shared"
 STATES, CHUNK, ROUNDS = 2000, 100, 9
 HERE = Path(__file__).parent
 ROBOTS = (
-    "stewart", "delta", "delta_cu", "prru", "upr_rpu", "five_bar", "rps3", "linear_delta",
-    str(HERE / "ankle.yaml"), str(HERE / "skew3.yaml"),
-)  # fmt: skip
+    "stewart",
+    "delta",
+    "delta_cu",
+    "prru",
+    "upr_rpu",
+    "five_bar",
+    "rps3",
+    "linear_delta",
+    str(HERE / "ankle.yaml"),
+    str(HERE / "skew3.yaml"),
+)
 CALLS = {
     "torques": ("q", "qd", "qdd", "wrench", "tau"),
     "inverse": ("pose", "tau"),
@@ -82,8 +90,7 @@ def build(robot, folder):
         words = [f"{a} + {own[a]} * i" if a in own else a for a in arguments[name]]
         parts.append(TIMED % (name, call.format(", ".join(words))))
     if form is not None:
-        parts.append("int textbook_one(const double *pose, double *q)\n{\n"
-                     "    return textbook(pose, q);\n}\n")  # fmt: skip
+        parts.append("int textbook_one(const double *pose, double *q)\n{\n    return textbook(pose, q);\n}\n")
     for file, text in c_package(robot).items():
         (folder / file).write_text(text)
     (folder / "loop.c").write_text("".join(parts))
@@ -144,10 +151,7 @@ def measure(robots, folder):
         for name, call in timed.items():
             own = units = 0.0
             for chunk in chunks:
-                pairs = [
-                    (run(unit_call, unit_states, chunk), run(call, states, chunk))
-                    for _ in range(ROUNDS)
-                ]
+                pairs = [(run(unit_call, unit_states, chunk), run(call, states, chunk)) for _ in range(ROUNDS)]
                 least = np.min(pairs, axis=0)
                 units, own = units + least[0], own + least[1]
             found[robot.name][name] = own / units
@@ -160,8 +164,7 @@ def main(arguments):
     robots = [load(name) for name in (arguments or ROBOTS)]
     with tempfile.TemporaryDirectory() as folder:
         found, unit = measure(robots, Path(folder))
-    names = ["inverse", "textbook", "torques_at_pose", "torques", "forward", "mass_matrix",
-             "accelerations"]  # fmt: skip
+    names = ["inverse", "textbook", "torques_at_pose", "torques", "forward", "mass_matrix", "accelerations"]
     lines = [
         f"Exported C, `gcc -O3 -march=native`, {STATES:,} states over the whole joint range, in "
         f"units of a Delta's `_torques` ({unit:.0f} ns) in the same process; the least of {ROUNDS} "

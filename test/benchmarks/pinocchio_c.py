@@ -35,9 +35,11 @@ RATES = np.sqrt([2.0, 3.0, 5.0, 7.0, 11.0, 13.0])
 """Of the joints, Hz: no two have a common multiple, so a long motion fills its box."""
 FLAGS = "-O3", "-march=native", "-DNDEBUG", "-w"
 DEFINED = (
-    "-DBOOST_MPL_LIMIT_LIST_SIZE=30", "-DBOOST_MPL_LIMIT_VECTOR_SIZE=30",
-    "-DBOOST_MPL_CFG_NO_PREPROCESSED_HEADERS", "-DBOOST_FUSION_INVOKE_MAX_ARITY=12",
-)  # fmt: skip
+    "-DBOOST_MPL_LIMIT_LIST_SIZE=30",
+    "-DBOOST_MPL_LIMIT_VECTOR_SIZE=30",
+    "-DBOOST_MPL_CFG_NO_PREPROCESSED_HEADERS",
+    "-DBOOST_FUSION_INVOKE_MAX_ARITY=12",
+)
 """As Pinocchio's own build has it."""
 HERE = Path(__file__).parent
 HEAD = "| robot | joints of the tree |"
@@ -146,8 +148,11 @@ def measured(name, folder, program, count=SAMPLES, part=0.3, rounds=ROUNDS):
     subprocess.run(command, cwd=folder, check=True)
     done = subprocess.run(
         [str(program), "machine.txt", "./pkm.so", prefix, str(rounds)],
-        cwd=folder, check=True, capture_output=True, text=True,
-    )  # fmt: skip
+        cwd=folder,
+        check=True,
+        capture_output=True,
+        text=True,
+    )
     return [float(word) for word in done.stdout.split()]
 
 
@@ -156,9 +161,17 @@ def compiled(folder):
     include = Path(pinocchio.__file__).parents[4] / "include"
     program = folder / "compare"
     command = [
-        "g++", "-std=c++17", *FLAGS, *DEFINED, f"-I{include}", "-I/usr/include/eigen3",
-        str(HERE / "pinocchio.cpp"), "-o", str(program), "-ldl",
-    ]  # fmt: skip
+        "g++",
+        "-std=c++17",
+        *FLAGS,
+        *DEFINED,
+        f"-I{include}",
+        "-I/usr/include/eigen3",
+        str(HERE / "pinocchio.cpp"),
+        "-o",
+        str(program),
+        "-ldl",
+    ]
     subprocess.run(command, check=True)
     return program
 

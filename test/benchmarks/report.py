@@ -60,10 +60,7 @@ def ratios(single):
     for robot in ("delta", "delta_cu"):
         ours = single[f"inverse_dynamics({robot})"]
         bare = single[f"Pinocchio, bare rnea of the tree ({robot})"]
-        lines.append(
-            f"| Pinocchio's bare `rnea` of the tree, over `inverse_dynamics` ({robot}) "
-            f"| {bare / ours:.1f} |"
-        )
+        lines.append(f"| Pinocchio's bare `rnea` of the tree, over `inverse_dynamics` ({robot}) | {bare / ours:.1f} |")
     return lines
 
 
@@ -93,15 +90,9 @@ def round_trip(trip):
     missed = []
     for name, f in trip["figures"].items():
         beside = ", ".join(f"{x:.2f}" for x in trip["ratios"].get(name, {}).values())
-        lines.append(
-            f"| {name} | {beside} | {f['p50_us']:.0f} | {f['p99_us']:.0f} | {f['cpu_us']:.0f} |"
-        )
+        lines.append(f"| {name} | {beside} | {f['p50_us']:.0f} | {f['p99_us']:.0f} | {f['cpu_us']:.0f} |")
         bounds = dict(zip(trip["ratios"].get(name, {}), BOUNDS, strict=False))
-        missed += [
-            f"{what} of {name}"
-            for what, most in bounds.items()
-            if trip["ratios"][name][what] > most
-        ]
+        missed += [f"{what} of {name}" for what, most in bounds.items() if trip["ratios"][name][what] > most]
     told = "The targets of the ratios are 1.10, 1.2 and 1.2; " + (
         f"not met: {', '.join(missed)}." if missed else "all are met."
     )

@@ -93,14 +93,10 @@ class Client:
         self.answered[name] = message.header.stamp.sec, message.header.stamp.nanosec
 
     def matched(self, name):
-        return self.publishers[name].get_subscription_count() and self.node.count_publishers(
-            self._topic(name)
-        )
+        return self.publishers[name].get_subscription_count() and self.node.count_publishers(self._topic(name))
 
     def wait_for(self, name):
-        wait_until(
-            lambda: self.matched(name), lambda: self.executor.spin_once(timeout_sec=0.1), 60.0, name
-        )
+        wait_until(lambda: self.matched(name), lambda: self.executor.spin_once(timeout_sec=0.1), 60.0, name)
 
     def send(self, name):
         """The next joint state of an even motion, now; its stamp."""

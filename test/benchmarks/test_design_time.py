@@ -46,14 +46,22 @@ def test_an_optimiser_that_compiles_each_machine_finds_no_better_one(benchmark, 
     start = np.array([robot.number(number) for number in BOX])
     began = process_time()
     other = minimize(
-        asked, start, method="Nelder-Mead", bounds=list(BOX.values()),
+        asked,
+        start,
+        method="Nelder-Mead",
+        bounds=list(BOX.values()),
         options={"xatol": 1e-4, "fatol": 1e-4},
-    )  # fmt: skip
+    )
     theirs = process_time() - began
     best = found.best.quantities["peak-effort"]
     record(
-        benchmark, "design", best=best, seconds=took, others_best=float(other.fun),
-        others_seconds=theirs, compiled=counted,
-    )  # fmt: skip
+        benchmark,
+        "design",
+        best=best,
+        seconds=took,
+        others_best=float(other.fun),
+        others_seconds=theirs,
+        compiled=counted,
+    )
     assert best <= 1.005 * other.fun
     assert took < theirs / 20.0

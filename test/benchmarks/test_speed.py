@@ -122,34 +122,22 @@ def test_round_trip(benchmark, ros):
     try:
         for name in commands:
             client.wait_for(name)
-        slices = [
-            {name: client.measure(name, SECONDS, children[name].pid) for name in commands}
-            for _ in range(SLICES)
-        ]
+        slices = [{name: client.measure(name, SECONDS, children[name].pid) for name in commands} for _ in range(SLICES)]
     finally:
         stop(*children.values())
 
     # The machine is elsewhere now and then: the median of slices, each beside its own echo.
     def median(name, value, beside=None):
-        return float(
-            np.median(
-                [value(pair[name]) / (value(pair[beside]) if beside else 1) for pair in slices]
-            )
-        )
+        return float(np.median([value(pair[name]) / (value(pair[beside]) if beside else 1) for pair in slices]))
 
     values = {
         "p50_us": lambda m: float(np.percentile(m.times, 50)) * 1e6,
         "p99_us": lambda m: float(np.percentile(m.times, 99)) * 1e6,
         "cpu_us": lambda m: m.cpu / m.sent * 1e6,
     }
-    figures = {
-        name: {what: median(name, value) for what, value in values.items()} for name in commands
-    }
+    figures = {name: {what: median(name, value) for what, value in values.items()} for name in commands}
     ratios = {
-        name: {
-            what: median(name, value, name.replace("delta_dynamics", "echo"))
-            for what, value in values.items()
-        }
+        name: {what: median(name, value, name.replace("delta_dynamics", "echo")) for what, value in values.items()}
         for name in commands
         if "echo" not in name
     }
@@ -161,9 +149,7 @@ def test_a_minute_without_a_lost_message(benchmark, ros, executor):
     """Queue depth as by default. A state's age is no matter here: what is late is not lost."""
     rclpy, context, domain = ros
     client = Client(rclpy, context, [executor])
-    child = start(
-        domain, executor, [*TWIN, "-p", f"executor:={executor}", "-p", "stale_after:=60.0"]
-    )
+    child = start(domain, executor, [*TWIN, "-p", f"executor:={executor}", "-p", "stale_after:=60.0"])
     try:
         client.wait_for(executor)
         client.stream(executor, 1.0)

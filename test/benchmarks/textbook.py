@@ -163,8 +163,7 @@ def ankle(robot: Robot) -> str:
     for side in ("left", "right"):
         motor, ball = joints[f"{side}_motor"], joints[f"{side}_ball"]
         foot = joints[f"{side}_foot"].at
-        rows.append([*motor.at, *(ball.at - motor.at), *(foot - joints["roll"].at),
-                     np.sum((ball.at - foot) ** 2)])  # fmt: skip
+        rows.append([*motor.at, *(ball.at - motor.at), *(foot - joints["roll"].at), np.sum((ball.at - foot) ** 2)])
     return (
         HEAD
         + table("rod", rows)
@@ -190,6 +189,10 @@ def ankle(robot: Robot) -> str:
 
 
 TEXTBOOK: dict[str, Callable[[Robot], str]] = {
-    "stewart": hexapod, "delta": delta, "rps3": rps3, "five_bar": five_bar, "ankle": ankle,
-}  # fmt: skip
+    "stewart": hexapod,
+    "delta": delta,
+    "rps3": rps3,
+    "five_bar": five_bar,
+    "ankle": ankle,
+}
 """By the robot's name."""

@@ -50,9 +50,7 @@ def test_a_machine_is_found_that_was_not_built_as_drawn(twin: Commands, tmp_path
     # A Delta feels only the difference of its radii.
     (combination,) = data["not_observed"]
     assert set(combination) == {"geometry.base_radius", "geometry.platform_radius"}
-    assert combination["geometry.base_radius"] == pytest.approx(
-        combination["geometry.platform_radius"], rel=1e-3
-    )
+    assert combination["geometry.base_radius"] == pytest.approx(combination["geometry.platform_radius"], rel=1e-3)
     radii = [found[f"geometry.{name}_radius"]["value"] for name in ("base", "platform")]
     true = drawn["base_radius"] + SHIFTS["base_radius"] - drawn["platform_radius"]
     assert radii[0] - radii[1] == pytest.approx(true, abs=1e-4)
@@ -69,10 +67,11 @@ def test_a_machine_is_found_that_was_not_built_as_drawn(twin: Commands, tmp_path
 @pytest.mark.parametrize(
     ("scale", "different", "text"),
     [
-        (1e3, 40, "m per axis after"), (1.0, 1, "1 different ones"),
+        (1e3, 40, "m per axis after"),
+        (1.0, 1, "1 different ones"),
         (1.0, 4, "enough for 10 numbers"),
     ],
-)  # fmt: skip
+)
 def test_poses_of_no_use_are_refused(scale: float, different: int, text: str) -> None:
     robot = load("delta_cu")
     q = np.random.default_rng(1).uniform(-0.5, 0.9, (different, 3)).repeat(40 // different, 0)

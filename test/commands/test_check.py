@@ -102,9 +102,7 @@ def stuck(topic, message, time):
 
 
 # The lines of the documents check the others.
-@pytest.mark.parametrize(
-    "bag", partly_long([DELTA, MILLING, STIFFNESS], STIFFNESS), ids=lambda path: path.stem
-)
+@pytest.mark.parametrize("bag", partly_long([DELTA, MILLING, STIFFNESS], STIFFNESS), ids=lambda path: path.stem)
 def test_recordings_are_good(twin, bag):
     result, mute = twin("check", bag), bag == STIFFNESS
     assert (result.code, result.err) == (4 if mute else 0, "")
@@ -137,14 +135,15 @@ def test_a_cut_out_part_is_good(twin, sample):
         (put("name", lambda n: [n[0], *n[:2]], *ONCE), REJECTED, "arm_1"),
         (
             put("position", lambda q: [q[0], q[1] + 0.3, q[2]], 0.9995, 1.0015),
-            "position steps", "at 1.000 s",
+            "position steps",
+            "at 1.000 s",
         ),
         (other_publisher, "position steps", "two publishers interleaved, 600 and 600 samples"),
         (lost, "missing samples", "60 of 1200"),
         (put("velocity", lambda v: [-v[0], *v[1:]]), "velocities", "arm_1 200 % (wrong sign?)"),
         (stuck, "velocities", "arm_1 stands still from 0.500 s to 0.69"),
     ],
-)  # fmt: skip
+)
 def test_a_fault_is_bad_and_named(tmp_path, change, what, value):
     report = checked(rewrite(DELTA, tmp_path / "bad.mcap", change))
     item = items_of(report)[what]
@@ -285,9 +284,7 @@ class TestPrintedBounds:
 
     def test_a_bound_widened_by_noise_is_printed(self, rng):
         r, _ = planned("five_bar")
-        loud = replace(
-            r, effort=r.effort + 0.4 * np.abs(r.effort).max(0) * rng.normal(size=r.q.shape)
-        )
+        loud = replace(r, effort=r.effort + 0.4 * np.abs(r.effort).max(0) * rng.normal(size=r.q.shape))
         found = check(loud)
         seen = [i for i in found.items if str(i.text).startswith("torque residual of")]
         assert found.compared is not None and len(seen) == r.robot.joints_count
@@ -331,17 +328,18 @@ class TestPayload:
         facts = inspect(DELTA).metadata["pkm_twin"]
         untold = {k: v for k, v in facts.items() if not k.startswith("payload")}
         metadata = {"pkm_twin": untold}
-        return rewrite(
-            DELTA, tmp_path / "s.mcap", metadata=metadata, begin=7.0, seconds=3.0, topics=[JOINTS]
-        )
+        return rewrite(DELTA, tmp_path / "s.mcap", metadata=metadata, begin=7.0, seconds=3.0, topics=[JOINTS])
 
     def test_by_option(self, twin, silent):
         hint = checked(silent)
         assert hint.code == 1 and any("--payload" in cause for cause in hint.data["causes"])
         data = twin.told("check", silent, "--payload", "0.15", "--load-times", "1.275,9")
         assert data["payload"] == {
-            "mass_kg": 0.15, "com_m": None, "held_s": [[1.275, 9.0]], "source": "option",
-        }  # fmt: skip
+            "mass_kg": 0.15,
+            "com_m": None,
+            "held_s": [[1.275, 9.0]],
+            "source": "option",
+        }
         assert checked(silent, payload="0.15").code == 1
         assert checked(silent, payload="0.6", load_times="1.275,9").code == 1
 
@@ -422,9 +420,10 @@ class TestCauses:
         carried = robot.changed(payload={"mass": mass})
         held = (m.time > 2.0) & (m.time < 6.0)
         efforts = np.where(
-            held[:, None], inverse_dynamics(carried, m.q, m.qd, m.qdd),
+            held[:, None],
+            inverse_dynamics(carried, m.q, m.qd, m.qdd),
             inverse_dynamics(robot, m.q, m.qd, m.qdd),
-        )  # fmt: skip
+        )
         (text,) = self.cause(recording_of(robot, m, efforts))
         found = [float(x) for x in re.findall(r"[\d.]+(?=[, ]|$)", text.partition("--payload")[2])]
         assert found == pytest.approx([mass, 2.0, 6.0], rel=0.15)
@@ -436,9 +435,7 @@ class TestCauses:
         wrench[:, 3:] *= 0.1
         efforts = inverse_dynamics(robot, m.q, m.qd, m.qdd, wrench)
         rotation = robot.rotation(robot.forward(m.q))
-        turned = np.concatenate(
-            [np.einsum("kji,kj->ki", rotation, wrench[:, k : k + 3]) for k in (0, 3)], 1
-        )
+        turned = np.concatenate([np.einsum("kji,kj->ki", rotation, wrench[:, k : k + 3]) for k in (0, 3)], 1)
         made = recording_of(robot, m, efforts)
         assert check(replace(made, wrench=wrench), thorough=False).answer == "good"
         for given, word in ((-wrench, "opposite sign"), (turned, "axes")):

@@ -71,9 +71,7 @@ class TestTopics:
             order = [both.plain.joint_names.index(name) for name in message.name]
             back = np.argsort(order)
             message.name = [both.names[k] for k in order]
-            for field, turn in (
-                ("position", both.positions), ("velocity", both.rates), ("effort", both.efforts)
-            ):  # fmt: skip
+            for field, turn in (("position", both.positions), ("velocity", both.rates), ("effort", both.efforts)):
                 values = np.array(getattr(message, field))[back]
                 setattr(message, field, turn(values)[order].tolist())
             return message

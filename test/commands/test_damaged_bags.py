@@ -105,7 +105,9 @@ def test_only_regular_files(twin, tmp_path):
         os.mkfifo(path)
     for path, kind in ((fifos[0], "FIFO"), (fifos[1], "FIFO"), ("/dev/zero", "device")):
         for command in (
-            ("check", path), ("recover", path, tmp_path / "new.mcap"), ("play", path),
+            ("check", path),
+            ("recover", path, tmp_path / "new.mcap"),
+            ("play", path),
             ("torques", "delta", path, "--out", tmp_path / "t.csv"),
-        ):  # fmt: skip
+        ):
             assert kind in twin.refused(*command)

@@ -79,9 +79,7 @@ def test_a_budget_names_each_contribution(twin, pick):
         squares = sum(part["rms_position_m"] ** 2 for part in parts)
         assert data["rms_position_m"] == pytest.approx(np.sqrt(squares))
     machines = data["monte_carlo"]
-    assert machines["rms_position_m"] == pytest.approx(
-        machines["first_order_rms_position_m"], rel=0.15
-    )
+    assert machines["rms_position_m"] == pytest.approx(machines["first_order_rms_position_m"], rel=0.15)
 
 
 @pytest.mark.parametrize("name", ["delta", "linear_delta"])
@@ -89,8 +87,9 @@ def test_a_file_has_tolerances_of_its_parts(twin, tmp_path, name):
     path, data = tmp_path / "loose.yaml", parameters_of(name)
     actuated = load(name).joint_names
     data["tolerances"] = {
-        "joints.*.offset": {"deviation": 1e-4}, f"joints.{actuated[0]}.backlash": {"bound": 3e-4},
-    }  # fmt: skip
+        "joints.*.offset": {"deviation": 1e-4},
+        f"joints.{actuated[0]}.backlash": {"bound": 3e-4},
+    }
     path.write_text(yaml.safe_dump(data))
     asked = twin.told("design", path, "--tolerance", "file")
     given = [f"joints.{joint}.offset=1e-4" for joint in actuated]
@@ -123,10 +122,12 @@ def test_copies_that_are_off_alike_stay_so_without_limbs(twin, tmp_path):
     path, out = tmp_path / "delta.yaml", tmp_path / "graph.yaml"
     data = yaml.safe_load(Path("examples/machines/delta_graph.yaml").read_text())
     data["tolerances"] = {
-        "limbs.joints.*.offset": {"deviation": 1e-4}, "limbs.rods.*.length": {"bound": 2e-4},
-        "limbs.bodies.arm.length": {"deviation": 3e-5}, "rods.left_2.length": {"deviation": 1e-5},
+        "limbs.joints.*.offset": {"deviation": 1e-4},
+        "limbs.rods.*.length": {"bound": 2e-4},
+        "limbs.bodies.arm.length": {"deviation": 3e-5},
+        "rods.left_2.length": {"deviation": 1e-5},
         "limbs.joints.motor.at[0]": {"deviation": 1e-4},
-    }  # fmt: skip
+    }
     path.write_text(yaml.safe_dump(data))
     assert "tolerances of limbs.joints.motor.at[0]" in twin.good("convert", path, "--out", out).out
     del data["tolerances"]["limbs.joints.motor.at[0]"]
@@ -137,9 +138,7 @@ def test_copies_that_are_off_alike_stay_so_without_limbs(twin, tmp_path):
     assert len(after["contributions"]) == len(before["contributions"]) == 5
     one = "joints.motor_1.offset,-joints.motor_2.offset=1e-4"
     other = "joints.motor_1.offset,joints.motor_2.offset=1e-4"
-    ways = [
-        twin.told("design", out, "--tolerance", text)["rms_position_m"] for text in (one, other)
-    ]
+    ways = [twin.told("design", out, "--tolerance", text)["rms_position_m"] for text in (one, other)]
     assert ways[0] != pytest.approx(ways[1], rel=0.1)
     bad = "joints.motor_1.offset,rods.left_1.length=1e-4"
     assert "rods.left_1.length" in twin.refused("design", out, "--tolerance", bad, code=2)

@@ -105,9 +105,7 @@ def tree():
     return app
 
 
-@pytest.mark.parametrize(
-    ("page", "line"), [pair for pair in commands() if pair[1].startswith(PROGRAMS[0])]
-)
+@pytest.mark.parametrize(("page", "line"), [pair for pair in commands() if pair[1].startswith(PROGRAMS[0])])
 def test_it_parses_as_it_stands(tree, page, line):
     """Every word is an argument or option of the command, with a value of its type."""
     words = shlex.split(line)[1:]

@@ -34,11 +34,7 @@ def run(tmp_path_factory):
     """Run ``pkm-twin`` where the page's package is installed."""
     pytest.importorskip("pip")
     folder = tmp_path_factory.mktemp("extensions")
-    blocks = dict(
-        re.findall(
-            r"^```(toml|python)\n(.*?)^```", PAGE.split("## Your own command")[1], re.M | re.S
-        )
-    )
+    blocks = dict(re.findall(r"^```(toml|python)\n(.*?)^```", PAGE.split("## Your own command")[1], re.M | re.S))
     (folder / "my_tools.py").write_text(blocks["python"], encoding="utf-8")
     points = blocks["toml"].replace('commands"]\n', 'commands"]' + BROKEN)
     (folder / "pyproject.toml").write_text(PROJECT + points, encoding="utf-8")
@@ -51,8 +47,11 @@ def run(tmp_path_factory):
     def call(*words):
         done = subprocess.run(
             [sys.executable, "-m", "pkm_twin.apps.cli", *words],
-            capture_output=True, text=True, cwd=folder, env=os.environ | {"PYTHONPATH": paths},
-        )  # fmt: skip
+            capture_output=True,
+            text=True,
+            cwd=folder,
+            env=os.environ | {"PYTHONPATH": paths},
+        )
         return Result(done.returncode, done.stdout, done.stderr)
 
     return call

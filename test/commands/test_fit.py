@@ -61,9 +61,19 @@ def test_fit_of_a_recorded_bag_finds_the_payload(twin, tmp_path):
     bag = rewrite(DELTA, tmp_path / "held.mcap", seconds=8.0, begin=6.5)
     out = tmp_path / "fitted.yaml"
     data = twin.told(
-        "fit", "delta_cu", bag, "--what", "payload", "--payload", "0", "--load-times", "1.775,8",
-        "--out", out, "--no-report",
-    )  # fmt: skip
+        "fit",
+        "delta_cu",
+        bag,
+        "--what",
+        "payload",
+        "--payload",
+        "0",
+        "--load-times",
+        "1.775,8",
+        "--out",
+        out,
+        "--no-report",
+    )
     found = {p["key"]: p for p in data["parameters"]}
     mass = found["payload.mass"]
     assert mass["value"] == pytest.approx(0.15, rel=0.01)
@@ -93,17 +103,22 @@ def test_refusals(twin, tmp_path, monkeypatch, arguments, text):
 def test_excite_writes_a_trajectory_within_the_limits_that_rests_at_both_ends(twin, tmp_path):
     out = tmp_path / "excite.mcap"
     data = twin.told(
-        "excite", "delta_cu", "--trials", "20", "--compare", DELTA, "--acceleration", "60",
-        "--out", out,
-    )  # fmt: skip
+        "excite",
+        "delta_cu",
+        "--trials",
+        "20",
+        "--compare",
+        DELTA,
+        "--acceleration",
+        "60",
+        "--out",
+        out,
+    )
     assert 1.0 < data["condition"] < data["condition_compared"]
     (message,) = open_bag(out).messages()
     points = message.message.points
     robot = load("delta_cu")
-    q, qd, qdd = (
-        np.array([list(getattr(p, k)) for p in points])
-        for k in ("positions", "velocities", "accelerations")
-    )
+    q, qd, qdd = (np.array([list(getattr(p, k)) for p in points]) for k in ("positions", "velocities", "accelerations"))
     assert list(message.message.joint_names) == list(robot.joint_names)
     for end in (0, -1):
         assert np.abs(qd[end]).max() < 1e-9
@@ -173,16 +188,12 @@ def test_copies_that_would_lose_elastic_members_are_refused_by_name(twin, tmp_pa
         ("time", lambda v: v * 1e-300, "time: '0.0, then "),
         LONG("time", lambda v: v * 1e300, "1e+06 s in all"),
         ("effort", lambda v: v * 1e3, "times what the robot's file makes of the motion: units?"),
-        LONG(
-            "effort", lambda v: v * 1e-3, "times what the robot's file makes of the motion: units?"
-        ),
+        LONG("effort", lambda v: v * 1e-3, "times what the robot's file makes of the motion: units?"),
         ("effort", lambda v: v * 1e-300, "nothing was measured"),
         ("position", lambda v: v + 3.0, "--beyond-limits"),
     ],
 )
-def test_numbers_that_are_no_recording_of_this_machine(
-    twin, tmp_path, monkeypatch, column, how, text
-):
+def test_numbers_that_are_no_recording_of_this_machine(twin, tmp_path, monkeypatch, column, how, text):
     monkeypatch.chdir(tmp_path)
     columns = read_columns(table(tmp_path / "plain.csv", load("five_bar"), 3.0))
     for name, values in columns.items():

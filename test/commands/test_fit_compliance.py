@@ -41,9 +41,7 @@ def test_fit_of_the_recorded_bag_writes_a_robot_with_a_softer_joint_and_a_report
     apart = {tuple(group["elements"]): group["known"] for group in data["not_told_apart"]}
     (known,) = apart["3R", "3U"]
     weights = known["weights"]
-    assert abs(known["value"] - weights["3R"] - 3.0 * weights["3U"]) < (
-        3.0 * known["standard_deviation"]
-    )
+    assert abs(known["value"] - weights["3R"] - 3.0 * weights["3U"]) < (3.0 * known["standard_deviation"])
     (held,) = data["held_out"]
     before, after = (held[f"residual_rms_{k}_m_m_m_rad_rad_rad"] for k in ("before", "after"))
     assert before[3] > 2.0 * after[3]
@@ -51,9 +49,7 @@ def test_fit_of_the_recorded_bag_writes_a_robot_with_a_softer_joint_and_a_report
     fitted, pose = load(str(out)), [-0.6, 0.0, 0.0]
     expected = load("upr_rpu").changed(element_compliance={"3U": 3.0})
     assert fitted.element_compliance["3U"] == pytest.approx(3.0, abs=0.7)
-    np.testing.assert_allclose(
-        np.diag(compliance(fitted, pose)), np.diag(compliance(expected, pose)), rtol=0.03
-    )
+    np.testing.assert_allclose(np.diag(compliance(fitted, pose)), np.diag(compliance(expected, pose)), rtol=0.03)
     text = out.read_text()
     assert "element_compliance.3U: fitted from upr_rpu_soft_joint.mcap, +- " in text
     assert "# Loads do not distinguish 3R and 3U" in text
@@ -69,9 +65,7 @@ def test_fit_of_a_table_with_three_gauges_says_what_it_found(twin, tmp_path, mon
     done = twin.good("fit", "upr_rpu", path, "--what", "compliance", "--no-report")
     assert "do not distinguish" in done.out
     assert "static.csv, dz" in done.out and "static.csv, rx" not in done.out
-    assert load(str(tmp_path / "fitted.yaml")).element_compliance["1B"] == pytest.approx(
-        1.0, abs=0.36
-    )
+    assert load(str(tmp_path / "fitted.yaml")).element_compliance["1B"] == pytest.approx(1.0, abs=0.36)
 
 
 @pytest.fixture
@@ -174,9 +168,7 @@ def test_a_deflection_type_without_its_fields(twin, tmp_path, monkeypatch):
         for topic, kind in topics.items():
             package = "sensor_msgs" if kind == "JointState" else "geometry_msgs"
             bag.add_topic(topic, f"{package}/msg/{kind}")
-        bag.add_topic(
-            "/measured_deflection", "geometry_msgs/msg/TransformStamped", definition="float64 x"
-        )
+        bag.add_topic("/measured_deflection", "geometry_msgs/msg/TransformStamped", definition="float64 x")
         for k, message in enumerate(open_bag(SOFT).messages(list(topics))):
             if k == 100:
                 break

@@ -65,14 +65,10 @@ def run(capsys, tmp_path, monkeypatch):
 def test_words_become_values(run):
     run("cart", "-3", "--balance", "3", "--at", "-1,2e-3", "--how", "slow", "4")
     (given,) = SEEN
-    assert given == Weigh(
-        robot="cart", times=(-3, 4), scale=3.0, at=(-1.0, 0.002), how="slow"
-    )  # fmt: skip
+    assert given == Weigh(robot="cart", times=(-3, 4), scale=3.0, at=(-1.0, 0.002), how="slow")
     run("cart", "--out", "-1.csv", "--no-picture")
     assert SEEN[0].out == Path("-1.csv")
-    for wrong in (
-        ("--scale", "9"), ("--scale", "nan"), ("--at", "1"), ("--how", "well"), ("-4", "9" * 400)
-    ):  # fmt: skip
+    for wrong in (("--scale", "9"), ("--scale", "nan"), ("--at", "1"), ("--how", "well"), ("-4", "9" * 400)):
         with pytest.raises(Exception, match=wrong[1]):
             run("cart", *wrong)
         assert not SEEN
@@ -94,16 +90,22 @@ def test_json_has_the_facts_with_units_and_the_terminal_the_answer_first(run):
     code, out = run("cart", "--json", "--bad")
     assert code == 1
     assert json.loads(out) == {
-        "mass": 2.0, "lost": None, "verdict": "bad", "picture": None, "pictures": [],
+        "mass": 2.0,
+        "lost": None,
+        "verdict": "bad",
+        "picture": None,
+        "pictures": [],
         "parts": {"arm": {"mass": 1.5, "length": 0.25}, "rod": {"mass": 0.5, "length": None}},
         "units": {"mass": "kg", "parts.mass": "kg", "parts.length": "m"},
-    }  # fmt: skip
+    }
     code, out = run("cart")
     lines = out.splitlines()
     assert (code, lines[:2]) == (0, ["2 kg", "mass: 2 kg"])
     assert [line.split() for line in lines[3:]] == [
-        ["mass", "(kg)", "long", "(mm)"], ["arm", "1.5", "250"], ["rod", "0.5", "-"]
-    ]  # fmt: skip
+        ["mass", "(kg)", "long", "(mm)"],
+        ["arm", "1.5", "250"],
+        ["rod", "0.5", "-"],
+    ]
 
 
 def test_a_wide_table_may_have_a_column_that_is_blank():

@@ -52,10 +52,13 @@ def test_an_older_name_runs_the_same_command(twin):
 
 
 LINES = {
-    "pkm-twin inf": "info", "pkm-twin --vers": "--version", "pkm-twin map delta comp": "compliance",
-    "pkm-twin atlas x comp": "compliance", "pkm-twin info delta --plat": "--platform",
+    "pkm-twin inf": "info",
+    "pkm-twin --vers": "--version",
+    "pkm-twin map delta comp": "compliance",
+    "pkm-twin atlas x comp": "compliance",
+    "pkm-twin info delta --plat": "--platform",
     "pkm-twin export fmu delta --kind to": "torques",
-}  # fmt: skip
+}
 
 
 def test_words_are_completed_in_bash_by_the_line_of_the_help(tmp_path, twin):
@@ -71,6 +74,8 @@ def test_words_are_completed_in_bash_by_the_line_of_the_help(tmp_path, twin):
         typed = f"COMP_WORDS=({line}); COMP_CWORD={count}; _pkm_twin_completion pkm-twin"
         done = subprocess.run(
             ["bash", "-c", f'set -u; {source}; {typed}; echo "${{COMPREPLY[@]}}"'],
-            env=os.environ | root, capture_output=True, text=True,
-        )  # fmt: skip
+            env=os.environ | root,
+            capture_output=True,
+            text=True,
+        )
         assert done.stdout.split() == [word], done.stderr

@@ -72,9 +72,7 @@ try:
 except KeyboardInterrupt:
     print("caught")
 """
-    done = subprocess.run(
-        [sys.executable, "-c", script], env=environment(), capture_output=True, text=True
-    )
+    done = subprocess.run([sys.executable, "-c", script], env=environment(), capture_output=True, text=True)
     assert (done.returncode, done.stdout, done.stderr) == (0, "caught\n", "")
 
 

@@ -79,9 +79,18 @@ def test_loads_in_blocks_are_those_of_the_whole(twin, tmp_path, monkeypatch):
         monkeypatch.setattr("pkm_twin.paths.joint_loads.SAMPLES_PER_BLOCK", block)
         out = tmp_path / f"{block}.csv"
         data = twin.told(
-            "loads", "five_bar", path(robot, tmp_path), "--bearings", tmp_path / "bearings.yaml",
-            "--out", out, "--payload", "0.2", "--load-times", "0.2,0.5",
-        )  # fmt: skip
+            "loads",
+            "five_bar",
+            path(robot, tmp_path),
+            "--bearings",
+            tmp_path / "bearings.yaml",
+            "--out",
+            out,
+            "--payload",
+            "0.2",
+            "--load-times",
+            "0.2,0.5",
+        )
         results.append((data["joints"], out.read_text()))
     (whole, table), (parts, again) = results
     assert table == again
@@ -166,9 +175,18 @@ def test_loads_of_a_path(name, twin, tmp_path, monkeypatch):
     joint = reactions(robot, robot.graph.home, *np.zeros((2, robot.joints_count))).names[-1]
     (tmp_path / "bearings.yaml").write_text(f"bearings: {{'{joint}': {{C: 5000}}}}")
     data = twin.told(
-        "loads", name, path(robot, tmp_path), "--bearings", "bearings.yaml", "--out", "a.csv",
-        "--spectrum", "s.csv", "--picture", "a.png",
-    )  # fmt: skip
+        "loads",
+        name,
+        path(robot, tmp_path),
+        "--bearings",
+        "bearings.yaml",
+        "--out",
+        "a.csv",
+        "--spectrum",
+        "s.csv",
+        "--picture",
+        "a.png",
+    )
     told, table = data["joints"], read_columns(tmp_path / "a.csv")
     force = np.stack([table[f"{joint}.f{axis}"] for axis in "xyz"], -1)
     peak = np.linalg.norm(force, axis=1).max()

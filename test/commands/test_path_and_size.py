@@ -40,9 +40,7 @@ def test_a_cycle_as_a_table_that_torques_reads(twin, tmp_path):
     data = twin.told(*CYCLE, "--out", out)
     assert out.with_suffix(".png").read_bytes()[:4] == b"\x89PNG"
     robot = load("delta")
-    assert data["duration_s"] == pytest.approx(
-        fastest(robot, cycle(robot, 0.025, 0.305, 0.025)).duration
-    )
+    assert data["duration_s"] == pytest.approx(fastest(robot, cycle(robot, 0.025, 0.305, 0.025)).duration)
     assert data["length_m"] == pytest.approx(0.71)
     ends = [limit["to_s"] for limit in data["limits"]]
     assert ends == sorted(ends)
@@ -154,9 +152,7 @@ def test_a_cycle_as_a_trajectory_that_size_reads(twin, tmp_path, geared):
     assert min(other["difference_from_model"]) > 0.05
     again = tmp_path / "torques.csv"
     twin.good("torques", "delta", out, "--out", again, "--no-picture")
-    np.testing.assert_allclose(
-        joined(read_columns(again), robot, "effort"), motion.effort, atol=1e-6
-    )
+    np.testing.assert_allclose(joined(read_columns(again), robot, "effort"), motion.effort, atol=1e-6)
     peak = result["drives"]["arm_1"]["joint"]["peak_effort_N_m"]
     assert peak == pytest.approx(np.abs(motion.effort[:, 0]).max())
 
@@ -169,16 +165,12 @@ def test_sizes_are_a_readers_own_sums(twin, tmp_path, geared):
     assert picture.read_bytes()[:4] == b"\x89PNG"
     robot, columns = load(geared), read_columns(out)
     t = columns["time"]
-    q, qd, qdd, tau = (
-        joined(columns, robot, word) for word in ("position", "velocity", "acceleration", "effort")
-    )
+    q, qd, qdd, tau = (joined(columns, robot, word) for word in ("position", "velocity", "acceleration", "effort"))
     whole = t[-1] - t[0]
     for i, joint in enumerate(robot.joint_names):
         side = result["drives"][joint]["joint"]
         power = tau[:, i] * qd[:, i]
-        assert side["rms_effort_N_m"] == pytest.approx(
-            np.sqrt(trapezoid(tau[:, i] ** 2, t) / whole)
-        )
+        assert side["rms_effort_N_m"] == pytest.approx(np.sqrt(trapezoid(tau[:, i] ** 2, t) / whole))
         assert side["peak_speed_rad_s"] == pytest.approx(np.abs(qd[:, i]).max())
         assert side["peak_power_W"] == pytest.approx(power.max())
         assert side["peak_regenerated_power_W"] == pytest.approx(-power.min())
@@ -209,9 +201,8 @@ def test_sizes_are_a_readers_own_sums(twin, tmp_path, geared):
 
 @pytest.mark.parametrize(
     ("name", "motion", "option"),
-    [("five_bar", ("--cycle", "30,100"), {"ratio": 10.0}),
-     ("linear_delta", ("--cycle", "20,80"), {"lead": 0.04})],
-)  # fmt: skip
+    [("five_bar", ("--cycle", "30,100"), {"ratio": 10.0}), ("linear_delta", ("--cycle", "20,80"), {"lead": 0.04})],
+)
 def test_a_gear_on_the_command_line_is_the_files_drive(twin, tmp_path, name, motion, option):
     data, share = parameters_of(name), 0.9
     section = data["joints"] if name == "five_bar" else data["limbs"]["joints"]
@@ -245,9 +236,7 @@ def test_a_gear_on_the_command_line_is_the_files_drive(twin, tmp_path, name, mot
 def motor_side(columns, robot, i, rotor, ratio, motor, share):
     """A reader's own motor: torque and speed of a ratio, and the greatest used part."""
     t = columns["time"]
-    qd, qdd, tau = (
-        joined(columns, robot, word)[:, i] for word in ("velocity", "acceleration", "effort")
-    )
+    qd, qdd, tau = (joined(columns, robot, word)[:, i] for word in ("velocity", "acceleration", "effort"))
     load = tau - rotor * qdd
     shaft = np.where(load * qd < 0, load * share / ratio, load / (ratio * share))
     torque, speed = motor["inertia"] * ratio * qdd + shaft, ratio * qd
@@ -262,8 +251,7 @@ def motor_side(columns, robot, i, rotor, ratio, motor, share):
 def test_the_ratio_is_that_of_a_search_by_brute_force(twin, tmp_path, geared):
     """All ratios of a fine grid, for each motor: of one drive, and of all drives alike."""
     out, drives = tmp_path / "cycle.csv", tmp_path / "drives.yaml"
-    twin.good("path", geared, "--cycle", "25,200,25", "--duration", "0.5", "--out", out,
-              "--no-picture")  # fmt: skip
+    twin.good("path", geared, "--cycle", "25,200,25", "--duration", "0.5", "--out", out, "--no-picture")
     base = {"rated_speed": 3000.0, "max_speed": 5000.0}
     motors = {
         "small": {"inertia": 4e-6, "continuous_torque": 0.12, "peak_torque": 0.4, **base},
@@ -276,17 +264,14 @@ def test_the_ratio_is_that_of_a_search_by_brute_force(twin, tmp_path, geared):
     rotor, share = GEAR["inertia"] * GEAR["ratio"] ** 2, GEAR["efficiency"]
     ratios, names = np.arange(5.0, 80.001, 0.25), robot.joint_names
     used = {
-        name: np.array([[motor_side(columns, robot, i, rotor, n, motor, share)[2] for n in ratios]
-                        for i in range(3)])
+        name: np.array([[motor_side(columns, robot, i, rotor, n, motor, share)[2] for n in ratios] for i in range(3)])
         for name, motor in motors.items()
-    }  # fmt: skip
+    }
     for i, joint in enumerate(names):
         for entry in data["drives"][joint]["drives"]:
             name = entry["motor"]
             best = used[name][i].min()
-            torque, rms, own = motor_side(
-                columns, robot, i, rotor, entry["ratio"], motors[name], share
-            )
+            torque, rms, own = motor_side(columns, robot, i, rotor, entry["ratio"], motors[name], share)
             assert own <= best * (1 + 1e-9) and own >= 0.98 * best
             assert entry["good"] == (own <= 1.0)
             assert entry["rms_torque_N_m"] == pytest.approx(rms)
@@ -312,13 +297,25 @@ def test_the_ratio_is_that_of_a_search_by_brute_force(twin, tmp_path, geared):
 def test_listed_gears_have_inertia_limits_and_cost(twin, tmp_path, geared):
     out, drives = tmp_path / "cycle.csv", tmp_path / "drives.yaml"
     twin.good("path", geared, "--cycle", "25,200", "--out", out, "--no-picture")
-    motor = {"inertia": 1.73e-5, "continuous_torque": 9.0, "peak_torque": 9.0, "cost": 100.0,
-             "rated_speed": 3000.0, "max_speed": 9000.0}  # fmt: skip
+    motor = {
+        "inertia": 1.73e-5,
+        "continuous_torque": 9.0,
+        "peak_torque": 9.0,
+        "cost": 100.0,
+        "rated_speed": 3000.0,
+        "max_speed": 9000.0,
+    }
     gears = {
         "weak": {"ratio": 20.0, "peak_torque": 1.0},
-        "tight": {"ratio": 10.0, "inertia": 4e-5, "efficiency": 0.8, "continuous_torque": 50.0,
-                  "backlash": 3e-4, "cost": 40.0},
-    }  # fmt: skip
+        "tight": {
+            "ratio": 10.0,
+            "inertia": 4e-5,
+            "efficiency": 0.8,
+            "continuous_torque": 50.0,
+            "backlash": 3e-4,
+            "cost": 40.0,
+        },
+    }
     text = yaml.safe_dump({"drives": {"one": motor}, "gears": gears})
     drives.write_text(text.replace("4.0e-05", "4e-5"))
     data = twin.told("size", geared, out, "--drives", drives)
@@ -330,9 +327,7 @@ def test_listed_gears_have_inertia_limits_and_cost(twin, tmp_path, geared):
     assert (entry["gear"], entry["cost"], entry["backlash"]) == ("tight", 140.0, 3e-4)
     qdd, tau = (joined(columns, robot, word)[:, 1] for word in ("acceleration", "effort"))
     t, through = columns["time"], tau - rotor * qdd
-    assert entry["used_gear_torque"] == pytest.approx(
-        np.sqrt(trapezoid(through**2, t) / (t[-1] - t[0])) / 50.0
-    )
+    assert entry["used_gear_torque"] == pytest.approx(np.sqrt(trapezoid(through**2, t) / (t[-1] - t[0])) / 50.0)
     seen = data["drives"]["arm_2"]["load_inertia_kg_m2"][1] / 100.0 + 4e-5
     assert entry["inertia_ratio"] == pytest.approx(seen / 1.73e-5)
     gears.pop("tight")
@@ -348,10 +343,16 @@ def test_listed_gears_have_inertia_limits_and_cost(twin, tmp_path, geared):
 def test_a_motor_is_limited_by_its_curve(twin, tmp_path, geared):
     out, drives = tmp_path / "cycle.csv", tmp_path / "drives.yaml"
     twin.good("path", geared, "--cycle", "25,200", "--out", out, "--no-picture")
-    motor = {"inertia": 1.73e-5, "continuous_torque": 9.0, "peak_torque": 9.0,
-             "rated_speed": 3000.0, "max_speed": 5000.0}  # fmt: skip
-    drives.write_text(yaml.safe_dump({"drives": {"flat": motor, "slow": {
-        **motor, "curve": [[0.0, 9.0], [200.0, 9.0]]}}}))  # fmt: skip
+    motor = {
+        "inertia": 1.73e-5,
+        "continuous_torque": 9.0,
+        "peak_torque": 9.0,
+        "rated_speed": 3000.0,
+        "max_speed": 5000.0,
+    }
+    drives.write_text(
+        yaml.safe_dump({"drives": {"flat": motor, "slow": {**motor, "curve": [[0.0, 9.0], [200.0, 9.0]]}}})
+    )
     result = twin.told("size", geared, out, "--drives", drives)
     flat, slow = result["drives"]["arm_1"]["drives"]
     assert flat["good"]
@@ -359,9 +360,18 @@ def test_a_motor_is_limited_by_its_curve(twin, tmp_path, geared):
     assert slow["used_speed"] > 1.0
     (one,) = read_motors(drives, ["flat"]).values()
     fit = Fit(
-        "flat", one, Gear(ratio=1.0), torque=np.inf, thermal=0.5, speed=1.2, geared=0.0,
-        inertia_ratio=1.0, rms=1.0, torques=np.ones(2), speeds=np.ones(2),
-    )  # fmt: skip
+        "flat",
+        one,
+        Gear(ratio=1.0),
+        torque=np.inf,
+        thermal=0.5,
+        speed=1.2,
+        geared=0.0,
+        inertia_ratio=1.0,
+        rms=1.0,
+        torques=np.ones(2),
+        speeds=np.ones(2),
+    )
     assert fit.answer == "too slow" and replace(fit, thermal=1.1).answer == "too small and too slow"
     assert [replace(fit, speed=0.9, torque=t).answer for t in (0.9, 1.1)] == ["fits", "too small"]
     text = twin.good("size", geared, out, "--drives", drives).out
@@ -388,8 +398,13 @@ def test_a_motor_is_limited_by_its_curve(twin, tmp_path, geared):
     ],
 )
 def test_a_motor_that_cannot_be_is_rejected_by_its_field(tmp_path, change):
-    motor = {"inertia": 1.73e-5, "continuous_torque": 6.0, "peak_torque": 9.0,
-             "rated_speed": 3000.0, "max_speed": 5000.0}  # fmt: skip
+    motor = {
+        "inertia": 1.73e-5,
+        "continuous_torque": 6.0,
+        "peak_torque": 9.0,
+        "rated_speed": 3000.0,
+        "max_speed": 5000.0,
+    }
     path = tmp_path / "drives.yaml"
     path.write_text(yaml.safe_dump({"drives": {"one": motor}}))
     assert len(read_motors(path)) == 1
@@ -412,9 +427,7 @@ def test_efforts_that_no_drive_has_are_rejected(twin, tmp_path, column):
 
 
 def test_a_recording_is_sized_by_its_measured_efforts(twin, sample):
-    measured, model = (
-        twin.told("size", "delta_cu", sample, "--efforts", what) for what in ("file", "model")
-    )
+    measured, model = (twin.told("size", "delta_cu", sample, "--efforts", what) for what in ("file", "model"))
     for joint in measured["drives"]:
         one, other = (r["drives"][joint]["joint"]["rms_effort_N_m"] for r in (measured, model))
         assert one == pytest.approx(other, rel=0.05)
@@ -449,10 +462,7 @@ def test_the_worst_of_the_workspace_is_that_of_many_tries(twin, name):
 def test_the_workspace_ends_before_a_limb_is_stretched(twin):
     """A drive's lever, 0 where arm and forearm lie in line, is at most the arm's length."""
     name, speed = "examples/machines/delta_1130.yaml", 2.0
-    kept, all_ = (
-        twin.told("size", name, "--over-workspace", f"{speed},50", "--lever", least)
-        for least in (0.4, 0.0)
-    )
+    kept, all_ = (twin.told("size", name, "--over-workspace", f"{speed},50", "--lever", least) for least in (0.4, 0.0))
     assert kept["least_lever"] == 0.4
     robot, length = load(REPOSITORY / name), 0.35
     for data, bounded in ((kept, True), (all_, False)):
@@ -558,10 +568,13 @@ def test_what_is_no_path_is_one_line(twin, tmp_path, text, options):
 
 def test_a_command_line_needs_one_path(twin, tmp_path):
     for words in (
-        "path delta", "path delta --cycle 0.025,0.305", "path delta --cycle 25,305 --circle 0.1",
+        "path delta",
+        "path delta --cycle 0.025,0.305",
+        "path delta --cycle 25,305 --circle 0.1",
         "path delta --circle 0.1 --direction 45",
-        "path delta --cycle 25,305 --effort 1,2", "size delta",
-    ):  # fmt: skip
+        "path delta --cycle 25,305 --effort 1,2",
+        "size delta",
+    ):
         twin.good(*words.split(), code=2)
 
 
@@ -651,6 +664,4 @@ def test_a_closed_cycle_without_friction_takes_no_energy(twin, tmp_path, fast):
     # It goes there and back alike, so that no drive takes energy from another.
     rows = [row.split() for row in twin(*line).out.splitlines() if row.startswith("arm_")]
     assert [row[7] for row in rows] == ["0"] * 3
-    assert sum(d["joint"]["energy_J"] for d in told["drives"].values()) == pytest.approx(
-        told["energy_J"], abs=1e-9
-    )
+    assert sum(d["joint"]["energy_J"] for d in told["drives"].values()) == pytest.approx(told["energy_J"], abs=1e-9)

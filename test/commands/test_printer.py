@@ -18,13 +18,17 @@ from test.support.robots import partly_long
 
 STEP = 40.0 / (200 * 16)
 REAL = Towers(
-    111.3, np.radians([210.6, 329.7, 90.0]), np.array([215.2, 214.9, 215.1]),
+    111.3,
+    np.radians([210.6, 329.7, 90.0]),
+    np.array([215.2, 214.9, 215.1]),
     np.array([339.2, 339.9, 340.3]),
-)  # fmt: skip
+)
 GUESS = Towers(
-    112.0, np.radians([210.0, 330.0, 90.0]), np.full(3, 215.0),
+    112.0,
+    np.radians([210.0, 330.0, 90.0]),
+    np.full(3, 215.0),
     155.0 + np.full(3, np.sqrt(215.0**2 - 112.0**2)),
-)  # fmt: skip
+)
 
 
 def contacts(spots: np.ndarray) -> np.ndarray:
@@ -50,8 +54,7 @@ def klipper(distances: int = 0) -> str:
     for k, limb in enumerate("abc"):
         lines += [f"[stepper_{limb}]", f"position_endstop = {above[k]:.6f}"]
         if limb == "a":
-            lines += ["rotation_distance: 20", "gear_ratio: 1:2", "microsteps: 16",
-                      "arm_length: 215"]  # fmt: skip
+            lines += ["rotation_distance: 20", "gear_ratio: 1:2", "microsteps: 16", "arm_length: 215"]
     lines += ["#*# [printer]", f"#*# delta_radius = {GUESS.radius:.6f}", "#*# [delta_calibrate]"]
     for k, travel in enumerate(contacts(SPOTS)):
         steps = ",".join(f"{value / STEP:.3f}" for value in travel)
@@ -123,9 +126,7 @@ def logs() -> dict[str, str]:
     order = {"c": 0, "x": 4, "y": 6, "z": 2, "yz": 1, "zx": 3, "xy": 5}
     g33 = " ".join(f"{name}:{z[k, 2]:+.5f}" for name, k in order.items())
     heights = " ".join(f"{value:.5f}" for value in z[:, 2])
-    g30 = "\n".join(
-        f"G30 P{k} X{x:.5f} Y{y:.5f} Z-99999" for k, (x, y) in enumerate(SPOTS.tolist())
-    )
+    g30 = "\n".join(f"G30 P{k} X{x:.5f} Y{y:.5f} Z-99999" for k, (x, y) in enumerate(SPOTS.tolist()))
     lines = "\n".join(f"X:{x:.4f} Y:{y:.4f} Z:{h:.4f}" for x, y, h in z.tolist())
     return {
         "marlin": f"{start} S80\nM666 X0 Y0 Z0\nG33 Auto Calibrate\n.{g33}\n.c:+0.1 x:+0.2",
@@ -158,9 +159,7 @@ def test_a_height_map(twin: Commands, tmp_path: Path) -> None:
         "0, 0.010, 0\n0.020, 0.030, 0.040\n0, 0.050, 0\n"
     )
     (tmp_path / "h.csv").write_text(text)
-    twin.good(
-        "printer", tmp_path / "h.csv", "--out", tmp_path / "p.yaml", "--data", tmp_path / "p.csv"
-    )
+    twin.good("printer", tmp_path / "h.csv", "--out", tmp_path / "p.yaml", "--data", tmp_path / "p.csv")
     rows = np.genfromtxt(tmp_path / "p.csv", delimiter=",", skip_header=1)
     places = GUESS.nozzle(-1e3 * rows[:, :3])
     expected = [[0, -40, 0.01], [-40, 0, 0.02], [0, 0, 0.03], [40, 0, 0.04], [0, 40, 0.05]]
@@ -185,22 +184,22 @@ def test_configurations_are_read_back(firmware: str, twin: Commands, tmp_path: P
     options = ["--probe-radius", "70", "--firmware", firmware]
     twin.good("printer", config, "--out", again, "--data", data, "--overwrite", *options)
     numbers = [
-        np.array(re.findall(r"-?\d+\.\d+", path.read_text().split("geometry:")[1]), float)
-        for path in (robot, again)
+        np.array(re.findall(r"-?\d+\.\d+", path.read_text().split("geometry:")[1]), float) for path in (robot, again)
     ]
     np.testing.assert_allclose(numbers[1], numbers[0], atol=2e-6)
 
 
 @pytest.mark.parametrize(
     ("text", "field"),
-    [("[printer]\nkinematics: delta\n", "delta_radius"),
-     ("M665 L215 R112 H155\nM666 X0 Y0 Z0\n", "probe table"),
-     ("M665 R112\nX:0 Y:0 Z:0\n", "M665 L")],
-)  # fmt: skip
+    [
+        ("[printer]\nkinematics: delta\n", "delta_radius"),
+        ("M665 L215 R112 H155\nM666 X0 Y0 Z0\n", "probe table"),
+        ("M665 R112\nX:0 Y:0 Z:0\n", "M665 L"),
+    ],
+)
 def test_what_is_missing_is_named(text: str, field: str, twin: Commands, tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_text(text)
-    words = ("printer", tmp_path / "a.txt", "--out", tmp_path / "b.yaml", "--data",
-             tmp_path / "c.csv")  # fmt: skip
+    words = ("printer", tmp_path / "a.txt", "--out", tmp_path / "b.yaml", "--data", tmp_path / "c.csv")
     assert field in twin.refused(*words)
     assert not (tmp_path / "b.yaml").exists()
 

@@ -63,9 +63,17 @@ class Asked:
 def how_fast(a: Asked) -> None:
     """A circle, as fast as limits allow: at each moment one is used up, and none exceeded."""
     told = a.twin.told(
-        "path", a.file, "--circle", a.radius, "--fastest", "--rate", 2000, "--out", a.motion,
+        "path",
+        a.file,
+        "--circle",
+        a.radius,
+        "--fastest",
+        "--rate",
+        2000,
+        "--out",
+        a.motion,
         "--no-picture",
-    )  # fmt: skip
+    )
     rows = list(csv.DictReader(a.motion.open()))
     a.table = {key: np.array([float(row[key]) for row in rows]) for key in rows[0] if rows[0][key]}
     assert a.table["time"][-1] == pytest.approx(told["duration_s"], abs=1e-3)
@@ -142,9 +150,7 @@ def what_friction(a: Asked) -> None:
     pose = robot.home() + waves[: len(size)].T * size
     q = robot.inverse(pose)
     qd = np.gradient(q, t, axis=0, edge_order=2)
-    rough = robot.changed(
-        friction={"viscous": 1.5 * robot.friction.viscous, "coulomb": 1.5 * robot.friction.coulomb}
-    )
+    rough = robot.changed(friction={"viscous": 1.5 * robot.friction.viscous, "coulomb": 1.5 * robot.friction.coulomb})
     effort = inverse_dynamics(rough, q, qd, np.gradient(qd, t, axis=0, edge_order=2))
     columns = {"time": t} | {f"{n}.position": q[:, k] for k, n in enumerate(robot.joint_names)}
     columns |= {f"{n}.effort": effort[:, k] for k, n in enumerate(robot.joint_names)}
@@ -161,17 +167,13 @@ def what_friction(a: Asked) -> None:
 def what_dimensions(a: Asked) -> None:
     """The zero of one joint is off by 2 mrad or 0.2 mm, and found."""
     robot, out = a.robot, a.folder / "true.yaml"
-    poses = robot.home() + a.radius * np.random.default_rng(2).uniform(
-        -2, 2, (40, len(robot.home()))
-    )
+    poses = robot.home() + a.radius * np.random.default_rng(2).uniform(-2, 2, (40, len(robot.home())))
     q = robot.inverse(poses)
     off = 2e-3 if robot.joint_units[0] == "rad" else 2e-4
     position, rotation = robot.platform(q)
     columns = {f"{n}.position": q[:, k] - off * (k == 0) for k, n in enumerate(robot.joint_names)}
     columns |= dict(zip("xyz", position.T, strict=True))
-    columns |= dict(
-        zip(("qx", "qy", "qz", "qw"), Rotation.from_matrix(rotation).as_quat().T, strict=True)
-    )
+    columns |= dict(zip(("qx", "qy", "qz", "qw"), Rotation.from_matrix(rotation).as_quat().T, strict=True))
     words = (
         "calibrate",
         a.file,
@@ -193,9 +195,18 @@ def which_length(a: Asked) -> None:
     """The best of a range: no machine of a grid, built anew, needs less effort."""
     path, own = f"parameters.{a.length}", a.robot.number(f"parameters.{a.length}")
     told = a.twin.told(
-        "design", a.file, "--vary", f"{path}={0.95 * own}:{1.05 * own}", "--path", a.motion,
-        "--minimise", "peak-effort", "--starts", 2, "--no-picture",
-    )  # fmt: skip
+        "design",
+        a.file,
+        "--vary",
+        f"{path}={0.95 * own}:{1.05 * own}",
+        "--path",
+        a.motion,
+        "--minimise",
+        "peak-effort",
+        "--starts",
+        2,
+        "--no-picture",
+    )
     pose, rate, change = (
         np.stack([a.table[f"{name}{what}"] for name in a.robot.pose_names], -1)
         for what in ("", ".velocity", ".acceleration")
@@ -239,9 +250,17 @@ def how_does_it_move_elsewhere(a: Asked) -> None:
 
 
 QUESTIONS = (
-    how_fast, which_drive, which_bearing, how_strong, is_it_good, what_friction, what_dimensions,
-    which_length, how_exact, how_does_it_move_elsewhere,
-)  # fmt: skip
+    how_fast,
+    which_drive,
+    which_bearing,
+    how_strong,
+    is_it_good,
+    what_friction,
+    what_dimensions,
+    which_length,
+    how_exact,
+    how_does_it_move_elsewhere,
+)
 
 
 @pytest.mark.parametrize("name", partly_long(MACHINES, "rrr3_planar"))

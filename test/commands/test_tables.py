@@ -68,9 +68,7 @@ def saved(kind, robot, time, q):
         "semicolon": lambda: written(["time", *joints], [time, *q.T], ";"),
         "decimal comma": lambda: written(["time", *joints], [time, *q.T], ";", ","),
         "tabs": lambda: written(["time", *joints], [time, *q.T], "\t", ","),
-        "units in headers": lambda: written(
-            ["time (ms)", *(f"{joint} [deg]" for joint in joints)], [1e3 * time, *deg]
-        ),
+        "units in headers": lambda: written(["time (ms)", *(f"{joint} [deg]" for joint in joints)], [1e3 * time, *deg]),
         "other names": lambda: "# of a logger\n" + written(["t", "q1", "q2"], [1e3 * time, *deg]),
     }
     if kind in text:
@@ -89,10 +87,17 @@ def saved(kind, robot, time, q):
 @pytest.mark.parametrize(
     "kind",
     [
-        "comma", "semicolon", "decimal comma", "tabs", "units in headers", "other names",
-        "Parquet", "MCAP", "rosbag2 folder",
+        "comma",
+        "semicolon",
+        "decimal comma",
+        "tabs",
+        "units in headers",
+        "other names",
+        "Parquet",
+        "MCAP",
+        "rosbag2 folder",
     ],
-)  # fmt: skip
+)
 def test_a_recording_is_the_same_in_all_kinds_of_files(kind, motion):
     robot, time, q = motion
     path, dialect = saved(kind, robot, time, q)
@@ -109,11 +114,17 @@ def test_a_recording_is_the_same_in_all_kinds_of_files(kind, motion):
 @pytest.mark.parametrize(
     "options",
     [
-        {"separator": "|"}, {"decimal": ";"}, {"units": "inch"}, {"units": "deg,rad"},
-        {"columns": "time"}, {"columns": "time=nothing"}, {"time": "nothing"},
-        {"time": "t", "columns": "time=u"}, {"columns": "elbow=t"},
+        {"separator": "|"},
+        {"decimal": ";"},
+        {"units": "inch"},
+        {"units": "deg,rad"},
+        {"columns": "time"},
+        {"columns": "time=nothing"},
+        {"time": "nothing"},
+        {"time": "t", "columns": "time=u"},
+        {"columns": "elbow=t"},
     ],
-)  # fmt: skip
+)
 def test_what_cannot_be_is_refused(options, motion):
     Path("a.csv").write_text(plain(*motion).replace("time", "t"))
     with pytest.raises(ParameterError):
@@ -165,8 +176,7 @@ def test_values_of_the_controller_and_of_the_motor_are_made_the_joints(name, tmp
             joint["drive"] = {"inertia": 1e-5, "rated_torque": 1.5, **gear}
     names = load(name).joint_names
     data["joint_map"] = {
-        joint: {"name": f"axis_{k}", "sign": (-1) ** k, "offset": 3.0, "ratio": 50.0}
-        for k, joint in enumerate(names)
+        joint: {"name": f"axis_{k}", "sign": (-1) ** k, "offset": 3.0, "ratio": 50.0} for k, joint in enumerate(names)
     }
     path, out = tmp_path / f"{name}.yaml", tmp_path / "a.csv"
     path.write_text(yaml.safe_dump(data))
@@ -177,10 +187,8 @@ def test_values_of_the_controller_and_of_the_motor_are_made_the_joints(name, tmp
     turns = np.array([(-1) ** k * drive.turns for k, drive in enumerate(robot.drives)])
     own = robot.controller
     motor = (turns * q / math.tau, turns * qd / math.tau, 100.0 * effort / turns / 1.5)
-    controller = (own.controller_positions(q), own.controller_rates(qd),
-                  own.controller_efforts(effort))  # fmt: skip
-    header = [f"axis_{k}.{word}" for word in ("position", "velocity", "effort")
-              for k in range(len(names))]  # fmt: skip
+    controller = (own.controller_positions(q), own.controller_rates(qd), own.controller_efforts(effort))
+    header = [f"axis_{k}.{word}" for word in ("position", "velocity", "effort") for k in range(len(names))]
     for side, units, values in (
         ("motor", "rev,ms,percent", motor),
         ("controller", "ms", controller),

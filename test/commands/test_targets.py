@@ -44,9 +44,7 @@ def commands(deflections, target):
     }
 
 
-@pytest.mark.parametrize(
-    "ending", [".html", ".yaml", ".yml", ".mcap", ".csv", ".png", ".bag", ".nc"]
-)
+@pytest.mark.parametrize("ending", [".html", ".yaml", ".yml", ".mcap", ".csv", ".png", ".bag", ".nc"])
 @pytest.mark.parametrize("kind", ["a FIFO", "a folder", "a character device"])
 def test_only_files_are_replaced(twin, tmp_path, deflections, ending, kind):
     if ending == ".nc":
@@ -111,9 +109,7 @@ def test_a_folder_that_is_not_there_is_told_before_the_work(twin, tmp_path, monk
         (("convert", "nofile"), "SOURCE: 'nofile'"),
     ],
 )
-def test_a_wrong_input_is_told_before_a_target_that_is_there(
-    twin, tmp_path, monkeypatch, line, text
-):
+def test_a_wrong_input_is_told_before_a_target_that_is_there(twin, tmp_path, monkeypatch, line, text):
     monkeypatch.chdir(tmp_path)
     names = ("out.yaml", "fitted.yaml", "calibrated.yaml")
     for name in names:
@@ -257,16 +253,19 @@ raise SystemExit(10 if codes == [0, 1] else 1)
 """Two commands, of which the second one fails."""
 
 
-@pytest.mark.parametrize(
-    "closed", partly_long([">&-", ">&- 2>&-", "<&- >&- 2>&-"], ">&-", "<&- >&- 2>&-")
-)
+@pytest.mark.parametrize("closed", partly_long([">&-", ">&- 2>&-", "<&- >&- 2>&-"], ">&-", "<&- >&- 2>&-"))
 def test_closed_outputs_lead_nowhere(tmp_path, closed):
     """Else the first file that is opened gets what is printed."""
     (tmp_path / "both.py").write_text(BOTH)
     done = subprocess.run(
-        f"{sys.executable} both.py {closed}", shell=True, cwd=tmp_path, capture_output=True,
-        text=True, stdin=subprocess.DEVNULL, env=os.environ | {"PYTHONPATH": str(REPOSITORY)},
-    )  # fmt: skip
+        f"{sys.executable} both.py {closed}",
+        shell=True,
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        stdin=subprocess.DEVNULL,
+        env=os.environ | {"PYTHONPATH": str(REPOSITORY)},
+    )
     assert done.returncode == 10
     assert done.stdout == "" and "Traceback" not in done.stderr
 
@@ -290,9 +289,13 @@ def test_a_full_disk_leaves_no_part_under_a_final_name(line, tmp_path):
         "cli.main(sys.argv[1:])\n"
     )
     done = subprocess.run(
-        [sys.executable, "-c", program, *line], cwd=tmp_path, capture_output=True, text=True,
-        env={**os.environ, "PYTHONPATH": str(REPOSITORY)}, check=False,
-    )  # fmt: skip
+        [sys.executable, "-c", program, *line],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(REPOSITORY)},
+        check=False,
+    )
     assert done.returncode == 1, done.stderr
     assert done.stderr.strip().splitlines()[-1].startswith("pkm-twin: ")
     assert "Traceback" not in done.stderr and ".tmp" not in done.stderr

@@ -177,8 +177,9 @@ def spoiled(change):
 def test_bad_csv(twin, tmp_path, change, text):
     columns = spoiled(change)
     rows = [",".join(columns)]
-    rows += [",".join(f'"{v}"' if "," in str(v) else str(v) for v in row)
-             for row in zip(*columns.values(), strict=True)]  # fmt: skip
+    rows += [
+        ",".join(f'"{v}"' if "," in str(v) else str(v) for v in row) for row in zip(*columns.values(), strict=True)
+    ]
     source = tmp_path / "bad.csv"
     source.write_text("\n".join(rows) + "\n")
     assert text in twin.refused("torques", "delta", source, "--out", tmp_path / "t.csv")
@@ -309,9 +310,7 @@ def test_parquet_without_pyarrow_is_refused_before_the_work(twin, tmp_path, monk
     assert "pyarrow" in text and ".part" not in text
 
 
-@pytest.mark.parametrize(
-    "content", [b"", b"time\n", b"\xff\xfe\x00", b"time,time\n1,2\n", b"a\n1,2"]
-)
+@pytest.mark.parametrize("content", [b"", b"time\n", b"\xff\xfe\x00", b"time,time\n1,2\n", b"a\n1,2"])
 def test_what_is_no_table(twin, tmp_path, content):
     source = tmp_path / "bad.csv"
     source.write_bytes(content)

@@ -47,9 +47,7 @@ def measured(changes: Array, factors: Array) -> Poses:
     """Poses of a machine with other ratios, which change with travel from 0.3 m on."""
     robot, q = spools()
     own = robot.controller
-    true = JointMap(
-        own.names, own.factors * factors, own.offsets + 0.05, changes, np.full(3, 0.3), own.units
-    )
+    true = JointMap(own.names, own.factors * factors, own.offsets + 0.05, changes, np.full(3, 0.3), own.units)
     noise = NOISE * np.random.default_rng(8).normal(size=q.shape)
     return Poses(np.asarray(true.controller_positions(q)), robot.platform(q)[0] + noise)
 
@@ -87,16 +85,14 @@ def test_a_measured_hexapod_is_predicted_as_well_as_by_a_fit_of_each_leg(
     """Nodes, zeros and transmissions of the example are off; motion capture has noise."""
     (count, wrong), rng = case, np.random.default_rng(1)
     robot = load(EXAMPLES / "hexapod.yaml")
-    nodes = [f"joints.{end}_{k}.at[{i}]"
-             for end, k, i in product((FOOT, BALL), range(1, 7), range(3))]  # fmt: skip
+    nodes = [f"joints.{end}_{k}.at[{i}]" for end, k, i in product((FOOT, BALL), range(1, 7), range(3))]
     real = robot.with_file_values({n: robot.number(n) + 4e-3 * rng.normal() for n in nodes})
     box = np.array([0.12, 0.12, 0.09, 0.15, 0.15, 0.15])
     q = real.inverse(robot.home() + [0, 0, 0.1, 0, 0, 0] + box * rng.uniform(-1, 1, (count, 6)))
     factors = robot.controller.factors * rng.uniform(0.93, 0.99, 6)
     position, rotation = real.platform(q)
     position = position + 2.5e-4 * rng.normal(size=position.shape)
-    rotation = (Rotation.from_rotvec(5e-4 * rng.normal(size=(count, 3)))
-                * Rotation.from_matrix(rotation)).as_matrix()  # fmt: skip
+    rotation = (Rotation.from_rotvec(5e-4 * rng.normal(size=(count, 3))) * Rotation.from_matrix(rotation)).as_matrix()
     learnt = np.arange(count) % HELD_OUT != HELD_OUT - 1
     position[rng.choice(np.flatnonzero(learnt), wrong, replace=False)] += 0.02
     motors = q * factors + robot.controller.offsets + 0.2 * rng.normal(size=6)
@@ -140,8 +136,10 @@ def test_tables_are_read_as_recordings_have_them(tmp_path: Path, how: str) -> No
     columns: list[str] = []
     unit = "mm"
     if how == "named":
-        columns = ["leg_*.position=leg_length_*,x=meas_pos_x [mm],y=meas_pos_y [mm]",
-                   "z=meas_pos_z [mm], q*=meas_ori_*"]  # fmt: skip
+        columns = [
+            "leg_*.position=leg_length_*,x=meas_pos_x [mm],y=meas_pos_y [mm]",
+            "z=meas_pos_z [mm], q*=meas_ori_*",
+        ]
         unit = "m"
     elif how == "headers with units":
         head, *rows = path.read_text().splitlines()
@@ -170,9 +168,7 @@ def test_micrometres_have_two_spellings(tmp_path: Path, header: str) -> None:
     np.testing.assert_allclose(read_poses(path, robot).position, [[1e-3, 2e-3, 3e-3]] * 3)
 
 
-@pytest.mark.parametrize(
-    "columns", [["x"], ["x=nothing"], ["w=meas_pos_x"], ["x=meas_pos_x [deg]"]]
-)
+@pytest.mark.parametrize("columns", [["x"], ["x=nothing"], ["w=meas_pos_x"], ["x=meas_pos_x [deg]"]])
 def test_columns_that_there_are_not_are_rejected(tmp_path: Path, columns: list[str]) -> None:
     path = recording(tmp_path)
     with pytest.raises(ParameterError):
@@ -180,9 +176,7 @@ def test_columns_that_there_are_not_are_rejected(tmp_path: Path, columns: list[s
 
 
 @pytest.mark.parametrize("how", ["shared", "travel"])
-def test_the_written_file_converts_the_controllers_numbers(
-    twin: Commands, tmp_path: Path, how: str
-) -> None:
+def test_the_written_file_converts_the_controllers_numbers(twin: Commands, tmp_path: Path, how: str) -> None:
     robot, _ = spools()
     text = (EXAMPLES.parents[2] / "config/linear_delta.yaml").read_text()
     entries = yaml.safe_dump({"joint_map": data_of(robot)["joint_map"]})
@@ -193,9 +187,16 @@ def test_the_written_file_converts_the_controllers_numbers(
     columns = dict(zip(names, np.hstack([poses.joints, poses.position]).T, strict=True))
     source = write_columns(tmp_path / "poses.csv", columns)
     result = twin.good(
-        "calibrate", tmp_path / "mine.yaml", source, "--out", tmp_path / "out.yaml",
-        "--transmission", how, "--only", "rods.left_1.ends[0]",
-    )  # fmt: skip
+        "calibrate",
+        tmp_path / "mine.yaml",
+        source,
+        "--out",
+        tmp_path / "out.yaml",
+        "--transmission",
+        how,
+        "--only",
+        "rods.left_1.ends[0]",
+    )
     assert max(map(len, result.out.splitlines())) < 400 and "rev" in result.out
     found = load(tmp_path / "out.yaml")
     seen = found.platform(found.controller.positions(poses.joints))[0]

@@ -97,8 +97,7 @@ def test_nights_to_a_verdict(twin, tmp_path, monkeypatch, rng):
     monkeypatch.chdir(tmp_path)
     robot = load("delta")
     sound, worn = (
-        measure(read(night(tmp_path / f"{c}.csv", robot, rng, coulomb=[c, 0.1, 0.1]), robot))
-        for c in (0.1, 0.5)
+        measure(read(night(tmp_path / f"{c}.csv", robot, rng, coulomb=[c, 0.1, 0.1]), robot)) for c in (0.1, 0.5)
     )
     for k in range(8):
         numbers = [
@@ -110,9 +109,7 @@ def test_nights_to_a_verdict(twin, tmp_path, monkeypatch, rng):
             told = twin.told("trend", "nights.db")
             assert not told["drifts"]
             assert told["judged"] == (len(told["series"]) if k == 5 else 0)
-    told = {
-        (s["quantity"], s["part"]): s for s in twin.told("trend", "nights.db", code=1)["series"]
-    }
+    told = {(s["quantity"], s["part"]): s for s in twin.told("trend", "nights.db", code=1)["series"]}
     worse = told["friction coulomb", robot.joint_names[0]]
     assert worse["drifts"]
     assert worse["changed"].startswith("2023-11-20")
@@ -129,9 +126,7 @@ def test_a_folder_is_judged_bag_by_bag(twin, tmp_path, sample):
     (folder / "bad.mcap").write_bytes(sample.read_bytes()[:5000])
     line = ("check", folder, "--jobs", 2, "--history", tmp_path / "h.db")
     told = twin.told(*line, code=1)["recordings"]
-    assert [(r["bag"].rpartition("/")[2], r["good"]) for r in told] == [
-        ("bad.mcap", False), ("good.mcap", True)
-    ]  # fmt: skip
+    assert [(r["bag"].rpartition("/")[2], r["good"]) for r in told] == [("bad.mcap", False), ("good.mcap", True)]
     (folder / "bad.mcap").unlink()
     twin.good("check", folder)
     assert {one.machine for one in read_history(tmp_path / "h.db")} == {"delta_cu"}
@@ -165,9 +160,7 @@ def test_another_program_s_database_is_rejected_and_stays_as_it_is(tables, twin,
 @pytest.mark.parametrize("value", [math.inf, -math.inf, math.nan, 1e300])
 def test_a_number_that_no_recording_gives_is_not_written(value, tmp_path):
     path = tmp_path / "nights.db"
-    for one in (
-        Measured("residual", "j", value, 0.1, "N m"), Measured("residual", "j", 0.1, -1.0, "N m")
-    ):  # fmt: skip
+    for one in (Measured("residual", "j", value, 0.1, "N m"), Measured("residual", "j", 0.1, -1.0, "N m")):
         with pytest.raises(ParameterError, match="residual of j"):
             append(path, "m", "delta", "1.mcap", DAY, True, [one])
     assert not path.exists()
@@ -176,10 +169,16 @@ def test_a_number_that_no_recording_gives_is_not_written(value, tmp_path):
 @pytest.mark.parametrize(
     ("column", "value"),
     [
-        ("value", math.inf), ("value", "many"), ("value", b"\x01\xff"), ("value", 1e300),
-        ("deviation", math.inf), ("deviation", -1.0), ("deviation", "few"), ("unit", b"\xff"),
+        ("value", math.inf),
+        ("value", "many"),
+        ("value", b"\x01\xff"),
+        ("value", 1e300),
+        ("deviation", math.inf),
+        ("deviation", -1.0),
+        ("deviation", "few"),
+        ("unit", b"\xff"),
     ],
-)  # fmt: skip
+)
 def test_a_damaged_number_of_a_history_is_named(column, value, twin, tmp_path):
     path = tmp_path / "nights.db"
     for k in range(8):

@@ -66,8 +66,7 @@ def test_torques_have_a_column_of_deviations(twin, unsure, tmp_path):
     twin.good("torques", unsure, source, "--out", out, "--no-picture")
     table = read_columns(out)
     q, qd, qdd, told = (
-        joined(table, robot, what)
-        for what in ("position", "velocity", "acceleration", "effort_deviation")
+        joined(table, robot, what) for what in ("position", "velocity", "acceleration", "effort_deviation")
     )
     np.testing.assert_allclose(told, torque_deviation(robot, q, qd, qdd), rtol=1e-9)
     assert (np.abs(told) < np.abs(inverse_dynamics(robot, q, qd, qdd))).all()

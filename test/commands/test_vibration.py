@@ -7,8 +7,17 @@ import yaml
 from test.commands.conftest import REPOSITORY
 
 MILLING = (
-    "--teeth", 2, "--tangential", 600e6, "--radial", 0.3, "--speeds", "9000,10000", "--points", 2,
-)  # fmt: skip
+    "--teeth",
+    2,
+    "--tangential",
+    600e6,
+    "--radial",
+    0.3,
+    "--speeds",
+    "9000,10000",
+    "--points",
+    2,
+)
 
 
 each = pytest.mark.parametrize("given", [("frf",), ("lobes", *MILLING)], ids=lambda given: given[0])

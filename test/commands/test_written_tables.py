@@ -17,9 +17,12 @@ from test.support.tables import of_joints, read_columns, write_columns
 
 ENDINGS = ("csv", *(["parquet"] if importlib.util.find_spec("pyarrow") else []))
 READERS = (
-    ("loads",), ("size",), ("size", "--efforts", "model"), ("map", "--along"),
+    ("loads",),
+    ("size",),
+    ("size", "--efforts", "model"),
+    ("map", "--along"),
     ("torques", "--out", "-"),
-)  # fmt: skip
+)
 NAMES = ("delta", "five_bar", "upr_rpu", "stewart")
 
 
@@ -56,9 +59,7 @@ def swings(robot, rng, count=101):
     """Times and joint positions of a motion from home and back."""
     time = np.linspace(0.0, 0.5, count)
     step = 0.05 * robot.size * np.sin(np.pi * time / time[-1]) ** 4
-    return time, robot.inverse(robot.home()) + step[:, None] * rng.uniform(
-        0.5, 1.0, robot.joints_count
-    )
+    return time, robot.inverse(robot.home()) + step[:, None] * rng.uniform(0.5, 1.0, robot.joints_count)
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
@@ -89,9 +90,17 @@ def test_a_planned_cycle_gives_the_same_answers_in_every_format(name, ending, tw
     first, out = tmp_path / "first.csv", tmp_path / f"again.{ending}"
     for path in (first, out):
         twin.good(
-            "path", name, "--cycle", "25,200,25", "--load", "0.5@0:3", "--fastest", "--out", path,
+            "path",
+            name,
+            "--cycle",
+            "25,200,25",
+            "--load",
+            "0.5@0:3",
+            "--fastest",
+            "--out",
+            path,
             "--no-picture",
-        )  # fmt: skip
+        )
     *expected, table = answers(twin, name, first)
     *found, same = answers(twin, name, out)
     alike(found, expected)
@@ -112,9 +121,7 @@ def spoilt(path, leave_out=(), change=()):
 def test_computed_efforts_without_what_they_rest_on_are_rejected(command, twin, tmp_path, rng):
     robot, source, out = load("delta"), tmp_path / "source.csv", tmp_path / "written.csv"
     time, q = swings(robot, rng)
-    forces = dict(
-        zip(WRENCH, np.outer([0.0, 0.0, -200.0, 0.0, 0.0, 0.0], 1.0 + 0 * time), strict=True)
-    )
+    forces = dict(zip(WRENCH, np.outer([0.0, 0.0, -200.0, 0.0, 0.0, 0.0], 1.0 + 0 * time), strict=True))
     write_columns(source, {"time": time} | of_joints(robot, "position", q) | forces)
     twin.good("torques", "delta", source, "--payload", "0.5", "--out", out, "--no-picture")
     names = list(read_columns(out))

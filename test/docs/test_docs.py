@@ -142,9 +142,7 @@ def test_the_example_runs(name):
 )
 def test_a_notebook_shows_what_it_stores(name, clone):
     """Else `make pages` stores it."""
-    cells = json.loads((DOCS.parent / f"examples/{name}.ipynb").read_text(encoding="utf-8"))[
-        "cells"
-    ]
+    cells = json.loads((DOCS.parent / f"examples/{name}.ipynb").read_text(encoding="utf-8"))["cells"]
     code = [cell for cell in cells if cell["cell_type"] == "code"]
     for cell, (text, pictures) in zip(code, notebooks.run(cells), strict=True):
         assert_output(notebooks.text_of(cell), text)
@@ -160,9 +158,7 @@ def test_the_errors_page_has_every_error_and_reason():
     """Else `make pages` writes it."""
     assert read_section("errors", DOCS / "errors.md") == errors.section()
     own = {kind for kind in vars(module).values() if inspect.isclass(kind)}
-    assert {k for k in own if issubclass(k, module.PkmTwinError)} - {module.PkmTwinError} <= set(
-        errors.ERRORS
-    )
+    assert {k for k in own if issubclass(k, module.PkmTwinError)} - {module.PkmTwinError} <= set(errors.ERRORS)
     assert set(errors.REASONS) == errors.reasons()
 
 

@@ -66,9 +66,5 @@ def test_search_in_pages_that_are_opened_as_files_needs_no_network(url, tmp_path
 
 
 def test_references_of_docstrings_become_names():
-    html = (
-        "errors as :func:<code>~a.b.modes</code>, :class:<code>a.Robot</code> <code>~/topic</code>"
-    )
-    assert search.on_page_content(html) == (
-        "errors as <code>modes</code>, <code>a.Robot</code> <code>~/topic</code>"
-    )
+    html = "errors as :func:<code>~a.b.modes</code>, :class:<code>a.Robot</code> <code>~/topic</code>"
+    assert search.on_page_content(html) == ("errors as <code>modes</code>, <code>a.Robot</code> <code>~/topic</code>")

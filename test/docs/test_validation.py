@@ -69,9 +69,7 @@ def test_torques_of_random_machines(name, machine):
     from tools.certificate.compare import BALANCE_BOUNDS, PLACE_BOUND, ROUTES, compare
     from tools.certificate.machines import ROBOTS
 
-    pattern = (
-        r"digits \(\d+ states\): worst relative difference (\S+)\. MuJoCo \(\d+ states\): (\S+)\. "
-    )
+    pattern = r"digits \(\d+ states\): worst relative difference (\S+)\. MuJoCo \(\d+ states\): (\S+)\. "
     worst, mujoco = numbers(PAGE, pattern)
     found = compare(name, (20261121, ROBOTS.index(name), machine), states=20, exact=2)
     for route in ROUTES:

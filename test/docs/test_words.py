@@ -155,8 +155,7 @@ def test_public_docstrings():
     found = [
         f"{path.relative_to(ROOT)}: {line}"
         for path in sources()
-        if path.parent.relative_to(ROOT).parts[0] not in ("pkm_twin", "launch")
-        or path.parent.name in ROOMS
+        if path.parent.relative_to(ROOT).parts[0] not in ("pkm_twin", "launch") or path.parent.name in ROOMS
         for text in docstrings(ast.parse(path.read_text(encoding="utf-8")))
         for line in banned(text)
     ]
@@ -191,10 +190,14 @@ def _members(kind):
 @pytest.mark.parametrize(
     "text",
     [
-        "a value that is refused", "what the motion tells", "the bag is drawn beside it",
-        "6 deviations of the model", "the distance to a singularity", "a page is made anew",
+        "a value that is refused",
+        "what the motion tells",
+        "the bag is drawn beside it",
+        "6 deviations of the model",
+        "the distance to a singularity",
+        "a page is made anew",
     ],
-)  # fmt: skip
+)
 def test_a_banned_word_is_found(text):
     assert len(banned(f"Good text.\n\nHere {text}\nstands.")) == 1
     assert banned("The key `refuse`, ```\ntold\n``` and a standard\ndeviation.") == []

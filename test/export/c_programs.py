@@ -37,14 +37,14 @@ REALTIME = next((name for k in range(29, 19, -1) if shutil.which(name := f"clang
 blocking = pytest.mark.parametrize(
     "watcher",
     [
-        pytest.param("", marks=pytest.mark.skipif(
-            platform.libc_ver()[0] != "glibc", reason="the hook is of glibc"
-        )),
-        pytest.param(REALTIME, id="RealtimeSanitizer", marks=[
-            pytest.mark.long, pytest.mark.skipif(not REALTIME, reason="there is no clang 20")
-        ]),
+        pytest.param("", marks=pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the hook is of glibc")),
+        pytest.param(
+            REALTIME,
+            id="RealtimeSanitizer",
+            marks=[pytest.mark.long, pytest.mark.skipif(not REALTIME, reason="there is no clang 20")],
+        ),
     ],
-)  # fmt: skip
+)
 """What watches calls: a hook of our own, or the compiler with RealtimeSanitizer."""
 SANITIZED = ("-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 
@@ -239,9 +239,7 @@ class Package:
         # Of every function its inputs and outputs, by name with sizes, as the header lists them.
         self.heads: dict[str, tuple[list[tuple[str, int]], list[tuple[str, int]]]] = {}
         plain = re.sub(r"\s+", " ", self.header)
-        for takes, gives, name in re.findall(
-            rf"([\w\[\], ]+) -> ([\w\[\], ]+)\. \*/ int {self.prefix}_(\w+)\(", plain
-        ):
+        for takes, gives, name in re.findall(rf"([\w\[\], ]+) -> ([\w\[\], ]+)\. \*/ int {self.prefix}_(\w+)\(", plain):
             pair = [re.findall(r"(\w+)\[(\d+)\]", part) for part in (takes, gives)]
             ins, outs = ([(word, int(size)) for word, size in part] for part in pair)
             self.heads[name] = ins, outs
@@ -254,8 +252,7 @@ class Package:
                 "NUMBER": str(number),
                 "DECLARED": ", ".join(f"{n}[{k}]" for n, k in [*ins, *outs]),
                 "READS": " ".join(
-                    f"if (fread({n}, sizeof(double), {k}, stdin) != {k}) {{ return 8; }}"
-                    for n, k in ins
+                    f"if (fread({n}, sizeof(double), {k}, stdin) != {k}) {{ return 8; }}" for n, k in ins
                 ),
                 "CALL": ", ".join(n for n, _ in [*ins, *outs]),
                 "WRITES": " ".join(f"fwrite({n}, sizeof(double), {k}, stdout);" for n, k in outs),
@@ -289,9 +286,7 @@ class Package:
         command = [*emulator, str(program), str(number), str(len(rows))]
         # The sanitizers' runtime has to be the first library.
         environment = {k: v for k, v in os.environ.items() if k != "LD_PRELOAD"}
-        found = subprocess.run(
-            command, input=rows.tobytes(), env=environment, capture_output=True, check=False
-        )
+        found = subprocess.run(command, input=rows.tobytes(), env=environment, capture_output=True, check=False)
         assert not found.returncode, found.stderr.decode()
         table = np.frombuffer(found.stdout).reshape(len(rows), -1)
         return table[:, 0], table[:, 1:]

@@ -104,9 +104,7 @@ def frames(package):
     sizes = {}
     for line in (package.folder / "o.su").read_text().splitlines():
         place, size, _ = line.split("\t")
-        sizes[place.rpartition(":")[2].removeprefix(f"{package.prefix}_").partition(".")[0]] = int(
-            size
-        )
+        sizes[place.rpartition(":")[2].removeprefix(f"{package.prefix}_").partition(".")[0]] = int(size)
 
     def deepest(name):
         """Frames of a function, of its form with parameters, and of what that calls."""

@@ -50,9 +50,18 @@ KEPT = ("delta_cu", "bolted")
 """Rods with members, and bars that hold twice."""
 NAMES = [*robot_names(), *(name for name in UNSEEN if name not in robot_names())]
 STRICT = (
-    "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Wvla", "-Wundef",
-    "-Wfloat-equal", "-Wdouble-promotion", "-Wcast-qual", "-Werror",
-)  # fmt: skip
+    "-Wall",
+    "-Wextra",
+    "-Wpedantic",
+    "-Wconversion",
+    "-Wshadow",
+    "-Wvla",
+    "-Wundef",
+    "-Wfloat-equal",
+    "-Wdouble-promotion",
+    "-Wcast-qual",
+    "-Werror",
+)
 CLOSE = {"compliance": 1e-11, "strain_energy": 1e-11}
 """Of the largest value; by default 1e-12. The frame's stiffness has a condition of 1e4 to 1e6."""
 PLAIN = ("-O0",)
@@ -157,9 +166,14 @@ def test_verdicts_are_those_of_python(exported, count, rng):
         np.testing.assert_array_equal(status == 0.0, robot.try_forward(at_edge)[1])
     for name, rows in inputs_of(robot, (q, *np.zeros((2, *q.shape)), np.zeros((count, 6)))).items():
         if name not in (
-            "inverse", "torques_at_pose", "joint_to_actuator", "gains", "compliance",
-            "strain_energy", "accelerations",
-        ):  # fmt: skip
+            "inverse",
+            "torques_at_pose",
+            "joint_to_actuator",
+            "gains",
+            "compliance",
+            "strain_energy",
+            "accelerations",
+        ):
             status, _ = package.run(program, name, *rows)
             np.testing.assert_array_equal(status == 0.0, good, err_msg=name)
 
@@ -245,11 +259,19 @@ def check_not_finite(robot, package, program):
 
 
 WITHOUT_NAN = (
-    "-fno-honor-nans", "-fno-honor-infinities", "-ffinite-math-only", "-ffast-math", "-Ofast",
-    "-ffast-math -fno-finite-math-only", "-ffast-math -fhonor-infinities",
-    "-funsafe-math-optimizations", "-ffp-model=fast", "-ffp-model=aggressive", "-fp-model=fast=2",
+    "-fno-honor-nans",
+    "-fno-honor-infinities",
+    "-ffinite-math-only",
+    "-ffast-math",
+    "-Ofast",
+    "-ffast-math -fno-finite-math-only",
+    "-ffast-math -fhonor-infinities",
+    "-funsafe-math-optimizations",
+    "-ffp-model=fast",
+    "-ffp-model=aggressive",
+    "-fp-model=fast=2",
     "-Xclang -menable-no-nans",
-)  # fmt: skip
+)
 """Flags of gcc, clang and icx under which a comparison with NaN may be dropped."""
 
 
@@ -286,9 +308,7 @@ def test_nothing_undefined_happens(name, tmp_path):
     ones = np.ones_like(q)
     for name, rows in inputs_of(robot, (q, ones, ones, np.ones((len(q), 6)))).items():
         if name == "inverse":
-            rows = (
-                np.concatenate([rows[0], 10.0 * np.nan_to_num(rows[0]), q[:, : rows[0].shape[1]]]),
-            )
+            rows = (np.concatenate([rows[0], 10.0 * np.nan_to_num(rows[0]), q[:, : rows[0].shape[1]]]),)
         status, found = package.run(program, name, *rows)
         assert np.isnan(found[status != 0.0]).all()
         assert np.isfinite(found[status == 0.0]).all()
@@ -411,12 +431,8 @@ def test_a_stream_has_the_results_of_its_samples(exported, rng):
     rows = np.hstack([rows, np.zeros((len(q), size))])
     rows[200:400:3, :n] = wild(robot, rng, 67)
     rows[410, rng.integers(0, 3 * n + 6)] = np.nan
-    rows[430:600:7, 3 * n + 6 :] = rng.normal(size=(25, size)) * 10.0 ** rng.integers(
-        -9, 9, (25, 1)
-    )
-    done = subprocess.run(
-        ["./stream"], cwd=package.folder, input=rows.tobytes(), capture_output=True, check=True
-    )
+    rows[430:600:7, 3 * n + 6 :] = rng.normal(size=(25, size)) * 10.0 ** rng.integers(-9, 9, (25, 1))
+    done = subprocess.run(["./stream"], cwd=package.folder, input=rows.tobytes(), capture_output=True, check=True)
     found = np.frombuffer(done.stdout).reshape(len(rows), 1 + n + size)
     status, tau, state = found[:, 0], found[:, 1 : 1 + n], found[:, 1 + n :]
     good = robot.try_forward(rows[:, :n])[1] & np.isfinite(rows).all(1)
@@ -435,17 +451,17 @@ def test_a_stream_has_the_results_of_its_samples(exported, rng):
 def test_a_stream_allocates_and_locks_nothing(small, watcher, rng):
     robot, package = small
     write_stream(package, robot.joints_count)
-    program = hooked(
-        package.folder, r"status = [^;]*", "stream.c", f"{package.prefix}.c", watcher=watcher
-    )
+    program = hooked(package.folder, r"status = [^;]*", "stream.c", f"{package.prefix}.c", watcher=watcher)
     rows = rng.normal(0.0, 0.3, (200_000, 3 * robot.joints_count + 6 + state_size(package)))
     assert watched(program, rows) == (len(rows), 0)
 
 
 LANGUAGES = (
-    "-std=c99 -fsyntax-only", "-x c++ -std=c++17 -fsyntax-only", "-std=c99 -O1",
+    "-std=c99 -fsyntax-only",
+    "-x c++ -std=c++17 -fsyntax-only",
+    "-std=c99 -O1",
     "-std=c99 -O2 -mfma",
-)  # fmt: skip
+)
 
 
 @pytest.mark.parametrize("compiler", COMPILERS)
@@ -455,9 +471,7 @@ def test_compilers_warn_of_nothing(exported, compiler, language):
     _, package = exported
     for name in (f"{package.prefix}.c", "example.c"):
         command = [compiler, *language.split(), *STRICT, "-c", name, "-o", os.devnull]
-        done = subprocess.run(
-            command, cwd=package.folder, capture_output=True, text=True, check=False
-        )
+        done = subprocess.run(command, cwd=package.folder, capture_output=True, text=True, check=False)
         assert not done.returncode, done.stderr
 
 
@@ -473,11 +487,10 @@ def test_only_constants_and_functions_of_the_robot_s_name(small):
     package.build("-O0")
     subprocess.run(
         [COMPILERS[0], "-std=c99", "-c", f"{package.prefix}.c", "-o", "o.o"],
-        cwd=package.folder, check=True,
-    )  # fmt: skip
-    symbols = subprocess.run(
-        ["nm", "o.o"], cwd=package.folder, capture_output=True, text=True, check=True
-    ).stdout
+        cwd=package.folder,
+        check=True,
+    )
+    symbols = subprocess.run(["nm", "o.o"], cwd=package.folder, capture_output=True, text=True, check=True).stdout
     kinds = dict(re.findall(r"(\w) (\w+)$", symbols, re.MULTILINE)[::-1])
     assert not set(kinds) & set("dDbBcC"), symbols
     own = re.findall(r" [a-zA-TV-Z] (\w+)", symbols)
@@ -494,13 +507,16 @@ def test_another_payload_by_parameters(name, tmp_path, rng):
     numbers = [mass, *com, *inertia.ravel()]
     given = ", ".join(map(repr, map(float, numbers)))
     driver = (package.folder / "driver.c").read_text()
-    driver = driver.replace("    long row;\n", f"""\
+    driver = driver.replace(
+        "    long row;\n",
+        f"""\
     long row;
     static const double load[13] = {{{given}}};
     double parameters[{size}];
     if (@_parameters(-1.0, load + 1, load + 4, parameters) != 2) {{ return 7; }}
     if (@_parameters(load[0], load + 1, load + 4, parameters) != 0) {{ return 7; }}
-""".replace("@", package.prefix))  # fmt: skip
+""".replace("@", package.prefix),
+    )
     driver = re.sub(rf"(\(double\){package.prefix}_\w+)\(", r"\1_with(parameters, ", driver)
     (package.folder / "driver.c").write_text(driver)
     program = package.build(*PLAIN)
@@ -512,27 +528,25 @@ def test_another_payload_by_parameters(name, tmp_path, rng):
         status, found = package.run(program, name, *inputs[name])
         right = ask(*inputs[name])
         assert not status.any(), name
-        np.testing.assert_allclose(
-            found, right, 0.0, CLOSE.get(name, 1e-12) * np.abs(right).max(), err_msg=name
-        )
+        np.testing.assert_allclose(found, right, 0.0, CLOSE.get(name, 1e-12) * np.abs(right).max(), err_msg=name)
 
 
 def drawn_payloads(rng, count):
     """Rows of mass, com and inertia, of real bodies and of others, some at the rule's edge."""
     rows = np.zeros((count, 13))
     for k, row in enumerate(rows):
-        row[0] = rng.choice(
-            [0.0, 1.0, 1e5, -1e-9, 100_001.0, 1e300, np.nan], p=[0.2, 0.4] + [0.08] * 5
-        )
-        row[1:4] = rng.normal(size=3) * rng.choice(
-            [0.0, 1.0, 40.0, 1e300, np.inf], p=[0.3, 0.4] + [0.1] * 3
-        )
+        row[0] = rng.choice([0.0, 1.0, 1e5, -1e-9, 100_001.0, 1e300, np.nan], p=[0.2, 0.4] + [0.08] * 5)
+        row[1:4] = rng.normal(size=3) * rng.choice([0.0, 1.0, 40.0, 1e300, np.inf], p=[0.3, 0.4] + [0.1] * 3)
         one, other = np.abs(rng.normal(size=2))
         edge = 1.0 + rng.choice([0.0, 1e-10, 1e-8, -1e-8, 1e-3])
         moments = [
-            rng.normal(size=3), 2.0 + np.abs(rng.normal(size=3)), [0.0, one, one * edge],
-            [one, other, (one + other) * edge], np.zeros(3), [0.0, 0.0, one],
-        ][k % 6]  # fmt: skip
+            rng.normal(size=3),
+            2.0 + np.abs(rng.normal(size=3)),
+            [0.0, one, one * edge],
+            [one, other, (one + other) * edge],
+            np.zeros(3),
+            [0.0, 0.0, one],
+        ][k % 6]
         axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
         inertia = axes @ np.diag(moments) @ axes.T * 10.0 ** rng.integers(-12, 15)
         inertia = (inertia + inertia.T) / 2.0
@@ -558,20 +572,23 @@ int main(void)
 }}
 """)
     command = [
-        COMPILERS[0], "-std=c99", *PLAIN, f"-I{package.folder}", "judge.c",
-        package.folder / f"{package.prefix}.c", "-o", "judge", "-lm",
-    ]  # fmt: skip
+        COMPILERS[0],
+        "-std=c99",
+        *PLAIN,
+        f"-I{package.folder}",
+        "judge.c",
+        package.folder / f"{package.prefix}.c",
+        "-o",
+        "judge",
+        "-lm",
+    ]
     subprocess.run(command, cwd=tmp_path, check=True)
     rows = drawn_payloads(rng, count)
-    done = subprocess.run(
-        [tmp_path / "judge"], input=rows.tobytes(), capture_output=True, check=True
-    )
+    done = subprocess.run([tmp_path / "judge"], input=rows.tobytes(), capture_output=True, check=True)
     right = []
     for mass, *rest in rows.tolist():
         try:
-            robot.changed(
-                payload={"mass": mass, "com": rest[:3], "inertia": np.reshape(rest[3:], (3, 3))}
-            )
+            robot.changed(payload={"mass": mass, "com": rest[:3], "inertia": np.reshape(rest[3:], (3, 3))})
             right.append("0")
         except ParameterError:
             right.append("2")
@@ -626,10 +643,14 @@ def test_names_become_identifiers():
 def test_friction_laws_are_those_of_python(tmp_path, rng):
     robot = loaded("five_bar").changed(
         friction={
-            "coulomb": 0.1, "stribeck": 0.2, "stribeck_speed": 0.3, "load_dependent": 0.1,
-            "cogging_cos": 0.05, "cogging_period": 0.2,
+            "coulomb": 0.1,
+            "stribeck": 0.2,
+            "stribeck_speed": 0.3,
+            "load_dependent": 0.1,
+            "cogging_cos": 0.05,
+            "cogging_period": 0.2,
         }
-    )  # fmt: skip
+    )
     package = Package(tmp_path, c_package(robot))
     program, inputs = package.build(*PLAIN), inputs_of(robot, random_motion(robot, rng, 50))
     for name in ("torques", "accelerations"):

@@ -26,9 +26,16 @@ from fmpy.validation import validate_fmu  # noqa: E402
 pytestmark = pytest.mark.skipif(find_compiler() is None, reason="there is no C compiler")
 
 STRICT = (
-    "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Wvla", "-Wundef",
-    "-Wcast-qual", "-Werror",
-)  # fmt: skip
+    "-Wall",
+    "-Wextra",
+    "-Wpedantic",
+    "-Wconversion",
+    "-Wshadow",
+    "-Wvla",
+    "-Wundef",
+    "-Wcast-qual",
+    "-Werror",
+)
 RANDOM = {"random bolted": 1, "random hinged_platform": 3}
 """Redundant closures, dry friction in all joints."""
 NAMES = ("five_bar", "delta_cu", "stewart", *RANDOM)
@@ -78,9 +85,7 @@ def last(result, what, robot):
 def simulated(path, kind, span, start, **more):
     if kind == "ModelExchange":
         more |= {"solver": "CVode", "relative_tolerance": 1e-11}
-    return fmpy.simulate_fmu(
-        path, stop_time=span, fmi_type=kind, start_values=start, output_interval=span / 10, **more
-    )
+    return fmpy.simulate_fmu(path, stop_time=span, fmi_type=kind, start_values=start, output_interval=span / 10, **more)
 
 
 @pytest.mark.parametrize("unit", partly_long(KINDS_OF, *KINDS_OF[1:3]), ids=str)
@@ -95,9 +100,7 @@ def test_fmpy_finds_nothing_wrong_and_every_run_writes_the_same(unit, tmp_path):
         archive.extractall(tmp_path)
     for compiler in filter(shutil.which, ("gcc", "clang")):
         command = [compiler, "-std=c99", *STRICT, "-fsyntax-only", "fmu.c"]
-        done = subprocess.run(
-            command, cwd=tmp_path / "sources", capture_output=True, text=True, check=False
-        )
+        done = subprocess.run(command, cwd=tmp_path / "sources", capture_output=True, text=True, check=False)
         assert not done.returncode, done.stderr
 
 
@@ -163,9 +166,8 @@ def test_torques_of_a_motion_with_another_payload(name, version, kind, unit):
     start |= {"payload.mass": load["mass"]}
     start |= {f"payload.com.{a}": x for a, x in zip("xyz", load["com"], strict=True)}
     start |= {
-        f"payload.inertia.{a}{b}": inertia[i][k]
-        for i, a in enumerate("xyz") for k, b in enumerate("xyz") if k >= i
-    }  # fmt: skip
+        f"payload.inertia.{a}{b}": inertia[i][k] for i, a in enumerate("xyz") for k, b in enumerate("xyz") if k >= i
+    }
     result = simulated(unit(robot, version, "torques"), kind, 0.01, start)
     right = inverse_dynamics(robot.changed(payload=load), q, qd, qdd, wrench)
     np.testing.assert_allclose(last(result, "tau", robot), right, 0.0, 1e-12 * np.abs(right).max())
@@ -185,9 +187,12 @@ def test_what_cannot_be_is_no_result(version, kind, unit):
         said.clear()
         with pytest.raises(fmpy.fmi1.FMICallException):
             fmpy.simulate_fmu(
-                path, stop_time=0.01, fmi_type="CoSimulation", start_values=start,
+                path,
+                stop_time=0.01,
+                fmi_type="CoSimulation",
+                start_values=start,
                 logger=lambda *words: said.append(words),
-            )  # fmt: skip
+            )
         assert said
 
 
@@ -197,9 +202,11 @@ def test_a_saved_state_goes_on_as_before(version, unit, tmp_path):
     path = unit(robot, version, "dynamics")
     described = fmpy.read_model_description(path)
     slave = {2: fmpy.fmi2.FMU2Slave, 3: fmpy.fmi3.FMU3Slave}[version](
-        guid=described.guid, unzipDirectory=fmpy.extract(path, str(tmp_path / "out")),
-        modelIdentifier=described.coSimulation.modelIdentifier, instanceName="one",
-    )  # fmt: skip
+        guid=described.guid,
+        unzipDirectory=fmpy.extract(path, str(tmp_path / "out")),
+        modelIdentifier=described.coSimulation.modelIdentifier,
+        instanceName="one",
+    )
     slave.instantiate()
     if version == 2:
         slave.setupExperiment(startTime=0.0)
@@ -211,9 +218,7 @@ def test_a_saved_state_goes_on_as_before(version, unit, tmp_path):
     words = [("state",)] * 3 + [("deS", "state")]
     if version == 3:
         words = [("State",)] * 3 + [("des", "State")]
-    get, restore, save, load = (
-        getattr(slave, name.format(*word)) for name, word in zip(names, words, strict=True)
-    )
+    get, restore, save, load = (getattr(slave, name.format(*word)) for name, word in zip(names, words, strict=True))
     slave.doStep(0.0, 0.01)
     state = get()
     slave.doStep(0.01, 0.01)

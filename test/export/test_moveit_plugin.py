@@ -20,9 +20,7 @@ from test.support.robots import load, partly_long, random_joints
 
 from .c_programs import COMPILERS, STRICT
 
-pytestmark = pytest.mark.skipif(
-    not COMPILERS or not shutil.which("g++"), reason="there is no C and C++ compiler"
-)
+pytestmark = pytest.mark.skipif(not COMPILERS or not shutil.which("g++"), reason="there is no C and C++ compiler")
 SUCCESS, IN_COLLISION, NO_SOLUTION = 1.0, -12.0, -31.0
 HEADERS = ("kinematics_base/kinematics_base", "robot_model/robot_model")
 DRIVER = r"""
@@ -133,9 +131,7 @@ class Plugin:
         command = [self.program, word, str(stop)]
         return subprocess.run(command, input=data, capture_output=True, check=True).stdout
 
-    def solve(
-        self, goals, seeds=0.0, call=0, approximate=0, size=None, limits=0, limit=0.0, stop=0.0
-    ):
+    def solve(self, goals, seeds=0.0, call=0, approximate=0, size=None, limits=0, limit=0.0, stop=0.0):
         """Codes, joint positions and their platform poses (7 numbers) of rows of goals."""
         size = self.n if size is None else size
         head = np.broadcast_to([call, approximate, size, limits, limit], (len(goals), 5))
@@ -150,9 +146,7 @@ class Plugin:
 
 @pytest.fixture(
     scope="module",
-    params=partly_long(
-        ("delta_cu", "five_bar", "rps3", "upr_rpu", "stewart"), "delta_cu", "five_bar"
-    ),
+    params=partly_long(("delta_cu", "five_bar", "rps3", "upr_rpu", "stewart"), "delta_cu", "five_bar"),
 )
 def plugin(request, tmp_path_factory):
     return Plugin(load(request.param), tmp_path_factory.mktemp("plugin"))

@@ -39,13 +39,10 @@ from .c_programs import COMPILERS, STRICT, blocking, hooked, watched
 
 ROS = [p for p in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if p]
 needs_ros2_control = pytest.mark.skipif(
-    not shutil.which("colcon")
-    or not any(Path(p, "share/controller_interface").is_dir() for p in ROS),
+    not shutil.which("colcon") or not any(Path(p, "share/controller_interface").is_dir() for p in ROS),
     reason="ros2_control is not installed in a sourced workspace with colcon",
 )
-needs_compiler = pytest.mark.skipif(
-    not COMPILERS or not shutil.which("g++"), reason="there is no C and C++ compiler"
-)
+needs_compiler = pytest.mark.skipif(not COMPILERS or not shutil.which("g++"), reason="there is no C and C++ compiler")
 NAMES = ["NOT_FINITE", "BEYOND_LIMIT", "NO_ASSEMBLY", "SINGULAR", "NO_STATE", "NONE"]
 DRIVER = r"""
 #include <cstdio>
@@ -103,17 +100,25 @@ class Core:
         (c_file,) = folder.glob("c/pkm_*.c")
         for command in (
             [COMPILERS[0], "-std=c99", "-O0", "-c", c_file, "-o", "robot.o"],
-            ["g++", *STRICT, "-Iinclude", "-Ic", "driver.cpp", "src/feedforward.cpp", "robot.o",
-             "-o", self.program, "-lm"],
-        ):  # fmt: skip
+            [
+                "g++",
+                *STRICT,
+                "-Iinclude",
+                "-Ic",
+                "driver.cpp",
+                "src/feedforward.cpp",
+                "robot.o",
+                "-o",
+                self.program,
+                "-lm",
+            ],
+        ):
             done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
             assert not done.returncode, done.stderr
 
     def run(self, rows, start, p=0.0, d=0.0, stop=0.0, hold=0.5, *, bounded=True):
         """Sound, verdict, effort and feedforward of updates: rows of 5 n numbers."""
-        head = np.concatenate(
-            [np.full(self.n, p), np.full(self.n, d), [stop, hold, bounded], start]
-        )
+        head = np.concatenate([np.full(self.n, p), np.full(self.n, d), [stop, hold, bounded], start])
         done = subprocess.run(
             [self.program],
             input=head.tobytes() + np.ascontiguousarray(rows).tobytes(),
@@ -155,9 +160,7 @@ class TestCore:
         motion = [both.positions(q), both.rates(qd), both.rates(qdd)]
         measured = [both.positions(q - miss[0]), both.rates(qd - miss[1])]
         p, d = 0.3, 0.07
-        sound, names, effort, forward = core.run(
-            np.hstack([*motion, *measured]), both.positions(q[0]), p, d
-        )
+        sound, names, effort, forward = core.run(np.hstack([*motion, *measured]), both.positions(q[0]), p, d)
         right = both.efforts(inverse_dynamics(model, q, qd, qdd))
         assert sound.all() and set(names) == {"NONE"}
         np.testing.assert_allclose(forward, right, 0.0, 1e-11 * np.abs(right).max())
@@ -169,16 +172,12 @@ class TestCore:
         both, core = mapped
         model = loaded(both.plain.name)
         q, qd, qdd, _ = random_motion(model, np.random.default_rng(3), 1)
-        good = np.hstack([
-            both.positions(q), both.rates(qd), both.rates(qdd), both.positions(q), both.rates(qd)
-        ])  # fmt: skip
+        good = np.hstack([both.positions(q), both.rates(qd), both.rates(qdd), both.positions(q), both.rates(qd)])
         bad = np.repeat(good, 3, 0)
         bad[[0, 1, 2], [0, core.n, 3 * core.n - 1]] = np.nan, np.inf, -np.inf
         rows = np.concatenate([good, *[bad] * 10, good, bad[:1]])
         weight = both.efforts(inverse_dynamics(model, q, 0.0 * qd, 0.0 * qdd))[0]
-        sound, names, effort, forward = core.run(
-            rows, good[0, : core.n], p=0.3, d=1e-3, hold=0.0205
-        )
+        sound, names, effort, forward = core.run(rows, good[0, : core.n], p=0.3, d=1e-3, hold=0.0205)
         assert names == ["NONE", *["NOT_FINITE"] * 30, "NONE", "NOT_FINITE"]
         np.testing.assert_array_equal(sound, [True] * 21 + [False] * 10 + [True] * 2)
         scale = 1e-11 * np.abs(weight).max()
@@ -207,9 +206,7 @@ class TestCore:
         np.testing.assert_allclose(effort, clipped(core, right), 0.0, scale)
         assert sound.all() and names == ["NONE"] * 30 + ["NOT_FINITE"]
 
-    def test_the_weight_is_carried_without_a_velocity_and_no_position_is_controlled_without(
-        self, mapped
-    ):
+    def test_the_weight_is_carried_without_a_velocity_and_no_position_is_controlled_without(self, mapped):
         both, core = mapped
         model = loaded(both.plain.name)
         q, qd, _, _ = random_motion(model, np.random.default_rng(5), 1)
@@ -251,9 +248,7 @@ class TestCore:
         _, core = mapped
         n, folder = core.n, core.program.parent
         sources = ("src/feedforward.cpp", "robot.o", "-Iinclude", "-Ic")
-        program = hooked(
-            folder, r"const bool sound = [^;]*", "driver.cpp", *sources, watcher=watcher
-        )
+        program = hooked(folder, r"const bool sound = [^;]*", "driver.cpp", *sources, watcher=watcher)
         start = core.robot.controller.controller_positions(core.robot.graph.home)
         head = np.concatenate([np.full(2 * n, 0.1), [0.1, np.inf, 1.0], start])
         rows = np.tile(start, 5) + rng.normal(0.0, 0.2, (200_000, 5 * n))
@@ -496,9 +491,7 @@ def test_settings_name_the_joints_and_have_the_gains_of_the_masses(files):
     assert manager["feedforward_controller"]["type"] in files["controllers.xml"]
     trajectories = sections["joint_trajectory_controller"]
     assert trajectories["joints"] == list(robot.joint_names)
-    assert trajectories["command_joints"] == [
-        f"feedforward_controller/{name}" for name in robot.joint_names
-    ]
+    assert trajectories["command_joints"] == [f"feedforward_controller/{name}" for name in robot.joint_names]
     (fallback,) = manager["feedforward_controller"]["fallback_controllers"]
     assert manager[fallback]["type"] in files["controllers.xml"]
     inertia = np.diag(mass_matrix(robot, robot.graph.home))
@@ -513,10 +506,14 @@ def test_settings_name_the_joints_and_have_the_gains_of_the_masses(files):
 @pytest.mark.parametrize(
     ("name", "package"),
     [
-        ("delta_cu", "delta_cu"), ("My Delta-2", "my_delta_2"), ("3rps", "robot_3rps"),
-        ("größe", "gru00f6u00dfe"), ("__", "robot"), ("a//b", "a_b"),
+        ("delta_cu", "delta_cu"),
+        ("My Delta-2", "my_delta_2"),
+        ("3rps", "robot_3rps"),
+        ("größe", "gru00f6u00dfe"),
+        ("__", "robot"),
+        ("a//b", "a_b"),
     ],
-)  # fmt: skip
+)
 def test_names_of_packages(name, package):
     robot = robot_of_data(sides("five_bar").data, name)
     assert package_name(robot) == f"{package}_ros2_control"
@@ -541,7 +538,5 @@ def test_the_package_builds_and_its_own_test_passes(name, tmp_path):
         (tmp_path / "src" / path).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "src" / path).write_text(text)
     for command in ("build", "test", "test-result"):
-        done = subprocess.run(
-            ["colcon", command], cwd=tmp_path, capture_output=True, text=True, check=False
-        )
+        done = subprocess.run(["colcon", command], cwd=tmp_path, capture_output=True, text=True, check=False)
         assert not done.returncode, done.stdout + done.stderr

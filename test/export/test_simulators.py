@@ -29,8 +29,13 @@ RANDOM = {"random hinged_platform": 3, "random prru3": 6, "random bolted": 1}
 """Redundant closures, joints that count from elsewhere, universal joints not at a right angle."""
 NAMES = (*robot_names(), *RANDOM)
 FREEDOMS = {
-    "fixed": 0, "revolute": 1, "prismatic": 1, "screw": 1, "universal": 2, "ball": 3,
-}  # fmt: skip
+    "fixed": 0,
+    "revolute": 1,
+    "prismatic": 1,
+    "screw": 1,
+    "universal": 2,
+    "ball": 3,
+}
 
 
 FALL, ROTOR = "gravity [0.0, 3.0, 0.0]", "the rotor inertia of left"
@@ -171,17 +176,12 @@ int main(int, char **words)
 def test_libsdformat_reads_every_robot(tmp_path):
     """Where its development files are installed."""
     asked = ["pkg-config", "--cflags", "--libs", "sdformat12"]
-    if (
-        not shutil.which("g++")
-        or subprocess.run(asked, capture_output=True, check=False).returncode
-    ):
+    if not shutil.which("g++") or subprocess.run(asked, capture_output=True, check=False).returncode:
         pytest.skip("no libsdformat-dev")
     flags = subprocess.run(asked, capture_output=True, text=True, check=True).stdout.split()
     (tmp_path / "read.cpp").write_text(PROGRAM)
     program = str(tmp_path / "read")
-    subprocess.run(
-        ["g++", "-std=c++17", "read.cpp", "-o", program, *flags], cwd=tmp_path, check=True
-    )
+    subprocess.run(["g++", "-std=c++17", "read.cpp", "-o", program, *flags], cwd=tmp_path, check=True)
     for name in NAMES:
         path = tmp_path / "robot.sdf"
         path.write_text(robot_sdf(robot_of(name)))
@@ -205,11 +205,7 @@ def written(folder):
 def test_the_commands_write_the_same_bytes_in_every_process(tmp_path):
     """Also where sets have an order of their own; never over what is there."""
     here = written(tmp_path / "here")
-    program = (
-        "import sys, pathlib\n"
-        "from test.export.test_simulators import written\n"
-        "written(pathlib.Path(sys.argv[1]))"
-    )
+    program = "import sys, pathlib\nfrom test.export.test_simulators import written\nwritten(pathlib.Path(sys.argv[1]))"
     environment = os.environ | {"PYTHONHASHSEED": "3", "PYTHONPATH": os.pathsep.join(sys.path)}
     command = [sys.executable, "-c", program, str(tmp_path / "there")]
     subprocess.run(command, env=environment, check=True, capture_output=True)

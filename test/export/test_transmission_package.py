@@ -17,15 +17,14 @@ from test.export.c_programs import COMPILERS, STRICT, hooked, watched
 from test.machine.random_machines import FILES, MACHINES
 from test.support.robots import load, partly_long
 
-pytestmark = pytest.mark.skipif(
-    not COMPILERS or not shutil.which("g++"), reason="there is no C and C++ compiler"
-)
+pytestmark = pytest.mark.skipif(not COMPILERS or not shutil.which("g++"), reason="there is no C and C++ compiler")
 GOOD, HELD, OUT_OF_REACH, NOT_FINITE = range(4)
 REDUNDANT = MACHINES.parents[2] / "examples/machines/rrr4_planar.yaml"
 HEADERS = (
-    "transmission_interface/transmission", "transmission_interface/exception",
+    "transmission_interface/transmission",
+    "transmission_interface/exception",
     "hardware_interface/types/hardware_interface_type_values",
-)  # fmt: skip
+)
 DRIVER = r"""
 #include <cstdio>
 #include <memory>
@@ -92,10 +91,9 @@ class Compiled:
         robot = load(FILES.get(name, name))
         rng, self.folder = np.random.default_rng(3), folder
         entries = {
-            joint: {"sign": float(rng.choice([-1, 1])), "ratio": rng.uniform(0.2, 9.0),
-                    "offset": rng.normal()}
+            joint: {"sign": float(rng.choice([-1, 1])), "ratio": rng.uniform(0.2, 9.0), "offset": rng.normal()}
             for joint in robot.joint_names
-        }  # fmt: skip
+        }
         self.robot = robot.changed(joint_map=entries)
         self.right = transmission(self.robot)
         self.n, self.m = self.robot.joints_count, len(self.robot.pose_names)
@@ -130,8 +128,9 @@ class Compiled:
 
     def run(self, *rows):
         """Status and results, in fours, of each call."""
-        done = subprocess.run([self.program], input=b"".join(r.tobytes() for r in rows),
-                              capture_output=True, check=True)  # fmt: skip
+        done = subprocess.run(
+            [self.program], input=b"".join(r.tobytes() for r in rows), capture_output=True, check=True
+        )
         values, found = np.frombuffer(done.stdout), []
         for row in rows:
             size = self.n if row[0] > 0.0 else self.m
@@ -150,9 +149,7 @@ def compiled(request, tmp_path_factory):
 
 def poses(compiled, count=20):
     rng, home = np.random.default_rng(4), compiled.robot.home()
-    return home + rng.uniform(-0.01, 0.01, (count, compiled.m)), rng.normal(
-        size=(2, count, compiled.m)
-    )
+    return home + rng.uniform(-0.01, 0.01, (count, compiled.m)), rng.normal(size=(2, count, compiled.m))
 
 
 def test_states_and_commands_are_those_of_python(compiled):
@@ -190,9 +187,7 @@ def test_out_of_reach_holds_the_last_result_for_one_call(compiled):
     beyond = compiled.rows(1.0, far, still, still, still)
     broken = compiled.rows(1.0, np.append(home[:-1], np.inf), still, still, still)
     good, held, lost, bad, again = compiled.run(at_home, beyond, beyond, broken, at_home)
-    assert [row[0] for row in (good, held, lost, bad, again)] == [
-        GOOD, HELD, OUT_OF_REACH, NOT_FINITE, GOOD
-    ]  # fmt: skip
+    assert [row[0] for row in (good, held, lost, bad, again)] == [GOOD, HELD, OUT_OF_REACH, NOT_FINITE, GOOD]
     np.testing.assert_array_equal(held[1][:3], good[1][:3])
     assert np.isnan(lost[1][:3]).all() and np.isnan(bad[1][:3]).all()
     np.testing.assert_array_equal(again[1], good[1])
@@ -204,9 +199,13 @@ def test_no_call_allocates(compiled):
     x, (v, f) = poses(compiled)
     rows = [compiled.rows(1.0, *row, row[0]) for row in zip(x, v, f, strict=True)]
     program = hooked(
-        compiled.folder, r"it->\w+_to_\w+\(\)", "driver.cpp", *compiled.flags, "transmission.o",
+        compiled.folder,
+        r"it->\w+_to_\w+\(\)",
+        "driver.cpp",
+        *compiled.flags,
+        "transmission.o",
         "robot.o",
-    )  # fmt: skip
+    )
     assert watched(program, np.concatenate(rows)) == (len(rows), 0)
 
 

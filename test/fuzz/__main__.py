@@ -24,8 +24,17 @@ from test.fuzz.tally import Kind, run
 from test.support.pages import FAULTS, read_section, write_section
 
 KINDS: tuple[type[Kind], ...] = (
-    Messages, DamagedBags, DamagedSplits, NonsenseBags, Cdr, Metadata, Yaml, Urdf, Csv, Commands,
-)  # fmt: skip
+    Messages,
+    DamagedBags,
+    DamagedSplits,
+    NonsenseBags,
+    Cdr,
+    Metadata,
+    Yaml,
+    Urdf,
+    Csv,
+    Commands,
+)
 NODES = "nodes.json"
 """What test_nodes.py leaves there."""
 INTRODUCTION = """## Fuzzing
@@ -45,10 +54,7 @@ alive; {torques:,} torques received, each finite and with the stamp of a valid m
 
 def row(found: dict[str, Any]) -> str:
     """A kind's figures as a row of the table."""
-    return (
-        f"| {found['kind']} | {found['examples']:,} | {found['taken']:,} | "
-        f"{len(found['failures'])} |"
-    )
+    return f"| {found['kind']} | {found['examples']:,} | {found['taken']:,} | {len(found['failures'])} |"
 
 
 def section(figures: list[dict[str, Any]], nodes: dict[str, Any] | None, before: str) -> str:
@@ -72,9 +78,7 @@ def main() -> int:
     parser.add_argument("--only", default="", help="kinds with this text in their name, by commas")
     parser.add_argument("--count", type=int, default=0, help="examples a kind, instead of seconds")
     parser.add_argument("--out", type=Path, default=Path("out/fuzz"), help="folder for the figures")
-    parser.add_argument(
-        "--page", action="store_true", help="only write what is there into the page"
-    )
+    parser.add_argument("--page", action="store_true", help="only write what is there into the page")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     files = [options.out / f"{kind.__name__}.json" for kind in KINDS]
@@ -97,8 +101,11 @@ def main() -> int:
                 count=options.count,
                 keep=lambda tally, target=target: target.write_text(tally.as_json() + "\n"),
             )
-        print(f"{kind.name}: {tally.examples:,} in {tally.spent:.0f} s, {tally.good:,} taken, "
-              f"{dict(tally.refused.most_common(6))}", flush=True)  # fmt: skip
+        print(
+            f"{kind.name}: {tally.examples:,} in {tally.spent:.0f} s, {tally.good:,} taken, "
+            f"{dict(tally.refused.most_common(6))}",
+            flush=True,
+        )
         for failure in tally.failures:
             print(f"  FAILED {failure}", flush=True)
         failed |= bool(tally.failures)

@@ -100,13 +100,9 @@ def text(value: str) -> bytes:
     return raw.text(value.encode(errors="replace"))
 
 
-NUMBERS = st.one_of(
-    st.integers(0, 3), st.sampled_from((2**16 - 1, 2**31, 2**32 - 1, 2**63, 2**64 - 1))
-)
+NUMBERS = st.one_of(st.integers(0, 3), st.sampled_from((2**16 - 1, 2**31, 2**32 - 1, 2**63, 2**64 - 1)))
 NAMES = st.one_of(
-    st.sampled_from(
-        ("", "/a", "/joint_states", "cdr", "ros2msg", STATE, "zstd", "lz4", "json", "a b\n", "\0")
-    ),
+    st.sampled_from(("", "/a", "/joint_states", "cdr", "ros2msg", STATE, "zstd", "lz4", "json", "a b\n", "\0")),
     st.text(max_size=12),
 )
 NONSENSE_YAML = st.one_of(

@@ -118,9 +118,7 @@ class Commands(Kind):
         # Now and then a word too much, too few, or in the place of another.
         if rng.random() < 0.4:
             at = rng.randint(0, len(line))
-            line[at : at + rng.randint(0, 2)] = rng.choices(
-                [*self.words, "--help", "--x"], k=rng.randrange(3)
-            )
+            line[at : at + rng.randint(0, 2)] = rng.choices([*self.words, "--help", "--x"], k=rng.randrange(3))
         return line
 
     def check(self, example: list[str]) -> str:

@@ -14,10 +14,37 @@ from test.bags.conftest import DEFINITIONS
 from test.fuzz.tally import Kind, refusal
 
 WORDS = (
-    "float64", "int8", "bool", "string", "wstring", "byte", "p/E", "E", "Header", "p/msg/M", "x",
-     "[]", "[3]", "[<=3]", "<=5", "[99999999999]", "=", "# c", "=" * 80, "MSG: p/E", "MSG:", "\n",
-     "\n", " ", " ", "a", "b", "class", "é", "9" * 30,
-)  # fmt: skip
+    "float64",
+    "int8",
+    "bool",
+    "string",
+    "wstring",
+    "byte",
+    "p/E",
+    "E",
+    "Header",
+    "p/msg/M",
+    "x",
+    "[]",
+    "[3]",
+    "[<=3]",
+    "<=5",
+    "[99999999999]",
+    "=",
+    "# c",
+    "=" * 80,
+    "MSG: p/E",
+    "MSG:",
+    "\n",
+    "\n",
+    " ",
+    " ",
+    "a",
+    "b",
+    "class",
+    "é",
+    "9" * 30,
+)
 
 
 def definitions() -> st.SearchStrategy[str]:
@@ -38,8 +65,7 @@ class Cdr(Kind):
         else:
             sizes = ("", "", "[]", "[2]", "[<=2]")
             definition = "\n".join(
-                f"{rng.choice(WORDS)}{rng.choice(sizes)} f{rng.randrange(10)}"
-                for _ in range(rng.randrange(7))
+                f"{rng.choice(WORDS)}{rng.choice(sizes)} f{rng.randrange(10)}" for _ in range(rng.randrange(7))
             )
         words = (b"\0\0\0\0", b"\1\0\0\0", b"\xff\xff\xff\xff")
         data = b"".join(rng.choices(words, k=rng.randrange(40)))

@@ -33,9 +33,21 @@ from test.nodes.harness import SECOND, Maker, Plain
 from test.support.robots import parameters_of, without
 
 VALUES = (
-    0.0, -0.0, 0.1, -0.7, 1.3, 1e3, -1e7, 1e18, 1e300, 5e-324, -1e-310,
-    math.nan, math.inf, -math.inf,
-)  # fmt: skip
+    0.0,
+    -0.0,
+    0.1,
+    -0.7,
+    1.3,
+    1e3,
+    -1e7,
+    1e18,
+    1e300,
+    5e-324,
+    -1e-310,
+    math.nan,
+    math.inf,
+    -math.inf,
+)
 JOINT_STATE = "sensor_msgs/msg/JointState"
 TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
 WRENCH = "geometry_msgs/msg/WrenchStamped"
@@ -302,9 +314,7 @@ def read_example(told: dict[str, Any], source: Source) -> tuple[str, Any]:
     q = source.motion(NOW)[0]
 
     def numbers(values: Any) -> list[float]:
-        return (
-            list(q) if values == "home" else [math.nan if v is None else float(v) for v in values]
-        )
+        return list(q) if values == "home" else [math.nan if v is None else float(v) for v in values]
 
     stamp = NOW + int(told.get("ahead", 0)) if "stamp" not in told else int(told["stamp"])
     names = told.get("names", list(source.names))

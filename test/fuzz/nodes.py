@@ -29,9 +29,20 @@ from test.fuzz.rules import Rules
 from test.nodes.harness import SECOND, stamp_of, values_of
 
 NAMES = (
-    "stale_after", "payload.mass", "payload.com", "gravity", "on_stop", "effort_limits", "", "é",
-    "friction.viscous", "singularity_warn", "differentiator.window", "mechanism", "x" * 2**20,
-)  # fmt: skip
+    "stale_after",
+    "payload.mass",
+    "payload.com",
+    "gravity",
+    "on_stop",
+    "effort_limits",
+    "",
+    "é",
+    "friction.viscous",
+    "singularity_warn",
+    "differentiator.window",
+    "mechanism",
+    "x" * 2**20,
+)
 EXPIRY = Duration(seconds=0.1)
 QUICK = ("use_sim_time:=true", "differentiator.window:=4", "recovery_count:=1")
 TYPES = (*range(11), 99, 128, 255)
@@ -73,8 +84,7 @@ class Fuzzed:
             "/fuzz/wrench": (WrenchStamped, WRENCH, self.source.wrench),
         }
         self.kinds = {
-            topic: (MessageCodec(name, message_definition(name)), draw)
-            for topic, (_, name, draw) in kinds.items()
+            topic: (MessageCodec(name, message_definition(name)), draw) for topic, (_, name, draw) in kinds.items()
         }
         # The gate takes torques of publishers alone that promise a deadline.
         promised = QoSProfile(depth=10, lifespan=EXPIRY, deadline=EXPIRY)

@@ -49,9 +49,7 @@ class Rules:
             return True
         if not all(map(math.isfinite, found)):
             return False
-        return bounds is None or all(
-            low <= v <= high for v, (low, high) in zip(found, bounds, strict=True)
-        )
+        return bounds is None or all(low <= v <= high for v, (low, high) in zip(found, bounds, strict=True))
 
     def joint_state(self, message: Any, now: int) -> bool:
         by_name = self.named(message, message.position)
@@ -70,9 +68,7 @@ class Rules:
         if by_name is None or not all(map(math.isfinite, by_name.values())):
             return False
         limits = self.robot.limits.effort
-        within = limits is None or all(
-            abs(by_name[j]) <= limit for j, limit in zip(self.names, limits, strict=True)
-        )
+        within = limits is None or all(abs(by_name[j]) <= limit for j, limit in zip(self.names, limits, strict=True))
         return within and self.stamp(message, now, STALE)
 
     def trajectory(self, message: Any) -> bool:

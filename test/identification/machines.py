@@ -36,14 +36,14 @@ class Drawn:
 
     def recorded(self, q: Array | None = None, effort: Array | None = None) -> Recording:
         return Recording(
-            self.robot, self.time, self.q if q is None else q,
+            self.robot,
+            self.time,
+            self.q if q is None else q,
             effort=self.efforts if effort is None else effort,
-        )  # fmt: skip
+        )
 
 
-def machine(
-    robot: Robot, rng: np.random.Generator, duration: float = 12.0, rate: float = 100.0
-) -> Drawn:
+def machine(robot: Robot, rng: np.random.Generator, duration: float = 12.0, rate: float = 100.0) -> Drawn:
     """With friction and a payload that the file does not have."""
     time, q, qd, qdd = smooth_motion(robot, rng, duration, rate)
     size = np.sqrt(np.mean(inverse_dynamics(robot, q, qd, qdd) ** 2, 0))
@@ -56,10 +56,11 @@ def machine(
             "coulomb": (rng.uniform(0.02, 0.1, n) * size).tolist(),
         },
         payload={
-            "mass": mass, "com": (radius * rng.uniform(-0.3, 0.3, 3)).tolist(),
+            "mass": mass,
+            "com": (radius * rng.uniform(-0.3, 0.3, 3)).tolist(),
             "inertia": [moment, 1.3 * moment, 1.6 * moment],
         },
-    )  # fmt: skip
+    )
     return Drawn(robot, truth, time, q, qd, qdd, inverse_dynamics(truth, q, qd, qdd))
 
 
@@ -74,19 +75,16 @@ def of_prior(robot: Robot, rng: np.random.Generator) -> Drawn:
     off = lengths.mixing @ (usual * rng.normal(size=len(usual)))
     truth = m.truth.changed(
         payload={
-            "mass": mass, "com": (radius * rng.uniform(-0.2, 0.2, 3)).tolist(),
+            "mass": mass,
+            "com": (radius * rng.uniform(-0.2, 0.2, 3)).tolist(),
             "inertia": [moment, 1.2 * moment, 1.3 * moment],
         }
-    )  # fmt: skip
-    truth = truth.numbered(
-        {p: truth.number(p) + by for p, by in zip(lengths.paths, off, strict=True)}
     )
+    truth = truth.numbered({p: truth.number(p) + by for p, by in zip(lengths.paths, off, strict=True)})
     return replace(m, truth=truth, efforts=inverse_dynamics(truth, m.q, m.qd, m.qdd))
 
 
-def noisy(
-    recorded: Recording, rng: np.random.Generator, share: float = 0.01, steps: float = 1e5
-) -> Recording:
+def noisy(recorded: Recording, rng: np.random.Generator, share: float = 0.01, steps: float = 1e5) -> Recording:
     """White noise of the efforts by their rms, an encoder of so many steps a span."""
     shape = recorded.q.shape
     size = np.sqrt(np.mean(recorded.effort**2, 0))
@@ -162,11 +160,13 @@ def lengths(m: Drawn, rng: np.random.Generator) -> Recording:
     """One length of the geometry off by 1 %, or a place by 1 % of the machine's size."""
     robot = m.truth
     found = {
-        path: value for path, (value, unit) in robot.file_numbers().items()
-        if unit == "m" and not path.startswith(("limits", "payload", "joint_map", "uncertainty",
-                                                "members", "inertia", "bodies"))
-        and ".com" not in path and "compliance" not in path
-    }  # fmt: skip
+        path: value
+        for path, (value, unit) in robot.file_numbers().items()
+        if unit == "m"
+        and not path.startswith(("limits", "payload", "joint_map", "uncertainty", "members", "inertia", "bodies"))
+        and ".com" not in path
+        and "compliance" not in path
+    }
     named = [p for p in found if p.startswith("geometry.") and "arm" in p]
     for _ in range(50):
         path = str(rng.choice(named or list(found)))
@@ -182,8 +182,7 @@ def lengths(m: Drawn, rng: np.random.Generator) -> Recording:
 
 
 WRONG: dict[str, Callable[[Drawn, np.random.Generator], Recording]] = {
-    f.__name__: f
-    for f in (gain, gains, sensor, sensors, late, load_friction, stribeck, elastic, lengths)
+    f.__name__: f for f in (gain, gains, sensor, sensors, late, load_friction, stribeck, elastic, lengths)
 }
 """Recordings that the model does not explain."""
 
@@ -240,12 +239,8 @@ IMPOSSIBLE: dict[str, Callable[[Recording, np.random.Generator], Recording]] = {
     "degrees": lambda r, _: replace(r, q=np.degrees(r.q)),
     "radians_for_degrees": lambda r, _: replace(r, q=np.radians(r.q)),
     "millimetres": lambda r, _: replace(r, q=1e3 * r.q),
-    "efforts_late": lambda r, rng: replace(
-        r, effort=shifted(r.effort, r.time, 0.3 * rng.choice([-1.0, 1.0]))
-    ),
-    "one_effort_late": lambda r, rng: one_effort(
-        r, rng, lambda v: np.interp(r.time - 0.3, r.time, v)
-    ),
+    "efforts_late": lambda r, rng: replace(r, effort=shifted(r.effort, r.time, 0.3 * rng.choice([-1.0, 1.0]))),
+    "one_effort_late": lambda r, rng: one_effort(r, rng, lambda v: np.interp(r.time - 0.3, r.time, v)),
     "efforts_shuffled": lambda r, rng: replace(r, effort=rng.permutation(r.effort)),
     "noise_for_efforts": lambda r, rng: replace(
         r, effort=r.effort.mean(0) + r.effort.std(0) * rng.normal(size=r.effort.shape)

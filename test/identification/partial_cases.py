@@ -18,10 +18,11 @@ from pkm_twin.mechanisms.catalogue import robot_of_data
 from test.support.robots import random_joints
 
 NOISE = {
-    **dict.fromkeys(("height", "plane"), 2e-5), **dict.fromkeys(("radius", "range"), 1e-5),
+    **dict.fromkeys(("height", "plane"), 2e-5),
+    **dict.fromkeys(("radius", "range"), 1e-5),
     **dict.fromkeys(("x", "y", "z", "distance"), 5e-5),
     **dict.fromkeys(("roll", "pitch", "yaw"), 3e-4),
-}  # fmt: skip
+}
 OFF = 1e-3
 """By which a machine's lengths are not as drawn, m; angles by as much at its platform's radius."""
 
@@ -66,11 +67,12 @@ def case(drawn: Robot, kinds: Sequence[str], count: int, seed: int, flat: bool =
     columns = dict(zip(("x", "y", "z"), position.T, strict=True))
     columns |= dict(zip(("roll", "pitch", "yaw"), angles.T, strict=True))
     columns |= {
-        "height": position[:, 2], "plane": position @ normal - 0.05,
+        "height": position[:, 2],
+        "plane": position @ normal - 0.05,
         "radius": np.linalg.norm(position - centre, axis=1),
         "range": np.linalg.norm(position - [1.5, -2.0, 0.8], axis=1) - 2.3,
         "distance": np.linalg.norm(position - position[other], axis=1),
-    }  # fmt: skip
+    }
     values = {kind: columns[kind] + rng.normal(scale=NOISE[kind], size=count) for kind in kinds}
     second = read[other] if "distance" in kinds else None
     return Case(drawn, measured_of(read, second, values, np.arange(count) + 2, {}), paths, truth)
@@ -122,19 +124,18 @@ class Towers(NamedTuple):
             {
                 "mechanism": "linear_delta",
                 "geometry": {
-                    "radius": self.radius / 1e3, "angles": self.angles.tolist(),
+                    "radius": self.radius / 1e3,
+                    "angles": self.angles.tolist(),
                     "arm_lengths": (self.arms / 1e3).tolist(),
                 },
                 "inertia": {"platform_mass": 0.3, "carriage_mass": 0.2},
                 "joint_map": offsets,
             },
             "printer",
-        )  # fmt: skip
+        )
 
 
-def published(
-    start: Towers, travel: Array, pairs: tuple[Array, Array, Array] | None
-) -> tuple[Towers, float, Array]:
+def published(start: Towers, travel: Array, pairs: tuple[Array, Array, Array] | None) -> tuple[Towers, float, Array]:
     """Klipper's calibration: least squares of heights, and of distances where there are some.
 
     Heights alone: radius, two angles, three endstops; with distances three arm lengths too. Written

@@ -23,9 +23,17 @@ from test.identification.machines import IMPOSSIBLE, WRONG, machine, noisy, shif
 from test.support.robots import load, partly_long
 
 MACHINES = (
-    "delta", "delta_cu", "five_bar", "linear_delta", "prru", "rps3", "stewart",
-    "machines/rsur", "machines/prru3", "machines/rcuu",
-)  # fmt: skip
+    "delta",
+    "delta_cu",
+    "five_bar",
+    "linear_delta",
+    "prru",
+    "rps3",
+    "stewart",
+    "machines/rsur",
+    "machines/prru3",
+    "machines/rcuu",
+)
 FAULTS = ("one_effort_negated", "effort_columns_swapped", "half_speed", "kilogram_force")
 
 
@@ -79,9 +87,7 @@ def test_efforts_that_are_late_leave_noise_alone() -> None:
     """Whatever the delay, it is found, also beside other friction, and then only noise is left."""
     rng = np.random.default_rng(11)
     m = machine(load("delta"), rng, 8.0, 500.0)
-    friction = {
-        key: 1.2 * np.array(getattr(m.truth.friction, key)) for key in ("viscous", "coulomb")
-    }
+    friction = {key: 1.2 * np.array(getattr(m.truth.friction, key)) for key in ("viscous", "coulomb")}
     rubbing = m.truth.changed(friction={key: each.tolist() for key, each in friction.items()})
     for late in (0.0, *rng.uniform(-8e-3, 8e-3, 2)):
         made = noisy(m.recorded(effort=shifted(m.efforts, m.time, late)), rng)
@@ -129,10 +135,12 @@ def test_drives_that_are_off_before_the_motion_are_left_out_of_both() -> None:
     m = machine(load("delta"), rng, 8.0, 250.0)
     sound, count = noisy(m.recorded(), rng), 500
     recorded = replace(
-        sound, robot=m.truth, time=np.arange(count + len(m.time)) / 250.0,
+        sound,
+        robot=m.truth,
+        time=np.arange(count + len(m.time)) / 250.0,
         q=np.concatenate([np.repeat(m.q[:1], count, 0), m.q]),
         effort=np.concatenate([np.zeros((count, 3)), sound.measured]),
-    )  # fmt: skip
+    )
     assert check(recorded).answer == "good"
     result = fit(m.robot, [recorded_of(recorded)], ("friction", "payload"))
     assert result.verdict.answer == "explains"
@@ -233,9 +241,7 @@ def test_a_payload_that_is_picked_is_fitted_with_its_times(name: str) -> None:
     light, heavy = (m.robot.changed(payload={"mass": mass}) for mass in (0.0, 0.5))
     held = (m.time > 4.0) & (m.time < 9.0)
     efforts = [inverse_dynamics(one, m.q, m.qd, m.qdd) for one in (light, heavy)]
-    made = noisy(
-        m.recorded(effort=np.where(held[:, None], *efforts[::-1])), np.random.default_rng(7)
-    )
+    made = noisy(m.recorded(effort=np.where(held[:, None], *efforts[::-1])), np.random.default_rng(7))
     made = replace(made, robot=light)
     (cause,) = check(made).causes
     found, _, notes = fit_recordings(light, [made])
@@ -258,8 +264,13 @@ def test_fit_and_check_agree(name: str) -> None:
     m = machine(load(path_of(name)), rng)
     # The payload is the file's: what is fitted can explain all.
     sound = noisy(m.recorded(), rng)
-    bare = m.robot.changed(payload={"mass": m.truth.payload.mass, "com": list(m.truth.payload.com),
-                                    "inertia": m.truth.payload.inertia.tolist()})  # fmt: skip
+    bare = m.robot.changed(
+        payload={
+            "mass": m.truth.payload.mass,
+            "com": list(m.truth.payload.com),
+            "inertia": m.truth.payload.inertia.tolist(),
+        }
+    )
     assert agree(bare, sound) == "explains"
     for what in (*FAULTS, "gain"):
         if what == "effort_columns_swapped" and bare.joints_count == 1:
@@ -274,10 +285,7 @@ def test_friction_that_may_hold_a_payload_at_rest_does_not_lighten_it() -> None:
     time = np.arange(0.0, 8.0, 1e-3)
     stroke = np.clip(np.abs((time + 0.4) % 1.6 - 0.8) / 0.4 - 0.5, 0.0, 1.0)
     size = np.array([0.5, 0.3, -0.4])
-    q = (
-        robot.inverse(robot.home())
-        + size * (stroke**3 * (10 - stroke * (15 - 6 * stroke)))[:, None]
-    )
+    q = robot.inverse(robot.home()) + size * (stroke**3 * (10 - stroke * (15 - 6 * stroke)))[:, None]
     qd = np.gradient(q, time, axis=0)
     heavy = robot.changed(payload={"mass": 0.5})
     effort = inverse_dynamics(heavy, q, qd, np.gradient(qd, time, axis=0))
@@ -296,9 +304,7 @@ def test_friction_that_may_hold_a_payload_at_rest_does_not_lighten_it() -> None:
 def test_a_fit_is_compared_with_the_file_wherever_it_starts() -> None:
     m = machine(load("delta"), np.random.default_rng(6), 8.0, 200.0)
     light, heavy = (m.robot.changed(payload={"mass": mass}) for mass in (0.1, 0.5))
-    made = noisy(
-        m.recorded(effort=inverse_dynamics(heavy, m.q, m.qd, m.qdd)), np.random.default_rng(8)
-    )
+    made = noisy(m.recorded(effort=inverse_dynamics(heavy, m.q, m.qd, m.qdd)), np.random.default_rng(8))
     sizes = []
     for start in (None, Load(0.4), Load(0.6, (0.05, 0.0, 0.02))):
         found, *_ = fit_recordings(light, [replace(made, robot=light, load=start)], ("payload",))

@@ -94,9 +94,7 @@ def test_changes_beyond_their_prior_are_rejected_or_marked(tmp_path: Path) -> No
     table, out = tmp_path / "poses.csv", tmp_path / "mine.yaml"
     rows = np.hstack([there.joints, there.position])
     write_columns(table, dict(zip(names, rows.T, strict=True)))
-    given = Calibrate(
-        robot="delta_cu", poses=table, out=out, only=only, no_offsets=True, accept=True
-    )
+    given = Calibrate(robot="delta_cu", poses=table, out=out, only=only, no_offsets=True, accept=True)
     (reason,) = command(given).data["accepted"]
     assert "geometry.forearm_length" in reason
     assert "accepted anyway" in out.read_text()
@@ -146,14 +144,8 @@ def test_noise_is_that_of_the_good_poses() -> None:
 def test_directions_are_called_by_what_they_mean(moves: Any, words: tuple[str, ...]) -> None:
     graph = load("stewart").graph
     names = [f"origin[{k}]" for k in range(3)]
-    names += [
-        f"joints.{name}.at[{k}]" for name, joint in graph.joints.items() if not joint.actuated
-        for k in range(3)
-    ]  # fmt: skip
-    columns = [
-        [float(name.endswith("[0]") and any(w in name for w in one)) for name in names]
-        for one in moves
-    ]
+    names += [f"joints.{name}.at[{k}]" for name, joint in graph.joints.items() if not joint.actuated for k in range(3)]
+    columns = [[float(name.endswith("[0]") and any(w in name for w in one)) for name in names] for one in moves]
     basis = np.linalg.qr(np.array(columns).T)[0]
     # Any basis of the same space is called the same.
     turn = np.linalg.qr(np.random.default_rng(1).normal(size=(len(moves),) * 2))[0]

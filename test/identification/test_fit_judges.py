@@ -30,11 +30,14 @@ from test.support.robots import load, partly_long
 
 KINDS: Any = ("friction", "payload")
 LIKELY = {
-    "gain": "gain of the efforts", "late": "efforts late", "sensor": "sensor offset",
+    "gain": "gain of the efforts",
+    "late": "efforts late",
+    "sensor": "sensor offset",
     "load_friction": "friction that grows with the load",
-    "stribeck": "static friction above Coulomb friction", "elastic": "elastic drive",
+    "stribeck": "static friction above Coulomb friction",
+    "elastic": "elastic drive",
     "lengths": "geometry",
-}  # fmt: skip
+}
 
 
 @cache
@@ -92,9 +95,7 @@ def test_a_recording_with_gaps_is_fitted_like_the_whole_one() -> None:
     for begin in np.cumsum([110, 30, 180, 340]):
         keep[begin : begin + 8] = False
     cut = whole.part(keep)
-    (one, _, none), (other, _, (note,)) = (
-        fit_recordings(m.robot, [record], KINDS) for record in (whole, cut)
-    )
+    (one, _, none), (other, _, (note,)) = (fit_recordings(m.robot, [record], KINDS) for record in (whole, cut))
     missing = missing_samples(cut.time)
     assert not none and missing.verdict is Verdict.BAD
     assert missing.value == "32 of 1200 (2.67 %)" and missing.value in note
@@ -173,9 +174,7 @@ def test_another_machine_of_the_file_s_kind_is_not_rejected(what: str) -> None:
     assert not rejected(what, "linear_delta", 4)
 
 
-WRONG_WAY = partly_long(
-    product(["five_bar", "prru", "rps3"], [True, False], [1.0, -1.0]), ("five_bar", False, -1.0)
-)
+WRONG_WAY = partly_long(product(["five_bar", "prru", "rps3"], [True, False], [1.0, -1.0]), ("five_bar", False, -1.0))
 
 
 @pytest.mark.parametrize("case", WRONG_WAY)
@@ -198,13 +197,18 @@ def test_a_drive_that_counts_the_wrong_way_is_named(case: tuple[str, bool, float
 @pytest.mark.parametrize("factor", [2.0, 4.0, 8.0, 16.0])
 @pytest.mark.parametrize("rate", [0.5, 2.0])
 @pytest.mark.parametrize("name", ["prru", "linear_delta", "upr_rpu", "five_bar"])
-def test_another_rate_of_time_is_rejected_said_or_within_the_deviations(
-    name: str, rate: float, factor: float
-) -> None:
+def test_another_rate_of_time_is_rejected_said_or_within_the_deviations(name: str, rate: float, factor: float) -> None:
     """Also of motions so slow that weight and friction make nearly all of the efforts."""
     m = drawn(name, 6)
-    slow = Drawn(m.robot, m.truth, factor * m.time, m.q, m.qd / factor, m.qdd / factor**2,
-                 inverse_dynamics(m.truth, m.q, m.qd / factor, m.qdd / factor**2))  # fmt: skip
+    slow = Drawn(
+        m.robot,
+        m.truth,
+        factor * m.time,
+        m.q,
+        m.qd / factor,
+        m.qdd / factor**2,
+        inverse_dynamics(m.truth, m.q, m.qd / factor, m.qdd / factor**2),
+    )
     sound = noisy(slow.recorded(), np.random.default_rng(7))
     assert fit(m.robot, [sound], KINDS).accepted == ()
     try:
@@ -217,9 +221,7 @@ def test_another_rate_of_time_is_rejected_said_or_within_the_deviations(
 @pytest.mark.long
 @pytest.mark.parametrize("share", [1.0, 3.0])
 @pytest.mark.parametrize("name", ["delta_cu", "prru", "upr_rpu"])
-def test_rotors_that_the_file_does_not_have_are_no_other_rate_of_time(
-    name: str, share: float
-) -> None:
+def test_rotors_that_the_file_does_not_have_are_no_other_rate_of_time(name: str, share: float) -> None:
     m = drawn(name, 6)
     home = m.robot.graph.home
     rotors = share * float(np.diag(mass_matrix(m.robot, home)).max()) * m.qdd
@@ -241,10 +243,14 @@ def test_what_the_model_leaves_out_is_found(what: str) -> None:
 
 
 ELASTIC = [
-    ("delta_cu", 0.01, 0.0), ("five_bar", 0.01, 0.0), ("linear_delta", 0.01, 0.0),
-    ("five_bar", 0.0, 3e-3), ("delta_cu", 0.0, 3e-3), ("linear_delta", 0.0, 3e-3),
+    ("delta_cu", 0.01, 0.0),
+    ("five_bar", 0.01, 0.0),
+    ("linear_delta", 0.01, 0.0),
+    ("five_bar", 0.0, 3e-3),
+    ("delta_cu", 0.0, 3e-3),
+    ("linear_delta", 0.0, 3e-3),
     ("delta_cu", -5e-3, 0.0),
-]  # fmt: skip
+]
 """How far drives give, rad or parts of the machine's size, and how late their efforts are, s."""
 
 
@@ -271,16 +277,13 @@ def test_it_is_found_or_within_the_standard_deviations(what: str, name: str) -> 
 
 @pytest.mark.parametrize(
     ("name", "other"),
-    [("delta_cu", "delta"),
-     *(pytest.param(*pair, marks=pytest.mark.long)
-       for pair in (("delta", "delta_cu"), ("delta_cu", "rps3")))],
-)  # fmt: skip
-@pytest.mark.parametrize(
-    ("duration", "rate"), [(1.2, 300.0), pytest.param(4.0, 100.0, marks=pytest.mark.long)]
+    [
+        ("delta_cu", "delta"),
+        *(pytest.param(*pair, marks=pytest.mark.long) for pair in (("delta", "delta_cu"), ("delta_cu", "rps3"))),
+    ],
 )
-def test_another_machine_is_rejected_or_not_explained(
-    name: str, other: str, duration: float, rate: float
-) -> None:
+@pytest.mark.parametrize(("duration", "rate"), [(1.2, 300.0), pytest.param(4.0, 100.0, marks=pytest.mark.long)])
+def test_another_machine_is_rejected_or_not_explained(name: str, other: str, duration: float, rate: float) -> None:
     m = machine(load(other), np.random.default_rng(3), duration, rate)
     rng = np.random.default_rng(4)
     try:
@@ -320,10 +323,7 @@ def test_scaled_efforts_are_rejected_and_heavier_machines_are_not(name: str) -> 
     kg = {p: 1.5 * v for p, (v, unit) in robot.file_numbers().items() if unit in ("kg", "kg m2")}
     heavy = robot.numbered({p: v for p, v in kg.items() if "rotor" not in p})
     rng = np.random.default_rng(8)
-    sound, heavier = (
-        noisy(m.recorded(effort=inverse_dynamics(one, m.q, m.qd, m.qdd)), rng)
-        for one in (robot, heavy)
-    )
+    sound, heavier = (noisy(m.recorded(effort=inverse_dynamics(one, m.q, m.qd, m.qdd)), rng) for one in (robot, heavy))
     scaled = replace(sound, effort=1.5 * sound.effort)
     for one, told in ((robot, r" N m and N"), (bare, "cannot tell"))[: 2 if "cu" in name else 1]:
         with pytest.raises(PkmTwinError, match=rf"are 1\.5\d* times .*{told}; --accept"):

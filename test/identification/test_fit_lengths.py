@@ -39,11 +39,10 @@ def robot_named(name: str) -> Robot:
 @pytest.mark.parametrize(
     "name",
     partly_long(
-        ["delta_cu", "linear_delta", "prru", "upr_rpu", "delta", "stewart", "random five_bar",
-         "random rsur"],
+        ["delta_cu", "linear_delta", "prru", "upr_rpu", "delta", "stewart", "random five_bar", "random rsur"],
         "delta_cu",
     ),
-)  # fmt: skip
+)
 def test_columns_are_differences_of_the_efforts(name: str) -> None:
     """Of the machine as fitted, with the payload while it is held."""
     robot = robot_named(name)
@@ -89,9 +88,7 @@ def test_a_sine_is_differentiated_to_its_ends(order: int) -> None:
     assert np.abs(found - exact)[3:-3].max() < 1e-3 * rates.max() ** order
 
 
-@pytest.mark.parametrize(
-    "name", partly_long(["linear_delta", "delta_cu", "five_bar"], "linear_delta", "five_bar")
-)
+@pytest.mark.parametrize("name", partly_long(["linear_delta", "delta_cu", "five_bar"], "linear_delta", "five_bar"))
 def test_drawn_lengths_change_the_efforts_as_their_columns_say(name: str) -> None:
     """At every row, those at the ends of the recording too."""
     robot, rng = load(name), np.random.default_rng(8)
@@ -122,9 +119,7 @@ def test_the_file_says_how_well_its_lengths_are_known() -> None:
     assert usual["geometry.forearm_length"] == USUAL * robot.graph.size
     all_in_one = Lengths.of(unsure(robot, {"geometry": {"relative": 1e-3}}))
     assert len(all_in_one.suspects) == 1
-    assert all_in_one.mixing[all_in_one.paths.index("geometry.arm_length"), 0] == robot.number(
-        "geometry.arm_length"
-    )
+    assert all_in_one.mixing[all_in_one.paths.index("geometry.arm_length"), 0] == robot.number("geometry.arm_length")
 
 
 def test_lengths_that_are_known_better_make_a_payload_known_better() -> None:
@@ -159,13 +154,15 @@ def errors_of(name: str, runs: range) -> tuple[Array, Array]:
 
 @pytest.mark.parametrize(
     ("name", "runs"),
-    [("delta", range(2)),
-     *(pytest.param(name, range(200), marks=[pytest.mark.long, pytest.mark.timeout(3600)])
-       for name in ("delta", "linear_delta", "five_bar"))],
-)  # fmt: skip
-def test_numbers_of_machines_with_usual_lengths_are_as_sure_as_they_are_said(
-    name: str, runs: range
-) -> None:
+    [
+        ("delta", range(2)),
+        *(
+            pytest.param(name, range(200), marks=[pytest.mark.long, pytest.mark.timeout(3600)])
+            for name in ("delta", "linear_delta", "five_bar")
+        ),
+    ],
+)
+def test_numbers_of_machines_with_usual_lengths_are_as_sure_as_they_are_said(name: str, runs: range) -> None:
     errors, parts = errors_of(name, runs)
     assert np.abs(errors).max() < 4.5
     assert 0.4 < np.sqrt(np.mean(errors**2)) < 1.2
@@ -184,10 +181,15 @@ def slower(name: str, factor: float) -> tuple[Robot, Recording]:
 
 @pytest.mark.parametrize(
     ("name", "factor", "slow"),
-    [("linear_delta", 60.0, True), ("linear_delta", 1.0, False),
-     *(pytest.param(*case, marks=pytest.mark.long)
-       for case in (("prru", 60.0, True), ("five_bar", 30.0, True), ("prru", 2.0, False)))],
-)  # fmt: skip
+    [
+        ("linear_delta", 60.0, True),
+        ("linear_delta", 1.0, False),
+        *(
+            pytest.param(*case, marks=pytest.mark.long)
+            for case in (("prru", 60.0, True), ("five_bar", 30.0, True), ("prru", 2.0, False))
+        ),
+    ],
+)
 def test_a_motion_too_slow_for_inertia_explains_none(name: str, factor: float, slow: bool) -> None:
     robot, record = slower(name, factor)
     verdict = fit(robot, [record], KINDS).verdict

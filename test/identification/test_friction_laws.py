@@ -19,8 +19,11 @@ from pkm_twin.recordings.payload import Load
 from test.identification.machines import machine, noisy
 from test.support.robots import load, partly_long
 
-CASES = [f"{name} {law}" for name in ("five_bar", "delta_cu", "linear_delta")
-         for law in ("none", "stribeck", "load-dependent", "periodic")]  # fmt: skip
+CASES = [
+    f"{name} {law}"
+    for name in ("five_bar", "delta_cu", "linear_delta")
+    for law in ("none", "stribeck", "load-dependent", "periodic")
+]
 
 
 def rubbing(m, law):
@@ -32,10 +35,11 @@ def rubbing(m, law):
         "stribeck": {"stribeck": 1.5 * coulomb, "stribeck_speed": 0.15 * speed},
         "load-dependent": {"load_dependent": np.full(n, 0.1)},
         "periodic": {
-            "cogging_cos": 0.05 * m.size, "cogging_sin": -0.03 * m.size,
+            "cogging_cos": 0.05 * m.size,
+            "cogging_sin": -0.03 * m.size,
             "cogging_period": travel / 7.3,
         },
-    }  # fmt: skip
+    }
     values = {key: value.tolist() for key, value in laws[law].items()}
     return m.truth.changed(friction=values), values
 

@@ -21,9 +21,7 @@ def test_the_measured_drive_has_friction_that_grows_with_the_load(tmp_path, monk
     """The owner's torque constant; 1.07 A + 0.10 |load current| is what the runs fit."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "fitted.yaml").touch()  # of a fit; this one writes none
-    result = CliRunner().invoke(
-        app, ["fit", "--drive", str(MEASURED), "--lever", "0.011391", "--json"]
-    )
+    result = CliRunner().invoke(app, ["fit", "--drive", str(MEASURED), "--lever", "0.011391", "--json"])
     assert result.exit_code == 0, result.output
     data = json.loads(result.stdout)
     assert data["torque_constant_nm_per_a"] == pytest.approx(0.0577, abs=1e-4)

@@ -18,9 +18,17 @@ def judged(
     inverse = np.linalg.pinv(explained.reshape(-1, explained.shape[-1]))
     found, covariance = inverse @ measured.ravel(), inverse @ inverse.T
     case = Case(
-        measured, explained, np.zeros((ROWS, CHANNELS, 0)), np.zeros(0), columns, measured,
-        np.ones((ROWS, CHANNELS)), np.ones(CHANNELS), 1.0, ROWS,
-    )  # fmt: skip
+        measured,
+        explained,
+        np.zeros((ROWS, CHANNELS, 0)),
+        np.zeros(0),
+        columns,
+        measured,
+        np.ones((ROWS, CHANNELS)),
+        np.ones(CHANNELS),
+        1.0,
+        ROWS,
+    )
     suspects = [Suspect("length", str(k), "m", float(u), known=True) for k, u in enumerate(usual)]
     verdict, _ = judge(["a", "b"], suspects, [case], np.full(explained.shape[-1], 1e3))
     return verdict, covariance, found

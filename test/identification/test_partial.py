@@ -26,9 +26,11 @@ from test.identification.partial_cases import Towers, case, published
 from test.support.robots import data_of, load, often, partly_long
 
 KIT = Towers(
-    105.0, np.radians([210.0, 330.0, 90.0]), np.array([215.0, 215.0, 215.0]),
+    105.0,
+    np.radians([210.0, 330.0, 90.0]),
+    np.array([215.0, 215.0, 215.0]),
     np.array([370.0, 370.0, 370.0]),
-)  # fmt: skip
+)
 
 
 @pytest.fixture(scope="module")
@@ -36,14 +38,11 @@ def printer() -> Robot:
     return KIT.robot()
 
 
-@pytest.mark.parametrize(
-    "name", partly_long(["stewart", "delta_cu", "rps3", "linear_delta"], "rps3")
-)
+@pytest.mark.parametrize("name", partly_long(["stewart", "delta_cu", "rps3", "linear_delta"], "rps3"))
 def test_derivatives_are_those_of_what_is_computed(name: str) -> None:
     """By central differences, of every kind and every number that may be fitted."""
     robot = load(name)
-    kinds = [k for k in KINDS if robot.coordinates[-1].axis is None or k not in
-             ("roll", "pitch", "yaw")]  # fmt: skip
+    kinds = [k for k in KINDS if robot.coordinates[-1].axis is None or k not in ("roll", "pitch", "yaw")]
     drawn = case(robot, kinds, 5, 1)
     paths = drawn.paths[:3]
     parameters = unknowns(robot, drawn.measured, paths, Free(frame=True, target=True))
@@ -57,9 +56,7 @@ def test_derivatives_are_those_of_what_is_computed(name: str) -> None:
         turn = np.zeros(3)
         if name in FRAME[3:]:
             turn[FRAME.index(name) - 3] = step
-        other = moved(
-            robot, state, drawn.measured.joints, before | {name: before[name] + step}, turn
-        )
+        other = moved(robot, state, drawn.measured.joints, before | {name: before[name] + step}, turn)
         return -np.concatenate(drawn.measured.parts(other))[:, 0]
 
     for k, name in enumerate(names):
@@ -69,17 +66,23 @@ def test_derivatives_are_those_of_what_is_computed(name: str) -> None:
 
 
 MACHINES = [
-    ("printer", "height", 30), ("printer", "height,distance", 20), ("printer", "radius", 40),
-    ("delta_cu", "plane", 40), ("delta", "distance", 40), ("stewart", "tilt", 60),
-    ("stewart", "x,z", 60), ("five_bar", "distance", 50), ("rps3", "height,tilt", 50),
-    ("linear_delta", "position", 30), ("delta", "range", 50), ("stewart", "range", 80),
-]  # fmt: skip
+    ("printer", "height", 30),
+    ("printer", "height,distance", 20),
+    ("printer", "radius", 40),
+    ("delta_cu", "plane", 40),
+    ("delta", "distance", 40),
+    ("stewart", "tilt", 60),
+    ("stewart", "x,z", 60),
+    ("five_bar", "distance", 50),
+    ("rps3", "height,tilt", 50),
+    ("linear_delta", "position", 30),
+    ("delta", "range", 50),
+    ("stewart", "range", 80),
+]
 
 
 @pytest.mark.parametrize("count", often(2, 100))
-def test_numbers_that_are_reported_are_right_and_the_rest_is_named(
-    count: int, printer: Robot
-) -> None:
+def test_numbers_that_are_reported_are_right_and_the_rest_is_named(count: int, printer: Robot) -> None:
     """Each of the machines in turn; a few numbers of thousands may be off by three deviations."""
     good = numbers = off = 0
     for seed in range(count):
@@ -123,23 +126,21 @@ def test_distances_and_angles_of_new_poses_err_by_what_is_stated(
         lines = [(p[:30:3] - p[1:31:3], p[:30:3] - p[2:32:3]) for p in (true, told)]
         sizes = [np.linalg.norm(line, axis=-1) for line in lines]
         far = (sizes[0] > 0.3 * sizes[0].max()).all(0)
-        turns = [
-            np.arccos(np.sum(a * b, -1) / np.prod(size, 0))
-            for (a, b), size in zip(lines, sizes, strict=True)
-        ]
+        turns = [np.arccos(np.sum(a * b, -1) / np.prod(size, 0)) for (a, b), size in zip(lines, sizes, strict=True)]
         wide = far & (np.abs(np.cos(turns[0])) < np.sqrt(0.75))
         scale, values = found.scale, [p.value for p in found.parameters]
         assert scale is not None and scale.determined and found.pairs and wide.any()
         names = [p.name for p in found.parameters]
         sums = [
-            (values[p.first] - one.truth[names[p.first]]
-             + p.sign * (values[p.second] - one.truth[names[p.second]])) / p.deviation
+            (values[p.first] - one.truth[names[p.first]] + p.sign * (values[p.second] - one.truth[names[p.second]]))
+            / p.deviation
             for p in found.pairs
-        ]  # fmt: skip
+        ]
         errors = (
             (sizes[1] / sizes[0] - 1.0)[:, far] / scale.distance,
-            (turns[1] - turns[0])[wide] / scale.angle, np.array(sums),
-        )  # fmt: skip
+            (turns[1] - turns[0])[wide] / scale.angle,
+            np.array(sums),
+        )
         over.append(tuple(float(np.mean(one**2)) for one in errors))
     # The median over the machines: a few directions make most of each machine's errors.
     ratio = np.sqrt(np.median(over, 0))
@@ -150,9 +151,11 @@ def probed(seed: int, distances: int, lean: float = 1e-3) -> tuple[Towers, dict[
     """A printer whose towers lean, probed at seven places as by the firmware, and by callipers."""
     rng = np.random.default_rng(seed)
     real = Towers(
-        KIT.radius + rng.normal(), KIT.angles + rng.normal(scale=0.005, size=3),
-        KIT.arms + rng.normal(scale=0.5, size=3), KIT.ends + rng.normal(size=3),
-    )  # fmt: skip
+        KIT.radius + rng.normal(),
+        KIT.angles + rng.normal(scale=0.005, size=3),
+        KIT.arms + rng.normal(scale=0.5, size=3),
+        KIT.ends + rng.normal(size=3),
+    )
     tilt = rng.normal(scale=lean, size=(3, 2))
     turn = np.radians(np.arange(6) * 60.0 + 30.0)
     ring = 70.0 * np.stack([np.cos(turn), np.sin(turn)], -1)
@@ -208,10 +211,7 @@ def test_distances_that_were_left_out_are_predicted(count: int, printer: Robot) 
         found = calibrate(printer, measured, geometric(printer, q))
         assert found.scale is not None and found.scale.determined
         robot = found.robot
-        ends = [
-            robot.platform(found.joint_map.positions(-1e-3 * data[key][8:]))[0]
-            for key in ("first", "second")
-        ]
+        ends = [robot.platform(found.joint_map.positions(-1e-3 * data[key][8:]))[0] for key in ("first", "second")]
         miss = 1e3 * np.linalg.norm(ends[0] - ends[1], axis=1) - data["lengths"][8:]
         pairs = tuple(data[key][:8] for key in ("first", "second", "lengths"))
         _, rms, left = published(start, data["travel"], pairs)  # type: ignore[arg-type]
@@ -225,10 +225,11 @@ def test_distances_that_were_left_out_are_predicted(count: int, printer: Robot) 
 def test_the_robot_moves_as_the_printer_does(printer: Robot) -> None:
     rng = np.random.default_rng(2)
     real = Towers(
-        KIT.radius + 1.0, KIT.angles + np.array([0.01, -0.02, 0.005]),
+        KIT.radius + 1.0,
+        KIT.angles + np.array([0.01, -0.02, 0.005]),
         KIT.arms + np.array([1.0, -1.0, 0.5]),
         KIT.ends + np.array([0.3, -0.2, 0.1]),
-    )  # fmt: skip
+    )
     robot = real.robot()
     places = np.column_stack([rng.uniform(-60, 60, (8, 2)), rng.uniform(0, 80, 8)])
     travel = real.travel(places)

@@ -60,9 +60,7 @@ class Stream:
         return touching
 
 
-def moves(
-    robot: Robot, rng: np.random.Generator, count: int, share: float, rest: float = REST
-) -> tuple[Array, ...]:
+def moves(robot: Robot, rng: np.random.Generator, count: int, share: float, rest: float = REST) -> tuple[Array, ...]:
     """Rest, then point to point without jerk at the ends: time, q, qd, qdd.
 
     :param share: of the joints' range that moves go to; each takes a quarter to half a second.
@@ -86,10 +84,16 @@ def moves(
 
 
 def measured(
-    robot: Robot, rng: np.random.Generator, motion: tuple[Array, ...], *,
-    masses: float = 0.0, each: float = 0.0, friction: float = 0.0, wrench: Array | None = None,
+    robot: Robot,
+    rng: np.random.Generator,
+    motion: tuple[Array, ...],
+    *,
+    masses: float = 0.0,
+    each: float = 0.0,
+    friction: float = 0.0,
+    wrench: Array | None = None,
     external: Array | None = None,
-) -> Stream:  # fmt: skip
+) -> Stream:
     """Efforts of a machine that departs from the model, with noise on rates and efforts.
 
     :param masses: all bodies are heavier by this share; ``each``: each by one of its own within it.
@@ -116,13 +120,15 @@ def measured(
     noise = 2e-3 * peak
     speed = 2e-4 * np.abs(qd).max(0)
     return Stream(
-        time, q, qd + speed * rng.normal(size=q.shape), qdd,
+        time,
+        q,
+        qd + speed * rng.normal(size=q.shape),
+        qdd,
         effort + noise * rng.normal(size=q.shape),
-    )  # fmt: skip
+    )
 
 
-def pushed(robot: Robot, rng: np.random.Generator, motion: tuple[Array, ...], share: float,
-           begin: float) -> Array:  # fmt: skip
+def pushed(robot: Robot, rng: np.random.Generator, motion: tuple[Array, ...], share: float, begin: float) -> Array:
     """A force on the platform in a drawn direction from a time on, shape (k, 6).
 
     :param share: of the peak effort of the joint that feels it most, when it begins.
@@ -208,16 +214,13 @@ def spot(robot: Robot, rng: np.random.Generator, parts: list[str]) -> tuple[str,
     length = np.array([np.linalg.norm(b.end[1] - b.start[1]) for b in found])
     bar = found[int(rng.choice(len(found), p=length / length.sum()))]
     sliding = any(
-        j.kind == "prismatic" and j.inner == BASE and j.outer == bar.part
-        for j in robot.graph.joints.values()
+        j.kind == "prismatic" and j.inner == BASE and j.outer == bar.part for j in robot.graph.joints.values()
     )
     thin = bar.part != robot.graph.platform and not sliding
     return bar.part, (bar.start, bar.end, float(rng.uniform())), thin
 
 
-def strike(
-    robot: Robot, rng: np.random.Generator, motion: tuple[Array, ...], kind: str
-) -> Strike | None:
+def strike(robot: Robot, rng: np.random.Generator, motion: tuple[Array, ...], kind: str) -> Strike | None:
     """A contact of a kind, ``platform``, ``limb`` or ``clamping``; None where the draw is none.
 
     The machine follows its path; what it strikes is a spring that the path compresses.
@@ -234,10 +237,7 @@ def strike(
     far = near
     bodies: tuple[str, ...] = (body,)
     if kind == CLAMPING:
-        apart = [
-            p for p, name in limbs.items()
-            if name != limbs[body] and (p, body) not in joined_bodies(robot.graph)
-        ]  # fmt: skip
+        apart = [p for p, name in limbs.items() if name != limbs[body] and (p, body) not in joined_bodies(robot.graph)]
         if not apart:
             return None
         other, far, _ = spot(robot, rng, apart)
@@ -261,9 +261,7 @@ def strike(
         # Even on a plate across the motion: normals as often as their cosine.
         normal = _unit(rng.normal(size=3)) - _unit(ahead)
         if thin:
-            ends = (
-                place_and_jacobian(robot, q[k : k + 1], (*near[:2], s))[0][0] for s in (0.0, 1.0)
-            )
+            ends = (place_and_jacobian(robot, q[k : k + 1], (*near[:2], s))[0][0] for s in (0.0, 1.0))
             along = _unit(np.subtract(*ends))
             normal = normal - along * (along @ normal)
     normal = _unit(normal)

@@ -44,19 +44,30 @@ def functions(robot):
     table = {
         name: (getattr(robot, name), [q])
         for name in (
-            "forward", "platform", "placements", "jacobian", "platform_jacobian", "body_jacobians",
-            "singularity", "passive", "try_forward", "try_jacobian", "try_singularity",
+            "forward",
+            "platform",
+            "placements",
+            "jacobian",
+            "platform_jacobian",
+            "body_jacobians",
+            "singularity",
+            "passive",
+            "try_forward",
+            "try_jacobian",
+            "try_singularity",
         )
-    }  # fmt: skip
+    }
     table |= {name: (getattr(robot, name), [pose]) for name in ("inverse", "try_inverse")}
     table |= {
         "pose_acceleration": (robot.pose_acceleration, [q, qd, qdd]),
         "passive_rates": (robot.passive_rates, [q, qd]),
         "sphere_force": (
-            lambda p, x, a: dynamics.max_driving_force(robot, p, x, 10.0, a), [pose, count, count],
+            lambda p, x, a: dynamics.max_driving_force(robot, p, x, 10.0, a),
+            [pose, count, count],
         ),
         "forces_range": (
-            lambda p, a: dynamics.max_driving_force_range(robot, p, 10.0, a), [pose, count],
+            lambda p, a: dynamics.max_driving_force_range(robot, p, 10.0, a),
+            [pose, count],
         ),
         "spread": (dynamics.spread, [count]),
         "tilted_pose": (dynamics.tilted_pose, [count, count, count]),
@@ -68,25 +79,38 @@ def functions(robot):
         "rotation": (robot.rotation, [pose]),
         "compliance_at": (response.compliance_at, [factors]),
         "deflection": (response.deflection, [WRENCH, factors]),
-    }  # fmt: skip
+    }
     for name in (
-        "inverse_dynamics", "dynamics_terms", "least_norm_reactions", "reactions", "regressor",
+        "inverse_dynamics",
+        "dynamics_terms",
+        "least_norm_reactions",
+        "reactions",
+        "regressor",
         "torque_deviation",
-    ):  # fmt: skip
+    ):
         table[name] = (bound(getattr(dynamics, name)), motion)
     for name, arrays in {
-        "mass_matrix": [q], "forward_dynamics": [q, qd, tau, WRENCH], "energy": [q, qd],
-        "platform_wrench": [q, tau], "joint_motion": [pose, count, count],
-        "energy_matrices": [pose], "energy_transfer": [pose, count],
+        "mass_matrix": [q],
+        "forward_dynamics": [q, qd, tau, WRENCH],
+        "energy": [q, qd],
+        "platform_wrench": [q, tau],
+        "joint_motion": [pose, count, count],
+        "energy_matrices": [pose],
+        "energy_transfer": [pose, count],
         "energy_transfer_range": [pose],
-    }.items():  # fmt: skip
+    }.items():
         table[name] = (bound(getattr(dynamics, name)), arrays)
     for name, arrays in {
-        "compliance": [pose], "stiffness": [pose], "strain_energy": [pose, WRENCH],
-        "compliance_deviation": [pose], "clearance": [pose], "reachable": [pose],
-        "setpoint_correction": [q, moved], "element_response": [pose],
+        "compliance": [pose],
+        "stiffness": [pose],
+        "strain_energy": [pose, WRENCH],
+        "compliance_deviation": [pose],
+        "clearance": [pose],
+        "reachable": [pose],
+        "setpoint_correction": [q, moved],
+        "element_response": [pose],
         "platform_response": [q, WRENCH],
-    }.items():  # fmt: skip
+    }.items():
         table[name] = (bound(getattr(elasticity, name)), arrays)
     return table
 
@@ -206,11 +230,15 @@ def test_real_numbers_of_any_kind_and_layout_are_those_numbers(name):
         right = flat(ask(*arrays))
         for k, array in enumerate(arrays):
             for other in (
-                array.tolist(), np.ma.array(array), array.astype(object),
-                np.array([Decimal(float(v)) for v in array]), array.astype(">f8"),
-                np.repeat(array, 2)[::2], array[::-1].copy()[::-1],
+                array.tolist(),
+                np.ma.array(array),
+                array.astype(object),
+                np.array([Decimal(float(v)) for v in array]),
+                array.astype(">f8"),
+                np.repeat(array, 2)[::2],
+                array[::-1].copy()[::-1],
                 np.lib.stride_tricks.as_strided(array, array.shape, array.strides),
-            ):  # fmt: skip
+            ):
                 given = [*arrays[:k], other, *arrays[k + 1 :]]
                 assert_same(flat(ask(*given)), right, function)
         if len(arrays) < 2 or function in ("deflection", "tilted_pose"):
@@ -350,23 +378,26 @@ class TestEstimators:
         q, qd, qdd = self.motion
         nothing, far = np.full(3, np.nan), np.array([-2.8, 0.8, -1.4])
         wrongs = [
-            (np.nan, self.motion, self.effort), (np.inf, self.motion, self.effort),
-            (times[-1], self.motion, self.effort), (0.0, self.motion, self.effort),
-            (0.5, (nothing, qd, qdd), self.effort), (0.5, (q, nothing, qdd), self.effort),
-            (0.5, (far, qd, qdd), self.effort), (0.5, (q[:2], qd, qdd), self.effort),
+            (np.nan, self.motion, self.effort),
+            (np.inf, self.motion, self.effort),
+            (times[-1], self.motion, self.effort),
+            (0.0, self.motion, self.effort),
+            (0.5, (nothing, qd, qdd), self.effort),
+            (0.5, (q, nothing, qdd), self.effort),
+            (0.5, (far, qd, qdd), self.effort),
+            (0.5, (q[:2], qd, qdd), self.effort),
             (0.5, (q, np.tile(qd, (2, 1)), qdd), self.effort),
-            (0.5, self.motion, nothing), (0.5, self.motion, self.effort[:1]),
+            (0.5, self.motion, nothing),
+            (0.5, self.motion, self.effort[:1]),
             (0.5, self.motion, np.ma.array(self.effort, mask=[1, 0, 0])),
             (0.5, self.motion, self.effort, np.full(6, np.nan)),
-        ]  # fmt: skip
+        ]
         if kind != "MomentumObserver":
             wrongs.append((0.5, (q, qd, nothing), self.effort))
         for wrong in wrongs:
             with pytest.raises(ValueError, match=r"\w"):
                 print(kind, wrong, self.push(disturbed, *wrong))
-        found = [
-            flat(self.push(made, 0.4, self.motion, self.effort)) for made in (disturbed, quiet)
-        ]
+        found = [flat(self.push(made, 0.4, self.motion, self.effort)) for made in (disturbed, quiet)]
         assert len(found[0])
         np.testing.assert_array_equal(*found)
 
@@ -380,18 +411,17 @@ class TestEstimators:
         for k, row in enumerate(rows):
             for place, value in zip(room, row, strict=True):
                 place[:] = value
-            pair = [
-                self.push(made, 0.02 * k, arrays[:3], arrays[3])
-                for made, arrays in ((fresh, row), (used, room))
-            ]
+            pair = [self.push(made, 0.02 * k, arrays[:3], arrays[3]) for made, arrays in ((fresh, row), (used, room))]
         np.testing.assert_array_equal(*map(flat, pair))
 
     def test_an_alarm_takes_no_sample_that_is_not_finite(self):
         alarm = elasticity.StiffnessAlarm(load("upr_rpu"))
         pose = load("upr_rpu").home()
         for wrench, deflection in (
-            (np.full(6, np.nan), np.zeros(6)), (WRENCH, np.full(6, np.inf)), (WRENCH, np.zeros(3)),
-        ):  # fmt: skip
+            (np.full(6, np.nan), np.zeros(6)),
+            (WRENCH, np.full(6, np.inf)),
+            (WRENCH, np.zeros(3)),
+        ):
             with pytest.raises(ValueError, match=r"\w"):
                 alarm.push(0.0, pose, wrench, deflection)
         assert alarm.count == 0

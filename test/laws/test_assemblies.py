@@ -25,18 +25,26 @@ def parallelogram():
         for name, com in (("crank", [0, 0, 0.1]), ("rod", [0.2, 0, 0.2]), ("rocker", [0.4, 0, 0.1]))
     }
     pins = {
-        "motor": ("base", "crank", [0, 0, 0]), "left": ("crank", "rod", [0, 0, 0.2]),
-        "foot": ("base", "rocker", [0.4, 0, 0]), "right": ("rocker", "rod", [0.4, 0, 0.2]),
-    }  # fmt: skip
+        "motor": ("base", "crank", [0, 0, 0]),
+        "left": ("crank", "rod", [0, 0, 0.2]),
+        "foot": ("base", "rocker", [0.4, 0, 0]),
+        "right": ("rocker", "rod", [0.4, 0, 0.2]),
+    }
     joints = {
-        name: {"type": "revolute", "between": [a, b], "at": at, "axis": [0, 1, 0]}
-        for name, (a, b, at) in pins.items()
+        name: {"type": "revolute", "between": [a, b], "at": at, "axis": [0, 1, 0]} for name, (a, b, at) in pins.items()
     }
     joints["motor"]["actuated"] = True
-    return robot_of_data({
-        "mechanism": "machine", "platform": "rod", "origin": [0.2, 0, 0.2], "pose": ["x"],
-        "bodies": bodies, "joints": joints,
-    }, "parallelogram")  # fmt: skip
+    return robot_of_data(
+        {
+            "mechanism": "machine",
+            "platform": "rod",
+            "origin": [0.2, 0, 0.2],
+            "pose": ["x"],
+            "bodies": bodies,
+            "joints": joints,
+        },
+        "parallelogram",
+    )
 
 
 MACHINES = {

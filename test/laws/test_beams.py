@@ -104,9 +104,7 @@ def test_mass_is_the_integral_over_the_shape_functions(section):
             flex[across, slope] = flex[slope, across] = sign * x**2 / (2 * bending)
             flex[slope, slope] = x / bending
         shape = shape + flex @ cut
-        density = np.diag(
-            [s.mass_per_length] * 3 + [2 * s.rotary_inertia, s.rotary_inertia, s.rotary_inertia]
-        )
+        density = np.diag([s.mass_per_length] * 3 + [2 * s.rotary_inertia, s.rotary_inertia, s.rotary_inertia])
         total += weight * shape.T @ density @ shape
     scale = np.sqrt(np.diag(mass))
     assert np.abs((total - mass) / np.outer(scale, scale)).max() < 1e-9
@@ -142,9 +140,7 @@ def test_shear_factors_of_a_tube():
 # ------------------------------------------------------------------ frequencies in closed form
 
 
-@pytest.mark.parametrize(
-    ("roots", "fixed", "rigid"), [(CLAMPED_FREE, range(6), 0), (FREE_FREE, (), 6)]
-)
+@pytest.mark.parametrize(("roots", "fixed", "rigid"), [(CLAMPED_FREE, range(6), 0), (FREE_FREE, (), 6)])
 def test_bending_of_a_slender_beam(roots, fixed, rigid):
     found = frequencies(*chain(SLENDER, 16, fixed), rigid + 6)
     expected = np.repeat(np.square(roots), 2) / LENGTH**2 * wave(SLENDER) / (2 * np.pi)
@@ -221,11 +217,7 @@ def test_cantilever_with_a_tip_mass(ratio, rng):
     along /= np.linalg.norm(along)
 
     def equation(x):
-        return (
-            1
-            + math.cos(x) * math.cosh(x)
-            - ratio * x * (math.sin(x) * math.cosh(x) - math.cos(x) * math.sinh(x))
-        )
+        return 1 + math.cos(x) * math.cosh(x) - ratio * x * (math.sin(x) * math.cosh(x) - math.cos(x) * math.sinh(x))
 
     expected = brentq(equation, 1e-3, 1.9) ** 2 / LENGTH**2 * wave(SLENDER) / (2 * math.pi)
     system = assemble(cantilever(SLENDER, along, body=point(mass)), 8)
@@ -340,8 +332,6 @@ def test_columns_add_up_to_the_stiffness(rng):
 
 
 def test_a_member_on_nothing_is_refused():
-    bar = Member(
-        "bar", "bar", TUBE, np.zeros(3), np.ones(3), Support("j", "arm", np.eye(3)), None
-    )  # fmt: skip
+    bar = Member("bar", "bar", TUBE, np.zeros(3), np.ones(3), Support("j", "arm", np.eye(3)), None)
     with pytest.raises(ValueError, match="arm"):
         assemble(frame_of(np.zeros(3), (bar,), ()), 2)

@@ -22,9 +22,7 @@ from pkm_twin.robot.workspace import reachable, regular_workspace
 from stiffness_monitor.structure import structural_model
 from test.support.robots import SHIPPED, load, partly_long, random_poses
 
-ROBOTS = [
-    name for name, robot in SHIPPED.items() if has_clearance(robot) and robot.mechanism != "machine"
-]
+ROBOTS = [name for name, robot in SHIPPED.items() if has_clearance(robot) and robot.mechanism != "machine"]
 
 
 def segments(a, b, c, d):
@@ -72,9 +70,7 @@ def test_nearly_parallel_segments_that_cross(angle):
     u, v = np.array([1.0, 0, 0]), np.array([math.cos(angle), math.sin(angle), 0])
     for offset in (0.0, 0.3):
         up = np.array([0, 0, offset])
-        assert segments(-u / 3, 2 * u / 3, up - v / 3, up + 2 * v / 3) == pytest.approx(
-            offset, abs=1e-15
-        )
+        assert segments(-u / 3, 2 * u / 3, up - v / 3, up + 2 * v / 3) == pytest.approx(offset, abs=1e-15)
 
 
 def tube(diameter):
@@ -116,9 +112,8 @@ VARIANTS = [
 
 @pytest.mark.parametrize(
     ("name", "sections"),
-    [case if k in BY_DEFAULT else pytest.param(*case, marks=pytest.mark.long)
-     for k, case in enumerate(VARIANTS)],
-)  # fmt: skip
+    [case if k in BY_DEFAULT else pytest.param(*case, marks=pytest.mark.long) for k, case in enumerate(VARIANTS)],
+)
 def test_members_are_those_of_the_frame(name, sections, variant, rng):
     """The elastic frame declares the same bars, each on its own."""
     robot, _ = variant(name, **sections)
@@ -133,9 +128,7 @@ def test_members_are_those_of_the_frame(name, sections, variant, rng):
         limbs = [m.name.split()[1] if " " in m.name else m.name[0] for m in members]
         assert len(set(limbs)) == 3
         gaps = {
-            frozenset((members[i].name, members[j].name)): bounded(*bars[i][:2], *bars[j][:2])
-            - bars[i][2]
-            - bars[j][2]
+            frozenset((members[i].name, members[j].name)): bounded(*bars[i][:2], *bars[j][:2]) - bars[i][2] - bars[j][2]
             for i in range(len(bars))
             for j in range(i)
             if limbs[i] != limbs[j]

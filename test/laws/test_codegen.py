@@ -53,11 +53,30 @@ def formula(x):
     a, b, c, d = x
     s = op.sqrt(a * a + b * b + 1.0)
     return [
-        a + b, a - b, a * b, -a, a / s, s, op.sin(a), op.cos(b), op.absolute(c), op.sign(d),
-        op.atan2(a, b), op.minimum(a, c), op.maximum(b, d), (a + b) * (a - b) - c / s + 3.0 * d,
-        op.exp(a), op.tanh(b), op.less(a, b), op.select(op.less(c, d), a, -b), op.select(c, a, d),
-        op.sin(a) * op.cos(a) - (-b) * (-c), 2.0 - (3.0 - a), (a - b) - (b - a), 0.0 * a + 1.0 * b,
-    ]  # fmt: skip
+        a + b,
+        a - b,
+        a * b,
+        -a,
+        a / s,
+        s,
+        op.sin(a),
+        op.cos(b),
+        op.absolute(c),
+        op.sign(d),
+        op.atan2(a, b),
+        op.minimum(a, c),
+        op.maximum(b, d),
+        (a + b) * (a - b) - c / s + 3.0 * d,
+        op.exp(a),
+        op.tanh(b),
+        op.less(a, b),
+        op.select(op.less(c, d), a, -b),
+        op.select(c, a, d),
+        op.sin(a) * op.cos(a) - (-b) * (-c),
+        2.0 - (3.0 - a),
+        (a - b) - (b - a),
+        0.0 * a + 1.0 * b,
+    ]
 
 
 def test_expressions_are_numpys_numbers(rng):
@@ -235,13 +254,13 @@ def test_sparse_factors_solve_as_numpy_does(size, rng):
         right = rng.normal(size=size)
         objects = full.astype(object)
         lu = SparseLU(objects, pivot_order(full[None]))
+        np.testing.assert_allclose(lu.solve(right).astype(float), np.linalg.solve(full, right), rtol=1e-9, atol=1e-10)
         np.testing.assert_allclose(
-            lu.solve(right).astype(float), np.linalg.solve(full, right), rtol=1e-9, atol=1e-10
+            lu.solve_transposed(right).astype(float),
+            np.linalg.solve(full.T, right),
+            rtol=1e-9,
+            atol=1e-10,
         )
-        np.testing.assert_allclose(
-            lu.solve_transposed(right).astype(float), np.linalg.solve(full.T, right),
-            rtol=1e-9, atol=1e-10,
-        )  # fmt: skip
         assert float(lu.inverse_determinant) * np.linalg.det(full) == pytest.approx(1.0, rel=1e-9)
 
 
@@ -278,9 +297,12 @@ def start(folder, program=PROGRAM):
     environment = {k: v for k, v in os.environ.items() if k != "_ROS_WHEELS_BOOTSTRAP_COMPLETE"}
     environment |= {"PKM_TWIN_CACHE": str(folder), "PYTHONPATH": os.pathsep.join(sys.path)}
     return subprocess.Popen(
-        [sys.executable, "-c", program], env=environment, text=True,
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-    )  # fmt: skip
+        [sys.executable, "-c", program],
+        env=environment,
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
 
 
 def finished(process):
@@ -464,9 +486,7 @@ def test_a_stored_program_that_must_not_run_is_rebuilt(tmp_path, monkeypatch, ha
     harm(*(paths[:2] if level == "name" else paths[2:]))
     assert outputs() == [2.0, 3.0]
     assert [path.read_bytes() for path in paths] == whole
-    assert {(path.stat().st_mode & 0o777, path.stat().st_uid) for path in paths} == {
-        (0o600, os.geteuid())
-    }
+    assert {(path.stat().st_mode & 0o777, path.stat().st_uid) for path in paths} == {(0o600, os.geteuid())}
 
 
 def test_trace_over_sparse_matrices(rng):

@@ -89,9 +89,7 @@ def test_what_cannot_be_a_bound_is_refused() -> None:
         ContactMonitor(load("delta"), sigmas=0.0)
 
 
-WATCHED = partly_long(
-    ["delta_cu", "linear_delta", "rps3", "stewart", "prru", "upr_rpu", "five_bar"], "linear_delta"
-)
+WATCHED = partly_long(["delta_cu", "linear_delta", "rps3", "stewart", "prru", "upr_rpu", "five_bar"], "linear_delta")
 
 
 @pytest.mark.parametrize("seed", partly_long(range(3), 0))
@@ -131,11 +129,9 @@ class TestDepartures:
         [(what, rest) for what in ("as the model", "both, 3 % each") for rest in (0.0, 0.5)],
         ("both, 3 % each", 0.0),
     ),
-)  # fmt: skip
+)
 @massive
-def test_free_motion_touches_nothing_from_the_first_sample_on(
-    name: str, case: tuple[str, float]
-) -> None:
+def test_free_motion_touches_nothing_from_the_first_sample_on(name: str, case: tuple[str, float]) -> None:
     """Also where the friction is large beside the efforts so far: the fastest moves come later."""
     what, rest = case
     robot, rng = load(name), np.random.default_rng([30, *name.encode()])

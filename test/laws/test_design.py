@@ -89,8 +89,7 @@ def test_quantities_are_those_of_each_machine_by_itself(picking):
     many = variants(robot, {"geometry.arm_length": [0.19, 0.24], "inertia.platform_mass": 0.3})
     f = PathMotion(many, path)
     peak, rms, energy, mass = (
-        q.worst(q.pieces(f))
-        for q in map(QUANTITIES.get, ("peak-effort", "rms-effort", "energy", "mass"))
+        q.worst(q.pieces(f)) for q in map(QUANTITIES.get, ("peak-effort", "rms-effort", "energy", "mass"))
     )
     for k, machine in enumerate(many):
         q = machine.inverse(path.pose)
@@ -104,15 +103,11 @@ def test_quantities_are_those_of_each_machine_by_itself(picking):
         assert peak[k] == pytest.approx(np.abs(tau).max(), rel=1e-4)
         whole = path.time[-1] - path.time[0]
         squares = np.trapezoid if hasattr(np, "trapezoid") else np.trapz
-        assert rms[k] == pytest.approx(
-            np.sqrt(squares(tau**2, path.time, axis=0) / whole).max(), rel=1e-4
-        )
+        assert rms[k] == pytest.approx(np.sqrt(squares(tau**2, path.time, axis=0) / whole).max(), rel=1e-4)
         power = np.maximum(tau * qd, 0.0)
         assert energy[k] == pytest.approx(squares(power, path.time, axis=0).sum(), rel=1e-4)
         bodies = [body.mass for body in machine.graph.bodies.values()]
-        assert mass[k] == pytest.approx(
-            sum(bodies) + sum(r.mass for r in machine.graph.rods.values())
-        )
+        assert mass[k] == pytest.approx(sum(bodies) + sum(r.mass for r in machine.graph.rods.values()))
 
 
 def test_the_ratio_of_least_motor_torque_is_that_of_brute_force(picking):
@@ -143,9 +138,16 @@ def test_the_ratio_of_least_motor_torque_is_that_of_brute_force(picking):
     assert result.best.quantities["motor-torque"] == pytest.approx(best[0], rel=3e-4)
     assert result.best.numbers["drive.ratio"] == pytest.approx(best[1], abs=0.5)
     # Its derivatives, by the ratio and by a length that moves the joints otherwise.
-    quantity, f = QUANTITIES["motor-torque"], PathMotion(variants(robot, {
-        "drive.ratio": 20.0, "geometry.arm_length": length, "drive.efficiency": 0.8,
-        "drive.inertia": 9e-6}), path)  # fmt: skip
+    quantity, f = (
+        QUANTITIES["motor-torque"],
+        PathMotion(
+            variants(
+                robot,
+                {"drive.ratio": 20.0, "geometry.arm_length": length, "drive.efficiency": 0.8, "drive.inertia": 9e-6},
+            ),
+            path,
+        ),
+    )
     slopes = quantity.slopes(f, np.arange(3))
     for k, step in enumerate((1e-3, 1e-6)):
         ahead, behind = (torque(20.0 + s * (k == 0), length + s * (k == 1)) for s in (step, -step))

@@ -81,9 +81,7 @@ def test_white_noise_shrinks_with_the_window(rng):
     for window in (10, 40):
         differentiator = Differentiator(2, window)
         noise = 1e-3 * rng.normal(size=(2000, 3))
-        results = [
-            differentiator.push((i + 1) * STEP, np.zeros(3), value) for i, value in enumerate(noise)
-        ]
+        results = [differentiator.push((i + 1) * STEP, np.zeros(3), value) for i, value in enumerate(noise)]
         spread.append(np.std([r[1] for r in results if r is not None]))
     # The end slope of a fit has a deviation that falls with window to the power 3/2.
     assert spread[0] / spread[1] == pytest.approx(4**1.5, rel=0.2)
@@ -109,10 +107,7 @@ def test_a_reset_or_another_kind_of_stream_fills_the_window_anew():
 
     def push(count, rates):
         zero = np.zeros(3)
-        return [
-            differentiator.push(next(stamps), zero, zero if rates else None) is not None
-            for _ in range(count)
-        ]
+        return [differentiator.push(next(stamps), zero, zero if rates else None) is not None for _ in range(count)]
 
     filling = [False] * 4 + [True] * 2
     assert push(6, True) == filling
@@ -218,9 +213,7 @@ def test_a_window_of_a_time_has_the_error_for_a_sine_that_it_says(rate, carries)
         t = i / rate
         q, qd, qdd = np.sin(turn * t) * np.array([1.0, 1.0, -(turn**2)])
         qd = turn * np.cos(turn * t)
-        result = differentiator.push(
-            round(t * SECOND), np.full(2, q), np.full(2, qd) if carries else None
-        )
+        result = differentiator.push(round(t * SECOND), np.full(2, q), np.full(2, qd) if carries else None)
         if result is not None:
             errors.append(abs(result[1][0] - qdd) / turn**2)
     span = (differentiator.window - 1) / rate
@@ -235,9 +228,7 @@ def test_lost_samples_and_jitter_leave_the_window_as_long(rng):
     stamps = np.array(stamps_of(rng, 400, 0.8))[rng.uniform(size=400) > 0.05].tolist()
     differentiator = Differentiator(2, 25, time=0.024)
     for k, stamp in enumerate(stamps):
-        assert (differentiator.push(stamp, np.zeros(3), np.zeros(3)) is None) == (
-            k < differentiator.window - 1
-        )
+        assert (differentiator.push(stamp, np.zeros(3), np.zeros(3)) is None) == (k < differentiator.window - 1)
     assert 22 <= differentiator.window <= 25
 
 

@@ -12,8 +12,7 @@ from pkm_twin.mechanisms.catalogue import robot_of_data
 from test.support.robots import load, parameters_of, partly_long, random_motion
 
 THIRDS = np.pi * np.array([1.0, 5.0 / 3.0, 1.0 / 3.0])
-CLOSURES = {"rods": ["rod"] * 3} | {f"rcu {k}": ["rod"] * k + ["rcu"] + ["rod"] * (2 - k)
-                                    for k in range(3)}  # fmt: skip
+CLOSURES = {"rods": ["rod"] * 3} | {f"rcu {k}": ["rod"] * k + ["rcu"] + ["rod"] * (2 - k) for k in range(3)}
 KINDS = [*CLOSURES, "below", "above", "upr_rpu"]
 
 
@@ -21,8 +20,7 @@ def machine(kind, **geometry):
     """A shipped robot with closures or a branch of its own and other dimensions."""
     name = "delta" if kind in CLOSURES else "prru" if kind in ("below", "above") else kind
     data = parameters_of(name)
-    data["geometry"] |= {k: v.tolist() if isinstance(v, np.ndarray) else v
-                         for k, v in geometry.items()}  # fmt: skip
+    data["geometry"] |= {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in geometry.items()}
     if kind in CLOSURES:
         data["geometry"]["closures"] = CLOSURES[kind]
     elif kind != name:
@@ -62,8 +60,7 @@ def upr_rpu_points(robot, pose):
     """Rotation of the platform, and the limbs' ends on it and on the base, (3, 3) each."""
     z, beta, gamma = pose
     rx = np.array([[1, 0, 0], [0, np.cos(beta), -np.sin(beta)], [0, np.sin(beta), np.cos(beta)]])
-    ry = np.array([[np.cos(gamma), 0, np.sin(gamma)], [0, 1, 0],
-                   [-np.sin(gamma), 0, np.cos(gamma)]])  # fmt: skip
+    ry = np.array([[np.cos(gamma), 0, np.sin(gamma)], [0, 1, 0], [-np.sin(gamma), 0, np.cos(gamma)]])
     pattern = np.array([[-1.0, 0, 0], [1, 0, 0], [0, 1, 0]])
     g, origin = robot.geometry, np.array([0.0, -z * np.tan(beta), z])
     rotation = rx @ ry
@@ -154,9 +151,7 @@ def test_permuting_limbs_permutes_torques(kind, rng):
     if kind in CLOSURES:
         data["geometry"]["closures"] = [CLOSURES[kind][k] for k in order]
     *motion, wrench = random_motion(given, rng, 50)
-    there = inverse_dynamics(
-        robot_of_data(data, "permuted"), *(x[:, order] for x in motion), wrench
-    )
+    there = inverse_dynamics(robot_of_data(data, "permuted"), *(x[:, order] for x in motion), wrench)
     here = inverse_dynamics(given, *motion, wrench)
     np.testing.assert_allclose(there, here[:, order], rtol=1e-10, atol=1e-9)
 
@@ -255,11 +250,8 @@ def test_masses_that_are_left_out_are_those_of_thin_rods_and_a_thin_disc(rng):
     short = robot_of_data(data, "short")
     rod, disc = lengths["limb_length"] ** 2 / 12, masses["platform_mass"] / 4
     masses |= {"link_com": 0.5, "platform_com": [0.0, 0.0, 0.0]}
-    masses |= {f"{k}_link_inertia": [masses[f"{k}_link_mass"] * rod, 0.0]
-               for k in ("lower", "upper")}  # fmt: skip
-    masses["platform_inertia"] = (
-        disc * lengths["platform_radius"] ** 2 * np.array([1.0, 1.0, 2.0])
-    ).tolist()
+    masses |= {f"{k}_link_inertia": [masses[f"{k}_link_mass"] * rod, 0.0] for k in ("lower", "upper")}
+    masses["platform_inertia"] = (disc * lengths["platform_radius"] ** 2 * np.array([1.0, 1.0, 2.0])).tolist()
     motion = random_motion(short, rng, 20)
     full = inverse_dynamics(robot_of_data(data, "full"), *motion)
     np.testing.assert_allclose(inverse_dynamics(short, *motion), full, rtol=1e-12)

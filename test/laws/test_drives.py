@@ -43,9 +43,7 @@ ZERO = np.zeros(2)
 
 @pytest.mark.parametrize("braked", [ZERO, np.array([0.3, 0.1]), np.array([2.0, 0.0])])
 def test_efforts_that_are_zero_or_constant_at_standstill(braked: Array) -> None:
-    time, still, effort, (before, during, after) = phases(
-        (1.0, False, None), (2.0, True, braked), (1.0, False, None)
-    )
+    time, still, effort, (before, during, after) = phases((1.0, False, None), (2.0, True, braked), (1.0, False, None))
     found = followed(time, still, effort)
     assert not found[before].any()
     # Zeros at once, anything else once it has been so for a tenth of a second.
@@ -80,9 +78,12 @@ def test_a_brake_that_opens_or_closes_bears_a_part() -> None:
     """The drive's effort comes back, or goes, before the machine moves: left out both ways."""
     ramp = HELD * np.linspace(0.0, 1.0, round(0.2 / PERIOD))[:, None]
     time, still, effort, (_, closing, _, opening, _) = phases(
-        (1.0, True, None), (0.2, True, ramp[::-1]), (1.0, True, ZERO), (0.2, True, ramp),
         (1.0, True, None),
-    )  # fmt: skip
+        (0.2, True, ramp[::-1]),
+        (1.0, True, ZERO),
+        (0.2, True, ramp),
+        (1.0, True, None),
+    )
     inner = slice(5, -10)
     found = followed(time, still, effort)
     assert found[opening][inner].all()
@@ -92,9 +93,7 @@ def test_a_brake_that_opens_or_closes_bears_a_part() -> None:
 
 
 def test_the_beginnings_are_counted() -> None:
-    time, still, effort, _ = phases(
-        (0.5, True, ZERO), (1.0, False, None), (0.5, True, ZERO), (1.0, False, None)
-    )
+    time, still, effort, _ = phases((0.5, True, ZERO), (1.0, False, None), (0.5, True, ZERO), (1.0, False, None))
     watch = DriveWatch()
     for row in zip(time, still, effort, strict=True):
         watch.push(*row, HELD)

@@ -32,9 +32,7 @@ def test_efforts_are_the_virtual_work_of_all_bodies(name, robot, rng):
     expected += robot.friction.viscous * qd + robot.friction.coulomb * np.sign(qd)
     expected += rotors(robot) * qdd + sum(rub.efforts for rub in rubs(robot, all_, q, qd))
     size = np.maximum(1.0, np.abs(expected).max())
-    np.testing.assert_allclose(
-        inverse_dynamics(robot, q, qd, qdd, wrench), expected, rtol=1e-11, atol=1e-11 * size
-    )
+    np.testing.assert_allclose(inverse_dynamics(robot, q, qd, qdd, wrench), expected, rtol=1e-11, atol=1e-11 * size)
 
 
 def rotors(robot):
@@ -69,9 +67,7 @@ def test_forward_dynamics_undoes_inverse(name, robot, rng):
     q, qd, qdd = states(robot, rng, 100)
     wrench = rng.normal(0.0, 10.0, (100, 6))
     tau = inverse_dynamics(robot, q, qd, qdd, wrench)
-    np.testing.assert_allclose(
-        forward_dynamics(robot, q, qd, tau, wrench), qdd, rtol=1e-9, atol=1e-9
-    )
+    np.testing.assert_allclose(forward_dynamics(robot, q, qd, tau, wrench), qdd, rtol=1e-9, atol=1e-9)
 
 
 def test_a_control_loop_fills_its_arrays_with_the_torques(name, robot, rng):
@@ -79,9 +75,7 @@ def test_a_control_loop_fills_its_arrays_with_the_torques(name, robot, rng):
     loop.q[:], loop.qd[:], loop.qdd[:] = states(robot, rng, 3)
     loop.wrench[:] = rng.normal(0.0, 10.0, (3, 6))
     assert loop() == 0
-    np.testing.assert_array_equal(
-        loop.tau, inverse_dynamics(robot, loop.q, loop.qd, loop.qdd, loop.wrench)
-    )
+    np.testing.assert_array_equal(loop.tau, inverse_dynamics(robot, loop.q, loop.qd, loop.qdd, loop.wrench))
     loop.qd[1] = np.inf
     assert loop() == 2 and np.isnan(loop.tau[1]).all()
 
@@ -98,8 +92,7 @@ def heavier_sections(data, times):
         if not isinstance(place, dict):
             return place
         return {
-            k: scaled(v) if k.endswith("mass") or k in ("density", "inertia") else walked(v)
-            for k, v in place.items()
+            k: scaled(v) if k.endswith("mass") or k in ("density", "inertia") else walked(v) for k, v in place.items()
         }
 
     if "inertia" in data:

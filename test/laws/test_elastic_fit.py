@@ -21,9 +21,7 @@ TRUTH = dict(zip(NAMES, (1.3, 0.9, 2.0, 0.8, 1.1, 1.0, 1.6, 1.0, 3.0), strict=Tr
 """Of a machine whose file has 1 everywhere."""
 ENGINES = (
     twin_recording,
-    pytest.param(
-        lambda factors: frame_recording(tuple(factors.items())), marks=pytest.mark.long, id="frame"
-    ),
+    pytest.param(lambda factors: frame_recording(tuple(factors.items())), marks=pytest.mark.long, id="frame"),
 )
 """The twin itself, and the independent one."""
 
@@ -64,9 +62,7 @@ def test_an_instruments_zero_is_found_and_a_direction_may_be_missing():
     assert result.measured.tolist() == [[True] * 6, [True] * 3 + [False] * 3]
     for number in result.numbers:
         assert number.after == pytest.approx(TRUTH[number.key[-1]], rel=1e-6)
-    both = [
-        noisy(one, np.random.default_rng(k), SENSORS) for k, one in enumerate((clean, recording))
-    ]
+    both = [noisy(one, np.random.default_rng(k), SENSORS) for k, one in enumerate((clean, recording))]
     result = fit_elements(ROBOT, both)
     np.testing.assert_allclose(result.zeros[1, :3], zero[:3], atol=5e-8)
     assert within(result, TRUTH)

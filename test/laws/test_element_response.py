@@ -42,14 +42,13 @@ def test_factors_are_those_of_the_file(name):
     np.testing.assert_allclose(response.compliance, compliance(robot, poses), atol=1e-12 * size)
     np.testing.assert_allclose(response.compliance_at(factors), expected, atol=1e-10 * size)
     moved, _ = response.deflection(wrenches, factors)
-    np.testing.assert_allclose(
-        moved, (expected @ wrenches[..., None])[..., 0], atol=1e-9 * np.abs(moved).max()
-    )
+    np.testing.assert_allclose(moved, (expected @ wrenches[..., None])[..., 0], atol=1e-9 * np.abs(moved).max())
     # All elements alike: compliance is their multiple.
     np.testing.assert_allclose(
-        response.compliance_at(np.full(len(factors), 2.5)), 2.5 * response.compliance,
+        response.compliance_at(np.full(len(factors), 2.5)),
+        2.5 * response.compliance,
         atol=1e-10 * size,
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.parametrize("name", ELASTIC)
@@ -70,9 +69,10 @@ def test_derivatives_are_those_of_a_complex_step_and_the_elements_energies(name)
     )
     # Homogeneous of degree one: the weighted sum is the compliance.
     np.testing.assert_allclose(
-        np.einsum("e,nejk->njk", factors, slopes), response.compliance_at(factors),
+        np.einsum("e,nejk->njk", factors, slopes),
+        response.compliance_at(factors),
         atol=1e-10 * size,
-    )  # fmt: skip
+    )
     energy = strain_energy(robot, poses, wrenches)
     assert energy.elements == response.names
     doubled = np.einsum("nj,nejk,nk->ne", wrenches, response.derivatives(), wrenches)

@@ -28,9 +28,20 @@ def cut(capsys, tmp_path):
 
     def run(*words):
         told = command(
-            capsys, "feed", "delta_cu", points, "--tolerance", TOLERANCE, "--speed", SPEED, "--out",
-            out, "--overwrite", "--json", *words,
-        )  # fmt: skip
+            capsys,
+            "feed",
+            "delta_cu",
+            points,
+            "--tolerance",
+            TOLERANCE,
+            "--speed",
+            SPEED,
+            "--out",
+            out,
+            "--overwrite",
+            "--json",
+            *words,
+        )
         table = list(csv.DictReader(out.open()))
         return json.loads(told.out), {k: np.array([float(r[k]) for r in table]) for k in table[0]}
 

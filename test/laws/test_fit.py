@@ -27,10 +27,8 @@ from test.support.robots import load, parameters_of, partly_long
 
 TRUTH = {
     "friction": {"viscous": [40.0, 60.0, 55.0], "coulomb": [15.0, 22.0, 9.0]},
-    "payload": {
-        "mass": 4.0, "com": [0.03, -0.02, 0.08], "inertia": np.diag([0.02, 0.03, 0.025]).tolist()
-    },
-}  # fmt: skip
+    "payload": {"mass": 4.0, "com": [0.03, -0.02, 0.08], "inertia": np.diag([0.02, 0.03, 0.025]).tolist()},
+}
 """Of a 3-PRRU whose file tells of neither."""
 
 
@@ -139,9 +137,7 @@ def test_late_efforts_and_outliers_are_no_friction():
 
 def test_refusals_by_name():
     robot, whole = load("five_bar"), still_joint()
-    short = dataclasses.replace(
-        whole, time=whole.time[:50], q=whole.q[:50], effort=whole.effort[:50]
-    )
+    short = dataclasses.replace(whole, time=whole.time[:50], q=whole.q[:50], effort=whole.effort[:50])
     with pytest.raises(PkmTwinError, match="still: too short"):
         fit(robot, [short], ("friction",))
     asleep = dataclasses.replace(whole, q=np.tile(whole.q[0], (len(whole.q), 1)))

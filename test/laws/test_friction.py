@@ -28,8 +28,7 @@ from test.support.robots import (
     random_motion,
 )
 
-NAMES = partly_long(["delta_cu", "prru", "upr_rpu", "random five_bar", "random rps3"],
-                    "prru", "random five_bar")  # fmt: skip
+NAMES = partly_long(["delta_cu", "prru", "upr_rpu", "random five_bar", "random rps3"], "prru", "random five_bar")
 ROBOTS = pytest.mark.parametrize("name", NAMES)
 PERIOD = 0.05
 
@@ -51,11 +50,17 @@ def rubbing(name, rng, *keys):
     size = np.abs(inverse_dynamics(plain, q, 0.0 * q, 0.0 * q)).max() + 0.5
     unit = joint_units_of_size(robot)
     scales = {
-        "viscous": 0.2 * size / unit, "coulomb": 0.1 * size, "offset": 0.05 * size,
-        "stribeck": 0.1 * size, "stribeck_speed": 0.3 * unit, "load_dependent": 0.3,
-        "cogging_cos": 0.03 * size, "cogging_sin": 0.03 * size, "cogging_period": PERIOD * unit,
+        "viscous": 0.2 * size / unit,
+        "coulomb": 0.1 * size,
+        "offset": 0.05 * size,
+        "stribeck": 0.1 * size,
+        "stribeck_speed": 0.3 * unit,
+        "load_dependent": 0.3,
+        "cogging_cos": 0.03 * size,
+        "cogging_sin": 0.03 * size,
+        "cogging_period": PERIOD * unit,
         "presliding": 0.01 * unit,
-    }  # fmt: skip
+    }
     drawn = {key: scale * rng.uniform(0.3, 1.0, n) for key, scale in scales.items()}
     chosen = {key: drawn[key].tolist() for key in keys or scales}
     return plain.changed(friction=chosen)

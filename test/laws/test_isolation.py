@@ -49,9 +49,7 @@ DEVIATIONS = [0.0, 1e-300, 0.1, 1e200]
 
 
 @pytest.mark.parametrize("name", partly_long(NAMES, "stewart", "five_bar"))
-def test_a_place_is_finite_or_none_and_usual_samples_bring_one(
-    name: str, rng: np.random.Generator
-) -> None:
+def test_a_place_is_finite_or_none_and_usual_samples_bring_one(name: str, rng: np.random.Generator) -> None:
     robot = load(name)
     locator, n = ContactLocator(robot), robot.joints_count
     q, still = random_joints(robot, rng, 1)[0], np.zeros(n)
@@ -98,16 +96,13 @@ def drawn(name: str, rng: np.random.Generator, count: int) -> list[tuple[str, Co
 
 @pytest.mark.parametrize("count", often(40, 400))
 @pytest.mark.parametrize("name", partly_long(NAMES, "delta_cu", "rps3"))
-def test_classes_are_right_as_often_as_their_confidence_says(
-    name: str, count: int, rng: np.random.Generator
-) -> None:
+def test_classes_are_right_as_often_as_their_confidence_says(name: str, count: int, rng: np.random.Generator) -> None:
     found = drawn(name, rng, count)
     right = [max(p.classes, key=lambda one: p.classes[one]) == limb for limb, p in found]
     sure = np.array([place.confidence for _, place in found])
     # Forces here are drawn a little differently from what the evidence expects.
     assert abs(np.mean(right) - sure.mean()) < 0.12 + 2.0 * np.sqrt(0.25 / count)
-    assert all((p.where == UNKNOWN) == (p.confidence < 0.5 or p.classes[UNKNOWN] == p.confidence)
-               for _, p in found)  # fmt: skip
+    assert all((p.where == UNKNOWN) == (p.confidence < 0.5 or p.classes[UNKNOWN] == p.confidence) for _, p in found)
 
 
 def test_six_joint_efforts_show_the_body(rng: np.random.Generator) -> None:
@@ -125,15 +120,13 @@ def test_what_one_joint_alone_feels_is_its_arm() -> None:
     assert place.where == "limb II" and place.confidence > 0.9
     # How far along it is not determined: one effort has one number.
     assert place.body == "arm II"
-    assert place.deviation > 0.2 * np.linalg.norm(np.ptp(
-        locator.places.at(q)[0][[p == "arm II" for p in locator.places.parts]], axis=0
-    ))  # fmt: skip
+    assert place.deviation > 0.2 * np.linalg.norm(
+        np.ptp(locator.places.at(q)[0][[p == "arm II" for p in locator.places.parts]], axis=0)
+    )
 
 
 @pytest.mark.parametrize("count", often(10, 60))
-def test_what_two_limbs_clamp_is_told_from_a_collision(
-    count: int, rng: np.random.Generator
-) -> None:
+def test_what_two_limbs_clamp_is_told_from_a_collision(count: int, rng: np.random.Generator) -> None:
     """Opposite forces on two limbs that approach each other, and a force on one of them."""
     assert not len(Places(load("delta_cu")).pairs[0])
     robot = load("stewart")
@@ -167,9 +160,10 @@ def test_a_contact_is_located_some_times_and_free_motion_never(
     located: list[float] = []
     push = ContactLocator.push
     monkeypatch.setattr(
-        ContactLocator, "push",
+        ContactLocator,
+        "push",
         lambda self, step, *rest: (located.append(step), push(self, step, *rest))[1],
-    )  # fmt: skip
+    )
     monitor, still = ContactMonitor(robot), np.zeros(6)
     monitor.prepare()
     located.clear()

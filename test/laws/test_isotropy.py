@@ -30,9 +30,7 @@ MASSIVE = [name for name in robots.MASSIVE if len(robots.SHIPPED[name].joint_nam
 THIRD = 2 * np.pi / 3
 TURN = np.array([[np.cos(THIRD), -np.sin(THIRD), 0], [np.sin(THIRD), np.cos(THIRD), 0], [0, 0, 1]])
 
-massive = pytest.mark.parametrize(
-    "name", partly_long(MASSIVE, "delta_cu", "prru", "rps3", "upr_rpu")
-)
+massive = pytest.mark.parametrize("name", partly_long(MASSIVE, "delta_cu", "prru", "rps3", "upr_rpu"))
 
 
 @pytest.fixture
@@ -58,8 +56,7 @@ def test_joint_motion_follows_the_pose_in_time(name, robot, rng):
     rates, accelerations = 0.1 * rng.normal(size=(2, *q.shape))
     motion = joint_motion(robot, pose, rates, accelerations)
     np.testing.assert_allclose(motion.q, q, atol=1e-10)
-    at = {k: robot.inverse(pose + k * h * rates + (k * h) ** 2 / 2 * accelerations)
-          for k in (-2, -1, 0, 1, 2)}  # fmt: skip
+    at = {k: robot.inverse(pose + k * h * rates + (k * h) ** 2 / 2 * accelerations) for k in (-2, -1, 0, 1, 2)}
     first = (8 * (at[1] - at[-1]) - (at[2] - at[-2])) / (12 * h)
     second = (16 * (at[1] + at[-1]) - (at[2] + at[-2]) - 30 * at[0]) / (12 * h * h)
     np.testing.assert_allclose(motion.qd, first, atol=1e-9)
@@ -121,9 +118,7 @@ def test_max_driving_force_is_inverse_dynamics_at_the_energy(name, robot, rng):
     tau = inverse_dynamics(robot, *motion) - dynamics_terms(robot, *motion).friction
     np.testing.assert_allclose(force, np.abs(tau).max(-1), rtol=1e-11)
     # The velocity part is even, and direction counts without its length.
-    np.testing.assert_allclose(
-        max_driving_force(robot, pose, -3 * direction, amount, acceleration), force, rtol=1e-11
-    )
+    np.testing.assert_allclose(max_driving_force(robot, pose, -3 * direction, amount, acceleration), force, rtol=1e-11)
 
 
 @massive
@@ -153,9 +148,11 @@ def test_max_driving_force_range_holds_all_samples_and_is_attained(name, robot, 
 def descended(forms, start):
     """What a search downhill from a direction finds, no matter how far it comes."""
     return minimize(
-        lambda x: largest(forms, x / np.linalg.norm(x)), start, method="Nelder-Mead",
+        lambda x: largest(forms, x / np.linalg.norm(x)),
+        start,
+        method="Nelder-Mead",
         options={"xatol": 1e-10, "fatol": 0.0, "maxfev": 400},
-    ).fun  # fmt: skip
+    ).fun
 
 
 SCALES = ([1.0, 1.0, 1.0], [1.0, 1e-3, 30.0], [1e4, 1.0, 1e-4])

@@ -13,9 +13,7 @@ from stiffness_monitor.structure import structural_model
 from test.support.robots import ELASTIC, load, parameters_of
 
 
-@pytest.mark.parametrize(
-    ("name", "section"), [("delta", "members"), ("prru", "members"), ("upr_rpu", "inertia")]
-)
+@pytest.mark.parametrize(("name", "section"), [("delta", "members"), ("prru", "members"), ("upr_rpu", "inertia")])
 def test_a_file_without_the_section_loads_and_is_refused_by_name(name, section, load_data):
     data = parameters_of(name)
     del data[section]
@@ -57,13 +55,9 @@ def test_an_inner_diameter_can_stand_for_the_density(with_members):
     robot = load("delta")
     members = parameters_of("delta")["members"]
     del members["arm"]["density"]
-    members["arm"]["inner_diameter"] = (
-        structural_model(robot, robot.graph.home).parts[0].section.inner_diameter
-    )
+    members["arm"]["inner_diameter"] = structural_model(robot, robot.graph.home).parts[0].section.inner_diameter
     other = with_members("delta", members)
-    assert natural_frequencies(other, robot.home()) == pytest.approx(
-        natural_frequencies(robot, robot.home())
-    )
+    assert natural_frequencies(other, robot.home()) == pytest.approx(natural_frequencies(robot, robot.home()))
     members["arm"]["inner_diameter"] = 0.04
     with pytest.raises(ParameterError) as caught:
         with_members("delta", members)

@@ -113,10 +113,7 @@ def test_locked_drives_carry_what_virtual_work_says(name, rng):
         expected = -robot.platform_jacobian(q).T @ wrench
         standing = {"base", *(part.name for part in frame.parts if isinstance(part, Carried))}
         members = [part for part in frame.parts if isinstance(part, Member)]
-        driven = [
-            k for k, member in enumerate(members)
-            if name == "upr_rpu" or member.inner.body in standing
-        ]  # fmt: skip
+        driven = [k for k, member in enumerate(members) if name == "upr_rpu" or member.inner.body in standing]
         assert len(driven) == len(robot.joint_names)
         for i, k in enumerate(driven):
             index, _, axes = system.members[k]
@@ -172,17 +169,12 @@ def test_frequencies_go_with_the_root_of_stiffness_over_mass(name, variant, rng)
         for modulus in ("youngs_modulus", "shear_modulus"):
             if key in members:
                 members[key][modulus] *= 4
-    assert natural_frequencies(variant(name, members=members)[0], poses) == pytest.approx(
-        2 * expected, rel=1e-8
-    )
+    assert natural_frequencies(variant(name, members=members)[0], poses) == pytest.approx(2 * expected, rel=1e-8)
     members = tubes(name)
     for key in ("arm", "forearm", "rcu_forearm"):
         if key in members:
             members[key]["density"] *= 4
-    inertia = {
-        key: 4 * parameters_of(name)["inertia"][key]
-        for key in ("platform_mass", "arm_mass", "forearm_mass")
-    }
+    inertia = {key: 4 * parameters_of(name)["inertia"][key] for key in ("platform_mass", "arm_mass", "forearm_mass")}
     heavy = variant(name, members=members, inertia=inertia)[0]
     assert natural_frequencies(heavy, poses) == pytest.approx(expected / 2, rel=1e-8)
 
@@ -247,9 +239,7 @@ def test_shares_sum_to_one_and_the_platforms_is_that_of_its_shape(name, rng):
         moved = found.shapes[k, :, found.nodes.index(body.name)]
         spin = moved[:, 3:]
         velocity = moved[:, :3] + np.cross(spin, body.at - robot.platform(robot.inverse(pose))[0])
-        energy = body.mass * (velocity**2).sum(-1) + np.einsum(
-            "ki,ij,kj->k", spin, body.inertia, spin
-        )
+        energy = body.mass * (velocity**2).sum(-1) + np.einsum("ki,ij,kj->k", spin, body.inertia, spin)
         # Shapes have unit generalised mass.
         assert energy == pytest.approx(shares.kinetic[k, :, index], rel=1e-9, abs=1e-12)
 
@@ -258,8 +248,7 @@ def test_joints_with_elasticity_are_elements_of_the_shares():
     robot = load("upr_rpu")
     found = modes(robot, robot.home())
     assert set(found.energies.elements) == {"platform", *robot.element_names}
-    static = {e[1] for e, s in zip(found.energies.elements, found.energies.kinetic[0], strict=True)
-              if s == 0.0}  # fmt: skip
+    static = {e[1] for e, s in zip(found.energies.elements, found.energies.kinetic[0], strict=True) if s == 0.0}
     assert static == {"R", "U"}
 
 

@@ -66,9 +66,7 @@ def check_closures(robot, q, bound):
             assert np.abs(np.sum(angle * first, -1) - between).max() < bound, joint.name
     for rod in robot.graph.rods.values():
         start, end = rod.ends
-        length = np.linalg.norm(
-            moved(pair, rod.outer, end) - moved(pair, rod.inner, start), axis=-1
-        )
+        length = np.linalg.norm(moved(pair, rod.outer, end) - moved(pair, rod.inner, start), axis=-1)
         assert np.abs(length - np.linalg.norm(end - start)).max() < bound * size, rod.name
 
 
@@ -111,9 +109,7 @@ def test_forward_undoes_inverse(name, rng):
 def test_jacobians_are_the_derivatives_of_forward(name, rng):
     robot = load(name)
     q = random_joints(robot, rng, 50)
-    np.testing.assert_allclose(
-        robot.jacobian(q), finite_difference(robot.forward, q), rtol=1e-6, atol=1e-7
-    )
+    np.testing.assert_allclose(robot.jacobian(q), finite_difference(robot.forward, q), rtol=1e-6, atol=1e-7)
     check_twists(robot.platform_jacobian(q), robot.platform, q)
 
 
@@ -174,8 +170,10 @@ def test_bodies_move_as_their_places_change(name, rng):
         w = np.stack([w[:, 2, 1], w[:, 0, 2], w[:, 1, 0]], -1)
         np.testing.assert_allclose(spin[:, k], w, atol=1e-8)
         bent = second(turned) @ turned[3].swapaxes(-1, -2)
-        alpha = np.stack([bent[:, 2, 1] - bent[:, 1, 2], bent[:, 0, 2] - bent[:, 2, 0],
-                          bent[:, 1, 0] - bent[:, 0, 1]], -1) / 2  # fmt: skip
+        alpha = (
+            np.stack([bent[:, 2, 1] - bent[:, 1, 2], bent[:, 0, 2] - bent[:, 2, 0], bent[:, 1, 0] - bent[:, 0, 1]], -1)
+            / 2
+        )
         matrix = turned[3] @ inertia @ turned[3].swapaxes(-1, -2)
         euler = np.einsum("nij,nj->ni", matrix, alpha)
         euler += np.cross(w, np.einsum("nij,nj->ni", matrix, w))
@@ -250,9 +248,7 @@ def test_far_joints_are_refused_in_one_line_with_limb_sample_and_miss(name, rng)
     """Whatever the joints are: an assembly whose closures hold, or one of the typed refusals."""
     robot = load(name)
     middle = robot.graph.home
-    reach = np.array(
-        [3.0 * robot.engine.tree.size if u == "m" else np.pi for u in robot.joint_units]
-    )
+    reach = np.array([3.0 * robot.engine.tree.size if u == "m" else np.pi for u in robot.joint_units])
     q = middle + rng.uniform(-1.0, 1.0, (400, len(middle))) * reach
     poses, good = robot.try_forward(q)
     assert np.isnan(poses[~good]).all()

@@ -89,18 +89,12 @@ def solved(kind, steps, q, start, near, foreseen, pace, scale, gap, side):
 
 def drawn(rng, count):
     """Near and far targets, starts about the root or about its negative, on both sides of rules."""
-    q = np.where(
-        rng.random(count) < 0.7, 10.0 ** rng.uniform(-1.0, 1.0, count), rng.normal(size=count)
-    )
+    q = np.where(rng.random(count) < 0.7, 10.0 ** rng.uniform(-1.0, 1.0, count), rng.normal(size=count))
     q = np.where(rng.random(count) < 0.1, 10.0 ** rng.uniform(-17.0, -1.0, count), q)
     root = np.sqrt(np.abs(q))
-    about = [
-        root * (1.0 + rng.normal(size=count) * 10.0 ** rng.uniform(-4, 0, count)) for _ in "12"
-    ]
+    about = [root * (1.0 + rng.normal(size=count) * 10.0 ** rng.uniform(-4, 0, count)) for _ in "12"]
     usual = rng.random((5, count)) < 0.8
-    pace = np.where(
-        usual[0], 1.0, 1.0 + rng.choice([-1.0, 1.0], count) * rng.uniform(0.1, 0.35, count)
-    )
+    pace = np.where(usual[0], 1.0, 1.0 + rng.choice([-1.0, 1.0], count) * rng.uniform(0.1, 0.35, count))
     scale = np.where(usual[1], 1.0, 10.0 ** rng.uniform(-10.0, 0.0, count))
     gap = np.where(usual[2], 0.0, 10.0 ** rng.uniform(-11.0, -9.0, count))
     side = np.where(usual[3], 1.0, rng.choice([-1.0, 0.0, 1e-12], count))

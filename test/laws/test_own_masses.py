@@ -55,10 +55,7 @@ def test_directions_of_reactions_are_each_machines_own():
     one, other = (least_norm_reactions(machine, q, still, still) for machine in (robot, turned))
     np.testing.assert_allclose(other.wrenches, one.wrenches, atol=1e-9)
     own = {joint.label or joint.name for joint in joints.values() if joint.directions}
-    along = [
-        k for k, name in enumerate(one.components)
-        if name.split(":")[0] in own and not name.endswith("along n")
-    ]  # fmt: skip
+    along = [k for k, name in enumerate(one.components) if name.split(":")[0] in own and not name.endswith("along n")]
     assert np.abs(one.values[along]).max() > 100.0
     np.testing.assert_allclose(other.values[along], -one.values[along], atol=1e-9)
 

@@ -109,15 +109,11 @@ class TestFiles:
     def test_many_keys_are_refused(self, load_text):
         refusal(load_text, "".join(f"k{i}: 0\n" for i in range(7000)))
 
-    @pytest.mark.parametrize(
-        "text", ["5e-1", "5.0e-1", "5.0E-1", ".5e0", "5.e-1", "+0.5", "0.05e1"]
-    )
+    @pytest.mark.parametrize("text", ["5e-1", "5.0e-1", "5.0E-1", ".5e0", "5.e-1", "+0.5", "0.05e1"])
     def test_a_number_is_one_however_it_is_written(self, load_text, text):
         assert load_text(f"{self.GOOD}\npayload: {{mass: {text}}}\n").payload.mass == 0.5
 
-    @pytest.mark.parametrize(
-        "path", ["/dev/zero", "/dev/null", "/", "/nonexistent.yaml", "a\0.yaml"]
-    )
+    @pytest.mark.parametrize("path", ["/dev/zero", "/dev/null", "/", "/nonexistent.yaml", "a\0.yaml"])
     def test_what_is_not_a_file_is_refused(self, path):
         refusal(load, path)
 

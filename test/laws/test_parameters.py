@@ -37,9 +37,7 @@ def test_arrays_are_read_only():
 
 
 class TestNames:
-    @pytest.mark.parametrize(
-        ("name", "closest"), [("delta_uc", "delta_cu"), ("upr_rpv", "upr_rpu"), ("pruu", "prru")]
-    )
+    @pytest.mark.parametrize(("name", "closest"), [("delta_uc", "delta_cu"), ("upr_rpv", "upr_rpu"), ("pruu", "prru")])
     def test_an_unknown_robot_names_the_closest(self, name, closest):
         error = refusal(load, name)
         assert isinstance(error, UnknownNameError)
@@ -66,9 +64,7 @@ class TestNames:
     def test_a_key_that_is_no_text_is_refused(self, load_text, key):
         refusal(load_text, f"{yaml.safe_dump(DELTA)}\n? {key}\n: 1\n")
 
-    @pytest.mark.parametrize(
-        "value", ["detla", "Delta", "", 5, None, True, ["delta"], {"delta": 1}, []]
-    )
+    @pytest.mark.parametrize("value", ["detla", "Delta", "", 5, None, True, ["delta"], {"delta": 1}, []])
     def test_an_unknown_mechanism_is_refused(self, load_data, value):
         assert refusal(load_data, changed(DELTA, "mechanism", value)).field == "mechanism"
 

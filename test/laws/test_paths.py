@@ -18,9 +18,7 @@ from pkm_twin.paths.motion import BINDING_USE
 from pkm_twin.paths.pieces import Arc, Corner, arc_through
 from test.support.robots import load, parameters_of, partly_long
 
-SOME = partly_long(
-    ["delta", "prru", "five_bar", "stewart", "linear_delta", "rps3"], "delta", "five_bar", "stewart"
-)
+SOME = partly_long(["delta", "prru", "five_bar", "stewart", "linear_delta", "rps3"], "delta", "five_bar", "stewart")
 
 
 def points_of(robot, count=4, seed=3):
@@ -39,9 +37,10 @@ def walked(path, count=400):
             tol = 1e-4 * np.abs(second).max() + 1e-9
             np.testing.assert_allclose(np.gradient(p, s, axis=0)[1:-1], first[1:-1], atol=tol)
             np.testing.assert_allclose(
-                np.gradient(first, s, axis=0)[1:-1], second[1:-1],
+                np.gradient(first, s, axis=0)[1:-1],
+                second[1:-1],
                 atol=2e-2 * np.abs(second).max() + 1e-9,
-            )  # fmt: skip
+            )
             places.append(p)
     return np.concatenate(places)
 
@@ -90,8 +89,7 @@ def test_arcs_are_circles_and_join_tangent_lines_at_speed():
     robot = load("delta")
     x, y, z = robot.home()
     r = 0.03
-    points = [[x - 0.05, y, z], [x, y, z], [x + r, y + r, z], [x, y + 2 * r, z],
-              [x - 0.05, y + 2 * r, z]]  # fmt: skip
+    points = [[x - 0.05, y, z], [x, y, z], [x + r, y + r, z], [x, y + 2 * r, z], [x - 0.05, y + 2 * r, z]]
     path = lines(robot, points, arc=[0, 0, 1, 0, 0])
     (stretch,) = path.stretches
     (arc,) = (piece for piece in stretch.pieces if isinstance(piece, Arc))
@@ -183,16 +181,16 @@ def used_at_most(motion, count=40_000):
     moved = np.diff(robot.forward(s.q)[:, :3], axis=0) if np.isfinite(limits.speed) else np.zeros(1)
     step = s.time[1]
     parts = (
-        effort / limits.effort, s.qd / limits.velocity, s.qdd / limits.acceleration,
+        effort / limits.effort,
+        s.qd / limits.velocity,
+        s.qdd / limits.acceleration,
         np.diff(s.qdd, axis=0) / step / limits.jerk,
         np.linalg.norm(moved, axis=-1) / step / limits.speed,
-    )  # fmt: skip
+    )
     return max(float(np.abs(part).max()) for part in parts)
 
 
-@pytest.mark.parametrize(
-    "seed", [*range(2), *(pytest.param(k, marks=pytest.mark.long) for k in range(2, 60))]
-)
+@pytest.mark.parametrize("seed", [*range(2), *(pytest.param(k, marks=pytest.mark.long) for k in range(2, 60))])
 @pytest.mark.parametrize("name", partly_long(["delta", "five_bar", "stewart"], "delta", "five_bar"))
 def test_limits_hold_between_points_that_are_close_too(name, seed):
     robot = load(name)
@@ -259,10 +257,15 @@ def test_rates_with_limits_of_jerk_are_those_of_the_positions():
     """Two of the points are 10 micrometres apart; there the machine nearly stops."""
     robot = load("delta_cu").changed(payload={"mass": 0.3})
     millimetres = [
-        [-2.3463, 9.4973, -353.3997], [0.4832, -6.3215, -366.7954], [-0.2985, 8.0417, -354.1937],
-        [8.2979, -4.5807, -360.5465], [8.2993, -4.5709, -360.5432], [-7.0692, 0.6709, -358.6772],
-        [-3.6767, -8.8975, -362.2181], [-2.1533, -4.2661, -361.0709],
-    ]  # fmt: skip
+        [-2.3463, 9.4973, -353.3997],
+        [0.4832, -6.3215, -366.7954],
+        [-0.2985, 8.0417, -354.1937],
+        [8.2979, -4.5807, -360.5465],
+        [8.2993, -4.5709, -360.5432],
+        [-7.0692, 0.6709, -358.6772],
+        [-3.6767, -8.8975, -362.2181],
+        [-2.1533, -4.2661, -361.0709],
+    ]
     motion = fastest(robot, 1e-3 * np.array(millimetres), jerk=4000.0, points=300)
     assert missed_by_the_rates(motion) < 1e-9
     assert max(motion.worst.values()) <= 1.0
@@ -397,21 +400,33 @@ POSES = {
     "cycle": lambda r: cycle(r, 0.02, 0.15, 0.03),
     "curve": lambda r: through(r, points_of(r, 5)),
     "corners": lambda r: lines(
-        r, [(-0.1, 0, -0.4), (-0.1, 0, -0.36), (0.1, 0, -0.36), (0.1, 0, -0.36),
-            (0.13, 0.05, -0.36), (0.1, 0.1, -0.36), (0.1, 0.1, -0.4)],
-        blend=[0, 0.02, 0, 0, 0, 0, 0], dwell=[0, 0, 0.05, 0.1, 0, 0, 0.02], arc=np.arange(7) == 4,
+        r,
+        [
+            (-0.1, 0, -0.4),
+            (-0.1, 0, -0.36),
+            (0.1, 0, -0.36),
+            (0.1, 0, -0.36),
+            (0.13, 0.05, -0.36),
+            (0.1, 0.1, -0.36),
+            (0.1, 0.1, -0.4),
+        ],
+        blend=[0, 0.02, 0, 0, 0, 0, 0],
+        dwell=[0, 0, 0.05, 0.1, 0, 0, 0.02],
+        arc=np.arange(7) == 4,
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize(
     ("name", "kind", "law", "jerk"),
     [
-        ("delta", "cycle", "fastest", None), ("delta", "corners", "fastest", None),
-        ("delta", "curve", "fastest", 2e4), ("delta", "corners", "s-curve", None),
+        ("delta", "cycle", "fastest", None),
+        ("delta", "corners", "fastest", None),
+        ("delta", "curve", "fastest", 2e4),
+        ("delta", "corners", "s-curve", None),
         ("five_bar", "curve", "fastest", None),
     ],
-)  # fmt: skip
+)
 def test_a_payload_changes_at_its_waypoint_and_the_limits_hold_with_it(name, kind, law, jerk):
     robot = load(name)
     path = POSES[kind](robot)
@@ -423,9 +438,7 @@ def test_a_payload_changes_at_its_waypoint_and_the_limits_hold_with_it(name, kin
         np.testing.assert_allclose(at, points_of(robot, 5)[1:], atol=1e-12)
     edges = [0.0, *m.switches, np.inf]
     assert m.load.spans == [
-        (begin, end, mass)
-        for begin, end, mass in zip(edges[:-1], edges[1:], masses, strict=True)
-        if mass is not None
+        (begin, end, mass) for begin, end, mass in zip(edges[:-1], edges[1:], masses, strict=True) if mass is not None
     ]
     times = np.linspace(0.0, m.duration, 20_001)
     s = m.sample(np.unique([*times, *m.switches, *np.nextafter(m.switches, 0.0)]))
@@ -434,9 +447,7 @@ def test_a_payload_changes_at_its_waypoint_and_the_limits_hold_with_it(name, kin
         own = robot if mass is None else robot.changed(payload={"mass": mass})
         rows = part == k
         effort = inverse_dynamics(own, s.q[rows], s.qd[rows], s.qdd[rows])
-        np.testing.assert_allclose(
-            s.effort[rows], effort, rtol=0, atol=1e-12 * np.abs(effort).max()
-        )
+        np.testing.assert_allclose(s.effort[rows], effort, rtol=0, atol=1e-12 * np.abs(effort).max())
         assert (np.abs(effort) <= robot.limits.effort * (1.0 + 1e-9)).all()
     if robot.limits.effort is not None and law == "fastest" and jerk is None:
         assert max(m.worst.values()) > 0.999
@@ -457,12 +468,8 @@ def test_one_payload_by_waypoints_is_the_robots_to_the_last_digit():
     # Reached before the rest there, and after that of the same waypoint before it.
     twice = lines(robot, [(0, 0, -0.4), (0, 0, -0.36), (0, 0, -0.36)], dwell=[0.1, 0.2, 0.3])
     m = fastest(robot, twice, payload=[0.0, 0.1, 0.2])
-    assert np.diff([m.begins[0] + m.runs[0].duration, *m.switches, m.duration]) == pytest.approx(
-        [0.0, 0.2, 0.3]
-    )
-    one, other = (
-        fastest(robot, twice, payload=[mass, None, None]).duration for mass in (None, 0.5)
-    )
+    assert np.diff([m.begins[0] + m.runs[0].duration, *m.switches, m.duration]) == pytest.approx([0.0, 0.2, 0.3])
+    one, other = (fastest(robot, twice, payload=[mass, None, None]).duration for mass in (None, 0.5))
     assert other > one
 
 

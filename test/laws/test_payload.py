@@ -27,9 +27,11 @@ def moved(robot: Robot, seconds: float) -> tuple[Array, Array, Array, Array]:
     angle = w * times[:, None] + np.arange(len(middle))
     reach = 0.4 * half
     return (
-        times, middle + reach * np.sin(angle), reach * w * np.cos(angle),
+        times,
+        middle + reach * np.sin(angle),
+        reach * w * np.cos(angle),
         -reach * w**2 * np.sin(angle),
-    )  # fmt: skip
+    )
 
 
 def fed(robot: Robot, *rows: Array, known: Array | None = None) -> PayloadEstimator:
@@ -40,9 +42,7 @@ def fed(robot: Robot, *rows: Array, known: Array | None = None) -> PayloadEstima
     return estimator
 
 
-@pytest.mark.parametrize(
-    ("name", "feels"), [("stewart", True), ("rps3", True), ("delta_cu", False)]
-)
+@pytest.mark.parametrize(("name", "feels"), [("stewart", True), ("rps3", True), ("delta_cu", False)])
 def test_a_load_is_found_with_what_the_machine_feels_of_it(name: str, feels: bool) -> None:
     """A platform that tilts feels the centre too, three translations the mass alone."""
     robot = load(name).changed(payload={"mass": 0.0})

@@ -39,8 +39,7 @@ def smooth(robot):
 
 def rubs_inside(robot):
     """Whether a passive joint has friction."""
-    return any(joint.viscous or joint.coulomb for joint in robot.graph.joints.values()
-               if not joint.actuated)  # fmt: skip
+    return any(joint.viscous or joint.coulomb for joint in robot.graph.joints.values() if not joint.actuated)
 
 
 def inner_friction(robot):
@@ -245,11 +244,14 @@ def rubbing(robot, rng, q, laws):
     }
     if laws:
         friction |= {
-            "stribeck": rng.uniform(0.0, 1.0, n).tolist(), "stribeck_speed": (0.3 * scale).tolist(),
+            "stribeck": rng.uniform(0.0, 1.0, n).tolist(),
+            "stribeck_speed": (0.3 * scale).tolist(),
             "load_dependent": rng.uniform(0.0, 0.3, n).tolist(),
-            "cogging_cos": rng.normal(size=n).tolist(), "cogging_sin": rng.normal(size=n).tolist(),
-            "cogging_period": (0.05 * scale).tolist(), "offset": rng.normal(size=n).tolist(),
-        }  # fmt: skip
+            "cogging_cos": rng.normal(size=n).tolist(),
+            "cogging_sin": rng.normal(size=n).tolist(),
+            "cogging_period": (0.05 * scale).tolist(),
+            "offset": rng.normal(size=n).tolist(),
+        }
     room = rng.choice([0.01, 0.1]) * scale
     stops = np.stack([q - room * rng.random(n), q + room * rng.random(n)], 1)
     return stopped_at(robot.changed(friction=friction), stops)
@@ -267,9 +269,11 @@ def balance(plant, effort):
     wave = 2.0 * np.pi / np.where(f.cogging_period > 0.0, f.cogging_period, 1.0)
     cogging = f.cogging_cos * np.sin(wave * plant.q) - f.cogging_sin * np.cos(wave * plant.q)
     parts = [
-        float(both.kinetic), float(both.potential), float((cogging / wave).sum()),
+        float(both.kinetic),
+        float(both.potential),
+        float((cogging / wave).sum()),
         -float((effort - f.offset) @ plant.q),
-    ]  # fmt: skip
+    ]
     return sum(parts), sum(map(abs, parts))
 
 

@@ -44,9 +44,7 @@ def apart(robot, one, other):
 def poses_about_home(robot, rng, count):
     home = robot.home()
     step = np.where([u == "rad" for u in robot.pose_units], 2.0, robot.graph.size)
-    return np.concatenate(
-        [home + part * step * rng.uniform(-1.0, 1.0, (count, len(home))) for part in SIZES]
-    )
+    return np.concatenate([home + part * step * rng.uniform(-1.0, 1.0, (count, len(home))) for part in SIZES])
 
 
 @pytest.mark.parametrize("count", often(80, 4000))
@@ -132,10 +130,12 @@ def test_all_joints_of_a_spherical_machine_in_one_point(shift, rng):
 
 @pytest.mark.parametrize(
     ("name", "far", "question"),
-    [("delta", [0.0, 0.0, -350.0], "z -350 m cannot be reached. Did you give mm?"),
-     ("prru", [0.84, 30.0, 0.0], "30 rad cannot be reached. Did you give degrees?"),
-     ("delta", [0.0, 0.0, -2.0], "")],
-)  # fmt: skip
+    [
+        ("delta", [0.0, 0.0, -350.0], "z -350 m cannot be reached. Did you give mm?"),
+        ("prru", [0.84, 30.0, 0.0], "30 rad cannot be reached. Did you give degrees?"),
+        ("delta", [0.0, 0.0, -2.0], ""),
+    ],
+)
 def test_a_pose_in_another_unit_is_asked_for(name, far, question):
     with pytest.raises((UnreachableError, SingularityError)) as refused:
         load(name).inverse(far)

@@ -23,9 +23,7 @@ from test.nodes.harness import SECOND, Maker, Plain, reject
 from test.support.robots import load
 
 COULOMB, PRESLIDING = np.array([0.3, 0.2, 0.25]), np.array([0.01, 0.02, 0.0])
-ROBOT = load("delta_cu").changed(
-    friction={"coulomb": COULOMB.tolist(), "presliding": PRESLIDING.tolist()}
-)
+ROBOT = load("delta_cu").changed(friction={"coulomb": COULOMB.tolist(), "presliding": PRESLIDING.tolist()})
 HOME = ROBOT.inverse(ROBOT.home())
 
 
@@ -204,9 +202,8 @@ def recorded(name, seed, reversals=True, memory=True):
 
 @pytest.mark.parametrize(
     "name, seeds",
-    [("five_bar", 1), *(pytest.param(one, 20, marks=pytest.mark.long)
-                        for one in ("five_bar", "delta_cu"))],
-)  # fmt: skip
+    [("five_bar", 1), *(pytest.param(one, 20, marks=pytest.mark.long) for one in ("five_bar", "delta_cu"))],
+)
 def test_slow_reversals_give_level_and_distance_within_their_deviations(name, seeds):
     away = {"coulomb": [], "presliding": []}
     for seed in range(seeds):
@@ -251,9 +248,7 @@ def test_tables_along_a_motion_have_memory_and_what_has_no_state_says_so(rng):
         assert np.abs(columns[f"{joint}.effort"] - effort[:, j]).max() < 1e-12
         assert np.abs(effort - change - static)[:, j].max() < 1e-12
     with pytest.warns(RobotWarning, match="presliding"):
-        files = c_package(
-            load("five_bar").changed(friction={"coulomb": [1, 1], "presliding": [1, 1]})
-        )
+        files = c_package(load("five_bar").changed(friction={"coulomb": [1, 1], "presliding": [1, 1]}))
     assert "presliding" in files["pkm_five_bar.h"]
     with pytest.raises(ParameterError, match="presliding"):
         ROBOT.changed(friction={"presliding": [-1.0, 0.0, 0.0]})

@@ -73,9 +73,7 @@ def forgetful():
 def test_keys_follow_the_sources_that_write_a_program(tmp_path, monkeypatch, forgetful):
     """On a copy of the sources, one of which changes at a time."""
     for package in PACKAGES:
-        shutil.copytree(
-            ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("*.pyc", "maps")
-        )
+        shutil.copytree(ROOT / package, tmp_path / package, ignore=shutil.ignore_patterns("*.pyc", "maps"))
     found = {name: kernel.code.key for name, kernel in kernels(load("delta_cu")).items()}
     for module in {CODEGEN}.union(*(key.writers for key in found.values())):
         own = sys.modules[module]

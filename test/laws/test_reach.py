@@ -16,16 +16,23 @@ from test.support.robots import every_robot, joint_range, load
 def slide(limits: object) -> Robot:
     """One slide along z from its home value 0.1, and the platform's reference point beside it."""
     data = {
-        "mechanism": "machine", "platform": "table", "origin": [0.3, 0.0, 1.0], "pose": ["z"],
+        "mechanism": "machine",
+        "platform": "table",
+        "origin": [0.3, 0.0, 1.0],
+        "pose": ["z"],
         "bodies": {"table": {"mass": 1.0, "com": [0, 0, 1.0], "inertia": [0.1, 0.1, 0.1]}},
         "joints": {
             "rail": {
-                "type": "prismatic", "between": ["base", "table"], "at": [0, 0, 1.0],
-                "axis": [0, 0, 1], "actuated": True, "home": 0.1,
+                "type": "prismatic",
+                "between": ["base", "table"],
+                "at": [0, 0, 1.0],
+                "axis": [0, 0, 1],
+                "actuated": True,
+                "home": 0.1,
                 **({} if limits is None else {"limits": {"position": limits}}),
             }
         },
-    }  # fmt: skip
+    }
     return robot_of_data(data, "slide")
 
 

@@ -51,9 +51,7 @@ def imbalance(robot, result, q, qd, qdd, wrench):
             origin = robot.platform(q)[0]
             force += wrench[:, :3]
             moment += wrench[:, 3:] + np.cross(origin, wrench[:, :3])
-        worst = max(
-            worst, (np.abs(force).max(-1) / size).max(), (np.abs(moment).max(-1) / size).max()
-        )
+        worst = max(worst, (np.abs(force).max(-1) / size).max(), (np.abs(moment).max(-1) / size).max())
     return worst
 
 
@@ -113,9 +111,7 @@ def test_a_hanging_delta_carries_its_weight():
         assert np.abs(platform[3:]).max() < 1e-14
 
 
-OVERCONSTRAINED = [
-    name for name in MASSIVE if load(name).engine.mobility.redundant and name != "delta_cu"
-]
+OVERCONSTRAINED = [name for name in MASSIVE if load(name).engine.mobility.redundant and name != "delta_cu"]
 
 
 @pytest.fixture(params=OVERCONSTRAINED)
@@ -129,9 +125,7 @@ def test_an_overconstrained_mechanism_names_what_statics_cannot_tell(overconstra
     np.testing.assert_array_equal(result.determinate, np.isfinite(result.wrenches))
     np.testing.assert_array_equal(result.determinate_components, np.isfinite(result.values))
     known = result.determinate_components.all(0)
-    assert {n for n, k in zip(result.components, known, strict=True) if not k} == set(
-        result.indeterminate
-    )
+    assert {n for n, k in zip(result.components, known, strict=True) if not k} == set(result.indeterminate)
     tau = reaching(overconstrained, *motion)
     np.testing.assert_allclose(result.efforts, tau, rtol=1e-9, atol=1e-10 * np.abs(tau).max())
 
@@ -287,21 +281,16 @@ def test_a_parallelogram_rod_by_rod_gives_the_same(half_width, rng):
     result = reactions(robot, *motion)
     all_ = bodies(robot, *motion[:3])
     origin = robot.platform(motion[0])[0]
-    for n, (points, wrenches, wrench) in enumerate(
-        zip(result.points, result.wrenches, motion[3], strict=True)
-    ):
+    for n, (points, wrenches, wrench) in enumerate(zip(result.points, result.wrenches, motion[3], strict=True)):
         model = RodByRod(robot, all_, n)
         platform = model.body("platform")
         about = np.cross(origin[n], wrench[:3])
-        model.loads[platform] += (
-            model.needs("payload") - wrench - np.concatenate([np.zeros(3), about])
-        )
+        model.loads[platform] += model.needs("payload") - wrench - np.concatenate([np.zeros(3), about])
         rods = {}
         for i, limb in enumerate(("I", "II", "III")):
             azimuth = robot.geometry.azimuths[i]
             t = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
-            joints = [result.names.index(f"{joint} {limb}")
-                      for joint in ("base joint", "elbow", "platform joint")]  # fmt: skip
+            joints = [result.names.index(f"{joint} {limb}") for joint in ("base joint", "elbow", "platform joint")]
             a, b, c = points[joints]
             arm = model.body(f"arm {limb}")
             model.ball(None, arm, a)
@@ -316,6 +305,4 @@ def test_a_parallelogram_rod_by_rod_gives_the_same(half_width, rng):
         for joint, ends in rods.items():
             force = sum(solution[where] for _, where in ends)
             couple = sum(np.cross(lever, solution[where]) for lever, where in ends)
-            np.testing.assert_allclose(
-                wrenches[joint], [*force, *couple], atol=1e-10 * np.abs(solution).max()
-            )
+            np.testing.assert_allclose(wrenches[joint], [*force, *couple], atol=1e-10 * np.abs(solution).max())

@@ -27,9 +27,7 @@ from test.support.robots import load, loaded, massive, random_motion
 def complete(name: str) -> Robot:
     """A loaded robot with offsets and rotors."""
     robot = loaded(name)
-    return robot.changed(
-        friction={"offset": [0.1, -0.2, 0.3, 0.1, -0.2, 0.3][: robot.joints_count]}
-    )
+    return robot.changed(friction={"offset": [0.1, -0.2, 0.3, 0.1, -0.2, 0.3][: robot.joints_count]})
 
 
 @massive

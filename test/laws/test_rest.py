@@ -69,9 +69,7 @@ def test_the_noise_is_that_which_was_added_whatever_the_motion(jitter: float) ->
 def test_a_stream_has_the_noise_of_its_last_samples(jitter: float) -> None:
     rng = np.random.default_rng(7)
     time = np.round(1e9 * uneven(rng, 60, 2e-3, jitter)).astype(int)
-    values = np.sin(np.arange(60.0) / 3.0)[:, None] + np.array([1.0, 1e-3, 0.0]) * rng.normal(
-        size=(60, 3)
-    )
+    values = np.sin(np.arange(60.0) / 3.0)[:, None] + np.array([1.0, 1e-3, 0.0]) * rng.normal(size=(60, 3))
     stream = NoiseEstimator()
     for k in range(60):
         stream.push(int(time[k]) + 1, [1e6, 0.0, float(k)])
@@ -150,9 +148,7 @@ def test_the_reach_of_friction_is_the_files(name: str) -> None:
 
 def test_friction_at_rest_explains_its_reach_and_no_more() -> None:
     still, reach = np.array([True, True, False]), np.array([1.0, 0.0, 1.0])
-    np.testing.assert_array_equal(
-        moving_rates(np.array([0.1, 0.1, 0.1]), still, reach), [0.0, 0.1, 0.1]
-    )
+    np.testing.assert_array_equal(moving_rates(np.array([0.1, 0.1, 0.1]), still, reach), [0.0, 0.1, 0.1])
     left = beyond_friction(np.array([[0.5, 0.5, 0.5], [-3.0, -3.0, -3.0]]), still, reach)
     np.testing.assert_array_equal(left, [[0.0, 0.5, 0.5], [-2.0, -3.0, -3.0]])
 
@@ -170,9 +166,7 @@ def moves(robot: Robot, time: Array) -> Array:
 
 @pytest.mark.parametrize("size", [0.0, 1e-6])
 @pytest.mark.parametrize("name", RUBBING)
-def test_a_table_of_positions_rubs_in_no_wrong_direction(
-    tmp_path: Path, name: str, size: float
-) -> None:
+def test_a_table_of_positions_rubs_in_no_wrong_direction(tmp_path: Path, name: str, size: float) -> None:
     robot = load(name)
     time = np.arange(0.1, 1.1, 0.01)
     true = moves(robot, time)
@@ -197,9 +191,7 @@ def test_a_trajectory_of_positions_likewise(name: str) -> None:
     robot = load(name)
     time = np.arange(0.1, 1.1, 0.01)
     q = moves(robot, time)
-    message = MAKE.trajectory(
-        robot.joint_names, [round(t * SECOND) for t in time], q.tolist(), stamp=NOW
-    )
+    message = MAKE.trajectory(robot.joint_names, [round(t * SECOND) for t in time], q.tolist(), stamp=NOW)
     efforts = Feedforward(robot, Settings(differentiate=True)).trajectory(message, NOW)
     qd = np.gradient(q, time, axis=0, edge_order=2)
     smooth = robot.changed(friction={"coulomb": [0.0] * robot.joints_count})

@@ -101,9 +101,7 @@ def expected(robot, judge, q):
     whole = "rad" in robot.pose_units
     point = judge.point(graph.platform, graph.origin).columns
     inverse = np.linalg.pinv((bodies[6 * k : 6 * k + 6] if whole else point) @ tangent)
-    farthest = max(
-        np.linalg.norm(body @ tangent @ inverse) for body in np.split(bodies, len(bodies) // 6)
-    )
+    farthest = max(np.linalg.norm(body @ tangent @ inverse) for body in np.split(bodies, len(bodies) // 6))
     moved = np.sqrt(len(q)) / farthest
     return min(1.0, held, moved)
 
@@ -130,18 +128,21 @@ def replaced(graph, turn, scale, shift):
     """The same machine elsewhere, turned and of another size."""
     joints = {
         name: replace(
-            joint, at=scale * turn @ joint.at + shift, axes=joint.axes @ turn.T,
+            joint,
+            at=scale * turn @ joint.at + shift,
+            axes=joint.axes @ turn.T,
             pitch=scale * joint.pitch,
         )
         for name, joint in graph.joints.items()
-    }  # fmt: skip
+    }
     rods = {
         name: replace(
-            rod, ends=scale * rod.ends @ turn.T + shift,
+            rod,
+            ends=scale * rod.ends @ turn.T + shift,
             pair=None if rod.pair is None else turn @ rod.pair,
         )
         for name, rod in graph.rods.items()
-    }  # fmt: skip
+    }
     return replace(graph, joints=joints, rods=rods, origin=scale * turn @ graph.origin + shift)
 
 
@@ -182,19 +183,18 @@ class TestOneMachineOneMeasure:
         # Translation joints slide along base axes.
         turns = all(joint.kind != "translation" for joint in graph.joints.values())
         scale, turn = rng.uniform(0.3, 3.0), rotation_of(rng.normal(size=3) * turns)
-        away = [
-            {n: rng.uniform(-1.0, 1.0) * (0.05 * graph.size if slides[n] else 0.1) for n in home}
-            for _ in range(2)
-        ]
+        away = [{n: rng.uniform(-1.0, 1.0) * (0.05 * graph.size if slides[n] else 0.1) for n in home} for _ in range(2)]
         away = [dict.fromkeys(home, 0.0), *away]
         states = [{n: home[n] + move[n] for n in home} for move in away]
         grown = [{n: home[n] + move[n] * scale ** slides[n] for n in home} for move in away]
         expected = self.measures(graph, states, point)
         assert all(0.0 < value <= 1.0 for value in expected)
         order = replace(
-            graph, bodies=shuffled(graph.bodies, rng), joints=shuffled(graph.joints, rng),
+            graph,
+            bodies=shuffled(graph.bodies, rng),
+            joints=shuffled(graph.joints, rng),
             rods=shuffled(graph.rods, rng),
-        )  # fmt: skip
+        )
         elsewhere = replaced(graph, turn, scale, rng.normal(size=3))
         cases = [(order, states), (elsewhere, grown)]
         if not point:

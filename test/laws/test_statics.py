@@ -24,9 +24,7 @@ def random_wrenches(rng, *shape):
 
 @elastic
 class TestEveryRobot:
-    def test_compliance_is_symmetric_positive_definite_and_the_deflection_of_unit_wrenches(
-        self, name, rng
-    ):
+    def test_compliance_is_symmetric_positive_definite_and_the_deflection_of_unit_wrenches(self, name, rng):
         robot = load(name)
         poses = random_poses(robot, rng, 6)
         matrix = compliance(robot, poses)
@@ -99,13 +97,15 @@ class TestEveryRobot:
         if name != "upr_rpu":  # its joints at the platform give
             for k in range(2):
                 rigid = [
-                    (points[k, -1], shifts[k, -1]) for points, shifts in many.values()
+                    (points[k, -1], shifts[k, -1])
+                    for points, shifts in many.values()
                     if np.allclose(
                         shifts[k, -1],
                         moved[k, :3] + np.cross(moved[k, 3:], points[k, -1] - place[k]),
-                        rtol=1e-9, atol=1e-15,
+                        rtol=1e-9,
+                        atol=1e-15,
                     )
-                ]  # fmt: skip
+                ]
                 assert len(rigid) >= len(robot.joint_names)
         for member, (points, shifts) in many.items():
             one = member_deflections(robot, q[1], wrench[1])[member]
@@ -122,9 +122,7 @@ class TestEveryRobot:
             assert [len(row) for row in outputs] == list(kernel.sizes[1])
 
 
-@pytest.mark.parametrize(
-    "name", [name for name in ELASTIC if name != "upr_rpu" and "members" in parameters_of(name)]
-)
+@pytest.mark.parametrize("name", [name for name in ELASTIC if name != "upr_rpu" and "members" in parameters_of(name)])
 def test_without_members_nothing_is_known_of_them_and_all_else_holds(name, rng):
     data = parameters_of(name)
     del data["members"]
@@ -161,10 +159,7 @@ def test_a_frame_that_is_a_mechanism_is_refused_by_its_sample(variant):
 def test_other_numbers_take_the_same_program():
     """Lengths, moduli, diameters and compliances are inputs; what is rigid is not."""
     robot = load("upr_rpu")
-    joints = {
-        k: (np.multiply(3.0, v)).tolist()
-        for k, v in parameters_of("upr_rpu")["joints_compliance"].items()
-    }
+    joints = {k: (np.multiply(3.0, v)).tolist() for k, v in parameters_of("upr_rpu")["joints_compliance"].items()}
     other = robot.changed(members={"diameter": [0.07, 0.08, 0.09]}, joints_compliance=joints)
     other = other.with_file_values({"geometry.base_radius": 1.03 * robot.geometry.base_radius})
     program = kernels(robot)[1].code

@@ -30,11 +30,16 @@ def test_no_motion_jumps(rng, rate, measured):
         some = np.sort(rng.choice(len(time), len(time) * 2 // 3, replace=False))
         trembling = time + rng.uniform(-0.2, 0.2, len(time)) * period
         cases = [
-            (time, q, qd), (time, np.round(q / step) * step, qd), (time, q, late),
+            (time, q, qd),
+            (time, np.round(q / step) * step, qd),
+            (time, q, late),
             (time, q + 1e-4 * rng.normal(size=q.shape), qd + 0.01 * rng.normal(size=q.shape)),
-            (trembling, q, qd), (time[some], q[some], qd[some]), (time, 1e-3 * q, 1e-3 * qd),
-            (time, np.round(0.02 * q / step) * step, 0.02 * qd), (time, 0.0 * q, 0.0 * qd),
-        ]  # fmt: skip
+            (trembling, q, qd),
+            (time[some], q[some], qd[some]),
+            (time, 1e-3 * q, 1e-3 * qd),
+            (time, np.round(0.02 * q / step) * step, 0.02 * qd),
+            (time, 0.0 * q, 0.0 * qd),
+        ]
         for case, (t, x, v) in enumerate(cases):
             found = steps_of(t, x, v if measured else None, LIMIT)
             assert not found.jumps.any() and found.publishers == (), case

@@ -54,9 +54,10 @@ def towards(data, body):
                 if far.get(one) == steps:
                     far.setdefault(other, steps + 1)
     return [
-        name for name, joint in data["joints"].items()
+        name
+        for name, joint in data["joints"].items()
         if body in joint["between"] and min(map(far.get, joint["between"])) < far[body]
-    ]  # fmt: skip
+    ]
 
 
 def with_drives(data, path):
@@ -74,9 +75,12 @@ def with_drives(data, path):
         new = f"carrier {len(made['joints'])}"
         made["bodies"][new] = CARRIER
         made["joints"][f"error {len(made['joints']) - count}"] = {
-            "type": type_, "between": [body, new], "at": list(at), "axis": list(axis),
+            "type": type_,
+            "between": [body, new],
+            "at": list(at),
+            "axis": list(axis),
             "actuated": True,
-        }  # fmt: skip
+        }
         return new
 
     if what == "offset":
@@ -99,9 +103,7 @@ def with_drives(data, path):
         made["bodies"]["half"] = CARRIER
         carrier = drive("half", "prismatic", a, along)
         inner, outer = entry["between"]
-        made["joints"]["rod foot"] = {
-            "type": "universal", "between": [inner, "half"], "at": a, "axes": across(along)
-        }  # fmt: skip
+        made["joints"]["rod foot"] = {"type": "universal", "between": [inner, "half"], "at": a, "axes": across(along)}
         made["joints"]["rod head"] = {"type": "spherical", "between": [carrier, outer], "at": b}
     else:
         start, *others = towards(data, name)
@@ -246,9 +248,12 @@ def test_a_body_of_a_planar_chain_is_longer_in_its_plane():
 def test_drawn_machines_have_the_standard_deviations():
     robot = load("linear_delta")
     sigma = {
-        "rods.left_1.length": 4e-5, "limbs.rods.right.length": 2e-5, "joints.rail_2.offset": 3e-5,
-        "joints.rail_3.axis[0]": 1e-4, "joints.rail_3.at[1]": 5e-5,
-    }  # fmt: skip
+        "rods.left_1.length": 4e-5,
+        "limbs.rods.right.length": 2e-5,
+        "joints.rail_2.offset": 3e-5,
+        "joints.rail_3.axis[0]": 1e-4,
+        "joints.rail_3.at[1]": 5e-5,
+    }
     q = robot.graph.home + np.array([[0.0, 0.0, 0.0], [0.03, -0.05, 0.02]])
     found, errors = tolerances(robot, sigma, q), drawn(robot, sigma, q, 4000)
     np.testing.assert_allclose(np.sqrt((errors**2).mean(0)), found.deviation, rtol=0.05)
@@ -262,9 +267,11 @@ def test_drawn_machines_have_the_standard_deviations():
 def test_drawn_machines_may_have_errors_of_parts_and_of_numbers():
     robot = load("delta")
     sigma = {
-        "geometry.arm_length": 2e-6, "joints.arm_1.axis[0]": 1e-5, "geometry.base_radius": 1e-6,
+        "geometry.arm_length": 2e-6,
+        "joints.arm_1.axis[0]": 1e-5,
+        "geometry.base_radius": 1e-6,
         "bodies.arm II.length": 3e-6,
-    }  # fmt: skip
+    }
     q = robot.graph.home + np.array([[0.0, 0.0, 0.0], [0.1, -0.2, 0.3]])
     found, rng = tolerances(robot, sigma, q), np.random.default_rng(0)
     first = sum(rng.normal(size=5)[:, None, None] * found.part(path) for path in sigma)
@@ -274,23 +281,39 @@ def test_drawn_machines_may_have_errors_of_parts_and_of_numbers():
 def pick_and_place_delta():
     """A Delta of base 0.2, arm 0.35, forearm 0.8 and platform 0.045 m, arms level at home."""
     rods = {
-        side: {"between": ["arm", "platform"], "mass": 0.1,
-               "ends": [[0.55, y, 0.0], [0.045, y, -(0.8**2 - 0.505**2) ** 0.5]]}
+        side: {
+            "between": ["arm", "platform"],
+            "mass": 0.1,
+            "ends": [[0.55, y, 0.0], [0.045, y, -((0.8**2 - 0.505**2) ** 0.5)]],
+        }
         for side, y in (("left", 0.05), ("right", -0.05))
-    }  # fmt: skip
+    }
     inertia = {"mass": 0.5, "inertia": [1e-3, 1e-3, 1e-3]}
-    motor = {"type": "revolute", "between": ["base", "arm"], "at": [0.2, 0.0, 0.0],
-             "axis": [0.0, 1.0, 0.0], "actuated": True,
-             "limits": {"position": [-0.9, 1.5]}}  # fmt: skip
+    motor = {
+        "type": "revolute",
+        "between": ["base", "arm"],
+        "at": [0.2, 0.0, 0.0],
+        "axis": [0.0, 1.0, 0.0],
+        "actuated": True,
+        "limits": {"position": [-0.9, 1.5]},
+    }
     origin = [0.0, 0.0, rods["left"]["ends"][1][2]]
-    return robot_of_data({
-        "mechanism": "machine", "platform": "platform", "origin": origin, "pose": ["x", "y", "z"],
-        "bodies": {"platform": {**inertia, "com": origin}},
-        "limbs": {
-            "azimuths": [0.0, 2.0943951, 4.1887902], "rods": rods, "joints": {"motor": motor},
-            "bodies": {"arm": {**inertia, "com": [0.34, 0.0, 0.0]}},
+    return robot_of_data(
+        {
+            "mechanism": "machine",
+            "platform": "platform",
+            "origin": origin,
+            "pose": ["x", "y", "z"],
+            "bodies": {"platform": {**inertia, "com": origin}},
+            "limbs": {
+                "azimuths": [0.0, 2.0943951, 4.1887902],
+                "rods": rods,
+                "joints": {"motor": motor},
+                "bodies": {"arm": {**inertia, "com": [0.34, 0.0, 0.0]}},
+            },
         },
-    }, "picker")  # fmt: skip
+        "picker",
+    )
 
 
 def test_one_longer_arm_and_all_arms_alike_or_by_themselves():
@@ -330,10 +353,11 @@ def test_bounds_hold_for_machines_that_are_drawn_within_them():
     """Uniform errors, a backlash and a clearance: their spread, and the worst of all signs."""
     robot = pick_and_place_delta()
     sigma = {
-        "rods.*.length": Tolerance(bound=3e-5), "rods.left_1.length": 1e-5,
+        "rods.*.length": Tolerance(bound=3e-5),
+        "rods.left_1.length": 1e-5,
         "joints.motor_2.backlash": Tolerance(bound=2e-4),
         "joints.motor_3.clearance": Tolerance(bound=4e-5),
-    }  # fmt: skip
+    }
     q = robot.graph.home + np.array([[0.0, 0.0, 0.0], [0.3, -0.2, 0.4]])
     found, errors = tolerances(robot, sigma, q), drawn(robot, sigma, q, 4000)
     assert len(found.sigma) == 6 + 1 + 3 and len(found.together) == 8
@@ -362,8 +386,11 @@ def test_bounds_hold_for_machines_that_are_drawn_within_them():
         each = tolerances(robot, {one: Tolerance(bound=1e-4), other: 1e-5}, q)
         np.testing.assert_allclose(each.sensitivity[one], each.sensitivity[other], atol=1e-12)
         assert each.bounds[one] == 5e-5 and each.sigma[one] == pytest.approx(1e-4 * 12**-0.5)
-    for path, size in (("joints.motor_1.backlash", 1e-4), ("joints.motor_1.clearance", 1e-4),
-                       ("joints.none*.offset", Tolerance(bound=1e-4))):  # fmt: skip
+    for path, size in (
+        ("joints.motor_1.backlash", 1e-4),
+        ("joints.motor_1.clearance", 1e-4),
+        ("joints.none*.offset", Tolerance(bound=1e-4)),
+    ):
         with pytest.raises(ParameterError):
             tolerances(robot, {path: size}, q)
 
@@ -378,9 +405,11 @@ def test_what_a_calibration_leaves_is_what_it_leaves():
     found = calibrate(robot, Poses(q, place + moved[:, :3], turn), geometric(robot, q))
     there, _ = found.robot.platform(found.joint_map.positions(q))
     left = left_by_calibration(
-        robot, lambda s: error * tolerances(robot, {path: error}, s).sensitivity[path][..., None],
-        q, q,
-    )  # fmt: skip
+        robot,
+        lambda s: error * tolerances(robot, {path: error}, s).sensitivity[path][..., None],
+        q,
+        q,
+    )
     assert rms(left[:, :3, 0]) == pytest.approx(rms(place + moved[:, :3] - there), rel=0.03)
     assert rms(left[:, :3, 0]) < 0.9 * rms(moved[:, :3])
 
@@ -388,19 +417,16 @@ def test_what_a_calibration_leaves_is_what_it_leaves():
 def test_numbers_of_a_file_without_parts_vary_as_the_file_says():
     robot = load("delta_cu")
     sigma = {
-        "geometry.arm_length": 2e-5, "geometry.base_radius": 1e-5,
+        "geometry.arm_length": 2e-5,
+        "geometry.base_radius": 1e-5,
         "geometry.platform_radius": 3e-5,
-    }  # fmt: skip
+    }
     q = workspace_states(robot, 20)
     found, errors = tolerances(robot, sigma, q), drawn(robot, sigma, q, 4000)
-    np.testing.assert_allclose(
-        np.sqrt((errors[..., :3] ** 2).mean(0)), found.deviation[:, :3], rtol=0.06
-    )
+    np.testing.assert_allclose(np.sqrt((errors[..., :3] ** 2).mean(0)), found.deviation[:, :3], rtol=0.06)
     arms = [f"bodies.arm {n}.length" for n in ("I", "II", "III")]
     each = tolerances(robot, dict.fromkeys(arms, 2e-5), q).sensitivity
-    np.testing.assert_allclose(
-        sum(each.values()), found.sensitivity["geometry.arm_length"], atol=1e-9
-    )
+    np.testing.assert_allclose(sum(each.values()), found.sensitivity["geometry.arm_length"], atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -444,10 +470,12 @@ def test_a_size_that_no_part_s_error_has_is_rejected(path, sigma):
 def test_the_first_wrong_word_of_a_path_is_named():
     robot = load("linear_delta")
     for path, word, near in (
-        ("rods.left_1.lenght", "lenght", "length"), ("rods.leftt_1.length", "leftt_1", "left_1"),
-        ("limbs.joints.rial.at[0]", "rial", "rail"), ("limbs[0].rods.left.length", 0, None),
+        ("rods.left_1.lenght", "lenght", "length"),
+        ("rods.leftt_1.length", "leftt_1", "left_1"),
+        ("limbs.joints.rial.at[0]", "rial", "rail"),
+        ("limbs[0].rods.left.length", 0, None),
         ("joints.rail_1.at[3]", 3, None),
-    ):  # fmt: skip
+    ):
         with pytest.raises(UnknownNameError) as caught:
             tolerances(robot, {path: 1e-4}, robot.graph.home)
         assert (caught.value.value, caught.value.closest) == (word, near)
@@ -480,24 +508,33 @@ def test_parallelograms_are_their_two_rods():
     robot = load("delta")
     graph = robot.graph
     data = {
-        "mechanism": "machine", "platform": graph.platform, "origin": graph.origin.tolist(),
+        "mechanism": "machine",
+        "platform": graph.platform,
+        "origin": graph.origin.tolist(),
         "pose": ["x", "y", "z"],
         "bodies": {n: CARRIER | {"mass": 1.0, "inertia": [0.01] * 3} for n in graph.bodies},
         "joints": {
             name: {
-                "type": joint.kind, "between": [joint.inner, joint.outer], "at": joint.at.tolist(),
-                "axis": joint.axes[0].tolist(), "actuated": True, "home": joint.home,
+                "type": joint.kind,
+                "between": [joint.inner, joint.outer],
+                "at": joint.at.tolist(),
+                "axis": joint.axes[0].tolist(),
+                "actuated": True,
+                "home": joint.home,
             }
-            for name, joint in graph.joints.items() if joint.actuated
+            for name, joint in graph.joints.items()
+            if joint.actuated
         },
         "rods": {
             f"{name} {side}": {
-                "between": [rod.inner, rod.outer], "mass": 0.1,
+                "between": [rod.inner, rod.outer],
+                "mass": 0.1,
                 "ends": (rod.ends + side * 0.5 * rod.width * rod.pair).tolist(),
             }
-            for name, rod in graph.rods.items() for side in (-1, 1)
+            for name, rod in graph.rods.items()
+            for side in (-1, 1)
         },
-    }  # fmt: skip
+    }
     other = robot_of_data(data, "rods")
     q = graph.home + np.array([0.1, -0.2, 0.05])
     same = [f"joints.arm_2.{what}" for what in ("at[0]", "at[1]", "axis[0]", "axis[1]", "offset")]
@@ -506,9 +543,7 @@ def test_parallelograms_are_their_two_rods():
     two = tolerances(other, dict.fromkeys([*same, *pair], 1e-4), q).sensitivity
     for path in same:
         np.testing.assert_allclose(one[path], two[path], rtol=0, atol=1e-9)
-    np.testing.assert_allclose(
-        one["rods.forearm I.length"], two[pair[0]] + two[pair[1]], rtol=0, atol=1e-9
-    )
+    np.testing.assert_allclose(one["rods.forearm I.length"], two[pair[0]] + two[pair[1]], rtol=0, atol=1e-9)
     assert np.abs(one["joints.arm_2.axis[1]"][3:]).max() > 0.1
 
 
@@ -525,8 +560,9 @@ def test_a_zero_moves_the_platform_as_the_drive_does():
             assert np.abs(exact).max() > 0.0
             np.testing.assert_allclose(
                 exact / exact[:, [np.abs(exact).max(0).argmax()]],
-                np.tile(found / found[np.abs(exact).max(0).argmax()], (3, 1)), atol=1e-3,
-            )  # fmt: skip
+                np.tile(found / found[np.abs(exact).max(0).argmax()], (3, 1)),
+                atol=1e-3,
+            )
 
 
 def test_a_platform_that_only_turns_has_shares_of_its_rotation():

@@ -43,14 +43,15 @@ def made(name, *, even=True):
     n = robot.joints_count
     entries = {
         joint: {
-            "name": f"motor {k}", "sign": float(rng.choice([-1, 1])), "offset": rng.normal(),
+            "name": f"motor {k}",
+            "sign": float(rng.choice([-1, 1])),
+            "offset": rng.normal(),
             "ratio": rng.uniform(0.2, 50.0),
             "ratio_change": 0.0 if even else rng.uniform(-0.3, 0.3),
         }
         for k, joint in enumerate(robot.joint_names)
-    }  # fmt: skip
-    limits = {"effort": rng.uniform(5.0, 50.0, n).tolist(),
-              "velocity": rng.uniform(1.0, 9.0, n).tolist()}  # fmt: skip
+    }
+    limits = {"effort": rng.uniform(5.0, 50.0, n).tolist(), "velocity": rng.uniform(1.0, 9.0, n).tolist()}
     return robot.changed(limits=limits).changed(joint_map=entries)
 
 
@@ -63,8 +64,7 @@ def drawn(robot, seed=0):
         q, good = robot.try_inverse(robot.home() + shift)
         q = q[good]
     poses, good = robot.try_forward(q)
-    around = np.vstack([poses[good][:, None] + 3.0 * STEP * s * np.eye(poses.shape[1])
-                        for s in (-1.0, 1.0)])  # fmt: skip
+    around = np.vstack([poses[good][:, None] + 3.0 * STEP * s * np.eye(poses.shape[1]) for s in (-1.0, 1.0)])
     reached = robot.try_inverse(around)[1].reshape(2, -1, poses.shape[1]).all((0, 2))
     poses = poses[good][reached][:SAMPLES]
     assert len(poses) == SAMPLES
@@ -76,8 +76,7 @@ def slopes(function, x):
     weights = ((1, 3 / 4), (2, -3 / 20), (3, 1 / 60))
     return np.stack(
         [
-            sum(c * (function(x + k * STEP * e) - function(x - k * STEP * e)) for k, c in weights)
-            / STEP
+            sum(c * (function(x + k * STEP * e) - function(x - k * STEP * e)) for k, c in weights) / STEP
             for e in np.eye(x.shape[-1])
         ],
         -1,
@@ -96,9 +95,7 @@ def test_positions_rates_and_efforts_come_back_with_the_same_power(name):
     power = np.einsum("ij,ij->i", v, f)
     apart = np.abs(np.einsum("ij,ij->i", there.velocity, there.effort) - power)
     assert apart.max() < 1e-12 * np.abs(there.velocity * there.effort).sum(-1).max()
-    np.testing.assert_array_equal(
-        there.position, robot.controller.controller_positions(robot.inverse(x))
-    )
+    np.testing.assert_array_equal(there.position, robot.controller.controller_positions(robot.inverse(x)))
     one = t.joint_to_actuator(x[0], v[0], f[0])
     np.testing.assert_allclose(one.effort, there.effort[0], rtol=1e-12, atol=1e-12)
     assert t.joint_to_actuator(x[:0], v[:0]).velocity.shape == (0, robot.joints_count)
@@ -180,9 +177,7 @@ def test_the_inertia_is_that_of_the_kinetic_energy(name):
     q = robot.inverse(x)
     rates = t.joint_to_actuator(x, v).velocity / robot.controller.factors
     right = energy(robot, q, rates).kinetic
-    np.testing.assert_allclose(
-        0.5 * np.einsum("ki,kij,kj->k", v, t.inertia(x), v), right, rtol=1e-9
-    )
+    np.testing.assert_allclose(0.5 * np.einsum("ki,kij,kj->k", v, t.inertia(x), v), right, rtol=1e-9)
 
 
 @pytest.mark.parametrize("even", [True, False])

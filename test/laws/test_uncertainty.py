@@ -89,18 +89,16 @@ def test_effects_are_differences_of_machines_with_other_numbers() -> None:
 
     def effect(cause: dict[str, float], call: Callable[[Robot], Array]) -> Array:
         low, high = (
-            robot.with_file_values({p: robot.number(p) + step * d for p, d in cause.items()})
-            for step in (-0.01, 0.01)
+            robot.with_file_values({p: robot.number(p) + step * d for p, d in cause.items()}) for step in (-0.01, 0.01)
         )
         return (call(high) - call(low)) / 0.02
 
     for found, call in (
         (position_effects(robot, q), lambda r: r.platform(q)[0]),
-        (torque_effects(robot, q, still, still, loads[0]),
-         lambda r: inverse_dynamics(r, q, still, still, loads[0])),
+        (torque_effects(robot, q, still, still, loads[0]), lambda r: inverse_dynamics(r, q, still, still, loads[0])),
         (compliance_effects(robot, pose), lambda r: compliance(r, pose)),
         (energy_effects(robot, pose, loads), lambda r: strain_energy(r, pose, loads).energies),
-    ):  # fmt: skip
+    ):
         expected = np.stack([effect(cause, call) for cause in robot.causes.values()], -1)
         assert expected.any()
         np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
@@ -156,9 +154,7 @@ def test_a_machine_keeps_what_its_file_says_beside_its_graph() -> None:
     assert again.controller.offsets[0] == 0.1
     q = again.inverse(again.home())
     still = np.zeros_like(q)
-    share = torque_deviation(again, q, still, still) / np.abs(
-        inverse_dynamics(again, q, still, still)
-    )
+    share = torque_deviation(again, q, still, still) / np.abs(inverse_dynamics(again, q, still, still))
     np.testing.assert_allclose(share, 0.02, rtol=1e-6)
 
 

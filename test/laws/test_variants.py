@@ -74,10 +74,14 @@ def judge(robot: Robot, numbers, rng, reacting=False, tolerance=1e-12):
         built += 1
         assert many.valid[k] and many.reason(k) == ""
         pairs = [
-            (tau[k], expected), (masses[k], mass_matrix(own, q)), (pose[k], own.forward(q)),
-            (place[k], own.platform(q)[0]), (turn[k], own.platform(q)[1]),
-            (measure[k], own.singularity(q)), (many.inverse(pose[k])[k], own.inverse(pose[k])),
-        ]  # fmt: skip
+            (tau[k], expected),
+            (masses[k], mass_matrix(own, q)),
+            (pose[k], own.forward(q)),
+            (place[k], own.platform(q)[0]),
+            (turn[k], own.platform(q)[1]),
+            (measure[k], own.singularity(q)),
+            (many.inverse(pose[k])[k], own.inverse(pose[k])),
+        ]
         if joints is not None:
             alone = reactions(own, q, qd, qdd, wrench)
             assert (joints.names, joints.bodies) == (alone.names, alone.bodies)
@@ -105,9 +109,13 @@ def taken(robot: Robot) -> tuple[list[float], str]:
     """What programs, nodes and commands take of a robot."""
     rows = derivatives.elastic_numbers(robot) if has(robot, "structure") else []
     rest = (
-        robot.limits, robot.passive_limits, robot.controller, robot.drives, robot.modal_damping,
+        robot.limits,
+        robot.passive_limits,
+        robot.controller,
+        robot.drives,
+        robot.modal_damping,
         [beam.outer for beam in robot.beams],
-    )  # fmt: skip
+    )
     return references([*geometry_and_masses(robot), *rows]).tolist(), repr(rest)
 
 
@@ -115,10 +123,12 @@ def taken(robot: Robot) -> tuple[list[float], str]:
     "name",
     partly_long(
         [*robot_names(), *sorted(map(str, MACHINES.glob("*.yaml")))],
-        "delta", "five_bar", str(SHARED),
+        "delta",
+        "five_bar",
+        str(SHARED),
     ),
     ids=lambda name: Path(name).stem,
-)  # fmt: skip
+)
 def test_a_number_has_an_effect_or_is_refused(name):
     """Those that the file lists, and the drives' of other names."""
     robot = load(name)
@@ -147,9 +157,7 @@ def test_a_drive_s_number_is_the_same_by_both_names(rng):
     np.testing.assert_array_equal(first, second)
     assert first[1, :, 1] - first[0, :, 1] == pytest.approx(2.0 * states[1][:, 1])
     for p in both:
-        assert torque_derivatives(robot, *states, by=[p]).by[p][:, 1] == pytest.approx(
-            states[1][:, 1]
-        )
+        assert torque_derivatives(robot, *states, by=[p]).by[p][:, 1] == pytest.approx(states[1][:, 1])
     with pytest.raises(ParameterError, match="each number once"):
         variants(robot, dict.fromkeys(both, 1.0))
 
@@ -173,22 +181,24 @@ def test_a_number_that_was_zero_goes_through_a_program_of_its_own(name, count, r
     """Places and axes that a program takes for zero: another structure, never a wrong answer."""
     robot = load(name)
     zeros = [
-        path for path, (value, _) in robot.file_numbers().items()
+        path
+        for path, (value, _) in robot.file_numbers().items()
         if value == 0.0 and not any(word in path for word in ASIDE)
-    ]  # fmt: skip
+    ]
     for path in rng.permutation(zeros)[:count]:
         judge(robot, {path: np.array([0.0, 1e-3, -0.02])}, rng)
 
 
-@pytest.mark.parametrize(
-    "name", partly_long(["five_bar", "stewart", "linear_delta", "rps3"], "linear_delta", "rps3")
-)
+@pytest.mark.parametrize("name", partly_long(["five_bar", "stewart", "linear_delta", "rps3"], "linear_delta", "rps3"))
 def test_a_limbs_number_is_that_of_all_its_copies(name, rng):
     robot = load(name)
-    paths = sorted({
-        ".".join(map(str, source.path)) for source in robot.sources.values()
-        if source.path[0] == "limbs" and source.path[-2] == "joints"
-    })  # fmt: skip
+    paths = sorted(
+        {
+            ".".join(map(str, source.path))
+            for source in robot.sources.values()
+            if source.path[0] == "limbs" and source.path[-2] == "joints"
+        }
+    )
     for path in paths[:3]:
         key = f"{path}.at[2]"
         try:
@@ -306,18 +316,31 @@ def test_a_limb_s_number_and_that_of_one_copy_vary_together(rng):
 
 def test_columns_of_several_lengths_are_rejected():
     with pytest.raises(ParameterError):
-        variants(
-            load("delta"), {"geometry.arm_length": [0.2, 0.3], "payload.mass": [0.1, 0.2, 0.3]}
-        )
+        variants(load("delta"), {"geometry.arm_length": [0.2, 0.3], "payload.mass": [0.1, 0.2, 0.3]})
 
 
 TUBE = {
-    "youngs_modulus": 7e10, "shear_modulus": 2.6e10, "density": 2700.0, "outer_diameter": 0.02,
-}  # fmt: skip
+    "youngs_modulus": 7e10,
+    "shear_modulus": 2.6e10,
+    "density": 2700.0,
+    "outer_diameter": 0.02,
+}
 SOFT = (
-    "arm_2r", "bolted", "delta_rcu", "elbow_motors", "five_bar", "four_bar", "linear_delta",
-    "prru3", "rcuu", "rps3", "rrr3_planar", "rrr3_spherical", "stewart", "upr_rpu",
-)  # fmt: skip
+    "arm_2r",
+    "bolted",
+    "delta_rcu",
+    "elbow_motors",
+    "five_bar",
+    "four_bar",
+    "linear_delta",
+    "prru3",
+    "rcuu",
+    "rps3",
+    "rrr3_planar",
+    "rrr3_spherical",
+    "stewart",
+    "upr_rpu",
+)
 """Machines whose platform moves by elastic joints, some of their directions rigid."""
 RIGID = ("limits", "joint_map", "uncertainty", "azimuth", "inertia", "axis", "axes")
 

@@ -26,9 +26,7 @@ def modes_of(frequencies, damping, shapes):
     """Modes of a tool point without the rest of a machine; shapes in the plane, 1/sqrt(kg)."""
     whole = np.zeros((len(frequencies), 6))
     whole[:, :2] = shapes
-    return ToolModes(
-        np.array(frequencies, float), np.array(damping, float), whole, np.zeros((6, 6)), np.eye(3)
-    )
+    return ToolModes(np.array(frequencies, float), np.array(damping, float), whole, np.zeros((6, 6)), np.eye(3))
 
 
 ONE = modes_of([922.0], [0.011], [[1.0 / np.sqrt(0.03993), 0.0]])
@@ -80,12 +78,8 @@ def test_the_response_is_a_linear_structure_s(name):
     own = natural_frequencies(robot, pose, 3)
     at = np.array([0.0, 0.37 * own[0], own[0], 1.3 * own[2]])
     found = frequency_response(robot, pose, at, damping=0.02)
-    np.testing.assert_allclose(
-        found[0].real, compliance(robot, pose), atol=1e-9 * abs(found[0]).max()
-    )
-    np.testing.assert_allclose(
-        found, found.swapaxes(-1, -2), rtol=1e-9, atol=1e-12 * abs(found).max()
-    )
+    np.testing.assert_allclose(found[0].real, compliance(robot, pose), atol=1e-9 * abs(found[0]).max())
+    np.testing.assert_allclose(found, found.swapaxes(-1, -2), rtol=1e-9, atol=1e-12 * abs(found).max())
     # Work of a harmonic force is never negative: damping takes it.
     assert (np.linalg.eigvalsh(-found.imag) > -1e-12 * abs(found).max()).all()
     offset = np.eye(6)
@@ -128,13 +122,15 @@ CASES = [
     (ONE, Milling(2, KT, 1.0 / 3.0, 0.5, up=True), 9000.0),
     (
         modes_of([60.0, 75.0], [0.03, 0.02], [[0.4, 0.15], [-0.05, 0.2]]),
-        Milling(3, KT, 0.3, 0.3, feed=1.0), 1500.0,
+        Milling(3, KT, 0.3, 0.3, feed=1.0),
+        1500.0,
     ),
     (
         modes_of([60.0, 75.0, 140.0], [0.03, 0.02, 0.02], [[0.4, 0.1], [-0.1, 0.5], [0.3, 0.3]]),
-        Milling(4, KT, 0.2, 0.3, up=True), 700.0,
+        Milling(4, KT, 0.2, 0.3, up=True),
+        700.0,
     ),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize("case", partly_long(range(len(CASES)), 0, 2))
@@ -179,9 +175,10 @@ def test_no_speed_of_a_range_is_worse_than_its_least_depth(seed):
     rng = np.random.default_rng(seed)
     count = int(rng.integers(1, 4))
     modes = modes_of(
-        rng.uniform(40.0, 250.0, count), rng.uniform(0.01, 0.04, count),
+        rng.uniform(40.0, 250.0, count),
+        rng.uniform(0.01, 0.04, count),
         0.3 * rng.normal(size=(count, 2)),
-    )  # fmt: skip
+    )
     milling = Milling(int(rng.integers(1, 4)), KT, 0.3, rng.choice([0.1, 0.5, 1.0]))
     high = 60.0 * modes.frequencies.max() / milling.teeth * rng.uniform(0.5, 1.5)
     low = 0.6 * high
@@ -241,16 +238,12 @@ def test_commands_write_what_the_functions_give(capsys, tmp_path):
     robot = load("upr_rpu")
     table, mat = tmp_path / "frf.csv", tmp_path / "lobes.mat"
     shared = ("--tool", "0,0,-0.1", "--damping", "0.03", "--json")
-    told = json.loads(
-        command(capsys, "frf", "upr_rpu", "--out", str(table), "--points", "5", *shared).out
-    )
+    told = json.loads(command(capsys, "frf", "upr_rpu", "--out", str(table), "--points", "5", *shared).out)
     rows = list(csv.DictReader(table.open()))
     at = [float(row["frequency"]) for row in rows]
     found = frequency_response(robot, robot.home(), at, damping=0.03, tool=[0, 0, -0.1])
     assert [float(row["xy.imag"]) for row in rows] == pytest.approx(found[:, 0, 1].imag.tolist())
-    assert told["modes"][0]["frequency_hz"] == pytest.approx(
-        natural_frequencies(robot, robot.home(), 1)[0]
-    )
+    assert told["modes"][0]["frequency_hz"] == pytest.approx(natural_frequencies(robot, robot.home(), 1)[0])
     assert told["most"]["compliance_m_per_n"] >= np.linalg.svd(found[:, :3, :3])[1].max()
     process = ("--teeth", "2", "--tangential", "600e6", "--radial", "0.3", "--immersion", "0.5")
     speeds = ("--speeds", "8000,12000", "--points", "2", "--out", str(mat))

@@ -47,11 +47,7 @@ def axes(*joints):
 
 def ends(*rods, mask=ANY):
     """Both ends of each group of rods; the rods of a group keep their places to each other."""
-    return [
-        ([f"rods.{name}.ends.{k}" for name in group.split()], SHIFT, mask)
-        for group in rods
-        for k in (0, 1)
-    ]
+    return [([f"rods.{name}.ends.{k}" for name in group.split()], SHIFT, mask) for group in rods for k in (0, 1)]
 
 
 def each(count, make):
@@ -67,9 +63,7 @@ FREE = {
         *axis("drive_1", "drive_2", "rcu_drive_1", "elbow_1"),
         *axes("wrist_1"),
     ],
-    "delta_translation": each(
-        3, lambda n: ends(f"forearm_{n}") + at(f"drive_{n}") + axis(f"drive_{n}")
-    ),
+    "delta_translation": each(3, lambda n: ends(f"forearm_{n}") + at(f"drive_{n}") + axis(f"drive_{n}")),
     "elbow_motors": each(3, lambda n: at(f"foot_{n}", f"motor_{n}", f"wrist_{n}")),
     "five_bar": at("left", "right", "elbow_left", "elbow_right", "tip"),
     "four_bar": at("motor", "crank_pin", "rocker_foot", "rocker_pin"),
@@ -96,9 +90,7 @@ FREE = {
         *axis("motor", "sleeve"),
         *axes("cross", "foot"),
     ],
-    "rps3": each(
-        3, lambda n: at(f"hinge_{n}", f"ball_{n}") + axis(f"hinge_{n}") + axis(f"leg_{n}")
-    ),
+    "rps3": each(3, lambda n: at(f"hinge_{n}", f"ball_{n}") + axis(f"hinge_{n}") + axis(f"leg_{n}")),
     "rrr3_planar": each(3, lambda n: at(f"motor_{n}", f"elbow_{n}", f"wrist_{n}")),
     "rrr3_spherical": each(3, lambda n: axis(f"motor_{n}", f"middle_{n}", f"crown_{n}")),
     "rsur": at("motor", "ball", "cross", "pivot") + axis("motor", "pivot") + axes("cross"),

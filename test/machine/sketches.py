@@ -20,8 +20,7 @@ X = np.array([1.0, 0.0, 0.0])
 
 
 SPHERE = (
-    '<inertial><mass value="6e-6"/><inertia ixx="1e-11" ixy="0" ixz="0" iyy="1e-11" iyz="0" '
-    'izz="1e-11"/></inertial>'
+    '<inertial><mass value="6e-6"/><inertia ixx="1e-11" ixy="0" ixz="0" iyy="1e-11" iyz="0" izz="1e-11"/></inertial>'
 )
 
 
@@ -75,9 +74,7 @@ class Sketch:
             at = frames[name]
             c, i = at.actInv(com), at.rotation.T @ inertia @ at.rotation
             moments = (
-                " ".join(
-                    f'i{"xyz"[j]}{"xyz"[k]}="{i[j, k]!r}"' for j in range(3) for k in range(j, 3)
-                )
+                " ".join(f'i{"xyz"[j]}{"xyz"[k]}="{i[j, k]!r}"' for j in range(3) for k in range(j, 3))
                 .replace("np.float64(", "")
                 .replace(")", "")
             )
@@ -134,8 +131,7 @@ class Sketch:
                 pairs.append(([f"{name}_A", f"{name}_B"], "6d" if kind == "revolute" else "3D"))
         if dialect not in ("yaml", "spheres"):
             commands = "".join(
-                f'<joint name="{name}"><command_interface name="effort"/></joint>'
-                for name in self.actuated
+                f'<joint name="{name}"><command_interface name="effort"/></joint>' for name in self.actuated
             )
             out.append(f'<ros2_control name="s" type="system">{commands}</ros2_control>')
         out.append("</robot>")
@@ -151,9 +147,7 @@ class Sketch:
         path = folder / f"{dialect}.urdf"
         path.write_text(content)
         if beside is not None:
-            path.with_suffix(".yaml").write_text(
-                "\n".join(f"{key}: {value}" for key, value in beside.items())
-            )
+            path.with_suffix(".yaml").write_text("\n".join(f"{key}: {value}" for key, value in beside.items()))
         return path
 
     def model(self):
@@ -168,9 +162,7 @@ class Sketch:
                 body = model.frames[model.getFrameId(link)]
                 place = body.placement * frames[link].actInv(frame)
                 pair.append(
-                    model.addFrame(
-                        pin.Frame(f"{name}_{link}", body.parentJoint, place, pin.FrameType.OP_FRAME)
-                    )
+                    model.addFrame(pin.Frame(f"{name}_{link}", body.parentJoint, place, pin.FrameType.OP_FRAME))
                 )
             ends.append((kind, *pair, frame.rotation.T @ axis))
         return model, model.createData(), ends
@@ -191,10 +183,7 @@ def closure_rows(model, data, ends, q):
     pin.updateFramePlacements(model, data)
     values, rows = [], []
     for kind, a, b, axis in ends:
-        ja, jb = (
-            pin.getFrameJacobian(model, data, f, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
-            for f in (a, b)
-        )
+        ja, jb = (pin.getFrameJacobian(model, data, f, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED) for f in (a, b))
         values.append(data.oMf[b].translation - data.oMf[a].translation)
         rows.append(jb[:3] - ja[:3])
         if kind == "fixed":
@@ -302,9 +291,7 @@ def delta():
             bar, off = f"bar_{i}{'_ab'[side]}", 0.05 * side * y
             along = (tip - elbow) / np.linalg.norm(tip - elbow)
             s.link(bar, 0.05, (elbow + tip) / 2 + off, size=0.01)
-            s.universal(
-                f"u_{bar}", f"arm_{i}", bar, elbow + off, y, np.cross(along, y), (0.05, 0.1)
-            )
+            s.universal(f"u_{bar}", f"arm_{i}", bar, elbow + off, y, np.cross(along, y), (0.05, 0.1))
             if i == 0 and side == -1:
                 for k, axis in enumerate((X, [0, 1, 0], Z)):
                     child = "platform" if k == 2 else f"socket_{k}"
@@ -331,9 +318,7 @@ def stewart():
         first = np.cross(along, Z) / np.linalg.norm(np.cross(along, Z))
         s.link(f"tube_{i}", 0.8, foot + 0.2 * along)
         s.link(f"piston_{i}", 0.5, head - 0.2 * along)
-        s.universal(
-            f"u{i}", "ground", f"tube_{i}", foot, first, np.cross(along, first), (0.1, -0.05)
-        )
+        s.universal(f"u{i}", "ground", f"tube_{i}", foot, first, np.cross(along, first), (0.1, -0.05))
         s.joint(
             f"m{i}",
             "prismatic",
@@ -363,9 +348,7 @@ def palletizer():
     """
     s = Sketch(seed=6)
     y, drive = [0, 1, 0], np.array([-0.02, 0, 0])
-    far, elbow_1, elbow_2 = (
-        np.array(p) for p in ([0.02, 0, 0], [-0.09, 0, -0.05], [0.1, 0, -0.04])
-    )
+    far, elbow_1, elbow_2 = (np.array(p) for p in ([0.02, 0, 0], [-0.09, 0, -0.05], [0.1, 0, -0.04]))
     tip, side = np.array([0.01, 0, -0.14]), np.array([0.02, 0, 0.03])
     foot, lift = far + np.array([0.03, 0, 0.01]), np.array([0.03, 0, 0.01])
     s.link("arm_1", 0.05, (drive + elbow_1) / 2, size=0.02)

@@ -91,9 +91,7 @@ def test_derivatives_by_a_frame_are_differences(kind, side, rng):
                 own[side] = s * way
                 moved = equations(kind, placed, at, axes, **{what: own})
                 values.append(placed.values(moved)[..., k])
-            np.testing.assert_allclose(
-                found @ way, (values[0] - values[1]) / (2.0 * STEP), atol=1e-8
-            )
+            np.testing.assert_allclose(found @ way, (values[0] - values[1]) / (2.0 * STEP), atol=1e-8)
 
 
 def test_a_pair_of_rods_holds_the_turn_about_its_normal(rng):

@@ -117,8 +117,7 @@ def test_joints_on_circles_are_those_of_all_ways_from_base_to_platform():
     rng = np.random.default_rng(0)
     for _ in range(60):
         count = int(rng.integers(4, 11))
-        pairs = {f"j{k}": tuple(rng.choice(list("abcdefg"), 2, replace=False).tolist())
-                 for k in range(count)}  # fmt: skip
+        pairs = {f"j{k}": tuple(rng.choice(list("abcdefg"), 2, replace=False).tolist()) for k in range(count)}
         expected = {name for way in ways(pairs, "a", "b") for name in way}
         assert set(find_circles(pairs, "a", "b")) == expected
 
@@ -173,21 +172,24 @@ WRONG = {
     "unknown motor": ({"base": "shank", "actuated": ["ankle"]}, UnknownNameError, "ankle_"),
     "ball": ({"base": "shank", "actuated": ["knee"]}, ParameterError, "ankle_left, ankle_right"),
     "too few": (
-        {"base": "shank", "actuated": ["ankle_left"]}, MobilityError,
+        {"base": "shank", "actuated": ["ankle_left"]},
+        MobilityError,
         "1 actuated joint for 2 degrees of freedom.*ankle_",
     ),
     "coupled": ({"base": "arm", "platform": "thumb"}, ParameterError, "can be driven: thumb"),
     "coupled motor": (
-        {"base": "arm", "platform": "thumb", "actuated": ["thumb"]}, ParameterError,
+        {"base": "arm", "platform": "thumb", "actuated": ["thumb"]},
+        ParameterError,
         "equality.grip.*--base",
     ),
     "whole": ({}, ParameterError, "equality.grip.*--base"),
     "idle motor": (
-        {"base": "shank", "platform": "ankle_cross"}, ParameterError,
+        {"base": "shank", "platform": "ankle_cross"},
+        ParameterError,
         "2 coordinates.*moves in pitch alone: choose another base",
     ),
     "pose": ({"base": "shank", "pose": ["x", "y"]}, ParameterError, "as roll, pitch"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -202,6 +204,4 @@ def test_a_yaml_has_its_own_base_and_motors():
     for options in ({"base": "base"}, {"actuated": ["left"]}, {"carry": True}):
         with pytest.raises(ParameterError, match=next(iter(options))):
             load("five_bar", **options)
-    assert load(
-        HUMANOID.parent / "machines/rss6.yaml", pose=["z", "y", "x", "yaw", "roll", "pitch"]
-    )
+    assert load(HUMANOID.parent / "machines/rss6.yaml", pose=["z", "y", "x", "yaw", "roll", "pitch"])

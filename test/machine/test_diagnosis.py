@@ -105,9 +105,7 @@ def test_rounding_is_taken_off_by_no_more_than_it_is(name, rng):
     for joint in data["joints"].values():
         for key in ("at", "axis", "axes"):
             if key in joint:
-                joint[key] = (
-                    np.array(joint[key]) + rng.uniform(-1e-8, 1e-8, np.shape(joint[key]))
-                ).tolist()
+                joint[key] = (np.array(joint[key]) + rng.uniform(-1e-8, 1e-8, np.shape(joint[key]))).tolist()
     rounded = graph_of(data)
     assert not is_right(rounded)
     ideal = repair(rounded, 1e-6).graph
@@ -140,13 +138,12 @@ def balls():
         along = np.subtract(*rod["ends"])
         inertia = rod["mass"] / 12 * (along @ along * np.eye(3) - np.outer(along, along))
         data["bodies"][name] = {
-            "mass": rod["mass"], "com": np.mean(rod["ends"], axis=0).tolist(),
+            "mass": rod["mass"],
+            "com": np.mean(rod["ends"], axis=0).tolist(),
             "inertia": inertia.tolist(),
-        }  # fmt: skip
+        }
         for end, (a, b) in enumerate(((inner, name), (name, outer))):
-            data["joints"][f"{name}_{end}"] = {
-                "type": "spherical", "between": [a, b], "at": rod["ends"][end]
-            }  # fmt: skip
+            data["joints"][f"{name}_{end}"] = {"type": "spherical", "between": [a, b], "at": rod["ends"][end]}
     return data
 
 

@@ -91,9 +91,7 @@ def test_the_graph_form_of_a_delta_is_as_stiff(delta_in_the_graph_form):
         expected = compliance(delta, pose)
         size = np.abs(expected).max()
         np.testing.assert_allclose(compliance(machine, pose), expected, atol=1e-12 * size)
-        np.testing.assert_allclose(
-            natural_frequencies(machine, pose), natural_frequencies(delta, pose), rtol=1e-9
-        )
+        np.testing.assert_allclose(natural_frequencies(machine, pose), natural_frequencies(delta, pose), rtol=1e-9)
         assert clearance(machine, pose) == pytest.approx(clearance(delta, pose), abs=1e-12)
         own, other = strain_energy(delta, pose, wrench), strain_energy(machine, pose, wrench)
         assert other.total == pytest.approx(own.total, rel=1e-10)
@@ -176,9 +174,7 @@ def test_factors_of_elements_stand_in_what_is_written_out(delta_in_the_graph_for
     assert again.element_compliance == {"arm I": 3.0}
     expected = machine.changed(element_compliance={"arm I": 3.0})
     size = np.abs(compliance(expected, POSES[0])).max()
-    np.testing.assert_allclose(
-        compliance(again, POSES[0]), compliance(expected, POSES[0]), atol=1e-9 * size
-    )
+    np.testing.assert_allclose(compliance(again, POSES[0]), compliance(expected, POSES[0]), atol=1e-9 * size)
 
 
 def test_a_frame_that_is_singular_at_home_is_answered_elsewhere():

@@ -93,26 +93,28 @@ def test_what_no_way_from_home_reaches_is_told(name, q):
 
 PENDULUM = {
     "bodies.bob": {"mass": 0.1, "com": [-0.1, 0, 0], "inertia": [1e-4, 1e-4, 1e-4]},
-    "joints.pivot": {
-        "type": "revolute", "between": ["arm_left", "bob"], "at": [-0.1, 0, 0.1], "axis": [0, 1, 0]
-    },
-}  # fmt: skip
+    "joints.pivot": {"type": "revolute", "between": ["arm_left", "bob"], "at": [-0.1, 0, 0.1], "axis": [0, 1, 0]},
+}
 """A body that swings as it likes."""
 IDLE = {
     "joints.elbow_left.actuated": True,
     "bodies.head": {"mass": 0.2, "com": [0, 0, 0.4], "inertia": [1e-4, 1e-4, 1e-4]},
     "joints.neck": {
-        "type": "revolute", "between": ["forearm_right", "head"], "at": [0, 0, 0.36],
+        "type": "revolute",
+        "between": ["forearm_right", "head"],
+        "at": [0, 0, 0.36],
         "axis": [0, 1, 0],
     },
     "platform": "head",
     "pose": ["x", "z", "pitch"],
-}  # fmt: skip
+}
 """Three motors for three freedoms, but two of them hold the third and the head is free."""
 PARALLEL = {
-    "joints.tip.axis": MISSING, "joints.tip.friction": MISSING, "joints.tip.type": "universal",
+    "joints.tip.axis": MISSING,
+    "joints.tip.friction": MISSING,
+    "joints.tip.type": "universal",
     "joints.tip.axes": [[0, 1, 0], [0, 2, 0]],
-}  # fmt: skip
+}
 BALL = {"joints.tip.type": "spherical", "joints.tip.actuated": True}
 ISLAND = {"mass": 1.0, "com": [1, 0, 0], "inertia": [1e-3, 1e-3, 1e-3]}
 REFUSALS = [
@@ -124,10 +126,8 @@ REFUSALS = [
     ("five_bar", {"pose": ["x", "y"]}, ("pose",), "y"),
     ("five_bar", {"pose": ["x"]}, ("pose",), ""),
     # The second motor of a serial arm moves nothing that has mass.
-    ("arm_2r", {"bodies.link_2": {}, "origin": [0.5, 0, 0.1]},
-     ("bodies.link_2", "bodies.link_2.mass"), "link_2"),
-    ("five_bar", {"joints.tip.between": ["forearm_lef", "forearm_right"]},
-     ("joints.tip.between",), "forearm_left"),
+    ("arm_2r", {"bodies.link_2": {}, "origin": [0.5, 0, 0.1]}, ("bodies.link_2", "bodies.link_2.mass"), "link_2"),
+    ("five_bar", {"joints.tip.between": ["forearm_lef", "forearm_right"]}, ("joints.tip.between",), "forearm_left"),
     ("five_bar", {"joints.tip.type": "revolut"}, ("joints.tip.type",), "revolute"),
     ("five_bar", {"joints.tip.type": "universal"}, ("joints.tip.axes", "joints.tip.axis"), ""),
     ("five_bar", {"joints.tip.axis": [0, 0, 0]}, ("joints.tip.axis",), ""),
@@ -137,7 +137,7 @@ REFUSALS = [
     ("five_bar", {"bodies.arm_left.inertia": [1e-3, 1e-3, 9e-3]}, ("bodies.arm_left.inertia",), ""),
     ("five_bar", {"platform": "forearm_rigth"}, ("platform",), "forearm_right"),
     ("five_bar", {"pose": ["x", "zz"]}, ("pose", "pose[1]", "pose.1"), ""),
-]  # fmt: skip
+]
 """What a file is refused for, and by which field."""
 
 

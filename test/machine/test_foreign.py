@@ -31,7 +31,7 @@ URDF = {
     f"<gazebo>{PLUGIN.format('libgazebo_mimic_joint_plugin.so')}</gazebo>": "mimic",
     f"<gazebo>{PLUGIN.format('gz::sim::systems::Buoyancy')}</gazebo>": "Buoyancy",
     '<drake:ball_constraint name="b"/>': "drake:ball_constraint",
-    '<drake:linear_bushing_rpy/>': "drake:linear_bushing_rpy",
+    "<drake:linear_bushing_rpy/>": "drake:linear_bushing_rpy",
     '<drake:joint name="j" type="planar"><drake:parent_frame/></drake:joint>': "drake:joint",
     '<force_element name="f"><torsional_spring/></force_element>': "force_element",
     '<coupling name="c"/>': "coupling",
@@ -40,7 +40,7 @@ URDF = {
     '<loop_joint name="l" type="gear"/>': "loop_joint.l.type",
     '<loop_joint name="l" type="spherical"><link1 link="arm_left"/></loop_joint>': "l.link2",
     "<wormhole/>": "wormhole",
-}  # fmt: skip
+}
 SDF = {
     "<link><gravity>false</gravity></link>": "gravity",
     "<link><kinematic>true</kinematic></link>": "kinematic",
@@ -56,7 +56,7 @@ SDF = {
     "<model><drake:ball_constraint/></model>": "drake:ball_constraint",
     f"<model>{PLUGIN.format('gz::sim::systems::Hydrodynamics')}</model>": "Hydrodynamics",
     f"<model>{PLUGIN.format('MimicJointSystem')}</model>": "Mimic",
-}  # fmt: skip
+}
 MJCF = {
     '<option><flag gravity="disable"/></option>': "gravity",
     '<option><flag equality="disable"/></option>': "equality",
@@ -124,13 +124,11 @@ def test_a_machine_without_gravity_carries_no_weight(ending, tmp_path):
     text = WRITERS[ending](FIVE_BAR.changed(friction={"coulomb": [0.0, 0.0]}))
     links = re.findall(r'<link name="([^"]+)"', text)
     off = {
-        "urdf": "".join(
-            f'<gazebo reference="{name}"><turnGravityOff>1</turnGravityOff></gazebo>'
-            for name in links
-        ) + "</robot>",
+        "urdf": "".join(f'<gazebo reference="{name}"><turnGravityOff>1</turnGravityOff></gazebo>' for name in links)
+        + "</robot>",
         "sdf": "<gravity>0</gravity></link>",
         "xml": '<option><flag gravity="disable"/></option></mujoco>',
-    }[ending]  # fmt: skip
+    }[ending]
     words, robot = outcome(tmp_path, ending, text.replace(off[off.rindex("<") :], off))
     assert robot is not None, words
     assert "gravity is switched off" in words and not robot.gravity.any()
@@ -151,10 +149,7 @@ def test_a_loop_joint_closes_a_loop(kind, axis, tmp_path):
     words, robot = outcome(tmp_path, "urdf", text[:start] + loop + text[end:])
     assert robot is not None, words
     q = np.array([0.05, -0.03]) + exact.inverse(exact.home())
-    found, expected = (
-        inverse_dynamics(one, q, np.array([0.3, -0.2]), np.array([1.0, 2.0]))
-        for one in (robot, exact)
-    )
+    found, expected = (inverse_dynamics(one, q, np.array([0.3, -0.2]), np.array([1.0, 2.0])) for one in (robot, exact))
     np.testing.assert_allclose(found, expected, 1e-9)
 
 

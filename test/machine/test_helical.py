@@ -29,25 +29,30 @@ def slide(lead):
             "pose": ["z"],
             "bodies": {
                 "screw": {"mass": 0.8, "com": [0, 0, 0.35], "inertia": [0.02, 0.02, SCREW]},
-                "carriage": {
-                    "mass": CARRIAGE, "com": [0.03, 0.01, 0.42], "inertia": [0.004, 0.005, 0.006]
-                },
+                "carriage": {"mass": CARRIAGE, "com": [0.03, 0.01, 0.42], "inertia": [0.004, 0.005, 0.006]},
             },
             "joints": {
                 "motor": {
-                    "type": "revolute", "between": ["base", "screw"], "at": [0, 0, 0],
-                    "axis": [0, 0, 1], "actuated": True, "rotor_inertia": ROTOR,
+                    "type": "revolute",
+                    "between": ["base", "screw"],
+                    "at": [0, 0, 0],
+                    "axis": [0, 0, 1],
+                    "actuated": True,
+                    "rotor_inertia": ROTOR,
                     "friction": {"viscous": VISCOUS, "coulomb": COULOMB},
                 },
                 "nut": {
-                    "type": "helical", "between": ["screw", "carriage"], "at": [0, 0, 0.4],
-                    "axis": [0, 0, 1], "lead": lead,
+                    "type": "helical",
+                    "between": ["screw", "carriage"],
+                    "at": [0, 0, 0.4],
+                    "axis": [0, 0, 1],
+                    "lead": lead,
                 },
                 "rail": {"type": "prismatic", "between": ["base", "carriage"], "axis": [0, 0, 1]},
             },
         },
         "slide",
-    )  # fmt: skip
+    )
 
 
 def driven(lead, at):
@@ -60,13 +65,18 @@ def driven(lead, at):
             "bodies": {"quill": {"mass": 1.5, "com": at, "inertia": [0.01, 0.02, 0.03]}},
             "joints": {
                 "feed": {
-                    "type": "helical", "between": ["base", "quill"], "at": [0, 0, 0],
-                    "axis": [1, 0, 0], "lead": lead, "actuated": True, "home": 0.3,
+                    "type": "helical",
+                    "between": ["base", "quill"],
+                    "at": [0, 0, 0],
+                    "axis": [1, 0, 0],
+                    "lead": lead,
+                    "actuated": True,
+                    "home": 0.3,
                 },
             },
         },
         "quill",
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.parametrize("lead", [0.01, -0.04])
@@ -127,8 +137,10 @@ def test_its_frame_gives_along_the_axis_as_a_screw_that_twists(lead):
     modulus, shear, outer = 200e9, 80e9, 0.02
     tube = {"youngs_modulus": modulus, "shear_modulus": shear, "outer_diameter": outer}
     data["bodies"]["screw"]["member"] = {
-        "from": [0, 0, 0], "to": [0, 0, 0.4], "section": tube | {"inner_diameter": 0.0}
-    }  # fmt: skip
+        "from": [0, 0, 0],
+        "to": [0, 0, 0.4],
+        "section": tube | {"inner_diameter": 0.0},
+    }
     joints = data["joints"]
     joints["motor"]["compliance"] = [0, 0, 0, 3e-4, 0, 0]
     joints["nut"]["compliance"] = [2e-9, 1e-9, 1e-9, 5e-5, 0, 0]
@@ -148,9 +160,7 @@ def test_it_is_written_out_and_read_again(rng):
     robot = slide(0.012)
     again = robot_of_data(robot_description(robot), "again")
     motion = rng.normal(size=(3, 5, 1))
-    np.testing.assert_array_equal(
-        inverse_dynamics(again, *motion), inverse_dynamics(robot, *motion)
-    )
+    np.testing.assert_array_equal(inverse_dynamics(again, *motion), inverse_dynamics(robot, *motion))
 
 
 def test_its_slide_follows_its_turn_in_a_urdf(rng):

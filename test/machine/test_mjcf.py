@@ -257,19 +257,16 @@ ATTRIBUTES = {
     "armature of a tendon": ('name="cord"', 'name="cord" armature="2"', "of tendon cord "),
     "fluid": ("<option", '<option density="1000"', "fluid"),
     # What would be another machine is rejected.
-    "coupled joints": (
-        "<equality>", '<equality><joint name="c" joint1="m" joint2="s"/>', ParameterError
-    ),
-    "coupled tendons": (
-        "<equality>", '<equality><tendon name="c" tendon1="cord"/>', ParameterError
-    ),
+    "coupled joints": ("<equality>", '<equality><joint name="c" joint1="m" joint2="s"/>', ParameterError),
+    "coupled tendons": ("<equality>", '<equality><tendon name="c" tendon1="cord"/>', ParameterError),
     "actuated tendon": ('joint="m"/></act', 'tendon="cord"/></act', ParameterError),
     "actuated ball": ('joint="m"/></act', 'joint="ball"/></act', ParameterError),
     "torquescale": (
         '<connect name="pin" body1="rod" body2="slider" anchor="0.3 -0.02 0"/>',
-        '<weld body1="rod" body2="slider" torquescale="0"/>', ParameterError,
+        '<weld body1="rod" body2="slider" torquescale="0"/>',
+        ParameterError,
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("attribute", ATTRIBUTES)
@@ -309,16 +306,20 @@ VARIANTS = {
         CONNECT: CONNECT + '<joint joint1="x" polycoef="0.05 0 0 0 0"/>',
     },
     "sites with names of bodies": {
-        END: BOX + '<site name="fore_2" pos="0.3 0 0"/>', 'site2="end"': 'site2="fore_2"',
+        END: BOX + '<site name="fore_2" pos="0.3 0 0"/>',
+        'site2="end"': 'site2="fore_2"',
     },
     "names as this reader makes them": {
         '<joint name="e1" axis="0 0 1"/>': SLIDE.replace('"x"', '"tool_frame"'),
-        '"fore_2"': '"e1_link"', END: BOX.replace('"tool"', '"box"') + "<site/>" + END,
-        '"end"': '"site_1"', '"e2"': '"box_body"', '"tip"': '"m1"',
+        '"fore_2"': '"e1_link"',
+        END: BOX.replace('"tool"', '"box"') + "<site/>" + END,
+        '"end"': '"site_1"',
+        '"e2"': '"box_body"',
+        '"tip"': '"m1"',
         CONNECT: CONNECT + '<joint joint1="tool_frame"/>',
     },
     "weld of sites": {END: HAND, "<connect": "<weld"},
-}  # fmt: skip
+}
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")

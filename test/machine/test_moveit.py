@@ -15,9 +15,7 @@ from pkm_twin.export.moveit import GROUP, LIMB, moveit_package
 from test.support.robots import load, parameters_of, partly_long
 
 
-@pytest.fixture(
-    params=partly_long(robot_names(), "delta_cu", "five_bar", "rps3", "upr_rpu"), scope="module"
-)
+@pytest.fixture(params=partly_long(robot_names(), "delta_cu", "five_bar", "rps3", "upr_rpu"), scope="module")
 def exported(request, tmp_path_factory):
     folder = tmp_path_factory.mktemp("moveit") / "package"
     with pytest.raises(SystemExit) as ended:
@@ -62,15 +60,12 @@ def test_bars_collide_as_they_are_seen_and_neighbours_are_left_out(exported):
     kinds = (pin.VISUAL, pin.COLLISION)
     seen, solid = (pin.buildGeomFromUrdfString(model, urdf, kind) for kind in kinds)
     shapes = [
-        [(g.parentFrame, str(g.placement), type(g.geometry)) for g in one.geometryObjects]
-        for one in (seen, solid)
+        [(g.parentFrame, str(g.placement), type(g.geometry)) for g in one.geometryObjects] for one in (seen, solid)
     ]
     assert shapes[0] == shapes[1] and shapes[0]
     solid.addAllCollisionPairs()
     everything = len(solid.collisionPairs)
-    pin.removeCollisionPairsFromXML(
-        model, solid, (folder / f"config/{robot.name}.srdf").read_text(), False
-    )
+    pin.removeCollisionPairsFromXML(model, solid, (folder / f"config/{robot.name}.srdf").read_text(), False)
     assert len(solid.collisionPairs) < everything
     data, pairs = model.createData(), solid.createData()
 

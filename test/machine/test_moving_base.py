@@ -18,9 +18,17 @@ from test.support.robots import load
 BOUND = 1e-11
 """Largest difference, relative to the largest effort."""
 MACHINES = (
-    "delta_rcu", "delta_translation", "hinged_platform", "linear_delta", "platform_motor", "prru3",
-    "rcuu", "rps3", "rsur", "upr_rpu",
-)  # fmt: skip
+    "delta_rcu",
+    "delta_translation",
+    "hinged_platform",
+    "linear_delta",
+    "platform_motor",
+    "prru3",
+    "rcuu",
+    "rps3",
+    "rsur",
+    "upr_rpu",
+)
 """Bodies on balls, free bodies, rods, slides and universal joints, of other dimensions."""
 STATES = 3
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
@@ -42,9 +50,12 @@ def carried(description):
     for k, (inner, outer) in enumerate(itertools.pairwise(chain)):
         data["bodies"][outer] = {}
         joints[f"move_{k}"] = {
-            "type": "prismatic" if k < 3 else "revolute", "between": [inner, outer],
-            "at": [0.0, 0.0, 0.0], "axis": np.eye(3)[k % 3].tolist(), "actuated": True,
-        }  # fmt: skip
+            "type": "prismatic" if k < 3 else "revolute",
+            "between": [inner, outer],
+            "at": [0.0, 0.0, 0.0],
+            "axis": np.eye(3)[k % 3].tolist(),
+            "actuated": True,
+        }
     data["joints"] = joints | data["joints"]
     return data
 
@@ -52,8 +63,7 @@ def carried(description):
 def shaken(judge, q, qd, qdd, wrench, rng):
     """Efforts of the machine's drives on a shaken ground, and the ground's motion in its axes."""
     at, rates, changes = (
-        np.concatenate([rng.uniform(-size, size, 6), own])
-        for size, own in ((0.3, q), (2.0, qd), (20.0, qdd))
+        np.concatenate([rng.uniform(-size, size, 6), own]) for size, own in ((0.3, q), (2.0, qd), (20.0, qdd))
     )
     judge.assemble(at)
     tangent = judge.tangent()

@@ -130,8 +130,13 @@ def test_a_parameter_of_tolerances_and_doubt():
 def test_units_follow_from_where_a_parameter_stands():
     units = {path: unit for path, (_, unit) in robot_with().file_numbers().items()}
     assert {name: units[f"parameters.{name}"] for name in (*NAMES, "plate")} == {
-        "arm": "m", "base": "m", "m": "kg", "forearm": "m", "drop": "m", "plate": "m",
-    }  # fmt: skip
+        "arm": "m",
+        "base": "m",
+        "m": "kg",
+        "forearm": "m",
+        "drop": "m",
+        "plate": "m",
+    }
 
 
 def test_a_new_value_is_written_where_the_parameter_stands(tmp_path):
@@ -141,8 +146,9 @@ def test_a_new_value_is_written_where_the_parameter_stands(tmp_path):
     text = edited_yaml(robot, str(path), new)
     old = SOURCE.splitlines()
     assert [line for line in text.splitlines() if line not in old] == [
-        "  # parameters.arm: longer", "  arm: 0.21  # pivot to elbow",
-    ]  # fmt: skip
+        "  # parameters.arm: longer",
+        "  arm: 0.21  # pivot to elbow",
+    ]
     # A copy's own number needs the file written out, with the parameter's new value.
     text = edited_yaml(robot, str(path), new | {"joints.motor_1.at[0]": Chosen(0.1, "moved")})
     path.write_text(text)
@@ -171,9 +177,7 @@ def test_what_an_edited_file_loses_of_its_expressions_is_told(tmp_path):
     names = [*(f"{name}.position" for name in robot.joint_names), "x", "y", "z"]
     seen = np.hstack([q, robot_with(arm=0.203).platform(q)[0]])
     np.savetxt(poses, seen, "%.17g", ",", header=",".join(names), comments="")
-    given = Calibrate(
-        robot=str(path), poses=poses, out=tmp_path / "mine.yaml", only=("parameters",)
-    )
+    given = Calibrate(robot=str(path), poses=poses, out=tmp_path / "mine.yaml", only=("parameters",))
     found = calibrate(given).data["parameters"]
     assert found["parameters.arm"]["value"] == pytest.approx(0.203, abs=1e-5)
     assert all(name.startswith("parameters.") for name in found)

@@ -14,9 +14,7 @@ AT = [0.4, 0.1, 0.02]
 
 
 def turning(inner, outer, at, **more):
-    return {
-        "type": "revolute", "between": [inner, outer], "at": at, "axis": [0, 0, 1], **more
-    }  # fmt: skip
+    return {"type": "revolute", "between": [inner, outer], "at": at, "axis": [0, 0, 1], **more}
 
 
 def body(mass, com):
@@ -32,9 +30,11 @@ def puck(table, elbow=True):
     }
     if table:
         joints["table"] = {
-            "type": "planar", "between": ["base", "puck"], "at": [0.38, 0.1, 0.03],
+            "type": "planar",
+            "between": ["base", "puck"],
+            "at": [0.38, 0.1, 0.03],
             "axis": [0, 0, 1],
-        }  # fmt: skip
+        }
     bodies = {
         "arm": body(0.6, [0.1, 0.02, 0]),
         "fore": body(0.4, [0.3, 0.06, 0.01]),

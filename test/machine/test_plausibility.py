@@ -88,8 +88,7 @@ HEAVY = {"bodies.crank_2.mass": 1.0, "bodies.crank_2.inertia": [5e6, 5e6, 5e6]}
 OUTSIDE = {"joints.motor_3.limits": {"position": [2.0, 3.0]}, "joints.motor_3.home": 1.0}
 BRICK = {"payload": {"mass": 500.0, "com": [0.0, 0.0, 0.0], "inertia": [1.0, 1.0, 1.0]}}
 FAR = {"payload": {"mass": 0.5, "com": [0.0, 0.0, 40.0], "inertia": [1e-3, 1e-3, 1e-3]}}
-STEEL = {"youngs_modulus": 2.1e11, "shear_modulus": 8e10, "outer_diameter": 0.05,
-         "inner_diameter": 0.04}  # fmt: skip
+STEEL = {"youngs_modulus": 2.1e11, "shear_modulus": 8e10, "outer_diameter": 0.05, "inner_diameter": 0.04}
 
 
 def barred(aside=0.0, **section):
@@ -115,19 +114,17 @@ KINDS = {
     "square millimetres": (square_millimetres, "crank_2: inertia", "m", None),
     "heavy inertia": (HEAVY, "crank_2: inertia", "m", np.sqrt(5e6)),
     "far centre": (far_centre, "coupler_1: com", "m", 120.0),
-    "degrees": ({"joints.motor_1.limits": {"position": [-90.0, 90.0]}},
-                "motor_1: limits.position", "rad", 90.0),
+    "degrees": ({"joints.motor_1.limits": {"position": [-90.0, 90.0]}}, "motor_1: limits.position", "rad", 90.0),
     "outside": (OUTSIDE, "motor_3: home", "rad", 1.0),
     "feather": ({"bodies.platform": {}}, "platform: mass", "kg", 0.0),
     "brick": (BRICK, "payload.mass", "kg", 500.0),
     "far payload": (FAR, "payload: com", "m", 40.0),
-    "gram centimetres": ({"joints.motor_2.rotor_inertia": 800.0},
-                         "motor_2: rotor_inertia", "kg", None),
+    "gram centimetres": ({"joints.motor_2.rotor_inertia": 800.0}, "motor_2: rotor_inertia", "kg", None),
     "millimetre gravity": ({"gravity": [0.0, -981000.0, 0.0]}, "gravity", "m/s2", 981000.0),
     "member's end": (barred(0.1), "crank_2: member", "m", 0.1),
     "megapascal": (barred(youngs_modulus=2.1e5), "crank_2: youngs_modulus", "Pa", 2.1e5),
     "earths": ({"gravity": [0.0, 0.0, -1.0]}, "gravity", "m/s2", 1.0),
-}  # fmt: skip
+}
 """What is changed, and the finding's field, unit and value."""
 
 
@@ -255,13 +252,15 @@ def table(path, times, rates=None):
 def test_times_of_a_table_in_milliseconds(tmp_path, twin):
     times = np.arange(60.0)
     seconds = table(tmp_path / "s.csv", 4e-3 * times, 1.0)
-    assert (
-        twin("torques", "five_bar", seconds, "--no-picture", "--out", tmp_path / "a.csv").err == ""
-    )
+    assert twin("torques", "five_bar", seconds, "--no-picture", "--out", tmp_path / "a.csv").err == ""
     alone = twin(
-        "torques", "five_bar", table(tmp_path / "ms.csv", 4.0 * times), "--no-picture", "--out",
+        "torques",
+        "five_bar",
+        table(tmp_path / "ms.csv", 4.0 * times),
+        "--no-picture",
+        "--out",
         tmp_path / "b.csv",
-    )  # fmt: skip
+    )
     assert alone.code == 0 and alone.err.startswith("warning: ") and alone.err.count("\n") == 1
     # Where velocities tell it for sure, the table is rejected.
     both = twin("torques", "five_bar", table(tmp_path / "both.csv", 4.0 * times, 1e3))

@@ -90,32 +90,34 @@ class Planar:
             joints["slide"] = {"type": "translation", "between": ["base", "platform"]}
         for k in range(self.n):
             for part, name in enumerate(("crank", "coupler")):
-                bodies[f"{name}_{k}"] = self._body(
-                    self.masses[part, k], self.coms[part, k], self.turns[part, k]
-                )
+                bodies[f"{name}_{k}"] = self._body(self.masses[part, k], self.coms[part, k], self.turns[part, k])
             joints[f"motor_{k}"] = joint | {
-                "between": ["base", f"crank_{k}"], "at": [*self.base[k].tolist(), 0.0],
-                "actuated": True, "home": float(self.home[k]),
+                "between": ["base", f"crank_{k}"],
+                "at": [*self.base[k].tolist(), 0.0],
+                "actuated": True,
+                "home": float(self.home[k]),
                 "friction": {"viscous": float(self.viscous[k]), "coulomb": float(self.coulomb[k])},
                 "rotor_inertia": float(self.rotor[k]),
-            }  # fmt: skip
+            }
             if self.limits is not None:
                 joints[f"motor_{k}"]["limits"] = {"effort": float(self.limits[k])}
             ends = f"crank_{k}", f"coupler_{k}", "platform"
-            for name, pair, at in (
-                ("elbow", ends[:2], self.elbow[k]), ("wrist", ends[1:], self.wrist[k])
-            ):  # fmt: skip
+            for name, pair, at in (("elbow", ends[:2], self.elbow[k]), ("wrist", ends[1:], self.wrist[k])):
                 joints[f"{name}_{k}"] = joint | {"between": [*pair], "at": [*at.tolist(), 0.0]}
         pose = ["x", "y"] if self.point else ["x", "y", "yaw"]
         return {
-            "mechanism": "machine", "pose": pose, "gravity": GRAVITY.tolist(), "bodies": bodies,
-            "origin": [0, 0, 0], "joints": joints, **more,
-        }  # fmt: skip
+            "mechanism": "machine",
+            "pose": pose,
+            "gravity": GRAVITY.tolist(),
+            "bodies": bodies,
+            "origin": [0, 0, 0],
+            "joints": joints,
+            **more,
+        }
 
     @staticmethod
     def _body(mass, com, turn):
-        return {"mass": float(mass), "com": [*map(float, com), 0.0],
-                "inertia": [turn, turn, float(turn) * 1.9]}  # fmt: skip
+        return {"mass": float(mass), "com": [*map(float, com), 0.0], "inertia": [turn, turn, float(turn) * 1.9]}
 
     def judged(self, pose, rate, change, wrench):
         """q, qd, qdd, rates by the pose (n, m), and forces that the pose's coordinates need."""
@@ -126,8 +128,12 @@ class Planar:
             """A point of the platform: place, velocity, acceleration, velocity by the pose."""
             arm = turned(yaw) @ (point - here)
             columns = np.column_stack([np.eye(2), across(arm)])[:, :m]
-            return (pose[:2] + arm, rate[:2] + spin * across(arm),
-                    change[:2] + swing * across(arm) - spin**2 * arm, columns)  # fmt: skip
+            return (
+                pose[:2] + arm,
+                rate[:2] + spin * across(arm),
+                change[:2] + swing * across(arm) - spin**2 * arm,
+                columns,
+            )
 
         q, qd, qdd, by = [], [], [], []
         need = np.zeros(m)
@@ -165,16 +171,25 @@ class Planar:
             qdd.append(seconds[0])
             by.append(each[0])
             arm = turned(turn) @ (self.coms[0, k] - self.base[k])
-            body(self.masses[0, k], 1.9 * self.turns[0, k],
-                 seconds[0] * across(arm) - rates[0]**2 * arm, seconds[0],
-                 np.outer(across(arm), each[0]), each[0])  # fmt: skip
+            body(
+                self.masses[0, k],
+                1.9 * self.turns[0, k],
+                seconds[0] * across(arm) - rates[0] ** 2 * arm,
+                seconds[0],
+                np.outer(across(arm), each[0]),
+                each[0],
+            )
             lean = (angle(r) - angle(second) + np.pi) % (2 * np.pi) - np.pi
             arm = turned(lean) @ (self.coms[1, k] - self.elbow[k])
             elbow = seconds[0] * across(p) - rates[0] ** 2 * p
-            body(self.masses[1, k], 1.9 * self.turns[1, k],
-                 elbow + seconds[1] * across(arm) - rates[1]**2 * arm, seconds[1],
-                 np.outer(across(p), each[0]) + np.outer(across(arm), each[1]),
-                 each[1])  # fmt: skip
+            body(
+                self.masses[1, k],
+                1.9 * self.turns[1, k],
+                elbow + seconds[1] * across(arm) - rates[1] ** 2 * arm,
+                seconds[1],
+                np.outer(across(p), each[0]) + np.outer(across(arm), each[1]),
+                each[1],
+            )
         q, qd, qdd, by = map(np.array, (q, qd, qdd, by))
         own = self.viscous * qd + self.coulomb * np.sign(qd) + self.rotor * qdd
         return q, qd, qdd, by, need + by.T @ own
@@ -193,9 +208,8 @@ LIMITS = {"none": None, "alike": np.full(6, 7.0), "unlike": np.array([2.0, 9.0, 
 
 @pytest.mark.parametrize(
     ("n", "point", "limits", "preloaded"),
-    [(3, True, "unlike", False), (4, True, "none", True), (4, False, "alike", False),
-     (5, False, "unlike", True)],
-)  # fmt: skip
+    [(3, True, "unlike", False), (4, True, "none", True), (4, False, "alike", False), (5, False, "unlike", True)],
+)
 def test_planar_machines_share_efforts_as_a_quadratic_programme_does(n, point, limits, preloaded):
     rng = np.random.default_rng(10 * n + point)
     bounds = LIMITS[limits]
@@ -287,18 +301,22 @@ def four_arms(rng):
         base, arm = rng.uniform(0.15, 0.2), rng.uniform(0.25, 0.3)
         elbow = [(base + arm * 0.9) * c, (base + arm * 0.9) * s, -arm * 0.3]
         bodies[f"arm_{k}"] = {
-            "mass": 0.3, "com": [(base + arm / 2) * c, (base + arm / 2) * s, -0.05],
+            "mass": 0.3,
+            "com": [(base + arm / 2) * c, (base + arm / 2) * s, -0.05],
             "inertia": [1e-3, 2e-3, 2e-3],
-        }  # fmt: skip
+        }
         joints[f"motor_{k}"] = {
-            "type": "revolute", "between": ["base", f"arm_{k}"], "at": [base * c, base * s, 0.0],
-            "axis": [-s, c, 0.0], "actuated": True, "rotor_inertia": 0.01,
+            "type": "revolute",
+            "between": ["base", f"arm_{k}"],
+            "at": [base * c, base * s, 0.0],
+            "axis": [-s, c, 0.0],
+            "actuated": True,
+            "rotor_inertia": 0.01,
             "limits": {"effort": float(rng.uniform(5, 40))},
-        }  # fmt: skip
+        }
         tip = [0.05 * c, 0.05 * s, -0.5]
         rods[f"rod_{k}"] = {"between": [f"arm_{k}", "platform"], "ends": [elbow, tip], "mass": 0.05}
-    return {"mechanism": "machine", "bodies": bodies, "joints": joints, "rods": rods,
-            "pose": ["x", "y", "z"]}  # fmt: skip
+    return {"mechanism": "machine", "bodies": bodies, "joints": joints, "rods": rods, "pose": ["x", "y", "z"]}
 
 
 def test_every_choice_of_drives_explains_a_spatial_machine():
@@ -321,9 +339,7 @@ def test_every_choice_of_drives_explains_a_spatial_machine():
         alone = inverse_dynamics(three, q[:, rows], qd[:, rows], qdd[:, rows], wrench)
         need = np.einsum("knm,kn->km", by[:, rows], alone)
         np.testing.assert_allclose(np.einsum("knm,kn->km", by, tau), need, atol=1e-9)
-        chosen = robot_of_data(
-            data | {"redundancy": {"leads": [f"motor_{k}" for k in rows]}}, "four"
-        )
+        chosen = robot_of_data(data | {"redundancy": {"leads": [f"motor_{k}" for k in rows]}}, "four")
         assert chosen.graph.leads == tuple(f"motor_{k}" for k in rows)
         np.testing.assert_allclose(inverse_dynamics(chosen, q, qd, qdd, wrench), tau, atol=1e-10)
         np.testing.assert_allclose(chosen.singularity(q), robot.singularity(q), rtol=1e-9)
@@ -372,9 +388,7 @@ def test_contradictions_are_no_assembly(planar, joint, what, amount):
     np.testing.assert_allclose(inverse_dynamics(planar, *state), good, atol=0.1)
     agreed = planar.project_redundant(*state)
     np.testing.assert_allclose(agreed[0][:, :3], state[0][:, :3])
-    np.testing.assert_allclose(
-        inverse_dynamics(planar, *agreed), inverse_dynamics(planar, *state), atol=1e-12
-    )
+    np.testing.assert_allclose(inverse_dynamics(planar, *agreed), inverse_dynamics(planar, *state), atol=1e-12)
 
 
 @pytest.mark.parametrize("turns", [1, -1])
@@ -409,9 +423,7 @@ def test_what_a_file_may_not_say():
     friction = {"viscous": 0.1, "load_dependent": 0.1}
     rejected("friction", lambda joints: joints["motor_2"].update(friction=friction))
     # An axis that is tilted takes freedoms away, which are none that drives share.
-    rejected(
-        "tilt|parallel", lambda joints: joints["elbow_1"].update(axis=[1e-4, 0, 1]), MobilityError
-    )
+    rejected("tilt|parallel", lambda joints: joints["elbow_1"].update(axis=[1e-4, 0, 1]), MobilityError)
     with pytest.raises(ParameterError, match="contacts"):
         from delta_dynamics import ContactMonitor
 
@@ -500,10 +512,11 @@ def test_errors_of_parts_move_the_platform_with_the_leading_joints_held():
     q = robot.inverse(pose)
     first, second = plane.elbow - plane.base, plane.wrist - plane.elbow
     paths = [
-        path for k in range(4) for path in
-        (f"bodies.crank_{k}.length", f"bodies.coupler_{k}.length", f"joints.motor_{k}.offset")
+        path
+        for k in range(4)
+        for path in (f"bodies.crank_{k}.length", f"bodies.coupler_{k}.length", f"joints.motor_{k}.offset")
         if k in leads or "offset" not in path
-    ]  # fmt: skip
+    ]
 
     def reached(errors):
         longer = lambda kind: np.array([errors.get(f"{kind}_{k}", 0.0) for k in range(4)])  # noqa: E731
@@ -621,9 +634,7 @@ def test_a_plant_under_computed_efforts_follows_the_path(planar):
 
 def test_a_simulated_machine_follows_a_trajectory_with_all_drives(planar):
     n, free = 4, np.full(4, np.inf)
-    machine = Simulation(
-        planar, MachineSettings(planar.graph.home, free, *tuned(planar, 8.0)), SECOND
-    )
+    machine = Simulation(planar, MachineSettings(planar.graph.home, free, *tuned(planar, 8.0)), SECOND)
     assert machine.stable_share == 1.0
     t = np.linspace(0.0, 0.4, 81)
     share, slope = 1 - np.cos(np.pi * t / 0.4), np.pi / 0.4
@@ -631,9 +642,7 @@ def test_a_simulated_machine_follows_a_trajectory_with_all_drives(planar):
     pose, speed = size * share[:, None], size * slope * np.sin(np.pi * t / 0.4)[:, None]
     q = planar.inverse(pose)
     qd, qdd = joint_rates(planar, q, speed, size * slope**2 * np.cos(np.pi * t / 0.4)[:, None])
-    message = Maker(Plain()).trajectory(
-        planar.joint_names, [round(s * SECOND) for s in t], q, qd, qdd
-    )
+    message = Maker(Plain()).trajectory(planar.joint_names, [round(s * SECOND) for s in t], q, qd, qdd)
     efforts = inverse_dynamics(planar, q, qd, qdd)
     for point, effort in zip(message.points, efforts, strict=True):
         point.effort = effort.tolist()
@@ -643,14 +652,13 @@ def test_a_simulated_machine_follows_a_trajectory_with_all_drives(planar):
         if k % 50 == 0:
             seen = machine.measured()
             np.testing.assert_allclose(seen.q, q[k // 5], atol=1e-3)
-            np.testing.assert_allclose(
-                seen.effort, efforts[k // 5], atol=0.15 * np.abs(efforts).max()
-            )
+            np.testing.assert_allclose(seen.effort, efforts[k // 5], atol=0.15 * np.abs(efforts).max())
     # A drive that follows has no stop: the machine stops there and says so.
     machine = Simulation(
         planar.changed(limits={"position": [[0, 3], [0, 3], [0, 3], [1.89, 1.91]]}),
-        MachineSettings(planar.graph.home, free, np.zeros(n), np.zeros(n)), SECOND,
-    )  # fmt: skip
+        MachineSettings(planar.graph.home, free, np.zeros(n), np.zeros(n)),
+        SECOND,
+    )
     machine.commands(SimpleNamespace(data=[0.0, 0.0, 0.0, 2.0]))
     with pytest.raises(MessageError, match=r"motor_4 is at .*1\.89 to 1\.91"):
         for _ in range(400):

@@ -59,9 +59,7 @@ def cell(request):
     return dataclasses.replace(both, mapped=mapped, names=list(mapped.controller.names))
 
 
-@pytest.fixture(
-    params=partly_long(robot_names(), "delta_cu", "five_bar", "rps3", "upr_rpu"), scope="module"
-)
+@pytest.fixture(params=partly_long(robot_names(), "delta_cu", "five_bar", "rps3", "upr_rpu"), scope="module")
 def robot(request):
     return load(request.param).changed(payload={"mass": 0.3, "com": [0.01, 0.02, -0.05]})
 
@@ -102,9 +100,7 @@ def test_the_platform_stands_where_the_robot_says_and_all_loops_are_closed(robot
     assert ends
     data = model.createData()
     position, rotation = robot.platform(states)
-    for q, passive, at, turned in zip(
-        states, robot.passive(states), position, rotation, strict=True
-    ):
+    for q, passive, at, turned in zip(states, robot.passive(states), position, rotation, strict=True):
         residual, _ = closure_rows(model, data, ends, configuration(model, robot, q, passive))
         assert np.abs(residual).max() < 1e-9
         platform = data.oMf[model.getFrameId("platform", pin.BODY)]
@@ -122,9 +118,7 @@ def test_no_passive_joint_has_a_space_and_the_files_have_the_same_names(name):
         found += [element.get("name") for element in root.iter("constraint")]
         assert len(set(found)) == len(found)
         assert not any(re.search(r"\s", name) for name in found)
-    moving = [
-        j for j in ET.fromstring(robot_urdf(robot)).findall("joint") if j.get("type") != "fixed"
-    ]
+    moving = [j for j in ET.fromstring(robot_urdf(robot)).findall("joint") if j.get("type") != "fixed"]
     assert {joint.get("name") for joint in moving} == names
 
 
@@ -202,9 +196,7 @@ def test_a_cell_s_links_follow_the_controller_s_numbers(cell):
     names = joint_names(robot, "some/Hardware")
     data, n = model.createData(), robot.joints_count
     q = random_joints(robot, np.random.default_rng(5), 20)
-    for given, passive, at, turned in zip(
-        cell.positions(q), robot.passive(q), *robot.platform(q), strict=True
-    ):
+    for given, passive, at, turned in zip(cell.positions(q), robot.passive(q), *robot.platform(q), strict=True):
         states = dict(zip(cell.names, given, strict=True))
         states |= dict(zip(names[n:], passive, strict=True))
         for name, (drive, factor, offset) in follows.items():
@@ -236,8 +228,7 @@ def test_a_cell_s_description_is_read_back_with_its_joint_map(cell, tmp_path):
 
 def test_a_ratio_that_changes_with_travel_has_no_description_for_a_controller():
     robot = robot_of_data(
-        sides("linear_delta").data
-        | {"joint_map": {"rail_1": {"ratio": 40.0, "ratio_change": 0.1}}},
+        sides("linear_delta").data | {"joint_map": {"rail_1": {"ratio": 40.0, "ratio_change": 0.1}}},
         "winch",
     )
     with pytest.raises(ParameterError, match="ratio_change"):

@@ -26,9 +26,11 @@ pytestmark = [
 ]
 NUMBER = re.compile(r"(?<![\w.])(?<!version=.)[-+]?\d+\.\d+(?:e[-+]?\d+)?(?![\w.])")
 WRITERS = {
-    "urdf": robot_urdf, "xml": robot_mjcf, "sdf": robot_sdf,
+    "urdf": robot_urdf,
+    "xml": robot_mjcf,
+    "sdf": robot_sdf,
     "yaml": lambda robot: yaml.safe_dump(robot_description(robot), sort_keys=False),
-}  # fmt: skip
+}
 """How a robot is written, by the ending of the file."""
 AMPLIFIED = 3000.0
 """How far efforts may be off, of the largest and in units of the last digit, at small motions."""
@@ -42,12 +44,12 @@ def wrist():
     """
     centre = np.array([0.0, 0.0, 0.2])
     data = {
-        "mechanism": "machine", "gravity": [0.0, 0.0, -9.81], "platform": "platform",
-        "bodies": {
-            "platform": {"mass": 1.1, "com": [0.01, 0.02, 0.23], "inertia": [2e-3, 3e-3, 2.5e-3]}
-        },
+        "mechanism": "machine",
+        "gravity": [0.0, 0.0, -9.81],
+        "platform": "platform",
+        "bodies": {"platform": {"mass": 1.1, "com": [0.01, 0.02, 0.23], "inertia": [2e-3, 3e-3, 2.5e-3]}},
         "joints": {},
-    }  # fmt: skip
+    }
     for k in range(3):
         turn = 2.0 * math.pi * k / 3.0 + 0.35
         bent = np.array([math.cos(turn), math.sin(turn), 0.9])
@@ -56,24 +58,33 @@ def wrist():
         data["bodies"] |= {
             f"ring_{k}": {"mass": 1.2, "com": [0.01, 0.0, 0.05], "inertia": [2e-3, 2e-3, 3.6e-3]},
             f"branch_{k}": {
-                "mass": 0.08, "com": (centre + 0.05 * (bent + end)).tolist(),
+                "mass": 0.08,
+                "com": (centre + 0.05 * (bent + end)).tolist(),
                 "inertia": [1e-4, 1e-4, 1.5e-4],
             },
-        }  # fmt: skip
+        }
         data["joints"] |= {
             f"motor_{k}": {
-                "type": "revolute", "between": ["base", f"ring_{k}"], "actuated": True,
-                "at": [0.0, 0.0, 0.05 + 0.03 * k], "axis": [0.0, 0.0, 1.0], "rotor_inertia": 5e-3,
+                "type": "revolute",
+                "between": ["base", f"ring_{k}"],
+                "actuated": True,
+                "at": [0.0, 0.0, 0.05 + 0.03 * k],
+                "axis": [0.0, 0.0, 1.0],
+                "rotor_inertia": 5e-3,
             },
             f"bend_{k}": {
-                "type": "revolute", "between": [f"ring_{k}", f"branch_{k}"],
-                "at": (centre + 0.09 * bent).tolist(), "axis": bent.tolist(),
+                "type": "revolute",
+                "between": [f"ring_{k}", f"branch_{k}"],
+                "at": (centre + 0.09 * bent).tolist(),
+                "axis": bent.tolist(),
             },
             f"end_{k}": {
-                "type": "spherical", "between": [f"branch_{k}", "platform"],
+                "type": "spherical",
+                "between": [f"branch_{k}", "platform"],
                 "at": (centre + 0.12 * end).tolist(),
-            } | ({} if k else {"type": "revolute", "axis": end.tolist()}),
-        }  # fmt: skip
+            }
+            | ({} if k else {"type": "revolute", "axis": end.tolist()}),
+        }
     return robot_of_data(data, "wrist")
 
 

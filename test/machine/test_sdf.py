@@ -152,9 +152,7 @@ def same(found, right):
     """Whether two machines are one, by their places and efforts."""
     motion = random_motion(right, np.random.default_rng(8), 5)
     np.testing.assert_allclose(found.platform(motion[0])[0], right.platform(motion[0])[0], 1e-9)
-    np.testing.assert_allclose(
-        inverse_dynamics(found, *motion), inverse_dynamics(right, *motion), 1e-8, 1e-10
-    )
+    np.testing.assert_allclose(inverse_dynamics(found, *motion), inverse_dynamics(right, *motion), 1e-8, 1e-10)
 
 
 def edited(tmp_path, changes, **options):
@@ -168,8 +166,16 @@ def edited(tmp_path, changes, **options):
     return path
 
 
-@pytest.mark.parametrize("name", ["five_bar", *(pytest.param(n, marks=pytest.mark.long) for n in (
-    "rps3", "delta_cu", "stewart", "random prru3", "random bolted"))])  # fmt: skip
+@pytest.mark.parametrize(
+    "name",
+    [
+        "five_bar",
+        *(
+            pytest.param(n, marks=pytest.mark.long)
+            for n in ("rps3", "delta_cu", "stewart", "random prru3", "random bolted")
+        ),
+    ],
+)
 def test_every_way_to_write_a_drawing_is_the_same_machine(name, tmp_path):
     if name.startswith("random"):
         data = variant(name.split()[1], np.random.default_rng(5))
@@ -366,18 +372,25 @@ def test_a_joint_of_the_world_may_be_called_as_one_of_the_model(tmp_path):
     own = M1.replace(old, new).replace("m1", "e1")
     own = own.replace("world", "ground::g").replace(">arm", ">five_bar::arm")
     changes = {
-        M1: "", old: new, "<static>1</static>": '<static>1</static><link name="g"/>',
+        M1: "",
+        old: new,
+        "<static>1</static>": '<static>1</static><link name="g"/>',
         MODEL: own + MODEL,
-    }  # fmt: skip
+    }
     found = load(edited(tmp_path, changes, motors=""), platform="tool")
     assert found.joint_names == ("m2", "e1_of_world")
     same(found, right)
 
 
-@pytest.mark.parametrize(("limit", "right"), [
-    ("<lower>-1</lower>", [-1.0, TURN]), ("<upper>1</upper>", [-TURN, 1.0]),
-    ("<lower>-1</lower><upper>2</upper>", [-1.0, 2.0]), ("<effort>3</effort>", None),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("limit", "right"),
+    [
+        ("<lower>-1</lower>", [-1.0, TURN]),
+        ("<upper>1</upper>", [-TURN, 1.0]),
+        ("<lower>-1</lower><upper>2</upper>", [-1.0, 2.0]),
+        ("<effort>3</effort>", None),
+    ],
+)
 def test_a_range_may_have_one_end(limit, right, tmp_path):
     axis = "<xyz>0 0 1</xyz></axis>"
     path = five_bar(tmp_path, axis, axis.replace("</axis>", f"<limit>{limit}</limit></axis>"))
@@ -395,20 +408,16 @@ REJECTED = {
     "two models": ("<static>1</static>", "<static>0</static>", "five_bar.sdf"),
     "mass": ("<mass>0.4</mass>", "<mass>-1</mass>", "link.arm_1.inertial.mass"),
     "auto": ("<inertial>", '<inertial auto="true">', "link.arm_1.inertial.auto"),
-    "degrees": ('<pose relative_to="arm_1"', '<pose degrees="yes" relative_to="arm_1"',
-                "link.fore_1.pose.degrees"),
+    "degrees": ('<pose relative_to="arm_1"', '<pose degrees="yes" relative_to="arm_1"', "link.fore_1.pose.degrees"),
     "include": ('<link name="fore_2">', '<include/><link name="fore_2">', "include"),
-    "weight": ('<link name="fore_2">', '<link name="fore_2"><gravity>0</gravity>',
-               "link.fore_2.gravity"),
+    "weight": ('<link name="fore_2">', '<link name="fore_2"><gravity>0</gravity>', "link.fore_2.gravity"),
     "motor": ("<joint_name>m2</joint_name>", "<joint_name>m3</joint_name>", "plugin"),
-    "mimic": ("<xyz>0 0 1</xyz></axis>", '<xyz>0 0 1</xyz><mimic joint="m1"/></axis>',
-              "joint.m1.mimic"),
+    "mimic": ("<xyz>0 0 1</xyz></axis>", '<xyz>0 0 1</xyz><mimic joint="m1"/></axis>', "joint.m1.mimic"),
     "frame of the world": (MODEL, f'{MODEL}<pose relative_to="none"/>', "model.five_bar.pose"),
-    "joint of the world": (MODEL, M1.replace("m1", "j").replace("arm_1", "five_bar::none") + MODEL,
-                           "joint.j.child"),
+    "joint of the world": (MODEL, M1.replace("m1", "j").replace("arm_1", "five_bar::none") + MODEL, "joint.j.child"),
     "no model": (MODEL, f"{MODEL}<static>1</static>", "five_bar.sdf"),
     "xacro": ("<static>1</static>", "<xacro:include/>", "five_bar.sdf"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", sorted(REJECTED))

@@ -111,12 +111,8 @@ def test_what_looks_like_millimetres_or_degrees_is_asked(tmp_path):
 def test_a_quaternion_serves_as_well_as_angles(tmp_path):
     expected = read_urdf(small(tmp_path))
     half = repr(float(np.sqrt(0.5)))
-    turned = read_urdf(
-        small(tmp_path, 'rpy="0 1.5707963267948966 0"', f'quat_xyzw="0 {half} 0 {half}"')
-    )
-    np.testing.assert_allclose(
-        turned["bodies"]["tool"]["inertia"], expected["bodies"]["tool"]["inertia"]
-    )
+    turned = read_urdf(small(tmp_path, 'rpy="0 1.5707963267948966 0"', f'quat_xyzw="0 {half} 0 {half}"'))
+    np.testing.assert_allclose(turned["bodies"]["tool"]["inertia"], expected["bodies"]["tool"]["inertia"])
     np.testing.assert_allclose(turned["origin"], expected["origin"], atol=1e-14)
 
 

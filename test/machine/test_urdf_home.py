@@ -208,9 +208,10 @@ def test_bars_between_two_balls_are_kept_from_spinning(tmp_path):
     names = [f"u_bar_{i}{s}" for i in range(3) for s in "ab" if f"u_bar_{i}{s}" in text]
     assert names
     beside = {
-        "name_mot": sketch.actuated, "joint_name": [f"{n}_1" for n in names],
+        "name_mot": sketch.actuated,
+        "joint_name": [f"{n}_1" for n in names],
         "joint_type": ["SPHERICAL"] * len(names),
-    }  # fmt: skip
+    }
     for name in names:
         start = text.index(f'<joint name="{name}_2"')
         part = text[start : text.index("</joint>", start)]
@@ -247,9 +248,7 @@ def test_what_moves_another_part_than_the_platform_is_named(tmp_path):
 
 def test_an_open_loop_is_named_with_its_gap(tmp_path, monkeypatch):
     tries, real = [], Assembly.close
-    monkeypatch.setattr(
-        Assembly, "close", lambda self, *given: tries.append(given) or real(self, *given)
-    )
+    monkeypatch.setattr(Assembly, "close", lambda self, *given: tries.append(given) or real(self, *given))
     path = five_bar().save(tmp_path)
     path.write_text(path.read_text().replace('<child_origin xyz="', '<child_origin xyz="5'))
     with warnings.catch_warnings(), pytest.raises(ParameterError) as error:

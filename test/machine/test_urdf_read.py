@@ -87,9 +87,7 @@ def test_every_body_and_joint_stands_where_pinocchio_has_it(sketch, described):
         np.testing.assert_allclose(joint["at"], state.oMf[b].translation, atol=1e-11)
         if kind == "revolute":
             np.testing.assert_allclose(joint["axis"], state.oMf[a].rotation @ axis, atol=1e-11)
-    np.testing.assert_allclose(
-        data["origin"], state.oMf[model.getFrameId("platform")].translation, atol=1e-12
-    )
+    np.testing.assert_allclose(data["origin"], state.oMf[model.getFrameId("platform")].translation, atol=1e-12)
 
 
 def test_the_three_dialects_say_the_same(sketch, described, tmp_path):

@@ -131,8 +131,7 @@ def test_a_yaml_file_beside_it_is_refused_by_name(content, tmp_path):
 def chain(folder, count):
     """A crank on a motor, and so many links that fixed joints hang one on another."""
     links = "".join(
-        f'<link name="l{k}"/><joint name="j{k}" type="fixed"><parent link="{parent}"/>'
-        f'<child link="l{k}"/></joint>'
+        f'<link name="l{k}"/><joint name="j{k}" type="fixed"><parent link="{parent}"/><child link="l{k}"/></joint>'
         for k, parent in enumerate(["crank", *(f"l{k}" for k in range(count - 1))])
     )
     path = small(folder)

@@ -17,15 +17,20 @@ pxr = pytest.importorskip("pxr")
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdPhysics  # noqa: E402
 
 pytestmark = [
-    pytest.mark.usefixtures("quickly_compiled"), pytest.mark.filterwarnings("ignore"),
-]  # fmt: skip
+    pytest.mark.usefixtures("quickly_compiled"),
+    pytest.mark.filterwarnings("ignore"),
+]
 HUMANOID = Path(__file__).resolve().parents[2] / "examples/humanoid.xml"
 LINKAGES = {
     "ankle": {"base": "shank", "platform": "foot"},
     "knee": {"base": "thigh", "platform": "shank"},
 }
-KINDS = {"ball": UsdPhysics.SphericalJoint, "hinge": UsdPhysics.RevoluteJoint,
-         "slide": UsdPhysics.PrismaticJoint, "fixed": UsdPhysics.FixedJoint}  # fmt: skip
+KINDS = {
+    "ball": UsdPhysics.SphericalJoint,
+    "hinge": UsdPhysics.RevoluteJoint,
+    "slide": UsdPhysics.PrismaticJoint,
+    "fixed": UsdPhysics.FixedJoint,
+}
 
 
 def write_usd(path, *, meters=1.0, nested=False, edit=None):
@@ -82,8 +87,16 @@ def write_usd(path, *, meters=1.0, nested=False, edit=None):
         name, parent = model.body(i).name, model.body(model.body_parentid[i]).name
         rotation, position = data.xmat[i].reshape(3, 3), data.xpos[i]
         prim = paths.get(parent, root) if nested else root
-        body(name, rotation, position, model.body_mass[i], model.body_ipos[i], model.body_iquat[i],
-             model.body_inertia[i], prim)  # fmt: skip
+        body(
+            name,
+            rotation,
+            position,
+            model.body_mass[i],
+            model.body_ipos[i],
+            model.body_iquat[i],
+            model.body_inertia[i],
+            prim,
+        )
         count, first = model.body_jntnum[i], model.body_jntadr[i]
         for k in range(first, first + count):
             if model.jnt_type[k] == mujoco.mjtJoint.mjJNT_FREE:
@@ -158,17 +171,18 @@ WRONG = {
     ),
     "mirrored": (_mirror, "/robot/foot.*mirrored"),
     "no body": (
-        lambda stage: UsdPhysics.Joint(stage.GetPrimAtPath("/robot/joints/ankle_roll"))
-        .GetBody1Rel().SetTargets([Sdf.Path("/robot/foo")]),
+        lambda stage: (
+            UsdPhysics.Joint(stage.GetPrimAtPath("/robot/joints/ankle_roll"))
+            .GetBody1Rel()
+            .SetTargets([Sdf.Path("/robot/foo")])
+        ),
         "ankle_roll.physics:body1: '/robot/foo'",
     ),
     "distance": (
-        lambda stage: stage.GetPrimAtPath("/robot/joints/ankle_roll").SetTypeName(
-            "PhysicsDistanceJoint"
-        ),
+        lambda stage: stage.GetPrimAtPath("/robot/joints/ankle_roll").SetTypeName("PhysicsDistanceJoint"),
         "/robot/joints/ankle_roll.*DistanceJoint",
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", sorted(WRONG))

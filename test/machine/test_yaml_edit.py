@@ -25,8 +25,7 @@ def test_friction_and_payload_are_written_into_every_file(name):
             if group.kind == "friction":
                 values.setdefault(base, []).append(value)
     values["payload", "mass"] = 0.5
-    values = {k: v if len(np.atleast_1d(v)) > 1 else float(np.atleast_1d(v)[0])
-              for k, v in values.items()}  # fmt: skip
+    values = {k: v if len(np.atleast_1d(v)) > 1 else float(np.atleast_1d(v)[0]) for k, v in values.items()}
     notes["payload", "mass"] = "a note"
     text = edit_yaml(text_of(name), values, notes)
     again = robot_of_data(yaml.safe_load(text), name)
@@ -44,10 +43,16 @@ def test_lists_sections_and_numbers_that_are_not_there():
     text = "a: 1  # one\nb:\n  - c: {d: 2}\n    e: [1, 2]\n  - c: {}\n    e: 3\n"
     new = edit_yaml(
         text,
-        {("b", 0, "c", "d"): 4.0, ("b", 0, "c", "f"): [1e-5, 2], ("b", 1, "c", "d"): 7,
-         ("b", 1, "g"): 8.0, ("h", "i", "j"): 9.0, ("b", 0, "e"): 5.0},
+        {
+            ("b", 0, "c", "d"): 4.0,
+            ("b", 0, "c", "f"): [1e-5, 2],
+            ("b", 1, "c", "d"): 7,
+            ("b", 1, "g"): 8.0,
+            ("h", "i", "j"): 9.0,
+            ("b", 0, "e"): 5.0,
+        },
         {("b", 0, "c", "d"): "note"},
-    )  # fmt: skip
+    )
     assert yaml.safe_load(new) == {
         "a": 1,
         "b": [{"c": {"d": 4, "f": [1e-5, 2]}, "e": 5}, {"c": {"d": 7}, "e": 3, "g": 8}],

@@ -51,9 +51,7 @@ class Browser:
         page's; at a half, drawing without a graphics card costs a quarter.
     """
 
-    def __init__(
-        self, program: str, size: tuple[int, int] = (600, 520), scale: float = 1.0
-    ) -> None:
+    def __init__(self, program: str, size: tuple[int, int] = (600, 520), scale: float = 1.0) -> None:
         self._program, self._size, self._scale = program, size, scale
         self._count = 0
         self.events: list[dict[str, Any]] = []
@@ -116,9 +114,7 @@ class Browser:
         number = self._count
 
         async def exchange() -> Any:
-            await self._socket.write_message(
-                json.dumps({"id": number, "method": method, "params": parameters})
-            )
+            await self._socket.write_message(json.dumps({"id": number, "method": method, "params": parameters}))
             while True:
                 text = await asyncio.wait_for(self._socket.read_message(), PATIENCE)
                 assert text is not None, "the browser closed the connection"
@@ -132,9 +128,7 @@ class Browser:
 
     def run(self, script: str) -> Any:
         """Value of a script in the page; a promise is waited for."""
-        answer = self.call(
-            "Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True
-        )
+        answer = self.call("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in answer, answer["exceptionDetails"]
         return answer["result"].get("value")
 
@@ -194,12 +188,15 @@ class Browser:
         :param pause: called before each event: a page may have to draw what is under the mouse.
         """
         kinds = ["mouseMoved", "mousePressed", *["mouseMoved"] * (len(places) - 1), "mouseReleased"]
-        for k, (kind, (x, y)) in enumerate(
-            zip(kinds, (places[0], *places, places[-1]), strict=True)
-        ):
+        for k, (kind, (x, y)) in enumerate(zip(kinds, (places[0], *places, places[-1]), strict=True)):
             pause()
             held = kind != "mouseReleased" and k > 0
             self.call(
-                "Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left" if k else "none",
-                buttons=int(held), clickCount=int(k > 0),
-            )  # fmt: skip
+                "Input.dispatchMouseEvent",
+                type=kind,
+                x=x,
+                y=y,
+                button="left" if k else "none",
+                buttons=int(held),
+                clickCount=int(k > 0),
+            )

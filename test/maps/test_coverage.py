@@ -48,9 +48,7 @@ def test_the_default_map_holds_all_that_is_reachable(name, count, rng):
 
 
 # A box of two and of three coordinates, and one about an axis.
-VOLUMES = partly_long(
-    [n for n, robot in SHIPPED.items() if len(robot.pose_names) in (2, 3)], "five_bar", "delta_cu"
-)
+VOLUMES = partly_long([n for n, robot in SHIPPED.items() if len(robot.pose_names) in (2, 3)], "five_bar", "delta_cu")
 
 
 @pytest.mark.usefixtures("short")
@@ -81,9 +79,7 @@ def test_on_the_axis_of_a_cylinder_the_azimuth_means_nothing(name):
 
 @pytest.mark.parametrize(
     "name",
-    partly_long(
-        [n for n, robot in SHIPPED.items() if robot.grid().kind == "box"], "five_bar", "stewart"
-    ),
+    partly_long([n for n, robot in SHIPPED.items() if robot.grid().kind == "box"], "five_bar", "stewart"),
 )
 def test_planes_of_every_number_of_coordinates(name, tmp_path, monkeypatch):
     """Through the least singularity index: values are those of the poses that planes have."""

@@ -24,10 +24,20 @@ from test.support.robots import load, partly_long
 
 MODES = "modes upr_rpu"
 STORED = partly_long(
-    ["compliance delta", "payload stewart", "acceleration five_bar", "workspace delta_cu",
-     "strain-energy upr_rpu", "isotropy prru", MODES],
-    "compliance delta", "payload stewart", "acceleration five_bar", MODES,
-)  # fmt: skip
+    [
+        "compliance delta",
+        "payload stewart",
+        "acceleration five_bar",
+        "workspace delta_cu",
+        "strain-energy upr_rpu",
+        "isotropy prru",
+        MODES,
+    ],
+    "compliance delta",
+    "payload stewart",
+    "acceleration five_bar",
+    MODES,
+)
 
 
 @pytest.fixture(params=STORED)
@@ -147,8 +157,7 @@ def test_shapes_are_those_of_the_pose_that_rings_lowest(small_maps):
         assert len(frames) == modes.MODE_COUNT * modes.FRAMES_PER_SWING
         # Half a swing later the shape is on the other side of rest.
         one, other = (
-            np.array([v for v in frames[f"3/{n}"].x if v is not None])
-            for n in (0, modes.FRAMES_PER_SWING // 2)
+            np.array([v for v in frames[f"3/{n}"].x if v is not None]) for n in (0, modes.FRAMES_PER_SWING // 2)
         )
         still = np.array([v for v in page.data[0].x if v is not None])
         assert one + other == pytest.approx(2 * still, abs=2e-5)

@@ -114,9 +114,7 @@ def test_what_drives_allow_is_brute_force(name, rng):
     names = [n for n in robot.pose_names if n in "xyz"]
     fast = found(robot, "acceleration", q)
     for k, value in enumerate(fast.value):
-        ways = np.vstack([fast.direction[k], directions(rng, 200)])[
-            :, ["xyz".index(n) for n in names]
-        ]
+        ways = np.vstack([fast.direction[k], directions(rng, 200)])[:, ["xyz".index(n) for n in names]]
         # From the pose's own acceleration, one sample at a time.
         pose = np.zeros((len(ways), len(robot.pose_names)))
         pose[:, [robot.pose_names.index(n) for n in names]] = value * ways
@@ -124,9 +122,7 @@ def test_what_drives_allow_is_brute_force(name, rng):
         share = np.abs(inverse_dynamics(robot, np.tile(q[k], (len(ways), 1)), 0 * qdd, qdd)) / limit
         if value > 0.0:
             assert share[0].max() == pytest.approx(1.0, rel=1e-9)
-            assert (
-                share[0].argmax() == fast.element[k] or share[0].max() == share[0][fast.element[k]]
-            )
+            assert share[0].argmax() == fast.element[k] or share[0].max() == share[0][fast.element[k]]
             assert share.max() <= 1.0 + 1e-9
         else:
             assert share.max() >= 1.0
@@ -328,19 +324,38 @@ def test_milling_depths_are_those_of_each_pose(capsys, tmp_path, monkeypatch):
     rows = [",".join(map(repr, [0.1 * k, *pose.tolist()])) for k, pose in enumerate(poses)]
     (tmp_path / "path.csv").write_text("\n".join([header, *rows]) + "\n")
     done = command(
-        capsys, "map", "upr_rpu", "cutting-depth", "--teeth", "2", "--tangential", "600e6",
-        "--radial", "0.3", "--immersion", "0.5", "--up", "--feed", "30", "--tool", "0,0,-0.1",
-        "--damping", "0.03,0.02", "--along", "path.csv", "--out", "a.csv", "--no-picture", "--json",
-    )  # fmt: skip
+        capsys,
+        "map",
+        "upr_rpu",
+        "cutting-depth",
+        "--teeth",
+        "2",
+        "--tangential",
+        "600e6",
+        "--radial",
+        "0.3",
+        "--immersion",
+        "0.5",
+        "--up",
+        "--feed",
+        "30",
+        "--tool",
+        "0,0,-0.1",
+        "--damping",
+        "0.03,0.02",
+        "--along",
+        "path.csv",
+        "--out",
+        "a.csv",
+        "--no-picture",
+        "--json",
+    )
     told = json.loads(done.out)["worst"][0]
     each = [stable_depth(robot, p, milling, damping=damping, tool=tool) for p in poses]
     assert told["value"] == pytest.approx(min(each)) and told["unit"] == "m"
     assert told["element"].startswith("mode ")
     # A process goes with its map, so that another does not continue it.
-    maps = [
-        map_of(robot, CuttingDepth(each, damping, tool), 60)
-        for each in (milling, Milling(3, 600e6, 0.3, 0.5))
-    ]
+    maps = [map_of(robot, CuttingDepth(each, damping, tool), 60) for each in (milling, Milling(3, 600e6, 0.3, 0.5))]
     assert maps[0].fingerprint != maps[1].fingerprint
 
 
@@ -353,10 +368,15 @@ def test_a_search_finds_what_is_best_at_the_border(rng):
     best = [
         evolve(
             lambda x: np.where((x**2).sum(1) <= 1.0, x[:, 0] + 0.2 * x[:, 1], -np.inf),
-            rng.uniform(-0.7, 0.7, (8, 2)), np.full(2, -1.0), np.ones(2), Few(), rng, inside,
+            rng.uniform(-0.7, 0.7, (8, 2)),
+            np.full(2, -1.0),
+            np.ones(2),
+            Few(),
+            rng,
+            inside,
         )[1]
         for inside in (lambda x: (x**2).sum(1) <= 1.0, None)
-    ]  # fmt: skip
+    ]
     assert 1.04**0.5 - best[0] < 1e-3 and best[0] > best[1]
 
 
@@ -532,11 +552,19 @@ def test_a_workspace_in_which_nothing_counts_names_the_cause(name):
 @pytest.mark.parametrize(
     ("value", "unit", "text"),
     [
-        (7.276, "kg", "7.276 kg"), (7276.0, "kg", "7.276 t"), (0.0123, "kg", "12.3 g"),
-        (3.277e-5, "m/N", "32.77 µm/N"), (2.5e-4, "m", "250 µm"), (1234.0, "m/s2", "1234 m/s2"),
-        (1.23e4, "J", "12.3 kJ"), (0.5, "rad", "0.5 rad"), (12.0, "rad/s2", "12 rad/s2"),
-        (0.05, "", "0.05"), (4.4e4, "Hz", "44 kHz"), (0.0, "N m", "0 N m"),
+        (7.276, "kg", "7.276 kg"),
+        (7276.0, "kg", "7.276 t"),
+        (0.0123, "kg", "12.3 g"),
+        (3.277e-5, "m/N", "32.77 µm/N"),
+        (2.5e-4, "m", "250 µm"),
+        (1234.0, "m/s2", "1234 m/s2"),
+        (1.23e4, "J", "12.3 kJ"),
+        (0.5, "rad", "0.5 rad"),
+        (12.0, "rad/s2", "12 rad/s2"),
+        (0.05, "", "0.05"),
+        (4.4e4, "Hz", "44 kHz"),
+        (0.0, "N m", "0 N m"),
     ],
-)  # fmt: skip
+)
 def test_units_have_prefixes_that_exist(value, unit, text):
     assert shown(value, unit) == text

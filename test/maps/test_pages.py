@@ -171,10 +171,14 @@ SETTLED = """new Promise(found => {
 @pytest.mark.parametrize(
     "stored",
     [
-        "workspace delta_cu", "payload stewart", LONG("modes upr_rpu"), LONG("isotropy prru"),
-        LONG("acceleration five_bar"), LONG("strain-energy upr_rpu"),
+        "workspace delta_cu",
+        "payload stewart",
+        LONG("modes upr_rpu"),
+        LONG("isotropy prru"),
+        LONG("acceleration five_bar"),
+        LONG("strain-energy upr_rpu"),
     ],
-)  # fmt: skip
+)
 def test_a_page_fits_into_its_window(browser, stored, small_maps, tmp_path):
     """No sideways scrolling, no text beyond the edges, and none over another."""
     with open_map(small_maps[stored]) as data:

@@ -53,8 +53,9 @@ def test_a_point_of_a_sphere_is_the_index_in_that_direction(balls, rng):
     for a, t, k in rng.choice(known, 12):
         rotation = lean(data.azimuth.values[a], data.tilt.values[t])
         # Tilts of Rx Ry Rz by its third column, and of Rz Ry Rx by its third row: both have these.
-        pose = np.array([float(data.sphere_height), np.arctan2(-rotation[1, 2], rotation[2, 2]),
-                         np.arcsin(rotation[0, 2])])  # fmt: skip
+        pose = np.array(
+            [float(data.sphere_height), np.arctan2(-rotation[1, 2], rotation[2, 2]), np.arcsin(rotation[0, 2])]
+        )
         assert np.allclose(robot.rotation(pose)[2, 2], rotation[2, 2], atol=1e-12)
         way = data.way.values[k]
         motion = joint_motion(robot, pose, way)
@@ -74,9 +75,14 @@ def test_spheres_are_drawn_where_poses_are_and_dashed_beyond_limits(balls):
     robot, data = balls
     azimuth, tilt = np.meshgrid(data.azimuth.values, data.tilt.values, indexing="ij")
     known = np.isfinite(data.sphere_energy.values).all(-1)
-    poses = np.stack([np.full(known.sum(), float(data.sphere_height)),
-                      np.arctan2(-np.sin(tilt) * np.sin(azimuth), np.cos(tilt))[known],
-                      np.arcsin(np.sin(tilt) * np.cos(azimuth))[known]], -1)  # fmt: skip
+    poses = np.stack(
+        [
+            np.full(known.sum(), float(data.sphere_height)),
+            np.arctan2(-np.sin(tilt) * np.sin(azimuth), np.cos(tilt))[known],
+            np.arcsin(np.sin(tilt) * np.cos(azimuth))[known],
+        ],
+        -1,
+    )
     inside = data.sphere_inside.values[known] > 0
     assert (inside == reachable(robot, poses)).all() and inside.any()
     drawn = spheres.draw_spheres(data)
@@ -177,8 +183,7 @@ def test_shares_are_drawn_by_rank_in_slices_and_in_the_plane(shares):
     factor = data.plane_factor.values
     known = np.isfinite(data.plane_value.values)
     assert factor[known].sum(-1) == pytest.approx(1.0, abs=1e-12)
-    (plane,) = [p for p in range(3) if "z" not in
-                (str(data.row_name.values[p]), str(data.column_name.values[p]))]  # fmt: skip
+    (plane,) = [p for p in range(3) if "z" not in (str(data.row_name.values[p]), str(data.column_name.values[p]))]
     i, j = np.argwhere(known[plane, :, :, 0])[5]
     pose = [-0.6, data.row_value.values[0, plane, i], data.column_value.values[0, plane, j]]
     expected = strain_energy(robot, pose, LOADS["P1"]).factors

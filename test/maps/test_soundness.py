@@ -115,9 +115,7 @@ def reverse(file):
         ("strain-energy upr_rpu", put("dominant", (0, 0, 0, 0), -2), "dominant"),
         ("strain-energy upr_rpu", put("factor", (0, 0, 0, 0, 0), 1.1), "factor"),
         pytest.param("modes prru", put("line", (0, 1), 28), "line", marks=pytest.mark.long),
-        pytest.param(
-            "modes prru", put("strain_share", (0, 0), 1.5), "strain_share", marks=pytest.mark.long
-        ),
+        pytest.param("modes prru", put("strain_share", (0, 0), 1.5), "strain_share", marks=pytest.mark.long),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )

@@ -157,9 +157,7 @@ def test_a_bound_on_clearance_takes_away(name, small_maps, tmp_path):
     assert "interfere in" not in "\n".join(figures.lines(data))
     assert float(left.volume) == pytest.approx((1 - lost) * float(data.volume))
     assert (left.circle.values <= data.circle.values).all()
-    assert left.circle.values == pytest.approx(
-        circles(robot, left.height.values, least_clearance=bound)
-    )
+    assert left.circle.values == pytest.approx(circles(robot, left.height.values, least_clearance=bound))
 
 
 def test_the_box_holds_what_interference_takes_away(variant):
@@ -194,8 +192,13 @@ def test_without_members_there_is_no_clearance(monkeypatch):
 
 
 def test_bounds_are_checked():
-    for bad in ({"points": 10}, {"least_singularity": 1.0}, {"least_clearance": -0.01},
-                {"least_clearance": np.inf}, {"least_clearance": np.nan}):  # fmt: skip
+    for bad in (
+        {"points": 10},
+        {"least_singularity": 1.0},
+        {"least_clearance": -0.01},
+        {"least_clearance": np.inf},
+        {"least_clearance": np.nan},
+    ):
         with pytest.raises(ParameterError):
             map_of(load("delta"), Workspace(), **bad)
 

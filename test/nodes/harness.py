@@ -98,9 +98,7 @@ class Maker:
                     time_from_start=self.kind.duration(sec=sec, nanosec=nanosec),
                 )
             )
-        return self.kind.trajectory(
-            header=self.header(stamp), joint_names=list(names), points=points
-        )
+        return self.kind.trajectory(header=self.header(stamp), joint_names=list(names), points=points)
 
     def wrench(self, values, stamp=0, frame="platform"):
         fx, fy, fz, mx, my, mz = values
@@ -455,18 +453,14 @@ class Running:
     types of topics that this side sends and collects; ``options`` are those of the process.
     """
 
-    def __init__(
-        self, peer, launch, module, name, *parameters, remaps, talk=None, hear=None, **options
-    ):
+    def __init__(self, peer, launch, module, name, *parameters, remaps, talk=None, hear=None, **options):
         self.peer, self.name, self._last = peer, name, 0
         peer.hear(DiagnosticArray, "/diagnostics")
         for topic, kind in (hear or {}).items():
             peer.hear(kind, f"/{name}/{topic}")
         for topic, kind in (talk or {}).items():
             peer.talk(kind, f"/{name}/{topic}")
-        self._start = lambda: launch(
-            module, *parameters, arguments=renamed(name, **remaps), **options
-        )
+        self._start = lambda: launch(module, *parameters, arguments=renamed(name, **remaps), **options)
         self.process = self._start()
 
     def received(self, topic):

@@ -97,10 +97,7 @@ class Weather:
 
         self.peer, self.launch, self.nodes = peer, launch, nodes
         self.rng = np.random.default_rng(1)
-        self.clients = {
-            name: peer.node.create_client(SetParameters, f"/{name}/set_parameters")
-            for name in nodes
-        }
+        self.clients = {name: peer.node.create_client(SetParameters, f"/{name}/set_parameters") for name in nodes}
         self.pending = []
         self.player = launch(None, code=PLAYER)
         self.stopped = None
@@ -248,9 +245,7 @@ class Ages:
                 "count": len(ages),
                 "older than stale_after": int((np.array(ages) > STALE).sum()),
             }
-            | dict(
-                zip(QUANTILES, np.percentile(ages, list(QUANTILES.values())).tolist(), strict=True)
-            )
+            | dict(zip(QUANTILES, np.percentile(ages, list(QUANTILES.values())).tolist(), strict=True))
             for what, ages in self.all.items()
             if len(ages)
         }
@@ -272,24 +267,18 @@ def write(folder, summary, watched, ages):
         axes[0, 1].plot(minutes, w.descriptors, style, label=name)
         axes[1, 0].plot(minutes, w.threads, style, label=name)
     titles = ("resident memory of each node", "open file descriptors", "threads")
-    for ax, title, what in zip(
-        axes.flat, titles, ("memory (MiB)", "number", "number"), strict=False
-    ):
+    for ax, title, what in zip(axes.flat, titles, ("memory (MiB)", "number", "number"), strict=False):
         ax.set(title=title, xlabel="time (min)", ylabel=what, ylim=(0, 1.2 * ax.get_ylim()[1]))
         ax.legend(ncols=2)
     last = axes[1, 1]
     for what, values in ages.all.items():
-        last.hist(
-            np.array(values) * 1e3, bins=np.geomspace(0.05, 1e3, 80), histtype="step", label=what
-        )
+        last.hist(np.array(values) * 1e3, bins=np.geomspace(0.05, 1e3, 80), histtype="step", label=what)
     last.axvline(1e3 * STALE, color="grey", linewidth=0.8, label="stale_after")
     last.set(xscale="log", yscale="log", xlabel="age at publication (ms)", ylabel="messages")
     last.set_title("age of the published messages")
     last.legend()
     memory, others = growth(summary)
-    figure.suptitle(
-        f"Growth under load: memory {memory:+.1f} MiB, descriptors and threads {others:+g}"
-    )
+    figure.suptitle(f"Growth under load: memory {memory:+.1f} MiB, descriptors and threads {others:+g}")
     figure.savefig(folder / "soak.png", dpi=110)
     pyplot.close(figure)
 

@@ -99,13 +99,8 @@ class Goal:
 
     def __init__(self, number, points=2, last=0.0):
         self.goal_id = SimpleNamespace(uuid=[number] * 16)
-        rows = [
-            SimpleNamespace(effort=[], velocities=[last] * 2, accelerations=[])
-            for _ in range(points)
-        ]
-        self.request = SimpleNamespace(
-            trajectory=SimpleNamespace(points=rows, joint_names=["a", "b"])
-        )
+        rows = [SimpleNamespace(effort=[], velocities=[last] * 2, accelerations=[]) for _ in range(points)]
+        self.request = SimpleNamespace(trajectory=SimpleNamespace(points=rows, joint_names=["a", "b"]))
         self.ends = []
 
     def execute(self, end):
@@ -327,9 +322,7 @@ def test_a_rejected_goal_is_logged_once(action):
         (SUCCEEDED, 0, 0.5, True),
     ],
 )
-def test_what_the_controller_ends_is_held_unless_another_motion_goes_on(
-    action, status, code, last, held
-):
+def test_what_the_controller_ends_is_held_unless_another_motion_goes_on(action, status, code, last, held):
     """An end at rest has the right effort; one that another trajectory replaced must go on."""
     action.accept(Goal(1, last=last))
     handle = action.controller.take()
@@ -409,9 +402,7 @@ def test_a_malformed_goal_is_rejected_before_it_is_accepted(action):
     """By what the node's core says of its shape; and every goal while the node is inactive."""
     robot = load("delta")
     core = Feedforward(robot, Settings())
-    served = action.code.EffortAction(
-        action.node, "/controller", None, lambda: None, True, check=core.check_shape
-    )
+    served = action.code.EffortAction(action.node, "/controller", None, lambda: None, True, check=core.check_shape)
     make, accept, reject = (
         Maker(Plain()),
         action.code.GoalResponse.ACCEPT,
@@ -429,11 +420,16 @@ def test_a_malformed_goal_is_rejected_before_it_is_accepted(action):
     action.node.active = True
     assert judge()[0] == accept
     bad = (
-        {"names": ("arm_1", "arm_2", "wrist")}, {"names": ("arm_1", "arm_2", "arm_2")},
-        {"names": ("arm_1", "arm_2")}, {"names": ()},
+        {"names": ("arm_1", "arm_2", "wrist")},
+        {"names": ("arm_1", "arm_2", "arm_2")},
+        {"names": ("arm_1", "arm_2")},
+        {"names": ()},
         {"times": []} | dict.fromkeys(("q", "qd", "qdd"), q[:0]),
-        {"q": q[:, :2]}, {"q": q[:, :0]}, {"qd": q[:, :2]}, {"qdd": q[:, :1]},
-    )  # fmt: skip
+        {"q": q[:, :2]},
+        {"q": q[:, :0]},
+        {"qd": q[:, :2]},
+        {"qdd": q[:, :1]},
+    )
     for changes in bad:
         verdict, message = judge(**changes)
         assert verdict == reject, changes

@@ -35,8 +35,7 @@ def imu(base, stamp, frame="imu_link", covariance=(0.0, 0.0)):
     r = np.array(MOUNT.xyz)
     there = change + np.cross(alpha, r) + np.cross(omega, np.cross(omega, r))
     turning, acceleration = (
-        SimpleNamespace(**dict(zip("xyz", (AXES.T @ values).tolist(), strict=True)))
-        for values in (omega, there)
+        SimpleNamespace(**dict(zip("xyz", (AXES.T @ values).tolist(), strict=True))) for values in (omega, there)
     )
     return SimpleNamespace(
         header=Maker(Plain()).header(stamp, frame),
@@ -148,12 +147,21 @@ def test_the_live_node_answers_with_the_tilt_that_the_imu_measures(peer, launch)
 
     tilted = np.concatenate([np.zeros(6), rotations.from_rpy(np.array([0.5, 0.2, 0.0])) @ UP])
     twin = Running(
-        peer, launch, MODULE, "on_ship", "base_imu:=true", "stale_after:=60.0", "imu.max_age:=60.0",
-        f"imu.xyz:={list(MOUNT.xyz)}", f"imu.rpy:={list(MOUNT.rpy)}",
-        "differentiator.window:=4", "recovery_count:=1",
+        peer,
+        launch,
+        MODULE,
+        "on_ship",
+        "base_imu:=true",
+        "stale_after:=60.0",
+        "imu.max_age:=60.0",
+        f"imu.xyz:={list(MOUNT.xyz)}",
+        f"imu.rpy:={list(MOUNT.rpy)}",
+        "differentiator.window:=4",
+        "recovery_count:=1",
         remaps={"joint_states": "states", "base_imu": "imu"},
-        talk={"states": JointState, "imu": Imu}, hear={"joint_torques": HEAR["joint_torques"]},
-    )  # fmt: skip
+        talk={"states": JointState, "imu": Imu},
+        hear={"joint_torques": HEAR["joint_torques"]},
+    )
     received = twin.received("joint_torques")
 
     def send():

@@ -40,9 +40,7 @@ class Gated(Running):
     def __init__(self, peer, launch, name, *parameters):
         remaps = {"joint_states": "states", "delta_dynamics/joint_torques": "torques"}
         hear = {"commands": Float64MultiArray, "commands_stamped": JointState}
-        super().__init__(
-            peer, launch, GATE, name, *SETTINGS, *parameters, remaps=remaps, hear=hear, fresh=True
-        )
+        super().__init__(peer, launch, GATE, name, *SETTINGS, *parameters, remaps=remaps, hear=hear, fresh=True)
         offered = QoSProfile(depth=10)
         offered.deadline = offered.lifespan = Duration(seconds=DEADLINE)
         self._torques = peer.node.create_publisher(JointState, f"/{name}/torques", offered)
@@ -180,8 +178,6 @@ def test_a_publisher_that_promises_no_deadline_is_told_of(heard, launch):
     heard.talk(JointState, "/demanding/torques")
     also = "another node on delta_dynamics/joint_torques has an incompatible QoS: deadline"
     named = "/peer offers torques with deadline none"
-    gated.diagnostics(
-        lambda a: also in values_of(a)["other problems"] and named in a.status[0].message
-    )
+    gated.diagnostics(lambda a: also in values_of(a)["other problems"] and named in a.status[0].message)
     assert all(command == ZEROS for command in gated.commands)
     gated.process.stop()

@@ -27,9 +27,7 @@ def program(*words):
 
 
 @pytest.mark.parametrize("executor", partly_long(["single", "events"], "events"))
-def test_nodes_of_one_process_answer_with_their_own_parameters_and_end_together(
-    domain, peer, executor
-):
+def test_nodes_of_one_process_answer_with_their_own_parameters_and_end_together(domain, peer, executor):
     space = f"of_{executor}"
     words = ["-r", f"__ns:=/{space}", "-p", "mechanism:=delta_cu", "-p", f"executor:={executor}"]
     for word in ("stale_after:=30.0", "acceleration:=differentiate"):
@@ -44,8 +42,7 @@ def test_nodes_of_one_process_answer_with_their_own_parameters_and_end_together(
         def answered():
             assert process.alive(), process.output
             return all(
-                peer.received(f"/{space}/{topic}")
-                for topic in ("delta_dynamics/joint_torques", "machine_state/pose")
+                peer.received(f"/{space}/{topic}") for topic in ("delta_dynamics/joint_torques", "machine_state/pose")
             )
 
         peer.until(answered, repeat=lambda: peer.send(f"/{space}/joint_states", state(peer.now())))
@@ -71,9 +68,7 @@ def test_nodes_of_one_process_answer_with_their_own_parameters_and_end_together(
     ],
 )
 def test_what_does_not_go_together_is_refused_in_one_line(domain, words, said):
-    done = subprocess.run(
-        program(*words), env=domain.environment(), capture_output=True, text=True, check=False
-    )
+    done = subprocess.run(program(*words), env=domain.environment(), capture_output=True, text=True, check=False)
     assert done.returncode == 2
     (line,) = done.stderr.splitlines()
     assert said in line

@@ -92,9 +92,7 @@ class TestTrajectories:
             answers = twin.ask(trajectory(stamp=twin.begin()))
             assert len(answers) == 1, f"{reason}: the bad trajectory was answered"
             expected[reason] = expected.get(reason, 0) + 1
-        array = twin.diagnostics(
-            lambda a: sum(counts_of(a, "trajectories rejected").values()) >= already + len(bad)
-        )
+        array = twin.diagnostics(lambda a: sum(counts_of(a, "trajectories rejected").values()) >= already + len(bad))
         assert counts_of(array, "trajectories rejected") == expected
         assert array.status[0].message.startswith("last reject: the trajectory ended 1")
         assert array.status[0].level == b"\x01"
@@ -128,9 +126,7 @@ class TestStreams:
         last = expected[-1].effort.tobytes()
         twin.peer.until(lambda: received and np.array(received[-1].data).tobytes() == last)
         commands = received[-len(expected) :]
-        for result, torque, residual, command in zip(
-            expected, torques, residuals, commands, strict=True
-        ):
+        for result, torque, residual, command in zip(expected, torques, residuals, commands, strict=True):
             for message in (torque, residual):
                 assert stamp_of(message) == result.stamp
                 assert tuple(message.name) == NAMES

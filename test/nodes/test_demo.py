@@ -54,9 +54,7 @@ def beginning(tmp_path):
 
 # Long: stopped inside the middleware, a process can hold what others of the machine need.
 @pytest.mark.long
-def test_a_node_that_waits_for_its_turn_answers_everything(
-    executor, beginning, tmp_path, monkeypatch
-):
+def test_a_node_that_waits_for_its_turn_answers_everything(executor, beginning, tmp_path, monkeypatch):
     starved = []
     stage = dataclasses.replace(demo.STAGES[0], bag="beginning")
     node, topic = executor.get_nodes()[0], stage.answer

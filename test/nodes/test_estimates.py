@@ -90,9 +90,7 @@ def test_a_load_and_a_push_are_told(peer, launch):
         turns += 1
         swing.send()
 
-    bodies, points = (
-        peer.received(f"/delta_dynamics/contact_{name}") for name in ("body", "point")
-    )
+    bodies, points = (peer.received(f"/delta_dynamics/contact_{name}") for name in ("body", "point"))
 
     def told():
         seen = any(m.wrench.force.x > 50.0 for m in pushed) and any(m.data for m in events)
@@ -142,11 +140,7 @@ def test_a_stream_that_begins_anew_at_earlier_stamps_is_estimated_as_before(back
         for topic in node.published.values():
             topic.clear()
         for tick, (*motion, effort) in enumerate(zip(*moved, efforts, strict=True)):
-            estimates.take(
-                Torques(
-                    begin + 1_000_000 * tick, tuple(motion), effort, effort, effort + rest, False
-                )
-            )
+            estimates.take(Torques(begin + 1_000_000 * tick, tuple(motion), effort, effort, effort + rest, False))
         counts.append({topic: len(told) for topic, told in node.published.items()})
         assert not node.published["~/contact"]
         pushed = [m.wrench.force.x for m in node.published["~/external_wrench"]]
@@ -219,11 +213,19 @@ def test_every_joint_has_its_wrench_and_a_state_without_one_has_its_torque(peer,
     expected = reactions(ROBOT, Q, REST, REST)
     topics = [f"reactions/{name.replace(' ', '_')}" for name in expected.names]
     node = Running(
-        peer, launch, None, "reacting", "publish_reactions:=true", "reactions_rate:=1000.0",
-        "recovery_count:=1", "base_frame:=floor", code=SINGULAR, remaps={"joint_states": "states"},
+        peer,
+        launch,
+        None,
+        "reacting",
+        "publish_reactions:=true",
+        "reactions_rate:=1000.0",
+        "recovery_count:=1",
+        "base_frame:=floor",
+        code=SINGULAR,
+        remaps={"joint_states": "states"},
         talk={"states": JointState},
         hear=dict.fromkeys(topics, WrenchStamped) | {"joint_torques": JointState},
-    )  # fmt: skip
+    )
 
     def send(q):
         for _ in range(30):
@@ -257,13 +259,21 @@ MEASURED = [100.0, 110.0, 120.0]
 def test_torque_residual_and_stop(peer, launch):
     """At rest the wrench is borne exactly; without it the stream stops."""
     node = Running(
-        peer, launch, "delta_dynamics.nodes.twin", "bearing", "mechanism:=prru", "use_wrench:=true",
-        "missing_wrench_policy:=stop", "max_wrench_age:=1.0", "stale_after:=5.0",
-        "differentiator.window:=4", "recovery_count:=1",
+        peer,
+        launch,
+        "delta_dynamics.nodes.twin",
+        "bearing",
+        "mechanism:=prru",
+        "use_wrench:=true",
+        "missing_wrench_policy:=stop",
+        "max_wrench_age:=1.0",
+        "stale_after:=5.0",
+        "differentiator.window:=4",
+        "recovery_count:=1",
         remaps={"joint_states": "states", "wrench": "wrench"},
         talk={"states": JointState, "wrench": WrenchStamped},
         hear=dict.fromkeys(("joint_torques", "torque_residual"), JointState),
-    )  # fmt: skip
+    )
     peer.until(peer.matched)
     torques, residuals = map(node.received, ("joint_torques", "torque_residual"))
 

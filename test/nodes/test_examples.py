@@ -73,17 +73,22 @@ class TestComputedTorque:
         peer.hear(Float64MultiArray, "/machine_sim/commands")
         return peer.received("/machine_sim/commands")
 
-    def test_it_follows_a_machine_that_is_one_percent_another(
-        self, launch_alone, peer, commands, tmp_path
-    ):
+    def test_it_follows_a_machine_that_is_one_percent_another(self, launch_alone, peer, commands, tmp_path):
         """One whose controller has other names and numbers for the joints."""
         robot = sides("delta_cu").write(tmp_path)
         kinds = "spread_kinds:=[masses, inertias, friction]"
         # Silence is of the wall's time, which a loaded machine has little of.
         controller = example(
-            launch_alone, "computed_torque.py", "--deadline", "60", "--seconds", "0.8",
-            "--robot", str(robot), parameters=(SIM_TIME,),
-        )  # fmt: skip
+            launch_alone,
+            "computed_torque.py",
+            "--deadline",
+            "60",
+            "--seconds",
+            "0.8",
+            "--robot",
+            str(robot),
+            parameters=(SIM_TIME,),
+        )
         # Its whole path takes a second or two: who is to hear it has to be there before.
         peer.until(lambda: peer.node.count_publishers("/machine_sim/commands"))
         sim = launch_alone(SIM, f"mechanism:={robot}", "clock:=lockstep", "spread:=0.01", kinds)
@@ -103,9 +108,14 @@ class TestComputedTorque:
             data = read_urdf(EXAMPLES / "humanoid.xml", **part)
         path.write_text(describe_machine_yaml(data))
         controller = example(
-            launch_alone, "ankle.py", "--deadline", "60", "--robot", str(path),
+            launch_alone,
+            "ankle.py",
+            "--deadline",
+            "60",
+            "--robot",
+            str(path),
             parameters=(SIM_TIME,),
-        )  # fmt: skip
+        )
         peer.until(lambda: peer.node.count_publishers("/machine_sim/commands"), PATIENCE)
         sim = launch_alone(SIM, f"mechanism:={path}", "clock:=lockstep")
         peer.until(lambda: not controller.alive(), PATIENCE)
@@ -118,9 +128,14 @@ class TestComputedTorque:
     def test_a_machine_that_falls_silent_stops_it_with_zeros(self, launch_alone, peer, commands):
         sim = launch_alone(SIM, "clock:=lockstep")
         controller = example(
-            launch_alone, "computed_torque.py", "--deadline", "2", "--seconds", "1000",
+            launch_alone,
+            "computed_torque.py",
+            "--deadline",
+            "2",
+            "--seconds",
+            "1000",
             parameters=(SIM_TIME,),
-        )  # fmt: skip
+        )
         peer.until(lambda: len(commands) > 50 and any(any(c.data) for c in commands), PATIENCE)
         assert controller.alive()
         sim.process.kill()

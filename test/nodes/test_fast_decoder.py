@@ -48,9 +48,7 @@ def trajectories(draw):
     joints, points = draw(st.integers(0, 6)), draw(st.integers(0, 9))
     present = [draw(st.booleans()) for _ in range(4)]
     times = draw(st.lists(st.integers(-(2**62), 2**62), min_size=points, max_size=points))
-    message = MAKE.trajectory(
-        draw(NAMES), [t % 10**18 - 10**17 for t in times], [draw(arrays(joints))] * points
-    )
+    message = MAKE.trajectory(draw(NAMES), [t % 10**18 - 10**17 for t in times], [draw(arrays(joints))] * points)
     for point in message.points:
         for what, here in zip(COLUMNS, present, strict=True):
             setattr(point, what, draw(arrays(joints)) if here else [])

@@ -81,9 +81,7 @@ SETTINGS = {
 def started(peer, launch, *names):
     """Nodes by name, started at once, each with settings of its own."""
     codes = dict.fromkeys(("late", "strict"), LATE)
-    return {
-        name: launched(peer, launch, name, *SETTINGS[name], code=codes.get(name)) for name in names
-    }
+    return {name: launched(peer, launch, name, *SETTINGS[name], code=codes.get(name)) for name in names}
 
 
 def at_pace(twin, count, period=1e-3, **fields):
@@ -259,9 +257,7 @@ class TestLoad:
         numbers = [info["publication_sequence_number"] for _, info in arrivals.heard]
         assert (np.diff(numbers) > 0).all()
 
-    @pytest.mark.parametrize(
-        ("name", "sent", "least", "most"), [("late", 100, 0, 0), ("strict", 400, 300, 400)]
-    )
+    @pytest.mark.parametrize(("name", "sent", "least", "most"), [("late", 100, 0, 0), ("strict", 400, 300, 400)])
     def test_a_queue_holds_what_came_while_the_node_stood(self, fleet, name, sent, least, most):
         """By default a tenth of a second at 1 kHz and more; what it does not hold is counted.
 
@@ -320,8 +316,7 @@ class TestLoad:
 
         def told():
             return any(
-                line in text_of(array)
-                and float(values_of(array)["longest callback (ms): joint_states"]) >= 20.0
+                line in text_of(array) and float(values_of(array)["longest callback (ms): joint_states"]) >= 20.0
                 for array in late.peer.received("/diagnostics")
                 if array.status[0].name == "/late"
             )
@@ -372,9 +367,7 @@ class TestClocks:
         clock = Clock(clock=MAKE.header(now).stamp)
         timed.peer.until(
             lambda: any(
-                stamp_of(a) == now
-                for a in timed.peer.received("/diagnostics")
-                if a.status[0].name == "/timed"
+                stamp_of(a) == now for a in timed.peer.received("/diagnostics") if a.status[0].name == "/timed"
             ),
             repeat=lambda: timed.peer.send("/clock", clock),
         )
@@ -462,9 +455,7 @@ class TestNeighbours:
             twin.peer.node.destroy_publisher(twin.peer._publishers[topic])
             twin.peer._publishers[topic] = before
 
-    @pytest.mark.parametrize(
-        "reliability", [ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT]
-    )
+    @pytest.mark.parametrize("reliability", [ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT])
     def test_publishers_of_both_kinds_are_answered(self, fleet, reliability):
         with self.offering(fleet["late"], JointState, "/late/states", reliability):
             running(fleet["late"])
@@ -500,9 +491,7 @@ class TestNeighbours:
         try:
             # One participant has one type a topic.
             stranger.create_publisher(Bool, "/strict/states", QoSProfile(depth=1))
-            line = (
-                "another node on joint_states has an incompatible message type: std_msgs/msg/Bool"
-            )
+            line = "another node on joint_states has an incompatible message type: std_msgs/msg/Bool"
             self.told(strict, lambda text: line in text)
         finally:
             stranger.destroy_node()
@@ -512,9 +501,7 @@ class TestNeighbours:
     def test_a_subscriber_that_does_not_fit_is_told(self, quick):
         node = quick.peer.node
         hasty = QoSProfile(depth=10, deadline=Duration(seconds=QUICK / 2))
-        listener = node.create_subscription(
-            JointState, "/quick/joint_torques", lambda message: None, hasty
-        )
+        listener = node.create_subscription(JointState, "/quick/joint_torques", lambda message: None, hasty)
         line = "another node on ~/joint_torques has an incompatible QoS: deadline"
         self.told(quick, lambda text: line in text)
         node.destroy_subscription(listener)

@@ -164,9 +164,7 @@ class TestRefusedSamples:
         # A jump ends the window, so that nothing is differentiated across it.
         begins = WINDOW - 1 if twin.stream.rejected.keys() & {"jump", "unreachable"} else 0
         results = answers(twin, make, range(10, 10 + WINDOW + 3))
-        assert [result is None for result in results] == [True] * begins + [False] * (
-            len(results) - begins
-        )
+        assert [result is None for result in results] == [True] * begins + [False] * (len(results) - begins)
         exact = inverse_dynamics(robot, *motion((10 + WINDOW + 2) / 1000))
         assert np.abs(results[-1].effort - exact).max() < 1e-9
         assert twin.stream.rejected.total() == 3
@@ -287,9 +285,7 @@ class TestTrajectories:
     )
     def test_differentiated_values_keep_the_bounds_of_given_ones(self, make, gap, reason, what):
         if gap == 10**8:
-            message = make.trajectory(
-                NAMES, [0, 1, 2], [[0.1] * 3] * 3, [[0.0] * 3, [1.0] * 3, [0.0] * 3]
-            )
+            message = make.trajectory(NAMES, [0, 1, 2], [[0.1] * 3] * 3, [[0.0] * 3, [1.0] * 3, [0.0] * 3])
             what = "acceleration"
         else:
             message = make.trajectory(NAMES, [0, gap, 2 * gap], [[0.0] * 3, [1.0] * 3, [0.0] * 3])
@@ -442,9 +438,7 @@ class TestLimits:
 
 
 class TestStopEffort:
-    @pytest.mark.parametrize(
-        ("settings", "sent"), [({}, None), ({"on_stop": "zeros"}, [0.0, 0.0, 0.0])]
-    )
+    @pytest.mark.parametrize(("settings", "sent"), [({}, None), ({"on_stop": "zeros"}, [0.0, 0.0, 0.0])])
     def test_nothing_or_zeros(self, make, settings, sent):
         effort = running(make, **settings).stop_effort(NOW + 10 * STEP)
         assert (effort if effort is None else effort.tolist()) == sent

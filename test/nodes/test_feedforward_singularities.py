@@ -52,9 +52,7 @@ def edge(robot, inside, outside):
 class TestSingularities:
     inside = np.array([0.2, 0.2, 0.2])
 
-    @settings(
-        max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-    )
+    @settings(max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
     @given(index=st.integers(0))
     def test_an_edge_of_reach_is_warned_of_then_stopped_before(self, limitless, unreachable, index):
         outside = unreachable[index % len(unreachable)]
@@ -124,9 +122,7 @@ class TestSingularities:
 class TestJumps:
     @pytest.mark.parametrize("joint", range(3))
     @pytest.mark.parametrize(("factor", "jumps"), [(1.01, True), (0.99, False)])
-    def test_a_joint_that_outruns_its_velocity_limit_stops_the_stream(
-        self, make, joint, factor, jumps
-    ):
+    def test_a_joint_that_outruns_its_velocity_limit_stops_the_stream(self, make, joint, factor, jumps):
         twin = core(trip_count=10**6)
         q = np.zeros(3)
         for i in range(WINDOW + 3):

@@ -232,8 +232,5 @@ def test_a_clock_jump_closes_the_gate_and_begins_anew(make):
     core.reset()
     assert core.stream.stops["clock jump"] == 1
     back = NOW - 100 * SECOND
-    answers = [
-        core.torques(torques(make, back + i * STEP), back + i * STEP, (3 + i) * STEP)
-        for i in (1, 2)
-    ]
+    answers = [core.torques(torques(make, back + i * STEP), back + i * STEP, (3 + i) * STEP) for i in (1, 2)]
     assert [answer is None for answer in answers] == [True, False]

@@ -49,9 +49,7 @@ def stream_until_end(twin, process):
 
 
 def test_a_running_node_is_good(twin, check):
-    process = check(
-        "judged/joint_torques", "--deadline", GENEROUS, "--duration", 1, "--wait", 60, "--json"
-    )
+    process = check("judged/joint_torques", "--deadline", GENEROUS, "--duration", 1, "--wait", 60, "--json")
     code, data, err = stream_until_end(twin, process)
     assert (code, err) == (0, "")
     assert data["good"]

@@ -132,10 +132,7 @@ class TestFeedforward:
             measured = inverse_dynamics(both.plain, q, qd, qdd) + 0.1
             now = NOW + i * STEP
             messages = states(both, q, qd if rates else None, measured, now)
-            plain, mapped = (
-                core.joint_state(message, now)
-                for core, message in zip(cores, messages, strict=True)
-            )
+            plain, mapped = (core.joint_state(message, now) for core, message in zip(cores, messages, strict=True))
         # Differences over a millisecond enlarge what rounding leaves of positions.
         close(mapped.sent, both.efforts(plain.effort), 1e-6)
         missed = np.abs(mapped.residual - plain.residual)
@@ -153,9 +150,12 @@ class TestFeedforward:
         exact = inverse_dynamics(both.plain, q, qd, qdd)
         order = list(range(both.plain.joints_count))[::-1]
         message = MAKE.trajectory(
-            [both.names[k] for k in order], stamps, both.positions(q)[:, order],
-            both.rates(qd)[:, order], both.rates(qdd)[:, order],
-        )  # fmt: skip
+            [both.names[k] for k in order],
+            stamps,
+            both.positions(q)[:, order],
+            both.rates(qd)[:, order],
+            both.rates(qdd)[:, order],
+        )
         close(Feedforward(both.mapped).trajectory(message, NOW), both.efforts(exact)[:, order])
 
     def test_a_stop_that_bears_the_weight(self, both):
@@ -240,9 +240,7 @@ class TestSimulation:
         rng = np.random.default_rng(1)
         for _ in range(20):
             held = inverse_dynamics(both.plain, plain.plant.q, still, still)
-            effort = 6.0 * held + 3.0 * both.plain.friction.coulomb * rng.choice(
-                [-1.0, 1.0], len(held)
-            )
+            effort = 6.0 * held + 3.0 * both.plain.friction.coulomb * rng.choice([-1.0, 1.0], len(held))
             plain.commands(SimpleNamespace(data=effort.tolist()))
             mapped.commands(SimpleNamespace(data=both.efforts(effort).tolist()))
             plain.advance()
@@ -259,9 +257,7 @@ class TestSimulation:
         stamps = [round(t * SECOND) for t in times]
         efforts = inverse_dynamics(both.plain, q, qd, qdd)
         one = MAKE.trajectory(both.plain.joint_names, stamps, q, qd, qdd)
-        other = MAKE.trajectory(
-            both.names, stamps, both.positions(q), both.rates(qd), both.rates(qdd)
-        )
+        other = MAKE.trajectory(both.names, stamps, both.positions(q), both.rates(qd), both.rates(qdd))
         for message, rows in ((one, efforts), (other, both.efforts(efforts))):
             for point, row in zip(message.points, rows.tolist(), strict=True):
                 point.effort = row

@@ -47,20 +47,30 @@ def cell(request, tmp_path_factory, peer, launch):
         peer.received(topic).clear()
     nodes = {
         "sim": launch(
-            "delta_dynamics.nodes.simulation", robot, "period:=0.01",
+            "delta_dynamics.nodes.simulation",
+            robot,
+            "period:=0.01",
             arguments=("-r", "wrench:=/sim/wrench"),
         ),
         "twin": launch(
-            "delta_dynamics.nodes.twin", robot, "differentiator.window:=4",
-            "publish_commands:=true", "on_stop:=gravity", f"stale_after:={LONG}",
+            "delta_dynamics.nodes.twin",
+            robot,
+            "differentiator.window:=4",
+            "publish_commands:=true",
+            "on_stop:=gravity",
+            f"stale_after:={LONG}",
         ),
         "gate": launch("delta_dynamics.nodes.gate", robot, "on_stop:=gravity", "deadline:=600.0"),
         "state": launch("pkm_twin.state.node", robot, "publish_tf:=none"),
         "stiffness": launch(
-            "stiffness_monitor.node", robot, "correct_setpoint:=true", "correction_bound:=1.0",
-            f"max_state_age:={LONG}", f"correction_age:={LONG}",
+            "stiffness_monitor.node",
+            robot,
+            "correct_setpoint:=true",
+            "correction_bound:=1.0",
+            f"max_state_age:={LONG}",
+            f"correction_age:={LONG}",
         ),
-    }  # fmt: skip
+    }
     for kind, topic in (
         (JointTrajectory, "/delta_dynamics/joint_trajectory"),
         (WrenchStamped, "/wrench"),
@@ -85,9 +95,7 @@ def test_every_joint_number_is_the_controllers(cell, peer):
         rows = [both.positions(near)], [both.rates(still)], [both.rates(still)]
         peer.send(
             "/delta_dynamics/joint_trajectory",
-            MAKE.trajectory(
-                both.names, [SECOND], *(np.array(r).tolist() for r in rows), now + 60 * SECOND
-            ),
+            MAKE.trajectory(both.names, [SECOND], *(np.array(r).tolist() for r in rows), now + 60 * SECOND),
         )
         peer.send("/wrench", MAKE.wrench(push, now))
         peer.send("/setpoint", MAKE.joint_state(both.names, both.positions(near), (), (), now))
@@ -112,9 +120,7 @@ def test_every_joint_number_is_the_controllers(cell, peer):
     assert list(state.effort) == [0.0] * n
     close("/delta_dynamics/joint_torques", "effort", both.efforts(held), efforts)
     close("/delta_dynamics/torque_residual", "effort", both.efforts(-held), efforts)
-    np.testing.assert_allclose(
-        last["/delta_dynamics/commands"].data, both.efforts(held), atol=1e-6 * efforts
-    )
+    np.testing.assert_allclose(last["/delta_dynamics/commands"].data, both.efforts(held), atol=1e-6 * efforts)
     filled = last["/delta_dynamics/joint_trajectory_ff"].points[0].effort
     bent = both.efforts(inverse_dynamics(robot, near, still, still))
     np.testing.assert_allclose(filled, bent, atol=1e-9 * efforts)

@@ -38,20 +38,18 @@ NODES = {
     "machine_state": "pkm_twin/state/node.py",
 }
 SHARED = (
-    "pkm_twin/ros/wrench.py", "pkm_twin/streams/wrench.py", "delta_dynamics/nodes/parameters.py",
+    "pkm_twin/ros/wrench.py",
+    "pkm_twin/streams/wrench.py",
+    "delta_dynamics/nodes/parameters.py",
     "delta_dynamics/feedforward.py",
-)  # fmt: skip
+)
 """Where nodes declare what they share, and what their settings are."""
 
 
 def literal(name, variable):
     """A top-level variable of a launch file, f-strings in it as <>."""
     tree = ast.parse((LAUNCH / f"{name}.launch.py").read_text(encoding="utf-8"))
-    (value,) = (
-        node.value
-        for node in tree.body
-        if isinstance(node, ast.Assign) and node.targets[0].id == variable
-    )
+    (value,) = (node.value for node in tree.body if isinstance(node, ast.Assign) and node.targets[0].id == variable)
 
     class Plain(ast.NodeTransformer):
         def visit_JoinedStr(self, node):
@@ -84,9 +82,7 @@ class TestText:
             assert set(names) <= set(arguments)
 
     @pytest.mark.parametrize("name", FILES)
-    def test_an_argument_that_a_file_lacks_is_rejected_where_the_command_line_names_it(
-        self, monkeypatch, name
-    ):
+    def test_an_argument_that_a_file_lacks_is_rejected_where_the_command_line_names_it(self, monkeypatch, name):
         """A user's own file, which includes it, has arguments of its own."""
         file, declared = str(LAUNCH / f"{name}.launch.py"), literal(name, "ARGUMENTS")
         for words in (["pkm_twin", f"{name}.launch.py"], [file]):
@@ -166,11 +162,10 @@ class TestRunning:
 
     def subscribed(self, peer):
         """Topics that a node of the launch subscribes to."""
-        return {
-            topic
-            for topic, _ in peer.node.get_topic_names_and_types()
-            if peer.node.count_subscribers(topic)
-        } - {"/parameter_events", "/rosout"}
+        return {topic for topic, _ in peer.node.get_topic_names_and_types() if peer.node.count_subscribers(topic)} - {
+            "/parameter_events",
+            "/rosout",
+        }
 
     def until_nodes(self, peer, process, *names):
         """Wait until exactly these nodes are there."""
@@ -201,9 +196,7 @@ class TestRunning:
             assert self.parameter(peer, node, "use_sim_time") is False
 
     def test_a_namespace_takes_every_topic_along(self, launched, peer):
-        process = launched(
-            "twin", "namespace:=left", "command_gate:=true", "machine_state:=true", "robot:=prru"
-        )
+        process = launched("twin", "namespace:=left", "command_gate:=true", "machine_state:=true", "robot:=prru")
         names = [f"/left/{node}" for node in NODES]
         self.until_nodes(peer, process, *names)
         peer.until(lambda: "/left/wrench" in self.subscribed(peer))
@@ -238,9 +231,7 @@ class TestRunning:
         assert self.parameter(peer, node, "deadline") == 0.25
 
     def test_a_killed_node_comes_again_and_so_does_the_gate_in_any_case(self, launched, peer):
-        process = launched(
-            "twin", "respawn:=false", "stiffness_monitor:=false", "command_gate:=true"
-        )
+        process = launched("twin", "respawn:=false", "stiffness_monitor:=false", "command_gate:=true")
         self.until_nodes(peer, process, "/delta_dynamics", "/command_gate")
         (gate,) = process.started("command_gate")
         os.kill(gate, signal.SIGKILL)
@@ -274,9 +265,7 @@ class TestRunning:
         assert self.parameter(peer, "/b/delta_dynamics", "mechanism") == "prru"
         assert self.parameter(peer, "/b/stiffness_monitor", "mechanism") == "prru"
 
-    @pytest.mark.skipif(
-        why_not("robot_state_publisher") is not None, reason="robot_state_publisher is missing"
-    )
+    @pytest.mark.skipif(why_not("robot_state_publisher") is not None, reason="robot_state_publisher is missing")
     @pytest.mark.parametrize("space", ["", "left"])
     @pytest.mark.parametrize("robot", robot_names())
     def test_every_link_stands_in_one_tree(self, launched, peer, robot, space):
@@ -288,11 +277,7 @@ class TestRunning:
         model = load(robot)
         q = model.inverse(model.home())
         position, rotation = model.platform(q)
-        links = {
-            element.get("name")
-            for element in ElementTree.fromstring(robot_urdf(model))
-            if element.tag == "link"
-        }
+        links = {element.get("name") for element in ElementTree.fromstring(robot_urdf(model)) if element.tag == "link"}
         prefix = f"{space}/" if space else ""
         chosen = [f"namespace:={space}"] if space else []
         process = launched("view", f"robot:={robot}", "rviz:=false", *chosen)
@@ -437,18 +422,14 @@ class TestRunning:
         assert process.wait() == 1
         assert "stale_after 0.2 s" in process.output and "deadline 0.1 s" in process.output
 
-    def test_a_node_that_refuses_its_configuration_is_not_started_for_ever(
-        self, launched, peer, tmp_path
-    ):
+    def test_a_node_that_refuses_its_configuration_is_not_started_for_ever(self, launched, peer, tmp_path):
         file = tmp_path / "parameters.yaml"
         file.write_text(yaml.safe_dump({"/**": {"ros__parameters": {"stale_aftr": 0.2}}}))
         process = launched("twin", f"params_file:={file}", "stiffness_monitor:=false")
         peer.until(lambda: "not started again" in process.output)
         assert len(process.started("delta_dynamics")) == 4
 
-    def test_composed_nodes_share_a_process_and_have_their_own_parameters(
-        self, launched, peer, tmp_path
-    ):
+    def test_composed_nodes_share_a_process_and_have_their_own_parameters(self, launched, peer, tmp_path):
         file = tmp_path / "parameters.yaml"
         sections = {
             "/left/delta_dynamics": {"ros__parameters": {"stale_after": 0.05}},
@@ -456,9 +437,14 @@ class TestRunning:
         }
         file.write_text(yaml.safe_dump(sections))
         process = launched(
-            "twin", "namespace:=left", "composed:=true", "command_gate:=true",
-            "machine_state:=true", "joint_states:=measured", f"params_file:={file}",
-        )  # fmt: skip
+            "twin",
+            "namespace:=left",
+            "composed:=true",
+            "command_gate:=true",
+            "machine_state:=true",
+            "joint_states:=measured",
+            f"params_file:={file}",
+        )
         self.until_nodes(peer, process, *(f"/left/{node}" for node in NODES))
         assert len(process.started("composed")) == len(process.started("command_gate")) == 1
         assert self.parameter(peer, "/left/delta_dynamics", "stale_after") == 0.05

@@ -56,10 +56,16 @@ class TestBeforeTheFirstAction:
     def call(self, monkeypatch, tmp_path):
         """Call a file's function with arguments: ``call(name, missing, **arguments)``."""
         for name in (
-            "launch", "launch.actions", "launch.event_handlers", "launch.events",
-            "launch.events.process", "launch.launch_context", "launch.launch_description_entity",
-            "launch_ros", "launch_ros.actions",
-        ):  # fmt: skip
+            "launch",
+            "launch.actions",
+            "launch.event_handlers",
+            "launch.events",
+            "launch.events.process",
+            "launch.launch_context",
+            "launch.launch_description_entity",
+            "launch_ros",
+            "launch_ros.actions",
+        ):
             monkeypatch.setitem(sys.modules, name, Stub(name))
         monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
 
@@ -100,13 +106,8 @@ class TestBeforeTheFirstAction:
         for value in (True, False):
             made = call(name, use_sim_time=str(value).lower(), **arguments)
             for node in (one.options for one in made if one.options.get("parameters")):
-                files = [yaml.safe_load(Path(f).read_text()) for f in node["parameters"]
-                         if isinstance(f, str)]  # fmt: skip
-                sections = [
-                    section.get("ros__parameters", {})
-                    for file in files
-                    for section in file.values()
-                ]
+                files = [yaml.safe_load(Path(f).read_text()) for f in node["parameters"] if isinstance(f, str)]
+                sections = [section.get("ros__parameters", {}) for file in files for section in file.values()]
                 given = [p for p in node["parameters"] if isinstance(p, dict)] + sections
                 assert [p["use_sim_time"] for p in given if "use_sim_time" in p] == [value]
 

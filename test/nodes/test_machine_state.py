@@ -166,9 +166,7 @@ class TestScene:
         load = loaded(robot, state.q)
         groups = by_group(scene.shapes(state, load))
         # Colours: the hottest is the dominant element, wherever it is.
-        shown = {
-            bar.element: shape.colour for bar, shape in zip(scene.bars, groups["bars"], strict=True)
-        }
+        shown = {bar.element: shape.colour for bar, shape in zip(scene.bars, groups["bars"], strict=True)}
         shown |= {shape.text: shape.colour for shape in groups.get("joints", [])}
         greatest = max(load.factors.values())
         assert set(load.factors) <= set(shown)

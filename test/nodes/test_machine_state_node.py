@@ -54,9 +54,13 @@ def node(peer, launch):
 
         peer.hear(TFMessage, "/tf")
     return launch(
-        MODULE, "mechanism:=upr_rpu", "max_state_age:=1.0", f"sensor.xyz:={list(XYZ)}",
-        "deflection_scale:=500.0", "tool.xyz:=[0.0, 0.0, 0.12]",
-    )  # fmt: skip
+        MODULE,
+        "mechanism:=upr_rpu",
+        "max_state_age:=1.0",
+        f"sensor.xyz:={list(XYZ)}",
+        "deflection_scale:=500.0",
+        "tool.xyz:=[0.0, 0.0, 0.12]",
+    )
 
 
 @pytest.fixture(scope="module")
@@ -83,9 +87,7 @@ def answers(node, peer):
 
     peer.until(drawn, repeat=ask)
     return {topic: received(topic)[-1] for topic in OUTPUTS} | {
-        "markers": next(
-            m for m in reversed(received("markers")) if any(x.ns == "wrench" for x in m.markers)
-        ),
+        "markers": next(m for m in reversed(received("markers")) if any(x.ns == "wrench" for x in m.markers)),
         "stamps": sent,
     }
 
@@ -184,9 +186,7 @@ def test_bad_messages_are_counted_and_publish_nothing(answers, node, peer):
     def send():
         stamp = peer.now()
         bad.add(stamp)
-        peer.send(
-            "/joint_states", MAKE.joint_state(ROBOT.joint_names, [np.nan, 0.5, 0.5], stamp=stamp)
-        )
+        peer.send("/joint_states", MAKE.joint_state(ROBOT.joint_names, [np.nan, 0.5, 0.5], stamp=stamp))
 
     def counted():
         array = peer.diagnostics("/machine_state")
@@ -203,10 +203,15 @@ def test_a_rigid_robot(launch, peer):
     robot = load("five_bar")
     q = robot.inverse(robot.home())
     node = Running(
-        peer, launch, MODULE, "rigid", "mechanism:=five_bar", talk={"states": JointState},
+        peer,
+        launch,
+        MODULE,
+        "rigid",
+        "mechanism:=five_bar",
+        talk={"states": JointState},
         remaps={"joint_states": "states", "wrench": "w"},
         hear={"markers": MarkerArray, "twist": TwistStamped, "joint_states": JointState},
-    )  # fmt: skip
+    )
 
     def ask():
         node.send("states", MAKE.joint_state(robot.joint_names, q, stamp=peer.now()))

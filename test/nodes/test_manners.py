@@ -157,16 +157,16 @@ def test_a_node_compiles_nothing_once_it_is_active(peer, launch):
 def test_the_graph_is_asked_once_however_many_are_there():
     """And of the others' only what concerns this node is compared."""
     asked, told = [], []
-    fits, unfit = (
-        QoSProfile(depth=1, reliability=ReliabilityPolicy[kind])
-        for kind in ("RELIABLE", "BEST_EFFORT")
-    )
+    fits, unfit = (QoSProfile(depth=1, reliability=ReliabilityPolicy[kind]) for kind in ("RELIABLE", "BEST_EFFORT"))
 
     def end(number, name, qos, kind="a/msg/A"):
         return TopicEndpointInfo(
-            node_name=name, node_namespace="/", topic_type=kind, qos_profile=qos,
+            node_name=name,
+            node_namespace="/",
+            topic_type=kind,
+            qos_profile=qos,
             endpoint_gid=[number],
-        )  # fmt: skip
+        )
 
     speakers = [end(k, "other", fits) for k in range(200)]
     speakers += [end(200, "other", unfit), end(201, "other", unfit, "a/msg/B")]
@@ -263,9 +263,7 @@ class TestRequests:
         before = counts_of(twin.diagnostics(), "trajectories rejected").get("unknown joint", 0)
         message = MAKE.trajectory(names, [SECOND], rows, zero, zero, twin.begin())
         twin.peer.send(f"/{twin.name}/joint_trajectory", message)
-        twin.diagnostics(
-            lambda a: counts_of(a, "trajectories rejected").get("unknown joint", 0) > before
-        )
+        twin.diagnostics(lambda a: counts_of(a, "trajectories rejected").get("unknown joint", 0) > before)
 
     def test_a_transition_that_does_not_exist_is_refused(self, twin):
         for transition in (Transition(id=77), Transition(label="fly"), Transition(id=3)):

@@ -124,10 +124,7 @@ def test_a_wrong_length_names_both_lengths(make):
 @pytest.mark.parametrize(
     ("kind", "changes", "reason", "words"),
     [
-        *(
-            ("state", {"names": at(NAMES, k, "elbow")}, "missing joint", [repr(NAMES[k])])
-            for k in range(3)
-        ),
+        *(("state", {"names": at(NAMES, k, "elbow")}, "missing joint", [repr(NAMES[k])]) for k in range(3)),
         (
             "state",
             {"names": (*NAMES, "arm_2"), "position": (*Q, 0.2), "velocity": (), "effort": ()},
@@ -207,9 +204,7 @@ def edges(limitless):
         return lambda v: reader.joint_state(state(make, **{what: at(Q, 1, v)}), NOW, RULES)
 
     def of_trajectory(reader, what):
-        return lambda v: reader.trajectory(
-            trajectory(make, **{what: at([Q] * 3, 1, at(Q, 2, v))}), NOW
-        )
+        return lambda v: reader.trajectory(trajectory(make, **{what: at([Q] * 3, 1, at(Q, 2, v))}), NOW)
 
     for reader, low, high, fast in ((own, -0.9, 1.3, 15.0), (free, -reach, reach, 1e4)):
         for of, end in ((of_state, ""), (of_trajectory, "s")):
@@ -220,9 +215,7 @@ def edges(limitless):
         yield lambda v, reader=reader: reader.commands(at(Q, 0, v)), -1e7, 1e7
     for k in range(6):
         yield (
-            lambda v, k=k: read_wrench(
-                make.wrench(at(WRENCH, k, v), NOW), NOW, RULES, "platform", False
-            ),
+            lambda v, k=k: read_wrench(make.wrench(at(WRENCH, k, v), NOW), NOW, RULES, "platform", False),
             -1e7,
             1e7,
         )

@@ -35,9 +35,7 @@ def watching(make, **changes):
 
 class TestAnswers:
     def test_compliance_and_energy_are_those_of_the_pose(self, make):
-        answer = watching(make, wrench_frame="base_link").wrench(
-            make.wrench(WRENCH, NOW, "base_link"), NOW
-        )
+        answer = watching(make, wrench_frame="base_link").wrench(make.wrench(WRENCH, NOW, "base_link"), NOW)
         assert answer.stamp == NOW
         assert np.allclose(answer.pose, POSE, atol=1e-12)
         assert (answer.wrench == WRENCH).all()

@@ -31,12 +31,12 @@ def work_through(backlog, arrivals, service, drop_cost=2e-5):
 
 @settings(max_examples=50)
 @given(
-    period=st.floats(5e-4, 5e-3), load=st.floats(0.1, 4.0), every=st.booleans(),
+    period=st.floats(5e-4, 5e-3),
+    load=st.floats(0.1, 4.0),
+    every=st.booleans(),
     seed=st.integers(0, 2**16),
-)  # fmt: skip
-def test_no_answer_is_of_a_message_that_waited_too_long_and_all_are_counted(
-    period, load, every, seed
-):
+)
+def test_no_answer_is_of_a_message_that_waited_too_long_and_all_are_counted(period, load, every, seed):
     backlog, count = Backlog(every), 3000
     arrivals = [(k + (seed * k % 7) / 7.0) * period for k in range(count)]
     answered, before = work_through(backlog, sorted(arrivals), load * period)

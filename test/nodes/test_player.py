@@ -29,10 +29,7 @@ from test.nodes.harness import DEADLINE, Command, Domain, Forked, Peer, Process
 COUNT = 100
 PERIOD = 0.005
 FIRST = 1_700_000_000 * 10**9
-PROGRAM = (
-    "import sys; from pkm_twin.ros.player import play; "
-    "print(play(sys.argv[1], **eval(sys.argv[2])))"
-)
+PROGRAM = "import sys; from pkm_twin.ros.player import play; print(play(sys.argv[1], **eval(sys.argv[2])))"
 MANY = QoSProfile(depth=1000)
 
 
@@ -61,9 +58,7 @@ def player(domain: Domain) -> Iterator[Callable[..., Process]]:
     def start(path: Path, fresh: bool = False, **options: object) -> Process:
         options = {"wait_for_subscribers": DEADLINE, **options}
         words = ["-c", PROGRAM, str(path), repr(options)]
-        started.append(
-            Command(domain, [sys.executable, *words]) if fresh else Forked(domain, words)
-        )
+        started.append(Command(domain, [sys.executable, *words]) if fresh else Forked(domain, words))
         return started[-1]
 
     yield start
@@ -98,9 +93,7 @@ def test_order_count_and_timing(bag: Path, peer: Peer, player: Callable[..., Pro
     assert f"PlayResult(messages={COUNT + COUNT // 10}, loops=1" in process.output
 
 
-def test_recorded_durability_is_offered(
-    bag: Path, peer: Peer, player: Callable[..., Process]
-) -> None:
+def test_recorded_durability_is_offered(bag: Path, peer: Peer, player: Callable[..., Process]) -> None:
     """A subscriber that asks for latched messages matches, which a volatile offer would not."""
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     peer.hear(String, "/elsewhere", latched)
@@ -158,8 +151,9 @@ def test_signal_during_a_long_pause(
 
 
 def test_missing_subscribers_are_named(bag: Path, player: Callable[..., Process]) -> None:
-    process = player(bag, rate=100.0, wait_for_subscribers=0.2, topics=["/note"], progress=False,
-                     remap={"/note": "/nobody"})  # fmt: skip
+    process = player(
+        bag, rate=100.0, wait_for_subscribers=0.2, topics=["/note"], progress=False, remap={"/note": "/nobody"}
+    )
     assert process.wait() == 0, process.output
     assert "no subscriber after 0.2 s: /nobody\n" in process.output
     assert f"messages={COUNT // 10}" in process.output

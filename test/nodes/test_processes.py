@@ -56,9 +56,7 @@ raise SystemExit(node.run(node.NODE))
         name = f"interrupted_{number}{callback}"
         twin = launched(peer, launch, name, code=code, fresh=True)
         process = twin.process
-        twin.peer.until(
-            lambda: not process.alive(), repeat=lambda: twin.send_state(state(twin.stamp()))
-        )
+        twin.peer.until(lambda: not process.alive(), repeat=lambda: twin.send_state(state(twin.stamp())))
         assert process.wait() == 0, process.output
         assert "Traceback" not in process.output
 
@@ -130,10 +128,8 @@ def test_a_home_that_cannot_be_written_costs_log_files_alone(domain, monkeypatch
     monkeypatch.setenv("ROS_LOG_DIR", "/proc/none/log")
     words = {
         "node": ["-m", MODULE],
-        "monitor-torques": [
-            "-m", "pkm_twin.apps.cli", "monitor-torques", "--wait", "0.1", "/none"
-        ],
-    }[command]  # fmt: skip
+        "monitor-torques": ["-m", "pkm_twin.apps.cli", "monitor-torques", "--wait", "0.1", "/none"],
+    }[command]
     process = Command(domain, [sys.executable, *words])
     try:
         wait_until(
@@ -235,9 +231,7 @@ def policies(pid):
 
 def locked(pid):
     """Kilobytes of memory that stay."""
-    (line,) = (
-        line for line in Path(f"/proc/{pid}/status").read_text().splitlines() if "VmLck" in line
-    )
+    (line,) = (line for line in Path(f"/proc/{pid}/status").read_text().splitlines() if "VmLck" in line)
     return int(line.split()[1])
 
 

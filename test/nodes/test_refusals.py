@@ -110,9 +110,7 @@ def told(domain, tmp_path_factory):
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    return dict(
-        zip(((node, given) for node, given, *_ in ALL), json.loads(done.stdout), strict=True)
-    )
+    return dict(zip(((node, given) for node, given, *_ in ALL), json.loads(done.stdout), strict=True))
 
 
 @pytest.mark.parametrize("case", ALL, ids=lambda case: f"{case[0]}-{case[1]}")

@@ -39,11 +39,18 @@ def answer(message):
 
 def test_the_transform_is_the_fixed_mount(peer, launch):
     node = Running(
-        peer, launch, "stiffness_monitor.node", "found", "mechanism:=upr_rpu",
-        "wrench_frame:=ft_sensor", "use_tf:=true", "max_state_age:=1.0",
+        peer,
+        launch,
+        "stiffness_monitor.node",
+        "found",
+        "mechanism:=upr_rpu",
+        "wrench_frame:=ft_sensor",
+        "use_tf:=true",
+        "max_state_age:=1.0",
         remaps={"joint_states": "states", "wrench": "wrench"},
-        talk={"states": JointState, "wrench": WrenchStamped}, hear={"deflection": TransformStamped},
-    )  # fmt: skip
+        talk={"states": JointState, "wrench": WrenchStamped},
+        hear={"deflection": TransformStamped},
+    )
     make, received = Maker(Ros()), node.received("deflection")
 
     def send():
@@ -52,9 +59,7 @@ def test_the_transform_is_the_fixed_mount(peer, launch):
         node.send("wrench", make.wrench(WRENCH, stamp, "ft_sensor"))
 
     # Without a transform every wrench is refused, and counted.
-    node.until(
-        lambda: counts_of(node.diagnostics(), "wrenches rejected").get("transform"), repeat=send
-    )
+    node.until(lambda: counts_of(node.diagnostics(), "wrenches rejected").get("transform"), repeat=send)
     assert not received
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     static = peer.node.create_publisher(TFMessage, "/tf_static", latched)
@@ -67,6 +72,4 @@ def test_the_transform_is_the_fixed_mount(peer, launch):
     assert (message.header.frame_id, message.child_frame_id) == ("platform", "platform_deflected")
     exact = answer(WRENCH)
     moved = message.transform.translation
-    assert np.allclose(
-        exact.rotation @ [moved.x, moved.y, moved.z], exact.energy.deflection[:3], rtol=1e-8
-    )
+    assert np.allclose(exact.rotation @ [moved.x, moved.y, moved.z], exact.energy.deflection[:3], rtol=1e-8)

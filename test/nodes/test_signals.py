@@ -124,9 +124,10 @@ def hearing():
     "case",
     partly_long(
         product(("_multiarray_umath", "_rclpy_pybind11"), SIGNALS),
-        ("_multiarray_umath", SIGNALS[0]), *(("_rclpy_pybind11", each) for each in SIGNALS[1:]),
+        ("_multiarray_umath", SIGNALS[0]),
+        *(("_rclpy_pybind11", each) for each in SIGNALS[1:]),
     ),
-)  # fmt: skip
+)
 def test_a_signal_in_an_import_ends_a_node_quietly(domain, case):
     loaded, number = case
     code = "from pkm_twin.apps.nodes import command_gate; command_gate()"
@@ -167,9 +168,7 @@ command_gate()
 
 def test_a_signal_that_comes_out_as_another_error_ends_a_node_quietly(domain):
     """All nodes are made by then, and end as they do after a signal."""
-    done = subprocess.run(
-        [sys.executable, "-c", WRAPPED], capture_output=True, text=True, env=domain.environment()
-    )
+    done = subprocess.run([sys.executable, "-c", WRAPPED], capture_output=True, text=True, env=domain.environment())
     assert done.returncode == 0 and "Traceback" not in done.stdout + done.stderr
 
 

@@ -140,9 +140,7 @@ def test_a_wrench_pushes_and_the_sensor_shows_it_in_the_platform_s_axes(make):
     q = head.inverse(head.home() + np.array([0.0, 0.1, -0.05]))
     rest = np.zeros(3)
     wrench = np.array([30.0, -20.0, -50.0, 1.0, 2.0, 0.5])
-    settings = MachineSettings(
-        q, np.full(3, np.inf), *tuned(head, 10.0), wrench=WrenchSignal(0.5 * wrench)
-    )
+    settings = MachineSettings(q, np.full(3, np.inf), *tuned(head, 10.0), wrench=WrenchSignal(0.5 * wrench))
     machine = Simulation(head, settings, BEGIN)
     machine.push(make.wrench(0.5 * wrench, frame="base_link"), "base_link")
     balance = inverse_dynamics(head, q, rest, rest, wrench)
@@ -247,16 +245,20 @@ def growth_in_time(robot, machine):
     rng = np.random.default_rng(2)
     q, n = machine.settings.start, robot.joints_count
     point = SimpleNamespace(
-        positions=q, velocities=0 * q, accelerations=0 * q, effort=0 * q,
+        positions=q,
+        velocities=0 * q,
+        accelerations=0 * q,
+        effort=0 * q,
         time_from_start=SimpleNamespace(sec=0, nanosec=0),
-    )  # fmt: skip
+    )
     machine.__dict__["stable_share"] = 1.0
     machine.trajectory(
         SimpleNamespace(
             header=SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=0)),
-            joint_names=robot.joint_names, points=[point],
+            joint_names=robot.joint_names,
+            points=[point],
         )
-    )  # fmt: skip
+    )
     machine.plant.qd = 1e-9 * rng.normal(size=n)
     sizes = [0.0]
     while len(sizes) < 60 and sizes[-1] < 1e-4:

@@ -50,9 +50,7 @@ def greet(peer):
         for topic, message in first.items():
             stamp = message.header.stamp
             stamp.nanosec += 1_000_000
-            stamp.sec, stamp.nanosec = (
-                stamp.sec + stamp.nanosec // SECOND, stamp.nanosec % SECOND
-            )  # fmt: skip
+            stamp.sec, stamp.nanosec = (stamp.sec + stamp.nanosec // SECOND, stamp.nanosec % SECOND)
             peer.send(topic, message)
 
     told = peer.received("/diagnostics")
@@ -102,9 +100,7 @@ def test_a_joint_three_times_softer_is_found_by_name_live(peer, launch):
     bad.header.frame_id = "tool"
     bad.header.stamp.sec = 1_700_000_021
     peer.send("/measured_deflection", bad)
-    peer.diagnostics(
-        "/stiffness_monitor", lambda a: counts_of(a, "deflections rejected").get("frame") == 1
-    )
+    peer.diagnostics("/stiffness_monitor", lambda a: counts_of(a, "deflections rejected").get("frame") == 1)
     answer = peer.call(Trigger, "/stiffness_monitor/reset_stiffness", Trigger.Request())
     assert answer.success
     peer.diagnostics("/stiffness_monitor", lambda a: "times the" not in a.status[0].message)

@@ -56,9 +56,7 @@ class Monitor(Running):
         own = {"joint_states": "states", "wrench": "wrench"}
         own |= {topic: topic for topic in ("setpoint", "torques")}
         talk = {"states": JointState, "wrench": WrenchStamped}
-        super().__init__(
-            peer, launch, MODULE, name, *parameters, remaps=own, talk=talk, hear=heard, **options
-        )
+        super().__init__(peer, launch, MODULE, name, *parameters, remaps=own, talk=talk, hear=heard, **options)
         self.robot, self.q, self._heard = robot, q, heard
 
     def joints(self, q, stamp=None, **fields):
@@ -243,9 +241,7 @@ class TestRejects:
             assert refused not in stamps, reason
             expected[reason] = expected.get(reason, 0) + 1
         array = platform.diagnostics(
-            lambda a: (
-                sum(counts_of(a, "wrenches rejected").values()) >= sum(before.values()) + len(bad)
-            )
+            lambda a: sum(counts_of(a, "wrenches rejected").values()) >= sum(before.values()) + len(bad)
         )
         assert counts_of(array, "wrenches rejected") == expected
         assert array.status[0].level == b"\x01"
@@ -306,9 +302,7 @@ class TestFrequencies:
 
 FORCE = (160.0, 90.0, 120.0)
 TOOL = [0.0, 0.0, -0.15]
-OFFSETS = dict.fromkeys(
-    ("setpoint_offset", "corrected_setpoint", "setpoint_with_torques"), JointState
-)
+OFFSETS = dict.fromkeys(("setpoint_offset", "corrected_setpoint", "setpoint_with_torques"), JointState)
 SINGULAR = """
 import stiffness_monitor.node as node
 from pkm_twin.errors import SingularityError
@@ -325,9 +319,17 @@ class TestCorrection:
     def test_set_points_are_corrected_by_the_measured_wrench(self, peer, launch):
         ages = [f"{name}:=600.0" for name in ("max_state_age", "correction_age")]
         node = Monitor(
-            peer, launch, "correcting", "correct_setpoint:=true", f"tool.xyz:={TOOL}", *ages,
-            "future_tolerance:=600.0", "pair_torques:=true", q=self.q, heard=OFFSETS,
-        )  # fmt: skip
+            peer,
+            launch,
+            "correcting",
+            "correct_setpoint:=true",
+            f"tool.xyz:={TOOL}",
+            *ages,
+            "future_tolerance:=600.0",
+            "pair_torques:=true",
+            q=self.q,
+            heard=OFFSETS,
+        )
         for topic in ("setpoint", "torques"):
             peer.talk(JointState, f"/correcting/{topic}")
         peer.until(peer.matched)
@@ -359,9 +361,7 @@ class TestCorrection:
             assert stamp_of(both[-1]) == stamp and list(both[-1].name) == list(NAMES)
             np.testing.assert_allclose(both[-1].position, self.q + 2e-3 + expected, atol=1e-12)
             assert list(both[-1].effort) == [1.0, -2.0, 3.0]
-        peer.send(
-            "/correcting/torques", MAKE.joint_state(NAMES, (), effort=[1.0] * 3, stamp=stamp + 1)
-        )
+        peer.send("/correcting/torques", MAKE.joint_state(NAMES, (), effort=[1.0] * 3, stamp=stamp + 1))
         # What the stamps of wrenches have to keep to holds for set points, as soon as it is set.
         request = SetParameters.Request()
         request.parameters = [Parameter("future_tolerance", value=0.1).to_parameter_msg()]
@@ -379,9 +379,15 @@ class TestCorrection:
     def test_a_wrench_without_a_correction_has_its_compliance(self, peer, launch):
         peer.hear(Float64MultiArray, "/loose/natural_frequencies")
         node = Monitor(
-            peer, launch, "loose", "correct_setpoint:=true", "frequencies_rate:=0.0", q=self.q,
-            heard={"compliance_stamped": JointState}, code=SINGULAR,
-        ).ready()  # fmt: skip
+            peer,
+            launch,
+            "loose",
+            "correct_setpoint:=true",
+            "frequencies_rate:=0.0",
+            q=self.q,
+            heard={"compliance_stamped": JointState},
+            code=SINGULAR,
+        ).ready()
         peer.until(lambda: "no correction or alarm: " in node.process.output)
         assert values_of(node.diagnostics())["exceptions"] == "0"
         # Off by the parameter.

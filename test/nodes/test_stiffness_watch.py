@@ -76,9 +76,12 @@ def departures_of(factors, rng=None, robot=ROBOT, **settings):
     recording = clean if rng is None else noisy(clean, rng, SENSORS)
     alarm = StiffnessAlarm(robot, AlarmSettings(**settings))
     rows = zip(
-        recording.time, robot.forward(recording.q), recording.wrench, recording.deflection,
+        recording.time,
+        robot.forward(recording.q),
+        recording.wrench,
+        recording.deflection,
         strict=True,
-    )  # fmt: skip
+    )
     for row in rows:
         alarm.push(*row)
     return alarm.judge()
@@ -99,9 +102,7 @@ def test_what_the_files_uncertainty_allows_is_no_alarm():
     """All joints by a fifth: four deviations of one cause, and below every element's bound."""
     factors = {f"{limb}{kind}": 1.2 for limb in (1, 2, 3) for kind in "RU"}
     assert departures_of(factors) == ()
-    (found,) = departures_of(
-        {"1B": 1.5}, np.random.default_rng(1), directions=(True,) * 3 + (False,) * 3
-    )
+    (found,) = departures_of({"1B": 1.5}, np.random.default_rng(1), directions=(True,) * 3 + (False,) * 3)
     assert found.element == "1B"
 
 
@@ -192,9 +193,7 @@ def test_the_wrench_of_a_deflection_is_that_between_its_neighbours(monkeypatch):
 
 def answers(watch, monitor, stamps):
     for stamp in stamps:
-        monitor.joint_state(
-            MAKE.joint_state(ROBOT.joint_names, [0.62, 0.6, 0.65], stamp=stamp), stamp
-        )
+        monitor.joint_state(MAKE.joint_state(ROBOT.joint_names, [0.62, 0.6, 0.65], stamp=stamp), stamp)
         watch.answer(monitor.wrench(MAKE.wrench([9, 8, 7, 1, 2, 3], stamp), stamp))
 
 

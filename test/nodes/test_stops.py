@@ -99,13 +99,9 @@ REASONS = {
 
 @pytest.mark.parametrize("reason", REASONS)
 def test_no_effort_of_a_stream_or_of_its_stop_passes_the_limits_or_is_of_an_old_pose(reason):
-    for robot, policy, on_stop in product(
-        (ROBOT, HEAVY), POLICIES, ("nothing", "zeros", "gravity")
-    ):
+    for robot, policy, on_stop in product((ROBOT, HEAVY), POLICIES, ("nothing", "zeros", "gravity")):
         window = WrenchWindow(WrenchReader(WrenchSettings()), SECOND, "ignore", 2, WINDOW)
-        own = Settings(
-            window=WINDOW, recovery_count=1, trip_count=4, limit_policy=policy, on_stop=on_stop
-        )
+        own = Settings(window=WINDOW, recovery_count=1, trip_count=4, limit_policy=policy, on_stop=on_stop)
         twin = Feedforward(robot, own, window)
         for k in range(10):
             try:
@@ -166,8 +162,7 @@ numbers = st.floats(-1e9, 1e9)
 
 @settings(max_examples=200)
 @example(rows=[[20.0, -20.0, 20.0]], mapped=True)
-@given(rows=st.lists(st.lists(numbers, min_size=3, max_size=3), min_size=1, max_size=4),
-       mapped=st.booleans())  # fmt: skip
+@given(rows=st.lists(st.lists(numbers, min_size=3, max_size=3), min_size=1, max_size=4), mapped=st.booleans())
 def test_every_policy_keeps_the_limits_and_changes_nothing_within_them(rows, mapped):
     robot = ROBOT.changed(joint_map=MAPPED) if mapped else ROBOT
     own = EffortLimits(robot)

@@ -68,9 +68,12 @@ def test_a_stop_after_a_suspension_sends_nothing_of_the_pose_before(heard, launc
         every=0.005,
     )
     torques, commands = suspended(
-        twin, 3.0 * STALE, "joint_torques", "commands",
+        twin,
+        3.0 * STALE,
+        "joint_torques",
+        "commands",
         send=lambda: fed and twin.send_state(at_rest(twin.stamp(), MOVED)),
-    )  # fmt: skip
+    )
     twin.diagnostics(lambda a: a.status[0].message.startswith("stopped"))
     heard.until(lambda: torques and commands)
     for effort in sent(torques) + sent(commands):
@@ -92,9 +95,14 @@ def test_a_suspended_gate_holds_no_pose_from_before(heard, launch_alone):
 def test_no_stop_sends_more_than_the_limits(heard, launch_alone):
     """A payload that cannot be held: by no policy does a stop's command pass a limit."""
     twin = launched(
-        heard, launch_alone, "heavy", "stale_after:=5.0", "trip_count:=2",
-        "payload.mass:=60.0", "on_stop:=gravity",
-    )  # fmt: skip
+        heard,
+        launch_alone,
+        "heavy",
+        "stale_after:=5.0",
+        "trip_count:=2",
+        "payload.mass:=60.0",
+        "on_stop:=gravity",
+    )
     torques, commands = (twin.received(topic) for topic in ("joint_torques", "commands"))
     twin.until(lambda: commands, repeat=lambda: twin.send_state(at_rest(twin.stamp())))
     for policy in ("warn", "clamp", "reject"):

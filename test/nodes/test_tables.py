@@ -102,9 +102,7 @@ def test_topics_and_services(node, peer):
         own = {row.name.removeprefix("/"): row.kind for row in rows}
         # Transforms where tf2 is installed.
         own = {name: kind for name, kind in own.items() if TF or not name.startswith("tf")}
-        allowed = {
-            element.text.removeprefix("/") for element in common.iterfind(f"{what}[@{how}]/*")
-        }
+        allowed = {element.text.removeprefix("/") for element in common.iterfind(f"{what}[@{how}]/*")}
         listened = set(OPTIONAL) if way == "in" else set()
         return found.items() >= own.items() and found.keys() | listened == own.keys() | allowed
 

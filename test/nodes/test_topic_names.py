@@ -39,9 +39,11 @@ def test_a_node_publishes_the_reactions_of_every_robot(name, peer, launch):
     except ValueError:
         pytest.skip("no masses")
     process = launch(
-        "delta_dynamics.nodes.twin", f"mechanism:={name}", "publish_reactions:=true",
+        "delta_dynamics.nodes.twin",
+        f"mechanism:={name}",
+        "publish_reactions:=true",
         arguments=["-r", f"__node:=of_{name}"],
-    )  # fmt: skip
+    )
     tokens = topic_tokens(names).values()
 
     def published():

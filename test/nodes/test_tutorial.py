@@ -32,7 +32,11 @@ def test_its_blocks_print_what_it_says(domain, tmp_path):
     environment["PATH"] = os.pathsep.join([str(folder), environment["PATH"]])
     found = subprocess.run(
         ["timeout", str(PATIENCE), "bash", "-c", "\n".join(script)],
-        stdout=subprocess.PIPE, text=True, cwd=tmp_path, env=environment, check=True,
-    ).stdout.split(MARK)  # fmt: skip
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=tmp_path,
+        env=environment,
+        check=True,
+    ).stdout.split(MARK)
     for block, output in zip(expected, found[:-1], strict=True):
         assert_output(block, output)

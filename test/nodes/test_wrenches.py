@@ -143,9 +143,7 @@ class TestTorques:
         q = self.ROBOT.inverse(self.ROBOT.home())
         rate = np.array([0.1, -0.05, 0.02])
         stamp = NOW + i * STEP
-        return MAKE.joint_state(
-            self.ROBOT.joint_names, q + rate * i / 1000, rate, effort, stamp
-        ), stamp
+        return MAKE.joint_state(self.ROBOT.joint_names, q + rate * i / 1000, rate, effort, stamp), stamp
 
     def answer(self, core, i, **options):
         message, stamp = self.state(i, **options)

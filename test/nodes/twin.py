@@ -29,17 +29,27 @@ COMMON = (
 Q = np.array([0.1, 0.2, 0.3])
 TALK = {"joint_trajectory": JointTrajectory, "states": JointState}
 HEAR = {
-    "joint_trajectory_ff": JointTrajectory, "joint_torques": JointState,
-    "torque_residual": JointState, "commands": Float64MultiArray,
-}  # fmt: skip
+    "joint_trajectory_ff": JointTrajectory,
+    "joint_torques": JointState,
+    "torque_residual": JointState,
+    "commands": Float64MultiArray,
+}
 
 
 def launched(peer, launch, name, *parameters, **options):
     """A node of this name in a process, its topics not yet connected."""
     return Twin(
-        peer, launch, MODULE, name, *COMMON, *parameters,
-        remaps={"joint_states": "states"}, talk=TALK, hear=HEAR, **options,
-    )  # fmt: skip
+        peer,
+        launch,
+        MODULE,
+        name,
+        *COMMON,
+        *parameters,
+        remaps={"joint_states": "states"},
+        talk=TALK,
+        hear=HEAR,
+        **options,
+    )
 
 
 class Twin(Running):
@@ -74,9 +84,7 @@ class Twin(Running):
             sent.append(stamp_of(message))
             self.send("joint_trajectory", message)
 
-        self.peer.until(
-            lambda: any(stamp_of(m) in sent[-1:] for m in received), repeat=ask, every=1.0
-        )
+        self.peer.until(lambda: any(stamp_of(m) in sent[-1:] for m in received), repeat=ask, every=1.0)
         received.clear()
 
     def ready(self):
@@ -129,10 +137,9 @@ class Twin(Running):
 
     def set(self, **values):
         """Set parameters atomically; dots are written as two underscores."""
-        return self.set_to([
-            Parameter(key.replace("__", "."), value=value).to_parameter_msg()
-            for key, value in values.items()
-        ])  # fmt: skip
+        return self.set_to(
+            [Parameter(key.replace("__", "."), value=value).to_parameter_msg() for key, value in values.items()]
+        )
 
     def get(self, *names):
         """Values of parameters, as messages."""

@@ -80,12 +80,9 @@ def bodies(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike) -> Bodies:
             (outputs[left],), _ = _code(robot.engine, where).run(picked, steps)
     assert np.isfinite(outputs).all()
     rows = outputs.reshape(*batch, len(points), 21 + 6 * n)
-    place, change, turned, omega, alpha = (
-        rows[..., a:b] for a, b in ((0, 3), (3, 6), (6, 15), (15, 18), (18, 21))
-    )
+    place, change, turned, omega, alpha = (rows[..., a:b] for a, b in ((0, 3), (3, 6), (6, 15), (15, 18), (18, 21)))
     turned = turned.reshape(*batch, -1, 3, 3)
-    linear, angular = (rows[..., a : a + 3 * n].reshape(*batch, -1, 3, n)
-                       for a in (21, 21 + 3 * n))  # fmt: skip
+    linear, angular = (rows[..., a : a + 3 * n].reshape(*batch, -1, 3, n) for a in (21, 21 + 3 * n))
     count = len(graph.bodies)
     own = [*range(count), len(points) - 1]
     home = np.array([*(b.inertia for b in graph.bodies.values()), load.inertia])
@@ -119,10 +116,13 @@ def bodies(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike) -> Bodies:
     return Bodies(
         robot.body_names,
         np.array([*(x.mass for x in graph.bodies.values()), *rod_mass, load.mass]),
-        middle(place), middle(change), joined(moment, rod_moment), middle(linear),
+        middle(place),
+        middle(change),
+        joined(moment, rod_moment),
+        middle(linear),
         joined(angular[..., own, :, :], swing / square[..., None]),
         joined(matrix, third[..., None] * thin),
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True)

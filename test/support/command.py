@@ -101,9 +101,7 @@ def typed_line(twin: Callable[..., Result], line: str) -> Result:
     return Result(done.returncode, done.stdout, done.stderr)
 
 
-def forked(
-    folder: Path, *arguments: Any, limit: int = resource.RLIM_INFINITY, out: str = ""
-) -> Result:
+def forked(folder: Path, *arguments: Any, limit: int = resource.RLIM_INFINITY, out: str = "") -> Result:
     """What a command gives in a fork of this process: it may be ended, and need not import.
 
     :param folder: where it runs.

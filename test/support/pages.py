@@ -73,8 +73,7 @@ def _like(printed: str, found: str) -> bool:
             pattern += r"\s+" if part.isspace() else re.escape(part)
     match = re.fullmatch(pattern, found.strip())
     return match is not None and all(
-        abs(float(a) - float(b)) <= 1.01 * _unit(a)
-        for a, b in zip(numbers_, match.groups(), strict=True)
+        abs(float(a) - float(b)) <= 1.01 * _unit(a) for a, b in zip(numbers_, match.groups(), strict=True)
     )
 
 

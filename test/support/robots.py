@@ -148,9 +148,7 @@ def joint_range(robot: Robot) -> tuple[Array, Array]:
     return robot.graph.home, np.array(half)
 
 
-def random_joints(
-    robot: Robot, rng: np.random.Generator, count: int, clear: float = CLEAR
-) -> Array:
+def random_joints(robot: Robot, rng: np.random.Generator, count: int, clear: float = CLEAR) -> Array:
     """Joint positions inside the middle of the limits that can be assembled, shape (count, n).
 
     Clear of singularities by that measure.

@@ -52,15 +52,19 @@ def limbs(robot, pose):
         # Force f2 acts at one end of the limb, the joint R stands at the other: moment -L f2.
         entries = [
             (
-                revolute[2], sideways + size**2 * about, -size * bend * about,
+                revolute[2],
+                sideways + size**2 * about,
+                -size * bend * about,
                 bend**2 * about + turn**2 * revolute[5],
             ),
             (
-                stretch, slip + flex * size**2 / 3, -0.5 * bend * flex * size,
+                stretch,
+                slip + flex * size**2 / 3,
+                -0.5 * bend * flex * size,
                 bend**2 * flex + turn**2 * twist,
             ),
             (first, last, 0.0, universal[5]),
-        ]  # fmt: skip
+        ]
         factors = [robot.element_compliance.get(f"{i + 1}{e}", 1.0) for e in "RBU"]
         yield (
             turned @ np.array([*wrenches, [0, 0, 0, 0, 0, 1]]).T,
@@ -73,9 +77,7 @@ def limbs(robot, pose):
 
 def closed_form(robot, pose, wrench):
     """Compliance, shape (6, 6), and the energies of the nine elements (equations 34 to 38)."""
-    found = [
-        (unit, elements, np.linalg.inv(sum(elements))) for unit, elements in limbs(robot, pose)
-    ]
+    found = [(unit, elements, np.linalg.inv(sum(elements))) for unit, elements in limbs(robot, pose)]
     compliance = np.linalg.inv(sum(unit @ stiff @ unit.T for unit, _, stiff in found))
     moved = compliance @ wrench
     loads = [(elements, stiff @ unit.T @ moved) for unit, elements, stiff in found]

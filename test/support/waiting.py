@@ -10,9 +10,7 @@ from typing import TypeVar
 V = TypeVar("V")
 
 
-def wait_until(
-    condition: Callable[[], V], pause: Callable[[], object], seconds: float, missing: str
-) -> V:
+def wait_until(condition: Callable[[], V], pause: Callable[[], object], seconds: float, missing: str) -> V:
     """What a condition gives, as soon as it is true.
 
     The clock is read before the condition is asked: however long the machine held this process up,

@@ -108,9 +108,7 @@ def test_the_rest_is_the_shear_factor(name, rigid, solids):
 @pytest.mark.long
 def test_rigid_ends_are_on_the_other_side(rigid, tmp_path):
     pose = POSES["configuration 2"]
-    theirs = solid_compliance(
-        structural_model(rigid, rigid.inverse(pose)), tmp_path, MESH, rigid_ends=True
-    )
+    theirs = solid_compliance(structural_model(rigid, rigid.inverse(pose)), tmp_path, MESH, rigid_ends=True)
     found = difference(compliance(rigid, pose), theirs)
     # Seen: 1.2 %, of which a mesh of 33 x 16 leaves 1.0 %.
     assert (found.diagonal > 0.0).all()
@@ -158,9 +156,7 @@ def test_cantilever_and_a_finer_mesh(meshes, rigid, tmp_path):
     end = length * axes[:, 0]
     section = Section(modulus, shear, diameter, 0.0, 1.0, round_bar(rigid))
     clamped, tip = Support("root", BASE, np.eye(3)), Support("tip", "platform", axes)
-    frame = StructuralModel(
-        end, "platform", (Member("bar", "bar", section, np.zeros(3), end, clamped, tip),), (), ()
-    )
+    frame = StructuralModel(end, "platform", (Member("bar", "bar", section, np.zeros(3), end, clamped, tip),), (), ())
     area, second = section.area, section.second_moment
     closed = np.zeros((6, 6))
     closed[0, 0] = length / (modulus * area)

@@ -75,9 +75,16 @@ def write_equations(robot, q, qd, qdd, wrench):
         couple = m.forearm_mass * span**2 / 12 * swelling[i]
         torque -= (platform + elbow).T @ push / 2 - turned.T @ couple  # equations 22, 23
     return SimpleNamespace(
-        velocity=velocity, acceleration=acceleration, torque=torque, w=w, arm=arm, spin=spin,
-        change=change, turning=turning, swelling=swelling,
-    )  # fmt: skip
+        velocity=velocity,
+        acceleration=acceleration,
+        torque=torque,
+        w=w,
+        arm=arm,
+        spin=spin,
+        change=change,
+        turning=turning,
+        swelling=swelling,
+    )
 
 
 @both
@@ -109,11 +116,13 @@ def test_equations_13_to_16_are_misprinted():
         first = g.arm_length * np.cross(s.change, s.arm)
         right = g.arm_length * np.cross(s.spin, np.cross(s.spin, s.arm))
         wrong = g.arm_length * np.cross(s.turning, np.cross(s.turning, s.arm))
-        assert first + right + tangential + inward == pytest.approx(
-            np.tile(s.acceleration, (3, 1)), abs=1e-12
+        assert first + right + tangential + inward == pytest.approx(np.tile(s.acceleration, (3, 1)), abs=1e-12)
+        missed.append(
+            [
+                np.abs(first + wrong + tangential + inward - s.acceleration).max(),
+                np.abs(first + right + inward - s.acceleration).max(),
+            ]
         )
-        missed.append([np.abs(first + wrong + tangential + inward - s.acceleration).max(),
-                       np.abs(first + right + inward - s.acceleration).max()])  # fmt: skip
         # Equation 16 without w x, and with the opposite sign, is no angular acceleration.
         assert np.abs(tangential / g.forearm_length - s.swelling).max() > 0.05
     pattern = r"by up to (\S+) mm/s2 in the example.*? by up to (\S+) mm/s2"
@@ -191,12 +200,8 @@ def test_the_tables_place_the_rcu_limb(limb, variant):
     closures = ["rcu" if k == limb else "rod" for k in range(3)]
     robot, _ = variant("delta_cu", geometry={"closures": closures})
     q, qd, qdd = paper.find_motion()
-    velocity = paper.measure_difference(
-        paper.find_velocity(robot, q, qd), paper.read_numbers(paper.TABLE_2)
-    )[0]
-    torque = paper.measure_difference(
-        inverse_dynamics(robot, q, qd, qdd, paper.LOAD), paper.find_printed_torques()
-    )[0]
+    velocity = paper.measure_difference(paper.find_velocity(robot, q, qd), paper.read_numbers(paper.TABLE_2))[0]
+    torque = paper.measure_difference(inverse_dynamics(robot, q, qd, qdd, paper.LOAD), paper.find_printed_torques())[0]
     if closures == list(load("delta_cu").geometry.closures):
         assert (velocity, torque) < (FOUND_VELOCITY[0], FOUND_TORQUE[0])
     else:
@@ -207,9 +212,7 @@ def test_the_tables_place_the_rcu_limb(limb, variant):
 def test_conclusion_1_torques_of_a_delta_are_larger():
     """Not in the example, where they are equal; slightly in other motions like it."""
     motion = paper.find_motion(np.linspace(0.0, 5.0, 51))
-    delta, delta_cu = (
-        inverse_dynamics(load(n), *motion, paper.LOAD) for n in ("delta", "delta_cu")
-    )
+    delta, delta_cu = (inverse_dynamics(load(n), *motion, paper.LOAD) for n in ("delta", "delta_cu"))
     np.testing.assert_allclose(delta, delta_cu, atol=1e-11)
     ratio, larger = paper.compare_deltas(1.0, True)
     fast, fewer = paper.compare_deltas(30.0, False)

@@ -25,16 +25,23 @@ def slider(*, velocity=None, viscous=0.0, coulomb=0.0, gravity=(0.0, 0.0, 0.0)):
     if velocity is not None:
         limits["velocity"] = velocity
     data = {
-        "mechanism": "machine", "platform": "table", "pose": ["x"], "gravity": list(gravity),
+        "mechanism": "machine",
+        "platform": "table",
+        "pose": ["x"],
+        "gravity": list(gravity),
         "bodies": {"table": {"mass": MASS, "com": [0, 0, 0], "inertia": [1, 1, 1]}},
         "joints": {
             "axis": {
-                "type": "prismatic", "between": ["base", "table"], "axis": [1, 0, 0],
-                "actuated": True, "home": 0.0, "limits": limits,
+                "type": "prismatic",
+                "between": ["base", "table"],
+                "axis": [1, 0, 0],
+                "actuated": True,
+                "home": 0.0,
+                "limits": limits,
                 "friction": {"viscous": viscous, "coulomb": coulomb},
             }
         },
-    }  # fmt: skip
+    }
     return robot_of_data(data, "slider")
 
 
@@ -144,9 +151,12 @@ def judged(robot, path, count, rounds=3, acceleration=np.inf):
             weight[1:] += share / np.maximum(root[1:], 1e-3 * root.max())
             weight[:-1] += share / np.maximum(root[:-1], 1e-3 * root.max())
             answer = linprog(
-                -weight / weight.max(), A_ub=sparse.vstack(rows).tocsr(), b_ub=np.concatenate(tops),
-                bounds=np.stack([0 * most, most], -1), method="highs",
-            )  # fmt: skip
+                -weight / weight.max(),
+                A_ub=sparse.vstack(rows).tocsr(),
+                b_ub=np.concatenate(tops),
+                bounds=np.stack([0 * most, most], -1),
+                method="highs",
+            )
             assert answer.status == 0, answer.message
             x = np.maximum(answer.x, 0.0)
             root = np.sqrt(x)

@@ -69,12 +69,7 @@ def test_the_deck_tells_other_robots_apart(isotropic, tmp_path):
     robot, other = isotropic("delta_cu", 0.0), isotropic("delta", 0.0)
     pose = robot.forward([0.22] * 3)
     ours = natural_frequencies(other, pose, elements=8)
-    assert (
-        np.abs(
-            ours / frequencies(structural_model(robot, robot.inverse(pose)), 6, tmp_path) - 1
-        ).max()
-        > 0.5
-    )
+    assert np.abs(ours / frequencies(structural_model(robot, robot.inverse(pose)), 6, tmp_path) - 1).max() > 0.5
 
 
 def test_the_tool_s_response_is_calculix_up_to_the_third_mode(isotropic, tmp_path):

@@ -87,9 +87,7 @@ def paper(robot: Prru, pose: Array) -> Position:
     for phi in g.azimuths:
         c, s = math.cos(phi), math.sin(phi)
         u = centre + rotation @ np.array([-r * c, -r * s, 0])
-        root = np.sqrt(
-            g.limb_length**2 - (u[0] + g.base_radius * c) ** 2 - (u[1] + g.base_radius * s) ** 2
-        )
+        root = np.sqrt(g.limb_length**2 - (u[0] + g.base_radius * c) ** 2 - (u[1] + g.base_radius * s) ** 2)
         below = g.branch == "below"
         q.append(u[2] - root if below else u[2] + root)
         # Equation 12 has the arc cosine, which loses the sign of an inward swing.

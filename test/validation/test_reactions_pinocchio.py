@@ -74,9 +74,7 @@ class TwoRods(LoopEngine):
                     else (pin.JointModelRY(), pin.JointModelRX())
                 )
                 first = self.model.addJoint(arm, kinds[0], elbow, f"first {limb}{rod}")
-                forearm = self.model.addJoint(
-                    first, kinds[1], pin.SE3.Identity(), f"forearm {limb}{rod}"
-                )
+                forearm = self.model.addJoint(first, kinds[1], pin.SE3.Identity(), f"forearm {limb}{rod}")
                 inertia = mass / len(rods) * length**2 / 12
                 centre = (0.0, 0.0, -length / 2)
                 self._body(forearm, mass / len(rods), centre, np.diag((inertia, inertia, 0.0)))
@@ -86,9 +84,7 @@ class TwoRods(LoopEngine):
                 self._points.append(PointLoop(end, corner))
                 if closure == "rcu":
                     # The forearm turns about t, the platform about r: t and r stay square.
-                    self._perpendiculars.append(
-                        PerpendicularLoop(end, np.array([0.0, 1.0, 0.0]), corner, turn[:, 0])
-                    )
+                    self._perpendiculars.append(PerpendicularLoop(end, np.array([0.0, 1.0, 0.0]), corner, turn[:, 0]))
 
     def _guess(self, q):
         """The assembly of the engine with one rod for two and a platform that cannot turn."""
@@ -126,8 +122,7 @@ def delta_reactions(data, q, qd, qdd, wrench):
         places = [placements[f"forearm {limb}{rod}"].translation for rod in rods]
         elbow = np.mean(places, 0)
         inner = [
-            at_point(found[f"forearm {limb}{rod}"], place - elbow)
-            for rod, place in zip(rods, places, strict=True)
+            at_point(found[f"forearm {limb}{rod}"], place - elbow) for rod, place in zip(rods, places, strict=True)
         ]
         result[f"elbow {limb}"] = np.sum(inner, 0), elbow
         ends = []
@@ -170,9 +165,7 @@ def test_every_joint_of_random_machines(name, machines, rng):
         case.data["friction"] = {"viscous": [0.0] * 3, "coulomb": [0.0] * 3}
         for q, qd, qdd, wrench in zip(case.q, case.qd, case.qdd, case.wrench, strict=True):
             ours = reactions(case.robot, q, qd, qdd, wrench)
-            theirs = (prru_reactions if name == "prru" else delta_reactions)(
-                case.data, q, qd, qdd, wrench
-            )
+            theirs = (prru_reactions if name == "prru" else delta_reactions)(case.data, q, qd, qdd, wrench)
             assert set(theirs) == set(ours.names)
             size = math.sqrt(float(np.mean(np.sum((ours.points - ours.points.mean(0)) ** 2, 1))))
             unit = np.array([1.0, 1.0, 1.0, size, size, size])

@@ -235,9 +235,7 @@ def test_every_control_does_what_it_says(browser, tmp_path):
     robot = load("five_bar")
     pose = robot.home() + np.array([0.02, -0.01])
     browser.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
-    browser.call(
-        "Browser.grantPermissions", permissions=["clipboardReadWrite", "clipboardSanitizedWrite"]
-    )
+    browser.call("Browser.grantPermissions", permissions=["clipboardReadWrite", "clipboardSanitizedWrite"])
     with serving("five_bar") as (_, address):
         link = f"?robot=five_bar&pose={pose[0]:.9g},{pose[1]:.9g}&load=0,5,0,0,0,0"
         browser.resize(500, 900)
@@ -263,9 +261,7 @@ def test_every_control_does_what_it_says(browser, tmp_path):
         browser.until(f"{TEXT % 'energy'} && {TEXT % 'energy'} !== '0'")
         assert read(browser, "energy") != number(float(energy.total))
         clicked(browser, "Go to the softest pose")
-        assert "µm" in browser.until(
-            f"({TEXT % 'note'} || '').includes('along') && {TEXT % 'note'}"
-        )
+        assert "µm" in browser.until(f"({TEXT % 'note'} || '').includes('along') && {TEXT % 'note'}")
         clicked(browser, "No wrench")
         browser.until(f"!{LINK}.value.includes('load')")
         assert addresses(browser) == {"127.0.0.1"}
@@ -302,9 +298,7 @@ def page():
 
 @pytest.mark.long
 @pytest.mark.timeout(1800)
-def test_the_mouse_drags_the_platform_along_one_axis_within_limits_and_chooses_a_mode(
-    browser, page
-):
+def test_the_mouse_drags_the_platform_along_one_axis_within_limits_and_chooses_a_mode(browser, page):
     browser.resize(1000, 700)
     browser.visit(page.address)
     pressed(browser, "label", "e.innerText === 'drag platform'")
@@ -326,9 +320,7 @@ def test_the_mouse_drags_the_platform_along_one_axis_within_limits_and_chooses_a
         def drag(ends=ends):
             browser.drag(*seen(ends, camera())[0].tolist(), pause=look)
 
-        wait_until(
-            lambda p=pose: (page.state.pose != p).any() or page.state.refusal, drag, 60.0, ""
-        )
+        wait_until(lambda p=pose: (page.state.pose != p).any() or page.state.refusal, drag, 60.0, "")
         wait_until(lambda: not page._dragged, look, 60.0, "")
         moved = page.state.pose - pose
         assert moved[axis] * way > 0.0 or page.state.refusal

@@ -36,9 +36,7 @@ def written(folder, filename, scale=1.0, origin=""):
     return path
 
 
-@pytest.mark.parametrize(
-    "filename", ["meshes/part.stl", "package://cell/meshes/part.stl", "file://{}/meshes/part.stl"]
-)
+@pytest.mark.parametrize("filename", ["meshes/part.stl", "package://cell/meshes/part.stl", "file://{}/meshes/part.stl"])
 def test_a_mesh_moves_with_its_link(tmp_path, filename, rng):
     folder = tmp_path / "cell"
     folder.mkdir()

@@ -135,9 +135,7 @@ def test_a_dragged_platform_goes_where_it_can(name, rng):
             continue
         moved = model.to_platform(state, *model.robot.platform(near.q))
         assert moved.refusal == ""
-        for got, asked in zip(
-            model.robot.platform(moved.q), model.robot.platform(near.q), strict=True
-        ):
+        for got, asked in zip(model.robot.platform(moved.q), model.robot.platform(near.q), strict=True):
             np.testing.assert_allclose(got, asked, atol=1e-6)
         position, rotation = model.robot.platform(state.q)
         assert model.to_platform(state, position + 100.0, rotation).q is state.q
@@ -157,9 +155,18 @@ def test_zero_but_for_rounding_has_no_sign():
 def test_a_link_that_says_something_else_changes_nothing():
     model = model_of("five_bar")
     good = model.link(model.start)
-    for link in ("", "?", "?pose=0,0.4", "?robot=delta&pose=0,0.4", "?robot=five_bar",
-                 good + ",1", good + "&load=1", good + "&load=1,2,3,4,5,nan",
-                 "?robot=five_bar&pose=0,x", "?robot=five_bar&pose=9,9"):  # fmt: skip
+    for link in (
+        "",
+        "?",
+        "?pose=0,0.4",
+        "?robot=delta&pose=0,0.4",
+        "?robot=five_bar",
+        good + ",1",
+        good + "&load=1",
+        good + "&load=1,2,3,4,5,nan",
+        "?robot=five_bar&pose=0,x",
+        "?robot=five_bar&pose=9,9",
+    ):
         state = model.linked(model.start, link)
         assert state.refusal, link
         assert state.q is model.start.q
@@ -291,9 +298,7 @@ def test_bars_keep_their_lengths_and_the_platform_carries_what_is_on_it(name, rn
         shift = np.array([0.01, -0.02, 0.03, 0.0, 0.0, 0.0])
         moved = scene.shapes(state.q, Deflection(shift, {}))
         np.testing.assert_allclose(moved.platform_at - shapes.platform_at, shift[:3], atol=1e-12)
-        for (_, spot), before, after in zip(
-            scene._balls, shapes.ball_at, moved.ball_at, strict=False
-        ):
+        for (_, spot), before, after in zip(scene._balls, shapes.ball_at, moved.ball_at, strict=False):
             expected = shift[:3] * scene._on_platform(spot)
             np.testing.assert_allclose(after - before, expected, atol=1e-12)
         np.testing.assert_allclose(np.linalg.norm(shapes.cylinder_turns, axis=1), 1.0)
@@ -357,9 +362,7 @@ def test_labels_do_not_cover_each_other(rng):
         spots = rng.random((12, 2)) * window
         sizes = np.column_stack([rng.uniform(30, 240, 12), np.full(12, 19.0)])
         found = anchors(spots, sizes, window)
-        shown = [
-            (s + h * offsets[a], h) for s, h, a in zip(spots, sizes / 2, found, strict=True) if a
-        ]
+        shown = [(s + h * offsets[a], h) for s, h, a in zip(spots, sizes / 2, found, strict=True) if a]
         assert len(shown) >= (3 if window[0] < 1000 else 10)
         for k, (middle, half) in enumerate(shown):
             assert (middle - half >= 0).all() and (middle + half <= window).all()
@@ -377,9 +380,7 @@ def test_meshes_are_closed():
         _, place = np.unique(np.round(points, 9), axis=0, return_inverse=True)
         corners = place.reshape(-1)[triangles]
         corners = corners[[len(set(row)) == 3 for row in corners.tolist()]]
-        edges = {
-            (a, b) for row in corners.tolist() for a, b in zip(row, row[1:] + row[:1], strict=True)
-        }
+        edges = {(a, b) for row in corners.tolist() for a, b in zip(row, row[1:] + row[:1], strict=True)}
         assert {(b, a) for a, b in edges} == edges
 
 

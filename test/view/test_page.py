@@ -25,10 +25,17 @@ from stiffness_monitor.modes import modes
 from test.support.robots import load
 
 CAMERA = {
-    "type": "ViewerCameraMessage", "wxyz": [1, 0, 0, 0], "position": [0, 0, 1], "fov": 1.0,
-    "near": 0.1, "far": 10.0, "image_height": 10, "image_width": 10, "look_at": [0, 0, 0],
+    "type": "ViewerCameraMessage",
+    "wxyz": [1, 0, 0, 0],
+    "position": [0, 0, 1],
+    "fov": 1.0,
+    "near": 0.1,
+    "far": 10.0,
+    "image_height": 10,
+    "image_width": 10,
+    "look_at": [0, 0, 0],
     "up_direction": [0, 0, 1],
-}  # fmt: skip
+}
 
 
 @pytest.fixture(scope="module")
@@ -97,9 +104,12 @@ def test_the_platform_is_dragged(page, caplog):
     start = page.model.robot.platform(page.model.start.q)[0]
     place = start + np.array([0.0, 0.0, 0.01])
     drag = {
-        "type": "TransformControlsUpdateMessage", "name": "/drag", "owner": "",
-        "wxyz": [1.0, 0.0, 0.0, 0.0], "position": place.tolist(),
-    }  # fmt: skip
+        "type": "TransformControlsUpdateMessage",
+        "name": "/drag",
+        "owner": "",
+        "wxyz": [1.0, 0.0, 0.0, 0.0],
+        "position": place.tolist(),
+    }
 
     async def talk():
         async with open_socket(page) as socket:
@@ -133,9 +143,7 @@ def test_a_mode_is_animated_at_the_pose_that_is_shown(page, monkeypatch):
     shape = found.shapes[1, 0]
     for _, moved, shares, most in drawn:
         np.testing.assert_allclose(np.outer(moved.platform, shape), np.outer(shape, moved.platform))
-        assert (
-            np.linalg.norm(moved.platform[:3]) <= MAX_SHOWN_DEFLECTION * page.model.robot.graph.size
-        )
+        assert np.linalg.norm(moved.platform[:3]) <= MAX_SHOWN_DEFLECTION * page.model.robot.graph.size
         for name, (at, way) in moved.members.items():
             own = [k for k, node in enumerate(found.nodes) if node.startswith(f"{name} ")]
             np.testing.assert_array_equal(at, found.positions[own])
@@ -181,9 +189,7 @@ def placed(page, states):
     middle, begin = np.array(start.look_at), np.array(start.position) - np.array(start.look_at)
     calls = []
     camera = SimpleNamespace(on_update=calls.append, wxyz=np.eye(4)[0], fov=1.0)
-    client = SimpleNamespace(
-        camera=camera, atomic=contextlib.nullcontext, client_id=-1, scene=page.server.scene
-    )
+    client = SimpleNamespace(camera=camera, atomic=contextlib.nullcontext, client_id=-1, scene=page.server.scene)
     asyncio.run(page.stage._frame(client))
     for width, height, distance in states:
         camera.image_width, camera.image_height = width, height

@@ -150,6 +150,4 @@ def test_the_monitors_own_status_is_understood():
     energy = strain_energy(robot, robot.home(), [30, -50, -40, 10, -20, 50])
     live = Live(robot)
     live.take("energy", status_message(energy.elements, energy.factors, energy.dominant))
-    assert live.heard().shares == pytest.approx(
-        dict(zip(energy.elements, energy.factors.tolist(), strict=True))
-    )
+    assert live.heard().shares == pytest.approx(dict(zip(energy.elements, energy.factors.tolist(), strict=True)))

@@ -25,9 +25,11 @@ NODES: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "machine_state": (STATES, "joint states answered", ("rate:=0.0",)),
 }
 """A node's answers, the count in its diagnostics, and its parameters."""
-ROBOTS = {"delta_cu": ("delta_dynamics", "stiffness_monitor", "machine_state"),
-          "prru": ("delta_dynamics", "stiffness_monitor", "machine_state"),
-          "upr_rpu": ("stiffness_monitor", "machine_state")}  # fmt: skip
+ROBOTS = {
+    "delta_cu": ("delta_dynamics", "stiffness_monitor", "machine_state"),
+    "prru": ("delta_dynamics", "stiffness_monitor", "machine_state"),
+    "upr_rpu": ("stiffness_monitor", "machine_state"),
+}
 """Nodes that a robot's bags have all messages for."""
 
 
@@ -39,9 +41,7 @@ def folder() -> Path:
     return Path(__file__).resolve().parents[2] / "bags"
 
 
-def play_bag(
-    other: Peer, bag: Path, robot: str, name: str, rate: float, given: list[str]
-) -> dict[str, str]:
+def play_bag(other: Peer, bag: Path, robot: str, name: str, rate: float, given: list[str]) -> dict[str, str]:
     """Play a bag to a node, and return the values of its diagnostics."""
     told: dict[str, str] = {}
 
@@ -56,9 +56,18 @@ def play_bag(
     with closing(twin):
         other.until(lambda: told, lambda: f"{name}'s diagnostics\n{twin.output}")
         player = Process(
-            "ros2", "bag", "play", str(bag), "--clock", "200", "--rate", str(rate), "--delay", "3",
+            "ros2",
+            "bag",
+            "play",
+            str(bag),
+            "--clock",
+            "200",
+            "--rate",
+            str(rate),
+            "--delay",
+            "3",
             "--disable-keyboard-controls",
-        )  # fmt: skip
+        )
         with closing(player):
             other.until(lambda: not player.alive(), "the player's end", 600.0)
         other.spin(3.0)

@@ -96,9 +96,7 @@ def node(*names: str, parameters: Iterable[str] = (), remap: Iterable[str] = ())
     """Start a node, or several in one process, with NAME:=VALUE and FROM:=TO."""
     words = [word for p in parameters for word in ("-p", p)]
     words += [word for r in remap for word in ("-r", r)]
-    program = (
-        [find_executable(names[0])] if len(names) == 1 else [find_executable("composed"), *names]
-    )
+    program = [find_executable(names[0])] if len(names) == 1 else [find_executable("composed"), *names]
     return Process(*program, *(["--ros-args", *words] if words else []))
 
 

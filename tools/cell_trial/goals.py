@@ -56,12 +56,8 @@ class Cell:
         # Where mock hardware stands.
         joints = ElementTree.fromstring(text).findall("ros2_control/joint")
         self.q = np.array([float(j.find("state_interface/param").text) for j in joints])
-        self.states = other.hear(
-            JointTrajectoryControllerState, f"/{CONTROLLER}/controller_state", 5000
-        )
-        self.client = ActionClient(
-            other.node, FollowJointTrajectory, "/delta_dynamics/follow_joint_trajectory"
-        )
+        self.states = other.hear(JointTrajectoryControllerState, f"/{CONTROLLER}/controller_state", 5000)
+        self.client = ActionClient(other.node, FollowJointTrajectory, "/delta_dynamics/follow_joint_trajectory")
         zero = 0.0 * self.q
         self.weight = inverse_dynamics(self.robot, self.q, zero, zero)
         self.peak = 0.0
@@ -74,12 +70,8 @@ class Cell:
                     "controller_manager": {
                         "ros__parameters": {
                             "update_rate": update_rate,
-                            "joint_state_broadcaster": {
-                                "type": "joint_state_broadcaster/JointStateBroadcaster"
-                            },
-                            CONTROLLER: {
-                                "type": "joint_trajectory_controller/JointTrajectoryController"
-                            },
+                            "joint_state_broadcaster": {"type": "joint_state_broadcaster/JointStateBroadcaster"},
+                            CONTROLLER: {"type": "joint_trajectory_controller/JointTrajectoryController"},
                         }
                     },
                     CONTROLLER: {
@@ -97,13 +89,24 @@ class Cell:
     def start_controller(self) -> None:
         """controller_manager with its two controllers, active."""
         self.manager = Process(
-            "ros2", "run", "controller_manager", "ros2_control_node",
-            "--ros-args", "--params-file", str(self._file),
-        )  # fmt: skip
+            "ros2",
+            "run",
+            "controller_manager",
+            "ros2_control_node",
+            "--ros-args",
+            "--params-file",
+            str(self._file),
+        )
         self.spawner = Process(
-            "ros2", "run", "controller_manager", "spawner",
-            "joint_state_broadcaster", CONTROLLER, "--param-file", str(self._file),
-        )  # fmt: skip
+            "ros2",
+            "run",
+            "controller_manager",
+            "spawner",
+            "joint_state_broadcaster",
+            CONTROLLER,
+            "--param-file",
+            str(self._file),
+        )
         self.states.clear()
         self.other.until(lambda: self.states, lambda: f"the controller\n{self.manager.output}")
 
@@ -116,9 +119,7 @@ class Cell:
                 f"controller_action:=/{CONTROLLER}/follow_joint_trajectory",
             ),
         )
-        self.other.until(
-            self.client.server_is_ready, lambda: f"the twin's action\n{self.twin.output}"
-        )
+        self.other.until(self.client.server_is_ready, lambda: f"the twin's action\n{self.twin.output}")
 
     def stop(self) -> None:
         """All processes."""
@@ -166,9 +167,7 @@ class Cell:
     def until_moving(self) -> None:
         """Wait until the controller follows the trajectory."""
         self.states.clear()
-        self.other.until(
-            lambda: self.states and any(self.states[-1].reference.velocities), "motion"
-        )
+        self.other.until(lambda: self.states and any(self.states[-1].reference.velocities), "motion")
 
     def least_share(self, since: float) -> float:
         """Return the least share of the gravity effort since a stamp, moving or not."""
@@ -230,8 +229,7 @@ def _say(cell: Cell, case: str, ended: tuple[str, str, float] | None, since: flo
         cell.pass_by(0.7)
         share, lost, miss = cell.weight_lost(since)
         words.append(
-            f"effort at the end {share:.4f} of the weight (miss {miss:.1e}), "
-            f"below 0.9 of it for {1e3 * lost:.0f} ms"
+            f"effort at the end {share:.4f} of the weight (miss {miss:.1e}), below 0.9 of it for {1e3 * lost:.0f} ms"
         )
     print(" ".join(words), flush=True)
 

@@ -69,9 +69,7 @@ class States:
         self.publisher = other.node.create_publisher(JointState, "joint_states", 1000)
         self.rng = np.random.default_rng(1)
 
-    def stream(
-        self, seconds: float, *, late: float = 0.0, moving: bool = True, drives: str = "on"
-    ) -> None:
+    def stream(self, seconds: float, *, late: float = 0.0, moving: bool = True, drives: str = "on") -> None:
         """Send for so long.
 
         :param late: age of the stamps, s; ``drives``: on, off, braked, or broken: NaN.
@@ -133,8 +131,7 @@ def urdf(_: Peer, tell: Results) -> None:
         wanted = words[1] if "--hardware-plugin" in words else wanted
         tell(
             code == 0 and plugin == wanted and prefixed == ("--prefix" in words),
-            f"export urdf {' '.join((ROBOT, *words))}: hardware plugin {plugin}, first link "
-            f"{names[0]}",
+            f"export urdf {' '.join((ROBOT, *words))}: hardware plugin {plugin}, first link {names[0]}",
         )
 
 
@@ -151,8 +148,7 @@ def description(other: Peer, tell: Results) -> None:
             # With a description that has no hardware it says so, and waits for another one.
             other.until(
                 lambda m=manager: (
-                    "ros2_control" in m.output.partition("Received")[2]
-                    or "Successful 'activate'" in m.output
+                    "ros2_control" in m.output.partition("Received")[2] or "Successful 'activate'" in m.output
                 ),
                 lambda m=manager: m.output,
             )
@@ -175,9 +171,13 @@ def deadline(other: Peer, tell: Results) -> None:
         slow = {"delta_dynamics": {"ros__parameters": {"stale_after": 0.5}}}
         file.write_text(yaml.safe_dump(slow))
         code, text = output(
-            "ros2", "launch", "pkm_twin", "twin.launch.py", "command_gate:=true",
+            "ros2",
+            "launch",
+            "pkm_twin",
+            "twin.launch.py",
+            "command_gate:=true",
             f"params_file:={file}",
-        )  # fmt: skip
+        )
     line = next((line for line in text.splitlines() if "stale_after" in line), "")
     tell(code and line and "process started" not in text, f"launch: exit code {code}, {line}")
     told = diagnosed(other)
@@ -270,9 +270,13 @@ def launch(_: Peer, tell: Results) -> None:
         bad = {"delta_dynamics": {"ros__parameters": {"differentiator.order": 99}}}
         file.write_text(yaml.safe_dump(bad))
         code, text = output(
-            "ros2", "launch", "pkm_twin", "twin.launch.py", "stiffness_monitor:=false",
+            "ros2",
+            "launch",
+            "pkm_twin",
+            "twin.launch.py",
+            "stiffness_monitor:=false",
             f"params_file:={file}",
-        )  # fmt: skip
+        )
     starts = text.count("process started")
     tell(starts == 4 and "not started again" in text, f"a bad parameter: started {starts} times")
 
@@ -295,9 +299,7 @@ def control(other: Peer, tell: Results) -> None:
         node("machine_state", parameters=(f"hardware_plugin:={MOCK}",)),
     ) as (started, _):
         other.until(lambda: commands, lambda: f"a command of the gate\n{started.output}")
-        other.until(
-            lambda: "active" in output("ros2", "control", "list_controllers")[1], "controllers"
-        )
+        other.until(lambda: "active" in output("ros2", "control", "list_controllers")[1], "controllers")
         other.spin(3.0)
         _, listed = output("ros2", "control", "list_controllers")
         lines = [" ".join(line.split()) for line in listed.splitlines() if "active" in line]

@@ -26,8 +26,9 @@ def loaded(robot: str, folder: Path) -> bool:
     package = folder / robot
     subprocess.run(
         [find_executable("pkm-twin"), "export", "moveit", robot, "--out", str(package)],
-        check=True, stdout=subprocess.DEVNULL,
-    )  # fmt: skip
+        check=True,
+        stdout=subprocess.DEVNULL,
+    )
     loader = Path(get_package_prefix("pkm_srdf_loader"), "lib", "pkm_srdf_loader", "load_srdf")
     (urdf,), (srdf,) = (list((package / "config").glob(f"*.{kind}")) for kind in ("urdf", "srdf"))
     done = subprocess.run([loader, urdf, srdf], capture_output=True, text=True, check=False)

@@ -52,9 +52,14 @@ MOCK = "mock_components/GenericSystem"
 TOPICS = "pkm_topic_hardware/TopicSystem"
 KINDS = ("positions", "velocities", "accelerations")
 HARDWARE = {
-    "mock": MOCK, "sim": TOPICS, "beyond": MOCK, "fall": TOPICS, "lost": TOPICS, "killed": MOCK,
+    "mock": MOCK,
+    "sim": TOPICS,
+    "beyond": MOCK,
+    "fall": TOPICS,
+    "lost": TOPICS,
+    "killed": MOCK,
     "twin": MOCK,
-}  # fmt: skip
+}
 MORE = 0.5
 """Payload that is added at run time, kg."""
 
@@ -96,9 +101,12 @@ def there_and_back(robot: Robot, start: Any, seconds: float) -> JointTrajectory:
     twice = w / 2.0 * (w * np.cos(w * phase) * rate**2 + np.sin(w * phase) * second) / seconds**2
     home = robot.controller.controller_positions(start)
     return trajectory(
-        list(robot.controller.names), 0.05 + seconds * t,
-        home + np.outer(shape, aim), np.outer(first, aim), np.outer(twice, aim),
-    )  # fmt: skip
+        list(robot.controller.names),
+        0.05 + seconds * t,
+        home + np.outer(shape, aim),
+        np.outer(first, aim),
+        np.outer(twice, aim),
+    )
 
 
 class Chain:
@@ -108,27 +116,26 @@ class Chain:
         self.other, self.robot, self.part = other, load(given), part
         self.bandwidth = bandwidth
         use, source, target = (
-            ("twin", TRAJECTORIES, "delta_dynamics")
-            if part == "twin"
-            else ("plugin", CONTROLLER, TRAJECTORIES)
+            ("twin", TRAJECTORIES, "delta_dynamics") if part == "twin" else ("plugin", CONTROLLER, TRAJECTORIES)
         )
-        self.states = other.hear(
-            JointTrajectoryControllerState, f"/{source}/controller_state", 50000
-        )
-        self.fallen = other.hear(
-            JointTrajectoryControllerState, f"/{GRAVITY}/controller_state", 50000
-        )
+        self.states = other.hear(JointTrajectoryControllerState, f"/{source}/controller_state", 50000)
+        self.fallen = other.hear(JointTrajectoryControllerState, f"/{GRAVITY}/controller_state", 50000)
         self.hardware = other.hear(JointState, "/joint_states", 50000)
         self.counts = other.hear(DiagnosticArray, "/diagnostics", 1000)
-        self.send = other.node.create_publisher(
-            JointTrajectory, f"/{target}/joint_trajectory", QoSProfile(depth=10)
-        )
+        self.send = other.node.create_publisher(JointTrajectory, f"/{target}/joint_trajectory", QoSProfile(depth=10))
         simulated = HARDWARE[part] == TOPICS
         settings = [f"controllers:={self._write_lockstep_settings()}"] if simulated else []
         self.process = Process(
-            "ros2", "launch", "pkm_twin", "control.launch.py", f"robot:={given}", f"use:={use}",
-            f"hardware_plugin:={HARDWARE[part]}", f"bandwidth:={bandwidth}", *settings,
-        )  # fmt: skip
+            "ros2",
+            "launch",
+            "pkm_twin",
+            "control.launch.py",
+            f"robot:={given}",
+            f"use:={use}",
+            f"hardware_plugin:={HARDWARE[part]}",
+            f"bandwidth:={bandwidth}",
+            *settings,
+        )
 
     def _write_lockstep_settings(self) -> Path:
         """Write the package's settings with simulated time, one command per 5 ms of /clock."""
@@ -182,9 +189,7 @@ class Chain:
         found = np.array([s.output.effort for s in self.states if any(s.reference.velocities)])
         columns = [np.array([getattr(p, name) for p in motion.points]) for name in KINDS]
         rates = robot.controller.rates
-        model = inverse_dynamics(
-            robot, robot.controller.positions(columns[0]), *map(rates, columns[1:])
-        )
+        model = inverse_dynamics(robot, robot.controller.positions(columns[0]), *map(rates, columns[1:]))
         right = robot.controller.controller_efforts(model)
         # The controller interpolates efforts between points.
         a, d = right[:-1], np.diff(right, axis=0)
@@ -219,10 +224,12 @@ class Chain:
         rows = [
             np.array([values(s) for s in states])
             for values in (
-                lambda s: s.reference.effort, lambda s: s.error.positions,
-                lambda s: s.error.velocities, lambda s: s.output.effort,
+                lambda s: s.reference.effort,
+                lambda s: s.error.positions,
+                lambda s: s.error.velocities,
+                lambda s: s.output.effort,
             )
-        ]  # fmt: skip
+        ]
         wanted = rows[0] + p * rows[1] + d * rows[2]
         beyond = int((np.abs(wanted) > limits).any(1).sum())
         error = np.abs(rows[3] - np.clip(wanted, -limits, limits)).max()
@@ -259,10 +266,11 @@ class Chain:
         self.set_parameter(CONTROLLER, "payload.mass", load.mass + MORE)
         self.robot = robot = self.robot.changed(
             payload={
-                "mass": load.mass + MORE, "com": load.com.tolist(),
+                "mass": load.mass + MORE,
+                "com": load.com.tolist(),
                 "inertia": load.inertia.tolist(),
             }
-        )  # fmt: skip
+        )
         aim = np.array(start)
         aim[0] = robot.limits.position[0, 1] + 0.2 * np.ptp(robot.limits.position[0])
         end, rest = robot.controller.controller_positions(aim)[None], np.zeros((1, len(start)))
@@ -309,9 +317,7 @@ class Chain:
         )
         self.set_parameter("topic_system", "lost", "")
         self.fallen.clear()
-        client = self.other.node.create_client(
-            SwitchController, "/controller_manager/switch_controller"
-        )
+        client = self.other.node.create_client(SwitchController, "/controller_manager/switch_controller")
         request = SwitchController.Request(activate_controllers=[GRAVITY], strictness=2)
         print(f"{self.part}: activated again: {self._call(client, request).ok}")
         self.other.until(lambda: self.fallen, GRAVITY)
@@ -345,15 +351,11 @@ def _output(*command: str) -> str:
 def twin_s_efforts(other: Peer, robot: Robot, given: str, states: list[Any]) -> Any:
     """Efforts of a running delta_dynamics for the references of these states, (count, n)."""
     answers = other.hear(JointTrajectory, "/delta_dynamics/joint_trajectory_ff", 10)
-    send = other.node.create_publisher(
-        JointTrajectory, "/delta_dynamics/joint_trajectory", QoSProfile(depth=10)
-    )
+    send = other.node.create_publisher(JointTrajectory, "/delta_dynamics/joint_trajectory", QoSProfile(depth=10))
     references = [s.reference for s in states]
     columns = [np.array([getattr(r, name) for r in references]) for name in KINDS]
     # Times only have to rise: efforts are those of each point.
-    message = trajectory(
-        list(robot.controller.names), 1e-3 * np.arange(1, len(states) + 1), *columns
-    )
+    message = trajectory(list(robot.controller.names), 1e-3 * np.arange(1, len(states) + 1), *columns)
     with closing(node("delta_dynamics", parameters=[f"mechanism:={given}"])):
         other.until(send.get_subscription_count, "delta_dynamics")
         other.spin(1.0)
@@ -379,9 +381,12 @@ def show(other: Peer, given: str, part: str, bandwidth: float) -> None:
         chain = Chain(other, given, part, bandwidth)
         with closing(chain.process):
             alone = {
-                "twin": chain.through_the_twin, "beyond": chain.beyond, "fall": chain.beyond,
-                "lost": chain.lost, "killed": chain.killed,
-            }  # fmt: skip
+                "twin": chain.through_the_twin,
+                "beyond": chain.beyond,
+                "fall": chain.beyond,
+                "lost": chain.lost,
+                "killed": chain.killed,
+            }
             if part in alone:
                 alone[part]()
                 return

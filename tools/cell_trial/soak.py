@@ -90,9 +90,7 @@ def robots(folder: Path, factor: float = 1.0) -> dict[str, Path]:
     return files
 
 
-def simulators(
-    spaces: Iterable[str], folder: Path, period: float, priority: int = 0
-) -> list[Process]:
+def simulators(spaces: Iterable[str], folder: Path, period: float, priority: int = 0) -> list[Process]:
     """Start a machine_sim for each namespace, driven by the efforts of its gate."""
     files = robots(folder, SIMULATED)
     return [
@@ -113,18 +111,31 @@ def launched(files: dict[str, Path], *extra: str) -> Process:
     """cell.launch.py with all nodes."""
     machines = ",".join(f"{space}={robot}" for space, robot in files.items())
     return Process(
-        "ros2", "launch", "pkm_twin", "cell.launch.py", f"machines:={machines}",
-        "command_gate:=true", "machine_state:=true", *extra,
-    )  # fmt: skip
+        "ros2",
+        "launch",
+        "pkm_twin",
+        "cell.launch.py",
+        f"machines:={machines}",
+        "command_gate:=true",
+        "machine_state:=true",
+        *extra,
+    )
 
 
 def launched_alone(files: dict[str, Path], *extra: str) -> Process:
     """twin.launch.py of the only machine, with all nodes."""
     ((space, robot),) = files.items()
     return Process(
-        "ros2", "launch", "pkm_twin", "twin.launch.py", f"robot:={robot}", f"namespace:={space}",
-        "command_gate:=true", "machine_state:=true", *extra,
-    )  # fmt: skip
+        "ros2",
+        "launch",
+        "pkm_twin",
+        "twin.launch.py",
+        f"robot:={robot}",
+        f"namespace:={space}",
+        "command_gate:=true",
+        "machine_state:=true",
+        *extra,
+    )
 
 
 PATIENT: dict[str, dict[str, float]] = {
@@ -209,8 +220,7 @@ def cell(other: Peer, seconds: float, extra: tuple[str, ...], priority: int) -> 
             needs=(*sims, cell_),
         )
         processes = _children(cell_) | {
-            f"machine_sim {space}": sim.process.pid
-            for space, sim in zip(MACHINES, sims, strict=True)
+            f"machine_sim {space}": sim.process.pid for space, sim in zip(MACHINES, sims, strict=True)
         }
         processes["recorder"] = recorder.process.pid
         print(f"two machines, all nodes, recorder, {seconds:.0f} s:")
@@ -234,13 +244,10 @@ def kilohertz(other: Peer, seconds: float, priority: int) -> bool:
     space, file = next(iter(robots(folder).items()))
     given = (f"mechanism:={file}", f"thread_priority:={priority}")
     nodes = {"machine_sim": simulators([space], folder, 0.001, priority)[0]} | {
-        name: node(name, parameters=given, remap=(f"__ns:=/{space}",))
-        for name in ("delta_dynamics", "command_gate")
+        name: node(name, parameters=given, remap=(f"__ns:=/{space}",)) for name in ("delta_dynamics", "command_gate")
     }
     try:
-        other.until(
-            lambda: len(watch.values) >= 3, "diagnostics of three nodes", needs=nodes.values()
-        )
+        other.until(lambda: len(watch.values) >= 3, "diagnostics of three nodes", needs=nodes.values())
         print(f"one machine at 1 kHz, {seconds:.0f} s:")
         return watched(watch, {name: p.process.pid for name, p in nodes.items()}, seconds)
     finally:
@@ -267,10 +274,7 @@ def stops(other: Peer, times: int, *, one: bool) -> bool:
             watch.messages.clear()
             running.append(launch := launch_of(files, extra))
             other.until(
-                lambda: (
-                    len(watch.commands) == len(topics)
-                    and all(any(command) for command in watch.commands.values())
-                ),
+                lambda: len(watch.commands) == len(topics) and all(any(command) for command in watch.commands.values()),
                 lambda: (
                     f"torques through the gates; commands {watch.commands}, nodes "
                     f"{watch.messages}\n{launch.output[-2000:]}"

@@ -31,9 +31,7 @@ class Figures:
     machines: int = 0
     efforts: dict[str, list[float]] = field(default_factory=lambda: {r: [] for r in ROUTES})
     places: dict[str, list[float]] = field(default_factory=lambda: {r: [] for r in ROUTES})
-    balances: dict[str, list[float]] = field(
-        default_factory=lambda: {name: [] for name in BALANCE_BOUNDS}
-    )
+    balances: dict[str, list[float]] = field(default_factory=lambda: {name: [] for name in BALANCE_BOUNDS})
 
     def add(self, other: Figures) -> None:
         """Take in the figures of another machine."""
@@ -69,9 +67,7 @@ def compare_case(case: Case, exact: int) -> Figures:
     figures.balances["residual"] = joint.residual.tolist()
     rotors = np.array([robot.graph.joints[name].rotor_inertia for name in robot.joint_names])
     reaching = got - drag - rotors * case.qdd
-    figures.balances["efforts"] = [
-        difference(one, other) for one, other in zip(joint.efforts, reaching, strict=True)
-    ]
+    figures.balances["efforts"] = [difference(one, other) for one, other in zip(joint.efforts, reaching, strict=True)]
 
     engine, source = engine_of(data), energies(data)
     mechanics = MujocoTree(robot_description(robot))
@@ -94,9 +90,7 @@ def compare_case(case: Case, exact: int) -> Figures:
         shares = (got[k] - drag[k]) * case.qd[k]
         load = case.wrench[k] @ twist[k]
         scale = np.abs(shares).sum() + abs(load)
-        figures.balances["power"].append(
-            float(abs(shares.sum() + load - result.energy_rate) / scale)
-        )
+        figures.balances["power"].append(float(abs(shares.sum() + load - result.energy_rate) / scale))
         size = abs(result.energy) + abs(result.kinetic)
         figures.balances["energy"].append(float(abs(stored[k] - result.energy) / size))
     return figures

@@ -133,9 +133,7 @@ class Energies:
         payload = params.get("payload") or {}
         if payload.get("mass"):
             self.solids.append(
-                Solid.of(
-                    payload["mass"], payload.get("com", (0, 0, 0)), payload.get("inertia", (0,) * 3)
-                )
+                Solid.of(payload["mass"], payload.get("com", (0, 0, 0)), payload.get("inertia", (0,) * 3))
             )
         self._base: Vector = []
         self._slope: Any = None
@@ -263,9 +261,7 @@ class Energies:
         with mpmath.workdps(DIGITS):
             self._settle(np.asarray(q, dtype=float))
             at = self._at
-            rate, change, load = (
-                [mpmath.mpf(float(v)) for v in values] for values in (qd, qdd, wrench)
-            )
+            rate, change, load = ([mpmath.mpf(float(v)) for v in values] for values in (qd, qdd, wrench))
             later = plus(at, rate, STEP), plus(rate, change, STEP)
             earlier = plus(at, rate, -STEP), plus(rate, change, -STEP)
             gained = _rate(self._momentum(*later), self._momentum(*earlier))

@@ -65,9 +65,7 @@ class DeltaEnergies(Energies):
         """Return the arm's direction, and the forearm's ends at elbow and platform."""
         size: Callable[[Any], Any] = float if m is math else mpmath.mpf
         r = [size(v) for v in self.out[i]]
-        base, platform, arm = (
-            size(self.lengths[k]) for k in ("base_radius", "platform_radius", "arm_length")
-        )
+        base, platform, arm = (size(self.lengths[k]) for k in ("base_radius", "platform_radius", "arm_length"))
         direction = [m.cos(q) * r[0], m.cos(q) * r[1], -m.sin(q)]
         elbow = [base * r[k] + arm * direction[k] for k in range(3)]
         corner = [u[k] + platform * r[k] for k in range(3)]

@@ -42,10 +42,7 @@ FACTORS = np.linspace(0.5, 2.0, 301)
 def rigid_joints() -> dict[str, list[float]]:
     """Return the shipped joint compliances with 0 for every finite entry."""
     joints = parameters_of("upr_rpu")["joints_compliance"]
-    return {
-        name: [math.inf if value == math.inf else 0.0 for value in entries]
-        for name, entries in joints.items()
-    }
+    return {name: [math.inf if value == math.inf else 0.0 for value in entries] for name, entries in joints.items()}
 
 
 def with_rigid_joints() -> Robot:
@@ -121,8 +118,7 @@ def deflections(bars: float = 1.0, joints: float = 1.0, base: Robot | None = Non
             "shear_modulus": members.shear_modulus / bars,
         },
         "joints_compliance": {
-            name: (joints * getattr(robot.joints_compliance, name)).tolist()
-            for name in rigid_joints()
+            name: (joints * getattr(robot.joints_compliance, name)).tolist() for name in rigid_joints()
         },
     }
     changed = robot.changed(**changes)
@@ -152,9 +148,7 @@ def paper_rows(factors: np.ndarray = FACTORS) -> PaperRows:
     robot = load("upr_rpu")
     best = []
     for name in ("bars", "joints"):
-        left = [
-            (error(deflections(base=robot, **{name: factor})), float(factor)) for factor in factors
-        ]
+        left = [(error(deflections(base=robot, **{name: factor})), float(factor)) for factor in factors]
         best.append(min(left)[::-1])
     held = with_rigid_joints()
     rigid = 1e6 * np.array([compliance(held, pose) @ LOAD for pose, *_ in TABLE_1])

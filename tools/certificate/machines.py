@@ -50,9 +50,7 @@ def build(data: dict[str, Any]) -> Robot:
 def friction(data: dict[str, Any], qd: np.ndarray) -> np.ndarray:
     """Effort that friction costs, for the routes that know none."""
     values = data.get("friction", {})
-    return np.multiply(values.get("viscous", 0.0), qd) + np.multiply(
-        values.get("coulomb", 0.0), np.sign(qd)
-    )
+    return np.multiply(values.get("viscous", 0.0), qd) + np.multiply(values.get("coulomb", 0.0), np.sign(qd))
 
 
 def random_case(name: str, rng: np.random.Generator, states: int) -> Case:
@@ -131,9 +129,7 @@ def _delta(rng: np.random.Generator, sliding: bool) -> dict[str, Any]:
     closures = ["rod", "rod", "rod"]
     if sliding:
         closures[rng.integers(3)] = "rcu"
-    azimuths = np.array([-1.0, 3.0, 7.0]) * math.pi / 6 + rng.uniform(
-        -AZIMUTH_ERROR, AZIMUTH_ERROR, 3
-    )
+    azimuths = np.array([-1.0, 3.0, 7.0]) * math.pi / 6 + rng.uniform(-AZIMUTH_ERROR, AZIMUTH_ERROR, 3)
     inertia = {
         "platform_mass": rng.uniform(0.1, 1.0),
         "arm_mass": rng.uniform(0.1, 1.0),
@@ -160,9 +156,7 @@ def _delta(rng: np.random.Generator, sliding: bool) -> dict[str, Any]:
 def _prru(rng: np.random.Generator) -> dict[str, Any]:
     base = rng.uniform(0.25, 0.5)
     limb = base * rng.uniform(1.4, 2.2)
-    azimuths = np.array([3.0, 5.0, 1.0]) * math.pi / 3 + rng.uniform(
-        -AZIMUTH_ERROR, AZIMUTH_ERROR, 3
-    )
+    azimuths = np.array([3.0, 5.0, 1.0]) * math.pi / 3 + rng.uniform(-AZIMUTH_ERROR, AZIMUTH_ERROR, 3)
     platform = float(rng.uniform(10.0, 40.0))
     links: dict[str, Any] = {}
     thin = rng.random() < THIN

@@ -143,9 +143,7 @@ def _balances(figures: dict[str, Figures], judge: Judge) -> str:
         found = [np.array(one.balances[key]) for one in figures.values()]
         if not sum(map(len, found)):
             continue
-        worst = judge(
-            max(float(v.max()) for v in found if len(v)), BALANCE_BOUNDS[key], f"balance of {title}"
-        )
+        worst = judge(max(float(v.max()) for v in found if len(v)), BALANCE_BOUNDS[key], f"balance of {title}")
         rows.append(f"| {title} | {text} | {worst} | {BALANCE_BOUNDS[key]:.0e} |")
     table = "\n".join(rows)
     return f"""### Balances
@@ -172,9 +170,7 @@ def _swings(swings: list[Swing], judge: Judge) -> str:
             for k, (one, two) in enumerate(((swing.q, other.q), (swing.qd, other.qd))):
                 apart = float(np.abs(one[-1] - two[-1]).max())
                 ends.append(judge(apart, bound, f"{what}, {('position', 'rate')[k]} at the end"))
-        rows.append(
-            f"| `{swing.machine}` | {swing.route} | {drift} | {closure} | {', '.join(ends)} |"
-        )
+        rows.append(f"| `{swing.machine}` | {swing.route} | {drift} | {closure} | {', '.join(ends)} |")
     table = "\n".join(rows)
     return f"""### Free swing of {DURATION:.0f} s
 

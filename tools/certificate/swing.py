@@ -91,9 +91,7 @@ def engine_of(data: dict[str, Any]) -> LoopEngine:
     return PrruEngine(data) if data["mechanism"] == "prru" else DeltaEngine(data)
 
 
-def closure_error(
-    data: dict[str, Any], q: np.ndarray, centre: np.ndarray, axes: np.ndarray
-) -> float:
+def closure_error(data: dict[str, Any], q: np.ndarray, centre: np.ndarray, axes: np.ndarray) -> float:
     """How far the limbs are from fitting between actuators and platform, m."""
     g = data["geometry"]
     worst = 0.0
@@ -130,9 +128,7 @@ def _sampled(function: Any, first: np.ndarray) -> np.ndarray:
     states = [first]
     for k in range(SAMPLES):
         span = DURATION * k / SAMPLES, DURATION * (k + 1) / SAMPLES
-        solution = solve_ivp(
-            function, span, states[-1], "DOP853", rtol=TOLERANCE, atol=TOLERANCE, t_eval=span[1:]
-        )
+        solution = solve_ivp(function, span, states[-1], "DOP853", rtol=TOLERANCE, atol=TOLERANCE, t_eval=span[1:])
         states.append(solution.y[:, -1])
     return np.array(states)
 
@@ -195,8 +191,6 @@ def _summary(
     resting = np.array([source.state_energy(place, STILL) for place in q])
     constant = total - q @ effort
     kinetic = float((total - resting).max())
-    closure = max(
-        closure_error(start.data, at, *place) for at, place in zip(q, places, strict=True)
-    )
+    closure = max(closure_error(start.data, at, *place) for at, place in zip(q, places, strict=True))
     drift = float(np.abs(constant - constant[0]).max()) / kinetic
     return Swing(start.title, route, q, qd, closure, drift)

@@ -66,9 +66,7 @@ def places():
     x = {name: k - (len(row) - 1) / 2 for row in rows for k, name in enumerate(row)}
     for _ in range(50):
         for row in rows:
-            near = {
-                n: np.mean([x[b if a == n else a] for a, b in arrows() if n in (a, b)]) for n in row
-            }
+            near = {n: np.mean([x[b if a == n else a] for a, b in arrows() if n in (a, b)]) for n in row}
             row.sort(key=near.__getitem__)
             for k, name in enumerate(row):
                 x[name] = 0.5 * near[name] + 0.5 * (k - (len(row) - 1) / 2)

@@ -17,8 +17,11 @@ SEVERAL = 2
 """Commands that an option has to have with one meaning to be explained once for all."""
 SHARED = "Options of several commands"
 GROUPS = {
-    "--columns": "table", "--topic": "recording", "--picture": "picture", "--teeth": "milling",
-}  # fmt: skip
+    "--columns": "table",
+    "--topic": "recording",
+    "--picture": "picture",
+    "--teeth": "milling",
+}
 """An option, and the name of those that the same commands have."""
 PLAIN = ("", "TEXT", "NUMBER", "NUMBERS", "COUNT")
 """Kinds of values that an option's explanation makes clear."""
@@ -85,8 +88,7 @@ def page() -> str:
     shared = [
         word
         for word in often
-        if len({words.split()[0] for words in users[word]}) > 1
-        or not any(word in words for words in common.values())
+        if len({words.split()[0] for words in users[word]}) > 1 or not any(word in words for words in common.values())
     ]
     # One meaning a name.
     names = [word.name for word in shared]
@@ -118,8 +120,7 @@ class Groups:
         self.shared = sorted(shared, key=lambda word: word.name)
         named = {word.name: word for word in shared}
         self.groups = {
-            name: [word for word in self.shared if users[word] == users[named[one]]]
-            for one, name in GROUPS.items()
+            name: [word for word in self.shared if users[word] == users[named[one]]] for one, name in GROUPS.items()
         }
 
     def lines(self) -> list[str]:
@@ -141,9 +142,7 @@ class Groups:
         return [f"Also {', '.join(names)}.", ""] if names else []
 
 
-def section(
-    name: str, command: Any, inner: dict[str, Any], own: Sequence[Word], groups: Groups
-) -> list[str]:
+def section(name: str, command: Any, inner: dict[str, Any], own: Sequence[Word], groups: Groups) -> list[str]:
     """Write a command, or the commands of a group after their common options."""
     lines, alone = [f"## `pkm-twin {name}`", ""], command in inner.values()
     if not alone:

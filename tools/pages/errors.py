@@ -46,8 +46,7 @@ ERRORS = {
     ),
     errors.SingularityError: (
         errors.SingularityError("joint state", (), 2e-9, 1e-6),
-        "keep `robot.singularity(q)` above 0.05 or more "
-        "([singularity index](concepts.md#singularity-index))",
+        "keep `robot.singularity(q)` above 0.05 or more ([singularity index](concepts.md#singularity-index))",
     ),
     errors.MessageError: (
         errors.MessageError("not finite", "position of arm_1 is nan"),

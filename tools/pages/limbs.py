@@ -31,8 +31,7 @@ def draw_circle(ax, centre, radius):
 
 def name(ax, place, text, side):
     """Write a name beside a place."""
-    ax.annotate(text, place, np.multiply(side, 8.0), textcoords="offset points", ha="center",
-                va="center", fontsize=11)  # fmt: skip
+    ax.annotate(text, place, np.multiply(side, 8.0), textcoords="offset points", ha="center", va="center", fontsize=11)
 
 
 def draw(path):
@@ -54,8 +53,9 @@ def draw(path):
     figure, ((first,), (second,), (third,)) = plots.columns(3, 1, 3.2)
     for ax, title in (
         (first, "1. the pose places the platform"),
-        (second, "2. reach: one distance"), (third, "3. turn: one direction"),
-    ):  # fmt: skip
+        (second, "2. reach: one distance"),
+        (third, "3. turn: one direction"),
+    ):
         ax.set_title(title, fontsize=11)
         ax.set_aspect("equal")
         ax.axis("off")

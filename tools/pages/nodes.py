@@ -87,9 +87,7 @@ def _values(setting: Setting) -> str:
         return "" if told else ", ".join(f"`{word}`" for word in setting.choices)
     if setting.low is None or setting.high is None:
         return setting.unit
-    low, high = (
-        str(int(v)) if v == int(v) < 1e8 else f"{v:g}" for v in (setting.low, setting.high)
-    )
+    low, high = (str(int(v)) if v == int(v) < 1e8 else f"{v:g}" for v in (setting.low, setting.high))
     return f"{low} to {high} {setting.unit}".strip()
 
 
@@ -115,10 +113,7 @@ def policy(text: str) -> str:
     """Return the security policy with the nodes' present topics and services."""
     for node in MODULES:
         found = class_of(node).topics.values()
-        allowed = "".join(
-            _group(head, [row.name for row in found if row.way == way])
-            for way, head in GROUPS.items()
-        )
+        allowed = "".join(_group(head, [row.name for row in found if row.way == way]) for way, head in GROUPS.items())
         start = text.index("/>\n", text.index(f'node="{node}"')) + len("/>\n")
         text = text[:start] + allowed + text[text.index("        </profile>", start) :]
     return text

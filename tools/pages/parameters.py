@@ -38,14 +38,22 @@ UNITS = {
     "{rotor}": "kg m2 or kg",
 }
 ROBOTS = {
-    "delta": delta.Delta, "linear_delta": linear_delta.LinearDelta, "prru": prru.Prru,
+    "delta": delta.Delta,
+    "linear_delta": linear_delta.LinearDelta,
+    "prru": prru.Prru,
     "upr_rpu": upr_rpu.UprRpu,
-}  # fmt: skip
+}
 TITLES = {
-    BodySpec: "bodies.NAME", JointSpec: "joints.NAME", RodSpec: "rods.NAME", Tube: "tube",
-    DriveSpec: "drive", FrictionSpec: "friction", friction_of(3): "friction",
-    JointMapEntry: "joint_map.JOINT", UncertaintyEntry: "uncertainty.PATH",
-}  # fmt: skip
+    BodySpec: "bodies.NAME",
+    JointSpec: "joints.NAME",
+    RodSpec: "rods.NAME",
+    Tube: "tube",
+    DriveSpec: "drive",
+    FrictionSpec: "friction",
+    friction_of(3): "friction",
+    JointMapEntry: "joint_map.JOINT",
+    UncertaintyEntry: "uncertainty.PATH",
+}
 """Headings of what has a table of its own."""
 
 

@@ -103,9 +103,7 @@ TABLES_4_TO_6: Final = (
 """Torque vectors of arms I to III, base axes, N mm."""
 
 
-def find_motion(
-    time: ArrayLike = TIME, signs: Array = SIGNS, home: float = HOME_ANGLE
-) -> tuple[Array, Array, Array]:
+def find_motion(time: ArrayLike = TIME, signs: Array = SIGNS, home: float = HOME_ANGLE) -> tuple[Array, Array, Array]:
     """Return the arms' angles, velocities and accelerations of the worked example, shape (k, 3)."""
     phase = RATE * np.asarray(time, float)[:, None]
     cosine, sine = signs * np.cos(phase), signs * np.sin(phase)
@@ -192,14 +190,18 @@ def draw_motion(file: Path) -> None:
     figure, columns = plots.columns(2, 1)
     curves = (
         (
-            find_velocity(robot, q, qd), TABLE_2, "velocity (mm/s)",
+            find_velocity(robot, q, qd),
+            TABLE_2,
+            "velocity (mm/s)",
             "Figure 3: how fast is the platform?",
         ),
         (
-            find_acceleration(robot, q, qd, qdd), TABLE_3, "acceleration (mm/s²)",
+            find_acceleration(robot, q, qd, qdd),
+            TABLE_3,
+            "acceleration (mm/s²)",
             "Figure 4: how does it accelerate?",
         ),
-    )  # fmt: skip
+    )
     for (ax,), (values, table, unit, title) in zip(columns, curves, strict=True):
         _draw_curves(ax, time, values, read_numbers(table), "xyz")
         plots.label(ax, "time (s)", unit, f"{title} Dots: table")
@@ -229,8 +231,7 @@ def draw_modes(file: Path, first: int) -> None:
     """Draw three mode shapes from the mode ``first`` on; the machine at rest is grey."""
     found = find_modes("delta_cu")
     names = [name.rpartition(" ")[0] for name in found.nodes]
-    lines = {n: np.array([k for k, name in enumerate(names) if name == n])
-             for n in dict.fromkeys(names) if n}  # fmt: skip
+    lines = {n: np.array([k for k, name in enumerate(names) if name == n]) for n in dict.fromkeys(names) if n}
     ends = [line[-1] for name, line in lines.items() if name.startswith("forearm")]
     # Round the platform, by the corners' azimuths.
     x, y, _ = (found.positions[ends] - found.positions[0]).T
@@ -304,7 +305,9 @@ def _find_equations() -> tuple[Row, ...]:
     virtual_work = "delta_dynamics.torques.virtual_work."
     return (
         Row(
-            "equation", (1, 2), "closure of a limb, and its derivative",
+            "equation",
+            (1, 2),
+            "closure of a limb, and its derivative",
             (
                 "pkm_twin.mechanisms.delta.Delta.make_graph",
                 "pkm_twin.kinematics.constraints.keep_distance",
@@ -313,99 +316,158 @@ def _find_equations() -> tuple[Row, ...]:
             "lost in the scan; equations 3 and 9 show what they are",
         ),
         Row(
-            "equation", (3,), "platform velocity from the arms' velocities",
-            ("pkm_twin.robot.robot.Robot.jacobian",), (TEST + "test_table_2_velocity", *same),
+            "equation",
+            (3,),
+            "platform velocity from the arms' velocities",
+            ("pkm_twin.robot.robot.Robot.jacobian",),
+            (TEST + "test_table_2_velocity", *same),
         ),
         Row(
-            "equation", (4, 5), "derivative of equation 1",
-            ("pkm_twin.kinematics.motion.Row",), same, "lost in the scan, as part of equation 6",
+            "equation",
+            (4, 5),
+            "derivative of equation 1",
+            ("pkm_twin.kinematics.motion.Row",),
+            same,
+            "lost in the scan, as part of equation 6",
         ),
         Row(
-            "equation", (6,), "platform acceleration",
+            "equation",
+            (6,),
+            "platform acceleration",
             ("pkm_twin.robot.robot.Robot.pose_acceleration",),
             (TEST + "test_table_3_acceleration", *same),
             "partly lost in the scan",
         ),
         Row(
-            "equation", (7, 8), "velocities of the centres of arm and forearm",
-            (motion + "velocity",), same,
+            "equation",
+            (7, 8),
+            "velocities of the centres of arm and forearm",
+            (motion + "velocity",),
+            same,
         ),
         Row(
-            "equation", (9,), "vector loop of a limb",
-            ("pkm_twin.mechanisms.delta.Delta.make_graph",), same,
+            "equation",
+            (9,),
+            "vector loop of a limb",
+            ("pkm_twin.mechanisms.delta.Delta.make_graph",),
+            same,
         ),
         Row(
-            "equation", (10, 11, 12), "angular velocity of a forearm",
-            (motion + "set_rates",), same,
+            "equation",
+            (10, 11, 12),
+            "angular velocity of a forearm",
+            (motion + "set_rates",),
+            same,
         ),
         Row(
-            "equation", (13, 14), "platform acceleration along a limb",
-            (motion + "set_accelerations",), misprinted, errata,
+            "equation",
+            (13, 14),
+            "platform acceleration along a limb",
+            (motion + "set_accelerations",),
+            misprinted,
+            errata,
         ),
         Row(
-            "equation", (15,), "acceleration of a forearm's centre",
-            (motion + "acceleration", virtual_work + "Forces.rod"), misprinted,
+            "equation",
+            (15,),
+            "acceleration of a forearm's centre",
+            (motion + "acceleration", virtual_work + "Forces.rod"),
+            misprinted,
             f"{errata}, partly lost in the scan",
         ),
         Row(
-            "equation", (16,), "angular acceleration of a forearm",
-            (motion + "set_accelerations", virtual_work + "Forces.rod"), misprinted, errata,
+            "equation",
+            (16,),
+            "angular acceleration of a forearm",
+            (motion + "set_accelerations", virtual_work + "Forces.rod"),
+            misprinted,
+            errata,
         ),
         Row(
-            "equation", (17, 18), "force and moment balance of an arm, reactions at A and B",
-            ("delta_dynamics.reactions",), balance,
+            "equation",
+            (17, 18),
+            "force and moment balance of an arm, reactions at A and B",
+            ("delta_dynamics.reactions",),
+            balance,
         ),
         Row(
-            "equation", (19, 20), "force and moment balance of a forearm, reactions at B and C",
-            ("delta_dynamics.reactions",), balance,
+            "equation",
+            (19, 20),
+            "force and moment balance of a forearm, reactions at B and C",
+            ("delta_dynamics.reactions",),
+            balance,
         ),
         Row(
-            "equation", (21,), "force balance of the platform",
-            ("delta_dynamics.reactions",), balance,
+            "equation",
+            (21,),
+            "force balance of the platform",
+            ("delta_dynamics.reactions",),
+            balance,
             "the parallelograms' moments are not in the paper",
         ),
         Row(
-            "equation", (22,), "virtual work of all bodies", (virtual_work + "Forces",), same,
+            "equation",
+            (22,),
+            "virtual work of all bodies",
+            (virtual_work + "Forces",),
+            same,
             "partly lost in the scan",
         ),
         Row(
-            "equation", (23,), "torques of the arms", (virtual_work + "inverse_dynamics",),
+            "equation",
+            (23,),
+            "torques of the arms",
+            (virtual_work + "inverse_dynamics",),
             (TEST + "test_tables_4_to_6_torques", *same),
             "partly lost in the scan",
         ),
-    )  # fmt: skip
+    )
 
 
 def _find_tables(velocity: Array, acceleration: Array, torques: Array) -> tuple[Row, ...]:
     errata = "[digits corrected](validation.md#delta-cu-dynamics-by-virtual-work)"
     rows = [
         Row(
-            "table", (1,), "dimensions, masses, densities", ("pkm_twin.load",),
-            (TEST + "test_table_1",), "all in the robot's file; the base's density has no effect",
+            "table",
+            (1,),
+            "dimensions, masses, densities",
+            ("pkm_twin.load",),
+            (TEST + "test_table_1",),
+            "all in the robot's file; the base's density has no effect",
         ),
         Row(
-            "table", (2,), "platform velocity", (__name__ + ".find_velocity",),
+            "table",
+            (2,),
+            "platform velocity",
+            (__name__ + ".find_velocity",),
             (TEST + "test_table_2_velocity",),
             f"three significant digits, then zeros; t = 3 s: {errata}",
             (_compare("table 2, velocity", "mm/s", TABLE_2, velocity),),
         ),
         Row(
-            "table", (3,), "platform acceleration", (__name__ + ".find_acceleration",),
+            "table",
+            (3,),
+            "platform acceleration",
+            (__name__ + ".find_acceleration",),
             (TEST + "test_table_3_acceleration",),
             f"three significant digits, then zeros; t = 4 s: {errata}",
             (_compare("table 3, acceleration", "mm/s²", TABLE_3, acceleration),),
         ),
-    ]  # fmt: skip
+    ]
     vectors = find_torque_vectors(load("delta_cu"), torques)
     for k, (limb, table) in enumerate(zip(("I", "II", "III"), TABLES_4_TO_6, strict=True)):
         compared = _compare(f"table {4 + k}, torque of arm {limb}", "N mm", table, vectors[:, k])
         rows.append(
             Row(
-                "table", (4 + k,), f"torque of arm {limb}, as a vector",
-                ("delta_dynamics.inverse_dynamics",), (TEST + "test_tables_4_to_6_torques",),
-                "printed to six or seven digits", (compared,),
+                "table",
+                (4 + k,),
+                f"torque of arm {limb}, as a vector",
+                ("delta_dynamics.inverse_dynamics",),
+                (TEST + "test_tables_4_to_6_torques",),
+                "printed to six or seven digits",
+                (compared,),
             )
-        )  # fmt: skip
+        )
     return tuple(rows)
 
 
@@ -422,30 +484,42 @@ def _find_figures(frequencies: str) -> tuple[Row, ...]:
     return (
         Row("figure", (1,), "the mechanism", note="lost in the scan"),
         Row(
-            "figure", (2,), "the virtual prototype", ("pkm_twin.view.drawing.draw",),
+            "figure",
+            (2,),
+            "the virtual prototype",
+            ("pkm_twin.view.drawing.draw",),
             note="lost in the scan; here the machine of the robot's file",
             pictures=("robot_delta_cu.png",),
         ),
         Row(
-            "figure", (3, 4), "velocity and acceleration of the platform, by ADAMS",
+            "figure",
+            (3, 4),
+            "velocity and acceleration of the platform, by ADAMS",
             (__name__ + ".draw_motion",),
             (TEST + "test_table_2_velocity", TEST + "test_table_3_acceleration"),
             "curves lost in the scan; the paper states that they agree with tables 2 and 3",
-            pictures=("delta_cu_motion.png",), drawn_by={"delta_cu_motion.png": draw_motion},
+            pictures=("delta_cu_motion.png",),
+            drawn_by={"delta_cu_motion.png": draw_motion},
         ),
         Row(
-            "figure", (5, 6, 7), "torques of arms I to III, by ADAMS",
+            "figure",
+            (5, 6, 7),
+            "torques of arms I to III, by ADAMS",
             (__name__ + ".draw_torques",),
             (
                 TEST + "test_tables_4_to_6_torques",
                 TEST + "test_conclusion_1_torques_of_a_delta_are_larger",
             ),
             "curves lost in the scan; the paper states that they agree with tables 4 to 6",
-            pictures=("delta_cu_torques.png",), drawn_by={"delta_cu_torques.png": draw_torques},
+            pictures=("delta_cu_torques.png",),
+            drawn_by={"delta_cu_torques.png": draw_torques},
         ),
         Row(
-            "figure", (8,), "six natural modes (orange: the R-C-U forearm)",
-            ("stiffness_monitor.modes.modes",), (TEST + "test_conclusion_2_mode_shapes",),
+            "figure",
+            (8,),
+            "six natural modes (orange: the R-C-U forearm)",
+            ("stiffness_monitor.modes.modes",),
+            (TEST + "test_conclusion_2_mode_shapes",),
             f"frequencies lost in the scan, here {frequencies} Hz. Modes 1 to 3 agree: platform, "
             "forearms and the joints between them. Modes 4 to 6: in print more deformation at the "
             "joints of arm and forearm; here the forearms bend, and these joints, rigid in the "
@@ -456,4 +530,4 @@ def _find_figures(frequencies: str) -> tuple[Row, ...]:
                 "delta_cu_modes_4_6.png": partial(draw_modes, first=4),
             },
         ),
-    )  # fmt: skip
+    )

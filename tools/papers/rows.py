@@ -76,8 +76,7 @@ class Row:
                 runs[-1].append(number)
             else:
                 runs.append([number])
-        texts = [f"{run[0]} to {run[-1]}" if len(run) > 2 else ", ".join(map(str, run))
-                 for run in runs]  # fmt: skip
+        texts = [f"{run[0]} to {run[-1]}" if len(run) > 2 else ", ".join(map(str, run)) for run in runs]
         return ", ".join(texts)
 
 

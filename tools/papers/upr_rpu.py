@@ -65,9 +65,12 @@ SHARES_DRAWN: Final = "map_upr_rpu_shares"
 
 
 def _equation(
-    numbers: Sequence[int], content: str, functions: tuple[str, ...], tests: tuple[str, ...],
+    numbers: Sequence[int],
+    content: str,
+    functions: tuple[str, ...],
+    tests: tuple[str, ...],
     note: str = "",
-) -> Row:  # fmt: skip
+) -> Row:
     return Row("equation", tuple(numbers), content, functions, tests, note)
 
 
@@ -75,17 +78,24 @@ EQUATIONS: Final = (
     _equation((1, 19), "unit wrenches of a limb", (UPR_RPU + "limb_wrenches",), LIMB),
     _equation((2,), "forces in a bar's section", (FRAME + "deformations",), CLOSED),
     _equation(
-        (3, 20), "bar compliance C_B", (FRAME + "deformations",), CLOSED,
+        (3, 20),
+        "bar compliance C_B",
+        (FRAME + "deformations",),
+        CLOSED,
         "the effective shear area is not printed: here the whole section, shear factor 1",
     ),
     _equation((4, 9, 14, 26), "strain energies", (SOLVED + "energies",), CLOSED),
     _equation(
-        (5, 6, 7, 11, 12, 13, 21, 22, 23, 24), "limb wrenches in a joint's axes",
-        (FRAME + "Frame._add_joint",), CLOSED,
+        (5, 6, 7, 11, 12, 13, 21, 22, 23, 24),
+        "limb wrenches in a joint's axes",
+        (FRAME + "Frame._add_joint",),
+        CLOSED,
     ),
     _equation((8, 25), "joint compliances", (UPR_RPU + "structure",), CLOSED),
     _equation(
-        (15,), "compliance of the UPR limbs' U joint", (UPR_RPU + "structure",),
+        (15,),
+        "compliance of the UPR limbs' U joint",
+        (UPR_RPU + "structure",),
         (TEST + "test_table_1_does_not_hang_on_the_lost_entry",),
         "last entry lost; 3.22e-11 rad/(N m), that of the RPU limb: no digit of table 1 changes "
         "between 1e-11 and 3.22e-11",
@@ -96,27 +106,31 @@ EQUATIONS: Final = (
     _equation((18,), "deformation of a UPR limb", (LIMBS,), LIMB),
     _equation((29, 31, 32), "deformations, virtual work", (SOLVED + "load",), LIMB),
     _equation(
-        (30,), "balance of the platform, J_i", (UPR_RPU + "limb_wrenches",), LIMB,
+        (30,),
+        "balance of the platform, J_i",
+        (UPR_RPU + "limb_wrenches",),
+        LIMB,
         "z of a pose is not defined: here the Z coordinate of o",
     ),
     _equation((33, 34), "stiffness K", (SOLVED + "factorise", "stiffness_monitor.stiffness"), LIMB),
     _equation((35,), "compliance C", (SOLVED + "factorise", RESPONSE), CLOSED),
-    _equation(
-        (36,), "amplitudes W_i", ("stiffness_monitor.limbs.LimbStiffness.amplitudes",), LIMB
-    ),
+    _equation((36,), "amplitudes W_i", ("stiffness_monitor.limbs.LimbStiffness.amplitudes",), LIMB),
     _equation((37,), "total strain energy U", (RESPONSE,), CLOSED),
     _equation((38,), "local strain-energy factors", (RESPONSE,), CLOSED),
     _equation(
-        (39,), "global strain-energy factors",
+        (39,),
+        "global strain-energy factors",
         ("pkm_twin.maps.kinds.strain_energy.StrainEnergy.facts",),
         (TEST + "test_table_2_over_the_volume", TEST + "test_table_2_over_points_on_rays"),
         "the integral is over the volume; the sum over N points depends on where they are",
     ),
     _equation(
-        (40,), "limits", ("stiffness_monitor.reachable",),
+        (40,),
+        "limits",
+        ("stiffness_monitor.reachable",),
         (TEST + "test_limits_bound_the_reachable_workspace",),
     ),
-)  # fmt: skip
+)
 
 
 def _compare(printed: str, values: Array) -> list[Printed]:
@@ -159,12 +173,13 @@ def find_rows() -> Paper:
         )
     }
     maxima = Comparison(
-        "2UPR-RPU, maxima stated of figure 7", tuple(MAXIMA),
+        "2UPR-RPU, maxima stated of figure 7",
+        tuple(MAXIMA),
         {
             where: _compare(" ".join(MAXIMA.values()), one.factors.max(axis=0)[columns])
             for where, one in vertical.items()
         },
-    )  # fmt: skip
+    )
     # Where limbs 1 and 2 change places, as gamma changes its sign.
     uneven = max(np.abs(one.factors[:, 1] - one.factors[:, 4]).max() for one in vertical.values())
     volume, rays = (one.lines["P1"][2].value for one in means)
@@ -186,7 +201,10 @@ def find_rows() -> Paper:
     loads = max(abs(n.value - float(n.text)) for n in small)
     tables = (
         Row(
-            "table", (1,), "deflections of two poses", ("stiffness_monitor.strain_energy",),
+            "table",
+            (1,),
+            "deflections of two poses",
+            ("stiffness_monitor.strain_energy",),
             (
                 TEST + "test_table_1_theory",
                 TEST + "test_table_1_finite_elements_within_the_papers_error",
@@ -197,27 +215,42 @@ def find_rows() -> Paper:
             comparisons=(theory, elements),
         ),
         Row(
-            "table", (2,), "global strain-energy factors",
+            "table",
+            (2,),
+            "global strain-energy factors",
             ("pkm_twin.maps.kinds.strain_energy.StrainEnergy.facts",),
             (TEST + "test_table_2_over_the_volume", TEST + "test_table_2_over_points_on_rays"),
             f"`pkm-twin {SHARES} {LOADS}` prints the means over the volume",
             comparisons=tuple(means),
         ),
-    )  # fmt: skip
+    )
     kind = "pkm_twin.maps.kinds.strain_energy.StrainEnergy."
     even = TEST + "test_distributions_symmetric_about_gamma_zero"
     drawn = SHARES_DRAWN
     figures = (
         Row(
-            "figure", (1,), "machine", (UPR_RPU + "make_graph",), CLOSED,
+            "figure",
+            (1,),
+            "machine",
+            (UPR_RPU + "make_graph",),
+            CLOSED,
             pictures=("robot_upr_rpu.png",),
         ),
-        Row("figure", (2, 3), "free bodies of the limbs", (UPR_RPU + "limb_wrenches",), LIMB,
-            "sketches; the forces in them are equations 1 and 19"),
-        Row("figure", (4,), "finite elements, deformed", note="another program's picture; its "
-            "displacements are table 1"),
         Row(
-            "figure", (5,), "reachable and prescribed workspace",
+            "figure",
+            (2, 3),
+            "free bodies of the limbs",
+            (UPR_RPU + "limb_wrenches",),
+            LIMB,
+            "sketches; the forces in them are equations 1 and 19",
+        ),
+        Row(
+            "figure", (4,), "finite elements, deformed", note="another program's picture; its displacements are table 1"
+        ),
+        Row(
+            "figure",
+            (5,),
+            "reachable and prescribed workspace",
             ("stiffness_monitor.regular_workspace",),
             (
                 TEST + "test_regular_workspace",
@@ -228,35 +261,52 @@ def find_rows() -> Paper:
             drawn_by={"map_upr_rpu_workspace": "map upr_rpu workspace --at=-0.6,0,0"},
         ),
         Row(
-            "figure", (6,), "strain energy under P1", (kind + "found",),
+            "figure",
+            (6,),
+            "strain energy under P1",
+            (kind + "found",),
             (even, TEST + "test_stated_maxima_at_z_600"),
             "even in gamma; in the plane z = -600 mm least within 2 degrees of the level pose",
-            pictures=(f"{drawn}_P1_energy_slices.png",), drawn_by={drawn: f"{SHARES} {LOADS}"},
+            pictures=(f"{drawn}_P1_energy_slices.png",),
+            drawn_by={drawn: f"{SHARES} {LOADS}"},
         ),
         Row(
-            "figure", (7,), "local factors under P1, slices", (kind + "figures",),
+            "figure",
+            (7,),
+            "local factors under P1, slices",
+            (kind + "figures",),
             (even, TEST + "test_stated_maxima_at_z_600"),
             "limb 2 mirrors limb 1; the paper has each factor even in gamma, here those of limb 3 "
-            f"alone are: with gamma's sign 1B changes by up to {uneven:.2f}", comparisons=(maxima,),
+            f"alone are: with gamma's sign 1B changes by up to {uneven:.2f}",
+            comparisons=(maxima,),
             pictures=tuple(f"{drawn}_P1_elements_{k}_slices.png" for k in (1, 2, 3)),
         ),
         Row(
-            "figure", (8,), "local factors under P1, plane z = -600 mm", (kind + "figures",),
+            "figure",
+            (8,),
+            "local factors under P1, plane z = -600 mm",
+            (kind + "figures",),
             (TEST + "test_vertical_load_at_home", TEST + "test_stated_maxima_at_z_600"),
             "in the level pose 1U and 2U hold 0.249 each, 1R and 2R 0.073",
             pictures=tuple(f"{drawn}_P1_elements_{k}_plane.png" for k in (1, 2, 3)),
         ),
         Row(
-            "figure", (9,), "three bars under P2", (kind + "figures",),
+            "figure",
+            (9,),
+            "three bars under P2",
+            (kind + "figures",),
             (TEST + "test_table_2_over_the_volume",),
             pictures=(f"{drawn}_P2_elements_1_slices.png",),
         ),
         Row(
-            "figure", (10,), "three bars under P3", (kind + "figures",),
+            "figure",
+            (10,),
+            "three bars under P3",
+            (kind + "figures",),
             (TEST + "test_table_2_over_the_volume",),
             pictures=(f"{drawn}_P3_elements_1_slices.png",),
         ),
-    )  # fmt: skip
+    )
     return Paper(
         "upr_rpu",
         "2UPR-RPU: stiffness by screws and strain energy",

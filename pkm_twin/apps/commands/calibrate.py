@@ -65,23 +65,22 @@ class Calibrate(OfRobot, ReadsTables, BeyondLimitsToo, Accepts, Overwrites):
 
     poses: Path | None = setting(
         None,
-        "CSV: JOINT.position columns, x y z (m), perhaps roll pitch yaw (rad) or qx qy qz qw; or "
-        "what --measure names",
+        "CSV: JOINT.position columns, x y z (m), perhaps roll pitch yaw (rad) or qx qy qz qw; or what --measure names",
         argument=True,
     )
     out: Path | None = setting(
-        None, "the calibrated robot, a YAML; default: calibrated.yaml", writes=True,
+        None,
+        "the calibrated robot, a YAML; default: calibrated.yaml",
+        writes=True,
         endings=(".yaml", ".yml"),
-    )  # fmt: skip
+    )
     only: tuple[str, ...] = setting(
         (), "fit only numbers whose path begins with this, joint offsets too; may be repeated"
     )
     no_offsets: bool = setting(False, "do not fit joint offsets")
     frame: bool = setting(False, "fit where the instrument stands: its six numbers")
     target: bool = setting(False, "fit where the target is on the platform: three numbers")
-    prior: float = setting(
-        0.01, "standard deviation of lengths before the fit, m", low=1e-6, high=1.0
-    )
+    prior: float = setting(0.01, "standard deviation of lengths before the fit, m", low=1e-6, high=1.0)
     transmission: Transmission = setting(
         Transmission.AUTO,
         "ratios of joint_map to fit: each by itself; shared: one factor for all; travel: each, and "
@@ -93,23 +92,16 @@ class Calibrate(OfRobot, ReadsTables, BeyondLimitsToo, Accepts, Overwrites):
         "what was measured, if not whole poses: height, distance, radius, range, plane, tilt, "
         "or of x, y, z, roll, pitch, yaw; separated by commas",
     )
-    noise: tuple[str, ...] = setting(
-        (), "KIND=VALUE: known standard deviation of a measurement, m or rad"
-    )
+    noise: tuple[str, ...] = setting((), "KIND=VALUE: known standard deviation of a measurement, m or rad")
     plan: Path | None = setting(
         None,
-        "write the poses to measure next, a CSV, and predict how well the machine will be known; "
-        "calibrate nothing",
+        "write the poses to measure next, a CSV, and predict how well the machine will be known; calibrate nothing",
         writes=True,
         endings=(".csv",),
     )
     count: int | None = setting(None, "poses of a plan", low=1, high=MAX_MEASUREMENTS)
-    accuracy: float | None = setting(
-        None, "standard deviation of the position that ends a plan, m", low=1e-9
-    )
-    within: str | None = setting(
-        None, "where a plan measures: x=-0.1:0.1,z=0 (m, rad); default: everywhere"
-    )
+    accuracy: float | None = setting(None, "standard deviation of the position that ends a plan, m", low=1e-9)
+    within: str | None = setting(None, "where a plan measures: x=-0.1:0.1,z=0 (m, rad); default: everywhere")
 
     @property
     def files(self) -> dict[str, Path]:
@@ -133,9 +125,13 @@ class Calibrate(OfRobot, ReadsTables, BeyondLimitsToo, Accepts, Overwrites):
     def free(self) -> dict[str, Any]:
         """What is fitted beside the file's numbers."""
         return {
-            "offsets": not self.no_offsets, "frame": self.frame, "target": self.target,
-            "prior": self.prior, "transmission": self.transmission, "only": self.only,
-        }  # fmt: skip
+            "offsets": not self.no_offsets,
+            "frame": self.frame,
+            "target": self.target,
+            "prior": self.prior,
+            "transmission": self.transmission,
+            "only": self.only,
+        }
 
 
 def calibrate(given: Calibrate) -> Report:
@@ -156,9 +152,15 @@ def calibrate(given: Calibrate) -> Report:
     if given.plan is not None:
         some = measured if isinstance(measured, Measured) else None
         chosen = plan_of(
-            machine, kinds, measured=some, within=within,
-            count=given.count, accuracy=given.accuracy, noise=known, **given.free,
-        )  # fmt: skip
+            machine,
+            kinds,
+            measured=some,
+            within=within,
+            count=given.count,
+            accuracy=given.accuracy,
+            noise=known,
+            **given.free,
+        )
         replace_file(given.plan, chosen.table(machine).encode())
         return planned(machine, chosen, given.accuracy, given.plan)
     if given.poses is None or measured is None:
@@ -172,9 +174,7 @@ def calibrate(given: Calibrate) -> Report:
             done += count
             update(done)
 
-        result = calibrated(
-            machine, measured, paths, accept=given.accept, progress=step, **given.free
-        )
+        result = calibrated(machine, measured, paths, accept=given.accept, progress=step, **given.free)
     source = f"calibrated with {one_line(given.poses.name, 100)}"
     marks = [*(f"accepted anyway: {fault}" for fault in result.faults), *notes]
     head = [f"{machine.name}, {source}: {len(measured.joints)} poses."]
@@ -188,18 +188,29 @@ def calibrate(given: Calibrate) -> Report:
 
 
 def report_of(
-    machine: Robot, source: str, result: Calibration, notes: Sequence[str], marks: Sequence[str],
+    machine: Robot,
+    source: str,
+    result: Calibration,
+    notes: Sequence[str],
+    marks: Sequence[str],
     out: Path | None,
-) -> Report:  # fmt: skip
+) -> Report:
     """Parameters, errors by kind of measurement, and what stays open."""
     first, scale = result.agreements[0], result.scale
     whole = {a.unit: a for a in result.agreements if a.name in ("position", "rotation")}
     before, after = (f"{1e3 * one.rms:.4f} m{first.unit}" for one in first.held_out)
     outliers = [
-        {"row": one.line - 1, "line": one.line, "kind": one.worst.kind, "size": one.worst.size,
-         "sigmas": one.worst.sigmas, "distance_m": one.size("m"), "distance_rad": one.size("rad")}
+        {
+            "row": one.line - 1,
+            "line": one.line,
+            "kind": one.worst.kind,
+            "size": one.worst.size,
+            "sigmas": one.worst.sigmas,
+            "distance_m": one.size("m"),
+            "distance_rad": one.size("rad"),
+        }
         for one in result.outliers
-    ]  # fmt: skip
+    ]
     facts = [
         Fact("robot", machine.name),
         Fact("condition", result.condition, text="condition number"),
@@ -208,27 +219,35 @@ def report_of(
         Fact("accepted", [str(fault) for fault in result.faults]),
         Fact("not_observed", result.unobserved),
         Fact("outliers", outliers),
-        Fact("scale", None if scale is None else {
-            "relative_deviation_before": scale.before, "relative_deviation": scale.after,
-            "determined": scale.determined,
-            "distance_deviation": scale.distance, "angle_deviation_rad": scale.angle,
-        }),
-    ]  # fmt: skip
+        Fact(
+            "scale",
+            None
+            if scale is None
+            else {
+                "relative_deviation_before": scale.before,
+                "relative_deviation": scale.after,
+                "determined": scale.determined,
+                "distance_deviation": scale.distance,
+                "angle_deviation_rad": scale.angle,
+            },
+        ),
+    ]
     for unit in ("m", "rad") if whole else ():
         facts.append(Fact(f"noise_{unit}", whole[unit].noise if unit in whole else None, unit))
     for name in ("fitted", "held_out") if whole else ():
         pairs = {unit: getattr(a, name) for unit, a in whole.items()}
         errors = {
-            when: {f"{key}_{unit}": value for unit, pair in pairs.items()
-                   for key, value in pair[k]._asdict().items()}
+            when: {f"{key}_{unit}": value for unit, pair in pairs.items() for key, value in pair[k]._asdict().items()}
             for k, when in enumerate(("before", "after"))
-        }  # fmt: skip
+        }
         facts.append(Fact(name, errors))
     columns = [
-        Column("before", form=".6g"), Column("value", text="after", form=".6g"),
-        Column("standard_deviation", text="standard deviation", form=".2g"), Column("unit"),
+        Column("before", form=".6g"),
+        Column("value", text="after", form=".6g"),
+        Column("standard_deviation", text="standard deviation", form=".2g"),
+        Column("unit"),
         Column("observed", text="determined"),
-    ]  # fmt: skip
+    ]
     rows = {p.name: [p.before, p.value, p.deviation, p.unit, p.observed] for p in result.parameters}
     kinds = [Column("unit", text=None), Column("count")]
     kinds += [Column(name, text=None) for name in ("before", "after", "held_out", "noise")]
@@ -256,22 +275,36 @@ def report_of(
         f"{machine.name}, {source}: held-out {first.name} error {after} RMS "
         f"({before} before); {found} of {len(rows)} numbers determined",
         facts,
-        [Table("parameters", columns, rows, "calibrated parameters"),
-         *([Table("determined_pairs", columns[:4], pairs, "sums and differences that are "
-                  "determined, of numbers that are not")] if pairs else []),
-         Table("measurements", kinds, agreements, "measured minus computed, RMS (worst); held out: "
-               "every fourth whole pose, else each measurement against a fit to all others")],
+        [
+            Table("parameters", columns, rows, "calibrated parameters"),
+            *(
+                [
+                    Table(
+                        "determined_pairs",
+                        columns[:4],
+                        pairs,
+                        "sums and differences that are determined, of numbers that are not",
+                    )
+                ]
+                if pairs
+                else []
+            ),
+            Table(
+                "measurements",
+                kinds,
+                agreements,
+                "measured minus computed, RMS (worst); held out: "
+                "every fourth whole pose, else each measurement against a fit to all others",
+            ),
+        ],
         notes=[*lines, *_open(result), *marks],
         files={"out": out},
-    )  # fmt: skip
+    )
 
 
 def _open(result: Estimate) -> list[str]:
     """Describe what the measurements do not determine, a line each."""
-    lines = [
-        fill(line, WIDTH, initial_indent="  ", subsequent_indent="    ")
-        for line in result.undetermined
-    ]
+    lines = [fill(line, WIDTH, initial_indent="  ", subsequent_indent="    ") for line in result.undetermined]
     told = "the poses do not determine these changes, and the calibration makes none of them; a "
     return [f"{told}number in one may still change with others:", *lines] if lines else []
 
@@ -284,9 +317,10 @@ def planned(robot: Robot, plan: Plan, accuracy: float | None, out: Path) -> Repo
     if accuracy is not None:
         goal = f"{1e3 * accuracy:g} mm"
         reached = (
-            f"{needed} measurements give the position to {goal}*" if needed is not None else
-            f"the position is not known to {goal} after {last} measurements: it stays at {known}"
-        )  # fmt: skip
+            f"{needed} measurements give the position to {goal}*"
+            if needed is not None
+            else f"the position is not known to {goal} after {last} measurements: it stays at {known}"
+        )
     columns = [
         Column("", text="position*, worst axis", scale=1e3, shown="mm"),
         Column("", text="distances", scale=100.0, shown="mm per 100 mm"),
@@ -299,10 +333,7 @@ def planned(robot: Robot, plan: Plan, accuracy: float | None, out: Path) -> Repo
         plan.angle.tolist(),
         *(v.tolist() for v in plan.quantity.values()),
     ]
-    rows = {
-        str(k): [values[k] for values in each]
-        for k in sorted({*(k for k in STEPS_SHOWN if k < last), last})
-    }
+    rows = {str(k): [values[k] for values in each] for k in sorted({*(k for k in STEPS_SHOWN if k < last), last})}
     title = "predicted standard deviations over the workspace, by number of measurements"
     names = [Column(n) for n in ("unit", "prior", "standard_deviation", "observed")]
     return Report(
@@ -315,14 +346,17 @@ def planned(robot: Robot, plan: Plan, accuracy: float | None, out: Path) -> Repo
             Fact("distance_deviation", plan.distance),
             Fact("angle_deviation_rad", plan.angle, "rad"),
             Fact("quantity_deviation", plan.quantity),
-            Fact("parameters", Table("", names, {
-                p.name: [p.unit, p.prior, p.deviation, p.observed] for p in plan.known.parameters
-            }).data),
+            Fact(
+                "parameters",
+                Table(
+                    "", names, {p.name: [p.unit, p.prior, p.deviation, p.observed] for p in plan.known.parameters}
+                ).data,
+            ),
         ],
         [Table("", columns, rows, title, "measurements")],
         notes=["* apart from a rigid motion of the whole workspace", *_open(plan.known)],
         files={"out": out},
-    )  # fmt: skip
+    )
 
 
 COMMAND = command(calibrate, "Identification and calibration")

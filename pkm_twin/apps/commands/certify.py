@@ -42,9 +42,7 @@ class Certify(OfRobot, Seeded):
     states: int = setting(20, "number of random states", low=1, high=100000)
     seed: int = setting(1, "seed of the random states", low=0, high=2**63 - 1)
     engine: tuple[str, ...] = setting((), "use only this engine: maximal, pinocchio or mujoco")
-    variants: int = setting(
-        0, "also check this many machines with other lengths and masses", low=0, high=10000
-    )
+    variants: int = setting(0, "also check this many machines with other lengths and masses", low=0, high=10000)
 
 
 def certify(given: Certify) -> Report:
@@ -56,15 +54,23 @@ def certify(given: Certify) -> Report:
         raise click.UsageError(f"no engine {unknown[0]!r}; there are {', '.join(ENGINES)}")
     with progress("states", given.states * (given.variants + 1)) as update:
         found = certify_variants(
-            given.machine(), given.variants, seed=given.seed, progress=update,
-            states=given.states, engines=given.engine or tuple(ENGINES),
-        )  # fmt: skip
+            given.machine(),
+            given.variants,
+            seed=given.seed,
+            progress=update,
+            states=given.states,
+            engines=given.engine or tuple(ENGINES),
+        )
     which = f"{found.robot} and {given.variants} variants" if given.variants else found.robot
     rows = {
-        f"{item.engine}: {item.what.replace('_', ' ')}":
-            [item.worst, item.median, item.bound, "good" if item.good else "bad"]
+        f"{item.engine}: {item.what.replace('_', ' ')}": [
+            item.worst,
+            item.median,
+            item.bound,
+            "good" if item.good else "bad",
+        ]
         for item in found.items
-    }  # fmt: skip
+    }
     columns = [Column("", text=name, form=".1e") for name in ("worst", "median", "bound")]
     notes = [f"{name} was not used: {reason}" for name, reason in found.missing.items()]
     if found.skipped:
@@ -75,10 +81,14 @@ def certify(given: Certify) -> Report:
         )
     # The one that is nearest to its bound, or farthest beyond it.
     worst = max(found.items, key=_share, default=None)
-    most = "" if worst is None else (
-        f"; nearest to its bound: {worst.what.replace('_', ' ')} {worst.worst:.1e} of "
-        f"{worst.bound:.1e}, against {worst.engine}"
-    )  # fmt: skip
+    most = (
+        ""
+        if worst is None
+        else (
+            f"; nearest to its bound: {worst.what.replace('_', ' ')} {worst.worst:.1e} of "
+            f"{worst.bound:.1e}, against {worst.engine}"
+        )
+    )
     return Report(
         f"{'good' if found.good else 'bad'}: {which}, compared with pkm_twin at {found.states} "
         f"states, seed {found.seed}{most}",

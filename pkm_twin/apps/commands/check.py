@@ -43,9 +43,7 @@ class Check(CarriesAtTimes, ReadsRecordings):
     judged.
     """
 
-    bag: Path = setting(
-        ..., "a bag: an MCAP file or a rosbag2 folder; a table; or a folder of bags", argument=True
-    )
+    bag: Path = setting(..., "a bag: an MCAP file or a rosbag2 folder; a table; or a folder of bags", argument=True)
     robot: str | None = setting(  # type: ignore[assignment]  # an argument of other commands
         None, "a robot's name or file; default: the robot that the recording names"
     )
@@ -59,9 +57,7 @@ class Check(CarriesAtTimes, ReadsRecordings):
         None,
         "also append residual, friction, payload and stiffness to this file, for `pkm-twin trend`",
     )
-    machine_name: str | None = setting(
-        None, "name in the history; default: the robot's", name="machine"
-    )
+    machine_name: str | None = setting(None, "name in the history; default: the robot's", name="machine")
     jobs: int = setting(1, "processes for a folder of bags", low=1, high=10**4)
 
 
@@ -116,23 +112,26 @@ def check_one(given: Check, path: Path, update: Any = None, thorough: bool = Tru
         answer + (f"; not judged: {', '.join(unknown)}" if unknown else ""),
         [
             Fact("causes", found.causes, text="explanation" if why else None, shown=why),
-            Fact("findings", found.findings, shown=findings,
-                 text="`fit` finds" if findings else None),
+            Fact("findings", found.findings, shown=findings, text="`fit` finds" if findings else None),
             Fact("hint", found.hint or None, text="hint" if found.hint else None, shown=found.hint),
-            Fact("bag", str(r.source)), Fact("robot", r.robot.name, text="robot"),
+            Fact("bag", str(r.source)),
+            Fact("robot", r.robot.name, text="robot"),
             Fact("topics", asdict(r.topics), text="topics", shown=str(r.topics)),
             payload_fact(r.load),
             *found.items,
-            Fact("uncertainty", found.bands or None), Fact("answer", found.answer),
-            Fact("not_judged", found.unjudged or None), Fact("good", good),
-            Fact("residuals", found.residuals), Fact("samples", len(r.time)),
+            Fact("uncertainty", found.bands or None),
+            Fact("answer", found.answer),
+            Fact("not_judged", found.unjudged or None),
+            Fact("good", good),
+            Fact("residuals", found.residuals),
+            Fact("samples", len(r.time)),
             Fact("duration_s", float(r.time[-1]), "s"),
             Fact("delay_s", None if found.compared is None else found.compared.late, "s"),
         ],
         notes=[] if r.robot.uncertainty else [none],
         verdict=Verdict.GOOD if good else Verdict.BAD if bad else Verdict.UNKNOWN,
         code=0 if good else REFUSED if bad else NOT_JUDGED,
-    )  # fmt: skip
+    )
 
 
 def _check_safely(given: Check, path: Path) -> dict[str, Any]:
@@ -176,12 +175,14 @@ def _check_folder(given: Check) -> Report:
     return Report(
         answer if count else f"{len(results)} good",
         [
-            Fact("folder", str(given.bag)), Fact("good", not count), Fact("recordings", results),
+            Fact("folder", str(given.bag)),
+            Fact("good", not count),
+            Fact("recordings", results),
         ],
         notes=notes,
         verdict=Verdict.BAD if count > unjudged else Verdict.UNKNOWN if count else Verdict.GOOD,
         code=NOT_JUDGED if count and count == unjudged else 0,
-    )  # fmt: skip
+    )
 
 
 COMMAND = command(check, "Recordings")

@@ -68,9 +68,7 @@ def compliance(given: Compliance) -> Report:
     ordered = sorted(shares.items(), key=lambda pair: -pair[1])
     load = ", ".join(f"{value:g}" for value in given.wrench)
     dominant = (
-        f"dominant elements, with equal shares: {', '.join(tied)}"
-        if tied
-        else f"dominant element {energy.dominant}"
+        f"dominant elements, with equal shares: {', '.join(tied)}" if tied else f"dominant element {energy.dominant}"
     )
     least = 1e-12 * np.abs(moved).max()
     facts = [
@@ -79,15 +77,23 @@ def compliance(given: Compliance) -> Report:
         Fact("wrench", given.wrench),
         Fact("compliance", c),
         Fact("compliance_deviation", compliance_deviation(machine, given.pose)),
-        Fact("deflection", moved, text="deflection (µm, µrad)",
-             shown=_format_micro(np.where(abs(moved) > least, moved, 0.0), ".4g")),
+        Fact(
+            "deflection",
+            moved,
+            text="deflection (µm, µrad)",
+            shown=_format_micro(np.where(abs(moved) > least, moved, 0.0), ".4g"),
+        ),
         Fact("total_energy", energy.total, "J", text="strain energy"),
-        Fact("factors", shares, text=None if energy.dominant == "none" else "shares",
-             shown=", ".join(f"{name} {100 * part:.1f} %" for name, part in ordered)),
+        Fact(
+            "factors",
+            shares,
+            text=None if energy.dominant == "none" else "shares",
+            shown=", ".join(f"{name} {100 * part:.1f} %" for name, part in ordered),
+        ),
         Fact("dominant", str(energy.dominant)),
         Fact("tie", tied),
         Fact("beyond_limits", {item.joint: item.value for item in beyond}),
-    ]  # fmt: skip
+    ]
     if machine.uncertainty:
         doubt = deflection_deviation(machine, given.pose, given.wrench)
         doubts = _format_micro(np.where(doubt > 1e-12 * doubt.max(), doubt, 0.0), ".2g")

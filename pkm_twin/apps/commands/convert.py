@@ -36,20 +36,16 @@ class Convert(OfPlatform, Writes):
 
     source: tuple[str, ...] = setting(
         ...,
-        f"{ROBOT_HELP}; or a printer's printer.cfg, log of M503, M665, M666 and probings, "
-        "heightmap.csv",
+        f"{ROBOT_HELP}; or a printer's printer.cfg, log of M503, M665, M666 and probings, heightmap.csv",
         argument=True,
     )
-    out: Path | None = setting(
-        None, "the robot file; default: print, of a printer printer.yaml", writes=True
-    )
-    data: Path | None = setting(
-        None, "of a printer: the measurements, a CSV; default: probes.csv", writes=True
-    )
+    out: Path | None = setting(None, "the robot file; default: print, of a printer printer.yaml", writes=True)
+    data: Path | None = setting(None, "of a printer: the measurements, a CSV; default: probes.csv", writes=True)
     firmware: Firmware | None = setting(
-        None, "of a printer; default: by what the files contain",
+        None,
+        "of a printer; default: by what the files contain",
         choices={one.value: one for one in Firmware},
-    )  # fmt: skip
+    )
     probe_radius: float | None = setting(None, "of G33's points, mm; default: B of M665", low=1.0)
 
 
@@ -99,15 +95,12 @@ def _convert_printer(given: Convert) -> Report:
         except OSError as error:
             raise FileError(path, error, "a text file") from None
     found = read_printer("\n".join(texts), given.firmware, given.probe_radius)
-    replace_file(
-        out, found.yaml(f"A printer's geometry, read from {one_line(paths[0].name, 100)}").encode()
-    )
+    replace_file(out, found.yaml(f"A printer's geometry, read from {one_line(paths[0].name, 100)}").encode())
     replace_file(data, found.table().encode())
     counts = {"height": len(found.heights), "distance": len(found.distances)}
     kinds = [name for name, count in counts.items() if count]
     return Report(
-        f"linear Delta, radius {found.radius:g} mm, "
-        f"{counts['height']} heights, {counts['distance']} distances",
+        f"linear Delta, radius {found.radius:g} mm, {counts['height']} heights, {counts['distance']} distances",
         [Fact("radius", found.radius * 1e-3, "m"), Fact("counts", counts)],
         notes=[f"next: pkm-twin calibrate {out} {data} --measure {','.join(kinds)}"],
         files={"out": out, "data": data},

@@ -59,39 +59,27 @@ class Design(Carries, ReadsMotions, Writes, Draws, Seeded):
         "KEY=LOW:HIGH: a value of the robot's file and its bounds, e.g. "
         "geometry.arm_length=0.15:0.3; KEY,KEY,-KEY=LOW:HIGH changes several by the same amount",
     )
-    path: Path | None = setting(
-        None, "motion of the robot: CSV or MCAP of `pkm-twin path`, or a recording"
-    )
+    path: Path | None = setting(None, "motion of the robot: CSV or MCAP of `pkm-twin path`, or a recording")
     minimise: tuple[str, ...] = setting(
         (),
-        "peak-effort, rms-effort, motor-torque, energy, deflection or mass; two of them give a "
-        "Pareto front",
+        "peak-effort, rms-effort, motor-torque, energy, deflection or mass; two of them give a Pareto front",
     )
-    subject_to: tuple[str, ...] = setting(
-        (), "bound on a quantity, e.g. 'singularity>=0.1' or 'peak-effort<=20'"
-    )
+    subject_to: tuple[str, ...] = setting((), "bound on a quantity, e.g. 'singularity>=0.1' or 'peak-effort<=20'")
     tolerance: tuple[str, ...] = setting(
         (),
         "KEY=SIGMA, standard deviation of a part's error, or KEY=+-BOUND, e.g. "
         "rods.*.length=2e-5; file: those of the robot's file; prints the pose error budget",
     )
-    monte_carlo: int = setting(
-        0, "with --tolerance: number of random machines to assemble exactly, too", low=0
-    )
-    sweep: str | None = setting(
-        None, "grid or sobol: compute machines within the bounds into --out FILE.nc"
-    )
-    samples: int = setting(
-        20, "machines of a sweep: per axis of a grid, or in total with sobol", low=1
-    )
-    scheduler: str | None = setting(
-        None, "with --sweep: address of a Dask scheduler, tcp://HOST:8786"
-    )
+    monte_carlo: int = setting(0, "with --tolerance: number of random machines to assemble exactly, too", low=0)
+    sweep: str | None = setting(None, "grid or sobol: compute machines within the bounds into --out FILE.nc")
+    samples: int = setting(20, "machines of a sweep: per axis of a grid, or in total with sobol", low=1)
+    scheduler: str | None = setting(None, "with --sweep: address of a Dask scheduler, tcp://HOST:8786")
     wrench: tuple[float, ...] | None = setting(
         None,
         "force and moment on the platform, N and N m, base axes; added to the path's",
-        count=6, metavar="fx,fy,fz,mx,my,mz",
-    )  # fmt: skip
+        count=6,
+        metavar="fx,fy,fz,mx,my,mz",
+    )
     starts: int = setting(64, "machines to try first; the best are optimised", low=1)
     points: int = setting(9, "points of a Pareto front", low=3)
     out: Path | None = setting(
@@ -108,8 +96,7 @@ def design(given: Design) -> Report:
         others = (given.vary, given.minimise, given.sweep, given.subject_to, given.out)
         if any(others) or given.picture:
             raise click.UsageError(
-                "--tolerance can only be combined with --path, --wrench, --monte-carlo, --seed and "
-                "--json"
+                "--tolerance can only be combined with --path, --wrench, --monte-carlo, --seed and --json"
             )
         return budget(given)
     if given.monte_carlo:
@@ -163,9 +150,16 @@ def optimised(given: Design, path: Path) -> Report:
     box = parse_vary(given.vary)
     with progress("searches", searches(len(given.minimise), given.points)) as update:
         found = find(
-            robot, box, way, given.minimise, given.subject_to, starts=given.starts,
-            points=given.points, seed=given.seed, progress=update,
-        )  # fmt: skip
+            robot,
+            box,
+            way,
+            given.minimise,
+            given.subject_to,
+            starts=given.starts,
+            points=given.points,
+            seed=given.seed,
+            progress=update,
+        )
     lost = [] if given.out is None else write_robot(robot, given.robot, found, path, given.out)
     before, best = found.before, found.best
     units = {name: robot.file_numbers().get(name, (0.0, ""))[1] for name in best.numbers}
@@ -177,11 +171,9 @@ def optimised(given: Design, path: Path) -> Report:
     tables = [
         Table(
             "variables",
-            [*both, Column("low", text=None), Column("high", text=None), unit,
-             Column("", text=" ")],
+            [*both, Column("low", text=None), Column("high", text=None), unit, Column("", text=" ")],
             {
-                name: [before.variables[name], value, *bounds[name], units.get(name, ""),
-                       at_bound(value, bounds[name])]
+                name: [before.variables[name], value, *bounds[name], units.get(name, ""), at_bound(value, bounds[name])]
                 for name, value in best.variables.items()
             },
         ),
@@ -193,7 +185,7 @@ def optimised(given: Design, path: Path) -> Report:
                 for name, value in best.quantities.items()
             },
         ),
-    ]  # fmt: skip
+    ]
     if found.front:
         names = [*found.minimise, *best.variables]
         rows = {
@@ -210,9 +202,7 @@ def optimised(given: Design, path: Path) -> Report:
     notes = [f"{joint} leaves its position limits on the path" for joint in limits]
     notes += lost
     if not before.feasible:
-        notes.insert(
-            0, "before: the file's machine cannot follow the path or does not keep the bounds"
-        )
+        notes.insert(0, "before: the file's machine cannot follow the path or does not keep the bounds")
     answer = f"{robot.name}: {' and '.join(changes)} on a path of {way.duration:.4g} s"
     return Report(
         f"{answer}; {found.machines} machines computed",
@@ -347,9 +337,7 @@ def swept(given: Design, path: Path, kind: str) -> Report:
     if kind not in SWEEPS:
         raise UnknownNameError("sweep", kind, SWEEPS)
     if given.minimise or given.subject_to or given.picture:
-        raise click.UsageError(
-            "--sweep computes all quantities; leave out --minimise and --subject-to"
-        )
+        raise click.UsageError("--sweep computes all quantities; leave out --minimise and --subject-to")
     if out is None or out.suffix != ".nc":
         raise ParameterError("out", str(out), "a name that ends in .nc, for --sweep")
     require("h5netcdf", "maps")
@@ -357,16 +345,19 @@ def swept(given: Design, path: Path, kind: str) -> Report:
     robot, way = read_path(given, path)
     box = parse_vary(given.vary)
     grid = kind == "grid"
-    compute = (
-        compute_serially
-        if given.scheduler is None
-        else partial(compute_on_cluster, scheduler=given.scheduler)
-    )
+    compute = compute_serially if given.scheduler is None else partial(compute_on_cluster, scheduler=given.scheduler)
     with progress("machines", given.samples ** len(box) if grid else given.samples) as update:
         table = sweep_box(
-            robot, box, way, None, given.samples,
-            "grid" if grid else "sobol", seed=given.seed, progress=update, compute=compute,
-        )  # fmt: skip
+            robot,
+            box,
+            way,
+            None,
+            given.samples,
+            "grid" if grid else "sobol",
+            seed=given.seed,
+            progress=update,
+            compute=compute,
+        )
     with writing(out):
         table.dataset(robot, path.name, kind).to_netcdf(out, engine="h5netcdf")
     count, lost = int(np.prod(table.shape)), int(np.isnan(table.quantities["peak-effort"]).sum())
@@ -405,11 +396,18 @@ def budget(given: Design) -> Report:
     summary = ErrorBudget(robot, found, q, calibrated_errors(robot, found, q))
     rows: dict[str, list[Any]] = {
         name: [
-            one.sigma, one.bound, one.unit, *one.position, *one.angle, one.calibrated, one.share,
-            one.text, "" if one.moves else "moves nothing",
+            one.sigma,
+            one.bound,
+            one.unit,
+            *one.position,
+            *one.angle,
+            one.calibrated,
+            one.share,
+            one.text,
+            "" if one.moves else "moves nothing",
         ]
         for name, one in summary.contributions.items()
-    }  # fmt: skip
+    }
     columns = [
         Column("sigma"),
         Column("bound", "", None),
@@ -425,8 +423,7 @@ def budget(given: Design) -> Report:
     ]
     moves, turns = summary.deviations
     turning, (shift, bound) = found.only_turns, summary.bounds
-    at, bound_at = (f" at {_place(robot, pose)}" for pose in
-                    (summary.worst_pose, summary.bound_pose))  # fmt: skip
+    at, bound_at = (f" at {_place(robot, pose)}" for pose in (summary.worst_pose, summary.bound_pose))
     most = greatest(turns)
     case = "worst case of all bounds" if found.is_exact else "upper bound of the worst case"
     facts = [
@@ -434,29 +431,34 @@ def budget(given: Design) -> Report:
         Fact("states", len(q)),
         Fact("path", None if given.path is None else str(given.path)),
         _report_length("rms_position_m", rms(moves)),
-        _report_length("greatest_position_m", greatest(moves),
-                None if turning else "largest standard deviation", at),
-        Fact("rms_angle_rad", rms(turns), "rad", "RMS rotation",
-             f"{1e3 * rms(turns):.4g} mrad"),
-        Fact("greatest_angle_rad", most, "rad", "largest standard deviation" if turning else None,
-             f"{1e3 * most:.4g} mrad{at}"),
+        _report_length("greatest_position_m", greatest(moves), None if turning else "largest standard deviation", at),
+        Fact("rms_angle_rad", rms(turns), "rad", "RMS rotation", f"{1e3 * rms(turns):.4g} mrad"),
+        Fact(
+            "greatest_angle_rad",
+            most,
+            "rad",
+            "largest standard deviation" if turning else None,
+            f"{1e3 * most:.4g} mrad{at}",
+        ),
         Fact("worst_pose", summary.worst_pose),
         _report_length("bound_position_m", shift, None if turning else case, bound_at),
-        Fact("bound_angle_rad", bound, "rad", case if turning else None,
-             f"{1e3 * bound:.4g} mrad{bound_at}"),
+        Fact("bound_angle_rad", bound, "rad", case if turning else None, f"{1e3 * bound:.4g} mrad{bound_at}"),
         Fact("bound_pose", summary.bound_pose),
         Fact("bound_is_reached", found.is_exact),
-        _report_length("rms_calibrated_position_m", summary.calibrated_position,
-                "RMS after a calibration without noise"),
-    ]  # fmt: skip
+        _report_length(
+            "rms_calibrated_position_m", summary.calibrated_position, "RMS after a calibration without noise"
+        ),
+    ]
     if given.monte_carlo:
         chosen, errors = draw_machines(summary, sigma, given.monte_carlo, given.seed)
         exact = {
-            "machines": given.monte_carlo, "states": len(chosen),
+            "machines": given.monte_carlo,
+            "states": len(chosen),
             "rms_position_m": rms(errors[..., :3]),
             "greatest_position_m": greatest(errors[..., :3]),
-            "rms_angle_rad": rms(errors[..., 3:]), "first_order_rms_position_m": rms(moves[chosen]),
-        }  # fmt: skip
+            "rms_angle_rad": rms(errors[..., 3:]),
+            "first_order_rms_position_m": rms(moves[chosen]),
+        }
         words = (
             f"RMS {1e3 * exact['rms_position_m']:.4g} mm in {len(chosen)} of the states "
             f"({1e3 * exact['first_order_rms_position_m']:.4g} mm to first order), largest error "
@@ -473,8 +475,7 @@ def budget(given: Design) -> Report:
         what = f"rotation {1e3 * rms(turns):.4g} mrad"
     held = f"{', '.join(robot.graph.leads)}" if robot.redundant else "actuated joints"
     return Report(
-        f"{robot.name}: standard deviation of the platform's {what} RMS over {where}, "
-        f"{len(q)} states, {held} held",
+        f"{robot.name}: standard deviation of the platform's {what} RMS over {where}, {len(q)} states, {held} held",
         facts,
         [Table("contributions", columns, rows, head="error")],
     )

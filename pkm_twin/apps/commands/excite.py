@@ -43,21 +43,23 @@ class Excite(OfRobot, AwayFromSingular, Seeded, Writes):
         "what the fit identifies: friction,rotor,payload,inertia or some",
     )
     out: Path = setting(
-        Path("excite.mcap"), "MCAP to write; the CSV has the same name with .csv", writes=True,
+        Path("excite.mcap"),
+        "MCAP to write; the CSV has the same name with .csv",
+        writes=True,
         endings=(".mcap",),
-    )  # fmt: skip
+    )
     compare: Path | None = setting(None, "also report the condition number of this bag")
     friction: bool = setting(
-        False, "slow sweeps up and down, one joint at a time, for friction", name="sweeps",
+        False,
+        "slow sweeps up and down, one joint at a time, for friction",
+        name="sweeps",
         older=("--friction",),
-    )  # fmt: skip
+    )
     duration: float = setting(10.0, "duration, s", low=1.0, high=600.0)
     harmonics: int = setting(6, "harmonics per joint", low=3, high=50)
     rate: float = setting(100.0, "points per second", low=10.0, high=1000.0)
     share: float = setting(0.9, "fraction of all limits to use", low=0.05, high=1.0)
-    acceleration: float | None = setting(
-        None, "acceleration limit of every joint, rad/s2 or m/s2; default: none"
-    )
+    acceleration: float | None = setting(None, "acceleration limit of every joint, rad/s2 or m/s2; default: none")
     trials: int = setting(300, "number of motions to try", low=10, high=10**6)
 
     @property
@@ -87,9 +89,14 @@ def excite(given: Excite) -> Report:
     else:
         with progress("excite", given.trials) as update:
             best = design(
-                judge, given.duration, given.harmonics, bounds, trials=given.trials,
-                seed=given.seed, progress=update,
-            )  # fmt: skip
+                judge,
+                given.duration,
+                given.harmonics,
+                bounds,
+                trials=given.trials,
+                seed=given.seed,
+                progress=update,
+            )
     time = np.arange(round(best.duration * bounds.rate) + 1) / bounds.rate
     time = time[time <= best.duration]
     plan = Recording(machine, time, *best.at(time))
@@ -114,18 +121,21 @@ def excite(given: Excite) -> Report:
     )
     size = f"{len(time)} points in {best.duration:.4g} s"
     return Report(
-        f"{machine.name}: every joint alone moves up and down at {_span(machine, best.speeds)}, "
-        f"{size}" if given.friction else
-        f"{machine.name}: condition number {best.condition:.4g} over {len(judge.columns)} base "
-        f"parameters, {size}",
+        f"{machine.name}: every joint alone moves up and down at {_span(machine, best.speeds)}, {size}"
+        if given.friction
+        else f"{machine.name}: condition number {best.condition:.4g} over {len(judge.columns)} base parameters, {size}",
         facts=[
-            Fact("robot", machine.name), Fact("condition", best.condition),
-            Fact("duration_s", best.duration, "s"), Fact("base_parameters", len(judge.columns)),
-            *shape, Fact("compare", given.compare), Fact("condition_compared", other),
+            Fact("robot", machine.name),
+            Fact("condition", best.condition),
+            Fact("duration_s", best.duration, "s"),
+            Fact("base_parameters", len(judge.columns)),
+            *shape,
+            Fact("compare", given.compare),
+            Fact("condition_compared", other),
         ],
         notes=notes,
         files=given.files,
-    )  # fmt: skip
+    )
 
 
 def _span(machine: Robot, speeds: Any) -> str:

@@ -131,9 +131,7 @@ class Ros2Control(ToFolder):
     package with colcon; it builds and runs without pkm_twin.
     """
 
-    bandwidth: float = setting(
-        0.0, "bandwidth for gains from the masses at home; 0: no gains", metavar="HZ"
-    )
+    bandwidth: float = setting(0.0, "bandwidth for gains from the masses at home; 0: no gains", metavar="HZ")
 
 
 def ros2_control(given: Ros2Control) -> Report:
@@ -224,9 +222,7 @@ class Urdf(Printed):
     and numbers, and the joints of the tree follow them through <mimic>.
     """
 
-    hardware_plugin: str = setting(
-        "mock_components/GenericSystem", "hardware plugin of ros2_control", metavar="NAME"
-    )
+    hardware_plugin: str = setting("mock_components/GenericSystem", "hardware plugin of ros2_control", metavar="NAME")
     prefix: str = setting("", "prefix for the names of all links and joints")
     no_ros2_control: bool = setting(False, "write no ros2_control element")
 
@@ -254,9 +250,7 @@ class ToPrinter(Printed):
     Towers are turned about z so that the third is at 90 degrees.
     """
 
-    firmware: Firmware = setting(
-        ..., "smoothieware cannot be written", choices={one.value: one for one in Firmware}
-    )
+    firmware: Firmware = setting(..., "smoothieware cannot be written", choices={one.value: one for one in Firmware})
 
 
 def printer(given: ToPrinter) -> Report:

@@ -74,17 +74,17 @@ class Fit(CarriesAtTimes, ReadsRecordings, BeyondLimitsToo, Accepts):
     """
 
     robot: str = setting("", f"{ROBOT_HELP}: the values to start from", argument=True)
-    recordings: tuple[Path, ...] = setting(
-        (), "bags, or CSV files with a header row", argument=True
-    )
+    recordings: tuple[Path, ...] = setting((), "bags, or CSV files with a header row", argument=True)
     what: str = setting(
         "friction,rotor,payload,inertia",
         "what to fit: friction,rotor,payload,inertia or some of them; or compliance",
     )
     out: Path | None = setting(
-        None, "YAML to write; the report has the same name with .html; default: fitted.yaml",
-        writes=True, endings=(".yaml", ".yml"),
-    )  # fmt: skip
+        None,
+        "YAML to write; the report has the same name with .html; default: fitted.yaml",
+        writes=True,
+        endings=(".yaml", ".yml"),
+    )
     no_report: bool = setting(False, "write no report with pictures")
     per_copy: bool = setting(False, "fit each copy of a limb by itself, and write all of them")
     friction: str = setting(
@@ -99,9 +99,13 @@ class Fit(CarriesAtTimes, ReadsRecordings, BeyondLimitsToo, Accepts):
     )
     drive: Path | None = setting(None, "one drive: CSV of traverses with weights, a row per run")
     lever: float | None = setting(
-        None, "with --drive, for mass_kg: travel per radian of the motor, m", name="spool-radius",
-        older=("--lever",), low=1e-6, high=1e3,
-    )  # fmt: skip
+        None,
+        "with --drive, for mass_kg: travel per radian of the motor, m",
+        name="spool-radius",
+        older=("--lever",),
+        low=1e-6,
+        high=1e3,
+    )
     overwrite: bool = setting(False, "replace the YAML and the report")
 
     @property
@@ -163,14 +167,9 @@ def fit(given: Fit) -> Report:
     if elastic:
         _ = machine.elastic
     with progress("fit", len(given.recordings)) as update:
-        read = [
-            given.read(path, machine, deflected=elastic, currents=currents)
-            for path in given.recordings
-        ]
+        read = [given.read(path, machine, deflected=elastic, currents=currents) for path in given.recordings]
         beyond = [
-            f"beyond limits: {r.name}: {item}"
-            for r in read
-            for item in given.admitted(machine, r.q, where=r.name)
+            f"beyond limits: {r.name}: {item}" for r in read for item in given.admitted(machine, r.q, where=r.name)
         ]
         result: Result
         choices: Sequence[Choice] = ()
@@ -179,9 +178,14 @@ def fit(given: Fit) -> Report:
             result = fit_elements(machine, read, progress=update, **options)
         else:
             result, choices, marks = fit_recordings(
-                machine, read, kinds, laws, constant=given.torque_constant, progress=update,
+                machine,
+                read,
+                kinds,
+                laws,
+                constant=given.torque_constant,
+                progress=update,
                 **options,
-            )  # fmt: skip
+            )
     worse = find_worse(result)
     refuse_faults([worse] if worse else [], given.accept)
     told = [note if len(read) == 1 else f"{r.name}: {note}" for r in read for note in r.notes]
@@ -198,9 +202,11 @@ def fit(given: Fit) -> Report:
     assert out is not None  # noqa: S101
     fitted = fitted_yaml(text, result.numbers, names)
     head = [
-        *marks, f"{report.answer}.", f"Fitted from {', '.join(names)}.",
+        *marks,
+        f"{report.answer}.",
+        f"Fitted from {', '.join(names)}.",
         *(f"{note}." for note in report.notes[len(marks) :]),
-    ]  # fmt: skip
+    ]
     head += [
         f"Residual rms held out of {name}: {before:.3g} before, {after:.3g} now, {unit}."
         for name, (before, after, _, unit) in report.tables[-1].rows.items()

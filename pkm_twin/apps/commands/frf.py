@@ -39,13 +39,13 @@ class FrequencyResponse(AtPose, OfTool, Writes, Draws):
     """
 
     frequencies: tuple[float, ...] | None = setting(
-        None, "range of the table, Hz; default: 0 to above the sixth mode",
-        count=2, metavar="LOW,HIGH",
-    )  # fmt: skip
-    points: int = setting(2001, "rows of the table", low=2, high=10**6)
-    out: Path | None = setting(
-        None, "table to write, .csv, .parquet or .mat", writes=True, endings=ENDINGS
+        None,
+        "range of the table, Hz; default: 0 to above the sixth mode",
+        count=2,
+        metavar="LOW,HIGH",
     )
+    points: int = setting(2001, "rows of the table", low=2, high=10**6)
+    out: Path | None = setting(None, "table to write, .csv, .parquet or .mat", writes=True, endings=ENDINGS)
 
 
 def frf(given: FrequencyResponse) -> Report:
@@ -97,9 +97,7 @@ def frf(given: FrequencyResponse) -> Report:
     )
 
 
-def of_modes(
-    machine: Robot, pose: list[float], frequencies: Array, damping: Array | None = None
-) -> list[Fact]:
+def of_modes(machine: Robot, pose: list[float], frequencies: Array, damping: Array | None = None) -> list[Fact]:
     """Return the robot, the pose, and its lowest modes."""
     found = [{"frequency_hz": f} for f in frequencies[:6].tolist()]
     texts = [f"{f:.4g} Hz" for f in frequencies[:6].tolist()]

@@ -93,43 +93,52 @@ def info(given: Info) -> Report:
         Fact("assumed_joints", assumed),
         Fact("pose", pose_units, text="pose", shown=_list_units(pose_units)),
         *_other_poses(robot),
-        Fact("joints", list(robot.joint_names), text="actuated joints",
-             shown=_list_units(joint_units)),
+        Fact("joints", list(robot.joint_names), text="actuated joints", shown=_list_units(joint_units)),
         *_report_leading(robot),
         Fact("joint_unit", robot.joint_unit),
         Fact("joint_units", list(robot.joint_units)),
         Fact("effort_unit", None if why_no_torques(robot) else robot.effort_unit),
         Fact("home_pose", home_pose, text="home pose", shown=_write_values(home_pose, pose_units)),
-        Fact("home_joints", home_joints, text="home joints",
-             shown=_write_values(home_joints, joint_units)),
-        Fact("singularity_at_home", value := float(robot.singularity(q)),
-             text="singularity index at home", shown=f"{value:.3f} (0 singular, 1 best)"),
-        Fact("clearance_at_home", gap, text=None if gap is None else "clearance at home",
-             shown="" if gap is None else f"{1e3 * gap:.3g} mm"
-             + ("" if gap > 0.0 else ": limbs interfere")),
+        Fact("home_joints", home_joints, text="home joints", shown=_write_values(home_joints, joint_units)),
+        Fact(
+            "singularity_at_home",
+            value := float(robot.singularity(q)),
+            text="singularity index at home",
+            shown=f"{value:.3f} (0 singular, 1 best)",
+        ),
+        Fact(
+            "clearance_at_home",
+            gap,
+            text=None if gap is None else "clearance at home",
+            shown="" if gap is None else f"{1e3 * gap:.3g} mm" + ("" if gap > 0.0 else ": limbs interfere"),
+        ),
         Fact("home_choice", robot.home_choice or None, text="home" if robot.home_choice else None),
         Fact("overconstrained", undetermined),
-        *(Fact("", text, text="overconstrained")
-          for text in grouped_reactions(undetermined)
-          or ["no: rigid-body equations determine every reaction"]),
+        *(
+            Fact("", text, text="overconstrained")
+            for text in grouped_reactions(undetermined) or ["no: rigid-body equations determine every reaction"]
+        ),
         Fact("plausibility", [dataclasses.asdict(finding) for finding in odd]),
-        *(Fact("", text, text="plausibility")
-          for text in [*(one.text for one in odd), *[fault] * bool(fault)]
-          or ["no implausible value"]),
+        *(
+            Fact("", text, text="plausibility")
+            for text in [*(one.text for one in odd), *[fault] * bool(fault)] or ["no implausible value"]
+        ),
         Fact("members_fault", fault or None),
         Fact("speed", slowness() or None, text="speed" if slowness() else None),
         Fact("parameters", sections),
         Fact("parameter_units", units),
         *(Fact("", text, text="parameter") for text in robot.book.told(units.get(PARAMETERS))),
-    ]  # fmt: skip
+    ]
     for section, value in sections.items():
         listed = section == "joints" and isinstance(value, list)
         if section not in ("mechanism", "name", PARAMETERS) and not listed:
             facts += _report_parameters(section, value, units.get(section, ""))
     return Report(
-        f"{robot.name}: {robot.description}", facts, figures={"": lambda: _draw_robot(robot)},
+        f"{robot.name}: {robot.description}",
+        facts,
+        figures={"": lambda: _draw_robot(robot)},
         notes=_note_joints_at_one_point(robot) if given.picture else [],
-    )  # fmt: skip
+    )
 
 
 def _note_joints_at_one_point(robot: Robot) -> list[str]:

@@ -47,13 +47,9 @@ class Loads(CarriesAtTimes, ReadsMotions, Writes, Draws):
     equations do not. Without elasticity these components are reported as undetermined.
     """
 
-    motion: Path = setting(
-        ..., "a recording or a path: MCAP, rosbag2 folder or table", argument=True
-    )
+    motion: Path = setting(..., "a recording or a path: MCAP, rosbag2 folder or table", argument=True)
     bearings: Path | None = setting(None, "YAML of bearings by joint: C (N), p, and X, Y")
-    exponent: float = setting(
-        5.0, "Wöhler exponent of the equivalent load range", low=1.0, high=50.0
-    )
+    exponent: float = setting(5.0, "Wöhler exponent of the equivalent load range", low=1.0, high=50.0)
     out: Path | None = setting(None, "CSV of the loads over time", writes=True)
     spectrum: Path | None = setting(None, "CSV of the rainflow counts", writes=True)
 
@@ -89,10 +85,9 @@ def loads(given: Loads) -> Report:
         ],
         _make_tables(joints),
         figures={"": lambda: draw(motion, found, answer)},
-        notes=[*motion.notes, *([UNDETERMINED] if open_ else []),
-               *([f"{IDLE}: {', '.join(idle)}"] if idle else [])],
+        notes=[*motion.notes, *([UNDETERMINED] if open_ else []), *([f"{IDLE}: {', '.join(idle)}"] if idle else [])],
         files={"out": given.out, "spectrum": given.spectrum},
-    )  # fmt: skip
+    )
 
 
 def of_joint(load: Summary, exponent: float, duration: float) -> dict[str, Any]:
@@ -107,18 +102,18 @@ def of_joint(load: Summary, exponent: float, duration: float) -> dict[str, Any]:
         entry |= {f"{what}_peak_{unit}": whole * peak, f"{what}_rms_{unit}": whole * rms}
         entry |= {f"{what}_determined_peak_{unit}": peak}
     entry["equivalent_range"] = {
-        axis: load.cycles(k).equivalent_range(exponent)
-        for k, axis in enumerate(WRENCH)
-        if axis not in open_axes
+        axis: load.cycles(k).equivalent_range(exponent) for k, axis in enumerate(WRENCH) if axis not in open_axes
     }
     if load.spec is not None:
         entry["life"] = None
         if load.known[0]:
             life = load.life(duration)
             entry["life"] = {
-                "equivalent_load_N": life.load, "turns": life.moved, "L10_turns": life.life,
+                "equivalent_load_N": life.load,
+                "turns": life.moved,
+                "L10_turns": life.life,
                 "L10_hours": life.hours,
-            }  # fmt: skip
+            }
             if load.slides:
                 travel = {"travel_m": life.moved, "L10_m": life.life}
                 entry["life"] |= {"turns": 0.0, "L10_turns": math.nan} | travel

@@ -54,12 +54,8 @@ class OfMap(Carries, Pages, Writes, Draws, Parallel):
     """The options of all maps."""
 
     kind: str = ""
-    points: int | None = setting(
-        None, "approximate number of poses; default: by kind", low=1, high=MAX_POSES
-    )
-    at: str | None = setting(
-        None, "pose that the planes go through: numbers separated by commas; default: the worst"
-    )
+    points: int | None = setting(None, "approximate number of poses; default: by kind", low=1, high=MAX_POSES)
+    at: str | None = setting(None, "pose that the planes go through: numbers separated by commas; default: the worst")
     along: Path | None = setting(
         None,
         "instead of the workspace: a CSV of `pkm-twin path`, or any motion that `pkm-twin torques` "
@@ -67,21 +63,19 @@ class OfMap(Carries, Pages, Writes, Draws, Parallel):
     )
     singularity: float | None = setting(
         None,
-        "singularity index (0 to 1) below which a pose does not count; default: 0.05, for "
-        "`workspace` 0",
+        "singularity index (0 to 1) below which a pose does not count; default: 0.05, for `workspace` 0",
     )
-    least_clearance: float = setting(
-        0.0, "distance between limbs (m) below which a pose does not count"
-    )
+    least_clearance: float = setting(0.0, "distance between limbs (m) below which a pose does not count")
     regular: bool = setting(
         False,
         "count only poses inside the largest circles about the axis, of 10 degrees or more if they "
         "are tilts (2UPR-RPU paper, figure 5)",
     )
     out: Path | None = setting(
-        None, "file to write; default: ROBOT_KIND.nc; .npz: also arrays of the poses that count",
+        None,
+        "file to write; default: ROBOT_KIND.nc; .npz: also arrays of the poses that count",
         writes=True,
-    )  # fmt: skip
+    )
     scheduler: str | None = setting(None, "address of a Dask scheduler: tcp://HOST:8786")
 
     @property
@@ -154,11 +148,15 @@ def compute(given: OfMap) -> Report:
         return along_path(given, kind, machine, cases, given.along)
     names = machine.pose_names
     sweep = map_of(
-        machine, kind, given.points, cases=cases,
+        machine,
+        kind,
+        given.points,
+        cases=cases,
         at=None if given.at is None else numbers(given.at, len(names), f"a pose {','.join(names)}"),
-        least_singularity=given.singularity, least_clearance=given.least_clearance,
+        least_singularity=given.singularity,
+        least_clearance=given.least_clearance,
         regular=given.regular,
-    )  # fmt: skip
+    )
     arrays = given.target if given.target.suffix == ".npz" else None
     if arrays is not None:
         refuse_existing(arrays, given.overwrite)
@@ -169,9 +167,13 @@ def compute(given: OfMap) -> Report:
     ):
         try:
             run(
-                sweep, target, workers=given.jobs, scheduler=given.scheduler,
-                overwrite=given.overwrite, progress=update,
-            )  # fmt: skip
+                sweep,
+                target,
+                workers=given.jobs,
+                scheduler=given.scheduler,
+                overwrite=given.overwrite,
+                progress=update,
+            )
         except KeyboardInterrupt:
             kept = f"stopped; finished parts are in {target}.parts, the same command continues"
             return Report(error=f"{kept} from there", code=INTERRUPTED)
@@ -209,9 +211,7 @@ def stored(file: Path, drawing: Path | None, html: bool, overwrite: bool) -> Rep
             refuse_existing(page, overwrite)
             write_page(data, page)
         pictures = {name: lambda one=one: one for name, one in drawn.items()}
-        return Report(
-            first, facts, figures=pictures, notes=rest, files={"file": file, "page": page}
-        )
+        return Report(first, facts, figures=pictures, notes=rest, files={"file": file, "page": page})
 
 
 def scalars(data: Dataset) -> dict[str, Any]:
@@ -241,10 +241,16 @@ def along_path(given: OfMap, kind: Kind, machine: Robot, cases: list[Case], path
     else:
         wrench = None
     found = along(
-        kind, machine, motion.clock, motion.q, cases=cases, wrench=wrench,
+        kind,
+        machine,
+        motion.clock,
+        motion.q,
+        cases=cases,
+        wrench=wrench,
         parts=by_load(machine, motion.load, motion.time, len(motion.q)),
-        least=given.singularity, least_clearance=given.least_clearance,
-    )  # fmt: skip
+        least=given.singularity,
+        least_clearance=given.least_clearance,
+    )
     if given.out is not None:
         replace_file(given.out, found.table().encode())
     beyond, least = int((~found.counted).sum()), found.least
@@ -256,9 +262,7 @@ def along_path(given: OfMap, kind: Kind, machine: Robot, cases: list[Case], path
         low = int((machine.try_singularity(motion.q)[0] < least).sum())
         alone = f"{low} have a singularity index below {least:g}"
         reason = alone if low == beyond else f"{alone}; others are beyond limits or limbs interfere"
-        notes.append(
-            f"{beyond} of {len(found.time)} samples would not count, but are included: {reason}"
-        )
+        notes.append(f"{beyond} of {len(found.time)} samples would not count, but are included: {reason}")
     return Report(
         first,
         [
@@ -288,14 +292,17 @@ def kind_of(given: OfMap) -> Kind:
 def offered(kind: type[Kind]) -> Command:
     """Return a kind as a command, with its own options and those of all maps."""
     milling = kind is CuttingDepth
-    own = [] if milling else [(f.name, get_type_hints(kind)[f.name], f)
-                              for f in dataclasses.fields(kind)]  # fmt: skip
+    own = [] if milling else [(f.name, get_type_hints(kind)[f.name], f) for f in dataclasses.fields(kind)]
     more: list[type[Any]] = [Loads] if kind.takes_wrench else []
     more += [OfMilling, OfTool] if milling else []
     given = dataclasses.make_dataclass(
-        kind.__name__, [*own, ("kind", str, kind.name)], bases=(*more, OfMap),
-        namespace={"__doc__": kind.__doc__, "__module__": __name__}, frozen=True, kw_only=True,
-    )  # fmt: skip
+        kind.__name__,
+        [*own, ("kind", str, kind.name)],
+        bases=(*more, OfMap),
+        namespace={"__doc__": kind.__doc__, "__module__": __name__},
+        frozen=True,
+        kw_only=True,
+    )
     return Command(given, compute)
 
 

@@ -63,9 +63,7 @@ def judge(topic: str, arrivals: Arrivals, offer: Offer) -> Report:
     mean = a.ages / count / SECOND if count else None
     beyond = f", {a.silences} beyond it" if a.silences else ""
 
-    def item(
-        name: str, value: Any, unit: str, text: str, words: str, bound: str, good: bool
-    ) -> Fact:
+    def item(name: str, value: Any, unit: str, text: str, words: str, bound: str, good: bool) -> Fact:
         # Nothing is known of torques that never came.
         verdict = Verdict.UNKNOWN if not count else Verdict.GOOD if good else Verdict.BAD
         return Fact(name, value, unit, text, words if count else "no message", bound, verdict)
@@ -74,15 +72,20 @@ def judge(topic: str, arrivals: Arrivals, offer: Offer) -> Report:
     ages = f"mean {1e3 * (mean or 0.0):.1f}, largest {1e3 * oldest:.1f} ms"
     lost = a.topic.missed
     items = [
-        Fact("messages", count, text="messages", shown=f"{count}{rate}", bound="1 or more",
-             verdict=Verdict.GOOD if count else Verdict.BAD),
-        item("longest_silence_s", silence, "s", "longest gap", f"{1e3 * silence:.1f} ms{beyond}",
-             most, not a.silences),
+        Fact(
+            "messages",
+            count,
+            text="messages",
+            shown=f"{count}{rate}",
+            bound="1 or more",
+            verdict=Verdict.GOOD if count else Verdict.BAD,
+        ),
+        item("longest_silence_s", silence, "s", "longest gap", f"{1e3 * silence:.1f} ms{beyond}", most, not a.silences),
         item("oldest_s", oldest, "s", "age on arrival", ages, most, not a.late),
         item("lost_messages", lost, "", "lost messages", str(lost), "0", not lost),
         item("faults", dict(a.faults), "", "faults", faults, "none", not a.faults),
         judged("publishers", str(offer.publishers), "1", offer.publishers == 1),
-    ]  # fmt: skip
+    ]
     for what, value in (("deadline", offer.deadline), ("lifespan", offer.lifespan)):
         if offer.publishers:
             # A hair for what the middleware rounds.
@@ -91,9 +94,12 @@ def judge(topic: str, arrivals: Arrivals, offer: Offer) -> Report:
             items.append(judged(f"{what} offered", words, most, good))
     bad = [fact.text or "" for fact in items if fact.verdict is Verdict.BAD]
     facts = [
-        Fact("topic", topic), Fact("good", not bad), Fact("mean_age_s", mean, "s"),
-        Fact("silences_beyond_deadline", a.silences), Fact("late_messages", a.late),
-    ]  # fmt: skip
+        Fact("topic", topic),
+        Fact("good", not bad),
+        Fact("mean_age_s", mean, "s"),
+        Fact("silences_beyond_deadline", a.silences),
+        Fact("late_messages", a.late),
+    ]
     answer = f"{topic}: bad: {', '.join(bad)}" if bad else f"{topic}: good, {count} messages"
     return Report(answer, [*facts, *items], verdict=Verdict.BAD if bad else Verdict.GOOD)
 
@@ -114,9 +120,14 @@ def monitor_torques(given: MonitorTorques) -> Report:
             except MessageError:
                 stamp = 0
             arrivals.arrived(
-                message.name, message.effort, stamp, now().nanoseconds, time.monotonic_ns(),
-                info["publication_sequence_number"], info["source_timestamp"],
-            )  # fmt: skip
+                message.name,
+                message.effort,
+                stamp,
+                now().nanoseconds,
+                time.monotonic_ns(),
+                info["publication_sequence_number"],
+                info["source_timestamp"],
+            )
 
         began = time.monotonic()
         try:

@@ -69,35 +69,37 @@ class Motion(Carries, ReadsTables, AwayFromSingular, Writes, Draws):
     `size`, `loads` and `design` read it, and reject efforts that the robot does not compute.
     """
 
-    waypoints: Path | None = setting(
-        None, "table of waypoints, unless --cycle or --circle is given", argument=True
-    )
+    waypoints: Path | None = setting(None, "table of waypoints, unless --cycle or --circle is given", argument=True)
     cycle: tuple[float, ...] | None = setting(
-        None, "pick-and-place cycle, mm: HEIGHT up, WIDTH across, DROP down (default: HEIGHT), and "
-        "back; the pose needs z, and x or y", count=0,
+        None,
+        "pick-and-place cycle, mm: HEIGHT up, WIDTH across, DROP down (default: HEIGHT), and "
+        "back; the pose needs z, and x or y",
+        count=0,
         metavar="HEIGHT,WIDTH[,DROP]",
-    )  # fmt: skip
-    circle: float | None = setting(
-        None, "follow a circle of this radius, m, or rad for a circle of two angles"
     )
+    circle: float | None = setting(None, "follow a circle of this radius, m, or rad for a circle of two angles")
     at: tuple[float, ...] | None = setting(
-        None, "centre of --cycle (between pick and place) or --circle: the pose's coordinates; "
-        "default: home", count=0,
-    )  # fmt: skip
+        None,
+        "centre of --cycle (between pick and place) or --circle: the pose's coordinates; default: home",
+        count=0,
+    )
     direction: float | None = setting(
         None,
         "direction of the cycle in the xy plane, degrees from x towards y; default: x, else y",
     )
     blend: float | None = setting(
-        None, "distance from a corner at which rounding begins, m; 0 stops at every waypoint; "
-        "default: a smooth curve", low=0.0,
-    )  # fmt: skip
+        None,
+        "distance from a corner at which rounding begins, m; 0 stops at every waypoint; default: a smooth curve",
+        low=0.0,
+    )
     dwell: float = setting(0.0, "dwell at pick and at place, s", low=0.0)
     carries: tuple[str, ...] = setting(
-        (), "payload from one waypoint to another, in place of --payload: 0.5@2:4 is 0.5 kg from "
-        "waypoint 2 until waypoint 4 is reached; may be repeated", name="load",
+        (),
+        "payload from one waypoint to another, in place of --payload: 0.5@2:4 is 0.5 kg from "
+        "waypoint 2 until waypoint 4 is reached; may be repeated",
+        name="load",
         metavar="MASS@FROM:TO",
-    )  # fmt: skip
+    )
     fastest: bool = setting(False, "plan the shortest motion within all limits")
     slow_where_soft: bool = setting(False, "plan the fastest cut within --deflection")
     force: float | None = setting(
@@ -106,34 +108,30 @@ class Motion(Carries, ReadsTables, AwayFromSingular, Writes, Draws):
     deflection: float | None = setting(
         None, "of --slow-where-soft: largest deflection of the platform, m", older=("--tolerance",)
     )
-    law: str = setting(
-        "quintic", "motion law without --fastest: quintic or s-curve, from stop to stop"
-    )
+    law: str = setting("quintic", "motion law without --fastest: quintic or s-curve, from stop to stop")
     duration: float | None = setting(None, "duration of the motion, s; default: the shortest")
     effort: tuple[float, ...] | None = setting(
-        None, "effort limit, one for all joints or one per joint, N m or N; default: the file's",
+        None,
+        "effort limit, one for all joints or one per joint, N m or N; default: the file's",
         count=0,
-    )  # fmt: skip
+    )
     velocity: tuple[float, ...] | None = setting(
         None, "velocity limit of the joints, rad/s or m/s; default: the file's", count=0
     )
     acceleration: tuple[float, ...] | None = setting(
         None, "acceleration limit of the joints, rad/s2 or m/s2; default: none", count=0
     )
-    jerk: tuple[float, ...] | None = setting(
-        None, "jerk limit of the joints, rad/s3 or m/s3; default: none", count=0
-    )
+    jerk: tuple[float, ...] | None = setting(None, "jerk limit of the joints, rad/s3 or m/s3; default: none", count=0)
     speed: float | None = setting(
-        None, "speed limit of the reference point, m/s, or of a pose of angles, rad/s; default: "
+        None,
+        "speed limit of the reference point, m/s, or of a pose of angles, rad/s; default: "
         "none; of --slow-where-soft the programmed feed",
-    )  # fmt: skip
-    share: float = setting(
-        1.0, "fraction of the file's effort and velocity limits to use", low=1e-3, high=1.0
     )
+    share: float = setting(1.0, "fraction of the file's effort and velocity limits to use", low=1e-3, high=1.0)
     shaper: str | None = setting(
-        None, "input shaper for the first natural frequency: zv, or zvd, which tolerates more "
-        "error of the frequency",
-    )  # fmt: skip
+        None,
+        "input shaper for the first natural frequency: zv, or zvd, which tolerates more error of the frequency",
+    )
     damping: float | None = setting(
         None,
         "damping ratio of that mode; default: `modal_damping` of the robot file",
@@ -142,9 +140,11 @@ class Motion(Carries, ReadsTables, AwayFromSingular, Writes, Draws):
     )
     rate: float = setting(1000.0, "samples per second in the file", low=1.0, high=1e5)
     out: Path | None = setting(
-        None, "file to write: FILE.mcap (a JointTrajectory with efforts), or a table, FILE.csv, "
-        ".parquet or .mat", writes=True, endings=(".mcap", *ENDINGS),
-    )  # fmt: skip
+        None,
+        "file to write: FILE.mcap (a JointTrajectory with efforts), or a table, FILE.csv, .parquet or .mat",
+        writes=True,
+        endings=(".mcap", *ENDINGS),
+    )
 
 
 def path(given: Motion) -> Report:
@@ -174,10 +174,17 @@ def path(given: Motion) -> Report:
     way, payload = _read_way(given, machine)
     law = "fastest" if given.fastest or given.slow_where_soft else given.law
     motion = timed(
-        machine, way, law, payload=payload, duration=given.duration, speed=given.speed,
-        share=given.share, singularity=given.singularity,
-        slowdown=None if cut is None else cut.slowdown, **bounds,
-    )  # fmt: skip
+        machine,
+        way,
+        law,
+        payload=payload,
+        duration=given.duration,
+        speed=given.speed,
+        share=given.share,
+        singularity=given.singularity,
+        slowdown=None if cut is None else cut.slowdown,
+        **bounds,
+    )
     if given.shaper is not None:
         motion = shaped(motion, given.shaper, None, given.damping, singularity=given.singularity)
     elif given.damping is not None:
@@ -196,8 +203,7 @@ def path(given: Motion) -> Report:
     if turns and "m" not in way_units:
         length = f"{motion.path.length / robot.size:.4g} rad"
     answer = (
-        f"{robot.name}: {motion.path.kind}, {length} in {motion.duration:.6g} s, "
-        f"at most {fine.speed.max():.4g} {unit}"
+        f"{robot.name}: {motion.path.kind}, {length} in {motion.duration:.6g} s, at most {fine.speed.max():.4g} {unit}"
     )
     facts = [
         Fact("robot", robot.name),
@@ -205,24 +211,34 @@ def path(given: Motion) -> Report:
         Fact("law", motion.law, text="motion law"),
         Fact("duration_s", motion.duration, "s"),
         Fact("length_m", motion.path.length, "m"),
-        Fact("stretches", [
-            {"begin_s": round(begin, 9), "duration_s": run.duration, "length_m": stretch.length,
-             "dwell_s": stretch.dwell}
-            for begin, run, stretch in zip(
-                motion.begins, motion.runs, motion.path.stretches, strict=True
-            )
-        ], text="segments from stop to stop", shown=str(len(motion.runs))),
+        Fact(
+            "stretches",
+            [
+                {
+                    "begin_s": round(begin, 9),
+                    "duration_s": run.duration,
+                    "length_m": stretch.length,
+                    "dwell_s": stretch.dwell,
+                }
+                for begin, run, stretch in zip(motion.begins, motion.runs, motion.path.stretches, strict=True)
+            ],
+            text="segments from stop to stop",
+            shown=str(len(motion.runs)),
+        ),
         payload_fact(carried),
         Fact("limits", [bound.as_json() for bound in motion.bounds]),
         Fact("used", motion.worst),
         Fact("peaks", motion.peaks),
         Fact(f"greatest_speed_{unit.replace('/', '_')}", float(fine.speed.max()), unit),
-    ]  # fmt: skip
+    ]
     if isinstance(motion, ShapedPath):
         low, high = motion.frequencies
         shaper = {
-            "kind": motion.shaper, "added_s": motion.added, "lowest_hz": low, "highest_hz": high,
-        }  # fmt: skip
+            "kind": motion.shaper,
+            "added_s": motion.added,
+            "lowest_hz": low,
+            "highest_hz": high,
+        }
         words = f"{motion.shaper} for {low:.4g} to {high:.4g} Hz, adds {motion.added:.4g} s"
         facts.append(Fact("shaper", shaper, text="shaper", shown=words))
     draw: Any = draw_limits
@@ -230,9 +246,12 @@ def path(given: Motion) -> Report:
         more, draw = _report_cut(cut, motion)
         facts += more
     return Report(
-        answer, facts, _lay_out(motion, given.slow_where_soft), {"": lambda: draw(motion, answer)},
+        answer,
+        facts,
+        _lay_out(motion, given.slow_where_soft),
+        {"": lambda: draw(motion, answer)},
         files={"out": given.out},
-    )  # fmt: skip
+    )
 
 
 def _read_way(given: Motion, machine: Robot) -> tuple[Way, Sequence[float | None] | None]:
@@ -271,20 +290,14 @@ def _read_path(given: Motion, machine: Robot) -> tuple[Way, list[float] | None]:
     lengths = given.cycle or ()
     if len(lengths) not in (2, 3) or min(lengths) < LEAST_CYCLE:
         found = ",".join(f"{length:g}" for length in lengths)
-        raise click.UsageError(
-            f"--cycle {found}: HEIGHT,WIDTH[,DROP] in millimetres, for example 25,305,25"
-        )
+        raise click.UsageError(f"--cycle {found}: HEIGHT,WIDTH[,DROP] in millimetres, for example 25,305,25")
     metres = [1e-3 * value for value in lengths]
     way = None if given.direction is None else math.radians(given.direction)
-    made = paths.cycle(
-        machine, *metres, at=given.at, direction=way, blend=given.blend, dwell=given.dwell
-    )
+    made = paths.cycle(machine, *metres, at=given.at, direction=way, blend=given.blend, dwell=given.dwell)
     return made, None
 
 
-def _check_limits(
-    name: str, values: tuple[float, ...] | None, machine: Robot
-) -> list[float] | None:
+def _check_limits(name: str, values: tuple[float, ...] | None, machine: Robot) -> list[float] | None:
     n = machine.joints_count
     if values is not None and (len(values) not in (1, n) or min(values) <= 0.0):
         found = ",".join(f"{value:g}" for value in values)
@@ -297,10 +310,7 @@ def _lay_out(motion: TimedPath, soft: bool) -> list[Table]:
     rows: dict[str, list[Any]] = {}
     words_of = {"speed": "speed or tolerance"} if soft else {}
     for bound in motion.bounds:
-        what = (
-            words_of.get(bound.what, bound.what)
-            or f"none (largest fraction of a limit: {100 * bound.used:.0f} %)"
-        )
+        what = words_of.get(bound.what, bound.what) or f"none (largest fraction of a limit: {100 * bound.used:.0f} %)"
         rows[f"{bound.begin:.4f} to {bound.end:.4f}"] = [what]
     peaks = {
         joint: [f"{one['value']:.4g} {one['unit']}" for one in values.values()]
@@ -368,16 +378,23 @@ def _report_cut(cut: SoftCut, motion: TimedPath) -> tuple[list[Fact], Any]:
     even = min(speed, tolerance / soft) if soft > 0.0 else speed
     facts = [
         Fact("greatest_feed_m_s", float(s.speed.max()), "m/s", "greatest feed"),
-        Fact("greatest_deflection_m", most, "m", "greatest deflection",
-             f"{1e6 * most:.4g} µm (tolerance {1e6 * tolerance:.4g} µm)"),
+        Fact(
+            "greatest_deflection_m",
+            most,
+            "m",
+            "greatest deflection",
+            f"{1e6 * most:.4g} µm (tolerance {1e6 * tolerance:.4g} µm)",
+        ),
         Fact("constant_feed_m_s", even, "m/s", "largest constant feed within the tolerance"),
         Fact("tolerance_m", tolerance, "m"),
-    ]  # fmt: skip
+    ]
 
     def draw(motion: TimedPath, title: str) -> Any:
         figure, axes = plots.columns(1, 2)
-        curves = ((1e3 * s.speed, "feed (mm/s)", 1e3 * speed),
-                  (1e6 * bend * s.speed, "deflection (µm)", 1e6 * tolerance))  # fmt: skip
+        curves = (
+            (1e3 * s.speed, "feed (mm/s)", 1e3 * speed),
+            (1e6 * bend * s.speed, "deflection (µm)", 1e6 * tolerance),
+        )
         for ax, (values, label, limit) in zip(axes[0], curves, strict=True):
             ax.plot(s.time, values, color=plots.COLOURS[0], lw=1.2)
             ax.axhline(limit, color=plots.COLOURS[1], lw=1.0)

@@ -27,13 +27,9 @@ class Play:
     """
 
     bag: Path = setting(..., "a bag: an MCAP file or a rosbag2 folder", argument=True)
-    speed: float = setting(
-        1.0, "speed factor; 1 is the recorded speed", low=1e-6, high=1e6, older=("--rate",)
-    )
+    speed: float = setting(1.0, "speed factor; 1 is the recorded speed", low=1e-6, high=1e6, older=("--rate",))
     loop: bool = setting(False, "restart at the end")
-    clock: float | None = setting(
-        None, "publish /clock at this many Hz, for nodes with use_sim_time"
-    )
+    clock: float | None = setting(None, "publish /clock at this many Hz, for nodes with use_sim_time")
     wait: float = setting(3.0, "longest wait (s) for a subscriber on every topic")
     topic: tuple[str, ...] = setting((), "play only these topics")
     remap: tuple[str, ...] = setting((), "FROM:=TO, play a topic under another name")
@@ -51,10 +47,15 @@ def play(given: Play) -> Report:
             raise click.UsageError(f"{text!r} is not of the form FROM:=TO")
         pairs[source] = target
     result = play_bag(
-        given.bag, rate=given.speed, loop=given.loop, clock=given.clock,
-        wait_for_subscribers=given.wait, topics=list(given.topic) or None, remap=pairs,
+        given.bag,
+        rate=given.speed,
+        loop=given.loop,
+        clock=given.clock,
+        wait_for_subscribers=given.wait,
+        topics=list(given.topic) or None,
+        remap=pairs,
         progress=not given.quiet,
-    )  # fmt: skip
+    )
     if result.interrupted:
         ignore_signals()
     facts = [Fact(name, value) for name, value in asdict(result).items()]

@@ -36,8 +36,7 @@ def recover(given: Recover) -> Report:
     result = recover_bag(given.bag, given.out, overwrite=given.overwrite)
     lost = f"{result.bytes_lost} bytes lost: {result.reason}"
     return Report(
-        f"{given.out}: {result.messages} messages saved, "
-        f"{'nothing lost' if result.lossless else lost}",
+        f"{given.out}: {result.messages} messages saved, {'nothing lost' if result.lossless else lost}",
         [*(Fact(k, v) for k, v in asdict(result).items()), Fact("lossless", result.lossless)],
         code=0 if result.lossless else SALVAGED,
     )

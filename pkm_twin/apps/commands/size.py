@@ -57,26 +57,22 @@ class Size(CarriesAtTimes, ReadsMotions, AwayFromSingular, Draws):
     a bag with a JointTrajectory.
     """
 
-    motion: Path | None = setting(
-        None, "a recording or a path: MCAP, rosbag2 folder or table", argument=True
-    )
-    drives: Path | None = setting(
-        None, "YAML of motors to compare, or `shipped` for the motors in config/drives"
-    )
-    motor: tuple[str, ...] = setting(
-        (), "compare only this motor of the drives file; may be repeated"
-    )
+    motion: Path | None = setting(None, "a recording or a path: MCAP, rosbag2 folder or table", argument=True)
+    drives: Path | None = setting(None, "YAML of motors to compare, or `shipped` for the motors in config/drives")
+    motor: tuple[str, ...] = setting((), "compare only this motor of the drives file; may be repeated")
     ratio: float | None = setting(
-        None, "gear of the joints that turn, where the file has no drive: turns of the motor per "
-        "turn of the joint", low=1e-6, high=1e6,
-    )  # fmt: skip
-    lead: float | None = setting(
-        None, "screw or belt of the joints that slide, where the file has no drive: m per turn of "
-        "the motor", low=1e-6, high=1e6,
-    )  # fmt: skip
-    ratios: str | None = setting(
-        None, "gears to choose from, in place of the file's: LOW:HIGH, or numbers with commas"
+        None,
+        "gear of the joints that turn, where the file has no drive: turns of the motor per turn of the joint",
+        low=1e-6,
+        high=1e6,
     )
+    lead: float | None = setting(
+        None,
+        "screw or belt of the joints that slide, where the file has no drive: m per turn of the motor",
+        low=1e-6,
+        high=1e6,
+    )
+    ratios: str | None = setting(None, "gears to choose from, in place of the file's: LOW:HIGH, or numbers with commas")
     leads: str | None = setting(None, "leads of screws or belts to choose from, likewise")
     efficiency: float | None = setting(
         None,
@@ -85,17 +81,25 @@ class Size(CarriesAtTimes, ReadsMotions, AwayFromSingular, Draws):
         high=1.0,
     )
     over_workspace: tuple[float, ...] | None = setting(
-        None, "in place of a motion: speed and acceleration of the tool point (m/s, m/s2), in the "
-        "worst direction at the worst pose", count=2, metavar="SPEED,ACCELERATION",
-    )  # fmt: skip
+        None,
+        "in place of a motion: speed and acceleration of the tool point (m/s, m/s2), in the "
+        "worst direction at the worst pose",
+        count=2,
+        metavar="SPEED,ACCELERATION",
+    )
     lever: float = setting(
-        0.3, "excludes poses near stretched limbs, where the ratio of tool to joint speed is below "
-        "this fraction of the largest", low=0.0, high=1.0,
-    )  # fmt: skip
+        0.3,
+        "excludes poses near stretched limbs, where the ratio of tool to joint speed is below "
+        "this fraction of the largest",
+        low=0.0,
+        high=1.0,
+    )
     efforts: str | None = setting(
-        None, "efforts to use; default: the file's; with --payload the model's, unless the file "
-        "has measured efforts that agree with them", choices=("file", "model"),
-    )  # fmt: skip
+        None,
+        "efforts to use; default: the file's; with --payload the model's, unless the file "
+        "has measured efforts that agree with them",
+        choices=("file", "model"),
+    )
 
 
 def size(given: Size) -> Report:
@@ -112,9 +116,7 @@ def size(given: Size) -> Report:
     if searched and (given.ratio is not None or given.lead is not None):
         raise click.UsageError("--ratio and --lead give one gear; leave out --ratios and --leads")
     if given.over_workspace is not None and (geared or given.drives is not None):
-        raise click.UsageError(
-            "--over-workspace reports joints; leave out --drives, --ratio and --lead"
-        )
+        raise click.UsageError("--over-workspace reports joints; leave out --drives, --ratio and --lead")
     if given.motion is None:
         return over_workspace(given)
     motors = {} if given.drives is None else read_motors(given.drives, given.motor)
@@ -151,10 +153,11 @@ def size(given: Size) -> Report:
         payload_fact(motion.load),
         Fact("difference_from_model", taken.difference),
         Fact("drives", {d.joint: d.as_json() for d in duties}),
-        Fact("energy_J", energy), Fact("motors_energy_J", motors_energy),
+        Fact("energy_J", energy),
+        Fact("motors_energy_J", motors_energy),
         Fact("regenerated_J", returned, "J", "regenerated energy"),
         Fact("mean_power_W", net / duration, "W", "mean power"),
-    ]  # fmt: skip
+    ]
     title = answer
     if taken.unlike:
         notes.append(f"{taken.unlike}; --efforts model uses the model's")
@@ -162,8 +165,12 @@ def size(given: Size) -> Report:
         best, words = smallest_motors(duties)
         facts, notes, title = facts + best, notes + words, f"{title}; {words[0]}"
     return Report(
-        answer, facts, _make_tables(duties), {"": lambda: draw(taken, duties, title)}, notes,
-    )  # fmt: skip
+        answer,
+        facts,
+        _make_tables(duties),
+        {"": lambda: draw(taken, duties, title)},
+        notes,
+    )
 
 
 def net_energy(duties: Sequence[Duty]) -> float:
@@ -188,8 +195,9 @@ def gears(given: Size, robot: Robot) -> tuple[list[Gear], list[Gears]]:
     share = given.efficiency or next(iter(shares), 1.0)
     one, choices = [], []
     for key, value, values in (
-        ("ratio", given.ratio, given.ratios), ("lead", given.lead, given.leads),
-    ):  # fmt: skip
+        ("ratio", given.ratio, given.ratios),
+        ("lead", given.lead, given.leads),
+    ):
         if value is not None:
             one.append(Gear(efficiency=share).sized(key, value))
         if values is not None:
@@ -215,10 +223,9 @@ def smallest_motors(duties: Sequence[DriveDuty]) -> tuple[list[Fact], list[str]]
         each[duty.joint] = None if k is None else duty.fits[k]
     facts = [
         Fact("smallest_motor", shared[0].name if shared else None),
-        Fact("smallest_for_all",
-             dict(zip(each, [fit.choice for fit in shared], strict=True)) if shared else None),
+        Fact("smallest_for_all", dict(zip(each, [fit.choice for fit in shared], strict=True)) if shared else None),
         Fact("smallest_for_each", {name: fit and fit.choice for name, fit in each.items()}),
-    ]  # fmt: skip
+    ]
     words = " and ".join(dict.fromkeys(map(str, shared))) or none
     own = ", ".join(f"{name} {fit or none}" for name, fit in each.items())
     return facts, [f"smallest motor for all drives: {words}", f"smallest for each drive: {own}"]
@@ -236,18 +243,29 @@ def _make_tables(duties: Sequence[DriveDuty]) -> list[Table]:
                 continue
             span = " to ".join(f"{v:.4g}" for v in d.load_inertia)
             rows[d.joint] = [
-                duty.peak, duty.rms, duty.speed, duty.mean_speed, duty.power, duty.braking,
-                net_energy([duty]), duty.returned,
+                duty.peak,
+                duty.rms,
+                duty.speed,
+                duty.mean_speed,
+                duty.power,
+                duty.braking,
+                net_energy([duty]),
+                duty.returned,
                 span if side == "joint" else d.inertia_ratio or "",
-            ]  # fmt: skip
+            ]
         force, rate, mass = ("N", "m/s", "kg") if slides else ("N m", "rad/s", "kg m2")
         last = Column("", mass, "load inertia") if side == "joint" else Column("", "", "load/rotor")
         columns = [
-            Column("", force, "effort |peak|"), Column("", force, "RMS"),
-            Column("", rate, "speed |peak|"), Column("", rate, "mean"),
-            Column("", "W", "power peak"), Column("", "W", "regenerated peak"),
-            Column("", "J", "net energy"), Column("", "J", "regenerated"), last,
-        ]  # fmt: skip
+            Column("", force, "effort |peak|"),
+            Column("", force, "RMS"),
+            Column("", rate, "speed |peak|"),
+            Column("", rate, "mean"),
+            Column("", "W", "power peak"),
+            Column("", "W", "regenerated peak"),
+            Column("", "J", "net energy"),
+            Column("", "J", "regenerated"),
+            last,
+        ]
         if rows:
             tables.append(Table("", columns, rows, head=side))
     for d in duties:
@@ -256,11 +274,14 @@ def _make_tables(duties: Sequence[DriveDuty]) -> list[Table]:
         columns.append(Column("", "", "inertia ratio", form=".3g"))
         rows = {
             fit.name: [
-                fit.answer, "-" if fit.speed > 1.0 else _format_percent(fit.torque),
-                _format_percent(fit.thermal), _format_percent(fit.speed), fit.inertia_ratio,
+                fit.answer,
+                "-" if fit.speed > 1.0 else _format_percent(fit.torque),
+                _format_percent(fit.thermal),
+                _format_percent(fit.speed),
+                fit.inertia_ratio,
             ]
             for fit in fits
-        }  # fmt: skip
+        }
         more: dict[str, list[Any]] = {
             "gear": [str(fit.gear) for fit in fits] if len({fit.gear for fit in fits}) > 1 else [],
             "cost": [fit.cost for fit in fits] if any(fit.cost is not None for fit in fits) else [],
@@ -290,9 +311,7 @@ def over_workspace(given: Size) -> Report:
         check_limit("over-workspace", value or LEAST_LIMIT)
     robot, held = given.machine(), given.load
     robot = robot if held is None else held.on(robot)
-    worst = worst_over_workspace(
-        robot, speed, change, singularity=given.singularity, lever=given.lever
-    )
+    worst = worst_over_workspace(robot, speed, change, singularity=given.singularity, lever=given.lever)
     names = robot.pose_names
     turns = only_turns(robot)
     data: dict[str, dict[str, Any]] = {}
@@ -316,25 +335,32 @@ def over_workspace(given: Size) -> Report:
     answer = (
         f"{robot.name}: {robot.joint_names[k]} needs up to {worst.effort[k]:.4g} "
         f"{robot.effort_units[k]} where the "
-        + ("platform turns at {:g} rad/s and {:g} rad/s2" if turns else
-           "tool point moves at {:g} m/s and {:g} m/s2").format(speed, change)
-    )  # fmt: skip
+        + (
+            "platform turns at {:g} rad/s and {:g} rad/s2" if turns else "tool point moves at {:g} m/s and {:g} m/s2"
+        ).format(speed, change)
+    )
     pose = f"pose ({', '.join(dict.fromkeys(robot.pose_units))})"
     columns = [Column("", "", text) for text in ("largest", " ", pose)]
     return Report(
         answer,
         [
-            Fact("robot", robot.name), Fact("speed_rad_s" if turns else "speed_m_s", speed),
+            Fact("robot", robot.name),
+            Fact("speed_rad_s" if turns else "speed_m_s", speed),
             Fact("acceleration_rad_s2" if turns else "acceleration_m_s2", change),
             Fact("least_singularity", given.singularity),
             Fact("least_lever", given.lever),
-            Fact("poses", worst.poses, text="poses of the workspace", shown=(
-                f"{worst.poses}, singularity index {given.singularity:g} or more, levers "
-                f"{given.lever:g} or more")),
+            Fact(
+                "poses",
+                worst.poses,
+                text="poses of the workspace",
+                shown=(
+                    f"{worst.poses}, singularity index {given.singularity:g} or more, levers {given.lever:g} or more"
+                ),
+            ),
             Fact("drives", data),
         ],
         [Table("", columns, rows, head="joint")],
-    )  # fmt: skip
+    )
 
 
 def near(duty: DriveDuty) -> list[Fit]:
@@ -384,13 +410,10 @@ def draw(taken: EffortComparison, duties: Sequence[DriveDuty], answer: str) -> A
             fit = near(d)[-1]
             for sign in (1.0, -1.0):
                 level = sign * fit.motor.continuous_torque
-                ax.axhline(
-                    level, color="0.5", ls="--", lw=1, label="continuous" if sign > 0 else None
-                )
+                ax.axhline(level, color="0.5", ls="--", lw=1, label="continuous" if sign > 0 else None)
             parts = tuple(map(_format_percent, (fit.torque, fit.thermal, fit.speed)))
-            words = (
-                f"{fit} {'' if fit.good else 'is '}{fit.answer}: "
-                "torque {}, RMS torque {}, speed {}".format(*parts)
+            words = f"{fit} {'' if fit.good else 'is '}{fit.answer}: torque {{}}, RMS torque {{}}, speed {{}}".format(
+                *parts
             )
             fastest = 1.3 * float(np.abs(speeds).max())
             ax.set(xlim=(-fastest, fastest), ylim=(-1.1 * most, 1.1 * most))

@@ -54,20 +54,20 @@ class Torques(CarriesAtTimes, ReadsMotions, AtPose, Writes, Draws):
     With --beyond-limits, the column beyond_limits is 1 where a joint is outside its limits.
     """
 
-    motion: Path | None = setting(
-        None, "a recording or a path: MCAP, rosbag2 folder or table", argument=True
-    )
-    at: str | None = setting(
-        None, "at rest at this pose, in place of a motion; separated by commas"
-    )
+    motion: Path | None = setting(None, "a recording or a path: MCAP, rosbag2 folder or table", argument=True)
+    at: str | None = setting(None, "at rest at this pose, in place of a motion; separated by commas")
     wrench: tuple[float, ...] | None = setting(
-        None, "with --at: force and moment on the platform, N and N m, base axes",
-        count=6, metavar="fx,fy,fz,mx,my,mz",
-    )  # fmt: skip
+        None,
+        "with --at: force and moment on the platform, N and N m, base axes",
+        count=6,
+        metavar="fx,fy,fz,mx,my,mz",
+    )
     out: Path | None = setting(
-        None, "table to write, .csv, .parquet or .mat; default of a motion: torques.csv",
-        writes=True, endings=ENDINGS,
-    )  # fmt: skip
+        None,
+        "table to write, .csv, .parquet or .mat; default of a motion: torques.csv",
+        writes=True,
+        endings=ENDINGS,
+    )
 
     def __post_init__(self) -> None:
         if self.out is None and self.at is None:
@@ -131,9 +131,12 @@ def torques(given: Torques) -> Report:
     if given.at is None:
         answer += f"{when:.4g} s, RMS {rms:.4g} {unit}"
         shown = [
-            Column("peak", text=None), Column("effort_at_peak", text="peak"),
-            Column("rms", text="RMS"), Column("unit"), Column("peak_at_s", "s", "peak at"),
-        ]  # fmt: skip
+            Column("peak", text=None),
+            Column("effort_at_peak", text="peak"),
+            Column("rms", text="RMS"),
+            Column("unit"),
+            Column("peak_at_s", "s", "peak at"),
+        ]
     else:
         answer += "rest"
         shown = [Column(name) for name in ("effort", "unit", *RESTING)]

@@ -35,9 +35,7 @@ class Trend(Draws):
     history: Path = setting(..., "a file that `pkm-twin check --history` wrote", argument=True)
     machine: str | None = setting(None, "report this machine only")
     baseline: int = setting(15, "number of first recordings that set the control limits", low=3)
-    false_alarm: float = setting(
-        0.01, "probability of a false alarm for a history without drift", low=1e-9, high=0.5
-    )
+    false_alarm: float = setting(0.01, "probability of a false alarm for a history without drift", low=1e-9, high=0.5)
 
 
 def trend(given: Trend) -> Report:
@@ -65,13 +63,15 @@ def trend(given: Trend) -> Report:
     return Report(
         answer=answer,
         facts=[
-            Fact("history", str(given.history)), Fact("drifts", bool(drifting)),
-            Fact("judged", len(results) - few), Fact("series", [one.as_json() for one in results]),
+            Fact("history", str(given.history)),
+            Fact("drifts", bool(drifting)),
+            Fact("judged", len(results) - few),
+            Fact("series", [one.as_json() for one in results]),
         ],
         figures={"": lambda: draw(results, answer)},
         notes=notes,
         verdict=Verdict.BAD if drifting else Verdict.UNKNOWN if few == len(results) else None,
-    )  # fmt: skip
+    )
 
 
 def draw(results: Sequence[Judged], answer: str) -> Any:
@@ -90,9 +90,7 @@ def draw(results: Sequence[Judged], answer: str) -> Any:
         s, days = one.series, np.array(one.series.days)
         known = np.nan_to_num(s.deviation)
         ax.errorbar(days, s.value, known, fmt=".-", ms=5, lw=0.8, color=plots.COLOURS[0])
-        ax.plot(
-            days[one.beyond], s.value[one.beyond], "o", mfc="none", ms=9, color=plots.COLOURS[1]
-        )
+        ax.plot(days[one.beyond], s.value[one.beyond], "o", mfc="none", ms=9, color=plots.COLOURS[1])
         if math.isfinite(one.centre):
             ax.axhline(one.centre, color="0.4", lw=0.8)
             ax.axhspan(one.low, one.high, color=plots.COLOURS[2], alpha=0.15, lw=0)

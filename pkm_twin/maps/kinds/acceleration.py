@@ -48,8 +48,7 @@ class Acceleration(Kind):
         limits, still = drive_limits(robot, "effort"), np.zeros_like(q)
         back, axes = unit_motions(robot, q)
         held = inverse_dynamics(robot, q, still, still, case.wrench)
-        columns = [inverse_dynamics(robot, q, still, c, case.wrench) - held
-                   for c in np.moveaxis(back, -1, 0)]  # fmt: skip
+        columns = [inverse_dynamics(robot, q, still, c, case.wrench) - held for c in np.moveaxis(back, -1, 0)]
         each = np.stack(columns, -1)
         size = np.linalg.norm(each, axis=-1)
         with np.errstate(divide="ignore", invalid="ignore"):

@@ -38,5 +38,4 @@ class Frequency(Kind):
         found = modes(robot, robot.forward(q), len(cases))
         _, direction = size_and_direction(found.shapes[..., 0, :3])
         strain = found.energies.strain.argmax(-1)
-        return [Found(found.frequencies[:, k], direction[:, k], strain[:, k])
-                for k in range(len(cases))]  # fmt: skip
+        return [Found(found.frequencies[:, k], direction[:, k], strain[:, k]) for k in range(len(cases))]

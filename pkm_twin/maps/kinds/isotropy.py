@@ -20,9 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from xarray import Dataset
 
-TRANSFER = Case(
-    "energy", "least share of the kinetic energy in the platform", "", "moves itself most", False
-)
+TRANSFER = Case("energy", "least share of the kinetic energy in the platform", "", "moves itself most", False)
 
 
 @dataclass(frozen=True)
@@ -30,9 +28,7 @@ class Isotropy(Kind):
     """Map kinetic energy and driving force in the worst direction of motion."""
 
     energy: float = setting(ENERGY, "the platform's kinetic energy for the driving force (J)")
-    spheres: bool = setting(
-        False, "also both indices in every direction of motion, on spheres at azimuth and tilt"
-    )
+    spheres: bool = setting(False, "also both indices in every direction of motion, on spheres at azimuth and tilt")
 
     name = "isotropy"
     question = "what does the worst direction cost?"

@@ -41,37 +41,39 @@ class Modes(Frequency):
     name = "modes"
     question = "how does it vibrate?"
     page_help = (
-        "Below: the frame at rest (grey) and in a mode, magnified, at the map's worst pose; "
-        "the button animates it."
+        "Below: the frame at rest (grey) and in a mode, magnified, at the map's worst pose; the button animates it."
     )
 
     def cases(self, robot: Robot) -> tuple[Case, ...]:
         """Return one case per mode, lowest first."""
         (first,) = super().cases(robot)
         numbers = range(1, MODE_COUNT + 1)
-        return tuple(replace(first, name=f"mode {k}", what=f"frequency of mode {k}",
-                             answer="lowest frequency" if k == 1 else "frequency there")
-                     for k in numbers)  # fmt: skip
+        return tuple(
+            replace(
+                first,
+                name=f"mode {k}",
+                what=f"frequency of mode {k}",
+                answer="lowest frequency" if k == 1 else "frequency there",
+            )
+            for k in numbers
+        )
 
     def summaries(self, space: Space, counted: int, apart: int) -> dict[str, Variable]:
         """Return the mode shapes at the planes' pose, their energy shares, and lines to draw."""
         pose, node, part = space.through(0), ("mode", "node", "space"), ("mode", "element")
         found = modes(space.robot, pose, len(space.cases))
-        edges = structure_edges(
-            structural_model(space.robot, space.robot.inverse(pose)), found.nodes
-        )
+        edges = structure_edges(structural_model(space.robot, space.robot.inverse(pose)), found.nodes)
         ends = {"valid_min": 0, "valid_max": len(found.nodes) - 1}
         what = "displacement of the nodes in a mode of unit generalised mass"
-        share = {kind: describe(f"part of the mode's {kind} energy", "", UNIT_INTERVAL)
-                 for kind in ("strain", "kinetic")}  # fmt: skip
+        share = {
+            kind: describe(f"part of the mode's {kind} energy", "", UNIT_INTERVAL) for kind in ("strain", "kinetic")
+        }
         return {
             "node": Variable(("node",), np.array(found.nodes, "U"), {}),
             "line": Variable(("edge", "end"), edges, describe("nodes that it joins", "", ends)),
             "position": Variable(("node", "space"), found.positions, describe("node at rest", "m")),
             "displacement": Variable(node, found.shapes[..., :3], describe(what, "1/sqrt(kg)")),
-            "shape_frequency": Variable(
-                ("mode",), found.frequencies, describe("of the shape", "Hz", NON_NEGATIVE)
-            ),
+            "shape_frequency": Variable(("mode",), found.frequencies, describe("of the shape", "Hz", NON_NEGATIVE)),
             "strain_share": Variable(part, found.energies.strain, share["strain"]),
             "kinetic_share": Variable(part, found.energies.kinetic, share["kinetic"]),
         }
@@ -124,8 +126,7 @@ class Modes(Frequency):
         figure.add_scatter3d(**_path_coordinates(rest, path), mode="lines", line=grey, **still)
         figure.add_scatter3d(**ground, mode="markers", marker=square, **still)
         names = ["" if k < 0 else str(data.node.values[k]) for k in path.tolist()]
-        figure.add_scatter3d(mode="lines", text=names, hovertemplate="%{text}<extra></extra>",
-                             showlegend=False)  # fmt: skip
+        figure.add_scatter3d(mode="lines", text=names, hovertemplate="%{text}<extra></extra>", showlegend=False)
         buttons, frames = [], []
         for mode in range(data.sizes["mode"]):
             moved, far = deformed(data, mode)
@@ -154,23 +155,31 @@ class Modes(Frequency):
         figure.data[2].update({name: values[0] for name, values in first.items()})
         title = {"text": "displacement over the mode's largest", "side": "right"}
         figure.update_layout(
-            coloraxis={"colorscale": "Viridis", "cmin": 0.0, "cmax": 1.0,
-                       "colorbar": {**BAR, "title": title}},
+            coloraxis={"colorscale": "Viridis", "cmin": 0.0, "cmax": 1.0, "colorbar": {**BAR, "title": title}},
             scene={
                 "aspectmode": "manual",
-                "aspectratio": dict(zip("xyz", (1.3 * (high - low) / (high - low).max()).tolist(),
-                                        strict=True)),
+                "aspectratio": dict(zip("xyz", (1.3 * (high - low) / (high - low).max()).tolist(), strict=True)),
                 "camera": {**CAMERA, "projection": {"type": "orthographic"}},
-                **{f"{axis}axis": {"title": f"{axis} (m)", "range": [a, b], "nticks": 6}
-                   for axis, a, b in zip("xyz", low.tolist(), high.tolist(), strict=True)},
+                **{
+                    f"{axis}axis": {"title": f"{axis} (m)", "range": [a, b], "nticks": 6}
+                    for axis, a, b in zip("xyz", low.tolist(), high.tolist(), strict=True)
+                },
             },
-            margin=MARGIN, uirevision="modes",
+            margin=MARGIN,
+            uirevision="modes",
             updatemenus=[
                 {"buttons": buttons, **MENU},
-                {"type": "buttons", "direction": "left", "showactive": False,
-                 "buttons": _animation_buttons(0), **MENU, "x": 1.0, "xanchor": "right"},
+                {
+                    "type": "buttons",
+                    "direction": "left",
+                    "showactive": False,
+                    "buttons": _animation_buttons(0),
+                    **MENU,
+                    "x": 1.0,
+                    "xanchor": "right",
+                },
             ],
-        )  # fmt: skip
+        )
         return figure
 
 
@@ -199,8 +208,7 @@ def _mode_title(data: Dataset, mode: int) -> list[str]:
     for kind in ("strain", "kinetic"):
         shares = data[f"{kind}_share"].values[mode]
         order = np.argsort(-shares, kind="stable")[:3]
-        parts = [f"{data.element.values[k]} {100 * shares[k]:.0f} %" for k in order
-                 if shares[k] >= 0.005]  # fmt: skip
+        parts = [f"{data.element.values[k]} {100 * shares[k]:.0f} %" for k in order if shares[k] >= 0.005]
         lines.append(f"{kind}: {', '.join(parts)}")
     return lines
 
@@ -221,9 +229,7 @@ def _join_edges(edges: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.array(path)
 
 
-def _values_along_path(
-    values: Array, path: NDArray[np.int64], gap: float | None = None
-) -> list[Any]:
+def _values_along_path(values: Array, path: NDArray[np.int64], gap: float | None = None) -> list[Any]:
     """Return values (nodes,) along a path as a list, which can hold None in gaps."""
     return [gap if k < 0 else round(float(values[k]), 5) for k in path.tolist()]
 

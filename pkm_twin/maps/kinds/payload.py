@@ -55,9 +55,7 @@ class Payload(Kind):
         held = inverse_dynamics(bare, q, still, still, case.wrench)
         each = inverse_dynamics(loaded, q, still, still, case.wrench) - held
         with np.errstate(divide="ignore", invalid="ignore"):
-            room = np.where(
-                np.abs(each) < ROUNDING * limits, np.inf, (np.copysign(limits, each) - held) / each
-            )
+            room = np.where(np.abs(each) < ROUNDING * limits, np.inf, (np.copysign(limits, each) - held) / each)
         over = np.abs(held) / limits
         fails = over.max(-1) > 1.0
         joint = np.where(fails, over.argmax(-1), room.argmin(-1))

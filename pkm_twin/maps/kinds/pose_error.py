@@ -56,15 +56,14 @@ def _moving_causes(robot: Robot) -> NDArray[np.intp]:
     points or axes at home: all parts that meet there move along, and home still closes.
     """
     for name, steps in robot.causes.items() if robot.mechanism == "machine" else ():
-        shared = [
-            path for path, step in steps.items() if step and SHARED_KEYS & {*keys_of(path)[2:3]}
-        ]
+        shared = [path for path, step in steps.items() if step and SHARED_KEYS & {*keys_of(path)[2:3]}]
         if shared:
             raise ParameterError(
-                f"uncertainty.{name}", shared[0],
+                f"uncertainty.{name}",
+                shared[0],
                 "numbers that move the platform at home, where this one is a place that parts "
                 "share; errors of single parts: pkm-twin design --tolerance",
-            )  # fmt: skip
+            )
     found = np.flatnonzero(position_effects(robot, robot.graph.home).any(0))
     if not len(found):
         what = "the standard deviation of a length or angle that moves the platform"

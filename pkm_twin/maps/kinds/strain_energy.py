@@ -90,9 +90,7 @@ class StrainEnergy(Compliance):
                 part = ranked[k : k + PANELS]
                 name = f"{before}elements_{k // PANELS + 1}"
                 named[name] = _draw_slices(data, case, part) | _draw_planes(data, case, part)
-            pictures |= {
-                f"{name}_{end}": one for name, ends in named.items() for end, one in ends.items()
-            }
+            pictures |= {f"{name}_{end}": one for name, ends in named.items() for end, one in ends.items()}
         return pictures
 
 
@@ -112,9 +110,7 @@ def _title(data: Dataset, case: str, elements: list[int], where: str) -> str:
     """Return the question, and the mean shares of the elements that answer it."""
     mean, _ = _rank(data, case)
     means = ", ".join(f"{data.element.values[n]} {100 * mean[n]:.1f} %" for n in elements)
-    what = (
-        f"which part gives? Mean share: {means}; " if elements else "where is the strain energy? "
-    )
+    what = f"which part gives? Mean share: {means}; " if elements else "where is the strain energy? "
     return f"{data.attrs['robot']}, {case}: {what}{where}"
 
 
@@ -142,21 +138,28 @@ def _draw_slices(data: Dataset, case: str, elements: list[int]) -> dict[str, Fig
     x, y = np.meshgrid(*(data[name].values for name in flat), indexing="ij")
     heights = data[upwards].values[chosen]
     figure: Figure
-    figure, columns = plots.columns(
-        len(tables), 1, 4.6 if elements else 6.0, subplot_kw={"projection": "3d"}
-    )
+    figure, columns = plots.columns(len(tables), 1, 4.6 if elements else 6.0, subplot_kw={"projection": "3d"})
     drawn: Any = None
     for table, (ax,), n in zip(tables, columns, elements or [-1], strict=True):
         for layer, height in zip(table[chosen], heights.tolist(), strict=True):
             drawn = ax.contourf(
-                x, y, np.ma.masked_invalid(scale * layer), levels, cmap=COLOUR_MAP, zdir="z",
-                offset=height, extend=extend,
-            )  # fmt: skip
+                x,
+                y,
+                np.ma.masked_invalid(scale * layer),
+                levels,
+                cmap=COLOUR_MAP,
+                zdir="z",
+                offset=height,
+                extend=extend,
+            )
         ax.set(
-            xlim=(x.min(), x.max()), ylim=(y.min(), y.max()), zlim=(heights[0], heights[-1]),
-            xlabel=f"{flat[0]} ({units[flat[0]]})", ylabel=f"{flat[1]} ({units[flat[1]]})",
+            xlim=(x.min(), x.max()),
+            ylim=(y.min(), y.max()),
+            zlim=(heights[0], heights[-1]),
+            xlabel=f"{flat[0]} ({units[flat[0]]})",
+            ylabel=f"{flat[1]} ({units[flat[1]]})",
             zticks=heights.round(3),
-        )  # fmt: skip
+        )
         ax.locator_params(axis="x", nbins=3)
         ax.locator_params(axis="y", nbins=3)
         ax.set_box_aspect((1.0, 1.0, 1.5), zoom=0.85)
@@ -181,11 +184,7 @@ def _draw_planes(data: Dataset, case: str, elements: list[int]) -> dict[str, Fig
     k = [str(name) for name in data.case.values].index(case)
     upwards = data.attrs["height"]
     full = full_planes(data, k)
-    across = [
-        p
-        for p in full
-        if upwards not in (str(data.row_name.values[p]), str(data.column_name.values[p]))
-    ]
+    across = [p for p in full if upwards not in (str(data.row_name.values[p]), str(data.column_name.values[p]))]
     plane = (across or full)[0]
     one = plane_of(data, k, plane)
     if len(one["names"]) < 2:

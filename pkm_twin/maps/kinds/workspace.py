@@ -37,12 +37,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from xarray import Dataset
 
-SINGULARITY: Final = Case(
-    "singularity", "singularity index", "", "least singularity index", largest=False
-)
-CLEARANCE: Final = Case(
-    "clearance", "clearance of the limbs", "m", "limbs nearest", False, interfering=True
-)
+SINGULARITY: Final = Case("singularity", "singularity index", "", "least singularity index", largest=False)
+CLEARANCE: Final = Case("clearance", "clearance of the limbs", "m", "limbs nearest", False, interfering=True)
 ANGLE: Final = Case("joint-angle", "largest passive joint angle", "rad", "bends most")
 LAYERS: Final = 101
 """Number of heights of the circles."""
@@ -89,9 +85,7 @@ class Workspace(Kind):
         if 1 < len(space.ticks) == len(robot.pose_names):
             cell = math.prod(float(ticks[1] - ticks[0]) for ticks in space.ticks)
             what = "volume of the reachable poses"
-            result["volume"] = scalar(
-                apart * cell, what, _volume_unit(robot.pose_units), NON_NEGATIVE
-            )
+            result["volume"] = scalar(apart * cell, what, _volume_unit(robot.pose_units), NON_NEGATIVE)
         if has_clearance(robot):
             share = (counted - apart) / counted if counted else math.nan
             what = "share of otherwise reachable poses in which limbs interfere"
@@ -132,9 +126,7 @@ class Workspace(Kind):
         return facts
 
     @classmethod
-    def overlay(
-        cls, data: Dataset, names: tuple[str, ...], through: Mapping[str, float], ax: Axes
-    ) -> str:
+    def overlay(cls, data: Dataset, names: tuple[str, ...], through: Mapping[str, float], ax: Axes) -> str:
         """Draw the circles about the axis and the cylinder, as a plane cuts them."""
         if "circle" not in data or len(names) != 2:
             return ""
@@ -158,9 +150,7 @@ class Workspace(Kind):
         return OVERLAY_CAPTION
 
 
-def regular(
-    robot: Robot, heights: Array, least: float, least_clearance: float
-) -> dict[str, Variable]:
+def regular(robot: Robot, heights: Array, least: float, least_clearance: float) -> dict[str, Variable]:
     """Return the largest circles about the axis at heights (n,), and the cylinder, for a file."""
     radius = circles(robot, heights, least=least, least_clearance=least_clearance)
     best, unit = largest_cylinder(heights, radius), distance_unit(robot)
@@ -199,9 +189,7 @@ def circles(
     z = np.atleast_1d(np.asarray(heights, np.float64))
     lateral = [robot.pose_names.index(name) for name in robot.grid().lateral]
     step = float(np.abs(robot.search_box()[lateral]).max()) / steps
-    return circle_radii(
-        robot, z, step, steps, least=max(least, CLEAR), least_clearance=least_clearance
-    )
+    return circle_radii(robot, z, step, steps, least=max(least, CLEAR), least_clearance=least_clearance)
 
 
 @dataclass(frozen=True)
