@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pkm_twin.codegen.arrays import Array, Mask, doubles, finite, vectors
+from pkm_twin.codegen.arrays import Array, Mask, common_batch, doubles, finite, vectors
 from pkm_twin.machine.rotations import skew
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
@@ -63,10 +63,11 @@ def setpoint_correction(
     limit = doubles(bound, "the bound")
     if limit.shape not in ((), (robot.joints_count,)) or not (limit >= 0.0).all():
         raise ValueError(f"bound is {limit.tolist()}; expected 0 or more, one number or one per joint")
-    moved = vectors(deflection, 6, "the deflection")
+    moved, point = vectors(deflection, 6, "the deflection"), vectors(tool, 3, "the tool point")
     if rotation is None:
         _, rotation = robot.platform(q)
-    lever = skew((rotation @ vectors(tool, 3, "the tool point")[..., None])[..., 0])
+    common_batch(rotation.shape[:-2], moved.shape[:-1], point.shape[:-1])
+    lever = skew((rotation @ point[..., None])[..., 0])
     twist = robot.platform_jacobian(q) / robot.joint_scales
     place, turn = twist[..., :3, :] - lever @ twist[..., 3:, :], twist[..., 3:, :]
     there = moved[..., :3] - _multiply(lever, moved[..., 3:])

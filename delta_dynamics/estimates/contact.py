@@ -23,7 +23,7 @@ from delta_dynamics.torques.uncertainty import (
     usual_effort,
 )
 from delta_dynamics.torques.virtual_work import inverse_dynamics, mass_matrix
-from pkm_twin.codegen.arrays import Array, finite, later, one_vector, vectors
+from pkm_twin.codegen.arrays import Array, common_batch, finite, later, one_vector, vectors
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.mechanism import SHARED
 from pkm_twin.robot.robot import Robot
@@ -133,6 +133,7 @@ def platform_wrench(robot: Robot, q: ArrayLike, external: ArrayLike) -> Array:
     jacobian = robot.platform_jacobian(q) * lever[:, None]
     inverse = np.linalg.pinv(np.swapaxes(jacobian, -1, -2), rcond=RANK)
     efforts = vectors(external, robot.joints_count, "efforts")
+    common_batch(jacobian.shape[:-2], efforts.shape[:-1])
     with np.errstate(over="ignore", invalid="ignore"):
         least = (inverse @ efforts[..., None])[..., 0] * lever
     return finite(least, "an effort")

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from delta_dynamics.torques.torque_terms import frictionless
 from delta_dynamics.torques.virtual_work import body_mass_matrix, mass_matrix
-from pkm_twin.codegen.arrays import Array, doubles, finite, vectors
+from pkm_twin.codegen.arrays import Array, common_batch, doubles, finite, vectors
 from pkm_twin.errors import ParameterError, SingularityError
 from pkm_twin.machine.pose_grid import zero_torsion
 from pkm_twin.robot.derivatives import joint_changes
@@ -202,8 +202,10 @@ def joint_motion(robot: Robot, pose: ArrayLike, rates: ArrayLike, accelerations:
     """
     q, inverse = _inverse_jacobian(robot, pose)
     m = len(robot.pose_names)
-    qd = np.einsum("...ij,...j->...i", inverse, vectors(rates, m, "pose rates"))
-    qdd = joint_changes(robot, q, qd, inverse, _accelerations(accelerations, m))
+    rates, changes = vectors(rates, m, "pose rates"), _accelerations(accelerations, m)
+    common_batch(q.shape[:-1], rates.shape[:-1], changes.shape[:-1])
+    qd = np.einsum("...ij,...j->...i", inverse, rates)
+    qdd = joint_changes(robot, q, qd, inverse, changes)
     finite(qdd, "an acceleration")
     q, qd, qdd = np.broadcast_arrays(q, qd, qdd)
     return JointMotion(q.copy(), qd.copy(), qdd)
@@ -235,6 +237,7 @@ def energy_transfer(robot: Robot, pose: ArrayLike, direction: ArrayLike) -> Arra
     """
     x = _directions(direction, len(robot.pose_names))
     platform, everything = energy_matrices(robot, pose)
+    common_batch(platform.shape[:-2], x.shape[:-1])
     return _form(platform, x) / _form(everything, x)
 
 
@@ -271,6 +274,7 @@ def max_driving_force(
     """
     x = _directions(direction, len(robot.pose_names))
     platform, _ = energy_matrices(robot, pose)
+    common_batch(platform.shape[:-2], x.shape[:-1])
     _inverse_root(robot, platform)
     rates = np.sqrt(2 * _energy(energy) / _form(platform, x))[..., None] * x
     motion = joint_motion(robot, pose, rates, acceleration)
@@ -359,7 +363,8 @@ def tilted_pose(height: ArrayLike, azimuth: ArrayLike, tilt: ArrayLike) -> Array
 
     The platform's axis leans by ``tilt`` towards ``azimuth`` (rad), as in the paper's maps.
     """
-    given = (finite(doubles(v), "a height or an angle") for v in (height, azimuth, tilt))
+    given = [finite(doubles(v), "a height or an angle") for v in (height, azimuth, tilt)]
+    common_batch(*(values.shape for values in given))
     z, a, t = np.broadcast_arrays(*given)
     return np.stack([z, *zero_torsion(t, a)], -1)
 

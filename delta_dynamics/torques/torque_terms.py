@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from delta_dynamics.torques.virtual_work import torques
-from pkm_twin.codegen.arrays import Array, Indices, vectors
+from pkm_twin.codegen.arrays import Array, Indices, common_batch, vectors
 from pkm_twin.machine.inertia import GRAVITY, Layout
 from pkm_twin.robot.robot import Robot
 
@@ -77,7 +77,7 @@ def dynamics_terms(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wr
     given = (q, "joint positions"), (qd, "joint rates"), (qdd, "joint accelerations")
     arrays = [vectors(values, n, what) for values, what in given]
     # The batch of all inputs together, so that every term has it.
-    shape = np.broadcast_shapes(*(a.shape[:-1] for a in arrays), load.shape[:-1])
+    shape = common_batch(*(a.shape[:-1] for a in (*arrays, load)))
     place, rate, change = (np.broadcast_to(a, (*shape, *a.shape[-1:])) for a in arrays)
     still = np.zeros(n)
     none = np.zeros(6)

@@ -97,6 +97,18 @@ def one_vector(values: ArrayLike, size: int, what: str) -> Array:
     return array
 
 
+def common_batch(*batches: tuple[int, ...]) -> tuple[int, ...]:
+    """Return the batch axes of inputs together.
+
+    :raises ValueError: batches of different sizes, of which none is one sample.
+    """
+    try:
+        return np.broadcast_shapes(*batches)
+    except ValueError:
+        found = " and ".join(str(batch) for batch in dict.fromkeys(batches) if batch)
+        raise ValueError(f"batches of {found} samples; expected the same of every input, or one sample") from None
+
+
 def later(time: float, last: float | None) -> float:
     """Check that the time of a sample is later than that of the sample before; return it, s.
 

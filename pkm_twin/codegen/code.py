@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pkm_twin.codegen import cache
-from pkm_twin.codegen.arrays import Array, doubles
+from pkm_twin.codegen.arrays import Array, common_batch, doubles
 from pkm_twin.codegen.key import ProgramKey
 from pkm_twin.codegen.plain import PlainCode
 from pkm_twin.codegen.program import Program
@@ -266,12 +266,12 @@ class Code:
         :returns: outputs, shape (..., size) each, NaN in refused samples; and the status: None if
             all samples are good, else shape (..., 2): 0 good, 1 refused or 2 not finite, and the
             fraction of the motion from home that was reached.
-        :raises ValueError: an input is not real numbers, or its last axis has another size.
+        :raises ValueError: an input is not real numbers, its last axis has another size, or batches differ.
         """
         arrays = self.checked(inputs)
         shape = max(arrays, key=_axes, default=_NO_INPUT).shape[:-1]
         if shape and not all([a.ndim == 1 or a.shape[:-1] == shape for a in arrays]):
-            shape = np.broadcast_shapes(*(a.shape[:-1] for a in arrays))
+            shape = common_batch(*(a.shape[:-1] for a in arrays))
             arrays = [
                 a.reshape(-1) if a.size == a.shape[-1] else np.broadcast_to(a, (*shape, a.shape[-1])) for a in arrays
             ]

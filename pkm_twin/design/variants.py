@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from delta_dynamics.torques.reactions import BALANCE_BOUND, Reactions, balanced, known_alone
-from pkm_twin.codegen.arrays import Array, doubles
+from pkm_twin.codegen.arrays import Array, common_batch, doubles
 from pkm_twin.codegen.code import Code
 from pkm_twin.codegen.kernels import MAX_GEOMETRY_MISMATCH
 from pkm_twin.design import programs
@@ -360,7 +360,7 @@ class Variants:
             each = array.ndim > 1 and array.shape[0] == k
             # A shape that begins with 1 gives all machines the same k samples.
             shapes.append((each, array.shape[1 if each or array.shape[:2] == (1, k) else 0 : -1]))
-        batch = np.broadcast_shapes(*(shape for _, shape in shapes))
+        batch = common_batch(*(shape for _, shape in shapes))
         rows = []
         for array, (each, shape) in zip(arrays, shapes, strict=True):
             machines, size, one = k if each else 1, array.shape[-1], math.prod(shape) == 1

@@ -127,10 +127,11 @@ def cut_out(tree: LoopTree, base: str, platform: str, *, carry: bool = False) ->
 
 
 def check_faults(tree: LoopTree) -> None:
-    """Reject joints that follow others, if they belong to the machine, and a lack of motors.
+    """Reject joints that follow others, if one of both belongs to the machine, and a lack of motors.
 
     :raises ParameterError: as the reader of the file found.
     """
+    own = {*tree.joints, *(joint.name for joint in tree.closures)}
     for names, error in tree.faults:
-        if any(name in tree.joints for name in names) or not (names or tree.actuated):
+        if own.intersection(names) or not (names or tree.actuated):
             raise error

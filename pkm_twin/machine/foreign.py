@@ -11,12 +11,13 @@ import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Final
 
 from pkm_twin.errors import ParameterError, warn
 from pkm_twin.machine import urdf_xml
 from pkm_twin.machine.graph import groups
-from pkm_twin.machine.loop_tree import Joint, Link
+from pkm_twin.machine.loop_tree import Fault, Joint, Link
 
 IGNORED: Final = {
     "spring_stiffness": "the spring",
@@ -47,12 +48,17 @@ FORCES: Final = re.compile(r"Buoyancy|Hydrodynamics|LiftDrag|Thruster|Wind|Sprin
 """Names of plugins that apply forces."""
 
 
-def check_elements(path: Path, parts: Iterable[ET.Element], owner: str = "") -> None:
+def check_elements(
+    path: Path, parts: Iterable[ET.Element], owner: str = "", joints: Mapping[ET.Element, str] = MappingProxyType({})
+) -> list[Fault]:
     """Reject or warn of elements that act in a simulator and are not read, and of what is in them.
 
     :param owner: what they belong to, for the error.
-    :raises ParameterError: one that makes another machine, by name.
+    :param joints: names of joints by their elements. What would be rejected inside one is returned,
+        with the joints that it couples: it concerns no machine without these.
+    :raises ParameterError: an element that makes another machine, by name.
     """
+    faults: list[Fault] = []
     for part in parts:
         tag, name = str(part.tag), part.get("name") or part.get("reference")
         where = ".".join(filter(None, (owner, tag, name)))
@@ -66,7 +72,15 @@ def check_elements(path: Path, parts: Iterable[ET.Element], owner: str = "") -> 
                 raise ParameterError("plugin", plugin, "joints without coupling")
             if FORCES.search(plugin):
                 warn(path, f"forces of the plugin {plugin} are ignored")
-        check_elements(path, part, f"{tag}.{name}" if name else owner)
+        try:
+            faults += check_elements(path, part, f"{tag}.{name}" if name else owner, joints)
+        except ParameterError as error:
+            if part not in joints:
+                raise
+            scope = joints[part].removesuffix(str(name))
+            leaders = [scope + one.get("joint", "") for one in part.iter() if COUPLING.search(str(one.tag))]
+            faults.append(((joints[part], *leaders), error))
+    return faults
 
 
 def _acts(part: ET.Element) -> bool:

@@ -60,7 +60,7 @@ def _joint_entry(joint: Joint) -> dict[str, Any]:
         data["actuated"] = True
     # Of a slide the file says where it counts from, lest a leg seems to have no length.
     if joint.home or (joint.actuated and joint.kind == "prismatic"):
-        data["home"] = joint.home
+        data["home"] = float(joint.home)
     if joint.rotor_inertia:
         data["rotor_inertia"] = joint.rotor_inertia
     if joint.viscous or joint.coulomb:

@@ -24,7 +24,7 @@ from pkm_twin.machine import foreign, urdf_xml
 from pkm_twin.machine.foreign import gravity_of
 from pkm_twin.machine.graph import spanning
 from pkm_twin.machine.joints import TURN, TYPES
-from pkm_twin.machine.loop_tree import Fault, Joint, Link, LoopTree, hung, link_of
+from pkm_twin.machine.loop_tree import Joint, Link, LoopTree, hung, link_of
 from pkm_twin.machine.precision import rounding_error
 from pkm_twin.machine.rotations import Pose, from_rpy
 from pkm_twin.machine.urdf_control import actuated_joints, read_beside
@@ -67,7 +67,7 @@ def read(path: Path, top: ET.Element, actuated: Sequence[str] | None = None) -> 
     links = {WORLD: Link(WORLD)}
     moments = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
     rounding = rounding_error((e.text or "").strip() for e in element.iter() if e.tag in moments)
-    foreign.check_elements(path, [element])
+    faults = foreign.check_elements(path, [element], joints={part: name for name, part in model.all("joint")})
     weight = {name: foreign.flag(part, "gravity", True) for name, part in model.all("link")}
     for name, part in model.all("link"):
         links[name] = _link(path, part, name, rounding).moved(model.place(name))
@@ -97,7 +97,6 @@ def read(path: Path, top: ET.Element, actuated: Sequence[str] | None = None) -> 
     types = {name: joint.kind for name, joint in joints.items()}
     # Where only some joints have an effort limit, these are motors.
     limited = [name for name, joint in joints.items() if "effort" in joint.limits]
-    faults: list[Fault] = []
     motors, marked = actuated_joints(path, top, read_beside(path), types, faults, others=limited, chosen=actuated)
 
     def rank(joint: Joint) -> tuple[bool, bool, int]:

@@ -106,7 +106,8 @@ def read(path: Path, robot: ET.Element, actuated: Sequence[str] | None = None) -
         try:
             _take_screw(element, joints, links)
         except ParameterError as error:
-            faults.append(((element.get("name", ""),), error))
+            leader = str(element.find("mimic").get("joint"))  # type: ignore[union-attr]
+            faults.append(((element.get("name", ""), leader), error))
     root = _root(links, joints)
     others = [element for element in robot if element.tag not in ("link", "joint")]
     foreign.check_elements(path, others)

@@ -118,6 +118,17 @@ class Recording:
     """Refused messages by reason."""
     first_reject: str = ""
 
+    def __post_init__(self) -> None:
+        """Check the joints' number.
+
+        :raises ParameterError: values of another number of samples, or of joints than the robot's.
+        """
+        shape = len(self.time), self.robot.joints_count
+        for name in ("q", "qd", "qdd", "effort"):
+            values = getattr(self, name)
+            if values is not None and values.shape != shape:
+                raise ParameterError(name, f"shape {values.shape}", f"{shape}, samples and joints of {self.robot.name}")
+
     @property
     def name(self) -> str:
         """The file's name, in one line."""

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -83,6 +83,26 @@ class Part:
     actuated: Sequence[str] | None = None
     pose: Sequence[str] | None = None
     carry: bool = False
+
+    def __post_init__(self) -> None:
+        """Check the kinds of names.
+
+        :raises ParameterError: a link that is no text, or names that are no list of texts.
+        """
+        for field in ("platform", "base"):
+            name = getattr(self, field)
+            if not isinstance(name, str | None):
+                raise ParameterError(field, name, "the name of a link")
+        for field in ("actuated", "pose"):
+            names = getattr(self, field)
+            if names is None:
+                continue
+            if (
+                isinstance(names, str)
+                or not isinstance(names, Collection)
+                or not all(isinstance(n, str) for n in names)
+            ):
+                raise ParameterError(field, names, "a list of names")
 
     @property
     def cuts(self) -> bool:

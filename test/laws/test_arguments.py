@@ -271,6 +271,15 @@ def test_batches_are_their_samples_and_results_are_read_only(name, rng):
             assert empty.shape in ((0, *many.shape[1:]), many.shape), function
 
 
+@pytest.mark.parametrize("name", ROBOTS)
+def test_batches_of_different_sizes_are_refused(name):
+    for function, (ask, arrays) in functions(load(name)).items():
+        for k in range(len(arrays) if len(arrays) > 1 else 0):
+            given = [np.tile(a, (2 if j == k else 3, 1)) for j, a in enumerate(arrays)]
+            with pytest.raises(ValueError, match=r"batches of|of one sample"):
+                print(f"{function}, argument {k}:", ask(*given))
+
+
 @pytest.mark.parametrize(("name", "far"), FAR.items())
 def test_states_without_an_assembly_are_refused_by_their_sample(name, far):
     robot = load(name)

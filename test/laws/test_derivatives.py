@@ -126,7 +126,7 @@ def test_of_pose_joints_and_compliance(name):
     found = [forward, inverse, *([compliance_derivatives(robot, pose, paths)] if elastic else [])]
     asked = [lambda r: r.forward(q), lambda r: r.inverse(pose), lambda r: r.compliance(pose)]
     for path in paths:
-        step = STEP * abs(known[path])
+        step = 4.0 * STEP * abs(known[path])
         many = variants(robot, {path: known[path] + step * POINTS})
         if not many.valid.all():
             continue

@@ -13,7 +13,7 @@ import pytest
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import Robot
-from pkm_twin.errors import PkmTwinError
+from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.identification.estimation import estimate, possible
 from pkm_twin.identification.fit import Fit, fit
 from pkm_twin.identification.identifiable import pseudo_inertia
@@ -96,6 +96,14 @@ def still_joint() -> Recording:
         values[:, 1] = held
     changed = robot.changed(friction={"viscous": [0.05, 0.08], "coulomb": [0.2, 0.3]})
     return Recording(robot, time, q, effort=inverse_dynamics(changed, q, qd, qdd), source="still")
+
+
+@pytest.mark.parametrize("name", ["q", "effort"])
+def test_a_recording_of_another_number_of_joints_is_rejected(name):
+    given = {"q": np.zeros((8, 2))} | {name: np.zeros((8, 3))}
+    with pytest.raises(ParameterError, match="samples and joints of five_bar") as error:
+        Recording(load("five_bar"), np.arange(8.0), **given)
+    assert error.value.field == name
 
 
 def test_what_the_motion_does_not_show_keeps_the_file_s_value_and_is_named():

@@ -144,6 +144,18 @@ def test_a_urdf_with_meshes_and_an_arm_is_cut_too(tmp_path):
         robot = load(path, base=root)
     x = right.home() + 0.01
     np.testing.assert_allclose(robot.inverse(x), right.inverse(x), atol=1e-9)
+    path.write_text(path.read_text().replace('joint="shoulder"', f'joint="{right.joint_names[0]}"'))
+    with pytest.raises(ParameterError, match=r"wrist.mimic"):
+        load(path, base=root)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"base": 3}, {"platform": ["foot"]}, {"actuated": "ankle_left"}, {"pose": 3}, {"actuated": [1, 2]}]
+)
+def test_names_of_another_kind_are_rejected(wrong):
+    with pytest.raises(ParameterError, match=r"expected a list of names|expected the name") as error:
+        load(HUMANOID, **{**LINKAGES["ankle"], **wrong})
+    assert error.value.field in wrong
 
 
 def test_actuators_of_tendons_and_sites_matter_where_they_act(tmp_path):

@@ -397,6 +397,25 @@ def test_a_range_may_have_one_end(limit, right, tmp_path):
     assert read_urdf(path)["joints"]["m1"]["limits"].get("position") == right
 
 
+FINGER = """<link name="{name}"/><joint name="{name}_hinge" type="revolute"><parent>{on}</parent><child>{name}</child>
+ <axis><xyz>0 0 1</xyz>{mimic}</axis></joint>"""
+
+
+@pytest.mark.parametrize(("leader", "counts"), [("finger_hinge", False), ("m1", True), ("e2", True)])
+def test_a_joint_that_follows_another_matters_where_one_of_both_belongs_to_the_machine(leader, counts, tmp_path):
+    fingers = FINGER.format(name="finger", on="world", mimic="")
+    fingers += FINGER.format(name="tip_of_it", on="finger", mimic=f'<mimic joint="{leader}"/>')
+    path = five_bar(tmp_path, "</model></world>", f"{fingers}</model></world>")
+    if counts:
+        with pytest.raises(ParameterError, match=r"tip_of_it_hinge\.mimic"):
+            load(path, platform="tool", base="world")
+        return
+    robot = load(path, platform="tool", base="world")
+    assert "finger" not in robot.graph.bodies
+    right = load(five_bar(tmp_path), platform="tool")
+    np.testing.assert_array_equal(robot.inverse(right.home()), right.inverse(right.home()))
+
+
 REJECTED = {
     "version": ('version="1.9"', 'version="2.0"', "sdf.version"),
     "type": ('type="continuous"', 'type="gearbox"', "joint.e1.type"),
