@@ -223,7 +223,7 @@ def _deflection_slopes(f: PathMotion, places: Index) -> Array:
 
 
 def _moving_masses(robot: Robot) -> list[Any]:
-    graph = robot.make_graph()
+    graph = robot.graph
     parts = [body.mass for body in graph.bodies.values()]
     return [sum((rod.mass for rod in graph.rods.values()), sum(parts, 0.0))]
 

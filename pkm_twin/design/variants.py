@@ -410,7 +410,7 @@ class Variants:
         if k not in self._patterns:
             given = dict(zip(self.paths, self.values[k].tolist(), strict=True))
             try:
-                self._patterns[k] = pattern_of(Tree(self.robot.numbered(given).make_graph()))
+                self._patterns[k] = pattern_of(Tree(self.robot.numbered(given).graph))
             except PkmTwinError:
                 self._patterns[k] = "none"
         return self._patterns[k]

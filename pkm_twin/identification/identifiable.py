@@ -138,7 +138,7 @@ def of_drives(robot: Robot) -> tuple[Identifiable, ...]:
 
 def _tens(robot: Robot) -> list[Any]:
     """Ten numbers of each body and of the payload about the base's origin, masses of rods."""
-    graph, load = robot.make_graph(), robot.payload
+    graph, load = robot.graph, robot.payload
     tens = [standard_parameters(body.mass, body.com, body.inertia) for body in graph.bodies.values()]
     tens.append(standard_parameters(load.mass, graph.origin + load.com, load.inertia))
     return [*(value for ten in tens for value in ten), *(rod.mass for rod in graph.rods.values())]

@@ -1,10 +1,10 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Bars, elastic structure and passive limits of a machine, by the entries of its file."""
+"""Bars, elasticity and passive limits of a machine, by the entries of its file."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
@@ -14,28 +14,41 @@ from pkm_twin.errors import ParameterError
 from pkm_twin.machine.graph import BASE, Graph, limb_numbers
 from pkm_twin.machine.graph_file import LimitSpec
 from pkm_twin.machine.joints import unit
-from pkm_twin.machine.members import Beam, RigidError, Structure
+from pkm_twin.machine.members import Beam, Parts
 from pkm_twin.machine.reach import PassiveLimit
 
 Specs = Mapping[str, Mapping[str, Any]]
 """Entries of a file by kind and name."""
+RIGID: Final = (
+    "bodies.NAME.member.section",
+    "a member's section, rods.NAME.section or joints.NAME.compliance: nothing is elastic",
+)
+"""Path and text of what makes parts elastic."""
 
 
-def find_beams(graph: Graph, specs: Specs) -> tuple[Beam, ...]:
-    """Return bodies with a member, and rods with a section or radius, limb by limb."""
+def find_parts(graph: Graph, specs: Specs) -> Parts:
+    """Return bodies with a member, rods with a section or radius, and the compliance of joints."""
     limb = limb_numbers(graph)
     beams = []
     for name, body in specs["bodies"].items():
         m = body.member
         if m is not None:
-            beams.append(Beam(name, name, limb[name], (name, m.start), (name, m.end), (name,), m.outer))
+            line = None if m.section is None else body.mass / norm(plain(m.end - m.start))
+            ends = (name, m.start), (name, m.end)
+            path = f"bodies.{name}.member.section"
+            beams.append(Beam(name, name, limb[name], *ends, (name,), m.outer, (), m.section, line, path))
     for name, rod in specs["rods"].items():
-        radius = rod.section.outer_diameter / 2 if rod.section is not None else rod.radius
+        tube = rod.section
+        radius = rod.radius if tube is None else tube.outer_diameter / 2
         if radius is not None:
-            inner, outer = rod.between
-            ends = (inner, rod.ends[0]), (outer, rod.ends[1])
-            beams.append(Beam(name, name, limb[name], *ends, (name,), radius))
-    return tuple(beams)
+            line = None if tube is None else rod.mass / norm(plain(rod.ends[1] - rod.ends[0]))
+            ends = (rod.between[0], rod.ends[0]), (rod.between[1], rod.ends[1])
+            beams.append(Beam(name, name, limb[name], *ends, (name,), radius, (), tube, line, f"rods.{name}.section"))
+    compliances = {
+        name: joint.compliance.tolist() for name, joint in specs["joints"].items() if joint.compliance is not None
+    }
+    missing = [f"rods.{name}.section" for name, rod in specs["rods"].items() if rod.section is None]
+    return Parts(graph, tuple(beams), compliances, (), RIGID, "".join(missing[:1]))
 
 
 def find_passive_limits(graph: Graph, specs: Specs) -> tuple[PassiveLimit, ...]:
@@ -93,44 +106,3 @@ def _swivel_axis(graph: Graph, specs: Specs, name: str, limits: LimitSpec) -> Ar
         None,
         "the direction in the middle of its range, base axes",
     )
-
-
-def find_structure(graph: Graph, specs: Specs) -> Structure:
-    """Return bars with sections, and the compliance of joints.
-
-    :raises RigidError: no body and no joint is elastic.
-    :raises ParameterError: sections that no bar has, all named, or a rod without one.
-    """
-    bars = [
-        (name, m.section, body.mass, m.end - m.start, f"bodies.{name}.member.section")
-        for name, body in specs["bodies"].items()
-        if (m := body.member) is not None
-    ] + [
-        (name, rod.section, rod.mass, rod.ends[1] - rod.ends[0], f"rods.{name}.section")
-        for name, rod in specs["rods"].items()
-    ]
-    sections, faults = {}, []
-    for name, tube, mass, along, path in bars:
-        try:
-            if tube is not None:
-                sections[name] = tube.section(mass / norm(plain(along)), path)
-        except ParameterError as error:
-            faults.append(error)
-    if faults:
-        first, *others = faults
-        more = "".join(f"; wrong too: {error.field}" for error in others)
-        raise ParameterError(first.field, first.value, f"{first.bound}{more}")
-    compliances = {
-        name: joint.compliance.tolist() for name, joint in specs["joints"].items() if joint.compliance is not None
-    }
-    if not sections and not compliances:
-        raise RigidError(
-            "bodies.NAME.member.section",
-            None,
-            "a member's section, rods.NAME.section or joints.NAME.compliance: nothing is elastic",
-        )
-    missing = [name for name in specs["rods"] if name not in sections]
-    if missing:
-        raise ParameterError(f"rods.{missing[0]}.section", None, "a section, as rods carry load")
-    beams = tuple(beam for beam in find_beams(graph, specs) if beam.name in sections)
-    return Structure(beams, sections, compliances)

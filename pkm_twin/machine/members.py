@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from pkm_twin.codegen.expressions import number, reference
 from pkm_twin.codegen.operations import maximum, sign, sqrt
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine import schema
+from pkm_twin.machine.graph import Graph
 
 Place = tuple[str, Array]
 """A point of a body, given at home."""
@@ -142,7 +143,8 @@ class Beam:
 
     ``element``: the name that it has in the energy shares: two rods can be one forearm. ``parts``:
     the bodies, or the rod, that it is; a telescope's are two. ``carries``: other bodies whose mass
-    it has. ``radius``: outer, m.
+    it has. ``radius``: outer, m. ``section``: of an elastic beam, or the tube that makes it with
+    ``mass_per_length``, kg/m; ``path``: the tube's place in the file.
     """
 
     name: str
@@ -153,6 +155,9 @@ class Beam:
     parts: tuple[str, ...]
     radius: float
     carries: tuple[str, ...] = ()
+    section: Section | Tube | None = None
+    mass_per_length: Any = 0.0
+    path: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,6 +199,49 @@ class Structure:
             name: [factors.get(name, 1.0) * value for value in values] for name, values in self.compliances.items()
         }
         return replace(self, sections=sections, compliances=compliances)
+
+
+@dataclass(frozen=True, eq=False)
+class Parts:
+    """What a robot file describes: the graph, its beams, and the compliance of joints by name.
+
+    ``order``: as of :class:`Structure`. ``rigid``: path and text of what makes parts elastic, for
+    the error where nothing is. ``missing``: path of a section that a bar must have and has not.
+    """
+
+    graph: Graph
+    beams: tuple[Beam, ...] = ()
+    compliances: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    order: tuple[str, ...] = ()
+    rigid: tuple[str, str] = ("members", "a section with the elastic members")
+    missing: str = ""
+
+    def structure(self) -> Structure:
+        """Return the elastic beams with their sections, and the compliance of joints.
+
+        :raises RigidError: no beam and no joint is elastic.
+        :raises ParameterError: sections that no bar can have, all named, or a missing one.
+        """
+        sections, faults = dict[str, Section](), dict[str, ParameterError]()
+        for beam in self.beams:
+            tube = beam.section
+            try:
+                if isinstance(tube, Tube):
+                    sections[beam.name] = tube.section(beam.mass_per_length, beam.path)
+                elif tube is not None:
+                    sections[beam.name] = tube
+            except ParameterError as error:
+                faults.setdefault(error.field, error)
+        if faults:
+            first, *others = faults.values()
+            more = "".join(f"; wrong too: {error.field}" for error in others)
+            raise ParameterError(first.field, first.value, f"{first.bound}{more}")
+        if not sections and not self.compliances:
+            raise RigidError(self.rigid[0], None, self.rigid[1])
+        if self.missing:
+            raise ParameterError(self.missing, None, "a section, as rods carry load")
+        beams = tuple(beam for beam in self.beams if beam.name in sections)
+        return Structure(beams, sections, self.compliances, self.order)
 
 
 def axial(across: Any, along: Any, axis: Array) -> Array:

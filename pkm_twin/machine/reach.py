@@ -39,7 +39,9 @@ class PassiveLimit:
     far: Array | None = None
 
 
-def position_box(graph: Graph, limits: Array | None, passive: Sequence[PassiveLimit] = ()) -> Array:
+def position_box(
+    graph: Graph, limits: Array | None, passive: Sequence[PassiveLimit] = (), paths: Sequence[str] = ()
+) -> Array:
     """Bounds that the platform's reference point cannot leave, shape (3, 2), m.
 
     Every joint on the base is the centre of a ball: its radius is the length of the shortest chain
@@ -47,6 +49,7 @@ def position_box(graph: Graph, limits: Array | None, passive: Sequence[PassiveLi
     the balls' boxes meet.
 
     :param limits: of the actuated joints, shape (n, 2), or None; ``passive``: of the others.
+    :param paths: of the actuated joints' limits in the file, for the error.
     :raises ParameterError: a slide without limits in every chain.
     """
     ends = {one.joint: (one.low, one.high) for one in passive if one.kind == "slide"}
@@ -78,11 +81,8 @@ def position_box(graph: Graph, limits: Array | None, passive: Sequence[PassiveLi
         free = [graph.joints[name] for name, way in travel.items() if math.isinf(way)]
         # A screw goes as far as its slide.
         first = min(free, key=lambda joint: (len(joint.freedoms), joint.freedoms[0].turns))
-        raise ParameterError(
-            f"joints.{first.name}.limits.position",
-            None,
-            "limits of the slides; without them the workspace is unbounded",
-        )
+        path = dict(zip(graph.actuated, paths, strict=False)).get(first.name, f"joints.{first.name}.limits.position")
+        raise ParameterError(path, None, "limits of the slides; without them the workspace is unbounded")
     return box
 
 

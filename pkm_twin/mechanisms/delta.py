@@ -19,7 +19,7 @@ Source: Delta-CU paper (table 1; equations 1 to 16 are computed by ``pkm_twin.ki
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, Final
 
@@ -35,15 +35,15 @@ from pkm_twin.kinematics.three_rods import meet_spheres
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import BASE, PLATFORM, UP, Body, Direction, Graph, Joint, Rod, array
 from pkm_twin.machine.joints import unit
-from pkm_twin.machine.members import Beam, RigidError, Structure, Tube, axial, disc
+from pkm_twin.machine.members import Beam, Parts, Place, Tube, axial, disc
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.sections import check_azimuths, length, mass, shared_middle
 from pkm_twin.mechanisms import TwinRobot
 
 LIMBS: Final = ("I", "II", "III")
 MAX_ITERATIONS: Final = 12
-EVEN: Final = 0.02
-"""Least of :meth:`Delta._evenness` at home, of 1."""
+MIN_REGULARITY: Final = 0.02
+"""Least regularity of the middle of the limits, of 1, with which it is taken for home."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,6 +115,7 @@ class Delta(TwinRobot):
 
     mobility: ClassVar[str] = "3: translations x, y, z"
     coordinates: ClassVar[tuple[Coordinate, ...]] = tuple(COORDINATES[c] for c in "xyz")
+    layout: ClassVar[PoseGrid] = PoseGrid("cylinder", ("x", "y", "z"), "z", ("x", "y"))
     limb_names: ClassVar[tuple[str, ...]] = tuple(f"limb {limb}" for limb in LIMBS)
 
     @property
@@ -122,11 +123,6 @@ class Delta(TwinRobot):
         """What machine it is, with its closures."""
         kinds = ", ".join(self.geometry.closures)
         return f"Delta robot, the platform translates; forearms of limbs 1 to 3: {kinds}"
-
-    @property
-    def size(self) -> float:
-        """The platform's radius, m."""
-        return self.geometry.platform_radius
 
     @cached_property
     def _directions(self) -> list[tuple[Array, Array]]:
@@ -148,45 +144,14 @@ class Delta(TwinRobot):
         span = platform + g.platform_radius * out - self._elbow(i, q)
         return span - (span @ along) * along if g.closures[i] == "rcu" else span
 
-    @cached_property
-    def _home(self) -> tuple[Array, Array]:
-        """Joints and platform at home."""
-        q = array(np.full(3, self.chosen_home() if self.home_joint is None else self.home_joint))
-        platform = self._assemble(q)
-        if platform is None:
-            g = self.geometry
-            raise ParameterError(
-                "geometry.forearm_length",
-                g.forearm_length,
-                "a length with which the limbs can be assembled",
-            )
-        return q, platform
+    def _assemble(self, q: Any) -> Array | None:
+        """Return the platform's centre below elbows at q (3,), rad; None if it cannot be assembled.
 
-    def chosen_home(self) -> float:
-        """Angle of the arms at home, rad: the middle of their limits, if it is regular.
-
-        Else the one that is farthest from singularities.
+        By Newton's method on the forearms' lengths, from the point on three rods.
         """
-        middle = shared_middle(self.limits.position)
-        if middle is not None and self._evenness(middle) > EVEN:
-            return middle
-        return float(max(np.linspace(-1.5, 1.5, 61), key=self._evenness))
-
-    def _evenness(self, angle: float) -> float:
-        """How well forearms hold the platform, and each arm moves its own; 0: no assembly."""
-        platform = self._assemble(np.full(3, angle))
-        if platform is None:
-            return 0.0
-        rows = np.array([self._forearm(i, angle, platform) for i in range(3)], float)
-        rows /= self.geometry.forearm_length
-        measure = float(abs(np.linalg.det(rows)))
-        for row, (out, _) in zip(rows, self._directions, strict=True):
-            measure = min(measure, float(abs(row @ (np.sin(angle) * out + np.cos(angle) * UP))))
-        return measure
-
-    def _assemble(self, q: Array) -> Array | None:
-        """Platform centre below the elbows; None where there is none in a known case."""
-        x, length = self._below(q), self.geometry.forearm_length
+        g, length = self.geometry, self.geometry.forearm_length
+        centres = [self._elbow(i, q[i]) - g.platform_radius * self._directions[i][0] for i in range(3)]
+        x = meet_spheres(centres, [length**2] * 3, -UP)[0]
         for _ in range(MAX_ITERATIONS):
             rows = [self._forearm(i, q[i], x) for i in range(3)]
             value = [(row @ row - length * length) * 0.5 for row in rows]
@@ -197,25 +162,141 @@ class Delta(TwinRobot):
                 return None
             step = sum(v * pair for v, pair in zip(value, pairs, strict=True)) / determinant
             x = x - step
-            # An expression's other cases take the steps that they may need.
+            # An expression's other values may need all steps.
             if x.dtype != object or not any(isinstance(v, Expression) for v in x):
                 x = np.asarray(x, np.float64)
                 if np.abs(np.asarray(step, float)).max() < 1e-13 * length:
                     return x
         return None if x.dtype != object else x
 
-    def _below(self, q: Any) -> Any:
-        """Return the place of a platform on three rods, below the elbows; with an rcu a guess."""
-        g = self.geometry
-        centres = [self._elbow(i, q[i]) - g.platform_radius * self._directions[i][0] for i in range(3)]
-        return meet_spheres(centres, [g.forearm_length**2] * 3, -UP)[0]
+    def chosen_home(self) -> float:
+        """Angle of the arms at home, rad: the middle of their limits, if it is regular.
 
-    def grid(self) -> PoseGrid:
-        """Places about the vertical axis."""
-        return PoseGrid("cylinder", self.pose_names, "z", ("x", "y"))
+        Else the one that is farthest from singularities.
+        """
+
+        def regularity(angle: float) -> float:
+            """Return how well forearms hold the platform and arms move them; 0: no assembly."""
+            platform = self._assemble(np.full(3, angle))
+            if platform is None:
+                return 0.0
+            rows = np.array([self._forearm(i, angle, platform) for i in range(3)], float)
+            rows /= self.geometry.forearm_length
+            pushed = [
+                float(abs(row @ (np.sin(angle) * out + np.cos(angle) * UP)))
+                for row, (out, _) in zip(rows, self._directions, strict=True)
+            ]
+            return min(float(abs(np.linalg.det(rows))), *pushed)
+
+        middle = shared_middle(self.limits.position)
+        if middle is not None and regularity(middle) > MIN_REGULARITY:
+            return middle
+        return float(max(np.linspace(-1.5, 1.5, 61), key=regularity))
+
+    def default_inertia(self) -> dict[str, Any]:
+        """Return the arms' inertia as even bars."""
+        return {"arm_inertia": self.inertia.arm_mass * self.geometry.arm_length**2 / 12}
+
+    def make_parts(self) -> Parts:
+        """Make arms on the base, forearms as parallelograms or on an rcu's joints, a platform.
+
+        Each limb closes from base to platform (Delta-CU paper, equation 9). Arms are clamped at
+        their locked drives.
+        """
+        g, members = self.geometry, self.members
+        m: Any = self.spelled.inertia
+        q = array(np.full(3, self.home_joint))
+        platform = self._assemble(q)
+        if platform is None:
+            bound = "a length with which the limbs can be assembled"
+            raise ParameterError("geometry.forearm_length", g.forearm_length, bound)
+        bodies: dict[str, Body] = {}
+        joints: dict[str, Joint] = {}
+        sliding: dict[str, Joint] = {}
+        rods: dict[str, Rod] = {}
+        bars: list[tuple[int, str, str, Place, Place, str, Any]] = []
+        compliances: dict[str, Sequence[float]] = {}
+        for i, limb in enumerate(LIMBS):
+            out, along = self._directions[i]
+            rcu = g.closures[i] == "rcu"
+            arm, forearm = f"arm {limb}", f"forearm {limb}"
+            base, elbow, outer = (f"{joint} {limb}" for joint in ("base joint", "elbow", "platform joint"))
+            pivot, tip = array(g.base_radius * out), plain(self._elbow(i, q[i]))
+            corner = array(platform + g.platform_radius * out)
+            span = plain(self._forearm(i, q[i], platform))
+            foot = array(corner - span)
+            fixed = tuple(Direction(name, BASE, array(v)) for name, v in (("r", out), ("t", along), ("z", UP)))
+            bodies[arm] = Body(
+                arm, m.arm_mass, array(pivot + m.arm_com * (tip - pivot)), _thin(m.arm_inertia, tip - pivot)
+            )
+            joints[self.joints[i]] = Joint(
+                self.joints[i],
+                "revolute",
+                BASE,
+                arm,
+                pivot,
+                array([along]),
+                actuated=True,
+                home=q[i],
+                rotor_inertia=self.reflected_rotor(m.rotor_inertia, slides=False),
+                directions=fixed,
+                label=base,
+            )
+            if rcu:
+                inertia = _thin(m.forearm_mass * g.forearm_length**2 / 12, span)
+                bodies[forearm] = Body(forearm, m.forearm_mass, array((foot + corner) / 2), inertia)
+                sliding[elbow] = Joint(elbow, "cylindrical", arm, forearm, foot, array([along]), directions=fixed)
+                axes = array([along, out])
+                sliding[outer] = Joint(
+                    outer, "universal", forearm, PLATFORM, corner, axes, directions=fixed, normal="z"
+                )
+            else:
+                rods[forearm] = Rod(
+                    forearm,
+                    arm,
+                    PLATFORM,
+                    array([foot, corner]),
+                    m.forearm_mass,
+                    array(along),
+                    0.0 if members is None else members.parallelogram_width,
+                    joints=(elbow, outer),
+                    label=f"limb {limb}",
+                )
+            line = m.forearm_mass / g.forearm_length
+            bars.append((i, arm, "", (arm, pivot), (arm, tip), "arm", m.arm_mass / g.arm_length))
+            if rcu:
+                bars.append((i, forearm, "", (forearm, foot), (forearm, corner), "rcu_forearm", line))
+            elif members is not None:
+                for side, end in ((-0.5, " a"), (0.5, " b")):
+                    aside = side * members.parallelogram_width * along
+                    ends = (arm, tip + aside), (PLATFORM, corner + aside)
+                    bars.append((i, forearm, end, *ends, "forearm", line / 2))
+            if members is not None:
+                soft = members.elbow_compliance
+                compliances[base] = (0, 0, 0, 0, members.drive_compliance, 0)
+                compliances[elbow] = (soft, 0 if rcu else soft, soft, 0, 0, 0)
+                compliances[outer] = (*[members.platform_joint_compliance] * 3, 0, 0, 0)
+        turning = None if members is None else members.platform_inertia
+        if turning is None:
+            turning = disc(m.platform_mass, g.platform_radius)
+        bodies[PLATFORM] = Body(PLATFORM, m.platform_mass, array(platform), array(turning))
+        # The parallelograms keep the platform from turning, so three slides carry it.
+        joints["translation"] = Joint("translation", "translation", BASE, PLATFORM, array(platform), virtual=True)
+        graph = Graph(bodies, {**joints, **sliding}, rods, PLATFORM, array(platform))
+        if members is None:
+            return Parts(graph)
+        if members.rcu_forearm is None and "rcu" in g.closures:
+            # Distances from a forearm without a diameter are not known, so no limb's are.
+            return Parts(graph, (), compliances, missing="members.rcu_forearm")
+        beams = []
+        for i, part, end, start, stop, key, line in bars:
+            tube: Tube = getattr(members, key)
+            radius = tube.outer_diameter / 2
+            beams.append(Beam(part + end, part, i, start, stop, (part,), radius, (), tube, line, f"members.{key}"))
+        return Parts(graph, tuple(beams), compliances)
 
     def search_box(self) -> Array:
-        """Each platform joint is within arm and forearm of its pivot, below the highest elbow."""
+        """Return bounds of the platform: within arm and forearm of all pivots, below all elbows."""
         g = self.geometry
         far = g.arm_length + g.forearm_length
         out = g.base_radius - g.platform_radius
@@ -227,144 +308,7 @@ class Delta(TwinRobot):
         box[2] = -far, g.arm_length * np.sin(min(max(-low, 0.0), np.pi / 2))
         return box
 
-    def make_graph(self) -> Graph:
-        """Arms on the base, forearms as parallelograms or on an rcu's joints, a platform.
-
-        Each limb closes from base to platform (Delta-CU paper, equation 9).
-        """
-        g = self.geometry
-        m: Any = self.spelled.inertia
-        q, platform = self._home
-        rotor = self.reflected_rotor(m.rotor_inertia, slides=False)
-        bodies: dict[str, Body] = {}
-        joints: dict[str, Joint] = {}
-        rods: dict[str, Rod] = {}
-        sliding: dict[str, Joint] = {}
-        for i, limb in enumerate(LIMBS):
-            out, along = self._directions[i]
-            arm, forearm = f"arm {limb}", f"forearm {limb}"
-            pivot = array(g.base_radius * out)
-            lever = plain(self._elbow(i, q[i])) - pivot
-            bodies[arm] = Body(arm, m.arm_mass, array(pivot + m.arm_com * lever), _thin(m.arm_inertia, lever))
-            fixed = tuple(Direction(name, BASE, array(v)) for name, v in (("r", out), ("t", along), ("z", UP)))
-            joints[self.joints[i]] = Joint(
-                self.joints[i],
-                "revolute",
-                BASE,
-                arm,
-                pivot,
-                array([along]),
-                actuated=True,
-                home=q[i],
-                rotor_inertia=rotor,
-                directions=fixed,
-                label=f"base joint {limb}",
-            )
-            corner = array(platform + g.platform_radius * out)
-            span = plain(self._forearm(i, q[i], platform))
-            foot = array(corner - span)
-            names = f"elbow {limb}", f"platform joint {limb}"
-            if g.closures[i] == "rod":
-                rods[forearm] = Rod(
-                    forearm,
-                    arm,
-                    PLATFORM,
-                    array([foot, corner]),
-                    m.forearm_mass,
-                    array(along),
-                    0.0 if self.members is None else self.members.parallelogram_width,
-                    joints=names,
-                    label=f"limb {limb}",
-                )
-                continue
-            middle = array((foot + corner) / 2)
-            rod = _thin(m.forearm_mass * g.forearm_length**2 / 12, span)
-            bodies[forearm] = Body(forearm, m.forearm_mass, middle, rod)
-            sliding[names[0]] = Joint(names[0], "cylindrical", arm, forearm, foot, array([along]), directions=fixed)
-            sliding[names[1]] = Joint(
-                names[1],
-                "universal",
-                forearm,
-                PLATFORM,
-                corner,
-                array([along, out]),
-                directions=fixed,
-                normal="z",
-            )
-        turning = None if self.members is None else self.members.platform_inertia
-        if turning is None:
-            turning = disc(m.platform_mass, g.platform_radius)
-        bodies[PLATFORM] = Body(PLATFORM, m.platform_mass, array(platform), array(turning))
-        # What the parallelograms hold is taken as given, so that three slides carry the platform.
-        joints["translation"] = Joint("translation", "translation", BASE, PLATFORM, array(platform), virtual=True)
-        return Graph(bodies, {**joints, **sliding}, rods, PLATFORM, array(platform))
-
-    @property
-    def spelled(self) -> Delta:
-        """With the arms' inertia: of even bars."""
-        m = self.inertia
-        bar = m.arm_mass * self.geometry.arm_length**2 / 12
-        given = bar if m.arm_inertia is None else m.arm_inertia
-        return self._with(inertia=replace(m, arm_inertia=given))
-
-    @cached_property
-    def beams(self) -> tuple[Beam, ...]:
-        """Arms and rods; none where the file does not tell every diameter."""
-        members, g = self.members, self.geometry
-        if members is None or ("rcu" in g.closures and members.rcu_forearm is None):
-            return ()
-        beams: list[Beam] = []
-        q, platform = self._home
-        for i, limb in enumerate(LIMBS):
-            out, along = self._directions[i]
-            arm, forearm = f"arm {limb}", f"forearm {limb}"
-            pivot = g.base_radius * out
-            tip = plain(self._elbow(i, q[i]))
-            beams.append(Beam(arm, arm, i, (arm, pivot), (arm, tip), (arm,), members.arm.outer_diameter / 2))
-            corner = platform + g.platform_radius * out
-            if g.closures[i] == "rcu":
-                foot = corner - plain(self._forearm(i, q[i], platform))
-                radius = members.rcu_forearm.outer_diameter / 2  # type: ignore[union-attr]
-                ends = (forearm, foot), (forearm, corner)
-                beams.append(Beam(forearm, forearm, i, *ends, (forearm,), radius))
-                continue
-            for side, name in ((-0.5, "a"), (0.5, "b")):
-                aside = side * members.parallelogram_width * along
-                ends = (arm, tip + aside), (PLATFORM, corner + aside)
-                radius = members.forearm.outer_diameter / 2
-                beams.append(Beam(f"{forearm} {name}", forearm, i, *ends, (forearm,), radius))
-        return tuple(beams)
-
-    def structure(self) -> Structure:
-        """Arms clamped at their locked drives, rods between arms and platform.
-
-        :raises RigidError: the file has no members.
-        :raises ParameterError: it has no rod for the rcu limb, or sections that no bar has.
-        """
-        g, m, members = self.geometry, self.inertia, self.members
-        if members is None:
-            raise RigidError("members", None, "a section with the elastic members, arms and forearms")
-        if "rcu" in g.closures and members.rcu_forearm is None:
-            raise ParameterError("members.rcu_forearm", None, "required for the rcu limb")
-        spread = m.forearm_mass / g.forearm_length
-        kinds = {"arm": members.arm.section(m.arm_mass / g.arm_length, "members.arm")}
-        if "rod" in g.closures:
-            kinds["rod"] = members.forearm.section(spread / 2, "members.forearm")
-        if members.rcu_forearm is not None and "rcu" in g.closures:
-            kinds["rcu"] = members.rcu_forearm.section(spread, "members.rcu_forearm")
-        sections = {
-            beam.name: kinds["arm" if beam.element.startswith("arm") else g.closures[beam.limb]] for beam in self.beams
-        }
-        compliances: dict[str, Sequence[float]] = {}
-        for limb, closure in zip(LIMBS, g.closures, strict=True):
-            elbow, outer = members.elbow_compliance, members.platform_joint_compliance
-            compliances[f"base joint {limb}"] = (0, 0, 0, 0, members.drive_compliance, 0)
-            held = (elbow, 0, elbow) if closure == "rcu" else (elbow,) * 3
-            compliances[f"elbow {limb}"] = (*held, 0, 0, 0)
-            compliances[f"platform joint {limb}"] = (outer, outer, outer, 0, 0, 0)
-        return Structure(self.beams, sections, compliances)
-
 
 def _thin(across: float, along: Array) -> Array:
-    """Inertia of a thin bar, ``across`` about every axis across it."""
+    """Return the inertia of a thin bar, ``across`` about every axis across it."""
     return array(axial(across, 0.0, unit(along)))

@@ -12,7 +12,6 @@ Branch: the nozzle below the carriages.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, ClassVar, Final
 
 import numpy as np
@@ -24,7 +23,7 @@ from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import BASE, PLATFORM, UP, Body, Graph, Joint, Rod, array
-from pkm_twin.machine.members import disc
+from pkm_twin.machine.members import Parts, disc
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.sections import check_azimuths, length, mass
 from pkm_twin.mechanisms import TwinRobot
@@ -73,6 +72,7 @@ class LinearDelta(TwinRobot):
 
     mobility: ClassVar[str] = "3: translations x, y, z"
     coordinates: ClassVar[tuple[Coordinate, ...]] = tuple(COORDINATES[c] for c in "xyz")
+    layout: ClassVar[PoseGrid] = PoseGrid("cylinder", ("x", "y", "z"), "z", ("x", "y"))
     limb_names: ClassVar[tuple[str, ...]] = tuple(f"tower {limb}" for limb in LIMBS)
     description: ClassVar[str] = "linear Delta, three towers with rod pairs"
 
@@ -81,34 +81,23 @@ class LinearDelta(TwinRobot):
         """The radius, m: no angle moves the nozzle by more."""
         return self.geometry.radius
 
-    @cached_property
-    def _towers(self) -> list[tuple[Any, Any, Any]]:
-        """Outwards, the rods' upper end with the nozzle at the origin, and the tower's axis."""
-        g, found = self.geometry, []
-        for i, angle in enumerate(g.angles):
-            out = plain([cos(angle), sin(angle), 0.0 * angle])
-            rise = sqrt(g.arm_lengths[i] ** 2 - g.radius**2)
-            axis: Any = UP
-            if g.leans is not None:
-                along = plain([-sin(angle), cos(angle), 0.0 * angle])
-                axis = g.leans[2 * i] * out + g.leans[2 * i + 1] * along + UP
-                axis = axis / sqrt(axis @ axis)
-            found.append((out, g.radius * out + rise * UP, axis))
-        return found
-
-    def grid(self) -> PoseGrid:
-        """Places about the vertical axis."""
-        return PoseGrid("cylinder", self.pose_names, "z", ("x", "y"))
-
-    def make_graph(self) -> Graph:
-        """Carriages on their towers, rods to the nozzle, a platform that does not turn."""
-        m = self.inertia
+    def make_parts(self) -> Parts:
+        """Make carriages on their towers, rods to the nozzle, a platform that does not turn."""
+        g, m = self.geometry, self.inertia
         rotor = self.reflected_rotor(m.rotor_inertia, slides=True)
         bodies: dict[str, Body] = {}
         joints: dict[str, Joint] = {}
         rods: dict[str, Rod] = {}
         for i, limb in enumerate(LIMBS):
-            out, top, axis = self._towers[i]
+            angle = g.angles[i]
+            out = plain([cos(angle), sin(angle), 0.0 * angle])
+            # The rods' upper end with the nozzle at the origin.
+            top = g.radius * out + sqrt(g.arm_lengths[i] ** 2 - g.radius**2) * UP
+            axis: Any = UP
+            if g.leans is not None:
+                along = plain([-sin(angle), cos(angle), 0.0 * angle])
+                axis = g.leans[2 * i] * out + g.leans[2 * i + 1] * along + UP
+                axis = axis / sqrt(axis @ axis)
             carriage = f"carriage {limb}"
             bodies[carriage] = Body(carriage, m.carriage_mass, array(top), np.zeros((3, 3)))
             joints[self.joints[i]] = Joint(
@@ -130,8 +119,8 @@ class LinearDelta(TwinRobot):
                 m.rod_mass,
                 array(np.cross(UP, out)),
             )
-        turning = disc(m.platform_mass, 0.3 * self.geometry.radius)
+        turning = disc(m.platform_mass, 0.3 * g.radius)
         bodies[PLATFORM] = Body(PLATFORM, m.platform_mass, array(np.zeros(3)), array(turning))
-        # What the rod pairs hold is taken as given, so that three slides carry the platform.
+        # The rod pairs keep the platform from turning, so three slides carry it.
         joints["translation"] = Joint("translation", "translation", BASE, PLATFORM, array(np.zeros(3)), virtual=True)
-        return Graph(bodies, joints, rods, PLATFORM, array(np.zeros(3)))
+        return Parts(Graph(bodies, joints, rods, PLATFORM, array(np.zeros(3))))

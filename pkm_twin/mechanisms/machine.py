@@ -25,7 +25,7 @@ from pkm_twin.kinematics.pose import COORDINATES, Coordinate, name_angles
 from pkm_twin.kinematics.rounding import repair_rounded
 from pkm_twin.kinematics.scheme import check_masses, choose_coordinates, choose_leads
 from pkm_twin.machine import schema
-from pkm_twin.machine.file_parts import find_beams, find_passive_limits, find_structure
+from pkm_twin.machine.file_parts import find_parts, find_passive_limits
 from pkm_twin.machine.formulas import PARAMETERS, Book
 from pkm_twin.machine.friction import not_shared
 from pkm_twin.machine.graph import (
@@ -48,7 +48,7 @@ from pkm_twin.machine.graph_file import (
     shared_by,
     written_out,
 )
-from pkm_twin.machine.members import Beam, Structure
+from pkm_twin.machine.members import Parts
 from pkm_twin.machine.places import (
     Keys,
     check_number,
@@ -345,11 +345,6 @@ class Machine(TwinRobot):
         return self.graph.actuated
 
     @property
-    def size(self) -> float:
-        """Greatest distance of a joint on the platform from its reference point, m."""
-        return self.graph.rim
-
-    @property
     def without_home(self) -> frozenset[str]:
         """Joints of which the file does not say where they count from."""
         return frozenset(n for n, joint in self.specs["joints"].items() if joint.home is None)
@@ -364,9 +359,9 @@ class Machine(TwinRobot):
         """Rotor and gear of each actuated joint, None where the file does not give them."""
         return tuple(self.specs["joints"][name].drive for name in self.joint_names)
 
-    def make_graph(self) -> Graph:
-        """Return the graph that the file describes."""
-        return self.described
+    def make_parts(self) -> Parts:
+        """Return the graph that the file describes, and its elastic members and joints."""
+        return find_parts(self.described, self.specs)
 
     def parameter_sections(self) -> dict[str, Any]:
         """Return the machine's sections written out, copies of limbs and elasticity included."""
@@ -428,18 +423,9 @@ class Machine(TwinRobot):
         return iter(found)
 
     @cached_property
-    def beams(self) -> tuple[Beam, ...]:
-        """Bodies with a member, and rods with a section or radius, limb by limb."""
-        return find_beams(self.graph, self.specs)
-
-    @cached_property
     def passive_limits(self) -> tuple[PassiveLimit, ...]:
         """Positions and swivels of joints that are not actuated, and of rods at both ends."""
         return find_passive_limits(self.graph, self.specs)
-
-    def structure(self) -> Structure:
-        """Bars with sections, and the compliance of joints."""
-        return find_structure(self.graph, self.specs)
 
     def elastic_entries(self) -> dict[str, dict[str, dict[str, Any]]]:
         """Members of bodies, sections and radii of rods, compliances of joints."""

@@ -19,8 +19,7 @@ paper has each link's mass at its slider joint, which ``link_com: 0`` gives.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
 from typing import Any, ClassVar, Final
 
 import numpy as np
@@ -31,7 +30,7 @@ from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate, name_angles
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import BASE, PLATFORM, UP, Body, Direction, Graph, Joint, array
-from pkm_twin.machine.members import Beam, RigidError, Structure, Tube, axial, disc
+from pkm_twin.machine.members import Beam, Parts, Tube, axial, disc
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.sections import check_azimuths, length, mass, shared_middle
 from pkm_twin.mechanisms import TwinRobot
@@ -114,71 +113,45 @@ class Prru(TwinRobot):
         COORDINATES["z"],
         *name_angles({"alpha": "x", "beta": "y"}),
     )
+    layout: ClassVar[PoseGrid] = PoseGrid("cylinder", ("z", "alpha", "beta"), "z", ("alpha", "beta"), zero_torsion=True)
     limb_names: ClassVar[tuple[str, ...]] = tuple(f"limb {limb}" for limb in LIMBS)
-
-    @property
-    def size(self) -> float:
-        """The platform's radius, m."""
-        return self.geometry.platform_radius
-
-    def _directions(self, i: int) -> tuple[Array, Array]:
-        """Return e and t of limb i, whose azimuth phi_i gives C_i (equations 2 and 3)."""
-        angle = self.geometry.azimuths[i]
-        e = np.array([np.cos(angle), np.sin(angle), 0.0])
-        return e, np.cross(UP, e)
-
-    @property
-    def _sign(self) -> float:
-        return 1.0 if self.geometry.branch == "below" else -1.0
-
-    @cached_property
-    def _rise(self) -> Any:
-        """Height of the level platform over the sliders."""
-        g = self.geometry
-        aside = g.base_radius - g.platform_radius
-        return self._sign * sqrt(g.limb_length**2 - aside**2)
-
-    def grid(self) -> PoseGrid:
-        """Tilts about the vertical axis, in tilt-and-torsion angles without torsion."""
-        return PoseGrid("cylinder", self.pose_names, "z", ("alpha", "beta"), zero_torsion=True)
-
-    def search_box(self) -> Array:
-        """Each platform joint is within a limb of its slider; tilts up to a right angle.
-
-        :raises ParameterError: sliders without limits travel without end.
-        """
-        g, travel = self.geometry, self.limits.position
-        if travel is None:
-            raise ParameterError(
-                "limits.position",
-                None,
-                "limits of the sliders; without them the workspace is unbounded",
-            )
-        reach, right = g.limb_length + g.platform_radius, np.pi / 2
-        z = float(travel.min()) - reach, float(travel.max()) + reach
-        return np.array([z, (-right, right), (-right, right)])
 
     def chosen_home(self) -> float:
         """Height of the sliders at home, m: the middle of their limits, else zero."""
         return shared_middle(self.limits.position) or 0.0
 
-    def make_graph(self) -> Graph:
-        """Make sliders, links and platform, level.
+    def default_inertia(self) -> dict[str, Any]:
+        """Return the inertias of links, thin rods, and of the platform, a disc."""
+        g, m = self.geometry, self.inertia
+        thin = np.array([g.limb_length**2 / 12, 0.0])
+        return {
+            "lower_link_inertia": m.lower_link_mass * thin,
+            "upper_link_inertia": m.upper_link_mass * thin,
+            "platform_inertia": disc(m.platform_mass, g.platform_radius),
+        }
+
+    def make_parts(self) -> Parts:
+        """Make sliders, links and platform, level; limbs are bars between slider and platform.
 
         The upper link turns about the limb (equation 4), by what the platform-fixed tangential axis
         of its universal joint asks for (equations 13 to 17): the graph's closures find the angle.
         """
-        g = self.geometry
+        g, members = self.geometry, self.members
         m: Any = self.spelled.inertia
-        height = self.chosen_home() if self.home_joint is None else self.home_joint
-        l = g.limb_length  # noqa: E741
+        height, l = self.home_joint, g.limb_length  # noqa: E741
         lower, upper = m.lower_link_inertia, m.upper_link_inertia
         rotor = self.reflected_rotor(m.rotor_inertia, slides=True)
+        aside = g.base_radius - g.platform_radius
+        # The level platform's height over the sliders.
+        rise = (1.0 if g.branch == "below" else -1.0) * sqrt(g.limb_length**2 - aside**2)
+        beams = []
         bodies: dict[str, Body] = {}
         joints: dict[str, Joint] = {}
-        origin = array([0.0, 0.0, height + self._rise])
+        origin = array([0.0, 0.0, height + rise])
         for i, limb in enumerate(LIMBS):
-            e, t = self._directions(i)
+            # Equations 2 and 3.
+            e = np.array([np.cos(g.azimuths[i]), np.sin(g.azimuths[i]), 0.0])
+            t = np.cross(UP, e)
             foot = array(height * UP - g.base_radius * e)
             head = array(origin - g.platform_radius * e)
             d = (head - foot) / l
@@ -210,51 +183,12 @@ class Prru(TwinRobot):
             ):
                 full = f"{label} {limb}"
                 joints[full] = Joint(full, kind, *pair, at, array(axes), directions=along)
+            if members is not None:
+                beam, tube, line = f"limb {limb}", members.limb, (m.lower_link_mass + m.upper_link_mass) / l
+                radius, ends = tube.outer_diameter / 2, ((high, foot), (high, head))
+                beams.append(Beam(beam, beam, i, *ends, (high,), radius, (low,), tube, line, "members.limb"))
         bodies[PLATFORM] = Body(PLATFORM, m.platform_mass, array(origin + m.platform_com), array(m.platform_inertia))
-        return Graph(bodies, joints, {}, PLATFORM, origin)
-
-    @property
-    def spelled(self) -> Prru:
-        """With the inertias of links, thin rods, and of the platform, a disc."""
-        g, m = self.geometry, self.inertia
-        thin = np.array([g.limb_length**2 / 12, 0.0])
-        usual: dict[str, Any] = {
-            "lower_link_inertia": m.lower_link_mass * thin,
-            "upper_link_inertia": m.upper_link_mass * thin,
-            "platform_inertia": disc(m.platform_mass, g.platform_radius),
-        }
-        left = {name: value for name, value in usual.items() if getattr(m, name) is None}
-        made: Prru = self._with(inertia=replace(m, **left))
-        return made
-
-    @cached_property
-    def beams(self) -> tuple[Beam, ...]:
-        """Limbs between slider and platform joints; none where the file has no members."""
-        if self.members is None:
-            return ()
-        radius = self.members.limb.outer_diameter / 2
-        beams = []
-        for i, limb in enumerate(LIMBS):
-            joint = self.graph.joints
-            name, high, low = f"limb {limb}", f"upper link {limb}", f"lower link {limb}"
-            ends = (
-                (high, joint[f"link joint {limb}"].at),
-                (high, joint[f"platform joint {limb}"].at),
-            )
-            beams.append(Beam(name, name, i, *ends, (high,), radius, (low,)))
-        return tuple(beams)
-
-    def structure(self) -> Structure:
-        """Limbs between locked sliders, which stand still, and the platform.
-
-        :raises RigidError: the file has no members.
-        """
-        if self.members is None:
-            raise RigidError("members", None, "a section with the elastic members, the limbs")
-        m = self.inertia
-        spread = (m.lower_link_mass + m.upper_link_mass) / self.geometry.limb_length
-        section = self.members.limb.section(spread, "members.limb")
-        return Structure(self.beams, {beam.name: section for beam in self.beams}, {})
+        return Parts(Graph(bodies, joints, {}, PLATFORM, origin), tuple(beams))
 
 
 def _named(body: str, **vectors: Array) -> tuple[Direction, ...]:

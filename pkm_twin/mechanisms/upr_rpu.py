@@ -25,22 +25,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass
 from typing import Any, ClassVar, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.expressions import Numbers, norm, reference
+from pkm_twin.codegen.expressions import Numbers, norm
 from pkm_twin.codegen.operations import absolute, atan2, cos, maximum, minimum, sin, sqrt
 from pkm_twin.errors import ParameterError
-from pkm_twin.kinematics.engine import Engine
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate, name_angles
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import BASE, MIN_LENGTH, PLATFORM, Body, Direction, Graph, Joint, array
-from pkm_twin.machine.members import Beam, Section, Structure, axial, compliances, disc, modulus
+from pkm_twin.machine.members import Beam, Parts, Section, axial, compliances, disc, modulus
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.sections import length, mass, shared_middle
 from pkm_twin.machine.tree import Tree
@@ -238,6 +236,8 @@ class UprRpu(TwinRobot):
     description: ClassVar[str] = "2UPR-RPU head, three actuated telescopic limbs"
     mobility: ClassVar[str] = "3: translation along Oo, rotations beta, gamma"
     limb_names: ClassVar[tuple[str, ...]] = ("limb 1", "limb 2", "limb 3")
+    layout: ClassVar[PoseGrid] = PoseGrid("cylinder", ("z", "beta", "gamma"), "z", ("beta", "gamma"))
+    limit_key: ClassVar[str] = "limits.limb_length"
     start: ClassVar[LargestRoot] = LargestRoot()
     coordinates: ClassVar[tuple[Coordinate, ...]] = (
         COORDINATES["z"],
@@ -255,45 +255,20 @@ class UprRpu(TwinRobot):
     )
 
     @property
-    def size(self) -> float:
-        """The platform's radius, m."""
-        return self.geometry.platform_radius
-
-    @property
     def _radii(self) -> tuple[float, float]:
         return self.geometry.platform_radius, self.geometry.base_radius
 
-    def chosen_home(self) -> Any:
+    def chosen_home(self) -> float:
         """Length of the limbs at home, m: the middle of their limits, if the platform hangs then.
 
         Else that at 1.5 times the greater radius below the base.
         """
         a, b = self._radii
-        aside, middle = absolute(a - b), shared_middle(self.limits.position)
-        if middle is not None and middle > reference(aside) * (1.0 + LEVEL):
+        aside, middle = abs(a - b), shared_middle(self.limits.position)
+        if middle is not None and middle > aside * (1.0 + LEVEL):
             return middle
-        deep = 1.5 * maximum(a, b)
-        return sqrt(aside * aside + deep * deep)
-
-    @property
-    def _limb_at_home(self) -> Any:
-        return self.chosen_home() if self.home_joint is None else self.home_joint
-
-    @property
-    def _height(self) -> Any:
-        """The platform's height at home, level, where all limbs have one length."""
-        a, b = self._radii
-        limb = self._limb_at_home
-        return -sqrt((limb - absolute(b - a)) * (limb + absolute(b - a)))
-
-    def massive(self) -> Engine:
-        """Return the engine of a robot with masses.
-
-        :raises ParameterError: the file has no inertia.
-        """
-        if self.inertia is None:
-            raise ParameterError("inertia", None, "a section with density, platform_mass and more")
-        return super().massive()
+        deep = 1.5 * max(a, b)
+        return math.sqrt(aside * aside + deep * deep)
 
     def limit_angles(self, pose: ArrayLike) -> Array:
         """Angle of each limb to the vertical, then to the platform's normal, (..., 6), rad."""
@@ -344,41 +319,60 @@ class UprRpu(TwinRobot):
             limbs.append(np.stack(columns, -1))
         return np.stack(limbs, -3)
 
-    def grid(self) -> PoseGrid:
-        """Tilts about the vertical axis, in the plane of beta and gamma."""
-        return PoseGrid("cylinder", self.pose_names, "z", ("beta", "gamma"))
-
     def search_box(self) -> Array:
-        """Limbs 1 and 2 end above and below o alike, so it is no deeper than they are long.
+        """Return bounds of the pose: limbs 1 and 2 end above and below o alike, so z is at most their length."""
+        box, lengths = super().search_box(), self.limits.limb_length
+        return box if lengths is None else np.array([(-float(lengths[:2].max()), 0.0), *box[1:]])
 
-        :raises ParameterError: limbs without limits grow without end.
+    def default_inertia(self) -> dict[str, Any]:
+        """Return the platform's inertia, of a disc."""
+        m: Any = self.inertia
+        return {"platform_inertia": disc(m.platform_mass, self.geometry.platform_radius)}
+
+    def make_parts(self) -> Parts:
+        """Make telescopic limbs at home, the platform level; joints elastic in their own axes.
+
+        Joint compliances of equations 8, 15 and 25 act in the joints' axes (equations 10 and 14);
+        bar and joints of a limb in series have the compliance C_i (equations 16 and 27).
+        A bar reaches from B to A, as in the paper, and its mass with it: a telescope's tubes that
+        overlap are not told apart. Without inertia bars have no mass.
         """
-        lengths = self.limits.limb_length
-        if lengths is None:
-            raise ParameterError(
-                "limits.limb_length",
-                None,
-                "limits of the limbs; without them the workspace is unbounded",
-            )
-        right = math.pi / 2
-        return np.array([(-float(lengths[:2].max()), 0.0), (-right, right), (-right, right)])
-
-    def make_graph(self) -> Graph:
-        """Telescopic limbs at home, the platform level."""
         a, b = self._radii
-        origin = array([0.0, 0.0, self._height])
+        inertia: Any = self.spelled.inertia
+        limb_length, aside = self.home_joint, absolute(b - a)
+        origin = array([0.0, 0.0, -sqrt((limb_length - aside) * (limb_length + aside))])
+        rotor = self.reflected_rotor(0.0 if inertia is None else inertia.rotor_inertia, slides=True)
+        members, soft = self.members, self.joints_compliance
+        density = 0.0 if inertia is None else inertia.density
         bodies: dict[str, Body] = {}
         joints: dict[str, Joint] = {}
-        inertia: Any = self.spelled.inertia
-        given = 0.0 if inertia is None else inertia.rotor_inertia
-        rotor = self.reflected_rotor(given, slides=True)
+        beams: list[Beam] = []
+        compliances: dict[str, Sequence[float]] = {}
         for i, limb in enumerate("123"):
             foot, head = array(b * _PATTERN[i]), array(origin + a * _PATTERN[i])
             reach = norm(head - foot)
             d = (head - foot) / reach
             low, high = f"lower tube {limb}", f"upper tube {limb}"
+            diameter = members.diameter[i]
             for name, at in ((low, foot + 0.25 * reach * d), (high, head - 0.25 * reach * d)):
-                bodies[name] = self._tube(name, i, reach / 2, d, at)
+                bodies[name] = Body(name, 0.0, array(at))
+                if inertia is not None:
+                    half, radius = reach / 2, diameter / 2
+                    weight = density * math.pi * radius**2 * half
+                    across, along = weight * (half**2 / 12 + radius**2 / 4), weight * radius**2 / 2
+                    bodies[name] = Body(name, weight, array(at), array(axial(across, along, d)))
+            section = Section(
+                members.youngs_modulus,
+                members.shear_modulus,
+                diameter,
+                0.0,
+                density * math.pi / 4 * diameter**2,
+                members.shear_factor,
+            )
+            bar, ends = f"{limb}B", ((low, foot), (high, head))
+            beams.append(Beam(bar, bar, i, *ends, (low, high), diameter / 2, (), section))
+            compliances[f"{limb}U"] = (soft.upr_universal if i < 2 else soft.rpu_universal).tolist()
+            compliances[f"{limb}R"] = (soft.upr_revolute if i < 2 else soft.rpu_revolute).tolist()
             u = np.cross(_Y, -d) if i < 2 else _X
             v = _Y if i < 2 else np.cross(-d, _X)
             turning = high if i < 2 else low
@@ -409,70 +403,12 @@ class UprRpu(TwinRobot):
                     _joint(f"U joint {limb}", (high, PLATFORM), head, [_X, _Y], universal, f"{limb}U"),
                 ]
             joints |= {joint.name: joint for joint in chain}
-        if inertia is None:
-            bodies[PLATFORM] = Body(PLATFORM, 0.0, origin)
-        else:
+        bodies[PLATFORM] = Body(PLATFORM, 0.0, origin)
+        if inertia is not None:
             com, about = origin + inertia.platform_com, inertia.platform_inertia
             bodies[PLATFORM] = Body(PLATFORM, inertia.platform_mass, array(com), array(about))
-        return Graph(bodies, joints, {}, PLATFORM, origin)
-
-    @property
-    def spelled(self) -> UprRpu:
-        """With the platform's inertia, of a disc."""
-        m = self.inertia
-        if m is None or m.platform_inertia is not None:
-            return self
-        usual = disc(m.platform_mass, self.geometry.platform_radius)
-        return self._with(inertia=replace(m, platform_inertia=usual))
-
-    def _tube(self, name: str, i: int, reach: float, d: Array, com: Array) -> Body:
-        """Return a round bar of half the limb."""
-        if self.inertia is None:
-            return Body(name, 0.0, array(com))
-        radius = self.members.diameter[i] / 2
-        weight = self.inertia.density * math.pi * radius**2 * reach
-        across, along = weight * (reach**2 / 12 + radius**2 / 4), weight * radius**2 / 2
-        return Body(name, weight, array(com), array(axial(across, along, d)))
-
-    @cached_property
-    def beams(self) -> tuple[Beam, ...]:
-        """The bars from B to A."""
-        a, b = self._radii
-        beams = []
-        for i, limb in enumerate("123"):
-            low, high = f"lower tube {limb}", f"upper tube {limb}"
-            ends = (low, b * _PATTERN[i]), (high, self.graph.origin + a * _PATTERN[i])
-            radius = self.members.diameter[i] / 2
-            beams.append(Beam(f"{limb}B", f"{limb}B", i, *ends, (low, high), radius))
-        return tuple(beams)
-
-    def structure(self) -> Structure:
-        """Return bars between base and platform, joints elastic in their own axes, drives locked.
-
-        Joint compliances of equations 8, 15 and 25 act in the joints' axes (equations 10 and 14);
-        bar and joints of a limb in series have the compliance C_i (equations 16 and 27).
-        A bar reaches from B to A, as in the paper, and its mass with it: a telescope's tubes that
-        overlap are not told apart. Without inertia bars have no mass.
-        """
-        m, j = self.members, self.joints_compliance
-        density = 0.0 if self.inertia is None else self.inertia.density
-        sections = {
-            beam.name: Section(
-                m.youngs_modulus,
-                m.shear_modulus,
-                d,
-                0.0,
-                density * math.pi / 4 * d**2,
-                m.shear_factor,
-            )
-            for beam, d in zip(self.beams, m.diameter.tolist(), strict=True)
-        }
-        compliances = {"3U": j.rpu_universal.tolist(), "3R": j.rpu_revolute.tolist()}
-        for limb in "12":
-            compliances[f"{limb}U"] = j.upr_universal.tolist()
-            compliances[f"{limb}R"] = j.upr_revolute.tolist()
         order = tuple(f"{limb}{element}" for limb in "123" for element in "RBU")
-        return Structure(self.beams, sections, compliances, order)
+        return Parts(Graph(bodies, joints, {}, PLATFORM, origin), tuple(beams), compliances, order)
 
 
 def _joint(

@@ -151,4 +151,4 @@ def _by_geometry(robot: Robot, q: ArrayLike, rows: Array) -> Array:
 
 def geometry_numbers(robot: Robot) -> list[Any]:
     """Return the geometry as ``Engine.geometry`` has it, of numbers or expressions."""
-    return list(geometry_of(robot.make_graph()))
+    return list(geometry_of(robot.graph))

@@ -1,7 +1,7 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """What every robot has of its file: parameters, the graph that follows, names and units.
 
-A mechanism is a schema and a function from its parameters to a graph.
+A mechanism is a schema and a function from its parameters to :class:`Parts`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from pkm_twin.machine.friction import compiled, law_names
 from pkm_twin.machine.graph import Graph, limb_numbers
 from pkm_twin.machine.inertia import Coefficients
 from pkm_twin.machine.joint_map import JointMap, JointMapEntry
-from pkm_twin.machine.members import Beam, RigidError, Structure
+from pkm_twin.machine.members import Beam, Parts, Structure
 from pkm_twin.machine.places import (
     Key,
     Keys,
@@ -99,7 +99,7 @@ class Mechanism(Common):
     drive: DriveSpec | None = schema.section(
         DriveSpec, text="of every actuated joint, in place of `inertia.rotor_inertia`", default=None
     )
-    home_joint: float | None = None
+    home_joint: Any = None
     """Value of every actuated joint at home, where a mechanism chooses it: kept by copies, so that
     other limits do not move the home."""
     book: Book = dataclasses.field(default_factory=Book)
@@ -108,6 +108,10 @@ class Mechanism(Common):
     """Friction laws that a fit may find, although the file's parameters of them are zero."""
 
     coordinates: ClassVar[tuple[Coordinate, ...]]
+    layout: ClassVar[PoseGrid | None] = None
+    """The poses of a workspace map about the machine's axis; None: along the pose coordinates."""
+    limit_key: ClassVar[str] = "limits.position"
+    """Path of the actuated joints' limits in the file."""
     start: ClassVar[Start | None] = None
     """A closed form of the forward kinematics that no structure tells."""
     changeable: ClassVar[tuple[str, ...]] = (
@@ -144,8 +148,11 @@ class Mechanism(Common):
 
     @property
     def size(self) -> float:
-        """The platform's radius, m: what makes a length of an angle of it."""
-        raise NotImplementedError
+        """Greatest distance of a joint on the platform from its reference point, m.
+
+        With it an angle becomes a length.
+        """
+        return float(self.graph.rim)
 
     @property
     def limb_names(self) -> tuple[str, ...]:
@@ -171,14 +178,24 @@ class Mechanism(Common):
         """
         return None
 
-    def make_graph(self) -> Graph:
-        """Bodies, joints and rods at home."""
+    def make_parts(self) -> Parts:
+        """Return the graph at home, and what of it is elastic, by the file's parameters."""
         raise NotImplementedError
+
+    @cached_property
+    def parts(self) -> Parts:
+        """The graph at home, and what of it is elastic."""
+        return self.make_parts()
+
+    @cached_property
+    def graph(self) -> Graph:
+        """Bodies, joints and rods at home."""
+        return self.parts.graph
 
     @cached_property
     def beams(self) -> tuple[Beam, ...]:
         """The bars that limb interference and elasticity are about; none: not known."""
-        return ()
+        return self.parts.beams
 
     def limit_angles(self, pose: ArrayLike) -> Array | None:
         """Angles that ``limits.joint_angle`` bounds, shape (..., k), rad; None where it is none."""
@@ -203,12 +220,12 @@ class Mechanism(Common):
         return {}
 
     def structure(self) -> Structure:
-        """Elastic beams and joints.
+        """Return the elastic beams and joints.
 
         :raises RigidError: the robot's file makes nothing elastic.
         :raises ParameterError: its elastic sections are incomplete or contradict its masses.
         """
-        raise RigidError("members", None, "a section with the elastic members")
+        return self.parts.structure()
 
     def elastic_entries(self) -> dict[str, dict[str, dict[str, Any]]]:
         """Return the elastic entries of bodies, joints and rods as plain data, by kind and name.
@@ -245,10 +262,17 @@ class Mechanism(Common):
         """Rotor and gear of each actuated joint, None where the file does not give them."""
         return (self.drive,) * self.joints_count
 
+    def default_inertia(self) -> dict[str, Any]:
+        """Return the value of every key of ``inertia`` that follows from others if left out."""
+        return {}
+
     @property
     def spelled(self: R) -> R:
         """The same with every inertia that its file may leave out."""
-        return self
+        own: Any = getattr(self, "inertia", None)
+        usual = {} if own is None else self.default_inertia()
+        left = {key: value for key, value in usual.items() if getattr(own, key) is None}
+        return self._with(inertia=dataclasses.replace(own, **left)) if left else self
 
     def mass_keys(self) -> Iterator[Keys]:
         """Where its file has masses, centres and inertias, of one that is :attr:`spelled` out."""
@@ -275,11 +299,6 @@ class Mechanism(Common):
         if given:
             raise ParameterError("inertia.rotor_inertia", given, "0, because the section drive has the rotor")
         return self.drive.reflected(slides, "drive")
-
-    @cached_property
-    def graph(self) -> Graph:
-        """Bodies, joints and rods at home."""
-        return self.make_graph()
 
     @cached_property
     def laws(self) -> tuple[str, ...]:
@@ -490,29 +509,23 @@ class Mechanism(Common):
         """What makes lengths of pose coordinates, shape (m,): 1, or the platform's radius."""
         return np.array([1.0 if unit == "m" else self.size for unit in self.pose_units])
 
-    @cached_property
-    def joint_scales(self) -> Array:
-        """The same of q, shape (n,); all 1 where the joints are of one kind."""
-        mixed = len(set(self.joint_units)) > 1
-        return np.array([self.size if mixed and u == "rad" else 1.0 for u in self.joint_units])
-
     def grid(self) -> PoseGrid:
         """Return the grid of poses of a workspace map; a box for a machine without an axis."""
-        return PoseGrid("box", self.pose_names)
+        return self.layout or PoseGrid("box", self.pose_names)
 
     def search_box(self) -> Array:
         """Return a box that contains all poses of the workspace, shape (m, 2), m and rad.
 
         :raises ParameterError: a limit that would bound the workspace is missing.
         """
-        place = position_box(self.graph, self.limits.position, self.passive_limits)
+        paths = [self.own_path(f"{self.limit_key}[{k}]") for k in range(self.joints_count)]
+        place = position_box(self.graph, self.limits.position, self.passive_limits, paths)
         rows = []
         for c in self.coordinates:
-            if c.axis is not None:
-                rows.append(place[c.axis])
-            else:
-                far = np.pi if len(c.entries) == 2 else np.pi / 2
-                rows.append(np.array([-far, far]))
+            # Tilts about an axis are below a right angle.
+            whole = len(c.entries) == 2 and self.layout is None
+            far = np.pi if whole else np.pi / 2
+            rows.append(np.array([-far, far]) if c.axis is None else place[c.axis])
         return np.array(rows)
 
     def changed(self: R, **sections: Mapping[str, object] | object) -> R:

@@ -99,7 +99,7 @@ class CauseSlopes:
 
 def geometry_and_masses(robot: Robot) -> list[Any]:
     """Return the geometry as ``Engine.geometry``, then the masses as ``Robot.inertial``."""
-    graph, load = robot.with_laws(robot.make_graph()), robot.payload
+    graph, load = robot.with_laws(robot.graph), robot.payload
     layout = Layout(Tree(graph))
     inertial = layout.pack(graph, robot.gravity, robot.friction)
     inertial = inertial + layout.payload(load.mass, load.com, load.inertia)

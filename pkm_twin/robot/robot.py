@@ -152,8 +152,10 @@ class Robot(Mechanism):
     def massive(self) -> Engine:
         """Return the engine of a robot with masses; its programs have the friction laws.
 
-        :raises ParameterError: the robot's file gives none.
+        :raises ParameterError: the robot's file gives none: it leaves out a section ``inertia``.
         """
+        if getattr(self, "inertia", True) is None:
+            raise ParameterError("inertia", None, "a section with the masses and inertias")
         return self._massive
 
     @property

@@ -309,7 +309,7 @@ def _find_equations() -> tuple[Row, ...]:
             (1, 2),
             "closure of a limb, and its derivative",
             (
-                "pkm_twin.mechanisms.delta.Delta.make_graph",
+                "pkm_twin.mechanisms.delta.Delta.make_parts",
                 "pkm_twin.kinematics.constraints.keep_distance",
             ),
             same,
@@ -349,7 +349,7 @@ def _find_equations() -> tuple[Row, ...]:
             "equation",
             (9,),
             "vector loop of a limb",
-            ("pkm_twin.mechanisms.delta.Delta.make_graph",),
+            ("pkm_twin.mechanisms.delta.Delta.make_parts",),
             same,
         ),
         Row(

@@ -50,7 +50,7 @@ class Comparison:
 class Row:
     """One numbered item of a paper, or several that one function computes.
 
-    ``functions``: dotted names ("pkm_twin.mechanisms.prru.Prru.make_graph"). ``tests``: a file and
+    ``functions``: dotted names ("pkm_twin.mechanisms.prru.Prru.make_parts"). ``tests``: a file and
     a function ("test/validation/test_prru_paper.py::test_position"). ``note``: what differs from
     print, or why the item is not computed. ``pictures``: files of docs/gallery that redraw a
     figure. ``drawn_by``: the line of ``pkm-twin`` that draws them, by the name that their files

@@ -232,7 +232,7 @@ def find_rows() -> Paper:
             "figure",
             (1,),
             "machine",
-            (UPR_RPU + "make_graph",),
+            (UPR_RPU + "make_parts",),
             CLOSED,
             pictures=("robot_upr_rpu.png",),
         ),
