@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import contextlib
 import copy
+import math
 import re
 from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -39,6 +40,7 @@ from pkm_twin.kinematics.constraints import (
     keep_pair,
     rotate,
 )
+from pkm_twin.kinematics.iterations import newton
 from pkm_twin.machine.graph import BASE, Graph, Joint, Rod, rotation_about_z
 from pkm_twin.machine.joints import across, unit
 from pkm_twin.machine.places import full_keys, keys_of, path_of
@@ -47,8 +49,6 @@ from pkm_twin.robot.robot import SINGULARITY_BOUND, Robot
 
 MAX_OPEN_FRACTION: Final = 1e-6
 """Largest fraction of an error's rows that may stay open if the parts can be assembled."""
-STEP_TOLERANCE: Final = 1e-12
-"""Size of the last Newton step of an assembly, in units of one."""
 MAX_ITERATIONS: Final = 30
 STENCIL: Final = 1e-3 * np.array([-2.0, -1.0, 1.0, 2.0])
 STENCIL_WEIGHTS: Final = np.array([1.0, -8.0, 8.0, -1.0]) / 12e-3
@@ -409,24 +409,24 @@ class Assembly:
             rotation=np.broadcast_to(start.rotation, (count, *start.rotation.shape)),
             shift=np.broadcast_to(start.shift, (count, *start.shift.shape)),
         )
-        worst = 0
-        for _ in range(MAX_ITERATIONS):
-            values = placed.values(self.equations(placed, errors))
-            step = np.moveaxis(self._solve_twists(np.moveaxis(values, 0, -1)), -1, 0)
-            placed = placed.moved(step)
-            last = float(np.abs(step).max())
-            worst = int(np.abs(values).max(-1).max(0).argmax())
-            if not last < 1.0:
-                break
-            if last < STEP_TOLERANCE:
-                left = float(np.abs(values).max())
-                if left > MAX_OPEN_FRACTION:
-                    break
-                name, origin = self.graph.platform, self.graph.origin
-                there = placed.point(name, origin + errors.get(("origin", name), 0.0))
-                turn = placed.turn(name) @ start.turn(name).swapaxes(-1, -2)
-                moved = there - start.point(name, self.robot.graph.origin)
-                return np.concatenate([moved, rotation_vector(turn)], -1)
+
+        def look(placed: Placement) -> tuple[Array, None]:
+            return placed.values(self.equations(placed, errors)), None
+
+        def solve(_: None, values: Array) -> Array:
+            return np.moveaxis(self._solve_twists(np.moveaxis(values, 0, -1)), -1, 0)
+
+        # The derivatives are those without errors, so steps need not halve.
+        placed, closed = newton(
+            placed, look, Placement.moved, solve, iterations=MAX_ITERATIONS, gain=math.inf, most=MAX_OPEN_FRACTION
+        )
+        if closed:
+            name, origin = self.graph.platform, self.graph.origin
+            there = placed.point(name, origin + errors.get(("origin", name), 0.0))
+            turn = placed.turn(name) @ start.turn(name).swapaxes(-1, -2)
+            moved = there - start.point(name, self.robot.graph.origin)
+            return np.concatenate([moved, rotation_vector(turn)], -1)
+        worst = int(np.abs(look(placed)[0]).max(-1).max(0).argmax())
         raise PkmTwinError(
             f"{self.robot.name}: rigid parts with errors of this size cannot be assembled at "
             f"{np.round(self.q.reshape(-1, self.q.shape[-1])[worst], 6).tolist()}"

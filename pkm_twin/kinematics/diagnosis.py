@@ -19,7 +19,7 @@ from pkm_twin.errors import MobilityError, ParameterError
 from pkm_twin.kinematics.linkage import Linkage
 from pkm_twin.kinematics.rounding import repair_few
 from pkm_twin.kinematics.spins import idle_bodies, null
-from pkm_twin.machine.graph import Graph, Joint
+from pkm_twin.machine.graph import Graph
 
 EXACT: Final = 1e-11
 """Deviations below this are the computer's rounding, rad or parts of the machine's size."""
@@ -54,15 +54,36 @@ def mobility_error(linkage: Linkage, causes: Sequence[Deviation] = ()) -> Mobili
     texts = [c.text for c in causes[:MAX_CAUSES]]
     if len(causes) > MAX_CAUSES:
         texts.append(f"and {len(causes) - MAX_CAUSES} deviations more")
-    if not causes:
-        texts = [*_loose(linkage), *_locked(linkage)]
+    if causes:
+        return MobilityError(linkage.joints, linkage.mobility.freedoms, texts)
+    graph = linkage.graph
+    # What moves although the actuated joints are held: bodies that turn alone, and the rest.
+    motion, ju = linkage.regular_state()
+    free = null(ju, _NONE)
+    if free.shape[1]:
+        spinning = [s for s in idle_bodies(graph, motion, free) if graph.platform not in s[0]]
+        for bodies, _, _ in spinning:
+            at = [j.name for j in graph.joints.values() if (j.inner in bodies) != (j.outer in bodies)]
+            texts.append(f"{' with '.join(bodies)} can turn alone, at {' and '.join(at)}")
+        ways = np.array([way for _, _, way in spinning]).reshape(-1, free.shape[1])
+        if names := _owners(linkage, free @ null(ways, _NONE)):
+            texts.append(f"with the actuated joints held, {', '.join(names)} can move")
+    # Actuated joints that cannot move, or only together.
+    ju, jq = linkage.scaled_at_home()
+    moves = null(np.hstack([ju, jq]), _NONE)[ju.shape[1] :]
+    rank = int(np.linalg.matrix_rank(moves, _NONE)) if moves.size else 0
+    if rank < linkage.joints:
+        sizes = np.linalg.norm(moves, axis=1) if moves.size else np.zeros(linkage.joints)
+        still = np.array(graph.leads)[sizes < _NONE].tolist()
+        tied = [name for name in graph.leads if name not in still]
+        texts += [f"{', '.join(still)} cannot move"] if still else []
+        texts += [f"{', '.join(tied)} have {rank} independent motions"] if len(tied) > rank else []
     return MobilityError(linkage.joints, linkage.mobility.freedoms, texts)
 
 
 def singular_home(linkage: Linkage, rank: int, beside: int) -> ParameterError:
     """Return the error of a singular home, with the joints that can move in it alone."""
-    motion, ju = linkage.regular_state()
-    del motion
+    ju = linkage.regular_state()[1]
     here = null(linkage.scaled_at_home()[0], _NONE)
     there = null(ju, _NONE)
     # What is free at home and not beside it.
@@ -89,13 +110,15 @@ def near_conditions(graph: Graph, freedoms: int = 0) -> list[Deviation]:
     found: list[Deviation] = []
     new = repaired.graph
     for name, joint in new.joints.items():
+        # Joints of one axis, those on the same bodies first.
+        others = [other for other in new.joints.values() if other is not joint and len(other.axes) == 1]
+        others.sort(key=lambda other: not {joint.inner, joint.outer} & {other.inner, other.outer})
         for k, axis in enumerate(joint.axes):
             angle = float(np.linalg.norm(np.cross(axis, graph.joints[name].axes[k])))
             which = f"{name}'s axis" + (f" {k + 1}" if len(joint.axes) > 1 else "")
-            other = _parallel_joint(new, joint, axis)
-            goal = f"parallel to {other}'s axis" if other else EVERYWHERE
-            parts = (name, other) if other else (name,)
-            found.append(Deviation(f"{which} is {angle:.2g} rad from {goal}", parts, angle, angle))
+            parallel = [o.name for o in others if float(np.linalg.norm(np.cross(axis, o.axes[0]))) < EXACT][:1]
+            goal = f"parallel to {parallel[0]}'s axis" if parallel else EVERYWHERE
+            found.append(Deviation(f"{which} is {angle:.2g} rad from {goal}", (name, *parallel), angle, angle))
     points = [(f"{n}", n, new.joints[n].at - j.at) for n, j in graph.joints.items()]
     points += [
         (f"the {side} of {n}", n, new.rods[n].ends[k] - rod.ends[k])
@@ -110,16 +133,6 @@ def near_conditions(graph: Graph, freedoms: int = 0) -> list[Deviation]:
     return sorted(found, key=lambda one: -one.size)
 
 
-def _parallel_joint(graph: Graph, joint: Joint, axis: Array) -> str:
-    """Return the first joint of one axis parallel to an axis of a joint, if it can be one's own."""
-    others = [other for other in graph.joints.values() if other is not joint and len(other.axes) == 1]
-    others.sort(key=lambda other: not {joint.inner, joint.outer} & {other.inner, other.outer})
-    for other in others:
-        if float(np.linalg.norm(np.cross(axis, other.axes[0]))) < EXACT:
-            return other.name
-    return ""
-
-
 def is_right(graph: Graph | None, freedoms: int = 0) -> bool:
     """Return whether at home the actuated joints determine the machine and can all move.
 
@@ -132,43 +145,6 @@ def is_right(graph: Graph | None, freedoms: int = 0) -> bool:
         return linkage.mobility.freedoms >= freedoms
     ju, _ = linkage.scaled_at_home()
     return null(ju, _NONE).shape[1] == 0 and linkage.mobility.freedoms == linkage.joints
-
-
-def _loose(linkage: Linkage) -> list[str]:
-    """Describe the motions that the held actuated joints leave free."""
-    motion, ju = linkage.regular_state()
-    free = null(ju, _NONE)
-    if not free.shape[1]:
-        return []
-    graph = linkage.graph
-    spinning = [s for s in idle_bodies(graph, motion, free) if graph.platform not in s[0]]
-    texts = []
-    for bodies, _, _ in spinning:
-        at = [j.name for j in graph.joints.values() if (j.inner in bodies) != (j.outer in bodies)]
-        texts.append(f"{' with '.join(bodies)} can turn alone, at {' and '.join(at)}")
-    ways = np.array([way for _, _, way in spinning]).reshape(-1, free.shape[1])
-    names = _owners(linkage, free @ null(ways, _NONE))
-    if names:
-        texts.append(f"with the actuated joints held, {', '.join(names)} can move")
-    return texts
-
-
-def _locked(linkage: Linkage) -> list[str]:
-    """Name actuated joints that cannot move, or only together."""
-    ju, jq = linkage.scaled_at_home()
-    unknown = ju.shape[1]
-    moves = null(np.hstack([ju, jq]), _NONE)[unknown:]
-    names = np.array(linkage.graph.leads)
-    rank = int(np.linalg.matrix_rank(moves, _NONE)) if moves.size else 0
-    if rank == linkage.joints:
-        return []
-    sizes = np.linalg.norm(moves, axis=1) if moves.size else np.zeros(linkage.joints)
-    still = names[sizes < _NONE].tolist()
-    tied = [n for n in names if n not in still]
-    texts = [f"{', '.join(still)} cannot move"] if still else []
-    if len(tied) > rank:
-        texts.append(f"{', '.join(tied)} have {rank} independent motions")
-    return texts
 
 
 def _owners(linkage: Linkage, motions: Array) -> list[str]:

@@ -8,7 +8,7 @@ whatever is asked: pose, Jacobians, torques.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property, partial
 from typing import Final
 from weakref import WeakValueDictionary
@@ -21,7 +21,7 @@ from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.key import EMPTY, ProgramKey
 from pkm_twin.codegen.program import Program
 from pkm_twin.errors import ParameterError, SingularityError
-from pkm_twin.kinematics.iterations import least_squares, newton
+from pkm_twin.kinematics.iterations import newton, solve_damped
 from pkm_twin.kinematics.linkage import hold
 from pkm_twin.kinematics.pose import Coordinate
 from pkm_twin.kinematics.posed import CarriedScheme
@@ -44,6 +44,8 @@ from pkm_twin.machine.graph import Graph
 _NO_PARAMETERS: Final = np.zeros(0)
 MET: Final = 1e-9
 """Largest miss of a closure that holds, over the machine's size."""
+TO_THE_END: Final[Mapping[str, float]] = {"gain": math.inf, "tolerance": 0.0}
+"""Options of Newton's method that takes all its steps: the values of least squares are wanted."""
 
 
 class Engine(Scheme):
@@ -83,10 +85,10 @@ class Engine(Scheme):
         while step > precision and done < 1.0:
             way = min(1.0, done + step)
             there = home + way * (q - home)
-            new = newton(x, partial(self._look, there), partial(self._moved, there))
+            new, closed = newton(x, partial(self._look, there), partial(self._moved, there))
             # Beyond a singularity is another assembly.
-            sign, measure = (0.0, 0.0) if new is None else self._regularity(new, there)
-            if new is None or sign != side or way > limit:
+            sign, measure = self._regularity(new, there) if closed else (0.0, 0.0)
+            if not closed or sign != side or way > limit:
                 step /= 8
                 continue
             x, done, least = new, way, min(least, measure)
@@ -110,8 +112,10 @@ class Engine(Scheme):
 
     def _shortest(self, x: Array, q: Array) -> tuple[str, float]:
         """Return the closure with the largest miss at the least-squares point, and its miss, m."""
-        values = least_squares(x, partial(self._look, q), partial(self._moved, q), 20)
-        if values is None:
+        look = partial(self._look, q)
+        x, _ = newton(x, look, partial(self._moved, q), solve_damped, iterations=20, **TO_THE_END)
+        values = look(x)[0]
+        if not np.isfinite(values).all():
             return self.parts[0], math.inf
         worst = int(np.abs(values).argmax())
         return self.parts[worst], float(abs(values[worst])) * self.tree.size
@@ -135,8 +139,9 @@ class Engine(Scheme):
             return self._walk(pose, state, step)[2]
 
         home = np.array([*self.tree.home, *self.graph.lead_home], float)
-        values = least_squares(home, look, move, 40)
-        if values is None:
+        state, _ = newton(home, look, move, solve_damped, iterations=40, **TO_THE_END)
+        values = look(state)[0]
+        if not np.isfinite(values).all():
             return self.graph.platform, math.inf, False
         misses, names = np.abs(values), self.parts
         if not names:

@@ -1,22 +1,19 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Iterations on closures that are not compiled whole: Newton, and Levenberg and Marquardt.
+"""Newton's method on constraint equations that are not compiled whole.
 
-Values, columns and steps are of unit one.
+Values, columns and steps are of unit one; states may be batches.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 
-Look = Callable[[Array], tuple[Array, Array]]
-"""Of a state the values, shape (rows,), and their derivatives, shape (rows, rates)."""
-Move = Callable[[Array, Array], Array]
-"""A state after a step of rates."""
+S = TypeVar("S")
 
 RANK: Final = 1e-9
 """Part of a matrix's largest singular value below which one counts as zero."""
@@ -25,39 +22,57 @@ DAMPING: Final = 1e-6
 ROUNDING: Final = 1e-14
 """Part of a matrix's largest entry below which its pivots are rounding."""
 MAX_STEP: Final = 0.2
+MAX_VALUE: Final = 1e-9
+"""Largest value of an equation that holds."""
 
 
-def newton(x: Array, look: Look, move: Move) -> Array | None:
-    """Solve for the state where all values vanish; None unless each step halves the last one."""
+def solve_least_norm(table: Array, values: Array) -> Array:
+    """Return the least step that cancels values as far as their derivatives allow."""
+    return np.asarray(np.linalg.lstsq(table, -values, rcond=RANK)[0], np.float64)
+
+
+def solve_damped(table: Array, values: Array) -> Array:
+    """Return a step of least squares with Levenberg's damping, at most MAX_STEP; NaN if too large."""
+    with np.errstate(over="ignore"):
+        square = table.T @ table
+    if not np.isfinite(square).all():
+        return np.full(table.shape[1], np.nan)
+    square += max(DAMPING, ROUNDING * float(square.max())) * np.eye(table.shape[1])
+    step = np.asarray(np.linalg.solve(square, -table.T @ values), np.float64)
+    return step * min(1.0, MAX_STEP / max(float(np.abs(step).max(initial=0.0)), 1e-300))
+
+
+def newton(
+    x: S,
+    look: Callable[[S], tuple[Array, Any]],
+    move: Callable[[S, Array], S],
+    solve: Callable[[Any, Array], Array] = solve_least_norm,
+    *,
+    iterations: int = MAX_ITERATIONS,
+    gain: float = 0.5,
+    tolerance: float = 1e-12,
+    most: float = MAX_VALUE,
+) -> tuple[S, bool]:
+    """Solve for the state where all values vanish; return the last state, and whether they do.
+
+    :param look: returns the values in a state, and what ``solve`` needs of their derivatives.
+    :param move: returns the state after a step of rates.
+    :param solve: returns the step that cancels values, of ``look``'s second and first result.
+    :param gain: each step must be below this part of the one before, else the method ends.
+    :param tolerance: size of the step that is the last one; ``most``: largest value that counts as
+        zero then.
+    """
     last = np.inf
-    for _ in range(MAX_ITERATIONS):
-        values, table = look(x)
-        if not (np.isfinite(values).all() and np.isfinite(table).all()):
-            return None
-        step = np.asarray(np.linalg.lstsq(table, -values, rcond=RANK)[0], np.float64)
-        size = float(np.abs(step).max(initial=0.0))
-        if not size < 0.5 * last:
-            return None
-        x = move(x, step)
-        if size < 1e-12:
-            return x if float(np.abs(values).max(initial=0.0)) < 1e-9 else None
-        last = max(size, 1e-13)
-    return None
-
-
-def least_squares(x: Array, look: Look, move: Move, iterations: int) -> Array | None:
-    """Return the values of least squares after damped steps; None if one is not finite."""
-    values, table = look(x)
     for _ in range(iterations):
-        if not (np.isfinite(values).all() and np.isfinite(table).all()):
-            return None
-        with np.errstate(over="ignore"):
-            damped = table.T @ table
-        if not np.isfinite(damped).all():
-            return None
-        damped += max(DAMPING, ROUNDING * float(damped.max())) * np.eye(table.shape[1])
-        step = np.asarray(np.linalg.solve(damped, -table.T @ values), np.float64)
-        step *= min(1.0, MAX_STEP / max(float(np.abs(step).max(initial=0.0)), 1e-300))
-        x = move(x, step)
         values, table = look(x)
-    return values
+        if not np.isfinite(values).all():
+            break
+        step = solve(table, values)
+        size = float(np.abs(step).max(initial=0.0))
+        if not size < gain * last:
+            break
+        x = move(x, step)
+        if size < tolerance:
+            return x, float(np.abs(values).max(initial=0.0)) < most
+        last = max(size, 0.1 * tolerance)
+    return x, False

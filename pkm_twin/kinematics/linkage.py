@@ -81,21 +81,20 @@ class Linkage:
             return np.array(Motion(self.tree, x, q).retracted(x, step / scales), float)
 
         x = np.array(self.tree.home if start is None else start, float)
-        return newton(x, look, move) if self.at(x, q)[1] else x
+        if not self.at(x, q)[1]:
+            return x
+        x, closed = newton(x, look, move)
+        return x if closed else None
 
     @cached_property
     def samples(self) -> list[tuple[Array, Array]]:
-        """States (x, q) at home and near it, found by the first linkage of a geometry for all."""
-        first = _firsts.setdefault(self.graph.key, self)
+        """States (x, q) at home and near it, the same in every run and for all of one geometry."""
+        graph, home = self.graph, self.graph.lead_home
+        first = _firsts.setdefault(graph.key, self)
         if first is not self:
             return first.samples
         # The one that chooses pose coordinates is followed by the one that has them.
         hold(self)
-        return self._near_home()
-
-    def _near_home(self) -> list[tuple[Array, Array]]:
-        """Sample states near home, the same ones in every run."""
-        graph, home = self.graph, self.graph.lead_home
         states = [(np.array(self.tree.home, float), home)]
         random = np.random.default_rng(0)
         slides = np.array([graph.joints[name].slides for name in graph.leads])

@@ -187,26 +187,25 @@ class Motion:
         Linear rows of the 3-PRRU paper's velocity maps J_M and J_Hij (equations 18 and 26).
         """
         out: Columns = {}
-        while body != BASE:
-            link, absolute = self.tree.links[body], False
+        for link in map(self.tree.links.__getitem__, self.tree.chain_to_base(body)):
+            origin, absolute = self.origin[link.body], False
             for step in reversed(link.steps):
                 key = ("q" if step.actuated else "u", step.rate)
                 if step.ball or step.free:
                     absolute = True
                     for i in range(3):
-                        out["u", step.rate + i] = cross(UNITS[i], at - self.origin[body])
+                        out["u", step.rate + i] = cross(UNITS[i], at - origin)
                         if step.free:
                             out["u", step.rate + 3 + i] = UNITS[i]
                     continue
                 axis = self.axis[id(step)]
-                column: Any = cross(axis, at - self.origin[body]) if step.turns else 0.0
+                column: Any = cross(axis, at - origin) if step.turns else 0.0
                 if step.slide:
                     column = column + step.slide * axis
                 out[key] = step.sign * column
             if absolute:
                 # Nothing of the parents' turning is inherited, only their translation.
-                at = self.origin[body]
-            body = link.parent
+                at = origin
         return out
 
     def angular_jacobian(self, body: str) -> Columns:
@@ -215,8 +214,7 @@ class Motion:
         Angular rows of the 3-PRRU paper's J_M and J_Hij (equations 19 to 21, and 27 to 29).
         """
         out: Columns = {}
-        while body != BASE:
-            link = self.tree.links[body]
+        for link in map(self.tree.links.__getitem__, self.tree.chain_to_base(body)):
             for step in reversed(link.steps):
                 if step.turns:
                     key = ("q" if step.actuated else "u", step.rate)
@@ -225,7 +223,6 @@ class Motion:
                     for i in range(3):
                         out["u", step.rate + i] = UNITS[i]
                     return out
-            body = link.parent
         return out
 
     # Closures.

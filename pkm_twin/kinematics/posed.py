@@ -354,7 +354,7 @@ class CarriedScheme(Scheme):
             return np.array(Motion(self.tree, x, pose).retracted(x, change), float)
 
         with np.errstate(all="ignore"):
-            if newton(np.array(self.tree.home, float), look, move) is None:
+            if not newton(np.array(self.tree.home, float), look, move)[1]:
                 return None
         misses = {limb.part: found.miss for limb, found in zip(self.limbs, limbs, strict=True)}
         return next((short for short in misses.items() if short[1] > 0.0), (self.parts[0], 0.0))

@@ -30,6 +30,7 @@ from pkm_twin.kinematics.constraints import (
     keep_distance,
     rotate,
 )
+from pkm_twin.kinematics.iterations import newton
 from pkm_twin.machine.graph import Graph, array
 from pkm_twin.machine.joints import HELD
 
@@ -184,10 +185,10 @@ def repair_few(graph: Graph, freedoms: int) -> Repair | None:
     return all_moved if all_moved and all_moved.largest < MAX_DEVIATION else None
 
 
-def _least(table: Array, value: Array, rank: int) -> Array:
-    """Solve table x = value in all positions with the largest ``rank`` singular values alone."""
+def _solve_truncated(rank: int, table: Array, value: Array) -> Array:
+    """Solve table x = -value in all positions with the largest ``rank`` singular values alone."""
     left, sizes, rows = np.linalg.svd(table, full_matrices=False)
-    parts = np.einsum("kir,ki->kr", left[:, :, :rank], value) / sizes[:, :rank]
+    parts = np.einsum("kir,ki->kr", left[:, :, :rank], -value) / sizes[:, :rank]
     return np.asarray(np.einsum("krj,kr->kj", rows[:, :rank], parts), np.float64)
 
 
@@ -221,14 +222,8 @@ class _Loops:
             way = np.einsum("kfi,kfj,kj->ki", free, free, way)
             way /= np.abs(way).max(axis=1, keepdims=True, initial=1e-300)
             placed = placed.moved(REACH / STEPS * way)
-            last = np.inf
-            for _ in range(CORRECTIONS):
-                value, table = self.equations(placed)
-                miss = float(np.abs(value).max(initial=0.0))
-                if miss < CLOSED or miss > 0.5 * last:
-                    break
-                placed = placed.moved(-_least(table, value, rank))
-                last = miss
+            solve = partial(_solve_truncated, rank)
+            placed, _ = newton(placed, self.equations, Placement.moved, solve, iterations=CORRECTIONS, tolerance=CLOSED)
         return placed
 
     def sizes(self, positions: Placement) -> Array:
@@ -272,7 +267,7 @@ class _Loops:
             step = np.linalg.lstsq(np.hstack(allowed), gap, rcond=noise)[0]
             change = np.asarray(-step, np.float64)
             self.change(change)
-            placed = placed.moved(-_least(table, value + by_vectors @ change, rank))
+            placed = placed.moved(_solve_truncated(rank, table, value + by_vectors @ change))
             last = miss
         return miss < CLOSED
 

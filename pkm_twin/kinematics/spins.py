@@ -16,9 +16,8 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.kinematics.linkage import Linkage
 from pkm_twin.kinematics.motion import Motion
-from pkm_twin.machine.graph import BASE, Body, Graph, Joint, array, merged
+from pkm_twin.machine.graph import BASE, Graph, Joint, array, merged
 from pkm_twin.machine.joints import across, unit
-from pkm_twin.machine.tree import Tree
 
 SPIN: Final = 0.05
 """A part whose centre of mass moves less than this share of the machine a radian only spins."""
@@ -40,42 +39,51 @@ def without_spins(graph: Graph) -> tuple[Graph, dict[str, float]]:
     """
     linkage = Linkage(graph)
     motion, ju = linkage.regular_state()
-    spins = null(ju, RANK)
+    tree, owners = linkage.tree, linkage.tree.owners
     # What is in no loop hangs loose and is left to be found so.
-    looped = _looped(linkage.tree)
-    spins = spins @ null(spins[[o not in looped for o in linkage.tree.owners]], RANK, absolute=True)
+    ways: dict[str, set[str]] = {BASE: set()}
+    for link in tree.links.values():
+        ways[link.body] = ways[link.parent] | {link.joint or f"free body {link.body}"}
+    ends = [(graph.joints[name].inner, graph.joints[name].outer) for name in tree.cut]
+    ends += [(rod.inner, rod.outer) for rod in graph.rods.values()]
+    looped = set().union(*(ways[a] ^ ways[b] for a, b in ends))
+    spins = null(ju, RANK)
+    spins = spins @ null(spins[[owner not in looped for owner in owners]], RANK, absolute=True)
+    heavy = [body for body in graph.bodies.values() if body.mass > 0.0]
     for body, point, rows, most in (
         (graph.platform, graph.origin, slice(6), RANK),
-        *((body.name, body.com, slice(3), SPIN * graph.size) for body in graph.bodies.values() if body.mass > 0.0),
+        *((body.name, body.com, slice(3), SPIN * graph.size) for body in heavy),
     ):
         spins = spins @ null(twist(motion, body, point)[rows] @ spins, most, absolute=True)
     joints, held = dict(graph.joints), dict[str, float]()
     while spins.shape[1]:
-        found = _hinge(linkage, spins) or _ball(linkage, motion, spins)
-        if found is None:
-            break
-        name, axes, spins, way = found
+        # The hinge with the largest part in a spin; of parts that are equal but for rounding the first.
+        shares = [
+            float(np.linalg.norm(row)) if owner in joints and graph.joints[owner].kind == "revolute" else 0.0
+            for row, owner in zip(spins, owners, strict=True)
+        ]
+        k = int(np.argmax(np.round(shares, 6)))
+        name, axes, way, lost = owners[k], np.zeros((0, 3)), spins @ spins[k], spins[k]
+        if not shares[k] > _NONE:
+            balls = (
+                (joint.name, np.array(across(axis)), spins @ way, way)
+                for bodies, axis, way in idle_bodies(graph, motion, spins)
+                for joint in graph.joints.values()
+                if joint.kind == "spherical" and {joint.inner, joint.outer} & set(bodies)
+            )
+            found = next(balls, None)
+            if found is None:
+                break
+            name, axes, way, lost = found
+        spins = spins @ null(lost[None], RANK)
         joints[name] = _held(joints[name], axes)
-        held[name] = max((_imbalance(motion, body, way) for body in graph.bodies.values()), default=0.0)
+        held[name] = 0.0
+        for one in graph.bodies.values():
+            rates = twist(motion, one.name, one.com) @ way
+            turn = float(np.linalg.norm(rates[3:]))
+            if turn > _NONE:
+                held[name] = max(held[name], one.mass * float(np.linalg.norm(rates[:3])) / turn)
     return replace(graph, joints=joints), held
-
-
-def _imbalance(motion: Motion, body: Body, way: Array) -> float:
-    """Return mass times the distance of a body's centre from a motion's axis, kg m."""
-    rates = twist(motion, body.name, body.com) @ way
-    turn = float(np.linalg.norm(rates[3:]))
-    return body.mass * float(np.linalg.norm(rates[:3])) / turn if turn > _NONE else 0.0
-
-
-def _looped(tree: Tree) -> set[str]:
-    """Return the tree's joints and free bodies in a loop, as owners of rates."""
-    ways: dict[str, set[str]] = {BASE: set()}
-    for link in tree.links.values():
-        ways[link.body] = ways[link.parent] | {link.joint or f"free body {link.body}"}
-    graph = tree.graph
-    ends = [(graph.joints[name].inner, graph.joints[name].outer) for name in tree.cut]
-    ends += [(rod.inner, rod.outer) for rod in graph.rods.values()]
-    return set().union(*(ways[a] ^ ways[b] for a, b in ends))
 
 
 def hold(graph: Graph, hinges: Sequence[str]) -> Graph:
@@ -143,33 +151,3 @@ def null(matrix: Array, bound: float, absolute: bool = False) -> Array:
     least = bound if absolute else bound * float(values.max(initial=0.0))
     rank = int(np.count_nonzero(values > max(least, 1e-300)))
     return np.asarray(rows[rank:].T, np.float64)
-
-
-_Found = tuple[str, Array, Array, Array]
-"""A joint, its new axes, the spins that are left, and the one that it held."""
-
-
-def _hinge(linkage: Linkage, spins: Array) -> _Found | None:
-    """Find the hinge that takes the largest part in a spin, to be fixed."""
-    joints, owners = linkage.graph.joints, linkage.tree.owners
-    parts = [
-        float(np.linalg.norm(row)) if joint is not None and joint.kind == "revolute" else 0.0
-        for row, joint in zip(spins, map(joints.get, owners), strict=True)
-    ]
-    # Rounded: of equal ones the first.
-    at = int(np.argmax(np.round(parts, 6)))
-    if not parts[at] > _NONE:
-        return None
-    left = spins @ null(spins[at][None], RANK)
-    return owners[at], np.zeros((0, 3)), left, spins @ spins[at]
-
-
-def _ball(linkage: Linkage, motion: Motion, spins: Array) -> _Found | None:
-    """Find a ball joint of a part that spins alone, to be universal across the spin."""
-    graph = linkage.graph
-    for bodies, axis, way in idle_bodies(graph, motion, spins):
-        for joint in graph.joints.values():
-            if joint.kind == "spherical" and {joint.inner, joint.outer} & set(bodies):
-                left = spins @ null(way[None], RANK)
-                return joint.name, np.array(across(axis)), left, spins @ way
-    return None

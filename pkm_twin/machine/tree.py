@@ -163,6 +163,14 @@ class Tree:
         """The step of every joint of the tree, of several freedoms the last one."""
         return {step.joint: step for link in self.links.values() for step in link.steps}
 
+    def chain_to_base(self, body: str) -> list[str]:
+        """Return a body and those between it and the ground."""
+        chain = []
+        while body != BASE:
+            chain.append(body)
+            body = self.links[body].parent
+        return chain
+
     def _span(self) -> dict[str, list[tuple[str, str | None]]]:
         graph = self.graph
         able = self.carriers

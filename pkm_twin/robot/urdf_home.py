@@ -21,6 +21,7 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import ParameterError, SingularityError
 from pkm_twin.kinematics.constraints import Equation, constraint_equations, keep_angle
+from pkm_twin.kinematics.iterations import newton
 from pkm_twin.kinematics.linkage import Linkage
 from pkm_twin.kinematics.motion import Motion, numbers
 from pkm_twin.kinematics.rounding import CHAIN, MAX_ROUNDING, Repair, repair_rounded
@@ -209,27 +210,30 @@ class Assembly:
         return best, miss
 
     def _close(self, values: Array, rank: float, held: Mask | bool) -> tuple[Array, float]:
-        self.place(values)
-        residual, _ = self.residuals(rates=False)
         slow = 0
-        for _ in range(MAX_ITERATIONS):
+
+        def look(values: Array) -> tuple[Array, Array]:
+            self.place(values)
+            return self.residuals(rates=False)[0], values
+
+        def solve(values: Array, residual: Array) -> Array:
+            """Return a truncated step, halved until it closes the loops further; zero if none does."""
+            nonlocal slow
             miss = float(np.linalg.norm(residual))
             if miss < 1e-15 or slow > MAX_SLOW_STEPS:
-                break
+                return np.zeros(len(values))
             rates = np.where(held, 0.0, self.residuals()[1])
             step = np.where(held, 0.0, -np.linalg.lstsq(rates, residual, rcond=rank)[0])
             step *= min(1.0, MAX_STEP / max(float(np.abs(step).max(initial=0.0)), 1e-300))
             for _ in range(12):
-                self.place(values + step)
-                residual, _ = self.residuals(rates=False)
-                less = float(np.linalg.norm(residual))
+                less = float(np.linalg.norm(look(values + step)[0]))
                 if less < miss:
-                    break
+                    slow = slow + 1 if less > 0.98 * miss else 0
+                    return np.asarray(step, np.float64)
                 step /= 2
-            else:
-                break
-            values = values + step
-            slow = slow + 1 if less > 0.98 * miss else 0
+            return np.zeros(len(values))
+
+        values, _ = newton(values, look, np.add, solve, iterations=MAX_ITERATIONS, gain=math.inf, tolerance=1e-300)
         self.place(values)
         return values, self.miss()
 

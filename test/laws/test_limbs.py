@@ -37,8 +37,8 @@ def followed(engine, q, steps=128):
     x, home = np.array(engine.tree.home, float), engine.graph.home
     for k in range(1, steps + 1):
         there = home + k / steps * (q - home)
-        x = newton(x, partial(engine._look, there), partial(engine._moved, there))
-        if x is None:
+        x, closed = newton(x, partial(engine._look, there), partial(engine._moved, there))
+        if not closed:
             return None
     return x
 
