@@ -53,7 +53,7 @@ class Drives:
         return values
 
     def judge(self, name: str, leads: Numbers, rest: Numbers, time: float) -> None:
-        """Rates or accelerations of the other drives have to be those that follow of the leads."""
+        """Require that rates or accelerations of the other drives follow from the leading ones."""
         values, own = self._given.get(name, ((), ()))
         if own is leads:
             for k in self.others:
@@ -61,7 +61,7 @@ class Drives:
                 self._margins.append(self._tolerance(k) / time - absolute(apart))
 
     def tolerance_margins(self) -> list[Any]:
-        """Numbers above zero where no drive contradicts those that lead; positions too."""
+        """Return numbers that are above zero where no drive contradicts the leading ones."""
         q, found = self.t.tape.inputs("q", self.count), list(self._margins)
         for k in self.others:
             x, step = self.t.x, self.t.tree.drives[k]
@@ -84,7 +84,7 @@ class Drives:
 
     @cached_property
     def null_rows(self) -> list[list[Any]]:
-        """N: by drive that does not lead, its own effort of one, and what the leading ones add."""
+        """N: per drive that does not lead, the efforts that move nothing; its own effort is one."""
         t = self.t
         steps = [t.tree.drives[k] for k in self.others]
         kept = t.jq[t.scheme.independent] if steps else np.zeros((0, 0))
@@ -93,7 +93,7 @@ class Drives:
         return self.null_rows
 
     def set_null_rows(self, rates: Sequence[Objects]) -> None:
-        """Take N by the rates of each drive that does not lead, by those of the leading ones."""
+        """Set N from the rate of each drive that does not lead per rate of the leading ones."""
         self.null_rows = []
         for k, own in zip(self.others, rates, strict=True):
             row: list[Any] = [0.0] * self.count
@@ -118,7 +118,7 @@ class Drives:
         return SparseCholesky(lower, [lower[i, i] for i in range(len(rows))])
 
     def shared(self, leads: Sequence[Any], *, preload: bool = False) -> list[Any]:
-        """Efforts of all drives that do what these of the leading ones would, shape (n,).
+        """Return efforts of all drives that act like these of the leading ones alone, shape (n,).
 
         Nearest to the preload, or least, each over its limit.
         """
@@ -136,14 +136,17 @@ class Drives:
         return efforts
 
     def on_leads(self, efforts: Sequence[Any]) -> list[Any]:
-        """B' tau: efforts of the leading drives alone that do what these of all do, shape (m,)."""
+        """Return B' tau: efforts of the leading drives alone that act like these of all, shape (m,)."""
         result = [efforts[k] for k in self.leading]
         for k, row in zip(self.others, self.null_rows, strict=True):
             result = [a - row[j] * efforts[k] for a, j in zip(result, self.leading, strict=True)]
         return result
 
     def followed(self, leads: Sequence[Any], still: Numbers) -> list[Any]:
-        """Accelerations of all drives by those that lead, and those of the unknowns without."""
+        """Return accelerations of all drives.
+
+        :param leads: of the leading drives; ``still``: of the unknowns while these are zero.
+        """
         result: list[Any] = [0.0] * self.count
         for k, value in zip(self.leading, leads, strict=True):
             result[k] = value
@@ -154,7 +157,7 @@ class Drives:
         return result
 
     def null_efforts(self) -> list[list[Any]]:
-        """N with rows of length one, at right angles, of efforts over their limits."""
+        """Return N with orthonormal rows, for efforts over their limits."""
         if not self.others:
             return []
         columns = [self._root.forward(list(column)) for column in zip(*self.null_rows, strict=True)]

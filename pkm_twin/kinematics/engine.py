@@ -56,11 +56,11 @@ class Engine(Scheme):
         return {}
 
     def _walk(self, pose: Array, state: Array, step: Array) -> list[Array]:
-        """Of unknowns and q: closures and pose equations, their derivatives, the state moved on."""
+        """Return values of closures and pose equations, their derivatives, and the state after a step."""
         return self.kernel("walk", walk_program)(_NO_PARAMETERS, state, pose, step)[0]
 
     def _look(self, q: Array, x: Array) -> tuple[Array, Array]:
-        """Closures and their derivatives by the unknowns, of unit one."""
+        """Return the closures and their derivatives by the unknowns, of unit one."""
         still = np.zeros(self.tree.unknown_rates + self.joints)
         values, table, _ = self._walk(self.home_pose, np.concatenate([x, q]), still)
         k = len(self.parts)
@@ -72,7 +72,7 @@ class Engine(Scheme):
         return self._walk(self.home_pose, np.concatenate([x, q]), steps)[2][: len(x)]
 
     def reach(self, q: Array, limit: float = 1.0, precision: float = 1e-4) -> tuple[float, Array, float]:
-        """How far the straight way from home to q leads without passing a singularity.
+        """Follow the straight line from home to q up to a singularity.
 
         :param limit: part of the way beyond which nothing is looked for.
         :returns: the part of the way, the unknowns there, and the closures' least reciprocal
@@ -95,7 +95,7 @@ class Engine(Scheme):
         return done, x, least
 
     def ending(self, q: Array, reached: float) -> tuple[str, float, float | None]:
-        """Why no assembly is found beyond a part of the straight way from home to q.
+        """Explain why no assembly is found beyond a part of the straight line from home to q.
 
         :returns: the part that falls short the most, by how much (m), and None; or, where there is
             an assembly behind a singularity, the closures' least reciprocal condition on the way.
@@ -106,7 +106,7 @@ class Engine(Scheme):
         return part, miss, least if miss < MET * self.tree.size else None
 
     def _regularity(self, x: Array, q: Array) -> tuple[float, float]:
-        """Sign of the determinant of the kept closures, and their reciprocal condition."""
+        """Return the sign of the independent closures' determinant, and their reciprocal condition."""
         matrix = self._look(q, x)[1][self.independent]
         return float(np.linalg.slogdet(matrix)[0]), _reciprocal(matrix)
 
@@ -188,12 +188,12 @@ class Engine(Scheme):
 
     @property
     def forward(self) -> Kernel:
-        """Q to pose (m), position (3) and rotation (9) of the platform."""
+        """Joint positions q to pose (m), position (3) and rotation (9) of the platform."""
         return self.kernel("forward", ahead_forward_program, self._ahead_key)
 
     @property
     def jacobian(self) -> Kernel:
-        """Q to pose rates per joint rate (m n) and platform twist per joint rate (6 n), by row."""
+        """Joint positions q to pose rates (m n) and platform twist (6 n) per joint rate, by row."""
         return self.kernel("jacobian", jacobian_program)
 
     @cached_property
@@ -265,25 +265,25 @@ class Engine(Scheme):
 
     @property
     def followed_inverse(self) -> Kernel:
-        """The program of :attr:`inverse` with the machine's own tree, as above."""
+        """The program of :attr:`inverse` with the machine's own tree, as :attr:`own_forward`."""
         write = partial(inverse_program, scheme=None)
         return self.kernel("followed inverse", write, repr(self.inverse_pivots))
 
     @property
     def quick_inverse(self) -> Kernel:
-        """The same of poses that are certainly right; others are rejected."""
+        """Pose to q where the assembly is certain; other poses are rejected."""
         if self.posed is None:
             return self.inverse
         return self.posed_kernel("quick inverse", quick_inverse_program)
 
     @property
     def placement(self) -> Kernel:
-        """Q to rotation (9) from home and place of the origin (3) of every body, by body."""
+        """Joint positions q to rotation (9) from home and origin (3) of every body, by body."""
         return self.kernel("placement", placement_program)
 
     @property
     def body_jacobian(self) -> Kernel:
-        """Q to the twist (6 n) of every body's frame per joint rate, by body."""
+        """Joint positions q to the twist (6 n) of every body's frame per joint rate, by body."""
         return self.kernel("body jacobian", body_jacobian_program)
 
     @property
@@ -293,7 +293,7 @@ class Engine(Scheme):
 
 
 def _reciprocal(matrix: Array) -> float:
-    """Reciprocal condition number."""
+    """Return the reciprocal condition number."""
     s = np.linalg.svd(matrix, compute_uv=False)
     return float(s[-1] / s[0]) if s.size and s[0] > 0.0 else 0.0
 

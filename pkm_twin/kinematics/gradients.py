@@ -11,7 +11,7 @@ from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics import pose as poses
 from pkm_twin.kinematics.engine import Engine
-from pkm_twin.kinematics.programs import forward_program
+from pkm_twin.kinematics.programs import forward_program, pose_accelerations
 from pkm_twin.kinematics.traced import Traced
 
 
@@ -30,42 +30,41 @@ def gradient_program(t: Traced, program: Program, by: Mapping[str, Numbers]) -> 
 
 
 def platform_gradient(engine: Engine) -> Kernel:
-    """Program of sums of pose, position and rotation: q and weights (m + 12) to the geometry's."""
-    return engine.kernel("platform gradient", _by_geometry, free=True)
+    """Compile the gradient by the geometry of sums of pose, position and rotation.
+
+    Inputs: q and the weights (m + 12) of these.
+    """
+    return engine.kernel(
+        "platform gradient", lambda t: gradient_program(t, forward_program(t), {"geometry": t.geometry}), free=True
+    )
 
 
 def pose_motion_gradient(engine: Engine) -> Kernel:
-    """Program of the gradient of sums of pose, rates and accelerations of the pose.
+    """Compile the gradient of sums of pose, rates and accelerations of the pose.
 
     q, qd, qdd and weights (3 m) to derivatives by q (n), qd (n) and the geometry.
     """
-    return engine.kernel("pose motion gradient", _pose_motion, free=True)
+
+    def write(t: Traced) -> Program:
+        t.solve()
+        qd, qdd = t.drives.given("qd"), t.drives.given("qdd")
+        t.set_rates(qd)
+        t.set_accelerations(qdd)
+        motion, coordinates = t.motion, t.scheme.coordinates
+        position, rotation = motion.platform()
+        velocity = motion.velocity(t.graph.platform, t.graph.origin)
+        outputs = {
+            "pose": t.lift(poses.values(coordinates, position, rotation)),
+            "rates": t.lift(poses.rates(coordinates, rotation, velocity, motion.omega[t.graph.platform])),
+            "accelerations": t.lift(pose_accelerations(t)),
+        }
+        program = Program(t.inputs("q", "qd", "qdd"), 0, outputs, t.equations())
+        by = {name: t.drives.variables(name) for name in ("q", "qd")}
+        return gradient_program(t, program, {**by, "geometry": t.geometry})
+
+    return engine.kernel("pose motion gradient", write, free=True)
 
 
 def free_forward(engine: Engine) -> Kernel:
-    """As :attr:`Engine.forward`, for machines of every structure."""
+    """Compile :attr:`Engine.forward` for machines of every structure."""
     return engine.kernel("free forward", lambda t: replace(forward_program(t), quick=True), free=True)
-
-
-def _by_geometry(t: Traced) -> Program:
-    return gradient_program(t, forward_program(t), {"geometry": t.geometry})
-
-
-def _pose_motion(t: Traced) -> Program:
-    t.solve()
-    qd, qdd = t.drives.given("qd"), t.drives.given("qdd")
-    t.set_rates(qd)
-    t.set_accelerations(qdd)
-    motion, graph, of = t.motion, t.graph, t.scheme.coordinates
-    position, rotation = motion.platform()
-    body, omega = graph.platform, motion.omega[graph.platform]
-    velocity = motion.velocity(body, graph.origin)
-    second = poses.accelerations(of, rotation, omega, motion.acceleration(body, graph.origin), motion.alpha[body])
-    outputs = {
-        "pose": t.lift(poses.values(of, position, rotation)),
-        "rates": t.lift(poses.rates(of, rotation, velocity, omega)),
-        "accelerations": t.lift(second),
-    }
-    program = Program(t.inputs("q", "qd", "qdd"), 0, outputs, t.equations())
-    by = {name: t.drives.variables(name) for name in ("q", "qd")}
-    return gradient_program(t, program, {**by, "geometry": t.geometry})

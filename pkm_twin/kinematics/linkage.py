@@ -27,7 +27,7 @@ REACH: Final = 0.6
 
 @dataclass(frozen=True)
 class Mobility:
-    """What the graph at home says.
+    """Degrees of freedom of a graph at home, and its closures.
 
     ``freedoms``: of the whole machine. ``rank``: of all closures. ``redundant``: closures less
     their rank. ``parts``: the cut joints and rods among which they are. ``unknowns``: of the tree.
@@ -49,7 +49,7 @@ class Linkage:
 
     @property
     def joints(self) -> int:
-        """Number of actuated joints, of dependent ones of those that lead."""
+        """Number of actuated joints that lead: all, unless drives are redundant."""
         return len(self.graph.leads)
 
     def at(self, x: Numbers, q: Numbers) -> tuple[Motion, list[Row]]:

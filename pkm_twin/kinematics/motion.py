@@ -8,7 +8,7 @@ recursion of rigid bodies in base axes (Featherstone, Rigid Body Dynamics Algori
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final, NamedTuple
@@ -22,7 +22,7 @@ from pkm_twin.codegen.operations import cos, sin, sqrt
 from pkm_twin.kinematics.constraints import Equation, constraint_equations, keep_distance
 from pkm_twin.machine.graph import BASE, Direction, Joint, Rod
 from pkm_twin.machine.joints import UNITS, Constraint
-from pkm_twin.machine.tree import Link, Step, Tree
+from pkm_twin.machine.tree import Step, Tree
 
 Columns = dict[tuple[str, int], Any]
 """By rate ("u" or "q", index): a vector, or a number."""
@@ -175,7 +175,7 @@ class Motion:
         return self.rotation[body] @ self.tree.axes[body].T
 
     def platform(self) -> tuple[Any, Any]:
-        """Position of the reference point, and the platform's rotation relative to home."""
+        """Return the reference point's position, and the platform's rotation relative to home."""
         graph = self.graph
         return self.point(graph.platform, graph.origin), self.turned(graph.platform)
 
@@ -355,11 +355,11 @@ class Motion:
             self._spin[link.body] = _spin(self.omega[link.body], al)
 
     def velocity(self, body: str, point: Array) -> Any:
-        """Velocity of a point of a body, given at home (Delta-CU paper, equations 7 and 8)."""
+        """Return the velocity of a point of a body, given at home (Delta-CU paper, equations 7, 8)."""
         return self.speed[body] + cross(self.omega[body], self.arm(body, point))
 
     def acceleration(self, body: str, point: Array) -> Any:
-        """Its acceleration less gravity (Delta-CU paper, equation 15)."""
+        """Return the acceleration, less gravity, of a point of a body (Delta-CU paper, equation 15)."""
         return self.change[body] + self._spin[body] @ self.arm(body, point)
 
     def spin(self, body: str) -> Any:
@@ -395,7 +395,7 @@ class Motion:
 
 
 def reaction_directions(joint: Joint) -> tuple[Direction, ...]:
-    """Three directions in which a joint's reactions are told, fixed in bodies."""
+    """Return the three directions, fixed in bodies, along which a joint's reactions are given."""
     if joint.directions:
         return joint.directions
     names = ("axis", "across 1", "across 2") if joint.type.count else "xyz"
@@ -441,6 +441,3 @@ def _spin(w: Any, al: Any) -> Objects:
         ],
         dtype=object,
     )
-
-
-__all__ = ["Columns", "Link", "Mapping", "Motion", "Row", "cross", "matrices", "numbers"]

@@ -94,7 +94,10 @@ def _values(t: Traced) -> list[Any]:
             if steps[0].free:
                 k = steps[0].position
                 values += list(t.x[k + 4 : k + 7])
-            values += _three_angles(_relative(t, link))
+            r = _relative(t, link)
+            # The angles a, b, c of Rx(a) Ry(b) Rz(c).
+            root = sqrt(r[0][0] * r[0][0] + r[0][1] * r[0][1])
+            values += [atan2(-r[1][2], r[2][2]), atan2(r[0][2], root), atan2(-r[0][1], r[0][0])]
             continue
         # A joint of one freedom has its own value at home.
         home = tree.graph.joints[steps[0].joint].home if len(steps) == 1 else 0.0
@@ -120,9 +123,14 @@ def _rates(t: Traced, qd: Numbers, u: Numbers) -> list[Any]:
             k = steps[0].rate
             if steps[0].free:
                 rates += list(u[k + 3 : k + 6])
-            inner = motion.turned(link.parent)
+            inner, r = motion.turned(link.parent), _relative(t, link)
             omega = inner.T @ (motion.omega[link.body] - motion.omega[link.parent])
-            rates += _three_rates(_relative(t, link), omega)
+            # omega = a' x + b' (0, cos a, sin a) + c' (sin b, -sin a cos b, cos a cos b): the rates
+            # are not finite where cos b is zero, as no three angles are everywhere.
+            root = sqrt(r[0][0] * r[0][0] + r[0][1] * r[0][1])
+            sine, cosine = -r[1][2] / root, r[2][2] / root
+            third = (cosine * omega[2] - sine * omega[1]) / root
+            rates += [omega[0] - third * r[0][2], cosine * omega[1] + sine * omega[2], third]
             continue
         for step in steps:
             rate = (qd if step.actuated else u)[step.rate]
@@ -163,29 +171,3 @@ def _rod_sides(rod: Rod, vector: Any) -> tuple[Any, Any, Any]:
     first, second = rod_axes(rod)
     side, up = np.cross(second, along), np.cross(first, along)
     return vector @ side, vector @ up, vector @ along
-
-
-def _three_angles(matrix: Objects) -> list[Any]:
-    """Return the angles a, b, c of Rx(a) Ry(b) Rz(c)."""
-    root = sqrt(matrix[0][0] * matrix[0][0] + matrix[0][1] * matrix[0][1])
-    return [
-        atan2(-matrix[1][2], matrix[2][2]),
-        atan2(matrix[0][2], root),
-        atan2(-matrix[0][1], matrix[0][0]),
-    ]
-
-
-def _three_rates(matrix: Objects, omega: Any) -> list[Any]:
-    """Rates of a, b, c by the angular velocity in the axes before them.
-
-    omega = a' x + b' (0, cos a, sin a) + c' (sin b, -sin a cos b, cos a cos b): not finite where
-    cos b is zero, as no three angles are everywhere.
-    """
-    root = sqrt(matrix[0][0] * matrix[0][0] + matrix[0][1] * matrix[0][1])
-    sine, cosine = -matrix[1][2] / root, matrix[2][2] / root
-    third = (cosine * omega[2] - sine * omega[1]) / root
-    return [
-        omega[0] - third * matrix[0][2],
-        cosine * omega[1] + sine * omega[2],
-        third,
-    ]

@@ -93,7 +93,10 @@ def _entry(matrix: Any, entry: Entry) -> Any:
 
 
 def _root(matrix: Any, entry: Entry) -> Any:
-    """Cosine of an elevation, from the other entries of its column: no square is subtracted."""
+    """Return the cosine of an elevation from the other entries of its column.
+
+    No square is subtracted from one, which would lose digits.
+    """
     row, column, _ = entry
     a, b = (matrix[i][column] for i in range(3) if i != row)
     return sqrt(a * a + b * b)
@@ -113,13 +116,13 @@ def values(coordinates: Sequence[Coordinate], position: Any, rotation: Any) -> l
 
 
 def _columns_turned(rotation: Any, by: Any) -> list[list[Any]]:
-    """``by`` x each column of a matrix."""
+    """Return the vector product of ``by`` and each column of a matrix."""
     turned = [cross(by, [rotation[i][k] for i in range(3)]) for k in range(3)]
     return [[turned[k][i] for k in range(3)] for i in range(3)]
 
 
 def rates(coordinates: Sequence[Coordinate], rotation: Any, velocity: Any, omega: Any) -> list[Any]:
-    """First derivatives of the pose in time, of the platform's velocity and angular velocity."""
+    """Return pose rates from the platform's velocity and angular velocity."""
     turned = _columns_turned(rotation, omega)
     result = []
     for c in coordinates:
@@ -141,7 +144,7 @@ def accelerations(
     acceleration: Any,
     alpha: Any,
 ) -> list[Any]:
-    """Second derivatives of the pose in time."""
+    """Return second derivatives of the pose in time."""
     once = _columns_turned(rotation, omega)
     again = _columns_turned(once, omega)
     bent = _columns_turned(rotation, alpha)
@@ -167,7 +170,7 @@ def accelerations(
 
 
 def rows(coordinates: Sequence[Coordinate], motion: Motion, pose: Numbers) -> list[tuple[Any, Columns]]:
-    """Equations of a pose, zero where the platform is there, and their derivatives by rates."""
+    """Return the equations of a pose, zero where the platform has it, and their derivatives."""
     body = motion.graph.platform
     position, rotation = motion.platform()
     linear = motion.linear_jacobian(body, position)

@@ -38,7 +38,7 @@ assembly is farther away unless a singularity is nearer than that."""
 
 
 def walk_program(t: Traced) -> Program:
-    """Closures, then pose equations, where they do not hold; the actuated joints unknown too."""
+    """Write the program of one step of Newton's method for a pose, with q among the unknowns."""
     scheme, tree, tape = t.scheme, t.tree, t.tape
     size, free = len(tree.home), tree.unknown_rates
     everything = tape.inputs(UNKNOWNS, size + t.joints)
@@ -123,7 +123,7 @@ def acceleration_program(t: Traced) -> Program:
 
 
 def projection_program(t: Traced) -> Program:
-    """Positions, rates and accelerations of all drives, by those of the drives that lead."""
+    """Write the program of all drives' positions, rates and accelerations by the leading ones."""
     t.solve()
     q, qd, qdd = (t.tape.inputs(name, t.drives.count)[t.drives.leading] for name in ("q", "qd", "qdd"))
     t.set_rates(qd)
@@ -137,7 +137,7 @@ def projection_program(t: Traced) -> Program:
 
 
 def ahead_forward_program(t: Traced) -> Program:
-    """Write the same program with the fewest unknowns."""
+    """Write :func:`forward_program` on the tree with the fewest unknowns."""
     return forward_program(t.ahead)
 
 
@@ -313,7 +313,7 @@ def follow_pose(t: Traced) -> tuple[tuple[Equations, ...], Objects]:
     origin = [0.0 if c.axis is None else t.graph.origin[c.axis] for c in scheme.coordinates]
 
     def system(state: Numbers, pose: Numbers) -> tuple[Motion, list[Row], list[Any], SparseLU]:
-        """Closures, pose equations, and the factors of their derivatives."""
+        """Return motion, closures, pose equations, and the factors of their derivatives."""
         motion = Motion(tree, state[:size], state[size:])
         rows = motion.closures()
         table = np.hstack(matrices(tree, rows))[scheme.independent]

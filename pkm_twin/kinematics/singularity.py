@@ -63,7 +63,12 @@ def singularity_kernel(engine: Engine) -> Kernel:
 
 def singularity_gradient(engine: Engine) -> Kernel:
     """Compile the program from q and a weight (1) to derivatives by q and by the geometry."""
-    return engine.kernel("singularity gradient", _gradient, free=True)
+
+    def write(t: Traced) -> Program:
+        by: dict[str, Numbers] = {"q": t.drives.variables("q"), "geometry": t.geometry}
+        return gradient_program(t, _singularity(t), by)
+
+    return engine.kernel("singularity gradient", write, free=True)
 
 
 def find_carriers(graph: Graph) -> frozenset[str]:
@@ -150,11 +155,6 @@ def _singularity(t: Traced) -> Program:
     return Program(t.inputs("q"), 0, outputs, t.equations())
 
 
-def _gradient(t: Traced) -> Program:
-    by: dict[str, Numbers] = {"q": t.drives.variables("q"), "geometry": t.geometry}
-    return gradient_program(t, _singularity(t), by)
-
-
 def singularity_measure(t: Traced) -> Any:
     """Return the measure of a solved motion for other programs; rates are overwritten."""
     point = all(c.axis is not None for c in t.scheme.coordinates)
@@ -180,7 +180,7 @@ def singularity_on_numbers(linkage: Linkage, q: Array, *, point: bool = False) -
 
 
 class _Numbers:
-    """What the measure asks of a traced machine, on numbers."""
+    """A linkage on numbers, with the attributes of :class:`Traced` that the measure uses."""
 
     def __init__(self, linkage: Linkage, q: Array) -> None:
         self.graph, self.joints = linkage.graph, linkage.joints
@@ -221,7 +221,10 @@ def _held(t: Traced | _Numbers) -> Any:
 
 
 def _moved(t: Traced | _Numbers, point: bool) -> Any:
-    """``point``: the platform is its reference point."""
+    """Return the second number, from bodies' motions per platform twist.
+
+    :param point: the pose has no angle, so the platform counts as its reference point.
+    """
     n, graph = t.joints, t.graph
     rates = _Rates(t)
     tool = (graph.origin, 0.0) if point else graph.frame(graph.platform)
@@ -256,7 +259,7 @@ class _Rates:
         self._products: dict[tuple[tuple[str, int], tuple[str, int]], Any] = {}
 
     def columns(self, name: str, frame: tuple[Any, Any]) -> dict[tuple[str, int], list[Any]]:
-        """S: by rate the velocity of a body's middle, and its angular velocity times its reach."""
+        """Return S: per rate the velocity of a body's middle, and angular velocity times its reach."""
         middle, reach = frame
         linear = self.motion.linear_jacobian(name, self.motion.point(name, middle))
         turning = self.motion.angular_jacobian(name)
@@ -267,7 +270,7 @@ class _Rates:
         }
 
     def motion_of(self, name: str, frame: tuple[Any, Any]) -> list[list[Any]]:
-        """D, six rows of the joints."""
+        """Return D, six rows with a column per joint."""
         rows: list[list[Any]] = [[0.0] * self.n for _ in range(6)]
         for key, six in self.columns(name, frame).items():
             for row, value in zip(rows, six, strict=True):
@@ -276,7 +279,10 @@ class _Rates:
         return rows
 
     def response(self, name: str, root: SparseCholesky) -> Any:
-        """tr((T'T)^-1 D'D), T'T = L E L': of D's rows, or of S'S and U (T'T)^-1 U', the shorter."""
+        """Return tr((T'T)^-1 D'D), with T'T = L E L'.
+
+        From D's rows, or from S'S and U (T'T)^-1 U', whichever takes fewer operations.
+        """
         frame = self.graph.frame(name)
         columns = list(self.columns(name, frame).items())
         total: Any = 0.0

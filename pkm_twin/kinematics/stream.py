@@ -24,7 +24,7 @@ LONGEST: Final = 0.02
 
 
 def stream_kernel(engine: Engine) -> Kernel:
-    """Program of a sample: q (n) and the row of the sample before, to its own row.
+    """Compile the program of a stream's sample: q (n) and the previous sample's row to its row.
 
     A row begins with q (n), the pose (m) and its rates per rate of the drives that lead (m m, by
     row). Then comes what shows a jump (m): how far the pose is from where the rates lead; and the

@@ -110,7 +110,7 @@ class Traced:
         return motion, limbs, x
 
     def solve(self) -> None:
-        """Take unknowns and closures."""
+        """Place the machine by its unknowns, and factor its closures."""
         scheme, tree = self.scheme, self.tree
         self.unknowns = self.tape.inputs(self.unknowns_name, len(scheme.solved[0]))
         self.motion, self.limbs, self.x = self._placed(self.unknowns)
@@ -128,22 +128,22 @@ class Traced:
 
     @property
     def drive_scales(self) -> list[Any]:
-        """What makes joint rates of unit one."""
+        """Factors that make joint rates of unit one."""
         joints = (self.graph.joints[name] for name in self.graph.leads)
         return [1.0 / self.tree.size if joint.slides else 1.0 for joint in joints]
 
     @property
     def pose_scales(self) -> list[Any]:
-        """What makes pose coordinates of unit one."""
+        """Factors that make pose coordinates of unit one."""
         size = self.tree.size
         return [1.0 if c.axis is None else 1.0 / size for c in self.scheme.coordinates]
 
     def inputs(self, *names: str, **more: int) -> dict[str, int]:
-        """Sizes of inputs of a program: by name those of all drives, and others."""
+        """Return the sizes of a program's inputs: one entry per drive for ``names``, and ``more``."""
         return dict.fromkeys(names, self.drives.count) | more
 
     def equations(self, **more: Any) -> tuple[Equations, ...]:
-        """Newton's method for the unknowns at q, from a guess or a closed form.
+        """Return Newton's method for the unknowns at q, from a guess or a closed form.
 
         :param more: further fields of the equations.
         """
@@ -183,7 +183,7 @@ class Traced:
         return (solved,)
 
     def retracted(self, values: Numbers, rates: Numbers = ()) -> list[Expression]:
-        """Unknowns of Newton's method, moved by small rates; turns have the length of one then."""
+        """Return Newton's unknowns after a step of small rates; turns are normalised."""
         places, kept = self.scheme.solved
         x, du = np.array(self.tree.home, object), np.zeros(self.tree.unknown_rates, object)
         x[places] = values
@@ -194,7 +194,7 @@ class Traced:
 
     @property
     def determinant(self) -> Any:
-        """Of all closures, over that at home: of Newton's equations and of the limbs."""
+        """Determinant of all closures over that at home, of Newton's equations and the limbs."""
         home = self._at_home
         result = home.newton.inverse_determinant / self.newton.inverse_determinant
         for here, there in zip(self.limbs, home.limbs, strict=True):
@@ -221,7 +221,7 @@ class Traced:
 
     @cached_property
     def _at_home(self) -> Factors:
-        """The same at home."""
+        """Limbs and factors at home."""
         scheme = self.scheme
         x = np.array(self.tree.home, dtype=object)
         _, limbs = scheme.place(self.tree, x, self.graph.lead_home)
@@ -264,7 +264,7 @@ class Traced:
         return -(at.jq.T @ at.lu.solve_transposed(unit))
 
     def rates_of_reaches(self, names: Sequence[str], *, home: bool = False) -> Objects:
-        """Return the same in fewer operations for joints that set a limb's distance.
+        """Return :meth:`rates_of_joints`, in fewer operations for joints that set a limb's reach.
 
         :param home: at home.
         """
@@ -288,7 +288,7 @@ class Traced:
         return np.array(rows, dtype=object)
 
     def _guess(self) -> list[Expression]:
-        """Unknowns along the tangent at home, corrected once by its derivatives: to second order.
+        """Return a guess of the unknowns to second order: the tangent at home, corrected once.
 
         This costs less than a correction by derivatives there, and the guess is nearer.
         """
@@ -304,11 +304,11 @@ class Traced:
         return self.retracted(tangent, -newton.solve([row.value for row in solved]))
 
     def lift(self, values: Numbers) -> list[Expression]:
-        """Results as expressions."""
+        """Return results as expressions."""
         return [self.tape.lift(value) for value in values]
 
     def square(self, values: Numbers, scales: Numbers) -> Expression:
-        """Sum of the squares of values times scales."""
+        """Return the sum of the squares of values times scales."""
         total: Any = 0.0
         for value, scale in zip(values, scales, strict=True):
             part = value * scale
@@ -355,7 +355,7 @@ class Traced:
         return result
 
     def set_rates(self, qd: Numbers) -> Objects:
-        """Rates of everything by qd; returns those of the unknowns."""
+        """Compute all rates from qd; return those of the unknowns."""
         kept = self.scheme.independent
         self.u = self._unknown(self.lu.solve(-(self.jq[kept] @ np.asarray(qd, dtype=object))))
         self.qd = qd
@@ -364,7 +364,7 @@ class Traced:
         return self.u
 
     def set_accelerations(self, qdd: Numbers, base: BaseMotion = FIXED) -> None:
-        """Accelerations of everything by qdd, after the rates; then the base moves, too.
+        """Compute all accelerations from qdd, after the rates; then the base may move too.
 
         Closures hold relative to the base: unknown rates and accelerations do not depend on it.
         """
@@ -377,7 +377,7 @@ class Traced:
         self.motion.set_accelerations(self.du, qdd)
 
     def rate_columns(self) -> list[Objects]:
-        """Rates of the unknowns per joint rate."""
+        """Return rates of the unknowns per joint rate."""
         kept = self.scheme.independent
         return [self._unknown(self.lu.solve(-self.jq[kept][:, j])) for j in range(self.joints)]
 

@@ -28,9 +28,7 @@ from pkm_twin.machine import schema
 from pkm_twin.machine.file_parts import find_parts, find_passive_limits
 from pkm_twin.machine.formulas import PARAMETERS, Book
 from pkm_twin.machine.friction import not_shared
-from pkm_twin.machine.graph import (
-    Graph,
-)
+from pkm_twin.machine.graph import Graph
 from pkm_twin.machine.graph_file import (
     KINDS,
     PER_COPY,
@@ -69,21 +67,12 @@ from pkm_twin.robot.robot_urdf import robot_description
 
 M = TypeVar("M", bound="Machine")
 
-RUBS: Final = 1e-12
-"""Viscous friction that is none, N m s/rad or N s/m."""
-MOST_JOINTS: Final = 12
+MAX_JOINTS: Final = 12
 """Most actuated joints."""
-
-
-_ELASTIC: Final = (
-    ("bodies", "member"),
-    ("joints", "compliance"),
-    ("rods", "section"),
-    ("rods", "radius"),
-)
-"""What a graph has no place for, by the kind of its entry."""
-_TURNING: Final = {"joint": "rad", "effort": "N m", "rotor": "kg m2"}
-_SLIDING: Final = {"joint": "m", "effort": "N", "rotor": "kg"}
+_ELASTIC: Final = (("bodies", "member"), ("joints", "compliance"), ("rods", "section"), ("rods", "radius"))
+"""Elastic keys, which a graph does not have, by the kind of their entry."""
+_GEOMETRY: Final = ("at", "axis", "axes", "ends", "azimuths")
+"""Keys of places and directions."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -148,8 +137,8 @@ class Machine(TwinRobot):
         if not book.formulas:
             specs = _without_rounding(data, graph, specs, name)
             graph = graph_of_entries(file.platform, specs, file.origin)
-        if len(graph.actuated) > MOST_JOINTS:
-            raise ParameterError("joints", len(graph.actuated), f"at most {MOST_JOINTS} actuated joints")
+        if len(graph.actuated) > MAX_JOINTS:
+            raise ParameterError("joints", len(graph.actuated), f"at most {MAX_JOINTS} actuated joints")
         own = drives_of(graph, specs["joints"])
         leads = choose_leads(graph, file.redundancy.leads or (), len(file.pose or ()))
         graph = shared_by(graph, leads, file.redundancy, own["limits"].effort)
@@ -185,9 +174,9 @@ class Machine(TwinRobot):
         return robot
 
     def changed(self: M, **sections: Mapping[str, object] | object) -> M:
-        """As of every robot; friction and limits are those of the joints' entries too.
+        """Copy with new values; friction and limits go into the joints' entries too.
 
-        ``parameters`` stand for the numbers that follow from them.
+        Numbers whose expressions contain changed ``parameters`` follow.
         """
         parameters = sections.pop(PARAMETERS, {})
         if isinstance(parameters, Mapping) and parameters:
@@ -225,10 +214,10 @@ class Machine(TwinRobot):
             )
 
     def numbered(self, values: Mapping[str, Any]) -> Machine:
-        """Paths of entries, ``joints.ball_1.at[0]``, or of a limb's, ``limbs.joints.ball.at[0]``.
+        """Copy the machine with other numbers at ``joints.ball_1.at[0]``, ``limbs.joints.ball.at[0]``.
 
-        A limb's number is that of all its copies, in the axes of azimuth zero; of an azimuth, the
-        copy is turned on.
+        A limb's number is that of all its copies, in the axes of azimuth zero; another azimuth
+        turns its copy.
         """
         book, values = self.book.moved(self.resolved(values))
         sources = dict(self.sources)
@@ -260,7 +249,7 @@ class Machine(TwinRobot):
         return made._with(described=described, specs=specs, sources=sources, book=book, **own)
 
     def with_file_values(self, values: Mapping[str, Any]) -> Any:
-        """As of every robot; parameters and expressions stay, but where a copy's number is new."""
+        """Return the machine of the same file with other numbers, where possible with its expressions."""
         data: Any = copy.deepcopy(self.book.data)
         values = self.resolved(values)
         kept = data and (self.book.values or self.book.formulas)
@@ -272,7 +261,7 @@ class Machine(TwinRobot):
         return type(self).from_data(data, self.name)
 
     def check_number(self, path: str) -> None:
-        """As a file's, in each of the entries that have it."""
+        """Check a number in each of the entries that have it."""
         path = self.own_path(path)
         keys = full_keys(path)
         for moved in self.book.moving([str(keys[-1])]) if keys[0] == PARAMETERS else ():
@@ -285,7 +274,7 @@ class Machine(TwinRobot):
             super().check_number(path)
 
     def number(self, path: str) -> float:
-        """Of a limb's numbers those of its first copy."""
+        """Return the number at a path; of a limb that of its first copy."""
         path = self.own_path(path)
         keys = full_keys(path)
         if keys[0] == PARAMETERS:
@@ -297,7 +286,7 @@ class Machine(TwinRobot):
         return super().number(path)
 
     def own_path(self, path: str) -> str:
-        """Friction and limits of the drives, ``friction.viscous[0]``, stand at the joints."""
+        """Return the path at the joint's entry of a drive's friction or limit: friction.viscous[0]."""
         section, key, k, *rest = [*keys_of(path), "", ""]
         drive = section in ("friction", "limits") and isinstance(k, int)
         if not drive or int(k) >= self.joints_count:
@@ -305,7 +294,7 @@ class Machine(TwinRobot):
         return path_of(["joints", self.joint_names[int(k)], section, key, *rest[:-2]])
 
     def named(self, keys: Sequence[str | int]) -> Iterator[tuple[str, str, Keys, float]]:
-        """As of every robot; of a limb's entry all copies; keys ``azimuth`` for a limb's own."""
+        """Yield the entries that keys name; of a limb all copies, keys ``azimuth`` for a limb's own."""
         keys = list(keys)
         for (kind, name), source in self.sources.items():
             if keys[:2] == [kind, name]:
@@ -324,24 +313,24 @@ class Machine(TwinRobot):
 
     @property
     def description(self) -> str:
-        """How many of what."""
+        """Numbers of actuated joints, bodies, joints and rods, and the pose coordinates."""
         g = self.graph
         counts = {"bodies": len(g.bodies), "joints": len(g.joints), "rods": len(g.rods)}
         parts = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
-        pose = ", ".join(self.pose_names)
-        drives = _counted(len(g.actuated), "actuated joint")
+        n, m = len(g.actuated), len(g.leads)
+        drives = f"{n} actuated joint{'s' * (n != 1)}"
         if self.redundant:
-            drives += f" for {_counted(len(g.leads), 'degree')} of freedom"
-        return f"{drives}, the platform moves in {pose}; {parts}"
+            drives += f" for {m} degree{'s' * (m != 1)} of freedom"
+        return f"{drives}, the platform moves in {', '.join(self.pose_names)}; {parts}"
 
     @property
     def mobility(self) -> str:
-        """Number and the pose coordinates."""
+        """Degrees of freedom and the pose coordinates."""
         return f"{self.engine.mobility.freedoms}: {', '.join(self.pose_names)}"
 
     @property
     def limb_names(self) -> tuple[str, ...]:
-        """Names of the actuated joints: each drives a limb."""
+        """Names of the actuated joints, each of which drives a limb."""
         return self.graph.actuated
 
     @property
@@ -368,49 +357,51 @@ class Machine(TwinRobot):
         return robot_description(self)
 
     def parameter_units(self) -> dict[str, Any]:
-        """Units of the same, of each joint by its own type."""
+        """Return units of the sections' numbers; of a joint by its own type."""
         sections = self.parameter_sections()
         plain = {key: value for key, value in sections.items() if key not in KINDS}
         result = schema.units(MachineFile, plain, {"effort": self.effort_unit})
+        turning = {"joint": "rad", "effort": "N m", "rotor": "kg m2"}
+        sliding = {"joint": "m", "effort": "N", "rotor": "kg"}
         for kind, spec in KINDS.items():
             result[kind] = {}
             for name, entry in sections.get(kind, {}).items():
                 slides = kind == "joints" and self.graph.joints[name].slides
-                words = _SLIDING if slides else _TURNING
-                result[kind][name] = schema.units(spec, entry, words)
+                result[kind][name] = schema.units(spec, entry, sliding if slides else turning)
         return result
 
     def file_numbers(self) -> dict[str, tuple[float, str]]:
-        """As of every robot, and the parameters."""
+        """List the file's numbers and its parameters, with their units."""
         units = self.parameter_units()
-        known = self.book.units({path: self._unit_of(path, units) for path in self.book.formulas})
+
+        def find_unit(path: str) -> str:
+            keys: Sequence[str | int] = full_keys(path)
+            for kind, name, where, _ in self.named(keys):
+                keys = [kind, name, *where]
+                break
+            unit: Any = units
+            for key in keys:
+                unit = "rad" if key == "azimuth" else unit
+                unit = unit.get(key, "") if isinstance(unit, Mapping) else unit
+            return unit if isinstance(unit, str) else ""
+
+        known = self.book.units({path: find_unit(path) for path in self.book.formulas})
         own = {f"{PARAMETERS}.{n}": (v, known[n]) for n, v in self.book.values.items()}
         return super().file_numbers() | own
 
-    def _unit_of(self, path: str, units: Any) -> str:
-        """Return the unit of a number of the file."""
-        keys = full_keys(path)
-        for kind, name, where, _ in self.named(keys):
-            keys = [kind, name, *where]
-            break
-        for key in keys:
-            units = "rad" if key == "azimuth" else units
-            units = units.get(key, "") if isinstance(units, Mapping) else units
-        return units if isinstance(units, str) else ""
-
     def friction_key(self, joint: str, what: str) -> Keys:
-        """Of a limb's joint in a list, one number a copy."""
+        """Return the keys of a joint's friction; a limb's joint has a list, one number per copy."""
         source = self.sources["joints", joint]
         tail: Keys = () if source.copies == 1 else (source.copy,)
         return (*source.path, "friction", what, *tail)
 
     def rotor_key(self, joint: str) -> Keys:
-        """Of a limb's joint once for all copies."""
+        """Return the keys of a joint's rotor, a limb's once for all copies."""
         tail = ["rotor_inertia"] if self.specs["joints"][joint].drive is None else ["drive", "inertia"]
         return (*self.sources["joints", joint].path, *tail)
 
     def mass_keys(self) -> Iterator[Keys]:
-        """Of every body with a mass and every rod, once for all copies of a limb."""
+        """Yield the keys of masses, centres and inertias, a limb's once for all copies."""
         found: dict[Keys, None] = {}
         for kind, entries in (("bodies", self.graph.bodies), ("rods", self.graph.rods)):
             for name, entry in entries.items():
@@ -428,7 +419,7 @@ class Machine(TwinRobot):
         return find_passive_limits(self.graph, self.specs)
 
     def elastic_entries(self) -> dict[str, dict[str, dict[str, Any]]]:
-        """Members of bodies, sections and radii of rods, compliances of joints."""
+        """Return members of bodies, sections and radii of rods, compliances of joints, for a file."""
         told: dict[str, dict[str, dict[str, Any]]] = {kind: {} for kind in KINDS}
         for kind, word in _ELASTIC:
             for name, spec in self.specs[kind].items():
@@ -439,7 +430,7 @@ class Machine(TwinRobot):
 
     @cached_property
     def led(self) -> Machine:
-        """Of drives that share the effort: those that lead; the others keep friction and rotor.
+        """The machine whose leading drives alone are actuated; the others keep friction and rotor.
 
         :raises ParameterError: a friction law that passive joints do not have.
         """
@@ -461,21 +452,21 @@ class Machine(TwinRobot):
             if spec.drive is not None:
                 slides = self.graph.joints[name].slides
                 joint["rotor_inertia"] = spec.drive.reflected(slides, f"joints.{name}.drive")
-            # Its rate is asked for where there is friction.
-            viscous = max(float(self.friction.viscous[k]), RUBS)
+            # A joint with friction, however small, is one whose rate is computed.
+            viscous = max(float(self.friction.viscous[k]), 1e-12)
             joint["friction"] = {"viscous": viscous, "coulomb": float(self.friction.coulomb[k])}
             data["joints"][name] = joint
         return type(self).from_data(data, self.name)
 
     def sharing_entries(self) -> dict[str, Any]:
-        """Of the file, with the joints that lead."""
+        """Return the section ``redundancy`` with the leading joints, for a file."""
         if not self.redundant:
             return {}
         own = schema.plain(self.redundancy)
         return {"redundancy": {**own, "leads": list(self.graph.leads)}}
 
     def passive_entries(self) -> dict[str, dict[str, dict[str, Any]]]:
-        """Limits of passive joints, swivels of rods."""
+        """Return limits of passive joints and swivels of rods, for a file."""
         told: dict[str, dict[str, dict[str, Any]]] = {"joints": {}, "rods": {}}
         for limit in self.passive_limits:
             if limit.kind == "rod":
@@ -486,15 +477,6 @@ class Machine(TwinRobot):
             else:
                 told["joints"][limit.joint] = {"limits": {"position": [limit.low, limit.high]}}
         return told
-
-
-def _counted(count: int, name: str) -> str:
-    """Return a number of things in words: `1 joint`, `2 joints`."""
-    return f"{count} {name}{'' if count == 1 else 's'}"
-
-
-_GEOMETRY: Final = ("at", "axis", "axes", "ends", "azimuths")
-"""Keys of places and directions."""
 
 
 def _without_rounding(
