@@ -354,13 +354,11 @@ class UprRpu(TwinRobot):
             d = (head - foot) / reach
             low, high = f"lower tube {limb}", f"upper tube {limb}"
             diameter = members.diameter[i]
+            half, radius = reach / 2, diameter / 2
+            weight = density * math.pi * radius**2 * half
+            across, along = weight * (half**2 / 12 + radius**2 / 4), weight * radius**2 / 2
             for name, at in ((low, foot + 0.25 * reach * d), (high, head - 0.25 * reach * d)):
-                bodies[name] = Body(name, 0.0, array(at))
-                if inertia is not None:
-                    half, radius = reach / 2, diameter / 2
-                    weight = density * math.pi * radius**2 * half
-                    across, along = weight * (half**2 / 12 + radius**2 / 4), weight * radius**2 / 2
-                    bodies[name] = Body(name, weight, array(at), array(axial(across, along, d)))
+                bodies[name] = Body(name, weight, array(at), array(axial(across, along, d)))
             section = Section(
                 members.youngs_modulus,
                 members.shear_modulus,
@@ -370,14 +368,33 @@ class UprRpu(TwinRobot):
                 members.shear_factor,
             )
             bar, ends = f"{limb}B", ((low, foot), (high, head))
-            beams.append(Beam(bar, bar, i, *ends, (low, high), diameter / 2, (), section))
+            beams.append(Beam(bar, bar, i, *ends, (low, high), radius, (), section))
             compliances[f"{limb}U"] = (soft.upr_universal if i < 2 else soft.rpu_universal).tolist()
             compliances[f"{limb}R"] = (soft.upr_revolute if i < 2 else soft.rpu_revolute).tolist()
-            u = np.cross(_Y, -d) if i < 2 else _X
-            v = _Y if i < 2 else np.cross(-d, _X)
-            turning = high if i < 2 else low
-            revolute = _named((turning, u), (turning, v), (turning, -d))
-            universal = _named((BASE if i < 2 else high, _X), (low if i < 2 else PLATFORM, _Y))
+            # UPR: the universal joint stands on the base; RPU: at the platform.
+            at_base, at_platform = ((BASE, low), foot), ((high, PLATFORM), head)
+            (pair, at), (other_pair, other_at) = (at_base, at_platform) if i < 2 else (at_platform, at_base)
+            inner, outer, w = *pair, np.cross(_X, _Y)
+            universal = Joint(
+                f"U joint {limb}",
+                "universal",
+                *pair,
+                at,
+                array([_X, _Y]),
+                directions=_directions(((inner, _X), (outer, _Y), (inner, w))),
+                label=f"{limb}U",
+            )
+            axis, turning = (_Y, high) if i < 2 else (_X, low)
+            u, v = (np.cross(_Y, -d), _Y) if i < 2 else (_X, np.cross(-d, _X))
+            revolute = Joint(
+                f"R joint {limb}",
+                "revolute",
+                *other_pair,
+                other_at,
+                array([axis]),
+                directions=_directions(((turning, u), (turning, v), (turning, -d))),
+                label=f"{limb}R",
+            )
             drive = Joint(
                 self.joints[i],
                 "prismatic",
@@ -390,18 +407,7 @@ class UprRpu(TwinRobot):
                 rotor_inertia=rotor,
                 label=f"P joint {limb}",
             )
-            if i < 2:
-                chain = [
-                    _joint(f"U joint {limb}", (BASE, low), foot, [_X, _Y], universal, f"{limb}U"),
-                    drive,
-                    _joint(f"R joint {limb}", (high, PLATFORM), head, [_Y], revolute, f"{limb}R"),
-                ]
-            else:
-                chain = [
-                    _joint(f"R joint {limb}", (BASE, low), foot, [_X], revolute, f"{limb}R"),
-                    drive,
-                    _joint(f"U joint {limb}", (high, PLATFORM), head, [_X, _Y], universal, f"{limb}U"),
-                ]
+            chain = (universal, drive, revolute) if i < 2 else (revolute, drive, universal)
             joints |= {joint.name: joint for joint in chain}
         bodies[PLATFORM] = Body(PLATFORM, 0.0, origin)
         if inertia is not None:
@@ -411,21 +417,6 @@ class UprRpu(TwinRobot):
         return Parts(Graph(bodies, joints, {}, PLATFORM, origin), tuple(beams), compliances, order)
 
 
-def _joint(
-    name: str,
-    pair: tuple[str, str],
-    at: Array,
-    axes: Sequence[Array],
-    directions: tuple[Direction, ...],
-    label: str,
-) -> Joint:
-    kind = "universal" if len(axes) == 2 else "revolute"
-    return Joint(name, kind, *pair, at, array(axes), directions=directions, label=label)
-
-
-def _named(*given: tuple[str, Array]) -> tuple[Direction, ...]:
-    """Directions u, v and w; without a third one it is normal to both, at home too."""
-    known = list(given)
-    if len(known) == 2:
-        known.append((known[0][0], np.cross(known[0][1], known[1][1])))
-    return tuple(Direction(n, body, array(v)) for n, (body, v) in zip("uvw", known, strict=True))
+def _directions(axes: Sequence[tuple[str, Array]]) -> tuple[Direction, ...]:
+    """Return directions u, v and w, each fixed in a body."""
+    return tuple(Direction(name, body, array(v)) for name, (body, v) in zip("uvw", axes, strict=True))

@@ -518,7 +518,7 @@ class Mechanism(Common):
 
         :raises ParameterError: a limit that would bound the workspace is missing.
         """
-        paths = [self.own_path(f"{self.limit_key}[{k}]") for k in range(self.joints_count)]
+        paths = [self.own_path(f"{self.limit_key}[{k}]").removesuffix(f"[{k}]") for k in range(self.joints_count)]
         place = position_box(self.graph, self.limits.position, self.passive_limits, paths)
         rows = []
         for c in self.coordinates:
