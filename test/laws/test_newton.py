@@ -12,6 +12,7 @@ import pytest
 from pkm_twin.codegen import expressions as ex
 from pkm_twin.codegen.program import STATE, Equations, Program, previous
 from pkm_twin.errors import PkmTwinError
+from pkm_twin.kinematics.iterations import newton, solve_damped
 from test.support.bodies import PlainKernel
 
 INPUTS = ("q", "start", "near", "foreseen", "pace", "scale", "gap", "side")
@@ -123,3 +124,32 @@ def test_a_program_reads_inputs_of_its_own_alone(name, index):
     tape = ex.Tape()
     with pytest.raises(PkmTwinError, match=rf"reads {name}\[{index}\]"):
         Program({"q": 1}, 0, {"y": [tape.input("q", 0) + tape.input(name, index)]})
+
+
+@pytest.mark.parametrize(
+    ("values", "closed"),
+    [
+        pytest.param(lambda x: x * x - 2.0, True, id="a simple root"),
+        pytest.param(lambda x: (x - 1.5) ** 2, False, id="a double root, where steps halve at best"),
+        pytest.param(lambda x: x * x + 1.0, False, id="no root"),
+        pytest.param(lambda x: x / 0.0, False, id="values that are not finite"),
+    ],
+)
+def test_newton_on_numbers_accepts_a_simple_root_alone(values, closed):
+    def look(x):
+        with np.errstate(all="ignore"):
+            return values(x), np.diag((values(x + 1e-7) - values(x - 1e-7)) / 2e-7)
+
+    x, found = newton(np.array([1.0]), look, np.add, iterations=60)
+    assert found == closed
+    if closed:
+        assert abs(values(x)[0]) < 1e-12
+
+
+def test_damped_steps_end_in_the_least_squares_of_equations_that_contradict_each_other(rng):
+    table, values = rng.normal(size=(5, 3)), rng.normal(size=5)
+    x, closed = newton(
+        np.zeros(3), lambda x: (table @ x - values, table), np.add, solve_damped, iterations=60, gain=inf, tolerance=0.0
+    )
+    assert not closed
+    np.testing.assert_allclose(x, np.linalg.lstsq(table, values, rcond=None)[0], atol=1e-9)
