@@ -99,7 +99,7 @@ class Repair:
 
     @property
     def text(self) -> str:
-        """What was done, in words."""
+        """A sentence about the largest move."""
         return (
             f"axes and points were moved by up to {self.largest:.1g} (rad, or parts of the "
             "machine's size), so that the machine can move: the file is rounded"

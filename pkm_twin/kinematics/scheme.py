@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""What programs of a graph depend on: closures that are solved, their pivots, pose coordinates."""
+"""How a graph's equations are solved: independent closures, their pivots, pose coordinates."""
 
 from __future__ import annotations
 
@@ -31,7 +31,8 @@ from pkm_twin.machine.graph import BASE, Graph
 from pkm_twin.machine.tree import Step, Tree
 
 MOVES: Final = 1e-6
-"""Motion of a drive at home, of unit one, and part of the best choice of drives, that is none."""
+"""Least motion of a drive at home, of unit one, and least determinant of a choice of drives, as part
+of the best one's: below, rounding decides."""
 
 POSE_MOVES: Final = (1e-3, 1e-6)
 """Least motion of the platform along a pose coordinate, of unit one: more than any file's rounding,
@@ -64,12 +65,12 @@ class Scheme(Linkage):
 
     @cached_property
     def geometry(self) -> Array:
-        """What programs take of the machine's geometry, shape (k,)."""
+        """The geometry's numbers that programs take as inputs, shape (k,)."""
         return np.array(geometry_of(self.graph), np.float64)
 
     @cached_property
     def structure(self) -> ProgramKey:
-        """All that programs depend on: machines of one structure share them."""
+        """The key of everything that programs depend on; machines of one structure share programs."""
         return EMPTY.also(
             repr(
                 (
@@ -93,7 +94,7 @@ class Scheme(Linkage):
 
     @cached_property
     def independent(self) -> list[int]:
-        """Closures that determine the unknowns; the others only judge.
+        """Independent loop constraints, which are solved; the others only judge the result.
 
         :raises ParameterError: something can move while the actuated joints are held.
         """
@@ -105,12 +106,12 @@ class Scheme(Linkage):
 
     @property
     def varying(self) -> list[int]:
-        """Unknown rates of coordinates that the closures do not hold at their value at home."""
+        """Unknown rates that are solved: those of coordinates that closures do not hold at home."""
         return list(range(self.tree.unknown_rates))
 
     @property
     def held(self) -> list[int]:
-        """The other unknown rates."""
+        """Unknown rates of coordinates that closures hold at their value at home."""
         return []
 
     def varies(self, step: Step) -> bool:
@@ -123,17 +124,17 @@ class Scheme(Linkage):
 
     @property
     def holding(self) -> list[int]:
-        """Closures that hold these coordinates."""
+        """Closures that hold the coordinates of :attr:`held`."""
         return []
 
     @property
     def holding_pivots(self) -> Order:
-        """Pivots of these closures by the coordinates."""
+        """Pivots of the closures :attr:`holding` by the coordinates :attr:`held`."""
         return ()
 
     @cached_property
     def pivots(self) -> Order:
-        """Of the independent closures by the unknowns, good in states near home."""
+        """Pivots of the independent closures by the unknowns, good in states near home."""
         return pivot_order(self._sampled[0][:, self.independent][:, :, self.varying])
 
     @cached_property
@@ -155,12 +156,12 @@ class Scheme(Linkage):
 
     @property
     def judged(self) -> list[int]:
-        """Closures of which the residual decides."""
+        """Closures whose residual decides whether a state is accepted."""
         return list(range(len(self.parts)))
 
     @cached_property
     def solved(self) -> tuple[list[int], list[int]]:
-        """What Newton's method has: indices of the unknowns, and of their rates."""
+        """Indices of Newton's unknowns, and of their rates: without limbs in closed form."""
         inner = {body for limb in self.limbs for body in limb.bodies}
         places, rates = list(range(len(self.tree.home))), list(range(self.tree.unknown_rates))
         for link in self.tree.links.values():
@@ -179,13 +180,13 @@ class Scheme(Linkage):
         return place_in_order(tree, self.order, x, q)
 
     def solved_rows(self, rows: Sequence[Row], poses: Sequence[LimbPose]) -> list[Row]:
-        """Of the independent closures those of no limb; and what limbs leave to other joints."""
+        """Return Newton's equations: independent closures of no limb, and equations that limbs leave."""
         limbs = {k for limb in self.limbs for k in limb.rows}
         return [rows[k] for k in self.independent if k not in limbs] + [row for pose in poses for row in pose.rows]
 
     @cached_property
     def solved_pivots(self) -> Order:
-        """As :attr:`pivots`, of the equations that Newton's method has."""
+        """Pivots of Newton's equations, good in states near home."""
         if not self.limbs:
             return self.pivots
         samples = []
@@ -197,7 +198,7 @@ class Scheme(Linkage):
 
     @cached_property
     def inverse_pivots(self) -> Order:
-        """The same of independent closures and pose by the unknowns and q."""
+        """Pivots of independent closures and pose by the unknowns and q, good in states near home."""
         samples = []
         for x, q in self.samples:
             there, closed = self.at(x, q)
@@ -257,7 +258,7 @@ class Scheme(Linkage):
         return np.array([0.0 if c.axis is None else origin[c.axis] for c in self.coordinates])
 
     def _inverse_matrix(self, motion: Motion, rows: Sequence[Row], pose: Numbers) -> Array:
-        """Scaled derivatives of independent closures and pose equations by u and qd."""
+        """Return scaled derivatives of independent closures and pose equations by u and qd."""
         ju, jq = self.scaled(rows)
         extra = self.pose_rows(motion, pose)
         table = np.array(self._pose_scales)[:, None] * numbers(extra)
@@ -316,7 +317,7 @@ def choose_leads(graph: Graph, wanted: Sequence[str] = (), pose: int = 0) -> tup
 
 
 def choose_coordinates(graph: Graph) -> tuple[str, ...]:
-    """Pose coordinates that determine the platform at home, as people command it.
+    """Choose pose coordinates that determine the platform at home, as people command it.
 
     If rotations alone determine it, as of an ankle, these are those that move most; else the first
     coordinates that do.

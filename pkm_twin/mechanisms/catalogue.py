@@ -134,5 +134,5 @@ def robot_of_data(data: Mapping[str, Any], name: str) -> Robot:
         raise UnknownNameError("mechanism", mechanism, CATALOGUE)
     module, kind = CATALOGUE[mechanism].split(":")
     made: type[Robot] = getattr(importlib.import_module(module), kind)
-    # A file's name may be of anything, and ends in titles, XML and JSON.
+    # File names are untrusted: they appear in titles, XML and JSON.
     return made.from_data(data, one_line(name, 200))

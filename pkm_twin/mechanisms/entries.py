@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ from pkm_twin.robot.urdf_read import read_urdf
 
 @dataclass(frozen=True)
 class Chosen:
-    """A new number of a file, and what stands above it."""
+    """A new number of a file, and the comment above it."""
 
     value: float
     comment: str
@@ -32,7 +33,7 @@ class Chosen:
 
 @dataclass(frozen=True)
 class Fitted:
-    """A new number of a file, its standard deviation in the same unit, and where it is from."""
+    """A new number of a file, its standard deviation in the same unit, and its source."""
 
     value: float
     deviation: float
@@ -41,7 +42,7 @@ class Fitted:
 
     @property
     def comment(self) -> str:
-        """What stands above the number."""
+        """The comment above the number."""
         unit = f" {self.unit}" if self.unit else ""
         return f"+- {self.deviation:.2g}{unit} (standard deviation), {self.source}"
 
@@ -87,7 +88,7 @@ def write_edited(path: Path, head: Sequence[str], text: str, before: Robot) -> l
         after = robot_of_data(parse_yaml(text, str(path)), path.stem)
     except ValueError as error:
         raise PkmTwinError(f"the values are not a valid robot, so {path} is not written: {error}") from None
-    # A name in it may have anything in it, a new line too.
+    # Names are untrusted: they may contain line breaks.
     lost = before.book.lost(after.book)
     whole = "".join(f"# {one_line(line, 2000)}\n" for line in (*head, *lost)) + text
     try:
@@ -105,7 +106,10 @@ def robot_text(name: str, *, per_copy: bool = False, **part: Any) -> tuple[str, 
         says of elasticity.
     """
     robot = load(name, **part)
-    if per_copy and not robot.elastic_entries() and _elastic(robot):
+    elastic = False
+    with suppress(ParameterError):
+        elastic = bool(robot.structure())
+    if per_copy and elastic and not robot.elastic_entries():
         raise ParameterError(
             "--per-copy",
             robot.name,
@@ -120,12 +124,3 @@ def robot_text(name: str, *, per_copy: bool = False, **part: Any) -> tuple[str, 
     else:
         return path.read_text(encoding="utf-8"), robot
     return describe_machine_yaml(data), robot_of_data(data, path.stem)
-
-
-def _elastic(robot: Robot) -> bool:
-    """Whether its file has elastic members or joints."""
-    try:
-        robot.structure()
-    except ParameterError:
-        return False
-    return True
