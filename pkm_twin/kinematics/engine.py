@@ -101,24 +101,21 @@ class Engine(Scheme):
             an assembly behind a singularity, the closures' least reciprocal condition on the way.
         """
         _, x, least = self.reach(q, max(reached, 1e-12) + 1 / 8)
-        part, miss = self._shortest(x, q)
-        # Where nothing falls short there is an assembly, but the way does not lead to it.
-        return part, miss, least if miss < MET * self.tree.size else None
-
-    def _regularity(self, x: Array, q: Array) -> tuple[float, float]:
-        """Return the sign of the independent closures' determinant, and their reciprocal condition."""
-        matrix = self._look(q, x)[1][self.independent]
-        return float(np.linalg.slogdet(matrix)[0]), _reciprocal(matrix)
-
-    def _shortest(self, x: Array, q: Array) -> tuple[str, float]:
-        """Return the closure with the largest miss at the least-squares point, and its miss, m."""
         look = partial(self._look, q)
         x, _ = newton(x, look, partial(self._moved, q), solve_damped, iterations=20, **TO_THE_END)
         values = look(x)[0]
         if not np.isfinite(values).all():
-            return self.parts[0], math.inf
+            return self.parts[0], math.inf, None
         worst = int(np.abs(values).argmax())
-        return self.parts[worst], float(abs(values[worst])) * self.tree.size
+        miss = float(abs(values[worst])) * self.tree.size
+        # Where nothing falls short there is an assembly, but the way does not lead to it.
+        return self.parts[worst], miss, least if miss < MET * self.tree.size else None
+
+    def _regularity(self, x: Array, q: Array) -> tuple[float, float]:
+        """Return the sign of the independent closures' determinant, and their reciprocal condition."""
+        matrix = self._look(q, x)[1][self.independent]
+        s = np.linalg.svd(matrix, compute_uv=False)
+        return float(np.linalg.slogdet(matrix)[0]), float(s[-1] / s[0]) if s.size and s[0] > 0.0 else 0.0
 
     def shortest_pose(self, pose: Array) -> tuple[str, float, bool]:
         """Return the closure with the largest miss while the platform is held in a pose.
@@ -290,12 +287,6 @@ class Engine(Scheme):
     def acceleration(self) -> Kernel:
         """q, qd, qdd to the second derivative of the pose (m)."""
         return self.kernel("acceleration", acceleration_program)
-
-
-def _reciprocal(matrix: Array) -> float:
-    """Return the reciprocal condition number."""
-    s = np.linalg.svd(matrix, compute_uv=False)
-    return float(s[-1] / s[0]) if s.size and s[0] > 0.0 else 0.0
 
 
 _engines: Final[WeakValueDictionary[ProgramKey, Engine]] = WeakValueDictionary()

@@ -391,7 +391,9 @@ def check_masses(scheme: Scheme, graph: Graph) -> None:
             np.sqrt(graph.joints[name].rotor_inertia) * rate for name, rate in zip(graph.actuated, rates, strict=True)
         ]
         for body in graph.bodies.values():
-            root = _root(body.inertia)
+            # A root R of the inertia, R' R.
+            moments, axes = np.linalg.eigh(body.inertia)
+            root = np.sqrt(np.maximum(moments, 0.0))[:, None] * axes.T
             column += [*(math.sqrt(body.mass) * numbers(motion.velocity(body.name, body.com)))]
             column += [*(root @ numbers(motion.omega[body.name]))]
         for rod in graph.rods.values():
@@ -410,9 +412,3 @@ def check_masses(scheme: Scheme, graph: Graph) -> None:
         graph.bodies[idle].mass,
         f"mass or rotor_inertia that resists {joint.name}: no massless body can move alone",
     )
-
-
-def _root(inertia: Array) -> Array:
-    """Return a matrix R whose product R' R is the symmetric matrix."""
-    values, vectors = np.linalg.eigh(inertia)
-    return np.asarray(np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T, np.float64)

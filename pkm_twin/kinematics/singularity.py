@@ -52,7 +52,7 @@ from pkm_twin.kinematics.motion import (
     numbers,
 )
 from pkm_twin.kinematics.traced import Traced
-from pkm_twin.machine.graph import BASE, Graph, Rod, groups
+from pkm_twin.machine.graph import BASE, Graph, groups
 from pkm_twin.machine.tree import Tree
 
 
@@ -136,17 +136,16 @@ class Placed(Motion):
 
     def closures(self) -> list[Row]:
         """Return the equations of all cut joints and rods, and the couples of pairs of rods."""
-        pairs = [self._couple(rod) for rod in self.graph.rods.values() if rod.pair is not None]
-        return [*super().closures(), *pairs]
-
-    def _couple(self, rod: Rod) -> Row:
-        """Return the equation of a pair's lengths: no turn about their plane's normal, t x w."""
-        bodies, (start, end) = (rod.inner, rod.outer), rod.ends
-        points = self.point(rod.inner, start), self.point(rod.outer, end)
-        pair = np.asarray(rod.pair)
-        vectors = self.direction(rod.inner, pair), self.direction(rod.outer, pair)
-        one = keep_pair(rod.name, bodies, points, vectors, norm(plain(end - start)))
-        return self._row(one, self._differences(one))
+        rows = super().closures()
+        for rod in self.graph.rods.values():
+            if rod.pair is not None:
+                # The pair's equal lengths: no turn about their plane's normal, t x w.
+                bodies, (start, end), pair = (rod.inner, rod.outer), rod.ends, np.asarray(rod.pair)
+                points = self.point(rod.inner, start), self.point(rod.outer, end)
+                vectors = self.direction(rod.inner, pair), self.direction(rod.outer, pair)
+                one = keep_pair(rod.name, bodies, points, vectors, norm(plain(end - start)))
+                rows.append(self._row(one, self._differences(one)))
+        return rows
 
 
 def _singularity(t: Traced) -> Program:
