@@ -27,13 +27,6 @@ States = NDArray[np.int8]
 
 TOLERANCE: Final = 1e-7
 """Tolerance of forces and motions, relative to the largest."""
-BLOCKS: Final = 10
-"""Block pivoting sweeps; then one row changes at a time, which always terminates."""
-REGULAR: Final = 1e-11
-"""Regularisation of dependent rows, relative to the largest diagonal element."""
-
-DEPENDENT: Final = 1e-7
-"""Length of a row's independent part, relative to the row, below which it is dependent."""
 
 
 def resisting(matrix: Array, motion: Array, low: Array, high: Array, states: States) -> tuple[Array, States]:
@@ -57,7 +50,8 @@ def resisting(matrix: Array, motion: Array, low: Array, high: Array, states: Sta
         raise ValueError("the motion is not finite")
     wrong_motion = TOLERANCE * size
     wrong_force = wrong_motion / np.maximum(diagonal, 1e-300)
-    regular = matrix + np.eye(len(motion)) * (REGULAR * diagonal.max())
+    # Dependent rows share their force, by a regularisation far below the tolerance.
+    regular = matrix + np.eye(len(motion)) * (1e-11 * diagonal.max())
     states = np.where(np.isinf(np.where(states > 0, high, low)), 0, states).astype(np.int8)
     for sweep in range(1000):
         force = np.where(states > 0, high, np.where(states < 0, low, 0.0))
@@ -74,14 +68,15 @@ def resisting(matrix: Array, motion: Array, low: Array, high: Array, states: Sta
         changes = np.flatnonzero(turned != states)
         if not len(changes):
             return force, states
-        if sweep >= BLOCKS:
+        if sweep >= 10:
+            # Block pivoting may cycle; one row at a time always terminates.
             changes = changes[:1]
         states[changes] = turned[changes]
     raise ValueError("no forces resist this motion")
 
 
 def independent(rows: Array, inverse: Array) -> list[int]:
-    """Return the indices of the rows that do not depend on earlier ones.
+    """Return the indices of the rows that do not depend on earlier ones, to a part of 1e-7.
 
     :param rows: shape (m, n).
     :param inverse: of the mass matrix, in which they are compared, shape (n, n).
@@ -92,7 +87,7 @@ def independent(rows: Array, inverse: Array) -> list[int]:
         left = row
         for done in basis:
             left = left - (done @ inverse @ left) * done
-        if left @ inverse @ left > DEPENDENT**2 * (row @ inverse @ row):
+        if left @ inverse @ left > 1e-7**2 * (row @ inverse @ row):
             kept.append(i)
             basis.append(left / np.sqrt(left @ inverse @ left))
     return kept
@@ -100,12 +95,6 @@ def independent(rows: Array, inverse: Array) -> list[int]:
 
 ZERO_VELOCITY: Final = 1e-12
 """Velocity that counts as zero, relative to the joints' contributions to it."""
-STIFF: Final = 0.1
-"""Decay by viscous friction in a part of a step above which it is integrated exactly."""
-RANK_TOLERANCE: Final = 1e-12
-"""Singular value below which rows are dependent, relative to the largest."""
-_NONE: Final = np.zeros(0)
-_NOBODY: Final = np.zeros(0, np.intp)
 
 
 @dataclass(slots=True)
@@ -119,24 +108,24 @@ class Law:
     slides: Indices
     signs: Array
     """Rows with dry friction that slide, and which way, shape (m,)."""
-    held: Indices = field(default_factory=lambda: _NOBODY)
+    held: Indices = field(default_factory=lambda: np.zeros(0, np.intp))
     """Rows that hold the others still, drives first, shape (h,)."""
-    low: Array = field(default_factory=lambda: _NONE)
-    high: Array = field(default_factory=lambda: _NONE)
+    low: Array = field(default_factory=lambda: np.zeros(0))
+    high: Array = field(default_factory=lambda: np.zeros(0))
     """Bounds of the forces that hold, shape (h,)."""
-    moves: Indices = field(default_factory=lambda: _NOBODY)
+    moves: Indices = field(default_factory=lambda: np.zeros(0, np.intp))
     """Actuated joints that are not held."""
-    floor: Array = field(default_factory=lambda: _NONE)
-    ceiling: Array = field(default_factory=lambda: _NONE)
+    floor: Array = field(default_factory=lambda: np.zeros(0))
+    ceiling: Array = field(default_factory=lambda: np.zeros(0))
     """How far they may go: to their stops; one that began beyond, no farther."""
 
-    given: Array = field(default_factory=lambda: _NONE)
-    effort: Array = field(default_factory=lambda: _NONE)
+    given: Array = field(default_factory=lambda: np.zeros(0))
+    effort: Array = field(default_factory=lambda: np.zeros(0))
     """Efforts of the drives without offset and dry friction, shape (n,)."""
     wrench: Array | None = None
-    first: Array = field(default_factory=lambda: _NONE)
+    first: Array = field(default_factory=lambda: np.zeros(0))
     """Accelerations at the start, shape (n,)."""
-    force: Array = field(default_factory=lambda: _NONE)
+    force: Array = field(default_factory=lambda: np.zeros(0))
     """Holding forces at the start, shape (h,)."""
 
     @property
@@ -235,8 +224,6 @@ class Resistance:
         pull[law.slides] = np.where(law.signs > 0.0, high[law.slides], low[law.slides])
         return pull
 
-    # Rows.
-
     def rows(self, here: Terms) -> Array:
         """Return the velocities of all rows by joint velocities, shape (n + k, n)."""
         return np.concatenate([self._drives, here.rows]) if self._passive else self._drives
@@ -245,12 +232,6 @@ class Resistance:
         """Return the velocities of all rows, shape (n + k,)."""
         qd = here.qd
         return np.concatenate([qd, here.rows @ qd]) if self._passive else qd
-
-    def seconds(self, here: Terms, a: Array) -> Array:
-        """Return the accelerations of all rows, shape (n + k,)."""
-        return np.concatenate([a, here.rows @ a + here.drift]) if self._passive else a
-
-    # States.
 
     def arrive(self, q: Array, qd: Array) -> Terms:
         """Return the terms of a new state, after an impact if there is one."""
@@ -271,7 +252,7 @@ class Resistance:
         if not ((up & (qd > 0.0)) | (down & (qd < 0.0))).any():
             return here
         j = np.flatnonzero(up | down)
-        across = _inverse(here.mass)[:, j]
+        across = np.linalg.inv(here.mass)[:, j]
         low, high = np.where(down[j], -math.inf, 0.0), np.where(up[j], math.inf, 0.0)
         # Friction, which is bounded, does not hold against an impact.
         impulse, states = resisting(across[j], qd[j], low, high, np.zeros(len(j), np.int8))
@@ -280,8 +261,6 @@ class Resistance:
         qd[up] = np.minimum(qd[up], 0.0)
         qd[down] = np.maximum(qd[down], 0.0)
         return self._anew(self.at(q, qd))
-
-    # Laws.
 
     def law(self, here: Terms, effort: Array, wrench: Array | None) -> Law:
         """Return which rows are held from now on, under efforts (n,) and a wrench (6,) and more."""
@@ -320,8 +299,11 @@ class Resistance:
         :param low: bounds of all rows' forces, shape (n + k,).
         """
         rows = self.rows(here)[z]
-        inverse = _inverse(here.mass)
-        motion = self.seconds(here, law.first)[z]
+        inverse = np.linalg.inv(here.mass)
+        motion = law.first
+        if self._passive:
+            motion = np.concatenate([motion, here.rows @ motion + here.drift])
+        motion = motion[z]
         force, states = resisting(rows @ inverse @ rows.T, motion, low[z], high[z], self._states[z])
         self._states[z] = states
         stays = np.flatnonzero(states == 0)
@@ -362,7 +344,7 @@ class Resistance:
             _, result, bad = dposv(here.mass, rest)
             if bad:
                 raise ValueError("the mass matrix is not positive")
-            return result, _NONE
+            return result, np.zeros(0)
         rows = self.rows(here)[law.held]
         matrix = np.zeros((n + h, n + h))
         matrix[:n, :n] = here.mass
@@ -378,7 +360,8 @@ class Resistance:
         if not self._damped:
             return undamped(span)
         damping = self._damping(here)
-        if span * dposv(here.mass, damping)[1].trace() < STIFF:
+        # A decay below a tenth is no stiffness for the classical method.
+        if span * dposv(here.mass, damping)[1].trace() < 0.1:
             return undamped(span)
         free = self._drives
         if len(law.held):
@@ -402,7 +385,7 @@ class Resistance:
         It needs no constant law, always has a result, and removes energy.
         """
         n = len(here.q)
-        inverse = _inverse(here.mass + span * self._damping(here))
+        inverse = np.linalg.inv(here.mass + span * self._damping(here))
         rest = law.given - here.bias + (0.0 if law.wrench is None else law.wrench @ here.twists)
         rates = inverse @ (here.mass @ here.qd + span * rest)
         up, down = here.q >= self._high, here.q <= self._low
@@ -425,27 +408,29 @@ class Resistance:
         low, high = np.minimum(self._low, here.q), np.maximum(self._high, here.q)
         return self._struck(self.at(np.clip(here.q + span * rates, low, high), rates))
 
-    # Changes.
-
-    def lasts(self, end: Terms, law: Law) -> bool:
-        """Return whether a law holds at the end of a part of a step.
+    def lasting_part(self, here: Terms, end: Terms, law: Law) -> float:
+        """Return the part of a span for which a law lasts, 1 for all of it.
 
         Joints keep their stops, rows that slide their directions, and forces that hold their
-        bounds.
+        bounds. Each of these margins is interpolated linearly between both ends of the span.
         """
-        q = end.q[law.moves]
-        if (q > law.ceiling).any() or (q < law.floor).any():
-            return False
+        before, after = here.q[law.moves], end.q[law.moves]
+        begins, ends = [law.ceiling - before, before - law.floor], [law.ceiling - after, after - law.floor]
         if len(law.slides):
-            rows = self.rows(end)[law.slides]
-            rounding = ZERO_VELOCITY * (np.abs(rows) @ np.abs(end.qd))
-            if (law.signs * (rows @ end.qd) < -rounding).any():
-                return False
-        if not len(law.held):
-            return True
-        force = self.accelerate(law, end)[1]
-        size = ZERO_VELOCITY * np.maximum(np.abs(force), np.abs(law.force))
-        return bool(((force <= law.high + size) & (force >= law.low - size)).all())
+            first, last = (self.rows(t)[law.slides] for t in (here, end))
+            begins.append(law.signs * (first @ here.qd))
+            ends.append(law.signs * (last @ end.qd) + ZERO_VELOCITY * (np.abs(last) @ np.abs(end.qd)))
+        if len(law.held):
+            force = self.accelerate(law, end)[1]
+            size = ZERO_VELOCITY * np.maximum(np.abs(force), np.abs(law.force))
+            begins += [law.high - law.force, law.force - law.low]
+            ends += [law.high - force + size, force - law.low + size]
+        margin, left = np.concatenate(begins), np.concatenate(ends)
+        broken = left < 0.0
+        if not broken.any():
+            return 1.0
+        margin = np.maximum(margin[broken], 0.0)
+        return float((margin / (margin - left[broken])).min())
 
     def settle(self, end: Terms, law: Law) -> Terms:
         """Return the state at the end of a part under a law; rows that are held stay still."""
@@ -455,12 +440,8 @@ class Resistance:
             # Rows of passive joints that are held would drift.
             rows = self.rows(end)[law.held]
             across = np.linalg.solve(end.mass, rows.T)
-            drift = np.linalg.lstsq(rows @ across, rows @ end.qd, rcond=RANK_TOLERANCE)[0]
+            drift = np.linalg.lstsq(rows @ across, rows @ end.qd, rcond=1e-12)[0]
             qd = end.qd - across @ drift
             qd[law.held[law.held < len(qd)]] = 0.0
             end = end if (qd == end.qd).all() else self.at(end.q, qd)
         return self._struck(end)
-
-
-def _inverse(matrix: Array) -> Array:
-    return np.asarray(np.linalg.inv(matrix), np.float64)

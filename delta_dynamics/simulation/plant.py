@@ -23,8 +23,8 @@ from pkm_twin.robot.robot import Robot
 
 PARTS: Final = 100
 """Parts of a step from which on it is integrated implicitly, as changes accumulate."""
-HALVINGS: Final = 12
-"""Times that a part is halved in which what sticks or slides changes; the last is implicit."""
+RESOLUTION: Final = 0.5**12
+"""Shortest part of a step, relative to it: the one in which what sticks or slides changes."""
 GROWTH: Final = 1e-9
 """Energy that the method may add in a part, relative to the kinetic energy; it is removed
 afterwards."""
@@ -38,11 +38,11 @@ class Plant:
 
     Between changes a step is one of a Runge-Kutta method of order four that is exact in viscous
     friction, however stiff; efforts and wrench are constant in it. Dry friction of all joints and
-    stops obey Coulomb's law: a joint sticks exactly and leaves only beyond its friction. A part in
-    which what sticks or slides changes is halved down to 1/4096 of the step, which is integrated
-    implicitly. Stops do not bounce: an impact projects the rates, in the mass matrix, onto those
-    that all stops allow. Energy grows by what efforts and wrench do and by nothing else; a part
-    that gains some is halved, too.
+    stops obey Coulomb's law: a joint sticks exactly and leaves only beyond its friction. A part
+    ends just before what sticks or slides changes, by linear interpolation; the change itself is
+    within 1/4096 of the step, which is integrated implicitly. Stops do not bounce: an impact
+    projects the rates, in the mass matrix, onto those that all stops allow. Energy grows by what
+    efforts and wrench do and by nothing else; a part that gains some is halved.
     """
 
     robot: Robot
@@ -103,15 +103,17 @@ class Plant:
         q, qd = self.q[self._leading], self.qd[self._leading]
         if here is None or here.q.tobytes() + here.qd.tobytes() != q.tobytes() + qd.tobytes():
             here = self._resistance.arrive(q, qd)
-        least, span = step * 0.5**HALVINGS, step
+        least, span, changes = step * RESOLUTION, step, False
         for part in itertools.count():
             # Where changes accumulate, implicit parts get longer.
             least *= 4.0 if part > PARTS else 1.0
             law, taken = self._resistance.law(here, effort, load), left
-            if not law.stands:
-                here, taken, changed = self._follow(here, law, min(left, span), least)
-                # The law changes soon after a part that is not the whole rest of the step.
-                span = step if changed or taken <= least else 0.5 * taken
+            if changes and not law.stands:
+                here, taken = self._cross(here, law, min(left, least))
+                changes, span = False, step
+            elif not law.stands:
+                here, taken, changes = self._follow(here, law, min(left, span), least)
+                span = 2.0 * taken
             self._resistance.passed(here)
             self._here, (self.q, self.qd) = here, self._all(here)
             left -= taken
@@ -119,33 +121,39 @@ class Plant:
                 return
 
     def _follow(self, here: Terms, law: Law, span: float, least: float) -> tuple[Terms, float, bool]:
-        """Integrate at most ``span`` s under a law that lasts.
+        """Integrate at most ``span`` s, as long as the law lasts.
 
-        A span in which the law changes, or in which the method adds energy, is halved; one of
-        ``least`` is integrated implicitly.
+        A span in which the law changes is cut before the change; one in which the method adds
+        energy, or has no result, is halved, down to ``least``.
 
-        :returns: the state, the time, and whether the law may have changed.
+        :returns: the state, the time, and whether the law changes next.
         """
-        resistance = self._resistance
+        resistance, changes = self._resistance, False
         while True:
+            part = 1.0
             with contextlib.suppress(PkmTwinError, ValueError):  # the law may change before
                 end, work = self._flow(here, law, span)
+                part = resistance.lasting_part(here, end, law)
                 growth = _growth(here, end, law, work)
-                most = GROWTH * (here.kinetic + end.kinetic) + _rounding(here, end, law)
-                if resistance.lasts(end, law) and growth <= most:
+                if part == 1.0 and growth <= GROWTH * (here.kinetic + end.kinetic) + _rounding(here, end, law):
                     settled = resistance.settle(end, law)
                     if settled is not end or growth > 0.0:
                         settled = _lessened(here, settled, law, work)
-                    return settled, span, False
+                    return settled, span, changes
             if span <= least:
-                break
+                return here, 0.0, True
+            changes = part < 1.0
+            span = max(part * span - 0.5 * least, least) if changes else 0.5 * span
+
+    def _cross(self, here: Terms, law: Law, span: float) -> tuple[Terms, float]:
+        """Integrate at most ``span`` s implicitly, whatever sticks or slides; return state and time."""
+        shortest = RESOLUTION * span
+        while True:
+            end = self._resistance.crawl(here, law, span)
+            sound = _growth(here, end, law, 0.0) <= end.kinetic + _rounding(here, end, law)
+            if sound or span <= shortest:
+                return _lessened(here, end, law), span
             span *= 0.5
-        for _ in range(HALVINGS):
-            end = resistance.crawl(here, law, span)
-            if _growth(here, end, law, 0.0) <= end.kinetic + _rounding(here, end, law):
-                break
-            span *= 0.5
-        return _lessened(here, end, law), span, True
 
     def _flow(self, here: Terms, law: Law, span: float) -> tuple[Terms, float]:
         """Return the state after a part, and the work of the wrench in it, J."""
