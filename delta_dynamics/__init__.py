@@ -1,20 +1,11 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Rigid-body dynamics of parallel kinematic machines."""
 
-from delta_dynamics.estimates.contact import (
-    Contact,
-    ContactMonitor,
-    MomentumObserver,
-    platform_wrench,
-)
+from delta_dynamics.estimates.contact import Contact, ContactMonitor, MomentumObserver, platform_wrench
 from delta_dynamics.estimates.isolation import ContactPlace
 from delta_dynamics.estimates.payload import PayloadEstimate, PayloadEstimator
 from delta_dynamics.torques.at_pose import PoseMotion, inverse_dynamics_at_pose
-from delta_dynamics.torques.derivatives import (
-    TorqueDerivatives,
-    torque_derivatives,
-    torque_gradient,
-)
+from delta_dynamics.torques.derivatives import TorqueDerivatives, torque_derivatives, torque_gradient
 from delta_dynamics.torques.elastic_reactions import elastic_reactions
 from delta_dynamics.torques.isotropy import (
     Extremes,

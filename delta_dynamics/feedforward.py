@@ -17,13 +17,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MessageError, ParameterError
 from pkm_twin.machine.friction import KNOWN_FRACTION, Dahl, Memory
 from pkm_twin.machine.joint_map import ControllerNumbers
-from pkm_twin.messages.reading import (
-    ExtraJoints,
-    JointReader,
-    JointSample,
-    Trajectory,
-    as_message_error,
-)
+from pkm_twin.messages.reading import ExtraJoints, JointReader, JointSample, Trajectory, as_message_error
 from pkm_twin.messages.stamps import SECOND, StampRules
 from pkm_twin.robot.derivatives import nearest_motion
 from pkm_twin.robot.effort_limits import NON_FINITE, EffortLimits, LimitedEfforts, LimitPolicy
@@ -37,11 +31,8 @@ from pkm_twin.streams.differentiator import Differentiator
 from pkm_twin.streams.matched import WrenchWindow
 from pkm_twin.streams.monitor import Core, StreamMonitor, counting, finished
 from pkm_twin.streams.rates import RateAgreement
-from pkm_twin.streams.rest import (
-    VelocityErrorEstimator,
-    gradient_gain,
-    velocity_error_bound,
-)
+from pkm_twin.streams.rest import VelocityErrorEstimator, gradient_gain, velocity_error_bound
+from pkm_twin.streams.wrench import STAMP_ORDER, check_order
 
 OnStop = Literal["nothing", "zeros", "gravity"]
 
@@ -98,21 +89,14 @@ class Settings:
     def __post_init__(self) -> None:
         if not self.singularity_stop <= self.singularity_warn:
             raise ParameterError(
-                "singularity_warn",
-                self.singularity_warn,
-                f"at least singularity_stop, {self.singularity_stop:g}",
+                "singularity_warn", self.singularity_warn, f"at least singularity_stop, {self.singularity_stop:g}"
             )
         if not self.order + 2 <= self.window:
             raise ParameterError("differentiator.window", self.window, f"at least order + 2, {self.order + 2}")
 
     @property
-    def window_time(self) -> float:
-        """Longest window, s."""
-        return 1e-3 * max(self.window - 1, 24)
-
-    @property
     def stamp_rules(self) -> StampRules:
-        """The rules for the stamp of a joint state."""
+        """Rules for the stamps of joint states."""
         return StampRules(
             accept_zero=self.accept_zero_stamp,
             future_tolerance=round(self.future_tolerance * SECOND),
@@ -121,16 +105,16 @@ class Settings:
 
 
 STOPPING: Final = (NON_FINITE, "singular", "jump", "no wrench", "no base motion")
-"""Reasons for which one sample stops the stream: it is none that the model describes."""
+"""Reasons for which a single sample stops the stream, because the model cannot describe it."""
 SLICE: Final = 256
-"""Points of a trajectory that are answered in one go."""
+"""Points of a trajectory that are computed between two turns of the executor."""
 
 
 class Torques(NamedTuple):
-    """Efforts for one joint state; ``measured`` ones are those of the sensors, None without.
+    """Efforts for one joint state; ``measured``: those of the sensors, None without.
 
-    ``wrench``: the one that they bear, base axes at the platform's reference point, shape (6,).
-    ``doubt``: how far the rates may be off, shape (n,), where somebody asks for it.
+    ``wrench``: the external wrench in these efforts, base axes at the platform's reference point,
+    shape (6,). ``doubt``: error bounds of the rates, shape (n,), None if they are not needed.
     ``memory``: the part of ``effort`` that friction with memory adds, shape (n,); 0 without.
     """
 
@@ -157,9 +141,9 @@ class Torques(NamedTuple):
 class Feedforward(Core):
     """Answers trajectories and a stream of joint states with feedforward efforts.
 
-    ``wrenches``: those that the stream's efforts bear; None bears none. ``base``: measures the
-    motion of the base; None: it is at rest. ``uncertain``: the doubt of rates is computed for every
-    robot, else it is known of those with dry friction alone.
+    ``wrenches``: external wrenches for the stream's efforts; None: none. ``base``: measures the
+    motion of the base; None: at rest. ``uncertain``: compute the rates' error bounds for every
+    robot, not only for those with dry friction.
     """
 
     robot: Robot
@@ -171,10 +155,9 @@ class Feedforward(Core):
     def __post_init__(self) -> None:
         s = self.settings
         self.stream = StreamMonitor(s.trip_count, s.recovery_count)
-        # Each trajectory stands for itself: a bad one does not speak against the next.
+        # Trajectories are independent: a rejected one does not affect the next.
         self.trajectories = counting()
         self.saturations = 0
-        self.dropped = 0
         self.near_singular = False
         self.near_singularities = 0
         self._last_stamp = 0
@@ -228,8 +211,13 @@ class Feedforward(Core):
         if self.base is not None:
             self.base.rules = self._rules
 
+    @property
+    def dropped(self) -> int:
+        """Number of joint states that were not newer than the one before."""
+        return self.stream.rejected[STAMP_ORDER]
+
     def reset(self) -> None:
-        """Forget the stream and the pose, as when the clock jumps: no torque across the seam."""
+        """Forget the stream and the pose after a jump of the clock: no torque spans the jump."""
         self.pose = None
         if self.base is not None:
             self.base.clear()
@@ -247,11 +235,11 @@ class Feedforward(Core):
         self.reset()
 
     def singularity(self) -> float | None:
-        """Distance of the last answered state from a singularity, 0 in one, 1 at best."""
+        """Return the last answered state's index, 0 in a singularity, 1 at best; None before."""
         return None if self._last_good is None else float(self.robot.singularity(self._last_good))
 
     def unknown_friction(self) -> list[str]:
-        """Joints whose friction depends on a way that the stream has not seen."""
+        """List the joints whose friction depends on motion before the stream began."""
         distance, memory = self.robot.friction.presliding, self._memory
         unknown = distance > 0.0
         if memory is not None:
@@ -276,10 +264,48 @@ class Feedforward(Core):
             at a point where one exceeds a limit.
         :returns: the generator's value, the efforts.
         """
-        with self.refusing(self.trajectories):
-            efforts = yield from self._trajectory_steps(message, now, holding)
-        self.trajectories.accept()
-        return efforts
+        robot, settings, reader, limits = self.robot, self.settings, self._reader, self.limits
+        with self.taking(self.trajectories):
+            if self.base is not None:
+                text = "the motion of the base during a trajectory is unknown"
+                raise MessageError("base motion", f"{text}; with base_imu only joint states are answered")
+            t = reader.trajectory(message, now)
+            yield
+            qd, qdd = _differentiate_points(t, settings.differentiate)
+            reader.check_derived(qd, qdd)
+            if t.qd is None and self._reach.any():
+                doubt = velocity_error_bound(t.times, t.q, gradient_gain(t.times))
+                qd = moving_rates(qd, np.abs(qd) <= doubt, self._reach)
+            efforts = np.empty_like(t.q)
+            saturated = False
+            for first in range(0, len(t.q), SLICE):
+                yield
+                part = slice(first, first + SLICE)
+                q = t.q[part]
+                beyond = _evaluate_points(first, partial(first_beyond, actuated=False), robot, q)
+                if beyond is not None:
+                    where = f"point {first + (beyond.index or 0)}: {beyond.joint}"
+                    text = f"is {beyond.value:g} {beyond.unit}, allowed {beyond.low:g} to {beyond.high:g}"
+                    raise MessageError("limit", f"{where} {text}")
+                measures: Array = _evaluate_points(first, robot.singularity, q)
+                worst, stop = int(measures.argmin()), self.settings.singularity_stop
+                if not measures[worst] >= stop:
+                    raise MessageError(
+                        "singular",
+                        f"point {first + worst}: close to a singularity or the edge of the workspace: "
+                        f"index {measures[worst]:.3g}, allowed {stop:g} or more; "
+                        f"{passing_singularity(float(measures[worst]), 'singularity_stop ')} passes",
+                    )
+                self.near_singularities += int((measures < self.settings.singularity_warn).sum())
+                solved = _evaluate_points(first, inverse_dynamics, robot, q, qd[part], qdd[part])
+                efforts[part], beyond = limits.apply(
+                    robot.controller.controller_efforts(solved), "zeros" if holding else settings.limit_policy
+                )
+                saturated |= beyond
+            self.saturations += saturated
+            # In the message's order, zero for joints that the model lacks.
+            padded = np.hstack([efforts, np.zeros((len(efforts), 1))])
+        return LimitedEfforts(ControllerNumbers(np.ascontiguousarray(padded[:, t.columns])))
 
     def check_shape(self, message: Any) -> None:
         """Check a trajectory's names and lengths, before its efforts are computed in steps.
@@ -290,7 +316,7 @@ class Feedforward(Core):
             self._reader.check_shape(message)
 
     def joint_state(self, message: Any, now: int, steady: int | None = None) -> Torques | None:
-        """Efforts for one joint state, or None while the window fills or a stop is latched.
+        """Compute the efforts for one joint state; None while the window fills or while stopped.
 
         :param now: the ROS clock, ns. ``steady``: the steady clock, ns; by default the same.
         :raises MessageError: the message is rejected, and counted.
@@ -305,14 +331,14 @@ class Feedforward(Core):
     def refuse(self, counts: StreamMonitor, error: MessageError) -> None:
         """Count a message that is rejected; several joint states in a row stop the stream.
 
-        A trajectory stops it where its input was finite: the model cannot be trusted then.
+        A trajectory stops it if the model gives no finite result for finite input.
         """
         super().refuse(counts, error)
         if error.reason in (STOPPING if counts is self.stream else (NON_FINITE,)):
             self.stream.stop(error.reason, str(error))
 
     def check_age(self, torques: Torques, now: int) -> None:
-        """Reject efforts that come too late, as after the process stood still.
+        """Reject efforts that are too late, for example after a suspension of the process.
 
         :raises MessageError: the state is older than ``stale_after`` by now; counted.
         """
@@ -326,7 +352,7 @@ class Feedforward(Core):
                 )
 
     def stop_effort(self, steady: int) -> LimitedEfforts | None:
-        """Return what is sent once on entering a stop, by the setting ``on_stop``; None is nothing.
+        """Return the efforts to send once when the stream stops, by ``on_stop``; None for nothing.
 
         :param steady: the steady clock, ns: gravity is that of a pose within ``stale_after``.
         """
@@ -334,57 +360,6 @@ class Feedforward(Core):
             return None
         pose = self.pose if self.settings.on_stop == "gravity" else None
         return find_holding_effort(self.limits, pose, steady, self.settings.stale_after, self._pull)
-
-    def _trajectory_steps(self, message: Any, now: int, holding: bool) -> Generator[None, None, LimitedEfforts]:
-        robot, settings, reader, limits = self.robot, self.settings, self._reader, self.limits
-        if self.base is not None:
-            raise MessageError(
-                "base motion",
-                "the motion of the base during a trajectory is unknown; with base_imu only joint states are answered",
-            )
-        t = reader.trajectory(message, now)
-        yield
-        qd, qdd = _derivatives(t, settings.differentiate)
-        reader.check_derived(qd, qdd)
-        if t.qd is None and self._reach.any():
-            doubt = velocity_error_bound(t.times, t.q, gradient_gain(t.times))
-            qd = moving_rates(qd, np.abs(qd) <= doubt, self._reach)
-        efforts = np.empty_like(t.q)
-        saturated = False
-        for first in range(0, len(t.q), SLICE):
-            yield
-            part = slice(first, first + SLICE)
-            q = t.q[part]
-            beyond = _evaluate_points(first, partial(first_beyond, actuated=False), robot, q)
-            if beyond is not None:
-                where = f"point {first + (beyond.index or 0)}: {beyond.joint}"
-                text = f"is {beyond.value:g} {beyond.unit}, allowed {beyond.low:g} to {beyond.high:g}"
-                raise MessageError("limit", f"{where} {text}")
-            self._check_singularity(_evaluate_points(first, robot.singularity, q), first)
-            solved = _evaluate_points(first, inverse_dynamics, robot, q, qd[part], qdd[part])
-            efforts[part], beyond = limits.apply(
-                robot.controller.controller_efforts(solved),
-                "zeros" if holding else settings.limit_policy,
-            )
-            saturated |= beyond
-        self.saturations += saturated
-        # In the message's order, zero for joints that the model lacks.
-        padded = np.hstack([efforts, np.zeros((len(efforts), 1))])
-        ordered = ControllerNumbers(np.ascontiguousarray(padded[:, t.columns]))
-        return LimitedEfforts(ordered)
-
-    def _check_singularity(self, measures: Array, first: int) -> None:
-        """Points of a trajectory from ``first`` on, shape (points,)."""
-        worst = int(measures.argmin())
-        stop = self.settings.singularity_stop
-        if not measures[worst] >= stop:
-            raise MessageError(
-                "singular",
-                f"point {first + worst}: close to a singularity or the edge of the workspace: "
-                f"index {measures[worst]:.3g}, allowed {stop:g} or more; "
-                f"{passing_singularity(float(measures[worst]), 'singularity_stop ')} passes",
-            )
-        self.near_singularities += int((measures < self.settings.singularity_warn).sum())
 
     def _forget_stream(self) -> None:
         self._last_stamp = 0
@@ -405,28 +380,17 @@ class Feedforward(Core):
         if self.wrenches is not None:
             self.wrenches.restart()
 
-    def _take_time(self, now: int) -> None:
-        """Reset the stream if the clock went back by more than ``future_tolerance``.
-
-        After a smaller step back the last stamp stays, and older samples are dropped.
-        """
+    def _joint_state(self, message: Any, now: int, steady: int) -> Torques | None:
+        """Compute the efforts of one sample; a rejected sample does not change the state."""
+        # After a smaller step back the last stamp stays, and older samples are rejected.
         if now < self._last_now - self._rules.future_tolerance:
             self.reset()
         self._last_now = now
-
-    def _joint_state(self, message: Any, now: int, steady: int) -> Torques | None:
-        """Compute the efforts of one sample; a rejected sample does not change the state."""
-        self._take_time(now)
         sample = self._reader.joint_state(message, now, self._rules)
+        check_order(sample.stamp, self._last_stamp + 1)
         silence = sample.stamp - self._last_stamp
-        if silence <= 0:
-            self.dropped += 1
-            raise MessageError("stamp order", f"the stamp is {-silence / SECOND:.6f} s before the last")
         if sample.qd is None and not self.settings.differentiate:
-            raise MessageError(
-                "no velocities",
-                "the joint state has no velocity; set acceleration to differentiate",
-            )
+            raise MessageError("no velocities", "the joint state has no velocity; set acceleration to differentiate")
         if silence > self.settings.stale_after * SECOND:
             if self._last_stamp:
                 text = f"no accepted joint state for {silence / SECOND:.3f} s, by the stamps"
@@ -439,12 +403,14 @@ class Feedforward(Core):
         try:
             near_singular = as_message_error(self._continuity.step, sample.stamp, sample.q)
         except MessageError:
-            # No derivative across a jump, nor across samples that the model has no state for.
+            # No derivative spans a jump, or samples at which the machine cannot be assembled.
             self._restart_fit()
             raise
         try:
-            rates = self._differentiated(sample)
-            doubt = self._doubt(sample, rates)
+            rates = self._differentiate(sample)
+            doubt = None
+            if self.uncertain or self._reach.any():
+                doubt = self._rest.push(sample.stamp, sample.q, sample.qd, None if rates is None else rates[0])
             measured, external = sample.effort, None
             if self.wrenches is not None:
                 self.wrenches.push(sample, self.robot.platform(sample.q)[1], wrench)
@@ -454,7 +420,7 @@ class Feedforward(Core):
                     external, measured = self.wrenches.through()
                 motion, sure, change = as_message_error(self._resolve_motion, sample, rates, doubt)
                 solved = as_message_error(inverse_dynamics, self.robot, sample.q, sure, change, external, base)
-                memory, added = self._remembered(sample.q, sure)
+                memory, added = self._add_friction_memory(sample.q, sure)
                 controller, effort = self.robot.controller, solved + added
                 sent, saturated = self.limits.apply(controller.controller_efforts(effort), self.settings.limit_policy)
                 if saturated:
@@ -478,8 +444,8 @@ class Feedforward(Core):
         self._last_good, self._memory = sample.q, memory
         return Torques(sample.stamp, motion, effort, sent, measured, saturated, external, doubt, added)
 
-    def _remembered(self, q: Array, rates: Array) -> tuple[Memory | None, Array | float]:
-        """Friction's memory with a sample more, and what it adds to the efforts, (n,)."""
+    def _add_friction_memory(self, q: Array, rates: Array) -> tuple[Memory | None, Array | float]:
+        """Return friction's memory after a sample, and its part of the efforts, (n,)."""
         friction = self.robot.friction
         if not friction.presliding.any():
             return None, 0.0
@@ -494,7 +460,7 @@ class Feedforward(Core):
 
         Rates below their noise count as zero.
         """
-        # Noise that is differentiated contradicts nothing: what is measured is judged.
+        # Differentiated noise may contradict the closures: the nearest motion does not.
         rate, change = nearest_motion(self.robot, sample.q, *rates)
         motion = sample.q, rate, change
         sure = rate if sample.qd is None else rates[0]
@@ -505,8 +471,8 @@ class Feedforward(Core):
             sure = own if sample.qd is None else sure
         return motion, sure, change
 
-    def _differentiated(self, sample: JointSample) -> tuple[Array, Array] | None:
-        """Rates and accelerations; what else looks through the window follows its length."""
+    def _differentiate(self, sample: JointSample) -> tuple[Array, Array] | None:
+        """Return rates and accelerations; pass a new length of the window on to its other users."""
         rates = self.differentiator.push(sample.stamp, sample.q, sample.qd)
         if self.differentiator.window != self._window:
             self._window = self.differentiator.window
@@ -515,25 +481,17 @@ class Feedforward(Core):
                 self.wrenches.window = self._window
         return rates
 
-    def _doubt(self, sample: JointSample, rates: tuple[Array, Array] | None) -> Array | None:
-        """How far the sample's rates may be off, where that makes a difference."""
-        if not (self.uncertain or self._reach.any()):
-            return None
-        rate = None if rates is None else rates[0]
-        return self._rest.push(sample.stamp, sample.q, sample.qd, rate)
-
 
 def _differentiator(s: Settings, robot: Robot) -> Differentiator:
-    made = Differentiator(s.order, s.window, time=s.window_time)
+    made = Differentiator(s.order, s.window, time=1e-3 * max(s.window - 1, 24))
     made.prepare(robot.joints_count)
     return made
 
 
 def warm_up(robot: Robot, *, base: bool = False) -> None:
-    """Compile, or load, what live use calls: single samples and batches.
+    """Compile, or load, the programs of live use: for single samples and for batches.
 
     :param base: whether the base moves.
-
     :raises ParameterError: a robot without masses.
     """
     q = robot.inverse(robot.home())
@@ -558,10 +516,8 @@ def _evaluate_points(first: int, call: Callable[..., Any], *arguments: Any) -> A
         raise MessageError(error.reason, f"in the points from point {first} on: {error}") from error
 
 
-def _derivatives(t: Trajectory, differentiate: bool) -> tuple[Array, Array]:
-    """Rates and accelerations of a trajectory's points, shape (p, n); differentiated where set.
-
-    Second-order differences on uneven times.
+def _differentiate_points(t: Trajectory, differentiate: bool) -> tuple[Array, Array]:
+    """Return rates and accelerations of a trajectory's points, (p, n), by differences if absent.
 
     :raises MessageError: some are absent and must not, or cannot, be differentiated.
     """

@@ -1,15 +1,14 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Pass stamped torques to an effort controller while they come, else zeros or gravity.
+"""Pass stamped torques to an effort controller while they arrive, else zeros or gravity.
 
-A command of plain numbers has no stamp, so a controller that takes it cannot distinguish a live
-torque from the last word of a dead process. This is the last place that can. Pure: times are
-arguments.
+A command of plain numbers has no stamp, so an effort controller cannot distinguish a live
+torque from the last one of a dead process: only this gate can. Pure: times are arguments.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Final, Literal
+from typing import Any, Literal
 
 from delta_dynamics.holding import MeasuredPose, find_holding_effort
 from pkm_twin.errors import MessageError
@@ -19,11 +18,9 @@ from pkm_twin.robot.effort_limits import EffortLimits, LimitedEfforts
 from pkm_twin.robot.robot import Robot
 from pkm_twin.settings import COUNT, FUTURE, LATE, SECONDS, setting
 from pkm_twin.streams.monitor import Core, StreamMonitor, counting
+from pkm_twin.streams.wrench import check_order
 
 OnStop = Literal["zeros", "gravity"]
-
-WAITING: Final = "waiting"
-"""The stop's reason before the first torque."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +49,8 @@ class GateSettings:
 class Gate(Core):
     """Forwards the torques of one robot; closed from the start, and whenever they stop.
 
-    The controller behind it may still hold what a gate before this one has sent, so that a new
-    gate is closed and :meth:`stop_command` is due before the first torque comes.
+    The controller may still hold the command of a gate before this one, so that a new gate is
+    closed and sends :meth:`stop_command` before the first torque.
     """
 
     robot: Robot
@@ -62,11 +59,10 @@ class Gate(Core):
     def __post_init__(self) -> None:
         s = self.settings
         self.stream = StreamMonitor(s.trip_count, s.recovery_count)
-        self.stream.stop(WAITING, "no torque yet")
+        self.stream.stop("waiting", "no torque yet")
         self.states = counting()
         self._rules = StampRules(
-            future_tolerance=round(s.future_tolerance * SECOND),
-            max_age=round(s.deadline * SECOND),
+            future_tolerance=round(s.future_tolerance * SECOND), max_age=round(s.deadline * SECOND)
         )
         self._reader = JointReader(self.robot)
         self._limits = EffortLimits(self.robot)
@@ -99,14 +95,20 @@ class Gate(Core):
         self.watch(steady)
         with self.refusing(self.stream):
             sample = self._reader.efforts(message, now, self._rules)
-            self._check_order(sample.stamp)
+            try:
+                check_order(sample.stamp, self._last_stamp + 1)
+            except MessageError:
+                # The torque of a stop has a later stamp than the states that the next torques answer:
+                # these are compared with this one. Two sources in turns are still rejected.
+                self._last_stamp = sample.stamp
+                raise
             efforts, _ = self._limits.apply(sample.given, "reject")
         self._last_stamp = sample.stamp
         self._last_arrival = steady
         return efforts if self.stream.accept() else None
 
     def joint_state(self, message: Any, now: int, steady: int) -> None:
-        """Keep where the robot stands: gravity is that of a measured state, never of a guess.
+        """Store the robot's measured pose, for the effort against gravity.
 
         :raises MessageError: the message is rejected, and counted.
         """
@@ -115,7 +117,7 @@ class Gate(Core):
         self._pose = MeasuredPose.from_sample(sample.q, sample.stamp, now, steady)
 
     def watch(self, steady: int) -> None:
-        """Close the gate where the torques have gone silent."""
+        """Close the gate if no torque arrived within the deadline."""
         silent = (steady - self._last_arrival) / SECOND
         if not self.stream.stopped and silent > self.settings.deadline:
             self.stream.stop("stale torques", f"no torque for {silent:.3f} s")
@@ -128,11 +130,3 @@ class Gate(Core):
         """
         pose = self._pose if self.settings.on_stop == "gravity" else None
         return find_holding_effort(self._limits, pose, steady, self.settings.deadline)
-
-    def _check_order(self, stamp: int) -> None:
-        if stamp <= self._last_stamp:
-            behind = (self._last_stamp - stamp) / SECOND
-            # Those after it are judged by it: a stop's torque is stamped later than the states are
-            # that the next ones answer. Of two that take turns every other one is still behind.
-            self._last_stamp = stamp
-            raise MessageError("stamp order", f"the stamp is {behind:.6f} s before the last")

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""The effort of a machine at rest that a stop sends. Pure: times are arguments."""
+"""The effort that holds a machine at rest, sent on a stop. Pure: times are arguments."""
 
 from __future__ import annotations
 
@@ -39,19 +39,14 @@ class MeasuredPose(NamedTuple):
 
 
 def find_holding_effort(
-    limits: EffortLimits,
-    pose: MeasuredPose | None,
-    steady: int,
-    max_age: float,
-    base: Array | None = None,
+    limits: EffortLimits, pose: MeasuredPose | None, steady: int, max_age: float, base: Array | None = None
 ) -> LimitedEfforts:
     """Return the effort against gravity in the pose, shape (n,), or zeros.
 
-    ``base``: acceleration of the base less gravity, shape (3,), m/s2; None: at rest.
+    Zeros without a pose, if the pose is older than ``max_age`` (s), if the model has no effort for
+    it, and if the effort exceeds a limit: a part of the holding effort would move the machine.
 
-    Zeros without a pose, where the pose is older than ``max_age`` (s), where the model has no
-    effort for it, and where the effort exceeds a limit: a machine that cannot be held must not be
-    pushed by a part of what would hold it.
+    :param base: acceleration of the base less gravity, shape (3,), m/s2; None: at rest.
     """
     robot = limits.robot
     zeros, _ = limits.apply(ControllerNumbers(np.zeros(robot.joints_count)), "zeros")

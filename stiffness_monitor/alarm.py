@@ -1,13 +1,13 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Which elastic element has departed from the file, by measured deflections under measured loads.
+"""Find elastic elements that have departed from the file, by deflections under measured loads.
 
 A measured deflection is C(s) w + F u + z and noise: s multiplies the elements' compliances
-(:mod:`stiffness_monitor.response`), F u is what the causes of the file's ``uncertainty`` make of C
-w, u of standard deviation 1, and z a zero of the instrument. The fewest elements are looked for
-whose factors explain a window of samples: always one more, the one that leaves the least sum of
-squares. It has departed where its factor is farther from 1 than a number of standard deviations, of
-the measured noise and of what the file's uncertainty says of that element. Elements that would
-explain the same nearly as well are named with it.
+(:mod:`stiffness_monitor.response`), F u is the effect of the file's ``uncertainty`` on C w, with u
+of standard deviation 1, and z a zero of the instrument. The fewest elements whose factors explain a
+window of samples are found by adding the one that leaves the least sum of squares. An element has
+departed if its factor differs from 1 by more than a number of standard deviations, of the measured
+noise and of the file's uncertainty for that element. Elements that would explain the samples nearly
+as well are named with it.
 """
 
 from __future__ import annotations
@@ -35,34 +35,10 @@ from stiffness_monitor.derivatives import compliance_effects, energy_effects
 from stiffness_monitor.monitor import Answer
 from stiffness_monitor.response import element_response
 
-MIN_SAMPLES: Final = 20
-"""Loaded samples in the window below which nothing is evaluated."""
-MAX_SAMPLES: Final = 1000
-"""Samples kept in the window; older ones go first."""
-LOADED_FRACTION: Final = 0.05
-"""Predicted deflection, relative to the largest in the window, above which a sample counts as
-loaded."""
-MIN_SIGNAL_TO_NOISE: Final = 10.0
-"""Standard deviation of the measured deflections over their noise, below which the wrenches are
-taken for sensor noise."""
-DISTINCT_SIGMAS: Final = 4.0
-"""Standard deviations by which the residual of an element must exceed the best element's to rule it
-out."""
-MIN_NOISE_FRACTION: Final = 1e-3
-"""Smallest noise of a direction, relative to the standard deviation of its deflections."""
 FACTOR_RANGE: Final = (0.05, 100.0)
 """Smallest and largest compliance factor of the search."""
 MAX_STEP_RATIO: Final = 3.0
 """Largest ratio of a factor's values in consecutive Gauss-Newton steps."""
-MAX_ITERATIONS: Final = 20
-"""Largest number of Gauss-Newton steps."""
-FACTOR_TOLERANCE: Final = 1e-4
-"""Change of the factors at which Gauss-Newton iteration ends."""
-SCREENING_FRACTION: Final = 0.5
-"""Fraction of its bound by which the first-order factor of some element must differ from 1 for the
-full search to start."""
-MAX_AUTOCORRELATION: Final = 0.95
-"""Largest correlation of consecutive residuals; more would make all variances infinite."""
 
 
 @dataclass(frozen=True)
@@ -190,7 +166,7 @@ class _Window:
         """Fit the factors of chosen elements to the window by Gauss-Newton, from ``start``."""
         factors, e = start, len(chosen)
         held = np.concatenate([np.zeros(e), self.prior])
-        for _ in range(MAX_ITERATIONS):
+        for _ in range(20):
             added, slopes = self.predict_change(chosen, factors)
             table = np.concatenate([slopes, self.common], -1).reshape(-1, len(held))
             target = (self.residual - added).ravel()
@@ -205,7 +181,7 @@ class _Window:
             )
             new = np.clip(factors + found[:e], *bounds)
             step, factors = np.abs(new - factors).max(initial=0.0), new
-            if step < FACTOR_TOLERANCE:
+            if step < 1e-4:  # a relative change below any noise
                 break
         left = target - table[:, e:] @ found[e:]
         squares = float(left @ left + held[e:] @ found[e:] ** 2)
@@ -224,7 +200,7 @@ class StiffnessAlarm:
     settings: AlarmSettings = field(default_factory=AlarmSettings)
 
     def __post_init__(self) -> None:
-        self._samples: deque[_Sample] = deque(maxlen=MAX_SAMPLES)
+        self._samples: deque[_Sample] = deque(maxlen=1000)
         self.names: tuple[str, ...] = ()
         # A machine may be singular at home; then the first sample's pose is used.
         with suppress(PkmTwinError, ValueError):
@@ -279,15 +255,18 @@ class StiffnessAlarm:
         if not self._samples:
             return None
         sizes = np.array([np.linalg.norm(sample.moved[:3]) for sample in self._samples])
-        if int((sizes > LOADED_FRACTION * sizes.max()).sum()) < MIN_SAMPLES or not sizes.max() > 0.0:
+        # 20 samples with a load, which predicts a twentieth of the largest deflection at least.
+        if int((sizes > 0.05 * sizes.max()).sum()) < 20 or not sizes.max() > 0.0:
             return None
         window, alike, loudest = self._build_window()
-        if loudest < MIN_SIGNAL_TO_NOISE:
+        if loudest < 10.0:
+            # The wrenches may be the sensor's noise.
             return None
         yield
         values, deviations = window.estimate_each(len(self.names))
         bounds = self._departure_bounds(np.sqrt(alike) * deviations, range(len(self.names)))
-        if not (np.abs(values - 1.0) > SCREENING_FRACTION * bounds).any():
+        if not (np.abs(values - 1.0) > 0.5 * bounds).any():
+            # To first order no factor comes near its bound: the full search would find none.
             return ()
         yield
         chosen = yield from self._select_elements(window, alike)
@@ -349,7 +328,8 @@ class StiffnessAlarm:
                 swapped[at], start[at] = k, 1.0
                 other = window.fit(swapped, start)
                 yield
-                if other.squares - fit.squares < DISTINCT_SIGMAS**2 * alike:
+                # Four standard deviations rule an element out.
+                if other.squares - fit.squares < 4.0**2 * alike:
                     others.append((other.squares, self.names[k], float(other.factors[at])))
             found.append(
                 Departure(
@@ -380,43 +360,31 @@ class StiffnessAlarm:
         plain = _Window(self._owner, reach, rest, carried, common, residual, prior)
         _, slopes = plain.predict_change(range(len(self.names)), np.ones(len(self.names)))
         size = np.std(measured[:, kept], 0)
-        noise, alike = _estimate_noise(residual, np.concatenate([slopes, common], -1), MIN_NOISE_FRACTION * size)
+        # Noise is what no element, cause or zero explains; its correlation in time widens variances.
+        table, least = np.concatenate([slopes, common], -1), 1e-3 * size
+        noise, left = np.maximum(least, 1e-30), residual
+        for _ in range(2):
+            rows = (table / noise[:, None]).reshape(-1, table.shape[-1])
+            scale = 1.0 / np.maximum(np.linalg.norm(rows, axis=0), 1e-300)
+            found = scale * np.linalg.lstsq(rows * scale, (residual / noise).ravel(), rcond=1e-12)[0]
+            left = residual - table @ found
+            noise = np.maximum(np.maximum(estimate_deviation(left - np.median(left, 0)), least), 1e-30)
+        scaled = left / noise
+        whole = float(np.sum(scaled**2))
+        correlation = float(np.sum(scaled[1:] * scaled[:-1])) / whole if whole > 0.0 else 0.0
+        # A correlation of 1 would make all variances infinite.
+        correlation = min(max(correlation, 0.0), 0.95)
+        alike = (1.0 + correlation) / (1.0 - correlation)
         loudest = float((size / noise).max())
         over = noise[:, None]
-        scaled = _Window(self._owner, reach / over, rest, carried, common / over, residual / noise, prior)
-        return scaled, alike, loudest
-
-
-def _estimate_noise(residual: Array, table: Array, least: Array) -> tuple[Array, float]:
-    """Estimate the noise of each direction (d,), which no element explains.
-
-    :param table: columns of all effects that may explain the residual, (k, d, p).
-
-    :returns: the noise, and the factor by which the residual's correlation in time widens
-    variances.
-    """
-    size = np.maximum(least, 1e-30)
-    left = residual
-    for _ in range(2):
-        rows = (table / size[:, None]).reshape(-1, table.shape[-1])
-        scale = 1.0 / np.maximum(np.linalg.norm(rows, axis=0), 1e-300)
-        found = scale * np.linalg.lstsq(rows * scale, (residual / size).ravel(), rcond=1e-12)[0]
-        left = residual - table @ found
-        spread = estimate_deviation(left - np.median(left, 0))
-        size = np.maximum(np.maximum(spread, least), 1e-30)
-    scaled = left / size
-    whole = float(np.sum(scaled**2))
-    alike = float(np.sum(scaled[1:] * scaled[:-1])) / whole if whole > 0.0 else 0.0
-    alike = min(max(alike, 0.0), MAX_AUTOCORRELATION)
-    return size, (1.0 + alike) / (1.0 - alike)
+        window = _Window(self._owner, reach / over, rest, carried, common / over, residual / noise, prior)
+        return window, alike, loudest
 
 
 def _file_deviations(robot: Robot, pose: Array, count: int) -> Array:
     """Return the relative deviation of each element's compliance by the file, (elements,).
 
     The elements' energies under six unit loads are compared at one pose.
-
-    Of its energy under six unit loads at one pose.
     """
     if not robot.causes:
         return np.zeros(count)
@@ -428,8 +396,6 @@ def _file_deviations(robot: Robot, pose: Array, count: int) -> Array:
 
 MAX_WAITING: Final = 64
 """Deflections that wait for the wrench after them; the latest stamps are dropped first."""
-EVALUATION_PERIOD: Final = 1.0
-"""Time between two evaluations, s of stamps."""
 
 
 @dataclass
@@ -504,26 +470,27 @@ class StiffnessWatch(Core):
             self.refuse(self.taken, MessageError("no wrench", text))
 
     def judgement(self) -> Generator[None, None, bool] | None:
-        """Start an evaluation in slices if one is due and none is running; else return None.
+        """Start an evaluation in slices if none is running and 1 s of stamps has passed.
 
         The generator returns whether ``departures`` are new; they are not after a :meth:`reset`.
         """
-        if self._judging is not None or self._due - self._judged < EVALUATION_PERIOD * SECOND:
+        if self._judging is not None or self._due - self._judged < SECOND:
             return None
         self._judged = self._due
-        self._judging = object()
-        return self._run_evaluation(self._judging)
+        mine = self._judging = object()
 
-    def _run_evaluation(self, mine: object) -> Generator[None, None, bool]:
-        try:
-            found = yield from self._alarm.judging()
-            if self._judging is not mine:
-                return False
-            self.departures = found
-            return True
-        finally:
-            if self._judging is mine:
-                self._judging = None
+        def evaluate() -> Generator[None, None, bool]:
+            try:
+                found = yield from self._alarm.judging()
+                if self._judging is not mine:
+                    return False
+                self.departures = found
+                return True
+            finally:
+                if self._judging is mine:
+                    self._judging = None
+
+        return evaluate()
 
     def _pair_waiting(self) -> None:
         """Pair the waiting deflections that have a wrench after them."""
@@ -540,7 +507,14 @@ class StiffnessWatch(Core):
 
     def _use_pair(self, sample: DeflectionSample) -> None:
         """Push a deflection with the wrench interpolated at its stamp to the alarm."""
-        before, after = self._find_neighbours(sample.stamp)
+        found = self._answers.around(sample.stamp)
+        if found is None:
+            raise MessageError("no wrench", "no wrenches before and after the deflection")
+        age = max(sample.stamp - found[0][0], found[1][0] - sample.stamp) / SECOND
+        if age > self.max_age:
+            text = f"the wrench next to the deflection is {age:.3f} s away, allowed {self.max_age:g} s"
+            raise MessageError("no wrench", text)
+        before, after = found[0][1], found[1][1]
         if sample.stamp - self._due < self.period * SECOND:
             return
         span = after.stamp - before.stamp
@@ -555,19 +529,3 @@ class StiffnessWatch(Core):
         except (UnreachableError, SingularityError, ValueError) as error:
             raise MessageError("pose", str(error)) from error
         self._due = sample.stamp
-
-    def _find_neighbours(self, stamp: int) -> tuple[Answer, Answer]:
-        """Return the wrenches before and after a stamp.
-
-        :raises MessageError: there is none on one side, or one is too old.
-        """
-        found = self._answers.around(stamp)
-        if found is None:
-            raise MessageError("no wrench", "no wrenches before and after the deflection")
-        age = max(stamp - found[0][0], found[1][0] - stamp) / SECOND
-        if age > self.max_age:
-            raise MessageError(
-                "no wrench",
-                f"the wrench next to the deflection is {age:.3f} s away, allowed {self.max_age:g} s",
-            )
-        return found[0][1], found[1][1]

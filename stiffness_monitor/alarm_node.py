@@ -6,12 +6,8 @@ Only the node ``stiffness_monitor`` imports this module.
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
-from typing import Any
-
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import TransformStamped
-from std_srvs.srv import Trigger
 
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.messages.stamps import StampRules
@@ -22,9 +18,8 @@ from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.turns import Task
 from pkm_twin.settings import SECONDS
 from stiffness_monitor.alarm import AlarmSettings, Departure, StiffnessWatch
+from stiffness_monitor.frame import DIRECTIONS
 from stiffness_monitor.monitor import Answer
-
-DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
 
 
 class StiffnessAlarmTopics:
@@ -45,7 +40,14 @@ class StiffnessAlarmTopics:
             "subscribe to measured_deflection and publish ~/stiffness_alarm: elements whose "
             "compliance differs from the file",
         )
-        settings = self._declare_settings()
+        words = node.declare("alarm.directions", list(DIRECTIONS), "measured directions, of x y z rx ry rz")
+        for word in words:
+            if word not in DIRECTIONS:
+                raise UnknownNameError("alarm.directions", word, DIRECTIONS)
+        if not words:
+            raise ParameterError("alarm.directions", [], "at least one of x y z rx ry rz")
+        measured = tuple(word in words for word in DIRECTIONS)
+        settings = node.declare_settings(AlarmSettings, fixed=True, directions=measured)
         age = node.declare(
             "alarm.wrench_age",
             0.02,
@@ -58,18 +60,7 @@ class StiffnessAlarmTopics:
         self._core = StiffnessWatch(robot, rules, frames, settings, age, period)
         self._alarm = node.create_guarded_publisher("~/stiffness_alarm")
         node.create_guarded_subscription("measured_deflection", self._on_deflection)
-        node.create_service(Trigger, "~/reset_stiffness", self._on_reset)
-
-    def _declare_settings(self) -> AlarmSettings:
-        node = self._node
-        words = node.declare("alarm.directions", list(DIRECTIONS), "measured directions, of x y z rx ry rz")
-        for word in words:
-            if word not in DIRECTIONS:
-                raise UnknownNameError("alarm.directions", word, DIRECTIONS)
-        if not words:
-            raise ParameterError("alarm.directions", [], "at least one of x y z rx ry rz")
-        measured = tuple(word in words for word in DIRECTIONS)
-        return node.declare_settings(AlarmSettings, fixed=True, directions=measured)
+        node.create_trigger("~/reset_stiffness", self._reset_stiffness)
 
     @property
     def departures(self) -> tuple[Departure, ...]:
@@ -115,15 +106,16 @@ class StiffnessAlarmTopics:
     def _start_evaluation(self, core: StiffnessWatch) -> None:
         """Start a due evaluation in slices: it takes tens of milliseconds, wrenches come sooner."""
         work = core.judgement()
-        if work is not None:
-            self._node.defer("measured_deflection", self._evaluate(core, work))
 
-    def _evaluate(self, core: StiffnessWatch, work: Generator[None, None, bool]) -> Task:
-        if (yield from work):
-            self._publish(core)
+        def evaluate() -> Task:
+            if work is not None and (yield from work):
+                self._publish(core)
+
+        if work is not None:
+            self._node.defer("measured_deflection", evaluate())
 
     def _publish(self, core: StiffnessWatch) -> None:
-        """Publish every evaluation with departures, and the first one without."""
+        """Publish every evaluation with departures, one WARN status each, and the first without, OK."""
         found = core.departures
         if found is None:
             return
@@ -131,15 +123,10 @@ class StiffnessAlarmTopics:
         if not names and self._reported == ():
             return
         self._reported = names
-        own = header(core.stamp, self._base)
-        self._alarm.publish(DiagnosticArray(header=own, status=self._statuses(found)))
-
-    def _statuses(self, found: Sequence[Departure]) -> list[DiagnosticStatus]:
-        """Return one WARN status per departure, or one OK status without any."""
         name, hardware = f"{self._node.get_name()}: stiffness", self._robot.name
-        if not found:
-            return [DiagnosticStatus(level=health.OK, name=name, message="none", hardware_id=hardware, values=[])]
         statuses = []
+        if not found:
+            statuses = [DiagnosticStatus(level=health.OK, name=name, message="none", hardware_id=hardware, values=[])]
         for departure in found:
             pairs = {
                 "element": departure.element,
@@ -158,9 +145,8 @@ class StiffnessAlarmTopics:
                     values=[KeyValue(key=key, value=value) for key, value in pairs.items()],
                 )
             )
-        return statuses
+        self._alarm.publish(DiagnosticArray(header=header(core.stamp, self._base), status=statuses))
 
-    def _on_reset(self, _request: Any, response: Any) -> Any:
+    def _reset_stiffness(self) -> str:
         self.reset()
-        response.success, response.message = True, "the stored deflections were deleted"
-        return response
+        return "the stored deflections were deleted"

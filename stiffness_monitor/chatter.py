@@ -23,42 +23,12 @@ from pkm_twin.errors import ParameterError, check_limit
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor.vibration import Complex, ToolModes, responses, tool_modes
 
-MIN_PEAK_FRACTION: Final = 0.01
-"""Peak of a mode in the cutting plane, relative to the largest peak, below which the mode is left
-out."""
-MAX_MODES: Final = 8
-"""Largest number of modes in the cutting plane."""
 MAX_WAVES: Final = 20.0
 """Largest number of vibrations of a mode per tooth period; process damping governs below."""
-BASE_DEGREE: Final = 10
-"""Polynomial degree of the displacement over a tooth period, plus four per vibration."""
 STEPS_PER_WAVE: Final = 20
 """Time steps per vibration; a tooth period has at least twice as many."""
-DEPTH_RATIO: Final = 1.25
-"""Ratio of consecutive depths that are tried until one is unstable."""
-FIRST_DEPTH_RATIO: Final = 0.4
-"""First depth that is tried, over the zero-order depth that is stable at every speed."""
 DEFAULT_DEPTH_RATIO: Final = 25.0
 """Default deepest depth that is tried, over the same zero-order depth."""
-DEPTHS_PER_BATCH: Final = 5
-"""Depths that are evaluated in one batch."""
-DEPTH_TOLERANCE: Final = 2e-4
-"""Relative tolerance of a limit depth."""
-MAX_LIMIT_RATIO: Final = 1.25
-"""Ratio of two neighbouring limit depths above which a speed between them is added."""
-MAX_MINIMUM_RATIO: Final = 1.001
-"""Ratio of limit depths next to a local minimum above which a speed between them is added."""
-MIN_SPEED_STEP: Final = 5e-4
-"""Relative distance of speeds below which none is added between them, as at a discontinuity."""
-MAX_WAVE_STEP: Final = 0.1
-"""Largest difference of vibrations per tooth period between neighbouring speeds; a lobe is one
-vibration wide."""
-MAX_BEST_SPEED_STEP: Final = 1e-3
-"""Largest relative distance of speeds within the margin of the best speed."""
-MAX_SPINDLE_SPEED: Final = 1e6
-"""Largest spindle speed, rpm."""
-DEPTH_RANGE: Final = (1e-6, 10.0)
-"""Valid range of ``deepest``, m."""
 SPEED_MARGIN: Final = 0.01
 """Default relative error of the spindle's speed."""
 
@@ -85,10 +55,7 @@ class Milling:
     def __post_init__(self) -> None:
         bounds = {
             "teeth": (1 <= self.teeth <= 100, "1 to 100"),
-            "tangential": (
-                1e6 <= self.tangential <= 1e11,
-                "1e6 to 1e11 N/m2, as 600e6 for 600 MPa",
-            ),
+            "tangential": (1e6 <= self.tangential <= 1e11, "1e6 to 1e11 N/m2, as 600e6 for 600 MPa"),
             "radial": (-10.0 <= self.radial <= 10.0, "-10 to 10, a ratio"),
             "immersion": (1e-3 <= self.immersion <= 1.0, "0.001 to 1, a ratio"),
             "feed": (abs(self.feed) < 1e3, "an angle, rad"),
@@ -177,13 +144,15 @@ class Lobes:
         before, after = np.append(1.0, ratio), np.append(ratio, 1.0)
         falls = np.append(True, np.diff(depth) <= 0.0)
         lowest = falls & np.append(np.diff(depth) >= 0.0, True)
-        unsure = lowest & (np.maximum(before, after) > MAX_MINIMUM_RATIO)
-        split = (ratio > MAX_LIMIT_RATIO) | unsure[1:] | unsure[:-1]
-        split = (split & (np.diff(n) > MIN_SPEED_STEP * n[1:])) | (waves[:-1] - waves[1:] > MAX_WAVE_STEP)
+        # Minima to 0.1 %, and steps of the depth by a quarter, up to 0.05 % of the speed, where depths may be
+        # discontinuous; ten speeds in a lobe, which is one vibration wide.
+        unsure = lowest & (np.maximum(before, after) > 1.001)
+        split = (ratio > 1.25) | unsure[1:] | unsure[:-1]
+        split = (split & (np.diff(n) > 5e-4 * n[1:])) | (waves[:-1] - waves[1:] > 0.1)
         if not split.any():
             best = self.steady()[0]
             near = (n[1:] > (1.0 - SPEED_MARGIN) * best) & (n[:-1] < (1.0 + SPEED_MARGIN) * best)
-            split = near & (np.diff(n) > MAX_BEST_SPEED_STEP * n[1:])
+            split = near & (np.diff(n) > 1e-3 * n[1:])
         return np.asarray(split)
 
 
@@ -197,13 +166,13 @@ class _CuttingPlane:
 
     @classmethod
     def of(cls, modes: ToolModes, milling: Milling) -> _CuttingPlane:
-        """Project tool-point modes onto the cutting plane, and drop the small ones."""
+        """Project tool-point modes onto the cutting plane; keep at most 8, and drop those below 1 %."""
         c, s = np.cos(milling.feed), np.sin(milling.feed)
         axes = modes.rotation @ np.array([[c, -s], [s, c], [0.0, 0.0]])
         shapes, turn = modes.shapes[:, :3] @ axes, 2.0 * np.pi * modes.frequencies
         peak = (shapes**2).sum(1) / (2.0 * modes.damping * turn**2)
-        order = np.argsort(-peak)[:MAX_MODES]
-        kept = np.sort(order[peak[order] >= MIN_PEAK_FRACTION * peak.max()])
+        order = np.argsort(-peak)[:8]
+        kept = np.sort(order[peak[order] >= 0.01 * peak.max()])
         return cls(turn[kept], modes.damping[kept], shapes[kept])
 
     def stable_depth(self, milling: Milling) -> tuple[float, float]:
@@ -245,33 +214,23 @@ class _CuttingPlane:
         """Return the fastest mode's vibrations per tooth period at speeds, rpm."""
         return np.asarray(60.0 * self.turn.max() / (2.0 * np.pi * milling.teeth) / speeds)
 
-    def transition(self, h: float) -> tuple[Array, Array, Array]:
-        """Return a time step's transition matrices (m, 2, 2) and input gains (m, 2).
-
-        :param h: time of the step, s.
-
-        :returns: the matrices of position and velocity, then the gains of the forces at the step's
-        begin and end.
-        """
-        w, z = self.turn, self.damping
-        root = w * np.sqrt(1.0 - z * z)
-        decay, c, s = np.exp(-z * w * h), np.cos(root * h), np.sin(root * h)
-        s = s / root
-        # Of position and rate: free motion, then that of a constant and of a rising force.
-        free = np.array([[c + z * w * s, s], [-w * w * s, c - z * w * s]]) * decay
-        one = np.array([(1.0 - free[0, 0]) / w**2, free[0, 1]])
-        ramp = np.array([h - 2.0 * z / w * (1.0 - free[0, 0]) - free[0, 1], 1.0 - free[0, 0]])
-        end = ramp / (w**2 * h)
-        return np.moveaxis(free, -1, 0), (one - end).T, end.T
-
     def spectral_radius(self, milling: Milling, speed: float, depths: Array) -> Array:
         """Return the largest eigenvalue size per tooth period, for depths (k,), m, at a speed."""
         period = 60.0 / (speed * milling.teeth)
         waves = float(self.waves(milling, np.array(speed)))
         count = max(2 * STEPS_PER_WAVE, int(np.ceil(STEPS_PER_WAVE * waves)))
-        force = milling.steps(count)
-        free, begin, end = self.transition(period / count)
-        # Only displacements at which a tooth cuts come back. They are smooth: polynomials of time.
+        force, h = milling.steps(count), period / count
+        # A step's free motion of positions and rates, (m, 2, 2), and their gains by the force at its begin and
+        # end, (m, 2), from the motion under a constant and under a rising force.
+        w, z = self.turn, self.damping
+        root = w * np.sqrt(1.0 - z * z)
+        decay, c, s = np.exp(-z * w * h), np.cos(root * h), np.sin(root * h) / root
+        free = np.array([[c + z * w * s, s], [-w * w * s, c - z * w * s]]) * decay
+        one = np.array([(1.0 - free[0, 0]) / w**2, free[0, 1]])
+        ramp = np.array([h - 2.0 * z / w * (1.0 - free[0, 0]) - free[0, 1], 1.0 - free[0, 0]])
+        end = ramp / (w**2 * h)
+        free, begin, end = np.moveaxis(free, -1, 0), (one - end).T, end.T
+        # Only displacements at which a tooth cuts return. They are smooth: polynomials of time.
         cut = np.flatnonzero(np.abs(force).max((1, 2)) > 1e-12 * milling.tangential)
         parts = np.split(cut, np.flatnonzero(np.diff(cut) > 1) + 1)
         basis = scipy.linalg.block_diag(*(_chebyshev_basis(len(part), waves / count) for part in parts))
@@ -287,11 +246,11 @@ class _CuttingPlane:
         rows = []
         for k in range(count):
             rows.append(u)
-            w = force[(k + 1) % count]
+            cutting = force[(k + 1) % count]
             past = before[k + 1] if k + 1 < count else first
             state = free @ state + begins @ f[:, None]
             u = at @ state[:, :, 0]
-            f = -b * np.linalg.solve(np.eye(2) + b * (w @ gain), w @ (u - past))
+            f = -b * np.linalg.solve(np.eye(2) + b * (cutting @ gain), cutting @ (u - past))
             state, u = state + ends @ f[:, None], u + gain @ f
         fitted = np.einsum("ck,kdin->dcin", np.linalg.pinv(basis), np.array(rows)[cut])
         whole = np.concatenate([part.reshape(len(depths), -1, n) for part in (state, fitted)], 1)
@@ -308,13 +267,14 @@ class _CuttingPlane:
 
         while margin(low) >= 0.0:
             low /= 4.0
-        count = max(2, int(np.ceil(np.log(deepest / low) / np.log(DEPTH_RATIO))) + 1)
+        # Depths grow by a quarter until one is unstable.
+        count = max(2, int(np.ceil(np.log(deepest / low) / np.log(1.25))) + 1)
         tried = np.geomspace(low, deepest, count)
-        for part in np.array_split(np.arange(1, count), max(1, count // DEPTHS_PER_BATCH)):
+        for part in np.array_split(np.arange(1, count), max(1, count // 5)):
             bad = self.spectral_radius(milling, speed, tried[part]) >= 1.0
             if bad.any():
                 k = int(part[bad.argmax()])
-                return float(scipy.optimize.brentq(margin, tried[k - 1], tried[k], rtol=DEPTH_TOLERANCE))
+                return float(scipy.optimize.brentq(margin, tried[k - 1], tried[k], rtol=2e-4))
         return np.inf
 
 
@@ -323,7 +283,8 @@ def _chebyshev_basis(count: int, waves: float) -> Array:
 
     :param waves: vibrations per step.
     """
-    degree = BASE_DEGREE + int(np.ceil(4.0 * waves * count))
+    # A degree of four per vibration resolves it to rounding, with a margin of ten.
+    degree = 10 + int(np.ceil(4.0 * waves * count))
     if count < 2 * degree:
         return np.eye(count)
     return np.asarray(np.polynomial.chebyshev.chebvander(np.linspace(-1.0, 1.0, count), degree))
@@ -362,12 +323,7 @@ def lobes_of(modes: ToolModes, milling: Milling, speeds: ArrayLike, deepest: flo
 
 
 def lobes_between(
-    modes: ToolModes,
-    milling: Milling,
-    low: float,
-    high: float,
-    points: int,
-    deepest: float | None = None,
+    modes: ToolModes, milling: Milling, low: float, high: float, points: int, deepest: float | None = None
 ) -> Lobes:
     """Find limit depths over a speed range, dense enough for its smallest and best depth.
 
@@ -405,7 +361,7 @@ def _check_range(plane: _CuttingPlane, milling: Milling, at: Array, deepest: flo
     if at.ndim != 1:
         raise ParameterError("speeds", at.shape, "one speed after another")
     for speed in (at.min(), at.max()) if at.size else ():
-        check_limit("speeds", float(speed), "rpm", 1e-3, MAX_SPINDLE_SPEED)
+        check_limit("speeds", float(speed), "rpm", 1e-3, 1e6)
     waves = plane.waves(milling, at)
     if len(at) and waves.max() > MAX_WAVES * (1.0 + 1e-12):
         bound = f"{at.min() * waves.max() / MAX_WAVES:.4g} rpm or more: process damping governs below"
@@ -415,12 +371,12 @@ def _check_range(plane: _CuttingPlane, milling: Milling, at: Array, deepest: flo
         raise ParameterError("deepest", None, "a depth, m, as no depth is unstable in theory")
     if deepest is None:
         return DEFAULT_DEPTH_RATIO * safe, safe
-    check_limit("deepest", deepest, "m", *DEPTH_RANGE)
+    check_limit("deepest", deepest, "m", *(1e-6, 10.0))
     return float(deepest), safe
 
 
 def _find_limits(plane: _CuttingPlane, milling: Milling, at: Array, last: float, safe: float) -> Lobes:
-    low = min(FIRST_DEPTH_RATIO * safe, 0.5 * last)
+    low = min(0.4 * safe, 0.5 * last)
     found = np.array([plane.find_limit(milling, float(speed), low, last) for speed in at])
     return Lobes(at, np.minimum(found, last), found > last, safe)
 

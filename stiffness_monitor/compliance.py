@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -27,7 +27,6 @@ MIN_PIVOT_RATIO: Final = 1e-10
 singularity, growing with the square of the distance from it."""
 TIE_TOLERANCE: Final = 1e-9
 """Relative difference below which two energies tie."""
-_UNLOADED: Final = np.zeros(6)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,8 +62,9 @@ def platform_response(robot: Robot, q: ArrayLike, wrench: ArrayLike) -> Platform
     """Return compliance, deflection and strain energies at joint positions, from one factorisation.
 
     2UPR-RPU paper: C (equation 35), the total strain energy U = P' C P / 2 (equation 37), and the
-    local strain-energy factors mu_ij = U_ij / U (equation 38), whose mean over even poses of a
-    workspace is the global factor (equation 39).
+    local strain-energy factors mu_ij = U_ij / U (equation 38); they are computed in
+    :meth:`.SymbolicFrame.factorise` and :func:`.write_response`. The mean of mu over even poses of
+    a workspace is the global factor (equation 39).
 
     :param q: joint positions, shape (..., n), rad or m; locked.
     :param wrench: external force and moment on the platform at its reference point, base axes,
@@ -75,7 +75,10 @@ def platform_response(robot: Robot, q: ArrayLike, wrench: ArrayLike) -> Platform
     :raises ValueError: a wrong last axis, or a value that is not finite.
     """
     names = robot.cached(Elastic).names
-    row = _evaluate(robot, q, wrench)
+    checked = partial(_evaluate_checked, robot)
+    row = robot.bound(_response_kernel, otherwise=checked)(q, wrench)
+    if row.ndim == 1 and not row[-1] > MIN_PIVOT_RATIO:
+        row = checked(q, wrench)
     row.setflags(write=False)
     n = len(names)
     factors, energies, deflection = row[..., :n], row[..., n : 2 * n], row[..., 2 * n : 2 * n + 6]
@@ -87,14 +90,7 @@ def platform_response(robot: Robot, q: ArrayLike, wrench: ArrayLike) -> Platform
         close = [k for k, share in enumerate(shares) if share > bound]
         dominant = names[close[0]] if close else "none"
         return PlatformResponse(
-            names,
-            matrix,
-            factors,
-            energies,
-            float(row[2 * n + 6]),
-            deflection,
-            dominant,
-            len(close) > 1,
+            names, matrix, factors, energies, float(row[2 * n + 6]), deflection, dominant, len(close) > 1
         )
     near = factors > factors.max(-1, keepdims=True) * (1.0 - TIE_TOLERANCE)
     # Index -1, without load, is the last name.
@@ -106,16 +102,9 @@ def platform_response(robot: Robot, q: ArrayLike, wrench: ArrayLike) -> Platform
         energies,
         np.ascontiguousarray(row[..., 2 * n + 6]),
         deflection,
-        _dominant_names(names)[first],
+        np.array([*names, "none"])[first],
         near.sum(-1) > 1,
     )
-
-
-def _evaluate(robot: Robot, q: ArrayLike, wrench: ArrayLike) -> Array:
-    """Evaluate the response program, shape (..., size); errors name the sample."""
-    checked = partial(_evaluate_checked, robot)
-    row = robot.bound(_response_kernel, otherwise=checked)(q, wrench)
-    return row if row.ndim > 1 or row[-1] > MIN_PIVOT_RATIO else checked(q, wrench)
 
 
 def _response_kernel(robot: Robot) -> Kernel:
@@ -163,7 +152,7 @@ def compliance(robot: Robot, pose: ArrayLike) -> Array:
         Other errors as :func:`platform_response`.
     """
     _ = robot.cached(Elastic)
-    return platform_response(robot, robot.inverse(pose), _UNLOADED).compliance.copy()
+    return platform_response(robot, robot.inverse(pose), np.zeros(6)).compliance.copy()
 
 
 def stiffness(robot: Robot, pose: ArrayLike) -> Array:
@@ -203,8 +192,3 @@ def kernels(robot: Robot) -> tuple[Kernel, ...]:
     :raises ParameterError: a robot without elastic members.
     """
     return robot.engine.forward, robot.cached(Elastic).response
-
-
-@lru_cache(maxsize=8)
-def _dominant_names(names: tuple[str, ...]) -> NDArray[np.str_]:
-    return np.array([*names, "none"])

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,10 +12,6 @@ from pkm_twin.codegen.arrays import Array, Mask, common_batch, doubles, finite, 
 from pkm_twin.machine.rotations import skew
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
-
-MIN_REACH_FRACTION: Final = 0.02
-"""Singular value, relative to the largest, below which the joints hardly move the tool point in
-that direction: correcting there would cost offsets of fifty times the deflection."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +129,8 @@ def _solve_least_norm(matrix: Array, target: Array, best: Array) -> tuple[Array,
     """
     u, values, vt = np.linalg.svd(matrix, full_matrices=False)
     greatest = np.linalg.svd(best, compute_uv=False)[..., :1]
-    held = values > MIN_REACH_FRACTION * greatest
+    # Directions that the joints hardly move would cost offsets of fifty times the deflection.
+    held = values > 0.02 * greatest
     along = np.where(held, _multiply(u.swapaxes(-1, -2), target) / np.where(held, values, 1.0), 0.0)
     kept = np.where(held[..., None], vt, 0.0)
     spare = np.eye(matrix.shape[-1]) - kept.swapaxes(-1, -2) @ kept

@@ -51,18 +51,10 @@ class SetpointCorrection(Core):
         self.setpoints = counting()
         """Counts of corrected and of rejected set points."""
         wanted = node.declare(
-            "correct_setpoint",
-            False,
-            "publish joint offsets that compensate the tool point's deflection",
+            "correct_setpoint", False, "publish joint offsets that compensate the tool point's deflection"
         )
-        self._tool = np.array(
-            triple(
-                node,
-                "tool.xyz",
-                "position of the tool point from the platform's reference point, platform axes",
-                "m",
-            )
-        )
+        text = "position of the tool point from the platform's reference point, platform axes"
+        self._tool = np.array(triple(node, "tool.xyz", text, "m"))
         self._bound = node.declare(
             "correction_bound",
             1e-3,
@@ -162,24 +154,19 @@ class SetpointCorrection(Core):
 
     def _on_setpoint(self, message: JointStateView) -> None:
         with self.taking(self.setpoints):
-            self._correct(message)
-
-    def _correct(self, message: JointStateView) -> None:
-        sample = self._reader.positions(message, self._node.now(), self._rules)
-        if self._offset is None:
-            raise MessageError("no wrench", "none to compute a correction from has arrived")
-        stamp, offset = self._offset
-        age = abs(sample.stamp - stamp) / SECOND
-        if age > self._age:
-            raise MessageError(
-                "no wrench",
-                f"the last one is {age:.3f} s from the set point, allowed {self._age:g} s",
-            )
-        position = self._stream.correct(sample.stamp, sample.q, offset)
-        corrected = self._robot.controller.controller_positions(position)
-        self._corrected.publish(sample.stamp, corrected)
-        if self._paired:
-            self._pair(sample.stamp, "position", corrected)
+            sample = self._reader.positions(message, self._node.now(), self._rules)
+            if self._offset is None:
+                raise MessageError("no wrench", "none to compute a correction from has arrived")
+            stamp, offset = self._offset
+            age = abs(sample.stamp - stamp) / SECOND
+            if age > self._age:
+                text = f"the last one is {age:.3f} s from the set point, allowed {self._age:g} s"
+                raise MessageError("no wrench", text)
+            position = self._stream.correct(sample.stamp, sample.q, offset)
+            corrected = self._robot.controller.controller_positions(position)
+            self._corrected.publish(sample.stamp, corrected)
+            if self._paired:
+                self._pair(sample.stamp, "position", corrected)
 
     def _on_torques(self, message: JointStateView) -> None:
         sample = self._reader.efforts(message, self._node.now(), self._rules)

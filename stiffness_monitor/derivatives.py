@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -27,11 +26,9 @@ Chosen = tuple[int, ...] | None
 
 
 def compliance_derivatives(robot: Robot, pose: ArrayLike, by: Sequence[str] = ()) -> Derivatives:
-    """Return derivatives of the compliance by the pose and by numbers of the file.
+    """Return derivatives of the compliance by the pose, and by numbers of the file at constant pose.
 
-    Derivatives by numbers hold the pose constant.
-
-    Exact to rounding.
+    They are exact to rounding.
 
     :param pose: shape (..., m), m and rad.
     :param by: dotted paths of numbers of the file, as :func:`pkm_twin.variants` takes them.
@@ -113,8 +110,16 @@ def compliance_gradient(elastic: Elastic) -> Kernel:
 
 def _gradient_kernel(elastic: Elastic, write: Write, chosen: Chosen) -> Kernel:
     """Return the compiled gradient of the program that ``write`` writes."""
-    name = f"gradient{write.__name__} by {chosen}"
-    return elastic.kernel(name, partial(_write_gradient, write, chosen), free=True)
+
+    def write_gradient(s: SymbolicFrame) -> Program:
+        program, t = write(s), s.t
+        numbers, q = [*t.geometry, *t.more], list(t.q)
+        if chosen is not None:
+            numbers = [numbers[k] for k in chosen]
+            q = q if min(chosen, default=math.inf) < len(t.geometry) else []
+        return gradient_program(t, program, {"q": q, "numbers": numbers})
+
+    return elastic.kernel(f"gradient{write.__name__} by {chosen}", write_gradient, free=True)
 
 
 def _write_compliance(s: SymbolicFrame) -> Program:
@@ -126,15 +131,6 @@ def _write_energies(s: SymbolicFrame) -> Program:
     s.factorise()
     s.load(s.t.tape.inputs("wrench", 6))
     return s.program({"wrench": 6}, {"energies": s.energies()})
-
-
-def _write_gradient(write: Write, chosen: Chosen, s: SymbolicFrame) -> Program:
-    program, t = write(s), s.t
-    numbers, q = [*t.geometry, *t.more], list(t.q)
-    if chosen is not None:
-        numbers = [numbers[k] for k in chosen]
-        q = q if min(chosen, default=math.inf) < len(t.geometry) else []
-    return gradient_program(t, program, {"q": q, "numbers": numbers})
 
 
 def compliance_deviation(robot: Robot, pose: ArrayLike) -> Array:

@@ -24,18 +24,13 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.lu import independent_rows, is_zero
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.graph import BASE
-from stiffness_monitor.structure import (
-    FREE,
-    RIGID,
-    Carried,
-    Member,
-    StructuralModel,
-    Support,
-)
+from stiffness_monitor.structure import FREE, RIGID, Carried, Member, StructuralModel, Support
 
 Row = dict[int, Any]
 """Entries of a linear form of the coordinates that are not zero."""
 
+DIRECTIONS: Final = ("x", "y", "z", "rx", "ry", "rz")
+"""Names of the displacements in their order."""
 PLATFORM: Final = 6
 """The platform's displacements are the first six coordinates."""
 PLANES: Final = ((1, 5, 1.0), (2, 4, -1.0))
@@ -143,7 +138,13 @@ class Frame:
                 self._add_member(part)
         self.last = self.size
         for closure in model.closures:
-            self._add_closure(closure.support, closure.inner, closure.at)
+            # The joint lets the second body move against the first one; other directions stay closed.
+            support = closure.support
+            first = self._point_on_body(*closure.inner, closure.at)
+            second = self._point_on_body(support.body, support.end, closure.at)
+            own, lets = self._add_joint(support)
+            minus, plus = (turned(support.axes.T, node.map) for node in (first, second))
+            self.held += [sum_forms((first.own, -minus[k]), (second.own, plus[k]), (own, -lets[k])) for k in range(6)]
 
     def _add_coordinates(self, count: int) -> range:
         self.size += count
@@ -179,16 +180,6 @@ class Frame:
         node = self._point_on_body(support.body, support.end, at)
         own, lets = self._add_joint(support)
         return Node((*node.own, *own), np.hstack((node.map, turned(support.axes, lets))), at)
-
-    def _add_closure(self, support: Support, inner: tuple[str, int], at: Any) -> None:
-        """Add the constraints between two attached bodies that a joint connects."""
-        first, second = (
-            self._point_on_body(*inner, at),
-            self._point_on_body(support.body, support.end, at),
-        )
-        own, lets = self._add_joint(support)
-        minus, plus = (turned(support.axes.T, node.map) for node in (first, second))
-        self.held += [sum_forms((first.own, -minus[k]), (second.own, plus[k]), (own, -lets[k])) for k in range(6)]
 
     def _add_member(self, member: Member) -> None:
         """Add a member with its supports at both ends."""

@@ -59,20 +59,20 @@ def limb_stiffness(robot: Robot, pose: ArrayLike) -> LimbStiffness:
     columns, owner = elastic_columns(robot, robot.inverse(pose))
     count = wrenches.shape[-3]
     limb = owner // (len(robot.cached(Elastic).names) // count)
+    found = []
+    for number in range(count):
+        # Static condensation of the limb's columns on the platform's displacements.
+        own = columns[..., limb == number]
+        touched = (own[..., PLATFORM:, :] != 0.0).any(-1)
+        inside = PLATFORM + np.flatnonzero(touched.reshape(-1, touched.shape[-1]).any(0))
+        rows = own[..., [*range(PLATFORM), *inside], :]
+        matrix = rows @ np.swapaxes(rows, -1, -2)
+        side = matrix[..., :PLATFORM, PLATFORM:]
+        inner = np.linalg.solve(matrix[..., PLATFORM:, PLATFORM:], np.swapaxes(side, -1, -2))
+        found.append(matrix[..., :PLATFORM, :PLATFORM] - side @ inner)
+    # K_i on the limb's own wrenches, and W_i = K_i J_i' C P (equations 17, 28 and 36).
     back = np.linalg.pinv(wrenches)
-    found = [_condense(columns[..., limb == number]) for number in range(count)]
     stiffness = back @ np.stack(found, -3) @ np.swapaxes(back, -1, -2)
     stiffness = (stiffness + np.swapaxes(stiffness, -1, -2)) / 2
     factors = stiffness @ np.swapaxes(wrenches, -1, -2) @ whole[..., None, :, :]
     return LimbStiffness(wrenches, stiffness, factors)
-
-
-def _condense(columns: Array) -> Array:
-    """Return the stiffness of one limb's columns on the platform's displacements, (..., 6, 6)."""
-    touched = (columns[..., PLATFORM:, :] != 0.0).any(-1)
-    inside = PLATFORM + np.flatnonzero(touched.reshape(-1, touched.shape[-1]).any(0))
-    rows = columns[..., [*range(PLATFORM), *inside], :]
-    matrix = rows @ np.swapaxes(rows, -1, -2)
-    side = matrix[..., :PLATFORM, PLATFORM:]
-    inner = np.linalg.solve(matrix[..., PLATFORM:, PLATFORM:], np.swapaxes(side, -1, -2))
-    return np.asarray(matrix[..., :PLATFORM, :PLATFORM] - side @ inner, np.float64)

@@ -10,10 +10,10 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MessageError
-from pkm_twin.messages.reading import WrenchSample, as_message_error
+from pkm_twin.messages.reading import as_message_error
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.streams.monitor import Pace
-from pkm_twin.streams.wrench import Mount, TimeCache, TimeSynchronizer, WrenchSettings
+from pkm_twin.streams.wrench import TimeCache, TimeSynchronizer, WrenchSettings
 from stiffness_monitor.compliance import PlatformResponse, platform_response
 
 Settings = WrenchSettings
@@ -79,36 +79,21 @@ class Monitor(TimeSynchronizer):
         :raises MessageError: the message is rejected, and counted.
         """
         with self.taking(self.wrenches):
-            return self._take_wrench(message, now)
-
-    def _take_wrench(self, message: Any, now: int) -> Answer | None:
-        sample, mount = self._wrench_reader.read(message, now)
-        if not self.pace.due(sample.stamp):
-            return None
-        q = self._nearest_joints(sample.stamp)
-        answer: Answer = as_message_error(self._compute, sample, mount, q)
-        found = answer.energy
-        if not (np.isfinite(found.compliance).all() and np.isfinite(found.deflection).all()):
-            raise MessageError("non-finite result", "the model gave a value that is not finite")
-        self.pace.answered(sample.stamp)
-        return answer
-
-    def _compute(self, sample: WrenchSample, mount: Mount, q: Array) -> Answer:
-        pose, _, rotation = self.robot.placed(q)
-        fixed = self._wrench_reader.at_reference(sample, mount, rotation)
-        energy = platform_response(self.robot, q, fixed)
-        return Answer(sample.stamp, q, pose, fixed, energy, rotation)
-
-    def _nearest_joints(self, stamp: int) -> Array:
-        """Return the joint positions of the state nearest in time."""
-        found = self._recent.nearest(stamp)
-        if found is None:
-            raise MessageError("no pose", "no pose: no joint state has arrived")
-        age = abs(stamp - found[0])
-        if age > self.settings.max_state_age * SECOND:
-            raise MessageError(
-                "no pose",
-                f"no pose: the nearest joint state is {age / SECOND:.3f} s away, allowed "
-                f"{self.settings.max_state_age:g} s",
-            )
-        return found[1]
+            sample, mount = self._wrench_reader.read(message, now)
+            if not self.pace.due(sample.stamp):
+                return None
+            found = self._recent.nearest(sample.stamp)
+            if found is None:
+                raise MessageError("no pose", "no pose: no joint state has arrived")
+            stamp, q = found
+            age, allowed = abs(sample.stamp - stamp) / SECOND, self.settings.max_state_age
+            if age > allowed:
+                text = f"no pose: the nearest joint state is {age:.3f} s away, allowed {allowed:g} s"
+                raise MessageError("no pose", text)
+            pose, _, rotation = as_message_error(self.robot.placed, q)
+            fixed = self._wrench_reader.at_reference(sample, mount, rotation)
+            energy: PlatformResponse = as_message_error(platform_response, self.robot, q, fixed)
+            if not (np.isfinite(energy.compliance).all() and np.isfinite(energy.deflection).all()):
+                raise MessageError("non-finite result", "the model gave a value that is not finite")
+            self.pace.answered(sample.stamp)
+            return Answer(sample.stamp, q, pose, fixed, energy, rotation)

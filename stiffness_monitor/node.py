@@ -16,7 +16,6 @@ from typing import Final
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Quaternion, TransformStamped, Vector3, WrenchStamped
-from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray, Header, MultiArrayDimension, String
 
 from pkm_twin.errors import PkmTwinError
@@ -31,13 +30,13 @@ from pkm_twin.streams.wrench import PLATFORM
 from stiffness_monitor.alarm_node import StiffnessAlarmTopics
 from stiffness_monitor.compliance import kernels
 from stiffness_monitor.correction_node import SetpointCorrection
+from stiffness_monitor.frame import DIRECTIONS
 from stiffness_monitor.modes import has_modes, natural_frequencies
 from stiffness_monitor.monitor import Answer, Monitor, Settings
 from stiffness_monitor.topics import STIFFNESS
 
-AXES: Final = ("x", "y", "z", "rx", "ry", "rz")
 UPPER_TRIANGLE: Final = np.triu_indices(6)
-ENTRIES: Final = tuple(f"{AXES[i]}_{AXES[j]}" for i, j in zip(*UPPER_TRIANGLE, strict=True))
+ENTRIES: Final = tuple(f"{DIRECTIONS[i]}_{DIRECTIONS[j]}" for i, j in zip(*UPPER_TRIANGLE, strict=True))
 """Names of the compliance's entries: displacement, then force or moment."""
 
 
@@ -45,6 +44,7 @@ class StiffnessMonitor(TwinNode):
     """Publish live compliance and strain energy of any robot with elastic members."""
 
     topics = STIFFNESS
+    core: Monitor
 
     def __init__(self) -> None:
         super().__init__("stiffness_monitor")
@@ -61,31 +61,31 @@ class StiffnessMonitor(TwinNode):
         mounts = declare_mounts(self, given or PLATFORM)
         self._platform_frame = given or ("" if mounts is None else PLATFORM)
         self.core = Monitor(robot, settings, mounts)
-        self.core.pace = Pace(
-            self.declare(
-                "rate",
-                0.0,
-                "largest rate of messages, by the stamps of the wrenches; 0: one for each wrench",
-                unit="Hz",
-                low=0.0,
-                high=1e4,
-            )
-        )
+        text = "largest rate of messages, by the stamps of the wrenches; 0: one for each wrench"
+        self.core.pace = Pace(self.declare("rate", 0.0, text, unit="Hz", low=0.0, high=1e4))
         self._correction = SetpointCorrection(self, robot, settings.stamp_rules)
         self._alarm = StiffnessAlarmTopics(
-            self,
-            robot,
-            settings.stamp_rules,
-            (settings.base_frame, self._platform_frame or settings.platform_frame),
+            self, robot, settings.stamp_rules, (settings.base_frame, self._platform_frame or settings.platform_frame)
         )
         # Messages without stamp or with text values have a second topic that plots can draw.
         self._outputs = [
             (self.create_guarded_publisher(topic), make)
             for topic, make in (
                 ("~/compliance", _compliance_message),
-                ("~/compliance_stamped", self._entries_message),
+                (
+                    "~/compliance_stamped",
+                    lambda a: named(self._in_base(a), ENTRIES, a.compliance[UPPER_TRIANGLE].tolist()),
+                ),
                 ("~/strain_energy", self._energies_message),
-                ("~/strain_energy_stamped", self._factors_message),
+                (
+                    "~/strain_energy_stamped",
+                    lambda a: named(
+                        self._in_base(a),
+                        a.energy.elements,
+                        a.energy.factors.tolist(),
+                        efforts=a.energy.energies.tolist(),
+                    ),
+                ),
                 ("~/dominant_element", lambda answer: String(data=answer.energy.dominant)),
                 ("~/deflection", self._deflection_message),
             )
@@ -109,9 +109,7 @@ class StiffnessMonitor(TwinNode):
         )
         self.create_guarded_subscription("wrench", self._on_wrench)
         self.follow(
-            changeable(Settings),
-            lambda values: with_parameters(self.core.settings, values),
-            self._change_settings,
+            changeable(Settings), lambda values: with_parameters(self.core.settings, values), self._change_settings
         )
         self.start()
 
@@ -163,12 +161,7 @@ class StiffnessMonitor(TwinNode):
             # Most of the time goes into messages: only those that have a subscriber are made.
             if publisher.get_subscription_count():
                 publisher.publish(make(answer))
-        for take in (self._correction.take, self._alarm.take):
-            try:
-                take(answer)
-            except (PkmTwinError, ValueError) as error:
-                # The compliance is still valid, for example close to a singularity.
-                self.log_throttled("beside", f"no correction or alarm: {error}")
+        self.call_beside("correction or alarm", answer, self._correction.take, self._alarm.take)
 
     def _publish_frequencies(self) -> None:
         """Publish the frequencies of the latest joint state, at most at ``frequencies_rate``."""
@@ -193,14 +186,6 @@ class StiffnessMonitor(TwinNode):
 
     def _in_base(self, answer: Answer) -> Header:
         return header(answer.stamp, self.core.settings.base_frame)
-
-    def _entries_message(self, answer: Answer) -> JointState:
-        return named(self._in_base(answer), ENTRIES, answer.compliance[UPPER_TRIANGLE].tolist())
-
-    def _factors_message(self, answer: Answer) -> JointState:
-        found = answer.energy
-        factors, energies = found.factors.tolist(), found.energies.tolist()
-        return named(self._in_base(answer), found.elements, factors, efforts=energies)
 
     def _energies_message(self, answer: Answer) -> DiagnosticArray:
         """Return factors, energy, pose and frame; no factors without load."""
@@ -248,7 +233,7 @@ def _compliance_message(answer: Answer) -> Float64MultiArray:
 
 
 NODE = StiffnessMonitor
-"""What a process of one or several nodes makes."""
+"""The node class, for a process of one or several nodes."""
 
 if __name__ == "__main__":
     sys.exit(run(NODE))

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 
@@ -16,9 +16,6 @@ from pkm_twin.machine.geometry import marks
 from pkm_twin.machine.graph import Graph
 from pkm_twin.machine.members import Place, Structure
 from pkm_twin.machine.tree import Tree
-
-_MAX_COMPLIANCE: Final = 1e300
-"""Compliance above which a joint direction counts as free."""
 
 Rigidities = Mapping[str, Sequence[Any]]
 """EA, GJ, EI, and 12 E I over the shear rigidity, by beam."""
@@ -92,5 +89,5 @@ def _find_point(places: Sequence[Array], at: Any) -> int | None:
 
 
 def _is_finite(compliance: Any) -> Any:
-    """Return an expression: 1 if a compliance is above zero and finite, else 0."""
-    return sign(compliance) * sign(maximum(0.0, _MAX_COMPLIANCE - compliance))
+    """Return an expression: 1 if a compliance is above zero and below 1e300, which is free, else 0."""
+    return sign(compliance) * sign(maximum(0.0, 1e300 - compliance))

@@ -27,7 +27,7 @@ from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics.motion import Motion
 from pkm_twin.kinematics.traced import Traced
 from pkm_twin.robot.robot import Robot
-from stiffness_monitor.frame import PLATFORM, Column, Frame, Row, bending_shape, sum_forms
+from stiffness_monitor.frame import PLATFORM, Frame, Row, bending_shape, sum_forms
 from stiffness_monitor.numbers import constant_pattern, list_numbers, substitute_numbers
 from stiffness_monitor.structure import FREE, place_plan, plan_structure
 
@@ -36,9 +36,6 @@ DEFLECTION_PARTS: Final = 4
 NO_PARAMETERS: Final = np.zeros(0)
 """Empty parameters of the programs: kernels hold all numbers."""
 _TINY: Final = 1e-200
-_CLOSURE_SCALE: Final = 1e-3
-"""Weight of dependent closures' residuals: times it they must be below the tolerance of other
-numbers, a billionth."""
 
 
 @dataclass(frozen=True)
@@ -125,7 +122,7 @@ class Elastic:
         The measure is the least pivot over its diagonal entry, which no choice of units changes: 0
         where the frame is a mechanism. Factors are zero where the wrench is.
         """
-        return self.kernel("platform response", _write_response)
+        return self.kernel("platform response", write_response)
 
     @cached_property
     def deflections(self) -> Kernel:
@@ -172,7 +169,11 @@ class SymbolicFrame:
         left = (k for k in range(frame.size) if k not in self.follow)
         self.place = {k: i for i, k in enumerate(left)}
         columns = [column for bar in frame.bars for column in frame.columns(bar)]
-        self.columns = [self._eliminate(column) for column in (*columns, *frame.springs)]
+        # By the coordinates that closures leave independent.
+        self.columns = [
+            column._replace(row={self.place[k]: value for k, value in _substitute(column.row, self.follow).items()})
+            for column in (*columns, *frame.springs)
+        ]
 
     def _frame(self, motion: Motion) -> Frame:
         compliances = self.structure.compliances
@@ -193,21 +194,17 @@ class SymbolicFrame:
             assumed += [(e, e.value) for e in t.tape.inputs(GEOMETRY, len(t.tape.reference))]
         follow, inverse, _ = solve_dependents(self.frame, chosen)
         _, there, left = solve_dependents(self._frame(known), chosen)
-        # With other numbers a redundant closure could become independent.
-        assumed += [(e * _CLOSURE_SCALE, 0.0) for e in t.lift(left)]
+        # With other numbers a redundant closure could become independent; numbers agree to 1e-9, residuals to 1e-6.
+        assumed += [(e * 1e-3, 0.0) for e in t.lift(left)]
         # Zero where the closures no longer determine the chosen coordinates.
         self.measure = 1.0 / maximum(absolute(inverse / there), _TINY)
         return follow
 
-    def _eliminate(self, column: Column) -> Column:
-        """Express a column by the coordinates that closures leave independent."""
-        row = _substitute(column.row, self.follow)
-        return column._replace(row={self.place[k]: value for k, value in row.items()})
-
     def factorise(self) -> None:
         """Factorise the stiffness; set the platform's ``compliance`` and the frame's ``measure``.
 
-        The platform's K and C (2UPR-RPU paper, equations 33 to 35).
+        K = sum of d b b' over the columns is the 2UPR-RPU paper's sum of J_i K_i J_i' (equations 33
+        and 34) with the limbs' inner coordinates, last the platform's; C = K^-1 there (equation 35).
         """
         n, first = len(self.place), len(self.place) - PLATFORM
         matrix: dict[tuple[int, int], Any] = {(i, i): 0.0 for i in range(n)}
@@ -237,8 +234,8 @@ class SymbolicFrame:
     def load(self, wrench: Any) -> None:
         """Apply a wrench to the platform; set coordinates ``x`` and the columns' ``amounts``.
 
-        Elements move with the platform, and their work is the wrench's (2UPR-RPU paper, equations
-        29, 31 and 32).
+        The platform moves by C P; elements move with it, and their work is the wrench's (2UPR-RPU
+        paper, equations 29, 31 and 32).
         """
         root, x = self.root, [0.0] * len(self.place)
         x[-PLATFORM:] = self.compliance @ wrench
@@ -251,9 +248,10 @@ class SymbolicFrame:
             self.x[k] = _dot(row.values(), [self.x[c] for c in row])
 
     def energies(self) -> list[Any]:
-        """Return the strain energies of the elements under the load, in their order.
+        """Return the strain energies U_ij of the elements under the load, in their order.
 
-        Of bars and joints (2UPR-RPU paper, equations 4, 9, 14 and 26).
+        Of bars and joints: W' C_ij W / 2 of the 2UPR-RPU paper (equations 4, 9, 14 and 26), here
+        d (b . x)^2 / 2 summed over an element's columns.
         """
         found: dict[str, Any] = dict.fromkeys(self.elastic.names, 0.0)
         for column, amount in zip(self.columns, self.amounts, strict=True):
@@ -295,7 +293,8 @@ def _write_compliance(s: SymbolicFrame) -> Program:
     return s.program({}, {"compliance": s.compliance.ravel(), "measure": [s.measure]})
 
 
-def _write_response(s: SymbolicFrame) -> Program:
+def write_response(s: SymbolicFrame) -> Program:
+    """Write the program of factors, energies, deflection, energy, C and pivot ratio."""
     s.factorise()
     wrench = s.t.tape.inputs("wrench", 6)
     size: Any = 0.0
@@ -303,10 +302,11 @@ def _write_response(s: SymbolicFrame) -> Program:
         size = maximum(size, absolute(value))
     # Scaled to unit size, so that squares of tiny or huge loads do not under- or overflow.
     s.load(wrench / maximum(size, 1e-300))
-    energies = s.energies()
-    total, square = sum(energies, 0.0), size * size
-    row = [value / maximum(total, 1e-300) for value in energies]
-    row += [value * square for value in energies]
+    # U_ij, U = sum of U_ij = P' C P / 2 and mu_ij = U_ij / U (2UPR-RPU paper, equations 37 and 38).
+    energies, square = s.energies(), size * size
+    total = sum(energies, 0.0)
+    factors = [energy / maximum(total, 1e-300) for energy in energies]
+    row = [*factors, *(energy * square for energy in energies)]
     row += [s.x[k] * size for k in range(PLATFORM)]
     return s.program({"wrench": 6}, {"row": [*row, total * square, *s.compliance.ravel(), s.measure]})
 

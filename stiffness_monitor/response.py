@@ -42,24 +42,21 @@ class ElementResponse:
     rest: Array
 
     def columns(self, factors: ArrayLike) -> tuple[Any, Any]:
-        """Return S as a vector (r,), and Z' (..., 6, r); factors may be complex."""
-        change = (self._checked(factors) - 1.0)[self.owner]
+        """Return S as a vector (r,), and Z' (..., 6, r); factors may be complex.
+
+        :raises ValueError: factors of another shape, or that are not finite.
+        """
+        size, given = len(self.names), np.asarray(factors)
+        if np.iscomplexobj(given):
+            # Complex factors serve complex-step derivatives.
+            one_vector(given.real, size, "factors")
+            one_vector(given.imag, size, "factors")
+        else:
+            given = one_vector(given, size, "factors")
+        change = (given - 1.0)[self.owner]
         matrix = np.eye(len(self.owner)) + self.rest * change
         columns = np.linalg.solve(matrix, np.swapaxes(self.reach, -1, -2))
         return change, np.swapaxes(columns, -1, -2)
-
-    def _checked(self, factors: ArrayLike) -> Any:
-        """Check factors, shape (elements,); complex ones serve complex-step derivatives.
-
-        :raises ValueError: another shape, or a factor that is not finite.
-        """
-        size = len(self.names)
-        if not np.iscomplexobj(factors):
-            return one_vector(factors, size, "factors")
-        array = np.asarray(factors, np.complex128)
-        for part in (array.real, array.imag):
-            one_vector(part, size, "factors")
-        return array
 
     def compliance_at(self, factors: ArrayLike) -> Any:
         """Return the compliance with factors (elements,), shape (..., 6, 6)."""

@@ -203,7 +203,17 @@ def structural_model(robot: Robot, q: ArrayLike) -> StructuralModel:
         structure.sections.__getitem__,
         lambda joint, k: float(structure.compliances[joint][k]),
     )
-    return replace(model, bodies=tuple(_lumped_masses(robot, posture.place, posture.turn)))
+    # Rigid bodies that are not modelled as beams, and the payload, with their inertia in the pose.
+    graph, load = robot.graph, robot.payload
+    beams = {n for beam in structure.beams for n in (*beam.parts, *beam.carries)}
+    lumps = [(name, b.mass, b.com, b.inertia, name) for name, b in graph.bodies.items() if name not in beams]
+    lumps.append(("payload", load.mass, graph.origin + load.com, load.inertia, graph.platform))
+    bodies = (
+        RigidBody(name, mass, posture.place(on, com), posture.turn(on, posture.turn(on, inertia).T), on)
+        for name, mass, com, inertia, on in lumps
+        if mass > 0.0
+    )
+    return replace(model, bodies=tuple(bodies))
 
 
 def place_plan(
@@ -394,17 +404,7 @@ class _Planner:
         self.points[beam.name] = [point for _, point in ends]
         known = strut or ends[0][0] == ends[1][0]
         self.parts.append(
-            Member(
-                beam.name,
-                beam.element,
-                beam.name,
-                ends[0],
-                ends[1],
-                inner,
-                outer,
-                strut,
-                length if known else None,
-            )
+            Member(beam.name, beam.element, beam.name, ends[0], ends[1], inner, outer, strut, length if known else None)
         )
 
     def _add_rod(self, beam: Beam) -> None:
@@ -421,18 +421,3 @@ class _Planner:
 def _is_nearer(at: Array, first: Array, second: Array) -> bool:
     """Return whether a position is nearer to the first of two points."""
     return reference(size(at - first)) < reference(size(at - second))
-
-
-def _lumped_masses(robot: Robot, place: Callable[[str, Array], Array], turn: Turn) -> list[RigidBody]:
-    """Return the rigid bodies (not modelled as beams) and the payload, with their inertia."""
-    graph, load = robot.graph, robot.payload
-    beams = {n for beam in robot.elastic.beams for n in (*beam.parts, *beam.carries)}
-    found = [
-        (name, body.mass, body.com, body.inertia, name) for name, body in graph.bodies.items() if name not in beams
-    ]
-    found.append(("payload", load.mass, graph.origin + load.com, load.inertia, graph.platform))
-    return [
-        RigidBody(name, mass, place(on, com), turn(on, turn(on, inertia).T), on)
-        for name, mass, com, inertia, on in found
-        if mass > 0.0
-    ]

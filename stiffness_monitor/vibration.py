@@ -24,8 +24,6 @@ Complex = NDArray[np.complex128]
 
 DYNAMIC_MODES: Final = 24
 """Modes that respond dynamically; the others respond statically."""
-MAX_FREQUENCY: Final = 1e6
-"""Largest valid frequency, Hz."""
 MAX_TOOL_DISTANCE: Final = 10.0
 """Largest distance of a tool point along an axis, over the machine's extent."""
 DAMPING: Final = (1e-5, 0.99)
@@ -64,7 +62,7 @@ class ToolModes:
         if at.ndim != 1:
             raise ParameterError("frequencies", at.shape, "one frequency after another")
         for frequency in (at.min(), at.max()) if at.size else ():
-            check_limit("frequencies", float(frequency), "Hz", 0.0, MAX_FREQUENCY)
+            check_limit("frequencies", float(frequency), "Hz", 0.0, 1e6)
         own = 2.0 * np.pi * self.frequencies
         return responses(2.0 * np.pi * at, own, self.damping, self.shapes) + self.rest
 

@@ -6,22 +6,14 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from delta_dynamics.estimates.isolation import ContactLocator, ContactPlace
 from delta_dynamics.torques.stiction import LoadShare, friction_reach, moving_rates
-from delta_dynamics.torques.uncertainty import (
-    AVERAGED,
-    EffortParts,
-    Noise,
-    effort_parts,
-    states_efforts,
-    torque_deviation,
-    usual_effort,
-)
+from delta_dynamics.torques.uncertainty import AVERAGED, Noise, effort_parts, torque_deviation, usual_effort
 from delta_dynamics.torques.virtual_work import inverse_dynamics, mass_matrix
 from pkm_twin.codegen.arrays import Array, common_batch, finite, later, one_vector, vectors
 from pkm_twin.messages.stamps import SECOND
@@ -29,9 +21,6 @@ from pkm_twin.robot.mechanism import SHARED
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.drives import BRAKE_TIME, DriveWatch
 from pkm_twin.streams.rest import VelocityErrorEstimator
-
-RANK: Final = 1e-9
-"""Singular value, relative to the largest, below which the joints do not measure a direction."""
 
 
 class MomentumObserver:
@@ -131,7 +120,8 @@ def platform_wrench(robot: Robot, q: ArrayLike, external: ArrayLike) -> Array:
     robot.check_independent("wrenches of measured efforts", SHARED)
     lever = np.array([1.0, 1.0, 1.0, *(3 * [robot.size])])
     jacobian = robot.platform_jacobian(q) * lever[:, None]
-    inverse = np.linalg.pinv(np.swapaxes(jacobian, -1, -2), rcond=RANK)
+    # Directions below a part of 1e-9 of the best one are not measured by the joints.
+    inverse = np.linalg.pinv(np.swapaxes(jacobian, -1, -2), rcond=1e-9)
     efforts = vectors(external, robot.joints_count, "efforts")
     common_batch(jacobian.shape[:-2], efforts.shape[:-1])
     with np.errstate(over="ignore", invalid="ignore"):
@@ -143,29 +133,17 @@ SIGMAS: Final = 6.0
 """Standard deviations of model and noise together that indicate a contact."""
 LEARNING: Final = 0.2
 """Time after the start in which only the noise is estimated, s."""
-CLIPPED: Final = 9.0
-"""Ratio of a square to the average above which it is clipped, so that a contact is not learnt as
-noise."""
 MIN_NOISE_FRACTION: Final = 1e-3
 """Smallest standard deviation of an effort, relative to the largest effort of the stream."""
-PLACED: Final = 0.004
-"""Period of estimates of a contact's position, s, up to ``EARLY`` after its beginning."""
-EARLY: Final = 0.04
-LATER: Final = 0.01
-"""Period after that: effort errors last longer, and so does the force."""
-MAX_LEARNT_FRICTION: Final = 0.2
-"""Largest friction that may be learnt, relative to the largest effort of the motion."""
-ONSET: Final = 0.1
-"""Time of motion in a direction before its friction is known, s."""
 
 
 @dataclass(frozen=True)
 class Contact:
     """Hold external efforts and their bound, (n,), N m or N, and the wrench (6,) of them.
 
-    ``touching``: whether an effort exceeds its bound. ``idle``: the drives are off or braked, so
-    the efforts contain no information; ``touching`` then keeps its last value. ``place``: the body
-    and the place on it while ``touching``.
+    ``touching``: an effort exceeds its bound. ``idle``: the drives are off or braked, so the efforts
+    contain no information; ``touching`` then keeps its last value. ``place``: the body and the
+    position on it while ``touching``.
     """
 
     external: Array
@@ -182,8 +160,8 @@ class Drag:
     A contact opposes motion in one direction only, so that friction is learnt all the time, also
     while the estimate looks like a contact.
 
-    Before a joint has moved in both directions, friction is what one of them shows, learnt while
-    nothing touches; where a joint has just begun to move for the first time, friction is unknown.
+    Before a joint has moved in both directions, friction is learnt from one of them while nothing
+    touches; of a joint that has just begun to move for the first time it is unknown.
     """
 
     def __init__(self, joints: int) -> None:
@@ -210,7 +188,7 @@ class Drag:
                     alone[k] = means[k]
             if min(times) > LEARNING:
                 known.append(max(0.0, min(means)))
-            elif max(times) > ONSET:
+            elif max(times) > 0.1:  # s of motion: a shorter one is an onset
                 known.append(max(0.0, alone[int(times[1] > times[0])]))
             else:
                 known.append(math.inf if rate != 0.0 else 0.0)
@@ -246,7 +224,8 @@ class ContactMonitor:
         self.observer.reset()
         self.drives = DriveWatch()
         self._rest = VelocityErrorEstimator(0.0)
-        self._noise = self._kept = Noise(np.zeros(n), LEARNING, CLIPPED)
+        # Squares are clipped at 9 times the average, so that a contact is not learnt as noise.
+        self._noise = self._kept = Noise(np.zeros(n), LEARNING, 9.0)
         self._unsure, self._slack, self._impulse, self._friction = np.zeros((4, n))
         self._greatest = usual_effort(self.robot)
         self._last: float | None = None
@@ -259,8 +238,9 @@ class ContactMonitor:
         """Use a robot with another payload, gravity or friction."""
         self._share = LoadShare(robot)
         self.robot = self.observer.robot = robot = self._share.robot
-        self.stated = states_efforts(robot)
-        """Whether the robot's file says how sure its efforts are."""
+        q, ones = robot.inverse(robot.home()), np.ones(robot.joints_count)
+        self.stated = bool(robot.uncertainty) and bool(torque_deviation(robot, q, ones, ones).any())
+        """True if the robot's file has uncertainties that efforts depend on."""
         self._reach = friction_reach(robot)
 
     def push(
@@ -278,7 +258,7 @@ class ContactMonitor:
             model alone.
         :param effort: measured, shape (n,).
         :param wrench: on the platform, known otherwise, base axes at its reference point, (6,).
-        :param doubt: how far the rates may be off, (n,); by default by their own noise.
+        :param doubt: error bounds of the rates, (n,); by default from their own noise.
         :raises ValueError: a sample that is not later than the last one, has another shape or is
             not finite; it moves nothing, nor does one without an assembly.
         """
@@ -301,7 +281,7 @@ class ContactMonitor:
         elif was_idle and not idle:
             self.observer.reset()
         if not self.drives.repeated:
-            # The efforts from here on may turn out to be a brake's.
+            # From here on the efforts may be those of a brake.
             self._kept = copy.copy(self._noise)
         external = self.observer.push(time, q, qd, effort, wrench, (mass, parts.moving))
         if external is None or last is None:
@@ -313,14 +293,32 @@ class ContactMonitor:
                 self._touching = False
             return self._verdict(q, external, idle)
         drag = self._drag.learn(step, external, np.where(still, 0.0, qd), touching=self._touching)
-        friction = np.minimum(drag, MAX_LEARNT_FRICTION * self._greatest) + np.where(still, self._reach + holds, 0.0)
-        self._follow(step, self._deviation(parts, q, sure, qdd, wrench), friction, doubt)
+        # What is learnt is bounded: a larger opposing effort is a contact.
+        friction = np.minimum(drag, 0.2 * self._greatest) + np.where(still, self._reach + holds, 0.0)
+        # Uncertainties pass the observer's filter, as the estimate does.
+        deviation = parts.default_deviation(self._greatest)
+        if self.stated:
+            deviation = torque_deviation(self.robot, q, sure, qdd, wrench)
+        part, self._friction = self.observer.bandwidth * step, friction
+        self._impulse = self.observer.bandwidth * np.abs(mass) @ doubt
+        slack = friction + self.observer.jump + self._impulse
+        self._unsure = (self._unsure + part * deviation) / (1.0 + part)
+        self._slack = (self._slack + part * slack) / (1.0 + part)
         self._noise.advance(step)
         left = np.maximum(np.abs(external) - self._slack - self._impulse, 0.0)
         if self._noise.settled:
             touching = bool((np.abs(external) > self._bound()).any())
             if touching:
-                self._locate(time, step, q, qd, external, begins=not self._touching)
+                begins, since = not self._touching, time - self._placed
+                if begins:
+                    self._since = time
+                    self.prepare().reset()
+                # A place is found every 4 ms at the beginning, later every 10 ms: errors of efforts last longer.
+                if begins or since >= (0.004 if time - self._since < 0.04 else 0.01) - 0.5 * step:
+                    locator = self.prepare()
+                    unsure = np.hypot(self._spread(), 0.5 * (self._friction + self._impulse))
+                    locator.push(step if begins else since, q, qd, external, unsure)
+                    self._place, self._placed = locator.place(), time
             self._touching = touching
             verdict = self._verdict(q, external, idle)
         else:
@@ -329,24 +327,8 @@ class ContactMonitor:
             self._noise.learn(left, (MIN_NOISE_FRACTION * self._greatest) ** 2)
         return verdict
 
-    def _locate(self, time: float, step: float, q: Array, qd: Array, external: Array, *, begins: bool) -> None:
-        """Locate the contact of the present sample."""
-        locator = self.prepare()
-        if begins:
-            self._since = time
-            locator.reset()
-        else:
-            wait = PLACED if time - self._since < EARLY else LATER
-            since = time - self._placed
-            if since < wait - 0.5 * step:
-                return
-            step = since
-        deviation = np.hypot(self._spread(), 0.5 * (self._friction + self._impulse))
-        locator.push(step, q, qd, external, deviation)
-        self._place, self._placed = locator.place(), time
-
     def prepare(self) -> ContactLocator:
-        """Compile the programs of a contact before there is one."""
+        """Compile the programs that locate a contact, before the first contact."""
         if self._locator is None:
             self._locator = ContactLocator(self.robot)
             n = self.robot.joints_count
@@ -355,20 +337,6 @@ class ContactMonitor:
             self._locator.push(1e-3, q, 0.0 * ones, ones, ones)
             self._locator.place()
         return self._locator
-
-    def _deviation(self, parts: EffortParts, *motion: Any) -> Array:
-        """Return the standard deviation of the model's efforts, shape (n,)."""
-        if self.stated:
-            return torque_deviation(self.robot, *motion)
-        return parts.default_deviation(self._greatest)
-
-    def _follow(self, step: float, deviation: Array, friction: Array, doubt: Array) -> None:
-        """Filter the uncertainty of efforts and momentum as the observer filters the estimate."""
-        part, self._friction = self.observer.bandwidth * step, friction
-        self._impulse = self.observer.bandwidth * np.abs(self.observer.mass) @ doubt
-        slack = friction + self.observer.jump + self._impulse
-        self._unsure = (self._unsure + part * deviation) / (1.0 + part)
-        self._slack = (self._slack + part * slack) / (1.0 + part)
 
     def _spread(self) -> Array:
         return np.asarray(np.sqrt(self._unsure**2 + self._noise.variance), np.float64)

@@ -42,16 +42,8 @@ CORRELATION: Final = 0.02
 """Correlation time of the efforts' errors, s."""
 MEMORY: Final = 0.1
 """Time after which a sample's weight has decayed to 1/e, s."""
-MAX_CLAMP_DISTANCE: Final = 0.4
-"""Largest distance of two bodies that clamp something, relative to the machine's size."""
-CLOSING: Final = 0.02
-"""Smallest approach speed of two clamping bodies, relative to the largest in the machine."""
-COARSE: Final = 0.15
-"""Standard deviation of clamping efforts relative to them, by the spacing of the positions."""
 SIZES: Final = np.array([0.1, 0.3, 1.0, 3.0, 10.0])
 """Forces that are compared, relative to that of a typical position."""
-BASE_PLACED: Final = np.append(np.eye(3), np.zeros(3))
-"""Rotation and origin of the base."""
 
 
 @dataclass(frozen=True)
@@ -93,26 +85,25 @@ def limbs_of(robot: Robot) -> dict[str, str]:
 
 
 def joined_bodies(graph: Graph) -> list[tuple[str, str]]:
-    """Return pairs of bodies and rods that a joint connects, both ways."""
+    """List the pairs of bodies and rods that a joint connects, in both orders."""
     return [*graph.links, *((b, a) for a, b in graph.links)]
 
 
-def _twists(t: Traced) -> Program:
-    """Write rotation (9), origin (3), and velocity and angular velocity per joint rate, by body."""
-    t.solve()
-    columns, rows = t.rate_columns(), []
-    for body in t.graph.bodies:
-        rows += [*np.ravel(t.motion.turned(body)), *t.motion.origin[body]]
-    for column, own in zip(columns, np.eye(t.joints), strict=True):
-        t.motion.set_rates(column, own)
+def _twist_kernel(robot: Robot) -> Kernel:
+    """Return the program of rotation (9), origin (3), and velocity and angular velocity per joint rate, by body."""
+
+    def write(t: Traced) -> Program:
+        t.solve()
+        columns, rows = t.rate_columns(), []
         for body in t.graph.bodies:
-            rows += [*t.motion.speed[body], *t.motion.omega[body]]
-    return Program(t.inputs("q"), 0, {"bodies": t.lift(rows)}, t.equations())
+            rows += [*np.ravel(t.motion.turned(body)), *t.motion.origin[body]]
+        for column, own in zip(columns, np.eye(t.joints), strict=True):
+            t.motion.set_rates(column, own)
+            for body in t.graph.bodies:
+                rows += [*t.motion.speed[body], *t.motion.omega[body]]
+        return Program(t.inputs("q"), 0, {"bodies": t.lift(rows)}, t.equations())
 
-
-def _kernel(robot: Robot) -> Kernel:
-    """Return the compiled program of body twists."""
-    return robot.engine.kernel("twists of bodies", _twists)
+    return robot.engine.kernel("twists of bodies", write)
 
 
 class Places:
@@ -189,8 +180,8 @@ class Places:
     def at(self, q: Array) -> tuple[Array, Array, Array]:
         """Return positions (P, 3), Jacobians (P, n, 3) and bar directions (P, 3), base axes."""
         n, count = self.robot.joints_count, len(self.robot.graph.bodies)
-        flat = self.robot.bound(_kernel)(q)
-        placed = np.concatenate([flat[: 12 * count], BASE_PLACED]).reshape(count + 1, 12)
+        flat = self.robot.bound(_twist_kernel)(q)
+        placed = np.concatenate([flat[: 12 * count], np.append(np.eye(3), np.zeros(3))]).reshape(count + 1, 12)
         rates = np.zeros((n, count + 1, 6))
         rates[:, :count] = flat[12 * count :].reshape(n, count, 6)
         placed, rates = placed[self._body], rates[:, self._body]
@@ -211,7 +202,7 @@ class Places:
 
 
 def _blocks(graph: Graph) -> set[str]:
-    """Return bodies that are not thin bars: the platform, and what slides on the base."""
+    """Return the bodies that are not thin bars: the platform, and sliders on the base."""
     return {graph.platform} | {
         joint.outer for joint in graph.joints.values() if joint.kind == "prismatic" and joint.inner == BASE
     }
@@ -220,13 +211,13 @@ def _blocks(graph: Graph) -> set[str]:
 class ContactLocator:
     """Accumulate the evidence of each position for one contact, from its samples.
 
-    Over a contact the place on the body and the direction of the force in base axes are one and
-    the same; so while the machine moves each sample narrows both. The force grows as the external
-    efforts do. Errors of the efforts last for longer than a contact's beginning, so all samples
-    together are as exact as one, and some of a stream's samples show as much as all.
+    During a contact the place on the body and the direction of the force in base axes are constant;
+    while the machine moves each sample narrows both. The force is proportional to the external
+    efforts. Errors of the efforts last longer than the beginning of a contact, so that all samples
+    together are as exact as one.
 
-    With n joint efforts a contact with the platform explains all directions of them if the
-    platform has n freedoms: it then has less evidence than a limb that explains them by fewer.
+    A platform with n freedoms explains efforts of all directions by a contact: it then has less
+    evidence than a limb that explains fewer.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -256,13 +247,17 @@ class ContactLocator:
         jacobian, way = turned.transpose(1, 2, 0), along.T
         if self._sums is None:
             self._begin(jacobian, sure, qd)
-        # The force grows with the efforts, in the units of the first sample.
+        # The force is proportional to the efforts, in the units of the first sample.
         sure = float(np.linalg.norm(external * self._unit)) * sure
         fade = math.exp(-step / MEMORY)
         weight = min(1.0, step / CORRELATION)
         one = jacobian * sure[:, None, None]
         one -= (self._slim * np.einsum("nip,ip->np", one, way))[:, None] * way
-        pair = sure[:, None] * self._approach(jacobian)
+        # Derivatives of the pairs' distances by joint positions, (n, pairs).
+        a, b = self._pairs
+        between = (self._at[a] - self._at[b]).T
+        between = between / np.sqrt((between * between).sum(0))
+        pair = sure[:, None] * np.einsum("nip,ip->np", jacobian.take(a, 2) - jacobian.take(b, 2), between)
         free = sure * self._usual
         sums = (
             np.array([len(q), y @ y]),
@@ -289,17 +284,10 @@ class ContactLocator:
         far = np.sqrt((apart * apart).sum(1))
         velocity = (qd @ jacobian.swapaxes(0, 1)).T
         rate = ((velocity[a] - velocity[b]) * apart).sum(1) / far
-        near = (far > 0.0) & (far < MAX_CLAMP_DISTANCE * self.places.robot.graph.size)
-        closing = near & (rate < -CLOSING * np.abs(rate[near]).max(initial=0.0))
+        # Bodies that clamp something are near each other, and approach clearly.
+        near = (far > 0.0) & (far < 0.4 * self.places.robot.graph.size)
+        closing = near & (rate < -0.02 * np.abs(rate[near]).max(initial=0.0))
         self._pairs, self._couple = (a[closing], b[closing]), self.places.couple_of[closing]
-
-    def _approach(self, jacobian: Array) -> Array:
-        """Return the derivatives of the pairs' distances by joint positions, (n, pairs)."""
-        a, b = self._pairs
-        way = (self._at[a] - self._at[b]).T
-        way = way / np.sqrt((way * way).sum(0))
-        apart = jacobian.take(a, 2) - jacobian.take(b, 2)
-        return np.asarray(np.einsum("nip,ip->np", apart, way), np.float64)
 
     @np.errstate(all="ignore")
     def place(self) -> ContactPlace | None:
@@ -307,7 +295,7 @@ class ContactLocator:
         if self._sums is None:
             return None
         if not np.isfinite(np.concatenate([self._sums, self._usual, self._at.ravel()])).all():
-            # Sums that are not finite stay so.
+            # Sums that are not finite would remain so.
             self.reset()
             return None
         found = self._found(self._sums)
@@ -326,14 +314,15 @@ class ContactLocator:
         other, others = sums[-2 * n :].reshape(2, n)
         places = self.places
         precision = ((self._force * SIZES) ** -2.0)[:, None]
-        one = _mean(_of_force(forces[:3], forces[3], precision))
-        noise = 1.0 + COARSE**2 * square * n / counted
-        pair = _mean(_of_numbers(line / noise, sides / noise, precision, one_sided=True))
+        one = _mean(_force_evidence(forces[:3], forces[3], precision))
+        # Clamping efforts are off by the spacing of the positions: 0.15 of their size.
+        noise = 1.0 + 0.15**2 * square * n / counted
+        pair = _mean(_component_evidence(line / noise, sides / noise, precision, one_sided=True))
         pair += 0.5 * (square * (1.0 - 1.0 / noise) - counted * math.log(noise))
-        nothing = float(_mean(_of_numbers(other, others, SIZES[:, None] ** -2.0).sum(-1)))
+        nothing = float(_mean(_component_evidence(other, others, SIZES[:, None] ** -2.0).sum(-1)))
         top = max(one.max(), pair.max(initial=-np.inf), nothing)
         likely = places.prior * np.exp(one - top)
-        # The fewer places can clamp, the less likely they do.
+        # Clamping is less likely if fewer places can clamp.
         clamped = PRIOR[CLAMPING] * np.exp(pair - top) / max(len(pair), PLACES**2)
         odd = float(PRIOR[UNKNOWN] * np.exp(nothing - top))
         by_class = places.of_class @ likely
@@ -342,46 +331,26 @@ class ContactLocator:
         classes = dict(zip((*places.classes, CLAMPING, UNKNOWN), shares.tolist(), strict=True))
         best = max(classes, key=lambda name: classes[name])
         if best == CLAMPING:
-            body, point, deviation = self._pair(clamped)
+            a, b = self._pairs
+            couple = int(np.argmax(np.bincount(self._couple, clamped)))
+            weights, at = np.where(self._couple == couple, clamped, 0.0), 0.5 * (self._at[a] + self._at[b])
+            body = " and ".join(places.couples[couple])
             where = f"{CLAMPING} {body}"
         else:
             if best != UNKNOWN:
                 likely = likely * places.of_class[places.classes.index(best)]
-            body, point, deviation = self._one(likely)
-            where = best
+            number = int(np.argmax(places.of_body @ likely))
+            weights, at = likely * places.of_body[number], self._at
+            body, where = places.bodies[number], best
+        # The weighted mean of the positions on the body, and their standard deviation.
+        share = weights / weights.sum()
+        point = share @ at
+        deviation = math.sqrt(float(share @ ((at - point) ** 2).sum(1)))
         confidence = classes[best]
-        return ContactPlace(
-            where if confidence >= NAMED else UNKNOWN,
-            confidence,
-            classes,
-            body,
-            point,
-            deviation,
-        )
-
-    def _one(self, likely: Array) -> tuple[str, Array, float]:
-        """Return the most likely body, mean position on it, and standard deviation."""
-        best = int(np.argmax(self.places.of_body @ likely))
-        point, deviation = _middle(likely * self.places.of_body[best], self._at)
-        return self.places.bodies[best], point, deviation
-
-    def _pair(self, clamped: Array) -> tuple[str, Array, float]:
-        """Return the most likely pair of bodies, the mean midpoint, and standard deviation."""
-        a, b = self._pairs
-        best = int(np.argmax(np.bincount(self._couple, clamped)))
-        between = 0.5 * (self._at[a] + self._at[b])
-        point, deviation = _middle(np.where(self._couple == best, clamped, 0.0), between)
-        return " and ".join(self.places.couples[best]), point, deviation
+        return ContactPlace(where if confidence >= NAMED else UNKNOWN, confidence, classes, body, point, deviation)
 
 
-def _middle(weights: Array, points: Array) -> tuple[Array, float]:
-    """Return the weighted mean of points, (3,), and their standard deviation."""
-    share = weights / weights.sum()
-    point = share @ points
-    return point, math.sqrt(float(share @ ((points - point) ** 2).sum(1)))
-
-
-def _of_force(matrix: Array, vector: Array, precision: Array) -> Array:
+def _force_evidence(matrix: Array, vector: Array, precision: Array) -> Array:
     """Return log marginal likelihoods, (sizes, hypotheses), up to a common constant.
 
     Of y = B f + noise with f normal of mean zero, by the factors of B' B + precision.
@@ -391,7 +360,7 @@ def _of_force(matrix: Array, vector: Array, precision: Array) -> Array:
     """
     (a, b, c), (_, d, e), (_, _, f) = matrix
     x, y, z = vector
-    # B' B has no negative eigenvalue, whatever rounding says.
+    # B' B has no negative eigenvalue, except by rounding.
     first = a + precision
     left, far = b / first, c / first
     second = np.maximum(d + precision - left * b, precision)
@@ -405,7 +374,7 @@ def _of_force(matrix: Array, vector: Array, precision: Array) -> Array:
     return np.asarray(0.5 * (square - np.log(size)), np.float64)
 
 
-def _of_numbers(squares: Array, parts: Array, precision: Array, *, one_sided: bool = False) -> Array:
+def _component_evidence(squares: Array, parts: Array, precision: Array, *, one_sided: bool = False) -> Array:
     """Return log marginal likelihoods of forces with one component, (sizes, hypotheses).
 
     :param squares: B' B, (hypotheses,); ``parts``: B' y.

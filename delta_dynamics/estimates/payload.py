@@ -29,15 +29,8 @@ MEMORY: Final = 20.0
 """Time after which a sample's weight has decayed to 1/e, s."""
 STEADY: Final = 0.4
 """Time after the start in which no jump is detected, s."""
-CLIPPED: Final = 4.0
-"""Ratio of a square to the average above which it is clipped, so that a jump is not learnt as
-noise."""
 JUMP: Final = 0.06
 """Averaging time of the residual for detecting a jump, s."""
-THRESHOLD: Final = 6.0
-"""Standard deviations of that average that indicate a jump."""
-MIN_NOISE_FRACTION: Final = 0.01
-"""Smallest standard deviation of an effort, relative to the robot's largest effort at rest."""
 
 
 @dataclass(frozen=True)
@@ -85,19 +78,18 @@ class PayloadEstimator:
         self._prior = np.array([mass_range, *(3 * [mass_range * reach])])
         still = np.zeros(robot.joints_count)
         rest = inverse_dynamics(robot, robot.inverse(robot.home()), still, still)
-        # A machine that hangs in balance has no effort at rest.
-        self._least = MIN_NOISE_FRACTION * max(float(np.abs(rest).max()), 1e-3 * self._scale())
+        # Smallest standard deviation of an effort; a balanced machine has no effort at rest.
+        limits = robot.limits.effort
+        scale = 1.0 if limits is None else float(np.abs(limits).max())
+        self._least = 0.01 * max(float(np.abs(rest).max()), 1e-3 * scale)
         self._reach = friction_reach(robot)
         self.drives = DriveWatch()
         self._rest = VelocityErrorEstimator(0.0)
         self.resets = 0
-        self._noise = Noise(np.full(robot.joints_count, 4.0 * self._least**2), STEADY, CLIPPED)
+        # Squares are clipped at 4 times the average, so that a jump is not learnt as noise.
+        self._noise = Noise(np.full(robot.joints_count, 4.0 * self._least**2), STEADY, 4.0)
         self.reset()
         self.resets = 0
-
-    def _scale(self) -> float:
-        limits = self.robot.limits.effort
-        return 1.0 if limits is None else float(np.abs(limits).max())
 
     def reset(self) -> None:
         """Reset the estimate of the load, but not that of the noise."""
@@ -110,7 +102,7 @@ class PayloadEstimator:
         self.begin_anew()
 
     def _keep(self) -> None:
-        """Store the estimate: the efforts from here on may turn out to be a brake's."""
+        """Store the estimate, because the next efforts may be those of a brake."""
         noise = copy.copy(self._noise)
         self._kept = self._information, self._weighted, self._average, self._since, noise
 
@@ -135,7 +127,7 @@ class PayloadEstimator:
         :param time: of the sample, s, later than the last one's.
         :param q: joint positions (n,), with rates, accelerations and measured efforts (n,).
         :param wrench: on the platform at its reference point, base axes, (6,), where it is known.
-        :param doubt: how far the rates may be off, (n,); by default by their own noise.
+        :param doubt: error bounds of the rates, (n,); by default from their own noise.
         :raises ValueError: a sample that is not later than the last one, has another shape or is
             not finite; it moves nothing, nor does one without an assembly.
         """
@@ -163,7 +155,11 @@ class PayloadEstimator:
         computed = inverse_dynamics(self.robot, q, sure, qdd, wrench)
         target = effort - computed + columns @ self._own
         left = beyond_friction(target - columns @ self._solution(), still, reach)
-        if self._jumped(left, step):
+        self._since += step
+        self._average = self._average + min(1.0, step / JUMP) * (left - self._average)
+        # Errors that last for their correlation time have this deviation in the average; 6 of it are a jump.
+        spread = np.sqrt(self._noise.variance * CORRELATION / (CORRELATION + JUMP))
+        if self._since >= STEADY and (np.abs(self._average) > 6.0 * spread).any():
             self.reset()
             self._last = time
             return self.estimate()
@@ -184,16 +180,6 @@ class PayloadEstimator:
     def _solution(self) -> Array:
         return np.asarray(np.linalg.solve(self._information, self._weighted), np.float64)
 
-    def _jumped(self, left: Array, step: float) -> bool:
-        """Return whether the averaged residual has left zero, once noise is known."""
-        self._since += step
-        self._average = self._average + min(1.0, step / JUMP) * (left - self._average)
-        if self._since < STEADY:
-            return False
-        # The average of errors that last for their correlation time.
-        spread = np.sqrt(self._noise.variance * CORRELATION / (CORRELATION + JUMP))
-        return bool((np.abs(self._average) > THRESHOLD * spread).any())
-
     def estimate(self) -> PayloadEstimate:
         """Return the present estimate."""
         values = self._solution()
@@ -203,7 +189,7 @@ class PayloadEstimator:
         told = np.diag(covariance)[1:] < (0.5 * self._prior[1:]) ** 2
         safe = mass if abs(mass) > 3.0 * deviation else math.nan
         com = values[1:] / safe
-        # First-order: of a quotient of two correlated numbers.
+        # Standard deviation of a quotient of two correlated numbers, to first order.
         gradient = np.hstack([-com[:, None] / safe, np.eye(3) / safe])
         spread = np.sqrt(np.einsum("ki,ij,kj->k", gradient, covariance, gradient))
         known = told & np.isfinite(com)
@@ -213,10 +199,5 @@ class PayloadEstimator:
             nowhere = np.full(3, np.inf)
             return PayloadEstimate(0.0, own.copy(), math.hypot(deviation, mass), nowhere, self.resets, mass)
         return PayloadEstimate(
-            mass,
-            np.where(known, com, own),
-            deviation,
-            np.where(known, spread, np.inf),
-            self.resets,
-            mass,
+            mass, np.where(known, com, own), deviation, np.where(known, spread, np.inf), self.resets, mass
         )

@@ -35,66 +35,59 @@ Result = FollowJointTrajectory.Result
 
 NAME = "~/follow_joint_trajectory"
 LOOK = 0.1
-"""How often goals that are under way are looked at, s."""
+"""Period of the checks of goals, s."""
 PING = 5
 MAX_SILENT_LOOKS = 18
-"""Checks without a status of the controller, after which its goals are aborted: 1.8 s."""
+"""Checks without a sign of the controller until it is asked for one, and until its goals are aborted: 1.8 s."""
 MATCHING = 5.0
-"""How long a goal waits for the controller's action to be found, s."""
-SETTLING = 3.0
-"""How long after a stop the machine may move before it rests, s."""
+"""Longest time to find the controller's action, s."""
 REST = 1e-3
 """Joint velocity below which the machine rests, rad/s or m/s."""
-MAX_REST_OFFSET = 1e-4
-"""Distance of rest from the hold point, rad or m, beyond which another one is sent."""
-LAST_TURNS = 5
-"""Turns of the executor that the last results take on their way."""
 
 
 @dataclass(eq=False)
 class _Goal:
-    """A goal of a client, and what has become of it at the controller."""
+    """A client's goal and its state at the controller; times on the steady clock, s.
+
+    ``handle``: of the action server. ``filled``: time at which its efforts were ready.
+    ``controller``: handle of the action client, once the controller has accepted the goal.
+    ``actual``: joint positions of the newest feedback, by name, ``measured`` at that time.
+    """
 
     handle: Any
-    """The server's."""
     filled: float | None = None
-    """When its efforts were ready, on the steady clock, s."""
     sent: bool = False
     controller: Any = None
-    """The client's handle of it, once the controller has accepted it."""
     actual: dict[str, float] = field(default_factory=dict)
-    """Joint positions of the newest feedback, by name."""
     measured: float = -math.inf
-    """When they were measured, on the steady clock, s."""
     held: bool = False
     asked: bool = False
 
 
 @dataclass
 class _Settling:
-    """A machine after a hold point: it only slows down, until it rests."""
+    """A machine after a hold point: it only slows down, until it rests.
+
+    ``held``: the hold point. ``place``: joint positions at the last check, at the time ``since``;
+    ``speed``: of the fastest joint then, None before the first check. Times on the steady clock, s.
+    """
 
     until: float
-    """On the steady clock, s."""
     names: list[str]
     held: list[float]
-    """The hold point."""
     place: list[float]
-    """The joints at the last look, at first the hold point."""
     since: float
-    """When that was, on the steady clock, s."""
     speed: float | None = None
-    """Previous speed of the fastest joint; None before the first check."""
 
 
 class EffortAction:
-    """Takes goals, has their efforts computed, and is the controller's client for the rest.
+    """Accept goals, compute their efforts, and forward them to the controller's action.
 
     Feedback, cancelling and the result pass through. A goal stays accepted until the controller's
-    result is there: rclpy polls whatever awaits in an executing goal without a pause.
+    result arrives, because rclpy polls an executing goal that awaits something without a pause.
 
-    A controller that ends a goal early holds the place with the effort of another one, or none. It
-    gets a hold point instead: where the machine is, with the effort that bears the weight there.
+    A controller that ends a goal early holds its position with the effort of another point, or
+    none. Therefore it gets a hold point: the present position with the effort against gravity.
     """
 
     def __init__(
@@ -114,10 +107,10 @@ class EffortAction:
         :param controller: the controller's action, by its name.
         :param efforts: efforts of a JointTrajectory in its own joint order, shape (points, n), in
             steps; raises MessageError.
-        :param place: where the joints are now, by name, in the controller's numbers; None where
-            that is not known.
+        :param place: gives the present joint positions by name, in the controller's numbers; None
+            if unknown.
         :param hold: whether hold points are sent. ``hold_efforts``: as ``efforts``, for them.
-        :param max_age: of the controller's feedback where ``place`` knows nothing, s.
+        :param max_age: largest age of the controller's feedback that replaces ``place``, s.
         :param check: rejects a malformed JointTrajectory at once; raises MessageError.
         """
         self._node, self._controller, self._efforts = node, controller, efforts
@@ -129,17 +122,18 @@ class EffortAction:
         self._goals: dict[bytes, _Goal] = {}
         self._ending: set[bytes] = set()
         self._holding = 0
-        """Hold points that the controller has not answered yet."""
+        """Number of hold points that the controller has not answered yet."""
         self._turns = 0
         self._silent = 0
-        """Looks since the controller's last sign of life."""
+        """Number of checks since the controller's last sign of life."""
         self._settling: _Settling | None = None
         node.create_guarded_timer(LOOK, self._look)
         self._server = ActionServer(
             node,
             FollowJointTrajectory,
             NAME,
-            execute_callback=self._never_begun,
+            # Goals are executed with their results, see ``_finish``.
+            execute_callback=lambda handle: Result(),
             goal_callback=self._judge,
             handle_accepted_callback=self._accepted,
             cancel_callback=self._cancel,
@@ -157,17 +151,17 @@ class EffortAction:
         return GoalResponse.ACCEPT
 
     def deactivated(self) -> None:
-        """Abort the goals that wait for their efforts; the controller keeps those that it has."""
+        """Abort the goals that wait for their efforts; goals at the controller continue."""
         for goal in list(self._goals.values()):
             if not goal.sent:
                 self._abort(goal, "the node was deactivated")
 
     def other_motion(self) -> None:
-        """Another trajectory went to the controller: no hold point may end it."""
+        """Cancel the hold points: another trajectory was sent to the controller."""
         self._settling = None
 
     def shutdown(self) -> None:
-        """Stop the machine where it is, and abort every goal."""
+        """Stop the machine at its present position, and abort every goal."""
         moving = [goal for goal in self._goals.values() if goal.sent]
         if moving:
             self._stop(moving[-1])
@@ -176,9 +170,10 @@ class EffortAction:
 
     @property
     def shutting_down(self) -> bool:
-        """Whether clients or the controller still wait for what :meth:`shutdown` has sent."""
+        """True while results and hold points of :meth:`shutdown` are on their way."""
         if self._ending or self._holding:
-            self._turns = LAST_TURNS
+            # The last results take a few turns of the executor.
+            self._turns = 5
         else:
             self._turns -= 1
         return self._turns > 0
@@ -192,10 +187,10 @@ class EffortAction:
                 self._finish(goal, GoalStatus.STATUS_CANCELED, Result())
             elif time.monotonic() - goal.filled > MATCHING:
                 self._abort(goal, f"no action server at {self._controller}")
-        self._look_for_life()
-        self._look_for_rest()
+        self._check_controller()
+        self._check_rest()
 
-    def _look_for_life(self) -> None:
+    def _check_controller(self) -> None:
         """Abort the goals of a controller that no longer answers.
 
         A killed controller ends no goal, and the middleware lists it for seconds.
@@ -208,13 +203,13 @@ class EffortAction:
                     goal.controller.cancel_goal_async()
                 self._abort(goal, f"{self._controller} disappeared during the goal")
         elif self._silent and self._silent % PING == 0:
-            # Nobody's goal: cancelling it changes nothing, and whoever serves the action answers.
+            # Cancelling an unknown goal changes nothing, but the controller answers.
             request = CancelGoal.Request()
             request.goal_info.goal_id.uuid = np.frombuffer(os.urandom(16), np.uint8)
             self._ping.call_async(request).add_done_callback(self._lives)
             for goal in sent:
                 if goal.controller is not None and not goal.asked:
-                    # One that was started again lives, and answers that it knows no such goal.
+                    # A restarted controller answers that it does not know the goal.
                     goal.asked = True
                     self._await_result(goal)
 
@@ -224,31 +219,29 @@ class EffortAction:
     def _accepted(self, handle: Any) -> None:
         goal = self._goals[_key(handle)] = _Goal(handle)
 
-        def refused(error: MessageError) -> None:
+        def fill() -> Task:
+            trajectory = goal.handle.request.trajectory
+            try:
+                efforts = yield from self._efforts(trajectory)
+            except MessageError as error:
+                refuse(error)
+                return
+            for k, (point, effort) in enumerate(zip(trajectory.points, efforts.tolist(), strict=True)):
+                point.effort = effort
+                if k % SLICE == SLICE - 1:
+                    yield
+            goal.filled = time.monotonic()
+            if goal.handle.is_cancel_requested:
+                self._finish(goal, GoalStatus.STATUS_CANCELED, Result())
+            self._send_filled()
+
+        def refuse(error: MessageError) -> None:
             self._abort(goal, f"delta_dynamics rejected the trajectory, {error.labelled}")
 
-        def steps() -> Task:
-            try:
-                yield from self._fill(goal)
-            except MessageError as error:
-                refused(error)
-
         try:
-            self._node.defer(NAME, steps())
+            self._node.defer(NAME, fill())
         except MessageError as error:
-            refused(error)
-
-    def _fill(self, goal: _Goal) -> Task:
-        trajectory = goal.handle.request.trajectory
-        efforts = yield from self._efforts(trajectory)
-        for k, (point, effort) in enumerate(zip(trajectory.points, efforts.tolist(), strict=True)):
-            point.effort = effort
-            if k % SLICE == SLICE - 1:
-                yield
-        goal.filled = time.monotonic()
-        if goal.handle.is_cancel_requested:
-            self._finish(goal, GoalStatus.STATUS_CANCELED, Result())
-        self._send_filled()
+            refuse(error)
 
     def _send_filled(self) -> None:
         """Send the goals that have their efforts to the controller, in the order of arrival."""
@@ -309,14 +302,14 @@ class EffortAction:
             # The controller keeps the last point's effort, also that of an acceleration.
             stopped = any([*last.velocities, *last.accelerations])
         else:
-            # What another trajectory has replaced is no stop.
+            # A goal that another trajectory replaced is no stop.
             stopped = end.result.error_code != Result.INVALID_GOAL
         if stopped and not goal.held and self._newest(goal):
             self._send_hold(goal)
         self._finish(goal, end.status, end.result)
 
     def _newest(self, goal: _Goal) -> bool:
-        """Whether the controller has got no goal after this one."""
+        """Return whether no other goal was sent to the controller after this one."""
         return [g for g in self._goals.values() if g.sent][-1:] == [goal]
 
     def _cancel(self, handle: Any) -> CancelResponse:
@@ -326,7 +319,7 @@ class EffortAction:
         return CancelResponse.ACCEPT
 
     def _stop(self, goal: _Goal) -> None:
-        """Cancel at the controller; a hold point comes first, so that no effort is missing."""
+        """Cancel a goal at the controller, after a hold point, so that an effort is always set."""
 
         def cancel(_: Any = None) -> None:
             if goal.controller is not None:
@@ -336,10 +329,10 @@ class EffortAction:
             cancel()
 
     def _send_hold(self, goal: _Goal, then: Callable[[Any], None] = lambda _: None) -> bool:
-        """Have the controller hold the place where the machine is, with the effort of its weight.
+        """Send the present position as hold point, with the effort against gravity.
 
         :param then: called with the controller's answer.
-        :returns: whether the place is known and the model has an effort for it.
+        :returns: whether the position is known and the model has an effort for it.
         """
         names = list(goal.handle.request.trajectory.joint_names)
         goal.held = True
@@ -370,13 +363,14 @@ class EffortAction:
             then(future.result())
 
         now = time.monotonic()
-        self._settling = _Settling(now + SETTLING, list(names), positions, positions, now)
+        # After a stop the machine rests within 3 s.
+        self._settling = _Settling(now + 3.0, list(names), positions, positions, now)
         goal = FollowJointTrajectory.Goal(trajectory=trajectory)
         self._client.send_goal_async(goal).add_done_callback(answered)
         return True
 
-    def _look_for_rest(self) -> None:
-        """Send another hold point if the machine came to rest elsewhere.
+    def _check_rest(self) -> None:
+        """Send another hold point if the machine rests more than 1e-4 rad or m off the last one.
 
         A machine that speeds up again is moved by another client of the controller.
         """
@@ -390,9 +384,9 @@ class EffortAction:
         elapsed = (now - settling.since) or LOOK
         speed = float(np.abs(np.subtract(place, settling.place)).max()) / elapsed
         before = settling.speed
-        # The first interval may be too short to tell rest.
+        # The first interval may be too short to recognise rest.
         if before is not None and speed < REST:
-            if np.abs(np.subtract(place, settling.held)).max() > MAX_REST_OFFSET:
+            if np.abs(np.subtract(place, settling.held)).max() > 1e-4:
                 self._send_point(settling.names, measured, lambda _: None)
         elif before is None or speed <= before + REST:
             self._settling = replace(settling, place=place, since=now, speed=speed)
@@ -403,7 +397,7 @@ class EffortAction:
         self._finish(goal, GoalStatus.STATUS_ABORTED, result)
 
     def _finish(self, goal: _Goal, status: int, result: Any) -> None:
-        """End a goal as the controller has ended it; once, whatever comes late."""
+        """End a goal with the controller's status and result; later ends of it are ignored."""
         key = _key(goal.handle)
         if self._goals.pop(key, None) is None:
             return
@@ -415,16 +409,13 @@ class EffortAction:
                 handle.succeed()
             elif handle.is_cancel_requested:
                 handle.canceled()
-                # The controller calls a goal invalid that the hold point has replaced.
+                # The controller reports a goal that the hold point replaced as invalid.
                 return Result() if goal.held else result
             else:
                 handle.abort()
             return result
 
         goal.handle.execute(end)
-
-    def _never_begun(self, handle: Any) -> Any:
-        raise NotImplementedError("goals end by what the controller says")
 
 
 def _key(handle: Any) -> bytes:

@@ -7,12 +7,10 @@ Only the node ``delta_dynamics`` imports this module.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import Inertia, InertiaStamped, Point, PointStamped, Vector3
 from std_msgs.msg import Bool, String
-from std_srvs.srv import Trigger
 
 from delta_dynamics.estimates.contact import SIGMAS, Contact, ContactMonitor
 from delta_dynamics.estimates.isolation import ContactPlace
@@ -25,14 +23,9 @@ from pkm_twin.ros.joints import JointPublisher, header, wrench_stamped, xyz
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.streams.monitor import Pace
 
-PAYLOAD_RATE = 250.0
-"""Samples a second that the payload is estimated from: errors last longer."""
-MAX_SILENCE = 0.1
-"""Longest gap in a stream, s; after it the estimates start again."""
-
 
 class Estimates:
-    """``~/payload``, ``~/external_wrench`` and ``~/contact`` of a stream that measures efforts."""
+    """Publish ``~/payload``, ``~/external_wrench`` and ``~/contact`` from measured efforts."""
 
     def __init__(self, node: TwinNode, robot: Callable[[], Robot], frames: tuple[str, str]):
         """Declare the parameters and create the topics that they ask for.
@@ -45,45 +38,26 @@ class Estimates:
         self.contacts = 0
         self._place: ContactPlace | None = None
         self._last = 0
-        self._pace = Pace(PAYLOAD_RATE)
+        # 250 samples a second: the errors of efforts last longer.
+        self._pace = Pace(250.0)
+        self._payload: PayloadEstimator | None = None
+        self._contact: ContactMonitor | None = None
         known = robot()
-        self._payload = self._create_payload(known)
-        self._contact = self._create_contact(known)
-        self._warm_up(known)
-
-    def _warm_up(self, robot: Robot) -> None:
-        """Compile what a stream's samples call, before there are any."""
-        still = np.zeros(robot.joints_count)
-        motion = robot.inverse(robot.home()), still, still
-        load = None if self._payload is None else PayloadEstimator(robot)
-        contact = None if self._contact is None else ContactMonitor(robot)
-        for k in range(2):
-            if load is not None:
-                load.push(float(k), *motion, still)
-            if contact is not None:
-                contact.push(float(k), motion, still)
-        if self._contact is not None:
-            self._contact.prepare()
-
-    def _create_payload(self, robot: Robot) -> PayloadEstimator | None:
-        node = self._node
-        if not node.declare(
-            "estimate_payload",
-            False,
-            "publish ~/payload: the payload estimated from the measured efforts",
+        still = np.zeros(known.joints_count)
+        motion = known.inverse(known.home()), still, still
+        if node.declare(
+            "estimate_payload", False, "publish ~/payload: the payload estimated from the measured efforts"
         ):
-            return None
-        self._load = node.create_guarded_publisher("~/payload")
-        self._load_deviation = node.create_guarded_publisher("~/payload_deviation")
-        node.create_service(Trigger, "~/reset_payload", self._reset_payload)
-        return PayloadEstimator(robot)
-
-    def _create_contact(self, robot: Robot) -> ContactMonitor | None:
-        node = self._node
+            self._load = node.create_guarded_publisher("~/payload")
+            self._load_deviation = node.create_guarded_publisher("~/payload_deviation")
+            node.create_trigger("~/reset_payload", self._reset_payload)
+            self._payload = PayloadEstimator(known)
+            # Two samples compile the programs of a stream.
+            first = PayloadEstimator(known)
+            for k in range(2):
+                first.push(float(k), *motion, still)
         wanted = node.declare(
-            "observe_wrench",
-            False,
-            "publish ~/external_wrench and ~/contact, estimated with a momentum observer",
+            "observe_wrench", False, "publish ~/external_wrench and ~/contact, estimated with a momentum observer"
         )
         bandwidth = node.declare(
             "observer.bandwidth",
@@ -101,13 +75,17 @@ class Estimates:
             high=1e3,
         )
         if not wanted:
-            return None
+            return
         self._wrench = node.create_guarded_publisher("~/external_wrench")
-        self._effort = JointPublisher(node, robot, "~/external_effort")
+        self._effort = JointPublisher(node, known, "~/external_effort")
         self._event = node.create_guarded_publisher("~/contact")
         self._body = node.create_guarded_publisher("~/contact_body")
         self._point = node.create_guarded_publisher("~/contact_point")
-        return ContactMonitor(robot, bandwidth, sigmas)
+        self._contact = ContactMonitor(known, bandwidth, sigmas)
+        self._contact.prepare()
+        for k in range(2):
+            self._contact.push(float(k), motion, still)
+        self._contact.reset()
 
     def warning(self) -> str:
         """Return the warning to log before the first sample; empty if there is none."""
@@ -129,7 +107,7 @@ class Estimates:
             self._payload.begin_anew()
 
     def change_robot(self, robot: Robot) -> None:
-        """Another payload, gravity or friction was set."""
+        """Use a robot with another payload, gravity or friction."""
         if self._payload is not None:
             self._payload = PayloadEstimator(robot)
         if self._contact is not None:
@@ -141,28 +119,37 @@ class Estimates:
             return
         # The estimates' models have friction without memory.
         effort = torques.measured - torques.memory
-        # The stream may have begun anew at earlier stamps, as where a bag loops.
-        if not 0 < torques.stamp - self._last <= MAX_SILENCE * SECOND:
+        # The stream may have begun again at earlier stamps, as a bag that loops, or after a gap of 0.1 s.
+        if not 0 < torques.stamp - self._last <= SECOND // 10:
             self.reset()
         self._last = torques.stamp
         if self._contact is not None:
-            self._take_contact(self._contact, torques, effort)
+            found = self._contact.push(torques.stamp / SECOND, torques.motion, effort, torques.wrench, torques.doubt)
+            if found is not None:
+                self._publish_contact(torques.stamp, found)
         if self._payload is not None and self._pace.due(torques.stamp):
             self._pace.answered(torques.stamp)
-            self._take_payload(self._payload, torques, effort)
+            load = self._payload.push(torques.stamp / SECOND, *torques.motion, effort, torques.wrench, torques.doubt)
+            if load is not None:
+                own = header(torques.stamp, self._frames[1])
+                for publisher, mass, com in (
+                    (self._load, load.mass, load.com),
+                    (self._load_deviation, load.mass_deviation, load.com_deviation),
+                ):
+                    publisher.publish(InertiaStamped(header=own, inertia=Inertia(m=mass, com=xyz(Vector3, com))))
 
     @property
     def wanted(self) -> bool:
-        """Whether anything is estimated."""
+        """True if a payload or contacts are estimated."""
         return self._contact is not None or self._payload is not None
 
     @property
     def idle(self) -> bool:
-        """Whether the drives are off or braked, so that their efforts are left out."""
+        """True if the drives are off or braked, so that their efforts are left out."""
         return any(core is not None and core.drives.idle for core in (self._contact, self._payload))
 
     def diagnose(self) -> dict[str, object]:
-        """Values of the node's diagnostic status."""
+        """Return values of the node's diagnostic status."""
         values: dict[str, object] = {}
         if self.wanted:
             values["drives off or braked"] = self.idle
@@ -182,48 +169,26 @@ class Estimates:
             values["payload changes detected"] = found.resets
         return values
 
-    def _take_contact(self, core: ContactMonitor, torques: Torques, effort: Any) -> None:
-        found = core.push(torques.stamp / SECOND, torques.motion, effort, torques.wrench, torques.doubt)
-        if found is None:
-            return
+    def _publish_contact(self, stamp: int, found: Contact) -> None:
+        """Publish the external wrench and efforts; contact and place only when they change."""
+        own = header(stamp, self._frames[0])
         if not found.idle:
-            self._publish_contact(torques.stamp, found)
+            self._wrench.publish(wrench_stamped(stamp, self._frames[0], found.wrench))
+            self._effort.publish(stamp, self._robot().controller.controller_efforts(found.external))
         if found.touching != self.touching:
             self.touching = found.touching
             self.contacts += found.touching
             self._event.publish(Bool(data=found.touching))
-        if found.place is not self._place:
-            self._publish_place(torques.stamp, found.place)
-
-    def _publish_place(self, stamp: int, place: ContactPlace | None) -> None:
-        before, self._place = self._place, place
-        where = "" if place is None else place.where
+        before, self._place = self._place, found.place
+        if found.place is before:
+            return
+        where = "" if found.place is None else found.place.where
         if where != ("" if before is None else before.where):
             self._body.publish(String(data=where))
-        if place is not None:
-            own = header(stamp, self._frames[0])
-            self._point.publish(PointStamped(header=own, point=xyz(Point, place.point)))
+        if found.place is not None:
+            self._point.publish(PointStamped(header=own, point=xyz(Point, found.place.point)))
 
-    def _publish_contact(self, stamp: int, found: Contact) -> None:
-        self._wrench.publish(wrench_stamped(stamp, self._frames[0], found.wrench))
-        own = self._robot().controller
-        self._effort.publish(stamp, own.controller_efforts(found.external))
-
-    def _take_payload(self, core: PayloadEstimator, torques: Torques, effort: Any) -> None:
-        found = core.push(torques.stamp / SECOND, *torques.motion, effort, torques.wrench, torques.doubt)
-        if found is None:
-            return
-        pairs = (
-            (self._load, found.mass, found.com),
-            (self._load_deviation, found.mass_deviation, found.com_deviation),
-        )
-        for publisher, mass, com in pairs:
-            inertia = Inertia(m=mass, com=xyz(Vector3, com))
-            own = header(torques.stamp, self._frames[1])
-            publisher.publish(InertiaStamped(header=own, inertia=inertia))
-
-    def _reset_payload(self, _request: Any, response: Any) -> Any:
+    def _reset_payload(self) -> str:
         if self._payload is not None:
             self._payload.reset()
-        response.success, response.message = True, "the payload estimate was reset"
-        return response
+        return "the payload estimate was reset"

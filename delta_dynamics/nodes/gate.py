@@ -5,10 +5,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import partial
-from typing import Final
 
 import numpy as np
 
@@ -25,32 +22,35 @@ from pkm_twin.ros.joints import EffortPublisher
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.run import run
 
-CHANGEABLE: Final = ("effort_limits", "payload.mass", "payload.com")
+CHANGEABLE = ("effort_limits", "payload.mass", "payload.com")
 """Parameters that may change while the gate runs."""
 TORQUES = "delta_dynamics/joint_torques"
 MAX_DEADLINE = 3600.0
 """Longest deadline that a node of the suite promises, s; the middleware's "none" is longer."""
-MAX_ACKNOWLEDGE_TIME = 0.5
-"""Longest wait at the end for the controller's acknowledgement of the last command, s."""
 
 
 class CommandGate(TwinNode):
-    """Forwards live torques, and sends zeros or gravity from the start until they come.
+    """Forward live torques, and send zeros or gravity without them, also before the first.
 
-    A process of its own: it outlives the node whose torques it forwards.
+    It has a process of its own, so that it outlives the node whose torques it forwards.
     """
 
     topics = GATE
+    core: Gate
 
     def __init__(self) -> None:
         super().__init__("command_gate")
         robot = self.declare_robot()
         settings = self.declare_settings(GateSettings, fixed=True)
-        self.core = Gate(robot, settings)
         self._closed = True
         # With names and a stamp for recordings and plots.
         self._commands = EffortPublisher(self, robot, "~/commands_stamped", "~/commands")
-        self._declare_robot(settings)
+        robot = changed(robot, declare_changes(self, robot, CHANGEABLE))
+        if settings.on_stop == "gravity":
+            # Compile before the first use; a robot without masses is rejected here.
+            zeros = np.zeros(len(robot.joint_names))
+            inverse_dynamics(robot, robot.inverse(robot.home()), zeros, zeros)
+        self.core = Gate(robot, settings)
         self.create_guarded_subscription(
             TORQUES,
             self._on_torques,
@@ -66,11 +66,7 @@ class CommandGate(TwinNode):
                 refuse=partial(self.core.refuse, self.core.states),
                 expected=True,
             )
-        self.follow(
-            CHANGEABLE,
-            lambda values: changed(self.core.robot, values),
-            self.core.change_robot,
-        )
+        self.follow(CHANGEABLE, lambda values: changed(self.core.robot, values), self.core.change_robot)
         self.create_guarded_timer(min(0.25 * settings.deadline, 0.1), self._watch)
         self.start(leap=settings.deadline + settings.future_tolerance)
 
@@ -84,39 +80,38 @@ class CommandGate(TwinNode):
         self.core.reset()
 
     def stream_broken(self, where: str) -> None:
-        """Whatever failed: the gate is closed."""
+        """Close the gate after an exception."""
         self.core.stream.stop("exception", f"{where} raised an exception")
 
     def activated(self) -> None:
-        """At once: the controller may still hold what a gate before this one has sent."""
+        """Send a command at once: the controller may still hold that of a gate before this one."""
         self._send(self.core.stop_command(time.monotonic_ns()))
 
     def deactivated(self) -> None:
         """Send the closed gate's command last, because the controller holds it indefinitely."""
         self.core.stream.stop("inactive", "the node was deactivated")
-        self._tell()
+        self._log_changes()
         self._send(self.core.stop_command(time.monotonic_ns()))
 
     def shutdown(self) -> None:
         """Send the last command, and wait until the controller has it."""
         super().shutdown()
-        self._commands.wait_for_controllers(MAX_ACKNOWLEDGE_TIME)
+        self._commands.wait_for_controllers()
 
     def reset_stop(self) -> str:
-        """Open without waiting for good torques."""
-        stream = self.core.stream
-        return stream.status if stream.resume() else ""
+        """Open without waiting for good torques; return the description of the stop."""
+        return self.core.stream.resume()
 
     def judge(self) -> tuple[bytes, str]:
-        """Level and message of the node's diagnostic status."""
+        """Return level and message of the node's diagnostic status."""
         stream = self.core.stream
         if stream.stopped:
-            return health.ERROR, f"closed: {self._promised_too_late() or stream.status}"
+            return health.ERROR, f"closed: {self._find_longer_deadline() or stream.status}"
         level, message = super().judge()
         return level, "open" if level == health.OK else message
 
     def values(self) -> dict[str, object]:
-        """Values of the node's diagnostic status."""
+        """Return the values of the node's diagnostic status."""
         stream = self.core.stream
         return {
             "open": not stream.stopped,
@@ -126,8 +121,8 @@ class CommandGate(TwinNode):
             **{f"closed: {k}": v for k, v in stream.stops.items()},
         }
 
-    def _promised_too_late(self) -> str:
-        """Whose torques the middleware keeps from the gate, as they promise a longer deadline."""
+    def _find_longer_deadline(self) -> str:
+        """Name a node whose torques the middleware withholds, as it offers a longer deadline."""
         deadline = self.core.settings.deadline
         for publisher in self.get_publishers_info_by_topic(self.resolve_topic_name(TORQUES)):
             promised = publisher.qos_profile.deadline.nanoseconds / SECOND
@@ -141,48 +136,28 @@ class CommandGate(TwinNode):
                 )
         return ""
 
-    def _declare_robot(self, settings: GateSettings) -> None:
-        """Effort limits, and the payload whose weight ``on_stop`` gravity bears."""
-        robot = self.core.robot
-        # Not every robot's file has a place for what is not given.
-        robot = changed(robot, declare_changes(self, robot, CHANGEABLE))
-        if settings.on_stop == "gravity":
-            # Refused here where the robot has no masses; and compiled before it is needed.
-            zeros = np.zeros(len(robot.joint_names))
-            inverse_dynamics(robot, robot.inverse(robot.home()), zeros, zeros)
-        self.core.change_robot(robot)
-
-    @contextmanager
-    def _watching(self) -> Iterator[None]:
-        """Send the closed gate's command at once if torques close the gate."""
-        running = not self.core.stream.stopped
-        try:
-            yield
-        finally:
-            if running and self.core.stream.stopped:
-                self._watch()
-
     def _refuse_torques(self, error: MessageError) -> None:
-        with self._watching():
+        with self.core.stream.reacting(self._watch):
             self.core.refuse(self.core.stream, error)
 
     def _on_torques(self, message: JointStateView) -> None:
-        with self._watching():
+        # A closed gate sends its command at once.
+        with self.core.stream.reacting(self._watch):
             command = self.core.torques(message, self.now(), time.monotonic_ns())
         if command is not None:
             self._send(command)
 
     def _watch(self) -> None:
-        """While the gate is closed its command is repeated: a controller may come late."""
+        """Repeat the command of a closed gate, as a controller may start late."""
         if not self.active:
             return
         steady = time.monotonic_ns()
         self.core.watch(steady)
-        self._tell()
+        self._log_changes()
         if self.core.stream.stopped:
             self._send(self.core.stop_command(steady))
 
-    def _tell(self) -> None:
+    def _log_changes(self) -> None:
         """Log each opening and closing of the gate."""
         stream = self.core.stream
         if stream.stopped is self._closed:

@@ -14,24 +14,9 @@ from pkm_twin.ros.node import TwinNode
 
 CHANGES: Final = {
     "payload.mass": ("payload", "mass", "kg", "mass of the payload"),
-    "payload.com": (
-        "payload",
-        "com",
-        "m",
-        "centre of mass of the payload, from the platform's reference point",
-    ),
-    "payload.inertia": (
-        "payload",
-        "inertia",
-        "kg m2",
-        "inertia of the payload about its com, 3 or 9 numbers",
-    ),
-    "friction.viscous": (
-        "friction",
-        "viscous",
-        "N m s or N s/m",
-        "viscous friction, one per joint",
-    ),
+    "payload.com": ("payload", "com", "m", "centre of mass of the payload, from the platform's reference point"),
+    "payload.inertia": ("payload", "inertia", "kg m2", "inertia of the payload about its com, 3 or 9 numbers"),
+    "friction.viscous": ("friction", "viscous", "N m s or N s/m", "viscous friction, one per joint"),
     "friction.coulomb": ("friction", "coulomb", "N m or N", "Coulomb friction, one per joint"),
     "friction.offset": ("friction", "offset", "N m or N", "constant effort, one per joint"),
     "gravity": ("gravity", "", "m/s2", "gravity in base axes"),
@@ -46,7 +31,7 @@ CHANGES: Final = {
 
 
 def declare_changes(node: TwinNode, robot: Robot, names: Collection[str] = CHANGES) -> dict[str, Any]:
-    """Declare these parameters; what is given in addition to the robot's file."""
+    """Declare these parameters; return the values that were given, by name."""
     changes = {}
     for name in names:
         section, key, unit, text = CHANGES[name]

@@ -18,13 +18,7 @@ from std_msgs.msg import Float64MultiArray
 
 from delta_dynamics.feedforward import warm_up
 from delta_dynamics.nodes.topics import SIMULATION
-from delta_dynamics.simulation.machine import (
-    MachineSettings,
-    PayloadEvent,
-    Simulation,
-    WrenchSignal,
-    tuned,
-)
+from delta_dynamics.simulation.machine import MachineSettings, PayloadEvent, Simulation, WrenchSignal, tuned
 from pkm_twin.bags.definitions import message_definition
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MessageError, ParameterError, short
@@ -32,7 +26,7 @@ from pkm_twin.messages.fast_decoder import DoublesTemplate, RawTrajectory
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.effort_limits import effort_limits
 from pkm_twin.robot.robot import Robot
-from pkm_twin.robot.variation import KINDS, MAX_SPREAD, Variation, varied
+from pkm_twin.robot.variation import KINDS, MAX_SPREAD, varied
 from pkm_twin.ros import health
 from pkm_twin.ros.joints import FIELDS, JointPublisher
 from pkm_twin.ros.node import TwinNode, latched_qos
@@ -40,40 +34,43 @@ from pkm_twin.ros.run import run
 
 BEGIN: Final = SECOND
 """Simulated time at the start, ns: a stamp of zero would be none."""
-TICK: Final = 1e-3
-"""Shortest period of the clock, s."""
-EARLY: Final = 0.75
-"""The part of a period after which the next one may begin."""
-BUDGET: Final = 5e-3
-"""How long one tick of the clock may simulate, s: messages are taken between."""
-BEHIND: Final = 0.1
-"""How far the machine may be behind the clock that it keeps, s; beyond, it stands still."""
-CLOCK_PERIOD: Final = 5_000_000
-"""Period of /clock, ns of simulated time."""
-ALONE: Final = 1.0
-"""In lockstep: how long an answer is waited for, s of the wall."""
+MAX_TICK_TIME: Final = 5e-3
+"""Longest time that one tick of the clock may simulate, s: messages are taken between ticks."""
 LOOK: Final = 0.05
+"""In lockstep: period of the checks for a silent commander, s."""
 WRENCH: Final = "geometry_msgs/msg/WrenchStamped"
 OWN_CLOCK: Final = "false, because machine_sim has its own clock"
 
 
 class MachineSim(TwinNode):
-    """A robot's drives and sensors, its motion simulated."""
+    """Simulate the motion of a robot with its drives and sensors."""
 
     topics = SIMULATION
+    core: Simulation
 
     def __init__(self) -> None:
         super().__init__("machine_sim")
         robot = self.declare_robot()
         robot.massive()
-        self._variation = self._declare_spread(robot)
+        size = self.declare(
+            "spread", 0.0, "relative perturbation of the robot file's parameters", low=0.0, high=MAX_SPREAD
+        )
+        kinds = self.declare("spread_kinds", list(KINDS), f"parameters to perturb: {', '.join(KINDS)}")
+        seed = self.declare("seed", 1, "seed of the perturbation", low=0, high=2**31 - 1)
+        distribution = self.declare(
+            "distribution",
+            "normal",
+            "normal: spread is the standard deviation; uniform: the bound",
+            choices=("normal", "uniform"),
+        )
+        self._variation = varied(robot, dict.fromkeys(kinds, size), seed, distribution)
         self._declare_clock()
         settings = self._declare_settings(robot)
         begin = BEGIN if self._simulated else self.now()
         self.core = Simulation(self._variation.robot, settings, begin)
         self._check_control()
         self._skipped = 0
-        # Compiled before there is a topic to be found by.
+        # Other nodes find this one by its topics: compile before.
         warm_up(self._variation.robot)
         self.core.plant.advance(np.zeros_like(settings.start), np.zeros(6), settings.period / settings.substeps)
         self.core.restart()
@@ -87,8 +84,8 @@ class MachineSim(TwinNode):
             self.create_guarded_timer(LOOK, self._go_alone)
         else:
             step = settings.period / self._factor if self._factor else 0.0
-            # One turn of the executor a period: with more it would cost more than the machine.
-            self.create_guarded_timer(max(TICK, step), self._catch_up)
+            # At most 1 kHz: more turns of the executor would cost more than the simulation.
+            self.create_guarded_timer(max(1e-3, step), self._catch_up)
         self.start()
         self._publish_drawn()
 
@@ -106,20 +103,20 @@ class MachineSim(TwinNode):
         self._publish()
 
     def reset_stop(self) -> str:
-        """Back to the start, braked."""
+        """Return to the start, braked."""
         text = self.core.failure
         self.core.restart()
         return text or "the machine is at its start"
 
     def judge(self) -> tuple[bytes, str]:
-        """Level and message of the node's diagnostic status."""
+        """Return level and message of the node's diagnostic status."""
         sim = self.core
         if sim.failure:
             return health.ERROR, f"the machine has failed: {sim.failure}"
         return health.OK, "braked: no command yet" if sim.braked else "moving freely"
 
     def values(self) -> dict[str, object]:
-        """Values of the node's diagnostic status."""
+        """Return the values of the node's diagnostic status."""
         sim = self.core
         return {
             "time (s)": f"{sim.time:.3f}",
@@ -130,20 +127,6 @@ class MachineSim(TwinNode):
             **sim.trajectories.counts("trajectories"),
             **sim.wrenches.counts("applied wrenches"),
         }
-
-    def _declare_spread(self, robot: Robot) -> Variation:
-        size = self.declare(
-            "spread", 0.0, "relative perturbation of the robot file's parameters", low=0.0, high=MAX_SPREAD
-        )
-        kinds = self.declare("spread_kinds", list(KINDS), f"parameters to perturb: {', '.join(KINDS)}")
-        seed = self.declare("seed", 1, "seed of the perturbation", low=0, high=2**31 - 1)
-        distribution = self.declare(
-            "distribution",
-            "normal",
-            "normal: spread is the standard deviation; uniform: the bound",
-            choices=("normal", "uniform"),
-        )
-        return varied(robot, dict.fromkeys(kinds, size), seed, distribution)
 
     def _declare_clock(self) -> None:
         self._clock_kind = self.declare(
@@ -165,7 +148,7 @@ class MachineSim(TwinNode):
             self._factor = 1.0
 
     def _declare_settings(self, robot: Robot) -> MachineSettings:
-        """Drives and sensors by the model: who tunes them does not know what was drawn."""
+        """Declare drives and sensors, whose defaults come from the unperturbed robot."""
         bandwidth = self.declare(
             "bandwidth", 10.0, "bandwidth of the position control, critically damped", unit="Hz", low=0.01, high=1000.0
         )
@@ -197,7 +180,7 @@ class MachineSim(TwinNode):
         )
 
     def _check_control(self) -> None:
-        """Efforts alone need no position control: a default that is too fast only warns.
+        """Check the position control's stability; default gains that are too high only warn.
 
         :raises ParameterError: gains that were given are unstable at the period.
         """
@@ -214,36 +197,22 @@ class MachineSim(TwinNode):
                 value = self.get_parameter(name).value
                 period = sim.settings.period
                 raise ParameterError(name, value, f"{right}, stable at period {period:g} s")
-        text = f"trajectories are rejected: {sim.control_fault()}"
-        self.health.limitations.append(text)
-        self.get_logger().warning(text)
+        self.report_limitation(f"trajectories are rejected: {sim.control_fault()}")
 
     def _declare_payloads(self, robot: Robot) -> tuple[PayloadEvent, ...]:
-        """Events as three lists; by default the robot's own payload from the start."""
+        """Declare payload events as three lists; by default the robot's own payload from the start."""
         own = robot.payload
-        times, masses, coms = (
-            self.declare(name, default, text, usual=usual)
-            for name, default, text, usual in (
-                (
-                    "payload.times",
-                    [0.0],
-                    "times at which the payload changes, s after the start",
-                    "",
-                ),
-                ("payload.masses", [own.mass], "payload from each time on, kg", "the robot's"),
-                (
-                    "payload.coms",
-                    own.com.tolist(),
-                    "centre of mass of the payload, m from the platform's reference point, three numbers per time",
-                    "the robot's",
-                ),
-            )
+        times = self.declare("payload.times", [0.0], "times at which the payload changes, s after the start")
+        masses = self.declare("payload.masses", [own.mass], "payload from each time on, kg", usual="the robot's")
+        coms = self.declare(
+            "payload.coms",
+            own.com.tolist(),
+            "centre of mass of the payload, m from the platform's reference point, three numbers per time",
+            usual="the robot's",
         )
         if len(masses) != len(times) or len(coms) != 3 * len(times):
             raise ParameterError(
-                "payload.masses",
-                list(masses),
-                f"{len(times)} numbers, and three for each in payload.coms",
+                "payload.masses", list(masses), f"{len(times)} numbers, and three for each in payload.coms"
             )
         events = tuple(
             PayloadEvent(float(t), float(m), tuple(map(float, coms[3 * i : 3 * i + 3])))
@@ -289,7 +258,7 @@ class MachineSim(TwinNode):
         self.core.commands(message)
         self._heard = time.monotonic()
         if self._lockstep:
-            # Answers to states that went out alone are no steps: one state is on its way at a time.
+            # Only the answer to the newest state is a step: some states were sent without a command.
             self._flying = max(0, self._flying - 1)
             if self._flying == 0:
                 self._advance()
@@ -306,28 +275,28 @@ class MachineSim(TwinNode):
         period = self.core.settings.period
         begun = time.monotonic()
         if self._factor == 0.0:
-            self._due = begun - BUDGET
+            self._due = begun - MAX_TICK_TIME
         step = period / self._factor if self._factor else 0.0
-        # The timer that is a little early does not wait for its next turn.
-        while self._due + EARLY * step <= (now := time.monotonic()):
-            if now - begun > BUDGET:
+        # A timer that is up to a quarter period early does not wait for its next turn.
+        while self._due + 0.75 * step <= (now := time.monotonic()):
+            if now - begun > MAX_TICK_TIME:
                 break
             self._due += step
             self._advance()
+        # A machine more than 0.1 s behind its clock skips the delay.
         behind = time.monotonic() - self._due
-        if self._factor and behind > BEHIND:
+        if self._factor and behind > 0.1:
             self._skipped += 1
             self._due += behind
             if not self._simulated:
                 self.core.skip(round(behind * SECOND))
 
     def _go_alone(self) -> None:
-        """Time goes on where nobody commands: before the first command, and without an answer."""
+        """Advance in lockstep before the first command, and without a command for 1 s."""
         if not self.active:
             return
-        silent = time.monotonic() - self._heard > ALONE
+        silent = time.monotonic() - self._heard > 1.0
         if silent:
-            # What has no answer by now has nobody who answers.
             self._flying = 0
         if self.core.braked or silent:
             self._advance()
@@ -342,13 +311,13 @@ class MachineSim(TwinNode):
     def _publish(self) -> None:
         measured = self.core.measured()
         if self._clock_topic is not None and measured.stamp >= self._clock_due:
-            self._clock_due = measured.stamp + CLOCK_PERIOD
+            self._clock_due = measured.stamp + SECOND // 200
             self._clock_topic.publish(Clock(clock=Time(nanoseconds=measured.stamp).to_msg()))
         stamped = divmod(measured.stamp, SECOND)
         self._wrenches.publish(self._wrench.fill(measured.wrench, stamped))
         own = self.core.robot.controller
         self._flying += 1
-        # Last: who answers it has all else.
+        # Published last: a node that answers it has received the others.
         self._states.publish(
             measured.stamp,
             own.controller_positions(measured.q),
@@ -371,7 +340,7 @@ class MachineSim(TwinNode):
 
 
 def _refuse_sim_time(changes: Sequence[Parameter]) -> SetParametersResult:
-    """While the node runs as at its start."""
+    """Reject use_sim_time while the node runs, as at its start."""
     good = not any(change.name == "use_sim_time" and change.value for change in changes)
     reason = "" if good else str(ParameterError("use_sim_time", True, OWN_CLOCK))
     return SetParametersResult(successful=good, reason=reason)

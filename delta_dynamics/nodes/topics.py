@@ -5,17 +5,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from pkm_twin.streams.topics import (
-    JOINTS,
-    NUMBERS,
-    STATUSES,
-    TEXT,
-    TRAJECTORY,
-    TRIGGER,
-    WRENCH,
-    Topic,
-    table,
-)
+from pkm_twin.streams.topics import JOINTS, NUMBERS, STATUSES, TEXT, TRAJECTORY, TRIGGER, WRENCH, Topic, table
 
 _INERTIA: Final = "geometry_msgs/InertiaStamped"
 _OBSERVED: Final = "`observe_wrench`"

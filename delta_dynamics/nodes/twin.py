@@ -5,20 +5,18 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import Any, Final
+from contextlib import AbstractContextManager
+from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import WrenchStamped
-from sensor_msgs.msg import Imu
 
 from delta_dynamics.feedforward import Feedforward, Settings, Torques, warm_up
 from delta_dynamics.nodes.estimates import Estimates
 from delta_dynamics.nodes.parameters import CHANGES, changed, declare_changes
 from delta_dynamics.nodes.topics import TWIN
 from delta_dynamics.torques.reactions import reactions
-from pkm_twin.errors import MessageError, ParameterError, PkmTwinError
+from pkm_twin.errors import MessageError, ParameterError
 from pkm_twin.messages.fast_decoder import JointStateView, RawTrajectory
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
@@ -35,34 +33,32 @@ from pkm_twin.streams.monitor import Pace
 from pkm_twin.streams.topics import topic_tokens
 from pkm_twin.streams.wrench import WrenchReader, WrenchSettings
 
-MAX_ACKNOWLEDGE_TIME: Final = 0.5
-"""Longest wait at the end for the controller's acknowledgement of the last command, s."""
-
 
 class DeltaDynamics(TwinNode):
     """Feedforward torques from the virtual-work model of any robot with masses."""
 
     topics = TWIN
+    core: Feedforward
 
     def __init__(self) -> None:
         super().__init__("delta_dynamics")
         robot = self.declare_robot()
-        base = self._create_base()
-        # Before there is a topic to be found by: the first start compiles for many seconds.
+        imu = "take the motion of the base from base_imu, else it is at rest; only joint states are answered then"
+        wanted = self.declare("base_imu", False, imu)
+        settings_of_imu = self.declare_settings(ImuSettings, fixed=True)
+        base = BaseImu(settings_of_imu) if wanted else None
+        # Other nodes find this one by its topics: compile before, as a first start takes many seconds.
         warm_up(robot, base=base is not None)
         robot = changed(robot, declare_changes(self, robot))
         settings = self.declare_settings(Settings)
         self.core = Feedforward(robot, settings, self._create_wrenches(settings), base)
         commands = self.declare("publish_commands", False, "publish ~/commands")
         if commands and "on_stop" not in self.given:
-            # A controller of plain commands holds the last one for ever.
-            raise ParameterError(
-                "on_stop",
-                None,
-                "nothing, zeros or gravity, explicitly set, because publish_commands is true",
-            )
+            # An effort controller holds the last plain command indefinitely.
+            text = "nothing, zeros or gravity, explicitly set, because publish_commands is true"
+            raise ParameterError("on_stop", None, text)
         self._trajectory = self.create_guarded_publisher("~/joint_trajectory_ff")
-        # A torque is worth nothing once the stream that it answers would be stale.
+        # A torque expires when the stream that it answers would be stale.
         stale_after = self.core.settings.stale_after
         self._torques = EffortPublisher(
             self, robot, "~/joint_torques", "~/commands", stale_after, with_plain=bool(commands)
@@ -84,35 +80,39 @@ class DeltaDynamics(TwinNode):
         )
         self._action = self._create_action()
         if base is not None:
-            self._check_base()
-            self.create_guarded_subscription("base_imu", self._on_imu, expected=True, every=True)
-        self.follow(
-            [*CHANGES, *changeable(Settings)],
-            self._prepare,
-            self._take,
-        )
+            for name in ("publish_reactions", "estimate_payload", "observe_wrench"):
+                if self.get_parameter(name).value:
+                    raise ParameterError(name, True, "false with base_imu: it is for a base at rest")
+            if self._action is not None:
+                raise ParameterError(
+                    "controller_action", self.get_parameter("controller_action").value, "empty with base_imu"
+                )
+            self.create_guarded_subscription(
+                "base_imu", lambda message: base.take(message, self.now()), expected=True, every=True
+            )
+        self.follow([*CHANGES, *changeable(Settings)], self._prepare, self._take)
         self._reported_window = 0
         self._accepted: tuple[int, Any] | None = None
-        """The last accepted joint state, and when it came by the steady clock, ns."""
+        """Arrival of the last accepted joint state by the steady clock, ns, and the message."""
         self._watchdog: Any = None
         self._watch_every(stale_after)
-        # A step after which no stamp that was good before is good now.
+        # A clock step that makes every accepted stamp too old.
         self.start(leap=stale_after + self.core.settings.future_tolerance)
 
     def time_jumped_backward(self) -> None:
-        """No torque across the seam: the stream starts again."""
+        """Start the stream again: no torque spans the jump."""
         self.core.reset()
         self._estimates.reset()
         self._reactions_pace.reset()
 
     def time_jumped_forward(self) -> None:
         """Stop a running stream, whose samples are stale after a jump of the clock."""
-        with self._telling_stop():
+        with self._reacting_to_stop():
             self.core.time_jumped_forward()
         self._estimates.reset()
 
     def stream_broken(self, where: str) -> None:
-        """Whatever failed: the stream is stopped."""
+        """Stop the stream after an exception."""
         self._stop("exception", f"{where} raised an exception")
 
     def activated(self) -> None:
@@ -132,20 +132,19 @@ class DeltaDynamics(TwinNode):
         if self._action is not None:
             self._action.shutdown()
         super().shutdown()
-        self._torques.wait_for_controllers(MAX_ACKNOWLEDGE_TIME)
+        self._torques.wait_for_controllers()
 
     @property
     def shutting_down(self) -> bool:
-        """Whether the ends of goals still wait for turns of the executor."""
+        """True while the ends of goals wait for turns of the executor."""
         return self._action is not None and self._action.shutting_down
 
     def reset_stop(self) -> str:
-        """End a stop without waiting for good samples."""
-        stream = self.core.stream
-        return stream.status if stream.resume() else ""
+        """End a stop without waiting for good samples; return its description."""
+        return self.core.stream.resume()
 
     def judge(self) -> tuple[bytes, str]:
-        """Level and message of the node's diagnostic status: the worst that there is."""
+        """Return level and message of the node's diagnostic status: those of the worst problem."""
         core, estimates = self.core, self._estimates
         if core.rates.fault:
             self.log_throttled("rates", core.rates.fault)
@@ -172,7 +171,7 @@ class DeltaDynamics(TwinNode):
         return level, message
 
     def values(self) -> dict[str, object]:
-        """Values of the node's diagnostic status."""
+        """Return the values of the node's diagnostic status."""
         core = self.core
         measure = core.singularity()
         values: dict[str, object] = {
@@ -198,7 +197,7 @@ class DeltaDynamics(TwinNode):
         return values
 
     def _window_text(self) -> str:
-        """How long the differentiator's window is and what it costs; a new length is logged."""
+        """Describe the differentiator's window and its errors; log a new length."""
         fit = self.core.differentiator
         if fit.period == 0.0:
             return ""
@@ -251,18 +250,10 @@ class DeltaDynamics(TwinNode):
         state = self._accepted[1]
         return dict(zip(state.name, map(float, state.position), strict=True))
 
-    def _silence(self) -> float:
-        """Since the last accepted joint state, by the steady clock, s; 0 before the first."""
-        if self._accepted is None:
-            return 0.0
-        return (time.monotonic_ns() - self._accepted[0]) / SECOND
-
     def _create_wrenches(self, settings: Settings) -> WrenchWindow | None:
         """Create the window of measured wrenches if ``use_wrench`` is set."""
         wanted = self.declare(
-            "use_wrench",
-            False,
-            "include the measured wrench in torques and residual of joint states",
+            "use_wrench", False, "include the measured wrench in torques and residual of joint states"
         )
         age = self.declare("max_wrench_age", 0.1, "largest time between a joint state and its wrench", **SECONDS)
         policy = self.declare(
@@ -283,39 +274,7 @@ class DeltaDynamics(TwinNode):
         if not wanted:
             return None
         self.create_guarded_subscription("wrench", self._on_wrench, expected=True, every=True)
-        return WrenchWindow(
-            WrenchReader(wrench, mounts),
-            round(age * SECOND),
-            policy,
-            settings.order,
-            settings.window,
-        )
-
-    def _create_base(self) -> BaseImu | None:
-        """Return what measures the motion of the base, where the parameter asks for it."""
-        wanted = self.declare(
-            "base_imu",
-            False,
-            "take the motion of the base from base_imu, else it is at rest; only joint states are answered then",
-        )
-        settings = self.declare_settings(ImuSettings, fixed=True)
-        return BaseImu(settings) if wanted else None
-
-    def _check_base(self) -> None:
-        """Reject what takes the base as at rest.
-
-        :raises ParameterError: naming the parameter.
-        """
-        for name in ("publish_reactions", "estimate_payload", "observe_wrench"):
-            if self.get_parameter(name).value:
-                raise ParameterError(name, True, "false with base_imu: it is for a base at rest")
-        if self._action is not None:
-            given = self.get_parameter("controller_action").value
-            raise ParameterError("controller_action", given, "empty with base_imu")
-
-    def _on_imu(self, message: Imu) -> None:
-        if self.core.base is not None:
-            self.core.base.take(message, self.now())
+        return WrenchWindow(WrenchReader(wrench, mounts), round(age * SECOND), policy, settings.order, settings.window)
 
     def _on_wrench(self, message: WrenchStamped) -> None:
         wrenches = self.core.wrenches
@@ -336,30 +295,31 @@ class DeltaDynamics(TwinNode):
             for name, token in topic_tokens(names).items()
         }
 
-    @contextmanager
-    def _telling_stop(self) -> Iterator[None]:
+    def _reacting_to_stop(self) -> AbstractContextManager[None]:
         """Log a stop of the stream within the block, and send the command of ``on_stop``."""
-        stream = self.core.stream
-        running = not stream.stopped
-        try:
-            yield
-        finally:
-            if running and stream.stopped:
-                self._send_stop()
+        core = self.core
+
+        def send_stop() -> None:
+            self.log_throttled("stop", f"stopped: {core.stream.status}")
+            stamp, effort = self.now(), core.stop_effort(time.monotonic_ns())
+            if effort is not None:
+                self._torques.publish(stamp, effort)
+
+        return core.stream.reacting(send_stop)
 
     def _on_trajectory(self, data: bytes) -> None:
         with self.core.refusing(self.core.trajectories):
             self.defer("~/joint_trajectory", self._answer_trajectory(data))
 
     def _answer_trajectory(self, data: bytes) -> Task:
-        """In steps, so that the stream is answered meanwhile."""
+        """Answer a trajectory in steps, so that the stream is answered meanwhile."""
         with self.core.refusing(self.core.trajectories):
             raw = RawTrajectory.of(data)
         steps = self.core.trajectory_steps(raw.fields, self.now())
         while True:
             yield
             try:
-                with self._telling_stop():
+                with self._reacting_to_stop():
                     next(steps)
             except StopIteration as end:
                 efforts = end.value
@@ -370,36 +330,29 @@ class DeltaDynamics(TwinNode):
             self._action.other_motion()
 
     def _refuse_joint_state(self, error: MessageError) -> None:
-        with self._telling_stop():
+        with self._reacting_to_stop():
             self.core.refuse(self.core.stream, error)
 
     def _on_joint_state(self, message: JointStateView) -> None:
         core, came = self.core, time.monotonic_ns()
-        with self._telling_stop():
+        with self._reacting_to_stop():
             torques = core.joint_state(message, self.now(), came)
             if torques is not None:
-                # The process may have stood still since.
+                # The process may have been suspended since.
                 core.check_age(torques, self.now())
-            # A rejected message, such as another machine's, is no sign of life of this one.
+            # A rejected message, for example of another machine, is no sign of life of this one.
             self._accepted = came, message
             if torques is None:
                 return
         self._torques.publish(torques.stamp, torques.sent)
-        residual = torques.residual
-        if residual is not None:
-            own = core.robot.controller
-            self._residual.publish(torques.stamp, own.controller_efforts(residual))
-        for tell in (self._estimates.take, self._tell_reactions):
-            try:
-                tell(torques)
-            except (PkmTwinError, ValueError) as error:
-                # In a constraint singularity, say: the torque is sound all the same.
-                self.log_throttled("beside", f"no reactions or estimates: {error}")
+        if torques.residual is not None:
+            self._residual.publish(torques.stamp, core.robot.controller.controller_efforts(torques.residual))
+        self.call_beside("reactions or estimates", torques, self._estimates.take, self._publish_reactions)
 
-    def _tell_reactions(self, torques: Torques) -> None:
-        """Every joint's wrench that rigid bodies determine, world axes, at the joint's point.
+    def _publish_reactions(self, torques: Torques) -> None:
+        """Publish each joint's wrench that rigid bodies determine, world axes, at the joint's point.
 
-        At a rate of their own: a dense solve a sample is too much for the stream's.
+        They have a rate of their own, as they need a dense solve per sample.
         """
         if not (self._reactions and self._reactions_pace.due(torques.stamp)):
             return
@@ -416,22 +369,15 @@ class DeltaDynamics(TwinNode):
         self._watchdog = self.create_guarded_timer(min(0.25 * stale_after, 0.1), self._watch)
 
     def _watch(self) -> None:
-        """Stop a stream that has gone silent; runs on the steady clock."""
-        core, silent = self.core, self._silence()
+        """Stop a silent stream; runs on the steady clock."""
+        core = self.core
+        silent = 0.0 if self._accepted is None else (time.monotonic_ns() - self._accepted[0]) / SECOND
         if not core.stream.stopped and silent > core.settings.stale_after:
             self._stop("stale input", f"no accepted joint state for {silent:.3f} s")
 
     def _stop(self, reason: str, text: str) -> None:
-        with self._telling_stop():
+        with self._reacting_to_stop():
             self.core.stop(reason, text)
-
-    def _send_stop(self) -> None:
-        core = self.core
-        self.log_throttled("stop", f"stopped: {core.stream.status}")
-        stamp = self.now()
-        effort = core.stop_effort(time.monotonic_ns())
-        if effort is not None:
-            self._torques.publish(stamp, effort)
 
     def _prepare(self, values: dict[str, Any]) -> tuple[Robot, Settings]:
         """Return the robot and the settings with new values of parameters."""
@@ -440,8 +386,7 @@ class DeltaDynamics(TwinNode):
         return robot, with_parameters(core.settings, values)
 
     def _take(self, prepared: tuple[Robot, Settings]) -> None:
-        robot, settings = prepared
-        core = self.core
+        (robot, settings), core = prepared, self.core
         before = core.settings
         if robot is not core.robot:
             core.change_robot(robot)

@@ -252,7 +252,7 @@ class Resistance:
         if not ((up & (qd > 0.0)) | (down & (qd < 0.0))).any():
             return here
         j = np.flatnonzero(up | down)
-        across = np.linalg.inv(here.mass)[:, j]
+        across = _inverse(here.mass)[:, j]
         low, high = np.where(down[j], -math.inf, 0.0), np.where(up[j], math.inf, 0.0)
         # Friction, which is bounded, does not hold against an impact.
         impulse, states = resisting(across[j], qd[j], low, high, np.zeros(len(j), np.int8))
@@ -299,7 +299,7 @@ class Resistance:
         :param low: bounds of all rows' forces, shape (n + k,).
         """
         rows = self.rows(here)[z]
-        inverse = np.linalg.inv(here.mass)
+        inverse = _inverse(here.mass)
         motion = law.first
         if self._passive:
             motion = np.concatenate([motion, here.rows @ motion + here.drift])
@@ -385,7 +385,7 @@ class Resistance:
         It needs no constant law, always has a result, and removes energy.
         """
         n = len(here.q)
-        inverse = np.linalg.inv(here.mass + span * self._damping(here))
+        inverse = _inverse(here.mass + span * self._damping(here))
         rest = law.given - here.bias + (0.0 if law.wrench is None else law.wrench @ here.twists)
         rates = inverse @ (here.mass @ here.qd + span * rest)
         up, down = here.q >= self._high, here.q <= self._low
@@ -445,3 +445,7 @@ class Resistance:
             qd[law.held[law.held < len(qd)]] = 0.0
             end = end if (qd == end.qd).all() else self.at(end.q, qd)
         return self._struck(end)
+
+
+def _inverse(matrix: Array) -> Array:
+    return np.asarray(np.linalg.inv(matrix), np.float64)

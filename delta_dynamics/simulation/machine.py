@@ -32,14 +32,10 @@ TimeoutAction = Literal["zeros", "hold"]
 
 SINGULAR: Final = 1e-3
 """Singularity index below which rigid bodies no longer describe the machine."""
-POSES: Final = 64
-"""Random poses among which the one with the fastest position control is searched."""
 MARGIN: Final = 1.25
 """Factor of all gains with which the position control must still be stable."""
 DELAYS: Final = 20
 """Periods of a delay that are modelled one by one; a longer delay is divided into as many."""
-NO_GROWTH: Final = 1e-6
-"""Growth of an error per period that is rounding, for example where no gain acts on a joint."""
 
 
 @dataclass(frozen=True)
@@ -91,12 +87,7 @@ class MachineSettings:
     resolution: Array = field(default_factory=lambda: np.zeros(1))
     """Encoder step, rad or m; 0 is none."""
     delay: float = setting(
-        0.0,
-        "delay of every effort command, in whole periods",
-        name="command_delay",
-        unit="s",
-        low=0.0,
-        high=10.0,
+        0.0, "delay of every effort command, in whole periods", name="command_delay", unit="s", low=0.0, high=10.0
     )
     deadline: float = setting(0.1, "longest gap between effort commands", unit="s", low=1e-3, high=10.0)
     timeout_action: TimeoutAction = setting(
@@ -130,7 +121,7 @@ def stable_share(robot: Robot, settings: MachineSettings) -> float:
     with gains that are higher by :data:`MARGIN`. The bandwidth is that of :func:`tuned`:
     stiffness goes by its square, damping by itself.
     """
-    q = np.vstack([settings.start, random_joints(robot, np.random.default_rng(0), POSES)])
+    q = np.vstack([settings.start, random_joints(robot, np.random.default_rng(0), 64)])
     inertias = []
     follow = robot.following(q)
     for event in settings.payloads or (None,):
@@ -144,7 +135,7 @@ def stable_share(robot: Robot, settings: MachineSettings) -> float:
 
     def stable(share: float) -> bool:
         return all(
-            error_growth(inertia, settings, gain * share**2, gain * share, rates) <= 1.0 + NO_GROWTH
+            error_growth(inertia, settings, gain * share**2, gain * share, rates) <= 1.0 + 1e-6
             for inertia, rates in inertias
             for gain in (1.0, MARGIN)
         )
@@ -159,11 +150,7 @@ def stable_share(robot: Robot, settings: MachineSettings) -> float:
 
 
 def error_growth(
-    inertia: Array,
-    settings: MachineSettings,
-    stiffness: float = 1.0,
-    damping: float = 1.0,
-    follow: Array | None = None,
+    inertia: Array, settings: MachineSettings, stiffness: float = 1.0, damping: float = 1.0, follow: Array | None = None
 ) -> float:
     """Return the largest factor by which a position control error grows in a period.
 
@@ -323,14 +310,20 @@ class Simulation(Core):
         :raises MessageError: it fails now: a singularity, the edge of reach, or no finite result.
         """
         s = self.settings
-        control = self._control()
-        if control is not None:
-            self._send(control)
+        if self._path is not None and self.now >= self._path[0]:
+            start, path = self._path
+            self.braked, self._commanded = False, None
+            wanted = path.at((self.now - start) / SECOND)
+            errors = wanted.q - self._seen, wanted.qd - self._seen_rate
+            self._send(np.asarray(s.stiffness * errors[0] + s.damping * errors[1] + wanted.effort))
         while self._coming and self._coming[0][0] <= self.now:
             self._apply(self._coming.popleft()[1])
-        if self._commanded is not None and self._silent() and s.timeout_action == "zeros":
+        silent = self._commanded is not None and self.now - self._commanded > s.deadline * SECOND
+        if silent and s.timeout_action == "zeros":
             self._apply(np.zeros_like(self._effort))
-        self._load()
+        while self._payloads and self._payloads[0].time <= self.time:
+            load = self._payloads.popleft().load
+            self.plant.change_robot(self.robot.changed(payload=load))
         if not self.failure and not self.braked:
             try:
                 as_message_error(self._move)
@@ -348,9 +341,13 @@ class Simulation(Core):
         for _ in range(s.substeps):
             self.plant.advance(self._effort, wrench, s.period / s.substeps)
         bounds = self.robot.limits.position
-        if bounds is not None:
-            for k in self.plant.others:
-                self._stops(k, *bounds[k])
+        for k in self.plant.others:
+            # Redundant drives have no simulated stop.
+            name, here = self.robot.joint_names[k], float(self.plant.q[k])
+            low, high = (-math.inf, math.inf) if bounds is None else bounds[k]
+            if not low <= here <= high:
+                how = f"is at {here:.4g}, allowed {low:g} to {high:g}, and has no simulated stop"
+                raise UnreachableError("joint state", name, (), 0.0, how=how)
         if not np.isfinite(self.plant.qd).all():
             raise MessageError("non-finite result", "the motion is not finite")
         try:
@@ -358,13 +355,6 @@ class Simulation(Core):
         except PkmTwinError:
             self.plant.q = q
             raise
-
-    def _stops(self, k: int, low: float, high: float) -> None:
-        """Reject a redundant drive beyond its limits, where it has no simulated stop."""
-        name, here = self.robot.joint_names[k], float(self.plant.q[k])
-        if not low <= here <= high:
-            how = f"is at {here:.4g}, allowed {low:g} to {high:g}, and has no simulated stop"
-            raise UnreachableError("joint state", name, (), 0.0, how=how)
 
     def _tick(self) -> None:
         """End the period: advance the clock, and sample the encoders."""
@@ -382,17 +372,6 @@ class Simulation(Core):
         steps = np.where(step > 0.0, step, 1.0)
         return np.where(step > 0.0, np.round(q / steps) * steps, q)
 
-    def _control(self) -> Array | None:
-        """Return the position control's effort, (n,); None if no trajectory is followed."""
-        if self._path is None or self.now < self._path[0]:
-            return None
-        start, path = self._path
-        self.braked, self._commanded = False, None
-        wanted = path.at((self.now - start) / SECOND)
-        s = self.settings
-        errors = wanted.q - self._seen, wanted.qd - self._seen_rate
-        return np.asarray(s.stiffness * errors[0] + s.damping * errors[1] + wanted.effort)
-
     def _send(self, effort: Array) -> None:
         self._coming.append((self.now + round(self.settings.delay * SECOND), effort))
 
@@ -400,16 +379,6 @@ class Simulation(Core):
         limits = self.settings.effort_limits
         self.saturations += bool((np.abs(effort) > limits).any())
         self._effort = np.clip(effort, -limits, limits)
-
-    def _silent(self) -> bool:
-        assert self._commanded is not None  # noqa: S101
-        return self.now - self._commanded > self.settings.deadline * SECOND
-
-    def _load(self) -> None:
-        """Apply payloads that are due."""
-        while self._payloads and self._payloads[0].time <= self.time:
-            load = self._payloads.popleft().load
-            self.plant.change_robot(self.robot.changed(payload=load))
 
     def _wrench(self) -> Array:
         return self.settings.wrench.at(self.time) + self._pushed

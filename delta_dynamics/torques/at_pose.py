@@ -6,37 +6,23 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from delta_dynamics.torques.virtual_work import (
-    Forces,
-    add_friction_and_rotors,
-    begun,
-    efforts_of_motion,
-)
+from delta_dynamics.torques.virtual_work import Forces, add_friction_and_rotors, begun, efforts_of_motion
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.code import GOOD
-from pkm_twin.codegen.expressions import PARAMETERS, Objects, snapped_all
+from pkm_twin.codegen.expressions import PARAMETERS, snapped_all
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.lu import SparseLU
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics.motion import BaseMotion
 from pkm_twin.kinematics.posed import CarriedScheme
-from pkm_twin.kinematics.programs import (
-    certify_assembly,
-    follow_pose,
-    pose_accelerations,
-    pose_factors,
-    solve_pose,
-)
+from pkm_twin.kinematics.programs import certify_assembly, follow_pose, pose_accelerations, pose_factors, solve_pose
 from pkm_twin.kinematics.traced import Traced
 from pkm_twin.machine.inertia import Layout, change_of_frame, loaded_joints
 from pkm_twin.robot.robot import Robot
-
-_NO_WRENCH: Final = np.zeros(6)
 
 
 @dataclass(frozen=True)
@@ -50,11 +36,7 @@ class PoseMotion:
 
 
 def inverse_dynamics_at_pose(
-    robot: Robot,
-    pose: ArrayLike,
-    rate: ArrayLike,
-    acceleration: ArrayLike,
-    wrench: ArrayLike | None = None,
+    robot: Robot, pose: ArrayLike, rate: ArrayLike, acceleration: ArrayLike, wrench: ArrayLike | None = None
 ) -> PoseMotion:
     """Compute joint motion and actuator efforts for a motion of the platform.
 
@@ -71,18 +53,14 @@ def inverse_dynamics_at_pose(
     :raises SingularityError: a pose beyond a singularity, or in one.
     :raises ValueError: a wrong last axis, or a value that is not finite.
     """
-    load = _NO_WRENCH if wrench is None else wrench
+    load = np.zeros(6) if wrench is None else wrench
     given = pose, rate, acceleration, load
     found = evaluate_at_pose(robot, pose_torques, unjudged_pose_torques, robot.inertial, *given)
     return PoseMotion(*found)
 
 
 def evaluate_at_pose(
-    robot: Robot,
-    certified: Callable[[Robot], Kernel],
-    accepted: Callable[[Robot], Kernel],
-    p: Array,
-    *given: ArrayLike,
+    robot: Robot, certified: Callable[[Robot], Kernel], accepted: Callable[[Robot], Kernel], p: Array, *given: ArrayLike
 ) -> list[Array]:
     """Evaluate a program of poses and other inputs; which poses are reached is judged as always.
 
@@ -118,7 +96,7 @@ def pose_torques(robot: Robot) -> Kernel:
 
 
 def unjudged_pose_torques(robot: Robot) -> Kernel:
-    """Return the same program for poses that the inverse kinematics has accepted."""
+    """Return the program of :func:`pose_torques` for poses that the inverse kinematics accepted."""
     if robot.massive().posed is None:
         return pose_torques(robot)
     write = partial(_pose_torques, certified=False)
@@ -135,9 +113,16 @@ def _pose_torques(t: Traced, scheme: CarriedScheme, *, certified: bool) -> Progr
     posed.set_rates(rate)
     posed.set_accelerations(acceleration, BaseMotion.at_rest(gravity))
 
-    # J_M' Q_M + sum of J_H' Q_H, on the pose coordinates (3-PRRU paper).
+    # Inertial parameters of all bodies, in frames of the tree that the pose drives.
+    p, bodies = t.tape.inputs(PARAMETERS, layout.size), np.zeros((len(posed.tree.links), 10), dtype=object)
+    for row, (name, link) in enumerate(posed.tree.links.items()):
+        if name in t.tree.links:
+            lever = snapped_all(t.tree.at[name] - link.at)
+            bodies[row] = change_of_frame(link.axes, lever) @ p[layout.body(name)]
+
+    # J_M' Q_M + sum of J_Hij' Q_Hij, on the pose coordinates (3-PRRU paper, equation 40).
     forces = Forces(posed.motion)
-    forces.inertia(_bodies_in_frames(t, posed), rods)
+    forces.inertia(bodies, rods)
     for k, joint in enumerate(loaded_joints(t.graph)):
         forces.joint(joint, passive[3 * k : 3 * k + 3])
     forces.wrench(t.tape.inputs("wrench", 6))
@@ -145,13 +130,14 @@ def _pose_torques(t: Traced, scheme: CarriedScheme, *, certified: bool) -> Progr
     jq = posed.jq[scheme.independent]
     on_pose = on_pose - jq.T @ posed.lu.solve_transposed(unknown[scheme.varying])
 
-    # F_d = -J^-T (J_M' Q_M + sum of J_H' Q_H) - Q_S, with the bodies' own signs.
+    # F_d = -J^-T (J_M' Q_M + sum of J_Hij' Q_Hij) - Q_S (equation 41); needed forces are minus Q.
     steps = [posed.tree.steps[name] for name in t.graph.actuated]
     rates, changes = ([values[step.rate] for step in steps] for values in (posed.u, posed.du))
     drives = posed.rates_of_joints(t.graph.actuated)
-    lead = SparseLU(drives[t.drives.leading], scheme.drive_pivots)
-    t.drives.set_null_rows([lead.solve_transposed(drives[k]) for k in t.drives.others])
-    leads = add_friction_and_rotors(t, parts, lead.solve_transposed(on_pose), q, rates, changes)
+    jacobian = SparseLU(drives[t.drives.leading], scheme.drive_pivots)
+    t.drives.set_null_rows([jacobian.solve_transposed(drives[k]) for k in t.drives.others])
+    f_d = jacobian.solve_transposed(on_pose)
+    leads = add_friction_and_rotors(t, parts, f_d, q, rates, changes)
     efforts = t.drives.shared(leads[0], preload=True)
     branch = certify_assembly(t, scheme, posed, q) if certified else []
     outputs = {"q": t.lift(q), "qd": t.lift(rates), "qdd": t.lift(changes), "tau": t.lift(efforts)}
@@ -186,17 +172,3 @@ def _followed_pose_torques(t: Traced, scheme: None) -> Program:
     }
     inputs = {"pose": m, "rate": m, "acceleration": m, "wrench": 6}
     return Program(inputs, layout.size, outputs, first + equations)
-
-
-def _bodies_in_frames(t: Traced, posed: Traced) -> Objects:
-    """Return the inertial parameters of all bodies in frames of the tree that the pose drives."""
-    layout, tree = Layout(t.tree), posed.tree
-    p = t.tape.inputs(PARAMETERS, layout.size)
-    rows: list[Any] = []
-    for name, link in tree.links.items():
-        if name not in t.tree.links:
-            rows.append(np.zeros(10))
-            continue
-        lever = snapped_all(t.tree.at[name] - link.at)
-        rows.append(change_of_frame(link.axes, lever) @ p[layout.body(name)])
-    return np.array(rows, dtype=object)

@@ -5,8 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,16 +19,14 @@ from pkm_twin.kinematics.traced import Traced
 from pkm_twin.robot.numbers import CauseSlopes, FileNumbers, geometry_and_masses
 from pkm_twin.robot.robot import Robot
 
-MOTION: Final = ("q", "qd", "qdd")
-
 
 @dataclass(frozen=True, eq=False)
 class TorqueDerivatives:
     """Derivatives of efforts; rows are efforts, as of Pinocchio's computeRNEADerivatives.
 
     ``q``, ``qd``, ``qdd``: by positions, rates and accelerations, shape (..., n, n). ``by``: by
-    numbers of the file, by path, shape (..., n). In SI units. Of a gradient (one sum of efforts)
-    the axis of efforts is left out.
+    numbers of the file, by path, shape (..., n). In SI units. The gradient of a sum of efforts has
+    no axis of efforts.
     """
 
     q: Array
@@ -40,12 +36,7 @@ class TorqueDerivatives:
 
 
 def torque_derivatives(
-    robot: Robot,
-    q: ArrayLike,
-    qd: ArrayLike,
-    qdd: ArrayLike,
-    wrench: ArrayLike | None = None,
-    by: Sequence[str] = (),
+    robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None = None, by: Sequence[str] = ()
 ) -> TorqueDerivatives:
     """Compute the derivatives of :func:`delta_dynamics.inverse_dynamics`, wrench constant.
 
@@ -89,21 +80,31 @@ def _derivatives(
 ) -> TorqueDerivatives:
     inputs = _inputs(motion, wrench, weights, rows=rows)
     by_q, by_qd, by_qdd = robot.evaluate(motion_gradient(robot), robot.inertial, *inputs)
-    return TorqueDerivatives(by_q, by_qd, by_qdd, _by_paths(robot, inputs, by))
+    found: dict[str, Array] = {}
+    if by:
+        table = _numbers_table(robot, inputs) @ numbers_slopes(robot, by)
+        found = {path: np.ascontiguousarray(table[..., k]) for k, path in enumerate(by)}
+    return TorqueDerivatives(by_q, by_qd, by_qdd, found)
 
 
 def torque_effects(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None) -> Array:
     """Return the change of efforts per standard deviation of each cause, (..., n, causes)."""
     causes = robot.cached(CauseSlopes, geometry_and_masses)
-    kernel = robot.cached(_effects)
+    kernel = robot.cached(_effects_kernel)
     inputs = _inputs((q, qd, qdd), wrench, np.eye(robot.joints_count), rows=True)
     (table,) = robot.evaluate(kernel, robot.inertial, *inputs)
     return np.asarray(table @ causes.slopes, np.float64)
 
 
-def _effects(robot: Robot) -> Kernel:
+def _effects_kernel(robot: Robot) -> Kernel:
     chosen = robot.cached(CauseSlopes, geometry_and_masses).chosen
-    return robot.massive().kernel(f"torque gradient by {chosen}", partial(_by_chosen, chosen), free=True)
+
+    def write(t: Traced) -> Program:
+        program = torque_program(t)
+        numbers = [*t.geometry, *t.tape.inputs(PARAMETERS, program.parameters)]
+        return gradient_program(t, program, {"numbers": [numbers[k] for k in chosen]})
+
+    return robot.massive().kernel(f"torque gradient by {chosen}", write, free=True)
 
 
 def _inputs(motion: Sequence[ArrayLike], wrench: ArrayLike | None, weights: Array, *, rows: bool) -> list[Array]:
@@ -113,13 +114,6 @@ def _inputs(motion: Sequence[ArrayLike], wrench: ArrayLike | None, weights: Arra
         # One sample without the axis is the quick way of a small batch.
         inputs = [array if array.ndim == 1 else array[..., None, :] for array in inputs]
     return [*inputs, weights]
-
-
-def _by_paths(robot: Robot, inputs: Sequence[Array], by: Sequence[str]) -> dict[str, Array]:
-    if not by:
-        return {}
-    table = _by_numbers_table(robot, inputs) @ numbers_slopes(robot, by)
-    return {path: np.ascontiguousarray(table[..., k]) for k, path in enumerate(by)}
 
 
 def numbers_slopes(robot: Robot, by: Sequence[str]) -> Array:
@@ -136,36 +130,30 @@ def torques_by_numbers(
         Others as of :func:`torque_derivatives`.
     """
     inputs = _inputs((q, qd, qdd), wrench, np.eye(robot.joints_count), rows=True)
-    return _by_numbers_table(robot, inputs) @ slopes
+    return _numbers_table(robot, inputs) @ slopes
 
 
-def _by_numbers_table(robot: Robot, inputs: Sequence[Array]) -> Array:
-    """By geometry and masses, in a row."""
+def _numbers_table(robot: Robot, inputs: Sequence[Array]) -> Array:
+    """Return the derivatives by geometry and masses, side by side on the last axis."""
     return np.concatenate(robot.evaluate(numbers_gradient(robot), robot.inertial, *inputs), -1)
 
 
 def motion_gradient(robot: Robot) -> Kernel:
-    """Program of q, qd, qdd, wrench and weights to derivatives by q, qd and qdd."""
-    return robot.massive().kernel("torque gradient", _by_motion)
+    """Return the program of q, qd, qdd, wrench and weights to derivatives by q, qd and qdd."""
+
+    def write(t: Traced) -> Program:
+        program = torque_program(t)
+        return gradient_program(t, program, {name: t.drives.variables(name) for name in ("q", "qd", "qdd")})
+
+    return robot.massive().kernel("torque gradient", write)
 
 
 def numbers_gradient(robot: Robot) -> Kernel:
-    """Program of the same to derivatives by the geometry and by the masses."""
-    return robot.massive().kernel("torque gradient by numbers", _by_numbers, free=True)
+    """Return the program of the same inputs to derivatives by the geometry and by the masses."""
 
+    def write(t: Traced) -> Program:
+        program = torque_program(t)
+        masses = t.tape.inputs(PARAMETERS, program.parameters)
+        return gradient_program(t, program, {"geometry": t.geometry, "masses": masses})
 
-def _by_motion(t: Traced) -> Program:
-    program = torque_program(t)
-    return gradient_program(t, program, {name: t.drives.variables(name) for name in MOTION})
-
-
-def _by_numbers(t: Traced) -> Program:
-    program = torque_program(t)
-    masses = t.tape.inputs(PARAMETERS, program.parameters)
-    return gradient_program(t, program, {"geometry": t.geometry, "masses": masses})
-
-
-def _by_chosen(chosen: Sequence[int], t: Traced) -> Program:
-    program = torque_program(t)
-    numbers = [*t.geometry, *t.tape.inputs(PARAMETERS, program.parameters)]
-    return gradient_program(t, program, {"numbers": [numbers[k] for k in chosen]})
+    return robot.massive().kernel("torque gradient by numbers", write, free=True)

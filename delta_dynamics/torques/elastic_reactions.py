@@ -9,7 +9,6 @@ between those of its ends, which is exact where its own inertia does not bend it
 from __future__ import annotations
 
 import math
-from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,13 +17,9 @@ from delta_dynamics.torques.reactions import Balance, Reactions, balance, known_
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.motion import reaction_directions
-from pkm_twin.machine.graph import Joint
 from pkm_twin.machine.members import Beam, Section
 from pkm_twin.robot.outline import Posture
 from pkm_twin.robot.robot import Robot
-
-SOFT: Final = 1e-9
-"""Part of the largest energy of a self-stress below which another stores none."""
 
 
 def elastic_reactions(
@@ -39,14 +34,16 @@ def elastic_reactions(
     if not found.null.any():
         return found.reactions(found.value, found.null)
     try:
-        energy = _energy(robot, np.asarray(q, np.float64), found)
+        matrices = energy_forms(robot, q, found).values()
     except ParameterError:
-        # No members: nothing decides.
+        # Without members nothing decides.
         return known_alone(found.reactions(found.value, found.null))
+    energy = np.asarray(sum(matrices, start=np.zeros_like(found.null)), np.float64)
     own = found.null * found.unit[..., None]
     stiff = own.swapaxes(-1, -2) @ energy @ own
     values, ways = np.linalg.eigh(stiff)
-    sound = values > SOFT * np.maximum(values[..., -1:], 1e-300)
+    # A self-stress with less than a part of 1e-9 of the largest energy stores none.
+    sound = values > 1e-9 * np.maximum(values[..., -1:], 1e-300)
     inverse = np.where(sound, 1.0 / np.where(sound, values, 1.0), 0.0)
     pull = own.swapaxes(-1, -2) @ (energy @ found.value[..., None])
     amounts = -ways @ (inverse[..., None] * (ways.swapaxes(-1, -2) @ pull))
@@ -54,71 +51,51 @@ def elastic_reactions(
     return known_alone(found.reactions(found.value + (own @ amounts)[..., 0], left))
 
 
-def reaction_energies(robot: Robot, q: ArrayLike, found: Balance, value: Array) -> dict[str, Array]:
-    """Complementary energy of each element, J, shape (...), of amounts (..., unknowns).
+def energy_forms(robot: Robot, q: ArrayLike, found: Balance) -> dict[str, Array]:
+    """Return twice the complementary energy by element, forms (..., unknowns, unknowns), J.
 
     :raises ParameterError: a robot without elastic members.
     """
-    return {
-        name: np.einsum("...k,...kl,...l->...", value, matrix, value) / 2.0
-        for name, matrix in _matrices(robot, np.asarray(q, np.float64), found).items()
-    }
-
-
-def _energy(robot: Robot, q: Array, found: Balance) -> Array:
-    parts = _matrices(robot, q, found).values()
-    return np.asarray(sum(parts, start=np.zeros_like(found.null)), np.float64)
-
-
-def _matrices(robot: Robot, q: Array, found: Balance) -> dict[str, Array]:
-    """Twice the energy by element, a quadratic form (..., unknowns, unknowns)."""
     structure, batch = robot.elastic, found.value.shape[:-1]
-    posture = Posture(robot, np.broadcast_to(q, (*batch, robot.joints_count)))
+    posture = Posture(robot, np.broadcast_to(np.asarray(q, np.float64), (*batch, robot.joints_count)))
     result: dict[str, Array] = {}
     for beam in structure.beams:
         if beam.parts[0] in robot.graph.rods or beam.parts[0] == robot.graph.platform:
             continue
         ends = [posture.place(*place) for place in (beam.inner, beam.outer)]
-        matrix = _of_beam(robot, beam, structure.sections[beam.name], ends, found)
+        matrix = _beam_form(robot, beam, structure.sections[beam.name], ends, found)
         result[beam.element] = result.get(beam.element, 0.0) + matrix
     for k, joint in enumerate(found.joints):
         known = [j for j in robot.graph.joints.values() if (j.label or j.name) == joint.name]
         values = structure.compliances.get(joint.name)
         if values is None or not known:
             continue
-        weights, axes = _along(known[0], [float(v) for v in values])
+        # Compliances along the joint's axes as in a structural model, 0 where rigid or free.
+        weights = np.array([float(v) if 0.0 < float(v) < math.inf else 0.0 for v in values])
+        own, directions = known[0], reaction_directions(known[0])
+        axes = [(d.body, d.vector) for d in directions]
+        if len(own.axes) == 2:
+            axes = [(own.inner, own.axes[0]), (own.outer, own.axes[1])]
+            normal = np.cross(*own.axes)
+            normal /= np.linalg.norm(normal)
+            columns = np.stack([own.axes[0], np.cross(normal, own.axes[0]), normal], -1)
+            order = np.abs(np.array([d.vector for d in directions]) @ columns).argmax(0)
+            weights = np.concatenate([weights[order], weights[3 + order]])
+            weights[3:5] = 0.0
         world = np.stack([posture.turn(*one) for one in axes], -1)
         if len(axes) == 2:
             normal = np.cross(world[..., 0], world[..., 1])
             normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
             world = np.stack([world[..., 0], np.cross(normal, world[..., 0]), normal], -1)
-        amounts = np.concatenate([world.swapaxes(-1, -2) @ found.spread[..., k, part, :] for part in (_F, _M)], -2)
+        halves = found.spread[..., k, :3, :], found.spread[..., k, 3:, :]
+        amounts = np.concatenate([world.swapaxes(-1, -2) @ half for half in halves], -2)
         matrix = amounts.swapaxes(-1, -2) @ (weights[:, None] * amounts)
         result[joint.name] = result.get(joint.name, 0.0) + matrix
     return result
 
 
-_F, _M = slice(0, 3), slice(3, 6)
-
-
-def _along(joint: Joint, values: list[float]) -> tuple[Array, list[tuple[str, Array]]]:
-    """Compliances (6,), 0 where rigid or free, and the axes that they are along, as structure's."""
-    finite = np.array([value if 0.0 < value < math.inf else 0.0 for value in values])
-    directions = reaction_directions(joint)
-    if len(joint.axes) != 2:
-        return finite, [(d.body, d.vector) for d in directions]
-    axes = [(joint.inner, joint.axes[0]), (joint.outer, joint.axes[1])]
-    normal = np.cross(joint.axes[0], joint.axes[1])
-    normal /= np.linalg.norm(normal)
-    columns = np.stack([joint.axes[0], np.cross(normal, joint.axes[0]), normal], -1)
-    order = np.abs(np.array([d.vector for d in directions]) @ columns).argmax(0)
-    weights = np.concatenate([finite[order], finite[3 + order]])
-    weights[3:5] = 0.0
-    return weights, axes
-
-
-def _of_beam(robot: Robot, beam: Beam, section: Section, ends: list[Array], found: Balance) -> Array:
-    """Twice a member's energy, (..., unknowns, unknowns)."""
+def _beam_form(robot: Robot, beam: Beam, section: Section, ends: list[Array], found: Balance) -> Array:
+    """Return twice a member's energy, (..., unknowns, unknowns)."""
     along = ends[1] - ends[0]
     length = np.linalg.norm(along, axis=-1)[..., None, None]
     first = along / length[..., 0]
@@ -130,9 +107,17 @@ def _of_beam(robot: Robot, beam: Beam, section: Section, ends: list[Array], foun
     stretch, twist, bend, across = section.rigidities
     shear = across / (12.0 * bend)
     weights = np.array([1 / stretch, shear, shear, 1 / twist, 1 / bend, 1 / bend])[:, None]
-    sides = _sides(robot, beam, found)
+    # Joints that load the member: index, sign of the wrench on it, and whether at its outer end.
+    at_home = {joint.label or joint.name: joint.at for joint in robot.graph.joints.values()}
+    sides = []
+    for k, joint in enumerate(found.joints):
+        inside = [body in beam.parts for body in (joint.inner, joint.outer)]
+        if inside[0] != inside[1]:
+            place = at_home.get(joint.name, found.points[..., k, :].reshape(-1, 3)[0])
+            apart = [float(np.linalg.norm(place - end)) for _, end in (beam.inner, beam.outer)]
+            sides.append((k, 1.0 if inside[1] else -1.0, apart[1] < apart[0]))
     total = np.zeros_like(found.null)
-    # Exact for the energy of a section's load that is linear, in a part that is.
+    # Three points integrate the energy of a section's linear load exactly.
     for x, weight in zip(*np.polynomial.legendre.leggauss(3), strict=True):
         share = (x + 1.0) / 2.0
         place = ends[0] + share * along
@@ -147,17 +132,3 @@ def _of_beam(robot: Robot, beam: Beam, section: Section, ends: list[Array], foun
         own = np.concatenate([axes @ load[..., :3, :], axes @ load[..., 3:, :]], -2)
         total += weight / 2.0 * length * (own.swapaxes(-1, -2) @ (weights * own))
     return total
-
-
-def _sides(robot: Robot, beam: Beam, found: Balance) -> list[tuple[int, float, bool]]:
-    """Joints that load a member: index, sign of the wrench on it, and whether at its outer end."""
-    at_home = {joint.label or joint.name: joint.at for joint in robot.graph.joints.values()}
-    result = []
-    for k, joint in enumerate(found.joints):
-        inside = [body in beam.parts for body in (joint.inner, joint.outer)]
-        if inside[0] == inside[1]:
-            continue
-        place = at_home.get(joint.name, found.points[..., k, :].reshape(-1, 3)[0])
-        apart = [float(np.linalg.norm(place - end)) for _, end in (beam.inner, beam.outer)]
-        result.append((k, 1.0 if inside[1] else -1.0, apart[1] < apart[0]))
-    return result

@@ -53,7 +53,7 @@ class Equations:
         self._parts = [slice(a, b) for a, b in pairwise(ends)]
 
     def at(self, q: Array, qd: Array) -> Terms:
-        """At joint positions and rates, shape (n,) each.
+        """Compute the terms at joint positions and rates, shape (n,) each.
 
         :raises UnreachableError: a joint state without an assembly.
         :raises SingularityError: a singularity on the way from home.
@@ -78,7 +78,7 @@ class Equations:
 
 
 def motion_kernel(robot: Robot) -> Kernel:
-    """Return the program of :class:`Terms`: q and qd to all terms but these two, row by row."""
+    """Return the program of :class:`Terms` from q and qd, row by row."""
     return robot.massive().kernel("motion", _motion)
 
 

@@ -48,7 +48,7 @@ MAX_SIZE: Final = 3
 
 
 def largest(forms: Array, y: Array) -> Array:
-    """max_a |y' G_a y|, shape (...); forms (..., n, m, m), y (..., m)."""
+    """Return max_a |y' G_a y|, shape (...); forms (..., n, m, m), y (..., m)."""
     return np.asarray(np.abs(np.einsum("...i,...aij,...j->...a", y, forms, y)).max(-1), np.float64)
 
 
@@ -61,16 +61,6 @@ def minimax_direction(forms: Array) -> Array:
     cubic det(y, G y, H y) = 0; common points of two cones. The best of them all is the answer, to
     rounding.
     """
-    points = _find_candidates(forms)
-    return np.asarray(points[largest(forms, points).argmin()], np.float64)
-
-
-def _units(vectors: Array) -> Array:
-    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True), np.float64)
-
-
-def _find_candidates(forms: Array) -> Array:
-    """Find unit vectors, shape (k, m), among which the minimum is."""
     count, size = forms.shape[:2]
     pairs = list(itertools.combinations(range(count), 2))
     cones = [(a, forms[a] - sign * forms[b]) for a, b in pairs for sign in (1.0, -1.0)]
@@ -83,16 +73,25 @@ def _find_candidates(forms: Array) -> Array:
             z = math.sqrt(-values[0]) * vectors[:, -1]
             found.append(np.stack([x + z, x - z]))
     if size == 3:
-        turned = [_TURN.T @ cone @ _TURN for _, cone in cones]
-        curves = [_conic(cone) for cone in turned]
-        for (a, _), cone, curve in zip(cones, turned, curves, strict=True):
-            stationary = _stationary(_TURN.T @ forms[a] @ _TURN, cone)
-            found.append(_common_points(curve, stationary) @ _TURN.T)
+        # At y = (1, u, v): rows G y as polynomials, and the polynomial y' G y of each form.
+        rows = {a: np.einsum("ij,juv->iuv", _scaled(_TURN.T @ forms[a] @ _TURN), _LINES) for a in range(count)}
+        curves = []
+        for a, cone in cones:
+            g, h = rows[a], np.einsum("ij,juv->iuv", _scaled(_TURN.T @ cone @ _TURN), _LINES)
+            conic = np.sum([_product(_LINES[i], h[i]) for i in range(3)], axis=0)
+            # det(y, G y, H y): zero where y' G y is stationary along y' H y = 0.
+            stationary = np.zeros((4, 4))
+            for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+                stationary += _product(_LINES[i], _product(g[j], h[k]) - _product(g[k], h[j]))
+            found.append(_common_points(conic, stationary) @ _TURN.T)
+            curves.append(conic)
         for one, other in itertools.combinations(curves, 2):
             found.append(_common_points(one, other) @ _TURN.T)
     points = np.concatenate(found)
-    # A point more does no harm: each is judged by the forms themselves.
-    return _units(points[np.isfinite(points).all(-1) & points.any(-1)])
+    # Points that are no minimum do no harm: each is judged by the forms themselves.
+    points = points[np.isfinite(points).all(-1) & points.any(-1)]
+    points /= np.linalg.norm(points, axis=-1, keepdims=True)
+    return np.asarray(points[largest(forms, points).argmin()], np.float64)
 
 
 _TURN: Final = np.linalg.qr([[1.0, 0.3, -0.4], [0.2, 0.9, 0.7], [-0.5, 0.6, 1.1]])[0]
@@ -104,7 +103,7 @@ _LINES[0, 0, 0] = _LINES[1, 1, 0] = _LINES[2, 0, 1] = 1.0
 
 
 def _product(p: Array, q: Array) -> Array:
-    """Product of two polynomials in u and v."""
+    """Multiply two polynomials in u and v."""
     result = np.zeros((p.shape[0] + q.shape[0] - 1, p.shape[1] + q.shape[1] - 1))
     for i, j in np.ndindex(*p.shape):
         result[i : i + q.shape[0], j : j + q.shape[1]] += p[i, j] * q
@@ -116,25 +115,8 @@ def _scaled(matrix: Array) -> Array:
     return np.asarray(matrix / size if size > 0.0 else matrix, np.float64)
 
 
-def _conic(h: Array) -> Array:
-    """Y' H y at y = (1, u, v)."""
-    rows = np.einsum("ij,juv->iuv", _scaled(h), _LINES)
-    total = np.sum([_product(_LINES[i], rows[i]) for i in range(3)], axis=0)
-    return np.asarray(total, np.float64)
-
-
-def _stationary(g: Array, h: Array) -> Array:
-    """det(y, G y, H y) at y = (1, u, v): zero where y' G y is stationary along y' H y = 0."""
-    a, b = (np.einsum("ij,juv->iuv", _scaled(m), _LINES) for m in (g, h))
-    result = np.zeros((4, 4))
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        result += _product(_LINES[i], _product(a[j], b[k]) - _product(a[k], b[j]))
-    return result
-
-
 def _common_points(conic: Array, curve: Array) -> Array:
-    """Points (1, u, v), shape (k, 3), of a conic, all those of another curve among them.
+    """Return points (1, u, v) of a conic, shape (k, 3), with all those of another curve.
 
     u are the eigenvalues of the polynomial Sylvester matrix of both in v; v follows from the
     conic.
@@ -191,7 +173,7 @@ class Extremes(NamedTuple):
 
 
 def joint_motion(robot: Robot, pose: ArrayLike, rates: ArrayLike, accelerations: ArrayLike = 0.0) -> JointMotion:
-    """Joint motion of a pose motion: qd = J^-1 Xdot, qdd = J^-1 (Xddot - Jdot qd).
+    """Compute the joint motion of a pose motion: qd = J^-1 Xdot, qdd = J^-1 (Xddot - Jdot qd).
 
     Exact: Jdot qd is the pose's acceleration at qdd = 0, computed from the bodies' motion (3-PRRU
     paper, equations 24 and 25, without its Hessian).
@@ -202,17 +184,19 @@ def joint_motion(robot: Robot, pose: ArrayLike, rates: ArrayLike, accelerations:
     """
     q, inverse = _inverse_jacobian(robot, pose)
     m = len(robot.pose_names)
-    rates, changes = vectors(rates, m, "pose rates"), _accelerations(accelerations, m)
-    common_batch(q.shape[:-1], rates.shape[:-1], changes.shape[:-1])
+    change = doubles(accelerations, "pose accelerations")
+    rates = vectors(rates, m, "pose rates")
+    change = vectors(np.broadcast_to(change, m) if change.ndim == 0 else change, m, "Xddot")
+    common_batch(q.shape[:-1], rates.shape[:-1], change.shape[:-1])
     qd = np.einsum("...ij,...j->...i", inverse, rates)
-    qdd = joint_changes(robot, q, qd, inverse, changes)
+    qdd = joint_changes(robot, q, qd, inverse, change)
     finite(qdd, "an acceleration")
     q, qd, qdd = np.broadcast_arrays(q, qd, qdd)
     return JointMotion(q.copy(), qd.copy(), qdd)
 
 
 def energy_matrices(robot: Robot, pose: ArrayLike) -> tuple[Array, Array]:
-    """Kinetic energy of the platform and of all bodies as forms of the pose rates.
+    """Return the kinetic energy of the platform and of all bodies as forms of the pose rates.
 
     E = Xdot' M Xdot / 2 (3-PRRU paper, equations 42 and 43).
 
@@ -229,7 +213,7 @@ def energy_matrices(robot: Robot, pose: ArrayLike) -> tuple[Array, Array]:
 
 
 def energy_transfer(robot: Robot, pose: ArrayLike, direction: ArrayLike) -> Array:
-    """eta_KE = E_M / E_all, the platform's part of the kinetic energy (equations 44 and 46).
+    """Compute eta_KE = E_M / E_all, the platform's part of the kinetic energy (equations 44, 46).
 
     :param pose: shape (..., m).
     :param direction: pose rates of any length above zero, shape (..., m).
@@ -242,27 +226,24 @@ def energy_transfer(robot: Robot, pose: ArrayLike, direction: ArrayLike) -> Arra
 
 
 def energy_transfer_range(robot: Robot, pose: ArrayLike) -> Extremes:
-    """Extremes of eta_KE over all directions, exact, from generalised eigenvalues.
+    """Find the extremes of eta_KE over all directions, exact, from generalised eigenvalues.
 
     :param pose: shape (..., m).
     :raises ParameterError: a direction of motion in which the bodies have no inertia.
     """
     platform, everything = energy_matrices(robot, pose)
     back = _inverse_root(robot, everything)
-    values, vectors = np.linalg.eigh(_congruent(back, platform))
+    form = back.swapaxes(-1, -2) @ platform @ back
+    values, vectors = np.linalg.eigh((form + form.swapaxes(-1, -2)) / 2)
     ends = vectors[..., [0, -1]]
     directions = _directions((back @ ends).swapaxes(-1, -2))
     return Extremes(values[..., 0], values[..., -1], directions)
 
 
 def max_driving_force(
-    robot: Robot,
-    pose: ArrayLike,
-    direction: ArrayLike,
-    energy: float = ENERGY,
-    acceleration: ArrayLike = 0.0,
+    robot: Robot, pose: ArrayLike, direction: ArrayLike, energy: float = ENERGY, acceleration: ArrayLike = 0.0
 ) -> Array:
-    """F_max, the largest |F_d| over the actuators (equation 47), N or N m.
+    """Compute F_max, the largest |F_d| over the actuators (equation 47), N or N m.
 
     Gravity and payload act, friction does not.
 
@@ -285,7 +266,7 @@ def max_driving_force(
 def max_driving_force_range(
     robot: Robot, pose: ArrayLike, energy: float = ENERGY, acceleration: ArrayLike = 0.0
 ) -> Extremes:
-    """Extremes of F_max over all directions at the platform's energy E_M, N or N m.
+    """Find the extremes of F_max over all directions at the platform's energy E_M, N or N m.
 
     On the ellipsoid of Xdot with that energy, scaled to the unit sphere, every F_d is a
     quadratic form y' G y. The greatest |F_d| is an eigenvalue, exact. The least F_max is the
@@ -309,7 +290,7 @@ def max_driving_force_range(
 def driving_force_peak(
     robot: Robot, pose: ArrayLike, energy: float = ENERGY, acceleration: ArrayLike = 0.0
 ) -> tuple[Array, Array, NDArray[np.int64]]:
-    """Greatest F_max over all directions, its direction (..., m), and the index of its actuator.
+    """Find the greatest F_max over all directions, its direction (..., m), and its actuator's index.
 
     Arguments as of :func:`max_driving_force_range`; any number of pose coordinates.
     """
@@ -319,7 +300,7 @@ def driving_force_peak(
 
 
 def _driving_forms(robot: Robot, pose: ArrayLike, energy: float, acceleration: ArrayLike) -> tuple[Array, Array]:
-    """Pose rates of unit vectors y, (..., m, m), and F_d of y as forms, (..., actuators, m, m)."""
+    """Return pose rates of unit vectors y, (..., m, m), and F_d of y, (..., actuators, m, m)."""
     where = doubles(pose, "poses")
     platform, _ = energy_matrices(robot, where)
     back = np.sqrt(2 * _energy(energy)) * _inverse_root(robot, platform)
@@ -343,7 +324,7 @@ def _driving_forms(robot: Robot, pose: ArrayLike, energy: float, acceleration: A
 
 
 def _peak(forms: Array) -> tuple[Array, Array, NDArray[np.int64]]:
-    """Greatest absolute value of forms on the unit sphere, where, and of which."""
+    """Return the largest absolute value of forms on the unit sphere, its place and its form's index."""
     values, vectors = np.linalg.eigh(forms)
     ends = np.abs(values[..., [0, -1]])
     flat = ends.reshape(*ends.shape[:-2], ends.shape[-2] * ends.shape[-1])
@@ -354,12 +335,12 @@ def _peak(forms: Array) -> tuple[Array, Array, NDArray[np.int64]]:
 
 
 def spread(values: ArrayLike) -> Array:
-    """Maximum minus minimum over the last axis, shape (...), for an index over all directions."""
+    """Return maximum minus minimum over the last axis, for an index over all directions."""
     return np.asarray(np.ptp(finite(doubles(values), "a value"), axis=-1), np.float64)
 
 
 def tilted_pose(height: ArrayLike, azimuth: ArrayLike, tilt: ArrayLike) -> Array:
-    """Pose (z, alpha, beta) of tilt-and-torsion angles with zero torsion, shape (..., 3).
+    """Return the pose (z, alpha, beta) of tilt-and-torsion angles with zero torsion, (..., 3).
 
     The platform's axis leans by ``tilt`` towards ``azimuth`` (rad), as in the paper's maps.
     """
@@ -369,14 +350,8 @@ def tilted_pose(height: ArrayLike, azimuth: ArrayLike, tilt: ArrayLike) -> Array
     return np.stack([z, *zero_torsion(t, a)], -1)
 
 
-def _accelerations(values: ArrayLike, size: int) -> Array:
-    """Xddot: vectors, or one number for all coordinates."""
-    array = doubles(values, "pose accelerations")
-    return vectors(np.broadcast_to(array, size) if array.ndim == 0 else array, size, "Xddot")
-
-
 def _inverse_jacobian(robot: Robot, pose: ArrayLike) -> tuple[Array, Array]:
-    """Joint positions and joint rates per pose rate, shapes (..., n) and (..., n, m)."""
+    """Return joint positions, (..., n), and joint rates per pose rate, (..., n, m)."""
     q = robot.inverse(pose)
     s = np.linalg.svd(robot.jacobian(q), compute_uv=False)
     # Against one m/rad at least: where all limbs are stretched the whole Jacobian vanishes.
@@ -389,7 +364,7 @@ def _inverse_jacobian(robot: Robot, pose: ArrayLike) -> tuple[Array, Array]:
 
 
 def _inverse_root(robot: Robot, form: Array) -> Array:
-    """B with B' M B = 1, shape (..., m, m)."""
+    """Return B with B' M B = 1, shape (..., m, m)."""
     try:
         root = np.linalg.cholesky(form)
     except np.linalg.LinAlgError:
@@ -399,13 +374,8 @@ def _inverse_root(robot: Robot, form: Array) -> Array:
     return np.asarray(np.linalg.inv(root).swapaxes(-1, -2), np.float64)
 
 
-def _congruent(back: Array, form: Array) -> Array:
-    result = back.swapaxes(-1, -2) @ form @ back
-    return np.asarray((result + result.swapaxes(-1, -2)) / 2, np.float64)
-
-
 def _form(matrix: Array, x: Array) -> Array:
-    """Quadratic form x' M x over batches."""
+    """Return the quadratic form x' M x, shape (...)."""
     return np.asarray(np.einsum("...i,...ij,...j->...", x, matrix, x), np.float64)
 
 

@@ -8,9 +8,8 @@ actuated joint.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Final
 
 import numpy as np
@@ -23,15 +22,7 @@ from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics.motion import BaseMotion
 from pkm_twin.kinematics.traced import Traced
 from pkm_twin.machine.friction import friction_values, linear_keys, taken
-from pkm_twin.machine.graph import Joint, Rod
-from pkm_twin.machine.inertia import (
-    TEN,
-    TEN_UNITS,
-    change_of_frame,
-    drive_units,
-    loaded_joints,
-    standard_parameters,
-)
+from pkm_twin.machine.inertia import TEN, TEN_UNITS, change_of_frame, drive_units, loaded_joints, standard_parameters
 from pkm_twin.machine.schema import frozen
 from pkm_twin.robot.mechanism import SHARED
 from pkm_twin.robot.robot import Robot
@@ -48,7 +39,7 @@ WRENCH: Final = "wrench"
 
 
 def parameter_names(robot: Robot) -> tuple[str, ...]:
-    """Names of the columns of :func:`regressor`, shape (p,): ``OWNER.WHAT``, and ``wrench``.
+    """List the columns of :func:`regressor` by name, shape (p,): ``OWNER.WHAT``, and ``wrench``.
 
     Every body and the payload have ``mass``, first moments ``mx my mz`` and inertia ``ixx iyy izz
     ixy ixz iyz``, in base axes at home: a body about its frame's origin at home
@@ -60,7 +51,7 @@ def parameter_names(robot: Robot) -> tuple[str, ...]:
 
 
 def parameter_units(robot: Robot) -> tuple[str, ...]:
-    """Units of the parameters, shape (p,)."""
+    """Return the units of the parameters, shape (p,)."""
     return tuple(unit for _, unit in _columns(robot))
 
 
@@ -108,11 +99,15 @@ def regressor(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench:
     platform = ten[..., list(links).index(graph.platform), :, :]
     lever = graph.origin - links[graph.platform].at
     rates, changes = (np.broadcast_to(np.asarray(v, np.float64), (*batch, n)) for v in (qd, qdd))
+    drives = np.zeros((*batch, n, n, len(DRIVE)))
+    for k in range(n):
+        rate = rates[..., k]
+        drives[..., k, k, :] = np.stack([rate, np.sign(rate), np.ones_like(rate), changes[..., k]], -1)
     parts = [
         np.moveaxis(ten, -3, -2).reshape(*batch, n, len(links) * ten.shape[-1]),
         other[..., :rods],
         platform @ change_of_frame(np.eye(3), lever),
-        _drive_columns(rates, changes),
+        drives.reshape(*batch, n, n * len(DRIVE)),
     ]
     if not robot.laws:
         return np.concatenate([*parts, other[..., rods:]], -1)
@@ -128,12 +123,12 @@ def regressor(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench:
 
 
 def law_keys(robot: Robot) -> tuple[str, ...]:
-    """Parameters of the drives' friction laws that efforts are linear in, less the basic ones."""
+    """List the parameters that efforts are linear in, of the drives' laws beyond the basic one."""
     return tuple(key for key in linear_keys(robot.laws) if key not in DRIVE)
 
 
 def law_columns(robot: Robot, q: Array, qd: Array, load: Array) -> Array:
-    """Efforts by units of :func:`law_keys`, joint by joint for each, shape (..., n, keys n).
+    """Return efforts by units of :func:`law_keys`, joint by joint for each, (..., n, keys n).
 
     :param load: efforts of the drives without friction, shape (..., n). All shape (..., n).
     """
@@ -148,7 +143,7 @@ def law_columns(robot: Robot, q: Array, qd: Array, load: Array) -> Array:
 
 
 def _body_columns(motion: Array, n: int) -> Array:
-    """Newton's and Euler's laws by a body's ten numbers, times its motion with each joint.
+    """Return Newton's and Euler's laws by a body's ten parameters, times its motion per joint.
 
     :param motion: rows a (less gravity), omega, alpha of the body, then velocities v of its origin
         and angular velocities w per joint rate, in its own axes, shape (..., 3 + 2 n, 3).
@@ -177,18 +172,8 @@ def _body_columns(motion: Array, n: int) -> Array:
     return np.concatenate([mass, first, diagonal, np.stack(pairs, -1)], -1)
 
 
-def _drive_columns(rates: Array, changes: Array) -> Array:
-    """Friction and rotors of the actuated joints, shape (..., n, 4 n)."""
-    *batch, n = rates.shape
-    columns = np.zeros((*batch, n, n, len(DRIVE)))
-    for k in range(n):
-        rate, change = rates[..., k], changes[..., k]
-        columns[..., k, k, :] = np.stack([rate, np.sign(rate), np.ones_like(rate), change], -1)
-    return columns.reshape(*batch, n, n * len(DRIVE))
-
-
 def _columns(robot: Robot) -> list[tuple[str, str]]:
-    """Names and units of the parameters."""
+    """Return the names and units of the parameters."""
     graph, tree = robot.graph, robot.massive().tree
 
     def ten(owner: str) -> list[tuple[str, str]]:
@@ -227,32 +212,32 @@ def _regressor(t: Traced) -> Program:
         rows += [speed[body] for speed, _ in twists] + [omega[body] for _, omega in twists]
         bodies += [entry for row in rows for entry in own @ row]
 
-    def powers(write: Callable[[Forces], None], *names: str) -> list[Any]:
-        forces = Forces(motion)
-        write(forces)
-        return [sum(speed[b] @ forces.force[b] + omega[b] @ forces.moment[b] for b in names) for speed, omega in twists]
+    columns: list[list[Any]] = []
 
-    columns = [powers(partial(_rod, rod), rod.inner, rod.outer) for rod in graph.rods.values()]
+    def add_powers(forces: Forces, *names: str) -> None:
+        columns.append(
+            [sum(speed[b] @ forces.force[b] + omega[b] @ forces.moment[b] for b in names) for speed, omega in twists]
+        )
+
+    for rod in graph.rods.values():
+        forces = Forces(motion)
+        forces.rod(rod, 1.0)
+        add_powers(forces, rod.inner, rod.outer)
     for joint in loaded_joints(graph):
-        columns += [powers(partial(_joint, joint, three), joint.inner, joint.outer) for three in np.eye(3)]
-    columns.append(powers(lambda forces: forces.wrench(wrench), graph.platform))
+        for three in np.eye(3):
+            forces = Forces(motion)
+            forces.joint(joint, three)
+            add_powers(forces, joint.inner, joint.outer)
+    forces = Forces(motion)
+    forces.wrench(wrench)
+    add_powers(forces, graph.platform)
     others = [column[j] for j in range(n) for column in columns]
     sizes = {"q": n, "qd": n, "qdd": n, "wrench": 6}
     return Program(sizes, 3, {"bodies": t.lift(bodies), "others": t.lift(others)}, t.equations())
 
 
-def _rod(rod: Rod, forces: Forces) -> None:
-    forces.rod(rod, 1.0)
-
-
-def _joint(joint: Joint, three: Array, forces: Forces) -> None:
-    forces.joint(joint, three)
-
-
 RANK: Final = 1e-8
 """Least pivot, of columns of norm one, that counts."""
-ABSENT: Final = 1e-10
-"""Part of the largest column's norm below which a column is zero, all of them of unit kg."""
 ROUNDING_COEFFICIENT: Final = 1e-7
 """Coefficients below it are rounding errors and count as zero."""
 
@@ -276,7 +261,7 @@ class BaseParameters:
 
     @property
     def count(self) -> int:
-        """How many there are, b."""
+        """Number of combinations, b."""
         return len(self.columns)
 
 
@@ -290,8 +275,17 @@ def base_parameters(robot: Robot, *, seed: int = 0) -> BaseParameters:
     names, pi = parameter_names(robot), parameter_values(robot)
     states = random_states(robot, max(60, 3 * len(names) // robot.joints_count), seed)
     table = regressor(robot, *states).reshape(-1, len(names))
-    units = natural_units(robot)
-    columns, matrix = independent(table / units, [_preference(name) for name in names])
+    # Units of kg by the machine's size: moments have a length in them, inertias its square. Drives lead
+    # combinations before bodies, bodies before the payload, masses and moments before products of inertia.
+    powers = dict(zip(TEN, (0, 1, 1, 1, 2, 2, 2, 2, 2, 2), strict=True))
+    units, preference = np.ones(len(names)), np.ones(len(names))
+    for k, name in enumerate(names[:-1]):
+        owner, _, what = name.rpartition(".")
+        units[k] = robot.engine.tree.size ** -powers.get(what, 0)
+        preference[k] = (0.1 if owner == PAYLOAD else 1.0) * (0.3 if what in TEN[7:] else 1.0)
+        if what in DRIVE:
+            preference[k] = 10.0
+    columns, matrix = independent(table / units, preference)
     matrix = matrix * units / units[list(columns)][:, None]
     led = [combination_name(row, k, names) for k, row in zip(columns, matrix, strict=True)]
     unseen = [name for k, name in enumerate(names[:-1]) if not matrix[:, k].any()]
@@ -299,9 +293,9 @@ def base_parameters(robot: Robot, *, seed: int = 0) -> BaseParameters:
 
 
 def random_states(robot: Robot, count: int, seed: int) -> tuple[Array, Array, Array]:
-    """Positions, rates and accelerations, shape (count, n) each, clear of singularities.
+    """Draw positions, rates and accelerations, shape (count, n) each, clear of singularities.
 
-    Of a size at which weight, accelerations and velocities weigh alike.
+    Their size is one at which weight, accelerations and velocities cause similar efforts.
     """
     rng = np.random.default_rng(seed)
     size, slides = robot.engine.tree.size, np.array([u == "m" for u in robot.joint_units])
@@ -311,16 +305,8 @@ def random_states(robot: Robot, count: int, seed: int) -> tuple[Array, Array, Ar
     return q, unit * np.sqrt(g) * rng.normal(size=q.shape), unit * g * rng.normal(size=q.shape)
 
 
-def _preference(name: str) -> float:
-    """Which parameters lead combinations: drives before bodies, bodies before the payload."""
-    owner, _, what = name.rpartition(".")
-    if what in DRIVE:
-        return 10.0
-    return (0.1 if owner == PAYLOAD else 1.0) * (0.3 if what in TEN[7:] else 1.0)
-
-
 def independent(table: Array, preference: ArrayLike = 1.0) -> tuple[tuple[int, ...], Array]:
-    """Columns that are independent of each other, and all columns by those.
+    """Choose columns that are independent of each other, and express all columns by them.
 
     :param table: shape (rows, p), columns of comparable units.
     :param preference: shape (p,): greater ones are taken first.
@@ -330,7 +316,8 @@ def independent(table: Array, preference: ArrayLike = 1.0) -> tuple[tuple[int, .
     from scipy.linalg import qr  # type: ignore[import-untyped]
 
     norms = np.linalg.norm(table, axis=0)
-    seen = np.flatnonzero(norms > ABSENT * norms.max())
+    # Smaller columns are zero but for rounding: all are of unit kg.
+    seen = np.flatnonzero(norms > 1e-10 * norms.max())
     weights = np.broadcast_to(np.asarray(preference, np.float64), norms.shape)
     norms = norms / weights
     r, pivots = qr(table[:, seen] / norms[seen], mode="r", pivoting=True)
@@ -343,17 +330,6 @@ def independent(table: Array, preference: ArrayLike = 1.0) -> tuple[tuple[int, .
     leading = seen[pivots[:rank]]
     order = np.argsort(leading)
     return tuple(int(k) for k in leading[order]), matrix[order]
-
-
-def natural_units(robot: Robot) -> Array:
-    """Return the factors that convert parameters to kg by the machine's size, shape (p,)."""
-    size = robot.engine.tree.size
-    powers = {what: (0, 1, 1, 1, 2, 2, 2, 2, 2, 2)[k] for k, what in enumerate(TEN)}
-    result = []
-    for name in parameter_names(robot):
-        what = name.rpartition(".")[2] if name != WRENCH else ""
-        result.append(size ** -powers.get(what, 0))
-    return np.array(result)
 
 
 def combination_name(row: Sequence[float] | Array, leading: int, names: Sequence[str]) -> str:

@@ -18,12 +18,10 @@ from pkm_twin.robot.robot import Robot
 
 SMALL_RATE: Final = 1e-6
 """A rate that only determines the sign of dry friction, rad/s or m/s."""
-SEEN: Final = 1e-9
-"""Share of the efforts at rest below which there is no friction."""
 
 
 def friction_reach(robot: Robot) -> Array:
-    """Effort that dry friction takes of each joint where it moves alone, shape (n,), N m or N.
+    """Compute the effort of dry friction at each joint that moves alone, shape (n,), N m or N.
 
     At home, passive joints' friction included; zero for a robot without masses.
     """
@@ -43,13 +41,13 @@ def friction_reach(robot: Robot) -> Array:
         back = np.array([inverse_dynamics(robot, q, -row, still) for row in rows])
         return np.asarray(np.diag(ahead - back) / 2.0, np.float64)
 
-    # Viscous friction doubles with the rates.
+    # Viscous friction doubles with the rates. Below a part of 1e-9 the rest is rounding.
     reach = 2.0 * odd_part(SMALL_RATE) - odd_part(2.0 * SMALL_RATE)
-    return np.where(reach > SEEN * (1.0 + size), reach, 0.0)
+    return np.where(reach > 1e-9 * (1.0 + size), reach, 0.0)
 
 
 class LoadShare:
-    """Takes the friction that grows with the load out of measured efforts.
+    """Removes the friction that grows with the load from measured efforts.
 
     What a payload or a contact adds to the load adds to this friction, too: by the known load alone
     an estimate would be wrong by its share. ``robot``: without that law, which explains the efforts
@@ -64,7 +62,7 @@ class LoadShare:
             self.robot = robot.changed(friction={"load_dependent": (0.0 * self.share).tolist()})
 
     def taken_out(self, q: Array, rates: Array, effort: Array) -> tuple[Array, Array]:
-        """Efforts without this friction, and what it may hold of a joint at rest, (n,) each.
+        """Return efforts without this friction, and its bound for joints at rest, (n,) each.
 
         :param rates: zero at rest.
         """
@@ -80,7 +78,7 @@ class LoadShare:
 
 
 def moving_rates(qd: Array, still: Mask, reach: Array) -> Array:
-    """Rates (..., n) with those of joints at rest zero where the joint has dry friction."""
+    """Return rates (..., n), zero for joints at rest that have dry friction."""
     return np.where(still & (reach > 0.0), 0.0, qd)
 
 

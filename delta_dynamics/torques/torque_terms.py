@@ -41,7 +41,7 @@ class Terms:
 
 
 def frictionless(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, *, weight: bool = True) -> Array:
-    """Actuator efforts without friction of any joint, shape (..., n), N m or N.
+    """Compute the actuator efforts without friction of any joint, shape (..., n), N m or N.
 
     :param weight: False leaves gravity out, too.
     """

@@ -79,10 +79,7 @@ class Transmission:
         return self.robot.controller.names
 
     def joint_to_actuator(
-        self,
-        position: ArrayLike,
-        velocity: ArrayLike | None = None,
-        effort: ArrayLike | None = None,
+        self, position: ArrayLike, velocity: ArrayLike | None = None, effort: ArrayLike | None = None
     ) -> TransmissionState:
         """Convert joint states to actuator states.
 
@@ -98,10 +95,7 @@ class Transmission:
         return TransmissionState(self.robot.controller.controller_positions(q), moved, given)
 
     def actuator_to_joint(
-        self,
-        position: ArrayLike,
-        velocity: ArrayLike | None = None,
-        effort: ArrayLike | None = None,
+        self, position: ArrayLike, velocity: ArrayLike | None = None, effort: ArrayLike | None = None
     ) -> TransmissionState:
         """Convert actuator states to joint states, as ``robot.forward`` finds the assembly.
 
@@ -126,11 +120,7 @@ class Transmission:
         return self._solve(position)[1]
 
     def gains(
-        self,
-        position: ArrayLike,
-        stiffness: ArrayLike,
-        damping: ArrayLike,
-        effort: ArrayLike | None = None,
+        self, position: ArrayLike, stiffness: ArrayLike, damping: ArrayLike, effort: ArrayLike | None = None
     ) -> tuple[Array, Array]:
         """Return the actuators' gains that give the joint a stiffness K and a damping D.
 
@@ -184,7 +174,12 @@ class Transmission:
         q, ratio = self._solve(position)
         # Efforts that the limits allow are bounded by planes c f <= sum_i limit_i |c B_i|, whose
         # normals c are across m - 1 rows of the ratio each.
-        normals = self._normals(ratio)
+        n, m = ratio.shape[-2:]
+        if n == m:
+            normals = np.linalg.inv(ratio).swapaxes(-1, -2)
+        else:
+            chosen = [list(rows) for rows in itertools.combinations(range(n), m - 1)]
+            normals = np.linalg.svd(ratio[..., chosen, :])[2][..., -1, :]
         reach = np.abs(normals @ ratio.swapaxes(-1, -2))
         reach[reach < _ROUNDING * reach.max(-1, keepdims=True)] = 0.0
         limits = self._limits("effort", q)[..., None, :]
@@ -251,15 +246,6 @@ class Transmission:
         weights = (self.robot.effort_scale / self.robot.controller.slopes(q)) ** 2
         weighted = (ratio * weights[..., None]).swapaxes(-1, -2)
         return np.asarray(np.linalg.inv(weighted @ ratio) @ weighted)
-
-    def _normals(self, ratio: Array) -> Array:
-        """Return vectors across each choice of m - 1 rows of the ratio, (..., choices, m)."""
-        n, m = ratio.shape[-2:]
-        if n == m:
-            return np.asarray(np.linalg.inv(ratio).swapaxes(-1, -2), np.float64)
-        chosen = [list(rows) for rows in itertools.combinations(range(n), m - 1)]
-        across = np.linalg.svd(ratio[..., chosen, :])[2][..., -1, :]
-        return np.asarray(across)
 
     def _limits(self, name: str, q: Array) -> Array:
         """Return the actuators' limits in the controller's numbers at positions q, (..., n)."""

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""How sure the efforts are: by what the robot's file says of its numbers, and by learnt noise."""
+"""Uncertainty of efforts: from the uncertainty of the robot file's numbers, and from learnt noise."""
 
 from __future__ import annotations
 
@@ -14,14 +14,11 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.robot.robot import Robot
 
 MASSES: Final = 0.015
-"""Default standard deviation of what masses need, as a share of gravity's, inertia's and the
-velocities' effort each: parts from CAD or a scale, cables and screws left out, are within a few
-percent."""
+"""Default standard deviation of efforts due to masses, as a share of those of gravity, inertia and
+velocities each: parts from CAD or a scale, cables and screws left out, are within a few percent."""
 FRICTION: Final = 0.015
-"""Default standard deviation of what is not in the model at all, as friction and cables, as a share
-of the greatest effort."""
-FALL: Final = 9.81
-"""Acceleration of the platform by which the usual effort is judged before there was any, m/s2."""
+"""Default standard deviation of efforts that are not modelled, such as friction and cables, as a
+share of the greatest effort."""
 
 
 class EffortParts(NamedTuple):
@@ -54,22 +51,14 @@ def effort_parts(robot: Robot, q: Array, qd: Array, qdd: Array, wrench: Array | 
 
 
 def usual_effort(robot: Robot) -> Array:
-    """Return each joint's effort at home against the weight, or to accelerate by g, (n,)."""
+    """Return each joint's effort at home against the weight, or to accelerate the platform by g, (n,)."""
     q, still = robot.inverse(robot.home()), np.zeros(robot.joints_count)
     lever = np.array([1.0, 1.0, 1.0, *(3 * [robot.size])])
     moves = np.linalg.norm(robot.platform_jacobian(q) * lever[:, None], axis=0)
     inertia = np.diag(mass_matrix(robot, q))
     held = np.abs(inverse_dynamics(robot, q, still, still))
     felt = moves > 1e-6 * moves.max(initial=0.0)
-    return np.where(felt, np.maximum(held, FALL * inertia / np.where(felt, moves, 1.0)), held)
-
-
-def states_efforts(robot: Robot) -> bool:
-    """Whether the robot's file says how sure a number is that its efforts depend on."""
-    if not robot.uncertainty:
-        return False
-    q, ones = robot.inverse(robot.home()), np.ones(robot.joints_count)
-    return bool(torque_deviation(robot, q, ones, ones).any())
+    return np.where(felt, np.maximum(held, 9.81 * inertia / np.where(felt, moves, 1.0)), held)
 
 
 def torque_deviation(
@@ -96,8 +85,8 @@ AVERAGED: Final = 1.0
 class Noise:
     """Variance of errors of mean zero, shape (n,): an average of their squares.
 
-    Once it is settled a square counts up to ``clipped`` times the average: what stands out, and
-    lasts, must not become noise.
+    Once it is settled a square counts up to ``clipped`` times the average: a lasting departure is
+    no noise.
     """
 
     def __init__(self, variance: Array, learning: float, clipped: float) -> None:
@@ -108,16 +97,16 @@ class Noise:
 
     @property
     def settled(self) -> bool:
-        """Whether there was time to learn."""
+        """True after the learning time."""
         return self._time > self._learning
 
     def advance(self, step: float) -> None:
-        """Time goes on, s, whether the next error counts or not."""
+        """Advance the time, s, whether the next error counts or not."""
         self._step = step
         self._time += step
 
     def learn(self, error: Array, least: Array | float) -> None:
-        """Take the errors at this time, shape (n,); ``least``: the variance is not below it."""
+        """Add the errors at this time, shape (n,); ``least``: lower bound of the variance."""
         square = error**2
         if self.settled:
             square = np.minimum(square, self._clipped * self.variance)

@@ -81,16 +81,16 @@ def moving_torques(robot: Robot) -> Kernel:
 
     :raises ParameterError: a robot whose file gives no masses.
     """
-    return robot.massive().kernel("moving torques", partial(_torques, base=9))
+    return robot.massive().kernel("moving torques", partial(torque_program, base=9))
 
 
 def stream_torques(robot: Robot) -> Kernel:
     """Return the program of a stream's efforts, see :mod:`pkm_twin.kinematics.stream`."""
-    return robot.massive().kernel("stream torques", _stream_torques)
+    return robot.massive().kernel("stream torques", lambda t: following(t, torque_program(t)))
 
 
 def mass_matrix(robot: Robot, q: ArrayLike) -> Array:
-    """Generalised mass matrix on the actuated joints, payload included, shape (..., n, n)."""
+    """Compute the mass matrix on the actuated joints, payload included, shape (..., n, n)."""
     # A simulation asks for one sample, several thousand times a second.
     return _square(robot, robot.bound(masses_kernel, robot.inertial)(q))
 
@@ -107,9 +107,7 @@ def _square(robot: Robot, flat: Array) -> Array:
 
 def body_mass_matrix(robot: Robot, q: ArrayLike, body: str) -> Array:
     """Return one body's part of the mass matrix, (..., n, n); the platform's with payload."""
-    layout = Layout(robot.massive().tree)
-    p = np.zeros_like(robot.inertial)
-    where = layout.body(body)
+    p, where = np.zeros_like(robot.inertial), Layout(robot.massive().tree).body(body)
     p[where] = robot.inertial[where]
     return _square(robot, robot.evaluate(masses_kernel(robot), p, q)[0])
 
@@ -117,7 +115,7 @@ def body_mass_matrix(robot: Robot, q: ArrayLike, body: str) -> Array:
 def forward_dynamics(
     robot: Robot, q: ArrayLike, qd: ArrayLike, tau: ArrayLike, wrench: ArrayLike | None = None
 ) -> Array:
-    """Joint accelerations that efforts cause, shape (..., n): the inverse of inverse_dynamics.
+    """Compute the joint accelerations that efforts cause, shape (..., n).
 
     :param tau: efforts of the actuators, shape (..., n), N m or N. Other parameters and errors as
         in :func:`inverse_dynamics`.
@@ -151,17 +149,14 @@ class Energy:
 
 
 def energy(robot: Robot, q: ArrayLike, qd: ArrayLike) -> Energy:
-    """Mechanical energy of all bodies and rotors, payload included."""
+    """Compute the mechanical energy of all bodies and rotors, payload included."""
     kernel = robot.massive().kernel("energy", _energy)
     (both,) = robot.evaluate(kernel, robot.inertial, q, qd)
     return Energy(both[..., 0].copy(), both[..., 1].copy())
 
 
-# Programs.
-
-
 class Forces:
-    """The wrench that every body needs at its origin, base axes; adds what acts on bodies.
+    """The force and moment that each body needs at its origin, base axes: minus the papers' Q.
 
     :meth:`generalised` sums up their virtual work (Delta-CU paper, step 4, equation 22).
     """
@@ -180,34 +175,34 @@ class Forces:
     def inertia(self, bodies: Objects, rods: Objects) -> None:
         """Add Newton's and Euler's laws, for the motion's accelerations (less gravity).
 
-        What a body needs is minus the 3-PRRU paper's Q_M, Q_S and Q_Hij (equations 32 to 37).
-        Couples of bodies that share a rotation act on the first of them: generalised efforts are
-        the same. For reactions take :meth:`body` of each.
+        These are minus the 3-PRRU paper's Q_M, Q_S and Q_Hij (equations 32 to 37). Couples of
+        bodies that share a rotation act on the first of them: generalised efforts are the same.
+        For reactions take :meth:`body` of each.
         """
         for name, ten in zip(self.motion.tree.links, bodies, strict=True):
-            self._linear(name, ten)
+            self._add_newton(name, ten)
         for name, matrix in self._couples(bodies):
-            self._euler(name, matrix)
+            self._add_euler(name, matrix)
         for mass, rod in zip(rods, self.motion.graph.rods.values(), strict=True):
             self.rod(rod, mass)
 
     def body(self, name: str, ten: Objects) -> None:
         """Add the force and moment that the acceleration of one body needs."""
-        self._linear(name, ten)
-        self._euler(name, _matrix(ten))
+        self._add_newton(name, ten)
+        self._add_euler(name, _inertia_matrix(ten))
 
-    def _linear(self, name: str, ten: Objects) -> None:
-        m = self.motion
-        first = m.rotation[name] @ ten[1:4]
-        self.force[name] = self.force[name] + m.change[name] * ten[0] + m.spin(name) @ first
-        self.moment[name] = self.moment[name] + cross(first, m.change[name])
+    def _add_newton(self, name: str, ten: Objects) -> None:
+        """Add m (a - g) of the origin and the first moment h's parts: spin h, and h x (a - g)."""
+        m, mass = self.motion, ten[0]
+        h = m.rotation[name] @ ten[1:4]
+        self.force[name] = self.force[name] + m.change[name] * mass + m.spin(name) @ h
+        self.moment[name] = self.moment[name] + cross(h, m.change[name])
 
-    def _euler(self, name: str, matrix: Objects) -> None:
-        m = self.motion
-        turned = m.rotation[name]
-        w, al = turned.T @ m.omega[name], turned.T @ m.alpha[name]
-        euler = turned @ (matrix @ al + cross(w, matrix @ w))
-        self.moment[name] = self.moment[name] + euler
+    def _add_euler(self, name: str, inertia: Objects) -> None:
+        """Add I alpha + omega x I omega, computed in the body's axes."""
+        m, turned = self.motion, self.motion.rotation[name]
+        omega, alpha = turned.T @ m.omega[name], turned.T @ m.alpha[name]
+        self.moment[name] = self.moment[name] + turned @ (inertia @ alpha + cross(omega, inertia @ omega))
 
     def _couples(self, bodies: Objects) -> list[tuple[str, Objects]]:
         """Moments of inertia about the origins, summed over bodies that share a rotation."""
@@ -215,8 +210,8 @@ class Forces:
         found: dict[str, Objects] = {}
         for name, ten in zip(self.motion.tree.links, bodies, strict=True):
             lead = first.setdefault(id(self.motion.rotation[name]), name)
-            matrix = _matrix(ten)
-            found[lead] = found[lead] + matrix if lead in found else matrix
+            inertia = _inertia_matrix(ten)
+            found[lead] = found[lead] + inertia if lead in found else inertia
         return list(found.items())
 
     def rod(self, rod: Rod, mass: Any) -> None:
@@ -225,10 +220,9 @@ class Forces:
         m (2 a + b) / 6 at its end of acceleration a and m (a + 2 b) / 6 at the other: its rotation
         is in it (Delta-CU paper, equations 15 and 16).
         """
-        m = self.motion
-        self._shared(rod, mass, m.acceleration)
+        self._share_ends(rod, mass, self.motion.acceleration)
 
-    def _shared(self, rod: Rod, mass: Any, motion: Callable[[str, Array], Any]) -> None:
+    def _share_ends(self, rod: Rod, mass: Any, motion: Callable[[str, Array], Any]) -> None:
         a, b = motion(rod.inner, rod.ends[0]), motion(rod.outer, rod.ends[1])
         sixth = mass * (1.0 / 6.0)
         self.push(rod.inner, rod.ends[0], sixth * (2.0 * a + b))
@@ -247,7 +241,7 @@ class Forces:
             spin = turned @ (matrix @ (turned.T @ m.omega[name]))
             self.moment[name] = self.moment[name] + spin
         for mass, rod in zip(rods, m.graph.rods.values(), strict=True):
-            self._shared(rod, mass, m.velocity)
+            self._share_ends(rod, mass, m.velocity)
 
     def passive(self, values: Objects) -> None:
         """Add friction and rotor inertia of passive joints, three numbers per joint."""
@@ -261,12 +255,12 @@ class Forces:
         self.pair(joint, viscous * rate + coulomb * sign(rate) + rotor * second)
 
     def passive_momenta(self, values: Objects) -> None:
-        """Momenta of the passive joints' rotors."""
+        """Add the momenta of the passive joints' rotors."""
         for k, joint in enumerate(loaded_joints(self.motion.graph)):
             self.pair(joint, values[3 * k + 2] * self.relative(joint, accelerated=False)[0])
 
     def relative(self, joint: Joint, *, accelerated: bool) -> tuple[Any, Any]:
-        """Rate and acceleration of a passive joint, of its outer body against its inner one."""
+        """Return rate and acceleration of a passive joint, of its outer body against its inner one."""
         m, a, b = self.motion, joint.inner, joint.outer
         axis = m.direction(a, joint.axes[0])
         second: Any = 0.0
@@ -301,10 +295,10 @@ class Forces:
         self.moment[graph.platform] = self.moment[graph.platform] - six[3:]
 
     def generalised(self) -> tuple[Objects, Objects]:
-        """Return the generalised forces of the unknown rates and of the drives, down the tree.
+        """Return the generalised forces on the unknown rates and on the drives, down the tree.
 
-        The power of all wrenches per rate: J_M' Q_M + J' Q_S + sum of J_Hij' Q_Hij, with the other
-        sign (3-PRRU paper, equations 38 and 39).
+        The power of all needed forces per rate, minus the sum of J_M' Q_M, J' Q_S and J_Hij' Q_Hij
+        (3-PRRU paper, equations 38 and 39; Delta-CU paper, equation 22).
         """
         m, tree = self.motion, self.motion.tree
         unknown = np.zeros(tree.unknown_rates, dtype=object)
@@ -334,7 +328,7 @@ class Forces:
         return unknown, driven
 
 
-def _matrix(ten: Objects) -> Objects:
+def _inertia_matrix(ten: Objects) -> Objects:
     xx, yy, zz, xy, xz, yz = ten[4:]
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]], dtype=object)
 
@@ -349,29 +343,28 @@ def begun(t: Traced) -> tuple[Layout, list[Objects]]:
 def efforts_of_motion(
     t: Traced, parts: list[Objects], qd: Objects, qdd: Objects, base: Objects | None = None
 ) -> tuple[list[Any], list[Any]]:
-    """Efforts for a motion under the input ``wrench``, of the drives that lead alone.
+    """Write the efforts of a motion under the input ``wrench``, of the leading drives.
 
-    :param base: its motion, shape (9,); None: at rest.
-    :returns: them, and what friction and rotor of each drive take, shape (n,).
+    :param base: motion of the base, shape (9,); None: at rest.
+    :returns: efforts of the leading drives, and the part of friction and rotor of all, shape (n,).
     """
-    loads = _loads(t, parts, qd, qdd, base)
-    tree, q = t.tree, t.drives.variables("q")
-    rates, changes = tree.of_drives(qd, t.u), tree.of_drives(qdd, t.du)
-    return add_friction_and_rotors(t, parts, loads, q, rates, changes)
+    f_d = driving_forces(t, parts, qd, qdd, base)
+    rates, changes = t.tree.of_drives(qd, t.u), t.tree.of_drives(qdd, t.du)
+    return add_friction_and_rotors(t, parts, f_d, t.drives.variables("q"), rates, changes)
 
 
 def add_friction_and_rotors(
     t: Traced, parts: list[Objects], loads: Numbers, q: Numbers, rates: Numbers, changes: Numbers
 ) -> tuple[list[Any], list[Any]]:
-    """Add what the drives themselves need to the loads of the leading drives.
+    """Add the drives' own friction and rotors to the loads of the leading drives.
 
     :param q: positions of all drives, shape (n,), with ``rates`` and ``changes`` (accelerations).
-    :returns: efforts of the drives that lead, and what friction and rotor of each drive take, (n,).
+    :returns: efforts of the leading drives, and the part of friction and rotor of all, shape (n,).
     """
     rotors = [rotor * change for rotor, change in zip(parts[ROTORS], changes, strict=True)]
     basic = _basic_friction(parts, rates)
-    for k, values in enumerate(_laws_of(t, parts)):
-        # Of drives that share the effort none has a law by load.
+    for k, values in enumerate(_law_values(t, parts)):
+        # No drive of several that share the effort has a law by load.
         load = 0.0 if t.drives.others else loads[k] + rotors[k]
         basic[k] = basic[k] + friction.taken(t.graph.laws, values, q[k], rates[k], load)
     rows = loads, t.drives.on_leads(basic), t.drives.on_leads(rotors)
@@ -380,24 +373,21 @@ def add_friction_and_rotors(
 
 
 def _basic_friction(parts: list[Objects], qd: Numbers) -> list[Any]:
-    """Viscous and Coulomb friction and the constant effort of each drive."""
+    """Return viscous and Coulomb friction and the constant effort of each drive."""
     rows = zip(*parts[3:6], qd, strict=True)
     return [viscous * v + coulomb * sign(v) + offset for viscous, coulomb, offset, v in rows]
 
 
-def _laws_of(t: Traced, parts: list[Objects]) -> list[dict[str, Any]]:
-    """By drive the parameters of its other friction laws; none where there is no law."""
+def _law_values(t: Traced, parts: list[Objects]) -> list[dict[str, Any]]:
+    """Return the parameters of each drive's other friction laws; an empty list without laws."""
     laws = Layout(t.tree).laws(parts[LAW_VALUES])
     return [{key: v[k] for key, v in laws.items()} for k in range(t.drives.count if laws else 0)]
 
 
-def _loads(t: Traced, parts: list[Objects], qd: Objects, qdd: Objects, base: Objects | None = None) -> list[Any]:
-    """Return the efforts without the drives' friction and rotors.
+def driving_forces(t: Traced, parts: list[Objects], qd: Objects, qdd: Objects, base: Objects | None = None) -> Objects:
+    """Write F_d, the efforts without the drives' friction and rotors, shape (m,).
 
-    :param base: its motion, shape (9,); None: at rest.
-
-    F_d = -J^-T (J_M' Q_M + sum of J_Hij' Q_Hij) - Q_S (3-PRRU paper, equations 40 and 41), on joint
-    rates: the closures' multipliers eliminate the unknown rates, which is the product with J^-T.
+    :param base: motion of the base, shape (9,); None: at rest.
     """
     bodies, rods, gravity, *_, passive = parts
     wrench = t.tape.inputs("wrench", 6)
@@ -408,23 +398,25 @@ def _loads(t: Traced, parts: list[Objects], qd: Objects, qdd: Objects, base: Obj
     forces.inertia(bodies, rods)
     forces.passive(passive)
     forces.wrench(wrench)
-    unknown, driven = forces.generalised()
-    multipliers = t.lu.solve_transposed(unknown)
-    return list(driven - t.jq[t.scheme.independent].T @ multipliers)
-
-
-def torque_program(t: Traced) -> Program:
-    """Write the program of :func:`torques`."""
-    return _torques(t)
+    # The 3-PRRU paper has F_d = -J^-T (J_M' Q_M + sum of J_Hij' Q_Hij) - Q_S (equations 40 and 41), the
+    # Delta-CU paper solves the same sum for tau (equation 23). With closures K u + J qd = 0 of the unknown
+    # rates u, -J^-T is here J' K^-T, and both generalised forces have the other sign than Q.
+    minus_q, minus_q_s = forces.generalised()
+    f_d: Objects = minus_q_s - t.jq[t.scheme.independent].T @ t.lu.solve_transposed(minus_q)
+    return f_d
 
 
 def body_efforts(robot: Robot) -> Kernel:
     """Return the program of the efforts that act on the bodies, without friction and rotors."""
-    return robot.massive().kernel("body efforts", partial(_torques, on_bodies=True))
+    return robot.massive().kernel("body efforts", partial(torque_program, on_bodies=True))
 
 
-def _torques(t: Traced, *, on_bodies: bool = False, base: int = 0) -> Program:
-    """Write the program of torques; ``base``: size of the input with the motion of the base."""
+def torque_program(t: Traced, *, on_bodies: bool = False, base: int = 0) -> Program:
+    """Write the program of :func:`torques`.
+
+    :param on_bodies: without friction and rotors of the drives.
+    :param base: size of the input with the motion of the base.
+    """
     layout, parts = begun(t)
     moving = t.tape.inputs("base", base) if base else None
     leads, own = efforts_of_motion(t, parts, t.drives.given("qd"), t.drives.given("qdd"), moving)
@@ -435,18 +427,14 @@ def _torques(t: Traced, *, on_bodies: bool = False, base: int = 0) -> Program:
     return Program(sizes, layout.size, {"efforts": t.lift(efforts)}, t.equations())
 
 
-def _stream_torques(t: Traced) -> Program:
-    return following(t, torque_program(t))
-
-
 def _accelerations(t: Traced) -> Program:
     layout, parts = begun(t)
     n = t.joints
     qd, tau = t.drives.given("qd"), t.tape.inputs("tau", t.drives.count)
     rest = np.array(t.drives.on_leads([*tau])) - efforts_of_motion(t, parts, qd, np.zeros(n))[0]
-    laws = _laws_of(t, parts)
+    laws = _law_values(t, parts)
     if laws and not t.drives.others:
-        loads, basic = _loads(t, parts, qd, np.zeros(n)), _basic_friction(parts, qd)
+        loads, basic = driving_forces(t, parts, qd, np.zeros(n)), _basic_friction(parts, qd)
         for k, values in enumerate(laws):
             at_place, dry, share = friction.parts(t.graph.laws, values, t.q[k], absolute(qd[k]))
             way = sign(qd[k])
@@ -467,7 +455,7 @@ def _accelerations(t: Traced) -> Program:
 
 
 def mass_entries(t: Traced, parts: list[Objects], visit: Callable[[Forces], None] | None = None) -> list[Any]:
-    """Entries of the mass matrix of the drives that lead, row by row.
+    """Write the entries of the leading drives' mass matrix, row by row.
 
     :param visit: called once a joint, while that joint alone moves, at rate one.
     """
@@ -504,7 +492,7 @@ def _masses(t: Traced) -> Program:
 
 
 def potential(t: Traced, bodies: Objects, rods: Objects, gravity: Objects) -> Any:
-    """Potential energy, zero at the base's origin."""
+    """Write the potential energy, zero at the base's origin."""
     motion = t.motion
     weighted: Any = np.zeros(3)
     for name, ten in zip(t.tree.links, bodies, strict=True):
@@ -531,7 +519,7 @@ def _energy(t: Traced) -> Program:
 
 
 def null_efforts(robot: Robot, q: ArrayLike) -> Array:
-    """Efforts that move nothing, shape (..., n - m, n), of n actuated joints and m freedoms.
+    """Compute efforts that move nothing, (..., n - m, n), of n actuated joints and m freedoms.
 
     The machine's inner forces: added to any efforts, they change the motion of no part. Rows are
     of unit length and at right angles in efforts over their limits (``limits.effort``; without
@@ -546,21 +534,13 @@ def null_efforts(robot: Robot, q: ArrayLike) -> Array:
 
 def null_kernel(robot: Robot) -> Kernel:
     """Return the program of :func:`null_efforts`: q to its entries, row by row."""
-    return robot.engine.kernel("null efforts", _null_efforts)
 
+    def write(t: Traced) -> Program:
+        t.solve()
+        rows = t.lift([value for row in t.drives.null_efforts() for value in row])
+        return Program(t.inputs("q"), 0, {"efforts": rows}, t.equations())
 
-def _null_efforts(t: Traced) -> Program:
-    t.solve()
-    rows = t.lift([value for row in t.drives.null_efforts() for value in row])
-    return Program(t.inputs("q"), 0, {"efforts": rows}, t.equations())
-
-
-def kernels(robot: Robot) -> tuple[Kernel, ...]:
-    """Return the programs that a node calls, to compile them before the first sample.
-
-    :raises ParameterError: a robot without masses.
-    """
-    return (torques(robot),)
+    return robot.engine.kernel("null efforts", write)
 
 
 class TorqueLoop:

@@ -27,12 +27,8 @@ ENCAPSULATION_BYTES: Final = 4
 STAMP_BYTES: Final = slice(4, 12)
 """Byte range of the stamp in a message that begins with a header."""
 LITTLE_ENDIAN: Final = b"\x00\x01"
-ENDIANNESS: Final = {b"\x00\x00": ">", LITTLE_ENDIAN: "<"}
 MAX_JOINT_STATE: Final = 2**18
-"""Most bytes of a joint state: far beyond all robots, and few enough to decode in no time that the
-stream would notice."""
-MAX_NAMES: Final = 1000
-"""Most joint names of a trajectory, for the same reason."""
+"""Most bytes of a joint state: far beyond all robots, and quickly decoded."""
 POINT_ARRAYS: Final = tuple(COLUMNS)
 TIME_INDEX: Final = len(POINT_ARRAYS)
 """Index of a point's time, which follows its arrays."""
@@ -115,40 +111,28 @@ class JointStateDecoder:
             message = self._codec.decode(data)
         except BagError as error:
             raise MessageError("cdr", str(error)) from error
-        arrays = (message.position, message.velocity, message.effort)
+        arrays, names = (message.position, message.velocity, message.effort), tuple(message.name)
+        stamp, frame = message.header.stamp, message.header.frame_id
         if data[:2] == LITTLE_ENDIAN:
-            self._layout = _find_layout(data, message, arrays)
-        stamp = message.header.stamp
-        header = _Header(_Time(stamp.sec, stamp.nanosec), message.header.frame_id)
-        return JointStateView(header, tuple(message.name), *arrays)
-
-
-def _find_layout(data: bytes, message: Any, arrays: Sequence[Sequence[float]]) -> _Layout:
-    end = STAMP_BYTES.stop
-    for text in (message.header.frame_id, None, *message.name):
-        end += -(end - ENCAPSULATION_BYTES) % 4 + 4
-        if text is not None:
-            # An empty string may be sent without its terminating zero.
-            end += struct.unpack_from("<I", data, end - 4)[0]
-    code = ["<iI", f"{end - STAMP_BYTES.stop}x"]
-    at = end
-    for values in arrays:
-        pad = -(at - ENCAPSULATION_BYTES) % 4
-        at += pad + 4
-        code.append(f"{pad}xI")
-        if len(values):
-            pad = -(at - ENCAPSULATION_BYTES) % 8
-            at += pad + 8 * len(values)
-            code.append(f"{pad}x{len(values)}d")
-    return _Layout(
-        len(data),
-        end,
-        data[STAMP_BYTES.stop : end],
-        struct.Struct("".join(code)),
-        (len(arrays[0]), len(arrays[1]), len(arrays[2])),
-        message.header.frame_id,
-        tuple(message.name),
-    )
+            end = STAMP_BYTES.stop
+            for text in (frame, None, *names):
+                end += -(end - ENCAPSULATION_BYTES) % 4 + 4
+                if text is not None:
+                    # An empty string may be sent without its terminating zero.
+                    end += struct.unpack_from("<I", data, end - 4)[0]
+            code, at = f"<iI{end - STAMP_BYTES.stop}x", end
+            for values in arrays:
+                pad = -(at - ENCAPSULATION_BYTES) % 4
+                at += pad + 4
+                code += f"{pad}xI"
+                if len(values):
+                    pad = -(at - ENCAPSULATION_BYTES) % 8
+                    at += pad + 8 * len(values)
+                    code += f"{pad}x{len(values)}d"
+            counts = (len(arrays[0]), len(arrays[1]), len(arrays[2]))
+            mark = data[STAMP_BYTES.stop : end]
+            self._layout = _Layout(len(data), end, mark, struct.Struct(code), counts, frame, names)
+        return JointStateView(_Header(_Time(stamp.sec, stamp.nanosec), frame), names, *arrays)
 
 
 def _count_doubles(value: Any) -> int:
@@ -186,10 +170,7 @@ class DoublesTemplate:
         }
         data = codec.encode({**message, **filled})
         self._head = data[:ENCAPSULATION_BYTES]
-        rest, self._pieces = (
-            data[STAMP_BYTES.stop if stamped else ENCAPSULATION_BYTES :],
-            list[bytes](),
-        )
+        rest, self._pieces = (data[STAMP_BYTES.stop if stamped else ENCAPSULATION_BYTES :], list[bytes]())
         self._sizes = [8 * count for count in arrays.values()]
         for mark, size in zip(marks, self._sizes, strict=True):
             piece, rest = rest.split(mark * (size // 8))
@@ -229,14 +210,14 @@ class RawTrajectory:
 
         :raises MessageError: the bytes are not such a message.
         """
-        order = ENDIANNESS.get(data[:2])
+        order = ({b"\x00\x00": ">", LITTLE_ENDIAN: "<"}).get(data[:2])
         if order is None or len(data) < STAMP_BYTES.stop:
             raise MessageError("cdr", f"{len(data)} bytes that are not plain CDR")
         sec, nanosec = struct.unpack_from(f"{order}iI", data, ENCAPSULATION_BYTES)
         frame, at = _read_text(data, STAMP_BYTES.stop, order)
         count, at = _read_number(data, at, order)
-        if count > MAX_NAMES:
-            raise MessageError("bounds", f"{count} joint names, at most {MAX_NAMES}")
+        if count > 1000:
+            raise MessageError("bounds", f"{count} joint names, at most 1000")
         names = []
         for _ in range(count):
             name, at = _read_text(data, at, order)
@@ -299,10 +280,7 @@ class _Points:
         first = _find_end(begin, lengths)
         second = _find_end(first, lengths)
         if (second - first) % 8 == 0:
-            groups = [
-                (slice(0, 1), begin, first - begin),
-                (slice(1, points), first, second - first),
-            ]
+            groups = [(slice(0, 1), begin, first - begin), (slice(1, points), first, second - first)]
         else:
             stride = second - begin
             groups = [(slice(0, points, 2), begin, stride), (slice(1, points, 2), first, stride)]
@@ -320,15 +298,7 @@ class _Points:
             values[which] = view
         return values
 
-    def write(
-        self,
-        data: bytearray,
-        array: int,
-        values: NDArray[Any],
-        kind: str,
-        *,
-        of_length: bool = False,
-    ) -> None:
+    def write(self, data: bytearray, array: int, values: NDArray[Any], kind: str, *, of_length: bool = False) -> None:
         """Write an array of all points."""
         for which, view in self._views(data, array, kind, values.shape[1], of_length):
             view[...] = values[which]
@@ -348,8 +318,7 @@ class _Points:
         if odd:
             point, i, length = min(odd)
             raise MessageError(
-                "length",
-                f"point {point}: {length} {POINT_ARRAYS[i]}, the first point has {self.lengths[i]}",
+                "length", f"point {point}: {length} {POINT_ARRAYS[i]}, the first point has {self.lengths[i]}"
             )
         if self.end > len(data):
             raise MessageError("cdr", f"{self.points} points take {self.end} bytes, {len(data)} are given")
@@ -366,8 +335,7 @@ class _Points:
 
 def _find_offsets(begin: int, lengths: Sequence[int]) -> list[tuple[int, int]]:
     """List the offsets of the length and first number of a point's arrays, then of its time."""
-    places = []
-    at = begin
+    places, at = [], begin
     for length in lengths:
         first = at + 4
         if length:

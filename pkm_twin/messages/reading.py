@@ -1,8 +1,6 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Convert messages, live or decoded, to checked arrays.
 
-Joint states, trajectories, wrenches and measured deflections.
-
 Every function either returns finite, complete, ordered data or raises
 :class:`~pkm_twin.errors.MessageError` with a short stable reason for counting. Times are
 integers in nanoseconds.
@@ -110,21 +108,14 @@ class TrajectoryFields:
         points = message.points
         names = tuple(message.joint_names)
         durations = [point.time_from_start for point in points]
-        return cls(
-            message.header,
-            names,
-            np.array([[d.sec for d in durations], [d.nanosec for d in durations]], np.int64),
-            {what: _stack_rows([getattr(point, what) for point in points], len(names)) for what in COLUMNS},
-        )
-
-
-def _stack_rows(rows: list[Sequence[float]], count: int) -> Array | Ragged | None:
-    if not any(map(len, rows)):
-        return None
-    for i, row in enumerate(rows):
-        if len(row) != count:
-            return Ragged(i, len(row))
-    return np.array(rows, np.float64)
+        times = np.array([[d.sec for d in durations], [d.nanosec for d in durations]], np.int64)
+        columns: dict[str, Array | Ragged | None] = dict.fromkeys(COLUMNS)
+        for what in COLUMNS:
+            rows = [getattr(point, what) for point in points]
+            odd = next((Ragged(i, len(row)) for i, row in enumerate(rows) if len(row) != len(names)), None)
+            if any(map(len, rows)):
+                columns[what] = odd or np.array(rows, np.float64)
+        return cls(message.header, names, times, columns)
 
 
 @dataclass(frozen=True)
@@ -178,10 +169,7 @@ class JointReader:
             # A value at its limit must still be accepted after the rounding of the conversion.
             shift = np.abs(self._map.offsets / self._map.factors).tolist()
             self._position = [
-                (
-                    low - CONVERSION_ROUNDING * (abs(low) + o),
-                    high + CONVERSION_ROUNDING * (abs(high) + o),
-                )
+                (low - CONVERSION_ROUNDING * (abs(low) + o), high + CONVERSION_ROUNDING * (abs(high) + o))
                 for (low, high), o in zip(self._position, shift, strict=True)
             ]
             rates = [rate * (1.0 + CONVERSION_ROUNDING) for rate in rates]
@@ -313,10 +301,7 @@ class JointReader:
             slow = all(map(le, rates, self.highest_velocity))
             if slow and all(second <= MAX_ACCELERATION for second in seconds):
                 return
-        for what, values, high in (
-            ("velocity", qd, self._highest_velocity),
-            ("acceleration", qdd, MAX_ACCELERATION),
-        ):
+        for what, values, high in (("velocity", qd, self._highest_velocity), ("acceleration", qdd, MAX_ACCELERATION)):
             good = np.abs(values) <= high
             if not good.all():
                 worst = tuple(np.argwhere(~good)[0])
@@ -347,12 +332,7 @@ class JointReader:
         return index
 
     def _take(
-        self,
-        what: str,
-        values: Sequence[float],
-        count: int,
-        index: list[int],
-        bounds: Sequence[tuple[float, ...]],
+        self, what: str, values: Sequence[float], count: int, index: list[int], bounds: Sequence[tuple[float, ...]]
     ) -> Array | None:
         if len(values) == 0:
             return None
@@ -369,11 +349,7 @@ class JointReader:
         return np.array(picked, np.float64)
 
     def _columns(
-        self,
-        what: str,
-        fields: TrajectoryFields,
-        index: list[int],
-        bounds: Sequence[tuple[float, ...]],
+        self, what: str, fields: TrajectoryFields, index: list[int], bounds: Sequence[tuple[float, ...]]
     ) -> Array | None:
         given = fields.columns[what]
         if given is None:
@@ -438,8 +414,7 @@ def _times_from_start(times: NDArray[np.int64]) -> NDArray[np.int64]:
     # Beyond MAX_DURATION seconds as floats do not resolve nanoseconds.
     if nanoseconds[-1] > MAX_DURATION:
         raise MessageError(
-            "bounds",
-            f"time_from_start ends at {nanoseconds[-1] / SECOND:g} s, at most {MAX_DURATION / SECOND:g} s",
+            "bounds", f"time_from_start ends at {nanoseconds[-1] / SECOND:g} s, at most {MAX_DURATION / SECOND:g} s"
         )
     falls = np.diff(nanoseconds) <= 0
     if falls.any():
@@ -490,13 +465,6 @@ def read_wrench(message: Any, now: int, rules: StampRules, frame: str, accept_em
     return WrenchSample(stamp, given or frame, np.array(values, np.float64))
 
 
-MAX_SENSED_ROTATION: Final = 1e3
-MAX_SENSED_ACCELERATION: Final = 1e4
-"""Largest components that an IMU may report, rad/s and m/s2: beyond all sensors."""
-NOT_MEASURED: Final = -1.0
-"""First entry of the covariance of a quantity that a sensor does not measure (sensor_msgs/Imu)."""
-
-
 class ImuSample(NamedTuple):
     """Angular velocity, rad/s, and acceleration less gravity, m/s2, (3,) each, in sensor axes."""
 
@@ -518,12 +486,10 @@ def read_imu(message: Any, now: int, rules: StampRules, frame: str) -> ImuSample
         raise MessageError("frame", f"frame is {shown(given)}, expected {frame!r}")
     stamp = rules.check(stamp_of(message.header), now)
     parts = []
-    for name, bound in (
-        ("angular_velocity", MAX_SENSED_ROTATION),
-        ("linear_acceleration", MAX_SENSED_ACCELERATION),
-    ):
+    # Largest components, rad/s and m/s2: beyond all sensors.
+    for name, bound in (("angular_velocity", 1e3), ("linear_acceleration", 1e4)):
         vector = getattr(message, name)
-        if float(getattr(message, f"{name}_covariance")[0]) == NOT_MEASURED:
+        if float(getattr(message, f"{name}_covariance")[0]) == -1.0:  # sensor_msgs/Imu: not measured
             raise MessageError("not measured", f"{name}_covariance[0] is -1: the sensor does not measure it")
         values = [vector.x, vector.y, vector.z]
         _check_numbers([f"{name}.{axis}" for axis in "xyz"], values, bound)
@@ -534,8 +500,6 @@ def read_imu(message: Any, now: int, rules: StampRules, frame: str) -> ImuSample
 MAX_SHIFT: Final = 0.1
 MAX_TURN: Final = 0.1
 """Largest deflection, m and rad: larger ones are not small, or belong to another pose."""
-MAX_NORM_ERROR: Final = 1e-3
-"""Largest difference of a quaternion's length from one."""
 
 
 class DeflectionSample(NamedTuple):
@@ -564,7 +528,7 @@ def read_deflection(message: Any, now: int, rules: StampRules) -> DeflectionSamp
     if far > MAX_SHIFT:
         raise MessageError("bounds", f"translation is {far:g} m, allowed up to {MAX_SHIFT:g}")
     length = math.hypot(*values[3:])
-    if abs(length - 1.0) > MAX_NORM_ERROR:
+    if abs(length - 1.0) > 1e-3:
         raise MessageError("bounds", f"the rotation's length is {length:g}, not 1")
     # A quaternion and its negative describe the same rotation.
     sign = math.copysign(1.0, turn.w)

@@ -11,8 +11,6 @@ from pkm_twin.errors import MessageError
 SECOND: Final = 1_000_000_000
 """Nanoseconds per second."""
 
-MIN_REPLAY_AGE: Final = 60 * SECOND
-"""Age of a stamp beyond which it is one of a recording, ns: no queue holds a message so long."""
 MAX_DURATION: Final = 1_000_000 * SECOND
 """Longest duration of a trajectory, ns: up to here seconds as floats resolve nanoseconds."""
 
@@ -43,25 +41,21 @@ class StampRules:
             )
         if self.max_age is not None and stamp < now - self.max_age:
             age = now - stamp
+            # No queue holds a message for a minute.
             cause = (
                 "a replayed bag needs use_sim_time and a /clock"
-                if age > MIN_REPLAY_AGE
+                if age > (60 * SECOND)
                 else "its sender, the network or this computer is overloaded, or clocks differ"
             )
             raise MessageError(
-                "stale stamp",
-                f"the stamp is {age / SECOND:.3f} s old, allowed {self.max_age / SECOND:g} s; {cause}",
+                "stale stamp", f"the stamp is {age / SECOND:.3f} s old, allowed {self.max_age / SECOND:g} s; {cause}"
             )
         return stamp
 
 
 def stamp_of(header: Any) -> int:
     """Return a header's stamp, ns, after checking that it is a valid time."""
-    return _to_nanoseconds("stamp", header.stamp)
-
-
-def _to_nanoseconds(what: str, time: Any) -> int:
-    sec, nanosec = time.sec, time.nanosec
+    sec, nanosec = header.stamp.sec, header.stamp.nanosec
     if sec < 0 or not 0 <= nanosec < SECOND:
-        raise MessageError("time", f"{what} is {sec} s and {nanosec} ns")
+        raise MessageError("time", f"stamp is {sec} s and {nanosec} ns")
     return int(sec * SECOND + nanosec)

@@ -33,12 +33,14 @@ def answer(name: str, summary: str, arguments: Sequence[str], others: str = "") 
         print(USAGE.format(words=f"{name} {others}".strip(), summary=summary, node=others or name))
         raise SystemExit(0)
     if own[0] == "--version":
-        print(_version())
+        from importlib.metadata import PackageNotFoundError, version
+
+        try:
+            print(version("pkm_twin"))
+        except PackageNotFoundError:
+            print("pkm_twin, not installed")
         raise SystemExit(0)
-    print(
-        f"cannot start: unknown argument {own[0]!r}; give parameters as --ros-args -p NAME:=VALUE",
-        file=sys.stderr,
-    )
+    print(f"cannot start: unknown argument {own[0]!r}; give parameters as --ros-args -p NAME:=VALUE", file=sys.stderr)
     raise SystemExit(2)
 
 
@@ -60,12 +62,3 @@ def check_launch_arguments(file: str, given: Iterable[str], declared: Iterable[s
         name = word.partition(":=")[0]
         if name not in known:
             raise UnknownNameError("launch argument", name, known)
-
-
-def _version() -> str:
-    from importlib.metadata import PackageNotFoundError, version
-
-    try:
-        return version("pkm_twin")
-    except PackageNotFoundError:
-        return "pkm_twin, not installed"

@@ -53,21 +53,13 @@ def own_node(name: str, needs: str, *, sim_time: bool = False, namespace: str = 
     except ImportError as error:
         raise PkmTwinError(f"{needs} needs ROS 2: source its setup, or {install('jazzy')} ({error})") from error
     context = rclpy.Context()
-    rclpy.init(
-        args=middleware_arguments([]),
-        context=context,
-        signal_handler_options=SignalHandlerOptions.NO,
-    )
+    rclpy.init(args=middleware_arguments([]), context=context, signal_handler_options=SignalHandlerOptions.NO)
     node = None
     try:
         clock = Parameter("use_sim_time", value=sim_time)
         try:
             node = Node(
-                name,
-                context=context,
-                namespace=namespace,
-                parameter_overrides=[clock],
-                start_parameter_services=False,
+                name, context=context, namespace=namespace, parameter_overrides=[clock], start_parameter_services=False
             )
         except InvalidNamespaceException as error:
             first = str(error).splitlines()[0]

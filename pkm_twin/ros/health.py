@@ -23,15 +23,11 @@ OK: Final = DiagnosticStatus.OK
 WARN: Final = DiagnosticStatus.WARN
 ERROR: Final = DiagnosticStatus.ERROR
 
-CALLBACKS_PER_OVERRUN: Final = 100
-"""Callbacks per late one (longer than its period) below which the diagnostics warn."""
 MAX_TEXT: Final = 500
 """Largest number of characters of a log line or of a value in the diagnostics."""
 MIN_PAUSE: Final = 1.0
 MAX_PAUSE: Final = 30.0
 """Smallest and largest pause between lines of one reason, s; a longer silence resets it."""
-UNKNOWN_NODE: Final = "_NODE_NAME_UNKNOWN_"
-"""Name that rmw gives a node of which only an endpoint has been discovered."""
 
 
 QOS: Final = "QoS"
@@ -122,27 +118,23 @@ class Health:
 
     def _find_incompatible_ends(self) -> None:
         """Find incompatible nodes in the graph; this costs less than the middleware's events."""
-        for topic, listeners in self._watched_topics.items():
-            before, now = self._incompatible_ends.get(topic, {}), self._incompatibilities(topic)
-            self._incompatible_ends[topic] = now
+        for topic, tells in self._watched_topics.items():
+            # The name as it was given: both calls remap it.
+            speakers = self._node.get_publishers_info_by_topic(topic)
+            listeners = self._node.get_subscriptions_info_by_topic(topic)
+            speaking, listening = ([*filter(self._is_own, ends)] for ends in (speakers, listeners))
+            strangers = [end for end in speakers if not self._is_own(end)]
+            # A node has few endpoints of its own, so that each foreign endpoint is checked about once.
+            pairs = [(s, r, r) for s, r in product(speaking, listeners)]
+            pairs += [(s, r, s) for s, r in product(strangers, listening)]
+            found = {bytes(end.endpoint_gid): find_incompatibility(s, r) for s, r, end in pairs}
+            before = self._incompatible_ends.get(topic, {})
+            now = self._incompatible_ends[topic] = {end: what for end, what in found.items() if what}
             for end in now.keys() - before.keys():
                 self._incompatible += now[end].kind == QOS
                 self.log_throttled(f"{topic} {now[end]}", f"another node on {topic} has an incompatible {now[end]}")
-                for tell in listeners:
+                for tell in tells:
                     tell(now[end])
-
-    def _incompatibilities(self, topic: str) -> dict[bytes, Incompatibility]:
-        """Return the incompatibilities of other nodes' endpoints, by endpoint identity."""
-        # The name as it was given: both calls remap it.
-        speakers = self._node.get_publishers_info_by_topic(topic)
-        listeners = self._node.get_subscriptions_info_by_topic(topic)
-        speaking, listening = ([*filter(self._is_own, ends)] for ends in (speakers, listeners))
-        strangers = [end for end in speakers if not self._is_own(end)]
-        # A node has few endpoints of its own, so that each foreign endpoint is checked about once.
-        pairs = [(s, r, r) for s, r in product(speaking, listeners)]
-        pairs += [(s, r, s) for s, r in product(strangers, listening)]
-        found = {bytes(end.endpoint_gid): find_incompatibility(s, r) for s, r, end in pairs}
-        return {end: what for end, what in found.items() if what}
 
     def _is_own(self, end: TopicEndpointInfo) -> bool:
         node = self._node
@@ -185,8 +177,8 @@ class Health:
             found.append((WARN, f"{clocks} messages of /clock had an invalid time in the last second"))
         if lost:
             found.append((WARN, f"{lost} messages lost in the last second"))
-        # Single late callbacks are normal on a machine that runs other programs too.
-        if overruns > taken / CALLBACKS_PER_OVERRUN:
+        # One late callback in a hundred is normal on a machine that runs other programs too.
+        if overruns > taken / 100:
             found.append((WARN, f"{overruns} of {taken} callbacks took longer than their period"))
         return found
 
@@ -247,8 +239,8 @@ def find_incompatibility(speaker: TopicEndpointInfo, listener: TopicEndpointInfo
 
 
 def node_of(end: TopicEndpointInfo) -> str:
-    """Return the full name of an endpoint's node, which the graph may not know yet."""
-    if end.node_name == UNKNOWN_NODE:
+    """Return the full name of an endpoint's node, which rmw may not know yet."""
+    if end.node_name == "_NODE_NAME_UNKNOWN_":
         return "a node whose name is not known yet"
     return f"{end.node_namespace.rstrip('/')}/{end.node_name}"
 

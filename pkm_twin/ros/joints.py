@@ -130,7 +130,7 @@ class EffortPublisher:
             self._plain.publish(self._template.fill(efforts))
         self._stamped.publish(stamp, efforts)
 
-    def wait_for_controllers(self, timeout: float) -> None:
-        """Wait until the controllers have acknowledged the last numbers, at most ``timeout`` s."""
+    def wait_for_controllers(self) -> None:
+        """Wait until the controllers have acknowledged the last numbers, at most 0.5 s."""
         if self._plain is not None:
-            self._plain.wait_for_all_acked(Duration(seconds=timeout))
+            self._plain.wait_for_all_acked(Duration(seconds=0.5))

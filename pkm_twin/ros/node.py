@@ -13,9 +13,9 @@ import os
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import suppress
-from typing import Any, ClassVar, Final
+from typing import Any, ClassVar, Final, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import SetParametersResult
@@ -32,7 +32,7 @@ from std_srvs.srv import Trigger
 
 from pkm_twin.bags.definitions import message_definition
 from pkm_twin.codegen.code import slowness
-from pkm_twin.errors import MessageError, ParameterError
+from pkm_twin.errors import MessageError, ParameterError, PkmTwinError
 from pkm_twin.messages.fast_decoder import JointStateDecoder
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.ros.health import OK, QOS, RELIABILITY, WARN, Health, Incompatibility, shorten
@@ -40,6 +40,8 @@ from pkm_twin.ros.parameters import ParameterNode
 from pkm_twin.ros.turns import LOW_RATE_PERIOD, LowRateGroup, Task, Tasks
 from pkm_twin.streams.monitor import Backlog, TopicStatistics
 from pkm_twin.streams.topics import JOINTS, Topic
+
+V = TypeVar("V")
 
 OVERRIDES: Final = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.RELIABILITY)
 EXPIRY: Final = (QoSPolicyKind.LIFESPAN, QoSPolicyKind.DEADLINE)
@@ -53,29 +55,7 @@ def output_qos() -> QoSProfile:
 
 def latched_qos() -> QoSProfile:
     """Return transient local QoS for what is constant while a node runs, such as a description."""
-    return QoSProfile(
-        depth=1,
-        reliability=ReliabilityPolicy.RELIABLE,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL,
-    )
-
-
-def input_qos(depth: int, *, best_effort: bool, expiry: float | None = None) -> QoSProfile:
-    """Return QoS for inputs: best effort matches all publishers, reliable only reliable ones.
-
-    :param expiry: lifespan and deadline that publishers must offer, s; None for any.
-    """
-    kind = ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE
-    qos = QoSProfile(depth=depth, reliability=kind)
-    if expiry is not None:
-        qos.lifespan = qos.deadline = Duration(seconds=expiry)
-    return qos
-
-
-# The middleware's threads hold its locks while they report an event, and wait for the lock that the
-# executor holds while it takes an event or ends: a node could deadlock.
-NO_SUBSCRIPTION_EVENTS: Final = SubscriptionEventCallbacks(use_default_callbacks=False)
-NO_PUBLISHER_EVENTS: Final = PublisherEventCallbacks(use_default_callbacks=False)
+    return QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class GuardedNode(ParameterNode):
@@ -123,6 +103,15 @@ class GuardedNode(ParameterNode):
         # The diagnostics run on the steady clock: they report a ROS clock that stands still.
         self.steady = Clock(clock_type=ClockType.STEADY_TIME)
 
+    def call_beside(self, what: str, answer: V, *takes: Callable[[V], object]) -> None:
+        """Pass an answer that is already published on to further outputs, whose errors are only logged."""
+        for take in takes:
+            try:
+                take(answer)
+            except (PkmTwinError, ValueError) as error:
+                # In a constraint singularity, for example, the answer itself is valid.
+                self.log_throttled("beside", f"no {what}: {error}")
+
     def stream_broken(self, where: str) -> None:
         """React to an exception in a callback: its stream cannot be trusted any more."""
 
@@ -138,6 +127,11 @@ class GuardedNode(ParameterNode):
         else:
             self.caught(where, error)
 
+    def report_limitation(self, text: str) -> None:
+        """Report a setting that is not possible here: in the log, and in the diagnostics for good."""
+        self.health.limitations.append(text)
+        self.get_logger().warning(text)
+
     def log_throttled(self, reason: str, text: str) -> None:
         """Log a reason with growing pauses; the diagnostics count every occurrence."""
         self.health.log_throttled(reason, text)
@@ -149,22 +143,32 @@ class GuardedNode(ParameterNode):
         return nanoseconds
 
     def create_subscription(
-        self,
-        msg_type: Any,
-        topic: str,
-        callback: Callable[..., None],
-        *arguments: Any,
-        **options: Any,
+        self, msg_type: Any, topic: str, callback: Callable[..., None], *arguments: Any, **options: Any
     ) -> Any:
-        """Subscribe as rclpy does; guard its own subscription of ``/clock``."""
+        """Subscribe as rclpy does; guard its own subscription of ``/clock``, and use no events.
+
+        The middleware's threads hold its locks while they report an event, and wait for the lock
+        that the executor holds while it takes an event or ends: a node could deadlock.
+        """
+        clock_callback = callback
+
+        def take_clock(message: Any) -> None:
+            # rclpy raises on invalid times.
+            sec, nanosec = message.clock.sec, message.clock.nanosec
+            if sec >= 0 and nanosec < SECOND:
+                clock_callback(message)
+                return
+            self.health.seen["clock messages rejected"] += 1
+            self.log_throttled("clock", f"/clock: rejected, invalid time: {sec} s and {nanosec} ns")
+
         if msg_type is ClockMessage:
-            callback = self._guard_clock(callback)
-        options.setdefault("event_callbacks", NO_SUBSCRIPTION_EVENTS)
+            callback = take_clock
+        options.setdefault("event_callbacks", SubscriptionEventCallbacks(use_default_callbacks=False))
         return super().create_subscription(msg_type, topic, callback, *arguments, **options)
 
     def create_publisher(self, *arguments: Any, **options: Any) -> Any:
-        """Create a publisher as rclpy does, without events of the middleware."""
-        options.setdefault("event_callbacks", NO_PUBLISHER_EVENTS)
+        """Create a publisher as rclpy does, without events, as :meth:`create_subscription`."""
+        options.setdefault("event_callbacks", PublisherEventCallbacks(use_default_callbacks=False))
         return super().create_publisher(*arguments, **options)
 
     def create_guarded_subscription(self, topic: str, callback: Callable[[Any], None], **options: Any) -> None:
@@ -194,6 +198,15 @@ class GuardedNode(ParameterNode):
         self.health.watch(topic)
         return self.create_publisher(row.message, topic, qos, qos_overriding_options=QoSOverridingOptions(overrides))
 
+    def create_trigger(self, name: str, react: Callable[[], str]) -> None:
+        """Create a std_srvs/Trigger service that answers with the text of ``react``."""
+
+        def answer(_request: Any, response: Any) -> Any:
+            response.success, response.message = True, react()
+            return response
+
+        self.create_service(Trigger, name, answer)
+
     def create_guarded_timer(self, period: float, callback: Callable[[], None]) -> Any:
         """Create a timer on the steady clock, with a guarded callback; period in s."""
 
@@ -204,19 +217,6 @@ class GuardedNode(ParameterNode):
                 self.caught(callback.__name__, error)
 
         return self.create_timer(period, guarded, clock=self.steady)
-
-    def _guard_clock(self, callback: Callable[[Any], None]) -> Callable[[Any], None]:
-        """Return rclpy's callback for ``/clock``, which raises on invalid times, with a check."""
-
-        def checked(message: Any) -> None:
-            sec, nanosec = message.clock.sec, message.clock.nanosec
-            if sec >= 0 and nanosec < SECOND:
-                callback(message)
-                return
-            self.health.seen["clock messages rejected"] += 1
-            self.log_throttled("clock", f"/clock: rejected, invalid time: {sec} s and {nanosec} ns")
-
-        return checked
 
 
 class GuardedSubscription:
@@ -268,7 +268,12 @@ class GuardedSubscription:
         node.health.watch(topic, self._relax_reliability)
 
     def _subscribe(self) -> Any:
-        relaxed, best_effort = self._relaxed, self._best_effort or self._relaxed
+        # Best effort matches all publishers, reliable only reliable ones.
+        relaxed, node = self._relaxed, self._node
+        kind = ReliabilityPolicy.BEST_EFFORT if self._best_effort or relaxed else ReliabilityPolicy.RELIABLE
+        qos = QoSProfile(depth=node.queue_depth, reliability=kind)
+        if self._expiry is not None:
+            qos.lifespan = qos.deadline = Duration(seconds=self._expiry)
 
         def heard(*arguments: Any) -> None:
             # The events executor passes both as one tuple.
@@ -281,12 +286,11 @@ class GuardedSubscription:
         heard.__signature__ = inspect.signature(  # type: ignore[attr-defined]
             lambda message, info: None
         )
-        node = self._node
         return node.create_subscription(
             self._kind,
             self._topic,
             heard,
-            input_qos(node.queue_depth, best_effort=best_effort, expiry=self._expiry),
+            qos,
             raw=self._raw,
             qos_overriding_options=QoSOverridingOptions(OVERRIDES[:-1] if relaxed else OVERRIDES),
         )
@@ -308,19 +312,17 @@ class GuardedSubscription:
                 if self._backlog.drop(waited, min(node.max_wait, self._expires()), began):
                     return
             node.health.seen["messages"] += 1
-            self._callback(message if self._decode is None else self._decode_message(message))
+            if self._decode is not None:
+                try:
+                    message = self._decode(message)
+                except MessageError as error:
+                    if self._refuse is not None:
+                        self._refuse(error)
+                    raise
+            self._callback(message)
         except Exception as error:
             node.failed(self._topic, error)
         statistics.handled(time.perf_counter() - began)
-
-    def _decode_message(self, data: bytes) -> Any:
-        assert self._decode is not None  # noqa: S101  asked for with it
-        try:
-            return self._decode(data)
-        except MessageError as error:
-            if self._refuse is not None:
-                self._refuse(error)
-            raise
 
     def _relax_reliability(self, what: Incompatibility) -> None:
         """Accept best-effort publishers from now on, unless a parameter says otherwise."""
@@ -333,11 +335,6 @@ class GuardedSubscription:
 
 
 COMPILING: Final = "loading or compiling the robot's programs: the node does not answer yet"
-START_REPORT_PERIOD: Final = 0.5
-"""Time between two reports of a starting node, s; stored programs load faster."""
-MAX_QUERIED: Final = 1000
-"""Largest number of entries of a request that only reads; one that sets has at most one per
-parameter. Longer requests would delay the stream."""
 
 
 class TwinNode(GuardedNode):
@@ -361,9 +358,9 @@ class TwinNode(GuardedNode):
     def _report_start(self) -> None:
         """Report that the node starts, repeatedly until it is created."""
         logger = self.get_logger()
-        # If a constructor fails, the context ends meanwhile.
+        # If a constructor fails, the context ends meanwhile. Stored programs load within half a second.
         with suppress(Exception):
-            while not self._cached.wait(START_REPORT_PERIOD) and self.context.ok():
+            while not self._cached.wait(0.5) and self.context.ok():
                 logger.info(COMPILING, once=True)
                 self._diagnostics.publish(self.health.array(WARN, COMPILING))
 
@@ -375,14 +372,14 @@ class TwinNode(GuardedNode):
         self.close_declarations()
         self._cached.set()
         self.create_guarded_timer(1.0, self._publish_diagnostics)
-        self.create_service(Trigger, "~/reset", self._on_reset)
+        self.create_trigger("~/reset", self._reset)
         for service in self.services:
             service.callback = guarded_service(service.srv_type, service.callback, self.health, lambda: self.declared)
             service.callback_group = self.low_rate
             self.low_rate.add_entity(service)
         if self.executor_kind == "single":
             self.create_guarded_timer(LOW_RATE_PERIOD, self.low_rate.open)
-        # Keep the handle alive: the middleware holds no reference.
+        # The middleware holds no reference of the handle.
         self._jump_handle = self.get_clock().create_jump_callback(
             JumpThreshold(
                 min_forward=None if leap is None else Duration(seconds=leap),
@@ -395,8 +392,7 @@ class TwinNode(GuardedNode):
         reach = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
         self.get_logger().info(f"{self.summary()}; domain {domain}, discovery {reach}")
         if slowness():
-            self.health.limitations.append(slowness())
-            self.get_logger().warning(slowness())
+            self.report_limitation(slowness())
         if self.autostart:
             self.trigger_configure()
             self.trigger_activate()
@@ -437,7 +433,7 @@ class TwinNode(GuardedNode):
 
     @property
     def shutting_down(self) -> bool:
-        """Whether the shutdown still needs turns of the executor."""
+        """True while the shutdown needs turns of the executor."""
         return False
 
     def activated(self) -> None:
@@ -476,7 +472,7 @@ class TwinNode(GuardedNode):
 
     @property
     def busy(self) -> bool:
-        """Whether tasks wait between the callbacks."""
+        """True while tasks wait between the callbacks."""
         return bool(self._tasks)
 
     def defer(self, where: str, task: Task) -> None:
@@ -491,11 +487,9 @@ class TwinNode(GuardedNode):
         self.low_rate.end_turn()
         self._tasks.step()
 
-    def _on_reset(self, request: Any, response: Any) -> Any:
+    def _reset(self) -> str:
         ended = self.reset_stop()
-        response.success = True
-        response.message = f"reset: {ended}" if ended else "no stop was latched"
-        return response
+        return f"reset: {ended}" if ended else "no stop was latched"
 
     def _on_clock_jump(self, jump: Any) -> None:
         try:
@@ -514,10 +508,7 @@ class TwinNode(GuardedNode):
 
 
 def guarded_service(
-    kind: Any,
-    callback: Callable[[Any, Any], Any],
-    health: Health,
-    declared: Callable[[], Mapping[str, Parameter]],
+    kind: Any, callback: Callable[[Any, Any], Any], health: Health, declared: Callable[[], Mapping[str, Parameter]]
 ) -> Any:
     """Wrap a service callback, also rclpy's own, so that it rejects invalid requests.
 
@@ -536,7 +527,12 @@ def guarded_service(
                     response.results.extend(one.results)
                 return response
             if kind in (SetParameters, SetParametersAtomically):
-                request.parameters = _select_changes(request.parameters, declared())
+                known = declared()
+                request.parameters = [
+                    one
+                    for one in request.parameters
+                    if one.name not in known or known[one.name].get_parameter_value() != one.value
+                ]
                 if not request.parameters:
                     good = SetParametersResult(successful=True)
                     one = kind is SetParametersAtomically
@@ -557,19 +553,14 @@ def guarded_service(
     return guarded
 
 
-def _select_changes(asked: Sequence[Any], declared: Mapping[str, Parameter]) -> list[Any]:
-    """Return the parameters of a request that differ from the node's."""
-    return [one for one in asked if one.name not in declared or declared[one.name].get_parameter_value() != one.value]
-
-
 def _check_size(request: Any, parameters: int) -> None:
-    """Reject a request that is so long that it would delay the stream.
+    """Reject a request that is so long that it would delay the stream: beyond 1000 entries.
 
-    :raises ParameterError: the request has too many entries.
+    :raises ParameterError: the request has too many entries; one that sets, more than parameters.
     """
     for field in ("parameters", "names", "prefixes"):
         entries = len(getattr(request, field, ()))
-        most = parameters if field == "parameters" else MAX_QUERIED
+        most = parameters if field == "parameters" else 1000
         if entries > most:
             raise ParameterError(field, entries, f"at most {most} in a request")
     named = Counter(parameter.name for parameter in getattr(request, "parameters", ()))

@@ -9,12 +9,7 @@ from collections.abc import Callable, Iterable, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from rcl_interfaces.msg import (
-    FloatingPointRange,
-    IntegerRange,
-    ParameterDescriptor,
-    SetParametersResult,
-)
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.lifecycle import LifecycleNode
 from rclpy.parameter import Parameter
@@ -29,9 +24,6 @@ if TYPE_CHECKING:
 
 S = TypeVar("S", bound="DataclassInstance")
 V = TypeVar("V")
-
-SUPPORTED_RCLPY = "7.1"
-"""Version of rclpy that stores parameter overrides as below, that of Jazzy."""
 
 
 class UnknownParametersError(PkmTwinError):
@@ -60,8 +52,21 @@ class ParameterNode(LifecycleNode):
 
     @property
     def given(self) -> dict[str, Any]:
-        """Parameters that the node was started with, by name."""
-        return parameter_overrides(self)
+        """Parameters that the node was started with, by name; a live view.
+
+        rclpy, of Jazzy at least, has no public name for them while they are not declared.
+
+        :raises RuntimeError: an rclpy version that stores them elsewhere.
+        """
+        try:
+            overrides: dict[str, Any] = self._parameter_overrides
+        except AttributeError:
+            try:
+                found = version("rclpy")
+            except PackageNotFoundError:
+                found = "of an unknown version"
+            raise RuntimeError(f"rclpy {found} is not supported; use 7.1") from None
+        return overrides
 
     @property
     def declared(self) -> dict[str, Parameter]:
@@ -139,12 +144,7 @@ class ParameterNode(LifecycleNode):
         if row.choices and value not in row.choices:
             raise UnknownNameError(name, value, row.choices)
 
-    def follow(
-        self,
-        names: Iterable[str],
-        prepare: Callable[[dict[str, Any]], V],
-        take: Callable[[V], object],
-    ) -> None:
+    def follow(self, names: Iterable[str], prepare: Callable[[dict[str, Any]], V], take: Callable[[V], object]) -> None:
         """Apply or reject a set of parameters as a whole, between two messages.
 
         :param names: of all parameters that ``prepare`` knows.
@@ -191,21 +191,20 @@ class ParameterNode(LifecycleNode):
         if deaf:
             # Setting it would be reported as successful.
             raise NotImplementedError(f"nothing follows a change of {', '.join(deaf)}")
-        self.add_pre_set_parameters_callback(self._convert_to_floats)
-        self.add_on_set_parameters_callback(_reject_nameless)
 
-    def _convert_to_floats(self, changes: list[Parameter]) -> list[Parameter]:
-        """Convert integers to floats where the declaration has floats."""
-        return [
-            _as_float(change, self.get_parameter(change.name).value) if self.has_parameter(change.name) else change
-            for change in changes
-        ]
+        def convert(changes: list[Parameter]) -> list[Parameter]:
+            return [
+                _as_float(change, self.get_parameter(change.name).value) if self.has_parameter(change.name) else change
+                for change in changes
+            ]
 
+        def reject_nameless(changes: list[Parameter]) -> SetParametersResult:
+            # rclpy would declare a parameter without a name.
+            good = all(change.name for change in changes)
+            return SetParametersResult(successful=good, reason="" if good else "a parameter without a name")
 
-def _reject_nameless(changes: list[Parameter]) -> SetParametersResult:
-    """Reject a parameter without a name, which rclpy would declare."""
-    good = all(change.name for change in changes)
-    return SetParametersResult(successful=good, reason="" if good else "a parameter without a name")
+        self.add_pre_set_parameters_callback(convert)
+        self.add_on_set_parameters_callback(reject_nameless)
 
 
 def _as_float(given: Parameter, like: Any) -> Parameter:
@@ -216,21 +215,3 @@ def _as_float(given: Parameter, like: Any) -> Parameter:
     if many and len(like) and isinstance(like[0], float) and given.type_ == Parameter.Type.INTEGER_ARRAY:
         return Parameter(given.name, value=[float(value) for value in given.value])
     return given
-
-
-def parameter_overrides(node: Any) -> dict[str, Any]:
-    """Return the parameters that the node was started with, by name; a live view.
-
-    rclpy has no public name for them while they are not declared.
-
-    :raises RuntimeError: an rclpy version that stores them elsewhere.
-    """
-    try:
-        overrides: dict[str, Any] = node._parameter_overrides
-    except AttributeError:
-        try:
-            found = version("rclpy")
-        except PackageNotFoundError:
-            found = "of an unknown version"
-        raise RuntimeError(f"rclpy {found} is not supported; use {SUPPORTED_RCLPY}") from None
-    return overrides

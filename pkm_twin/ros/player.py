@@ -18,25 +18,15 @@ from pathlib import Path
 from typing import Any
 
 from pkm_twin.bags.definitions import message_class, message_definition, parse_definition
-from pkm_twin.bags.qos import OfferedQos, parse_qos, require_topic
-from pkm_twin.bags.reader import Bag, BagMessage, TopicInfo, open_bag
+from pkm_twin.bags.qos import parse_qos, require_topic
+from pkm_twin.bags.reader import Bag, BagMessage, open_bag
 from pkm_twin.errors import BagError, ParameterError
 from pkm_twin.ros.context import own_node
 
 CLOCK_TOPIC = "/clock"
 MAX_CLOCK = 2**31 - 1
 """Largest time that a /clock message can hold, s."""
-_MIN_DEPTH = 1000
-"""Smallest queue depth: a second at 1 kHz, so that a subscriber delayed so long loses nothing."""
-_DELIVERY_TIME = 1.0
-"""Largest time for the last messages to reach reliable subscribers, s."""
-_MATCH_TIME = 60.0
-"""Largest time that lockstep waits for a subscriber to discover its publisher, s."""
 _SLEEP_OVERSHOOT = 0.002
-_SHORT_SLEEP = 0.0001
-"""Bound of the overshoot of a sleep, s, and the short sleeps for the remaining time."""
-_SIGNAL_PERIOD = 0.02
-"""Period at which a long wait checks for a signal, s."""
 
 
 @dataclass
@@ -49,8 +39,8 @@ class _Stop:
     asked: bool = False
 
     def wait(self, seconds: float) -> None:
-        """Sleep, but no longer than until the next check for a signal."""
-        time.sleep(min(seconds, _SIGNAL_PERIOD))
+        """Sleep, but no longer than 20 ms, so that signals are checked."""
+        time.sleep(min(seconds, 0.02))
 
 
 @dataclass(frozen=True)
@@ -102,10 +92,7 @@ def play(
     _check_number("clock", clock or 0.0, (clock or 0.0) >= 0, "0 or more, Hz")
     _check_number("wait_for_subscribers", wait_for_subscribers, wait_for_subscribers >= 0, "0 or more, s")
     bag = open_bag(path)
-    if clock:
-        _check_log_times(bag)
-    names = _select_topics(bag, topics, bool(clock))
-    targets = _find_targets(bag, names, remap or {})
+    targets = _find_targets(bag, topics, remap or {}, bool(clock))
     stop = _Stop()
     with (
         _stop_on_signals(stop) if pace is None else nullcontext(),
@@ -113,13 +100,14 @@ def play(
     ):
         awaited = {**publishers, CLOCK_TOPIC: clock_publisher} if clock else publishers
         _await_subscribers(awaited, wait_for_subscribers, stop)
-        replay = _Replay(bag, publishers, rate, stop, pace)
-        if clock and clock_publisher:
-            replay.add_clock(clock_publisher, clock)
+        replay = _Replay(bag, publishers, rate, stop, pace, clock_publisher, clock or 0.0)
         with _progress_bar(bag, progress) as update:
             result = replay.run(loop=loop, update=update)
         if not result.interrupted:
-            _await_delivery(publishers)
+            # Reliable subscribers get the last messages before the publishers are gone, within 1 s.
+            give_up = time.monotonic() + 1.0
+            for publisher in publishers.values():
+                _await_acknowledged(publisher, max(0.0, give_up - time.monotonic()))
     return result
 
 
@@ -128,68 +116,36 @@ def _check_number(name: str, value: float, holds: bool, bound: str) -> None:
         raise ParameterError(name, value, bound)
 
 
-def _check_log_times(bag: Bag) -> None:
-    """Reject log times that a clock message cannot hold: they would wrap around."""
+def _find_targets(bag: Bag, topics: Iterable[str] | None, remap: Mapping[str, str], own_clock: bool) -> dict[str, str]:
+    """Return the topic to publish on for each topic to play, after all checks of the bag."""
+    path, known = bag.report.path, bag.report.topics
     end = bag.report.start_time * 1e-9 + bag.report.duration
-    if not end < MAX_CLOCK:
-        raise BagError(
-            f"log times up to {end:.0f} s do not fit a /clock, which ends at {MAX_CLOCK} s; play without a clock",
-            path=bag.report.path,
-            reason="time",
-        )
-
-
-def _select_topics(bag: Bag, topics: Iterable[str] | None, own_clock: bool) -> list[str]:
-    """Return the topics to play, checked to be playable here."""
-    known = bag.report.topics
+    if own_clock and not end < MAX_CLOCK:
+        # Larger times would wrap around in a clock message.
+        text = f"log times up to {end:.0f} s do not fit a /clock, which ends at {MAX_CLOCK} s; play without a clock"
+        raise BagError(text, path=path, reason="time")
     names = list(known) if topics is None else list(dict.fromkeys(topics))
     for name in names:
         if name not in known:
-            raise BagError(
-                f"no topic {name}; topics: {', '.join(known)}",
-                path=bag.report.path,
-                reason="no_topic",
-            )
+            raise BagError(f"no topic {name}; topics: {', '.join(known)}", path=path, reason="no_topic")
     names = [name for name in names if not (own_clock and name == CLOCK_TOPIC)]
     for name in names:
-        _check_type(bag, name, known[name])
-    return names
-
-
-def _check_type(bag: Bag, name: str, info: TopicInfo) -> None:
-    """Reject a type whose recorded definition is not the installed one.
-
-    The recorded bytes are published as they are: subscribers would misread them without notice.
-    """
-    if info.encoding != "cdr" or info.schema_encoding != "ros2msg":
-        raise BagError(
-            f"topic {name}, type {info.type}, is encoded as {info.encoding!r} by "
-            f"{info.schema_encoding!r}; playable are 'cdr' by 'ros2msg'",
-            path=bag.report.path,
-            reason="encoding",
-        )
-    recorded = parse_definition(info.type, info.definition)
-    installed = parse_definition(info.type, message_definition(info.type))
-    for held, fields in installed.items():
-        if recorded.get(held) != fields:
-            raise BagError(
-                f"topic {name}: {held} was recorded with other fields than are installed here",
-                path=bag.report.path,
-                reason="type",
-            )
-
-
-def _find_targets(bag: Bag, names: list[str], remap: Mapping[str, str]) -> dict[str, str]:
-    unknown = sorted(remap.keys() - bag.report.topics.keys())
+        # The recorded bytes are published as they are: subscribers with another definition would misread them.
+        info = known[name]
+        if info.encoding != "cdr" or info.schema_encoding != "ros2msg":
+            text = f"topic {name}, type {info.type}, is encoded as {info.encoding!r} by {info.schema_encoding!r}"
+            raise BagError(f"{text}; playable are 'cdr' by 'ros2msg'", path=path, reason="encoding")
+        recorded = parse_definition(info.type, info.definition)
+        for held, fields in parse_definition(info.type, message_definition(info.type)).items():
+            if recorded.get(held) != fields:
+                text = f"topic {name}: {held} was recorded with other fields than are installed here"
+                raise BagError(text, path=path, reason="type")
+    unknown = sorted(remap.keys() - known.keys())
     if unknown:
-        raise BagError(
-            f"cannot remap {', '.join(unknown)}; topics: {', '.join(bag.report.topics)}",
-            path=bag.report.path,
-            reason="no_topic",
-        )
-    # Check all offers before anything is published.
+        text = f"cannot remap {', '.join(unknown)}; topics: {', '.join(known)}"
+        raise BagError(text, path=path, reason="no_topic")
     for name in names:
-        parse_qos(name, bag.report.topics[name].offered_qos)
+        parse_qos(name, known[name].offered_qos)
     return {name: require_topic(remap.get(name, name)) for name in names}
 
 
@@ -214,38 +170,30 @@ def _stop_on_signals(stop: _Stop) -> Iterator[None]:
 
 @contextmanager
 def _create_publishers(bag: Bag, targets: Mapping[str, str], with_clock: bool) -> Iterator[tuple[dict[str, Any], Any]]:
-    """Yield a publisher for each recorded topic, and one for the clock or None."""
-    with own_node("pkm_twin_player", "playing") as node:
-        from rclpy.qos import QoSProfile
+    """Yield a publisher for each recorded topic, and one for the clock or None.
 
-        publishers = {
-            name: node.create_publisher(
-                message_class(bag.report.topics[name].type),
-                target,
-                _publisher_qos(parse_qos(name, bag.report.topics[name].offered_qos)),
+    Deadline, lifespan and liveliness of the recorded offers are left out: a replay cannot guarantee
+    them.
+    """
+    with own_node("pkm_twin_player", "playing") as node:
+        from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+        publishers = {}
+        for name, target in targets.items():
+            offer = parse_qos(name, bag.report.topics[name].offered_qos)
+            latched = offer.transient_local
+            qos = QoSProfile(
+                # A second at 1 kHz, so that a subscriber delayed so long loses nothing.
+                depth=max(offer.depth, 1 if latched else 1000),
+                reliability=ReliabilityPolicy.RELIABLE if offer.reliable else ReliabilityPolicy.BEST_EFFORT,
+                durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
             )
-            for name, target in targets.items()
-        }
+            publishers[name] = node.create_publisher(message_class(bag.report.topics[name].type), target, qos)
         clock = None
         if with_clock:
             kind = message_class("rosgraph_msgs/msg/Clock")
             clock = node.create_publisher(kind, CLOCK_TOPIC, QoSProfile(depth=10))
         yield publishers, clock
-
-
-def _publisher_qos(offer: OfferedQos) -> Any:
-    """Return the publisher's QoS for a recorded offer.
-
-    Deadline, lifespan and liveliness are left out: a replay cannot guarantee them.
-    """
-    from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-
-    latched = offer.transient_local
-    return QoSProfile(
-        depth=max(offer.depth, 1 if latched else _MIN_DEPTH),
-        reliability=ReliabilityPolicy.RELIABLE if offer.reliable else ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-    )
 
 
 def _await_subscribers(publishers: Mapping[str, Any], seconds: float, stop: _Stop) -> None:
@@ -258,13 +206,6 @@ def _await_subscribers(publishers: Mapping[str, Any], seconds: float, stop: _Sto
             print(f"no subscriber after {seconds:g} s: {topics}", file=sys.stderr)
             return
         stop.wait(0.02 if missing else 0.0)
-
-
-def _await_delivery(publishers: Mapping[str, Any]) -> None:
-    """Give reliable subscribers time to get the last messages before the publishers are gone."""
-    give_up = time.monotonic() + _DELIVERY_TIME
-    for publisher in publishers.values():
-        _await_acknowledged(publisher, max(0.0, give_up - time.monotonic()))
 
 
 def _await_acknowledged(publisher: Any, seconds: float) -> None:
@@ -309,31 +250,18 @@ class _Replay:
         rate: float,
         stop: _Stop,
         pace: Callable[[BagMessage], None] | None,
+        clock: Any = None,
+        clock_rate: float = 0.0,
     ) -> None:
-        self._bag = bag
-        self._pace = pace
-        self._publishers = publishers
-        self._rate = rate
-        self._stop = stop
-        self._clock: Callable[[int], None] | None = None
-        self._clock_period = math.inf
+        self._bag, self._publishers = bag, publishers
+        self._rate, self._stop, self._pace = rate, stop, pace
+        self._clock = clock
+        self._clock_period = 1 / clock_rate if clock_rate else math.inf
         self._messages = 0
         self._late = 0.0
         # A subscriber that has not discovered its publisher receives the first messages after
         # later ones of other topics.
         self._unmatched = set(publishers if pace is not None else ())
-
-    def add_clock(self, publisher: Any, frequency: float) -> None:
-        """Publish bag time ``frequency`` times per second of wall time."""
-        kind = publisher.msg_type
-
-        def publish(now: int) -> None:
-            message = kind()
-            message.clock.sec, message.clock.nanosec = divmod(now, 10**9)
-            publisher.publish(message)
-
-        self._clock = publish
-        self._clock_period = 1 / frequency
 
     def run(self, *, loop: bool, update: Callable[[float, int], None]) -> PlayResult:
         begin = time.monotonic()
@@ -352,7 +280,7 @@ class _Replay:
         )
 
     def _play_once(self, update: Callable[[float, int], None]) -> None:
-        """Play the bag once; ``begin`` is the monotonic time of its first message."""
+        """Play the bag once."""
         first = self._bag.report.start_time
         begin = time.monotonic()
         tick = begin
@@ -362,7 +290,10 @@ class _Replay:
             while self._clock and tick <= due:
                 if not self._sleep_until(tick):
                     return
-                self._clock(first + round((tick - begin) * self._rate * 1e9))
+                time_message = self._clock.msg_type()
+                now = first + round((tick - begin) * self._rate * 1e9)
+                time_message.clock.sec, time_message.clock.nanosec = divmod(now, 10**9)
+                self._clock.publish(time_message)
                 tick += self._clock_period
             if self._pace is not None:
                 self._pace(message)
@@ -372,12 +303,12 @@ class _Replay:
             publisher.publish(message.data)
             if message.topic in self._unmatched:
                 self._unmatched.discard(message.topic)
-                _await_acknowledged(publisher, _MATCH_TIME)
-            now = time.monotonic()
+                _await_acknowledged(publisher, 60.0)
+            sent = time.monotonic()
             self._messages += 1
-            self._late = max(self._late, now - due)
-            if now - drawn > 0.1:
-                drawn = now
+            self._late = max(self._late, sent - due)
+            if sent - drawn > 0.1:
+                drawn = sent
                 update((message.log_time - first) * 1e-9, self._messages)
         update(self._bag.report.duration, self._messages)
 
@@ -389,5 +320,5 @@ class _Replay:
             if left > _SLEEP_OVERSHOOT:
                 self._stop.wait(left - _SLEEP_OVERSHOOT / 2)
             else:
-                time.sleep(min(left, _SHORT_SLEEP))
+                time.sleep(min(left, 0.0001))
         return not self._stop.asked

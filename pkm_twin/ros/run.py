@@ -11,7 +11,6 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Final
 
 import rclpy
 from rclpy.exceptions import ParameterException
@@ -25,9 +24,6 @@ from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.parameters import UnknownParametersError
 from pkm_twin.ros.signals import NodeSignals, ignore_signals
 from pkm_twin.threads import one_blas_thread
-
-_MCL_CURRENT: Final = 1
-_MCL_ONFAULT: Final = 4
 
 
 def set_priority(priority: int) -> None:
@@ -48,16 +44,8 @@ def set_priority(priority: int) -> None:
             continue  # It has ended meanwhile.
         except OSError as error:
             raise OSError(f"SCHED_FIFO: {error.strerror}") from None
-    if ctypes.CDLL(None, use_errno=True).mlockall(_MCL_CURRENT | _MCL_ONFAULT):
+    if ctypes.CDLL(None, use_errno=True).mlockall(1 | 4):  # MCL_CURRENT | MCL_ONFAULT
         raise OSError(f"locking memory: {os.strerror(ctypes.get_errno())}")
-
-
-MAX_SPIN_TIME: Final = 0.5
-"""Period at which the events executor checks whether to end, s."""
-MAX_SHUTDOWN_TIME: Final = 1.0
-"""Largest time in which a node may finish what others wait for, s: a launcher gives five."""
-MAX_TEARDOWN_TIME: Final = 3.0
-"""Largest time in which rclpy and the middleware may end, s: their threads can deadlock."""
 
 
 class _Executor:
@@ -70,7 +58,7 @@ class _Executor:
         for node in nodes:
             self._executor.add_node(node)
         # The events executor needs a timeout to end; the single one creates a timer per timeout.
-        self._patience = MAX_SPIN_TIME if events else None
+        self._patience = 0.5 if events else None
 
     def spin(self, ended: Callable[[], bool]) -> None:
         """Run callbacks, and between them a step of the waiting tasks, until ``ended``."""
@@ -93,24 +81,13 @@ class _Executor:
         self._executor.shutdown()
 
 
-def _set_process_priority(nodes: Sequence[TwinNode]) -> None:
-    """Set the largest priority that a node asks for; without permission, only warn."""
-    node = max(nodes, key=lambda n: n.thread_priority)
-    if node.thread_priority:
-        try:
-            set_priority(node.thread_priority)
-        except OSError as error:
-            text = f"thread_priority: {node.thread_priority} is not possible here: {error}"
-            node.health.limitations.append(text)
-            node.get_logger().warning(text)
-
-
 def run(*factories: Callable[[], TwinNode], arguments: Sequence[str] | None = None) -> int:
     """Run a node, or several in one executor, until SIGINT, SIGTERM or SIGHUP.
 
     The middleware does not handle signals, because it would close the topics at once: a signal ends
     the spinning at its next event, then :meth:`TwinNode.shutdown` is called while the topics exist.
-    After that, the process must end within :data:`MAX_TEARDOWN_TIME`.
+    After that, a node may finish within 1 s (a launcher gives five), and the process must end within
+    3 s, because threads of rclpy and the middleware can deadlock.
 
     :returns: 0 after a signal, 1 if a node rejects its configuration.
     """
@@ -130,7 +107,13 @@ def run(*factories: Callable[[], TwinNode], arguments: Sequence[str] | None = No
                 for factory in factories:
                     nodes.append(factory())
             one_blas_thread()
-            _set_process_priority(nodes)
+            node = max(nodes, key=lambda n: n.thread_priority)
+            if node.thread_priority:
+                try:
+                    set_priority(node.thread_priority)
+                except OSError as error:
+                    text = f"thread_priority: {node.thread_priority} is not possible here: {error}"
+                    node.report_limitation(text)
             # Everything loaded by now stays: exclude it from garbage collection.
             gc.collect()
             gc.freeze()
@@ -154,11 +137,11 @@ def run(*factories: Callable[[], TwinNode], arguments: Sequence[str] | None = No
         ignore_signals()
         for node in nodes:
             node.shutdown()
-        end = time.monotonic() + MAX_SHUTDOWN_TIME
+        end = time.monotonic() + 1.0
         if executor is not None:
             executor.spin(lambda: not any([n.shutting_down for n in nodes]) or time.monotonic() > end)
         # A thread without Python's lock ends the process if it hangs, and prints where.
-        faulthandler.dump_traceback_later(MAX_TEARDOWN_TIME, exit=True)
+        faulthandler.dump_traceback_later(3.0, exit=True)
         if executor is not None:
             executor.close()
         for node in nodes:

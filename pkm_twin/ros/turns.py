@@ -14,8 +14,7 @@ from pkm_twin.errors import MessageError
 MAX_TASKS: Final = 10
 """Largest number of waiting tasks."""
 LOW_RATE_PERIOD: Final = 0.1
-LOW_RATE_TURNS: Final = 3
-"""Period at which requests are checked, s, and the smallest number of turns for it."""
+"""Period at which requests are checked, s."""
 
 Task = Generator[None, None, None]
 
@@ -32,8 +31,8 @@ class LowRateGroup(MutuallyExclusiveCallbackGroup):
         self._turns = 0
 
     def open(self) -> None:
-        """Let the next turns of the executor check the group."""
-        self._turns = LOW_RATE_TURNS
+        """Let the next three turns of the executor check the group."""
+        self._turns = 3
 
     def end_turn(self) -> None:
         """Count a turn of the executor."""

@@ -20,13 +20,6 @@ from pkm_twin.streams.wrench import ZERO, Mount, TimeCache, Triple, check_mount,
 
 AVERAGING_TIME: Final = 1.0
 """Time constant of the mean acceleration, s: a base that stays in place has gravity alone in it."""
-FIT_TIME: Final = 0.024
-"""Time of the angular velocities that are differentiated, s, as of a stream of joint states."""
-MIN_GRAVITY: Final = 0.5
-"""Least mean acceleration over that of gravity: with less the sensor's driver removes gravity, or a
-base falls."""
-
-_STILL: Final = np.zeros(3)
 
 
 @dataclass(frozen=True)
@@ -37,10 +30,7 @@ class ImuSettings:
     xyz: Triple = setting(ZERO, "position of the IMU from the base's origin, base axes", name="imu.xyz", unit="m")
     rpy: Triple = setting(ZERO, "roll, pitch and yaw of the IMU relative to the base", name="imu.rpy", unit="rad")
     max_age: float = setting(
-        0.02,
-        "largest time between a joint state and the nearest message of base_imu",
-        name="imu.max_age",
-        **LATE,
+        0.02, "largest time between a joint state and the nearest message of base_imu", name="imu.max_age", **LATE
     )
 
     def __post_init__(self) -> None:
@@ -66,7 +56,8 @@ class BaseImu(Core):
 
     def __post_init__(self) -> None:
         self._mount = Mount.of(self.settings.xyz, self.settings.rpy)
-        self._fit = Differentiator(time=FIT_TIME)
+        # The window of angular velocities is as long as that of joint states.
+        self._fit = Differentiator(time=0.024)
         self._fit.prepare(3)
         self.clear()
 
@@ -93,7 +84,7 @@ class BaseImu(Core):
                 self.clear()
                 self._start, self.mean = sample.stamp, force
             try:
-                rates = self._fit.push(sample.stamp, _STILL, omega)
+                rates = self._fit.push(sample.stamp, np.zeros(3), omega)
             except MessageError:
                 self._fit.retract()
                 raise
@@ -115,18 +106,14 @@ class BaseImu(Core):
         age = math.inf if found is None else abs(stamp - found[0]) / SECOND
         if found is None or age > self.settings.max_age:
             far = "none has arrived" if found is None else f"the nearest is {age:.3f} s away"
-            raise MessageError(
-                "no base motion",
-                f"no message of base_imu within {self.settings.max_age:g} s: {far}",
-            )
+            text = f"no message of base_imu within {self.settings.max_age:g} s: {far}"
+            raise MessageError("no base motion", text)
         seen = (self._last - self._start) / SECOND
         size, weight = float(np.linalg.norm(self.mean)), float(np.linalg.norm(gravity))
         if seen < AVERAGING_TIME:
-            raise MessageError(
-                "no base motion",
-                f"base_imu has been measured for {seen:.2f} s; {AVERAGING_TIME:g} s are needed",
-            )
-        if size < MIN_GRAVITY * weight:
+            text = f"base_imu has been measured for {seen:.2f} s; {AVERAGING_TIME:g} s are needed"
+            raise MessageError("no base motion", text)
+        if size < 0.5 * weight:
             raise MessageError(
                 "no base motion",
                 f"the mean acceleration of base_imu is {size:.3g} m/s2, expected {weight:.3g}: an "

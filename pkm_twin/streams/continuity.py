@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 
@@ -17,10 +16,6 @@ from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import passing_singularity
 from pkm_twin.streams.steps import farthest
-
-MAX_MOVE: Final = 0.25
-"""Largest unpredicted move of the pose between two samples, relative to the robot's size: a larger
-one means that the assembly probably changed."""
 
 
 @dataclass(slots=True)
@@ -48,7 +43,8 @@ class Continuity:
         self.robot = robot
         self.warn, self.stop = warn, stop
         self._velocity = tuple(velocity)
-        self._largest = MAX_MOVE * robot.size
+        # A larger unpredicted move of the pose between two samples is probably another assembly.
+        self._largest = 0.25 * robot.size
         self._scales = robot.pose_scales
         n, m = len(robot.joint_names), len(self._scales)
         self._state_size = n + m + m * m
@@ -79,7 +75,20 @@ class Continuity:
         state = _State(stamp, result)
         *beyond, measure = result.tolist()[self._state_size :]
         if last is not None:
-            self._check_jump(last, state, beyond)
+            period = (stamp - last.stamp) / SECOND
+            joints = zip(result.tolist(), last.numbers.tolist(), self._velocity, strict=False)
+            for joint, (here, there, velocity) in enumerate(joints):
+                bound = farthest(velocity, period)
+                if not abs(here - there) <= bound:
+                    controller = self.robot.controller
+                    unit = self.robot.joint_units[joint] if controller.plain else "of its units"
+                    moved, _, most = controller.shown(joint, "velocity", here - there, -bound, bound)
+                    text = f"moved by {moved:g} {unit} in {period:g} s, allowed {most:g}"
+                    raise MessageError("jump", f"{controller.names[joint]} {text}")
+            if not max(beyond) <= self._largest:
+                name = self.robot.pose_names[beyond.index(max(beyond))]
+                text = "jumped but the joints did not: the assembly mode changed"
+                raise MessageError("jump", f"{name} of the platform {text}")
         if not measure >= self.stop:
             raise MessageError(
                 "singular",
@@ -89,28 +98,6 @@ class Continuity:
             )
         self._before, self._last = last, state
         return bool(measure < self.warn)
-
-    def _check_jump(self, last: _State, state: _State, beyond: list[float]) -> None:
-        """Reject joints that moved farther than their velocity limits allow, and pose jumps."""
-        period = (state.stamp - last.stamp) / SECOND
-        joints = zip(state.numbers.tolist(), last.numbers.tolist(), self._velocity, strict=False)
-        for joint, (now, before, velocity) in enumerate(joints):
-            bound = farthest(velocity, period)
-            if not abs(now - before) <= bound:
-                controller = self.robot.controller
-                unit = self.robot.joint_units[joint] if controller.plain else "of its units"
-                moved, _, most = controller.shown(joint, "velocity", now - before, -bound, bound)
-                raise MessageError(
-                    "jump",
-                    f"{controller.names[joint]} moved by {moved:g} {unit} in {period:g} s, allowed {most:g}",
-                )
-        worst = max(beyond)
-        if not worst <= self._largest:
-            raise MessageError(
-                "jump",
-                f"{self.robot.pose_names[beyond.index(worst)]} of the platform jumped but the "
-                "joints did not: the assembly mode changed",
-            )
 
 
 def _stream(robot: Robot) -> Kernel:

@@ -31,14 +31,10 @@ from pkm_twin.codegen.program import Program
 from pkm_twin.errors import MessageError
 from pkm_twin.messages.stamps import SECOND
 
-MIN_PIVOT: Final = 1e-8
-"""Smallest pivot of the normal equations; even stamps give 1e-4 or more."""
 BLOCK_SAMPLES: Final = 32
 """Samples that one call of the program sums up; the default window, 25, fits in one block."""
 MIN_SAMPLES: Final = 5
 """Fewest samples of a window."""
-FILLING_TOLERANCE: Final = 1.1
-"""A filling window may exceed its time by this factor before the stream counts as slow."""
 _NO_PARAMETERS: Final = np.zeros(0)
 
 
@@ -146,7 +142,7 @@ class Differentiator:
         return derivative, back, fit_weights(back, self.degree, derivative, 0.0)
 
     def _apart(self, stamp: int) -> bool:
-        """Return whether the stream was silent for too long to fit a polynomial across."""
+        """Return whether the stream was silent for too long to fit one polynomial."""
         if self._count < MIN_SAMPLES:
             return False
         newest = self._stamps.item((self._count - 1) % self._places)
@@ -192,9 +188,9 @@ class Differentiator:
         held = min(self._count, self.window)
         self._span = self._stamps.item(end - 1) - self._stamps.item(end - held)
         least, time = max(MIN_SAMPLES, self.degree + 2), self.time * SECOND
-        # A full window may be too long for a moment because samples were lost.
+        # A full window may be twice too long for a moment, because samples were lost.
         filling = self._count <= self.window == self._most
-        if held > least and self._span > (FILLING_TOLERANCE if filling else 2.0) * time:
+        if held > least and self._span > (1.1 if filling else 2.0) * time:
             self._fit_samples(max(1 + round(time * (held - 1) / self._span), least))
         if self._count < self.window:
             return None
@@ -245,7 +241,8 @@ class _Fit:
         first = end - BLOCK_SAMPLES
         inputs = sums, stamps[first:end], values[first * n : end * n], weights, place
         result: Array = self._call(*inputs)
-        if not min(result[2 * n :].tolist()) > MIN_PIVOT:
+        # Even stamps give pivots of 1e-4 or more.
+        if not min(result[2 * n :].tolist()) > 1e-8:
             raise MessageError("uneven stamps", "the stamps of the window are too uneven to differentiate")
         return result[:n], result[n : 2 * n]
 
@@ -293,10 +290,7 @@ def _write_fit_program(degree: int, joints: int, solved: bool) -> Program:
         for _ in range(size):
             here.append(here[-1] * t)
         results = []
-        for slopes, scale in (
-            ([0, *range(1, size)], rate),
-            ([k * (k - 1) for k in range(size)], rate * rate),
-        ):
+        for slopes, scale in (([0, *range(1, size)], rate), ([k * (k - 1) for k in range(size)], rate * rate)):
             first = 1 if scale is rate else 2
             # The derivative is w' V y with V V' w = d.
             d = [float(s) * here[k - first] if s else 0.0 for k, s in enumerate(slopes)]

@@ -16,18 +16,12 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array, Mask
 
-FROZEN_TIME: Final = 0.1
-"""Efforts that do not change for this time, s, and for CONSTANT_SAMPLES are not measured."""
 CONSTANT_SAMPLES: Final = 10
 """Fewest samples without a change."""
 MAX_RELATIVE_CHANGE: Final = 1e-9
 """Largest change that counts as none, as a fraction of the largest effort."""
-MAX_RELATIVE_ERROR: Final = 0.05
-"""Largest error of constant efforts that agree with the model, relative to the expected efforts."""
 BRAKE_TIME: Final = 0.5
 """Longest time for which a brake opens or closes, s."""
-AVERAGING_TIME: Final = 0.02
-"""Time constant of the average of "a joint moves", s: noise appears as a motion now and then."""
 
 
 class DriveWatch:
@@ -66,30 +60,28 @@ class DriveWatch:
             self._moving = moves
         else:
             step = time - self._last[0]
-            self._moving += min(1.0, step / AVERAGING_TIME) * (moves - self._moving)
+            # Averaged over 20 ms: noise appears as a motion now and then.
+            self._moving += min(1.0, step / 0.02) * (moves - self._moving)
             change = max(map(abs, map(sub, efforts, self._last[1])))
             same = change <= MAX_RELATIVE_CHANGE * greatest
             self._frozen = self._frozen + step if same else 0.0
             self.repeated = self.repeated + 1 if same else 0
         self._last = time, efforts
-        before, self.idle = self.idle, self._judge(time, efforts, expected, greatest)
+        before = self.idle
+        # Efforts that agree with the model within 5 % carry the machine, also constant ones.
+        wanted = expected.tolist()
+        off = max(map(abs, map(sub, efforts, wanted))) > 0.05 * max(map(abs, wanted))
+        frozen = self._frozen >= 0.1 and self.repeated >= CONSTANT_SAMPLES
+        if self._moving > 0.5:
+            self._released, self.idle = -math.inf, False
+        elif greatest == 0.0 or (frozen and off):
+            self._released = time if off else self._released
+            self.idle = True
+        else:
+            # While a brake opens or has just closed, it carries a part of the drive's effort.
+            self.idle = off and time - self._released < BRAKE_TIME
         self.changes += self.idle and not before
         return self.idle
-
-    def _judge(self, time: float, efforts: list[float], expected: Array, greatest: float) -> bool:
-        if self._moving > 0.5:
-            self._released = -math.inf
-            return False
-        wanted = expected.tolist()
-        missed = max(map(abs, map(sub, efforts, wanted)))
-        off = missed > MAX_RELATIVE_ERROR * max(map(abs, wanted))
-        frozen = self._frozen >= FROZEN_TIME and self.repeated >= CONSTANT_SAMPLES
-        if greatest == 0.0 or (frozen and off):
-            if off:
-                self._released = time
-            return True
-        # While a brake opens or has just closed, it carries a part of the drive's effort.
-        return off and time - self._released < BRAKE_TIME
 
 
 def idle_samples(time: Array, still: Mask, effort: Array, expected: Array) -> Mask:

@@ -97,9 +97,7 @@ class WrenchWindow(Core):
     def change_stamps(self, accept_zero_stamp: bool, future_tolerance: float) -> None:
         """Use other rules for stamps from the next wrench on."""
         settings = dataclasses.replace(
-            self.reader.settings,
-            accept_zero_stamp=accept_zero_stamp,
-            future_tolerance=future_tolerance,
+            self.reader.settings, accept_zero_stamp=accept_zero_stamp, future_tolerance=future_tolerance
         )
         self.reader = WrenchReader(settings, self.reader.mounts)
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Final, TypeVar, cast
@@ -14,15 +14,10 @@ from pkm_twin.messages.stamps import SECOND
 
 V = TypeVar("V")
 
-MIN_REJECTS_SHOWN: Final = 5
-"""Number of rejects after a stop from which the status shows their reason."""
-PERIOD_SMOOTHING: Final = 0.1
-"""Weight of the newest period in the exponential mean."""
-
 
 @dataclass
 class StreamMonitor:
-    """Decides whether a stream may be answered.
+    """Decide whether a stream may be answered.
 
     ``trip_count`` rejects in a row stop the stream; it resumes after ``recovery_count`` good
     samples in a row. ``rejected`` and ``stops`` are counted by reason. ``reason`` and ``text``
@@ -68,7 +63,7 @@ class StreamMonitor:
     def status(self) -> str:
         """Reason of the stop, and of rejects since then if there are many."""
         status, (count, reason, text) = label_reason(self.reason, self.text), self._since
-        if count >= MIN_REJECTS_SHOWN:
+        if count >= 5:  # fewer are stray ones
             status += f"; rejected since then: {count}"
             status += "" if reason == self.reason else f", the last: {label_reason(reason, text)}"
         return status
@@ -89,11 +84,22 @@ class StreamMonitor:
         rejected = {f"{what} rejected: {k}": v for k, v in self.rejected.items()}
         return {f"{what} {taken}": self.accepted, **rejected}
 
-    def resume(self) -> bool:
-        """Resume a stopped stream at once; return whether it was stopped."""
-        stopped, self.stopped = self.stopped, False
+    def resume(self) -> str:
+        """Resume a stopped stream at once; return the stop's description, empty without a stop."""
+        ended = self.status if self.stopped else ""
+        self.stopped = False
         self._bad = self._good = 0
-        return stopped
+        return ended
+
+    @contextmanager
+    def reacting(self, react: Callable[[], object]) -> Iterator[None]:
+        """Call ``react`` at the end of this block if the stream stopped in it."""
+        running = not self.stopped
+        try:
+            yield
+        finally:
+            if running and self.stopped:
+                react()
 
 
 def finished(steps: Generator[None, None, V]) -> V:
@@ -142,7 +148,7 @@ class Core:
 
 @dataclass
 class TopicStatistics:
-    """Counts of a topic's lost messages and of answers that took too long.
+    """Count a topic's lost messages and the answers that took too long.
 
     ``missed``: lost messages by the middleware's sequence numbers. ``overruns``: answers that took
     longer than the mean time between messages. ``longest``: time of the longest answer, s.
@@ -169,7 +175,7 @@ class TopicStatistics:
             self._periods += 1
             # The bound keeps a silence out of the mean, but lets it follow a slower stream.
             longest = 2.0 * self._period if self._periods > 1 else period
-            weight = max(PERIOD_SMOOTHING, 1.0 / self._periods)
+            weight = max(0.1, 1.0 / self._periods)
             self._period += (min(period, longest) - self._period) * weight
         self.messages += 1
         self._sent = sent
@@ -196,7 +202,7 @@ RELIEF: Final = 1.0
 
 @dataclass
 class Backlog:
-    """Decides which of the messages that wait for a node are dropped, so that it answers new ones.
+    """Decide which of the messages that wait for a node are dropped, so that it answers new ones.
 
     ``every``: once the node has caught up, answer all messages again until one waits too long, as
     for messages that are differentiated, where each gap empties the window. Otherwise answer only
@@ -232,7 +238,7 @@ class Backlog:
 
 
 class Pace:
-    """Thins a stream to a largest rate, Hz, by its stamps; rate 0 passes every sample.
+    """Thin a stream to a largest rate, Hz, by its stamps; rate 0 passes every sample.
 
     A stream of exactly this rate passes completely in spite of jitter in its stamps.
     """

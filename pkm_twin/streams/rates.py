@@ -23,14 +23,6 @@ MIN_BLOCK_TIME: Final = 0.05
 """Shortest time over which moves are compared, s."""
 MIN_STEPS: Final = 5
 """Fewest steps between samples in a block."""
-JUDGED_BLOCKS: Final = 20
-"""Number of blocks of a live stream that are judged together."""
-MIN_MOVE: Final = 0.01
-"""Joints are judged if the root of the sum of their squared moves is at least this, rad; for a
-prismatic joint this fraction of the machine's size."""
-MAX_LIVE_ERROR: Final = 0.4
-"""Largest RMS difference of the moves of a live stream, relative to the larger RMS move: what
-delayed velocities may cause."""
 STANDSTILL_FRACTION: Final = 0.03
 """Moves below this fraction of the other quantity's moves count as standing still."""
 MAX_RATE: Final = 0.15
@@ -64,13 +56,16 @@ class RateAgreement:
 
     ``fault``: description of the joint that disagrees most in the last blocks; empty without one.
 
+    Joints are judged if the root of the sum of their squared moves is at least 0.01 rad, or 0.01 of
+    the machine's size; delayed velocities may cause an RMS difference of 0.4 of the moves.
+
     :param blocks: number of blocks that are kept and judged; None keeps all and judges none.
     """
 
-    def __init__(self, robot: Robot, blocks: int | None = JUDGED_BLOCKS) -> None:
+    def __init__(self, robot: Robot, blocks: int | None = 20) -> None:
         self._names, self._count = robot.joint_names, blocks
         sizes = [robot.size if unit == "m" else 1.0 for unit in robot.joint_units]
-        self._least = MIN_MOVE * np.array(sizes)
+        self._least = 0.01 * np.array(sizes)
         self.reset()
 
     def reset(self) -> None:
@@ -124,7 +119,7 @@ class RateAgreement:
         error = np.where(moves, rms(told - moved) / np.maximum(size, 1e-300), 0.0)
         j = int(np.argmax(error))
         self.fault = ""
-        if error[j] > MAX_LIVE_ERROR:
+        if error[j] > 0.4:
             cause = find_likely_cause(moved[:, j], told[:, j])
             self.fault = (
                 f"{self._names[j]}: velocities differ from the rate of the positions by {100 * error[j]:.2g} %{cause}"
@@ -132,11 +127,7 @@ class RateAgreement:
 
 
 def rate_faults(
-    robot: Robot,
-    stamps: np.ndarray[Any, np.dtype[np.int64]],
-    q: Array,
-    qd: Array,
-    jumps: Mask | None = None,
+    robot: Robot, stamps: np.ndarray[Any, np.dtype[np.int64]], q: Array, qd: Array, jumps: Mask | None = None
 ) -> tuple[Array, list[str]]:
     """Compare the velocities of a recording with its positions.
 

@@ -89,7 +89,9 @@ class VelocityErrorEstimator:
             return SIGMAS * np.array(sizes)
         times, columns = self._noise.recent()
         period = times[-1] / (len(times) - 1)
-        slope = _backward_slope_weights(*times[-3:])
+        # Weights of a parabola's slope at the last of three times.
+        a, b = times[-1] - times[-2], times[-1] - times[-3]
+        slope = a / (b * (b - a)), -b / (a * (b - a)), (a + b) / (a * b)
         slack = SIGMAS * math.sqrt(sum(map(mul, slope, slope)))
         bounds = []
         for size, column, given in zip(sizes, columns, rate.tolist(), strict=True):
@@ -99,9 +101,3 @@ class VelocityErrorEstimator:
             late = apart if apart > slack * size else 0.0
             bounds.append(SIGMAS * size * self.gain / period + late)
         return np.array(bounds)
-
-
-def _backward_slope_weights(first: float, second: float, third: float) -> tuple[float, float, float]:
-    """Return the weights of a parabola's slope at the third of three times."""
-    a, b = third - second, third - first
-    return a / (b * (b - a)), -b / (a * (b - a)), (a + b) / (a * b)

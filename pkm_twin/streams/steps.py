@@ -23,8 +23,6 @@ STAMP_ERROR: Final = 5e-3
 """Largest error of stamps, s; a joint may be off by this time at its largest velocity."""
 MAX_SPEED_RATIO: Final = 2.0
 """Largest mean velocity between two samples relative to the joint's velocity limit."""
-VELOCITY_DELAY: Final = 0.01
-"""Largest delay of measured velocities, s."""
 MEDIAN_STEPS: Final = 5
 """Number of steps whose median replaces a measured velocity."""
 MAX_GAP_PERIODS: Final = 3.5
@@ -37,28 +35,8 @@ LOOKBACK_SAMPLES: Final = 10
 """One of this number of samples before is from the same publisher."""
 MOTION_QUANTILE: Final = 0.85
 """The velocity of the motion is this quantile over the samples; higher ones may be jumps."""
-UNEXPLAINED_QUANTILE: Final = 0.95
-"""Without measured velocities this quantile of the unexplained moves belongs to the motion."""
-NOISE_QUANTILE: Final = 0.1
-"""Quantile of the second differences, small enough to lie within one publisher without jumps,"""
-NOISE_QUANTILE_VALUE: Final = 0.1257
-"""and its value for noise of unit standard deviation: this quantile of |N(0, 1)|."""
 ALTERNATING_BLOCK: Final = 16
-"""Alternating publishers are looked for in blocks of this number of samples,"""
-ALTERNATING_PART: Final = 0.75
-"""of which at least this fraction must alternate."""
-MAX_REPEATS: Final = 3
-"""Longest run of repeated samples; a longer run is an encoder that stands still."""
-MIN_CROSSINGS: Final = 4
-"""Fewest equal steps up and down in turn that identify play in a joint,"""
-CROSSING_SIGMAS: Final = 8.0
-"""each at least this many standard deviations of the noise, beyond all of 1e9 normal numbers,"""
-CROSSING_TICKS: Final = 10.0
-"""and this many steps of the encoder, whose rounding goes up and down in turn, too."""
-CROSSING_SPREAD: Final = 0.15
-"""Largest median absolute deviation of the steps' sizes, relative to their median,"""
-CROSSING_TURNS: Final = 0.75
-"""and smallest fraction of steps opposite to the one before: a pair in three samples is missed."""
+"""Alternating publishers are looked for in blocks of this number of samples."""
 GAP_TOLERANCE: Final = 0.25
 """Largest difference of a gap due to missing samples from a whole number of periods, in periods."""
 
@@ -110,17 +88,28 @@ def steps_of(time: Array, q: Array, qd: Array | None, limit: Sequence[float] | A
     low, high = _bound_velocities(qd, rates, period)
     steps = np.abs(move)
     tick = _find_resolution(steps)
-    speed = np.quantile(_nearest_distances(q), MOTION_QUANTILE, axis=0) / period
+    # Each sample's distance to the nearest of those before it: with two publishers one is of the same.
+    nearest = steps.copy()
+    for lag in range(2, min(LOOKBACK_SAMPLES, k - 1) + 1):
+        nearest[lag - 1 :] = np.minimum(nearest[lag - 1 :], np.abs(q[lag:] - q[:-lag]))
+    speed = np.quantile(nearest, MOTION_QUANTILE, axis=0) / period
     if qd is not None:
         speed = np.maximum(speed, np.quantile(np.abs(qd), MOTION_QUANTILE, axis=0))
-    floor = 2.0 * SIGMAS * _estimate_tracks_noise(time, q) + 2.0 * tick
+    # The noise of the positions, also with two publishers: the 0.1 quantile of second differences lies
+    # within one publisher, without jumps; of |N(0, 1)| it is 0.1257.
+    noise = np.full(n, np.inf)
+    for lag in (1, 2, 3):
+        if k > 2 * lag:
+            parts = [find_differences(time[i::lag], q[i::lag], 3) for i in range(lag)]
+            noise = np.minimum(noise, np.quantile(np.concatenate(parts), 0.1, axis=0) / 0.1257)
+    floor = 2.0 * SIGMAS * np.where(np.isfinite(noise), noise, 0.0) + 2.0 * tick
     off = SIGMAS * float(estimate_deviation(span - period)[0])
     slack = max(min(STAMP_ERROR, period), off) * speed + floor
     near = span[:, 0] <= (MAX_GAP_PERIODS if qd is not None else 1.5) * period
     sizes = np.maximum(np.maximum(move - high * span, low * span - move), 0.0)
     if qd is None and near.any():
-        # Medians over several steps do not follow fast changes of the velocity.
-        slack = slack + SIGMAS * np.quantile(sizes[near], UNEXPLAINED_QUANTILE, axis=0)
+        # 95 % of the moves belong to the motion. Medians over several steps do not follow fast changes of the velocity.
+        slack = slack + SIGMAS * np.quantile(sizes[near], 0.95, axis=0)
     sizes = np.where(near[:, None] & (sizes > slack), sizes, 0.0)
     if limit is not None:
         bound = farthest(np.asarray(limit, np.float64), span)
@@ -142,7 +131,8 @@ def repeats_of(time: Array, q: Array) -> Mask:
     """Find samples that repeat the sample before although a joint is moving, shape (k,).
 
     Such samples differ from the cubic through two samples on each side, as the encoder was not read
-    at their time. The bound on this difference excludes slow joints of a coarse encoder.
+    at their time. The bound on this difference excludes slow joints of a coarse encoder. More than
+    three repeated samples are an encoder that stands still.
 
     :param time: rising, shape (k,), s; q, shape (k, n).
     """
@@ -153,7 +143,7 @@ def repeats_of(time: Array, q: Array) -> Mask:
     own = [estimate_noise(time[new], one[new, None])[0] for one, new in zip(q.T, apart.T, strict=True)]
     floor = 2.0 * SIGMAS * np.array(own) + 2.0 * _find_resolution(np.abs(move))
     period = np.median(np.diff(time))
-    for count in range(1, min(MAX_REPEATS, len(move) - 3) + 1):
+    for count in range(1, min(3, len(move) - 3) + 1):
         around = np.array([0, 1, count + 2, count + 3])
         apart_from = np.prod(count + 1 - around) / (count + 1 - around)
         weights = apart_from / [np.prod([x - y for y in around if y != x]) for x in around]
@@ -172,7 +162,10 @@ def find_play(q: Array) -> tuple[Array, NDArray[np.int64]]:
 
     Where the load of a joint turns, play between it and its encoder is a step from one sample to
     the next, up and down in turn, always by the same. A step b has third differences of b, and of
-    -b / 2 on both sides of it; a motion has none of both. Zero where there is no play.
+    -b / 2 on both sides of it; a motion has none of both. Zero where there is no play: play has at
+    least four steps, three quarters of them opposite to the one before, of sizes within 15 %, above
+    8 standard deviations of the noise (beyond all of 1e9 normal numbers) and above 10 steps of the
+    encoder, whose rounding goes up and down in turn, too.
 
     :param q: positions at even times, shape (k, n).
     """
@@ -180,18 +173,18 @@ def find_play(q: Array) -> tuple[Array, NDArray[np.int64]]:
     if len(q) < 6:
         return size, count
     bent = np.diff(q, 3, axis=0) / -2.0
-    floor = CROSSING_SIGMAS * estimate_deviation(bent)
-    floor = np.maximum(floor, CROSSING_TICKS * _find_resolution(np.abs(np.diff(q, axis=0))))
+    floor = 8.0 * estimate_deviation(bent)
+    floor = np.maximum(floor, 10.0 * _find_resolution(np.abs(np.diff(q, axis=0))))
     middle, before, after = bent[1:-1], bent[:-2], bent[2:]
     against = np.maximum(np.sign(middle) * before, np.sign(middle) * after)
     sharp = (np.abs(middle) > floor) & (against < -0.25 * np.abs(middle))
     for j in range(q.shape[1]):
         steps = middle[sharp[:, j], j]
-        if len(steps) < MIN_CROSSINGS:
+        if len(steps) < 4:
             continue
         usual = float(np.median(np.abs(steps)))
-        alike = float(np.median(np.abs(np.abs(steps) - usual))) <= CROSSING_SPREAD * usual
-        if alike and np.mean(steps[1:] * steps[:-1] < 0.0) >= CROSSING_TURNS:
+        alike = float(np.median(np.abs(np.abs(steps) - usual))) <= 0.15 * usual
+        if alike and np.mean(steps[1:] * steps[:-1] < 0.0) >= 0.75:
             size[j], count[j] = usual, len(steps)
     return size, count
 
@@ -202,29 +195,6 @@ def _find_resolution(steps: Array) -> Array:
     return np.where(np.isfinite(least), least, 0.0)
 
 
-def _nearest_distances(q: Array) -> Array:
-    """Return each sample's distance to the nearest of the LOOKBACK_SAMPLES before, (k - 1, n).
-
-    With two publishers at least one of these samples is from the same publisher.
-    """
-    lags = [np.abs(q[lag:] - q[:-lag]) for lag in range(1, min(LOOKBACK_SAMPLES, len(q) - 1) + 1)]
-    least = lags[0].copy()
-    for lag, apart in enumerate(lags[1:], 1):
-        least[lag:] = np.minimum(least[lag:], apart)
-    return least
-
-
-def _estimate_tracks_noise(time: Array, q: Array) -> Array:
-    """Estimate the standard deviation of the positions' noise, (n,), also with two publishers."""
-    found = np.full(q.shape[1], np.inf)
-    for lag in (1, 2, 3):
-        if len(q) > 2 * lag:
-            parts = [find_differences(time[k::lag], q[k::lag], 3) for k in range(lag)]
-            size = np.quantile(np.concatenate(parts), NOISE_QUANTILE, axis=0)
-            found = np.minimum(found, size / NOISE_QUANTILE_VALUE)
-    return np.where(np.isfinite(found), found, 0.0)
-
-
 def _bound_velocities(qd: Array | None, rates: Array, period: float) -> tuple[Array, Array]:
     """Return the smallest and the largest velocity around each step, shape (k - 1, n) each."""
     if qd is None:
@@ -233,7 +203,8 @@ def _bound_velocities(qd: Array | None, rates: Array, period: float) -> tuple[Ar
         around = np.median(sliding_window_view(wide, MEDIAN_STEPS, axis=0), -1)
         before, after = around[: len(rates)], around[MEDIAN_STEPS + 1 :]
         return np.minimum(before, after), np.maximum(before, after)
-    reach = min(max(1, round(VELOCITY_DELAY / period)), len(qd) - 1)
+    # Measured velocities may be 10 ms late.
+    reach = min(max(1, round(0.01 / period)), len(qd) - 1)
     wide = np.pad(qd, ((reach - 1, reach - 1), (0, 0)), mode="edge")
     windows = sliding_window_view(wide, 2 * reach, axis=0)
     return windows.min(-1), windows.max(-1)
@@ -260,7 +231,8 @@ def _find_alternating_tracks(time: Array, q: Array) -> Array:
     moved = twice[: blocks * ALTERNATING_BLOCK].reshape(shape).mean(1)
     bent *= np.sign(bent.sum(1, keepdims=True))
     clear = bent > np.maximum(moved + SIGMAS * size, 2.0 * _find_resolution(twice))[:, None]
-    apart = np.where(clear.mean(1) > ALTERNATING_PART, bent.mean(1), 0.0)
+    # At least three quarters of a block alternate.
+    apart = np.where(clear.mean(1) > 0.75, bent.mean(1), 0.0)
     found[1 : blocks * ALTERNATING_BLOCK + 1] = np.repeat(apart, ALTERNATING_BLOCK, 0)
     return found
 

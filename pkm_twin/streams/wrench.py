@@ -28,8 +28,6 @@ PLATFORM: Final = "platform"
 ZERO: Final = (0.0, 0.0, 0.0)
 STAMP_ORDER: Final = "stamp order"
 """Reason for rejecting a message that is older than the one before."""
-MAX_OFFSET: Final = 100.0
-"""Largest distance of a sensor from the reference point along an axis, m."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +53,8 @@ def check_mount(entries: Mapping[str, Triple]) -> None:
     :raises ParameterError: naming the parameter and its bounds.
     """
     for name, values in entries.items():
-        bound = MAX_OFFSET if name.endswith("xyz") else 4.0 * math.pi
+        # A sensor farther off than 100 m is a wrong unit.
+        bound = 100.0 if name.endswith("xyz") else 4.0 * math.pi
         if len(values) != 3 or not all(abs(value) <= bound for value in values):
             raise ParameterError(name, list(values), f"3 numbers from {-bound:g} to {bound:g}")
 
@@ -82,10 +81,7 @@ class WrenchSettings:
     future_tolerance: float = setting(0.1, FUTURE, **SECONDS)
     accept_zero_stamp: bool = setting(False, ZERO_STAMP)
     sensor_xyz: Triple = setting(
-        ZERO,
-        "position of the sensor from the platform's reference point, platform axes",
-        name="sensor.xyz",
-        unit="m",
+        ZERO, "position of the sensor from the platform's reference point, platform axes", name="sensor.xyz", unit="m"
     )
     sensor_rpy: Triple = setting(
         ZERO,
@@ -101,9 +97,7 @@ class WrenchSettings:
         check_mount({"sensor.xyz": self.sensor_xyz, "sensor.rpy": self.sensor_rpy})
         if self.wrench_frame == self.base_frame and any(self.sensor_rpy):
             raise ParameterError(
-                "sensor.rpy",
-                list(self.sensor_rpy),
-                f"zeros where wrench_frame is base_frame, {self.base_frame!r}",
+                "sensor.rpy", list(self.sensor_rpy), f"zeros where wrench_frame is base_frame, {self.base_frame!r}"
             )
 
     @property

@@ -117,7 +117,7 @@ class Topics:
         self.published[topic] = []
         return type("Publisher", (), {"publish": staticmethod(self.published[topic].append)})
 
-    def create_service(self, *_):
+    def create_trigger(self, *_):
         pass
 
 

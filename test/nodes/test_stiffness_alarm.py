@@ -121,7 +121,7 @@ class Quiet:
     def nothing(self, *_, **__):
         pass
 
-    create_guarded_publisher = create_guarded_subscription = create_service = defer = nothing
+    create_guarded_publisher = create_guarded_subscription = create_trigger = defer = nothing
 
 
 def test_rules_and_frames_that_change_hold_for_the_next_deflection():

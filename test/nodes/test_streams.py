@@ -29,7 +29,7 @@ def check_history(stream, events):
             accepted += not stopped
             assert stream.accept() is not stopped
         elif event == "resume":
-            assert stream.resume() is stopped
+            assert bool(stream.resume()) is stopped
             stopped, bad, good = False, 0, 0
         else:
             good = 0

@@ -122,7 +122,7 @@ EQUATIONS: Final = (
     _equation(
         "40-41",
         "driving forces F_d",
-        ("delta_dynamics.inverse_dynamics", TORQUES + "_loads"),
+        ("delta_dynamics.inverse_dynamics", TORQUES + "driving_forces"),
         FORCES,
     ),
     _equation(
