@@ -11,7 +11,7 @@ from typing import Any, Final, Literal, NamedTuple
 import numpy as np
 
 from delta_dynamics.holding import MeasuredPose, find_holding_effort
-from delta_dynamics.torques.stiction import friction_reach, moving_rates
+from delta_dynamics.torques.stiction import friction_reach, zero_resting_rates
 from delta_dynamics.torques.virtual_work import inverse_dynamics
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MessageError, ParameterError
@@ -275,7 +275,7 @@ class Feedforward(Core):
             reader.check_derived(qd, qdd)
             if t.qd is None and self._reach.any():
                 doubt = velocity_error_bound(t.times, t.q, gradient_gain(t.times))
-                qd = moving_rates(qd, np.abs(qd) <= doubt, self._reach)
+                qd = zero_resting_rates(qd, np.abs(qd) <= doubt, self._reach)
             efforts = np.empty_like(t.q)
             saturated = False
             for first in range(0, len(t.q), SLICE):
@@ -465,7 +465,7 @@ class Feedforward(Core):
         motion = sample.q, rate, change
         sure = rate if sample.qd is None else rates[0]
         if doubt is not None:
-            sure = moving_rates(sure, np.abs(sure) <= doubt, self._reach)
+            sure = zero_resting_rates(sure, np.abs(sure) <= doubt, self._reach)
         if self.robot.redundant:
             _, own, change = self.robot.project_redundant(sample.q, sure, change)
             sure = own if sample.qd is None else sure

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from delta_dynamics.estimates.isolation import ContactLocator, ContactPlace
-from delta_dynamics.torques.stiction import LoadShare, friction_reach, moving_rates
+from delta_dynamics.torques.stiction import LoadShare, friction_reach, zero_resting_rates
 from delta_dynamics.torques.uncertainty import AVERAGED, Noise, effort_parts, torque_deviation, usual_effort
 from delta_dynamics.torques.virtual_work import inverse_dynamics, mass_matrix
 from pkm_twin.codegen.arrays import Array, common_batch, finite, later, one_vector, vectors
@@ -269,8 +269,8 @@ class ContactMonitor:
         if doubt is None:
             doubt = self._rest.push(round(time * SECOND), q, qd, qd)
         still = np.abs(qd) <= doubt
-        sure = moving_rates(qd, still, self._reach + self._share.share)
-        effort, holds = self._share.taken_out(q, sure, effort)
+        sure = zero_resting_rates(qd, still, self._reach + self._share.share)
+        effort, holds = self._share.remove(q, sure, effort)
         parts = effort_parts(self.robot, q, sure, qdd, wrench, mass)
         self._last = time
         self._greatest = np.maximum(self._greatest, np.abs(parts.whole))

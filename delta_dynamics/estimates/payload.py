@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from delta_dynamics.torques.regressor import PAYLOAD, parameter_names, regressor
-from delta_dynamics.torques.stiction import LoadShare, beyond_friction, friction_reach, moving_rates
+from delta_dynamics.torques.stiction import LoadShare, beyond_friction, friction_reach, zero_resting_rates
 from delta_dynamics.torques.uncertainty import Noise
 from delta_dynamics.torques.virtual_work import inverse_dynamics
 from pkm_twin.codegen.arrays import Array, later, one_vector
@@ -148,8 +148,8 @@ class PayloadEstimator:
         if not self.drives.repeated:
             self._keep()
         step = time - last
-        sure = moving_rates(qd, still, self._reach + self._share.share)
-        effort, holds = self._share.taken_out(q, sure, effort)
+        sure = zero_resting_rates(qd, still, self._reach + self._share.share)
+        effort, holds = self._share.remove(q, sure, effort)
         reach = self._reach + holds
         columns = regressor(self.robot, q, sure, qdd)[:, self._columns]
         computed = inverse_dynamics(self.robot, q, sure, qdd, wrench)

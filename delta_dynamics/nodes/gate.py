@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 
 from delta_dynamics.gate import Gate, GateSettings
-from delta_dynamics.nodes.parameters import changed, declare_changes
+from delta_dynamics.nodes.parameters import change_robot, declare_changes
 from delta_dynamics.nodes.topics import GATE
 from delta_dynamics.torques.virtual_work import inverse_dynamics
 from pkm_twin.errors import MessageError
@@ -45,7 +45,7 @@ class CommandGate(TwinNode):
         self._closed = True
         # With names and a stamp for recordings and plots.
         self._commands = EffortPublisher(self, robot, "~/commands_stamped", "~/commands")
-        robot = changed(robot, declare_changes(self, robot, CHANGEABLE))
+        robot = change_robot(robot, declare_changes(self, robot, CHANGEABLE))
         if settings.on_stop == "gravity":
             # Compile before the first use; a robot without masses is rejected here.
             zeros = np.zeros(len(robot.joint_names))
@@ -66,7 +66,7 @@ class CommandGate(TwinNode):
                 refuse=partial(self.core.refuse, self.core.states),
                 expected=True,
             )
-        self.follow(CHANGEABLE, lambda values: changed(self.core.robot, values), self.core.change_robot)
+        self.follow(CHANGEABLE, lambda values: change_robot(self.core.robot, values), self.core.change_robot)
         self.create_guarded_timer(min(0.25 * settings.deadline, 0.1), self._watch)
         self.start(leap=settings.deadline + settings.future_tolerance)
 

@@ -49,7 +49,7 @@ def declare_changes(node: TwinNode, robot: Robot, names: Collection[str] = CHANG
     return changes
 
 
-def changed(robot: Robot, values: dict[str, Any]) -> Robot:
+def change_robot(robot: Robot, values: dict[str, Any]) -> Robot:
     """Return the robot with new values of :data:`CHANGES`."""
     sections: dict[str, Any] = {}
     for name, value in values.items():

@@ -18,7 +18,13 @@ from std_msgs.msg import Float64MultiArray
 
 from delta_dynamics.feedforward import warm_up
 from delta_dynamics.nodes.topics import SIMULATION
-from delta_dynamics.simulation.machine import MachineSettings, PayloadEvent, Simulation, WrenchSignal, tuned
+from delta_dynamics.simulation.machine import (
+    MachineSettings,
+    PayloadEvent,
+    Simulation,
+    WrenchSignal,
+    tune_position_control,
+)
 from pkm_twin.bags.definitions import message_definition
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MessageError, ParameterError, short
@@ -152,7 +158,7 @@ class MachineSim(TwinNode):
         bandwidth = self.declare(
             "bandwidth", 10.0, "bandwidth of the position control, critically damped", unit="Hz", low=0.01, high=1000.0
         )
-        stiffness, damping = tuned(robot, bandwidth)
+        stiffness, damping = tune_position_control(robot, bandwidth)
         home = robot.inverse(robot.home())
         return self.declare_settings(
             MachineSettings,

@@ -13,7 +13,7 @@ from geometry_msgs.msg import WrenchStamped
 
 from delta_dynamics.feedforward import Feedforward, Settings, Torques, warm_up
 from delta_dynamics.nodes.estimates import Estimates
-from delta_dynamics.nodes.parameters import CHANGES, changed, declare_changes
+from delta_dynamics.nodes.parameters import CHANGES, change_robot, declare_changes
 from delta_dynamics.nodes.topics import TWIN
 from delta_dynamics.torques.reactions import reactions
 from pkm_twin.errors import MessageError, ParameterError
@@ -49,7 +49,7 @@ class DeltaDynamics(TwinNode):
         base = BaseImu(settings_of_imu) if wanted else None
         # Other nodes find this one by its topics: compile before, as a first start takes many seconds.
         warm_up(robot, base=base is not None)
-        robot = changed(robot, declare_changes(self, robot))
+        robot = change_robot(robot, declare_changes(self, robot))
         settings = self.declare_settings(Settings)
         self.core = Feedforward(robot, settings, self._create_wrenches(settings), base)
         commands = self.declare("publish_commands", False, "publish ~/commands")
@@ -382,7 +382,7 @@ class DeltaDynamics(TwinNode):
     def _prepare(self, values: dict[str, Any]) -> tuple[Robot, Settings]:
         """Return the robot and the settings with new values of parameters."""
         core, own = self.core, {k: v for k, v in values.items() if k in CHANGES}
-        robot = changed(core.robot, own) if own else core.robot
+        robot = change_robot(core.robot, own) if own else core.robot
         return robot, with_parameters(core.settings, values)
 
     def _take(self, prepared: tuple[Robot, Settings]) -> None:

@@ -29,7 +29,9 @@ TOLERANCE: Final = 1e-7
 """Tolerance of forces and motions, relative to the largest."""
 
 
-def resisting(matrix: Array, motion: Array, low: Array, high: Array, states: States) -> tuple[Array, States]:
+def solve_resisting_forces(
+    matrix: Array, motion: Array, low: Array, high: Array, states: States
+) -> tuple[Array, States]:
     """Solve for forces that resist motions: a bounded linear complementarity problem.
 
     What is left of the motion, w = motion - matrix force, is zero where the force is between its
@@ -75,7 +77,7 @@ def resisting(matrix: Array, motion: Array, low: Array, high: Array, states: Sta
     raise ValueError("no forces resist this motion")
 
 
-def independent(rows: Array, inverse: Array) -> list[int]:
+def find_independent_rows(rows: Array, inverse: Array) -> list[int]:
     """Return the indices of the rows that do not depend on earlier ones, to a part of 1e-7.
 
     :param rows: shape (m, n).
@@ -183,24 +185,24 @@ class Resistance:
         if not self._laws:
             return here
         energy = np.sum(potential(self._laws, self._numbers, q))
-        energy += 0.5 * np.sum(self._level * self._distance * self._remembered(q).z ** 2)
-        bias, energy = here.bias + self._at_place(q), here.potential + float(energy)
+        energy += 0.5 * np.sum(self._level * self._distance * self._move_memory(q).z ** 2)
+        bias, energy = here.bias + self._position_friction(q), here.potential + float(energy)
         return here._replace(bias=bias, potential=energy)
 
-    def _remembered(self, q: Array) -> Memory:
+    def _move_memory(self, q: Array) -> Memory:
         """Return the friction memory after a straight motion to a position."""
         before = self.memory = self.memory or Memory.begun(q)
         return before.after(q[None], np.sign(q - before.q), self._distance).last
 
-    def passed(self, here: Terms) -> None:
+    def store_memory(self, here: Terms) -> None:
         """Store the friction memory at a part's end."""
         if self._level.any():
-            self.memory = self._remembered(here.q)
+            self.memory = self._move_memory(here.q)
 
-    def _at_place(self, q: Array) -> Array:
+    def _position_friction(self, q: Array) -> Array:
         """Return the drives' friction that does not depend on velocity, shape (n,)."""
         own = parts(self._laws, self._numbers, q, np.zeros_like(q))[0]
-        return np.asarray(own + self._level * self._remembered(q).z, np.float64)
+        return np.asarray(own + self._level * self._move_memory(q).z, np.float64)
 
     def _bounds(self, here: Terms, given: Array) -> tuple[Array, Array]:
         """Return the smallest and largest dry friction of all rows at a state, shape (n + k,).
@@ -211,11 +213,11 @@ class Resistance:
         if self._laws:
             n = len(given)
             _, dry, share = parts(self._laws, self._numbers, here.q, np.abs(here.qd))
-            held = given - self._at_place(here.q) - self._viscous * here.qd
+            held = given - self._position_friction(here.q) - self._viscous * here.qd
             low[:n], high[:n] = bounds(held, self._dry[:n] + dry, share)
         return low, high
 
-    def _pull(self, law: Law, here: Terms) -> Array:
+    def _dry_friction(self, law: Law, here: Terms) -> Array:
         """Return the dry friction of all rows at a state, (n + k,); unchanged for still rows."""
         if not self._laws:
             return law.pull
@@ -228,24 +230,24 @@ class Resistance:
         """Return the velocities of all rows by joint velocities, shape (n + k, n)."""
         return np.concatenate([self._drives, here.rows]) if self._passive else self._drives
 
-    def rates(self, here: Terms) -> Array:
+    def row_rates(self, here: Terms) -> Array:
         """Return the velocities of all rows, shape (n + k,)."""
         qd = here.qd
         return np.concatenate([qd, here.rows @ qd]) if self._passive else qd
 
     def arrive(self, q: Array, qd: Array) -> Terms:
         """Return the terms of a new state, after an impact if there is one."""
-        return self._struck(self._anew(self.at(q, qd)))
+        return self._apply_impact(self._classify_rows(self.at(q, qd)))
 
-    def _anew(self, here: Terms) -> Terms:
+    def _classify_rows(self, here: Terms) -> Terms:
         """Determine which rows move, and in which direction."""
-        rates = self.rates(here)
+        rates = self.row_rates(here)
         self._still = np.abs(rates) <= ZERO_VELOCITY * np.abs(self.rows(here) * here.qd).max(1)
         self._states = np.where(self._still, 0.0, np.sign(rates)).astype(np.int8)
         self._law = None
         return here
 
-    def _struck(self, here: Terms) -> Terms:
+    def _apply_impact(self, here: Terms) -> Terms:
         """Return the state after the impact of joints at their stops; the same without one."""
         q, qd = here.q, here.qd
         up, down = q >= self._high, q <= self._low
@@ -255,18 +257,18 @@ class Resistance:
         across = _inverse(here.mass)[:, j]
         low, high = np.where(down[j], -math.inf, 0.0), np.where(up[j], math.inf, 0.0)
         # Friction, which is bounded, does not hold against an impact.
-        impulse, states = resisting(across[j], qd[j], low, high, np.zeros(len(j), np.int8))
+        impulse, states = solve_resisting_forces(across[j], qd[j], low, high, np.zeros(len(j), np.int8))
         qd = qd - across @ impulse
         qd[j[states == 0]] = 0.0
         qd[up] = np.minimum(qd[up], 0.0)
         qd[down] = np.maximum(qd[down], 0.0)
-        return self._anew(self.at(q, qd))
+        return self._classify_rows(self.at(q, qd))
 
-    def law(self, here: Terms, effort: Array, wrench: Array | None) -> Law:
+    def find_law(self, here: Terms, effort: Array, wrench: Array | None) -> Law:
         """Return which rows are held from now on, under efforts (n,) and a wrench (6,) and more."""
         law = self._law
         if law is not None:
-            self._load(law, here, effort, wrench)
+            self._set_load(law, here, effort, wrench)
             # Forces of rows that depend on the held ones stay as they are, within their bounds.
             if not len(law.held) or ((law.low <= law.force) & (law.force <= law.high)).all():
                 return law
@@ -276,7 +278,7 @@ class Resistance:
         pull = np.zeros(len(self._dry))
         pull[slides] = self._dry[slides] * signs
         law = self._law = Law(pull, np.zeros(len(self._dry), bool), slides, signs)
-        self._load(law, here, effort, wrench)
+        self._set_load(law, here, effort, wrench)
         up = (here.q >= self._high) & (here.qd == 0.0)
         down = (here.q <= self._low) & (here.qd == 0.0)
         resists = still & self._rubs
@@ -285,14 +287,14 @@ class Resistance:
             low, high = self._bounds(here, law.given)
             high[:n][up] = math.inf
             low[:n][down] = -math.inf
-            self._hold(law, here, np.flatnonzero(resists), low, high)
-            self._load(law, here, effort, wrench)
+            self._find_held_rows(law, here, np.flatnonzero(resists), low, high)
+            self._set_load(law, here, effort, wrench)
         law.moves = np.flatnonzero(~law.still[:n])
         law.floor = np.minimum(self._low, here.q)[law.moves]
         law.ceiling = np.maximum(self._high, here.q)[law.moves]
         return law
 
-    def _hold(self, law: Law, here: Terms, z: Indices, low: Array, high: Array) -> None:
+    def _find_held_rows(self, law: Law, here: Terms, z: Indices, low: Array, high: Array) -> None:
         """Decide which of the still rows z are held.
 
         :param law: of all other rows.
@@ -304,14 +306,14 @@ class Resistance:
         if self._passive:
             motion = np.concatenate([motion, here.rows @ motion + here.drift])
         motion = motion[z]
-        force, states = resisting(rows @ inverse @ rows.T, motion, low[z], high[z], self._states[z])
+        force, states = solve_resisting_forces(rows @ inverse @ rows.T, motion, low[z], high[z], self._states[z])
         self._states[z] = states
         stays = np.flatnonzero(states == 0)
         # A row that depends on others does not hold: its force is constant, and it is still.
-        own = stays[independent(rows[stays], inverse)]
+        own = stays[find_independent_rows(rows[stays], inverse)]
         law.still[z[stays]] = True
         for i in np.flatnonzero(states):
-            law.still[z[i]] = len(independent(rows[[*own, i]], inverse)) == len(own)
+            law.still[z[i]] = len(find_independent_rows(rows[[*own, i]], inverse)) == len(own)
         force[own] = 0.0
         law.pull[z] = force
         slides = z[~law.still[z] & self._rubs[z]]
@@ -320,7 +322,7 @@ class Resistance:
         law.held = z[own]
         law.low, law.high = low[law.held], high[law.held]
 
-    def _load(self, law: Law, here: Terms, effort: Array, wrench: Array | None) -> None:
+    def _set_load(self, law: Law, here: Terms, effort: Array, wrench: Array | None) -> None:
         law.given, law.wrench = effort - self._offset, wrench
         law.effort = law.given - law.pull[: len(effort)]
         if self._laws and len(law.held):
@@ -332,7 +334,7 @@ class Resistance:
 
     def accelerate(self, law: Law, here: Terms) -> tuple[Array, Array]:
         """Return accelerations at a state, shape (n,), and the holding forces, shape (h,)."""
-        n, h, pull = len(law.effort), len(law.held), self._pull(law, here)
+        n, h, pull = len(law.effort), len(law.held), self._dry_friction(law, here)
         rest = (law.given - pull[:n] if self._laws else law.effort) - here.bias
         if law.wrench is not None:
             rest = rest + law.wrench @ here.twists
@@ -378,7 +380,7 @@ class Resistance:
         inner: Array = (here.rows.T * self._inner) @ here.rows
         return np.diag(self._viscous) + inner
 
-    def crawl(self, here: Terms, law: Law, span: float) -> Terms:
+    def step_implicitly(self, here: Terms, law: Law, span: float) -> Terms:
         """Integrate a part of a step by Moreau's implicit time stepping, of order one.
 
         For changes faster than can be resolved: friction so stiff that its transients have decayed.
@@ -398,7 +400,7 @@ class Resistance:
         rows = self.rows(here)[z]
         states = np.zeros(len(z), np.int8)
         if len(z):
-            force, states = resisting(rows @ inverse @ rows.T, rows @ rates, low[z], high[z], states)
+            force, states = solve_resisting_forces(rows @ inverse @ rows.T, rows @ rates, low[z], high[z], states)
             rates = rates - inverse @ (rows.T @ force)
             rates[z[(states == 0) & (z < n)]] = 0.0
         self._law = None
@@ -406,7 +408,7 @@ class Resistance:
         self._still[z] = states == 0
         self._states[z] = states
         low, high = np.minimum(self._low, here.q), np.maximum(self._high, here.q)
-        return self._struck(self.at(np.clip(here.q + span * rates, low, high), rates))
+        return self._apply_impact(self.at(np.clip(here.q + span * rates, low, high), rates))
 
     def lasting_part(self, here: Terms, end: Terms, law: Law) -> float:
         """Return the part of a span for which a law lasts, 1 for all of it.
@@ -444,7 +446,7 @@ class Resistance:
             qd = end.qd - across @ drift
             qd[law.held[law.held < len(qd)]] = 0.0
             end = end if (qd == end.qd).all() else self.at(end.q, qd)
-        return self._struck(end)
+        return self._apply_impact(end)
 
 
 def _inverse(matrix: Array) -> Array:

@@ -100,7 +100,7 @@ class MachineSettings:
     wrench: WrenchSignal = field(default_factory=WrenchSignal)
 
 
-def tuned(robot: Robot, bandwidth: float) -> tuple[Array, Array]:
+def tune_position_control(robot: Robot, bandwidth: float) -> tuple[Array, Array]:
     """Return stiffness and damping of a position control, by the masses at home, (n,) each.
 
     Drives that share the effort share the masses.
@@ -118,7 +118,7 @@ def stable_share(robot: Robot, settings: MachineSettings) -> float:
 
     Stable: in the discrete loop of the sampled control and the machine's masses, linear about rest,
     no error grows, at the start and in the pose where the loop is fastest, with every payload, and
-    with gains that are higher by :data:`MARGIN`. The bandwidth is that of :func:`tuned`:
+    with gains that are higher by :data:`MARGIN`. The bandwidth is that of :func:`tune_position_control`:
     stiffness goes by its square, damping by itself.
     """
     q = np.vstack([settings.start, random_joints(robot, np.random.default_rng(0), 64)])

@@ -68,7 +68,7 @@ class Plant:
         self._resistance = Resistance(robot.led, pushed, memory)
         self._here: Terms | None = None
 
-    def _all(self, here: Terms) -> tuple[Array, Array]:
+    def _all_drives(self, here: Terms) -> tuple[Array, Array]:
         """Return positions and velocities of all drives."""
         if not self.others:
             return here.q.copy(), here.qd.copy()
@@ -107,15 +107,15 @@ class Plant:
         for part in itertools.count():
             # Where changes accumulate, implicit parts get longer.
             least *= 4.0 if part > PARTS else 1.0
-            law, taken = self._resistance.law(here, effort, load), left
+            law, taken = self._resistance.find_law(here, effort, load), left
             if changes and not law.stands:
                 here, taken = self._cross(here, law, min(left, least))
                 changes, span = False, step
             elif not law.stands:
                 here, taken, changes = self._follow(here, law, min(left, span), least)
                 span = 2.0 * taken
-            self._resistance.passed(here)
-            self._here, (self.q, self.qd) = here, self._all(here)
+            self._resistance.store_memory(here)
+            self._here, (self.q, self.qd) = here, self._all_drives(here)
             left -= taken
             if left <= 0.0:
                 return
@@ -134,11 +134,11 @@ class Plant:
             with contextlib.suppress(PkmTwinError, ValueError):  # the law may change before
                 end, work = self._flow(here, law, span)
                 part = resistance.lasting_part(here, end, law)
-                growth = _growth(here, end, law, work)
-                if part == 1.0 and growth <= GROWTH * (here.kinetic + end.kinetic) + _rounding(here, end, law):
+                growth = _energy_growth(here, end, law, work)
+                if part == 1.0 and growth <= GROWTH * (here.kinetic + end.kinetic) + _energy_rounding(here, end, law):
                     settled = resistance.settle(end, law)
                     if settled is not end or growth > 0.0:
-                        settled = _lessened(here, settled, law, work)
+                        settled = _remove_growth(here, settled, law, work)
                     return settled, span, changes
             if span <= least:
                 return here, 0.0, True
@@ -149,10 +149,10 @@ class Plant:
         """Integrate at most ``span`` s implicitly, whatever sticks or slides; return state and time."""
         shortest = RESOLUTION * span
         while True:
-            end = self._resistance.crawl(here, law, span)
-            sound = _growth(here, end, law, 0.0) <= end.kinetic + _rounding(here, end, law)
+            end = self._resistance.step_implicitly(here, law, span)
+            sound = _energy_growth(here, end, law, 0.0) <= end.kinetic + _energy_rounding(here, end, law)
             if sound or span <= shortest:
-                return _lessened(here, end, law), span
+                return _remove_growth(here, end, law), span
             span *= 0.5
 
     def _flow(self, here: Terms, law: Law, span: float) -> tuple[Terms, float]:
@@ -171,7 +171,7 @@ class Plant:
         return end, span / 6.0 * (powers[0] + 2.0 * (powers[1] + powers[2]) + powers[3])
 
 
-def _growth(here: Terms, end: Terms, law: Law, work: float) -> float:
+def _energy_growth(here: Terms, end: Terms, law: Law, work: float) -> float:
     """Return the energy that the integration has added, J.
 
     :param work: of the wrench, J.
@@ -180,17 +180,17 @@ def _growth(here: Terms, end: Terms, law: Law, work: float) -> float:
     return end.kinetic - here.kinetic + (end.potential - here.potential) - done
 
 
-def _rounding(here: Terms, end: Terms, law: Law) -> float:
+def _energy_rounding(here: Terms, end: Terms, law: Law) -> float:
     """Bound the rounding error of the energy growth, J, including that of positions."""
     forces = np.abs(law.given) + np.abs(here.bias)
     size = here.kinetic + end.kinetic + abs(here.potential) + abs(end.potential)
     return ROUNDING * (size + float(forces @ np.abs(here.q)))
 
 
-def _lessened(here: Terms, end: Terms, law: Law, work: float = 0.0) -> Terms:
+def _remove_growth(here: Terms, end: Terms, law: Law, work: float = 0.0) -> Terms:
     """Return the end state without the energy that the integration has added."""
-    growth = _growth(here, end, law, work)
-    if growth <= 0.0 or growth <= _rounding(here, end, law):
+    growth = _energy_growth(here, end, law, work)
+    if growth <= 0.0 or growth <= _energy_rounding(here, end, law):
         return end
     # The change is so small that the other terms of the state are kept.
     left = max(0.0, 1.0 - growth / end.kinetic) if end.kinetic else 0.0

@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike
 
-from delta_dynamics.torques.virtual_work import Forces, add_friction_and_rotors, begun, efforts_of_motion
+from delta_dynamics.torques.virtual_work import Forces, add_friction_and_rotors, efforts_of_motion, solve_and_split
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.code import GOOD
 from pkm_twin.codegen.expressions import PARAMETERS, snapped_all
@@ -155,7 +155,7 @@ def _followed_pose_torques(t: Traced, scheme: None) -> Program:
     del scheme
     m = t.joints
     first, q = follow_pose(t)
-    layout, parts = begun(t)
+    layout, parts = solve_and_split(t)
     equations = t.equations(goal=t.lift(q), stage=len(first))
     rate, acceleration = (t.tape.inputs(name, m) for name in ("rate", "acceleration"))
     lu = pose_factors(t)

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from delta_dynamics.torques.virtual_work import Forces, begun, mass_entries, potential
+from delta_dynamics.torques.virtual_work import Forces, mass_entries, potential, solve_and_split
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
@@ -83,7 +83,7 @@ def motion_kernel(robot: Robot) -> Kernel:
 
 
 def _motion(t: Traced) -> Program:
-    layout, parts = begun(t)
+    layout, parts = solve_and_split(t)
     bodies, rods, gravity, *_, passive = parts
     n, graph, motion = t.joints, t.scheme.graph, t.motion
     qd = t.tape.inputs("qd", n)

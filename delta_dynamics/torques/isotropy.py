@@ -22,7 +22,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from delta_dynamics.torques.torque_terms import frictionless
+from delta_dynamics.torques.torque_terms import efforts_without_friction
 from delta_dynamics.torques.virtual_work import body_mass_matrix, mass_matrix
 from pkm_twin.codegen.arrays import Array, common_batch, doubles, finite, vectors
 from pkm_twin.errors import ParameterError, SingularityError
@@ -259,7 +259,7 @@ def max_driving_force(
     _inverse_root(robot, platform)
     rates = np.sqrt(2 * _energy(energy) / _form(platform, x))[..., None] * x
     motion = joint_motion(robot, pose, rates, acceleration)
-    forces = frictionless(robot, *motion)
+    forces = efforts_without_friction(robot, *motion)
     return np.asarray(np.abs(forces).max(-1), np.float64)
 
 
@@ -306,13 +306,13 @@ def _driving_forms(robot: Robot, pose: ArrayLike, energy: float, acceleration: A
     back = np.sqrt(2 * _energy(energy)) * _inverse_root(robot, platform)
     size = where.shape[-1]
     start = joint_motion(robot, where, np.zeros(size), acceleration)
-    constant = frictionless(robot, *start)
+    constant = efforts_without_friction(robot, *start)
     pairs = list(itertools.combinations(range(size), 2))
     units = np.eye(size)
     mixed = np.array([units[j] + units[k] for j, k in pairs]).reshape(-1, size)
     probes = np.einsum("...ij,kj->...ki", back, np.concatenate([units, mixed]))
     motion = joint_motion(robot, where[..., None, :], probes, np.zeros(size))
-    moved = frictionless(robot, *motion, weight=False)
+    moved = efforts_without_friction(robot, *motion, weight=False)
     forms = np.zeros((*constant.shape, size, size))
     for j in range(size):
         forms[..., j, j] = moved[..., j, :]

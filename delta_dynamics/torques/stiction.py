@@ -61,7 +61,7 @@ class LoadShare:
             self.share = friction_values(robot.laws, robot.friction)["load_dependent"]
             self.robot = robot.changed(friction={"load_dependent": (0.0 * self.share).tolist()})
 
-    def taken_out(self, q: Array, rates: Array, effort: Array) -> tuple[Array, Array]:
+    def remove(self, q: Array, rates: Array, effort: Array) -> tuple[Array, Array]:
         """Return efforts without this friction, and its bound for joints at rest, (n,) each.
 
         :param rates: zero at rest.
@@ -77,7 +77,7 @@ class LoadShare:
         return effort - share * np.abs(load) * way, holds
 
 
-def moving_rates(qd: Array, still: Mask, reach: Array) -> Array:
+def zero_resting_rates(qd: Array, still: Mask, reach: Array) -> Array:
     """Return rates (..., n), zero for joints at rest that have dry friction."""
     return np.where(still & (reach > 0.0), 0.0, qd)
 

@@ -40,7 +40,9 @@ class Terms:
         return own + self.payload + self.friction + self.external + self.preload
 
 
-def frictionless(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, *, weight: bool = True) -> Array:
+def efforts_without_friction(
+    robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, *, weight: bool = True
+) -> Array:
     """Compute the actuator efforts without friction of any joint, shape (..., n), N m or N.
 
     :param weight: False leaves gravity out, too.

@@ -333,7 +333,7 @@ def _inertia_matrix(ten: Objects) -> Objects:
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]], dtype=object)
 
 
-def begun(t: Traced) -> tuple[Layout, list[Objects]]:
+def solve_and_split(t: Traced) -> tuple[Layout, list[Objects]]:
     """Solve the closures; return the layout of the run-time inputs, and its parts."""
     t.solve()
     layout = Layout(t.tree)
@@ -417,7 +417,7 @@ def torque_program(t: Traced, *, on_bodies: bool = False, base: int = 0) -> Prog
     :param on_bodies: without friction and rotors of the drives.
     :param base: size of the input with the motion of the base.
     """
-    layout, parts = begun(t)
+    layout, parts = solve_and_split(t)
     moving = t.tape.inputs("base", base) if base else None
     leads, own = efforts_of_motion(t, parts, t.drives.given("qd"), t.drives.given("qdd"), moving)
     efforts = t.drives.shared(leads, preload=True)
@@ -428,7 +428,7 @@ def torque_program(t: Traced, *, on_bodies: bool = False, base: int = 0) -> Prog
 
 
 def _accelerations(t: Traced) -> Program:
-    layout, parts = begun(t)
+    layout, parts = solve_and_split(t)
     n = t.joints
     qd, tau = t.drives.given("qd"), t.tape.inputs("tau", t.drives.count)
     rest = np.array(t.drives.on_leads([*tau])) - efforts_of_motion(t, parts, qd, np.zeros(n))[0]
@@ -483,7 +483,7 @@ def mass_entries(t: Traced, parts: list[Objects], visit: Callable[[Forces], None
 
 
 def _masses(t: Traced) -> Program:
-    layout, parts = begun(t)
+    layout, parts = solve_and_split(t)
     rows: Any = np.reshape(mass_entries(t, parts), (t.joints, t.joints)).tolist()
     for _ in range(2):
         rows = [t.drives.shared(row) for row in zip(*rows, strict=True)]
@@ -504,7 +504,7 @@ def potential(t: Traced, bodies: Objects, rods: Objects, gravity: Objects) -> An
 
 
 def _energy(t: Traced) -> Program:
-    layout, (bodies, rods, gravity, *_, rotors, passive) = begun(t)
+    layout, (bodies, rods, gravity, *_, rotors, passive) = solve_and_split(t)
     qd = t.drives.given("qd")
     u = t.set_rates(qd)
     forces = Forces(t.motion)

@@ -19,7 +19,7 @@ from xml.sax.saxutils import escape
 import numpy as np
 import yaml
 
-from delta_dynamics.simulation.machine import tuned
+from delta_dynamics.simulation.machine import tune_position_control
 from pkm_twin.codegen.arrays import ROUNDING_NOISE, Array
 from pkm_twin.errors import check_limit
 from pkm_twin.export.c_package import c_package, identifier
@@ -180,7 +180,7 @@ def _write_drives(robot: Robot) -> str:
 def _damping(robot: Robot) -> Array:
     """Damping of the gravity controller in the controller's numbers, shape (n,)."""
     # Critical damping of a bandwidth f is 4 pi f times the mass.
-    _, damping = tuned(robot, 1.0 / (4.0 * np.pi * DAMPING_TIME))
+    _, damping = tune_position_control(robot, 1.0 / (4.0 * np.pi * DAMPING_TIME))
     # Digits that other arithmetic does not change.
     return np.array([float(f"{d:.6g}") for d in damping / robot.controller.factors**2])
 
@@ -225,7 +225,7 @@ def _controllers(robot: Robot, package: str, bandwidth: float) -> str:
     controller = robot.controller
     joints = list(controller.names)
     # Efforts of the controller's numbers per the controller's numbers.
-    gains = [values / controller.factors**2 for values in tuned(robot, bandwidth)]
+    gains = [values / controller.factors**2 for values in tune_position_control(robot, bandwidth)]
     own: dict[str, Any] = {
         "gains": {
             # Digits that other arithmetic does not change.

@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
 
-from delta_dynamics.torques.stiction import beyond_friction, friction_reach, moving_rates
+from delta_dynamics.torques.stiction import beyond_friction, friction_reach, zero_resting_rates
 from delta_dynamics.torques.virtual_work import inverse_dynamics, null_efforts
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import PkmTwinError
@@ -228,7 +228,7 @@ def _compared(r: Recording, bound: float) -> Compared | None:
         return None
 
     def efforts(track: Track, alike: Array) -> Array:
-        qd = moving_rates(track.qd, ~track.moves(how), reach)
+        qd = zero_resting_rates(track.qd, ~track.moves(how), reach)
         made = by_held(r, inverse_dynamics, track.time, track.q, qd, track.qdd, track.wrench)
         made = made + Dahl.remembered(robot.friction, track.q, qd)[0]
         return _each(alike, made)
@@ -245,7 +245,7 @@ def _compared(r: Recording, bound: float) -> Compared | None:
         slack = _each(np.abs(alike), np.where(track.moves(how), doubt, reach))
         left = beyond_friction(_each(alike, track.effort) - expected, slack > 0.0, slack)
         change = np.gradient(expected, period, axis=0)
-        qd = moving_rates(track.qd, ~track.moves(how), reach)
+        qd = zero_resting_rates(track.qd, ~track.moves(how), reach)
         rubs = np.concatenate([alike * part[:, None] for part in (qd, np.sign(qd))], -1)
         sharp.append({"expected": expected, "left": left, "change": change, "rubs": rubs})
     smooth = filtered(sharp, period, how)

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from delta_dynamics import dynamics_terms, inverse_dynamics, reactions, torque_deviation
-from delta_dynamics.torques.stiction import friction_reach, moving_rates
+from delta_dynamics.torques.stiction import friction_reach, zero_resting_rates
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, PkmTwinError, SingularityError, UnreachableError
 from pkm_twin.machine.friction import Dahl
@@ -125,7 +125,7 @@ def _friction_rates(m: Recording) -> Array:
     qd = m.motion[1]
     if m.still is None:
         return qd
-    rates = moving_rates(qd, m.still, friction_reach(m.robot))
+    rates = zero_resting_rates(qd, m.still, friction_reach(m.robot))
     # Redundant drives follow those at rest.
     rests = (rates != qd).any(1)
     rates[rests] = m.robot.project_redundant(m.q[rests], rates[rests])[1]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from delta_dynamics import energy, inverse_dynamics, mass_matrix
-from delta_dynamics.simulation.friction_contact import resisting
+from delta_dynamics.simulation.friction_contact import solve_resisting_forces
 from delta_dynamics.simulation.plant import Plant
 from delta_dynamics.torques.equations import Equations
 from pkm_twin.errors import PkmTwinError
@@ -196,7 +196,7 @@ def test_forces_of_friction_and_stops_obey_coulomb(n, rng):
             matrix[-1], motion[-1] = matrix[0], motion[0]
             matrix[:, -1] = matrix[:, 0]
             matrix[-1, -1] = matrix[0, 0]
-        force, states = resisting(matrix, motion, low, high, rng.integers(-1, 2, n))
+        force, states = solve_resisting_forces(matrix, motion, low, high, rng.integers(-1, 2, n))
         left = motion - matrix @ force
         size = 1e-6 * max(1.0, np.abs(motion).max() + np.abs(matrix @ np.minimum(dry, 1.0)).max())
         assert (force >= low - size).all() and (force <= high + size).all()

@@ -11,7 +11,7 @@ import pytest
 
 from delta_dynamics import inverse_dynamics
 from delta_dynamics.feedforward import Feedforward, Settings
-from delta_dynamics.torques.stiction import beyond_friction, friction_reach, moving_rates
+from delta_dynamics.torques.stiction import beyond_friction, friction_reach, zero_resting_rates
 from pkm_twin import Robot
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError
@@ -148,7 +148,7 @@ def test_the_reach_of_friction_is_the_files(name: str) -> None:
 
 def test_friction_at_rest_explains_its_reach_and_no_more() -> None:
     still, reach = np.array([True, True, False]), np.array([1.0, 0.0, 1.0])
-    np.testing.assert_array_equal(moving_rates(np.array([0.1, 0.1, 0.1]), still, reach), [0.0, 0.1, 0.1])
+    np.testing.assert_array_equal(zero_resting_rates(np.array([0.1, 0.1, 0.1]), still, reach), [0.0, 0.1, 0.1])
     left = beyond_friction(np.array([[0.5, 0.5, 0.5], [-3.0, -3.0, -3.0]]), still, reach)
     np.testing.assert_array_equal(left, [[0.0, 0.5, 0.5], [-2.0, -3.0, -3.0]])
 

@@ -25,7 +25,7 @@ from delta_dynamics import (
     torque_derivatives,
 )
 from delta_dynamics.feedforward import Feedforward, Settings
-from delta_dynamics.simulation.machine import MachineSettings, Simulation, tuned
+from delta_dynamics.simulation.machine import MachineSettings, Simulation, tune_position_control
 from delta_dynamics.simulation.plant import Plant
 from pkm_twin import load
 from pkm_twin.design import PosePath, design, drawn, tolerances
@@ -634,7 +634,7 @@ def test_a_plant_under_computed_efforts_follows_the_path(planar):
 
 def test_a_simulated_machine_follows_a_trajectory_with_all_drives(planar):
     n, free = 4, np.full(4, np.inf)
-    machine = Simulation(planar, MachineSettings(planar.graph.home, free, *tuned(planar, 8.0)), SECOND)
+    machine = Simulation(planar, MachineSettings(planar.graph.home, free, *tune_position_control(planar, 8.0)), SECOND)
     assert machine.stable_share == 1.0
     t = np.linspace(0.0, 0.4, 81)
     share, slope = 1 - np.cos(np.pi * t / 0.4), np.pi / 0.4

@@ -19,7 +19,7 @@ from delta_dynamics import inverse_dynamics
 from delta_dynamics.feedforward import Feedforward, Settings
 from delta_dynamics.gate import Gate, GateSettings
 from delta_dynamics.nodes.topics import GATE, SIMULATION, TWIN
-from delta_dynamics.simulation.machine import MachineSettings, Simulation, tuned
+from delta_dynamics.simulation.machine import MachineSettings, Simulation, tune_position_control
 from pkm_twin.errors import MessageError
 from pkm_twin.messages.reading import JointReader
 from pkm_twin.messages.stamps import StampRules
@@ -230,7 +230,7 @@ class TestGate:
 class TestSimulation:
     def machines(self, both):
         home = both.plain.inverse(both.plain.home())
-        stiffness, damping = tuned(both.plain, 5.0)
+        stiffness, damping = tune_position_control(both.plain, 5.0)
         settings = MachineSettings(home, effort_limits(both.plain), stiffness, damping)
         return [Simulation(robot, settings, SECOND) for robot in (both.plain, both.mapped)]
 

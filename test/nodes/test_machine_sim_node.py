@@ -18,7 +18,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from delta_dynamics import inverse_dynamics
 from delta_dynamics.nodes.simulation import LOOK
-from delta_dynamics.simulation.machine import MachineSettings, Simulation, WrenchSignal, tuned
+from delta_dynamics.simulation.machine import MachineSettings, Simulation, WrenchSignal, tune_position_control
 from pkm_twin.robot.variation import varied
 from test.nodes.harness import SECOND, counts_of, stamp_of
 from test.support.robots import load
@@ -84,7 +84,7 @@ def test_lockstep_gives_the_core_s_numbers(peer, machine):
         MachineSettings(
             HOME,
             robot.limits.effort,
-            *tuned(robot, 10.0),
+            *tune_position_control(robot, 10.0),
             resolution=np.full(3, 1e-5),
             deadline=10.0,
             wrench=WrenchSignal(np.array([1.0, 0.0, -2.0, 0.0, 0.0, 0.0])),

@@ -14,7 +14,7 @@ from delta_dynamics.simulation.machine import (
     Simulation,
     WrenchSignal,
     error_growth,
-    tuned,
+    tune_position_control,
 )
 from pkm_twin.errors import MessageError, ParameterError
 from pkm_twin.robot.variation import varied
@@ -29,7 +29,7 @@ BEGIN = 5 * SECOND
 
 
 def simulation(robot=ROBOT, **changes):
-    stiffness, damping = tuned(robot, 10.0)
+    stiffness, damping = tune_position_control(robot, 10.0)
     limits = ROBOT.limits.effort
     settings = MachineSettings(HOME, limits, stiffness, damping)
     return Simulation(robot, dataclasses.replace(settings, **changes), BEGIN)
@@ -140,7 +140,9 @@ def test_a_wrench_pushes_and_the_sensor_shows_it_in_the_platform_s_axes(make):
     q = head.inverse(head.home() + np.array([0.0, 0.1, -0.05]))
     rest = np.zeros(3)
     wrench = np.array([30.0, -20.0, -50.0, 1.0, 2.0, 0.5])
-    settings = MachineSettings(q, np.full(3, np.inf), *tuned(head, 10.0), wrench=WrenchSignal(0.5 * wrench))
+    settings = MachineSettings(
+        q, np.full(3, np.inf), *tune_position_control(head, 10.0), wrench=WrenchSignal(0.5 * wrench)
+    )
     machine = Simulation(head, settings, BEGIN)
     machine.push(make.wrench(0.5 * wrench, frame="base_link"), "base_link")
     balance = inverse_dynamics(head, q, rest, rest, wrench)
@@ -236,7 +238,7 @@ def home_of(robot):
 def controlled(robot, bandwidth, **changes):
     """A machine whose drives have no limits, under position control."""
     free = np.full(robot.joints_count, np.inf)
-    settings = MachineSettings(home_of(robot), free, *tuned(robot, bandwidth), **changes)
+    settings = MachineSettings(home_of(robot), free, *tune_position_control(robot, bandwidth), **changes)
     return Simulation(robot, settings, BEGIN)
 
 

@@ -43,7 +43,7 @@ from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from delta_dynamics import inverse_dynamics
-from delta_dynamics.simulation.machine import tuned
+from delta_dynamics.simulation.machine import tune_position_control
 from pkm_twin import Robot, load
 from pkm_twin.export.ros2_control import CONTROLLER, GRAVITY, TRAJECTORIES, package_name
 from pkm_twin.robot.effort_limits import effort_limits
@@ -219,7 +219,7 @@ class Chain:
     def compare_control(self, states: list[Any]) -> None:
         """Compare commands with feedforward plus PD within the limits, of the same updates."""
         robot, scale = self.robot, self.robot.controller.factors**2
-        p, d = (gains / scale for gains in tuned(robot, self.bandwidth))
+        p, d = (gains / scale for gains in tune_position_control(robot, self.bandwidth))
         limits = np.abs(robot.controller.controller_efforts(effort_limits(robot)))
         rows = [
             np.array([values(s) for s in states])
