@@ -334,8 +334,14 @@ def test_an_impact_is_the_least_change_that_all_stops_allow(name, machine, rng):
 
 
 @every_machine("delta_cu", "five_bar", "random elbow_motors")
-def test_stick_and_slip_at_the_default_step_is_that_of_small_steps(name, machine):
-    robot = machine(name)
+def test_stick_and_slip_at_the_default_step_is_that_of_small_steps(name, machine, monkeypatch):
+    robot, evaluations, at = machine(name), [], Equations.at
+
+    def counted(equations, *state):
+        evaluations[-1] += 1
+        return at(equations, *state)
+
+    monkeypatch.setattr(Equations, "at", counted)
     n = robot.joints_count
     q = robot.inverse(robot.home())
     weight = inverse_dynamics(smooth(robot), q, 0.0 * q, 0.0 * q)
@@ -350,12 +356,16 @@ def test_stick_and_slip_at_the_default_step_is_that_of_small_steps(name, machine
             effort = weight + 1.5 * dry * np.sin(turn * k * STEP + phase)
             for _ in range(parts):
                 before = plant.q
+                evaluations.append(0)
                 plant.advance(effort, NO_WRENCH, STEP / parts)
             stuck += int((plant.q == before).any())
         ends.append(plant.q)
     print(f"{name}: {np.abs(ends[0] - ends[1]).max():.1e}, moved {np.abs(ends[1] - q).max():.1e}")
     assert np.abs(ends[0] - ends[1]).max() < 1e-7
     assert np.abs(ends[1] - q).max() > 1e-5 and stuck
+    # A change takes about ten evaluations, and a step has up to three; without one it takes four.
+    print(f"{name}: evaluations of a step: mean {np.mean(evaluations):.1f}, worst {max(evaluations)}")
+    assert max(evaluations) < 60 and np.mean(evaluations) < 8
 
 
 @pytest.mark.parametrize("decay", [0.01, 0.3, 2.8, 50.0, 1e5])
