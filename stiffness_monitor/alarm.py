@@ -493,7 +493,6 @@ class StiffnessWatch(Core):
         return evaluate()
 
     def _pair_waiting(self) -> None:
-        """Pair the waiting deflections that have a wrench after them."""
         latest = self._answers.latest
         while self._waiting and latest is not None and self._waiting[0].stamp <= latest[0]:
             sample = self._waiting.pop(0)

@@ -151,7 +151,6 @@ class Frame:
         return range(self.size - count, self.size)
 
     def _point_on_body(self, body: str, end: int, at: Any) -> Node:
-        """Return the point of a body at a position."""
         if (body, end) not in self.nodes:
             raise ValueError(f"{body} is not connected to the base")
         node = self.nodes[body, end]
@@ -182,7 +181,6 @@ class Frame:
         return Node((*node.own, *own), np.hstack((node.map, turned(support.axes, lets))), at)
 
     def _add_member(self, member: Member) -> None:
-        """Add a member with its supports at both ends."""
         ends = []
         pairs = (member.inner, member.start), (member.outer, member.end)
         for k, (support, at) in enumerate(pairs):

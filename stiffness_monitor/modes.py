@@ -290,18 +290,13 @@ def modes(robot: Robot, pose: ArrayLike, count: int = 6, *, elements: int = ELEM
     """
     q = _solve_joints(robot, pose)
     batch = q.shape[:-1]
-    frequencies: list[Array] = []
-    positions: list[Array] = []
-    shapes: list[Array] = []
-    strain: list[Array] = []
-    kinetic: list[Array] = []
     if not np.prod(batch, dtype=int):
         raise ValueError("modes: no poses given")
+    poses = []
     for index in np.ndindex(*batch):
         system = frame_system(robot, q[index], elements)
-        values, vectors = solve_modes(system, count, index, vectors=True)
-        frequencies.append(values)
-        positions.append(system.positions)
+        frequencies, vectors = solve_modes(system, count, index, vectors=True)
+        shapes, strain, kinetic = [], [], []
         for vector in vectors.T:
             shape = system.displacements(vector)
             largest = np.unravel_index(np.argmax(np.abs(shape[:, :3])), (len(shape), 3))
@@ -309,20 +304,12 @@ def modes(robot: Robot, pose: ArrayLike, count: int = 6, *, elements: int = ELEM
             names, elastic, moving = system.energies(vector)
             strain.append(elastic / elastic.sum())
             kinetic.append(moving / moving.sum())
-
-    def stack(rows: list[Array], *shape: int) -> Array:
-        array = np.array(rows).reshape(*batch, *shape)
-        array.setflags(write=False)
-        return array
-
-    size = len(system.nodes)
-    return Modes(
-        stack(frequencies, count),
-        system.nodes,
-        stack(positions, size, 3),
-        stack(shapes, count, size, 6),
-        Energies(names, stack(strain, count, len(names)), stack(kinetic, count, len(names))),
-    )
+        poses.append((frequencies, system.positions, shapes, strain, kinetic))
+    tables = [np.array(rows).reshape(*batch, *np.shape(rows[0])) for rows in zip(*poses, strict=True)]
+    for table in tables:
+        table.setflags(write=False)
+    values, positions, displacements, strains, kinetics = tables
+    return Modes(values, system.nodes, positions, displacements, Energies(names, strains, kinetics))
 
 
 def has_modes(robot: Robot) -> bool:

@@ -419,5 +419,4 @@ class _Planner:
 
 
 def _is_nearer(at: Array, first: Array, second: Array) -> bool:
-    """Return whether a position is nearer to the first of two points."""
     return reference(size(at - first)) < reference(size(at - second))

@@ -158,7 +158,6 @@ class CommandGate(TwinNode):
             self._send(self.core.stop_command(steady))
 
     def _log_changes(self) -> None:
-        """Log each opening and closing of the gate."""
         stream = self.core.stream
         if stream.stopped is self._closed:
             return

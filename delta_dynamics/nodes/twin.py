@@ -212,7 +212,6 @@ class DeltaDynamics(TwinNode):
         return text
 
     def _create_action(self) -> Any:
-        """Create the action ``~/follow_joint_trajectory`` if a controller is named."""
         controller = self.declare(
             "controller_action",
             "",
@@ -251,7 +250,6 @@ class DeltaDynamics(TwinNode):
         return dict(zip(state.name, map(float, state.position), strict=True))
 
     def _create_wrenches(self, settings: Settings) -> WrenchWindow | None:
-        """Create the window of measured wrenches if ``use_wrench`` is set."""
         wanted = self.declare(
             "use_wrench", False, "include the measured wrench in torques and residual of joint states"
         )
@@ -282,7 +280,6 @@ class DeltaDynamics(TwinNode):
             wrenches.take(message, self.now())
 
     def _create_reaction_publishers(self, robot: Robot) -> dict[str, Any]:
-        """Create a publisher for each joint's reaction if ``publish_reactions`` is set."""
         wanted = self.declare("publish_reactions", False, "publish ~/reactions/*")
         rate = self.declare("reactions_rate", 50.0, "rate of ~/reactions/*", unit="Hz", low=1e-3, high=1e4)
         self._reactions_pace = Pace(rate)
@@ -380,7 +377,6 @@ class DeltaDynamics(TwinNode):
             self.core.stop(reason, text)
 
     def _prepare(self, values: dict[str, Any]) -> tuple[Robot, Settings]:
-        """Return the robot and the settings with new values of parameters."""
         core, own = self.core, {k: v for k, v in values.items() if k in CHANGES}
         robot = change_robot(core.robot, own) if own else core.robot
         return robot, with_parameters(core.settings, values)

@@ -69,7 +69,6 @@ class Plant:
         self._here: Terms | None = None
 
     def _all_drives(self, here: Terms) -> tuple[Array, Array]:
-        """Return positions and velocities of all drives."""
         if not self.others:
             return here.q.copy(), here.qd.copy()
         q, qd = self.q.copy(), np.zeros_like(self.q)

@@ -173,7 +173,6 @@ def _body_columns(motion: Array, n: int) -> Array:
 
 
 def _columns(robot: Robot) -> list[tuple[str, str]]:
-    """Return the names and units of the parameters."""
     graph, tree = robot.graph, robot.massive().tree
 
     def ten(owner: str) -> list[tuple[str, str]]:

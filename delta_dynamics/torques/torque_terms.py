@@ -55,7 +55,6 @@ def efforts_without_friction(
 
 
 def _set_zero(p: Array, part: slice | Indices) -> Array:
-    """Return inputs with some of them set to zero."""
     result = p.copy()
     result[part] = 0.0
     return result

@@ -208,7 +208,6 @@ class ParameterNode(LifecycleNode):
 
 
 def _as_float(given: Parameter, like: Any) -> Parameter:
-    """Convert a parameter of integers to floats if ``like`` has floats."""
     if isinstance(like, float) and given.type_ == Parameter.Type.INTEGER:
         return Parameter(given.name, value=float(given.value))
     many = not isinstance(like, str) and hasattr(like, "__len__")
