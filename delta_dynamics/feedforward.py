@@ -39,7 +39,7 @@ OnStop = Literal["nothing", "zeros", "gravity"]
 
 @dataclass(frozen=True)
 class Settings:
-    """How the node answers; the robot's own values are in the robot."""
+    """Settings of the node; values of the robot are in the robot."""
 
     differentiate: bool = setting(
         False,

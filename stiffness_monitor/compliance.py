@@ -55,7 +55,7 @@ class PlatformResponse:
 
 
 StrainEnergy = PlatformResponse
-"""What :func:`strain_energy` returns."""
+"""Result of :func:`strain_energy`."""
 
 
 def platform_response(robot: Robot, q: ArrayLike, wrench: ArrayLike) -> PlatformResponse:

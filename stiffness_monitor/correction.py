@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Where to push: joint offsets that cancel what a wrench does to the tool point."""
+"""Joint offsets that cancel the displacement of the tool point by a wrench."""
 
 from __future__ import annotations
 

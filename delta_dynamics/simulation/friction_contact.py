@@ -101,7 +101,7 @@ ZERO_VELOCITY: Final = 1e-12
 
 @dataclass(slots=True)
 class Law:
-    """Describe which rows slide (m) in which direction and which are held (h), until a change."""
+    """The rows that slide (m), their directions, and the rows that are held (h), until a change."""
 
     pull: Array
     """Constant dry friction of all rows, shape (n + k,)."""
@@ -109,7 +109,7 @@ class Law:
     """Rows that do not move, shape (n + k,)."""
     slides: Indices
     signs: Array
-    """Rows with dry friction that slide, and which way, shape (m,)."""
+    """Rows with dry friction that slide, and their directions, shape (m,)."""
     held: Indices = field(default_factory=lambda: np.zeros(0, np.intp))
     """Rows that hold the others still, drives first, shape (h,)."""
     low: Array = field(default_factory=lambda: np.zeros(0))
@@ -119,7 +119,7 @@ class Law:
     """Actuated joints that are not held."""
     floor: Array = field(default_factory=lambda: np.zeros(0))
     ceiling: Array = field(default_factory=lambda: np.zeros(0))
-    """How far they may go: to their stops; one that began beyond, no farther."""
+    """Bounds of their positions: the stops, or the position at the begin if it is beyond."""
 
     given: Array = field(default_factory=lambda: np.zeros(0))
     effort: Array = field(default_factory=lambda: np.zeros(0))
@@ -132,7 +132,7 @@ class Law:
 
     @property
     def stands(self) -> bool:
-        """Whether nothing moves."""
+        """True if all drives are held."""
         return len(self.held) == len(self.effort)
 
 

@@ -95,8 +95,8 @@ def minimax_direction(forms: Array) -> Array:
 
 
 _TURN: Final = np.linalg.qr([[1.0, 0.3, -0.4], [0.2, 0.9, 0.7], [-0.5, 0.6, 1.1]])[0]
-"""A rotation without meaning: planes of symmetry are then no lines u = constant, and no points
-that count lie at infinity."""
+"""An arbitrary rotation, so that planes of symmetry are no lines u = constant, and no minimum lies at
+infinity."""
 _LINES: Final = np.zeros((3, 2, 2))
 """y = (1, u, v) as polynomials: entry (i, j) of each is the coefficient of u^i v^j."""
 _LINES[0, 0, 0] = _LINES[1, 1, 0] = _LINES[2, 0, 1] = 1.0

@@ -101,7 +101,7 @@ class NodeSignals:
 
     def __init__(self) -> None:
         self.raises = False
-        """Whether the first signal raises KeyboardInterrupt, and a later one if that was lost."""
+        """True while the first signal raises KeyboardInterrupt, and a later one if that was lost."""
         self.came = False
         for number in _node_signals():
             signal.signal(number, self._take)

@@ -1,2 +1,2 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""What a stream of samples needs: differentiation, continuity, counting. Pure."""
+"""Differentiation, continuity, noise and counts of streams of samples. Pure: times are arguments."""

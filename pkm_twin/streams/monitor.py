@@ -194,8 +194,8 @@ class TopicStatistics:
 
 
 CAUGHT_UP: Final = 0.5
-"""A node has caught up below this fraction of the longest wait: on a busy computer every message
-waits for some milliseconds, and a smaller bound would drop all."""
+"""Fraction of the longest wait below which a node has caught up: on a busy computer every message
+waits for some milliseconds, so that a smaller bound would drop all."""
 RELIEF: Final = 1.0
 """Time without a dropped message that ends an overload, s."""
 
