@@ -18,7 +18,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MobilityError, ParameterError
 from pkm_twin.kinematics.linkage import Linkage
 from pkm_twin.kinematics.rounding import repair_few
-from pkm_twin.kinematics.spins import idle_bodies, null
+from pkm_twin.kinematics.spins import MIN_MOTION, idle_bodies, null
 from pkm_twin.machine.graph import Graph
 
 EXACT: Final = 1e-11
@@ -26,8 +26,6 @@ EXACT: Final = 1e-11
 EVERYWHERE: Final = "where all loops close in every position"
 MAX_CAUSES: Final = 5
 """Most causes that an error names."""
-_NONE: Final = 1e-6
-"""Motions of unit one below this count as zero."""
 
 
 class Deviation(NamedTuple):
@@ -59,22 +57,22 @@ def mobility_error(linkage: Linkage, causes: Sequence[Deviation] = ()) -> Mobili
     graph = linkage.graph
     # What moves although the actuated joints are held: bodies that turn alone, and the rest.
     motion, ju = linkage.regular_state()
-    free = null(ju, _NONE)
+    free = null(ju, MIN_MOTION)
     if free.shape[1]:
         spinning = [s for s in idle_bodies(graph, motion, free) if graph.platform not in s[0]]
         for bodies, _, _ in spinning:
             at = [j.name for j in graph.joints.values() if (j.inner in bodies) != (j.outer in bodies)]
             texts.append(f"{' with '.join(bodies)} can turn alone, at {' and '.join(at)}")
         ways = np.array([way for _, _, way in spinning]).reshape(-1, free.shape[1])
-        if names := _owners(linkage, free @ null(ways, _NONE)):
+        if names := _owners(linkage, free @ null(ways, MIN_MOTION)):
             texts.append(f"with the actuated joints held, {', '.join(names)} can move")
     # Actuated joints that cannot move, or only together.
     ju, jq = linkage.scaled_at_home()
-    moves = null(np.hstack([ju, jq]), _NONE)[ju.shape[1] :]
-    rank = int(np.linalg.matrix_rank(moves, _NONE)) if moves.size else 0
+    moves = null(np.hstack([ju, jq]), MIN_MOTION)[ju.shape[1] :]
+    rank = int(np.linalg.matrix_rank(moves, MIN_MOTION)) if moves.size else 0
     if rank < linkage.joints:
         sizes = np.linalg.norm(moves, axis=1) if moves.size else np.zeros(linkage.joints)
-        still = np.array(graph.leads)[sizes < _NONE].tolist()
+        still = np.array(graph.leads)[sizes < MIN_MOTION].tolist()
         tied = [name for name in graph.leads if name not in still]
         texts += [f"{', '.join(still)} cannot move"] if still else []
         texts += [f"{', '.join(tied)} have {rank} independent motions"] if len(tied) > rank else []
@@ -84,8 +82,8 @@ def mobility_error(linkage: Linkage, causes: Sequence[Deviation] = ()) -> Mobili
 def singular_home(linkage: Linkage, rank: int, beside: int) -> ParameterError:
     """Return the error of a singular home, with the joints that can move in it alone."""
     ju = linkage.regular_state()[1]
-    here = null(linkage.scaled_at_home()[0], _NONE)
-    there = null(ju, _NONE)
+    here = null(linkage.scaled_at_home()[0], MIN_MOTION)
+    there = null(ju, MIN_MOTION)
     # What is free at home and not beside it.
     extra = here - there @ (there.T @ here)
     names = _owners(linkage, extra) if here.shape[1] > there.shape[1] else list(linkage.graph.leads)
@@ -144,12 +142,12 @@ def is_right(graph: Graph | None, freedoms: int = 0) -> bool:
     if freedoms:
         return linkage.mobility.freedoms >= freedoms
     ju, _ = linkage.scaled_at_home()
-    return null(ju, _NONE).shape[1] == 0 and linkage.mobility.freedoms == linkage.joints
+    return null(ju, MIN_MOTION).shape[1] == 0 and linkage.mobility.freedoms == linkage.joints
 
 
 def _owners(linkage: Linkage, motions: Array) -> list[str]:
     """List the joints, and bodies that only rods hold, of motions (unknown rates, count)."""
-    parts = np.abs(motions).max(1, initial=0.0) > _NONE
+    parts = np.abs(motions).max(1, initial=0.0) > MIN_MOTION
     owners: Sequence[str] = linkage.tree.owners
     found = dict.fromkeys(o for o, part in zip(owners, parts, strict=True) if part)
     return [name.removeprefix("free body ") for name in found]

@@ -38,10 +38,9 @@ from pkm_twin.kinematics.programs import (
     walk_program,
 )
 from pkm_twin.kinematics.scheme import Scheme, Start
-from pkm_twin.kinematics.traced import Traced
+from pkm_twin.kinematics.traced import NO_NUMBERS, Traced
 from pkm_twin.machine.graph import Graph
 
-_NO_PARAMETERS: Final = np.zeros(0)
 MET: Final = 1e-9
 """Largest miss of a closure that holds, over the machine's size."""
 TO_THE_END: Final[Mapping[str, float]] = {"gain": math.inf, "tolerance": 0.0}
@@ -57,7 +56,7 @@ class Engine(Scheme):
 
     def _walk(self, pose: Array, state: Array, step: Array) -> list[Array]:
         """Return values of closures and pose equations, their derivatives, and the state after a step."""
-        return self.kernel("walk", walk_program)(_NO_PARAMETERS, state, pose, step)[0]
+        return self.kernel("walk", walk_program)(NO_NUMBERS, state, pose, step)[0]
 
     def _look(self, q: Array, x: Array) -> tuple[Array, Array]:
         """Return the closures and their derivatives by the unknowns, of unit one."""
@@ -157,7 +156,7 @@ class Engine(Scheme):
         """
         known = self._kernels.get(name)
         if known is None:
-            known = self.kernel_with(_NO_PARAMETERS, name, write, extra, free=free)
+            known = self.kernel_with(NO_NUMBERS, name, write, extra, free=free)
             self._kernels[name] = known
         return known
 

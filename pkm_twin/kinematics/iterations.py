@@ -18,10 +18,8 @@ S = TypeVar("S")
 RANK: Final = 1e-9
 """Part of a matrix's largest singular value below which one counts as zero."""
 MAX_ITERATIONS: Final = 12
-DAMPING: Final = 1e-6
-ROUNDING: Final = 1e-14
-"""Part of a matrix's largest entry below which its pivots are rounding."""
 MAX_STEP: Final = 0.2
+"""Largest damped step, rad or parts of the machine's size: derivatives hold about that far."""
 MAX_VALUE: Final = 1e-9
 """Largest value of an equation that holds."""
 
@@ -37,7 +35,8 @@ def solve_damped(table: Array, values: Array) -> Array:
         square = table.T @ table
     if not np.isfinite(square).all():
         return np.full(table.shape[1], np.nan)
-    square += max(DAMPING, ROUNDING * float(square.max())) * np.eye(table.shape[1])
+    # A damping below 1e-14 of the largest entry would be lost in its rounding.
+    square += max(1e-6, 1e-14 * float(square.max())) * np.eye(table.shape[1])
     step = np.asarray(np.linalg.solve(square, -table.T @ values), np.float64)
     return step * min(1.0, MAX_STEP / max(float(np.abs(step).max(initial=0.0)), 1e-300))
 

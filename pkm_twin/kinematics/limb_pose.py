@@ -49,15 +49,6 @@ class Limb:
     spin: str = ""
 
 
-def chain_to_base(tree: Tree, body: str) -> list[str]:
-    """Return a body and those between it and the ground."""
-    chain = []
-    while body != BASE:
-        chain.append(body)
-        body = tree.links[body].parent
-    return chain
-
-
 class LimbPose:
     """A limb solved for bodies at its ends that are placed, on numbers and expressions alike.
 
@@ -99,7 +90,7 @@ class LimbPose:
         top, last = tree.links[limb.turns[0]], tree.links[limb.turns[-1]]
         every = [step for body in limb.turns for step in tree.links[body].steps]
         steps = [step for step in every if step.turns]
-        beyond = [body for body in limb.bodies if top.body in chain_to_base(tree, body)]
+        beyond = [body for body in limb.bodies if top.body in tree.chain_to_base(body)]
         before = [body for body in limb.bodies if body not in beyond]
         after = beyond[len(limb.turns) :]
         lever = home = snapped_all(last.axes.T @ (at - last.at))

@@ -13,7 +13,7 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import Numbers, reference
-from pkm_twin.kinematics.limb_pose import Limb, LimbPose, chain_to_base, place_in_order
+from pkm_twin.kinematics.limb_pose import Limb, LimbPose, place_in_order
 from pkm_twin.kinematics.motion import Motion, Row, numbers
 from pkm_twin.machine.graph import BASE, Graph
 from pkm_twin.machine.tree import Link, Step, Tree
@@ -84,7 +84,7 @@ def find_hanging_limbs(scheme: Closures) -> tuple[Limb, ...]:
             root = _find_root(tree, tip)
             if root is None:
                 continue
-            bodies = tuple(body for body in tree.links if root in chain_to_base(tree, body))
+            bodies = tuple(body for body in tree.links if root in tree.chain_to_base(body))
             inside = set(bodies)
             alone = sum(bool(inside & set(pair)) for pair in ends) == 1
             driven = all(step.actuated for b in bodies if b != root for step in tree.links[b].steps)
@@ -101,7 +101,7 @@ def _find_root(tree: Tree, tip: str) -> str | None:
 
     Its centre rests: where drives carried it, Newton's method could step over a singularity.
     """
-    for body in chain_to_base(tree, tip):
+    for body in tree.chain_to_base(tip):
         steps = tree.links[body].steps
         if not all(step.actuated for step in steps):
             hangs = tree.links[body].parent == BASE and [s.circle for s in steps] == [True, True]
@@ -120,7 +120,7 @@ def _is_regular(scheme: Closures, limb: Limb) -> bool:
 def _solve_sample(scheme: Closures, limb: Limb, x: Numbers, q: Numbers) -> LimbPose:
     """Solve a limb of a sampled state, whose other bodies are placed."""
     tree, inner = scheme.tree, set(limb.bodies)
-    others = [body for body in tree.links if not inner.intersection(chain_to_base(tree, body))]
+    others = [body for body in tree.links if not inner.intersection(tree.chain_to_base(body))]
     motion = Motion(tree, x, q, others)
     given = np.array(x, dtype=object)
     for step in (s for body in limb.bodies for s in tree.links[body].steps if not s.actuated):
@@ -198,7 +198,7 @@ def _order_once(scheme: Closures, barred: Collection[Limb]) -> tuple[tuple[str |
     tree = scheme.tree
     order: list[str | Limb] = []
     placed, varying = {BASE}, set()
-    wanted = chain_to_base(tree, tree.graph.platform)[::-1]
+    wanted = tree.chain_to_base(tree.graph.platform)[::-1]
     wanted += [body for body in tree.links if body not in wanted]
     while len(placed) <= len(tree.links):
         ready = [b for b in wanted if b not in placed and tree.links[b].parent in placed]
@@ -231,7 +231,7 @@ def _find_candidates(scheme: Closures, placed: Collection[str]) -> Iterator[Limb
         rows = tuple(k for k in scheme.independent if scheme.parts[k] == part)
         for tip, beyond in ((cut.inner, cut.outer), (cut.outer, cut.inner)):
             low, high = (
-                [body for body in chain_to_base(tree, end)[::-1] if body not in placed] for end in (tip, beyond)
+                [body for body in tree.chain_to_base(end)[::-1] if body not in placed] for end in (tip, beyond)
             )
             links = [tree.links[body] for body in (*low, *high)]
             if any(scheme.holds(step) for link in links for step in link.steps):

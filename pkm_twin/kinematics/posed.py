@@ -23,7 +23,7 @@ from pkm_twin.codegen.lu import Order, independent_rows, pivot_order
 from pkm_twin.kinematics import pose as poses
 from pkm_twin.kinematics.diagnosis import mobility_error
 from pkm_twin.kinematics.iterations import newton
-from pkm_twin.kinematics.limb_pose import Limb, LimbPose, chain_to_base, place_in_order
+from pkm_twin.kinematics.limb_pose import Limb, LimbPose, place_in_order
 from pkm_twin.kinematics.limbs import order_closed
 from pkm_twin.kinematics.linkage import REACH
 from pkm_twin.kinematics.motion import Motion, numbers
@@ -314,7 +314,7 @@ class CarriedScheme(Scheme):
     @property
     def has_closed_limbs(self) -> bool:
         """Whether Newton's method has the coordinates of the platform alone."""
-        stem = chain_to_base(self.tree, self.graph.platform)
+        stem = self.tree.chain_to_base(self.graph.platform)
         opened = [entry for entry in self.order if not isinstance(entry, Limb)]
         passive = (b for b in opened if not all(s.actuated for s in self.tree.links[b].steps))
         return set(passive) <= set(stem)
@@ -334,7 +334,7 @@ class CarriedScheme(Scheme):
         rates = self.solved[1]
         inner = {
             step.rate
-            for body in chain_to_base(self.tree, self.graph.platform)
+            for body in self.tree.chain_to_base(self.graph.platform)
             for step in self.tree.links[body].steps
             if not step.actuated
         }

@@ -23,8 +23,8 @@ SPIN: Final = 0.05
 """A part whose centre of mass moves less than this share of the machine a radian only spins."""
 RANK: Final = 1e-8
 """Part of the greatest singular value below which one counts as zero."""
-_NONE: Final = 1e-6
-"""Part of a spin below which a joint has none in it."""
+MIN_MOTION: Final = 1e-6
+"""Least motion of unit one; below, a joint or body stands still."""
 
 
 def without_spins(graph: Graph) -> tuple[Graph, dict[str, float]]:
@@ -64,7 +64,7 @@ def without_spins(graph: Graph) -> tuple[Graph, dict[str, float]]:
         ]
         k = int(np.argmax(np.round(shares, 6)))
         name, axes, way, lost = owners[k], np.zeros((0, 3)), spins @ spins[k], spins[k]
-        if not shares[k] > _NONE:
+        if not shares[k] > MIN_MOTION:
             balls = (
                 (joint.name, np.array(across(axis)), spins @ way, way)
                 for bodies, axis, way in idle_bodies(graph, motion, spins)
@@ -81,7 +81,7 @@ def without_spins(graph: Graph) -> tuple[Graph, dict[str, float]]:
         for one in graph.bodies.values():
             rates = twist(motion, one.name, one.com) @ way
             turn = float(np.linalg.norm(rates[3:]))
-            if turn > _NONE:
+            if turn > MIN_MOTION:
                 held[name] = max(held[name], one.mass * float(np.linalg.norm(rates[:3])) / turn)
     return replace(graph, joints=joints), held
 
@@ -119,10 +119,10 @@ def idle_bodies(graph: Graph, motion: Motion, free: Array) -> list[tuple[list[st
     for names in groups.values():
         others = [rows for body, rows in moved.items() if body not in names]
         own = [body for body in names if body in moved]
-        alone = null(np.vstack(others), _NONE, absolute=True) if others else np.eye(free.shape[1])
+        alone = null(np.vstack(others), MIN_MOTION, absolute=True) if others else np.eye(free.shape[1])
         for way in alone.T if own else ():
             turning = moved[own[0]][3:] @ way
-            if float(np.linalg.norm(turning)) > _NONE:
+            if float(np.linalg.norm(turning)) > MIN_MOTION:
                 turned = np.asarray(motion.turned(own[0]), float)
                 found.append((own, unit(turned.T @ turning), way))
     return found
