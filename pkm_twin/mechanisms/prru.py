@@ -149,7 +149,7 @@ class Prru(TwinRobot):
         joints: dict[str, Joint] = {}
         origin = array([0.0, 0.0, height + rise])
         for i, limb in enumerate(LIMBS):
-            # Equations 2 and 3.
+            # Radial and tangential direction, equations 2 and 3.
             e = np.array([np.cos(g.azimuths[i]), np.sin(g.azimuths[i]), 0.0])
             t = np.cross(UP, e)
             foot = array(height * UP - g.base_radius * e)

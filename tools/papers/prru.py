@@ -37,7 +37,7 @@ def _equation(numbers: str, content: str, functions: tuple[str, ...], tests: tup
 
 EQUATIONS: Final = (
     _equation("1", "platform's pose by alpha, beta, gamma", (CHAIN,), GEOMETRY),
-    _equation("2-3", "lower link's frame at the slider joint", (PRRU + "_directions",), GEOMETRY),
+    _equation("2-3", "lower link's frame at the slider joint", (PRRU + "make_parts",), GEOMETRY),
     _equation(
         "4",
         "upper link's frame",
