@@ -217,15 +217,6 @@ class Resistance:
             low[:n], high[:n] = bounds(held, self._dry[:n] + dry, share)
         return low, high
 
-    def _dry_friction(self, law: Law, here: Terms) -> Array:
-        """Return the dry friction of all rows at a state, (n + k,); unchanged for still rows."""
-        if not self._laws:
-            return law.pull
-        low, high = self._bounds(here, law.given)
-        pull = law.pull.copy()
-        pull[law.slides] = np.where(law.signs > 0.0, high[law.slides], low[law.slides])
-        return pull
-
     def rows(self, here: Terms) -> Array:
         """Return the velocities of all rows by joint velocities, shape (n + k, n)."""
         return np.concatenate([self._drives, here.rows]) if self._passive else self._drives
@@ -287,40 +278,31 @@ class Resistance:
             low, high = self._bounds(here, law.given)
             high[:n][up] = math.inf
             low[:n][down] = -math.inf
-            self._find_held_rows(law, here, np.flatnonzero(resists), low, high)
+            # Forces that resist the motion of the still rows z, with friction of all others as it is.
+            z, inverse, motion = np.flatnonzero(resists), _inverse(here.mass), law.first
+            rows = self.rows(here)[z]
+            if self._passive:
+                motion = np.concatenate([motion, here.rows @ motion + here.drift])
+            force, states = solve_resisting_forces(rows @ inverse @ rows.T, motion[z], low[z], high[z], self._states[z])
+            self._states[z] = states
+            stays = np.flatnonzero(states == 0)
+            # A row that depends on others does not hold: its force is constant, and it is still.
+            own = stays[find_independent_rows(rows[stays], inverse)]
+            law.still[z[stays]] = True
+            for i in np.flatnonzero(states):
+                law.still[z[i]] = len(find_independent_rows(rows[[*own, i]], inverse)) == len(own)
+            force[own] = 0.0
+            law.pull[z] = force
+            begins = z[~law.still[z] & self._rubs[z]]
+            law.slides = np.concatenate([law.slides, begins])
+            law.signs = np.concatenate([law.signs, self._states[begins]])
+            law.held = z[own]
+            law.low, law.high = low[law.held], high[law.held]
             self._set_load(law, here, effort, wrench)
         law.moves = np.flatnonzero(~law.still[:n])
         law.floor = np.minimum(self._low, here.q)[law.moves]
         law.ceiling = np.maximum(self._high, here.q)[law.moves]
         return law
-
-    def _find_held_rows(self, law: Law, here: Terms, z: Indices, low: Array, high: Array) -> None:
-        """Decide which of the still rows z are held.
-
-        :param law: of all other rows.
-        :param low: bounds of all rows' forces, shape (n + k,).
-        """
-        rows = self.rows(here)[z]
-        inverse = _inverse(here.mass)
-        motion = law.first
-        if self._passive:
-            motion = np.concatenate([motion, here.rows @ motion + here.drift])
-        motion = motion[z]
-        force, states = solve_resisting_forces(rows @ inverse @ rows.T, motion, low[z], high[z], self._states[z])
-        self._states[z] = states
-        stays = np.flatnonzero(states == 0)
-        # A row that depends on others does not hold: its force is constant, and it is still.
-        own = stays[find_independent_rows(rows[stays], inverse)]
-        law.still[z[stays]] = True
-        for i in np.flatnonzero(states):
-            law.still[z[i]] = len(find_independent_rows(rows[[*own, i]], inverse)) == len(own)
-        force[own] = 0.0
-        law.pull[z] = force
-        slides = z[~law.still[z] & self._rubs[z]]
-        law.slides = np.concatenate([law.slides, slides])
-        law.signs = np.concatenate([law.signs, self._states[slides]])
-        law.held = z[own]
-        law.low, law.high = low[law.held], high[law.held]
 
     def _set_load(self, law: Law, here: Terms, effort: Array, wrench: Array | None) -> None:
         law.given, law.wrench = effort - self._offset, wrench
@@ -334,8 +316,13 @@ class Resistance:
 
     def accelerate(self, law: Law, here: Terms) -> tuple[Array, Array]:
         """Return accelerations at a state, shape (n,), and the holding forces, shape (h,)."""
-        n, h, pull = len(law.effort), len(law.held), self._dry_friction(law, here)
-        rest = (law.given - pull[:n] if self._laws else law.effort) - here.bias
+        n, h, effort = len(law.effort), len(law.held), law.effort
+        if self._laws:
+            low, high = self._bounds(here, law.given)
+            pull = law.pull.copy()
+            pull[law.slides] = np.where(law.signs > 0.0, high[law.slides], low[law.slides])
+            effort = law.given - pull[:n]
+        rest = effort - here.bias
         if law.wrench is not None:
             rest = rest + law.wrench @ here.twists
         if self._passive:
