@@ -29,7 +29,8 @@ def check_history(stream, events):
             accepted += not stopped
             assert stream.accept() is not stopped
         elif event == "resume":
-            assert bool(stream.resume()) is stopped
+            status = stream.status
+            assert stream.resume() == (status if stopped else "")
             stopped, bad, good = False, 0, 0
         else:
             good = 0
@@ -44,7 +45,11 @@ def check_history(stream, events):
                 stopped, since = True, []
                 stops.append(event)
             ask = stream.stop if event == "stop" else stream.reject
-            assert ask(event, text) is begins
+            reactions = []
+            with stream.reacting(lambda seen=reactions, at=number: seen.append(at)):
+                assert ask(event, text) is begins
+                assert not reactions
+            assert reactions == [number] * begins
         assert (stream.stopped, stream.accepted) == (stopped, accepted)
         assert stream.stops == Counter(stops)
         assert stream.counts("x", "taken") == {
