@@ -5,8 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator
 from dataclasses import dataclass, field
-from functools import partial
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Final, Literal, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
 
@@ -33,6 +32,9 @@ from pkm_twin.streams.monitor import Core, StreamMonitor, counting, finished
 from pkm_twin.streams.rates import RateAgreement
 from pkm_twin.streams.rest import VelocityErrorEstimator, gradient_gain, velocity_error_bound
 from pkm_twin.streams.wrench import STAMP_ORDER, check_order
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 OnStop = Literal["nothing", "zeros", "gravity"]
 
@@ -282,12 +284,12 @@ class Feedforward(Core):
                 yield
                 part = slice(first, first + SLICE)
                 q = t.q[part]
-                beyond = _evaluate_points(first, partial(first_beyond, actuated=False), robot, q)
+                beyond = _evaluate_points(first, first_beyond, robot, q, actuated=False)
                 if beyond is not None:
                     where = f"point {first + (beyond.index or 0)}: {beyond.joint}"
                     text = f"is {beyond.value:g} {beyond.unit}, allowed {beyond.low:g} to {beyond.high:g}"
                     raise MessageError("limit", f"{where} {text}")
-                measures: Array = _evaluate_points(first, robot.singularity, q)
+                measures = _evaluate_points(first, robot.singularity, q)
                 worst, stop = int(measures.argmin()), self.settings.singularity_stop
                 if not measures[worst] >= stop:
                     raise MessageError(
@@ -298,10 +300,10 @@ class Feedforward(Core):
                     )
                 self.near_singularities += int((measures < self.settings.singularity_warn).sum())
                 solved = _evaluate_points(first, inverse_dynamics, robot, q, qd[part], qdd[part])
-                efforts[part], beyond = limits.apply(
+                efforts[part], limited = limits.apply(
                     robot.controller.controller_efforts(solved), "zeros" if holding else settings.limit_policy
                 )
-                saturated |= beyond
+                saturated |= limited
             self.saturations += saturated
             # In the message's order, zero for joints that the model lacks.
             padded = np.hstack([efforts, np.zeros((len(efforts), 1))])
@@ -503,13 +505,13 @@ def warm_up(robot: Robot, *, base: bool = False) -> None:
         inverse_dynamics(robot, here, rest, rest, base=np.zeros(9) if base else None)
 
 
-def _evaluate_points(first: int, call: Callable[..., Any], *arguments: Any) -> Any:
+def _evaluate_points(first: int, call: Callable[P, R], *arguments: P.args, **options: P.kwargs) -> R:
     """Evaluate the model at a trajectory's points from ``first`` on; errors name the point.
 
     :raises MessageError: the model refuses.
     """
     try:
-        return as_message_error(call, *arguments)
+        return as_message_error(call, *arguments, **options)
     except MessageError as error:
         if first == 0:
             raise

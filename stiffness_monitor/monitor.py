@@ -92,7 +92,7 @@ class Monitor(TimeSynchronizer):
                 raise MessageError("no pose", text)
             pose, _, rotation = as_message_error(self.robot.placed, q)
             fixed = self._wrench_reader.at_reference(sample, mount, rotation)
-            energy: PlatformResponse = as_message_error(platform_response, self.robot, q, fixed)
+            energy = as_message_error(platform_response, self.robot, q, fixed)
             if not (np.isfinite(energy.compliance).all() and np.isfinite(energy.deflection).all()):
                 raise MessageError("non-finite result", "the model gave a value that is not finite")
             self.pace.answered(sample.stamp)

@@ -13,7 +13,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import le
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Final, Literal, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,9 @@ from pkm_twin.errors import MessageError, SingularityError, UnreachableError
 from pkm_twin.machine.joint_map import ControllerNumbers, JointMap
 from pkm_twin.messages.stamps import MAX_DURATION, SECOND, StampRules, stamp_of
 from pkm_twin.robot.robot import Robot
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 TINY: Final = sys.float_info.min
 """Smallest normal number: a smaller value that is not zero comes from damaged data."""
@@ -388,10 +391,10 @@ def shown(name: str) -> str:
     return repr(name if len(name) <= MAX_SHOWN else name[:MAX_SHOWN] + "...")
 
 
-def as_message_error(call: Callable[..., Any], *arguments: Any) -> Any:
+def as_message_error(call: Callable[P, R], *arguments: P.args, **options: P.kwargs) -> R:
     """Call the model; convert its errors to a MessageError of the message that caused them."""
     try:
-        return call(*arguments)
+        return call(*arguments, **options)
     except MessageError:
         raise
     except UnreachableError as error:
