@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import ArrayLike
 
-from delta_dynamics.torques.virtual_work import Forces, add_friction_and_rotors, efforts_of_motion, solve_and_split
+from delta_dynamics.torques.virtual_work import Forces, add_friction_and_rotors, efforts_of_motion
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.code import GOOD
 from pkm_twin.codegen.expressions import PARAMETERS, snapped_all
@@ -103,6 +103,16 @@ def unjudged_pose_torques(robot: Robot) -> Kernel:
     return robot.massive().posed_kernel("torques at accepted pose", write)
 
 
+def followed_pose_torques(robot: Robot) -> Kernel:
+    """Return the same program with the machine's own tree, which holds for other dimensions too.
+
+    Poses are accepted as by :attr:`.engine.Engine.followed_inverse`.
+    """
+    engine = robot.massive()
+    write = partial(_followed_pose_torques, scheme=None)
+    return engine.kernel("followed torques at pose", write, repr(engine.inverse_pivots))
+
+
 def _pose_torques(t: Traced, scheme: CarriedScheme, *, certified: bool) -> Program:
     posed, q = solve_pose(t, scheme)
     m = len(posed.q)
@@ -130,7 +140,8 @@ def _pose_torques(t: Traced, scheme: CarriedScheme, *, certified: bool) -> Progr
     jq = posed.jq[scheme.independent]
     on_pose = on_pose - jq.T @ posed.lu.solve_transposed(unknown[scheme.varying])
 
-    # F_d = -J^-T (J_M' Q_M + sum of J_Hij' Q_Hij) - Q_S (equation 41); needed forces are minus Q.
+    # F_d = -J^-T (J_M' Q_M + sum of J_Hij' Q_Hij) - Q_S with J = dq/dX (equations 24 and 41); needed forces
+    # are minus Q.
     steps = [posed.tree.steps[name] for name in t.graph.actuated]
     rates, changes = ([values[step.rate] for step in steps] for values in (posed.u, posed.du))
     drives = posed.rates_of_joints(t.graph.actuated)
@@ -154,9 +165,9 @@ def _followed_pose_torques(t: Traced, scheme: None) -> Program:
     """Write the program of a machine whose pose is followed with its own tree, as of a screw."""
     del scheme
     m = t.joints
-    first, q = follow_pose(t)
-    layout, parts = solve_and_split(t)
-    equations = t.equations(goal=t.lift(q), stage=len(first))
+    equations, q = follow_pose(t)
+    layout = Layout(t.tree)
+    parts = layout.split(t.tape.inputs(PARAMETERS, layout.size))
     rate, acceleration = (t.tape.inputs(name, m) for name in ("rate", "acceleration"))
     lu = pose_factors(t)
     qd = lu.solve(rate)
@@ -171,4 +182,4 @@ def _followed_pose_torques(t: Traced, scheme: None) -> Program:
         "tau": t.lift(t.drives.shared(efforts, preload=True)),
     }
     inputs = {"pose": m, "rate": m, "acceleration": m, "wrench": 6}
-    return Program(inputs, layout.size, outputs, first + equations)
+    return Program(inputs, layout.size, outputs, equations)

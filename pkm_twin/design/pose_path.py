@@ -1,9 +1,7 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Describe a path of the platform, and compute how machines with other numbers follow it.
 
-The pose p and its first and second derivatives in time stay the same. Joints follow:
-
-    q by the inverse,   J qd = p',   J qdd = p'' - J' qd      (J the pose's Jacobian)
+The pose p and its first and second derivatives in time stay the same; joints and efforts follow.
 
 A sum w . tau of efforts has a direct derivative by a number g of the file, less the part that
 keeps the pose: with P, V and A the pose, its rate and its acceleration as functions of q, qd, qdd
@@ -12,7 +10,7 @@ and g,
     d(w . tau)/dg = tau_g - a . A_g - v . V_g - p . P_g,
     J^T a = tau_qdd,   J^T v = tau_qd - A_qd^T a,   J^T p = tau_q - A_q^T a - V_q^T v
 
-(the adjoint of the implicit function theorem, three times).
+with J the pose's Jacobian (the adjoint of the implicit function theorem, three times).
 """
 
 from __future__ import annotations
@@ -108,9 +106,33 @@ class PathMotion:
         return np.broadcast_to(values, (len(self.many), *values.shape))
 
     @cached_property
+    def _motion(self) -> list[Array]:
+        """Joint positions, velocities, accelerations and efforts, shape (k, t, n) each."""
+        path = self.path
+        samples = path.pose, path.rate, path.acceleration, path.wrench
+        return self.many.run(programs.torques_at_pose, *map(self._for_machines, samples))[0]
+
+    @cached_property
     def q(self) -> Array:
         """Joint positions, shape (k, t, n)."""
+        if self.many.robot.has_masses:
+            return self._motion[0]
         return self.many.inverse(self._for_machines(self.path.pose))
+
+    @property
+    def qd(self) -> Array:
+        """Joint velocities, shape (k, t, n)."""
+        return self._motion[1]
+
+    @property
+    def qdd(self) -> Array:
+        """Joint accelerations, shape (k, t, n)."""
+        return self._motion[2]
+
+    @property
+    def efforts(self) -> Array:
+        """Efforts, shape (k, t, n), N m or N."""
+        return self._motion[3]
 
     @cached_property
     def jacobian(self) -> Array:
@@ -118,34 +140,6 @@ class PathMotion:
         found = self.many.jacobian(self.q)
         good = np.isfinite(found).all((-1, -2), keepdims=True)
         return np.where(good, found, np.eye(*found.shape[-2:]))
-
-    def _solve_jacobian(self, right: Array) -> Array:
-        """Return J^-1 times vectors (k, t, m); for redundant drives as ``inverse_jacobian``."""
-        robot = self.many.robot
-        if not robot.redundant:
-            return _solve(self.jacobian, right)
-        back = (self.jacobian / robot.effort_scale**2).swapaxes(-1, -2)
-        return np.asarray((back @ _solve(self.jacobian @ back, right)[..., None])[..., 0])
-
-    @cached_property
-    def qd(self) -> Array:
-        """Joint velocities, shape (k, t, n)."""
-        return np.where(np.isfinite(self.q), self._solve_jacobian(self._for_machines(self.path.rate)), np.nan)
-
-    @cached_property
-    def qdd(self) -> Array:
-        """Joint accelerations, shape (k, t, n)."""
-        own = np.zeros_like(self.qd)
-        if self.many.robot.redundant:
-            own = self.many.project_redundant(self.q, self.qd, own)[2]
-        bent = self.many.pose_acceleration(self.q, self.qd, own)
-        return own + self._solve_jacobian(self._for_machines(self.path.acceleration) - bent)
-
-    @cached_property
-    def efforts(self) -> Array:
-        """Efforts, shape (k, t, n), N m or N."""
-        load = self._for_machines(self.path.wrench)
-        return self.many.inverse_dynamics(self.q, self.qd, self.qdd, load)
 
     @cached_property
     def singularity(self) -> Array:

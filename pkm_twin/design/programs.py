@@ -9,6 +9,7 @@ from typing import Final, Protocol
 
 import numpy as np
 
+from delta_dynamics.torques.at_pose import followed_pose_torques
 from delta_dynamics.torques.derivatives import motion_gradient, numbers_gradient
 from delta_dynamics.torques.reactions import loads_kernel
 from delta_dynamics.torques.virtual_work import masses_kernel
@@ -102,6 +103,8 @@ singularity: Final = asks(lambda robot: robot.singularity_kernel())
 """From q to the singularity index."""
 torques: Final = asks(torques_kernel, of_masses)
 """From q, qd, qdd and wrench to efforts."""
+torques_at_pose: Final = asks(followed_pose_torques, of_masses)
+"""From pose, rate, acceleration and wrench to q, qd, qdd and efforts."""
 loads: Final = asks(loads_kernel, of_masses)
 """From q, qd, qdd and wrench to the joints' loads and positions."""
 masses: Final = asks(masses_kernel, of_masses)

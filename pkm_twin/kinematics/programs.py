@@ -150,13 +150,22 @@ def inverse_program(t: Traced, scheme: CarriedScheme | None) -> Program:
     """
     pose = t.tape.inputs("pose", len(t.scheme.coordinates))
     if scheme is None:
-        first, found = follow_pose(t)
-        q = list(found)
+        equations, leads = follow_pose(t)
+        q = t.tree.values_of_drives(leads, t.x)
     else:
         posed, q = solve_pose(t, scheme)
-        first = posed.equations()
         t = t.ahead
+        equations = posed.equations() + confirm_pose(t, [q[k] for k in t.drives.leading])
+    return Program({"pose": len(pose)}, 0, {"q": t.lift(q)}, equations)
+
+
+def confirm_pose(t: Traced, leads: Numbers) -> tuple[Equations, ...]:
+    """Return the closures of the leading joints as ``forward`` solves them, with its pose as verdict.
+
+    The joints of a pose may belong to another assembly too; such a pose is rejected.
+    """
     t.solve()
+    pose = t.tape.inputs("pose", len(t.scheme.coordinates))
     there = poses.values(t.scheme.coordinates, *t.motion.platform())
     same: list[Any] = []
     for c, scale, a, b in zip(t.scheme.coordinates, t.pose_scales, there, pose, strict=True):
@@ -166,10 +175,7 @@ def inverse_program(t: Traced, scheme: CarriedScheme | None) -> Program:
             same.append(cos(apart))
             apart = sin(apart)
         same.append(SAME_POSE - absolute(apart) * scale)
-    leads = q if scheme is None else [q[k] for k in t.drives.leading]
-    solved = t.equations(branch=t.lift(same), goal=t.lift(leads), stage=len(first))
-    values = t.tree.values_of_drives(q, t.x) if scheme is None else q
-    return Program({"pose": len(pose)}, 0, {"q": t.lift(values)}, first + solved)
+    return t.equations(branch=t.lift(same), goal=t.lift(leads), stage=1)
 
 
 def quick_inverse_program(t: Traced, scheme: CarriedScheme) -> Program:
@@ -200,9 +206,7 @@ def transmission_program(t: Traced, scheme: CarriedScheme | None, *, certified: 
     m = len(t.scheme.coordinates)
     rate = t.tape.inputs("rate", m) if curved else None
     if scheme is None:
-        first, leads = follow_pose(t)
-        t.solve()
-        equations = (*first, *t.equations(goal=t.lift(leads), stage=len(first)))
+        equations, leads = follow_pose(t)
         q = t.tree.values_of_drives(leads, t.x)
         lu = pose_factors(t)
         follow = np.array(t.rate_columns(), dtype=object).T
@@ -304,7 +308,10 @@ def certify_assembly(t: Traced, scheme: CarriedScheme, posed: Traced, q: Sequenc
 
 
 def follow_pose(t: Traced) -> tuple[tuple[Equations, ...], Objects]:
-    """Return Newton's method for all unknowns and leading joints of a pose, and these joints."""
+    """Solve the machine's own tree for a pose, and return the equations and the leading joints.
+
+    Newton's method finds all unknowns and joints; :func:`confirm_pose` judges them.
+    """
     scheme, tree, tape = t.scheme, t.tree, t.tape
     goal = tape.inputs("pose", len(scheme.coordinates))
     size, split = len(tree.home), tree.unknown_rates
@@ -342,4 +349,5 @@ def follow_pose(t: Traced) -> tuple[tuple[Equations, ...], Objects]:
         t.square([r.value for r in rows] + equations, [r.scale for r in rows] + t.pose_scales),
         unknowns=POSED,
     )
-    return (solved,), everything[size:]
+    leads = everything[size:]
+    return (solved, *confirm_pose(t, leads)), leads

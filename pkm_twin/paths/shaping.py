@@ -18,6 +18,7 @@ import numpy as np
 import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
 from numpy.typing import ArrayLike
 
+from delta_dynamics import inverse_dynamics_at_pose
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.paths.joint_path import check_positions, check_singularity, reference_velocity
@@ -30,16 +31,8 @@ HALF_PERIODS: Final = {"zv": 1, "zvd": 2}
 """Half vibration periods by which each shaper lengthens a stretch."""
 POSES_PER_STRETCH: Final = 16
 """Poses of a stretch at which the frequency is computed."""
-MAX_ITERATIONS: Final = 3
-"""Number of times the frequencies are computed: on the motion, then on the shaped one."""
 MIN_TIME_STEP: Final = 1e-9
 """Difference below which two times are the same, s."""
-CHECKED_TIMES: Final = 4001
-"""Times at which a shaped motion is compared with its limits."""
-ROUNDING: Final = 1e-9
-"""Excess of a limit, as a fraction, that is a rounding error."""
-MAX_SLOWDOWNS: Final = 8
-"""Largest number of times that a motion that exceeds a limit is slowed down."""
 
 
 @dataclass(frozen=True)
@@ -97,11 +90,10 @@ class ShapedPath(TimedPath):
 
     @cached_property
     def _sample_times(self) -> Array:
-        return np.linspace(0.0, self.duration, CHECKED_TIMES)
+        return np.linspace(0.0, self.duration, 4001)
 
     @cached_property
     def _peak_usage(self) -> Array:
-        """Greatest used part of each limit at all times, shape (4 n + 1,)."""
         assert self.phase is not None  # noqa: S101  shaped() gives it
         plain = np.concatenate([begin + run.times for begin, run in zip(self.begins, self.runs, strict=True)])
         # Each delayed copy jumps where the unshaped motion does, later.
@@ -131,9 +123,12 @@ class ShapedPath(TimedPath):
             pose += amplitude * own.pose
             rate += amplitude * own_rate * first[:, None]
             change += amplitude * (own_change * (first**2)[:, None] + own_rate * second[:, None])
-        q = robot.inverse(pose)
-        qd, qdd = joint_rates(robot, q, rate, change)
-        effort = self._efforts(t, q, qd, qdd)
+        if robot.has_masses:
+            found = inverse_dynamics_at_pose(self.carried[0].robot, pose, rate, change, self.wrench)
+            q, qd, qdd, effort = found.q, found.qd, found.qdd, found.tau
+        else:
+            q, effort = robot.inverse(pose), None
+            qd, qdd = joint_rates(robot, q, rate, change)
         speed = np.linalg.norm(reference_velocity(robot, q, qd), axis=1)
         return Samples(t, q, qd, qdd, effort, pose, speed, speed)
 
@@ -176,27 +171,28 @@ def shaped(
     weights *= float(np.exp(-np.pi * damping / root)) ** np.arange(len(weights))
     amplitudes = tuple((weights / weights.sum()).tolist())
 
-    def add_settling_rests(plain: TimedPath, phase: Phase) -> TimedPath:
-        """Add rests so that all delayed copies end before the next stretch begins."""
-        rests, end = [plain.rests[0]], 0.0
-        for run, rest in zip(plain.runs, plain.rests[1:], strict=True):
-            end += rests[-1] + run.duration
-            arrived = phase.earlier(np.array([end]), -HALF_PERIODS[shaper] * np.pi)[0]
-            rests.append(float(arrived[0]) - end + rest)
-        return replace(plain, rests=tuple(rests))
-
     def shape_path(plain: TimedPath) -> ShapedPath:
         looked, tails = plain, np.zeros(len(plain.runs))
-        for _ in range(MAX_ITERATIONS):
+        # Frequencies of the motion, then of the shaped one.
+        for _ in range(3):
             # The shaped motion passes its poses later, which changes the frequencies over time.
             spans = zip(looked.begins, looked.runs, tails, strict=True)
             times = np.concatenate(
                 [begin + np.linspace(0.0, run.duration + tail, POSES_PER_STRETCH) for begin, run, tail in spans]
             )
             times = times[np.diff(times, prepend=-1.0) > MIN_TIME_STEP]
-            rate = _damped_frequencies(looked, times, frequency, root)
+            undamped = np.asarray(frequency(looked.sample(times).pose), np.float64)
+            if not (np.isfinite(undamped).all() and (undamped > 0.0).all()):
+                raise ParameterError("frequency", undamped.tolist(), "finite numbers above 0, Hz")
+            rate = 2.0 * np.pi * root * undamped
             phase = Phase(times, rate)
-            base = add_settling_rests(plain, phase)
+            # All delayed copies end before the next stretch begins.
+            rests, end = [plain.rests[0]], 0.0
+            for run, rest in zip(plain.runs, plain.rests[1:], strict=True):
+                end += rests[-1] + run.duration
+                arrived = phase.earlier(np.array([end]), -HALF_PERIODS[shaper] * np.pi)[0]
+                rests.append(float(arrived[0]) - end + rest)
+            base = replace(plain, rests=tuple(rests))
             tails = np.array(base.rests[1:]) - plain.rests[1:]
             low, high = float(rate.min()), float(rate.max())
             looked = shaped_path = ShapedPath(
@@ -210,10 +206,10 @@ def shaped(
         return shaped_path
 
     plain = motion
-    for _ in range(MAX_SLOWDOWNS):
+    for _ in range(8):
         result = shape_path(plain)
         over = max(result.worst.values(), default=0.0)
-        if over <= 1.0 + ROUNDING:
+        if over <= 1.0 + 1e-9:
             fine = result.fine
             way = np.cumsum(fine.speed * np.diff(fine.time, prepend=0.0))
             check_positions(motion.robot, way, fine.q, 0.0)
@@ -221,11 +217,3 @@ def shaped(
             return result
         plain = replace(plain, runs=tuple(run.slower(over) for run in plain.runs))
     raise ParameterError("motion", f"{shaper} passes its limits", "wider limits, or no shaper")
-
-
-def _damped_frequencies(motion: TimedPath, times: Array, frequency: Callable[[Array], Array], root: float) -> Array:
-    """Return the damped angular frequency of the first mode along a motion, rad/s."""
-    found = np.asarray(frequency(motion.sample(times).pose), np.float64)
-    if not (np.isfinite(found).all() and (found > 0.0).all()):
-        raise ParameterError("frequency", found.tolist(), "finite numbers above 0, Hz")
-    return 2.0 * np.pi * root * found

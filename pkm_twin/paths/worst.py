@@ -9,33 +9,24 @@ from typing import Final
 
 import numpy as np
 
-from delta_dynamics import inverse_dynamics
+from delta_dynamics import inverse_dynamics, inverse_dynamics_at_pose
 from delta_dynamics.torques.isotropy import sphere_directions
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import ParameterError
-from pkm_twin.paths.joint_path import only_turns
-from pkm_twin.robot.derivatives import joint_changes
+from pkm_twin.paths.joint_path import Index, only_turns
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import causes, counts, try_inverse
 
 DEFAULT_RAYS: Final = 1000
 """Rays from home on which poses of the workspace are taken."""
-RAY_FRACTIONS: Final = (1.0, 0.8, 0.5)
-"""Fractions of a ray's length at which poses are taken."""
-BISECTIONS: Final = 14
-"""Bisection steps to a ray's end."""
 COARSE_DIRECTIONS: Final = 32
 """Directions of the tool point's speed at all poses."""
 FINE_DIRECTIONS: Final = 2000
 """Directions at each drive's worst poses."""
-REFINED_POSES: Final = 8
-"""Worst poses of each drive at which the fine directions are evaluated."""
 MIN_SINGULARITY_INDEX: Final = 0.05
 """Default smallest singularity index of a pose that counts."""
 MIN_LEVER: Final = 0.3
 """Default smallest lever of a drive at a pose that counts, over its largest."""
-DIFFERENCE_STEP: Final = 1e-4
-"""Joint step of a finite difference, rad or m."""
 
 
 @dataclass(frozen=True)
@@ -114,11 +105,11 @@ def _poses_on_rays(robot: Robot, rays: int, singularity: float, least: Array) ->
         why = causes(robot, q, home[None], known, singularity, -math.inf)
         raise ParameterError("workspace", f"home ({_named(robot, home)})", f"a home inside: {why}")
     low, high = np.zeros(len(span)), np.ones(len(span))
-    for _ in range(BISECTIONS):
+    for _ in range(14):
         middle = 0.5 * (low + high)
         good = _are_in_workspace(robot, home + middle[:, None] * span, singularity, least)
         low, high = np.where(good, middle, low), np.where(good, high, middle)
-    rows = [home + (part * low)[:, None] * span for part in RAY_FRACTIONS]
+    rows = [home + (part * low)[:, None] * span for part in (1.0, 0.8, 0.5)]
     found = np.concatenate([home[None], *rows])
     return np.asarray(found[_are_in_workspace(robot, found, singularity, least)], np.float64)
 
@@ -140,22 +131,15 @@ def _joint_rates(robot: Robot, q: Array) -> Array:
     if only_turns(robot):
         robot.check_independent("worst directions of a rotation")
         return np.asarray(np.linalg.inv(np.linalg.qr(_rotation_jacobian(robot, q))[1]), np.float64)
-    places = [i for i, name in enumerate(robot.pose_names) if name in ("x", "y", "z")]
-    return robot.inverse_jacobian(q)[..., places]
+    return robot.inverse_jacobian(q)[..., _position_columns(robot)]
+
+
+def _position_columns(robot: Robot) -> list[int]:
+    return [i for i, name in enumerate(robot.pose_names) if name in ("x", "y", "z")]
 
 
 def _rotation_jacobian(robot: Robot, q: Array) -> Array:
     return robot.platform_jacobian(q)[..., 3:, :]
-
-
-def _steady_accelerations(robot: Robot, q: Array, qd: Array) -> Array:
-    """Return joint accelerations at which the tool point (or rotation) keeps its velocity."""
-    if not only_turns(robot):
-        return joint_changes(robot, q, qd, robot.inverse_jacobian(q))
-    step = DIFFERENCE_STEP / np.maximum(np.abs(qd).max(-1, keepdims=True), DIFFERENCE_STEP)
-    ahead, behind = (_rotation_jacobian(robot, q + way * step * qd) for way in (1.0, -1.0))
-    own = (ahead - behind) @ qd[..., None] / (2.0 * step[..., None])
-    return np.asarray(-(np.linalg.pinv(_rotation_jacobian(robot, q)) @ own)[..., 0], np.float64)
 
 
 def worst_over_workspace(
@@ -185,10 +169,15 @@ def worst_over_workspace(
     k, n = q.shape
     zero = np.zeros_like(q)
     holding = np.abs(inverse_dynamics(robot, q, zero, zero))
-    greatest = _efforts_by_direction(robot, q, back, speed, acceleration, COARSE_DIRECTIONS).max(1)
+
+    def find_greatest(rows: Index | slice, directions: int) -> Array:
+        found = _efforts_by_direction(robot, poses[rows], q[rows], back[rows], speed, acceleration, directions)
+        return np.asarray(found.max(1), np.float64)
+
+    greatest = find_greatest(slice(None), COARSE_DIRECTIONS)
     for joint in range(n):
-        close = np.argsort(-greatest[:, joint])[:REFINED_POSES]
-        finer = _efforts_by_direction(robot, q[close], back[close], speed, acceleration, FINE_DIRECTIONS).max(1)
+        close = np.argsort(-greatest[:, joint])[:8]
+        finer = find_greatest(close, FINE_DIRECTIONS)
         greatest[close] = np.maximum(greatest[close], finer)
     rates = speed * np.linalg.norm(back, axis=-1)
 
@@ -199,31 +188,38 @@ def worst_over_workspace(
     return Worst(*pick(greatest), *pick(holding), *pick(rates), poses=k)
 
 
-def _efforts_by_direction(robot: Robot, q: Array, back: Array, speed: float, acceleration: float, count: int) -> Array:
+def _efforts_by_direction(
+    robot: Robot, poses: Array, q: Array, back: Array, speed: float, acceleration: float, count: int
+) -> Array:
     """Return the largest efforts by direction of the speed, (k, count + 1, n); the last is rest.
 
-    :param back: joint rates per velocity of the position, shape (k, n, size).
+    :param back: joint rates per velocity of the position, shape (k, n, size), at ``poses`` and q.
     """
-    k, n, size = back.shape
-    ways = _unit_vectors(size, count)
+    size = back.shape[-1]
+    if size == 1:
+        ways = np.array([[1.0], [-1.0]])
+    elif size == 2:
+        angle = 2 * np.pi * np.arange(count) / count
+        ways = np.stack([np.cos(angle), np.sin(angle)], -1)
+    else:
+        ways = sphere_directions(count)
     ways = np.concatenate([speed * ways, np.zeros((1, size))])
-    wide = (k, len(ways), n)
-    qd = np.einsum("knj,dj->kdn", back, ways).reshape(-1, n)
-    qs = np.broadcast_to(q[:, None], wide).reshape(-1, n)
-    base = inverse_dynamics(robot, qs, qd, _steady_accelerations(robot, qs, qd)).reshape(wide)
+    if only_turns(robot):
+        qd = np.einsum("knj,dj->kdn", back, ways)
+        qs = np.broadcast_to(q[:, None], qd.shape)
+        # Accelerations at which the rotation is steady, from differences of its Jacobian.
+        step = 1e-4 / np.maximum(np.abs(qd).max(-1, keepdims=True), 1e-4)
+        ahead, behind = (_rotation_jacobian(robot, qs + way * step * qd) for way in (1.0, -1.0))
+        own = (ahead - behind) @ qd[..., None] / (2.0 * step[..., None])
+        qdd = -(np.linalg.pinv(_rotation_jacobian(robot, qs)) @ own)[..., 0]
+        base = inverse_dynamics(robot, qs, qd, qdd)
+    else:
+        rates = np.zeros((len(ways), poses.shape[-1]))
+        rates[:, _position_columns(robot)] = ways
+        base = inverse_dynamics_at_pose(robot, poses[:, None], rates, np.zeros_like(poses[0])).tau
     still = np.zeros_like(q)
     held = inverse_dynamics(robot, q, still, still)
     # Efforts by an acceleration along each axis of the position.
     rows = [inverse_dynamics(robot, q, still, back[..., i]) - held for i in range(size)]
     swing = acceleration * np.linalg.norm(np.stack(rows, -1), axis=-1)
     return np.asarray(np.abs(base) + swing[:, None], np.float64)
-
-
-def _unit_vectors(size: int, count: int) -> Array:
-    """Return unit vectors of a position of ``size`` coordinates, shape (count, size)."""
-    if size == 1:
-        return np.array([[1.0], [-1.0]])
-    if size == 2:
-        angle = 2 * np.pi * np.arange(count) / count
-        return np.stack([np.cos(angle), np.sin(angle)], -1)
-    return np.asarray(sphere_directions(count), np.float64)

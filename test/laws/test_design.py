@@ -8,7 +8,7 @@ import copy
 import numpy as np
 import pytest
 
-from delta_dynamics import inverse_dynamics
+from delta_dynamics import inverse_dynamics, inverse_dynamics_at_pose
 from pkm_twin import variants
 from pkm_twin.design import PosePath, design, sweep
 from pkm_twin.design.pose_path import PathMotion
@@ -23,6 +23,7 @@ NUMBERS = {
     "delta_cu": ["geometry.arm_length", "geometry.base_radius"],
     "stewart": ["limbs.joints.foot_a.at[0]", "joints.ball_b_2.at[1]", "bodies.platform.mass"],
 }
+RRR4 = "examples/machines/rrr4_planar.yaml"
 BOX = {"geometry.arm_length": (0.1, 0.4), "geometry.forearm_length": (0.25, 0.7)}
 
 
@@ -40,6 +41,22 @@ def wave(name, samples=7):
         (time, q, qd, qdd),
         PosePath.of_joints(robot, time, q, qd, qdd, rng.normal(size=6)),
     )
+
+
+@pytest.mark.parametrize("name", partly_long(("prru", RRR4, "stewart"), "prru", RRR4))
+def test_machines_follow_a_path_as_each_of_them_at_its_poses(name, rng):
+    """Two programs: of many machines with their own tree, and of one by limbs."""
+    robot = load(name)
+    number = next(path for path in robot.file_numbers() if path.startswith(("geometry", "joints", "limbs")))
+    many = variants(robot, {number: robot.number(number) + 1e-3 * robot.graph.size * np.array([-1.0, 0.5])})
+    pose = robot.home() + 0.02 * rng.normal(size=(5, len(robot.pose_names)))
+    rate, change = rng.normal(size=(2, *pose.shape))
+    wrench = rng.normal(size=(5, 6))
+    f = PathMotion(many, PosePath(np.arange(5.0), pose, rate, change, wrench))
+    for k, machine in enumerate(many):
+        one = inverse_dynamics_at_pose(machine, pose, rate, change, wrench)
+        for found, given in ((f.q, one.q), (f.qd, one.qd), (f.qdd, one.qdd), (f.efforts, one.tau)):
+            np.testing.assert_allclose(found[k], given, rtol=0, atol=1e-11 * max(1.0, np.abs(given).max()))
 
 
 def pick_and_place():

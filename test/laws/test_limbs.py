@@ -123,6 +123,21 @@ def test_torques_of_a_motion_of_the_pose_are_those_of_its_joints(name, rng):
     np.testing.assert_array_equal(one.tau, found.tau[0])
 
 
+def test_a_machine_that_is_followed_has_no_torques_of_another_assembly(rng):
+    """As machines with screws are: its pose is found with its own tree, far from home too."""
+    robot = load("rps3").with_file_values({"joints.hinge_1.at[0]": load("rps3").number("joints.hinge_1.at[0]") + 1e-3})
+    vars(robot.engine)["posed"] = vars(robot.massive())["posed"] = None
+    far = np.where([unit == "m" for unit in robot.pose_units], 0.8 * robot.size, 1.2)
+    poses = robot.home() + rng.uniform(-1.0, 1.0, (300, 3)) * far
+    good = robot.try_inverse(poses)[1]
+    assert 0 < good.sum() < len(poses)
+    found = inverse_dynamics_at_pose(robot, poses[good], np.zeros(3), np.zeros(3))
+    np.testing.assert_allclose(robot.forward(found.q), poses[good], atol=1e-9)
+    for pose in poses[~good][:20]:
+        with pytest.raises(PkmTwinError):
+            inverse_dynamics_at_pose(robot, pose, np.zeros(3), np.zeros(3))
+
+
 def test_a_pose_that_is_not_reached_has_no_torques():
     robot = load("delta")
     pose, still = robot.home(), np.zeros(3)
