@@ -122,7 +122,7 @@ EQUATIONS: Final = (
     _equation(
         "40-41",
         "driving forces F_d",
-        ("delta_dynamics.inverse_dynamics", TORQUES + "driving_forces"),
+        ("delta_dynamics.inverse_dynamics", TORQUES + "driving_forces", "delta_dynamics.torques.at_pose._pose_torques"),
         FORCES,
     ),
     _equation(

@@ -54,6 +54,7 @@ SOLVED: Final = "stiffness_monitor.programs.SymbolicFrame."
 UPR_RPU: Final = "pkm_twin.mechanisms.upr_rpu.UprRpu."
 LIMBS: Final = "stiffness_monitor.limb_stiffness"
 RESPONSE: Final = "stiffness_monitor.platform_response"
+ENERGIES: Final = "stiffness_monitor.programs.write_response"
 CLOSED: Final = ("test/laws/test_stiffness.py::test_closed_form",)
 LIMB: Final = (TEST + "test_limb_stiffness_is_the_papers",)
 SHARES: Final = "map upr_rpu strain-energy --elements --regular --at=-0.6,0,0"
@@ -115,8 +116,8 @@ EQUATIONS: Final = (
     _equation((33, 34), "stiffness K", (SOLVED + "factorise", "stiffness_monitor.stiffness"), LIMB),
     _equation((35,), "compliance C", (SOLVED + "factorise", RESPONSE), CLOSED),
     _equation((36,), "amplitudes W_i", ("stiffness_monitor.limbs.LimbStiffness.amplitudes",), LIMB),
-    _equation((37,), "total strain energy U", (RESPONSE,), CLOSED),
-    _equation((38,), "local strain-energy factors", (RESPONSE,), CLOSED),
+    _equation((37,), "total strain energy U", (RESPONSE, ENERGIES), CLOSED),
+    _equation((38,), "local strain-energy factors", (RESPONSE, ENERGIES), CLOSED),
     _equation(
         (39,),
         "global strain-energy factors",
