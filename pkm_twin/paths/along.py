@@ -27,8 +27,6 @@ SAMPLES_PER_BLOCK: Final = 4096
 BEYOND_LIMITS: Final = "beyond_limits"
 EFFORT_TOLERANCE: Final = 1e-6
 """Largest relative difference of two computations of the same efforts."""
-SAME_NUMBERS: Final = 1e-3
-"""The same, of one robot, whose files have nine digits or more: beyond rounding, below any term."""
 MAX_EFFORT_DIFFERENCE: Final = 0.05
 """RMS difference between a file's efforts and the model's, over the model's RMS, above which it is
 reported."""
@@ -82,7 +80,7 @@ def check_computed(motion: Recording) -> Recording:
     origin, away = motion.origin, relative_difference(motion.computed, model_efforts(motion))
     other = "" if origin is None else origin.differs_from(motion.robot)
     worst = int(away.argmax())
-    if away[worst] <= (MAX_EFFORT_DIFFERENCE if origin is None or other else SAME_NUMBERS):
+    if away[worst] <= (MAX_EFFORT_DIFFERENCE if origin is None or other else 1e-3):
         return motion
     if other:
         return replace(motion, notes=(*motion.notes, other))

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from delta_dynamics import inverse_dynamics
 from pkm_twin.codegen.arrays import Array, doubles
 from pkm_twin.errors import ParameterError
-from pkm_twin.paths.geometry import MIN_DISTANCE, Path, Stretch
+from pkm_twin.paths.geometry import MIN_DISTANCE, Path
 from pkm_twin.paths.pieces import SubPiece
 from pkm_twin.recordings.payload import Load
 from pkm_twin.robot.robot import Robot
@@ -65,24 +65,20 @@ def split_at_payloads(
     for mark, mass in zip(path.marks[1:], masses[1:], strict=True):
         if mass == result[-1].mass:
             continue
-        piece = 0
+        k = 0
         if mark.stretch >= 0:
-            stretches[mark.stretch], piece = _split_piece(stretches[mark.stretch], mark.way)
-        result.append(PayloadChange(robots[mass], mass, mark.stretch, piece, mark.rest))
+            # The piece that begins with the payload; one that the change lies within is split.
+            pieces, way = list(stretches[mark.stretch].pieces), mark.way
+            while k < len(pieces) and way >= pieces[k].length - MIN_DISTANCE and way > MIN_DISTANCE:
+                way -= pieces[k].length
+                k += 1
+            if k < len(pieces) and way > MIN_DISTANCE:
+                whole = pieces[k]
+                pieces[k : k + 1] = SubPiece(whole, 0.0, way), SubPiece(whole, way, whole.length)
+                stretches[mark.stretch] = replace(stretches[mark.stretch], pieces=tuple(pieces))
+                k += 1
+        result.append(PayloadChange(robots[mass], mass, mark.stretch, k, mark.rest))
     return replace(path, stretches=tuple(stretches)), tuple(result)
-
-
-def _split_piece(stretch: Stretch, way: float) -> tuple[Stretch, int]:
-    """Split a stretch so that a piece begins at ``way``; return it and the piece's number."""
-    for k, piece in enumerate(stretch.pieces):
-        if way <= MIN_DISTANCE:
-            return stretch, k
-        if way < piece.length - MIN_DISTANCE:
-            parts = SubPiece(piece, 0.0, way), SubPiece(piece, way, piece.length)
-            pieces = (*stretch.pieces[:k], *parts, *stretch.pieces[k + 1 :])
-            return replace(stretch, pieces=pieces), k + 1
-        way -= piece.length
-    return stretch, len(stretch.pieces)
 
 
 def loaded_robots(carried: Sequence[PayloadChange], stretch: int, pieces: int) -> tuple[Robot, ...]:

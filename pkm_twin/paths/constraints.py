@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, check_limit
-from pkm_twin.paths.joint_path import Index, JointPath, describe_place
+from pkm_twin.paths.joint_path import Index, JointPath
 from pkm_twin.robot.robot import Robot
 
 MIN_RATE_FRACTION: Final = 1e-12
@@ -187,46 +187,30 @@ class Rows:
     @classmethod
     def of(cls, part: JointPath, forces: Forces | None, limits: Limits) -> Rows:
         """Return the rows of a stretch's points."""
-        p = len(part.s)
-        alpha, beta, drag, fixed, dry = ([np.zeros((p, 0))] for _ in range(5))
-        used = np.isfinite(limits.effort)
-        if forces is not None and used.any():
-            scale = 1.0 / limits.effort[used]
-            alpha.append(forces.a[:, used] * scale)
-            beta.append(forces.b[:, used] * scale)
-            drag.append(forces.w[:, used] * scale)
-            fixed.append(forces.g[:, used] * scale)
-            dry.append(forces.k[:, used] * scale)
-        used = np.isfinite(limits.acceleration)
-        if used.any():
-            scale = 1.0 / limits.acceleration[used]
-            alpha.append(part.first[:, used] * scale)
-            beta.append(part.second[:, used] * scale)
-            drag.append(np.zeros((p, int(used.sum()))))
-            fixed.append(drag[-1])
-            dry.append(drag[-1])
-        a, b, w, g, k = (np.concatenate(rows, 1) for rows in (alpha, beta, drag, fixed, dry))
-        most = _velocity_bound(part, limits)
-        return cls(a, b, w, g, k, np.minimum(most, _unreachable_bound(part, a, most)))
-
-
-def _unreachable_bound(part: JointPath, alpha: Array, most: Array) -> float:
-    """Return an x that no motion reaches: ten times that of constant full acceleration."""
-    size = np.abs(alpha).max(1, initial=0.0)
-    pushed = size > MIN_RATE_FRACTION * size.max()
-    if not pushed.any():
-        return float(most[np.isfinite(most)].max())
-    return float(10.0 * 2.0 * part.s[-1] * (2.0 / size[pushed]).max())
-
-
-def _velocity_bound(part: JointPath, limits: Limits) -> Array:
-    """Return the largest x by joint velocities and the tool's speed, shape (p,)."""
-    rates = np.abs(part.first)
-    least = MIN_RATE_FRACTION * max(float(rates.max()), 1e-300)
-    with np.errstate(divide="ignore"):
-        fastest = np.where(rates > least, limits.velocity / np.maximum(rates, least), np.inf)
-        tool = limits.speed / np.maximum(part.felt, 1e-300)
-    return np.asarray(np.minimum(fastest.min(1), tool) ** 2, np.float64)
+        zero = np.zeros_like(part.first)
+        tables = [(limits.acceleration, (part.first, part.second, zero, zero, zero))]
+        if forces is not None:
+            tables.insert(0, (limits.effort, (forces.a, forces.b, forces.w, forces.g, forces.k)))
+        columns = []
+        for bound, values in tables:
+            used = np.isfinite(bound)
+            columns.append([value[:, used] * (1.0 / bound[used]) for value in values])
+        a, b, w, g, k = (np.concatenate(rows, 1) for rows in zip(*columns, strict=True))
+        # Bounds by joint velocities and the tool's speed.
+        rates = np.abs(part.first)
+        least = MIN_RATE_FRACTION * max(float(rates.max()), 1e-300)
+        with np.errstate(divide="ignore"):
+            fastest = np.where(rates > least, limits.velocity / np.maximum(rates, least), np.inf)
+            tool = limits.speed / np.maximum(part.felt, 1e-300)
+        most = np.minimum(fastest.min(1), tool) ** 2
+        # An x that no motion reaches: ten times that of constant full acceleration.
+        size = np.abs(a).max(1, initial=0.0)
+        pushed = size > MIN_RATE_FRACTION * size.max()
+        if pushed.any():
+            beyond = float(10.0 * 2.0 * part.s[-1] * (2.0 / size[pushed]).max())
+        else:
+            beyond = float(most[np.isfinite(most)].max())
+        return cls(a, b, w, g, k, np.minimum(most, beyond))
 
 
 def limit_names(robot: Robot) -> list[str]:
@@ -238,34 +222,10 @@ def limit_names(robot: Robot) -> list[str]:
 
 def limit_usage(limits: Limits, effort: Array | None, qd: Array, qdd: Array, qddd: Array, speed: Array) -> Array:
     """Return the signed used fraction of each limit, (k, 4 n + 1), 1 at the limit, 0 without."""
-    zero = np.zeros_like(qd)
-    parts = [
-        values / bound
-        for values, bound in (
-            (zero if effort is None else effort, limits.effort),
-            (qd, limits.velocity),
-            (qdd, limits.acceleration),
-            (qddd, limits.jerk),
-        )
-    ]
-    return np.concatenate([*parts, (np.asarray(speed) / limits.speed)[:, None]], 1)
-
-
-def check_rest(part: JointPath, rows: Rows, limits: Limits) -> None:
-    """Reject a path on which the drives cannot hold the machine at rest.
-
-    :raises ParameterError: names the position and the joint.
-    """
-    size = np.abs(rows.fixed + rows.dry)
-    if not size.size or (size < 1.0).all():
-        return
-    row, column = np.unravel_index(int(size.argmax()), size.shape)
-    robot = part.curve.robot
-    where = describe_place(robot, part.q[row], part.curve.begin + float(part.s[row]))
-    bounded = np.flatnonzero(np.isfinite(limits.effort))
-    name = robot.joint_names[bounded[column]]
-    raise ParameterError(
-        f"path: effort of {name} at rest {where}",
-        f"{100 * float(size[row, column]):.4g} % of its limit",
-        "less than 100 %: the drive cannot hold the machine there",
+    parts = (
+        (np.zeros_like(qd) if effort is None else effort) / limits.effort,
+        qd / limits.velocity,
+        qdd / limits.acceleration,
+        qddd / limits.jerk,
     )
+    return np.concatenate([*parts, (np.asarray(speed) / limits.speed)[:, None]], 1)

@@ -16,10 +16,10 @@ from numpy.typing import ArrayLike
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.paths.carrying import split_at_payloads
-from pkm_twin.paths.constraints import Forces, Limits, Rows, check_rest
+from pkm_twin.paths.constraints import Forces, Limits, Rows
 from pkm_twin.paths.geometry import Path, through
 from pkm_twin.paths.jerk import MAX_PROGRAMS, smooth_profile, smooth_run
-from pkm_twin.paths.joint_path import JointPath, Slowdown, joint_paths
+from pkm_twin.paths.joint_path import JointPath, Slowdown, describe_place, joint_paths
 from pkm_twin.paths.motion import Run, TimedPath, needs_forces, run_peaks, sample_run
 from pkm_twin.paths.profile import fastest_profile
 from pkm_twin.robot.robot import Robot
@@ -61,8 +61,6 @@ def s_curve(cruise: float, smooth: float) -> Law:
     return Law(np.concatenate([[0.0], np.cumsum(steps)]), np.array(rows).T)
 
 
-MIN_DURATION: Final = 1e-6
-"""Duration of a stretch that no limit bounds, s."""
 LAWS: Final[Mapping[str, Sequence[Law]]] = {
     "quintic": (QUINTIC,),
     "s-curve": tuple(
@@ -104,13 +102,11 @@ def run_by_law(part: JointPath, law: Law, limits: Limits, wrench: Array | None) 
             hits = (sign * linear) ** 2 + 4.0 * sign * square * rest >= 0.0
             slowest = np.where(hits, (sign * linear + root) / (2.0 * rest), 0.0)
             duration = max(duration, float(slowest.max()))
-    return run.slower(max(duration, MIN_DURATION))
+    return run.slower(max(duration, 1e-6))
 
 
 DEFAULT_POINTS: Final = 1000
 """Default number of points of a path."""
-MAX_JERK_POINTS: Final = 400
-"""Largest number of points with jerk limits, where each is a variable of linear programs."""
 MIN_SINGULARITY_INDEX: Final = 0.01
 """Default smallest singularity index of a path: the nodes' ``singularity_stop``."""
 LIMIT_RESERVE: Final = 1e-4
@@ -132,10 +128,6 @@ MAX_PARTS: Final = 8
 """Largest number of parts into which an interval is divided at a time."""
 MAX_JERK_REFINEMENTS: Final = 4
 """Largest number of times that intervals are divided with jerk limits."""
-MAX_SPEED_RATIO: Final = 2.0
-"""Ratio of squared speeds at an interval's ends above which it is divided with jerk limits."""
-UNDIVIDED_ENDS: Final = 8
-"""Intervals next to a stop that are not divided: their points are already closer."""
 
 
 def fastest(
@@ -171,7 +163,7 @@ def fastest(
     :param share: fraction of the robot file's efforts and velocities to use.
     :param singularity: least singularity index on the path, 0 to 1.
     :param wrench: constant external wrench on the platform, (6,), base axes.
-    :param points: about how many points of the path; at most :data:`MAX_JERK_POINTS` with a
+    :param points: about how many points of the path; at most 400 with a
         jerk limit.
     :param slowdown: divides ``speed`` at points of the path, by their joint positions (p, n) and
         the direction (p, 3) of the reference point, base axes: returns 1 or more, (p,).
@@ -233,7 +225,8 @@ def timed(
         limits.check()
     load = None if wrench is None else np.asarray(wrench, float)
     jerks = law == "fastest" and np.isfinite(limits.jerk).any()
-    points = min(points, MAX_JERK_POINTS) if jerks else points
+    # Each point is a variable of linear programs.
+    points = min(points, 400) if jerks else points
 
     def plan(part: JointPath) -> Run:
         if law == "fastest":
@@ -270,7 +263,10 @@ def _solve_stretch(part: JointPath, limits: Limits, wrench: Array | None) -> Run
     x: Array | None = None
     for count in range(MAX_REFINEMENTS + MAX_TIGHTENINGS):
         x = fastest_profile(rows, part.left, part.steps, share, x)
-        _check_no_stop(part, x)
+        stopped = (x[:-1] + x[1:]) <= 0.0
+        if stopped.any():
+            way = part.curve.begin + float(part.s[part.left[int(stopped.argmax())]])
+            raise ParameterError("path", f"no motion after {way:.4g} m", "limits that let the machine pass")
         run = Run.of(part, x)
         used = run_peaks(run, limits, wrench)
         over = used.max(1)
@@ -326,8 +322,9 @@ def _solve_with_jerk(part: JointPath, limits: Limits, wrench: Array | None) -> R
         # The programs are inaccurate in intervals in which the speed changes by much.
         parts = np.ones(len(share), np.int64)
         if count < MAX_JERK_REFINEMENTS:
-            steep = np.maximum(x[1:], x[:-1]) > MAX_SPEED_RATIO * np.minimum(x[1:], x[:-1])
-            steep[:UNDIVIDED_ENDS] = steep[-UNDIVIDED_ENDS:] = False
+            steep = np.maximum(x[1:], x[:-1]) > 2.0 * np.minimum(x[1:], x[:-1])
+            # Points next to a stop are already closer.
+            steep[:8] = steep[-8:] = False
             long = part.steps > MAX_PARTS * part.curve.least_step
             parts[steep & long & (over.max(0) > 1.0 + REFINEMENT_EXCESS)] = MAX_PARTS
         divided = bool((parts > 1).any())
@@ -343,22 +340,26 @@ def _solve_with_jerk(part: JointPath, limits: Limits, wrench: Array | None) -> R
 
 
 def _limit_rows(part: JointPath, limits: Limits, wrench: Array | None) -> Rows:
-    """Return the limits at the points of a stretch, reduced by :data:`LIMIT_RESERVE`."""
-    forces = None
+    """Return the limits at the points of a stretch, reduced by :data:`LIMIT_RESERVE`.
+
+    :raises ParameterError: the drives cannot hold the machine at rest at a point.
+    """
+    forces, robot = None, part.curve.robot
     if needs_forces(part, limits):
         points = np.arange(len(part.s))
         forces = Forces.of(part, points, part.q, part.first, part.second, wrench)
     rows = Rows.of(part, forces, limits.part(1.0 - LIMIT_RESERVE))
-    check_rest(part, rows, limits)
+    held = np.abs(rows.fixed + rows.dry)
+    if held.size and not held.max() < 1.0:
+        row, column = np.unravel_index(int(held.argmax()), held.shape)
+        where = describe_place(robot, part.q[row], part.curve.begin + float(part.s[row]))
+        name = robot.joint_names[np.flatnonzero(np.isfinite(limits.effort))[column]]
+        raise ParameterError(
+            f"path: effort of {name} at rest {where}",
+            f"{100 * float(held[row, column]):.4g} % of its limit",
+            "less than 100 %: the drive cannot hold the machine there",
+        )
     return rows
-
-
-def _check_no_stop(part: JointPath, x: Array) -> None:
-    """Reject a profile that stops on the way."""
-    slow = (x[:-1] + x[1:]) <= 0.0
-    if slow.any():
-        way = part.curve.begin + float(part.s[part.left[int(slow.argmax())]])
-        raise ParameterError("path", f"no motion after {way:.4g} m", "limits that let the machine pass")
 
 
 def slowdown_factor(used: Array) -> float:

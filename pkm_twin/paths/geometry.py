@@ -25,9 +25,6 @@ Space = Literal["pose", "joint"]
 
 MIN_DISTANCE: Final = 1e-9
 """Distance below which two waypoints coincide, m."""
-REVERSAL_COSINE: Final = -0.985
-"""Cosine of the angle between two lines below which the corner (170 degrees or more) cannot be
-rounded."""
 TANGENT_TOLERANCE: Final = 1e-6
 """Difference of two unit directions below which a path continues without a stop."""
 
@@ -156,110 +153,71 @@ def lines(
         keep = int(np.flatnonzero(new[:k])[-1])
         dwells[keep], arcs[keep] = dwells[k], arcs[keep] and arcs[k]
     values, blends, dwells, arcs = (v[new] for v in (values, blends, dwells, arcs))
-    made = _Lines(robot, space, values, blends, dwells, arcs).path()
+    made = _join_waypoints(robot, space, values, blends, dwells, arcs)
     places = zip(np.cumsum(new) - 1, rested.tolist(), strict=True)
     return replace(made, marks=tuple(made.marks[k]._replace(rest=rest) for k, rest in places))
 
 
-class _Lines:
+def _join_waypoints(robot: Robot, space: Space, points: Array, blends: Array, dwells: Array, arcs: Mask) -> Path:
     """Build the pieces between waypoints that differ."""
-
-    def __init__(
-        self,
-        robot: Robot,
-        space: Space,
-        points: Array,
-        blends: Array,
-        dwells: Array,
-        arcs: Mask,
-    ) -> None:
-        self.robot, self.space = robot, space
-        self.points, self.blends, self.dwells, self.arcs = points, blends, dwells, arcs
-        self.scales = scales_of(robot, space)
-
-    def path(self) -> Path:
-        moves = list(self._make_pieces())
-        pieces: list[Piece] = []
-        stretches: list[Stretch] = []
-        marks = [Mark(-1, 0.0)]
-        last = len(moves) - 1
-        cut = 0.0
-        for k, (piece, end) in enumerate(moves):
-            following = moves[k + 1][0] if k < last else None
-            radius = 0.0 if following is None else self._blend_radius(end, piece, following)
-            if isinstance(piece, Arc):
-                middle = _total_length(pieces) + piece.to(self.points[end - 1])
-                marks.append(Mark(len(stretches), middle))
-            pieces += _shorten(piece, cut, radius)
-            marks.append(Mark(len(stretches), _total_length(pieces) + radius))
-            cut = radius
-            out = _end_direction(piece)
-            into = out if following is None else following.at(np.zeros(1))[1][0]
-            if radius > 0.0:
-                pieces.append(Corner(self.points[end], out, into, radius))
-                continue
-            apart = float(np.linalg.norm((out - into) * self.scales))
-            if k == last or apart > TANGENT_TOLERANCE or self.dwells[end] > 0.0:
-                stretches.append(Stretch(tuple(pieces), float(self.dwells[end])))
-                pieces = []
-        return Path(self.space, tuple(stretches), float(self.dwells[0]), "lines", tuple(marks))
-
-    def _make_pieces(self) -> Sequence[tuple[Piece, int]]:
-        """Return each line or arc, and the waypoint at its end."""
-        result: list[tuple[Piece, int]] = []
-        k, last = 0, len(self.points) - 1
-        if self.arcs[0] or self.arcs[last]:
-            raise ParameterError("waypoints: arc", "the first or last", "waypoints between two others")
-        while k < last:
-            if self.arcs[k + 1]:
-                if self.arcs[k + 2]:
-                    raise ParameterError(f"waypoint {k + 2}: arc", 1, "only one point between the ends of an arc")
-                result.append((self._make_arc(k), k + 2))
-                k += 2
-                continue
-            way = self.points[k + 1] - self.points[k]
-            length = float(np.linalg.norm(way * self.scales))
-            result.append((Line(self.points[k], way / length, length), k + 1))
-            k += 1
-        return result
-
-    def _blend_radius(self, k: int, piece: Piece, following: Piece) -> float:
-        """Return the blend radius of a corner, m; 0 if the path stops there or has no corner."""
-        wanted = float(self.blends[k])
-        if wanted == 0.0 or self.dwells[k] > 0.0:
-            return 0.0
-        if not (isinstance(piece, Line) and isinstance(following, Line)):
-            raise ParameterError(f"waypoint {k}: blend", wanted, "0 where an arc begins or ends (make it tangent)")
-        turn = float(np.sum(piece.slope * following.slope * self.scales**2))
-        if turn <= REVERSAL_COSINE or turn >= 1.0 - TANGENT_TOLERANCE**2:
-            return 0.0
-        return min(wanted, 0.5 * piece.length, 0.5 * following.length)
-
-    def _make_arc(self, k: int) -> Arc:
-        """Return the arc from waypoint k through the next one to the one after it."""
-        names = self.robot.pose_names if self.space == "pose" else ()
-        places = [i for i, name in enumerate(names) if name in ("x", "y", "z")]
-        if len(places) < 2:
-            raise ParameterError(f"waypoint {k + 1}: arc", 1, "poses with two or more of x, y, z among them")
-        return arc_through(*self.points[k : k + 3], places=places, where=f"waypoint {k + 1}")
+    scales, last = scales_of(robot, space), len(points) - 1
+    if arcs[0] or arcs[last]:
+        raise ParameterError("waypoints: arc", "the first or last", "waypoints between two others")
+    places = [i for i, name in enumerate(robot.pose_names if space == "pose" else ()) if name in ("x", "y", "z")]
+    moves: list[tuple[Piece, int]] = []
+    k = 0
+    while k < last:
+        if arcs[k + 1]:
+            if arcs[k + 2]:
+                raise ParameterError(f"waypoint {k + 2}: arc", 1, "only one point between the ends of an arc")
+            if len(places) < 2:
+                raise ParameterError(f"waypoint {k + 1}: arc", 1, "poses with two or more of x, y, z among them")
+            arc = arc_through(*points[k : k + 3], places=places, where=f"waypoint {k + 1}")
+            moves.append((arc, k + 2))
+        else:
+            way = points[k + 1] - points[k]
+            length = float(np.linalg.norm(way * scales))
+            moves.append((Line(points[k], way / length, length), k + 1))
+        k = moves[-1][1]
+    pieces: list[Piece] = []
+    stretches: list[Stretch] = []
+    marks = [Mark(-1, 0.0)]
+    cut = 0.0
+    for (piece, end), following in zip(moves, [*(move for move, _ in moves[1:]), None], strict=True):
+        out = np.asarray(piece.at(np.array([piece.length]))[1][0], np.float64)
+        into = out if following is None else following.at(np.zeros(1))[1][0]
+        radius, wanted = 0.0, float(blends[end])
+        if following is not None and wanted > 0.0 and dwells[end] == 0.0:
+            if not (isinstance(piece, Line) and isinstance(following, Line)):
+                raise ParameterError(
+                    f"waypoint {end}: blend", wanted, "0 where an arc begins or ends (make it tangent)"
+                )
+            turn = float(np.sum(out * into * scales**2))
+            # A corner of 170 degrees or more cannot be rounded.
+            if -0.985 < turn < 1.0 - TANGENT_TOLERANCE**2:
+                radius = min(wanted, 0.5 * piece.length, 0.5 * following.length)
+        if isinstance(piece, Arc):
+            marks.append(Mark(len(stretches), _total_length(pieces) + piece.to(points[end - 1])))
+        length = piece.length - cut - radius
+        if length > MIN_DISTANCE:
+            # An arc is never shortened.
+            pieces.append(
+                Line(piece.begin + cut * piece.slope, piece.slope, length) if isinstance(piece, Line) else piece
+            )
+        marks.append(Mark(len(stretches), _total_length(pieces) + radius))
+        cut = radius
+        if radius > 0.0:
+            pieces.append(Corner(points[end], out, into, radius))
+            continue
+        apart = float(np.linalg.norm((out - into) * scales))
+        if following is None or apart > TANGENT_TOLERANCE or dwells[end] > 0.0:
+            stretches.append(Stretch(tuple(pieces), float(dwells[end])))
+            pieces = []
+    return Path(space, tuple(stretches), float(dwells[0]), "lines", tuple(marks))
 
 
 def _total_length(pieces: Sequence[Piece]) -> float:
     return sum(piece.length for piece in pieces)
-
-
-def _end_direction(piece: Piece) -> Array:
-    return np.asarray(piece.at(np.array([piece.length]))[1][0], np.float64)
-
-
-def _shorten(piece: Piece, begin: float, end: float) -> list[Piece]:
-    """Return a line without its first and last parts; nothing if no length is left."""
-    length = piece.length - begin - end
-    if not length > MIN_DISTANCE:
-        return []
-    if begin == end == 0.0 or not isinstance(piece, Line):
-        return [piece]
-    return [Line(piece.begin + begin * piece.slope, piece.slope, length)]
 
 
 def circle(robot: Robot, centre: ArrayLike, radius: float, *, turns: float = 1.0) -> Path:

@@ -26,40 +26,6 @@ Index = NDArray[np.int64]
 
 MAX_PROGRAMS: Final = 20
 """Largest number of linear programs."""
-DURATION_TOLERANCE: Final = 1e-4
-"""Relative change of the duration at which the sequence ends."""
-MIN_PROFILE_FRACTION: Final = 1e-9
-"""Smallest x inside a stretch, relative to the largest, so that the machine does not stop there."""
-MAX_SLOWDOWNS: Final = 6
-"""Largest number of times that the start is slowed until a program has a solution."""
-MAX_RAISES: Final = 20
-"""Largest number of times that a profile is raised where the speed would be negative."""
-ROUNDING: Final = 1e-12
-"""Negative speed, relative to the largest, that is a rounding error."""
-
-
-def _min_speed(knots: Array, v: Array, u: Array) -> Array:
-    """Return the smallest speed between knots by v and u there, (k,); shape (k - 1,).
-
-    The acceleration may change its sign within an interval, where the speed then has a minimum.
-    """
-    span, change = np.diff(knots), np.diff(u)
-    rises = (u[:-1] < 0.0) & (u[1:] > 0.0)
-    # Speed change from the left knot to the minimum, where the acceleration is zero.
-    dip = np.where(rises, -0.5 * u[:-1] ** 2 * span / np.where(rises, change, 1.0), 0.0)
-    return np.minimum(np.minimum(v[:-1], v[1:]), v[:-1] + dip)
-
-
-def _boundary_derivatives(part: JointPath) -> tuple[Array, Array, tuple[Array, Array]]:
-    """Return q', q'' at points between two intervals, and q''' on both sides.
-
-    Shape (i - 1, n) each; q''' jumps where two pieces meet.
-    """
-    left = part.left
-    third = (part.second[left + 1] - part.second[left]) / part.steps[:, None]
-    at = left[1:]
-    second = 0.5 * (part.second[at] + part.second[left[:-1] + 1])
-    return part.first[at], second, (third[:-1], third[1:])
 
 
 def smooth_profile(
@@ -92,10 +58,18 @@ def smooth_profile(
     )
     h = part.steps
     best, x = np.inf, start / unit
+    # Bounds next to a stop by the jerk: from rest s = jerk t^3 / 6 and v = jerk t^2 / 2.
+    by_rest = np.full(len(x), np.inf)
+    by_rest[[0, -1]] = 0.0
+    for k, step, at in ((1, h[0], 0), (-2, h[-1], -1)):
+        least = float((jerk / np.maximum(np.abs(part.first[at]), 1e-300)).min())
+        by_rest[k] = min(by_rest[k], 0.25 * least ** (2 / 3) * (6.0 * step) ** (4 / 3))
     count = slower = 0
     while count < programs:
-        *table, most = interval_rows(rows, part.left, h, x, share)
-        own, bound = _program_rows(*table)
+        p, q, low, high, most = interval_rows(rows, part.left, h, x, share)
+        number, column = np.arange(p.size), np.repeat(np.arange(len(p)), p.shape[1])
+        # low <= p x + q x' <= high
+        own = _sparse_matrix([(p, number, column), (q, number, column + 1)], (p.size, len(x)))
         more, top = _jerk_rows(part, jerk, h, x, jerks)
         v = np.sqrt(np.maximum(x, 1e-12 * x.max()))
         weight = np.zeros(len(x))
@@ -104,12 +78,12 @@ def smooth_profile(
         weight[1:] += way / v[1:]
         answer = scipy.optimize.linprog(
             -weight / weight[1:-1].max(),
-            A_ub=scipy.sparse.vstack([own, more]).tocsr(),
-            b_ub=np.concatenate([bound, top]),
-            bounds=np.stack([np.zeros(len(x)), _bound_from_rest(part, jerk, most)], 1),
+            A_ub=scipy.sparse.vstack([own, -own, more]).tocsr(),
+            b_ub=np.concatenate([high.ravel(), -low.ravel(), top]),
+            bounds=np.stack([np.zeros(len(x)), np.minimum(most, by_rest)], 1),
             method="highs",
         )
-        if answer.status != 0 and count == 0 and slower < MAX_SLOWDOWNS:
+        if answer.status != 0 and count == 0 and slower < 6:
             # A slower motion has smaller jerks, so that the bounds' tangents there are feasible.
             x, slower = 0.25 * x, slower + 1
             continue
@@ -120,25 +94,13 @@ def smooth_profile(
         duration = float(np.sum(2.0 * h / np.maximum(v[:-1] + v[1:], 1e-300)))
         if not duration < best:
             break
-        settled = duration > best * (1.0 - DURATION_TOLERANCE)
+        settled = duration > best * (1.0 - 1e-4)
         best, x, count = duration, new, count + 1
         if settled:
             break
-    x[1:-1] = np.maximum(x[1:-1], MIN_PROFILE_FRACTION * x.max())
+    # The machine does not stop inside a stretch.
+    x[1:-1] = np.maximum(x[1:-1], 1e-9 * x.max())
     return unit * x
-
-
-def _bound_from_rest(part: JointPath, jerk: Array, most: Array) -> Array:
-    """Return the largest x at the intervals' ends, (i + 1,), also by the jerk at stops."""
-    most = most.copy()
-    most[0] = most[-1] = 0.0
-    for k, step, at in ((1, part.steps[0], 0), (-2, part.steps[-1], -1)):
-        rates = np.abs(part.first[at])
-        least = float((jerk / np.maximum(rates, 1e-300)).min())
-        if np.isfinite(least):
-            # From rest s = jerk t^3 / 6 and v = jerk t^2 / 2.
-            most[k] = min(most[k], 0.25 * least ** (2 / 3) * (6.0 * step) ** (4 / 3))
-    return most
 
 
 def _sparse_matrix(rows: list[tuple[Any, Any, Any]], shape: tuple[int, int]) -> scipy.sparse.csr_matrix:
@@ -147,20 +109,13 @@ def _sparse_matrix(rows: list[tuple[Any, Any, Any]], shape: tuple[int, int]) -> 
     return scipy.sparse.coo_matrix((values, (row, column)), shape=shape).tocsr()
 
 
-def _program_rows(p: Array, q: Array, least: Array, greatest: Array) -> tuple[scipy.sparse.csr_matrix, Array]:
-    """Write least <= p x + q x' <= greatest of all intervals, (i, r), as A x <= b."""
-    count, width = p.shape
-    number, column = np.arange(p.size), np.repeat(np.arange(count), width)
-    made = _sparse_matrix([(p, number, column), (q, number, column + 1)], (p.size, count + 1))
-    return scipy.sparse.vstack([made, -made]), np.concatenate([greatest.ravel(), -least.ravel()])
-
-
 def _jerk_rows(part: JointPath, jerk: Array, h: Array, x: Array, share: Array) -> tuple[scipy.sparse.csr_matrix, Array]:
     """Write the jerk limits at points between two intervals, linearised about a profile."""
-    used = np.isfinite(jerk)
-    first, second, sides = _boundary_derivatives(part)
-    # As fractions of the limits.
-    first, second = first[:, used] / jerk[used], second[:, used] / jerk[used]
+    used, left = np.isfinite(jerk), part.left
+    # Derivatives of the path as fractions of the limits; the third jumps where two pieces meet.
+    third = (part.second[left + 1] - part.second[left]) / part.steps[:, None]
+    second = 0.5 * (part.second[left[1:]] + part.second[left[:-1] + 1])
+    first, second, third = (rows[:, used] / jerk[used] for rows in (part.first[left[1:]], second, third))
     most = np.minimum(share[1:], share[:-1])[:, None]
     count, width = first.shape
     before, behind = h[:-1][:, None], h[1:][:, None]
@@ -179,10 +134,10 @@ def _jerk_rows(part: JointPath, jerk: Array, h: Array, x: Array, share: Array) -
     point = np.repeat(np.arange(count), width)
     made: list[tuple[Any, Any, Any]] = []
     at = 0
-    for sign, third in product((1.0, -1.0), sides):
+    for sign, side in product((1.0, -1.0), (third[:-1], third[1:])):
         number = at + np.arange(count * width)
         made.append((sign * front, number, point))
-        made.append((sign * (here + third[:, used] / jerk[used]) + tangent, number, point + 1))
+        made.append((sign * (here + side) + tangent, number, point + 1))
         made.append((sign * after, number, point + 2))
         at += count * width
     bound = np.ravel(np.broadcast_to(top, (count, width)))
@@ -196,11 +151,14 @@ def smooth_run(part: JointPath, x: Array) -> Run | None:
     raised there.
     """
     x = x.copy()
-    for count in range(MAX_RAISES):
+    for count in range(20):
         knots, way, v, u = _integrate_profile(part, x)
-        below = -_min_speed(knots, v, u)
+        # The acceleration may change its sign within an interval, where the speed has a minimum.
+        rises = (u[:-1] < 0.0) & (u[1:] > 0.0)
+        dip = np.where(rises, -0.5 * u[:-1] ** 2 * np.diff(knots) / np.where(rises, np.diff(u), 1.0), 0.0)
+        below = -np.minimum(np.minimum(v[:-1], v[1:]), v[:-1] + dip)
         # Between two middles of intervals lies the point of their common end.
-        low = np.flatnonzero(below > ROUNDING * v.max())
+        low = np.flatnonzero(below > 1e-12 * v.max())
         if not len(low):
             jerk = np.diff(u) / np.diff(knots)
             return Run(part, knots, np.stack([way[:-1], v[:-1], u[:-1] / 2, jerk / 6]))

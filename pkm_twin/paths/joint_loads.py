@@ -23,17 +23,11 @@ from pkm_twin.errors import ParameterError, warn
 from pkm_twin.files import replacing
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import BASE, Joint
+from pkm_twin.machine.rotations import skew
 from pkm_twin.paths.sizing import read_entries
 from pkm_twin.recordings import Recording, by_load
 from pkm_twin.recordings.tables import WRENCH as AXES
 from pkm_twin.robot.robot import Robot
-
-RATED_TURNS: Final = 1e6
-"""Revolutions for which a rotary bearing's C holds (ISO 281)."""
-RATED_TRAVEL: Final = 1e5
-"""Travel for which a linear bearing's C holds, m (ISO 14728-1)."""
-MIN_STEP: Final = 1e-12
-"""Mean step below which a bearing does not move, rad or m: rounding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,22 +140,19 @@ def bearing_life(
     """
     force, steps = np.asarray(load, np.float64), np.abs(np.asarray(moved, np.float64))
     whole = float(steps.sum())
-    still = whole <= MIN_STEP * len(steps)
+    # A smaller mean step, rad or m, is rounding.
+    still = whole <= 1e-12 * len(steps)
     mean = float(np.mean(force**exponent) if still else np.sum(force**exponent * steps) / whole)
     equivalent, amount = mean ** (1.0 / exponent), whole if slides else whole / math.tau
     if still or not equivalent > 0.0:
         life = math.nan if equivalent > 0.0 else math.inf
         return Life(equivalent, amount, life, life)
-    life = (RATED_TRAVEL if slides else RATED_TURNS) * (rating / equivalent) ** exponent
+    life = (1e5 if slides else 1e6) * (rating / equivalent) ** exponent
     return Life(equivalent, amount, life, life / amount * duration / 3600.0)
 
 
 SAMPLES_PER_BLOCK: Final = 512
 """Samples computed at a time: each has matrices of all unknowns."""
-SPECTRUM_CLASSES: Final = 32
-"""Classes of range in a written load spectrum."""
-ZERO_COMPONENT: Final = 1e-9
-"""Component of a unit vector below which it is perpendicular to an axis."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,7 +203,10 @@ def joint_loads(motion: Recording) -> Iterator[list[JointLoad]]:
         for rod in motion.robot.graph.rods.values():
             # A rod's rotation is that of its direction; its spin is idle.
             start, end = (found.points[:, order.index(name)] for name in rod.joint_names)
-            turn[rod.name] = _minimal_rotation(rod.ends[1] - rod.ends[0], end - start)
+            home, now = rod.ends[1] - rod.ends[0], end - start
+            a, b = home / np.linalg.norm(home), now / np.linalg.norm(now, axis=-1, keepdims=True)
+            across = skew(np.cross(a, b))
+            turn[rod.name] = np.eye(3) + across + across @ across / (1.0 + b @ a)[:, None, None]
         result = []
         for k, (name, (inner, outer)) in enumerate(zip(found.names, found.bodies, strict=True)):
             back = turn[inner].swapaxes(-1, -2)
@@ -231,17 +225,11 @@ def joint_loads(motion: Recording) -> Iterator[list[JointLoad]]:
             if name in last:
                 parts = tuple(map(np.concatenate, zip(last[name], parts, strict=True)))
             last[name] = tuple(part[-1:] for part in parts)
-            travelled = np.abs(np.diff(parts[3]))
-            result.append(JointLoad(name, parts[0], parts[1], _step_angles(parts[2]), travelled))
+            step = parts[2][:-1].swapaxes(-1, -2) @ parts[2][1:]
+            sine = np.linalg.norm([step[:, i, j] - step[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))], axis=0)
+            angles = np.arctan2(sine, np.trace(step, axis1=-2, axis2=-1) - 1.0)
+            result.append(JointLoad(name, parts[0], parts[1], angles, np.abs(np.diff(parts[3]))))
         yield result
-
-
-def _step_angles(rotations: Array) -> Array:
-    """Return angles between consecutive rotations (k, 3, 3), shape (k - 1,), rad."""
-    step = rotations[:-1].swapaxes(-1, -2) @ rotations[1:]
-    skew = np.stack([step[:, i, j] - step[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))], -1)
-    sine = np.linalg.norm(skew, axis=-1)
-    return np.asarray(np.arctan2(sine, np.trace(step, axis1=-2, axis2=-1) - 1.0), np.float64)
 
 
 class Summary:
@@ -286,7 +274,12 @@ class Summary:
         for k in np.flatnonzero(self.determined):
             self.reversals[k].add(load.own[fresh, k])
         if self.spec is not None:
-            amount = bearing_load(load.own[:, :3], self.spec, self.axis)
+            force = load.own[:, :3]
+            amount = np.linalg.norm(force, axis=-1)
+            if self.axis is not None:
+                along = force @ self.axis
+                across = np.sqrt(np.maximum(amount**2 - along**2, 0.0))
+                amount = self.spec.X * across + (self.spec.Y or 0.0) * np.abs(along)
             moved = load.travelled if self.slides else load.turned
             self.bearing.append(((amount[1:] + amount[:-1]) / 2.0, moved))
 
@@ -302,20 +295,12 @@ class Summary:
 
 
 def _multiply(matrices: Array, vectors: Array) -> Array:
-    """Multiply matrices and vectors; NaN components only affect directions they act along."""
-    products = np.where(np.abs(matrices) > ZERO_COMPONENT, matrices * vectors[..., None, :], 0.0)
+    """Multiply matrices and vectors; NaN components only affect directions they act along.
+
+    A unit vector with a component below 1e-9 is perpendicular to that axis.
+    """
+    products = np.where(np.abs(matrices) > 1e-9, matrices * vectors[..., None, :], 0.0)
     return np.asarray(products.sum(-1), np.float64)
-
-
-def _minimal_rotation(home: Array, now: Array) -> Array:
-    """Return the smallest rotations from one direction to others, shape (k, 3, 3)."""
-    a = home / np.linalg.norm(home)
-    b = now / np.linalg.norm(now, axis=-1, keepdims=True)
-    v, cosine = np.cross(a, b), b @ a
-    x, y, z = v.T
-    zero = np.zeros_like(x)
-    cross = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(-1, 3, 3)
-    return np.asarray(np.eye(3) + cross + cross @ cross / (1.0 + cosine)[:, None, None], np.float64)
 
 
 def read_bearings(path: Path, names: tuple[str, ...], robot: Robot) -> dict[str, BearingSpec]:
@@ -379,22 +364,6 @@ def bearing_axis(joint: Joint | None, name: str, spec: BearingSpec) -> Array | N
     return np.asarray(axis / np.linalg.norm(axis), np.float64)
 
 
-def bearing_load(force: Array, spec: BearingSpec, axis: Array | None) -> Array:
-    """Return a bearing's equivalent load under forces (k, 3), inner body's axes, (k,), N."""
-    amount = np.linalg.norm(force, axis=-1)
-    if axis is None:
-        return np.asarray(amount)
-    along = force @ axis
-    across = np.sqrt(np.maximum(amount**2 - along**2, 0.0))
-    return np.asarray(spec.X * across + (spec.Y or 0.0) * np.abs(along), np.float64)
-
-
-def write_rows(writer: Any, time: Array, loads: Sequence[JointLoad]) -> None:
-    """Write wrenches over time in base axes as CSV rows; empty where undetermined."""
-    rows = np.concatenate([time[:, None], *(load.wrench[-len(time) :] for load in loads)], -1)
-    writer.writerows([["" if v != v else v for v in row] for row in rows.tolist()])
-
-
 def format_spectra(loads: Sequence[Summary]) -> str:
     """Return rainflow counts by joint, component and class of range, as CSV."""
     text = io.StringIO()
@@ -404,7 +373,7 @@ def format_spectra(loads: Sequence[Summary]) -> str:
         for k, axis in enumerate(AXES):
             cycles = load.cycles(k)
             if load.determined[k] and len(cycles.ranges):
-                for end, count in zip(*cycles.spectrum(SPECTRUM_CLASSES), strict=True):
+                for end, count in zip(*cycles.spectrum(32), strict=True):
                     writer.writerow([load.name, axis, float(end), float(count)])
     return text.getvalue()
 
@@ -440,7 +409,10 @@ def summarise_loads(
                 summary.add(load)
             end = result[0].samples
             if writer is not None:
-                write_rows(writer, motion.clock[begin:end], block)
+                time = motion.clock[begin:end]
+                rows = np.concatenate([time[:, None], *(load.wrench[-len(time) :] for load in block)], -1)
+                # Undetermined components stay empty.
+                writer.writerows([["" if v != v else v for v in row] for row in rows.tolist()])
             begin = end
             if progress is not None:
                 progress(end)

@@ -24,11 +24,6 @@ Index = NDArray[np.int64]
 
 MIN_POINTS: Final = 16
 """Smallest number of intervals of a piece."""
-MIN_STEP_FRACTION: Final = 1e-5
-"""Shortest interval, as a fraction of the robot's size: the second derivatives of a quintic over a
-shorter one are rounding errors."""
-GRADING_EXPONENT: Final = 1.5
-"""Exponent of the distance from a stop by which points are spaced: speed grows with its root."""
 Slowdown = Callable[[Array, Array], Array]
 """Function of joint positions (p, n) and the reference point's direction (p, 3): factors (p,)."""
 
@@ -51,8 +46,8 @@ class Curve:
 
     @property
     def least_step(self) -> float:
-        """Shortest interval, m."""
-        return MIN_STEP_FRACTION * self.robot.size
+        """Shortest interval, m; second derivatives of a quintic over less are rounding errors."""
+        return 1e-5 * self.robot.size
 
     def grid(self, points: int) -> list[Array]:
         """Return about so many points: half by the pieces' lengths, half equal for all pieces."""
@@ -60,8 +55,29 @@ class Curve:
         for k, piece in enumerate(pieces):
             share = piece.length / self.stretch.length + 1.0 / len(pieces)
             count = max(MIN_POINTS, len(piece.knots), round(0.5 * points * share))
-            even = _grade_points(count, begins=k == 0, ends=k == len(pieces) - 1)
-            result.append(_insert_knots(piece.length * even, piece.knots, self.least_step))
+            # Closer near a stop: the speed grows with the root of the distance from it.
+            t = np.linspace(0.0, 1.0, count + 1)
+            begins, ends = k == 0, k == len(pieces) - 1
+            if begins and ends:
+                half = 0.5 * (2.0 * np.minimum(t, 1.0 - t)) ** 1.5
+                t = np.where(t < 0.5, half, 1.0 - half)
+            elif begins:
+                t = t**1.5
+            elif ends:
+                t = 1.0 - (1.0 - t) ** 1.5
+            s = piece.length * t
+            knots: list[float] = []
+            for knot in piece.knots.tolist():
+                inside = min(knot, s[-1] - knot) > self.least_step
+                if inside and not (knots and knot - knots[-1] < self.least_step):
+                    knots.append(knot)
+            if knots:
+                # Points closer to a knot than a quarter of their spacing move to it.
+                away = np.abs(s[:, None] - np.array(knots)).min(1)
+                free = away > np.maximum(0.25 * np.gradient(s), self.least_step)
+                free[[0, -1]] = True
+                s = np.sort(np.concatenate([s[free], knots]))
+            result.append(s)
         return result
 
     def at(self, grid: list[Array]) -> JointPath:
@@ -81,7 +97,14 @@ class Curve:
             q, first, second = place, slope, bend
             robot.forward(q)
         else:
-            q = _solve_inverse(robot, place, self.begin + s)
+            q, good = robot.try_inverse(place)
+            if not good.all():
+                row = int(np.argmin(good))
+                where = _format_place(robot, place[row], self.begin + float(s[row]))
+                try:
+                    robot.inverse(place[row])
+                except (UnreachableError, SingularityError) as error:
+                    raise ParameterError(f"path {where}", error, "a pose that the machine reaches") from None
             first, second = joint_rates(robot, q, slope, bend)
         check_positions(robot, s, q, self.begin)
         check_singularity(robot, self.begin + s, q, self.singularity)
@@ -203,50 +226,6 @@ def reference_velocity(robot: Robot, q: Array, qd: Array) -> Array:
 def only_turns(robot: Robot) -> bool:
     """Return whether no coordinate of the pose is a position."""
     return not {"x", "y", "z"} & set(robot.pose_names)
-
-
-def _solve_inverse(robot: Robot, places: Array, way: Array) -> Array:
-    """Return joint positions of poses (k, m).
-
-    :raises ParameterError: names the first pose out of reach, and its path length of (k,).
-    """
-    q, good = robot.try_inverse(places)
-    if good.all():
-        return q
-    row = int(np.argmin(good))
-    where = _format_place(robot, places[row], float(way[row]))
-    try:
-        robot.inverse(places[row])
-    except (UnreachableError, SingularityError) as error:
-        raise ParameterError(f"path {where}", error, "a pose that the machine reaches") from None
-    return robot.inverse(places)
-
-
-def _insert_knots(s: Array, knots: Array, least: float) -> Array:
-    """Move points of a piece to its knots; no two points closer than ``least``."""
-    inner: list[float] = []
-    for knot in knots.tolist():
-        if min(knot, s[-1] - knot) > least and not (inner and knot - inner[-1] < least):
-            inner.append(knot)
-    if not inner:
-        return s
-    at = np.array(inner)
-    # Keep the points that are at least a quarter of their spacing away from the knots.
-    away = np.abs(s[:, None] - at).min(1)
-    free = away > np.maximum(0.25 * np.gradient(s), least)
-    free[[0, -1]] = True
-    return np.sort(np.concatenate([s[free], at]))
-
-
-def _grade_points(count: int, *, begins: bool, ends: bool) -> Array:
-    """Return points from 0 to 1, shape (count + 1,), closer near a stop."""
-    t = np.linspace(0.0, 1.0, count + 1)
-    if begins and ends:
-        half = 0.5 * (2.0 * np.minimum(t, 1.0 - t)) ** GRADING_EXPONENT
-        return np.where(t < 0.5, half, 1.0 - half)
-    if begins:
-        return np.asarray(t**GRADING_EXPONENT)
-    return np.asarray(1.0 - (1.0 - t) ** GRADING_EXPONENT if ends else t)
 
 
 def describe_place(robot: Robot, q: Array, way: float) -> str:

@@ -25,21 +25,13 @@ Index = NDArray[np.int64]
 
 BINDING_USE: Final = 0.98
 """Used fraction of a limit from which on it binds."""
-BISECTIONS: Final = 60
-"""Bisection steps to the time of a position: an interval shrinks to rounding."""
-MIN_SPEED_FRACTION: Final = 1e-9
-"""Smallest speed along the path of a moving machine, relative to its mean speed."""
 MAX_SAMPLES: Final = 10_000_000
 """Largest number of samples of a motion at a rate."""
-PARTS_PER_INTERVAL: Final = (4, 16, 64, 256)
-"""Parts of an interval at whose ends limits are checked, more where needed."""
 JUMP_CLEARANCE: Final = 1e-6
 """Fraction of an interval between its outer samples and its ends, where accelerations jump."""
 PEAK_TOLERANCE: Final = 2e-5
 """Excess between samples, as a fraction of a limit, that is added to them; above it, more samples
 are taken."""
-MIN_BOUND_FRACTION: Final = 0.01
-"""Fraction of the duration below which an interval joins the one before it."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +104,8 @@ class Run:
         way, begins = self.part.ends[1:-1], self.way[0]
         k = np.clip(np.searchsorted(begins, way, side="right") - 1, 0, len(begins) - 1)
         low, high = self.knots[k], self.knots[k + 1]
-        for _ in range(BISECTIONS):
+        # An interval shrinks to rounding.
+        for _ in range(60):
             middle = 0.5 * (low + high)
             before = self.evaluate(k, middle)[0] < way
             low, high = np.where(before, middle, low), np.where(before, high, middle)
@@ -222,19 +215,16 @@ class TimedPath:
             if len(mine):
                 # The end counts as rest; the beginning as motion, with its friction.
                 moves = (t[mine] >= begin) & (t[mine] - begin < run.duration * (1.0 - 1e-12))
-                own = sample_run(run, self._local_times(k, t[mine]), moves)
+                local = t[mine] - begin
+                for change, switch in zip(self.carried[1:], self.switches, strict=True):
+                    if change.stretch == k and not change.rest:
+                        # Rounding leaves no time on the other side of a change of payload.
+                        end = float(run.ends[run.part.first_of(change.piece)])
+                        before = np.minimum(local, np.nextafter(end, 0.0))
+                        local = np.where(t[mine] >= switch, np.maximum(local, end), before)
+                own = sample_run(run, local, moves)
                 q[mine], qd[mine], qdd[mine], travel[mine], felt[mine] = own[:5]
         return Samples(t, q, qd, qdd, self._efforts(t, q, qd, qdd), robot.forward(q), travel, felt)
-
-    def _local_times(self, k: int, t: Array) -> Array:
-        """Return times since the begin of run k, on the same side of each change of payload."""
-        run, local = self.runs[k], t - self.begins[k]
-        for change, switch in zip(self.carried[1:], self.switches, strict=True):
-            if change.stretch == k and not change.rest:
-                end = float(run.ends[run.part.first_of(change.piece)])
-                before = np.minimum(local, np.nextafter(end, 0.0))
-                local = np.where(t >= switch, np.maximum(local, end), before)
-        return local
 
     def uniform(self, rate: float) -> Samples:
         """Return the motion at ``rate`` samples per second.
@@ -400,7 +390,8 @@ def sample_run(run: Run, time: Array, moves: Mask | bool = True, tool: bool = Tr
     :param tool: whether to compute the speeds; otherwise they are zero.
     """
     interval, part, v, u = run.at(time)
-    creep = MIN_SPEED_FRACTION * run.part.ends[-1] / run.duration
+    # A machine that moves is never at rest, where friction has no direction.
+    creep = 1e-9 * run.part.ends[-1] / run.duration
     v, u = np.where(moves, np.maximum(v, creep), 0.0), np.where(moves, u, 0.0)
     q, qd, qdd = run.part.motion(interval, part, v, u)
     robot = run.part.curve.robot
@@ -426,7 +417,7 @@ def peaks(limits: Limits, times: Array, sample: Callable[[Array], Moments]) -> A
     n = len(limits.jerk)
     result = np.zeros((len(spans), 4 * n + 1))
     todo = np.arange(len(spans))
-    for cells in PARTS_PER_INTERVAL:
+    for cells in (4, 16, 64, 256):
         parts = JUMP_CLEARANCE + (1.0 - 2.0 * JUMP_CLEARANCE) * np.linspace(0.0, 1.0, cells + 1)
         effort, qd, qdd, felt = sample((times[todo, None] + spans[todo, None] * parts).ravel())
         jerk = np.zeros_like(qd)
@@ -482,11 +473,11 @@ def find_binding(used: Array) -> list[int]:
 def merge_bounds(time: Array, columns: list[int], names: list[str], used: Array) -> list[Bound]:
     """Join samples to intervals of one binding limit.
 
-    An interval shorter than :data:`MIN_BOUND_FRACTION` of the duration joins the one before it.
+    An interval shorter than a hundredth of the duration joins the one before it.
     """
     if len(time) < 2:
         return []
-    brief = MIN_BOUND_FRACTION * float(time[-1] - time[0])
+    brief = 0.01 * float(time[-1] - time[0])
     changes = (i for i in range(1, len(columns)) if columns[i] != columns[i - 1])
     edges = [0, *changes, len(columns) - 1]
     spans = [(b, e, columns[b]) for b, e in pairwise(edges) if e > b]

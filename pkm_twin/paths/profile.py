@@ -13,7 +13,6 @@ analysis, IEEE Transactions on Robotics 34 (2018), with the first-order interpol
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,17 +21,6 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.paths.constraints import Rows
 
 Index = NDArray[np.int64]
-
-MAX_NEWTON_STEPS: Final = 50
-"""Largest number of Newton steps to an interval's largest x; two or three are usual."""
-ZERO_COEFFICIENT: Final = 1e-12
-"""Coefficient, relative to the row's largest, that counts as zero."""
-SPEED_TOLERANCE: Final = 3e-4
-"""Relative change of the speeds at which viscous friction has converged."""
-MAX_ITERATIONS: Final = 8
-"""Largest number of solutions for viscous friction."""
-MIN_SPEED_FRACTION: Final = 0.01
-"""Speed, relative to the largest, below which viscous friction is that of this speed."""
 
 
 Numbers = list[float]
@@ -53,7 +41,8 @@ class IntervalPrograms:
     @classmethod
     def of(cls, p: Array, q: Array, least: Array, greatest: Array, most: Array) -> IntervalPrograms:
         """Convert rows least <= p x + q x' <= greatest, (i, r); ``most`` at the ends, (i + 1,)."""
-        level = np.abs(q) <= ZERO_COEFFICIENT * np.abs(p)
+        # A smaller coefficient is rounding: the row does not bound x'.
+        level = np.abs(q) <= 1e-12 * np.abs(p)
         with np.errstate(divide="ignore", invalid="ignore"):
             one, other, slope = least / q, greatest / q, -p / q
             cap = np.where(level & (p != 0.0), np.maximum(least / p, greatest / p), np.inf)
@@ -89,7 +78,8 @@ def _largest_start(low: Numbers, high: Numbers, slopes: Numbers, x: float, after
     The gap between the largest lower and the smallest upper line on x' is convex in x and open at
     0, so Newton's steps from the right converge to where it closes.
     """
-    for _ in range(MAX_NEWTON_STEPS):
+    # Two or three steps are usual.
+    for _ in range(50):
         least, rise, most, fall = 0.0, 0.0, after, 0.0
         for c, e, d in zip(low, high, slopes, strict=True):
             way = d * x
@@ -130,7 +120,8 @@ def interval_rows(
         beta, fixed = rows.beta[k], rows.fixed[k]
         if x is not None:
             v = np.sqrt(x)
-            about = np.maximum(v[end], MIN_SPEED_FRACTION * v.max())[:, None]
+            # The friction's slope is infinite at rest.
+            about = np.maximum(v[end], 0.01 * v.max())[:, None]
             beta = beta + rows.drag[k] / (2.0 * about)
             fixed = fixed + 0.5 * rows.drag[k] * about
         alphas.append(rows.alpha[k] / double)
@@ -159,14 +150,12 @@ def fastest_profile(rows: Rows, left: Index, steps: Array, part: Array, about: A
     :param part: of each interval's limits that is used, shape (i,).
     :param about: a profile close to the result, about which viscous friction is linear first.
     """
-    x = about if rows.drag.any() else None
-    for _ in range(MAX_ITERATIONS):
-        new = IntervalPrograms.of(*interval_rows(rows, left, steps, x, part)).solve()
-        if not rows.drag.any():
-            return new
-        before, x = x, new
-        if before is not None:
-            change = np.abs(np.sqrt(x) - np.sqrt(before)).max()
-            if change <= SPEED_TOLERANCE * np.sqrt(x.max()):
-                break
-    return new
+    viscous = rows.drag.any()
+    x = about if viscous else None
+    # With viscous friction until the speeds change by less than 3e-4.
+    for _ in range(8 if viscous else 1):
+        before, x = x, IntervalPrograms.of(*interval_rows(rows, left, steps, x, part)).solve()
+        if before is not None and np.abs(np.sqrt(x) - np.sqrt(before)).max() <= 3e-4 * np.sqrt(x.max()):
+            break
+    assert x is not None  # noqa: S101  one solution at least
+    return x

@@ -35,16 +35,12 @@ from pkm_twin.recordings.recording import Recording
 
 SAMPLES_PER_BLOCK: Final = 4096
 """Samples computed at a time, so that memory use is bounded."""
-MIN_SAMPLES: Final = 2
-"""Smallest number of samples of a motion."""
 SHIPPED: Final = "shipped"
 """Name of the file of drives that is shipped with the package."""
 RPM: Final = 2 * math.pi / 60
 """One revolution per minute, rad/s."""
 GEARS_PER_ROUND: Final = 33
 """Gears of a range that are tried in a round."""
-REFINEMENTS: Final = 4
-"""Rounds of the search in a range; each is between the neighbours of the best gear."""
 
 
 @dataclass(frozen=True)
@@ -454,8 +450,8 @@ def size_drives(
         joint that has one, or of another type.
     """
     robot, time, (q, qd, qdd, _) = motion.robot, motion.time, motion.motion
-    if len(time) < MIN_SAMPLES:
-        raise ParameterError("motion", f"{len(time)} samples", f"{MIN_SAMPLES} or more")
+    if len(time) < 2:
+        raise ParameterError("motion", f"{len(time)} samples", "2 or more")
     loaded = by_load(robot, motion.load, time, SAMPLES_PER_BLOCK)
     inertias = np.concatenate([mass_matrix(one, q[rows]) for one, rows in loaded])
     masses = np.diagonal(inertias, axis1=-2, axis2=-1)
@@ -474,7 +470,16 @@ def size_drives(
         span = (float(load.min()), float(load.max()))
         duty = DriveDuty(joint, slides, Duty.of(time, effort[:, i], qd[:, i], net[:, i]), span)
         axis = _Axis(time, qd[:, i], qdd[:, i], effort[:, i] - rotor * qdd[:, i], span[1])
-        drive = own if not given else _drive_with_gear(joint, slides, rotor, own, given)
+        drive = own
+        if given:
+            if own is not None:
+                raise ParameterError(f"drive of {joint}", "in the file", "no ratio or lead; or --ratios")
+            gear = next((gear for gear in given if (gear.lead is not None) == slides), None)
+            if gear is None:
+                raise ParameterError(
+                    f"drive of {joint}", None, f"--{'lead' if slides else 'ratio'}, for this type of joint"
+                )
+            drive = gear.drive(rotor / gear.drive().turns ** 2)
         if drive is not None:
             torques = axis.torques(drive.inertia, drive)
             speeds = drive.turns * axis.qd
@@ -495,7 +500,22 @@ def size_drives(
         axes.append(axis)
     if not motors:
         return duties
-    chosen = [_allowed_gears(robot.name, duty, choices) for duty in duties]
+    chosen = []
+    for duty in duties:
+        drive, allowed = (
+            duty.drive,
+            next((one for one in choices if (one.gears[0].lead is not None) == duty.slides), None),
+        )
+        if allowed is None:
+            if drive is None or choices:
+                need = "lead, m per turn of the motor" if duty.slides else "ratio, turns of the motor"
+                raise ParameterError(
+                    f"{robot.name}: drive of {duty.joint}",
+                    f"no {need.partition(',')[0]}",
+                    f"--{need}, or a section drive in the file, to compare motors",
+                )
+            allowed = Gears((Gear(drive.ratio, drive.lead, drive.efficiency),))
+        chosen.append(allowed)
     for choice in dict.fromkeys(chosen):
         rows = [i for i, one in enumerate(chosen) if one == choice]
         alike = [_fit_best_gear([axes[i] for i in rows], n, m, choice) for n, m in motors.items()]
@@ -506,33 +526,6 @@ def size_drives(
                 own_fits = tuple(_fit_best_gear([axes[i]], n, m, choice)[0] for n, m in motors.items())
             duties[i] = replace(duties[i], fits=own_fits, alike=shared)
     return duties
-
-
-def _drive_with_gear(joint: str, slides: bool, rotor: float, own: DriveSpec | None, given: Sequence[Gear]) -> DriveSpec:
-    """Return the drive of a joint with a rotor inertia at the joint, kg m2 or kg."""
-    if own is not None:
-        raise ParameterError(f"drive of {joint}", "in the file", "no ratio or lead; or --ratios")
-    gear = next((gear for gear in given if (gear.lead is not None) == slides), None)
-    if gear is None:
-        name = "lead" if slides else "ratio"
-        raise ParameterError(f"drive of {joint}", None, f"--{name}, for this type of joint")
-    return gear.drive(rotor / gear.drive().turns ** 2)
-
-
-def _allowed_gears(robot: str, duty: DriveDuty, choices: Sequence[Gears]) -> Gears:
-    """Return the gears that a drive may have."""
-    for choice in choices:
-        if (choice.gears[0].lead is not None) == duty.slides:
-            return choice
-    drive = duty.drive
-    if drive is None or choices:
-        need = "lead, m per turn of the motor" if duty.slides else "ratio, turns of the motor"
-        raise ParameterError(
-            f"{robot}: drive of {duty.joint}",
-            f"no {'lead' if duty.slides else 'ratio'}",
-            f"--{need}, or a section drive in the file, to compare motors",
-        )
-    return Gears((Gear(drive.ratio, drive.lead, drive.efficiency),))
 
 
 @dataclass(frozen=True)
@@ -586,16 +579,17 @@ class _Axis:
 
 def _fit_best_gear(axes: Sequence[_Axis], name: str, motor: Motor, choice: Gears) -> list[Fit]:
     """Fit joints with one gear: that with the smallest largest used fraction of all joints."""
-    for _ in range(REFINEMENTS if choice.span else 1):
+
+    def ranking(fits: list[Fit]) -> tuple[float, float]:
+        # Beyond its curve a motor has no torque; then the other fractions decide.
+        return max(f.used for f in fits), max(max(f.thermal, f.speed) for f in fits)
+
+    # Each round of a range is between the neighbours of the best gear.
+    for _ in range(4 if choice.span else 1):
         rows = [[axis.fit(name, motor, gear) for axis in axes] for gear in choice.gears]
-        k = min(range(len(rows)), key=lambda i: _ranking(rows[i]))
+        k = min(range(len(rows)), key=lambda i: ranking(rows[i]))
         choice = choice.near(k) if choice.span else choice
     return rows[k]
-
-
-def _ranking(fits: Sequence[Fit]) -> tuple[float, float]:
-    """Return the ranking key of fits; beyond the curve, where a torque is infinite, the others."""
-    return max(f.used for f in fits), max(max(f.thermal, f.speed) for f in fits)
 
 
 def find_smallest(fits: Sequence[Sequence[Fit]]) -> int | None:

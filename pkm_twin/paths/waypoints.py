@@ -21,7 +21,6 @@ from pkm_twin.recordings.tables import (
     PLAIN,
     WRENCH,
     Dialect,
-    Table,
     kinds_of,
     read_table,
 )
@@ -41,7 +40,8 @@ def read_waypoints(
 
     A smooth curve; with ``blend`` (m) or one of the columns :data:`PATH_COLUMNS`, lines and arcs.
 
-    :returns: the path, and the payload from each waypoint on, kg, where the table has it.
+    :returns: the path, and the payload from each waypoint on, kg, where the table has it, with the
+        robot file's centre of mass.
     :raises ParameterError: a column is missing, unknown, or a number is out of range.
     """
     kinds = kinds_of(robot)
@@ -64,7 +64,22 @@ def read_waypoints(
             if space == "pose":
                 where = f"{file}: {robot.name} moves in {', '.join(few)}; column"
             raise UnknownNameError(where, name, (*few, *PATH_COLUMNS, "payload"))
-    masses = _read_payloads(table, robot)
+    masses = None
+    if PAYLOAD[0] in table:
+        kilograms, centre = table[PAYLOAD[0]], table.fill(PAYLOAD[1:])
+        for mass in np.unique(kilograms[kilograms != robot.payload.mass]).tolist():
+            try:
+                Load(mass).on(robot)
+            except ParameterError as error:
+                where = f"{table.line(int((kilograms == mass).argmax()))}, column payload"
+                raise ParameterError(where, error.value, error.bound) from None
+        if centre is not None and (centre != robot.payload.com)[kilograms > 0.0].any():
+            raise ParameterError(
+                f"{file}: {', '.join(PAYLOAD[1:])}",
+                "a centre of mass",
+                "that of the robot's file; without the columns, --payload MASS,x,y,z carries another",
+            )
+        masses = kilograms.tolist()
     given = {name: table[name] for name in PATH_COLUMNS if name in table}
     if blend is None and not given:
         return through(robot, points, space=space), masses
@@ -81,26 +96,6 @@ def read_waypoints(
     except ParameterError as error:
         raise ParameterError(f"{file}: {error.field}", error.value, error.bound) from None
     return made, masses
-
-
-def _read_payloads(table: Table, robot: Robot) -> list[float] | None:
-    """Read the payload from each waypoint on, kg, with the robot file's centre of mass."""
-    if PAYLOAD[0] not in table:
-        return None
-    masses, centre = table[PAYLOAD[0]], table.fill(PAYLOAD[1:])
-    for mass in np.unique(masses[masses != robot.payload.mass]).tolist():
-        try:
-            Load(mass).on(robot)
-        except ParameterError as error:
-            where = f"{table.line(int((masses == mass).argmax()))}, column payload"
-            raise ParameterError(where, error.value, error.bound) from None
-    if centre is not None and (centre != robot.payload.com)[masses > 0.0].any():
-        raise ParameterError(
-            f"{table.path}: {', '.join(PAYLOAD[1:])}",
-            "a centre of mass",
-            "that of the robot's file; without the columns, --payload MASS,x,y,z carries another",
-        )
-    return list(masses.tolist())
 
 
 def parse_loads(texts: Sequence[str], waypoints: int) -> list[float | None]:
