@@ -17,10 +17,6 @@ from pkm_twin.robot.robot import Robot
 
 DECIMALS: Final = 12
 """Decimal places of an error in m or rad; further digits are rounding errors."""
-MOTIONLESS: Final = 1e-9
-"""Motion of the platform, m or rad, per unit of an error, below which the error moves nothing."""
-DRAWN_STATES: Final = 25
-"""Joint states, spread over all, in which random machines are assembled."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +67,7 @@ class ErrorBudget:
                 rms(self.calibrated[name].round(DECIMALS)),
                 sum(found.variance[path] for path in paths),
                 found.texts[paths[0]],
-                any(np.any(np.abs(found.sensitivity[path]) > MOTIONLESS) for path in paths),
+                any(np.any(np.abs(found.sensitivity[path]) > 1e-9) for path in paths),
             )
         return dict(sorted(result.items(), key=lambda item: -item[1].share))
 
@@ -110,9 +106,9 @@ class ErrorBudget:
 def draw_machines(
     budget: ErrorBudget, sigma: Mapping[str, float | Tolerance], count: int, seed: int
 ) -> tuple[Sequence[int], Array]:
-    """Assemble random machines exactly at :data:`DRAWN_STATES` of the budget's states.
+    """Assemble random machines exactly at 25 of the budget's states.
 
     :returns: the indices of the states, and the errors as of :func:`~pkm_twin.design.drawn`.
     """
-    chosen = np.unique(np.linspace(0, len(budget.q) - 1, DRAWN_STATES).round().astype(int))
+    chosen = np.unique(np.linspace(0, len(budget.q) - 1, 25).round().astype(int))
     return chosen.tolist(), drawn(budget.robot, sigma, budget.q[chosen], count, seed)

@@ -49,7 +49,6 @@ from pkm_twin.robot.robot import SINGULARITY_BOUND, Robot
 
 MAX_OPEN_FRACTION: Final = 1e-6
 """Largest fraction of an error's rows that may stay open if the parts can be assembled."""
-MAX_ITERATIONS: Final = 30
 STENCIL: Final = 1e-3 * np.array([-2.0, -1.0, 1.0, 2.0])
 STENCIL_WEIGHTS: Final = np.array([1.0, -8.0, 8.0, -1.0]) / 12e-3
 """Fourth-order finite difference; errors of a rigid part change its rows smoothly."""
@@ -89,42 +88,44 @@ def part_of(robot: Robot, path: str) -> Part | None:
 
     :raises ParameterError: the machine's entry has no such error.
     """
-    keys = full_keys(path)
+    effects: dict[Effect, Array] = {}
     if "," in path:
-        return _join_parts(robot, path)
+        found: list[Part] = []
+        for word in path.split(","):
+            one = word.strip()
+            part = part_of(robot, one.removeprefix("-"))
+            if part is None or part.unit != (found or [part])[0].unit:
+                raise ParameterError(f"tolerance {path}", one, "parts alone, in m or in rad")
+            found.append(part)
+            for what, vector in part.effects.items():
+                effects[what] = effects.get(what, 0.0) + (-vector if one.startswith("-") else vector)
+        return Part(effects, f"{found[0].text}, and {len(found) - 1} more alike", found[0].unit)
+    keys = full_keys(path)
     if keys[0] not in (*ERROR_KEYS, "limbs"):
         numbers = robot.file_numbers()
         if keys[0] in {keys_of(number)[0] for number in numbers}:
             return None
         raise unknown_number(path, [*map(path_of, _error_keys(robot)), *numbers])
-    effects: dict[Effect, Array] = {}
     texts, unit_ = [], ""
     for kind, name, where, azimuth in robot.named(keys):
-        found = _part_effects(robot, kind, name, where, rotation_about_z(azimuth), path)
-        if found is None:
+        entry = _part_effects(robot, kind, name, where, rotation_about_z(azimuth), path)
+        if entry is None:
             break
-        effects |= found[0]
-        texts.append(found[1])
-        unit_ = found[2]
-    if not effects:
-        raise _explain_unknown(robot, keys, path)
-    alike = ", and its copies alike" if len(texts) > 1 else ""
-    return Part(effects, texts[0] + alike, unit_)
-
-
-def _join_parts(robot: Robot, path: str) -> Part:
-    """Return the common error of the parts of several paths."""
-    effects: dict[Effect, Array] = {}
-    found: list[Part] = []
-    for word in path.split(","):
-        one = word.strip()
-        part = part_of(robot, one.removeprefix("-"))
-        if part is None or part.unit != (found or [part])[0].unit:
-            raise ParameterError(f"tolerance {path}", one, "parts alone, in m or in rad")
-        found.append(part)
-        for what, vector in part.effects.items():
-            effects[what] = effects.get(what, 0.0) + (-vector if one.startswith("-") else vector)
-    return Part(effects, f"{found[0].text}, and {len(found) - 1} more alike", found[0].unit)
+        effects |= entry[0]
+        texts.append(entry[1])
+        unit_ = entry[2]
+    if effects:
+        return Part(effects, texts[0] + (", and its copies alike" if len(texts) > 1 else ""), unit_)
+    # Name the first unknown word.
+    known = list(_error_keys(robot))
+    for k in range(len(keys) + 1):
+        words = {str(one[k]) for one in known if one[:k] == keys[:k] and len(one) > k}
+        if k < len(keys) and words and str(keys[k]) not in words:
+            raise UnknownNameError(path, keys[k], words)
+        if not words or k == len(keys):
+            rest = f"one of {', '.join(sorted(words))} behind it" if words else "no more keys"
+            raise ParameterError(path, path_of(keys[k:]) or None, rest)
+    raise AssertionError(path)
 
 
 def _error_keys(robot: Robot) -> Iterator[list[str | int]]:
@@ -157,19 +158,6 @@ def matching(robot: Robot, pattern: str) -> list[str]:
     if not found:
         raise ParameterError("tolerance", pattern, "a pattern that fits a part, as rods.*.length")
     return list(dict.fromkeys(found))
-
-
-def _explain_unknown(robot: Robot, keys: Sequence[str | int], path: str) -> ParameterError:
-    """Return the error for a path without a part: it names the first unknown word."""
-    known = list(_error_keys(robot))
-    for k in range(len(keys) + 1):
-        words = {str(one[k]) for one in known if one[:k] == keys[:k] and len(one) > k}
-        if k < len(keys) and words and str(keys[k]) not in words:
-            return UnknownNameError(path, keys[k], words)
-        if not words or k == len(keys):
-            rest = f"one of {', '.join(sorted(words))} behind it" if words else "no more keys"
-            return ParameterError(path, path_of(keys[k:]) or None, rest)
-    raise AssertionError(path)
 
 
 def _part_effects(
@@ -418,7 +406,7 @@ class Assembly:
 
         # The derivatives are those without errors, so steps need not halve.
         placed, closed = newton(
-            placed, look, Placement.moved, solve, iterations=MAX_ITERATIONS, gain=math.inf, most=MAX_OPEN_FRACTION
+            placed, look, Placement.moved, solve, iterations=30, gain=math.inf, most=MAX_OPEN_FRACTION
         )
         if closed:
             name, origin = self.graph.platform, self.graph.origin

@@ -24,8 +24,6 @@ from pkm_twin.robot.robot import Robot
 
 Index = NDArray[np.intp]
 
-CONSTRAINT: Final = re.compile(r"\s*([\w-]+)\s*(<=|>=)\s*(\S+)\s*")
-
 
 @dataclass(frozen=True)
 class Quantity:
@@ -79,7 +77,7 @@ class Constraint:
 
         :raises ParameterError: another form, quantity, or side.
         """
-        match = CONSTRAINT.fullmatch(text)
+        match = re.fullmatch(r"\s*([\w-]+)\s*(<=|>=)\s*(\S+)\s*", text)
         try:
             bound = float(match[3]) if match else math.nan
         except ValueError:
@@ -119,10 +117,6 @@ def effort_scales(robot: Robot) -> Array:
     return 1.0 / np.asarray(limit, np.float64)
 
 
-def _peak_efforts(f: PathMotion) -> Array:
-    return np.abs(f.efforts) * effort_scales(f.many.robot)
-
-
 def _peak_slopes(f: PathMotion, places: Index) -> Array:
     rows = np.arange(len(places))
     weights = np.zeros(f.efforts.shape[1:])
@@ -141,10 +135,6 @@ def _rms_gradient(f: PathMotion, values: Array, place: int) -> Array:
     """Return the derivatives of one RMS by one machine's values, shape (t,)."""
     root = _rms_over_time(f, values)[0, place] * f.path.duration
     return np.asarray(f.path.weights * values[0, :, place] / max(root, 1e-300), np.float64)
-
-
-def _rms_efforts(f: PathMotion) -> Array:
-    return _rms_over_time(f, f.efforts) * effort_scales(f.many.robot)
 
 
 def _rms_slopes(f: PathMotion, places: Index) -> Array:
@@ -238,20 +228,22 @@ def _cached_numbers(f: PathMotion, of: Callable[[Robot], list[Any]]) -> FileNumb
     return found
 
 
-def _mass(f: PathMotion) -> Array:
-    return _cached_numbers(f, _moving_masses)(f.many.values)
-
-
-def _mass_slopes(f: PathMotion, places: Index) -> Array:
-    slopes = _cached_numbers(f, _moving_masses).slopes_at(f.many.values)
-    return np.repeat(slopes[0], len(places), 0)
-
-
 QUANTITIES: Final = {
     quantity.name: quantity
     for quantity in (
-        Quantity("peak-effort", "greatest effort of any joint", _peak_efforts, _peak_slopes, True),
-        Quantity("rms-effort", "greatest RMS effort of a joint", _rms_efforts, _rms_slopes),
+        Quantity(
+            "peak-effort",
+            "greatest effort of any joint",
+            lambda f: np.abs(f.efforts) * effort_scales(f.many.robot),
+            _peak_slopes,
+            True,
+        ),
+        Quantity(
+            "rms-effort",
+            "greatest RMS effort of a joint",
+            lambda f: _rms_over_time(f, f.efforts) * effort_scales(f.many.robot),
+            _rms_slopes,
+        ),
         Quantity(
             "motor-torque",
             "greatest RMS torque of a motor, of files with drives",
@@ -266,7 +258,12 @@ QUANTITIES: Final = {
             _deflection_slopes,
             True,
         ),
-        Quantity("mass", "mass of all bodies and rods without payload", _mass, _mass_slopes),
+        Quantity(
+            "mass",
+            "mass of all bodies and rods without payload",
+            lambda f: _cached_numbers(f, _moving_masses)(f.many.values),
+            lambda f, places: np.repeat(_cached_numbers(f, _moving_masses).slopes_at(f.many.values)[0], len(places), 0),
+        ),
         Quantity(
             "singularity",
             "least singularity index",

@@ -28,22 +28,12 @@ from pkm_twin.robot.robot import Robot
 
 Index = NDArray[np.intp]
 
-MAX_RUNS: Final = 20
-"""Largest number of SLSQP runs from a start."""
-MAX_SHRINKS: Final = 12
-"""Largest number of times that the box is made smaller."""
-NEAR_WORST_FRACTION: Final = 0.7
-"""Fraction of the largest piece above which pieces are included."""
-MAX_PIECES: Final = 40
-"""Largest number of pieces of a quantity that are included at a time."""
 MISS_TOLERANCE: Final = 1e-6
 """Excess of a bound, relative to it, that counts as none."""
 GAIN_TOLERANCE: Final = 1e-7
 """Relative gain below which the search ends."""
 DIFFERENCE_STEP: Final = 1e-4
 """Step of central differences, as a fraction of a variable's range."""
-SAMPLES_PER_BATCH: Final = 200_000
-"""Samples of all machines that are computed at a time."""
 
 
 @dataclass(frozen=True)
@@ -81,19 +71,16 @@ class Problem:
         self.count += len(y)
         return self._many.with_values(self.variables.values(y), checked=self._checked)
 
-    def followed(self, y: Array) -> PathMotion:
-        """Return the motion of the machines of points (k, d) on the path."""
-        return PathMotion(self.machines(y), self.path)
-
     def pieces(self, y: Array, quantities: Sequence[Quantity]) -> list[Array]:
         """Return the pieces of each quantity, (k, pieces), for points (k, d), in batches.
 
         Machines that cannot follow the path have NaN.
         """
-        size = max(1, SAMPLES_PER_BATCH // len(self.path.time))
+        # Samples of all machines that are computed at a time.
+        size = max(1, 200_000 // len(self.path.time))
         parts = []
         for k in range(0, len(y), size):
-            followed = self.followed(y[k : k + size])
+            followed = PathMotion(self.machines(y[k : k + size]), self.path)
             lost = np.asarray(~np.isfinite(followed.q).all((1, 2)))
             found = [quantity.pieces(followed) for quantity in quantities]
             parts.append([np.where(lost[:, None], np.nan, rows) for rows in found])
@@ -101,7 +88,7 @@ class Problem:
 
     def point(self, y: Array, constraints: Sequence[Constraint]) -> DesignPoint:
         """Return a machine with all quantities that its file has data for."""
-        followed = self.followed(y[None])
+        followed = PathMotion(self.machines(y[None]), self.path)
         found: dict[str, float] = {}
         for name, quantity in QUANTITIES.items():
             wanted = any(c.quantity is quantity for c in constraints)
@@ -147,7 +134,7 @@ class Search:
         scale = max(abs(aim), 1e-300)
         chosen = [np.zeros(0, np.intp) for _ in self._all]
         radius, shrinks = 1.0, 0
-        for _ in range(MAX_RUNS):
+        for _ in range(20):
             chosen = [
                 np.union1d(old, self._pieces_near_worst(k, found[0]))
                 for k, (old, found) in enumerate(zip(chosen, pieces, strict=True))
@@ -178,11 +165,9 @@ class Search:
                     np.union1d(old, self._pieces_near_worst(k, p[0]))
                     for k, (old, p) in enumerate(zip(chosen, new, strict=True))
                 ]
-            radius, shrinks = (
-                0.5 * max(min(radius, step if step > 0.0 else radius), 1e-9),
-                shrinks + 1,
-            )
-            if shrinks > MAX_SHRINKS:
+            radius = 0.5 * max(min(radius, step if step > 0.0 else radius), 1e-9)
+            shrinks += 1
+            if shrinks > 12:
                 break
         return best, aim, miss
 
@@ -196,10 +181,11 @@ class Search:
         padded = np.pad(table, ((1, 1), (0, 0)), constant_values=-np.inf)
         peaks = (table >= padded[:-2]) & (table >= padded[2:])
         worst = float(table.max())
-        reach = worst - (1.0 - NEAR_WORST_FRACTION) * max(abs(worst), 0.3 if quantity.least else 0.0)
+        # Pieces above seven tenths of the largest.
+        reach = worst - 0.3 * max(abs(worst), 0.3 if quantity.least else 0.0)
         flat = table.ravel()
         order = np.flatnonzero(peaks.ravel() & (flat >= reach))
-        return order[np.argsort(-flat[order], kind="stable")][:MAX_PIECES]
+        return order[np.argsort(-flat[order], kind="stable")][:40]
 
 
 def is_better(aim: float, miss: float, old_aim: float, old_miss: float) -> bool:
@@ -383,7 +369,10 @@ def design(
     if deflects and not path.wrench.any():
         raise ParameterError("wrench", None, "a wrench that deflects the platform")
     problem = Problem(robot, Variables.of(robot, vary), path)
-    first = _start_points(problem, starts, seed)
+    own = problem.variables.start
+    first = sobol(len(own), starts, seed)
+    if ((own >= 0.0) & (own <= 1.0)).all():
+        first = np.vstack([own, first])
     done, rejected = 0, 0
 
     def search_from(aim: Quantity, bounds: Sequence[Constraint], tries: Array) -> Array | None:
@@ -404,16 +393,21 @@ def design(
 
     least = search_from(aims[0], constraints, first)
     if least is None:
-        raise _explain_failure(problem, constraints, first, rejected)
+        if rejected >= len(first):
+            raise PkmTwinError(f"{robot.name}: none of {len(first)} machines tried can follow the path")
+        kept = ", ".join(map(str, constraints))
+        raise PkmTwinError(f"{robot.name}: no machine found that follows the path and keeps {kept}")
     front: list[Array] = [least]
     if len(aims) > 1:
         other = search_from(aims[1], constraints, np.vstack([first, least]))
         assert other is not None  # noqa: S101  the first end of the front keeps the bounds
         front = _trace_front(problem, aims, constraints, (least, other), points, search_from)
     told = [problem.point(y, constraints) for y in front]
-    best = told[len(told) // 2 if len(told) > 1 else 0]
-    if len(told) > 1:
-        best = _choose_middle(told, names)
+    # The machine nearest to both smallest aims, relative to their ranges.
+    table = np.array([[point.quantities[name] for name in names] for point in told])
+    span = np.ptp(table, 0)
+    near = (table - table.min(0)) / np.where(span > 0.0, span, 1.0)
+    best = told[int(np.argmin((near**2).sum(1)))]
     before = problem.point(problem.variables.start, constraints)
     return Design(
         robot.with_file_values(best.numbers),
@@ -435,14 +429,6 @@ def searches(aims: int, points: int = DEFAULT_FRONT_POINTS) -> int:
 def _ranking(aims: Array, misses: Array, k: int) -> tuple[float, float]:
     kept = misses[k] <= MISS_TOLERANCE
     return (0.0, float(aims[k])) if kept else (float(misses[k]), 0.0)
-
-
-def _start_points(problem: Problem, count: int, seed: int) -> Array:
-    """Return Sobol points in the box, and the file's numbers if inside, (k, d)."""
-    points = sobol(len(problem.variables), count, seed)
-    own = problem.variables.start
-    inside = bool(((own >= 0.0) & (own <= 1.0)).all())
-    return np.vstack([own, points]) if inside else points
 
 
 def sobol(dimensions: int, count: int, seed: int) -> Array:
@@ -474,19 +460,3 @@ def _trace_front(
         if found is not None:
             front.append(found)
     return [*front, ends[1]]
-
-
-def _choose_middle(front: Sequence[DesignPoint], names: Sequence[str]) -> DesignPoint:
-    """Return the front's machine nearest to both smallest aims, relative to their ranges."""
-    table = np.array([[point.quantities[name] for name in names] for point in front])
-    span = np.ptp(table, 0)
-    near = (table - table.min(0)) / np.where(span > 0.0, span, 1.0)
-    return front[int(np.argmin((near**2).sum(1)))]
-
-
-def _explain_failure(problem: Problem, constraints: Sequence[Constraint], starts: Array, rejected: int) -> PkmTwinError:
-    name = problem.robot.name
-    if rejected >= len(starts):
-        return PkmTwinError(f"{name}: none of {len(starts)} machines tried can follow the path")
-    bounds = ", ".join(map(str, constraints))
-    return PkmTwinError(f"{name}: no machine found that follows the path and keeps {bounds}")

@@ -85,16 +85,6 @@ class Box:
         return {key: value for key, value in vars(self).items() if key != "problem"}
 
 
-def known_quantities(robot: Robot, path: PosePath) -> list[str]:
-    """Return the quantities that the robot's file and the path have data for."""
-    try:
-        elastic = bool(robot.element_names)
-    except ParameterError:
-        elastic = False
-    known = {"deflection": elastic and path.wrench.any(), "motor-torque": None not in robot.drives}
-    return [name for name in QUANTITIES if known.get(name, True)]
-
-
 Work = Sequence[tuple[int, Array]]
 """Numbered points."""
 
@@ -126,7 +116,14 @@ def sweep(
     :param compute: evaluates the parts, in any order.
     :raises ParameterError: an unknown path or quantity, or an invalid count.
     """
-    wanted = known_quantities(robot, path) if quantities is None else quantities
+    wanted = quantities
+    if wanted is None:
+        try:
+            elastic = bool(robot.element_names)
+        except ParameterError:
+            elastic = False
+        known = {"deflection": elastic and path.wrench.any(), "motor-torque": None not in robot.drives}
+        wanted = [name for name in QUANTITIES if known.get(name, True)]
     names = tuple(find_quantity(name, "quantities").name for name in wanted)
     box = Box(robot, vary, path, names)
     variables = box.problem.variables

@@ -34,10 +34,6 @@ MIN_SINGULARITY_INDEX: Final = 0.05
 """Smallest singularity index of joint states that represent the workspace."""
 MAX_DEVIATION: Final = 0.02
 """Largest standard deviation, rad, or relative to the machine's size: more is a wrong unit."""
-MOTION_ROUNDING: Final = 1e-9
-"""Motion of the reference point per rotation of the platform that is rounding, m per rad."""
-MAX_COMBINED_ERRORS: Final = 12
-"""Errors up to which all combinations of signs are tried: 2,048 different ones."""
 STATES_PER_BLOCK: Final = 256
 """States whose bodies are solved at a time: each has large tables."""
 
@@ -84,9 +80,12 @@ class Tolerances:
 
     @cached_property
     def is_exact(self) -> bool:
-        """Whether :attr:`farthest` is attained: few errors, none of a free direction."""
+        """True if :attr:`farthest` is attained: few errors, none of a free direction.
+
+        Up to 12 errors all combinations of signs are tried: 2,048 different ones.
+        """
         single = all(len(paths) == 1 for paths in self.together.values())
-        return single and len(self.bounds) <= MAX_COMBINED_ERRORS
+        return single and len(self.bounds) <= 12
 
     @cached_property
     def farthest(self) -> Array:
@@ -130,7 +129,7 @@ class Tolerances:
     def only_turns(self) -> bool:
         """Whether the errors rotate the platform about its reference point without moving it."""
         moves, turns = np.split(self.deviation, 2, -1)
-        return bool(np.linalg.norm(moves) < MOTION_ROUNDING * np.linalg.norm(turns))
+        return bool(np.linalg.norm(moves) < 1e-9 * np.linalg.norm(turns))
 
     @cached_property
     def variance(self) -> dict[str, float]:

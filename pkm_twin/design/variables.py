@@ -6,7 +6,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 
@@ -15,10 +14,6 @@ from pkm_twin.errors import ParameterError
 from pkm_twin.machine.formulas import PARAMETERS
 from pkm_twin.machine.uncertainty import Tolerance
 from pkm_twin.robot.robot import Robot
-
-MAX_RANGE: Final = 1e4
-"""Largest range of a variable over its value in the file, or the machine's size: the search
-resolves a millionth of the range, so a wider one loses the value."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +64,8 @@ class Variables:
                     raise ParameterError("vary", f"{PARAMETERS}.{name}", bound)
             own_value = abs(robot.number(parts[0]))
             unit = robot.file_numbers().get(parts[0], (0.0, ""))[1]
-            widest = MAX_RANGE * max(own_value, robot.graph.size if unit == "m" else 1.0)
+            # The search resolves a millionth of the range: a wider one loses the value.
+            widest = 1e4 * max(own_value, robot.graph.size if unit == "m" else 1.0)
             if not high - low <= widest:
                 raise ParameterError(
                     f"vary {text}",

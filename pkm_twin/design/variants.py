@@ -36,21 +36,8 @@ from stiffness_monitor.programs import Elastic
 
 Mask = NDArray[np.bool_]
 
-MAX_CORNER_NUMBERS: Final = 5
-"""Numbers of a section up to which all combinations of smallest and largest value are checked."""
 SAMPLES_PER_BALANCE: Final = 2048
 """Samples whose joint loads are solved at a time: each has large tables."""
-REACTION_ARRAYS: Final = (
-    "points",
-    "wrenches",
-    "determinate",
-    "values",
-    "determinate_components",
-    "residual",
-)
-"""Names of the arrays of reactions."""
-HOME_NEIGHBOURHOOD: Final = 1e-3
-"""Distance from home at which a machine must be assembled too, rad, or over the machine's size."""
 
 
 class Variants:
@@ -115,7 +102,8 @@ class Variants:
         home, graph = self.robot.graph.home, self.robot.graph
         reach = [graph.size if graph.joints[name].slides else 1.0 for name in graph.actuated]
         steps = np.linspace(-1.0, 1.0, len(home)) + 0.3
-        away = HOME_NEIGHBOURHOOD * np.array([0.0 * steps, steps, -steps]) * reach
+        # Assembled at home alone, a machine may have no freedom.
+        away = 1e-3 * np.array([0.0 * steps, steps, -steps]) * reach
         rest = [np.zeros_like(home)] * 2 * self.robot.redundant
         ask = programs.project_redundant if self.robot.redundant else programs.forward
         (poses, *_), good = self.run(ask, (home + away)[None], *rest)
@@ -156,16 +144,13 @@ class Variants:
             found = balanced(self.robot, taken, strict=False)
             parts.append(known_alone(found.reactions(found.value, found.null)))
         kept = np.concatenate([part.residual <= BALANCE_BOUND for part in parts])
-
-        def everywhere(name: str) -> NDArray[Any]:
+        made: dict[str, Any] = {}
+        for name in ("points", "wrenches", "determinate", "values", "determinate_components", "residual"):
             values = np.concatenate([getattr(part, name) for part in parts])
-            missing = False if values.dtype == bool else np.nan
-            table = np.full((good.size, *values.shape[1:]), missing)
+            table = np.full((good.size, *values.shape[1:]), False if values.dtype == bool else np.nan)
             table[at[kept]] = values[kept]
             table.setflags(write=False)
-            return table.reshape(*good.shape[:-1], *values.shape[1:])
-
-        made: dict[str, Any] = {name: everywhere(name) for name in REACTION_ARRAYS}
+            made[name] = table.reshape(*good.shape[:-1], *values.shape[1:])
         return replace(parts[0], **made)
 
     def mass_matrix(self, q: ArrayLike) -> Array:
@@ -305,7 +290,8 @@ class Variants:
         Numbers that depend on a parameter may be any function of it.
         """
         paths = [self.paths[column] for column in columns]
-        if len(columns) > MAX_CORNER_NUMBERS or any(keys_of(path)[0] == PARAMETERS for path in paths):
+        # More numbers have too many corners.
+        if len(columns) > 5 or any(keys_of(path)[0] == PARAMETERS for path in paths):
             return False
         ends = zip(rows.min(0).tolist(), rows.max(0).tolist(), strict=True)
         return all(self._is_valid(paths, row) for row in set(itertools.product(*ends)))
@@ -334,26 +320,6 @@ class Variants:
     def run(self, ask: programs.Ask, *inputs: ArrayLike) -> tuple[list[Array], Mask]:
         """Return outputs (k, ..., size) each, and which are valid, shape (k, ..., 1)."""
         code, prepared = self._prepare(ask, self.robot)
-        rows, batch = self._arrange_inputs(code, inputs)
-        k, count = len(self), math.prod(batch)
-        fits = prepared[:, -1] <= MAX_GEOMETRY_MISMATCH
-        if fits.all():
-            outputs, status = code.run_each(prepared, *rows)
-            good = np.ones((k, count), bool) if status is None else status[..., 0] == 0.0
-        else:
-            outputs = [np.full((k, count, size), np.nan) for size in code.sizes[1]]
-            good = np.zeros((k, count), bool)
-            for one, rest, own in self._programs_by_structure(ask):
-                picked = [row[own] if len(row) > 1 else row for row in rows]
-                found, status = one.run_each(rest[own], *picked)
-                for table, values in zip(outputs, found, strict=True):
-                    table[own] = values
-                good[own] = True if status is None else status[..., 0] == 0.0
-        shaped = [values.reshape(k, *batch, values.shape[-1]) for values in outputs]
-        return shaped, np.asarray(good).reshape(k, *batch, 1)
-
-    def _arrange_inputs(self, code: Code, inputs: Sequence[ArrayLike]) -> tuple[list[Array], tuple[int, ...]]:
-        """Return inputs as :meth:`Code.run_each` takes them, and the batch axes."""
         k = len(self)
         arrays, shapes = code.checked(inputs), []
         for array in arrays:
@@ -361,15 +327,29 @@ class Variants:
             # A shape that begins with 1 gives all machines the same k samples.
             shapes.append((each, array.shape[1 if each or array.shape[:2] == (1, k) else 0 : -1]))
         batch = common_batch(*(shape for _, shape in shapes))
+        count = math.prod(batch)
+        # As the code takes them: (k or 1, samples or 1, size).
         rows = []
         for array, (each, shape) in zip(arrays, shapes, strict=True):
             machines, size, one = k if each else 1, array.shape[-1], math.prod(shape) == 1
             values = array.reshape(machines, *([1] * (len(batch) - len(shape))), *shape, size)
             if not one:
                 values = np.broadcast_to(values, (machines, *batch, size))
-            values = values.reshape(machines, 1 if one else math.prod(batch), size)
-            rows.append(np.ascontiguousarray(values))
-        return rows, batch
+            rows.append(np.ascontiguousarray(values.reshape(machines, 1 if one else count, size)))
+        if (prepared[:, -1] <= MAX_GEOMETRY_MISMATCH).all():
+            outputs, status = code.run_each(prepared, *rows)
+            good = np.ones((k, count), bool) if status is None else status[..., 0] == 0.0
+        else:
+            outputs = [np.full((k, count, size), np.nan) for size in code.sizes[1]]
+            good = np.zeros((k, count), bool)
+            for one_code, rest, own in self._programs_by_structure(ask):
+                picked = [row[own] if len(row) > 1 else row for row in rows]
+                found, status = one_code.run_each(rest[own], *picked)
+                for table, values in zip(outputs, found, strict=True):
+                    table[own] = values
+                good[own] = True if status is None else status[..., 0] == 0.0
+        shaped = [values.reshape(k, *batch, values.shape[-1]) for values in outputs]
+        return shaped, np.asarray(good).reshape(k, *batch, 1)
 
     def _programs_by_structure(self, ask: programs.Ask) -> Iterator[tuple[Code, Array, NDArray[np.intp]]]:
         """Yield each structure's program with the machines that it is valid for."""
