@@ -25,18 +25,12 @@ if TYPE_CHECKING:
 
 COLOUR_MAP: Final = "viridis"
 PREFIXES: Final = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
-SEARCH_NOISE: Final = 5e-6
-"""Coordinate, m or rad, below which the search's result counts as zero."""
 PANELS: Final = 3
 """Largest number of planes in a picture."""
 MIN_SHOWN: Final = 5e-5
 """Coordinate, m or rad, or component of a direction, below which zero is shown."""
 SCALE_QUANTILE: Final = 0.95
 """Quantile of the values that ends the colour scale if there are outliers."""
-OUTLIER_RATIO: Final = 2.0
-"""Largest value over that quantile from which on there are outliers."""
-CONTOUR_QUANTILES: Final = ((0.35, 0.85), (0.25, 0.6, 0.9))
-"""Quantiles of a plane's contours: for panels in a full row, and for fewer panels."""
 
 
 def scale_of(greatest: float, unit: str) -> tuple[float, str]:
@@ -107,7 +101,7 @@ def sentence(answer: dict[str, Any]) -> str:
 
     The pose can be given to commands; it has enough digits to keep its singularity index.
     """
-    pose = ", ".join(f"{_drop_noise(v, SEARCH_NOISE):.6g}" for v in answer["pose"].values())
+    pose = ", ".join(f"{_drop_noise(v, 5e-6):.6g}" for v in answer["pose"].values())
     text = f"{answer['answer']}: {shown(answer['value'], answer['unit'])}"
     way = np.array(answer.get("direction", []))
     if len(way) and np.isfinite(way).all() and way.any():
@@ -170,7 +164,7 @@ def limits(values: Array, worst: float) -> tuple[float, float]:
     known = values[np.isfinite(values)]
     every = np.append(known, worst) if math.isfinite(worst) else known
     low, high = (float(every.min()), float(every.max())) if len(every) else (0.0, 1.0)
-    if len(known) and high > OUTLIER_RATIO * (most := float(np.quantile(known, SCALE_QUANTILE))) > 0.0:
+    if len(known) and high > 2.0 * (most := float(np.quantile(known, SCALE_QUANTILE))) > 0.0:
         high = most
     if 0.0 <= low <= 0.5 * high:
         low = 0.0
@@ -216,61 +210,49 @@ def planes(data: Dataset, case: int) -> Figure:
     """Draw up to three planes of a case through its worst pose, with one colour scale."""
     kind, part = kind_of(data), data.isel(case=case)
     drawn = [plane_of(data, case, k) for k in sorted(full_planes(data, case)[:PANELS])]
-    count = len(drawn)
+    count, flat = len(drawn), len(drawn[0]["names"]) > 1
     worst = float(part.worst_value)
     values = np.concatenate([one["values"].ravel() for one in drawn])
     low, high = limits(values, worst)
     beyond = bool((np.append(values, worst) > high).any())
     scale, unit = scale_of(max(abs(low), abs(high)), str(part.case_unit.values))
     label = textwrap.fill(f"{part.case_what.values} ({unit or 'dimensionless'})", 48)
+    # Equal scales where all coordinates have one unit; a single panel fills the width.
+    height, widths = 0.5 * plots.WIDTH, [1.0] * count
+    if count == PANELS:
+        height = plots.WIDTH / PANELS + 0.9
+    elif count == 1 and flat and len(set(drawn[0]["units"])) == 1:
+        across, up = map(np.ptp, drawn[0]["ticks"])
+        height = float(np.clip(0.8 * plots.WIDTH * up / across, 3.0, 0.7 * plots.WIDTH) + 0.6)
+    if count > 1 and len({unit for one in drawn for unit in one["units"]}) == 1:
+        spans = np.array([np.ptp(one["ticks"][0]) for one in drawn])
+        widths = np.clip(spans / spans.max(), 0.5, 1.0).tolist()
     with plots.pyplot().rc_context({"font.size": 9}):
-        high_of = plots.WIDTH / PANELS + 0.9 if count == PANELS else _height(drawn[0], count)
         figure: Figure
-        figure, columns = plots.columns(count, 1, high_of, gridspec_kw={"width_ratios": _widths(drawn)})
+        figure, columns = plots.columns(count, 1, height, gridspec_kw={"width_ratios": widths})
         axes, over = [column[0] for column in columns], ""
         for one, ax in zip(drawn, axes, strict=True):
-            if len(one["names"]) == 1:
-                _draw_line(one, ax, scale, label)
+            if not flat:
+                ax.plot(one["ticks"][0], scale * one["values"][:, 0], color=plots.COLOURS[0])
+                plots.label(ax, f"{one['names'][0]} ({one['units'][0]})", label)
+                if one["star"]:
+                    k = int(np.abs(one["ticks"][0] - one["star"][0]).argmin())
+                    ax.plot(one["star"][0], scale * one["values"][k, 0], "*", color="red", ms=12)
                 continue
-            mesh = draw_panel(one, ax, scale, scale * low, scale * high, CONTOUR_QUANTILES[count < PANELS])
+            # Contours at fewer quantiles in a full row of panels.
+            quantiles = (0.25, 0.6, 0.9) if count < PANELS else (0.35, 0.85)
+            mesh = draw_panel(one, ax, scale, scale * low, scale * high, quantiles)
             over = kind.overlay(data, one["names"], one["through"], ax)
-        if len(drawn[0]["names"]) > 1:
+        if flat:
             bar = figure.colorbar(mesh, ax=axes, aspect=25, pad=0.01, extend="max" if beyond else "neither")
             bar.set_label(label)
         rows = plots.head(figure, "\n".join(title(data, case)), 10)
-        figure.set_figheight(high_of + 0.2 * rows)
-        figure.supxlabel(_caption(drawn, beyond) + over, fontsize=8.5, color="0.3")
+        figure.set_figheight(height + 0.2 * rows)
+        star = "star: worst pose; " if any(one["star"] for one in drawn) else ""
+        more = "; brightest: this or more" if beyond else ""
+        caption = f"{star}outline: joint limits; white: does not count{more}{over}"
+        figure.supxlabel(caption, fontsize=8.5, color="0.3")
     return figure
-
-
-def _height(one: dict[str, Any], count: int) -> float:
-    """Return the height of one or two panels, inches; equal scales fill the width."""
-    if count > 1 or len(set(one["units"])) != 1 or len(one["names"]) == 1:
-        return 0.5 * plots.WIDTH
-    across, up = map(np.ptp, one["ticks"])
-    return float(np.clip(0.8 * plots.WIDTH * up / across, 3.0, 0.7 * plots.WIDTH) + 0.6)
-
-
-def _widths(drawn: list[dict[str, Any]]) -> list[float]:
-    """Return the widths of panels: with equal scales if all coordinates have one unit."""
-    if len({unit for one in drawn for unit in one["units"]}) > 1 or len(drawn) == 1:
-        return [1.0] * len(drawn)
-    widths = np.array([np.ptp(one["ticks"][0]) for one in drawn])
-    return list(np.clip(widths / widths.max(), 0.5, 1.0).tolist())
-
-
-def _caption(drawn: list[dict[str, Any]], beyond: bool) -> str:
-    star = "star: worst pose; " if any(one["star"] for one in drawn) else ""
-    more = "; brightest: this or more" if beyond else ""
-    return f"{star}outline: joint limits; white: does not count{more}"
-
-
-def _draw_line(one: dict[str, Any], ax: Axes, scale: float, label: str) -> None:
-    ax.plot(one["ticks"][0], scale * one["values"][:, 0], color=plots.COLOURS[0])
-    plots.label(ax, f"{one['names'][0]} ({one['units'][0]})", label)
-    if one["star"]:
-        k = int(np.abs(one["ticks"][0] - one["star"][0]).argmin())
-        ax.plot(one["star"][0], scale * one["values"][k, 0], "*", color="red", ms=12)
 
 
 def draw_panel(one: dict[str, Any], ax: Axes, scale: float, low: float, high: float, shares: Sequence[float]) -> Any:

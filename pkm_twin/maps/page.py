@@ -25,8 +25,6 @@ if TYPE_CHECKING:
 CAMERA: Final = {"eye": {"x": 1.3, "y": -1.5, "z": 0.95}, "center": {"x": 0, "y": 0, "z": -0.1}}
 FLAT_LIGHT: Final = {"ambient": 1.0, "diffuse": 0.0, "specular": 0.0, "fresnel": 0.0}
 """Light that shows colours as in the colour bar."""
-CONFIG: Final = {"displaylogo": False, "responsive": True, "showSendToCloud": False}
-"""Plotly settings without buttons that need the network."""
 MENU: Final = {"x": 0.0, "y": 1.0, "xanchor": "left", "yanchor": "bottom", "pad": {"b": 8}}
 BAR: Final = {"len": 0.8, "thickness": 12, "title": {"side": "right"}}
 """Colour bar with its title along it, to fit narrow windows."""
@@ -53,7 +51,8 @@ def write_page(data: Dataset, path: Path) -> Path:
         one.to_html(
             include_plotlyjs=k == 0,
             full_html=False,
-            config=CONFIG,
+            # No buttons that need the network.
+            config={"displaylogo": False, "responsive": True, "showSendToCloud": False},
             default_width="100%",
             default_height="100%",
             auto_play=False,
@@ -69,7 +68,19 @@ def write_page(data: Dataset, path: Path) -> Path:
 
 def page(data: Dataset) -> Any:
     """Return a figure of all cases: layers for three coordinates, else planes."""
-    return _layers(data) if len(data.coordinate) == 3 else _planes(data)
+    figure, buttons = _layers(data) if len(data.coordinate) == 3 else _planes(data)
+    figure.update_layout(
+        coloraxis={"colorscale": "Viridis", "colorbar": BAR},
+        updatemenus=[{"buttons": buttons, **MENU}],
+    )
+    # Show the menu's first entry.
+    first, layout = buttons[0]["args"]
+    for name, values in first.items():
+        for trace, value in zip(figure.data, values, strict=True):
+            if value is not None:
+                trace[name] = value
+    figure.update_layout(layout)
+    return figure
 
 
 def _case_layout(data: Dataset, case: int, values: Array) -> tuple[float, str, dict[str, Any]]:
@@ -87,7 +98,7 @@ def _case_layout(data: Dataset, case: int, values: Array) -> tuple[float, str, d
     return scale, unit, layout
 
 
-def _layers(data: Dataset) -> Any:
+def _layers(data: Dataset) -> tuple[Any, list[dict[str, Any]]]:
     graph = require("plotly.graph_objects", "maps")
     units = figures.units_of(data)
     dims = list(units)
@@ -131,6 +142,9 @@ def _layers(data: Dataset) -> Any:
             **{axis: [*(t[axis] for t in figure.data[:-1]), place] for axis, place in zip("xyz", star, strict=True)},
         }
         buttons.append(button(str(case), change, layout))
+    # Ranges with a margin stay constant when traces are hidden.
+    ends = [(float(np.nanmin(values)), float(np.nanmax(values))) for values in (x, y, heights)]
+    ranges = [[low - 0.05 * (high - low), high + 0.05 * (high - low)] for low, high in ends]
     count = len(kept)
     every = {"label": "all", "method": "restyle", "args": [{"visible": [True] * (count + 1)}]}
     slices = [
@@ -140,8 +154,8 @@ def _layers(data: Dataset) -> Any:
     figure.update_layout(
         scene={
             **{
-                f"{axis}axis": {"title": name, "range": axis_range(ends)}
-                for axis, name, ends in zip("xyz", names, (x, y, heights), strict=True)
+                f"{axis}axis": {"title": name, "range": span}
+                for axis, name, span in zip("xyz", names, ranges, strict=True)
             },
             "aspectmode": "cube",
             "camera": CAMERA,
@@ -157,10 +171,10 @@ def _layers(data: Dataset) -> Any:
             }
         ],
     )
-    return _show_first(figure, buttons)
+    return figure, buttons
 
 
-def _planes(data: Dataset) -> Any:
+def _planes(data: Dataset) -> tuple[Any, list[dict[str, Any]]]:
     graph = require("plotly.graph_objects", "maps")
     figure, buttons = graph.Figure(), []
     every = [(k, p) for k in range(len(data.case)) for p in figures.full_planes(data, k)]
@@ -200,24 +214,8 @@ def _planes(data: Dataset) -> Any:
     for trace, seen in zip(figure.data, visible[0], strict=True):
         trace.visible = seen
     figure.update_layout(margin={**MARGIN, "l": 70, "b": 60})
-    return _show_first(
-        figure, [button(text, {"visible": seen}, layout) for (text, layout), seen in zip(buttons, visible, strict=True)]
-    )
-
-
-def _show_first(figure: Any, buttons: list[dict[str, Any]]) -> Any:
-    """Set up a figure's menu, and show its first entry."""
-    figure.update_layout(
-        coloraxis={"colorscale": "Viridis", "colorbar": BAR},
-        updatemenus=[{"buttons": buttons, **MENU}],
-    )
-    first, layout = buttons[0]["args"]
-    for name, values in first.items():
-        for trace, value in zip(figure.data, values, strict=True):
-            if value is not None:
-                trace[name] = value
-    figure.update_layout(layout)
-    return figure
+    shown = zip(buttons, visible, strict=True)
+    return figure, [button(text, {"visible": seen}, layout) for (text, layout), seen in shown]
 
 
 def button(label: str, data: dict[str, Any], layout: dict[str, Any], traces: list[int] | None = None) -> dict[str, Any]:
@@ -253,9 +251,3 @@ def grid_triangles(shown: NDArray[np.bool_]) -> dict[str, NDArray[np.int64]]:
     three = three[np.tile(missing, 2) & (three >= 0).all(1)]
     corners = np.concatenate([corners[whole], three])
     return dict(zip("ijk", np.unique(corners, axis=0).T, strict=True))
-
-
-def axis_range(values: Array) -> list[float]:
-    """Return the ends of an axis with a margin, constant when traces are hidden."""
-    low, high = float(np.nanmin(values)), float(np.nanmax(values))
-    return [low - 0.05 * (high - low), high + 0.05 * (high - low)]

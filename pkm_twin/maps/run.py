@@ -17,10 +17,9 @@ import pickle
 import signal
 from asyncio import CancelledError
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures import CancelledError as FutureCancelled
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -35,14 +34,8 @@ Progress = Callable[[int], None]
 Work = Sequence[tuple[int, Any]]
 """Numbered parts of a task."""
 
-MAX_POOL_FAILURES: Final = 3
-"""Number of times that worker processes may die before the sweep is given up."""
-MAX_SERIAL_CHUNKS: Final = 3
-"""Number of chunks up to which no processes are started."""
 CONNECT_TIMEOUT: Final = "10s"
 """Time in which a scheduler must answer."""
-CHUNKS_PER_WORKER: Final = 2
-"""Chunks per worker in flight."""
 
 
 class Task(Protocol):
@@ -128,7 +121,8 @@ def _compute_pending(
         results = compute_on_cluster(sweep, work, scheduler)
     else:
         count = workers or os.cpu_count() or 1
-        alone = count == 1 or len(work) <= MAX_SERIAL_CHUNKS
+        # Starting processes takes longer than a few chunks.
+        alone = count == 1 or len(work) <= 3
         results = compute_serially(sweep, work) if alone else compute_on_cores(sweep, work, count, parts.folder)
     for index, values in results:
         if values is not None:
@@ -149,45 +143,37 @@ def compute_on_cores(sweep: Map, work: Work, workers: int, folder: Path) -> Iter
     The processes save their chunks themselves (None here): only a number goes through the pipe,
     which a process killed during a long message would block. A killed process costs its chunk's
     time.
+
+    :raises ClusterError: processes died three times.
     """
     # The first chunk compiles what the others load; processes that all compile would waste it.
     first = next((k for k, (_, chunk) in enumerate(work) if sweep.count(chunk)), 0)
     yield from compute_serially(sweep, [work[first]])
     rest = dict([*work[:first], *work[first + 1 :]])
-    broken = 0
+    # Pickled here once: a pool that fails to pickle its work would wait forever.
+    packed, broken = pickle.dumps(sweep), 0
     while rest:
+        # Not forked: the parent has threads (the progress bar's).
+        context = multiprocessing.get_context("spawn")
+        pool = ProcessPoolExecutor(min(workers, len(rest)), mp_context=context)
         try:
-            for index in _run_pool(sweep, list(rest.items()), min(workers, len(rest)), folder):
+            # A terminal sends Ctrl-C to all its processes; the parent alone handles it.
+            signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+            try:
+                with one_blas_thread_for_children():
+                    futures = [pool.submit(_evaluate_and_save, packed, c, folder, k) for k, c in rest.items()]
+            finally:
+                signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+            for future in as_completed(futures):
+                index = future.result()
                 del rest[index]
                 yield index, None
         except BrokenProcessPool:
             broken += 1
-            if broken == MAX_POOL_FAILURES:
-                raise ClusterError(f"processes died {MAX_POOL_FAILURES} times in this sweep") from None
-
-
-def _run_pool(sweep: Map, work: Work, workers: int, folder: Path) -> Iterator[int]:
-    # Not forked: the parent has threads (the progress bar's).
-    context = multiprocessing.get_context("spawn")
-    # Pickled here once: a pool that fails to pickle its work would wait forever.
-    packed = pickle.dumps(sweep)
-    pool = ProcessPoolExecutor(workers, mp_context=context)
-    queue = iter(work)
-    flying: set[Future[int]] = set()
-    try:
-        while True:
-            for index, chunk in queue:
-                with _without_interrupts(), one_blas_thread_for_children():
-                    flying.add(pool.submit(_evaluate_and_save, packed, chunk, folder, index))
-                if len(flying) >= CHUNKS_PER_WORKER * workers:
-                    break
-            if not flying:
-                break
-            finished, flying = wait(flying, return_when=FIRST_COMPLETED)
-            for future in finished:
-                yield future.result()
-    finally:
-        pool.shutdown(cancel_futures=True)
+            if broken == 3:
+                raise ClusterError("processes died 3 times in this sweep") from None
+        finally:
+            pool.shutdown(cancel_futures=True)
 
 
 def compute_on_cluster(sweep: Task, work: Work, scheduler: str) -> Iterator[tuple[int, Values]]:
@@ -208,12 +194,25 @@ def compute_on_cluster(sweep: Task, work: Work, scheduler: str) -> Iterator[tupl
         client = distributed.Client(scheduler, timeout=CONNECT_TIMEOUT, set_as_default=False)
     except (OSError, TimeoutError, ValueError, RuntimeError) as error:
         raise ClusterError(f"no Dask scheduler answers at {scheduler}: {error}") from None
+
+    def submit(index: int, chunk: Any) -> Any:
+        key = f"map-{sweep.fingerprint[:16]}-{index}"
+        return client.submit(evaluate_chunk, sweep, chunk, pkm_twin.__version__, key=key, pure=False)
+
     with client:
         threads = sum(client.nthreads().values())
         if not threads:
             raise ClusterError(f"the Dask scheduler at {scheduler} has no workers")
         try:
-            yield from _collect_results(sweep, work, distributed, client, threads)
+            # Two chunks per thread in flight; results are not kept.
+            queue = itertools.starmap(submit, work)
+            finished = distributed.as_completed(list(itertools.islice(queue, 2 * threads)), loop=client.loop)
+            for future in finished:
+                values, index = future.result(), int(future.key.rpartition("-")[2])
+                del future
+                yield index, values
+                for following in itertools.islice(queue, 1):
+                    finished.add(following)
         except distributed.KilledWorker as error:
             raise ClusterError(f"workers kept dying: {error}") from None
         except (CancelledError, FutureCancelled, distributed.comm.CommClosedError):
@@ -222,26 +221,6 @@ def compute_on_cluster(sweep: Task, work: Work, scheduler: str) -> Iterator[tupl
             raise
         except OSError as error:
             raise ClusterError(f"the Dask scheduler at {scheduler}: {error}") from None
-
-
-def _collect_results(
-    sweep: Task, work: Work, distributed: Any, client: Any, threads: int
-) -> Iterator[tuple[int, Values]]:
-    def submit(index: int, chunk: Any) -> Any:
-        key = f"map-{sweep.fingerprint[:16]}-{index}"
-        return client.submit(evaluate_chunk, sweep, chunk, pkm_twin.__version__, key=key, pure=False)
-
-    queue = itertools.starmap(submit, work)
-    flying = list(itertools.islice(queue, CHUNKS_PER_WORKER * threads))
-    finished = distributed.as_completed(flying, loop=client.loop)
-    del flying
-    for future in finished:
-        values = future.result()
-        index = int(future.key.rpartition("-")[2])
-        del future
-        yield index, values
-        for following in itertools.islice(queue, 1):
-            finished.add(following)
 
 
 def evaluate_chunk(sweep: Task, chunk: Any, version: str) -> Values:
@@ -268,16 +247,3 @@ def _unpickle(packed: bytes) -> Map:
     # Once per process, so that the robot's caches serve all chunks.
     sweep: Map = pickle.loads(packed)  # noqa: S301  from the parent
     return sweep
-
-
-@contextmanager
-def _without_interrupts() -> Iterator[None]:
-    """Block SIGINT while a process is started, which then never receives it.
-
-    A terminal sends Ctrl-C to all its processes; the parent alone handles it.
-    """
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})

@@ -17,26 +17,10 @@ from pkm_twin.maps.kind import Case, Kind, Space, Worst, evaluate_kind
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import causes, passing_singularity, reachable, try_forward
 
-JOINT_STATES: Final = 2**14
-"""Joint states, evenly spread between the limits, whose poses bound a workspace."""
-CLIMB_STARTS: Final = 32
-"""States from which the ends of a workspace of many coordinates are searched."""
 GRID_SIDE: Final = 33
 """Poses along each coordinate of the grid that bounds a workspace, or a plane's visible part."""
 MAX_GRID_DIMENSIONS: Final = 3
 """Largest number of pose coordinates of a full grid."""
-NEIGHBOURS: Final = 64
-"""Poses near the worst that show whether the bound on the singularity index excludes worse ones."""
-EDGE_WALKERS: Final = 1024
-"""Points with the smallest counted singularity index that walk to its bound."""
-EDGE_STEPS: Final = 24
-"""Steps of their walk."""
-EDGE_STARTS: Final = 128
-"""Points on that border from which the worst pose is searched."""
-BISECTIONS: Final = 12
-"""Bisection steps towards a point that does not count."""
-LIMIT_MARGIN: Final = 1e-9
-"""Fraction of a joint's range that the search keeps away from its ends."""
 
 
 def find_worst(space: Space, case: Case, starts: Array, tell: Callable[[float], object] = abs) -> Worst:
@@ -53,7 +37,8 @@ def find_worst(space: Space, case: Case, starts: Array, tell: Callable[[float], 
     rng = np.random.default_rng(0)
     first = robot.inverse(starts) if by_joints and len(starts) else starts
     if by_joints:
-        low, high = low + LIMIT_MARGIN * (high - low), high - LIMIT_MARGIN * (high - low)
+        # Keep away from the ends, where rounding decides what counts.
+        low, high = low + 1e-9 * (high - low), high - 1e-9 * (high - low)
 
     def inside(x: Array) -> NDArray[np.bool_]:
         return space.counts(*space.state(x), case)
@@ -98,7 +83,8 @@ def find_worst(space: Space, case: Case, starts: Array, tell: Callable[[float], 
         raise ParameterError("robot", robot.name, f"{bound}: {why}" if why else bound)
     q, pose, _ = space.state(x[None])
     found = evaluate_kind(kind, robot, q, [case])[0]
-    near = rng.normal(size=(NEIGHBOURS, len(x))) * 10.0 ** rng.uniform(-4.0, -2.0, (NEIGHBOURS, 1))
+    # Poses near the worst show whether the bound on the singularity index excludes worse ones.
+    near = rng.normal(size=(64, len(x))) * 10.0 ** rng.uniform(-4.0, -2.0, (64, 1))
     state = space.state(np.clip(x + near * (high - low), low, high))
     below = replace(space, least=0.0).counts(*state, case) & ~space.counts(*state, case)
     (beyond,) = evaluate_kind(kind, robot, state[0][below], [case])
@@ -131,9 +117,9 @@ def _edge_states(
     index = index_at(x)
     if not len(x) or space.least <= 0.0 or not (index_at(tried) < space.least).any():
         return x[:0]
-    order = np.argsort(index, kind="stable")[:EDGE_WALKERS]
+    order = np.argsort(index, kind="stable")[:1024]
     x, index = x[order], index[order]
-    for size in np.geomspace(0.1, 1e-4, EDGE_STEPS):
+    for size in np.geomspace(0.1, 1e-4, 24):
         moved = np.clip(x + size * (high - low) * rng.normal(size=x.shape), low, high)
         moved = _pull_inside(x, moved, inside)
         nearer = index_at(moved) < index
@@ -142,7 +128,7 @@ def _edge_states(
     x = x[index < 2.0 * space.least]
     chosen: list[int] = [0] if len(x) else []
     apart = np.full(len(x), np.inf)
-    while chosen and len(chosen) < min(EDGE_STARTS, len(x)):
+    while chosen and len(chosen) < min(128, len(x)):
         apart = np.minimum(apart, np.linalg.norm((x - x[chosen[-1]]) / (high - low), axis=1))
         chosen.append(int(apart.argmax()))
     return x[chosen]
@@ -203,7 +189,7 @@ def _pull_inside(x: Array, moved: Array, inside: Callable[[Array], NDArray[np.bo
     """
     share = inside(moved).astype(float)
     step = np.where(share < 1.0, 0.5, 0.0)
-    for _ in range(BISECTIONS):
+    for _ in range(12):
         good = inside(x + (share + step)[:, None] * (moved - x))
         share, step = share + np.where(good, step, 0.0), 0.5 * step
     return np.asarray(x + share[:, None] * (moved - x))
@@ -258,7 +244,7 @@ def _poses_from_joints(robot: Robot) -> Array:
 
     # Extremes are mostly where joints are at a limit or in the middle of their range.
     corners = np.stack(np.meshgrid(*[[0.0, 0.5, 1.0]] * count, indexing="ij"), -1)
-    inner = qmc.Halton(count, scramble=False).random(JOINT_STATES)
+    inner = qmc.Halton(count, scramble=False).random(2**14)
     share = np.concatenate([corners.reshape(-1, count), inner])
     q = robot.try_project_redundant(limits[:, 0] + share * np.ptp(limits, axis=1))
     poses, good = try_forward(robot, q)
@@ -267,7 +253,7 @@ def _poses_from_joints(robot: Robot) -> Array:
     if len(robot.pose_names) > MAX_GRID_DIMENSIONS and len(q):
         # With many joints, so few states are sparse: climb to the ends.
         ends = [
-            _climb(robot, limits, q[np.argsort(-sign * poses[:, k])[:CLIMB_STARTS]], k, sign)
+            _climb(robot, limits, q[np.argsort(-sign * poses[:, k])[:32]], k, sign)
             for k in range(poses.shape[1])
             for sign in (-1.0, 1.0)
         ]

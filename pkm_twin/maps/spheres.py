@@ -37,25 +37,11 @@ TILTS: Final = np.radians([0.0, 15.0, 30.0, 45.0])
 """Tilts of the spheres, rad; the paper's images end at 45 degrees."""
 AZIMUTHS: Final = np.radians(np.arange(0.0, 360.0, 30.0))
 """Azimuths of the spheres, rad; those of the paper's statement, 60, 180 and 300 degrees, too."""
-DIRECTIONS_PER_SPHERE: Final = 1000
-"""Directions on a sphere, about 6 degrees apart."""
-MIN_SINGULARITY_INDEX: Final = 1e-3
-"""Singularity index below which a pose has no sphere: efforts grow without bound there."""
 RADIUS: Final = math.radians(7.0)
 """Radius of a drawn sphere, rad of tilt: neighbours on a ring and of the next ring stay apart."""
 VIEW_DIRECTION: Final = np.array([0.5, math.sqrt(0.75), 0.0])
 """Unit vector towards the viewer, in pose rates: the rate of the position points up, and that of a
 tilt to the right does so too."""
-SCALE_QUANTILE: Final = 0.995
-"""Quantile of the values at the end of a colour scale; higher values share its last colour."""
-TOP_CAMERA: Final = {
-    "eye": {"x": 0.0, "y": 0.0, "z": 1.25},
-    "up": {"x": 0.0, "y": 1.0, "z": 0.0},
-    "projection": {"type": "orthographic"},
-}
-"""Camera of the page that looks from above, as in the picture."""
-OUTSIDE_COLOUR: Final = "#D55E00"
-"""Colour of the rim of spheres whose pose is outside the machine's limits."""
 
 
 def check_tilts(robot: Robot) -> None:
@@ -84,8 +70,10 @@ def find_spheres(space: Space, energy: float) -> dict[str, Variable]:
     lean = robot.platform(q[known])[1][:, 2, 2]
     if not np.allclose(lean, np.cos(tilt[known]), rtol=0.0, atol=1e-9):
         raise ParameterError("spheres", ",".join(robot.pose_names), "tilts about x and y (as prru)")
-    known[known] = robot.try_singularity(q[known])[0] >= MIN_SINGULARITY_INDEX
-    directions = sphere_directions(DIRECTIONS_PER_SPHERE)
+    # Below, efforts grow without bound.
+    known[known] = robot.try_singularity(q[known])[0] >= 1e-3
+    # About 6 degrees apart.
+    directions = sphere_directions(1000)
     share, force = np.full((2, *tilt.shape, len(directions)), np.nan)
     at = poses[known][:, None]
     share[known] = energy_transfer(robot, at, directions)
@@ -143,11 +131,6 @@ def state_ranges(data: Dataset) -> list[str]:
     return lines
 
 
-def _limits(values: Array) -> tuple[float, float]:
-    """Return the ends of a scale: the least value, and one that few values exceed."""
-    return float(np.nanmin(values)), float(np.nanquantile(values, SCALE_QUANTILE))
-
-
 def _height(data: Dataset) -> str:
     return f"{data.coordinate.values[0]} = {float(data.sphere_height):.4g} m"
 
@@ -196,7 +179,7 @@ def _draw(data: Dataset, index: str) -> Figure:
 
     question, label = questions(data)[index]
     values, inside = data[f"sphere_{index}"].values, data.sphere_inside.values
-    low, high = _limits(values)
+    low, high = float(np.nanmin(values)), float(np.nanquantile(values, 0.995))
     ways = data.way.values
     right, up = _axes()
     flat = np.stack([ways @ right, ways @ up], -1)
@@ -220,7 +203,7 @@ def _draw(data: Dataset, index: str) -> Figure:
         )
         rim: dict[str, Any] = {"ec": "0.3", "lw": 0.6}
         if not inside[a, t]:
-            rim = {"ec": OUTSIDE_COLOUR, "lw": 1.6, "ls": "--"}
+            rim = {"ec": "#D55E00", "lw": 1.6, "ls": "--"}
         circle = Circle((float(centre[0]), float(centre[1])), RADIUS, fill=False, zorder=3, **rim)
         ax.add_patch(circle)
         mesh.set_clip_path(circle)
@@ -285,7 +268,9 @@ def make_page(data: Dataset) -> Any:
 
     ways, places = data.way.values, _sphere_centres(data)
     corners = _triangles(ways)
-    vertices = np.concatenate([np.append(c, 0.0) + RADIUS * _to_scene(ways) for _, _, c in places])
+    # In the scene's axes the viewer of the picture looks down.
+    scene = RADIUS * ways @ np.stack([*_axes(), VIEW_DIRECTION], -1)
+    vertices = np.concatenate([np.append(c, 0.0) + scene for _, _, c in places])
     every = np.concatenate([corners + k * len(ways) for k in range(len(places))])
     poses = np.degrees([(data.azimuth.values[a], data.tilt.values[t]) for a, t, _ in places])
     named = np.hstack((np.repeat(poses, len(ways), 0), np.tile(ways, (len(places), 1))))
@@ -303,7 +288,7 @@ def make_page(data: Dataset) -> Any:
     buttons = []
     for index, (_, label) in questions(data).items():
         values = data[f"sphere_{index}"].values
-        low, high = _limits(values)
+        low, high = float(np.nanmin(values)), float(np.nanquantile(values, 0.995))
         shown = np.concatenate([round_digits(values[a, t]) for a, t, _ in places])
         said = f"{where}{label.partition(':')[0]} %{{intensity:.4~g}}<extra></extra>"
         layout = {"coloraxis.cmin": low, "coloraxis.cmax": high, "coloraxis.colorbar.title.text": label}
@@ -326,13 +311,17 @@ def make_page(data: Dataset) -> Any:
         coloraxis={"colorscale": "Viridis", "colorbar": BAR},
         margin=MARGIN,
         updatemenus=[{"buttons": buttons, **MENU}],
-        scene={"xaxis": hidden, "yaxis": hidden, "zaxis": hidden, "aspectmode": "data", "camera": TOP_CAMERA},
+        scene={
+            "xaxis": hidden,
+            "yaxis": hidden,
+            "zaxis": hidden,
+            "aspectmode": "data",
+            "camera": {
+                "eye": {"x": 0.0, "y": 0.0, "z": 1.25},
+                "up": {"x": 0.0, "y": 1.0, "z": 0.0},
+                "projection": {"type": "orthographic"},
+            },
+        },
     )
     figure.update_layout(layout)
     return figure
-
-
-def _to_scene(ways: Array) -> Array:
-    """Return directions in the scene's axes, in which the viewer of the picture looks down."""
-    right, up = _axes()
-    return np.asarray(ways @ np.stack([right, up, VIEW_DIRECTION], -1), np.float64)

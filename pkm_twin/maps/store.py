@@ -41,9 +41,7 @@ if TYPE_CHECKING:
     from pkm_twin.maps.sweep import Chunk, Map
     from pkm_twin.robot.robot import Robot
 
-_INFO_FILE: Final = "sweep.json"
 _LOCK_FILE: Final = "lock"
-_JOINED_FILE: Final = "joined.tmp"
 _FIELD_FILTERS: Final = {
     "compression": "gzip",
     "compression_opts": 1,
@@ -55,11 +53,8 @@ _OWN_NAMES: Final = re.compile(r"sweep\.json|lock|\d{8}\.npz|[\w.]+\.tmp")
 """Names of the files that a run writes into its folder."""
 CHECKSUM_ATTRIBUTE: Final = {"checksum": "SHA-256 of all before, in the last 32 bytes"}
 """Attribute of a file that has its checksum at the end."""
-ROUNDING: Final = 1e-9
-"""Largest excess of a number over its bounds, which are of order 1."""
 _SEAL_MARK: Final = b"\npkm_twin atlas SHA-256\n"
 _SEAL: Final = len(_SEAL_MARK) + hashlib.sha256().digest_size
-_BLOCK_SIZE: Final = 1 << 20
 _SLAB_SIZE: Final = 1 << 22
 """Approximate number of values of a variable that are checked at once."""
 
@@ -130,17 +125,17 @@ class Parts:
             raise MapError(self.folder, "is not a folder; the chunks need a folder of this name")
         while self._lock < 0:
             self.folder.mkdir(parents=True, exist_ok=True)
-            foreign = [name for name in self._names() if not _OWN_NAMES.fullmatch(name)]
+            foreign = [name for name in os.listdir(self.folder) if not _OWN_NAMES.fullmatch(name)]
             if foreign:
                 raise MapError(self.folder, f"holds {foreign[0]!r}, which no map wrote; move it elsewhere")
             self._lock = self._acquire_lock()
-        mark = self.folder / _INFO_FILE
+        mark = self.folder / "sweep.json"
         try:
             found = json.loads(mark.read_text())["fingerprint"]
         except (OSError, ValueError, KeyError, TypeError):
             found = None
         if found != self._sweep.fingerprint:
-            chunks = [name for name in self._names() if name != _LOCK_FILE]
+            chunks = [name for name in os.listdir(self.folder) if name != _LOCK_FILE]
             if chunks and not overwrite:
                 self.close()
                 raise MapError(self.folder, "holds chunks of another sweep; --overwrite drops them")
@@ -151,9 +146,6 @@ class Parts:
         # Temporary files of killed runs.
         for path in self.folder.glob("*.tmp"):
             path.unlink(missing_ok=True)
-
-    def _names(self) -> list[str]:
-        return [path.name for path in self.folder.iterdir()]
 
     def _acquire_lock(self) -> int:
         """Return the lock's file descriptor; below 0 if the folder was removed meanwhile.
@@ -187,8 +179,8 @@ class Parts:
 
     def pending(self) -> list[int]:
         """Return the indices of missing chunks."""
-        here = set(self._names())
-        return [i for i in range(len(self._chunks)) if self._path(i).name not in here]
+        here = set(os.listdir(self.folder))
+        return [i for i in range(len(self._chunks)) if _part_path(self.folder, i).name not in here]
 
     def save(self, index: int, values: Values) -> None:
         """Save a finished chunk."""
@@ -205,23 +197,24 @@ class Parts:
             yield chunk, self._read(index)
 
     def _read(self, index: int, names: Sequence[str] = ()) -> Values:
+        path = _part_path(self.folder, index)
         try:
-            with np.load(self._path(index), allow_pickle=False) as data:
+            with np.load(path, allow_pickle=False) as data:
                 return {name: data[name] for name in names or data.files}
         except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
-            raise MapError(self._path(index), f"damaged ({error}); remove it") from None
+            raise MapError(path, f"damaged ({error}); remove it") from None
 
     def drop(self) -> None:
         """Remove the files of runs, and the folder if it is empty then."""
-        for name in self._names():
-            if _OWN_NAMES.fullmatch(name):
-                (self.folder / name).unlink(missing_ok=True)
+        for name in filter(_OWN_NAMES.fullmatch, os.listdir(self.folder)):
+            (self.folder / name).unlink(missing_ok=True)
         self.close()
         with suppress(OSError):
             self.folder.rmdir()
 
-    def _path(self, index: int) -> Path:
-        return _part_path(self.folder, index)
+
+def _part_path(folder: Path, index: int) -> Path:
+    return folder / f"{index:08}.npz"
 
 
 def save_part(folder: Path, index: int, values: Values) -> None:
@@ -239,10 +232,6 @@ def save_part(folder: Path, index: int, values: Values) -> None:
         except BaseException:
             hidden.unlink(missing_ok=True)
             raise
-
-
-def _part_path(folder: Path, index: int) -> Path:
-    return folder / f"{index:08}.npz"
 
 
 class _Sink(io.RawIOBase):
@@ -293,7 +282,7 @@ def join(sweep: Map, parts: Parts, out: Path) -> None:
     :raises MapError: a damaged chunk.
     :raises OSError: the disk is full, or the target cannot be written.
     """
-    hidden = parts.folder / _JOINED_FILE
+    hidden = parts.folder / "joined.tmp"
     try:
         with hidden.open("w+b", buffering=0) as file:
             sink = _Sink(file)
@@ -323,8 +312,17 @@ def _write_file(sweep: Map, parts: Parts, sink: _Sink) -> None:
         }
         for key, value in (sweep.attributes | CHECKSUM_ATTRIBUTE).items():
             file.attrs[key] = value
-        for name, coordinate in (sweep.coordinates | summaries).items():
-            _write_variable(file, name, coordinate.dims, coordinate.values, coordinate.attrs)
+        for name, small in (sweep.coordinates | summaries).items():
+            array = np.asarray(small.values)
+            if array.dtype.kind == "U":
+                variable = file.create_variable(name, small.dims, require("h5py", "maps").string_dtype())
+                for index in np.ndindex(array.shape):
+                    variable[index] = str(array[index])
+            else:
+                filters = {"fletcher32": True} if array.size and array.ndim else {}
+                variable = file.create_variable(name, small.dims, array.dtype, **filters)
+                variable[...] = array
+            variable.attrs.update(_convert_bounds(small.attrs, array.dtype))
         sizes = sweep.sizes
         fields = sweep.fields
         for name, field in fields.items():
@@ -343,20 +341,6 @@ def _write_file(sweep: Map, parts: Parts, sink: _Sink) -> None:
                 raise sink.error
             for name in values.keys() & fields.keys():
                 file[name][chunk.place(fields[name].dims)] = values[name]
-
-
-def _write_variable(file: Any, name: str, dims: tuple[str, ...], values: Any, attrs: Any) -> None:
-    array = np.asarray(values)
-    if array.dtype.kind == "U":
-        h5py = require("h5py", "maps")
-        variable = file.create_variable(name, dims, h5py.string_dtype())
-        for index in np.ndindex(array.shape):
-            variable[index] = str(array[index])
-    else:
-        filters = {"fletcher32": True} if array.size and array.ndim else {}
-        variable = file.create_variable(name, dims, array.dtype, **filters)
-        variable[...] = array
-    variable.attrs.update(_convert_bounds(attrs, array.dtype))
 
 
 def _convert_bounds(attrs: Mapping[str, Any], dtype: Any) -> dict[str, Any]:
@@ -403,16 +387,19 @@ def open_map(path: Path) -> Dataset:
         if not path.is_file():
             raise MapError(path, "no regular file")
         # Checked before HDF5 opens the file, because damage may crash the process there.
-        whole = verify_checksum(path)
-    if whole is False:
-        raise MapError(path, "damaged, or changed by another program: its checksum differs")
+        with path.open("rb") as file:
+            size = max(0, file.seek(0, 2) - _SEAL)
+            file.seek(size)
+            sealed, digest = file.read(len(_SEAL_MARK)) == _SEAL_MARK, file.read()
+            if sealed and digest != _digest(file, size):
+                raise MapError(path, "damaged, or changed by another program: its checksum differs")
     data = _open_dataset(xarray, path)
     try:
         if data.attrs.get("format") != FORMAT_VERSION:
             older = "kind" in data.attrs and "robot" in data.attrs
             what = "made by an earlier version: build it again" if older else "no map"
             raise MapError(path, what)
-        if whole is None and CHECKSUM_ATTRIBUTE.keys() <= data.attrs.keys():
+        if not sealed and CHECKSUM_ATTRIBUTE.keys() <= data.attrs.keys():
             what = "damaged, or written by another program: its checksum is missing"
             raise MapError(path, what)
         with reading(path):
@@ -436,21 +423,10 @@ def seal(file: BinaryIO) -> None:
         rest = rest[file.write(rest) :]
 
 
-def verify_checksum(path: Path) -> bool | None:
-    """Return whether the checksum at a file's end is correct; None without a checksum."""
-    with path.open("rb") as file:
-        size = file.seek(0, 2) - _SEAL
-        if size < 0:
-            return None
-        file.seek(size)
-        mark, digest = file.read(len(_SEAL_MARK)), file.read()
-        return digest == _digest(file, size) if mark == _SEAL_MARK else None
-
-
 def _digest(file: BinaryIO, size: int) -> bytes:
     file.seek(0)
     found = hashlib.sha256()
-    while size > 0 and (block := file.read(min(size, _BLOCK_SIZE))):
+    while size > 0 and (block := file.read(min(size, (1 << 20)))):
         found.update(block)
         size -= len(block)
     return found.digest()
@@ -473,7 +449,8 @@ def find_invalid_number(data: Dataset) -> str:
                 return f"{name} has the value nan"
             # The smallest and the largest number; NaN if there is none.
             for value in (np.fmin.reduce(values, None), np.fmax.reduce(values, None)):
-                if math.isinf(value) or value < low - ROUNDING or value > high + ROUNDING:
+                # Numbers are of order 1; a smaller excess is rounding.
+                if math.isinf(value) or value < low - 1e-9 or value > high + 1e-9:
                     return f"{name} has the value {value:g}, allowed: {low:g} to {high:g}"
             if variable.dims == (name,) and (np.diff(values) < 0).any():
                 return f"the axis {name} decreases"

@@ -48,16 +48,8 @@ from pkm_twin.robot.clearance import has_clearance, joint_clearance
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import LEAST_TILT, distance_unit, keeps_limits
 
-MAX_TICKS: Final = 2001
-"""Largest number of poses along one coordinate."""
 STARTS_PER_CHUNK: Final = 16
 """Worst poses of a chunk that the search may start from."""
-ZOOMS: Final = 3
-"""Number of times that the reachable part of a plane is searched, each time on a finer grid."""
-MIN_VIEW_FRACTION: Final = 0.1
-"""Smallest fraction of a coordinate's range that a plane shows on each side of its pose."""
-PLANE_SIDE_RANGE: Final = (11, 151)
-"""Smallest and largest number of poses along a side of a plane."""
 
 
 @dataclass(frozen=True)
@@ -226,11 +218,15 @@ class Map(Space):
 
     def chunks(self) -> list[Chunk]:
         """Return all chunks: those of the grid, then those of the planes."""
-        chunks = _split_rows(self.shape[0], self.rows)
+
+        def split(count: int, rows: int, plane: int | None = None, case: int | None = None) -> list[Chunk]:
+            return [Chunk(start, min(start + rows, count), plane, case) for start in range(0, count, rows)]
+
+        chunks = split(self.shape[0], self.rows)
         rows = max(1, self.kind.chunk // self.sizes["column"])
         cases = (None,) if self.kind.together else range(len(self.cases))
         for plane, case in itertools.product(range(len(self.planes)), cases):
-            chunks += [replace(c, plane=plane, case=case) for c in _split_rows(self.side, rows)]
+            chunks += split(self.side, rows, plane, case)
         return chunks
 
     def count(self, chunk: Chunk) -> int:
@@ -253,7 +249,8 @@ class Map(Space):
         shown, pose = list(self.planes[plane]), self.through(case)
         box = bounds = self.bounds[shown]
         least, most = np.minimum(bounds[:, 0], pose[shown]), np.maximum(bounds[:, 1], pose[shown])
-        for _ in range(ZOOMS):
+        # Each time on a finer grid.
+        for _ in range(3):
             ticks = [_make_ticks(ends, pose[k], GRID_SIDE) for k, ends in zip(shown, box, strict=True)]
             poses = self._plane_poses(plane, case, ticks)
             q, _, known = self.of_poses(poses)
@@ -261,7 +258,7 @@ class Map(Space):
             seen = np.concatenate([poses[reach], pose[None]])[:, shown]
             # More than a step, so that a tip between the poses appears on the next grid.
             margin = 1.5 * np.array([np.diff(side).max() for side in ticks])
-            around = np.maximum(margin, MIN_VIEW_FRACTION * np.ptp(bounds, axis=1))
+            around = np.maximum(margin, 0.1 * np.ptp(bounds, axis=1))
             low = np.minimum(seen.min(0) - margin, pose[shown] - around)
             high = np.maximum(seen.max(0) + margin, pose[shown] + around)
             box = np.stack([np.maximum(low, least), np.minimum(high, most)], -1)
@@ -382,45 +379,44 @@ class Map(Space):
                 [[*self.plane_ticks(p, c), np.zeros(1)][k] for p in range(len(self.planes))]
                 for c in range(len(self.cases))
             ]
-            what = describe(f"pose coordinate along the {dim}s")
-            result[f"{dim}_value"] = Variable(("case", "plane", dim), np.array(sides), what)
-        poses = np.array([self.through(k) for k in range(len(self.cases))])
-        what = describe("pose that the planes go through, m and rad")
-        result["through"] = Variable(("case", "coordinate"), poses, what)
-        if self.circles is not None:
-            result |= circle_variables(self.robot, *self.circles)
-        return result | self._worst_variables() | self.kind.summaries(self, counted, apart)
-
-    def _worst_variables(self) -> dict[str, Variable]:
-        """Return value, pose, singularity index, direction and element of the worst poses."""
-        worst, what = self.worst, "the worst value"
-        value = [one.found.value[0] for one in worst]
-        index = [one.index for one in worst]
-        bound = [self.least if one.bounded else np.nan for one in worst]
-        least = f"singularity index below which poses are worse than {what}, if it is there"
-        result = {
-            "worst_value": Variable(("case",), np.array(value), describe(what)),
+            result[f"{dim}_value"] = Variable(
+                ("case", "plane", dim), np.array(sides), describe(f"pose coordinate along the {dim}s")
+            )
+        worst, cases, axes = self.worst, ("case",), self.kind.axes(self.robot)
+        pose, least = ("case", "coordinate"), "singularity index below which poses are worse"
+        result |= {
+            "through": Variable(
+                pose,
+                np.array([self.through(k) for k in range(len(self.cases))]),
+                describe("pose that the planes go through, m and rad"),
+            ),
+            "worst_value": Variable(
+                cases, np.array([one.found.value[0] for one in worst]), describe("the worst value")
+            ),
             "worst_singularity": Variable(
-                ("case",),
-                np.array(index),
-                describe(f"singularity index of {what}", "", UNIT_INTERVAL),
+                cases,
+                np.array([one.index for one in worst]),
+                describe("singularity index of the worst value", "", UNIT_INTERVAL),
             ),
-            "worst_bound": Variable(("case",), np.array(bound), describe(least, "", UNIT_INTERVAL)),
-            "worst_pose": Variable(
-                ("case", "coordinate"),
-                np.array([one.pose for one in worst]),
-                describe(f"of {what}"),
+            "worst_bound": Variable(
+                cases,
+                np.array([self.least if one.bounded else np.nan for one in worst]),
+                describe(f"{least} than the worst value, if it is there", "", UNIT_INTERVAL),
             ),
+            "worst_pose": Variable(pose, np.array([one.pose for one in worst]), describe("of the worst value")),
         }
-        if self.kind.axes(self.robot):
-            none_of = np.full((1, len(self.kind.axes(self.robot))), np.nan)
+        if axes:
+            none_of = np.full((1, len(axes)), np.nan)
             ways = [none_of if (d := one.found.direction) is None else d for one in worst]
-            result["worst_direction"] = Variable(("case", "axis"), np.concatenate(ways), describe(f"of {what}"))
+            what = describe("of the worst value")
+            result["worst_direction"] = Variable(("case", "axis"), np.concatenate(ways), what)
         if self.elements:
             names = describe(f"index of the {self.kind.element}", "", {"valid_min": -1})
             blame = np.array([-1 if (e := one.found.element) is None else e[0] for one in worst])
-            result["worst_element"] = Variable(("case",), blame, names)
-        return result
+            result["worst_element"] = Variable(cases, blame, names)
+        if self.circles is not None:
+            result |= circle_variables(self.robot, *self.circles)
+        return result | self.kind.summaries(self, counted, apart)
 
 
 def _store(values: Values, case: int, kept: Mask, found: Found) -> None:
@@ -440,10 +436,6 @@ def _make_ticks(ends: Array, value: float, count: int) -> Array:
     ticks = np.linspace(min(ends[0], value), max(ends[1], value), count)
     ticks[np.abs(ticks - value).argmin()] = value
     return np.asarray(ticks, np.float64)
-
-
-def _split_rows(count: int, rows: int) -> list[Chunk]:
-    return [Chunk(start, min(start + rows, count)) for start in range(0, count, rows)]
 
 
 def map_of(
@@ -499,7 +491,7 @@ def map_of(
         bounds = np.array([sides[name] for name in robot.pose_names])
     ticks: tuple[Array, ...] = ()
     if count <= MAX_GRID_DIMENSIONS:
-        length = max(5, min(round(total ** (1 / count)), MAX_TICKS))
+        length = max(5, min(round(total ** (1 / count)), 2001))
         # An odd number across an axis, so that the axis is on the grid.
         odd = length + 1 - length % 2
         lateral = robot.grid().lateral
@@ -508,7 +500,6 @@ def map_of(
             for (low, high), name in zip(bounds, robot.pose_names, strict=True)
         )
     side = round(math.sqrt(total / (3 if count > 2 else 1))) if count > 1 else total
-    fewest, most = PLANE_SIDE_RANGE
     return Map(
         robot,
         kind,
@@ -516,7 +507,7 @@ def map_of(
         bounds,
         ticks,
         total,
-        min(max(side, fewest), most),
+        min(max(side, 11), 151),
         least,
         least_clearance,
         None if at is None else np.array(at, np.float64),

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 
 MODE_COUNT: Final = 6
 """Number of modes of the map."""
-DRAWN_MODES: Final = 3
-"""Number of modes in the picture of shapes."""
 MAX_DRAWN_DISPLACEMENT: Final = 0.13
 """Largest displacement of a drawn mode shape over the size of the machine."""
 FRAMES_PER_SWING: Final = 16
@@ -83,7 +81,7 @@ class Modes(Frequency):
         """Draw the shapes of the lowest modes, coloured by displacement."""
         from mpl_toolkits.mplot3d.art3d import Line3DCollection  # type: ignore[import-untyped]
 
-        figure, columns = plots.columns(DRAWN_MODES, 1, 4.6, subplot_kw={"projection": "3d"})
+        figure, columns = plots.columns(3, 1, 4.6, subplot_kw={"projection": "3d"})
         axes = [column[0] for column in columns]
         rest, edges = data.position.values, data.line.values
         low, high = _scene_bounds(rest)
@@ -117,7 +115,13 @@ class Modes(Frequency):
         graph = require("plotly.graph_objects", "maps")
         from pkm_twin.maps.page import BAR, CAMERA, MARGIN, MENU, button
 
-        rest, path = data.position.values, _join_edges(data.line.values)
+        # All lines as one path, with -1 between lines that do not meet.
+        rest, nodes = data.position.values, list[int]()
+        for start, end in data.line.values.tolist():
+            if not nodes or nodes[-1] != start:
+                nodes += [-1, start] if nodes else [start]
+            nodes.append(end)
+        path = np.array(nodes)
         low, high = _scene_bounds(rest)
         still: dict[str, Any] = {"hoverinfo": "skip", "showlegend": False}
         figure = graph.Figure()
@@ -217,16 +221,6 @@ def _scene_bounds(rest: Array) -> tuple[Array, Array]:
     """Return bounds of the scene for all modes, with a margin for the shapes."""
     margin = 0.6 * MAX_DRAWN_DISPLACEMENT * float(np.linalg.norm(np.ptp(rest, axis=0)))
     return rest.min(0) - margin, rest.max(0) + margin
-
-
-def _join_edges(edges: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the nodes of all lines as one path, with -1 between lines that do not meet."""
-    path: list[int] = []
-    for start, end in edges.tolist():
-        if not path or path[-1] != start:
-            path += [start] if not path else [-1, start]
-        path.append(end)
-    return np.array(path)
 
 
 def _values_along_path(values: Array, path: NDArray[np.int64], gap: float | None = None) -> list[Any]:

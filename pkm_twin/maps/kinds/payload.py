@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 import numpy as np
 
 from delta_dynamics import inverse_dynamics
@@ -12,9 +10,6 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.maps.kind import Case, Found, Kind, drive_limits
 from pkm_twin.robot.robot import Robot
-
-ROUNDING: Final = 1e-12
-"""Motion over the machine's size, or effort over its limit, that is a rounding error."""
 
 
 class Payload(Kind):
@@ -46,7 +41,7 @@ class Payload(Kind):
         :raises ParameterError: the mass does not move, as the platform rotates about it.
         """
         moved, com = robot.platform_jacobian(robot.graph.home)[:3], robot.payload.com
-        if not com.any() and np.abs(moved).max() < ROUNDING * robot.size:
+        if not com.any() and np.abs(moved).max() < 1e-12 * robot.size:
             bound = "--payload MASS,x,y,z, away from the point that the platform turns about"
             raise ParameterError("payload.com", com.tolist(), bound)
         limits, still = drive_limits(robot, "effort"), np.zeros_like(q)
@@ -55,7 +50,7 @@ class Payload(Kind):
         held = inverse_dynamics(bare, q, still, still, case.wrench)
         each = inverse_dynamics(loaded, q, still, still, case.wrench) - held
         with np.errstate(divide="ignore", invalid="ignore"):
-            room = np.where(np.abs(each) < ROUNDING * limits, np.inf, (np.copysign(limits, each) - held) / each)
+            room = np.where(np.abs(each) < 1e-12 * limits, np.inf, (np.copysign(limits, each) - held) / each)
         over = np.abs(held) / limits
         fails = over.max(-1) > 1.0
         joint = np.where(fails, over.argmax(-1), room.argmin(-1))

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,9 +12,6 @@ from pkm_twin.machine.places import keys_of
 from pkm_twin.maps.kind import Case, Found, Kind, largest_axis
 from pkm_twin.robot.derivatives import position_effects
 from pkm_twin.robot.robot import Robot
-
-SHARED_KEYS: Final = {"at", "axis", "axes", "ends"}
-"""Keys of a machine's points and axes at home."""
 
 
 class PoseError(Kind):
@@ -56,7 +51,8 @@ def _moving_causes(robot: Robot) -> NDArray[np.intp]:
     points or axes at home: all parts that meet there move along, and home still closes.
     """
     for name, steps in robot.causes.items() if robot.mechanism == "machine" else ():
-        shared = [path for path, step in steps.items() if step and SHARED_KEYS & {*keys_of(path)[2:3]}]
+        places = {"at", "axis", "axes", "ends"}
+        shared = [path for path, step in steps.items() if step and places & {*keys_of(path)[2:3]}]
         if shared:
             raise ParameterError(
                 f"uncertainty.{name}",

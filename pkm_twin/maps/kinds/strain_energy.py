@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from xarray import Dataset
 
-MIN_DRAWN_SHARE: Final = 0.005
-"""Mean share of an element below which it has no picture."""
 PANELS: Final = 3
 """Number of elements in a picture."""
 SLICES: Final = 5
@@ -84,7 +82,7 @@ class StrainEnergy(Compliance):
         for case in data.case.values if _draws_elements(data) else ():
             before = f"{case}_" if len(data.case) > 1 else ""
             mean, order = _rank(data, case)
-            ranked = [int(n) for n in order if mean[n] >= MIN_DRAWN_SHARE]
+            ranked = [int(n) for n in order if mean[n] >= 0.005]
             named = {f"{before}energy": _draw_slices(data, case, [])}
             for k in range(0, len(ranked), PANELS):
                 part = ranked[k : k + PANELS]

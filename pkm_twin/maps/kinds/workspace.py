@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -85,7 +85,10 @@ class Workspace(Kind):
         if 1 < len(space.ticks) == len(robot.pose_names):
             cell = math.prod(float(ticks[1] - ticks[0]) for ticks in space.ticks)
             what = "volume of the reachable poses"
-            result["volume"] = scalar(apart * cell, what, _volume_unit(robot.pose_units), NON_NEGATIVE)
+            counts = {unit: robot.pose_units.count(unit) for unit in sorted(set(robot.pose_units))}
+            # As "m3", "m rad2".
+            unit = " ".join(f"{unit}{power if power > 1 else ''}" for unit, power in counts.items())
+            result["volume"] = scalar(apart * cell, what, unit, NON_NEGATIVE)
         if has_clearance(robot):
             share = (counted - apart) / counted if counted else math.nan
             what = "share of otherwise reachable poses in which limbs interfere"
@@ -215,9 +218,3 @@ def largest_cylinder(heights: Array, radius: Array) -> Cylinder:
             volume = float(volumes[j])
             best = Cylinder(float(heights[i]), float(heights[i + j]), float(thin[j]))
     return best
-
-
-def _volume_unit(units: Iterable[str]) -> str:
-    """Return the unit of a volume: "m3", "m rad2"."""
-    counts = {unit: list(units).count(unit) for unit in sorted(set(units))}
-    return " ".join(f"{unit}{power if power > 1 else ''}" for unit, power in counts.items())
