@@ -21,13 +21,8 @@ from typing import Any
 from pkm_twin.bags.definitions import CODES, Field, brief, parse_definition
 from pkm_twin.errors import BagError
 
-# Encapsulation header of plain CDR: representation identifier; the options that follow are free.
-_ENDIANNESS = {b"\x00\x00": ">", b"\x00\x01": "<"}
-_NATIVE = "<" if sys.byteorder == "little" else ">"
 _SIZES = {code: struct.calcsize(f"={code}") for code in CODES.values()}
 _UNPACK = {order: {code: struct.Struct(f"{order}{code}").unpack_from for code in _SIZES} for order in "<>"}
-_ARRAY_CODES = {"?": "B"}
-"""Codes of ``array`` for types that it lacks: those of their bytes."""
 _LITTLE_HEADER = b"\x00\x01\x00\x00"
 
 
@@ -56,7 +51,7 @@ class MessageCodec:
         :raises BagError: the buffer is too short for the type, its encapsulation is not plain CDR,
             or a string in it is not UTF-8 ended by a zero.
         """
-        order = _ENDIANNESS.get(bytes(data[:2])) if len(data) >= 4 else None
+        order = {b"\x00\x00": ">", b"\x00\x01": "<"}.get(bytes(data[:2])) if len(data) >= 4 else None
         if order is None:
             head = bytes(data[:4]).hex(" ")
             expected = "plain CDR, 00 00 or 00 01 and two option bytes"
@@ -118,26 +113,39 @@ class MessageCodec:
         fields = self.definition[name]
         if not fields:
             out.append(0)
-        get = _getter(message, fields, where)
+        # A mapping may leave a field out, whose value is then None.
+        get: Callable[[str], Any]
+        names = [field.name for field in fields]
+        if isinstance(message, Mapping):
+            unknown = sorted(str(key) for key in message if key not in names)
+            if unknown:
+                text = f"{where} has no field {', '.join(unknown)}; fields: {', '.join(names)}"
+                raise BagError(text, reason="message")
+            get = message.get
+        else:
+            missing = [name for name in names if not hasattr(message, name)]
+            if missing:
+                text = f"{where} is {brief(message)}, without {', '.join(missing)}"
+                raise BagError(text, reason="message")
+            get = partial(getattr, message)
         for field in fields:
-            self._encode_field(field, get(field.name), out, f"{where}.{field.name}")
-
-    def _encode_field(self, field: Field, value: Any, out: bytearray, where: str) -> None:
-        if field.size is None:
-            self._encode_items(field, [self._default(field) if value is None else value], out, where)
-            return
-        if value is None:
-            value = [self._default(field)] * (field.size if field.fixed else 0)
-        if isinstance(value, str | Mapping) or not hasattr(value, "__len__"):
-            raise BagError(f"{where} is {brief(value)}; expected a sequence", reason="message")
-        count = len(value)
-        if (field.fixed and count != field.size) or (field.upto and count > (field.size or 0)):
-            expected = f"{'at most ' * field.upto}{field.size}"
-            raise BagError(f"{where} has {count} items; expected {expected}", reason="message")
-        if not field.fixed:
-            _put(out, "I", [count], where)
-        if count:
-            self._encode_items(field, value, out, where)
+            value = get(field.name)
+            place = f"{where}.{field.name}"
+            if field.size is None:
+                self._encode_items(field, [self._default(field) if value is None else value], out, place)
+            else:
+                if value is None:
+                    value = [self._default(field)] * (field.size if field.fixed else 0)
+                if isinstance(value, str | Mapping) or not hasattr(value, "__len__"):
+                    raise BagError(f"{place} is {brief(value)}; expected a sequence", reason="message")
+                count = len(value)
+                if (field.fixed and count != field.size) or (field.upto and count > (field.size or 0)):
+                    expected = f"{'at most ' * field.upto}{field.size}"
+                    raise BagError(f"{place} has {count} items; expected {expected}", reason="message")
+                if not field.fixed:
+                    _put(out, "I", [count], place)
+                if count:
+                    self._encode_items(field, value, out, place)
 
     def _encode_items(self, field: Field, values: Sequence[Any], out: bytearray, where: str) -> None:
         code = CODES.get(field.base)
@@ -147,7 +155,14 @@ class MessageCodec:
             _put(out, code, values, where)
         elif field.base == "string":
             for text in values:
-                _put_text(out, text, field.chars, where)
+                if not isinstance(text, str):
+                    raise BagError(f"{where} is {brief(text)}; expected text", reason="message")
+                if field.chars and len(text) > field.chars:
+                    raise BagError(f"{where} has {len(text)} characters; at most {field.chars}", reason="message")
+                raw = text.encode()
+                _put(out, "I", [len(raw) + 1], where)
+                out.extend(raw)
+                out.append(0)
         else:
             for item in values:
                 self._encode(field.base, item, out, where)
@@ -166,7 +181,7 @@ class _Source:
         self._type_name = type_name
         self._data = data
         self._unpack = _UNPACK[order]
-        self._swapped = order != _NATIVE
+        self._swapped = order != ("<" if sys.byteorder == "little" else ">")
         self._end = len(data)
         self.position = len(_LITTLE_HEADER)
 
@@ -184,7 +199,8 @@ class _Source:
         self.position += -(self.position - len(_LITTLE_HEADER)) % size
 
     def numbers(self, code: str, count: int) -> array.array[Any]:
-        values: array.array[Any] = array.array(_ARRAY_CODES.get(code, code))
+        # `array` has no bool: its bytes are taken.
+        values: array.array[Any] = array.array("B" if code == "?" else code)
         if count:
             self._align(values.itemsize)
             begin = self.position
@@ -226,30 +242,3 @@ def _put(out: bytearray, code: str, values: Sequence[Any], where: str) -> None:
     except (struct.error, OverflowError) as error:
         text = f"{where} is {brief(values if len(values) > 1 else values[0])}: {error}"
         raise BagError(text, reason="message") from error
-
-
-def _put_text(out: bytearray, text: object, limit: int, where: str) -> None:
-    if not isinstance(text, str):
-        raise BagError(f"{where} is {brief(text)}; expected text", reason="message")
-    if limit and len(text) > limit:
-        raise BagError(f"{where} has {len(text)} characters; at most {limit}", reason="message")
-    raw = text.encode()
-    _put(out, "I", [len(raw) + 1], where)
-    out.extend(raw)
-    out.append(0)
-
-
-def _getter(message: object, fields: Sequence[Field], where: str) -> Callable[[str], Any]:
-    """Return a function from field name to value, None where a mapping leaves the field out."""
-    names = [field.name for field in fields]
-    if isinstance(message, Mapping):
-        unknown = sorted(str(key) for key in message if key not in names)
-        if unknown:
-            text = f"{where} has no field {', '.join(unknown)}; fields: {', '.join(names)}"
-            raise BagError(text, reason="message")
-        return message.get
-    missing = [name for name in names if not hasattr(message, name)]
-    if missing:
-        text = f"{where} is {brief(message)}, without {', '.join(missing)}"
-        raise BagError(text, reason="message")
-    return lambda name: getattr(message, name)

@@ -31,8 +31,6 @@ CODES = {
     "float64": "d",
 }
 """Struct code of a primitive; ``byte`` and ``char`` are both unsigned 8-bit in ROS 2."""
-# What the message classes print -> what a .msg file says.
-_MSG_NAMES = {"double": "float64", "float": "float32", "boolean": "bool", "octet": "byte"}
 
 MAX_DEFINITION_CHARACTERS = 1024**2
 """Longest definition text; the longest of the common interfaces has some 20,000 characters."""
@@ -43,22 +41,12 @@ MAX_NESTING = 50
 MAX_BOUND = 2**32 - 1
 """Largest array size and bound: lengths are 32-bit numbers in CDR."""
 
-_TYPE_NAME = re.compile(r"[a-z][a-z0-9_]*/msg/[A-Z][A-Za-z0-9]*")
 _FIELD = re.compile(
     r"(?P<base>[A-Za-z][\w/]*)(?:<=(?P<chars>\d+))?"
     r"(?P<array>\[(?:(?P<upto><=)?(?P<size>\d+))?\])?\s+(?P<name>[A-Za-z]\w*)\s*(?P<rest>.*)",
     re.ASCII,
 )
-# package/Type, or package/msg/Type.
-_HELD_NAME = re.compile(r"[A-Za-z]\w*(?:/\w+)*/[A-Za-z]\w*", re.ASCII)
 _SPEC = re.compile(r"(?P<base>[A-Za-z][\w/]*)(?:<(?P<chars>\d+)>)?(?:\[(?P<size>\d+)\])?")
-_SEQUENCE = re.compile(r"sequence<(?P<item>.+?)(?:,\s*(?P<bound>\d+))?>")
-
-# Present in every ROS 2 system; some writers leave their text out of the definition.
-_BUILTIN = {
-    "builtin_interfaces/Time": "int32 sec\nuint32 nanosec",
-    "builtin_interfaces/Duration": "int32 sec\nuint32 nanosec",
-}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,7 +65,7 @@ class Field:
 
     @property
     def fixed(self) -> bool:
-        """Whether the field is an array without a length in front."""
+        """True if the field is an array without a length in front."""
         return bool(self.size) and not self.upto
 
 
@@ -90,7 +78,7 @@ def message_class(type_name: str) -> Any:
 
     :raises BagError: the name is malformed, or its package is not installed here.
     """
-    if not _TYPE_NAME.fullmatch(type_name):
+    if not re.fullmatch(r"[a-z][a-z0-9_]*/msg/[A-Z][A-Za-z0-9]*", type_name):
         text = f"{type_name!r} is not a type name; expected package/msg/Type"
         raise BagError(text, reason="type")
     package, _, name = type_name.split("/")
@@ -135,8 +123,8 @@ def _short_name(type_name: str) -> str:
 
 
 def _check_type_name(type_name: str) -> str:
-    """Return the short name of a type; raise if it is not a type name."""
-    if not _HELD_NAME.fullmatch(type_name):
+    # package/Type, or package/msg/Type.
+    if not re.fullmatch(r"[A-Za-z]\w*(?:/\w+)*/[A-Za-z]\w*", type_name, re.ASCII):
         text = f"{brief(type_name)} is not a type name; expected package/msg/Type"
         raise BagError(text, reason="schema")
     return _short_name(type_name)
@@ -144,11 +132,13 @@ def _check_type_name(type_name: str) -> str:
 
 def _class_field(name: str, spec: str) -> Field:
     """Turn ``sequence<double, 3>`` and its like, as the classes print them, into a field."""
-    sequence = _SEQUENCE.fullmatch(spec)
+    sequence = re.fullmatch(r"sequence<(?P<item>.+?)(?:,\s*(?P<bound>\d+))?>", spec)
     match = _SPEC.fullmatch(sequence["item"] if sequence else spec)
     if match is None:
         raise BagError(f"field {name} has the unknown type {spec!r}", reason="type")
-    base = _MSG_NAMES.get(match["base"], match["base"])
+    base = {"double": "float64", "float": "float32", "boolean": "bool", "octet": "byte"}.get(
+        match["base"], match["base"]
+    )
     size: int | None = int(match["size"]) if match["size"] else None
     if sequence:
         size = int(sequence["bound"] or 0)
@@ -171,7 +161,11 @@ def parse_definition(type_name: str, text: str) -> Definition:
         error = f"the definition of {type_name} has {len(text)} characters"
         raise BagError(f"{error}; at most {MAX_DEFINITION_CHARACTERS}", reason="schema")
     own = _check_type_name(type_name)
-    texts = dict(_BUILTIN)
+    # Present in every ROS 2 system; some writers leave their text out of the definition.
+    texts = {
+        "builtin_interfaces/Time": "int32 sec\nuint32 nanosec",
+        "builtin_interfaces/Duration": "int32 sec\nuint32 nanosec",
+    }
     for index, part in enumerate(re.split(r"^={3,}[ \t]*$", text, flags=re.MULTILINE)):
         name = own
         fields = part
@@ -198,36 +192,29 @@ def _resolve(name: str, texts: Mapping[str, str], definition: Definition, holder
     if len(holders) >= MAX_NESTING:
         text = f"{holders[0]} holds types {len(holders)} deep; at most {MAX_NESTING - 1}"
         raise BagError(text, reason="schema")
-    fields = tuple(_parse_fields(name, texts))
-    if len(fields) + sum(map(len, definition.values())) > MAX_FIELDS:
-        text = f"{(*holders, name)[0]} has more than {MAX_FIELDS} fields with all that it holds"
-        raise BagError(text, reason="schema")
-    for field in fields:
-        if "/" in field.base:
-            _resolve(field.base, texts, definition, (*holders, name))
-    definition[name] = fields
-
-
-def _parse_fields(name: str, texts: Mapping[str, str]) -> list[Field]:
     fields = []
     for line in texts[name].splitlines():
         # A string constant may hold a '#', so constants are told apart before comments are cut.
         match = _FIELD.fullmatch(line.strip())
+        if match is None and line.split("#")[0].strip():
+            raise BagError(f"definition of {name}: {brief(line)} is not a field", reason="schema")
         if match is None or match["rest"].startswith("="):
-            if match is None and line.split("#")[0].strip():
-                text = f"definition of {name}: {brief(line)} is not a field"
-                raise BagError(text, reason="schema")
             continue
         base = _base_type(match["base"], name.split("/", 1)[0], texts)
         where = f"definition of {name}: field {match['name']}"
         size = None if match["array"] is None else _read_bound(match["size"], where)
         chars = _read_bound(match["chars"], where)
         fields.append(Field(match["name"], base, size, bool(match["upto"]), chars))
-    return fields
+    if len(fields) + sum(map(len, definition.values())) > MAX_FIELDS:
+        text = f"{(*holders, name)[0]} has more than {MAX_FIELDS} fields with all that it holds"
+        raise BagError(text, reason="schema")
+    for field in fields:
+        if "/" in field.base:
+            _resolve(field.base, texts, definition, (*holders, name))
+    definition[name] = tuple(fields)
 
 
 def _read_bound(digits: str | None, where: str) -> int:
-    """Read a size or bound of a definition; 0 if there is none."""
     # Python refuses to convert thousands of digits.
     if digits and (len(digits) > 20 or int(digits) > MAX_BOUND):
         text = f"{where} has the bound {brief(digits)}; at most {MAX_BOUND}"

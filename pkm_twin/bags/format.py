@@ -34,8 +34,6 @@ MAX_TOTAL_RATIO = 200
 """Largest ratio of all that is unpacked and read to the file's size, beyond FREE_TOTAL_BYTES."""
 FREE_TOTAL_BYTES = 128 * 1024**2
 """Every file may unpack to so much."""
-RECORD_COST = 64
-"""Bytes that a record in a chunk counts for beside its own: the time that it takes."""
 MAX_CHUNK_BYTES = 64 * 1024**2
 """Largest unpacked chunk."""
 MAX_RATIO = 1000
@@ -51,12 +49,7 @@ FOOTER_BYTES = FRAME.size + 20
 CRC_BYTES = 4
 _BLOCK_BYTES = 1024**2
 _MESSAGE = struct.Struct("<HIQQ")
-_KINDS: dict[int, Any] = {op: getattr(mcap, op.name.title().replace("_", "")) for op in Op if op != Op.MESSAGE}
 NAMES = {int(op): op.name.lower().replace("_", " ") for op in Op}
-_FOREIGN = {
-    b"#ROSBAG V2.0": "a ROS 1 bag, not MCAP",
-    b"\x1f\x8b": "a gzip-compressed file; unpack it first",
-}
 
 
 class FormatError(Exception):
@@ -172,7 +165,10 @@ class RecordReader:
     def read_magic(self) -> None:
         """Read the opening mark; say in plain words what a file without it is."""
         head = self.read(min(self.size, 16), "opening mark")
-        for magic, text in _FOREIGN.items():
+        for magic, text in {
+            b"#ROSBAG V2.0": "a ROS 1 bag, not MCAP",
+            b"\x1f\x8b": "a gzip-compressed file; unpack it first",
+        }.items():
             if head.startswith(magic):
                 raise FormatError(f"this is {text}", 0, "not_mcap")
         if not head:
@@ -220,7 +216,7 @@ def parse_record(opcode: int, body: bytes, offset: int) -> Any:
     """Return a record of a known kind, which holds its fields and nothing else."""
     stream = _Exact(io.BytesIO(body))
     with _name_faults(opcode, offset):
-        record = _KINDS[opcode].read(stream)
+        record = getattr(mcap, Op(opcode).name.title().replace("_", "")).read(stream)
     if left := len(body) - stream.count:
         raise FormatError(f"the {opcode_name(opcode)} record has {left} bytes too many", offset)
     # A chunk has no map, and may be large.
@@ -242,7 +238,7 @@ def iterate_records(data: bytes, offset: int, budget: Budget | None = None) -> I
     position, size = 0, len(data)
     while position < size:
         if budget is not None:
-            budget.spend(RECORD_COST, offset)
+            budget.spend(64, offset)
         if size - position < FRAME.size:
             raise FormatError(f"{size - position} stray bytes end the chunk", offset)
         opcode, length = FRAME.unpack_from(data, position)

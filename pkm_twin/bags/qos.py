@@ -22,8 +22,6 @@ MAX_NESTING: Final = 50
 """Deepest nesting; rosbag2 writes eight."""
 _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
-_TOPIC = re.compile(r"(?:/[A-Za-z_][A-Za-z0-9_]*)+")
-
 
 @dataclass(frozen=True)
 class OfferedQos:
@@ -95,7 +93,7 @@ def require_topic(name: str) -> str:
 
     :raises BagError: it is another text.
     """
-    if len(name) > MAX_TOPIC_CHARACTERS or not _TOPIC.fullmatch(name):
+    if len(name) > MAX_TOPIC_CHARACTERS or not re.fullmatch(r"(?:/[A-Za-z_][A-Za-z0-9_]*)+", name):
         names = "/names of letters, digits and _, none beginning with a digit"
         text = f"{name!r} is no topic name; expected {names}"
         raise BagError(f"{text}, at most {MAX_TOPIC_CHARACTERS} characters", reason="topic")

@@ -194,19 +194,14 @@ class Bag:
         if unknown:
             text = f"no topic {', '.join(unknown)}; topics: {', '.join(sorted(known))}"
             raise BagError(text, path=self._path, reason="no_topic")
-        return self._ordered(wanted) if order == "log_time" else self._in_file(wanted)
+        return self._iterate(wanted, order == "log_time")
 
-    def _in_file(self, wanted: set[str]) -> Iterator[BagMessage]:
-        for part in self._parts:
-            with part.file.open() as reader:
-                for segment in part.segments:
-                    yield from part.parse(segment, reader, wanted)
-
-    def _ordered(self, wanted: set[str]) -> Iterator[BagMessage]:
+    def _iterate(self, wanted: set[str], sort: bool) -> Iterator[BagMessage]:
         waiting: list[tuple[int, int, int, int, BagMessage]] = []
         held = 0
         places = [(n, segment) for n, part in enumerate(self._parts) for segment in part.segments]
-        places.sort(key=lambda place: (place[1].messages.start, place[0], place[1].offset))
+        if sort:
+            places.sort(key=lambda place: (place[1].messages.start, place[0], place[1].offset))
         # Splits follow each other in time, so one is open at once.
         current = -1
         with ExitStack() as opened:
@@ -215,6 +210,9 @@ class Bag:
                     opened.close()
                     reader = opened.enter_context(self._parts[number].file.open())
                     current = number
+                if not sort:
+                    yield from self._parts[number].parse(segment, reader, wanted)
+                    continue
                 # Nothing from here on is earlier than this segment's start. A message of exactly
                 # that time stays, since the segment may stand before it in the file.
                 while waiting and waiting[0][0] < segment.messages.start:
@@ -236,7 +234,6 @@ class Bag:
 
 @lru_cache(maxsize=256)
 def _make_codec(name: str, text: bytes) -> MessageCodec:
-    """Build the codec of a type; a long definition takes time."""
     try:
         return MessageCodec(name, text.decode())
     except UnicodeDecodeError:
@@ -244,7 +241,6 @@ def _make_codec(name: str, text: bytes) -> MessageCodec:
 
 
 def _decode(channel: Channel, schema: Schema | None, data: bytes) -> Any:
-    """Decode a message of the channel."""
     try:
         kind = f"type {schema.name if schema else 'no schema'}"
         if channel.message_encoding != "cdr":

@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from pkm_twin.bags.format import FormatError, RecordReader
+from pkm_twin.bags.format import FormatError
 from pkm_twin.bags.storage import BagFile, find_storage, list_files
 from pkm_twin.bags.strict import Check, check_files
 from pkm_twin.bags.writer import McapWriter, refuse_existing, write_error
@@ -36,10 +36,6 @@ class RecoverResult:
     def lossless(self) -> bool:
         """True where nothing of the source was lost."""
         return not self.reason
-
-
-ROSBAG2 = "rosbag2"
-"""Name of the record in which rosbag2 repeats its ``metadata.yaml``."""
 
 
 def recover(source: str | Path, target: str | Path, *, overwrite: bool = False) -> RecoverResult:
@@ -74,11 +70,25 @@ def recover(source: str | Path, target: str | Path, *, overwrite: bool = False) 
                     for title, entries, verified in check.metadata:
                         # Where it had no CRC of its own it gets none: doubt is not made proof.
                         # rosbag2's record of its own files is not true of the new one.
-                        if title != ROSBAG2:
+                        if title != "rosbag2":
                             writer.put_metadata(title, entries, verified)
                     if check.segments:
                         with file.open() as reader:
-                            _copy_messages(check, reader, writer)
+                            # Write the messages unpacked: the new bag has no metadata to say
+                            # that they are packed.
+                            records, numbers = check.records, dict[int, int]()
+                            for part in check.segments:
+                                for _, message in records.iterate_messages(part.read(reader), part.offset):
+                                    with suppress(FormatError):
+                                        data = records.unpack_message(message, part.offset, reader.budget)
+                                        own = message.channel_id
+                                        if own not in numbers:
+                                            channel = records.channels[own]
+                                            numbers[own] = writer.register(
+                                                records.schemas.get(channel.schema_id), channel
+                                            )
+                                        times = message.publish_time, message.sequence
+                                        writer.add_message(numbers[own], message.log_time, data, *times)
                 writer.finish()
                 os.fsync(output.fileno())
             if not any(check.message_count for check in found):
@@ -98,7 +108,7 @@ def recover(source: str | Path, target: str | Path, *, overwrite: bool = False) 
 
 
 def _find_files(source: Path) -> tuple[Sequence[BagFile], str]:
-    """Return the files to save, and the fault of the folder's metadata; empty if it is sound."""
+    """Return the files to save, and the fault of the folder's metadata if any."""
     try:
         return find_storage(source).files, ""
     except BagError as error:
@@ -108,18 +118,3 @@ def _find_files(source: Path) -> tuple[Sequence[BagFile], str]:
         if not found:
             raise
         return found, str(error)
-
-
-def _copy_messages(check: Check, reader: RecordReader, writer: McapWriter) -> None:
-    """Write the messages unpacked: the new bag has no metadata to say that they are packed."""
-    records, numbers = check.records, dict[int, int]()
-    for part in check.segments:
-        for _, message in records.iterate_messages(part.read(reader), part.offset):
-            with suppress(FormatError):
-                data = records.unpack_message(message, part.offset, reader.budget)
-                own = message.channel_id
-                if own not in numbers:
-                    channel = records.channels[own]
-                    numbers[own] = writer.register(records.schemas.get(channel.schema_id), channel)
-                times = message.publish_time, message.sequence
-                writer.add_message(numbers[own], message.log_time, data, *times)

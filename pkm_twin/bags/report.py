@@ -67,8 +67,34 @@ def make_report(path: Path, storage: Storage, checks: Sequence[Check]) -> BagRep
     topics: dict[str, TopicInfo] = {}
     counts, whole = dict[str, int](), Span()
     for file, check in zip(storage.files, checks, strict=True):
-        for name, info in _each_topic(check):
-            _join_topic(topics, name, info, file.path)
+        schemas = check.records.schemas
+        # Many channels may share one long definition.
+        texts = {number: schema.data.decode(errors="replace") for number, schema in schemas.items()}
+        for number, channel in check.records.channels.items():
+            schema, span, name = schemas.get(channel.schema_id), check.spans.get(number, Span()), channel.topic
+            info = TopicInfo(
+                type=schema.name if schema else "",
+                count=span.count,
+                start=span.start,
+                end=span.end,
+                offered_qos=channel.metadata.get("offered_qos_profiles", ""),
+                definition=texts.get(channel.schema_id, ""),
+                encoding=channel.message_encoding,
+                schema_encoding=schema.encoding if schema else "",
+            )
+            known = topics.get(name, info)
+            fault = ""
+            if known.type != info.type:
+                fault = f"two types, {known.type} and {info.type}"
+            elif not _one_form(known, info):
+                fault = f"two forms of the type {info.type}: definition or encoding differ"
+            if fault:
+                raise BagError(f"topic {name} has {fault}", path=file.path, reason="type")
+            # Another publisher, or another file of the bag.
+            if name in topics and known.count and info.count:
+                start, end = min(known.start, info.start), max(known.end, info.end)
+                info = replace(known, count=known.count + info.count, start=start, end=end)
+            topics[name] = info if info.count else known
         counts[f" in {file.path.name}"] = check.message_count
         whole.join(check.total)
     stated = {"": storage.message_count} if storage.message_count is not None else {}
@@ -123,53 +149,8 @@ def _find_warnings(check: Check) -> Iterator[str]:
         yield f"{unknown} records of unknown kinds were passed over"
 
 
-def _each_topic(check: Check) -> Iterator[tuple[str, TopicInfo]]:
-    """Yield the topic of each channel."""
-    schemas = check.records.schemas
-    # Many channels may share one long definition.
-    texts = {number: schema.data.decode(errors="replace") for number, schema in schemas.items()}
-    for number, channel in check.records.channels.items():
-        schema = schemas.get(channel.schema_id)
-        span = check.spans.get(number, Span())
-        yield (
-            channel.topic,
-            TopicInfo(
-                type=schema.name if schema else "",
-                count=span.count,
-                start=span.start,
-                end=span.end,
-                offered_qos=channel.metadata.get("offered_qos_profiles", ""),
-                definition=texts.get(channel.schema_id, ""),
-                encoding=channel.message_encoding,
-                schema_encoding=schema.encoding if schema else "",
-            ),
-        )
-
-
-def _join_topic(topics: dict[str, TopicInfo], name: str, info: TopicInfo, path: Path) -> None:
-    """Add a channel of the topic ``name``: another publisher's, or of another file of the bag.
-
-    :raises BagError: it is not of the type, with the fields, that the topic has so far.
-    """
-    known = topics.get(name)
-    if known is None:
-        topics[name] = info
-        return
-    if known.type != info.type:
-        text = f"topic {name} has two types, {known.type} and {info.type}"
-        raise BagError(text, path=path, reason="type")
-    if not _one_form(known, info):
-        text = f"topic {name} has two forms of the type {info.type}: definition or encoding differ"
-        raise BagError(text, path=path, reason="type")
-    if not (known.count and info.count):
-        topics[name] = known if known.count or not info.count else info
-        return
-    start, end = min(known.start, info.start), max(known.end, info.end)
-    topics[name] = replace(known, count=known.count + info.count, start=start, end=end)
-
-
 def _one_form(one: TopicInfo, other: TopicInfo) -> bool:
-    """Whether messages of both can be read alike; definitions may differ in comments."""
+    """Return whether messages of both topics can be read alike; comments of definitions may differ."""
     if (one.encoding, one.schema_encoding) != (other.encoding, other.schema_encoding):
         return False
     if one.definition == other.definition:

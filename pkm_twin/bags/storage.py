@@ -28,7 +28,6 @@ METADATA_FILE: Final = "metadata.yaml"
 MAX_METADATA_BYTES: Final = 4 * 1024**2
 """Largest ``metadata.yaml`` that is read; one of a hundred topics has some 60 kB."""
 SQLITE_MAGIC: Final = b"SQLite format 3\x00"
-_BLOCK_BYTES = 1024**2
 
 
 class BagFile:
@@ -61,7 +60,7 @@ class BagFile:
 
     @cached_property
     def _unpacked(self) -> IO[bytes]:
-        """The file's content. What does not unpack is missing at the end, and is found missing."""
+        """Return the unpacked file; what does not unpack is found missing at its end."""
         # Closed, and so gone, with the bag that holds it.
         target = tempfile.TemporaryFile()  # noqa: SIM115
         with open_regular(self.path) as file:
@@ -69,7 +68,7 @@ class BagFile:
             unpacker = zstandard.ZstdDecompressor()
             with unpacker.stream_reader(file, read_across_frames=True) as source:
                 try:
-                    while block := source.read(_BLOCK_BYTES):
+                    while block := source.read(1024**2):
                         budget.spend(len(block), None)
                         target.write(block)
                 except zstandard.ZstdError:
@@ -94,7 +93,7 @@ class Storage:
 
 
 def is_bag(path: Path) -> bool:
-    """Whether a path is meant as a bag: a folder, or by its name or first bytes one of its files.
+    """Return whether a path is meant as a bag: a folder, or by its name or first bytes one of its files.
 
     :raises OSError: the file is there, but cannot be opened or is no regular one.
     """
@@ -122,7 +121,43 @@ def find_storage(path: Path) -> Storage:
         inside = ", ".join(p.name for p in list_files(path)) or "no .mcap file"
         text = f"is a folder without {METADATA_FILE}: no rosbag2 bag; name a file in it: {inside}"
         raise BagError(text, path=path, reason="folder")
-    return _described(path, _Field(file, "", _load(file)))
+    facts = _Field(file, "", _load(file)).get("rosbag2_bagfile_information")
+    storage = facts.get("storage_identifier")
+    if storage.text() == "sqlite3":
+        text = f"is an SQLite bag, not MCAP; {write_conversion(path)} converts it"
+        raise BagError(text, path=path, reason="not_mcap")
+    # `ros2 bag reindex` leaves it empty; what the files are is seen when they are opened.
+    if storage.text() != "mcap" and storage.value != "":
+        raise storage.error("'mcap'")
+    packing = facts.get("compression_format")
+    if packing.text().lower() not in ("", "none", "zstd"):
+        raise packing.error("'zstd' or ''")
+    files = []
+    for entry in facts.get("relative_file_paths").items():
+        name = entry.text()
+        # rosbag2 puts its files beside the metadata; anything else could be any file.
+        if not name or name in (".", "..") or "/" in name or "\0" in name:
+            raise entry.error("the name of a file in the folder")
+        files.append(BagFile(path / name))
+    if not files:
+        raise facts.get("relative_file_paths").error("the names of the bag's files")
+    topics = {
+        entry.get("topic_metadata").get("name").text(): entry.get("message_count").count()
+        for entry in facts.get("topics_with_message_count").items(optional=True)
+    }
+    # Of a file that is packed as a whole rosbag2 states the name before the packing.
+    names = {file.path.name.removesuffix(".zstd"): file.path.name for file in files}
+    parts = {
+        names.get(name.removesuffix(".zstd"), name): entry.get("message_count").count()
+        for entry in facts.get("files").items(optional=True)
+        for name in (entry.get("path").text(),)
+    }
+    return Storage(
+        tuple(files),
+        facts.get("message_count").count(),
+        {name: count for name, count in topics.items() if count is not None},
+        {name: count for name, count in parts.items() if count is not None},
+    )
 
 
 def list_files(folder: Path) -> list[Path]:
@@ -183,46 +218,6 @@ class _Field:
         if not isinstance(self.value, int) or isinstance(self.value, bool) or self.value < 0:
             raise self.error("a count, 0 or more")
         return self.value
-
-
-def _described(folder: Path, root: _Field) -> Storage:
-    facts = root.get("rosbag2_bagfile_information")
-    storage = facts.get("storage_identifier")
-    if storage.text() == "sqlite3":
-        text = f"is an SQLite bag, not MCAP; {write_conversion(folder)} converts it"
-        raise BagError(text, path=folder, reason="not_mcap")
-    # `ros2 bag reindex` leaves it empty; what the files are is seen when they are opened.
-    if storage.text() != "mcap" and storage.value != "":
-        raise storage.error("'mcap'")
-    packing = facts.get("compression_format")
-    if packing.text().lower() not in ("", "none", "zstd"):
-        raise packing.error("'zstd' or ''")
-    files = []
-    for entry in facts.get("relative_file_paths").items():
-        name = entry.text()
-        # rosbag2 puts its files beside the metadata; anything else could be any file.
-        if not name or name in (".", "..") or "/" in name or "\0" in name:
-            raise entry.error("the name of a file in the folder")
-        files.append(BagFile(folder / name))
-    if not files:
-        raise facts.get("relative_file_paths").error("the names of the bag's files")
-    topics = {
-        entry.get("topic_metadata").get("name").text(): entry.get("message_count").count()
-        for entry in facts.get("topics_with_message_count").items(optional=True)
-    }
-    # Of a file that is packed as a whole rosbag2 states the name before the packing.
-    names = {file.path.name.removesuffix(".zstd"): file.path.name for file in files}
-    parts = {
-        names.get(name.removesuffix(".zstd"), name): entry.get("message_count").count()
-        for entry in facts.get("files").items(optional=True)
-        for name in (entry.get("path").text(),)
-    }
-    return Storage(
-        tuple(files),
-        facts.get("message_count").count(),
-        {name: count for name, count in topics.items() if count is not None},
-        {name: count for name, count in parts.items() if count is not None},
-    )
 
 
 def _load(path: Path) -> object:

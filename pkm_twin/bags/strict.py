@@ -43,7 +43,6 @@ from pkm_twin.errors import BagError
 
 # Messages outside chunks are read back in runs of about this size.
 _RUN_BYTES = 1024**2
-_IN_DATA = (Op.SCHEMA, Op.CHANNEL, Op.MESSAGE, Op.CHUNK, Op.MESSAGE_INDEX, Op.METADATA)
 
 
 @dataclass(slots=True)
@@ -93,36 +92,6 @@ class TrustedSummary(NamedTuple):
     data_end: int
     records: list[mcap.Schema | mcap.Channel]
     chunks: dict[int, int]
-
-
-def read_trusted_summary(reader: RecordReader) -> TrustedSummary:
-    """Return the summary's statements, none where it is missing or does not match its CRC."""
-    nothing = TrustedSummary(reader.size, [], {})
-    end = reader.size - FOOTER_BYTES - len(MAGIC)
-    try:
-        tail = reader.read_at(max(end, 0), FOOTER_BYTES, "footer")
-        footer = parse_record(Op.FOOTER, tail[FRAME.size :], end)
-        start = footer.summary_start
-        if not footer.summary_crc or not len(MAGIC) < start <= end <= start + MAX_RECORD_BYTES:
-            return nothing
-        summary = reader.read_at(start, end - start, "summary")
-        # The CRC goes as far as the footer's own CRC field.
-        if zlib.crc32(summary + tail[:-CRC_BYTES]) != footer.summary_crc:
-            return nothing
-        found = TrustedSummary(start, [], {})
-        for opcode, begin, stop in iterate_records(summary, start):
-            if opcode in (Op.SCHEMA, Op.CHANNEL):
-                found.records.append(parse_record(opcode, summary[begin:stop], start))
-            elif opcode == Op.CHUNK_INDEX:
-                index = parse_record(opcode, summary[begin:stop], start)
-                if FRAME.size < index.chunk_length <= start - index.chunk_start_offset:
-                    found.chunks[index.chunk_start_offset] = index.chunk_length
-    except FormatError:
-        return nothing
-    chunks = dict(sorted(found.chunks.items()))
-    # A list in which chunks overlap is of no help.
-    overlap = any(at + chunks[at] > behind for at, behind in pairwise(chunks))
-    return found._replace(chunks={} if overlap else chunks)
 
 
 class Check:
@@ -176,7 +145,32 @@ class Check:
 
     @cached_property
     def _trusted(self) -> TrustedSummary:
-        return read_trusted_summary(self._reader)
+        nothing = TrustedSummary(self._reader.size, [], {})
+        end = self._reader.size - FOOTER_BYTES - len(MAGIC)
+        try:
+            tail = self._reader.read_at(max(end, 0), FOOTER_BYTES, "footer")
+            footer = parse_record(Op.FOOTER, tail[FRAME.size :], end)
+            start = footer.summary_start
+            if not footer.summary_crc or not len(MAGIC) < start <= end <= start + MAX_RECORD_BYTES:
+                return nothing
+            summary = self._reader.read_at(start, end - start, "summary")
+            # The CRC goes as far as the footer's own CRC field.
+            if zlib.crc32(summary + tail[:-CRC_BYTES]) != footer.summary_crc:
+                return nothing
+            found = TrustedSummary(start, [], {})
+            for opcode, begin, stop in iterate_records(summary, start):
+                if opcode in (Op.SCHEMA, Op.CHANNEL):
+                    found.records.append(parse_record(opcode, summary[begin:stop], start))
+                elif opcode == Op.CHUNK_INDEX:
+                    index = parse_record(opcode, summary[begin:stop], start)
+                    if FRAME.size < index.chunk_length <= start - index.chunk_start_offset:
+                        found.chunks[index.chunk_start_offset] = index.chunk_length
+        except FormatError:
+            return nothing
+        chunks = dict(sorted(found.chunks.items()))
+        # A list in which chunks overlap is of no help.
+        overlap = any(at + chunks[at] > behind for at, behind in pairwise(chunks))
+        return found._replace(chunks={} if overlap else chunks)
 
     @property
     def left_out(self) -> str:
@@ -189,12 +183,12 @@ class Check:
 
     @property
     def has_crc(self) -> bool:
-        """Whether a CRC covers every message."""
+        """True if a CRC covers every message."""
         return self.has_data_crc or all(part.has_crc for part in self.segments)
 
     @property
     def has_index(self) -> bool:
-        """Whether the summary lists every chunk."""
+        """True if the summary lists every chunk."""
         return bool(self._chunks) and self._indexed == set(self._chunks.values())
 
     @property
@@ -236,7 +230,18 @@ class Check:
                 if error.reason == TOTAL_CAP:
                     raise
                 if self.fault:
-                    data_end = self._resume(at, end, opcode)
+                    # Go on behind the damaged record at ``at``, which should stop at ``end``.
+                    data_end, _, chunks = self._trusted
+                    if at in chunks:
+                        end = at + chunks[at]
+                    else:
+                        # In order, and one behind the other: the scan never goes back.
+                        offsets = [*chunks, data_end]
+                        later = offsets[min(bisect_right(offsets, at), len(chunks))]
+                        end = later if end <= at or end > later else end
+                    self.chunks_lost += opcode == Op.CHUNK or at in chunks
+                    self.bytes_lost += end - at
+                    self._reader.position = end
                 else:
                     # Read once more: the summary may have the channel that the record needs.
                     reader.position = at
@@ -250,24 +255,6 @@ class Check:
         self._in_data = (len(self.records.schemas), len(self.records.channels))
         return True
 
-    def _resume(self, at: int, end: int, opcode: int) -> int:
-        """Go on behind the damaged record at ``at``, which should stop at ``end``.
-
-        Return where the data end.
-        """
-        data_end, _, chunks = self._trusted
-        if at in chunks:
-            end = at + chunks[at]
-        else:
-            # In order, and one behind the other: the scan never goes back.
-            offsets = [*chunks, data_end]
-            later = offsets[min(bisect_right(offsets, at), len(chunks))]
-            end = later if end <= at or end > later else end
-        self.chunks_lost += opcode == Op.CHUNK or at in chunks
-        self.bytes_lost += end - at
-        self._reader.position = end
-        return data_end
-
     def _take(self, at: int, opcode: int, length: int) -> None:
         """Read the record at ``at``, whose frame has been read."""
         reader, whole = self._reader, FRAME.size + length
@@ -278,7 +265,11 @@ class Check:
             self.bytes_lost += whole
             return
         header = opcode == Op.HEADER and at == len(MAGIC)
-        if opcode in NAMES and opcode not in _IN_DATA and not header:
+        if (
+            opcode in NAMES
+            and opcode not in (Op.SCHEMA, Op.CHANNEL, Op.MESSAGE, Op.CHUNK, Op.MESSAGE_INDEX, Op.METADATA)
+            and not header
+        ):
             raise FormatError(f"a {opcode_name(opcode)} record stands in the data section", at)
         body = reader.read_body(opcode, length)
         if opcode not in NAMES:
@@ -286,7 +277,16 @@ class Check:
             self.bytes_lost += whole
             return
         if opcode == Op.MESSAGE:
-            self._take_message(at, FRAME.pack(opcode, length) + body)
+            # A run of messages outside chunks is one segment.
+            record = FRAME.pack(opcode, length) + body
+            span = self._count_messages(record, at)
+            last = self.segments[-1] if self.segments else None
+            begin, length = at, len(record)
+            follows = last and not last.is_chunk and last.offset + last.length == at
+            if last and follows and last.length + length <= _RUN_BYTES:
+                begin, length = last.offset, last.length + length
+                span.join(self.segments.pop().messages)
+            self.segments.append(Segment(begin, length, span, is_chunk=False, has_crc=False))
             return
         match record := parse_record(opcode, body, at):
             case mcap.Header():
@@ -294,22 +294,32 @@ class Check:
             case mcap.Schema() | mcap.Channel():
                 self.records.add(record, at)
             case mcap.Chunk():
-                self._take_chunk(at, record, whole)
+                data = unpack_chunk(record, at, self._reader.budget)
+                span = self._count_messages(data, at)
+                for kind in self.records.passed_over:
+                    if kind in NAMES:
+                        self._note(FormatError(f"a {opcode_name(kind)} record stands in a chunk", at))
+                stated = record.message_start_time, record.message_end_time
+                if stated != (span.start, span.end):
+                    text = f"the chunk's messages span {span.start} to {span.end} ns"
+                    self._note(FormatError(f"{text}; the file says {stated[0]} to {stated[1]}", at))
+                self.segments.append(Segment(at, whole, span, is_chunk=True, has_crc=record.uncompressed_crc != 0))
+                self._chunk = mcap.ChunkIndex(
+                    chunk_start_offset=at,
+                    chunk_length=whole,
+                    compression=record.compression,
+                    compressed_size=len(record.data),
+                    uncompressed_size=len(data),
+                    message_start_time=span.start,
+                    message_end_time=span.end,
+                    message_index_offsets={},
+                    message_index_length=0,
+                )
             case mcap.MessageIndex():
                 self._take_index(at, record, whole)
             case mcap.Metadata(name=title):
                 self.metadata.append((title, *check_metadata(record, at)))
                 self._indexes.add(_digest(mcap.MetadataIndex(at, whole, title)))
-
-    def _take_message(self, at: int, record: bytes) -> None:
-        span = self._count_messages(record, at)
-        last = self.segments[-1] if self.segments else None
-        begin, length = at, len(record)
-        follows = last and not last.is_chunk and last.offset + last.length == at
-        if last and follows and last.length + length <= _RUN_BYTES:
-            begin, length = last.offset, last.length + length
-            span.join(self.segments.pop().messages)
-        self.segments.append(Segment(begin, length, span, is_chunk=False, has_crc=False))
 
     def _count_messages(self, data: bytes, at: int) -> Span:
         """Count the messages in ``data`` and note what their indexes must say."""
@@ -340,29 +350,6 @@ class Check:
         self.out_of_order += late
         self.bytes_lost += lost
         return whole
-
-    def _take_chunk(self, at: int, chunk: mcap.Chunk, length: int) -> None:
-        data = unpack_chunk(chunk, at, self._reader.budget)
-        span = self._count_messages(data, at)
-        for opcode in self.records.passed_over:
-            if opcode in NAMES:
-                self._note(FormatError(f"a {opcode_name(opcode)} record stands in a chunk", at))
-        stated = chunk.message_start_time, chunk.message_end_time
-        if stated != (span.start, span.end):
-            text = f"the chunk's messages span {span.start} to {span.end} ns"
-            self._note(FormatError(f"{text}; the file says {stated[0]} to {stated[1]}", at))
-        self.segments.append(Segment(at, length, span, is_chunk=True, has_crc=chunk.uncompressed_crc != 0))
-        self._chunk = mcap.ChunkIndex(
-            chunk_start_offset=at,
-            chunk_length=length,
-            compression=chunk.compression,
-            compressed_size=len(chunk.data),
-            uncompressed_size=len(data),
-            message_start_time=span.start,
-            message_end_time=span.end,
-            message_index_offsets={},
-            message_index_length=0,
-        )
 
     def _take_index(self, at: int, index: mcap.MessageIndex, length: int) -> None:
         number = index.channel_id
@@ -402,7 +389,33 @@ class Check:
             if opcode == Op.FOOTER:
                 break
             if opcode in NAMES:
-                self._read_summary_record(at, opcode, body)
+                if Op.SUMMARY_OFFSET in self._groups and opcode != Op.SUMMARY_OFFSET:
+                    text = f"a {opcode_name(opcode)} record stands among the summary offsets"
+                    raise FormatError(text, at)
+                match record := None if opcode == Op.MESSAGE else parse_record(opcode, body, at):
+                    case mcap.Schema() | mcap.Channel():
+                        self.records.add(record, at)
+                    case mcap.Statistics():
+                        if self.statistics:
+                            raise FormatError("the summary has two statistics records", at)
+                        self.statistics = record
+                    case mcap.ChunkIndex():
+                        known = self._chunks.get(_digest(record))
+                        if known is None or known in self._indexed:
+                            where = record.chunk_start_offset
+                            raise FormatError(f"a chunk index does not match the chunk at byte {where}", at)
+                        self._indexed.add(known)
+                    case mcap.MetadataIndex() | mcap.AttachmentIndex():
+                        if _digest(record) not in self._indexes:
+                            text = f"the {opcode_name(opcode)} does not match the one at byte"
+                            raise FormatError(f"{text} {record.offset}", at)
+                    case mcap.SummaryOffset(group_opcode=kind, group_start=start, group_length=length):
+                        # Writers may list a group that has no records.
+                        if length and self._groups.get(kind) != (start, length):
+                            text = f"a summary offset does not match the {opcode_name(kind)} records"
+                            raise FormatError(text, at)
+                    case _:
+                        raise FormatError(f"a {opcode_name(opcode)} record stands in the summary", at)
             else:
                 self.records.passed_over[opcode] += 1
             start, size = self._groups.get(opcode, (at, 0))
@@ -429,35 +442,6 @@ class Check:
             raise FormatError("the file does not end with the MCAP signature", at)
         if left := reader.size - reader.position:
             raise FormatError(f"{left} bytes follow the end of the bag", reader.position)
-
-    def _read_summary_record(self, at: int, opcode: int, body: bytes) -> None:
-        if Op.SUMMARY_OFFSET in self._groups and opcode != Op.SUMMARY_OFFSET:
-            text = f"a {opcode_name(opcode)} record stands among the summary offsets"
-            raise FormatError(text, at)
-        match record := None if opcode == Op.MESSAGE else parse_record(opcode, body, at):
-            case mcap.Schema() | mcap.Channel():
-                self.records.add(record, at)
-            case mcap.Statistics():
-                if self.statistics:
-                    raise FormatError("the summary has two statistics records", at)
-                self.statistics = record
-            case mcap.ChunkIndex():
-                known = self._chunks.get(_digest(record))
-                if known is None or known in self._indexed:
-                    where = record.chunk_start_offset
-                    raise FormatError(f"a chunk index does not match the chunk at byte {where}", at)
-                self._indexed.add(known)
-            case mcap.MetadataIndex() | mcap.AttachmentIndex():
-                if _digest(record) not in self._indexes:
-                    text = f"the {opcode_name(opcode)} does not match the one at byte"
-                    raise FormatError(f"{text} {record.offset}", at)
-            case mcap.SummaryOffset(group_opcode=kind, group_start=start, group_length=length):
-                # Writers may list a group that has no records.
-                if length and self._groups.get(kind) != (start, length):
-                    text = f"a summary offset does not match the {opcode_name(kind)} records"
-                    raise FormatError(text, at)
-            case _:
-                raise FormatError(f"a {opcode_name(opcode)} record stands in the summary", at)
 
     def _compare_counts(self) -> None:
         if self._indexed and not self.has_index:

@@ -25,13 +25,8 @@ from pkm_twin.bags.format import FREE_BYTES, MAX_CHUNK_BYTES, METADATA_CRC, meta
 from pkm_twin.errors import BagError
 from pkm_twin.files import replacing, require_replaceable
 
-LIBRARY = "pkm_twin"
-"""Name of the library in the header of own bags."""
 FLUSH_PERIOD = 0.05
 """How often a live recording reaches the operating system, s; half of what a kill may cost."""
-
-# What the writer may hold in memory before it slows its caller down.
-_QUEUE_LIMIT = 20_000
 
 
 def refuse_existing(path: Path, overwrite: bool) -> None:
@@ -40,18 +35,15 @@ def refuse_existing(path: Path, overwrite: bool) -> None:
         raise BagError("exists already", path=path, reason="exists")
 
 
-_REASONS = {
-    errno.ENOSPC: "disk_full",
-    errno.EDQUOT: "disk_full",
-    errno.EFBIG: "disk_full",
-    errno.EEXIST: "exists",
-    errno.ENOENT: "not_found",
-}
-
-
 def write_error(error: OSError, path: Path) -> BagError:
     """Return the caller's error where the system cannot write ``path``."""
-    reason = _REASONS.get(error.errno or 0, "io")
+    reason = {
+        errno.ENOSPC: "disk_full",
+        errno.EDQUOT: "disk_full",
+        errno.EFBIG: "disk_full",
+        errno.EEXIST: "exists",
+        errno.ENOENT: "not_found",
+    }.get(error.errno or 0, "io")
     return BagError(f"cannot be written: {error.strerror or error}", path=path, reason=reason)
 
 
@@ -80,7 +72,7 @@ class McapWriter(Writer):
     def __init__(self, file: io.FileIO, path: Path, chunk_size: int, profile: str) -> None:
         super().__init__(cast("IO[bytes]", _Target(file, path)), chunk_size, enable_data_crcs=True)
         self._numbers: dict[str, Any] = {}
-        self.start(profile, LIBRARY)
+        self.start(profile, "pkm_twin")
 
     def register(self, schema: Schema | None, channel: Channel) -> int:
         """Return the number of a channel, whose own numbers do not count."""
@@ -251,7 +243,8 @@ class BagWriter:
         self._sequences[topic] += 1
         sequence = self._sequences[topic]
         self._queue.put(lambda: self._add(topic, logged, data, published, sequence))
-        while self._queue.qsize() > _QUEUE_LIMIT and self._error is None:
+        # What the writer may hold in memory before it slows its caller down.
+        while self._queue.qsize() > 20_000 and self._error is None:
             time.sleep(0.001)
 
     def close(self) -> None:
@@ -307,7 +300,22 @@ class BagWriter:
 
     def _work(self) -> None:
         try:
-            self._take_in()
+            # Do what is in the queue until it is closed, flushing in time.
+            due: float | None = None
+            while True:
+                if due is not None and time.monotonic() >= due:
+                    self._writer.flush()
+                    due = None
+                wait = None if due is None else max(0.0, due - time.monotonic())
+                try:
+                    job = self._queue.get(timeout=wait)
+                except queue.Empty:
+                    continue
+                if job is None:
+                    break
+                job()
+                if due is None and self._period is not None:
+                    due = time.monotonic() + self._period
             self._writer.finish()
         except BagError as error:
             self._error = error
@@ -316,24 +324,6 @@ class BagWriter:
             self._error = BagError(f"cannot be written: {error}", path=self._path, reason="io")
         finally:
             self._file.close()
-
-    def _take_in(self) -> None:
-        """Do what is in the queue until it is closed, flushing in time."""
-        due: float | None = None
-        while True:
-            if due is not None and time.monotonic() >= due:
-                self._writer.flush()
-                due = None
-            wait = None if due is None else max(0.0, due - time.monotonic())
-            try:
-                job = self._queue.get(timeout=wait)
-            except queue.Empty:
-                continue
-            if job is None:
-                return
-            job()
-            if due is None and self._period is not None:
-                due = time.monotonic() + self._period
 
 
 @contextmanager
