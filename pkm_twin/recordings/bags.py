@@ -61,7 +61,17 @@ def read_bag(
     :raises BagError: the bag is damaged, names no robot, or lacks what is asked for.
     """
     bag = open_bag(path)
-    machine = _find_robot(bag, robot)
+    # The robot, which may be a name; without one, the robot of the bag's metadata.
+    if robot is not None:
+        machine = robot if isinstance(robot, Robot) else load(robot)
+    else:
+        recorded = bag.report.metadata.get("pkm_twin", {}).get("robot")
+        if recorded is None:
+            raise BagError("the bag names no robot; use --robot", path=bag.report.path, reason="no robot")
+        # Not a path: a bag does not choose which files are opened.
+        if recorded not in robot_names():
+            raise metadata_error(bag, "robot", recorded, f"one of {', '.join(robot_names())}; or give --robot")
+        machine = load(recorded)
     held = how.load or told_load(bag)
     kinds = {topic.type for topic in bag.report.topics.values()}
     if (how.trajectory or how.planned) and JOINT_STATE not in kinds and TRAJECTORY in kinds:
@@ -99,7 +109,41 @@ def read_bag(
         first_reject=found.first_reject,
     )
     if how.deflected:
-        return _sample_deflections(r, stamps, found, how)
+        counts = {r.topics.wrench: found.wrenches, r.topics.deflection: found.deflections}
+        for topic, samples in counts.items():
+            if not samples:
+                text = f"no usable message on {topic}: {r.first_reject}"
+                raise BagError(text, path=r.source, reason="no messages")
+        moved = {one.stamp: one for one in found.deflections}
+        moved_stamps = np.array(sorted(moved), np.int64)
+        times, wrench = _sort_wrenches(found.wrenches)
+        apart = [np.abs(at[_find_nearest(at, moved_stamps)] - moved_stamps) / SECOND for at in (times, stamps)]
+        near = moved_stamps[(np.array(apart) <= MAX_DEFLECTION_OFFSET).all(0)]
+        if not len(near):
+            raise BagError(
+                f"no deflection on {r.topics.deflection} has a wrench and a joint state within "
+                f"{MAX_DEFLECTION_OFFSET:g} s",
+                path=r.source,
+                reason="no pairs",
+            )
+        q, wrench = _interpolate(near, stamps, r.q), _interpolate(near, times, wrench)
+        rotation = r.robot.platform(q)[1]
+        values = np.array([moved[stamp].values for stamp in near.tolist()])
+        fixed = np.array([moved[stamp].frame == how.base_frame for stamp in near.tolist()])
+        return Recording(
+            r.robot,
+            (near - near[0]) / SECOND,
+            q,
+            wrench=in_base_axes(wrench, rotation) if r.topics.turns else wrench,
+            deflection=np.where(fixed[:, None], values, in_base_axes(values, rotation)),
+            source=r.source,
+            notes=r.notes,
+            start=int(near[0]),
+            bag=r.bag,
+            topics=r.topics,
+            rejected=r.rejected,
+            first_reject=r.first_reject,
+        )
     if not found.wrenches:
         return r
     at, wrench = _sort_wrenches(found.wrenches)
@@ -117,27 +161,11 @@ def bags_of(folder: Path) -> list[Path]:
 
 
 def is_collection(path: Path) -> bool:
-    """Whether a path is a folder of recordings, not a rosbag2 bag itself."""
+    """Return whether a path is a folder of recordings, not a rosbag2 bag itself."""
     if not path.is_dir() or (path / METADATA_FILE).exists():
         return False
     # A bag whose metadata is lost has its files side by side.
     return bool(bags_of(path)) and not any(path.glob("*.db3"))
-
-
-def _find_robot(bag: Bag, name: str | Robot | None) -> Robot:
-    """Return the robot, which may be a name; without one, the robot of the bag's metadata.
-
-    :raises BagError: neither is given, or the bag names one that is not in ``config/``.
-    """
-    if name is not None:
-        return name if isinstance(name, Robot) else load(name)
-    recorded = bag.report.metadata.get("pkm_twin", {}).get("robot")
-    if recorded is None:
-        raise BagError("the bag names no robot; use --robot", path=bag.report.path, reason="no robot")
-    # Not a path: a bag does not choose which files are opened.
-    if recorded not in robot_names():
-        raise metadata_error(bag, "robot", recorded, f"one of {', '.join(robot_names())}; or give --robot")
-    return load(recorded)
 
 
 class _Found(NamedTuple):
@@ -161,7 +189,25 @@ def _read_messages(
     :raises BagError: no joint state is accepted.
     """
     reader, rules = JointReader(robot, limited=how.limited), StampRules(future_tolerance=2**62)
-    wrench_of = _make_wrench_reader(how, rules)
+    # Wrenches of one frame: the first that is accepted, or the option's.
+    accepted = how.wrench_frame
+
+    def wrench_of(message: Any, now: int) -> WrenchSample:
+        nonlocal accepted
+        given = message.header.frame_id
+        if accepted is None and given in (PLATFORM, how.base_frame):
+            accepted = given
+        try:
+            return read_wrench(message, now, rules, accepted or PLATFORM, accept_empty=False)
+        except MessageError as error:
+            if error.reason != "frame" or not given:
+                raise
+            raise MessageError(
+                "frame",
+                f"{error}; --wrench-frame accepts a frame that turns with the platform, "
+                "--base-frame one with base axes",
+            ) from None
+
     found, first = _Found([], [], [], Counter(), ""), ""
     names = [topics.joint_states, topics.wrench, topics.deflection]
     own, others = set(robot.controller.names), 0
@@ -200,36 +246,13 @@ def _read_messages(
     return found._replace(first_reject=first, others=others)
 
 
-def _make_wrench_reader(how: ReadOptions, rules: StampRules) -> Callable[[Any, int], WrenchSample]:
-    """Return a reader of geometry_msgs/WrenchStamped (and log time, ns) of one frame."""
-    accepted = how.wrench_frame
-
-    def read(message: Any, now: int) -> WrenchSample:
-        nonlocal accepted
-        given = message.header.frame_id
-        if accepted is None and given in (PLATFORM, how.base_frame):
-            accepted = given
-        try:
-            return read_wrench(message, now, rules, accepted or PLATFORM, accept_empty=False)
-        except MessageError as error:
-            if error.reason != "frame" or not given:
-                raise
-            raise MessageError(
-                "frame",
-                f"{error}; --wrench-frame accepts a frame that turns with the platform, "
-                "--base-frame one with base axes",
-            ) from None
-
-    return read
-
-
 def _stack(values: list[Array | None]) -> Array | None:
     present = [v for v in values if v is not None]
     return np.array(present) if len(present) == len(values) else None
 
 
 def _sort_wrenches(samples: list[WrenchSample]) -> tuple[Stamps, Array]:
-    """Stamps and wrenches (k, 6) in the order of the stamps; of one stamp the last."""
+    """Sort wrenches (k, 6) by their stamps; of one stamp the last is kept."""
     by_stamp = {one.stamp: one.wrench for one in samples}
     at = sorted(by_stamp)
     return np.array(at, np.int64), np.array([by_stamp[stamp] for stamp in at])
@@ -243,49 +266,8 @@ def _find_nearest(stamps: Stamps, others: Stamps) -> NDArray[np.intp]:
     return np.where(before, left, right)
 
 
-def _sample_deflections(r: Recording, joints: Stamps, found: _Found, how: ReadOptions) -> Recording:
-    """Interpolate a recording linearly at the times of its deflections.
-
-    :raises BagError: no deflection has both near it.
-    """
-    counts = {r.topics.wrench: found.wrenches, r.topics.deflection: found.deflections}
-    for topic, samples in counts.items():
-        if not samples:
-            text = f"no usable message on {topic}: {r.first_reject}"
-            raise BagError(text, path=r.source, reason="no messages")
-    moved = {one.stamp: one for one in found.deflections}
-    stamps = np.array(sorted(moved), np.int64)
-    times, wrench = _sort_wrenches(found.wrenches)
-    apart = [np.abs(at[_find_nearest(at, stamps)] - stamps) / SECOND for at in (times, joints)]
-    near = stamps[(np.array(apart) <= MAX_DEFLECTION_OFFSET).all(0)]
-    if not len(near):
-        raise BagError(
-            f"no deflection on {r.topics.deflection} has a wrench and a joint state within {MAX_DEFLECTION_OFFSET:g} s",
-            path=r.source,
-            reason="no pairs",
-        )
-    q, wrench = _interpolate(near, joints, r.q), _interpolate(near, times, wrench)
-    rotation = r.robot.platform(q)[1]
-    values = np.array([moved[stamp].values for stamp in near.tolist()])
-    fixed = np.array([moved[stamp].frame == how.base_frame for stamp in near.tolist()])
-    return Recording(
-        r.robot,
-        (near - near[0]) / SECOND,
-        q,
-        wrench=in_base_axes(wrench, rotation) if r.topics.turns else wrench,
-        deflection=np.where(fixed[:, None], values, in_base_axes(values, rotation)),
-        source=r.source,
-        notes=r.notes,
-        start=int(near[0]),
-        bag=r.bag,
-        topics=r.topics,
-        rejected=r.rejected,
-        first_reject=r.first_reject,
-    )
-
-
 def _interpolate(stamps: Stamps, others: Stamps, values: Array) -> Array:
-    """Values (k, n) at the stamps, linear between two."""
+    """Interpolate values (k, n) linearly at the stamps."""
     at = (stamps - others[0]) / SECOND
     known = (others - others[0]) / SECOND
     return np.stack([np.interp(at, known, column) for column in values.T], -1)
@@ -347,7 +329,7 @@ def write_motion(path: Path, r: Recording, facts: Mapping[str, Any], overwrite: 
 
 
 def _columns(r: Recording) -> dict[str, Array]:
-    """Columns of a table: time, the joints' motion and efforts, the pose and its rates."""
+    """Return a table's columns: time, the joints' motion and efforts, the pose and its rates."""
     q, qd, qdd, _ = r.motion
     words = {"position": q, "velocity": qd, "acceleration": qdd}
     words |= {} if r.effort is None else {"effort": r.effort}

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -18,7 +19,7 @@ from pkm_twin.bags.reader import Bag
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.files import parse_numbers
-from pkm_twin.recordings.payload import Load, load_facts, metadata_error, payload_columns
+from pkm_twin.recordings.payload import CENTRE, MASS, PICKED, RELEASED, Load, metadata_error, payload_columns
 from pkm_twin.recordings.tables import WRENCH, Table
 from pkm_twin.robot.robot import Robot
 
@@ -26,8 +27,6 @@ COMPUTED_WITH: Final = "computed_with"
 """Key of the digest; the name of a table's column ends in the robot's name."""
 MARK: Final = f"{COMPUTED_WITH}."
 GRAVITY: Final = ("gravity.x", "gravity.y", "gravity.z")
-DIGEST_BYTES: Final = 6
-"""A table's number, of 53 bits, holds the digest exactly."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +44,8 @@ class Origin:
     def of(cls, robot: Robot) -> Origin:
         """Return the origin of what a robot computes."""
         numbers = json.dumps([robot.mechanism, robot.parameter_sections()], sort_keys=True)
-        digest = hashlib.sha256(numbers.encode()).digest()[:DIGEST_BYTES]
+        # A table's number, of 53 bits, holds six bytes exactly.
+        digest = hashlib.sha256(numbers.encode()).digest()[:6]
         return cls(robot.name, int.from_bytes(digest), tuple(robot.gravity.tolist()))
 
     @classmethod
@@ -111,9 +111,12 @@ def origin_columns(robot: Robot, load: Load | None, wrench: Array | None, time: 
 def origin_facts(robot: Robot, load: Load | None) -> dict[str, Any]:
     """Return a bag's metadata of what efforts without a wrench rest on."""
     own = Origin.of(robot)
-    facts = {
-        "robot": own.robot,
-        COMPUTED_WITH: own.digest,
-        "gravity": " ".join(map(repr, own.gravity)),
-    }
-    return facts | load_facts(load)
+    facts = {"robot": own.robot, COMPUTED_WITH: own.digest, "gravity": " ".join(map(repr, own.gravity))}
+    if load is not None:
+        # Times are rounded as the bag's stamps are.
+        *times, _ = zip(*load.spans, strict=True)
+        stamped = [[round(1e9 * t) / 1e9 if math.isfinite(t) else t for t in row] for row in times]
+        values = [*stamped, load.masses or [load.mass]]
+        facts |= {key: " ".join(map(repr, v)) for key, v in zip((PICKED, RELEASED, MASS), values, strict=True)}
+        facts |= {} if load.com is None else {CENTRE: " ".join(map(repr, load.com))}
+    return facts

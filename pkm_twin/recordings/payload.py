@@ -37,7 +37,7 @@ class Load:
     times: tuple[tuple[float, float], ...] = ()
     source: str = "option"
     sought: bool = False
-    """Whether it is fitted, and is the robot's own."""
+    """True if it is fitted, and is the robot's own."""
     masses: tuple[float, ...] = ()
 
     @classmethod
@@ -166,18 +166,6 @@ MASS, PICKED, RELEASED, CENTRE = ("payload_mass_kg", "payload_picked_s", "payloa
 """Keys of a bag's metadata on its payload; several intervals have blanks between."""
 
 
-def load_facts(carried: Load | None) -> dict[str, Any]:
-    """Return a payload as a bag's metadata; times are rounded as its stamps are."""
-    if carried is None:
-        return {}
-    rows = list(zip(*carried.spans, strict=True))
-    stamped = [[round(1e9 * t) / 1e9 if math.isfinite(t) else t for t in row] for row in rows[:2]]
-    values = [*stamped, [carried.mass] if not carried.masses else carried.masses]
-    facts = dict(zip((PICKED, RELEASED, MASS), (" ".join(map(repr, v)) for v in values), strict=True))
-    com = {} if carried.com is None else {CENTRE: " ".join(map(repr, carried.com))}
-    return facts | com
-
-
 def told_load(bag: Bag) -> Load | None:
     """Read the payload from the bag's metadata.
 
@@ -207,7 +195,7 @@ def told_load(bag: Bag) -> Load | None:
 
 
 def _fact(bag: Bag, facts: Mapping[str, str], name: str) -> list[float]:
-    """Numbers of a value; only a release may be infinite, which is never."""
+    """Read the numbers of a value; only the last release may be infinite."""
     try:
         values = [float(word) for word in facts[name].split()]
     except (KeyError, ValueError):

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -40,22 +40,8 @@ from pkm_twin.robot.robot import Robot
 RECORDING: Final = "an MCAP file, a rosbag2 folder, or a table with columns time, JOINT.position ..."
 FOLLOW: Final = ("joints", "pose")
 SIDES: Final = ("joint", "controller", "motor")
-CONVERTED: Final[Mapping[str, Callable[[JointMap, Array], Array]]] = {
-    "position": JointMap.positions,
-    "velocity": JointMap.rates,
-    "acceleration": JointMap.rates,
-    "effort": JointMap.efforts,
-    "measured": JointMap.efforts,
-    # A current is made an effort at the joint by one factor, which has the gear.
-    "current": lambda own, values: values * np.sign(own.factors),
-}
-"""The joints' values of a controller's or motor's, by the column's word."""
 TERM: Final = "effort_gravity"
 """In every table that `torques` writes."""
-BASIS: Final = {"effort_external": ("a wrench", WRENCH), "effort_payload": ("a payload", PAYLOAD)}
-"""Terms of an effort, what each rests on, and the columns that have it."""
-POSE_MISS: Final = 1e-3
-"""Difference between a table's pose and that of its joint positions, of the robot's size."""
 BLOCK: Final = 4096
 """Samples computed at a time, so that memory stays flat."""
 SIZES: Final = dict(
@@ -66,16 +52,10 @@ SIZES: Final = dict(
     )
 )
 """Greatest values of a table's columns, as of messages: N, N m, m, rad."""
-MAX_STEP: Final = 0.2
-"""Largest mean step of a motion, s; above it the times look like milliseconds."""
 MIN_STEP: Final = 1e-9
 """Smallest step between two times, s: the resolution of a bag's stamps."""
-SINCE_1970_NS: Final = 1e17
-"""Times above this are nanoseconds since 1970: it is the year 1973."""
 MAX_DURATION: Final = 1e6
 """Longest recording, s, as for trajectories."""
-MAX_UNIT_SAMPLES: Final = 500
-"""Largest number of samples from which units are judged."""
 DEFAULT: Final = ReadOptions()
 
 
@@ -118,7 +98,6 @@ def read(
 
 
 def _read_table_recording(path: Path, name: str | Robot | None, how: ReadOptions) -> Recording:
-    """Read a table as a recording; see :func:`read`."""
     if name is None:
         # A file that is no recording of any robot is rejected as such.
         try:
@@ -140,8 +119,21 @@ def _read_table_recording(path: Path, name: str | Robot | None, how: ReadOptions
     def stack(word: str) -> Array | None:
         values = table.stack_if([f"{joint}.{word}" for joint in joints])
         if values is not None and word in EFFORTS[:2] and "effort" in how.dialect.units:
-            values = values * _find_rated_torques(robot, how.side)
-        return values if values is None or side is None else CONVERTED[word](side, values)
+            # In per cent of the motors' rated torques, N m.
+            if how.side != "motor":
+                raise ParameterError("--units", "percent", "--side motor: it is the motor's rated torque")
+            rated = [drive.rated_torque for drive in _require_drives(robot)]
+            if None in rated:
+                raise ParameterError(f"{robot.name}: drive.rated_torque", None, "N m, for per cent of it")
+            values = values * np.array(rated, np.float64)
+        if values is None or side is None:
+            return values
+        if word == "current":
+            # It is made an effort at the joint by one factor, which has the gear.
+            return np.asarray(values * np.sign(side.factors))
+        if word == "position":
+            return side.positions(values)
+        return side.efforts(values) if word in EFFORTS else side.rates(values)
 
     q = stack("position")
     if q is None and any(f"{joint}.position" in table for joint in robot.joint_names):
@@ -164,10 +156,32 @@ def _read_table_recording(path: Path, name: str | Robot | None, how: ReadOptions
     # Beside the terms of a model the efforts are their sum.
     computed = any(f"{joint}.{TERM}" in table for joint in robot.joint_names)
     if computed:
-        _check_basis(table, robot, how)
+        # Reject computed efforts without the wrench or payload that they were computed with.
+        own = how.load is not None or robot.payload.mass > 0.0
+        for term, (what, needed_columns) in {
+            "effort_external": ("a wrench", WRENCH),
+            "effort_payload": ("a payload", PAYLOAD),
+        }.items():
+            if any(name in table for name in needed_columns) or (needed_columns is PAYLOAD and own):
+                continue
+            for joint in robot.joint_names:
+                most = np.abs(table.get(f"{joint}.{term}", np.zeros(1))).max()
+                if most > 0.0:
+                    raise ParameterError(
+                        f"{table.path}: {joint}.{term}",
+                        float(most),
+                        f"{what} that the efforts were computed with: columns {', '.join(needed_columns)}",
+                    )
     if posed:
         assert pose is not None  # noqa: S101  one of the two is there
-        q, qd, qdd = _invert_pose(table, robot, pose)
+        # Joint positions of a pose, and their rates where the table has those of the pose.
+        q = robot.inverse(pose)
+        # Joint rates in the table are those of the machine whose joint positions it has.
+        qd, qdd = (table.stack_if([f"{name}.{what}" for name in robot.pose_names]) for what in RATES[1:])
+        if set(robot.joint_names) & set(robot.pose_names) or qd is None or qdd is None:
+            q, qd, qdd = q, None, None
+        else:
+            q, qd, qdd = q, *joint_rates(robot, q, qd, qdd)
         rates = "" if qd is not None else "; velocities and accelerations differentiated"
         notes.append(f"joints computed from the pose, {', '.join(robot.pose_names)}{rates}")
     else:
@@ -247,16 +261,6 @@ def _require_drives(robot: Robot) -> list[DriveSpec]:
     return [drive for drive in robot.drives if drive is not None]
 
 
-def _find_rated_torques(robot: Robot, side: str) -> Array:
-    """Return the motors' rated torques, shape (n,), N m."""
-    if side != "motor":
-        raise ParameterError("--units", "percent", "--side motor: it is the motor's rated torque")
-    rated = [drive.rated_torque for drive in _require_drives(robot)]
-    if None in rated:
-        raise ParameterError(f"{robot.name}: drive.rated_torque", None, "N m, for per cent of it")
-    return np.array(rated, np.float64)
-
-
 def _refuse_misspelt(table: Table, robot: Robot, joints: Sequence[str], how: ReadOptions) -> None:
     """Reject what would be read if its name were right, where nothing else may be there.
 
@@ -278,35 +282,6 @@ def _refuse_misspelt(table: Table, robot: Robot, joints: Sequence[str], how: Rea
                 raise UnknownNameError(f"{table.path}: column", name, known)
 
 
-def _check_basis(table: Table, robot: Robot, how: ReadOptions) -> None:
-    """Reject computed efforts without the wrench or payload that they were computed with.
-
-    :raises ParameterError: by the term of the efforts that is not zero.
-    """
-    own = how.load is not None or robot.payload.mass > 0.0
-    for term, (what, columns) in BASIS.items():
-        if any(name in table for name in columns) or (columns is PAYLOAD and own):
-            continue
-        for joint in robot.joint_names:
-            most = np.abs(table.get(f"{joint}.{term}", np.zeros(1))).max()
-            if most > 0.0:
-                raise ParameterError(
-                    f"{table.path}: {joint}.{term}",
-                    float(most),
-                    f"{what} that the efforts were computed with: columns {', '.join(columns)}",
-                )
-
-
-def _invert_pose(table: Table, robot: Robot, pose: Array) -> tuple[Array, Array | None, Array | None]:
-    """Joint positions of a pose, and their rates where the table has those of the pose."""
-    q = robot.inverse(pose)
-    # Joint rates in the table are those of the machine whose joint positions it has.
-    qd, qdd = (table.stack_if([f"{name}.{what}" for name in robot.pose_names]) for what in RATES[1:])
-    if set(robot.joint_names) & set(robot.pose_names) or qd is None or qdd is None:
-        return q, None, None
-    return q, *joint_rates(robot, q, qd, qdd)
-
-
 def times_of(path: Path, values: Array) -> Array:
     """Return a column of times, s from its first.
 
@@ -322,7 +297,7 @@ def times_of(path: Path, values: Array) -> Array:
             f"{path}: time",
             found or f"{values[0]:g} to {values[-1]:g}",
             f"rising times, {MIN_STEP:g} s or more apart, up to {MAX_DURATION:g} s in all"
-            + ("; are these nanoseconds? --units ns" if values[0] > SINCE_1970_NS else ""),
+            + ("; are these nanoseconds? --units ns" if values[0] > 1e17 else ""),
         )
     return time
 
@@ -342,7 +317,8 @@ def check_pose(path: Path, robot: Robot, q: Array, pose: Array, how: str = "") -
         # What has no pose is rejected with its own reason later.
         size = np.where(good, np.linalg.norm(off * robot.pose_scales, axis=1), 0.0)
         worst = int(size.argmax())
-        if size[worst] > POSE_MISS * robot.size:
+        # A pose may miss that of the joints by 1e-3 of the machine's size.
+        if size[worst] > 1e-3 * robot.size:
             names = ", ".join(robot.pose_names)
             raise ParameterError(
                 f"{path}: {names}, sample {begin + worst}",
@@ -374,19 +350,19 @@ def check_units(path: Path, robot: Robot, time: Array, q: Array, qd: Array | Non
                 f"seconds: velocities are {told / moved:.4g} times those of the positions, as with "
                 "times in milliseconds",
             )
-    if step > MAX_STEP:
+    if step > 0.2:
         warn(path, f"time: steps of {step:g} s; expected seconds; are these milliseconds?")
 
 
 def _is_in_degrees(robot: Robot, q: Array) -> bool:
-    """Whether most joint states are none of the robot, and all are if they are in degrees.
+    """Return whether most joint states are none of the robot, and all are if they are in degrees.
 
     What is beyond a limit by a little is in rad: most have a joint more than half a turn from zero.
     """
     turns = np.array([unit == "rad" for unit in robot.joint_units])
     if not turns.any():
         return False
-    some = q[:: max(1, len(q) // MAX_UNIT_SAMPLES)]
+    some = q[:: max(1, len(q) // 500)]
 
     def possible(states: Array) -> Mask:
         outside, _ = beyond_limits(robot, states)

@@ -27,8 +27,6 @@ from pkm_twin.streams.rest import gradient_gain, velocity_error_bound
 from pkm_twin.streams.steps import MAX_GAP_PERIODS, Steps, repeats_of, steps_of
 from pkm_twin.streams.wrench import WrenchSettings
 
-BY_SAMPLE: Final = ("time", "q", "qd", "qdd", "effort", "wrench", "deflection", "pose", "still", "computed")
-"""Fields with a row for each sample."""
 MAPPED: Final = "tables use the model's joint values; joint_map applies to messages and bags only"
 """Printed for a robot that has a map."""
 MAX_LISTED_JUMPS: Final = 4
@@ -234,7 +232,10 @@ class Recording:
 
     def part(self, rows: Any) -> Recording:
         """Return some of the samples, by a slice, mask or indices; times stay as they are."""
-        values = {name: getattr(self, name) for name in BY_SAMPLE}
+        values = {
+            name: getattr(self, name)
+            for name in ("time", "q", "qd", "qdd", "effort", "wrench", "deflection", "pose", "still", "computed")
+        }
         return replace(self, **{k: v[rows] for k, v in values.items() if v is not None})
 
     @property
@@ -310,7 +311,7 @@ class Recording:
 
 
 def _differentiate(values: Array, time: Array) -> Array:
-    """Second-order differences on uneven times, shape (samples, n)."""
+    """Differentiate with second order on uneven times, shape (samples, n)."""
     with np.errstate(all="ignore"):
         return np.gradient(values, time, axis=0, edge_order=2)
 

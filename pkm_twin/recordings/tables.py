@@ -279,7 +279,14 @@ def _read_csv(
                 raise ParameterError(f"{path}: line {number}", len(row), f"{len(header)} values")
             for name, cell, needed in zip(header, row, read, strict=True):
                 try:
-                    cells.append(_parse_number(cell))
+                    # An empty cell is NaN.
+                    if not cell.strip():
+                        value = math.nan
+                    else:
+                        value = decimal(cell)
+                        if not math.isfinite(value):
+                            raise ValueError(f"{cell!r} is not finite")
+                    cells.append(value)
                 except ValueError:
                     if not needed:
                         cells.append(math.nan)
@@ -293,7 +300,7 @@ def _read_csv(
 
 
 def _find_needed(header: list[str], kinds: Mapping[str, str] | None, dialect: Dialect) -> list[bool]:
-    """Return which columns must have numbers: all, or where ``kinds`` are given those of them."""
+    """Return which columns must have numbers: all, or those of ``kinds`` if given."""
     return [not kinds or name in kinds for name in _name_columns(header, kinds or {}, dialect)[0]]
 
 
@@ -337,7 +344,7 @@ def _read_lines(text: TextIO, path: Path) -> Iterator[str]:
 
 
 def _split_rows(path: Path, lines: Iterator[str], first: str, dialect: Dialect) -> Iterator[list[str]]:
-    """Rows with decimal points; what is found by itself is told."""
+    """Yield rows with decimal points; a separator or comma that is detected is reported."""
     separator = dialect.separator
     if separator is None:
         # Names hold no separators: one that is there, and no other, is certain.
@@ -355,19 +362,6 @@ def _split_rows(path: Path, lines: Iterator[str], first: str, dialect: Dialect) 
             if comma:
                 warn(path, "numbers have a decimal comma")
         yield [cell.replace(",", ".") for cell in row] if comma else row
-
-
-def _parse_number(cell: str) -> float:
-    """Return a cell's number, NaN for an empty cell.
-
-    :raises ValueError: no finite number.
-    """
-    if not cell.strip():
-        return math.nan
-    value = decimal(cell)
-    if not math.isfinite(value):
-        raise ValueError(f"{cell!r} is not finite")
-    return value
 
 
 def _name_columns(header: Sequence[str], kinds: Mapping[str, str], dialect: Dialect) -> tuple[list[str], list[float]]:
@@ -434,31 +428,25 @@ def write_table(columns: Mapping[str, Array], path: Path) -> None:
     :raises ParameterError: another ending, or pyarrow is missing.
     """
     check_target(path)
+    if path.suffix == ".mat":
+        from scipy.io import savemat  # type: ignore[import-untyped]
+
+        named = {re.sub(r"^(?=[\d_])", "x", re.sub(r"\W", "_", name)): v for name, v in columns.items()}
+        if len(named) < len(columns):
+            raise ParameterError("out", str(path), "CSV: names of columns are the same in MATLAB")
     with replacing(path) as hidden:
-        {".parquet": _write_parquet, ".mat": _write_mat}.get(path.suffix, _write_csv)(columns, hidden)
+        if path.suffix == ".parquet":
+            import pyarrow
+            from pyarrow import parquet
 
-
-def _write_csv(columns: Mapping[str, Array], path: Path) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(columns)
-        for row in zip(*(values.tolist() for values in columns.values()), strict=True):
-            # An undetermined reaction is an empty cell; repr keeps every digit.
-            writer.writerow(["" if value != value else repr(value) for value in row])
-
-
-def _write_mat(columns: Mapping[str, Array], path: Path) -> None:
-    from scipy.io import savemat  # type: ignore[import-untyped]
-
-    named = {re.sub(r"^(?=[\d_])", "x", re.sub(r"\W", "_", name)): v for name, v in columns.items()}
-    if len(named) < len(columns):
-        raise ParameterError("out", str(path), "CSV: names of columns are the same in MATLAB")
-    with path.open("wb") as file:
-        savemat(file, named, oned_as="column")
-
-
-def _write_parquet(columns: Mapping[str, Array], path: Path) -> None:
-    import pyarrow
-    from pyarrow import parquet
-
-    parquet.write_table(pyarrow.table(dict(columns)), path)
+            parquet.write_table(pyarrow.table(dict(columns)), hidden)
+        elif path.suffix == ".mat":
+            with hidden.open("wb") as file:
+                savemat(file, named, oned_as="column")
+        else:
+            with hidden.open("w", newline="", encoding="utf-8") as text:
+                writer = csv.writer(text)
+                writer.writerow(columns)
+                for row in zip(*(values.tolist() for values in columns.values()), strict=True):
+                    # An undetermined reaction is an empty cell; repr keeps every digit.
+                    writer.writerow(["" if value != value else repr(value) for value in row])

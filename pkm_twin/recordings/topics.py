@@ -17,23 +17,8 @@ JOINT_STATE: Final = "sensor_msgs/msg/JointState"
 TRANSFORM: Final = "geometry_msgs/msg/TransformStamped"
 WRENCH: Final = "geometry_msgs/msg/WrenchStamped"
 TRAJECTORY: Final = "trajectory_msgs/msg/JointTrajectory"
-TWIN_OUTPUTS: Final = (
-    "joint_torques",
-    "torque_residual",
-    "reactions",
-    "machine_state",
-    "commands_stamped",
-    "compliance_stamped",
-    "strain_energy_stamped",
-    "natural_frequencies_stamped",
-)
-"""Last names of the twin's own topics of these types, or a name before the last."""
-COMPUTED: Final = ["stiffness_monitor", "deflection"]
-"""The end of the topic that the twin's own, computed, deflections come on."""
 COLUMNS: Final = "columns of the table"
 """Text in place of topics for a table."""
-TRUTHS: Final = ("ground_truth", "groundtruth")
-"""Names in topics that a simulation publishes and no sensor does."""
 
 _FIELDS: Final = {
     "std_msgs/Header": ("builtin_interfaces/Time stamp", "string frame_id"),
@@ -75,8 +60,6 @@ DEFINITIONS: Final = {
     ),
 }
 """Definitions of the types that are read and written."""
-# How many messages of a topic are looked at for the robot's joints.
-_LOOK = 50
 
 
 @dataclass(frozen=True)
@@ -90,7 +73,7 @@ class Topics:
     frame: str = ""
     """Frame of the accepted wrenches."""
     turns: bool = False
-    """Whether that frame turns with the platform."""
+    """True if that frame turns with the platform."""
 
     def __str__(self) -> str:
         if self.joint_states == COLUMNS:
@@ -128,35 +111,7 @@ def choose_topics(bag: Bag, robot: Robot, wanted: Sequence[str] = (), deflected:
         if len(set(names)) > 1:
             raise _make_choice_error(bag, f"{' and '.join(names)} are both {kind}; choose one with --topic")
     left_out: dict[str, str] = {}
-    joints = _choose_joints(bag, robot, kinds[JOINT_STATE], left_out)
-    wrenches = _find_candidates(bag, WRENCH, kinds[WRENCH], left_out)
-    if kinds[JOINT_STATE] and not kinds[WRENCH]:
-        left_out.update({name: "not chosen" for name in wrenches})
-        wrenches = []
-    wrench = _pick_usual(bag, "wrenches", wrenches, "wrench", left_out)
-    deflection = None
-    if deflected:
-        fit = _find_candidates(bag, TRANSFORM, kinds[TRANSFORM], left_out)
-        fit = [name for name in fit if bag.report.topics[name].count]
-        deflection = _pick_usual(bag, "deflections", fit, "measured_deflection", left_out)
-        missing = (
-            (
-                deflection,
-                "deflection",
-                f"no deflection in the bag: a topic of {TRANSFORM} from the platform to the deflected platform",
-            ),
-            (wrench, "wrench", "no wrench in the bag; compliance needs the applied wrench"),
-        )
-        for topic, what, text in missing:
-            if topic is None:
-                raise _make_choice_error(bag, text, f"no {what}")
-    for name in filter(None, (joints, wrench, deflection)):
-        require_definition(bag, name)
-    return Topics(joints, wrench, deflection, left_out)
-
-
-def _choose_joints(bag: Bag, robot: Robot, wanted: list[str], left_out: dict[str, str]) -> str:
-    named = _find_candidates(bag, JOINT_STATE, wanted, left_out)
+    named = _find_candidates(bag, JOINT_STATE, kinds[JOINT_STATE], left_out)
     filled = [name for name in named if bag.report.topics[name].count]
     if not filled:
         aside = "; ".join(f"{name} is there, but {why}" for name, why in left_out.items())
@@ -171,33 +126,60 @@ def _choose_joints(bag: Bag, robot: Robot, wanted: list[str], left_out: dict[str
     for name in filled:
         require_definition(bag, name)
     # As the controller calls them, which recorded them.
-    joints = robot.controller.names
-    seen = _read_joint_names(bag, filled, set(joints))
-    fit = [name for name in filled if set(joints) <= seen[name]]
+    own = robot.controller.names
+    seen = _read_joint_names(bag, filled, set(own))
+    fit = [name for name in filled if set(own) <= seen[name]]
     for name in filled:
         if name not in fit:
             left_out[name] = f"joints {', '.join(sorted(seen[name])) or 'none'}"
     if not fit:
         name = filled[0]
-        missing = next(joint for joint in joints if joint not in seen[name])
+        missing = next(joint for joint in own if joint not in seen[name])
         raise _make_choice_error(
             bag,
             f"no topic has all joints of {robot.name}: on {name} joint {missing!r} is missing, "
             f"it has {', '.join(sorted(seen[name])) or 'none'}",
             "no joint states",
         )
-    return _pick_usual(bag, "joint states", fit, "joint_states", left_out) or fit[0]
+    joints = _pick_usual(bag, "joint states", fit, "joint_states", left_out) or fit[0]
+    wrenches = _find_candidates(bag, WRENCH, kinds[WRENCH], left_out)
+    if kinds[JOINT_STATE] and not kinds[WRENCH]:
+        left_out.update({name: "not chosen" for name in wrenches})
+        wrenches = []
+    wrench = _pick_usual(bag, "wrenches", wrenches, "wrench", left_out)
+    deflection = None
+    if deflected:
+        fit = _find_candidates(bag, TRANSFORM, kinds[TRANSFORM], left_out)
+        fit = [name for name in fit if bag.report.topics[name].count]
+        deflection = _pick_usual(bag, "deflections", fit, "measured_deflection", left_out)
+        if deflection is None:
+            text = f"no deflection in the bag: a topic of {TRANSFORM} from the platform to the deflected platform"
+            raise _make_choice_error(bag, text, "no deflection")
+        if wrench is None:
+            text = "no wrench in the bag; compliance needs the applied wrench"
+            raise _make_choice_error(bag, text, "no wrench")
+    for name in filter(None, (joints, wrench, deflection)):
+        require_definition(bag, name)
+    return Topics(joints, wrench, deflection, left_out)
 
 
 def is_output(topic: str) -> bool:
-    """Whether the name is one of the twin's own topics."""
+    """Return whether the name is one of the twin's own topics."""
     last = topic.split("/")[-2:]
-    return last == COMPUTED or any(part in TWIN_OUTPUTS for part in last)
-
-
-def is_truth(topic: str) -> bool:
-    """Whether the name is one that a simulation publishes and no sensor does."""
-    return any(part in TRUTHS for part in topic.split("/"))
+    return last == ["stiffness_monitor", "deflection"] or any(
+        part
+        in (
+            "joint_torques",
+            "torque_residual",
+            "reactions",
+            "machine_state",
+            "commands_stamped",
+            "compliance_stamped",
+            "strain_energy_stamped",
+            "natural_frequencies_stamped",
+        )
+        for part in last
+    )
 
 
 def type_of(info: TopicInfo) -> str:
@@ -207,7 +189,7 @@ def type_of(info: TopicInfo) -> str:
 
 
 def _find_candidates(bag: Bag, kind: str, wanted: list[str], left_out: dict[str, str]) -> list[str]:
-    """Topics of a type: the wanted ones, else all but the twin's own and a simulation's truths."""
+    """Find topics of a type: the wanted, else all but the twin's and a simulation's own."""
     fit = []
     for name, info in bag.report.topics.items():
         if type_of(info) != kind:
@@ -216,7 +198,7 @@ def _find_candidates(bag: Bag, kind: str, wanted: list[str], left_out: dict[str,
             left_out[name] = f"its encoding is {info.encoding}; expected cdr"
         elif wanted and name not in wanted:
             left_out[name] = "not chosen"
-        elif not wanted and is_truth(name):
+        elif not wanted and any(part in ("ground_truth", "groundtruth") for part in name.split("/")):
             left_out[name] = "no sensor's; --topic uses it"
         elif not wanted and is_output(name):
             left_out[name] = "published by pkm_twin"
@@ -238,7 +220,7 @@ def _pick_usual(bag: Bag, what: str, fit: list[str], usual: str, left_out: dict[
 
 
 def _read_joint_names(bag: Bag, topics: list[str], joints: set[str]) -> dict[str, set[str]]:
-    """Joint names of the first message of each topic, or of one soon after that has all joints."""
+    """Read joint names of each topic's first message, or of an early one that has all joints."""
     seen: dict[str, set[str]] = {}
     count: Counter[str] = Counter()
     open_topics = set(topics)
@@ -249,7 +231,7 @@ def _read_joint_names(bag: Bag, topics: list[str], joints: set[str]) -> dict[str
         count[message.topic] += 1
         if message.topic not in seen or joints <= names:
             seen[message.topic] = names
-        if joints <= names or count[message.topic] >= _LOOK:
+        if joints <= names or count[message.topic] >= 50:
             open_topics.discard(message.topic)
             if not open_topics:
                 break
