@@ -141,7 +141,7 @@ class Lockstep:
 
     @property
     def answered(self) -> bool:
-        """Whether the last message is answered."""
+        """True if the last message is answered."""
         return self._recorder.newest >= self._last
 
     def _wait(self, condition: Callable[[], bool]) -> None:
@@ -172,7 +172,10 @@ def stamp(data: bytes) -> int:
 @contextmanager
 def process(command: Sequence[str]) -> Iterator[subprocess.Popen[bytes]]:
     """Run a child process in a session of its own; end it with SIGINT and wait for it."""
-    child = subprocess.Popen(command, start_new_session=True, env=child_environment())  # noqa: S603
+    # Return the environment for a child, changed so that ROS wheels find their libraries.
+    environment = dict(os.environ)
+    environment.pop("_ROS_WHEELS_BOOTSTRAP_COMPLETE", None)
+    child = subprocess.Popen(command, start_new_session=True, env=environment)  # noqa: S603
     try:
         yield child
     finally:
@@ -183,13 +186,6 @@ def process(command: Sequence[str]) -> Iterator[subprocess.Popen[bytes]]:
             except subprocess.TimeoutExpired:
                 child.kill()
                 child.wait()
-
-
-def child_environment() -> dict[str, str]:
-    """Return the environment for a child, changed so that ROS wheels find their libraries."""
-    environment = dict(os.environ)
-    environment.pop("_ROS_WHEELS_BOOTSTRAP_COMPLETE", None)
-    return environment
 
 
 def wait_for(

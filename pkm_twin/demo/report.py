@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,13 +20,6 @@ from pkm_twin.recordings import ReadOptions, Recording, read
 from pkm_twin.recordings.recording import differentiated
 from pkm_twin.report import Fact, plots
 from pkm_twin.report import judged as judge
-from pkm_twin.robot.robot import Robot
-
-MAX_RESIDUAL = 0.05
-"""Largest residual RMS without payload, relative to the joint's peak effort."""
-
-MAX_CUTTING_RESIDUAL = 0.01
-"""Largest residual RMS while cutting, relative to the peak effort: without the wrench 0.15."""
 
 MIN_ANSWERED = 0.95
 """Smallest fraction of the samples that must be answered."""
@@ -46,7 +39,6 @@ class Panel:
 
 
 def _select_window(time: Array, seconds: float, whole: Array) -> Mask:
-    """Select the times to draw: some seconds from the first eighth of all times on."""
     begin = float(whole[len(whole) // 8]) if len(whole) else 0.0
     return (time >= begin) & (time <= begin + seconds)
 
@@ -59,7 +51,10 @@ def report_dynamics(bag: Path, recording: Path, prefix: str) -> tuple[list[Fact]
     residuals = _read_by_stamp(recording, f"/{prefix}/delta_dynamics/torque_residual")
     answered = [i for i, s in enumerate(r.stamps.tolist()) if s in torques and s in residuals]
     stamps, time = r.stamps[answered].tolist(), r.time[answered]
-    predicted, residual = (_stack_efforts(found, stamps, robot) for found in (torques, residuals))
+    predicted, residual = (
+        np.array([found[stamp].effort for stamp in stamps]).reshape(-1, len(robot.joint_names))
+        for found in (torques, residuals)
+    )
     measured = np.zeros_like(predicted) if r.effort is None else r.effort[answered]
     near = _select_window(time, 2.0, time)
     rms = f", residual RMS {_rms(residual[near])[0]:.2g} {unit}" if near.any() else ""
@@ -89,29 +84,7 @@ def report_dynamics(bag: Path, recording: Path, prefix: str) -> tuple[list[Fact]
             bool((part < bound).all()),
         )
 
-    free = _find_unloaded(r)[answered]
-    findings += [
-        told(prefix, "peak effort", _format_list(np.abs(predicted).max(0), unit)),
-        told(prefix, "RMS effort", _format_list(_rms(predicted), unit)),
-        left("without load", free, MAX_RESIDUAL),
-    ]
-    if r.wrench is not None:
-        # Samples with a cutting force, which the node received.
-        findings.append(left("while cutting", ~free, MAX_CUTTING_RESIDUAL))
-    if r.load is not None and r.load.times:
-        begin, end = r.load.times[0]
-        held = (time > begin + 0.5) & (time < end - 0.5)
-        findings += _judge_payload(prefix, r, residual, free, np.array(answered), held)
-    return findings, panel
-
-
-def _rms(values: Array) -> Array:
-    """Return each joint's root mean square over the samples."""
-    return np.asarray(np.sqrt(np.mean(values**2, 0)), np.float64)
-
-
-def _find_unloaded(r: Recording) -> Mask:
-    """Find samples without payload or cutting force, at least half a second away from either."""
+    # Find samples without payload or cutting force, at least half a second away from either.
     if r.load is not None:
         loaded = r.load.held(r.time)
     elif r.wrench is not None:
@@ -121,15 +94,34 @@ def _find_unloaded(r: Recording) -> Mask:
         loaded = np.zeros(len(r.time), bool)
     edge = r.time[loaded]
     if not len(edge):
-        return ~loaded
-    after = np.minimum(np.searchsorted(edge, r.time), len(edge) - 1)
-    before = np.maximum(after - 1, 0)
-    nearest = np.minimum(np.abs(edge[after] - r.time), np.abs(edge[before] - r.time))
-    return np.asarray(nearest > 0.5, np.bool_)
+        free = ~loaded
+    else:
+        after = np.minimum(np.searchsorted(edge, r.time), len(edge) - 1)
+        before = np.maximum(after - 1, 0)
+        nearest = np.minimum(np.abs(edge[after] - r.time), np.abs(edge[before] - r.time))
+        free = np.asarray(nearest > 0.5, np.bool_)
+    free = free[answered]
+    findings += [
+        told(prefix, "peak effort", _format_list(np.abs(predicted).max(0), unit)),
+        told(prefix, "RMS effort", _format_list(_rms(predicted), unit)),
+        left("without load", free, 0.05),
+    ]
+    if r.wrench is not None:
+        # Samples with a cutting force, which the node received.
+        # Without the wrench the residual is 15 %.
+        findings.append(left("while cutting", ~free, 0.01))
+    if r.load is not None and r.load.times:
+        begin, end = r.load.times[0]
+        held = (time > begin + 0.5) & (time < end - 0.5)
+        findings += _judge_payload(prefix, r, residual, free, np.array(answered), held)
+    return findings, panel
+
+
+def _rms(values: Array) -> Array:
+    return np.asarray(np.sqrt(np.mean(values**2, 0)), np.float64)
 
 
 def _judge_payload(prefix: str, r: Recording, residual: Array, free: Mask, answered: Indices, held: Mask) -> list[Fact]:
-    """Judge the payload's step in the residual and the mass estimated from it."""
     assert r.load is not None  # noqa: S101
     change = residual[held] - residual[free].mean(0)
     step = np.linalg.norm(change.mean(0))
@@ -220,12 +212,6 @@ REPORTS: dict[str, Reports] = {
 
 def _read_by_stamp(bag: Path, topic: str) -> dict[int, Any]:
     return {stamp_of(m.message.header): m.message for m in read_messages(bag, [topic])}
-
-
-def _stack_efforts(messages: Mapping[int, Any], stamps: list[int], robot: Robot) -> Array:
-    """Return the messages' efforts in the robot's joint order, shape (samples, n)."""
-    efforts = [messages[stamp].effort for stamp in stamps]
-    return np.array(efforts).reshape(-1, len(robot.joint_names))
 
 
 def share(bag: str, what: str, count: int, total: int) -> Fact:

@@ -47,8 +47,6 @@ PERIOD: Final = 2e-3
 """Period of the machine's joint states, s, which a busy computer can still record."""
 SPREADS: Final = (0.01, 0.2)
 """Relative standard deviations of the machine's parameters."""
-AMPLITUDES: Final = (0.5, -0.4, 0.6)
-"""Amplitudes of the joints' motion from home and back, rad."""
 DURATION: Final = 0.8
 """Duration of the motion, s."""
 POINTS: Final = 81
@@ -101,7 +99,23 @@ def run(spread: float, recorder: Recorder, executor: SingleThreadedExecutor, con
     # Deep queues, as a busy computer catches up in bursts.
     moved += ["-p", f"spread:={spread}", "-p", f"{QUEUE_PARAMETER}:={DEPTH}"]
     console.print(f"machine_sim at {100 * spread:g} % spread: PD, then with feedforward")
-    plain = _make_trajectory()
+    # Make a trajectory from home and back, at rest at both ends, that starts on receipt.
+    robot = load(ROBOT)
+    home = robot.inverse(robot.home())
+    x = np.linspace(0.0, 1.0, POINTS)
+    # 64 (x - x^2)^3 is 1 at x = 1/2, and its first two derivatives vanish at both ends.
+    blend = 64.0 * np.array([-1.0, 3.0, -3.0, 1.0, 0.0, 0.0, 0.0])
+    rows = [np.outer(np.polyval(np.polyder(blend, k), x) / DURATION**k, (0.5, -0.4, 0.6)) for k in range(3)]
+    plain = JointTrajectory(joint_names=list(robot.joint_names))
+    for k in range(POINTS):
+        point = JointTrajectoryPoint(
+            positions=(home + rows[0][k]).tolist(),
+            velocities=rows[1][k].tolist(),
+            accelerations=rows[2][k].tolist(),
+        )
+        time = round(x[k] * DURATION * SECOND)
+        point.time_from_start.sec, point.time_from_start.nanosec = divmod(time, SECOND)
+        plain.points.append(point)
     with process(moved) as first, process(asked) as second:
 
         def await_that(condition: Callable[[], bool], what: str) -> None:
@@ -136,27 +150,6 @@ def run(spread: float, recorder: Recorder, executor: SingleThreadedExecutor, con
         node.destroy_publisher(publisher)
 
 
-def _make_trajectory() -> JointTrajectory:
-    """Make a trajectory from home and back, at rest at both ends, that starts on receipt."""
-    robot = load(ROBOT)
-    home = robot.inverse(robot.home())
-    x = np.linspace(0.0, 1.0, POINTS)
-    # 64 (x - x^2)^3 is 1 at x = 1/2, and its first two derivatives vanish at both ends.
-    blend = 64.0 * np.array([-1.0, 3.0, -3.0, 1.0, 0.0, 0.0, 0.0])
-    rows = [np.outer(np.polyval(np.polyder(blend, k), x) / DURATION**k, AMPLITUDES) for k in range(3)]
-    message = JointTrajectory(joint_names=list(robot.joint_names))
-    for k in range(POINTS):
-        point = JointTrajectoryPoint(
-            positions=(home + rows[0][k]).tolist(),
-            velocities=rows[1][k].tolist(),
-            accelerations=rows[2][k].tolist(),
-        )
-        time = round(x[k] * DURATION * SECOND)
-        point.time_from_start.sec, point.time_from_start.nanosec = divmod(time, SECOND)
-        message.points.append(point)
-    return message
-
-
 @dataclass(frozen=True)
 class Run:
     """One run along the path: duration and times, s; errors (rad) and efforts (N m), (p, n)."""
@@ -184,7 +177,30 @@ def report(recording: Path) -> tuple[list[Fact], Panel]:
     robot = load(ROBOT)
     for i, spread in enumerate(SPREADS):
         name = prefix(spread)
-        plain, ahead = _read_runs(recording, name)
+        # Read the runs without and with feedforward from the recording.
+        reader = JointReader(load(ROBOT), with_effort=True)
+        messages = read_messages(recording, [f"/{name}/joint_states"])
+        states = {stamp_of(m.message.header): m.message for m in messages}
+        stamps = np.array(sorted(states))
+        moving = np.array([any(states[stamp].velocity) for stamp in stamps.tolist()])
+        # A trajectory begins at the last joint state at rest.
+        starts = stamps[:-1][~moving[:-1] & moving[1:]]
+        topic = f"/{name}/machine_sim/joint_trajectory"
+        trajectories = [reader.trajectory(m.message, 0) for m in read_messages(recording, [topic])]
+        found: dict[bool, Run] = {}
+        for trajectory, start in zip(trajectories, starts.tolist(), strict=False):
+            path = JointPath(trajectory)
+            end = start + round(path.duration * SECOND)
+            during = stamps[(stamps > start) & (stamps <= end)].tolist()
+            # The machine publishes its joints in the robot's order.
+            q = np.array([states[s].position for s in during])
+            times = (np.array(during) - start) / SECOND
+            wanted = np.array([path.at(t).q for t in times.tolist()])
+            effort = np.array([states[s].effort for s in during])
+            found[trajectory.effort is not None] = Run(path.duration, times, q - wanted, effort)
+        if len(found) != 2 or len(starts) != 2:
+            raise BagError(f"{name}: {len(found)} of two runs were recorded", path=recording)
+        plain, ahead = found[False], found[True]
         there = sum(len(run.time) for run in (plain, ahead))
         all_in_all = sum(round(run.duration / PERIOD) for run in (plain, ahead))
         findings.append(share(name, "joint states recorded", there, all_in_all))
@@ -202,30 +218,3 @@ def report(recording: Path) -> tuple[list[Fact], Panel]:
         value = f"{ratio:.1f} times better"
         findings.append(judged(f"{name}: {what}", value, bound, bool(ratio >= MIN_IMPROVEMENT)))
     return findings, panel
-
-
-def _read_runs(recording: Path, name: str) -> tuple[Run, Run]:
-    """Read the runs without and with feedforward from the recording."""
-    reader = JointReader(load(ROBOT), with_effort=True)
-    messages = read_messages(recording, [f"/{name}/joint_states"])
-    states = {stamp_of(m.message.header): m.message for m in messages}
-    stamps = np.array(sorted(states))
-    moving = np.array([any(states[stamp].velocity) for stamp in stamps.tolist()])
-    # A trajectory begins at the last joint state at rest.
-    starts = stamps[:-1][~moving[:-1] & moving[1:]]
-    topic = f"/{name}/machine_sim/joint_trajectory"
-    trajectories = [reader.trajectory(m.message, 0) for m in read_messages(recording, [topic])]
-    found: dict[bool, Run] = {}
-    for trajectory, start in zip(trajectories, starts.tolist(), strict=False):
-        path = JointPath(trajectory)
-        end = start + round(path.duration * SECOND)
-        during = stamps[(stamps > start) & (stamps <= end)].tolist()
-        # The machine publishes its joints in the robot's order.
-        q = np.array([states[s].position for s in during])
-        times = (np.array(during) - start) / SECOND
-        wanted = np.array([path.at(t).q for t in times.tolist()])
-        effort = np.array([states[s].effort for s in during])
-        found[trajectory.effort is not None] = Run(path.duration, times, q - wanted, effort)
-    if len(found) != 2 or len(starts) != 2:
-        raise BagError(f"{name}: {len(found)} of two runs were recorded", path=recording)
-    return found[False], found[True]

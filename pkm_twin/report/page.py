@@ -31,8 +31,6 @@ img {{ max-width: 100%; }}
 </body>
 </html>
 """
-DPI: Final = 100
-"""Resolution of the page's pictures, dots per inch: 900 pixels wide."""
 
 
 def page(title: str, report: Report, more: Sequence[Table] = (), figures: Sequence[str] = ()) -> str:
@@ -49,7 +47,7 @@ def page(title: str, report: Report, more: Sequence[Table] = (), figures: Sequen
     parts += [f'<div class="plot">{figure}</div>' for figure in figures]
     parts += [_write_table(table) for table in (*report.tables, *more) if table.rows]
     for draw in report.figures.values():
-        data = base64.b64encode(plots.rendered(draw(), DPI)).decode()
+        data = base64.b64encode(plots.rendered(draw(), 100)).decode()
         parts.append(f'<img alt="" src="data:image/png;base64,{data}">')
     return SHELL.format(title=html.escape(title), body="\n".join(parts))
 

@@ -17,7 +17,6 @@ from pkm_twin.files import replace_file
 
 # Okabe and Ito's colours, told apart by colour-blind readers too.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#F0E442", "#000000")
-WINE: Final = "#882255"
 TERMS: Final = ("gravity", "inertia", "velocity", "payload", "friction", "external")
 """Of an effort."""
 MAX_SINGLE_COLUMN_TIME: Final = 5.0
@@ -140,12 +139,11 @@ def torques(motion: Any, table: Mapping[str, Any], title: str) -> Any:
 
 
 def _draw_efforts(ax: Any, joint: str, table: Mapping[str, Any], terms: bool) -> None:
-    """Draw a joint's efforts over time, their terms and their standard deviation."""
     time, effort = table["time"], table[f"{joint}.effort"]
     measured = table.get(f"{joint}.measured")
     if measured is not None:
         ax.plot(time, measured, color="0.7", lw=3, label="measured")
-        ax.plot(time, measured - effort, color=WINE, lw=1, label="measured - sum")
+        ax.plot(time, measured - effort, color="#882255", lw=1, label="measured - sum")
     ax.plot(time, effort, color="black", lw=1, label="sum")
     if f"{joint}.effort_deviation" in table:
         band = 2.0 * table[f"{joint}.effort_deviation"]

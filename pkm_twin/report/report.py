@@ -182,7 +182,6 @@ class Report:
 
 
 def _largest_size(values: Iterable[Any]) -> float:
-    """Return the largest absolute value of the finite numbers; 0 if there is none."""
     sizes = [abs(v) for v in values if isinstance(v, int | float) and math.isfinite(v)]
     return float(max(sizes, default=0.0))
 

@@ -58,7 +58,6 @@ def text_of(report: Report) -> str:
 
 
 def _layout_judged(facts: Sequence[Fact]) -> Iterator[str]:
-    """Lay out judged properties as a table with coloured verdicts."""
     # A verdict stays on its row's first line, where it is coloured.
     words = [fact.verdict.words.replace(" ", BLANK) if fact.verdict else "" for fact in facts]
     rows = [

@@ -21,10 +21,6 @@ WIDTH, HEIGHT = 600, 480
 DPI: Final = 100
 FINE: Final = 2
 """Samples per pixel and direction."""
-AXES: Final = ((213, 60, 40), (40, 140, 60), (40, 80, 200))
-"""Colours of the base frame's x, y and z."""
-LIGHT: Final = np.array([-0.45, 0.65, -0.61])
-"""Direction of the light: right, up, and away from the eye."""
 
 
 class Camera:
@@ -64,7 +60,8 @@ class Camera:
         return (rows, columns), x, y
 
     def _paint(self, window: Any, depth: Array, normal: Array, colour: Any, opacity: float = 1.0) -> None:
-        bright = 0.5 + 0.5 * np.clip(normal @ LIGHT, 0.0, 1.0)
+        # The light comes from the left above, behind the eye.
+        bright = 0.5 + 0.5 * np.clip(normal @ np.array([-0.45, 0.65, -0.61]), 0.0, 1.0)
         nearer = depth < self.depth[window]
         lit = bright[..., None] * np.asarray(colour) / 255.0
         under = self.image[window]
@@ -125,10 +122,6 @@ class Camera:
         return np.asarray(fine.mean((1, 3)), np.float64)
 
 
-GROUND_BAR: Final = 0.015
-"""Radius of the ground between a planar linkage's joints, of the machine's size."""
-
-
 def draw(robot: Robot, marked: bool = False) -> Any:
     """Draw the robot at home as a matplotlib figure.
 
@@ -152,7 +145,7 @@ def draw(robot: Robot, marked: bool = False) -> Any:
     if len(scene.base):
         camera.plate(scene.base, GROUND, opacity=0.35)
     elif len(ground := base_line(robot.graph)):
-        camera.cylinder(ground, GROUND_BAR * scene.size, GROUND)
+        camera.cylinder(ground, 0.015 * scene.size, GROUND)
     figure = pyplot().figure(figsize=(WIDTH / DPI, HEIGHT / DPI), dpi=DPI)
     ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     extent = (camera.low[0], camera.high[0], camera.low[1], camera.high[1])
@@ -169,29 +162,9 @@ def draw(robot: Robot, marked: bool = False) -> Any:
         if anchor:
             at = point + camera.pixel * down * size / 2 * ANCHORS[anchor]
             ax.text(*at, name, va="center", **style)
-    _draw_corners(ax, camera, style)
-    if marked:
-        _draw_points(ax, camera, robot)
-    return figure
-
-
-def _draw_points(ax: Any, camera: Camera, robot: Robot) -> None:
-    """Draw the centres of mass of bodies and the reference point at home, with a legend."""
-    masses = [body.com for body in robot.graph.bodies.values() if body.mass > 0.0]
-    for places, marker, name in (
-        (masses, "o", "centre of mass of a body"),
-        ([robot.graph.origin], "X", "reference point"),
-    ):
-        seen = camera.see(np.reshape(places, (-1, 3)))[:, :2]
-        ax.plot(*seen.T, marker, label=name, color="w", markeredgecolor="k", markersize=8)
-    ax.legend(loc="upper left", fontsize=9, frameon=False)
-    ax.set(xlim=(camera.low[0], camera.high[0]), ylim=(camera.low[1], camera.high[1]))
-
-
-def _draw_corners(ax: Any, camera: Camera, style: dict[str, Any]) -> None:
-    """Directions of the base frame at the left, a length at the right."""
+    # The directions of the base frame at the left, a length at the right.
     start = camera.low + 45 * camera.pixel
-    for name, colour, axis in zip("xyz", AXES, np.eye(3), strict=True):
+    for name, colour, axis in zip("xyz", ((213, 60, 40), (40, 140, 60), (40, 80, 200)), np.eye(3), strict=True):
         tip = start + 32 * camera.pixel * camera.see(axis)[:2]
         ax.annotate(
             "",
@@ -210,3 +183,14 @@ def _draw_corners(ax: Any, camera: Camera, style: dict[str, Any]) -> None:
     right, low = camera.high[0] - 25 * camera.pixel, camera.low[1] + 22 * camera.pixel
     ax.plot([right - length, right], [low, low], color="k", linewidth=2)
     ax.text(right - length / 2, low + 8 * camera.pixel, f"{length:g} m", **style)
+    if marked:
+        masses = [body.com for body in robot.graph.bodies.values() if body.mass > 0.0]
+        for places, marker, name in (
+            (masses, "o", "centre of mass of a body"),
+            ([robot.graph.origin], "X", "reference point"),
+        ):
+            seen = camera.see(np.reshape(places, (-1, 3)))[:, :2]
+            ax.plot(*seen.T, marker, label=name, color="w", markeredgecolor="k", markersize=8)
+        ax.legend(loc="upper left", fontsize=9, frameon=False)
+        ax.set(xlim=(camera.low[0], camera.high[0]), ylim=(camera.low[1], camera.high[1]))
+    return figure

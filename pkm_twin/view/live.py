@@ -24,8 +24,6 @@ from pkm_twin.robot.robot import Robot
 
 SPAN: Final = 20.0
 """How much of the past is drawn, s."""
-RATE: Final = 50.0
-"""Points a second of a trace; more are left out."""
 TOPICS: Final = {
     "state": ("sensor_msgs/msg/JointState", "joint_states"),
     "torque": ("sensor_msgs/msg/JointState", "delta_dynamics/joint_torques"),
@@ -96,7 +94,8 @@ class Live:
         trace = self._traces[name]
         if trace and sample.stamp < trace[-1][0]:
             trace.clear()  # the clock jumped back: a bag begins anew
-        if trace and sample.stamp - trace[-1][0] < SECOND / RATE:
+        # At most 50 points a second are kept.
+        if trace and sample.stamp - trace[-1][0] < SECOND / 50.0:
             return
         trace.append((sample.stamp, sample.effort))
         while sample.stamp - trace[0][0] > SPAN * SECOND:

@@ -29,15 +29,6 @@ from stiffness_monitor.compliance import member_deflections
 
 Grade = Literal["good", "warn", "bad"]
 
-AXES: Final = ("fx", "fy", "fz", "mx", "my", "mz")
-CLOSE_CLEARANCE: Final = 0.005
-"""Clearance below which limbs are shown as near each other, m."""
-SAMPLES: Final = 1000
-"""Joint states of which the ranges of the pose sliders are made."""
-SAME: Final = 1e-6
-"""By how much a pose may miss itself, there and back, per 1 and its size; m and rad."""
-STEPS: Final = 6
-"""Steps of Newton from one place of the platform to the next that is asked for."""
 MAX_SHOWN_DEFLECTION: Final = 0.3
 """Size that the greatest deflection may be enlarged to, per size of the machine."""
 
@@ -131,8 +122,8 @@ class Model:
     def pose_ranges(self) -> tuple[Range, ...]:
         """Ranges of the pose that joint states all over their ranges reach, rounded outwards."""
         robot = self.robot
-        lows, highs = (np.array([getattr(r, end) for r in self.joint_ranges]) for end in _ENDS)
-        random = np.random.default_rng(0).random((SAMPLES, robot.joints_count))
+        lows, highs = (np.array([getattr(r, end) for r in self.joint_ranges]) for end in ("low", "high"))
+        random = np.random.default_rng(0).random((1000, robot.joints_count))
         corners = np.array(list(itertools.product((0.0, 1.0), repeat=robot.joints_count)))
         parts = np.concatenate([corners, random])
         states = robot.try_project_redundant(lows + (highs - lows) * parts)
@@ -158,7 +149,10 @@ class Model:
             force = float(np.median(held[np.isfinite(held)]))
         force, moment = _round(force), _round(force * robot.size)
         tops = [("N", force)] * 3 + [("N m", moment)] * 3
-        return tuple(Range(name, unit, -top, top, _step(2 * top)) for name, (unit, top) in zip(AXES, tops, strict=True))
+        return tuple(
+            Range(name, unit, -top, top, _step(2 * top))
+            for name, (unit, top) in zip(("fx", "fy", "fz", "mx", "my", "mz"), tops, strict=True)
+        )
 
     @cached_property
     def enlargement(self) -> Range:
@@ -195,7 +189,7 @@ class Model:
         robot, q = self.robot, state.q
         weights = np.repeat([1.0, robot.size], 3)
         try:
-            for _ in range(STEPS):
+            for _ in range(6):
                 at, turn = robot.platform(q)
                 turned = Rotation.from_matrix(rotation @ turn.T).as_rotvec()
                 missing = weights * np.concatenate([position - at, turned])
@@ -219,7 +213,8 @@ class Model:
         except ValueError as error:
             return _refuse(state, str(error))
         if asked is not None:
-            if (np.abs(pose - asked) > SAME * (1.0 + np.abs(asked))).any():
+            # A pose there and back may miss itself by 1e-6 per 1 and its size; m and rad.
+            if (np.abs(pose - asked) > 1e-6 * (1.0 + np.abs(asked))).any():
                 return _refuse(state, "the pose is in another assembly mode than home")
             pose = asked
         beyond = self._describe_beyond_passive(q, pose)
@@ -315,15 +310,19 @@ class Model:
         except (PkmTwinError, ValueError) as error:
             why["energy"] = one_line(str(error))
         position, rotation = robot.platform(state.q)
+        over = np.zeros(robot.joints_count, np.bool_)
+        if effort is not None and robot.limits.effort is not None:
+            over = np.abs(effort) > robot.limits.effort
+        # Limbs nearer than 5 mm are shown as near each other.
         return Numbers(
             position,
             rotation,
             measure,
             _grade(measure, stop, warn),
             gap,
-            "good" if gap is None else _grade(gap, 0.0, CLOSE_CLEARANCE),
+            "good" if gap is None else _grade(gap, 0.0, 0.005),
             effort,
-            self._find_overloaded(effort),
+            tuple(name for name, beyond in zip(robot.joint_names, over, strict=True) if beyond),
             energy,
             why,
         )
@@ -333,16 +332,6 @@ class Model:
         robot, q = self.robot, state.q
         wrench = np.linalg.solve(platform_response(robot, q, np.zeros(6)).compliance, deflection)
         return Deflection(np.array(deflection), member_deflections(robot, q, wrench))
-
-    def _find_overloaded(self, effort: Array | None) -> tuple[str, ...]:
-        limits = self.robot.limits.effort
-        if effort is None or limits is None:
-            return ()
-        names = zip(self.robot.joint_names, np.abs(effort) > limits, strict=True)
-        return tuple(name for name, beyond in names if beyond)
-
-
-_ENDS: Final = ("low", "high")
 
 
 def _write_numbers(values: Array) -> str:

@@ -26,11 +26,8 @@ from pkm_twin.view.model import Model, Range, State
 from pkm_twin.view.scene import DRIVE, Scene
 from pkm_twin.view.stage import Stage
 
-_LOG: Final = logging.getLogger("pkm_twin")
 ADDRESS: Final = "127.0.0.1"
 """The only address that is listened on."""
-PERIOD: Final = 0.05
-"""How often what moves by itself is drawn, s."""
 
 
 @contextmanager
@@ -67,7 +64,7 @@ class Moving(Protocol):
 
     @property
     def busy(self) -> bool:
-        """Whether it moves now."""
+        """True if it moves now."""
 
     def step(self) -> None:
         """Draw what moved since the last step."""
@@ -109,10 +106,10 @@ class Page:
                 self._pose = self._add_sliders(model.pose_ranges, "pose", self._move_pose)
             self.ask(gui.add_button("Home").on_click, "home", self._go_home)
             self._check("names of drives", True, self.stage.name_drives)
-            self._check("drag platform", False, self.stage.show_gizmo)
+            self._check("drag platform", False, partial(setattr, self.stage.gizmo, "visible"))
             self.ask(self.stage.gizmo.on_update, "drag", self._drag)
             self._check("trail of the tool", False, self.stage.leave_trail)
-            if self.stage.has_meshes:
+            if self.stage.meshes:
                 self._check("meshes of the URDF, which do not bend", True, self.stage.show_meshes)
         self.load_tab = tabs.add_tab("Load")
         with self.load_tab:
@@ -148,7 +145,7 @@ class Page:
     def run(self) -> None:
         """Serve until a signal ends the process."""
         while True:
-            self._wake.wait(PERIOD if any(item.busy for item in self.moving) else 1.0)
+            self._wake.wait(0.05 if any(item.busy for item in self.moving) else 1.0)
             self._wake.clear()
             self.step()
 
@@ -169,7 +166,7 @@ class Page:
             reason = f"{type(error).__name__}: {one_line(str(error))}"
             if reason not in self._failures:
                 self._failures.add(reason)
-                _LOG.warning("view: a change was rejected: %s", reason)
+                logging.getLogger("pkm_twin").warning("view: a change was rejected: %s", reason)
 
     def become(self, state: State) -> None:
         """Show another state; one with a refusal leaves the sliders where they were put."""
@@ -259,7 +256,7 @@ class Search:
 
     @property
     def busy(self) -> bool:
-        """Whether it is under way, or found what is not shown yet."""
+        """True if it is under way, or found what is not shown yet."""
         return self._found is not None
 
     def _begin(self) -> None:
@@ -298,7 +295,7 @@ class Search:
 
 
 def _put(handles: Sequence[Any], values: Array) -> None:
-    """Move sliders to values: to an end where a value is beyond."""
+    """Move sliders to values, or to the nearest end of their range."""
     for handle, value in zip(handles, values.tolist(), strict=True):
         # What is zero but for rounding has no sign.
         handle.value = round(min(max(value, handle.min), handle.max), 12) + 0.0

@@ -21,15 +21,10 @@ from stiffness_monitor.modes import Modes, modes
 
 COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 """Colours of the joints' curves (Okabe and Ito 2008)."""
-SPEEDS: Final = ("0.25", "0.5", "1", "2", "4")
 MODES: Final = 6
 """Natural modes to choose from."""
-MODE_PERIOD: Final = 1.5
-"""Period of an animated mode, s."""
 _MEASURED: Final = "measured"
 """A wide curve, on which the model's is seen."""
-MARKED: Final = 0.25
-"""How often the curves' mark of the present moves while a bag plays, s."""
 
 
 class BagPanel:
@@ -43,7 +38,7 @@ class BagPanel:
         with page.first:
             self._time = gui.add_slider("time, s", 0.0, max(timeline.end, 0.01), 0.001, 0.0)
             self._play = gui.add_button("Play")
-            self._speed = gui.add_dropdown("speed factor", SPEEDS, initial_value="1")
+            self._speed = gui.add_dropdown("speed factor", ("0.25", "0.5", "1", "2", "4"), initial_value="1")
             self._instant = gui.add_html("")
             names = page.model.robot.joint_names
             self._times, self._twin, self._measured = timeline.curves()
@@ -72,7 +67,7 @@ class BagPanel:
         self._charts.append((chart, values))
 
     def _efforts(self) -> Array:
-        """Curves of the chosen joint: measured where the bag has it, and of the model, (j, k)."""
+        """Return the chosen joint's measured efforts, if any, and the model's, (j, k)."""
         k = self._page.model.robot.joint_names.index(self._joint.value)
         both = (self._measured, self._twin)
         return np.column_stack([values[:, k] for values in both if values is not None])
@@ -88,7 +83,7 @@ class BagPanel:
 
     @property
     def busy(self) -> bool:
-        """Whether it plays."""
+        """True if it plays."""
         return self._since is not None
 
     def show(self, at: float) -> None:
@@ -105,7 +100,7 @@ class BagPanel:
         state = page.model.to_joints(state, at.q)
         self._instant.content = texts.instant(page.model.robot, self._timeline, at)
         page.become(state)
-        if not self.busy or time.monotonic() - self._marked > MARKED:
+        if not self.busy or time.monotonic() - self._marked > 0.25:
             self._marked = time.monotonic()
             for chart, values in self._charts:
                 chart.data = (*chart.data[:-1], self._mark(values))
@@ -120,7 +115,6 @@ class BagPanel:
         self._play.label = "Pause" if self.busy else "Play"
 
     def _restart(self) -> None:
-        """Play on from the slider's time, at the chosen speed."""
         if self.busy:
             self._since = time.monotonic(), self._time.value
 
@@ -154,7 +148,7 @@ class ModePanel:
 
     @property
     def busy(self) -> bool:
-        """Whether a mode is chosen."""
+        """True if a mode is chosen."""
         return bool(self._choice.value != "none")
 
     def _choose(self) -> None:
@@ -193,7 +187,7 @@ class ModePanel:
         if self._state is None or not np.array_equal(self._state.pose, state.pose):
             self._solve(state)
         if self._modes is not None:
-            swing = float(np.sin(2 * np.pi * time.monotonic() / MODE_PERIOD))
+            swing = float(np.sin(2 * np.pi * time.monotonic() / 1.5))
             most = max(self._shares, key=lambda name: self._shares[name])
             self._page.stage.draw(state.q, self._shape.times(swing), self._shares, most)
 
@@ -252,7 +246,7 @@ def _chart(
     *,
     mark: bool = False,
 ) -> Any:
-    """Curves with names and colours, values (k, n), and where asked for a mark of the present."""
+    """Draw curves with names and colours, values (k, n), and if asked a mark of the present."""
     from viser import uplot
 
     points = uplot.Series_Points(show=False)

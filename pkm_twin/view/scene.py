@@ -36,8 +36,6 @@ DRIVE: Final = (0, 114, 178)
 GROUND: Final = (70, 74, 80)
 JOINT: Final = (98, 104, 112)
 """Rods, platform and drives: distinct with every kind of colour vision (Okabe and Ito 2008)."""
-PIECES: Final = 4
-"""Straight pieces of a member."""
 SCALE: Final = np.array([[198, 206, 214], [240, 228, 66], [213, 94, 0]], np.float64)
 """From no share of the energy to the greatest one: grey, yellow, vermilion (Okabe and Ito 2008)."""
 
@@ -122,7 +120,7 @@ class Scene:
         ]
         self.bars = (*robot_bars(robot), *pins)
         members = np.arange(len(self.bars)) < len(robot.beams)
-        self.pieces = np.where(members, PIECES, 1)
+        self.pieces = np.where(members, 4, 1)
         """Straight pieces that each bar is drawn of: members bend."""
         self.base = base_face(graph)
         self.platform = platform_face(graph) - graph.origin
@@ -142,14 +140,12 @@ class Scene:
                 self._balls += [(name, (body, end + aside)) for name, body, end in ends]
         self._members: dict[tuple[str, bytes], str] = {}
 
-    def _get_member(self, place: Place) -> str:
+    def _find_member(self, place: Place) -> str:
         """Return the member that ends at a point, else that it lies on; empty without one."""
-        key = place[0], place[1].tobytes()
-        if key not in self._members:
-            self._members[key] = self._find_member(*place)
-        return self._members[key]
-
-    def _find_member(self, body: str, point: Array) -> str:
+        body, point = place
+        key = body, point.tobytes()
+        if key in self._members:
+            return self._members[key]
         near = 1e-6 * self.size
         ends = [
             (owner == body, beam.name)
@@ -159,10 +155,11 @@ class Scene:
         ]
         found = [name for own, name in ends if own]
         found += [beam.name for beam in self.robot.beams if body in beam.parts]
-        return next(iter([*found, *(name for _, name in ends)]), "")
+        self._members[key] = next(iter([*found, *(name for _, name in ends)]), "")
+        return self._members[key]
 
     def _on_platform(self, place: Place) -> bool:
-        """Whether a point moves with the platform: one of it, or of a joint with it."""
+        """Return whether a point moves with the platform: on it, or of a joint with it."""
         graph, (body, point) = self.robot.graph, place
         if body == graph.platform:
             return True
@@ -200,7 +197,7 @@ class Scene:
                 return point
             if self._on_platform(spot):
                 return np.asarray(origin + shift + turn.apply(point - origin), np.float64)
-            member = moved.members.get(self._get_member(spot))
+            member = moved.members.get(self._find_member(spot))
             return point if member is None else point + _interpolate_along(*member, point[None])[0]
 
         def line(bar: Bar, pieces: int, name: str) -> Array:
@@ -219,9 +216,19 @@ class Scene:
         motors = [line(bar, 1, "") for bar in self._drives.values()]
         ends = np.concatenate([np.stack([a[:-1], a[1:]], axis=1) for a in (*lines, *motors)])
         thick = np.array([bar.radius for bar in self.bars])
-        bar_colours = np.array([self._choose_colour(bar, colours) for bar in self.bars])
-        radii = [*np.repeat(thick, self.pieces), *(bar.radius for bar in self._drives.values())]
-        at, turns, sizes = _place_cylinders(ends, np.array(radii))
+        parts = dict.fromkeys(graph.rods, ROD) | {BASE: GROUND, graph.platform: PLATFORM}
+        bar_colours = np.array([colours.get(bar.element, parts.get(bar.part, BODY)) for bar in self.bars])
+        radii = np.array([*np.repeat(thick, self.pieces), *(bar.radius for bar in self._drives.values())])
+        along = ends[:, 1] - ends[:, 0]
+        length = np.linalg.norm(along, axis=1)
+        z = along / np.maximum(length, 1e-12)[:, None]
+        z[length < 1e-12] = (0.0, 0.0, 1.0)
+        # Any direction across will do: a cylinder is round.
+        least = np.eye(3)[np.argmin(np.abs(z), axis=1)]
+        x = np.cross(least, z)
+        x /= np.linalg.norm(x, axis=1, keepdims=True)
+        turns = Rotation.from_matrix(np.stack([x, np.cross(z, x), z], axis=-1))
+        at, turns, sizes = ends.mean(1), _convert_to_quaternions(turns), np.column_stack([radii, radii, length])
         balls = [place(spot) for _, spot in self._balls]
         ball_radii = np.array([1.25 * self._find_radius(spot) for _, spot in self._balls])
         # Round ends, so that bars of one body meet without gaps.
@@ -268,16 +275,6 @@ class Scene:
             result[body] = at, _convert_to_quaternions(turn)
         return result
 
-    def _choose_colour(self, bar: Bar, colours: Mapping[str, Colour]) -> Colour:
-        if bar.element in colours:
-            return colours[bar.element]
-        graph = self.robot.graph
-        if bar.part == BASE:
-            return GROUND
-        if bar.part == graph.platform:
-            return PLATFORM
-        return ROD if bar.part in graph.rods else BODY
-
     def _make_motor(self, joint: Joint) -> Bar:
         """Return the cylinder that stands for a drive, along its axis."""
         axis, body, middle = joint.axes[0], joint.inner, joint.at
@@ -308,22 +305,8 @@ def _interpolate_along(points: Array, displacements: Array, at: Array) -> Array:
     return np.asarray((1.0 - part) * displacements[first] + part * displacements[first + 1])
 
 
-def _place_cylinders(ends: Array, radii: Array) -> tuple[Array, Array, Array]:
-    """Middles, quaternions and sizes of cylinders between two points each, shape (k, 2, 3)."""
-    along = ends[:, 1] - ends[:, 0]
-    length = np.linalg.norm(along, axis=1)
-    z = along / np.maximum(length, 1e-12)[:, None]
-    z[length < 1e-12] = (0.0, 0.0, 1.0)
-    # Any direction across will do: a cylinder is round.
-    least = np.eye(3)[np.argmin(np.abs(z), axis=1)]
-    x = np.cross(least, z)
-    x /= np.linalg.norm(x, axis=1, keepdims=True)
-    turns = Rotation.from_matrix(np.stack([x, np.cross(z, x), z], axis=-1))
-    return ends.mean(1), _convert_to_quaternions(turns), np.column_stack([radii, radii, length])
-
-
 def _convert_to_quaternions(turns: Rotation) -> Array:
-    """Quaternions with w first, shape (..., 4)."""
+    """Return quaternions with w first, shape (..., 4)."""
     return np.asarray(np.roll(turns.as_quat(), 1, axis=-1), np.float64)
 
 

@@ -28,23 +28,15 @@ from pkm_twin.view.scene import (
     seen,
 )
 
-FLOOR: Final = (150, 156, 164)
 FORCE: Final = (0, 158, 115)
-MOMENT: Final = (204, 121, 167)
-ARROW: Final = 0.4
-"""Length of the greatest wrench's arrow, per size of the machine."""
 LETTER: Final = (7.4, 19.0)
 """Width and height of a label's letter, at the most, pixels."""
-TRAIL: Final = 1000
-"""Places of the reference point that are kept."""
 LOOK: Final = np.array([0.62, -0.95, 0.42])
 """From where the machine is looked at, in its greatest extents from its middle."""
-MIN_SCENE_PIXELS: Final = 100
-"""Width and height of a scene below which it is being laid out, and nothing is fitted, pixels."""
 
 
 def farther(width: float, height: float) -> float:
-    """How much farther away the camera is in a window that is narrower than high, as a factor."""
+    """Return the factor on the camera's distance in a window that is narrower than high."""
     return max(1.0, height / width)
 
 
@@ -91,7 +83,36 @@ class Stage:
         camera.look_at = tuple(middle.tolist())
         camera.up = (0.0, 0.0, 1.0)
         draw.add_frame("/base", **_axes(0.12 * size, size))
-        self._add_plates()
+        graph = scene.robot.graph
+        feet = [j.at for j in graph.joints.values() if BASE in (j.inner, j.outer)]
+        away = float(np.sign((graph.origin - np.mean(feet, axis=0))[2])) or 1.0
+        if len(scene.base):
+            draw.add_mesh_simple(
+                "/base_plate",
+                *plate(scene.base - [0.0, 0.0, 0.02 * away * size], 0.03 * size),
+                color=(150, 156, 164),
+                flat_shading=True,
+            )
+        self._platform = draw.add_frame("/platform", **_axes(0.1 * size, size))
+        # A flange and its axis on the platform.
+        (round_, faces), _ = round_mesh()
+        for name, radius, length in (("flange", 0.05, 0.03), ("tool", 0.012, 0.2)):
+            shape = size * (round_ * [radius, radius, length] + [0.0, 0.0, away * length / 2])
+            draw.add_mesh_simple(f"/platform/{name}", shape, faces, color=BODY)
+        self._rest = draw.add_frame("/at_rest", show_axes=False, visible=False)
+        self._rest_bars = draw.add_line_segments(
+            "/bars_at_rest",
+            np.zeros((1, 2, 3)),
+            colors=GROUND,
+            thickness=1.5,
+            thickness_units="screen",
+            visible=False,
+        )
+        if len(scene.platform):
+            moving = plate(scene.platform, 0.016 * size)
+            draw.add_mesh_simple("/platform/plate", *moving, color=PLATFORM, flat_shading=True)
+            still = plate(scene.platform, 0.01 * size)
+            draw.add_mesh_simple("/at_rest/plate", *still, color=(110, 110, 110), opacity=0.35)
         (cylinder, cylinder_faces), (ball, ball_faces) = round_mesh()
         self._cylinders = draw.add_batched_meshes_simple(
             "/machine/bars",
@@ -114,7 +135,12 @@ class Stage:
             batched_colors=_to_linear(shapes.ball_colours),
             lod="off",
         )
-        self._meshes = self._add_bodies()
+        # Frames of the bodies that have meshes; bars are seen through them.
+        self.meshes = {}
+        for k, (body, mesh) in enumerate(body_meshes(scene.robot).items()):
+            self.meshes[body] = draw.add_frame(f"/meshes/{k}", show_axes=False)
+            colour = {BASE: GROUND, scene.robot.graph.platform: PLATFORM}.get(body, BODY)
+            draw.add_mesh_simple(f"/meshes/{k}/mesh", *mesh, color=colour, opacity=0.6)
         self._passed: list[Array] = []
         rotates = any(unit == "rad" for unit in scene.robot.pose_units)
         self.gizmo = draw.add_transform_controls(
@@ -131,7 +157,7 @@ class Stage:
         self._arrows = draw.add_arrows(
             "/wrench",
             np.zeros((2, 2, 3)),
-            _to_linear(np.array([FORCE, MOMENT])),
+            _to_linear(np.array([FORCE, (204, 121, 167)])),
             shaft_radius=0.008 * size,
             head_radius=0.02 * size,
             head_length=0.05 * size,
@@ -160,7 +186,8 @@ class Stage:
             with contextlib.suppress(ArithmeticError, TypeError, ValueError):
                 self._arrange(camera, labels)
                 width, height = camera.image_width, camera.image_height
-                if not min(width, height) >= MIN_SCENE_PIXELS:
+                # Below this size the scene is being laid out.
+                if not min(width, height) >= 100:
                     return
                 way, factor = camera.position - camera.look_at, farther(width, height)
                 part = float(way @ begin / (begin @ begin))
@@ -175,61 +202,9 @@ class Stage:
 
         client.camera.on_update(fit)
 
-    def _add_plates(self) -> None:
-        draw, scene, size = self._server.scene, self._scene, self._scene.size
-        graph = scene.robot.graph
-        feet = [j.at for j in graph.joints.values() if BASE in (j.inner, j.outer)]
-        away = float(np.sign((graph.origin - np.mean(feet, axis=0))[2])) or 1.0
-        if len(scene.base):
-            draw.add_mesh_simple(
-                "/base_plate",
-                *plate(scene.base - [0.0, 0.0, 0.02 * away * size], 0.03 * size),
-                color=FLOOR,
-                flat_shading=True,
-            )
-        self._platform = draw.add_frame("/platform", **_axes(0.1 * size, size))
-        self._add_tool(away)
-        self._rest = draw.add_frame("/at_rest", show_axes=False, visible=False)
-        self._rest_bars = draw.add_line_segments(
-            "/bars_at_rest",
-            np.zeros((1, 2, 3)),
-            colors=GROUND,
-            thickness=1.5,
-            thickness_units="screen",
-            visible=False,
-        )
-        if len(scene.platform):
-            moving = plate(scene.platform, 0.016 * size)
-            draw.add_mesh_simple("/platform/plate", *moving, color=PLATFORM, flat_shading=True)
-            still = plate(scene.platform, 0.01 * size)
-            draw.add_mesh_simple("/at_rest/plate", *still, color=(110, 110, 110), opacity=0.35)
-
-    def _add_tool(self, away: float) -> None:
-        """Draw a flange and its axis on the platform; ``away``: 1 for a base below, -1 above."""
-        (round_, faces), _ = round_mesh()
-        size = self._scene.size
-        for name, radius, length in (("flange", 0.05, 0.03), ("tool", 0.012, 0.2)):
-            shape = size * (round_ * [radius, radius, length] + [0.0, 0.0, away * length / 2])
-            self._server.scene.add_mesh_simple(f"/platform/{name}", shape, faces, color=BODY)
-
-    def _add_bodies(self) -> dict[str, Any]:
-        """Frames of the bodies that have meshes in the robot's file; bars are seen through them."""
-        draw, platform = self._server.scene, self._scene.robot.graph.platform
-        frames = {}
-        for k, (body, (corners, faces)) in enumerate(body_meshes(self._scene.robot).items()):
-            frames[body] = draw.add_frame(f"/meshes/{k}", show_axes=False)
-            colour = {BASE: GROUND, platform: PLATFORM}.get(body, BODY)
-            draw.add_mesh_simple(f"/meshes/{k}/mesh", corners, faces, color=colour, opacity=0.6)
-        return frames
-
-    @property
-    def has_meshes(self) -> bool:
-        """Whether any body has a mesh."""
-        return bool(self._meshes)
-
     def show_meshes(self, shown: bool) -> None:
-        """Whether the meshes of the robot's file are drawn."""
-        for frame in self._meshes.values():
+        """Show or hide the meshes of the robot's file."""
+        for frame in self.meshes.values():
             frame.visible = shown
 
     def draw(
@@ -254,10 +229,10 @@ class Stage:
         balls.batched_scales = shapes.ball_sizes
         balls.batched_colors = _to_linear(shapes.ball_colours)
         self._platform.position, self._platform.wxyz = shapes.platform_at, shapes.platform_turn
-        if self._meshes:
+        if self.meshes:
             for body, (at, turn) in self._scene.frames(q, moved).items():
-                if body in self._meshes:
-                    self._meshes[body].position, self._meshes[body].wxyz = at, turn
+                if body in self.meshes:
+                    self.meshes[body].position, self.meshes[body].wxyz = at, turn
         self._places, self._element = dict(shapes.drives), ""
         self._rest.visible = self._rest_bars.visible = moved is not RIGID
         if moved is not RIGID:
@@ -292,20 +267,16 @@ class Stage:
                 label.text, label.anchor, label.position = text, placed[text], self._places[text]
 
     def draw_wrench(self, at: Array, part: Array) -> None:
-        """Arrows of a wrench at the reference point: the force ends there, the moment begins.
+        """Draw a wrench's arrows at the reference point: the force ends there, the moment begins.
 
         :param part: of the greatest wrench, (6,), base axes.
         """
         self._arrows.visible = bool(part.any())
-        force, moment = ARROW * self._scene.size * part.reshape(2, 3)
+        force, moment = 0.4 * self._scene.size * part.reshape(2, 3)
         self._arrows.points = np.array([[at - force, at], [at, at + moment]])
 
-    def show_gizmo(self, shown: bool) -> None:
-        """Whether the platform can be dragged."""
-        self.gizmo.visible = shown
-
     def leave_trail(self, shown: bool) -> None:
-        """Whether the reference point draws a line; a new one begins now."""
+        """Show or hide the line that the reference point draws; a new one begins now."""
         self._trail.visible, self._passed = shown, []
 
     def extend_trail(self, at: Array) -> None:
@@ -314,12 +285,12 @@ class Stage:
         if not self._trail.visible or (passed and np.linalg.norm(at - passed[-1]) < 1e-3 * self._scene.size):
             return
         passed.append(at)
-        del passed[:-TRAIL]
+        del passed[:-1000]
         if len(passed) > 1:
             self._trail.points = np.stack([passed[:-1], passed[1:]], axis=1)
 
     def name_drives(self, shown: bool) -> None:
-        """Whether the drives have their names beside them."""
+        """Show or hide the names of the drives."""
         self._named = shown
         self._arrange_all()
 
@@ -333,7 +304,7 @@ def _axes(length: float, size: float) -> dict[str, float]:
 
 
 def _to_linear(colours: NDArray[Any]) -> NDArray[np.uint8]:
-    """Colours of a screen as amounts of light: viser takes those of batches so."""
+    """Convert a screen's colours to amounts of light, as viser takes those of batches."""
     part = np.asarray(colours) / 255.0
     light = np.where(part <= 0.04045, part / 12.92, ((part + 0.055) / 1.055) ** 2.4)
     return np.round(255 * light).astype(np.uint8)

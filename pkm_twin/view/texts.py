@@ -74,7 +74,6 @@ const take = left => requestAnimationFrame(() => {
   if (empty && left) return take(left - 1);
   link.href = sheet.toDataURL('image/png'); link.download = this.dataset.name; link.click() });
 take(200)"""
-_MISSING: Final = "&ndash;"
 _STYLE: Final = "font-size:0.82em;line-height:1.5;padding:0.15em 0.9em 0.4em"
 
 
@@ -233,7 +232,7 @@ def _judged(key: str, what: str, value: float | None, unit: str, grade: Grade, h
 
 def _write_value(key: str, value: float | None, unit: str, colour: str = "inherit", bold: bool = False) -> str:
     if value is None:
-        return f'<span id="{key}">{_MISSING}</span>'
+        return f'<span id="{key}">{"&ndash;"}</span>'
     weight = ";font-weight:700" if bold else ""
     shown = f'<span id="{key}" style="color:{colour}{weight}">{number(value)}</span>'
     return f"{shown}&nbsp;{escape(unit)}" if unit else shown
