@@ -26,8 +26,6 @@ from pkm_twin.robot.robot import Robot
 
 VERSIONS: Final = (2, 3)
 KINDS: Final = ("dynamics", "torques")
-INTERNAL: Final = 1e-4
-"""Step of the integrator in co-simulation, s, where the importer sets no other."""
 MODEL: Final = "fmu.c"
 CONSTANTS: Final = f"""\
 #define LEAST {MASSLESS!r}
@@ -42,14 +40,6 @@ CONSTANTS: Final = f"""\
 #define CHANGES 20
 #define INSTANT 1e-8
 """
-COMPILERS: Final = ("cc", "gcc", "clang")
-_FOLDERS: Final = {
-    ("x86_64", 2): "linux64",
-    ("x86_64", 3): "x86_64-linux",
-    ("aarch64", 2): "aarch64-linux",
-    ("aarch64", 3): "aarch64-linux",
-}
-_ZIPPED: Final = (1980, 1, 1, 0, 0, 0)
 
 
 class Fmu:
@@ -156,7 +146,8 @@ class Fmu:
         if self.dynamic:
             for k in accelerations:
                 found[k] = replace(found[k], needs=every)
-            add("STEP", [Variable("step", "p", "s", "longest internal step of co-simulation", INTERNAL)])
+            # Step of the integrator in co-simulation, s, where the importer sets no other.
+            add("STEP", [Variable("step", "p", "s", "longest internal step of co-simulation", 1e-4)])
         else:
             efforts_at = joints("tau", "effort that the motion needs", "o")
             add("TAU", [replace(v, needs=every) for v in efforts_at])
@@ -201,8 +192,9 @@ class Fmu:
 
     # Files.
 
-    def _write_model(self) -> str:
-        """Write the wrapper's source, with ``TOKEN`` in place of its token."""
+    def _files(self) -> dict[str, str]:
+        prefix = self.identifier
+        # Write the wrapper's source, with ``TOKEN`` in place of its token.
         robot, size = self.robot, len(self.variables)
         defined = {
             "N": self.n,
@@ -241,14 +233,10 @@ class Fmu:
             *map(read_source, ["model", *model]),
             write_interface(self.version),
         ]
-        return "\n".join(parts).replace("@", self.identifier)
-
-    def _files(self) -> dict[str, str]:
-        prefix = self.identifier
         sources = {
             f"{prefix}.h": self._package.header(),
             f"{prefix}.c": self._package.source(),
-            MODEL: self._write_model(),
+            MODEL: "\n".join(parts).replace("@", self.identifier),
         }
         described = Description(
             self.robot.name or prefix,
@@ -286,14 +274,19 @@ class Fmu:
         :raises ParameterError: the compiler does not accept the sources, with what it printed.
         """
         files: dict[str, bytes] = {name: text.encode() for name, text in self.files.items()}
-        folder = _FOLDERS.get((platform.machine(), self.version))
+        folder = {
+            ("x86_64", 2): "linux64",
+            ("x86_64", 3): "x86_64-linux",
+            ("aarch64", 2): "aarch64-linux",
+            ("aarch64", 3): "aarch64-linux",
+        }.get((platform.machine(), self.version))
         if compiler is not None and folder is not None and platform.system() == "Linux":
             name = f"binaries/{folder}/{self.identifier}.so"
             files[name] = self._binary(compiler)
         made = io.BytesIO()
         with zipfile.ZipFile(made, "w", zipfile.ZIP_DEFLATED) as archive:
             for name, content in files.items():
-                entry = zipfile.ZipInfo(name, _ZIPPED)
+                entry = zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0))
                 entry.compress_type = zipfile.ZIP_DEFLATED
                 entry.external_attr = 0o644 << 16
                 archive.writestr(entry, content)
@@ -330,4 +323,4 @@ class Fmu:
 
 def find_compiler() -> str | None:
     """Find the first C compiler on the PATH."""
-    return next((path for name in COMPILERS if (path := shutil.which(name))), None)
+    return next((path for name in ("cc", "gcc", "clang") if (path := shutil.which(name))), None)

@@ -11,45 +11,9 @@ from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from typing import Final
 
-_CALL = {
-    2: "c->log(c->environment, c->name, status, category[status], what)",
-    3: "c->log(c->environment, status, category[status], what)",
-}
-
 Functions = Mapping[str, tuple[str, str]]
 """By name: arguments behind the instance, and the body."""
 
-_MODES: Final[Functions] = {
-    "EnterEventMode": ("", "return STATUS_OK;"),
-    "EnterContinuousTimeMode": ("", "return STATUS_OK;"),
-    "Terminate": ("", "return STATUS_OK;"),
-    "Reset": ("", "begin(&c->model); return STATUS_OK;"),
-    "ExitInitializationMode": ("", "int changed; return update(c, &changed);"),
-    "SetTime": ("double time", "c->model.v[0] = time; return STATUS_OK;"),
-    "GetNominalsOfContinuousStates": (
-        "double *values, size_t count",
-        "return nominals(values, count);",
-    ),
-    "SetContinuousStates": ("const double *x, size_t count", "return set_states(c, x, count);"),
-    "GetContinuousStates": ("double *x, size_t count", "return get_states(c, x, count);"),
-    "GetEventIndicators": (
-        "double *values, size_t count",
-        "return get_indicators(c, values, count);",
-    ),
-}
-_STATE: Final[Functions] = {
-    "GetFMU{state}": ("void **state", "return copy_state(c, state);"),
-    "SetFMU{state}": ("void *state", "return restore(c, state, sizeof c->model);"),
-    "FreeFMU{state}": ("void **state", "return forget(state);"),
-    "SerializedFMU{state}Size": (
-        "void *state, size_t *size",
-        "*size = sizeof c->model; return STATUS_OK;",
-    ),
-    "SerializeFMU{state}": (
-        "void *state, unsigned char *bytes, size_t size",
-        "return save(c, state, bytes, size);",
-    ),
-}
 _SECOND: Final[Functions] = {
     "SetDebugLogging": ("int on, size_t count, const char *const *categories", "return STATUS_OK;"),
     "SetupExperiment": (
@@ -244,12 +208,50 @@ def read_source(name: str) -> str:
 
 def write_interface(version: int) -> str:
     """Write the functions of FMI 2 or 3, which follow the model's."""
-    functions = dict(_MODES)
+    functions = {
+        "EnterEventMode": ("", "return STATUS_OK;"),
+        "EnterContinuousTimeMode": ("", "return STATUS_OK;"),
+        "Terminate": ("", "return STATUS_OK;"),
+        "Reset": ("", "begin(&c->model); return STATUS_OK;"),
+        "ExitInitializationMode": ("", "int changed; return update(c, &changed);"),
+        "SetTime": ("double time", "c->model.v[0] = time; return STATUS_OK;"),
+        "GetNominalsOfContinuousStates": (
+            "double *values, size_t count",
+            "return nominals(values, count);",
+        ),
+        "SetContinuousStates": ("const double *x, size_t count", "return set_states(c, x, count);"),
+        "GetContinuousStates": ("double *x, size_t count", "return get_states(c, x, count);"),
+        "GetEventIndicators": (
+            "double *values, size_t count",
+            "return get_indicators(c, values, count);",
+        ),
+    }
     state = "state" if version == 2 else "State"
-    functions |= {name.format(state=state): entry for name, entry in _STATE.items()}
+    functions |= {
+        name.format(state=state): entry
+        for name, entry in {
+            "GetFMU{state}": ("void **state", "return copy_state(c, state);"),
+            "SetFMU{state}": ("void *state", "return restore(c, state, sizeof c->model);"),
+            "FreeFMU{state}": ("void **state", "return forget(state);"),
+            "SerializedFMU{state}Size": (
+                "void *state, size_t *size",
+                "*size = sizeof c->model; return STATUS_OK;",
+            ),
+            "SerializeFMU{state}": (
+                "void *state, unsigned char *bytes, size_t size",
+                "return save(c, state, bytes, size);",
+            ),
+        }.items()
+    }
     functions |= _SECOND if version == 2 else _THIRD
     shared = read_source("shared").replace("LOGGER\n", read_source(f"logger{version}") + "\n", 1)
-    shared = shared.replace("CALL_LOGGER", _CALL[version])
+    shared = shared.replace(
+        "CALL_LOGGER",
+        {
+            2: "c->log(c->environment, c->name, status, category[status], what)",
+            3: "c->log(c->environment, status, category[status], what)",
+        }[version],
+    )
     macro = f"""\
 /* Sources that are linked with others are compiled with FMI{version}_FUNCTION_PREFIX=@_; a library
    has the standard's names. */
@@ -264,13 +266,16 @@ def write_interface(version: int) -> str:
 
 
 def _function(name: str, arguments: str, body: str) -> str:
-    """One function whose first argument is the instance; arguments that it does not read too."""
+    """Write one function whose first argument is the instance."""
     names = [part.split()[-1].lstrip("*") for part in arguments.split(", ")] if arguments else []
     words = _words(body)
     unused = [f"    (void){name};" for name in names if name not in words]
     head = ", ".join(["void *instance", *([arguments] if arguments else [])])
     first = ["    Instance *c = (Instance *)instance;"] if "c" in words else ["    (void)instance;"]
-    lines = [line if line.startswith(" ") else f"    {line}" for line in _lines(body)]
+    lines = [
+        line if line.startswith(" ") else f"    {line}"
+        for line in body.replace("; return", ";\n    return").replace("; *", ";\n    *").split("\n")
+    ]
     return "\n".join(
         [
             f"EXPORT Status FMI({name})({head})",
@@ -286,7 +291,3 @@ def _function(name: str, arguments: str, body: str) -> str:
 
 def _words(body: str) -> Sequence[str]:
     return "".join(x if x.isalnum() or x == "_" else " " for x in body).split()
-
-
-def _lines(body: str) -> list[str]:
-    return body.replace("; return", ";\n    return").replace("; *", ";\n    *").split("\n")

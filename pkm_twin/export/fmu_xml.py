@@ -125,7 +125,6 @@ def _units(top: ET.Element, d: Description) -> None:
 
 
 def _attributes(d: Description, v: Variable) -> dict[str, str]:
-    """Start, unit and what makes a state one."""
     found = {"start": repr(v.start)} if v.start is not None else {}
     if v.unit:
         found["unit"] = v.unit

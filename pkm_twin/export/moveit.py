@@ -35,9 +35,6 @@ GROUP: Final = "actuated"
 """The planning group."""
 LIMB: Final = "limb"
 """The chain from the ground to the platform, for the numeric solver."""
-NUMERIC: Final = "kdl_kinematics_plugin/KDLKinematicsPlugin"
-ACCELERATION_FRACTION: Final = 0.5
-"""Fraction of the effort left at home after gravity that a planner may use to accelerate."""
 POSITION: Final = 1e-4
 """Largest distance between a goal and the machine's pose, m: MoveIt's tolerance of goals."""
 ORIENTATION: Final = 1e-3
@@ -58,16 +55,64 @@ def moveit_package(robot: Robot, kinematics: str = "") -> dict[str, str]:
     if not robot.controller.plain or robot.controller.names != tuple(robot.joint_names):
         raise ParameterError("joint_map", list(robot.controller.names), "none: MoveIt plans in the URDF's numbers")
     name = re.sub(r"\W", "_", robot.name or robot.mechanism)
-    groups = write_srdf(robot)
+    # Write the SRDF: groups, passive joints, home state, and links that always touch.
+    tree = robot_tree(robot)
+    parts = parts_of(tree)
+    root = ET.Element("robot", name=tree.name)
+    joints = list(robot.joint_names)
+    group = ET.SubElement(root, "group", name=GROUP)
+    for joint in joints:
+        ET.SubElement(group, "joint", name=joint)
+    # Actuated joints between the ground and the platform.
+    above = {part.child: part for part in parts}
+    found, link = [], PLATFORM
+    while link in above:
+        found += [above[link].name] if above[link].name in joints else []
+        link = above[link].parent
+    if found:
+        limb = ET.SubElement(root, "group", name=LIMB)
+        ET.SubElement(limb, "chain", base_link=GROUND, tip_link=PLATFORM)
+    home = ET.SubElement(root, "group_state", name="home", group=GROUP)
+    for joint, value in zip(joints, robot.inverse(robot.home()).tolist(), strict=True):
+        ET.SubElement(home, "joint", name=joint, value=f"{value:.12g}")
+    ET.SubElement(root, "virtual_joint", name="ground", type="fixed", parent_frame="world", child_link=GROUND)
+    for joint in robot.passive_joints:
+        ET.SubElement(root, "passive_joint", name=joint)
+    touching = dict.fromkeys(_touching(tree), "Default")
+    touching |= dict.fromkeys(_held(tree, parts), "Adjacent")
+    for (first, second), reason in touching.items():
+        ET.SubElement(root, "disable_collisions", link1=first, link2=second, reason=reason)
+    ET.indent(root)
+    groups = '<?xml version="1.0"?>\n' + ET.tostring(root, encoding="unicode") + "\n"
     package = package_name(robot, "moveit_config")
     solver = kinematics or f"{package}/Kinematics"
+    settings = {"kinematics_solver_search_resolution": 0.005, "kinematics_solver_timeout": 0.05}
+    solvers = {LIMB: "kdl_kinematics_plugin/KDLKinematicsPlugin" if (f'name="{LIMB}"' in groups) else "", GROUP: solver}
     texts = {
         f"config/{name}.urdf": robot_urdf(robot, hardware=""),
         f"config/{name}.srdf": groups,
         "config/joint_limits.yaml": _yaml(_joint_limits(robot, accelerations(robot))),
-        "config/kinematics.yaml": _yaml(_kinematics(solver, f'name="{LIMB}"' in groups)),
+        "config/kinematics.yaml": _yaml(
+            {group: {"kinematics_solver": s, **settings} for group, s in solvers.items() if s}
+        ),
         "config/moveit_controllers.yaml": _yaml(_controllers(robot)),
-        "config/ompl_planning.yaml": _yaml(PLANNING),
+        "config/ompl_planning.yaml": _yaml(
+            {
+                "planning_plugins": ["ompl_interface/OMPLPlanner"],
+                "request_adapters": [
+                    "default_planning_request_adapters/ResolveConstraintFrames",
+                    "default_planning_request_adapters/ValidateWorkspaceBounds",
+                    "default_planning_request_adapters/CheckStartStateBounds",
+                    "default_planning_request_adapters/CheckStartStateCollision",
+                ],
+                "response_adapters": [
+                    "default_planning_response_adapters/AddTimeOptimalParameterization",
+                    "default_planning_response_adapters/ValidateSolution",
+                ],
+                "planner_configs": {"RRTConnect": {"type": "geometric::RRTConnect", "range": 0.0}},
+                GROUP: {"default_planner_config": "RRTConnect", "planner_configs": ["RRTConnect"]},
+            }
+        ),
         "launch/move_group.launch.py": LAUNCH.format(name=name, package=package),
     }
     texts |= {f"c/{path}": text for path, text in c_package(robot).items()}
@@ -124,43 +169,9 @@ def accelerations(robot: Robot) -> list[float]:
     weight = np.abs(inverse_dynamics(robot, q, 0.0 * q, 0.0 * q))
     inertia = np.diag(mass_matrix(robot, q))
     with np.errstate(divide="ignore"):
-        return list(ACCELERATION_FRACTION * np.maximum(limits - weight, 0.0) / inertia)
-
-
-def write_srdf(robot: Robot) -> str:
-    """Write the SRDF: groups, passive joints, home state, and links that always touch."""
-    tree = robot_tree(robot)
-    parts = parts_of(tree)
-    root = ET.Element("robot", name=tree.name)
-    joints = list(robot.joint_names)
-    group = ET.SubElement(root, "group", name=GROUP)
-    for joint in joints:
-        ET.SubElement(group, "joint", name=joint)
-    if _drives_of_chain(parts, joints):
-        limb = ET.SubElement(root, "group", name=LIMB)
-        ET.SubElement(limb, "chain", base_link=GROUND, tip_link=PLATFORM)
-    home = ET.SubElement(root, "group_state", name="home", group=GROUP)
-    for joint, value in zip(joints, robot.inverse(robot.home()).tolist(), strict=True):
-        ET.SubElement(home, "joint", name=joint, value=f"{value:.12g}")
-    ET.SubElement(root, "virtual_joint", name="ground", type="fixed", parent_frame="world", child_link=GROUND)
-    for joint in robot.passive_joints:
-        ET.SubElement(root, "passive_joint", name=joint)
-    touching = dict.fromkeys(_touching(tree), "Default")
-    touching |= dict.fromkeys(_held(tree, parts), "Adjacent")
-    for (first, second), reason in touching.items():
-        ET.SubElement(root, "disable_collisions", link1=first, link2=second, reason=reason)
-    ET.indent(root)
-    return '<?xml version="1.0"?>\n' + ET.tostring(root, encoding="unicode") + "\n"
-
-
-def _drives_of_chain(parts: Sequence[Single], actuated: Sequence[str]) -> list[str]:
-    """Actuated joints between the ground and the platform."""
-    above = {part.child: part for part in parts}
-    found, link = [], PLATFORM
-    while link in above:
-        found += [above[link].name] if above[link].name in actuated else []
-        link = above[link].parent
-    return found
+        # Fraction of the effort left at home after gravity that a planner may use to
+        # accelerate.
+        return list(0.5 * np.maximum(limits - weight, 0.0) / inertia)
 
 
 def _held(tree: LoopTree, parts: Sequence[Single]) -> list[tuple[str, str]]:
@@ -179,7 +190,7 @@ def _held(tree: LoopTree, parts: Sequence[Single]) -> list[tuple[str, str]]:
 
 
 def _touching(tree: LoopTree) -> list[tuple[str, str]]:
-    """Pairs of links whose shapes intersect at home: bars that meet in one point of a body."""
+    """Find pairs of links whose shapes intersect at home: bars that meet in a point of a body."""
     pairs = []
     for one, other in combinations(tree.capsules, 2):
         gap = distance(one.start, one.end - one.start, other.start, other.end - other.start)
@@ -207,12 +218,6 @@ def _joint_limits(robot: Robot, accelerations: Sequence[float]) -> dict[str, Any
     }
 
 
-def _kinematics(plugin: str, numeric: bool) -> dict[str, Any]:
-    settings = {"kinematics_solver_search_resolution": 0.005, "kinematics_solver_timeout": 0.05}
-    solvers = {LIMB: NUMERIC if numeric else "", GROUP: plugin}
-    return {group: {"kinematics_solver": s, **settings} for group, s in solvers.items() if s}
-
-
 def _controllers(robot: Robot) -> dict[str, Any]:
     return {
         "moveit_controller_manager": ("moveit_simple_controller_manager/MoveItSimpleControllerManager"),
@@ -231,22 +236,6 @@ def _controllers(robot: Robot) -> dict[str, Any]:
 def _yaml(data: dict[str, Any]) -> str:
     return yaml.safe_dump(data, sort_keys=False)
 
-
-PLANNING: Final[dict[str, Any]] = {
-    "planning_plugins": ["ompl_interface/OMPLPlanner"],
-    "request_adapters": [
-        "default_planning_request_adapters/ResolveConstraintFrames",
-        "default_planning_request_adapters/ValidateWorkspaceBounds",
-        "default_planning_request_adapters/CheckStartStateBounds",
-        "default_planning_request_adapters/CheckStartStateCollision",
-    ],
-    "response_adapters": [
-        "default_planning_response_adapters/AddTimeOptimalParameterization",
-        "default_planning_response_adapters/ValidateSolution",
-    ],
-    "planner_configs": {"RRTConnect": {"type": "geometric::RRTConnect", "range": 0.0}},
-    GROUP: {"default_planner_config": "RRTConnect", "planner_configs": ["RRTConnect"]},
-}
 
 LAUNCH: Final = """# Made by pkm-twin export moveit {name}.
 from moveit_configs_utils import MoveItConfigsBuilder

@@ -53,10 +53,6 @@ SHARED: Final = {
   return status;""",
 }
 """Bodies of functions of the model: where drives share the effort, and where each has its own."""
-LOOP_PERIOD: Final = 1e-3
-"""Usual period of a fast control loop, s: rounding of positions over it is no motion."""
-MIN_TEST_INDEX: Final = 0.05
-"""Least singularity index of the motions that the package's own test makes."""
 
 
 def package_name(robot: Robot, kind: str = "ros2_control") -> str:
@@ -96,7 +92,6 @@ def printable(robot: Robot) -> str:
 
 
 def _templates(folder: Traversable, above: str = "") -> Iterable[tuple[str, str]]:
-    """Paths and texts of all files below a folder."""
     for item in sorted(folder.iterdir(), key=lambda item: item.name):
         if item.is_dir():
             yield from _templates(item, f"{above}{item.name}/")
@@ -111,7 +106,52 @@ def _words(robot: Robot, package: str) -> dict[str, str]:
     load, controller = robot.payload, robot.controller
     home = _start(robot)
     directions = _directions(robot)
-    steps = np.abs(controller.factors) * _range(robot, home)
+    # How far every joint may go from home, all at once and in any direction, shape (n,).
+    units = np.array([1.0 if unit == "rad" else robot.graph.size for unit in robot.joint_units])
+    if robot.redundant:
+        # Joints that move by themselves contradict each other.
+        ranges = np.asarray(robot.graph.sharing[0] / 4.0 * units, np.float64)
+    else:
+        if robot.limits.position is not None:
+            room = np.abs(robot.limits.position - home[:, None]).min(1)
+            units = np.where(room > 0.0, np.minimum(units, room), units)
+        signs = np.array(np.meshgrid(*[(-1.0, 0.0, 1.0)] * len(home))).reshape(len(home), -1).T
+        size = 0.2
+        for _ in range(20):
+            index, good = robot.try_singularity(home + size * units * signs)
+            # Least singularity index of the motions that the package's own test makes.
+            if good.all() and (index > 0.05).all():
+                break
+            size /= 2.0
+        ranges = np.asarray(size * units, np.float64)
+    steps = np.abs(controller.factors) * ranges
+    # Write one line per actuated joint, with limits in the controller's values.
+    controller, limits, friction = robot.controller, robot.limits, robot.friction
+    n = robot.joints_count
+    position = np.array([[-np.inf, np.inf]] * n) if limits.position is None else limits.position
+    # A negative sign turns them round; ends without a limit stay without one.
+    ends = np.sort(controller.offsets[:, None] + controller.factors[:, None] * position, axis=1)
+    effort = np.full(n, np.inf) if limits.effort is None else np.asarray(limits.effort)
+    # The rates that rounding of the positions makes, in the controller's numbers, (n,).
+    controller = robot.controller
+    units = np.array([1.0 if unit == "rad" else robot.graph.size for unit in robot.joint_units])
+    largest = np.abs(controller.offsets) + np.abs(controller.factors) * units
+    # Usual period of a fast control loop, s: rounding of positions over it is no motion.
+    columns = (
+        controller.factors,
+        controller.offsets,
+        ends[:, 0],
+        ends[:, 1],
+        effort / np.abs(controller.factors),
+        friction.viscous,
+        friction.coulomb,
+        _damping(robot),
+        np.asarray(ROUNDING_NOISE * largest / 1e-3, np.float64),
+    )
+    lines = [
+        f"  {{{literal(name)}, {', '.join(number(column[k]) for column in columns)}}},"
+        for k, name in enumerate(controller.names)
+    ]
     return {
         "ROBOT": shown,
         "XMLROBOT": escape(shown),
@@ -123,7 +163,7 @@ def _words(robot: Robot, package: str) -> dict[str, str]:
         "POSENAMES": ", ".join(POSE[k] for k in directions),
         "POSE": _write_row(directions),
         "PAYLOAD": "{" + ", ".join([number(load.mass), _write_row(load.com), _write_row(np.ravel(load.inertia))]) + "}",
-        "DRIVES": _write_drives(robot),
+        "DRIVES": "\n".join(lines),
         "STOP": f"{DAMPING_TIME:g}",
         "MAXMASS": number(MAX_MASS),
         "MAXLENGTH": number(MAX_LENGTH),
@@ -151,74 +191,21 @@ def _directions(robot: Robot) -> list[int]:
     return list(choices[int(np.argmax(sizes))])
 
 
-def _write_drives(robot: Robot) -> str:
-    """Write one line per actuated joint, with limits in the controller's values."""
-    controller, limits, friction = robot.controller, robot.limits, robot.friction
-    n = robot.joints_count
-    position = np.array([[-np.inf, np.inf]] * n) if limits.position is None else limits.position
-    # A negative sign turns them round; ends without a limit stay without one.
-    ends = np.sort(controller.offsets[:, None] + controller.factors[:, None] * position, axis=1)
-    effort = np.full(n, np.inf) if limits.effort is None else np.asarray(limits.effort)
-    columns = (
-        controller.factors,
-        controller.offsets,
-        ends[:, 0],
-        ends[:, 1],
-        effort / np.abs(controller.factors),
-        friction.viscous,
-        friction.coulomb,
-        _damping(robot),
-        _rounding_rates(robot),
-    )
-    lines = [
-        f"  {{{literal(name)}, {', '.join(number(column[k]) for column in columns)}}},"
-        for k, name in enumerate(controller.names)
-    ]
-    return "\n".join(lines)
-
-
 def _damping(robot: Robot) -> Array:
-    """Damping of the gravity controller in the controller's numbers, shape (n,)."""
+    """Return the gravity controller's damping in the controller's numbers, shape (n,)."""
     # Critical damping of a bandwidth f is 4 pi f times the mass.
     _, damping = tune_position_control(robot, 1.0 / (4.0 * np.pi * DAMPING_TIME))
     # Digits that other arithmetic does not change.
     return np.array([float(f"{d:.6g}") for d in damping / robot.controller.factors**2])
 
 
-def _rounding_rates(robot: Robot) -> Array:
-    """Return the rates that rounding of the positions makes, in the controller's numbers, (n,)."""
-    controller = robot.controller
-    units = np.array([1.0 if unit == "rad" else robot.graph.size for unit in robot.joint_units])
-    largest = np.abs(controller.offsets) + np.abs(controller.factors) * units
-    return np.asarray(ROUNDING_NOISE * largest / LOOP_PERIOD, np.float64)
-
-
 def _start(robot: Robot) -> Array:
-    """Home, or the middle of the limits where these leave home out, shape (n,)."""
+    """Return home, or the middle of the limits where they exclude home, shape (n,)."""
     home, limits = robot.graph.home, robot.limits.position
     if limits is None or ((limits[:, 0] <= home) & (home <= limits[:, 1])).all():
         return home
     middle = np.where(np.isfinite(limits).all(1), limits.mean(1), home)
     return middle if robot.try_forward(middle)[1] else home
-
-
-def _range(robot: Robot, home: Array) -> Array:
-    """How far every joint may go from home, all at once and in any direction, shape (n,)."""
-    units = np.array([1.0 if unit == "rad" else robot.graph.size for unit in robot.joint_units])
-    if robot.redundant:
-        # Joints that move by themselves contradict each other.
-        return np.asarray(robot.graph.sharing[0] / 4.0 * units, np.float64)
-    if robot.limits.position is not None:
-        room = np.abs(robot.limits.position - home[:, None]).min(1)
-        units = np.where(room > 0.0, np.minimum(units, room), units)
-    signs = np.array(np.meshgrid(*[(-1.0, 0.0, 1.0)] * len(home))).reshape(len(home), -1).T
-    size = 0.2
-    for _ in range(20):
-        index, good = robot.try_singularity(home + size * units * signs)
-        if good.all() and (index > MIN_TEST_INDEX).all():
-            break
-        size /= 2.0
-    return np.asarray(size * units, np.float64)
 
 
 def _controllers(robot: Robot, package: str, bandwidth: float) -> str:
@@ -272,7 +259,6 @@ def number(value: float) -> str:
 
 
 def _write_row(values: Iterable[Any]) -> str:
-    """Write the numbers of a std::array."""
     items = [str(v) if isinstance(v, int) else number(v) for v in values]
     return "{" + ", ".join(items) + "}"
 

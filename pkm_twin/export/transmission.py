@@ -7,14 +7,11 @@ and numbers.
 
 from __future__ import annotations
 
-from typing import Final
 from xml.sax.saxutils import quoteattr
 
 from pkm_twin.export.c_package import Package
 from pkm_twin.export.ros2_control import fill_templates, literal, number, package_name, printable
 from pkm_twin.robot.robot import Robot
-
-FUNCTIONS: Final = ("inverse", "joint_to_actuator", "actuator_to_joint", "gains")
 
 
 def transmission_package(robot: Robot) -> dict[str, str]:
@@ -24,7 +21,7 @@ def transmission_package(robot: Robot) -> dict[str, str]:
     """
     controller, package = robot.controller, package_name(robot, "transmission")
     controller.check_even()
-    code, shown = Package(robot, FUNCTIONS), printable(robot)
+    code, shown = Package(robot, ("inverse", "joint_to_actuator", "actuator_to_joint", "gains")), printable(robot)
     drives = [
         f"  {{{literal(name)}, {number(factor)}, {number(offset)}}},"
         for name, factor, offset in zip(controller.names, controller.factors, controller.offsets, strict=True)
