@@ -31,6 +31,7 @@ def _print_version(context: click.Context, _option: click.Parameter, asked: bool
 
 
 app = Tasks(
+    NAME,
     """Compute torques and stiffness of parallel robots, and compare recordings with the model.
 
     Start with `pkm-twin robots`, then `pkm-twin info delta_cu`; or check a recording with

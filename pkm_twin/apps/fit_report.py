@@ -14,15 +14,9 @@ from pkm_twin.identification.compare import lateness
 from pkm_twin.identification.deflections import ElasticFit
 from pkm_twin.identification.drives import DriveFriction, Law
 from pkm_twin.identification.fit import Fit, Judged, Result
-from pkm_twin.identification.parameters import Combination, Group, Number
+from pkm_twin.identification.parameters import Group, Number
 from pkm_twin.report import Column, Fact, Report, Table, plots
 
-MOST_SAMPLES: Final = 4000
-"""Drawn of each recording."""
-MOST_NUMBERS: Final = 20
-"""In the picture of changes."""
-FAR: Final = 30.0
-"""Standard deviations beyond which that picture's scale is logarithmic."""
 COMBINED: Final = "known only in combination with others"
 BY_AXIS: Final = "m_m_m_rad_rad_rad"
 """The end of a key in JSON: units of a deflection's directions."""
@@ -39,10 +33,26 @@ def report_of(result: Result, marks: Sequence[str] = ()) -> tuple[Report, list[T
     own = tuple(units[channel.name] for channel in verdict.channels)
     shown = [n for n in result.numbers if n.status != "not excited"]
     idle = [label(n) for n in result.of("not excited")]
-    held = _find_held_out(result)
+    # RMS residuals before and now, measured peak, unit: of the channels that were measured.
+    held = {}
+    for judged in result.judged:
+        sizes = judged.rms(judged.before), judged.rms(judged.after), np.abs(judged.measured).max(0)
+        for name, unit, *row in zip(result.channels, result.units, *sizes, strict=True):
+            if np.isfinite(row).all():
+                before, after, peak = map(float, row)
+                held[f"{judged.name}, {name}"] = before, after, peak, unit
     if isinstance(result, Fit):
         names, facts = result.problem.parameters.names, _report_efforts(result)
-        more = _describe_delays(result)
+        # Describe how the signals of each recording were filtered.
+        more = []
+        for made, delay in zip(result.problem.whole, result.delays, strict=True):
+            how, late = made.how, lateness(delay, made.period)
+            cutoff = "no low-pass" if how.cutoff is None else f"low-pass at {how.cutoff:.3g} Hz"
+            more.append(
+                f"{made.recording.name}: efforts are {late or 'on time'}; "
+                f"differentiated over {how.window} samples, {cutoff}, "
+                f"one of every {how.keep_every} samples used"
+            )
         more += [f"efforts replaced as outliers: {result.outliers}"] if result.outliers else []
     elif isinstance(result, ElasticFit):
         names = tuple(map(_element, result.numbers))
@@ -59,7 +69,7 @@ def report_of(result: Result, marks: Sequence[str] = ()) -> tuple[Report, list[T
     parameters = [
         {
             "key": n.name,
-            **_describe_number(n, elastic),
+            **({"element": _element(n), "unit": "of the file's compliance"} if elastic else {"unit": n.unit}),
             "before": n.before,
             "value": n.after,
             "standard_deviation": n.deviation,
@@ -67,6 +77,38 @@ def report_of(result: Result, marks: Sequence[str] = ()) -> tuple[Report, list[T
         }
         for n in result.numbers
     ]
+    columns = [
+        Column("", text="RMS with the file's values", form=".3g"),
+        Column("", text="with the fitted ones", form=".3g"),
+        Column("", text="measured peak", form=".3g"),
+        Column("", text="unit"),
+    ]
+    numbers = {label(n): n for n in shown}
+    number_columns = [
+        Column("", text="in the file", form=".6g"),
+        Column("", text="fitted", form=".6g"),
+        Column("", text="standard deviation"),
+        Column("", text="unit"),
+        Column("", text=" "),
+    ]
+    number_rows = {
+        name: (n.before, n.after, n.spread, n.unit, COMBINED if n.status == "combination" else "")
+        for name, n in numbers.items()
+    }
+    channel_columns = [
+        Column("", text=text)
+        for text in (
+            "RMS residual in the band of the motion",
+            "RMS noise there",
+            "unit",
+            "variation without a known cause (%)",
+            "held out over fitted",
+        )
+    ]
+    channel_rows = {
+        c.name: (c.residual, c.noise, unit, 100.0 * c.left, c.held_out)
+        for c, unit in zip(result.verdict.channels, own, strict=True)
+    }
     return Report(
         _answer(result, held),
         [
@@ -81,11 +123,14 @@ def report_of(result: Result, marks: Sequence[str] = ()) -> tuple[Report, list[T
             Fact("not_excited", idle),
             *facts,
         ],
-        [_make_number_table({label(n): n for n in shown}), _make_residual_table(held)],
+        [
+            Table("", number_columns, number_rows, "parameters", "parameter"),
+            Table("", columns, held, "residual of the last third, which was held out", "recording"),
+        ],
         {"": partial(_draw_changes, {label(n): n for n in shown})}
         | {f"_{k}": partial(_draw_residuals, one, units) for k, one in enumerate(result.judged)},
         notes,
-    ), [_make_channel_table(result, own)]
+    ), [Table("", channel_columns, channel_rows, "verdict", "channel")]
 
 
 def _name(number: Number) -> str:
@@ -96,26 +141,8 @@ def _element(number: Number) -> str:
     return str(number.key[-1])
 
 
-def _describe_number(number: Number, elastic: bool) -> dict[str, Any]:
-    if not elastic:
-        return {"unit": number.unit}
-    return {"element": _element(number), "unit": "of the file's compliance"}
-
-
-def _find_held_out(result: Result) -> dict[str, tuple[float, float, float, str]]:
-    """RMS residuals before and now, measured peak, unit: of the channels that were measured."""
-    rows = {}
-    for judged in result.judged:
-        sizes = judged.rms(judged.before), judged.rms(judged.after), np.abs(judged.measured).max(0)
-        for name, unit, *row in zip(result.channels, result.units, *sizes, strict=True):
-            if np.isfinite(row).all():
-                before, after, peak = map(float, row)
-                rows[f"{judged.name}, {name}"] = before, after, peak, unit
-    return rows
-
-
 def _answer(result: Result, held: Mapping[str, tuple[float, float, float, str]]) -> str:
-    """Whether the model explains the recordings, and the worst held-out channel."""
+    """Describe whether the model explains the recordings, and the worst held-out channel."""
     name, (before, after, peak, unit) = max(held.items(), key=lambda row: row[1][1] / max(row[1][2], 1e-300))
     return (
         f"{result.robot.name}: {result.verdict}; the worst held-out residual is "
@@ -124,66 +151,8 @@ def _answer(result: Result, held: Mapping[str, tuple[float, float, float, str]])
     )
 
 
-def _make_number_table(numbers: Mapping[str, Number]) -> Table:
-    columns = [
-        Column("", text="in the file", form=".6g"),
-        Column("", text="fitted", form=".6g"),
-        Column("", text="standard deviation"),
-        Column("", text="unit"),
-        Column("", text=" "),
-    ]
-    rows = {
-        name: (n.before, n.after, n.spread, n.unit, COMBINED if n.status == "combination" else "")
-        for name, n in numbers.items()
-    }
-    return Table("", columns, rows, "parameters", "parameter")
-
-
-def _make_residual_table(held: Mapping[str, tuple[float, float, float, str]]) -> Table:
-    columns = [
-        Column("", text="RMS with the file's values", form=".3g"),
-        Column("", text="with the fitted ones", form=".3g"),
-        Column("", text="measured peak", form=".3g"),
-        Column("", text="unit"),
-    ]
-    return Table("", columns, held, "residual of the last third, which was held out", "recording")
-
-
-def _make_channel_table(result: Result, units: Sequence[str]) -> Table:
-    """Return what the verdict says of each channel."""
-    columns = [
-        Column("", text=text)
-        for text in (
-            "RMS residual in the band of the motion",
-            "RMS noise there",
-            "unit",
-            "variation without a known cause (%)",
-            "held out over fitted",
-        )
-    ]
-    rows = {
-        c.name: (c.residual, c.noise, unit, 100.0 * c.left, c.held_out)
-        for c, unit in zip(result.verdict.channels, units, strict=True)
-    }
-    return Table("", columns, rows, "verdict", "channel")
-
-
-def _describe_delays(result: Fit) -> list[str]:
-    """Describe how the signals of each recording were filtered."""
-    lines = []
-    for made, delay in zip(result.problem.whole, result.delays, strict=True):
-        how, late = made.how, lateness(delay, made.period)
-        cutoff = "no low-pass" if how.cutoff is None else f"low-pass at {how.cutoff:.3g} Hz"
-        lines.append(
-            f"{made.recording.name}: efforts are {late or 'on time'}; "
-            f"differentiated over {how.window} samples, {cutoff}, "
-            f"one of every {how.keep_every} samples used"
-        )
-    return lines
-
-
 def _report_efforts(result: Fit) -> list[Fact]:
-    """Noise, delays, filters and what was held out."""
+    """Report noise, delays, filters and what was held out."""
     joints, units = result.channels, result.units
     held = [
         {
@@ -246,19 +215,18 @@ def _report_elastic(result: ElasticFit) -> list[Fact]:
 
 
 def _describe_group(group: Group) -> str:
-    """One line on elements that the loads do not distinguish."""
-    told = "; ".join(map(_write_sum, group.known)) or "nothing"
+    sums = []
+    for one in group.known:
+        terms = " + ".join(f"{w:.2f} x {name}" for name, w in one.weights.items())
+        sums.append(f"{terms.replace('+ -', '- ')} = {one.value:.4g} +- {one.deviation:.2g}")
+    told = "; ".join(sums) or "nothing"
     return f"Loads do not distinguish {' and '.join(group.elements)}; they identify {told}"
 
 
-def _write_sum(one: Combination) -> str:
-    terms = " + ".join(f"{w:.2f} x {name}" for name, w in one.weights.items())
-    return f"{terms.replace('+ -', '- ')} = {one.value:.4g} +- {one.deviation:.2g}"
-
-
 def _draw_residuals(judged: Judged, units: Mapping[str, str]) -> Any:
-    """Residuals of each measured channel before and now, with the model's own deviation."""
-    step = max(1, len(judged.time) // MOST_SAMPLES)
+    """Draw residuals of each channel before and now, with the model's standard deviation."""
+    # At most 4,000 samples of a recording are drawn.
+    step = max(1, len(judged.time) // 4000)
     rows: dict[str, list[Array]] = {}
     series = (judged.measured - judged.before, judged.measured - judged.after, judged.deviation)
     for k, name in enumerate(units):
@@ -284,13 +252,14 @@ def _draw_residuals(judged: Judged, units: Mapping[str, str]) -> Any:
 
 
 def _draw_changes(shown: Mapping[str, Number]) -> Any:
-    """How far numbers moved, the furthest first; over standard deviations where known."""
+    """Draw how far numbers moved, in standard deviations where known."""
     known = all(np.isfinite(n.deviation) and n.deviation > 0.0 for n in shown.values())
     moved = {
         name: (n.after - n.before) / (n.deviation if known else max(abs(n.before), abs(n.after), 1e-300))
         for name, n in shown.items()
     }
-    order = sorted(moved, key=lambda name: -abs(moved[name]))[:MOST_NUMBERS]
+    # The twenty that changed most.
+    order = sorted(moved, key=lambda name: -abs(moved[name]))[:20]
     figure, ((ax,),) = plots.columns(1, 1, 1.6 + 0.28 * len(order))
     places = np.arange(len(order))[::-1]
     colours = [plots.COLOURS[0 if shown[name].status == "fitted" else 4] for name in order]
@@ -303,7 +272,8 @@ def _draw_changes(shown: Mapping[str, Number]) -> Any:
         title = f"{far} of {len(moved)} numbers moved by more than two standard deviations (grey)"
     else:
         title = "What changed most; standard deviations are withheld"
-    if max(map(abs, moved.values()), default=0.0) > FAR:
+    # Beyond 30 standard deviations the scale is logarithmic.
+    if max(map(abs, moved.values()), default=0.0) > 30.0:
         ax.set_xscale("symlog", linthresh=2.0)
     over = "standard deviation" if known else "larger value"
     plots.label(ax, f"change over the {over}; orange: {COMBINED}", "")
@@ -312,7 +282,6 @@ def _draw_changes(shown: Mapping[str, Number]) -> Any:
 
 
 def _write_terms(law: Law) -> str:
-    """Write a drive's friction law with its values."""
     each = zip(law.terms, law.values, law.deviations, strict=True)
     return ", ".join(
         f"{term} {value:.3f} +- {deviation:.3f}" + (" A" if term != "load-dependent" else "")
@@ -321,7 +290,7 @@ def _write_terms(law: Law) -> str:
 
 
 def drive_report(found: DriveFriction) -> Report:
-    """Of a drive's torque constant and friction law."""
+    """Report a drive's torque constant and friction law."""
     rows: dict[str, dict[str, Any]] = {}
     for law in found.laws:
         each = zip(law.terms, law.values, law.deviations, strict=True)

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import MISSING
 from pathlib import Path
 from types import UnionType
-from typing import Any, Final, TypeVar, Union, get_args, get_origin
+from typing import Any, Final, Union, get_args, get_origin
 from typing import get_type_hints as hints_of
 
 import click
@@ -27,16 +27,11 @@ from pkm_twin.report import Fact, Report
 from pkm_twin.report.terminal import present
 from pkm_twin.settings import Setting
 
-G = TypeVar("G")
-
-LARGEST_SHOWN: Final = 1e5
-"""The largest upper bound that help shows; larger ones only catch slips."""
-METAVARS: Final = {Path: "FILE", str: "TEXT", int: "COUNT", float: "NUMBER"}
 NEGATIVE: Final = re.compile(r"-\.?\d")
-"""How a word begins that is a negative number and no option."""
+"""Beginning of a negative number, which click takes for an option where an argument stands."""
 MARK: Final = " "
-"""Precedes a negative number until its value is read, because click takes words that begin with
-a dash for options."""
+"""Precedes a negative number until its value is read. click's own ``ignore_unknown_options`` would
+also take a misspelt option for an argument."""
 
 
 class Value(click.ParamType):  # type: ignore[type-arg]
@@ -94,13 +89,13 @@ class Option(click.Option):
         if kind is bool:
             super().__init__([name, field], is_flag=True, help=row.text)
             return
-        metavar, text = METAVARS.get(kind), row.text
+        metavar, text = {Path: "FILE", str: "TEXT", int: "COUNT", float: "NUMBER"}.get(kind), row.text
         if row.choices:
             metavar = "|".join(row.choices)
         elif row.count is not None:
             metavar = "NUMBERS"
         elif kind in (int, float) and row.low is not None and row.high is not None:
-            text += f" [{row.low:g} to {row.high:g}]" * (row.high < LARGEST_SHOWN)
+            text += f" [{row.low:g} to {row.high:g}]" * (row.high < 1e5)
         self.shown, known = _write_default(row, default)
         if row.alone is not None:
             known |= {"is_flag": False, "flag_value": row.alone}
@@ -108,7 +103,7 @@ class Option(click.Option):
             [name, field],
             type=Value(kind, row),
             metavar=row.metavar or metavar,
-            help=text,
+            help=inspect.cleandoc(text),
             multiple=repeated,
             required=default is MISSING,
             show_default=bool(self.shown),
@@ -149,7 +144,7 @@ class Argument(click.Argument):
 
 
 class Command(click.Command):
-    """A command: a class of settings, whose docstring is the help, and a function of it."""
+    """A command: a class of settings, whose docstring is the help, and the function ``run``."""
 
     def __init__(self, given: type[Any], run: Callable[[Any], Report], task: str = "") -> None:
         """``task``: the heading in the list of commands; empty for a command of a group."""
@@ -253,13 +248,17 @@ class Command(click.Command):
             refuse_existing(target, overwrite, source)
 
 
-def command(run: Callable[[G], Report], task: str = "") -> Command:
-    """Return the command of a function; the class of its one parameter declares the options.
+def command(task: str = "") -> Callable[[Callable[[Any], Report]], Command]:
+    """Make a function a command; the class of its one parameter declares the options.
 
     :param task: the heading in the list of commands.
     """
-    (given,) = (kind for name, kind in hints_of(run).items() if name != "return")
-    return Command(given, run, task)
+
+    def decorate(run: Callable[[Any], Report]) -> Command:
+        (given,) = (kind for name, kind in hints_of(run).items() if name != "return")
+        return Command(given, run, task)
+
+    return decorate
 
 
 class Group(click.Group):
@@ -270,6 +269,7 @@ class Group(click.Group):
 
     def __init__(
         self,
+        name: str,
         text: str,
         commands: Mapping[str, click.Command],
         task: str = "",
@@ -278,6 +278,7 @@ class Group(click.Group):
     ) -> None:
         """``commands``: in the order of the help. ``metavar``: what follows the name, in help."""
         super().__init__(
+            name,
             help=inspect.cleandoc(text),
             subcommand_metavar=metavar,
             no_args_is_help=False,
@@ -291,17 +292,9 @@ class Group(click.Group):
         """Return the names of the commands in their order."""
         return list(self.commands)
 
-    def order(self, words: list[str]) -> list[str]:
-        """Return the words after the group's name, the command's name first."""
-        return words
-
     def show(self, name: str) -> str:
         """Return a command's name as it is typed, with arguments that stand before it."""
         return name
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Read the words up to the command's name."""
-        return super().parse_args(ctx, self.order(args))
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]

@@ -55,12 +55,12 @@ def commands() -> Extensible[click.Command]:
     """Return all commands of ``pkm-twin``, each loaded when it is first taken."""
     files = sorted((Path(__file__).parent / "commands").glob("[a-z]*.py"))
     names = [file.stem.replace("_", "-") for file in files]
-    return Extensible(
-        "pkm_twin.commands",
-        click.Command,
-        names,
-        lambda name: import_module(module_of(name)).COMMAND,
-    )
+    return Extensible("pkm_twin.commands", click.Command, names, _load)
+
+
+def _load(name: str) -> click.Command:
+    found = vars(import_module(module_of(name))).values()
+    return next(one for one in found if isinstance(one, click.Command) and one.name == name)
 
 
 def module_of(name: str) -> str:

@@ -20,21 +20,23 @@ MODULES = {
     "machine_state": "pkm_twin.state.node",
     "machine_sim": "delta_dynamics.nodes.simulation",
 }
-SUMMARIES = {
-    "delta_dynamics": "Computes feedforward torques from trajectories and joint states.",
-    "command_gate": "Forwards stamped torques to an effort controller, and zeros when they stop.",
-    "stiffness_monitor": "Computes compliance and the dominant element from wrenches and joints.",
-    "machine_state": "Computes all joints, the platform's motion and markers from joint states.",
-    "machine_sim": "Simulates the machine under efforts or trajectories, publishes joint states.",
-}
 TOGETHER = tuple(name for name in MODULES if name != "command_gate")
-COMPOSED = f"Runs several nodes in one process and one executor: {', '.join(TOGETHER)}."
 
 
 def _run(name: str) -> None:
     leave_at_once()
     open_standard_streams()
-    answer(name, SUMMARIES[name], sys.argv[1:])
+    answer(
+        name,
+        {
+            "delta_dynamics": "Computes feedforward torques from trajectories and joint states.",
+            "command_gate": "Forwards stamped torques to an effort controller, and zeros when they stop.",
+            "stiffness_monitor": "Computes compliance and the dominant element from wrenches and joints.",
+            "machine_state": "Computes all joints, the platform's motion and markers from joint states.",
+            "machine_sim": "Simulates the machine under efforts or trajectories, publishes joint states.",
+        }[name],
+        sys.argv[1:],
+    )
     _start(name, [name])
 
 
@@ -53,7 +55,12 @@ def composed() -> None:
     words = sys.argv[1:]
     end = words.index("--ros-args") if "--ros-args" in words else len(words)
     names = [word for word in words[:end] if not word.startswith("-")]
-    answer("composed", COMPOSED, [word for word in words[:end] if word not in names], "NODE")
+    answer(
+        "composed",
+        f"Runs several nodes in one process and one executor: {', '.join(TOGETHER)}.",
+        [word for word in words[:end] if word not in names],
+        "NODE",
+    )
     if not names or set(names) - set(TOGETHER) or len(set(names)) < len(names):
         print(
             f"cannot start: composed {' '.join(names)}: expected one or more of "

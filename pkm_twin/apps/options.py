@@ -41,19 +41,17 @@ class OfPlatform:
     platform: str | None = setting(None, "for a URDF, MJCF, SDF or USD: the link that carries the tool")
     base: str | None = setting(
         None,
-        "for such a file: the link that is the ground; what is neither between base and "
-        "platform nor in a loop with that is left out; default: the root, nothing left out",
+        "the link that is the ground of such a file; only parts between base and platform, and loops "
+        "with them, are kept; default: the root",
     )
-    actuated: tuple[str, ...] = setting(
-        (), "for such a file: joints with motors, NAME,NAME,...; default: as the file marks them"
-    )
+    actuated: tuple[str, ...] = setting((), "joints of such a file that have motors, NAME,NAME,...; default: as marked")
     pose_names: tuple[str, ...] = setting(
         (),
-        "names of the pose coordinates, of x y z roll pitch yaw; default: see `pkm-twin info`",
+        "pose coordinates, of x y z roll pitch yaw; default: see `info`",
         name="pose",
         metavar="NAMES",
     )
-    carry: bool = setting(False, "with --base: parts beyond the platform are its payload, fixed as drawn")
+    carry: bool = setting(False, "with --base: parts beyond the platform are its payload")
 
     @property
     def part(self) -> dict[str, Any]:
@@ -86,8 +84,8 @@ class Carries(OfRobot):
 
     payload: str | None = setting(
         None,
-        "payload on the platform: MASS[,x,y,z], kg, m from the platform's reference point; "
-        "default: the recording's if it has one, else the robot file's",
+        "payload: MASS[,x,y,z], kg, m from the platform's reference point; default: the recording's, "
+        "else the robot file's",
     )
 
     @property
@@ -117,7 +115,7 @@ class CarriesAtTimes(Carries):
 
     load_times: str | None = setting(
         None,
-        "intervals in which --payload is held: FROM,TO[,FROM,TO...], s from the start; default: always",
+        "times at which --payload is held: FROM,TO[,FROM,TO...], s; default: always",
     )
 
     def machine(self) -> Robot:
@@ -129,20 +127,19 @@ class CarriesAtTimes(Carries):
 class ReadsTables:
     """How tables are written."""
 
-    separator: str | None = setting(None, "separator of a table's columns: , ; or tab; default: detected")
-    decimal: str | None = setting(None, "decimal mark of a table's numbers: . or ,; default: detected")
+    separator: str | None = setting(None, "column separator: , ; or tab; default: detected")
+    decimal: str | None = setting(None, "decimal mark: . or ,; default: detected")
     columns: tuple[str, ...] = setting(
         (),
-        "names of a table's columns, OURS=THEIRS,...: 'leg_*.position=motor_*, x=pos_x [mm]'; * in "
-        "both stands for the same text; may be repeated",
+        "column names, OURS=THEIRS,...: 'leg_*.position=motor_*, x=pos_x [mm]'",
     )
     units: str | None = setting(
         None,
-        "units of columns whose header has none: rad, mrad, deg, rev, m, cm, mm, um, s, "
-        "ms, us, ns, percent (of rated torque, with --side motor); default SI",
+        "units of columns whose header has none: rad, mrad, deg, rev, m, cm, mm, um, s, ms, us, ns, "
+        "percent (of rated torque); default: SI",
         older=("--unit",),
     )
-    time: str | None = setting(None, "name of a table's column of times")
+    time: str | None = setting(None, "name of the time column")
 
     @property
     def dialect(self) -> Dialect:
@@ -159,20 +156,17 @@ class ReadsTables:
 class ReadsRecordings(ReadsTables):
     """Which topics of a recording are read, and how its tables are written."""
 
-    topic: tuple[str, ...] = setting(
-        (), "topic of joint states or wrenches; default: detected by the robot's joint names"
-    )
+    topic: tuple[str, ...] = setting((), "topic of joint states or wrenches; default: by joint names")
     side: str = setting(
         "joint",
-        "whose values a table's joints have: the joint's, the controller's (joint_map) or the motor's (drive)",
+        "whose values a table has: the joint's, controller's (joint_map) or motor's (drive)",
         choices=("joint", "controller", "motor"),
     )
     wrench_frame: str | None = setting(
         None,
-        "frame of a bag's wrenches, if it turns with the platform; default: platform or "
-        "--base-frame, as in the first wrench",
+        "frame of wrenches that turns with the platform; default: platform or --base-frame, as in the first wrench",
     )
-    base_frame: str = setting("base_link", "frame of a bag's wrenches with base axes")
+    base_frame: str = setting("base_link", "frame of wrenches with base axes")
 
     def read(
         self,
@@ -204,8 +198,7 @@ class ReadsMotions(ReadsRecordings):
 
     follow: str | None = setting(
         None,
-        "columns of a table that give the motion: joints, or pose (planned again for this robot); "
-        "default: both, which must agree",
+        "the table's motion: joints, or pose (planned again for this robot); default: both, which must agree",
         choices=("joints", "pose"),
     )
 
@@ -225,7 +218,7 @@ class ReadsMotions(ReadsRecordings):
 class BeyondLimitsToo:
     """Work outside the joint limits."""
 
-    beyond_limits: bool = setting(False, "also compute outside the joint limits, and mark these results")
+    beyond_limits: bool = setting(False, "also compute outside the joint limits, marked")
 
     def admitted(self, machine: Robot, q: Array, qd: Array | None = None, where: str = "") -> list[Beyond]:
         """Describe what joint states (..., n) have beyond the joint limits.
@@ -267,13 +260,13 @@ class OfTool:
 
     tool: tuple[float, ...] = setting(
         (0.0, 0.0, 0.0),
-        "tool point from the platform's reference point, platform axes, m",
+        "tool point from the reference point, platform axes, m",
         count=3,
         metavar="x,y,z",
     )
     damping: tuple[float, ...] | None = setting(
         None,
-        "damping ratio of each mode from the lowest on; the last one holds for all others; default: the robot file's",
+        "damping ratios of modes from the lowest; the last holds for all others; default: the robot file's",
         count=0,
     )
 
@@ -287,7 +280,7 @@ class OfMilling:
     radial: float = setting(..., "ratio of radial to tangential cutting force, Kr")
     immersion: float = setting(1.0, "radial depth of cut over tool diameter, 1 is a slot")
     up: bool = setting(False, "up-milling instead of down-milling")
-    feed: float = setting(0.0, "direction of the feed in the platform's xy plane, degrees from x towards y")
+    feed: float = setting(0.0, "direction of the feed, degrees from x towards y")
 
     @property
     def milling(self) -> Milling:
@@ -311,7 +304,7 @@ class OfMilling:
 class Accepts:
     """Data that the machine cannot have produced."""
 
-    accept: bool = setting(False, "also use a recording that contradicts the machine, and mark the results")
+    accept: bool = setting(False, "also use a recording that contradicts the machine, marked")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -334,7 +327,7 @@ class Draws(Overwrites):
 
     picture: str | None = setting(
         None,
-        "draw the result: .png, .svg or .pdf, or - for a PNG to stdout; default: next to --out",
+        "picture to draw: .png, .svg or .pdf, - for stdout; default: next to --out",
         metavar="[FILE]",
         alone=BESIDE,
     )

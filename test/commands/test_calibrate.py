@@ -161,5 +161,5 @@ def test_numbers_that_are_no_poses_of_this_machine(
     path, out = tmp_path / "poses.csv", tmp_path / "mine.yaml"
     write_columns(path, columns)
     with pytest.raises(PkmTwinError, match=re.escape(text)):
-        command(Calibrate(robot="upr_rpu", poses=path, out=out, frame=frame))
+        command.run(Calibrate(robot="upr_rpu", poses=path, out=out, frame=frame))
     assert not out.exists()

@@ -24,7 +24,7 @@ py-modules = ["my_tools"]
 BROKEN = """
 absent = "my_tools:ABSENT"
 number = "my_tools:setting"
-info = "my_tools:HEIGHT"
+info = "my_tools:height"
 """
 """Commands: two that cannot be loaded, and one that has the name of another."""
 

@@ -136,7 +136,7 @@ def test_excite_says_what_to_change_where_a_fit_would_know_little(tmp_path, tria
     """Ten slow tries in a second are no excitation; sixty in ten seconds are."""
     short = {"duration": 1.0, "harmonics": 3, "acceleration": 0.1} if trials == 10 else {}
     out = tmp_path / "excite.mcap"
-    report = excite(Excite(robot="five_bar", what="friction", trials=trials, out=out, **short))
+    report = excite.run(Excite(robot="five_bar", what="friction", trials=trials, out=out, **short))
     assert bool(report.notes) == (report.data["condition"] > LARGE) == bool(short)
 
 

@@ -52,7 +52,7 @@ def weigh(given: Weigh) -> Report:
 @pytest.fixture
 def run(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    made = command(weigh, "Robots")
+    made = command("Robots")(weigh)
 
     def call(*words):
         SEEN.clear()
@@ -144,15 +144,15 @@ def test_targets_are_checked_before_the_work(run, tmp_path):
 
 
 def test_a_table_on_stdout_has_its_report_on_stderr(capfd):
-    made = command(weigh, "Robots")
+    made = command("Robots")(weigh)
     made.main(["cart", "--out", "-", "--json"], prog_name="weigh", standalone_mode=False)
     out, err = capfd.readouterr()
     assert (out, json.loads(err)["mass"]) == ("", 2.0)
 
 
 def test_another_command_of_a_group_is_wrong_usage():
-    both = {"weigh": command(weigh), "tare": command(weigh)}
-    made = Group("Scales.", both)
+    both = {"weigh": command()(weigh), "tare": command()(weigh)}
+    made = Group("scales", "Scales.", both)
     with pytest.raises(click.UsageError, match="'weight'; did you mean 'weigh'"):
         made.main(["weight"], standalone_mode=False)
 
@@ -169,7 +169,7 @@ def test_what_is_so_without_a_word_may_be_said(run, word, without):
 
 
 def test_a_picture_goes_to_stdout_and_the_report_to_stderr(capsysbinary):
-    made = command(weigh, "Robots")
+    made = command("Robots")(weigh)
     made.main(["cart", "--picture", "-", "--json"], prog_name="weigh", standalone_mode=False)
     out, err = capsysbinary.readouterr()
     assert out[:4] == b"\x89PNG"

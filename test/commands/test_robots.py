@@ -41,7 +41,7 @@ class TestInfo:
         assert np.allclose(robot.inverse(pose), list(data["home_joints"].values()))
 
     def test_every_parameter_is_shown_with_its_unit(self, twin, name):
-        report = info(Info(robot=name))
+        report = info.run(Info(robot=name))
         assert twin("info", name).out == text_of(report) + "\n"
         assert "-0.0000" not in text_of(report)
         rows = {fact.text: fact.words for fact in report.facts if fact.text}
@@ -67,7 +67,7 @@ class TestInfo:
 @every_robot
 def test_closures_that_are_redundant_make_a_machine_overconstrained(name):
     """Or it is told which joint of the model repeats what the limbs hold."""
-    report = info(Info(robot=name))
+    report = info.run(Info(robot=name))
     data, shown = report.data, {fact.text: fact.words for fact in report.facts}
     redundant, open_reactions = data["redundant_closures"], data["overconstrained"]
     repeats = f"joint {'+'.join(data['assumed_joints'])} repeats"

@@ -95,7 +95,7 @@ def test_changes_beyond_their_prior_are_rejected_or_marked(tmp_path: Path) -> No
     rows = np.hstack([there.joints, there.position])
     write_columns(table, dict(zip(names, rows.T, strict=True)))
     given = Calibrate(robot="delta_cu", poses=table, out=out, only=only, no_offsets=True, accept=True)
-    (reason,) = command(given).data["accepted"]
+    (reason,) = command.run(given).data["accepted"]
     assert "geometry.forearm_length" in reason
     assert "accepted anyway" in out.read_text()
 

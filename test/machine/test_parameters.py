@@ -178,7 +178,7 @@ def test_what_an_edited_file_loses_of_its_expressions_is_told(tmp_path):
     seen = np.hstack([q, robot_with(arm=0.203).platform(q)[0]])
     np.savetxt(poses, seen, "%.17g", ",", header=",".join(names), comments="")
     given = Calibrate(robot=str(path), poses=poses, out=tmp_path / "mine.yaml", only=("parameters",))
-    found = calibrate(given).data["parameters"]
+    found = calibrate.run(given).data["parameters"]
     assert found["parameters.arm"]["value"] == pytest.approx(0.203, abs=1e-5)
     assert all(name.startswith("parameters.") for name in found)
     assert load(tmp_path / "mine.yaml").book.formulas.keys() == robot.book.formulas.keys()

@@ -150,14 +150,21 @@ def section(name: str, command: Any, inner: dict[str, Any], own: Sequence[Word],
         often = [word for word in within if within.count(word) > len(inner) / 2]
         lines += [first(command.help), "", *map(str, own), *([""] if own else [])]
         lines += groups.named(often)
+    plain = []
     for words, one in inner.items():
         every = words_of(one)
+        told = [word for word in every if word not in own and word not in groups.shared]
+        names = groups.named([word for word in every if alone or word not in often])
+        if not (alone or told or names):
+            plain.append(f"`{words.split()[-1]}`")
+            continue
         typed = words if alone else f"{name} {command.show(words.split()[-1])}"
         usage = " ".join(w.name for w in every if w.argument and w.name not in typed.split())
         lines += [f"`{f'pkm-twin {typed} {usage}'.rstrip()}`: {first(one.help)}", ""]
-        told = [word for word in every if word not in own and word not in groups.shared]
         lines += [*map(str, told), ""] if told else []
-        lines += groups.named([word for word in every if alone or word not in often])
+        lines += names
+    if plain:
+        lines += [f"Without options of their own: {', '.join(plain)}.", ""]
     return lines
 
 

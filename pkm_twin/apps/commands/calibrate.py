@@ -41,8 +41,6 @@ WIDTH: Final = 100
 """Columns of a line of text."""
 MOST_SHOWN: Final = 10
 """Outliers that are printed."""
-STEPS_SHOWN: Final = (0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
-"""Measurements of a plan after which its deviations are printed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,7 +63,7 @@ class Calibrate(OfRobot, ReadsTables, BeyondLimitsToo, Accepts, Overwrites):
 
     poses: Path | None = setting(
         None,
-        "CSV: JOINT.position columns, x y z (m), perhaps roll pitch yaw (rad) or qx qy qz qw; or what --measure names",
+        "CSV of JOINT.position, x y z (m), perhaps roll pitch yaw (rad) or qx qy qz qw; or as --measure names",
         argument=True,
     )
     out: Path | None = setting(
@@ -74,28 +72,26 @@ class Calibrate(OfRobot, ReadsTables, BeyondLimitsToo, Accepts, Overwrites):
         writes=True,
         endings=(".yaml", ".yml"),
     )
-    only: tuple[str, ...] = setting(
-        (), "fit only numbers whose path begins with this, joint offsets too; may be repeated"
-    )
+    only: tuple[str, ...] = setting((), "fit only numbers whose path begins so; may be repeated")
     no_offsets: bool = setting(False, "do not fit joint offsets")
-    frame: bool = setting(False, "fit where the instrument stands: its six numbers")
-    target: bool = setting(False, "fit where the target is on the platform: three numbers")
+    frame: bool = setting(False, "also fit the instrument's pose")
+    target: bool = setting(False, "also fit the target's position on the platform")
     prior: float = setting(0.01, "standard deviation of lengths before the fit, m", low=1e-6, high=1.0)
     transmission: Transmission = setting(
         Transmission.AUTO,
-        "ratios of joint_map to fit: each by itself; shared: one factor for all; travel: each, and "
-        "its change over travel; file: none; auto: each of a sliding joint that is not 1",
+        "ratios of joint_map to fit: each; shared: one factor; travel: each and its change over "
+        "travel; file: none; auto: those of sliding joints that are not 1",
         choices={str(how): how for how in Transmission},
     )
     measure: tuple[str, ...] = setting(
         (),
-        "what was measured, if not whole poses: height, distance, radius, range, plane, tilt, "
-        "or of x, y, z, roll, pitch, yaw; separated by commas",
+        "what was measured, if not poses: height, distance, radius, range, plane, tilt, or some of "
+        "x, y, z, roll, pitch, yaw",
     )
     noise: tuple[str, ...] = setting((), "KIND=VALUE: known standard deviation of a measurement, m or rad")
     plan: Path | None = setting(
         None,
-        "write the poses to measure next, a CSV, and predict how well the machine will be known; calibrate nothing",
+        "only write the poses to measure next, a CSV, with predicted accuracy",
         writes=True,
         endings=(".csv",),
     )
@@ -134,6 +130,7 @@ class Calibrate(OfRobot, ReadsTables, BeyondLimitsToo, Accepts, Overwrites):
         }
 
 
+@command("Identification and calibration")
 def calibrate(given: Calibrate) -> Report:
     """Calibrate a robot's numbers, or plan the poses to measure.
 
@@ -303,7 +300,6 @@ def report_of(
 
 
 def _open(result: Estimate) -> list[str]:
-    """Describe what the measurements do not determine, a line each."""
     lines = [fill(line, WIDTH, initial_indent="  ", subsequent_indent="    ") for line in result.undetermined]
     told = "the poses do not determine these changes, and the calibration makes none of them; a "
     return [f"{told}number in one may still change with others:", *lines] if lines else []
@@ -333,7 +329,10 @@ def planned(robot: Robot, plan: Plan, accuracy: float | None, out: Path) -> Repo
         plan.angle.tolist(),
         *(v.tolist() for v in plan.quantity.values()),
     ]
-    rows = {str(k): [values[k] for values in each] for k in sorted({*(k for k in STEPS_SHOWN if k < last), last})}
+    rows = {
+        str(k): [values[k] for values in each]
+        for k in sorted({*(k for k in (0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128) if k < last), last})
+    }
     title = "predicted standard deviations over the workspace, by number of measurements"
     names = [Column(n) for n in ("unit", "prior", "standard_deviation", "observed")]
     return Report(
@@ -357,6 +356,3 @@ def planned(robot: Robot, plan: Plan, accuracy: float | None, out: Path) -> Repo
         notes=["* apart from a rigid motion of the whole workspace", *_open(plan.known)],
         files={"out": out},
     )
-
-
-COMMAND = command(calibrate, "Identification and calibration")

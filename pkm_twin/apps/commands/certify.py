@@ -42,9 +42,10 @@ class Certify(OfRobot, Seeded):
     states: int = setting(20, "number of random states", low=1, high=100000)
     seed: int = setting(1, "seed of the random states", low=0, high=2**63 - 1)
     engine: tuple[str, ...] = setting((), "use only this engine: maximal, pinocchio or mujoco")
-    variants: int = setting(0, "also check this many machines with other lengths and masses", low=0, high=10000)
+    variants: int = setting(0, "also check this many randomly changed machines", low=0, high=10000)
 
 
+@command("Robots")
 def certify(given: Certify) -> Report:
     """Compare the model with each independent engine, against the bounds."""
     from pkm_twin.certify.certificate import ENGINES, certify_variants
@@ -100,8 +101,5 @@ def certify(given: Certify) -> Report:
 
 
 def _share(item: Item) -> float:
-    """Of its bound, of which nothing may be left where it is 0."""
+    """Return the worst difference over its bound; a bound of 0 allows none."""
     return item.worst / item.bound if item.bound else math.inf if item.worst else 0.0
-
-
-COMMAND = command(certify, "Robots")

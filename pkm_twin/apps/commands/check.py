@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 import multiprocessing
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -49,18 +50,19 @@ class Check(CarriesAtTimes, ReadsRecordings):
     )
     residual: float = setting(
         0.05,
-        "largest RMS torque residual that is good, as a fraction of the peak: 0.05 is 5 %",
+        "largest good RMS residual of the efforts, as a fraction of the peak",
         low=0.0,
         high=1.0,
     )
     history: Path | None = setting(
         None,
-        "also append residual, friction, payload and stiffness to this file, for `pkm-twin trend`",
+        "also append the results to this file, for `pkm-twin trend`",
     )
     machine_name: str | None = setting(None, "name in the history; default: the robot's", name="machine")
     jobs: int = setting(1, "processes for a folder of bags", low=1, high=10**4)
 
 
+@command("Recordings")
 def check(given: Check) -> Report:
     """Judge a recording, or all of a folder."""
     from pkm_twin.bags.reader import DamagedBagError
@@ -135,22 +137,11 @@ def check_one(given: Check, path: Path, update: Any = None, thorough: bool = Tru
 
 
 def _check_safely(given: Check, path: Path) -> dict[str, Any]:
-    """One recording of many, as plain data; a damaged one too."""
+    """Judge a recording of a folder, as plain data; a damaged one is no error."""
     try:
         return check_one(given, path, thorough=False).data
     except (PkmTwinError, OSError) as error:
         return {"bag": str(path), "good": False, "error": one_line(str(error))}
-
-
-def _check_all(given: Check, paths: Sequence[Path]) -> Iterator[dict[str, Any]]:
-    """Verdicts in the order of the recordings, as they come, on so many processes."""
-    each, jobs = partial(_check_safely, given), min(given.jobs, len(paths))
-    if jobs == 1:
-        yield from map(each, paths)
-        return
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(jobs, mp_context=context) as pool:
-        yield from pool.map(each, paths)
 
 
 def _check_folder(given: Check) -> Report:
@@ -158,8 +149,13 @@ def _check_folder(given: Check) -> Report:
     from pkm_twin.recordings.bags import bags_of
 
     paths, results = bags_of(given.bag), list[dict[str, Any]]()
-    with progress("checking", len(paths)) as update:
-        for result in _check_all(given, paths):
+    each, jobs = partial(_check_safely, given), min(given.jobs, len(paths))
+    with progress("checking", len(paths)) as update, ExitStack() as stack:
+        run: Callable[..., Iterable[dict[str, Any]]] = map
+        if jobs > 1:
+            pool = ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn"))
+            run = stack.enter_context(pool).map
+        for result in run(each, paths):
             results.append(result)
             update(len(results))
     notes = []
@@ -183,6 +179,3 @@ def _check_folder(given: Check) -> Report:
         verdict=Verdict.BAD if count > unjudged else Verdict.UNKNOWN if count else Verdict.GOOD,
         code=NOT_JUDGED if count and count == unjudged else 0,
     )
-
-
-COMMAND = command(check, "Recordings")

@@ -14,7 +14,6 @@ from pkm_twin.report import Column, Fact, Report, Table
 from pkm_twin.settings import setting
 
 AXES = ("x", "y", "z", "rx", "ry", "rz")
-LOADS = ("fx", "fy", "fz", "mx", "my", "mz")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -28,16 +27,15 @@ class Compliance(OfRobot, BeyondLimitsToo):
     joint). Stiffen the dominant element first: it stores the largest share.
     """
 
-    pose: tuple[float, ...] = setting(
-        ..., "the pose's coordinates, for upr_rpu z (m), beta, gamma (rad)", argument=True
-    )
+    pose: tuple[float, ...] = setting(..., "the pose's coordinates, m and rad", argument=True)
     wrench: tuple[float, ...] = setting(
         (0.0, 0.0, 1.0, 0.0, 0.0, 0.0),
-        "load case, fx,fy,fz,mx,my,mz at the platform's reference point, N and N m, base axes",
+        "load fx,fy,fz,mx,my,mz at the reference point, N and N m, base axes",
         count=6,
     )
 
 
+@command("Stiffness, workspace and vibration")
 def compliance(given: Compliance) -> Report:
     """Compute the platform's compliance, deflection and shares of strain energy.
 
@@ -103,7 +101,7 @@ def compliance(given: Compliance) -> Report:
     # What is zero by symmetry is printed so, not as rounding.
     cells = np.where(abs(c) < 1e-9 * np.outer(size, size), 0.0, c)
     rows = {axis: row.tolist() for axis, row in zip(AXES, cells, strict=True)}
-    columns = [Column("", text=name, form=".3e") for name in LOADS]
+    columns = [Column("", text=name, form=".3e") for name in ("fx", "fy", "fz", "mx", "my", "mz")]
     title = "compliance at the platform's reference point, base axes: m and rad, per N and N m"
     return Report(
         answer=f"{machine.name}: {dominant} under the wrench {load} (N, N m)",
@@ -116,6 +114,3 @@ def compliance(given: Compliance) -> Report:
 def _format_micro(values: object, form: str) -> str:
     pairs = zip(AXES, values, strict=True)  # type: ignore[call-overload]
     return ", ".join(f"{name} {1e6 * value:{form}}" for name, value in pairs)
-
-
-COMMAND = command(compliance, "Stiffness, workspace and vibration")

@@ -16,9 +16,6 @@ from pkm_twin.report import Fact, Report
 from pkm_twin.robot.printers import Firmware, read_printer
 from pkm_twin.settings import setting
 
-ROBOTS = (".yaml", ".yml", ".xacro", *TREES)
-MAX_BYTES = 64 * 1024**2
-
 
 @dataclass(frozen=True, kw_only=True)
 class Convert(OfPlatform, Writes):
@@ -40,15 +37,16 @@ class Convert(OfPlatform, Writes):
         argument=True,
     )
     out: Path | None = setting(None, "the robot file; default: print, of a printer printer.yaml", writes=True)
-    data: Path | None = setting(None, "of a printer: the measurements, a CSV; default: probes.csv", writes=True)
+    data: Path | None = setting(None, "a printer's measurements, a CSV; default: probes.csv", writes=True)
     firmware: Firmware | None = setting(
         None,
-        "of a printer; default: by what the files contain",
+        "of a printer; default: detected",
         choices={one.value: one for one in Firmware},
     )
     probe_radius: float | None = setting(None, "of G33's points, mm; default: B of M665", low=1.0)
 
 
+@command("Robots")
 def convert(given: Convert) -> Report:
     """Write the YAML of a robot, or of a printer with its measurements.
 
@@ -56,8 +54,32 @@ def convert(given: Convert) -> Report:
     """
     first = given.source[0]
     ending = Path(first).suffix
-    if len(given.source) > 1 or (ending not in ROBOTS if ending else Path(first).is_file()):
-        return _convert_printer(given)
+    if len(given.source) > 1 or (
+        ending not in (".yaml", ".yml", ".xacro", *TREES) if ending else Path(first).is_file()
+    ):
+        # Write a printer's geometry and probings.
+        out, data = given.out or Path("printer.yaml"), given.data or Path("probes.csv")
+        for target in (out, data):
+            refuse_existing(target, given.overwrite)
+        paths = [Path(name) for name in given.source]
+        texts = []
+        for path in paths:
+            try:
+                with open_regular(path) as file:
+                    texts.append(file.read(64 * 1024**2).decode("utf-8-sig", "replace"))
+            except OSError as error:
+                raise FileError(path, error, "a text file") from None
+        found = read_printer("\n".join(texts), given.firmware, given.probe_radius)
+        replace_file(out, found.yaml(f"A printer's geometry, read from {one_line(paths[0].name, 100)}").encode())
+        replace_file(data, found.table().encode())
+        counts = {"height": len(found.heights), "distance": len(found.distances)}
+        kinds = [name for name, count in counts.items() if count]
+        return Report(
+            f"linear Delta, radius {found.radius:g} mm, {counts['height']} heights, {counts['distance']} distances",
+            [Fact("radius", found.radius * 1e-3, "m"), Fact("counts", counts)],
+            notes=[f"next: pkm-twin calibrate {out} {data} --measure {','.join(kinds)}"],
+            files={"out": out, "data": data},
+        )
     if not ending and first not in robot_names():
         raise UnknownNameError("SOURCE", first, [*robot_names(), "a robot's or a printer's file"])
     from pkm_twin.machine.machine_yaml import describe_machine_yaml
@@ -79,32 +101,3 @@ def convert(given: Convert) -> Report:
         return Report(facts=[Fact("yaml", text)], raw=text, notes=notes)
     replace_file(given.out, text.encode())
     return Report(files={"out": given.out}, notes=notes)
-
-
-def _convert_printer(given: Convert) -> Report:
-    """Write a printer's geometry and probings."""
-    out, data = given.out or Path("printer.yaml"), given.data or Path("probes.csv")
-    for target in (out, data):
-        refuse_existing(target, given.overwrite)
-    paths = [Path(name) for name in given.source]
-    texts = []
-    for path in paths:
-        try:
-            with open_regular(path) as file:
-                texts.append(file.read(MAX_BYTES).decode("utf-8-sig", "replace"))
-        except OSError as error:
-            raise FileError(path, error, "a text file") from None
-    found = read_printer("\n".join(texts), given.firmware, given.probe_radius)
-    replace_file(out, found.yaml(f"A printer's geometry, read from {one_line(paths[0].name, 100)}").encode())
-    replace_file(data, found.table().encode())
-    counts = {"height": len(found.heights), "distance": len(found.distances)}
-    kinds = [name for name, count in counts.items() if count]
-    return Report(
-        f"linear Delta, radius {found.radius:g} mm, {counts['height']} heights, {counts['distance']} distances",
-        [Fact("radius", found.radius * 1e-3, "m"), Fact("counts", counts)],
-        notes=[f"next: pkm-twin calibrate {out} {data} --measure {','.join(kinds)}"],
-        files={"out": out, "data": data},
-    )
-
-
-COMMAND = command(convert, "Robots")

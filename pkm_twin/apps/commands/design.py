@@ -21,14 +21,10 @@ from pkm_twin.settings import setting
 
 if TYPE_CHECKING:
     from pkm_twin.design import Design as Found
-    from pkm_twin.design import DesignPoint, PosePath
+    from pkm_twin.design import PosePath
     from pkm_twin.robot.robot import Robot
 
 SWEEPS: Final = ("grid", "sobol")
-FILE_DIGITS: Final = 12
-"""Significant digits of a number that is written."""
-STATES: Final = 2000
-"""Joint states that stand for the workspace."""
 OF_FILE: Final = "file"
 """In place of a tolerance: those of the robot's file."""
 Box = Mapping[str, tuple[float, float]]
@@ -56,8 +52,8 @@ class Design(Carries, ReadsMotions, Writes, Draws, Seeded):
 
     vary: tuple[str, ...] = setting(
         (),
-        "KEY=LOW:HIGH: a value of the robot's file and its bounds, e.g. "
-        "geometry.arm_length=0.15:0.3; KEY,KEY,-KEY=LOW:HIGH changes several by the same amount",
+        "KEY=LOW:HIGH: bounds of a value, e.g. geometry.arm_length=0.15:0.3; KEY,KEY,-KEY=LOW:HIGH "
+        "changes several by the same amount",
     )
     path: Path | None = setting(None, "motion of the robot: CSV or MCAP of `pkm-twin path`, or a recording")
     minimise: tuple[str, ...] = setting(
@@ -67,26 +63,24 @@ class Design(Carries, ReadsMotions, Writes, Draws, Seeded):
     subject_to: tuple[str, ...] = setting((), "bound on a quantity, e.g. 'singularity>=0.1' or 'peak-effort<=20'")
     tolerance: tuple[str, ...] = setting(
         (),
-        "KEY=SIGMA, standard deviation of a part's error, or KEY=+-BOUND, e.g. "
-        "rods.*.length=2e-5; file: those of the robot's file; prints the pose error budget",
+        "print the pose error budget: KEY=SIGMA or KEY=+-BOUND, e.g. rods.*.length=2e-5; file: the robot file's",
     )
-    monte_carlo: int = setting(0, "with --tolerance: number of random machines to assemble exactly, too", low=0)
+    monte_carlo: int = setting(0, "with --tolerance: also assemble this many random machines", low=0)
     sweep: str | None = setting(None, "grid or sobol: compute machines within the bounds into --out FILE.nc")
-    samples: int = setting(20, "machines of a sweep: per axis of a grid, or in total with sobol", low=1)
+    samples: int = setting(20, "machines of a sweep: per axis of a grid, or in total", low=1)
     scheduler: str | None = setting(None, "with --sweep: address of a Dask scheduler, tcp://HOST:8786")
     wrench: tuple[float, ...] | None = setting(
         None,
-        "force and moment on the platform, N and N m, base axes; added to the path's",
+        "wrench on the platform, N and N m, base axes; added to the path's",
         count=6,
         metavar="fx,fy,fz,mx,my,mz",
     )
     starts: int = setting(64, "machines to try first; the best are optimised", low=1)
     points: int = setting(9, "points of a Pareto front", low=3)
-    out: Path | None = setting(
-        None, "FILE.yaml: the robot's file with the new values; for a sweep FILE.nc", writes=True
-    )
+    out: Path | None = setting(None, "the robot's file with the new values, .yaml; of a sweep .nc", writes=True)
 
 
+@command("Design and export")
 def design(given: Design) -> Report:
     """Optimise a machine, sweep its numbers, or compute its budget of pose errors.
 
@@ -212,7 +206,10 @@ def optimised(given: Design, path: Path) -> Report:
             Fact("subject_to", [str(bound) for bound in found.constraints]),
             Fact("numbers", dict(best.numbers)),
             Fact("before_feasible", before.feasible),
-            Fact("front", [_describe_point(point) for point in found.front]),
+            Fact(
+                "front",
+                [{"variables": dict(point.variables), "quantities": dict(point.quantities)} for point in found.front],
+            ),
             Fact("machines", found.machines),
             Fact("rejected_starts", found.rejected),
             Fact("beyond_position_limits", limits),
@@ -253,18 +250,14 @@ def against_limits(found: Found, path: PosePath) -> Iterator[Fact]:
 
 
 def at_bound(value: float, bound: tuple[float, float]) -> str:
-    """Whether a value is at a bound, in words."""
+    """Describe the bound that a value is at; empty if it is at none."""
     near = 1e-6 * (bound[1] - bound[0])
     low, high = abs(value - bound[0]) < near, abs(value - bound[1]) < near
     return "at its lower bound" if low else "at its upper bound" if high else ""
 
 
-def _describe_point(point: DesignPoint) -> dict[str, Any]:
-    return {"variables": dict(point.variables), "quantities": dict(point.quantities)}
-
-
 def write_robot(robot: Robot, source: str, found: Found, path: Path, out: Path) -> list[str]:
-    """Write the robot's file with the new numbers; what it loses of expressions, in lines.
+    """Write the robot's file with the new numbers; return the lost expressions, a line each.
 
     :raises PkmTwinError: not writable.
     """
@@ -273,7 +266,7 @@ def write_robot(robot: Robot, source: str, found: Found, path: Path, out: Path) 
     kept = "".join(f", {bound}" for bound in found.constraints)
     values = {
         name: Chosen(
-            float(f"{value:.{FILE_DIGITS}g}"),
+            float(f"{value:.12g}"),
             f"was {' = '.join([*([text] if text else []), f'{robot.number(name):.6g}'])}",
         )
         for name, value in found.best.numbers.items()
@@ -323,7 +316,7 @@ def draw(robot: Robot, found: Found, path: PosePath, answer: str) -> Any:
 
 
 def swept(given: Design, path: Path, kind: str) -> Report:
-    """All quantities of machines within bounds, as NetCDF.
+    """Compute all quantities of machines within bounds, as NetCDF.
 
     :raises MissingExtraError: h5netcdf or xarray is not installed.
     """
@@ -386,7 +379,7 @@ def budget(given: Design) -> Report:
             raise ParameterError("tolerances", None, "a section tolerances in the robot file")
         sigma = {**robot.tolerances, **sigma}
     if given.path is None:
-        q = workspace_states(robot, STATES, given.seed)
+        q = workspace_states(robot, 2000, given.seed)
     else:
         q, where = (
             robot.inverse(read_path(given, given.path, efforts=False)[1].pose),
@@ -487,6 +480,3 @@ def _place(robot: Robot, pose: Any) -> str:
 
 def _report_length(name: str, value: float, text: str | None = None, more: str = "") -> Fact:
     return Fact(name, value, "m", text, f"{1e3 * value:.4g} mm{more}")
-
-
-COMMAND = command(design, "Design and export")

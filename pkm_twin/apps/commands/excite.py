@@ -17,7 +17,6 @@ from pkm_twin.report import Fact, Report
 from pkm_twin.settings import setting
 
 if TYPE_CHECKING:
-    from pkm_twin.identification.excitation import Judge
     from pkm_twin.robot.robot import Robot
 
 LARGE: Final = 1e3
@@ -40,7 +39,7 @@ class Excite(OfRobot, AwayFromSingular, Seeded, Writes):
 
     what: str = setting(
         "friction,rotor,payload,inertia",
-        "what the fit identifies: friction,rotor,payload,inertia or some",
+        "what the fit identifies: some of friction,rotor,payload,inertia",
     )
     out: Path = setting(
         Path("excite.mcap"),
@@ -68,6 +67,7 @@ class Excite(OfRobot, AwayFromSingular, Seeded, Writes):
         return {"out": self.out, "table": self.out.with_suffix(".csv")}
 
 
+@command("Identification and calibration")
 def excite(given: Excite) -> Report:
     """Plan an exciting trajectory; compare its condition number with that of a bag.
 
@@ -76,12 +76,21 @@ def excite(given: Excite) -> Report:
     from pkm_twin.identification.excitation import Bounds, Judge, sweeps
     from pkm_twin.identification.excitation import excite as design
     from pkm_twin.identification.parameters import file_parameters, kinds_of
-    from pkm_twin.recordings import Recording
+    from pkm_twin.identification.samples import tracks
+    from pkm_twin.recordings import Recording, read
     from pkm_twin.recordings.bags import write_motion
 
     machine = given.machine()
     judge = Judge.of(machine, file_parameters(machine, kinds_of(given.what)))
-    other = None if given.compare is None else _find_condition(given.compare, judge)
+    other = None
+    if given.compare is not None:
+        recorded = read(given.compare, machine)
+        pieces, _ = tracks(recorded.time, recorded.q, np.zeros_like(recorded.q))
+        if not pieces:
+            raise BagError("too few joint states in a row", path=given.compare, reason="too short")
+        parts = [np.concatenate([getattr(p, k) for p in pieces]) for k in ("q", "qd", "qdd")]
+        step = max(1, len(parts[0]) // 2000)
+        other = judge.condition(*(part[::step] for part in parts))
     bounds = Bounds(given.share, given.acceleration, given.singularity, given.rate)
     best: Any
     if given.friction:
@@ -139,24 +148,7 @@ def excite(given: Excite) -> Report:
 
 
 def _span(machine: Robot, speeds: Any) -> str:
-    """Lowest to highest speed (n, speeds) of joints that turn, and of those that slide."""
+    """Write the range of the speeds (n, speeds) of joints that turn, and of those that slide."""
     units = np.array(machine.joint_units)
     rows = {unit: speeds[units == unit] for unit in machine.joint_units}
     return " and ".join(f"{one.min():.2g} to {one.max():.2g} {u}/s" for u, one in rows.items())
-
-
-def _find_condition(path: Path, judge: Judge) -> float:
-    """Condition number of a recorded motion."""
-    from pkm_twin.identification.samples import tracks
-    from pkm_twin.recordings import read
-
-    r = read(path, judge.robot)
-    pieces, _ = tracks(r.time, r.q, np.zeros_like(r.q))
-    if not pieces:
-        raise BagError("too few joint states in a row", path=path, reason="too short")
-    parts = [np.concatenate([getattr(p, k) for p in pieces]) for k in ("q", "qd", "qdd")]
-    step = max(1, len(parts[0]) // 2000)
-    return judge.condition(*(part[::step] for part in parts))
-
-
-COMMAND = command(excite, "Identification and calibration")

@@ -79,6 +79,7 @@ class Moveit(ToFolder):
     )
 
 
+@command()
 def moveit(given: Moveit) -> Report:
     """Write a package for MoveIt."""
     from pkm_twin.export.moveit import moveit_package
@@ -96,6 +97,7 @@ class C(ToFolder):
     """
 
 
+@command()
 def c(given: C) -> Report:
     """Write a package in C."""
     from pkm_twin.export.c_package import c_package
@@ -115,6 +117,7 @@ class PythonFile(ToFile):
     array: str = setting("numpy", "array library", choices=("numpy", "jax", "torch"))
 
 
+@command()
 def python(given: PythonFile) -> Report:
     """Write a Python module."""
     from pkm_twin.export.python_file import python_file
@@ -131,9 +134,10 @@ class Ros2Control(ToFolder):
     package with colcon; it builds and runs without pkm_twin.
     """
 
-    bandwidth: float = setting(0.0, "bandwidth for gains from the masses at home; 0: no gains", metavar="HZ")
+    bandwidth: float = setting(0.0, "bandwidth of the gains; 0: no gains", metavar="HZ")
 
 
+@command()
 def ros2_control(given: Ros2Control) -> Report:
     """Write a package of controllers."""
     from pkm_twin.export.ros2_control import ros2_control_package
@@ -150,6 +154,7 @@ class Transmission(ToFolder):
     """
 
 
+@command()
 def transmission(given: Transmission) -> Report:
     """Write a package with a transmission of ros2_control."""
     from pkm_twin.export.transmission import transmission_package
@@ -167,11 +172,12 @@ class FunctionalMockupUnit(ToFile):
     fmi: int = setting(3, "FMI version", choices={"2": 2, "3": 3})
     kind: str = setting(
         "dynamics",
-        "dynamics: motion under efforts; torques: efforts of a motion",
+        "motion under efforts, or efforts of a motion",
         choices=("dynamics", "torques"),
     )
 
 
+@command()
 def fmu(given: FunctionalMockupUnit) -> Report:
     """Write an archive of sources, with a binary where a compiler is found."""
     from pkm_twin.export.fmu import Fmu, find_compiler
@@ -187,6 +193,7 @@ class Mjcf(ToFile):
     """Write an MJCF for MuJoCo: bodies, loops as constraints, motors, a keyframe at home."""
 
 
+@command()
 def mjcf(given: Mjcf) -> Report:
     """Write a model whose keyframe holds its weight."""
     from delta_dynamics import inverse_dynamics
@@ -203,6 +210,7 @@ class Sdf(ToFile):
     """Write an SDF model: links and all joints, also those that close the loops."""
 
 
+@command()
 def sdf(given: Sdf) -> Report:
     """Write a model for Gazebo."""
     from pkm_twin.robot.robot_urdf import robot_sdf
@@ -227,6 +235,7 @@ class Urdf(Printed):
     no_ros2_control: bool = setting(False, "write no ros2_control element")
 
 
+@command()
 def urdf(given: Urdf) -> Report:
     """Write a URDF.
 
@@ -253,24 +262,26 @@ class ToPrinter(Printed):
     firmware: Firmware = setting(..., "smoothieware cannot be written", choices={one.value: one for one in Firmware})
 
 
+@command()
 def printer(given: ToPrinter) -> Report:
     """Write a printer's configuration."""
     return given.write(written(printer_of(given.machine()), given.firmware))
 
 
 OWN: Final = {
-    "c": command(c),
-    "python": command(python),
-    "ros2-control": command(ros2_control),
-    "transmission": command(transmission),
-    "fmu": command(fmu),
-    "urdf": command(urdf),
-    "mjcf": command(mjcf),
-    "sdf": command(sdf),
-    "moveit": command(moveit),
-    "printer": command(printer),
+    "c": c,
+    "python": python,
+    "ros2-control": ros2_control,
+    "transmission": transmission,
+    "fmu": fmu,
+    "urdf": urdf,
+    "mjcf": mjcf,
+    "sdf": sdf,
+    "moveit": moveit,
+    "printer": printer,
 }
-COMMAND = Group(
+export = Group(
+    "export",
     "Export a robot to other software.",
     Extensible("pkm_twin.exports", click.Command, OWN, OWN.__getitem__),
     "Design and export",

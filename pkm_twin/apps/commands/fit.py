@@ -77,27 +77,25 @@ class Fit(CarriesAtTimes, ReadsRecordings, BeyondLimitsToo, Accepts):
     recordings: tuple[Path, ...] = setting((), "bags, or CSV files with a header row", argument=True)
     what: str = setting(
         "friction,rotor,payload,inertia",
-        "what to fit: friction,rotor,payload,inertia or some of them; or compliance",
+        "what to fit: some of friction,rotor,payload,inertia; or compliance",
     )
     out: Path | None = setting(
         None,
-        "YAML to write; the report has the same name with .html; default: fitted.yaml",
+        "YAML to write, with a report .html; default: fitted.yaml",
         writes=True,
         endings=(".yaml", ".yml"),
     )
     no_report: bool = setting(False, "write no report with pictures")
-    per_copy: bool = setting(False, "fit each copy of a limb by itself, and write all of them")
+    per_copy: bool = setting(False, "fit each copy of a limb by itself")
     friction: str = setting(
         "auto",
-        "friction laws of the drives in addition to the file's: auto, coulomb (no other), "
-        "stribeck, load-dependent, periodic, dahl, several with commas",
+        "further friction laws: auto, coulomb (none), or some of stribeck, load-dependent, periodic, dahl",
     )
     torque_constant: str | None = setting(
         None,
-        "efforts are motor currents, A: N m or N per ampere at the joint, one number or one per "
-        "joint with commas; `fit` identifies it from the file's masses",
+        "efforts are motor currents: N m or N per ampere at the joint, one or one per joint; `fit` identifies it",
     )
-    drive: Path | None = setting(None, "one drive: CSV of traverses with weights, a row per run")
+    drive: Path | None = setting(None, "fit one drive: CSV of traverses with weights")
     lever: float | None = setting(
         None,
         "with --drive, for mass_kg: travel per radian of the motor, m",
@@ -136,6 +134,7 @@ class Fit(CarriesAtTimes, ReadsRecordings, BeyondLimitsToo, Accepts):
         return None, laws
 
 
+@command("Identification and calibration")
 def fit(given: Fit) -> Report:
     """Identify the robot's parameters from recordings, and write the files.
 
@@ -219,6 +218,3 @@ def fit(given: Fit) -> Report:
             title = f"{result.robot.name}: fitted from {', '.join(names)}"
             replace_file(html, page(title, report, more).encode())
     return dataclasses.replace(report, facts=[*report.facts, *facts], files=given.files)
-
-
-COMMAND = command(fit, "Identification and calibration")

@@ -48,6 +48,7 @@ class FrequencyResponse(AtPose, OfTool, Writes, Draws):
     out: Path | None = setting(None, "table to write, .csv, .parquet or .mat", writes=True, endings=ENDINGS)
 
 
+@command("Stiffness, workspace and vibration")
 def frf(given: FrequencyResponse) -> Report:
     """Compute the modes and the frequency response at the tool point."""
     from stiffness_monitor.modes import natural_frequencies
@@ -127,6 +128,3 @@ def draw(grid: Any, response: Any, modes: ToolModes, title: str) -> Any:
     plots.legend(size)
     plots.label(phase, "frequency (Hz)", "phase (deg)")
     return figure
-
-
-COMMAND = command(frf, "Stiffness, workspace and vibration")

@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any, Final
 
 import numpy as np
@@ -23,8 +24,6 @@ from pkm_twin.robot.clearance import clearance, has_clearance
 from pkm_twin.robot.plausibility import findings, why_no_torques
 from pkm_twin.robot.robot import Robot
 
-DRAWN_APART: Final = 0.02
-"""Distance of drives, of the machine's size, up to which a picture shows them at one point."""
 MOST_NAMES: Final = 6
 """Most names that a line has."""
 
@@ -39,25 +38,9 @@ class Info(OfRobot, Draws):
     """
 
 
-def _report_leading(robot: Robot) -> list[Fact]:
-    """Of more actuated joints than degrees of freedom those that lead."""
-    leads = list(robot.graph.leads)
-    return [Fact("leads", leads, text="joints that lead")] if robot.redundant else []
-
-
-def _other_poses(robot: Robot) -> list[Fact]:
-    """Return other sets of pose coordinates that a file of bodies and joints may have."""
-    if robot.mechanism != "machine":
-        return []
-    found = [list(names) for names in list_coordinates(robot.graph) if names != robot.pose_names]
-    shown = "; ".join(", ".join(names) for names in found[:MOST_NAMES])
-    shown += f" and {len(found) - MOST_NAMES} more" if len(found) > MOST_NAMES else ""
-    text = "other pose coordinates" if found else None
-    return [Fact("other_poses", found, text=text, shown=f"{shown} (`pose`, --pose)")]
-
-
+@command("Robots")
 def info(given: Info) -> Report:
-    """Every parameter, mobility, overconstraint and the home pose."""
+    """Report every parameter, mobility, overconstraint and the home pose."""
     robot = given.machine()
     home = robot.home()
     q = robot.inverse(home)
@@ -80,6 +63,15 @@ def info(given: Info) -> Report:
         numbers = robot.file_numbers()
         sections[PARAMETERS] = dict(robot.book.values)
         units[PARAMETERS] = {n: numbers[f"{PARAMETERS}.{n}"][1] for n in robot.book.values}
+    other_poses = []
+    if robot.mechanism == "machine":
+        found = [list(names) for names in list_coordinates(robot.graph) if names != robot.pose_names]
+        shown = "; ".join(", ".join(names) for names in found[:MOST_NAMES])
+        shown += f" and {len(found) - MOST_NAMES} more" if len(found) > MOST_NAMES else ""
+        text = "other pose coordinates" if found else None
+        other_poses = [Fact("other_poses", found, text=text, shown=f"{shown} (`pose`, --pose)")]
+    # Of more actuated joints than degrees of freedom those that lead.
+    leads = list(robot.graph.leads)
     facts = [
         Fact("name", robot.name),
         Fact("mechanism", robot.mechanism),
@@ -92,9 +84,9 @@ def info(given: Info) -> Report:
         Fact("redundant_closures", engine.redundant),
         Fact("assumed_joints", assumed),
         Fact("pose", pose_units, text="pose", shown=_list_units(pose_units)),
-        *_other_poses(robot),
+        *other_poses,
         Fact("joints", list(robot.joint_names), text="actuated joints", shown=_list_units(joint_units)),
-        *_report_leading(robot),
+        *([Fact("leads", leads, text="joints that lead")] if robot.redundant else []),
         Fact("joint_unit", robot.joint_unit),
         Fact("joint_units", list(robot.joint_units)),
         Fact("effort_unit", None if why_no_torques(robot) else robot.effort_unit),
@@ -133,27 +125,24 @@ def info(given: Info) -> Report:
         listed = section == "joints" and isinstance(value, list)
         if section not in ("mechanism", "name", PARAMETERS) and not listed:
             facts += _report_parameters(section, value, units.get(section, ""))
+    places = np.array([robot.graph.joints[name].at for name in robot.joint_names])
+    notes = []
+    # Drives nearer than 2 % of the machine's size are drawn at one point.
+    if given.picture and len(places) > 1 and np.ptp(places, axis=0).max() <= 0.02 * robot.graph.size:
+        notes.append(
+            f"{', '.join(robot.joint_names)} stand at one point in the picture: give each joint's `at` "
+            "a point of its own along its axis, which changes nothing else"
+        )
     return Report(
         f"{robot.name}: {robot.description}",
         facts,
-        figures={"": lambda: _draw_robot(robot)},
-        notes=_note_joints_at_one_point(robot) if given.picture else [],
+        figures={"": lambda: import_module("pkm_twin.view.drawing").draw(robot, marked=True)},
+        notes=notes,
     )
 
 
-def _note_joints_at_one_point(robot: Robot) -> list[str]:
-    """Return a note on how to draw a machine apart whose drives' joints stand at one point."""
-    places = np.array([robot.graph.joints[name].at for name in robot.joint_names])
-    if len(places) < 2 or np.ptp(places, axis=0).max() > DRAWN_APART * robot.graph.size:
-        return []
-    return [
-        f"{', '.join(robot.joint_names)} stand at one point in the picture: give each joint's `at` "
-        "a point of its own along its axis, which changes nothing else"
-    ]
-
-
 def members_fault(robot: Robot) -> str:
-    """Why maps reject the members that the file gives; empty where they do not, or it has none."""
+    """Return why maps reject the file's members; empty if they do not, or there are none."""
     try:
         robot.structure()
     except RigidError:
@@ -161,12 +150,6 @@ def members_fault(robot: Robot) -> str:
     except ParameterError as error:
         return str(error)
     return ""
-
-
-def _draw_robot(robot: Robot) -> Any:
-    from pkm_twin.view.drawing import draw
-
-    return draw(robot, marked=True)
 
 
 def overconstraint(robot: Robot) -> list[str]:
@@ -182,7 +165,7 @@ def overconstraint(robot: Robot) -> list[str]:
 
 
 def grouped_reactions(names: Sequence[str]) -> list[str]:
-    """Reactions in few words: of each joint what is not determined, alike joints in one line.
+    """Shorten reactions: what is not determined of each joint, joints that are alike in one line.
 
     :param names: as :func:`delta_dynamics.reactions` has them, "JOINT: force along DIRECTION".
     """
@@ -199,11 +182,15 @@ def grouped_reactions(names: Sequence[str]) -> list[str]:
     for joint, kinds in joints.items():
         words = [f"{kind} {_directions(directions)}".strip() for kind, directions in kinds.items()]
         alike.setdefault(" and ".join(words), []).append(joint)
-    return [f"{_shorten(names)}: not determined: {what}" for what, names in alike.items()] + others
+    lines = []
+    for what, joined in alike.items():
+        more = f" and {len(joined) - MOST_NAMES} more" if len(joined) > MOST_NAMES else ""
+        lines.append(f"{', '.join(joined[:MOST_NAMES])}{more}: not determined: {what}")
+    return lines + others
 
 
 def _directions(names: list[str]) -> str:
-    """Directions of one joint's forces or moments."""
+    """Describe the directions of one joint's forces or moments."""
     if len(names) == 3:
         return "in all directions"
     both = {"across 1", "across 2"} <= set(names)
@@ -213,13 +200,6 @@ def _directions(names: list[str]) -> str:
     elif any("across" in n for n in names):
         words.append("in one direction across the axis")
     return " and ".join(words)
-
-
-def _shorten(names: list[str]) -> str:
-    """Names, of many the first."""
-    if len(names) <= MOST_NAMES:
-        return ", ".join(names)
-    return f"{', '.join(names[:MOST_NAMES])} and {len(names) - MOST_NAMES} more"
 
 
 def _report_parameters(name: str, value: Any, unit: Any) -> Iterator[Fact]:
@@ -239,6 +219,3 @@ def _list_units(units: dict[str, str]) -> str:
 def _write_values(values: dict[str, float], units: dict[str, str]) -> str:
     # Rounded first, so that nothing reads -0.0000.
     return ", ".join(f"{k} {round(v, 4) + 0.0:.4f} {units[k]}" for k, v in values.items())
-
-
-COMMAND = command(info, "Robots")

@@ -24,12 +24,6 @@ if TYPE_CHECKING:
     from pkm_twin.paths.joint_loads import Summary
     from pkm_twin.recordings import Recording
 
-SHOWN: Final = 6
-"""Most joints in a picture."""
-UNDETERMINED: Final = (
-    "undetermined: neither rigid-body equations nor elastic members or joints determine it; in a "
-    "planar linkage make one pin of a loop spherical and one cylindrical, or give compliances"
-)
 IDLE: Final = "no life, because the bearing bears a load and does not move"
 
 
@@ -54,6 +48,7 @@ class Loads(CarriesAtTimes, ReadsMotions, Writes, Draws):
     spectrum: Path | None = setting(None, "CSV of the rainflow counts", writes=True)
 
 
+@command("Torques, paths and drives")
 def loads(given: Loads) -> Report:
     """Compute the loads of all joints; the answer names the largest."""
     from pkm_twin.paths.joint_loads import format_spectra, summarise_loads
@@ -85,7 +80,18 @@ def loads(given: Loads) -> Report:
         ],
         _make_tables(joints),
         figures={"": lambda: draw(motion, found, answer)},
-        notes=[*motion.notes, *([UNDETERMINED] if open_ else []), *([f"{IDLE}: {', '.join(idle)}"] if idle else [])],
+        notes=[
+            *motion.notes,
+            *(
+                [
+                    "undetermined: neither rigid-body equations nor elastic members or joints determine it; in a "
+                    "planar linkage make one pin of a loop spherical and one cylindrical, or give compliances"
+                ]
+                if open_
+                else []
+            ),
+            *([f"{IDLE}: {', '.join(idle)}"] if idle else []),
+        ],
         files={"out": given.out, "spectrum": given.spectrum},
     )
 
@@ -121,7 +127,6 @@ def of_joint(load: Summary, exponent: float, duration: float) -> dict[str, Any]:
 
 
 def _make_tables(joints: dict[str, Any]) -> list[Table]:
-    """Peaks, ranges and lives, as the terminal shows them."""
     columns = [
         Column("bearing_force_peak_N", "N", "force peak"),
         Column("bearing_force_rms_N", "N", "RMS"),
@@ -157,7 +162,7 @@ def draw(motion: Recording, loads: Sequence[Summary], title: str) -> Any:
     shown = sorted(told, key=lambda load: -load.peaks[2])
     figure, axes = plots.columns(2, 1)
     (force,), (counted,) = axes
-    for k, load in enumerate(shown[:SHOWN]):
+    for k, load in enumerate(shown[:6]):
         style = {"color": plots.COLOURS[k], "ls": plots.DASHES[k % 3], "lw": 1.2}
         label = f"{load.name}: {'' if load.known[2] else 'at least '}{load.peaks[2]:.4g} N"
         force.plot(motion.clock, np.concatenate(load.sizes), label=label, **style)
@@ -180,6 +185,3 @@ def draw(motion: Recording, loads: Sequence[Summary], title: str) -> Any:
             plots.legend(ax, below=True)
     plots.head(figure, title)
     return figure
-
-
-COMMAND = command(loads, "Torques, paths and drives")

@@ -41,11 +41,12 @@ class Lobes(OfMilling, AtPose, OfTool, Writes, Draws):
     points: int = setting(181, "evenly spaced spindle speeds; more are added at lobes", low=2, high=10**5)
     deepest: float | None = setting(
         None,
-        "largest depth to compute, m; default: 25 times the depth that is stable at every speed",
+        "largest depth to compute, m; default: 25 times the depth stable at every speed",
     )
     out: Path | None = setting(None, "table to write, .csv, .parquet or .mat", writes=True, endings=ENDINGS)
 
 
+@command("Stiffness, workspace and vibration")
 def lobes(given: Lobes) -> Report:
     """Compute the limits of stability over the spindle's speed."""
     from stiffness_monitor.chatter import SPEED_MARGIN, lobes_between
@@ -108,6 +109,3 @@ def draw(found: Limits, milling: Milling, title: str) -> Any:
     ax.set_ylim(0.0, 1.05 * depth.max())
     ax.margins(x=0.0)
     return figure
-
-
-COMMAND = command(lobes, "Stiffness, workspace and vibration")

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, get_type_hints
 
+import click
+
 from pkm_twin.apps.frame import Command, Group, command
 from pkm_twin.apps.options import (
     Carries,
@@ -32,13 +34,9 @@ from pkm_twin.ros.signals import INTERRUPTED, first_signal
 from pkm_twin.settings import setting
 
 if TYPE_CHECKING:
-    from xarray import Dataset
-
     from pkm_twin.maps.kind import Case
     from pkm_twin.robot.robot import Robot
 
-MAX_POSES: Final = 10**11
-"""Poses beyond which a number is a slip."""
 SIX: Final = "six numbers separated by commas, N and N m; or NAME=six numbers"
 
 
@@ -54,22 +52,20 @@ class OfMap(Carries, Pages, Writes, Draws, Parallel):
     """The options of all maps."""
 
     kind: str = ""
-    points: int | None = setting(None, "approximate number of poses; default: by kind", low=1, high=MAX_POSES)
-    at: str | None = setting(None, "pose that the planes go through: numbers separated by commas; default: the worst")
+    points: int | None = setting(None, "approximate number of poses; default: by kind", low=1, high=10**11)
+    at: str | None = setting(None, "pose that the planes go through; default: the worst")
     along: Path | None = setting(
         None,
-        "instead of the workspace: a CSV of `pkm-twin path`, or any motion that `pkm-twin torques` "
-        "reads; --out FILE.csv writes the values",
+        "a motion in place of the workspace; --out FILE.csv writes the values",
     )
     singularity: float | None = setting(
         None,
-        "singularity index (0 to 1) below which a pose does not count; default: 0.05, for `workspace` 0",
+        "singularity index below which a pose does not count; default: 0.05, for `workspace` 0",
     )
     least_clearance: float = setting(0.0, "distance between limbs (m) below which a pose does not count")
     regular: bool = setting(
         False,
-        "count only poses inside the largest circles about the axis, of 10 degrees or more if they "
-        "are tilts (2UPR-RPU paper, figure 5)",
+        "count only poses inside the largest circles about the axis (2UPR-RPU paper, figure 5)",
     )
     out: Path | None = setting(
         None,
@@ -128,6 +124,7 @@ class Show(Pages, Overwrites):
         return (self.out or self.file).with_suffix(".png")
 
 
+@command()
 def show(given: Show) -> Report:
     """Show what a stored map answers, with its pictures."""
     return stored(given.file, given.drawing(""), given.html, given.overwrite)
@@ -145,7 +142,62 @@ def compute(given: OfMap) -> Report:
     kind, machine = kind_of(given), given.machine()
     cases = given.cases(kind, machine)
     if given.along is not None:
-        return along_path(given, kind, machine, cases, given.along)
+        # Evaluate the kind along a path; report the worst of each case.
+        path = given.along
+        from pkm_twin.maps.along import along
+        from pkm_twin.paths.along import check_computed, settle_rests
+        from pkm_twin.recordings import ReadOptions, read
+        from pkm_twin.recordings.payload import by_load
+
+        if given.out is not None and given.out.suffix != ".csv":
+            raise ParameterError("out", str(given.out), "a name that ends in .csv")
+        motion = read(path, machine, ReadOptions(planned=True, load=given.load))
+        if motion.computed is not None and given.payload is None:
+            check_computed(settle_rests(motion.with_rates()))
+        wrench = None if cases or not kind.takes_wrench else motion.wrench
+        if wrench is not None and wrench.any():
+            cases = [kind.loaded(machine, "wrench of the path", wrench[wrench.any(1)][0].tolist())]
+        else:
+            wrench = None
+        found = along(
+            kind,
+            machine,
+            motion.clock,
+            motion.q,
+            cases=cases,
+            wrench=wrench,
+            parts=by_load(machine, motion.load, motion.time, len(motion.q)),
+            least=given.singularity,
+            least_clearance=given.least_clearance,
+        )
+        if given.out is not None:
+            replace_file(given.out, found.table().encode())
+        beyond, least = int((~found.counted).sum()), found.least
+        first, *rest = found.sentences
+        bound = f", singularity index {least:g} or more" if least > 0.0 else ""
+        under = [] if wrench is None else ["under the wrench of the path"]
+        notes = [*rest, *under, f"{len(found.time)} samples of {path}{bound if not beyond else ''}"]
+        if beyond:
+            low = int((machine.try_singularity(motion.q)[0] < least).sum())
+            alone = f"{low} have a singularity index below {least:g}"
+            reason = alone if low == beyond else f"{alone}; others are beyond limits or limbs interfere"
+            notes.append(f"{beyond} of {len(found.time)} samples would not count, but are included: {reason}")
+        return Report(
+            first,
+            [
+                Fact("robot", machine.name),
+                Fact("kind", kind.name),
+                Fact("samples", len(found.time)),
+                Fact("samples_that_do_not_count", beyond),
+                Fact("singularity_bound", least if least > 0.0 else None),
+                payload_fact(motion.load),
+                Fact("worst", found.worst),
+                Fact("files", [str(path) for path in (given.out, given.drawing("")) if path]),
+            ],
+            figures={"": found.draw},
+            notes=notes,
+            files={"out": given.out},
+        )
     names = machine.pose_names
     sweep = map_of(
         machine,
@@ -202,7 +254,16 @@ def stored(file: Path, drawing: Path | None, html: bool, overwrite: bool) -> Rep
                 Fact("kind", data.attrs["kind"]),
                 Fact("sizes", {str(name): size for name, size in data.sizes.items()}),
                 Fact("worst", figures.answers(data)),
-                Fact("facts", scalars(data)),
+                Fact(
+                    "facts",
+                    (
+                        {
+                            str(name): {"value": float(variable), "unit": variable.attrs.get("units", "")}
+                            for name, variable in data.data_vars.items()
+                            if not variable.dims and math.isfinite(float(variable))
+                        }
+                    ),
+                ),
             ]
         drawn = {} if drawing is None else figures.draw(data)
         page = None
@@ -212,73 +273,6 @@ def stored(file: Path, drawing: Path | None, html: bool, overwrite: bool) -> Rep
             write_page(data, page)
         pictures = {name: lambda one=one: one for name, one in drawn.items()}
         return Report(first, facts, figures=pictures, notes=rest, files={"file": file, "page": page})
-
-
-def scalars(data: Dataset) -> dict[str, Any]:
-    """Single numbers of a map, with their units."""
-    return {
-        str(name): {"value": float(variable), "unit": variable.attrs.get("units", "")}
-        for name, variable in data.data_vars.items()
-        if not variable.dims and math.isfinite(float(variable))
-    }
-
-
-def along_path(given: OfMap, kind: Kind, machine: Robot, cases: list[Case], path: Path) -> Report:
-    """Evaluate the kind along a path; report the worst of each case."""
-    from pkm_twin.maps.along import along
-    from pkm_twin.paths.along import check_computed, settle_rests
-    from pkm_twin.recordings import ReadOptions, read
-    from pkm_twin.recordings.payload import by_load
-
-    if given.out is not None and given.out.suffix != ".csv":
-        raise ParameterError("out", str(given.out), "a name that ends in .csv")
-    motion = read(path, machine, ReadOptions(planned=True, load=given.load))
-    if motion.computed is not None and given.payload is None:
-        check_computed(settle_rests(motion.with_rates()))
-    wrench = None if cases or not kind.takes_wrench else motion.wrench
-    if wrench is not None and wrench.any():
-        cases = [kind.loaded(machine, "wrench of the path", wrench[wrench.any(1)][0].tolist())]
-    else:
-        wrench = None
-    found = along(
-        kind,
-        machine,
-        motion.clock,
-        motion.q,
-        cases=cases,
-        wrench=wrench,
-        parts=by_load(machine, motion.load, motion.time, len(motion.q)),
-        least=given.singularity,
-        least_clearance=given.least_clearance,
-    )
-    if given.out is not None:
-        replace_file(given.out, found.table().encode())
-    beyond, least = int((~found.counted).sum()), found.least
-    first, *rest = found.sentences
-    bound = f", singularity index {least:g} or more" if least > 0.0 else ""
-    under = [] if wrench is None else ["under the wrench of the path"]
-    notes = [*rest, *under, f"{len(found.time)} samples of {path}{bound if not beyond else ''}"]
-    if beyond:
-        low = int((machine.try_singularity(motion.q)[0] < least).sum())
-        alone = f"{low} have a singularity index below {least:g}"
-        reason = alone if low == beyond else f"{alone}; others are beyond limits or limbs interfere"
-        notes.append(f"{beyond} of {len(found.time)} samples would not count, but are included: {reason}")
-    return Report(
-        first,
-        [
-            Fact("robot", machine.name),
-            Fact("kind", kind.name),
-            Fact("samples", len(found.time)),
-            Fact("samples_that_do_not_count", beyond),
-            Fact("singularity_bound", least if least > 0.0 else None),
-            payload_fact(motion.load),
-            Fact("worst", found.worst),
-            Fact("files", [str(path) for path in (given.out, given.drawing("")) if path]),
-        ],
-        figures={"": found.draw},
-        notes=notes,
-        files={"out": given.out},
-    )
 
 
 def kind_of(given: OfMap) -> Kind:
@@ -309,21 +303,21 @@ def offered(kind: type[Kind]) -> Command:
 class AfterRobot(Group):
     """Kinds as commands after the robot; ``show`` stands in its place."""
 
-    def order(self, words: list[str]) -> list[str]:
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Exchange the robot and the kind, so that the kind is the command's name."""
-        if not words or words[0] in self.commands:
-            return words
-        if len(words) == 1 or words[1].startswith("-"):
-            return [word for word in words if word.startswith("-")]
-        return [words[1], words[0], *words[2:]]
+        if args and args[0] not in self.commands:
+            alone = len(args) == 1 or args[1].startswith("-")
+            options = [word for word in args if word.startswith("-")]
+            args = options if alone else [args[1], args[0], *args[2:]]
+        return super().parse_args(ctx, args)
 
     def show(self, name: str) -> str:
         """Return the name with the robot before it."""
         return name if name == "show" else f"ROBOT {name}"
 
 
-SHOW: Final = command(show)
-COMMAND = AfterRobot(
+map_ = AfterRobot(
+    "map",
     """Map a quantity over the workspace, find its worst pose, and draw planes through it.
 
     `pkm-twin map ROBOT KIND` computes a map, `pkm-twin map show FILE` plots a stored one again.
@@ -337,7 +331,7 @@ COMMAND = AfterRobot(
         "pkm_twin.maps",
         Kind,
         ["show", *OWN],
-        lambda name: SHOW if name == "show" else offered(OWN[name]),
+        lambda name: show if name == "show" else offered(OWN[name]),
         offered,
     ),
     "Stiffness, workspace and vibration",

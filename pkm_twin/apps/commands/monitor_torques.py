@@ -18,10 +18,6 @@ from pkm_twin.settings import setting
 from pkm_twin.streams.arrivals import Arrivals
 
 TYPE: Final = "sensor_msgs/msg/JointState"
-DEPTH: Final = 1000
-"""Deep enough that a stall of this process is no loss of the topic's."""
-LOOK: Final = 0.05
-"""How often silence, signals and the end of the time are looked for, s."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,7 +33,7 @@ class MonitorTorques:
 
     topic: str = setting("delta_dynamics/joint_torques", "topic of stamped torques", argument=True)
     deadline: float = setting(
-        0.1, "longest gap and greatest age (s) that the controller tolerates", low=1e-6, high=3600.0
+        0.1, "longest gap and greatest age that the controller tolerates, s", low=1e-6, high=3600.0
     )
     duration: float = setting(10.0, "how long to watch, s; Ctrl-C ends earlier", low=1e-3, high=1e7)
     wait: float = setting(5.0, "longest wait (s) for the first message", low=1e-3, high=1e7)
@@ -54,7 +50,7 @@ class Offer:
 
 
 def judge(topic: str, arrivals: Arrivals, offer: Offer) -> Report:
-    """Judge the messages that came by what a controller needs."""
+    """Judge the received messages by what a controller needs."""
     a, count = arrivals, arrivals.count
     most = f"at most {1e3 * a.deadline:g} ms"
     duration = (a.last - a.first) / SECOND
@@ -104,6 +100,7 @@ def judge(topic: str, arrivals: Arrivals, offer: Offer) -> Report:
     return Report(answer, [*facts, *items], verdict=Verdict.BAD if bad else Verdict.GOOD)
 
 
+@command("Recordings")
 def monitor_torques(given: MonitorTorques) -> Report:
     """Subscribe for a while, or until the first signal.
 
@@ -134,8 +131,21 @@ def monitor_torques(given: MonitorTorques) -> Report:
             with first_signal(KeyboardInterrupt):
                 while time.monotonic() - began < given.wait or arrivals.count:
                     subscribed = subscribed or _subscribe(node, name, take)
-                    spin(LOOK)
-                    offer = _find_offer(node, name) or offer
+                    spin(0.05)
+                    # The offered QoS of the present publishers; None without any.
+                    profiles = [info.qos_profile for info in node.get_publishers_info_by_topic(name)]
+
+                    def weakest(promises: tuple[Any, ...]) -> float:
+                        """In s; the middleware's largest number means no promise."""
+                        seconds = [promise.nanoseconds / SECOND for promise in promises]
+                        return max(one if 0.0 < one < 1e9 else math.inf for one in seconds)
+
+                    if not profiles:
+                        offered = None
+                    else:
+                        deadline, lifespan = zip(*((one.deadline, one.lifespan) for one in profiles), strict=True)
+                        offered = Offer(len(profiles), weakest(deadline), weakest(lifespan))
+                    offer = offered or offer
                     end = arrivals.first + given.duration * SECOND
                     if arrivals.count and time.monotonic_ns() > end:
                         break
@@ -164,24 +174,7 @@ def _subscribe(node: Any, topic: str, take: Any) -> bool:
         )
     reliable, best_effort = ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT
     all_reliable = all(info.qos_profile.reliability == reliable for info in infos)
-    qos = QoSProfile(depth=DEPTH, reliability=reliable if all_reliable else best_effort)
+    # A deep queue: a stall of this process is no loss of the topic's.
+    qos = QoSProfile(depth=1000, reliability=reliable if all_reliable else best_effort)
     node.create_subscription(JointState, topic, take, qos)
     return True
-
-
-def _find_offer(node: Any, topic: str) -> Offer | None:
-    """Return the offered QoS of the present publishers; None without any."""
-    profiles = [info.qos_profile for info in node.get_publishers_info_by_topic(topic)]
-
-    def weakest(promises: tuple[Any, ...]) -> float:
-        """In s; the middleware's largest number means no promise."""
-        seconds = [promise.nanoseconds / SECOND for promise in promises]
-        return max(one if 0.0 < one < 1e9 else math.inf for one in seconds)
-
-    if not profiles:
-        return None
-    deadline, lifespan = zip(*((one.deadline, one.lifespan) for one in profiles), strict=True)
-    return Offer(len(profiles), weakest(deadline), weakest(lifespan))
-
-
-COMMAND = command(monitor_torques, "Recordings")

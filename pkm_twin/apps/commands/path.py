@@ -4,10 +4,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import click
 import numpy as np
@@ -32,11 +31,6 @@ if TYPE_CHECKING:
     from pkm_twin.paths import TimedPath
     from pkm_twin.paths.along import SoftCut
     from pkm_twin.robot.robot import Robot
-
-LEAST_CYCLE: Final = 1.0
-"""Millimetres below which a cycle's numbers look like metres."""
-SHOWN: Final = 0.3
-"""Greatest used part of a limit from which on the picture has its line."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -72,31 +66,29 @@ class Motion(Carries, ReadsTables, AwayFromSingular, Writes, Draws):
     waypoints: Path | None = setting(None, "table of waypoints, unless --cycle or --circle is given", argument=True)
     cycle: tuple[float, ...] | None = setting(
         None,
-        "pick-and-place cycle, mm: HEIGHT up, WIDTH across, DROP down (default: HEIGHT), and "
-        "back; the pose needs z, and x or y",
+        "pick-and-place cycle, mm: HEIGHT up, WIDTH across, DROP down (default: HEIGHT), and back",
         count=0,
         metavar="HEIGHT,WIDTH[,DROP]",
     )
-    circle: float | None = setting(None, "follow a circle of this radius, m, or rad for a circle of two angles")
+    circle: float | None = setting(None, "follow a circle of this radius, m, or rad for angles")
     at: tuple[float, ...] | None = setting(
         None,
-        "centre of --cycle (between pick and place) or --circle: the pose's coordinates; default: home",
+        "pose at the centre of --cycle or --circle; default: home",
         count=0,
     )
     direction: float | None = setting(
         None,
-        "direction of the cycle in the xy plane, degrees from x towards y; default: x, else y",
+        "direction of the cycle, degrees from x towards y; default: x, else y",
     )
     blend: float | None = setting(
         None,
-        "distance from a corner at which rounding begins, m; 0 stops at every waypoint; default: a smooth curve",
+        "distance from corners at which rounding begins, m; 0: stop at waypoints; default: a smooth curve",
         low=0.0,
     )
     dwell: float = setting(0.0, "dwell at pick and at place, s", low=0.0)
     carries: tuple[str, ...] = setting(
         (),
-        "payload from one waypoint to another, in place of --payload: 0.5@2:4 is 0.5 kg from "
-        "waypoint 2 until waypoint 4 is reached; may be repeated",
+        "payload between waypoints: 0.5@2:4 is 0.5 kg from waypoint 2 to 4; may be repeated",
         name="load",
         metavar="MASS@FROM:TO",
     )
@@ -112,46 +104,46 @@ class Motion(Carries, ReadsTables, AwayFromSingular, Writes, Draws):
     duration: float | None = setting(None, "duration of the motion, s; default: the shortest")
     effort: tuple[float, ...] | None = setting(
         None,
-        "effort limit, one for all joints or one per joint, N m or N; default: the file's",
+        "effort limits, one or one per joint, N m or N; default: the file's",
         count=0,
     )
-    velocity: tuple[float, ...] | None = setting(
-        None, "velocity limit of the joints, rad/s or m/s; default: the file's", count=0
-    )
+    velocity: tuple[float, ...] | None = setting(None, "velocity limits, rad/s or m/s; default: the file's", count=0)
     acceleration: tuple[float, ...] | None = setting(
-        None, "acceleration limit of the joints, rad/s2 or m/s2; default: none", count=0
+        None, "acceleration limits, rad/s2 or m/s2; default: none", count=0
     )
-    jerk: tuple[float, ...] | None = setting(None, "jerk limit of the joints, rad/s3 or m/s3; default: none", count=0)
+    jerk: tuple[float, ...] | None = setting(None, "jerk limits, rad/s3 or m/s3; default: none", count=0)
     speed: float | None = setting(
         None,
-        "speed limit of the reference point, m/s, or of a pose of angles, rad/s; default: "
-        "none; of --slow-where-soft the programmed feed",
+        "speed limit of the reference point, m/s, or rad/s for angles; with --slow-where-soft the "
+        "programmed feed; default: none",
     )
     share: float = setting(1.0, "fraction of the file's effort and velocity limits to use", low=1e-3, high=1.0)
     shaper: str | None = setting(
         None,
-        "input shaper for the first natural frequency: zv, or zvd, which tolerates more error of the frequency",
+        "input shaper for the first natural frequency: zv, or zvd (more robust)",
     )
     damping: float | None = setting(
         None,
-        "damping ratio of that mode; default: `modal_damping` of the robot file",
+        "its damping ratio; default: the robot file's",
         low=0.0,
         high=0.99,
     )
     rate: float = setting(1000.0, "samples per second in the file", low=1.0, high=1e5)
     out: Path | None = setting(
         None,
-        "file to write: FILE.mcap (a JointTrajectory with efforts), or a table, FILE.csv, .parquet or .mat",
+        "file to write: .mcap (a JointTrajectory with efforts), or a table, .csv, .parquet or .mat",
         writes=True,
         endings=(".mcap", *ENDINGS),
     )
 
 
+@command("Torques, paths and drives")
 def path(given: Motion) -> Report:
     """Plan the motion along a path; report which limits it uses."""
     from pkm_twin.paths import ShapedPath, shaped, timed
     from pkm_twin.paths.along import SoftCut
     from pkm_twin.paths.joint_path import only_turns
+    from pkm_twin.paths.waypoints import parse_loads
     from pkm_twin.recordings import Recording
     from pkm_twin.recordings.bags import write_motion
 
@@ -167,11 +159,21 @@ def path(given: Motion) -> Report:
     cut = None
     if given.slow_where_soft:
         cut = SoftCut(machine, given.force or 0.0, given.deflection or 0.0, given.speed or 0.0)
-    bounds: dict[str, Any] = {
-        name: _check_limits(name, getattr(given, name), machine)
-        for name in ("effort", "velocity", "acceleration", "jerk")
-    }
-    way, payload = _read_way(given, machine)
+    bounds: dict[str, Any] = {}
+    for name in ("effort", "velocity", "acceleration", "jerk"):
+        values, n = getattr(given, name), machine.joints_count
+        if values is not None and (len(values) not in (1, n) or min(values) <= 0.0):
+            found = ",".join(f"{value:g}" for value in values)
+            raise click.UsageError(f"--{name} {found}: one number above 0, or {n} with commas between")
+        bounds[name] = None if values is None else list(values)
+    if given.carries and given.payload is not None:
+        raise click.UsageError("--payload is for the whole path; leave it out with --load")
+    way, masses = _read_path(given, machine)
+    option = "--load" if given.carries else "--payload" if given.payload is not None else ""
+    same = not given.carries and set(masses or ()) <= {machine.payload.mass}
+    if masses is not None and option and not same:
+        raise click.UsageError(f"the waypoints have a column payload; leave out {option}")
+    payload = parse_loads(given.carries, len(way.marks)) if given.carries else masses
     law = "fastest" if given.fastest or given.slow_where_soft else given.law
     motion = timed(
         machine,
@@ -245,27 +247,32 @@ def path(given: Motion) -> Report:
     if cut is not None:
         more, draw = _report_cut(cut, motion)
         facts += more
+    # Tables of limits and peaks; with ``soft`` the tolerance bounds the speed, too.
+    rows: dict[str, list[Any]] = {}
+    words_of = {"speed": "speed or tolerance"} if given.slow_where_soft else {}
+    for bound in motion.bounds:
+        what = words_of.get(bound.what, bound.what) or f"none (largest fraction of a limit: {100 * bound.used:.0f} %)"
+        rows[f"{bound.begin:.4f} to {bound.end:.4f}"] = [what]
+    peaks = {
+        joint: [f"{one['value']:.4g} {one['unit']}" for one in values.values()]
+        for joint, values in motion.peaks.items()
+    }
+    peak_columns = [Column("", "", word) for word in next(iter(motion.peaks.values()))]
+    worst = sorted(motion.worst.items(), key=lambda item: -item[1])[:6]
+    used = {words_of.get(name, name): [100.0 * value] for name, value in worst}
+    tables = [
+        Table("", [Column("", "", "limit that binds")], rows, head="time (s)"),
+        Table("", peak_columns, peaks, head="|peak|"),
+    ]
+    if used:
+        tables.append(Table("", [Column("", "%", "used")], used, head="limit"))
     return Report(
         answer,
         facts,
-        _lay_out(motion, given.slow_where_soft),
+        tables,
         {"": lambda: draw(motion, answer)},
         files={"out": given.out},
     )
-
-
-def _read_way(given: Motion, machine: Robot) -> tuple[Way, Sequence[float | None] | None]:
-    """Return the path, and the payload from each of its waypoints on."""
-    from pkm_twin.paths.waypoints import parse_loads
-
-    if given.carries and given.payload is not None:
-        raise click.UsageError("--payload is for the whole path; leave it out with --load")
-    way, masses = _read_path(given, machine)
-    option = "--load" if given.carries else "--payload" if given.payload is not None else ""
-    same = not given.carries and set(masses or ()) <= {machine.payload.mass}
-    if masses is not None and option and not same:
-        raise click.UsageError(f"the waypoints have a column payload; leave out {option}")
-    return way, parse_loads(given.carries, len(way.marks)) if given.carries else masses
 
 
 def _read_path(given: Motion, machine: Robot) -> tuple[Way, list[float] | None]:
@@ -288,7 +295,8 @@ def _read_path(given: Motion, machine: Robot) -> tuple[Way, list[float] | None]:
         home = machine.home() if given.at is None else np.array(given.at)
         return paths.circle(machine, home, given.circle), None
     lengths = given.cycle or ()
-    if len(lengths) not in (2, 3) or min(lengths) < LEAST_CYCLE:
+    # Less than a millimetre looks like metres.
+    if len(lengths) not in (2, 3) or min(lengths) < 1.0:
         found = ",".join(f"{length:g}" for length in lengths)
         raise click.UsageError(f"--cycle {found}: HEIGHT,WIDTH[,DROP] in millimetres, for example 25,305,25")
     metres = [1e-3 * value for value in lengths]
@@ -297,39 +305,8 @@ def _read_path(given: Motion, machine: Robot) -> tuple[Way, list[float] | None]:
     return made, None
 
 
-def _check_limits(name: str, values: tuple[float, ...] | None, machine: Robot) -> list[float] | None:
-    n = machine.joints_count
-    if values is not None and (len(values) not in (1, n) or min(values) <= 0.0):
-        found = ",".join(f"{value:g}" for value in values)
-        raise click.UsageError(f"--{name} {found}: one number above 0, or {n} with commas between")
-    return None if values is None else list(values)
-
-
-def _lay_out(motion: TimedPath, soft: bool) -> list[Table]:
-    """Return tables of limits and peaks; with ``soft`` the tolerance bounds the speed, too."""
-    rows: dict[str, list[Any]] = {}
-    words_of = {"speed": "speed or tolerance"} if soft else {}
-    for bound in motion.bounds:
-        what = words_of.get(bound.what, bound.what) or f"none (largest fraction of a limit: {100 * bound.used:.0f} %)"
-        rows[f"{bound.begin:.4f} to {bound.end:.4f}"] = [what]
-    peaks = {
-        joint: [f"{one['value']:.4g} {one['unit']}" for one in values.values()]
-        for joint, values in motion.peaks.items()
-    }
-    words = [Column("", "", word) for word in next(iter(motion.peaks.values()))]
-    worst = sorted(motion.worst.items(), key=lambda item: -item[1])[:6]
-    used = {words_of.get(name, name): [100.0 * value] for name, value in worst}
-    tables = [
-        Table("", [Column("", "", "limit that binds")], rows, head="time (s)"),
-        Table("", words, peaks, head="|peak|"),
-    ]
-    if used:
-        tables.append(Table("", [Column("", "%", "used")], used, head="limit"))
-    return tables
-
-
 def draw_limits(motion: TimedPath, title: str) -> Any:
-    """How much of each limit is used when, coloured by the one that binds."""
+    """Draw the used fraction of each limit over time, coloured by the limit that binds."""
     from pkm_twin.paths.constraints import limit_names
     from pkm_twin.paths.joint_path import only_turns
 
@@ -337,7 +314,8 @@ def draw_limits(motion: TimedPath, title: str) -> Any:
     used, time = motion.used, motion.fine.time
     top, low = axes[0]
     names = limit_names(motion.robot)
-    shown = [i for i in np.argsort(-used.max(0)) if used[:, i].max() > SHOWN][:8]
+    # A limit has its line if the motion uses 30 % of it.
+    shown = [i for i in np.argsort(-used.max(0)) if used[:, i].max() > 0.3][:8]
     colours = {names[i]: plots.COLOURS[k] for k, i in enumerate(shown)}
     for i in shown:
         top.plot(time, 100 * used[:, i], color=colours[names[i]], lw=1.2, label=names[i])
@@ -405,6 +383,3 @@ def _report_cut(cut: SoftCut, motion: TimedPath) -> tuple[list[Fact], Any]:
         return figure
 
     return facts, draw
-
-
-COMMAND = command(path, "Torques, paths and drives")

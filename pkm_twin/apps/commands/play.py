@@ -29,13 +29,14 @@ class Play:
     bag: Path = setting(..., "a bag: an MCAP file or a rosbag2 folder", argument=True)
     speed: float = setting(1.0, "speed factor; 1 is the recorded speed", low=1e-6, high=1e6, older=("--rate",))
     loop: bool = setting(False, "restart at the end")
-    clock: float | None = setting(None, "publish /clock at this many Hz, for nodes with use_sim_time")
+    clock: float | None = setting(None, "publish /clock, Hz, for nodes with use_sim_time")
     wait: float = setting(3.0, "longest wait (s) for a subscriber on every topic")
     topic: tuple[str, ...] = setting((), "play only these topics")
     remap: tuple[str, ...] = setting((), "FROM:=TO, play a topic under another name")
     quiet: bool = setting(False, "no progress bar")
 
 
+@command("Recordings")
 def play(given: Play) -> Report:
     """Publish the messages of a bag."""
     from pkm_twin.ros.player import play as play_bag
@@ -60,6 +61,3 @@ def play(given: Play) -> Report:
         ignore_signals()
     facts = [Fact(name, value) for name, value in asdict(result).items()]
     return Report(f"{given.bag}: {result.messages} messages published", facts)
-
-
-COMMAND = command(play, "Recordings")

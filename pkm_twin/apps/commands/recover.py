@@ -26,6 +26,7 @@ class Recover(Overwrites):
     out: Path = setting(..., "the new bag", argument=True, writes=True)
 
 
+@command("Recordings")
 def recover(given: Recover) -> Report:
     """Write what can be read of a bag.
 
@@ -40,6 +41,3 @@ def recover(given: Recover) -> Report:
         [*(Fact(k, v) for k, v in asdict(result).items()), Fact("lossless", result.lossless)],
         code=0 if result.lossless else SALVAGED,
     )
-
-
-COMMAND = command(recover, "Recordings")

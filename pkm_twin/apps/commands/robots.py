@@ -14,12 +14,10 @@ class Robots:
     """List the robots that ship with pkm_twin."""
 
 
+@command("Robots")
 def robots(given: Robots) -> Report:
     """List the robots with a sentence on each."""
     from pkm_twin import load, robot_names
 
     rows = {name: [load(name).description] for name in robot_names()}
     return Report(tables=[Table("robots", [Column("description", text=" ")], rows)])
-
-
-COMMAND = command(robots, "Robots")

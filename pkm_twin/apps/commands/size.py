@@ -30,11 +30,6 @@ if TYPE_CHECKING:
 
 MOST_PERCENT: Final = 1000.0
 """A used part of more is printed as more."""
-DRAWN: Final = 4
-"""Most drives in a picture."""
-CLOSED_CYCLE: Final = 1e-4
-"""Part of the regenerated energy below which the net energy is an integration error: one drive of a
-fastest cycle errs by 1.3e-5 at 1 kHz, as its effort steps within an interval."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,54 +53,52 @@ class Size(CarriesAtTimes, ReadsMotions, AwayFromSingular, Draws):
     """
 
     motion: Path | None = setting(None, "a recording or a path: MCAP, rosbag2 folder or table", argument=True)
-    drives: Path | None = setting(None, "YAML of motors to compare, or `shipped` for the motors in config/drives")
-    motor: tuple[str, ...] = setting((), "compare only this motor of the drives file; may be repeated")
+    drives: Path | None = setting(None, "YAML of motors to compare, or `shipped`")
+    motor: tuple[str, ...] = setting((), "compare only this motor; may be repeated")
     ratio: float | None = setting(
         None,
-        "gear of the joints that turn, where the file has no drive: turns of the motor per turn of the joint",
+        "gear ratio of turning joints without a drive in the file",
         low=1e-6,
         high=1e6,
     )
     lead: float | None = setting(
         None,
-        "screw or belt of the joints that slide, where the file has no drive: m per turn of the motor",
+        "lead of sliding joints without a drive in the file, m per turn of the motor",
         low=1e-6,
         high=1e6,
     )
-    ratios: str | None = setting(None, "gears to choose from, in place of the file's: LOW:HIGH, or numbers with commas")
-    leads: str | None = setting(None, "leads of screws or belts to choose from, likewise")
+    ratios: str | None = setting(None, "gear ratios to choose from: LOW:HIGH, or numbers with commas")
+    leads: str | None = setting(None, "leads to choose from, likewise")
     efficiency: float | None = setting(
         None,
-        "efficiency of gears, screws and belts; default: the robot file's, or 1",
+        "efficiency of the gears; default: the robot file's, or 1",
         low=1e-3,
         high=1.0,
     )
     over_workspace: tuple[float, ...] | None = setting(
         None,
-        "in place of a motion: speed and acceleration of the tool point (m/s, m/s2), in the "
-        "worst direction at the worst pose",
+        "in place of a motion: speed and acceleration of the tool point (m/s, m/s2) in the worst direction and pose",
         count=2,
         metavar="SPEED,ACCELERATION",
     )
     lever: float = setting(
         0.3,
-        "excludes poses near stretched limbs, where the ratio of tool to joint speed is below "
-        "this fraction of the largest",
+        "leaves out poses whose ratio of tool to joint speed is below this fraction of the largest",
         low=0.0,
         high=1.0,
     )
     efforts: str | None = setting(
         None,
-        "efforts to use; default: the file's; with --payload the model's, unless the file "
-        "has measured efforts that agree with them",
+        "efforts to use; default: the file's, with --payload the model's unless the file's agree",
         choices=("file", "model"),
     )
 
 
+@command("Torques, paths and drives")
 def size(given: Size) -> Report:
     """Compute what each drive must give, and which motors can."""
     from pkm_twin.paths.along import EFFORT_TOLERANCE, compare_efforts
-    from pkm_twin.paths.sizing import read_motors, size_drives
+    from pkm_twin.paths.sizing import find_smallest, read_motors, size_drives
 
     if (given.motion is None) == (given.over_workspace is None):
         raise click.UsageError("give a recording or path, or --over-workspace")
@@ -162,8 +155,23 @@ def size(given: Size) -> Report:
     if taken.unlike:
         notes.append(f"{taken.unlike}; --efforts model uses the model's")
     if motors:
-        best, words = smallest_motors(duties)
-        facts, notes, title = facts + best, notes + words, f"{title}; {words[0]}"
+        none = f"none of {len(duties[0].fits)}"
+        alike = find_smallest([duty.alike for duty in duties])
+        shared = [] if alike is None else [duty.alike[alike] for duty in duties]
+        each: dict[str, Fit | None] = {}
+        for duty in duties:
+            k = find_smallest([duty.fits])
+            each[duty.joint] = None if k is None else duty.fits[k]
+        for_all = dict(zip(each, [fit.choice for fit in shared], strict=True)) if shared else None
+        facts += [
+            Fact("smallest_motor", shared[0].name if shared else None),
+            Fact("smallest_for_all", for_all),
+            Fact("smallest_for_each", {name: fit and fit.choice for name, fit in each.items()}),
+        ]
+        best = f"smallest motor for all drives: {' and '.join(dict.fromkeys(map(str, shared))) or none}"
+        own = ", ".join(f"{name} {fit or none}" for name, fit in each.items())
+        notes += [best, f"smallest for each drive: {own}"]
+        title = f"{title}; {best}"
     return Report(
         answer,
         facts,
@@ -176,11 +184,13 @@ def size(given: Size) -> Report:
 def net_energy(duties: Sequence[Duty]) -> float:
     """Return the energy that drives take, J: 0 for a closed cycle, which gives back all of it."""
     net = sum(duty.energy for duty in duties)
-    return net if abs(net) > CLOSED_CYCLE * sum(duty.returned for duty in duties) else 0.0
+    # Part of the regenerated energy below which the net energy is an integration error: one
+    # drive of a fastest cycle errs by 1.3e-5 at 1 kHz, as its effort steps within an interval.
+    return net if abs(net) > 1e-4 * sum(duty.returned for duty in duties) else 0.0
 
 
 def gears(given: Size, robot: Robot) -> tuple[list[Gear], list[Gears]]:
-    """Gears of the joints, and those to choose from.
+    """Return the gears of the joints, and those to choose from.
 
     :raises ParameterError: numbers that no gear has.
     """
@@ -210,29 +220,7 @@ def gears(given: Size, robot: Robot) -> tuple[list[Gear], list[Gears]]:
     return one, choices
 
 
-def smallest_motors(duties: Sequence[DriveDuty]) -> tuple[list[Fact], list[str]]:
-    """Find the smallest motor with a gear for all drives and for each; return facts and words."""
-    from pkm_twin.paths.sizing import find_smallest
-
-    none = f"none of {len(duties[0].fits)}"
-    alike = find_smallest([duty.alike for duty in duties])
-    shared = [] if alike is None else [duty.alike[alike] for duty in duties]
-    each = {}
-    for duty in duties:
-        k = find_smallest([duty.fits])
-        each[duty.joint] = None if k is None else duty.fits[k]
-    facts = [
-        Fact("smallest_motor", shared[0].name if shared else None),
-        Fact("smallest_for_all", dict(zip(each, [fit.choice for fit in shared], strict=True)) if shared else None),
-        Fact("smallest_for_each", {name: fit and fit.choice for name, fit in each.items()}),
-    ]
-    words = " and ".join(dict.fromkeys(map(str, shared))) or none
-    own = ", ".join(f"{name} {fit or none}" for name, fit in each.items())
-    return facts, [f"smallest motor for all drives: {words}", f"smallest for each drive: {own}"]
-
-
 def _make_tables(duties: Sequence[DriveDuty]) -> list[Table]:
-    """Joints, motors and the comparisons, as the terminal shows them."""
     tables = []
     sides = [("joint", True), ("joint", False), ("motor", False)]
     for side, slides in sides:
@@ -374,7 +362,7 @@ def draw(taken: EffortComparison, duties: Sequence[DriveDuty], answer: str) -> A
     """Torque against speed, an axes for each drive, with the curves of motors or the limits."""
     from pkm_twin.paths.sizing import RPM
 
-    shown = duties[:DRAWN]
+    shown = duties[:4]
     figure, axes = plots.columns(1, len(shown))
     m = taken.motion
     for k, (ax, d) in enumerate(zip(axes[0], shown, strict=True)):
@@ -421,6 +409,3 @@ def draw(taken: EffortComparison, duties: Sequence[DriveDuty], answer: str) -> A
         plots.legend(ax)
     plots.head(figure, answer)
     return figure
-
-
-COMMAND = command(size, "Torques, paths and drives")

@@ -55,16 +55,16 @@ class Torques(CarriesAtTimes, ReadsMotions, AtPose, Writes, Draws):
     """
 
     motion: Path | None = setting(None, "a recording or a path: MCAP, rosbag2 folder or table", argument=True)
-    at: str | None = setting(None, "at rest at this pose, in place of a motion; separated by commas")
+    at: str | None = setting(None, "pose at rest, in place of a motion")
     wrench: tuple[float, ...] | None = setting(
         None,
-        "with --at: force and moment on the platform, N and N m, base axes",
+        "with --at: wrench on the platform, N and N m, base axes",
         count=6,
         metavar="fx,fy,fz,mx,my,mz",
     )
     out: Path | None = setting(
         None,
-        "table to write, .csv, .parquet or .mat; default of a motion: torques.csv",
+        "table to write, .csv, .parquet or .mat; default: torques.csv",
         writes=True,
         endings=ENDINGS,
     )
@@ -86,6 +86,7 @@ class Torques(CarriesAtTimes, ReadsMotions, AtPose, Writes, Draws):
         return Recording(machine, np.zeros(1), q, still, still, wrench=wrench, load=self.load)
 
 
+@command("Torques, paths and drives")
 def torques(given: Torques) -> Report:
     """Peak and RMS effort of each joint, and the table."""
     from pkm_twin.paths.along import torque_table
@@ -163,6 +164,3 @@ def torques(given: Torques) -> Report:
         ],
         files={"out": given.out},
     )
-
-
-COMMAND = command(torques, "Torques, paths and drives")

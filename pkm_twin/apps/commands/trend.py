@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from pkm_twin.apps.frame import command
 from pkm_twin.apps.options import Draws
@@ -17,9 +17,6 @@ from pkm_twin.settings import setting
 
 if TYPE_CHECKING:
     from pkm_twin.identification.history import Judged
-
-SHOWN: Final = 4
-"""Most series in a picture."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,11 +32,12 @@ class Trend(Draws):
     history: Path = setting(..., "a file that `pkm-twin check --history` wrote", argument=True)
     machine: str | None = setting(None, "report this machine only")
     baseline: int = setting(15, "number of first recordings that set the control limits", low=3)
-    false_alarm: float = setting(0.01, "probability of a false alarm for a history without drift", low=1e-9, high=0.5)
+    false_alarm: float = setting(0.01, "probability of a false alarm without drift", low=1e-9, high=0.5)
 
 
+@command("Recordings")
 def trend(given: Trend) -> Report:
-    """Which series of a history drift.
+    """Find the series of a history that drift.
 
     :raises ParameterError: no history, or one without numbers of this machine.
     """
@@ -75,12 +73,12 @@ def trend(given: Trend) -> Report:
 
 
 def draw(results: Sequence[Judged], answer: str) -> Any:
-    """Series with their control limits, those that drift first."""
+    """Draw the series with their control limits, those that drift first."""
     import numpy as np
 
     from pkm_twin.report import plots
 
-    order = sorted(results, key=lambda one: (not one.drifts, -len(one.series.value)))[:SHOWN]
+    order = sorted(results, key=lambda one: (not one.drifts, -len(one.series.value)))[:4]
     width = min(2, len(order))
     figure, by_column = plots.columns(width, math.ceil(len(order) / width))
     axes = np.array(by_column).T.ravel()
@@ -102,6 +100,3 @@ def draw(results: Sequence[Judged], answer: str) -> Any:
     marks = "band: control limits; ring: outside them; dashed: the mean changed"
     plots.head(figure, f"Is it getting worse? {answer}{shown}\n{marks}")
     return figure
-
-
-COMMAND = command(trend, "Recordings")

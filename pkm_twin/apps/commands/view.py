@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -17,9 +17,6 @@ from pkm_twin.apps.options import CarriesAtTimes, ReadsRecordings
 from pkm_twin.console import progress
 from pkm_twin.report import Report
 from pkm_twin.settings import setting
-
-if TYPE_CHECKING:
-    from pkm_twin.view.timeline import Timeline
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,6 +36,7 @@ class View(CarriesAtTimes, ReadsRecordings):
     port: int = setting(8080, "port to listen on; 0: any free port", low=0, high=65535)
 
 
+@command("Robots")
 def view(given: View) -> Report:
     """Serve the page until a signal ends it.
 
@@ -59,11 +57,15 @@ def view(given: View) -> Report:
     from pkm_twin.view.model import Model
     from pkm_twin.view.page import ADDRESS, Page, serving
     from pkm_twin.view.panels import BagPanel, LivePanel, ModePanel
+    from pkm_twin.view.timeline import Timeline
     from stiffness_monitor.modes import has_modes
 
     with ExitStack() as stack:
         machine = load(given.robot, **given.part)
-        timeline = None if bag is None else _read_timeline(bag, given)
+        timeline = None
+        if bag is not None:
+            with progress("reading", None) as update:
+                timeline = Timeline.of(given.read(bag, given.robot, update, limited=True))
         model = Model(machine)
         server = stack.enter_context(serving(given.port))
         page = Page(server, model, "Bag" if timeline is not None else "Live" if given.live else "")
@@ -80,17 +82,9 @@ def view(given: View) -> Report:
     return Report()
 
 
-def _read_timeline(bag: Path, given: View) -> Timeline:
-    from pkm_twin.view.timeline import Timeline
-
-    with progress("reading", None) as update:
-        recording = given.read(bag, given.robot, update, limited=True)
-    return Timeline.of(recording)
-
-
 @contextmanager
 def listening(live: Any, namespace: str) -> Iterator[None]:
-    """Messages of the nodes in a namespace reach ``live`` while the block lasts."""
+    """Pass messages of the nodes in a namespace to ``live`` while the block lasts."""
     from pkm_twin.ros.context import listening_node, subscribe_best_effort
     from pkm_twin.view.live import TOPICS
 
@@ -110,6 +104,3 @@ def listening(live: Any, namespace: str) -> Iterator[None]:
         finally:
             ended.set()
             thread.join()
-
-
-COMMAND = command(view, "Robots")

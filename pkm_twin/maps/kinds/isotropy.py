@@ -28,7 +28,7 @@ class Isotropy(Kind):
     """Map kinetic energy and driving force in the worst direction of motion."""
 
     energy: float = setting(ENERGY, "the platform's kinetic energy for the driving force (J)")
-    spheres: bool = setting(False, "also both indices in every direction of motion, on spheres at azimuth and tilt")
+    spheres: bool = setting(False, "also both indices in every direction, on spheres")
 
     name = "isotropy"
     question = "what does the worst direction cost?"

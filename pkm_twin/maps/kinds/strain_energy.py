@@ -33,7 +33,7 @@ class StrainEnergy(Compliance):
 
     slices: bool = setting(
         False,
-        "also pictures of the energy and of each element's share, in slices and in a plane",
+        "also pictures of energy and shares, in slices and a plane",
         name="elements",
     )
 
