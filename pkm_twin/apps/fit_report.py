@@ -207,11 +207,7 @@ def _report_elastic(result: ElasticFit) -> list[Fact]:
         for judged, zero, measured in each
     ]
     noise = np.where(result.measured.any(0), result.estimate.noise, np.nan)
-    return [
-        Fact("not_told_apart", groups),
-        Fact(f"deflection_noise_{BY_AXIS}", noise),
-        Fact("held_out", held),
-    ]
+    return [Fact("not_told_apart", groups), Fact(f"deflection_noise_{BY_AXIS}", noise), Fact("held_out", held)]
 
 
 def _describe_group(group: Group) -> str:
@@ -295,11 +291,7 @@ def drive_report(found: DriveFriction) -> Report:
     for law in found.laws:
         each = zip(law.terms, law.values, law.deviations, strict=True)
         rows[law.name] = {term: {"value": v, "standard_deviation": d} for term, v, d in each}
-        rows[law.name] |= {
-            "residual_a": law.residual,
-            "held_out_a": law.held_out,
-            "held_out_drive_a": law.other_drives,
-        }
+        rows[law.name] |= {"residual_a": law.residual, "held_out_a": law.held_out, "held_out_drive_a": law.other_drives}
     notes = []
     for law in found.laws:
         line = f"{law.name}: {_write_terms(law)}; residual {law.residual:.3f} A"

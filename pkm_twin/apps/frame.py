@@ -129,11 +129,7 @@ class Argument(click.Argument):
         kind, repeated = _read_type(kind, row)
         self.shown, known = _write_default(row, default)
         super().__init__(
-            [field],
-            type=Value(kind, row),
-            required=default is MISSING,
-            nargs=-1 if repeated else 1,
-            **known,
+            [field], type=Value(kind, row), required=default is MISSING, nargs=-1 if repeated else 1, **known
         )
         self.row = row
 

@@ -46,10 +46,7 @@ class OfPlatform:
     )
     actuated: tuple[str, ...] = setting((), "joints of such a file that have motors, NAME,NAME,...; default: as marked")
     pose_names: tuple[str, ...] = setting(
-        (),
-        "pose coordinates, of x y z roll pitch yaw; default: see `info`",
-        name="pose",
-        metavar="NAMES",
+        (), "pose coordinates, of x y z roll pitch yaw; default: see `info`", name="pose", metavar="NAMES"
     )
     carry: bool = setting(False, "with --base: parts beyond the platform are its payload")
 
@@ -113,10 +110,7 @@ class Carries(OfRobot):
 class CarriesAtTimes(Carries):
     """A payload that is held in intervals."""
 
-    load_times: str | None = setting(
-        None,
-        "times at which --payload is held: FROM,TO[,FROM,TO...], s; default: always",
-    )
+    load_times: str | None = setting(None, "times at which --payload is held: FROM,TO[,FROM,TO...], s; default: always")
 
     def machine(self) -> Robot:
         """Load the robot alone: the recording knows what it carries and when."""
@@ -129,10 +123,7 @@ class ReadsTables:
 
     separator: str | None = setting(None, "column separator: , ; or tab; default: detected")
     decimal: str | None = setting(None, "decimal mark: . or ,; default: detected")
-    columns: tuple[str, ...] = setting(
-        (),
-        "column names, OURS=THEIRS,...: 'leg_*.position=motor_*, x=pos_x [mm]'",
-    )
+    columns: tuple[str, ...] = setting((), "column names, OURS=THEIRS,...: 'leg_*.position=motor_*, x=pos_x [mm]'")
     units: str | None = setting(
         None,
         "units of columns whose header has none: rad, mrad, deg, rev, m, cm, mm, um, s, ms, us, ns, "
@@ -169,11 +160,7 @@ class ReadsRecordings(ReadsTables):
     base_frame: str = setting("base_link", "frame of wrenches with base axes")
 
     def read(
-        self,
-        path: Path,
-        robot: Robot | str | None,
-        progress: Callable[[int], None] | None = None,
-        **more: Any,
+        self, path: Path, robot: Robot | str | None, progress: Callable[[int], None] | None = None, **more: Any
     ) -> Recording:
         """Read a recording; ``more``: other fields of ``ReadOptions``."""
         from pkm_twin.bags.storage import is_bag
@@ -259,10 +246,7 @@ class OfTool:
     """The modes of the tool point."""
 
     tool: tuple[float, ...] = setting(
-        (0.0, 0.0, 0.0),
-        "tool point from the reference point, platform axes, m",
-        count=3,
-        metavar="x,y,z",
+        (0.0, 0.0, 0.0), "tool point from the reference point, platform axes, m", count=3, metavar="x,y,z"
     )
     damping: tuple[float, ...] | None = setting(
         None,
@@ -290,14 +274,7 @@ class OfMilling:
         """
         from stiffness_monitor.chatter import Milling
 
-        return Milling(
-            self.teeth,
-            self.tangential,
-            self.radial,
-            self.immersion,
-            self.up,
-            math.radians(self.feed),
-        )
+        return Milling(self.teeth, self.tangential, self.radial, self.immersion, self.up, math.radians(self.feed))
 
 
 @dataclass(frozen=True, kw_only=True)

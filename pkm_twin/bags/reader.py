@@ -94,10 +94,7 @@ def inspect(path: str | Path) -> BagReport:
 
 
 def read_messages(
-    path: str | Path,
-    topics: Iterable[str] | None = None,
-    *,
-    order: Literal["log_time", "file"] = "log_time",
+    path: str | Path, topics: Iterable[str] | None = None, *, order: Literal["log_time", "file"] = "log_time"
 ) -> Iterator[BagMessage]:
     """Check a whole bag, then yield its messages; see :meth:`Bag.messages`."""
     return open_bag(path).messages(topics, order=order)
@@ -172,10 +169,7 @@ class Bag:
         self.report = report
 
     def messages(
-        self,
-        topics: Iterable[str] | None = None,
-        *,
-        order: Literal["log_time", "file"] = "log_time",
+        self, topics: Iterable[str] | None = None, *, order: Literal["log_time", "file"] = "log_time"
     ) -> Iterator[BagMessage]:
         """Yield the messages of ``topics`` (all by default).
 

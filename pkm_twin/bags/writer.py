@@ -206,13 +206,7 @@ class BagWriter:
         self._sequences[topic] = 0
         self._queue.put(lambda: self._register(topic, type_name, text, qos))
 
-    def write(
-        self,
-        topic: str,
-        message: object,
-        log_time_ns: int,
-        publish_time_ns: int | None = None,
-    ) -> None:
+    def write(self, topic: str, message: object, log_time_ns: int, publish_time_ns: int | None = None) -> None:
         """Record one message at its log time; its publish time is the same unless given.
 
         ``message`` is CDR bytes, which are taken as they are, a live ROS message, a mapping, or an
@@ -272,10 +266,7 @@ class BagWriter:
         return self
 
     def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         # The first error is the one to tell.
         with suppress(*([BagError] if error else [])):
@@ -334,10 +325,7 @@ def whole_bag(path: Path, overwrite: bool, metadata: Mapping[str, Mapping[str, s
     """
     refuse_existing(path, overwrite)
     try:
-        with (
-            replacing(path) as hidden,
-            BagWriter(hidden, metadata=metadata, flush_period=None) as writer,
-        ):
+        with replacing(path) as hidden, BagWriter(hidden, metadata=metadata, flush_period=None) as writer:
             yield writer
     except OSError as error:
         raise write_error(error, path) from error

@@ -189,10 +189,7 @@ def process(command: Sequence[str]) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def wait_for(
-    executor: SingleThreadedExecutor,
-    condition: Callable[[], bool],
-    what: str,
-    child: subprocess.Popen[bytes],
+    executor: SingleThreadedExecutor, condition: Callable[[], bool], what: str, child: subprocess.Popen[bytes]
 ) -> None:
     """Spin until the condition holds.
 
@@ -207,11 +204,7 @@ def wait_for(
             raise PkmTwinError(f"waiting for {what}: nothing for {PATIENCE:g} s; this machine is too slow or too busy")
 
 
-def drain(
-    executor: SingleThreadedExecutor,
-    recorder: Recorder,
-    answered: Callable[[], bool] = lambda: True,
-) -> None:
+def drain(executor: SingleThreadedExecutor, recorder: Recorder, answered: Callable[[], bool] = lambda: True) -> None:
     """Receive messages until none has come for half a second.
 
     :param answered: returns whether all expected messages have come; otherwise the wait is ten

@@ -25,17 +25,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from pkm_twin.bags.reader import BagMessage, BagWriter, inspect
 from pkm_twin.demo import tracking
-from pkm_twin.demo.recorder import (
-    DEPTH,
-    PATIENCE,
-    STATE,
-    TRAJECTORY,
-    Lockstep,
-    Recorder,
-    drain,
-    process,
-    wait_for,
-)
+from pkm_twin.demo.recorder import DEPTH, PATIENCE, STATE, TRAJECTORY, Lockstep, Recorder, drain, process, wait_for
 from pkm_twin.demo.report import REPORTS, draw
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.report import Fact, Report, Verdict
@@ -65,13 +55,7 @@ class Stage:
         """Arguments of the node, with queues that do not overflow on a busy computer."""
         queues = [f"qos_overrides.{t}.subscription.reliability:=reliable" for t in self.inputs]
         queues += [f"qos_overrides.{t}.publisher.depth:={DEPTH}" for t in self.outputs]
-        given = (
-            "use_sim_time:=true",
-            "future_tolerance:=1.0",
-            PATIENT_QUEUE,
-            *self.parameters,
-            *queues,
-        )
+        given = ("use_sim_time:=true", "future_tolerance:=1.0", PATIENT_QUEUE, *self.parameters, *queues)
         return ["--ros-args", *(word for parameter in given for word in ("-p", parameter))]
 
 
@@ -153,13 +137,7 @@ def run_stage(stage: Stage, bag: Path, recorder: Recorder, executor: SingleThrea
             done = (message.log_time - report.start_time) / 1e9
             progress.update(bar, completed=done, messages=recorder.total - before)
 
-        play(
-            bag,
-            topics=stage.inputs,
-            wait_for_subscribers=PATIENCE,
-            progress=False,
-            pace=pace,
-        )
+        play(bag, topics=stage.inputs, wait_for_subscribers=PATIENCE, progress=False, pace=pace)
         drain(executor, recorder, lambda: lockstep.answered)
         lockstep.close()
         progress.update(bar, completed=seconds, messages=recorder.total - before)

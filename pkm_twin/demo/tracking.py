@@ -24,15 +24,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from pkm_twin import load
 from pkm_twin.bags.reader import read_messages
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.demo.recorder import (
-    DEPTH,
-    STATE,
-    TRAJECTORY,
-    Recorder,
-    drain,
-    process,
-    wait_for,
-)
+from pkm_twin.demo.recorder import DEPTH, STATE, TRAJECTORY, Recorder, drain, process, wait_for
 from pkm_twin.demo.report import Panel, share, told
 from pkm_twin.errors import BagError
 from pkm_twin.messages.reading import JointReader
@@ -109,9 +101,7 @@ def run(spread: float, recorder: Recorder, executor: SingleThreadedExecutor, con
     plain = JointTrajectory(joint_names=list(robot.joint_names))
     for k in range(POINTS):
         point = JointTrajectoryPoint(
-            positions=(home + rows[0][k]).tolist(),
-            velocities=rows[1][k].tolist(),
-            accelerations=rows[2][k].tolist(),
+            positions=(home + rows[0][k]).tolist(), velocities=rows[1][k].tolist(), accelerations=rows[2][k].tolist()
         )
         time = round(x[k] * DURATION * SECOND)
         point.time_from_start.sec, point.time_from_start.nanosec = divmod(time, SECOND)

@@ -21,20 +21,11 @@ _SECOND: Final[Functions] = {
         "c->model.v[0] = start; return STATUS_OK;",
     ),
     "EnterInitializationMode": ("", "return STATUS_OK;"),
-    "GetReal": (
-        "const Reference *vr, size_t count, double *values",
-        "return get_reals(c, vr, count, values);",
-    ),
-    "SetReal": (
-        "const Reference *vr, size_t count, const double *values",
-        "return set_reals(c, vr, count, values);",
-    ),
+    "GetReal": ("const Reference *vr, size_t count, double *values", "return get_reals(c, vr, count, values);"),
+    "SetReal": ("const Reference *vr, size_t count, const double *values", "return set_reals(c, vr, count, values);"),
     "GetInteger": ("const Reference *vr, size_t count, int *values", "return get_status(c, vr, count, values);"),
     **{
-        f"{what}{kind}": (
-            f"const Reference *vr, size_t count, {const}{kinds} *values",
-            "return unsupported(c, count);",
-        )
+        f"{what}{kind}": (f"const Reference *vr, size_t count, {const}{kinds} *values", "return unsupported(c, count);")
         for what, const in (("Get", ""), ("Set", "const "))
         for kind, kinds in (("Integer", "int"), ("Boolean", "int"), ("String", "char *"))
         if what + kind != "GetInteger"
@@ -50,10 +41,7 @@ _SECOND: Final[Functions] = {
         "const double *seed, double *values",
         "return unsupported(c, 1);",
     ),
-    "NewDiscreteStates": (
-        "EventInfo *info",
-        "memset(info, 0, sizeof *info); return update(c, &info->values_changed);",
-    ),
+    "NewDiscreteStates": ("EventInfo *info", "memset(info, 0, sizeof *info); return update(c, &info->values_changed);"),
     "CompletedIntegratorStep": (
         "int kept, int *event_mode, int *terminate",
         "*event_mode = 0; *terminate = 0; return STATUS_OK;",
@@ -96,10 +84,7 @@ _NUMBERS: Final = {
 }
 _MANY: Final = "const Reference *vr, size_t count, "
 _THIRD: Final[Functions] = {
-    "SetDebugLogging": (
-        "bool on, size_t count, const char *const *categories",
-        "return STATUS_OK;",
-    ),
+    "SetDebugLogging": ("bool on, size_t count, const char *const *categories", "return STATUS_OK;"),
     "EnterInitializationMode": (
         "bool tolerant, double tolerance, double start, bool stops, double stop",
         "c->model.v[0] = start; return STATUS_OK;",
@@ -118,17 +103,11 @@ _THIRD: Final[Functions] = {
     ),
     "SetInt32": (_MANY + "const int32_t *values, size_t size", "return unsupported(c, count);"),
     **{
-        f"{what}{kind}": (
-            f"{_MANY}{const}{kinds} *values, size_t size",
-            "return unsupported(c, count);",
-        )
+        f"{what}{kind}": (f"{_MANY}{const}{kinds} *values, size_t size", "return unsupported(c, count);")
         for what, const in (("Get", ""), ("Set", "const "))
         for kind, kinds in _NUMBERS.items()
     },
-    "GetBinary": (
-        _MANY + "size_t *sizes, const unsigned char **values, size_t size",
-        "return unsupported(c, count);",
-    ),
+    "GetBinary": (_MANY + "size_t *sizes, const unsigned char **values, size_t size", "return unsupported(c, count);"),
     "SetBinary": (
         _MANY + "const size_t *sizes, const unsigned char *const *values, size_t size",
         "return unsupported(c, count);",
@@ -157,10 +136,7 @@ _THIRD: Final[Functions] = {
         "return unsupported(c, count);",
     ),
     "GetShiftDecimal": (_MANY + "double *values", "return unsupported(c, count);"),
-    "GetShiftFraction": (
-        _MANY + "uint64_t *counters, uint64_t *resolutions",
-        "return unsupported(c, count);",
-    ),
+    "GetShiftFraction": (_MANY + "uint64_t *counters, uint64_t *resolutions", "return unsupported(c, count);"),
     "SetIntervalDecimal": (_MANY + "const double *values", "return unsupported(c, count);"),
     "SetShiftDecimal": (_MANY + "const double *values", "return unsupported(c, count);"),
     **{
@@ -215,16 +191,10 @@ def write_interface(version: int) -> str:
         "Reset": ("", "begin(&c->model); return STATUS_OK;"),
         "ExitInitializationMode": ("", "int changed; return update(c, &changed);"),
         "SetTime": ("double time", "c->model.v[0] = time; return STATUS_OK;"),
-        "GetNominalsOfContinuousStates": (
-            "double *values, size_t count",
-            "return nominals(values, count);",
-        ),
+        "GetNominalsOfContinuousStates": ("double *values, size_t count", "return nominals(values, count);"),
         "SetContinuousStates": ("const double *x, size_t count", "return set_states(c, x, count);"),
         "GetContinuousStates": ("double *x, size_t count", "return get_states(c, x, count);"),
-        "GetEventIndicators": (
-            "double *values, size_t count",
-            "return get_indicators(c, values, count);",
-        ),
+        "GetEventIndicators": ("double *values, size_t count", "return get_indicators(c, values, count);"),
     }
     state = "state" if version == 2 else "State"
     functions |= {
@@ -233,10 +203,7 @@ def write_interface(version: int) -> str:
             "GetFMU{state}": ("void **state", "return copy_state(c, state);"),
             "SetFMU{state}": ("void *state", "return restore(c, state, sizeof c->model);"),
             "FreeFMU{state}": ("void **state", "return forget(state);"),
-            "SerializedFMU{state}Size": (
-                "void *state, size_t *size",
-                "*size = sizeof c->model; return STATUS_OK;",
-            ),
+            "SerializedFMU{state}Size": ("void *state, size_t *size", "*size = sizeof c->model; return STATUS_OK;"),
             "SerializeFMU{state}": (
                 "void *state, unsigned char *bytes, size_t size",
                 "return save(c, state, bytes, size);",
@@ -276,17 +243,7 @@ def _function(name: str, arguments: str, body: str) -> str:
         line if line.startswith(" ") else f"    {line}"
         for line in body.replace("; return", ";\n    return").replace("; *", ";\n    *").split("\n")
     ]
-    return "\n".join(
-        [
-            f"EXPORT Status FMI({name})({head})",
-            "{",
-            *first,
-            *unused,
-            *lines,
-            "}",
-            "",
-        ]
-    )
+    return "\n".join([f"EXPORT Status FMI({name})({head})", "{", *first, *unused, *lines, "}", ""])
 
 
 def _words(body: str) -> Sequence[str]:

@@ -220,11 +220,7 @@ def _third(d: Description) -> ET.Element:
         kind = "Int32" if v.whole else "Float64"
         ET.SubElement(variables, kind, {a: b for a, b in entry.items() if b})
     structure = ET.SubElement(top, "ModelStructure")
-    for tag, kinds in (
-        ("Output", "so"),
-        ("ContinuousStateDerivative", "d"),
-        ("InitialUnknown", "od"),
-    ):
+    for tag, kinds in (("Output", "so"), ("ContinuousStateDerivative", "d"), ("InitialUnknown", "od")):
         for k, v in d.unknowns(kinds):
             needs = " ".join(map(str, v.needs))
             ET.SubElement(structure, tag, valueReference=str(k), dependencies=needs)

@@ -211,11 +211,7 @@ def _joint_limits(robot: Robot, accelerations: Sequence[float]) -> dict[str, Any
             "has_acceleration_limits": acceleration < np.inf,
             "max_acceleration": acceleration if acceleration < np.inf else 0.0,
         }
-    return {
-        "default_velocity_scaling_factor": 0.1,
-        "default_acceleration_scaling_factor": 0.1,
-        "joint_limits": limits,
-    }
+    return {"default_velocity_scaling_factor": 0.1, "default_acceleration_scaling_factor": 0.1, "joint_limits": limits}
 
 
 def _controllers(robot: Robot) -> dict[str, Any]:

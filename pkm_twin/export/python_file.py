@@ -15,32 +15,13 @@ from typing import Any, Final
 from pkm_twin.codegen.expressions import PARAMETERS, Expression
 from pkm_twin.codegen.operations import OPERATIONS
 from pkm_twin.codegen.plain import source
-from pkm_twin.codegen.program import (
-    AHEAD,
-    AT,
-    CLOSED,
-    CONTRACTION,
-    FIRST,
-    LEAST,
-    MARGIN,
-    RESIDUAL,
-    STATE,
-    previous,
-)
+from pkm_twin.codegen.program import AHEAD, AT, CLOSED, CONTRACTION, FIRST, LEAST, MARGIN, RESIDUAL, STATE, previous
 from pkm_twin.export.c99 import Folding, Routine
 from pkm_twin.export.c_package import Package
 from pkm_twin.kinematics.programs import SAME_POSE
 from pkm_twin.robot.robot import Robot
 
-FUNCTIONS: Final = (
-    "forward",
-    "inverse",
-    "jacobian",
-    "torques",
-    "joint_to_actuator",
-    "actuator_to_joint",
-    "gains",
-)
+FUNCTIONS: Final = ("forward", "inverse", "jacobian", "torques", "joint_to_actuator", "actuator_to_joint", "gains")
 CORRECTIONS: Final = 6
 """Corrections of a call. Of 10,000 states each of delta_cu, prru, rps3 and five_bar, 5 reach all
 that 12 reach; one more makes the derivatives exact."""

@@ -225,17 +225,12 @@ def _controllers(robot: Robot, package: str, bandwidth: float) -> str:
         "controller_manager": {
             "update_rate": 500,
             "joint_state_broadcaster": {"type": "joint_state_broadcaster/JointStateBroadcaster"},
-            CONTROLLER: {
-                "type": f"{package}/FeedforwardController",
-                "fallback_controllers": [GRAVITY],
-            },
+            CONTROLLER: {"type": f"{package}/FeedforwardController", "fallback_controllers": [GRAVITY]},
             GRAVITY: {"type": f"{package}/GravityController"},
             TRAJECTORIES: {"type": "joint_trajectory_controller/JointTrajectoryController"},
         },
         CONTROLLER: own,
-        GRAVITY: {
-            "gains": {name: {"d": float(d)} for name, d in zip(joints, _damping(robot), strict=True)},
-        },
+        GRAVITY: {"gains": {name: {"d": float(d)} for name, d in zip(joints, _damping(robot), strict=True)}},
         TRAJECTORIES: {
             "joints": joints,
             "command_joints": [f"{CONTROLLER}/{joint}" for joint in joints],

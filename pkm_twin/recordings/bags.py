@@ -48,10 +48,7 @@ MAX_DEFLECTION_OFFSET: Final = 0.02
 
 
 def read_bag(
-    path: Path,
-    robot: str | Robot | None,
-    how: ReadOptions,
-    progress: Callable[[int], None] | None = None,
+    path: Path, robot: str | Robot | None, how: ReadOptions, progress: Callable[[int], None] | None = None
 ) -> Recording:
     """Read a bag's joint states and its other measurements; messages are checked as by a node.
 
@@ -178,11 +175,7 @@ class _Found(NamedTuple):
 
 
 def _read_messages(
-    bag: Bag,
-    robot: Robot,
-    topics: Topics,
-    how: ReadOptions,
-    progress: Callable[[int], None] | None,
+    bag: Bag, robot: Robot, topics: Topics, how: ReadOptions, progress: Callable[[int], None] | None
 ) -> _Found:
     """Yield the accepted messages of the chosen topics, joint states in the order of their stamps.
 
@@ -239,9 +232,7 @@ def _read_messages(
             first = first or one_line(text)
     if not found.samples:
         raise BagError(
-            f"no usable joint state for {robot.name}: {first}",
-            path=bag.report.path,
-            reason="no joint states",
+            f"no usable joint state for {robot.name}: {first}", path=bag.report.path, reason="no joint states"
         )
     return found._replace(first_reject=first, others=others)
 
@@ -369,13 +360,5 @@ def read_trajectory(bag: Bag, robot: Robot) -> Recording | None:
     if plan.qd is None or plan.qdd is None or len(plan.times) < 2:
         return None
     return Recording(
-        robot,
-        plan.times,
-        plan.q,
-        plan.qd,
-        plan.qdd,
-        plan.effort,
-        efforts="effort",
-        bag=bag,
-        topics=Topics(names[0]),
+        robot, plan.times, plan.q, plan.qd, plan.qdd, plan.effort, efforts="effort", bag=bag, topics=Topics(names[0])
     )

@@ -42,10 +42,7 @@ class Load:
 
     @classmethod
     def of(
-        cls,
-        spans: Sequence[tuple[float, float, float]],
-        source: str,
-        com: tuple[float, float, float] | None = None,
+        cls, spans: Sequence[tuple[float, float, float]], source: str, com: tuple[float, float, float] | None = None
     ) -> Load:
         """Build the load of intervals, each with begin, end (s) and mass (kg)."""
         masses = tuple(mass for *_, mass in spans)
@@ -210,9 +207,7 @@ def _fact(bag: Bag, facts: Mapping[str, str], name: str) -> list[float]:
 def metadata_error(bag: Bag, name: str, value: str | None, expected: str) -> BagError:
     """Return the error for a wrong value in the bag's own metadata."""
     return BagError(
-        f"metadata 'pkm_twin': {name} is {value!r}; expected {expected}",
-        path=bag.report.path,
-        reason="metadata",
+        f"metadata 'pkm_twin': {name} is {value!r}; expected {expected}", path=bag.report.path, reason="metadata"
     )
 
 

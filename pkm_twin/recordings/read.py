@@ -45,11 +45,7 @@ TERM: Final = "effort_gravity"
 BLOCK: Final = 4096
 """Samples computed at a time, so that memory stays flat."""
 SIZES: Final = dict(
-    zip(
-        (*WRENCH, *DEFLECTION),
-        np.repeat([MAX_LOAD, MAX_LOAD, MAX_SHIFT, MAX_TURN], 3).tolist(),
-        strict=True,
-    )
+    zip((*WRENCH, *DEFLECTION), np.repeat([MAX_LOAD, MAX_LOAD, MAX_SHIFT, MAX_TURN], 3).tolist(), strict=True)
 )
 """Greatest values of a table's columns, as of messages: N, N m, m, rad."""
 MIN_STEP: Final = 1e-9
@@ -109,10 +105,7 @@ def _read_table_recording(path: Path, name: str | Robot | None, how: ReadOptions
             raise ParameterError(str(path), f"columns {one_line(', '.join(columns), 80)}", RECORDING)
         raise ParameterError("--robot", None, "a robot, because a table does not name its robot")
     robot = name if isinstance(name, Robot) else load(name)
-    table, side = (
-        read_table(path, kinds_of(robot, how.side), how.dialect),
-        _find_map(robot, how.side),
-    )
+    table, side = (read_table(path, kinds_of(robot, how.side), how.dialect), _find_map(robot, how.side))
     joints = robot.joint_names if side is None else side.names
     _refuse_misspelt(table, robot, joints, how)
 
@@ -209,9 +202,7 @@ def _read_table_recording(path: Path, name: str | Robot | None, how: ReadOptions
         bad = np.flatnonzero((sizes > bound) | ((sizes < TINY) & (sizes > 0.0)))
         if len(bad):
             raise ParameterError(
-                f"{table.line(bad[0])}: {name}",
-                float(table[name][bad[0]]),
-                f"0, or {TINY:g} to {bound:g} in size",
+                f"{table.line(bad[0])}: {name}", float(table[name][bad[0]]), f"0, or {TINY:g} to {bound:g} in size"
             )
     held = how.load or load_of_table(robot, table, time)
     return Recording(

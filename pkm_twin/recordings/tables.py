@@ -155,9 +155,7 @@ class Table(dict[str, Array]):
         for name in names:
             if name not in self:
                 raise ParameterError(
-                    str(self.path),
-                    ", ".join(self),
-                    f"a column {name!r}; --columns {name}=HEADER names another",
+                    str(self.path), ", ".join(self), f"a column {name!r}; --columns {name}=HEADER names another"
                 )
 
     def stack(self, names: Sequence[str]) -> Array:
@@ -205,11 +203,7 @@ def kinds_of(robot: Robot, side: str = "joint") -> dict[str, str]:
 
 
 def read_table(
-    path: Path,
-    kinds: Mapping[str, str] | None = None,
-    dialect: Dialect = PLAIN,
-    *,
-    blank: bool = False,
+    path: Path, kinds: Mapping[str, str] | None = None, dialect: Dialect = PLAIN, *, blank: bool = False
 ) -> Table:
     """Columns of a CSV or, by its ending, Parquet file with a header row, in SI units.
 

@@ -26,12 +26,7 @@ DASHES: Final = ("-", "--", ":", "-.")
 WIDTH: Final = 9.0
 """Of every figure, inches: letters of 8 points are 11 pixels high where it is 900 pixels wide."""
 DPI: Final = 200
-STYLE: Final[Any] = {
-    "font.size": 10,
-    "axes.titlesize": 11,
-    "legend.fontsize": 9,
-    "figure.titlesize": 12,
-}
+STYLE: Final[Any] = {"font.size": 10, "axes.titlesize": 11, "legend.fontsize": 9, "figure.titlesize": 12}
 
 
 def pyplot() -> Any:
@@ -48,12 +43,7 @@ def pyplot() -> Any:
 def columns(count: int, rows: int, height: float | None = None, **options: Any) -> tuple[Any, list[Any]]:
     """Make a figure of ``count`` columns with ``rows`` axes each; ``height`` in inches."""
     figure, axes = pyplot().subplots(
-        rows,
-        count,
-        figsize=(WIDTH, height or max(3 * rows, 4.2)),
-        squeeze=False,
-        layout="constrained",
-        **options,
+        rows, count, figsize=(WIDTH, height or max(3 * rows, 4.2)), squeeze=False, layout="constrained", **options
     )
     return figure, list(axes.T)
 

@@ -166,12 +166,7 @@ def draw(robot: Robot, marked: bool = False) -> Any:
     start = camera.low + 45 * camera.pixel
     for name, colour, axis in zip("xyz", ((213, 60, 40), (40, 140, 60), (40, 80, 200)), np.eye(3), strict=True):
         tip = start + 32 * camera.pixel * camera.see(axis)[:2]
-        ax.annotate(
-            "",
-            tip,
-            start,
-            arrowprops={"arrowstyle": "-|>", "color": np.array(colour) / 255, "linewidth": 1.5},
-        )
+        ax.annotate("", tip, start, arrowprops={"arrowstyle": "-|>", "color": np.array(colour) / 255, "linewidth": 1.5})
         at = start + 42 * camera.pixel * camera.see(axis)[:2]
         ax.text(*at, name, va="center", **style)
     reach = 0.25 * (camera.high[0] - camera.low[0])

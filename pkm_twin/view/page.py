@@ -84,12 +84,7 @@ class Page:
         self._dragged = False
         self._wake = threading.Event()
         self._tops = np.array([r.high for r in model.wrench_ranges])
-        server.gui.configure_theme(
-            control_width="medium",
-            show_logo=False,
-            show_share_button=False,
-            brand_color=DRIVE,
-        )
+        server.gui.configure_theme(control_width="medium", show_logo=False, show_share_button=False, brand_color=DRIVE)
         # On a narrow screen the browser shows it as a sheet at the bottom instead.
         server.gui.main_panel.dock_right()
         server.gui.set_panel_label(f"pkm-twin view {model.robot.name}")

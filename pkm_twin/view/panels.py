@@ -51,11 +51,7 @@ class BagPanel:
                     del efforts[_MEASURED]
                 self._add_chart("effort of the joint", self._efforts(), efforts)
                 if self._measured is not None:
-                    self._add_chart(
-                        "residual: measured minus model",
-                        self._measured - self._twin,
-                        _coloured(names),
-                    )
+                    self._add_chart("residual: measured minus model", self._measured - self._twin, _coloured(names))
         page.ask(self._time.on_update, "time", self._go)
         page.ask(self._play.on_click, "play", self._play_or_pause)
         page.ask(self._speed.on_update, "speed", self._restart)
@@ -238,13 +234,7 @@ def _coloured(names: Sequence[str]) -> dict[str, str]:
 
 
 def _chart(
-    page: Page,
-    title: str,
-    times: Array,
-    values: Array,
-    colours: Mapping[str, str],
-    *,
-    mark: bool = False,
+    page: Page, title: str, times: Array, values: Array, colours: Mapping[str, str], *, mark: bool = False
 ) -> Any:
     """Draw curves with names and colours, values (k, n), and if asked a mark of the present."""
     from viser import uplot

@@ -14,16 +14,7 @@ from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine.graph import BASE, Joint
 from pkm_twin.machine.members import Place
-from pkm_twin.robot.outline import (
-    BAR,
-    Bar,
-    Posture,
-    base_face,
-    platform_face,
-    robot_bars,
-    telescope,
-    tube_start,
-)
+from pkm_twin.robot.outline import BAR, Bar, Posture, base_face, platform_face, robot_bars, telescope, tube_start
 from pkm_twin.robot.robot import Robot
 
 Colour = tuple[int, int, int]

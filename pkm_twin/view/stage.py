@@ -15,18 +15,7 @@ from numpy.typing import NDArray
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine.graph import BASE
 from pkm_twin.view.meshes import body_meshes
-from pkm_twin.view.scene import (
-    BODY,
-    GROUND,
-    PLATFORM,
-    RIGID,
-    Deflection,
-    Scene,
-    anchors,
-    plate,
-    round_mesh,
-    seen,
-)
+from pkm_twin.view.scene import BODY, GROUND, PLATFORM, RIGID, Deflection, Scene, anchors, plate, round_mesh, seen
 
 FORCE: Final = (0, 158, 115)
 LETTER: Final = (7.4, 19.0)
@@ -55,10 +44,7 @@ class Stage:
         for name, place in (("key", LOOK * [-0.3, 0.5, 3.0]), ("back", -LOOK)):
             bright = 1.7 if name == "key" else 0.4
             draw.add_light_directional(
-                f"/lights/{name}",
-                intensity=bright,
-                position=tuple(place.tolist()),
-                cast_shadow=name == "key",
+                f"/lights/{name}", intensity=bright, position=tuple(place.tolist()), cast_shadow=name == "key"
             )
         low, high = scene.box()
         middle, reach = (low + high) / 2, float((high - low).max())
@@ -101,12 +87,7 @@ class Stage:
             draw.add_mesh_simple(f"/platform/{name}", shape, faces, color=BODY)
         self._rest = draw.add_frame("/at_rest", show_axes=False, visible=False)
         self._rest_bars = draw.add_line_segments(
-            "/bars_at_rest",
-            np.zeros((1, 2, 3)),
-            colors=GROUND,
-            thickness=1.5,
-            thickness_units="screen",
-            visible=False,
+            "/bars_at_rest", np.zeros((1, 2, 3)), colors=GROUND, thickness=1.5, thickness_units="screen", visible=False
         )
         if len(scene.platform):
             moving = plate(scene.platform, 0.016 * size)
@@ -208,11 +189,7 @@ class Stage:
             frame.visible = shown
 
     def draw(
-        self,
-        q: Array,
-        moved: Deflection = RIGID,
-        shares: Mapping[str, float] | None = None,
-        dominant: str = "",
+        self, q: Array, moved: Deflection = RIGID, shares: Mapping[str, float] | None = None, dominant: str = ""
     ) -> None:
         """Draw the machine at q (n,), with a deflection that is already enlarged.
 
@@ -296,11 +273,7 @@ class Stage:
 
 
 def _axes(length: float, size: float) -> dict[str, float]:
-    return {
-        "axes_length": length,
-        "axes_radius": 0.004 * size,
-        "origin_radius": 0.008 * size,
-    }
+    return {"axes_length": length, "axes_radius": 0.004 * size, "origin_radius": 0.008 * size}
 
 
 def _to_linear(colours: NDArray[Any]) -> NDArray[np.uint8]:

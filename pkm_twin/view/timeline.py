@@ -102,8 +102,4 @@ class Timeline:
             return np.zeros(0), np.zeros((0, self.q.shape[1])), None
         known = np.flatnonzero(~np.isnan(self.twin).any(1))
         rows = known[:: max(1, -(-len(known) // POINTS))]
-        return (
-            self.time[rows],
-            self.twin[rows],
-            None if self.measured is None else self.measured[rows],
-        )
+        return (self.time[rows], self.twin[rows], None if self.measured is None else self.measured[rows])

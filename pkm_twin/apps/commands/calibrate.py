@@ -19,15 +19,7 @@ from pkm_twin.identification.calibration import Calibration, Estimate, geometric
 from pkm_twin.identification.calibration import calibrate as calibrated
 from pkm_twin.identification.calibration_fit import STEPS
 from pkm_twin.identification.calibration_state import Transmission
-from pkm_twin.identification.measurements import (
-    KINDS,
-    Kind,
-    Measured,
-    kinds_of,
-    parse_noise,
-    read_measured,
-    read_poses,
-)
+from pkm_twin.identification.measurements import KINDS, Kind, Measured, kinds_of, parse_noise, read_measured, read_poses
 from pkm_twin.identification.plan import MAX_MEASUREMENTS, Plan, parse_within
 from pkm_twin.identification.plan import plan as plan_of
 from pkm_twin.mechanisms.entries import edited_yaml, write_edited
@@ -67,10 +59,7 @@ class Calibrate(OfRobot, ReadsTables, BeyondLimitsToo, Accepts, Overwrites):
         argument=True,
     )
     out: Path | None = setting(
-        None,
-        "the calibrated robot, a YAML; default: calibrated.yaml",
-        writes=True,
-        endings=(".yaml", ".yml"),
+        None, "the calibrated robot, a YAML; default: calibrated.yaml", writes=True, endings=(".yaml", ".yml")
     )
     only: tuple[str, ...] = setting((), "fit only numbers whose path begins so; may be repeated")
     no_offsets: bool = setting(False, "do not fit joint offsets")
@@ -90,10 +79,7 @@ class Calibrate(OfRobot, ReadsTables, BeyondLimitsToo, Accepts, Overwrites):
     )
     noise: tuple[str, ...] = setting((), "KIND=VALUE: known standard deviation of a measurement, m or rad")
     plan: Path | None = setting(
-        None,
-        "only write the poses to measure next, a CSV, with predicted accuracy",
-        writes=True,
-        endings=(".csv",),
+        None, "only write the poses to measure next, a CSV, with predicted accuracy", writes=True, endings=(".csv",)
     )
     count: int | None = setting(None, "poses of a plan", low=1, high=MAX_MEASUREMENTS)
     accuracy: float | None = setting(None, "standard deviation of the position that ends a plan, m", low=1e-9)
@@ -185,12 +171,7 @@ def calibrate(given: Calibrate) -> Report:
 
 
 def report_of(
-    machine: Robot,
-    source: str,
-    result: Calibration,
-    notes: Sequence[str],
-    marks: Sequence[str],
-    out: Path | None,
+    machine: Robot, source: str, result: Calibration, notes: Sequence[str], marks: Sequence[str], out: Path | None
 ) -> Report:
     """Parameters, errors by kind of measurement, and what stays open."""
     first, scale = result.agreements[0], result.scale

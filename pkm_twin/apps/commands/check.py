@@ -13,14 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from pkm_twin.apps.frame import command
-from pkm_twin.apps.options import (
-    NOT_JUDGED,
-    REFUSED,
-    SALVAGED,
-    CarriesAtTimes,
-    ReadsRecordings,
-    payload_fact,
-)
+from pkm_twin.apps.options import NOT_JUDGED, REFUSED, SALVAGED, CarriesAtTimes, ReadsRecordings, payload_fact
 from pkm_twin.console import progress
 from pkm_twin.errors import ParameterError, PkmTwinError, one_line
 from pkm_twin.report import Fact, Report, Verdict
@@ -49,15 +42,9 @@ class Check(CarriesAtTimes, ReadsRecordings):
         None, "a robot's name or file; default: the robot that the recording names"
     )
     residual: float = setting(
-        0.05,
-        "largest good RMS residual of the efforts, as a fraction of the peak",
-        low=0.0,
-        high=1.0,
+        0.05, "largest good RMS residual of the efforts, as a fraction of the peak", low=0.0, high=1.0
     )
-    history: Path | None = setting(
-        None,
-        "also append the results to this file, for `pkm-twin trend`",
-    )
+    history: Path | None = setting(None, "also append the results to this file, for `pkm-twin trend`")
     machine_name: str | None = setting(None, "name in the history; default: the robot's", name="machine")
     jobs: int = setting(1, "processes for a folder of bags", low=1, high=10**4)
 
@@ -170,11 +157,7 @@ def _check_folder(given: Check) -> Report:
     answer += f", {unjudged} not judged" if unjudged else ""
     return Report(
         answer if count else f"{len(results)} good",
-        [
-            Fact("folder", str(given.bag)),
-            Fact("good", not count),
-            Fact("recordings", results),
-        ],
+        [Fact("folder", str(given.bag)), Fact("good", not count), Fact("recordings", results)],
         notes=notes,
         verdict=Verdict.BAD if count > unjudged else Verdict.UNKNOWN if count else Verdict.GOOD,
         code=NOT_JUDGED if count and count == unjudged else 0,

@@ -29,9 +29,7 @@ class Compliance(OfRobot, BeyondLimitsToo):
 
     pose: tuple[float, ...] = setting(..., "the pose's coordinates, m and rad", argument=True)
     wrench: tuple[float, ...] = setting(
-        (0.0, 0.0, 1.0, 0.0, 0.0, 0.0),
-        "load fx,fy,fz,mx,my,mz at the reference point, N and N m, base axes",
-        count=6,
+        (0.0, 0.0, 1.0, 0.0, 0.0, 0.0), "load fx,fy,fz,mx,my,mz at the reference point, N and N m, base axes", count=6
     )
 
 

@@ -39,9 +39,7 @@ class Convert(OfPlatform, Writes):
     out: Path | None = setting(None, "the robot file; default: print, of a printer printer.yaml", writes=True)
     data: Path | None = setting(None, "a printer's measurements, a CSV; default: probes.csv", writes=True)
     firmware: Firmware | None = setting(
-        None,
-        "of a printer; default: detected",
-        choices={one.value: one for one in Firmware},
+        None, "of a printer; default: detected", choices={one.value: one for one in Firmware}
     )
     probe_radius: float | None = setting(None, "of G33's points, mm; default: B of M665", low=1.0)
 

@@ -57,23 +57,18 @@ class Design(Carries, ReadsMotions, Writes, Draws, Seeded):
     )
     path: Path | None = setting(None, "motion of the robot: CSV or MCAP of `pkm-twin path`, or a recording")
     minimise: tuple[str, ...] = setting(
-        (),
-        "peak-effort, rms-effort, motor-torque, energy, deflection or mass; two of them give a Pareto front",
+        (), "peak-effort, rms-effort, motor-torque, energy, deflection or mass; two of them give a Pareto front"
     )
     subject_to: tuple[str, ...] = setting((), "bound on a quantity, e.g. 'singularity>=0.1' or 'peak-effort<=20'")
     tolerance: tuple[str, ...] = setting(
-        (),
-        "print the pose error budget: KEY=SIGMA or KEY=+-BOUND, e.g. rods.*.length=2e-5; file: the robot file's",
+        (), "print the pose error budget: KEY=SIGMA or KEY=+-BOUND, e.g. rods.*.length=2e-5; file: the robot file's"
     )
     monte_carlo: int = setting(0, "with --tolerance: also assemble this many random machines", low=0)
     sweep: str | None = setting(None, "grid or sobol: compute machines within the bounds into --out FILE.nc")
     samples: int = setting(20, "machines of a sweep: per axis of a grid, or in total", low=1)
     scheduler: str | None = setting(None, "with --sweep: address of a Dask scheduler, tcp://HOST:8786")
     wrench: tuple[float, ...] | None = setting(
-        None,
-        "wrench on the platform, N and N m, base axes; added to the path's",
-        count=6,
-        metavar="fx,fy,fz,mx,my,mz",
+        None, "wrench on the platform, N and N m, base axes; added to the path's", count=6, metavar="fx,fy,fz,mx,my,mz"
     )
     starts: int = setting(64, "machines to try first; the best are optimised", low=1)
     points: int = setting(9, "points of a Pareto front", low=3)
@@ -240,13 +235,7 @@ def against_limits(found: Found, path: PosePath) -> Iterator[Fact]:
     index = float(followed.singularity.min())
     what = "singularity index on the path"
     numbers = {"number": index, "limit": MIN_SINGULARITY_INDEX, "unit": ""}
-    yield judged(
-        what,
-        f"{index:.4g}",
-        f"{MIN_SINGULARITY_INDEX:g} or more",
-        index >= MIN_SINGULARITY_INDEX,
-        **numbers,
-    )
+    yield judged(what, f"{index:.4g}", f"{MIN_SINGULARITY_INDEX:g} or more", index >= MIN_SINGULARITY_INDEX, **numbers)
 
 
 def at_bound(value: float, bound: tuple[float, float]) -> str:
@@ -266,8 +255,7 @@ def write_robot(robot: Robot, source: str, found: Found, path: Path, out: Path) 
     kept = "".join(f", {bound}" for bound in found.constraints)
     values = {
         name: Chosen(
-            float(f"{value:.12g}"),
-            f"was {' = '.join([*([text] if text else []), f'{robot.number(name):.6g}'])}",
+            float(f"{value:.12g}"), f"was {' = '.join([*([text] if text else []), f'{robot.number(name):.6g}'])}"
         )
         for name, value in found.best.numbers.items()
         for text in [robot.book.text(name)]
@@ -381,10 +369,7 @@ def budget(given: Design) -> Report:
     if given.path is None:
         q = workspace_states(robot, 2000, given.seed)
     else:
-        q, where = (
-            robot.inverse(read_path(given, given.path, efforts=False)[1].pose),
-            given.path.name,
-        )
+        q, where = (robot.inverse(read_path(given, given.path, efforts=False)[1].pose), given.path.name)
     found = tolerances(robot, sigma, q, given.wrench)
     summary = ErrorBudget(robot, found, q, calibrated_errors(robot, found, q))
     rows: dict[str, list[Any]] = {

@@ -38,21 +38,14 @@ class Excite(OfRobot, AwayFromSingular, Seeded, Writes):
     """
 
     what: str = setting(
-        "friction,rotor,payload,inertia",
-        "what the fit identifies: some of friction,rotor,payload,inertia",
+        "friction,rotor,payload,inertia", "what the fit identifies: some of friction,rotor,payload,inertia"
     )
     out: Path = setting(
-        Path("excite.mcap"),
-        "MCAP to write; the CSV has the same name with .csv",
-        writes=True,
-        endings=(".mcap",),
+        Path("excite.mcap"), "MCAP to write; the CSV has the same name with .csv", writes=True, endings=(".mcap",)
     )
     compare: Path | None = setting(None, "also report the condition number of this bag")
     friction: bool = setting(
-        False,
-        "slow sweeps up and down, one joint at a time, for friction",
-        name="sweeps",
-        older=("--friction",),
+        False, "slow sweeps up and down, one joint at a time, for friction", name="sweeps", older=("--friction",)
     )
     duration: float = setting(10.0, "duration, s", low=1.0, high=600.0)
     harmonics: int = setting(6, "harmonics per joint", low=3, high=50)
@@ -98,13 +91,7 @@ def excite(given: Excite) -> Report:
     else:
         with progress("excite", given.trials) as update:
             best = design(
-                judge,
-                given.duration,
-                given.harmonics,
-                bounds,
-                trials=given.trials,
-                seed=given.seed,
-                progress=update,
+                judge, given.duration, given.harmonics, bounds, trials=given.trials, seed=given.seed, progress=update
             )
     time = np.arange(round(best.duration * bounds.rate) + 1) / bounds.rate
     time = time[time <= best.duration]

@@ -170,11 +170,7 @@ class FunctionalMockupUnit(ToFile):
     """
 
     fmi: int = setting(3, "FMI version", choices={"2": 2, "3": 3})
-    kind: str = setting(
-        "dynamics",
-        "motion under efforts, or efforts of a motion",
-        choices=("dynamics", "torques"),
-    )
+    kind: str = setting("dynamics", "motion under efforts, or efforts of a motion", choices=("dynamics", "torques"))
 
 
 @command()

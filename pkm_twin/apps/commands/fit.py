@@ -12,13 +12,7 @@ from typing import TYPE_CHECKING
 import click
 
 from pkm_twin.apps.frame import command
-from pkm_twin.apps.options import (
-    ROBOT_HELP,
-    Accepts,
-    BeyondLimitsToo,
-    CarriesAtTimes,
-    ReadsRecordings,
-)
+from pkm_twin.apps.options import ROBOT_HELP, Accepts, BeyondLimitsToo, CarriesAtTimes, ReadsRecordings
 from pkm_twin.console import progress, writing
 from pkm_twin.errors import ParameterError
 from pkm_twin.files import replace_file
@@ -76,24 +70,18 @@ class Fit(CarriesAtTimes, ReadsRecordings, BeyondLimitsToo, Accepts):
     robot: str = setting("", f"{ROBOT_HELP}: the values to start from", argument=True)
     recordings: tuple[Path, ...] = setting((), "bags, or CSV files with a header row", argument=True)
     what: str = setting(
-        "friction,rotor,payload,inertia",
-        "what to fit: some of friction,rotor,payload,inertia; or compliance",
+        "friction,rotor,payload,inertia", "what to fit: some of friction,rotor,payload,inertia; or compliance"
     )
     out: Path | None = setting(
-        None,
-        "YAML to write, with a report .html; default: fitted.yaml",
-        writes=True,
-        endings=(".yaml", ".yml"),
+        None, "YAML to write, with a report .html; default: fitted.yaml", writes=True, endings=(".yaml", ".yml")
     )
     no_report: bool = setting(False, "write no report with pictures")
     per_copy: bool = setting(False, "fit each copy of a limb by itself")
     friction: str = setting(
-        "auto",
-        "further friction laws: auto, coulomb (none), or some of stribeck, load-dependent, periodic, dahl",
+        "auto", "further friction laws: auto, coulomb (none), or some of stribeck, load-dependent, periodic, dahl"
     )
     torque_constant: str | None = setting(
-        None,
-        "efforts are motor currents: N m or N per ampere at the joint, one or one per joint; `fit` identifies it",
+        None, "efforts are motor currents: N m or N per ampere at the joint, one or one per joint; `fit` identifies it"
     )
     drive: Path | None = setting(None, "fit one drive: CSV of traverses with weights")
     lever: float | None = setting(
@@ -177,13 +165,7 @@ def fit(given: Fit) -> Report:
             result = fit_elements(machine, read, progress=update, **options)
         else:
             result, choices, marks = fit_recordings(
-                machine,
-                read,
-                kinds,
-                laws,
-                constant=given.torque_constant,
-                progress=update,
-                **options,
+                machine, read, kinds, laws, constant=given.torque_constant, progress=update, **options
             )
     worse = find_worse(result)
     refuse_faults([worse] if worse else [], given.accept)

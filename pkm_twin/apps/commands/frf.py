@@ -39,10 +39,7 @@ class FrequencyResponse(AtPose, OfTool, Writes, Draws):
     """
 
     frequencies: tuple[float, ...] | None = setting(
-        None,
-        "range of the table, Hz; default: 0 to above the sixth mode",
-        count=2,
-        metavar="LOW,HIGH",
+        None, "range of the table, Hz; default: 0 to above the sixth mode", count=2, metavar="LOW,HIGH"
     )
     points: int = setting(2001, "rows of the table", low=2, high=10**6)
     out: Path | None = setting(None, "table to write, .csv, .parquet or .mat", writes=True, endings=ENDINGS)

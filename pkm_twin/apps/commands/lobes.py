@@ -40,8 +40,7 @@ class Lobes(OfMilling, AtPose, OfTool, Writes, Draws):
     speeds: tuple[float, ...] = setting(..., "spindle speeds, rpm", count=2, metavar="LOW,HIGH")
     points: int = setting(181, "evenly spaced spindle speeds; more are added at lobes", low=2, high=10**5)
     deepest: float | None = setting(
-        None,
-        "largest depth to compute, m; default: 25 times the depth stable at every speed",
+        None, "largest depth to compute, m; default: 25 times the depth stable at every speed"
     )
     out: Path | None = setting(None, "table to write, .csv, .parquet or .mat", writes=True, endings=ENDINGS)
 

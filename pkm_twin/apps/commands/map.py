@@ -12,16 +12,7 @@ from typing import TYPE_CHECKING, Any, Final, get_type_hints
 import click
 
 from pkm_twin.apps.frame import Command, Group, command
-from pkm_twin.apps.options import (
-    Carries,
-    Draws,
-    OfMilling,
-    OfTool,
-    Overwrites,
-    Parallel,
-    Writes,
-    payload_fact,
-)
+from pkm_twin.apps.options import Carries, Draws, OfMilling, OfTool, Overwrites, Parallel, Writes, payload_fact
 from pkm_twin.console import numbers, progress, refuse_existing
 from pkm_twin.errors import ParameterError
 from pkm_twin.extensions import Extensible
@@ -54,23 +45,16 @@ class OfMap(Carries, Pages, Writes, Draws, Parallel):
     kind: str = ""
     points: int | None = setting(None, "approximate number of poses; default: by kind", low=1, high=10**11)
     at: str | None = setting(None, "pose that the planes go through; default: the worst")
-    along: Path | None = setting(
-        None,
-        "a motion in place of the workspace; --out FILE.csv writes the values",
-    )
+    along: Path | None = setting(None, "a motion in place of the workspace; --out FILE.csv writes the values")
     singularity: float | None = setting(
-        None,
-        "singularity index below which a pose does not count; default: 0.05, for `workspace` 0",
+        None, "singularity index below which a pose does not count; default: 0.05, for `workspace` 0"
     )
     least_clearance: float = setting(0.0, "distance between limbs (m) below which a pose does not count")
     regular: bool = setting(
-        False,
-        "count only poses inside the largest circles about the axis (2UPR-RPU paper, figure 5)",
+        False, "count only poses inside the largest circles about the axis (2UPR-RPU paper, figure 5)"
     )
     out: Path | None = setting(
-        None,
-        "file to write; default: ROBOT_KIND.nc; .npz: also arrays of the poses that count",
-        writes=True,
+        None, "file to write; default: ROBOT_KIND.nc; .npz: also arrays of the poses that count", writes=True
     )
     scheduler: str | None = setting(None, "address of a Dask scheduler: tcp://HOST:8786")
 
@@ -213,18 +197,10 @@ def compute(given: OfMap) -> Report:
     if arrays is not None:
         refuse_existing(arrays, given.overwrite)
     target = given.target.with_suffix(".nc") if arrays else given.target
-    with (
-        first_signal(KeyboardInterrupt),
-        progress(f"{kind.name} of {machine.name}", sweep.points) as update,
-    ):
+    with first_signal(KeyboardInterrupt), progress(f"{kind.name} of {machine.name}", sweep.points) as update:
         try:
             run(
-                sweep,
-                target,
-                workers=given.jobs,
-                scheduler=given.scheduler,
-                overwrite=given.overwrite,
-                progress=update,
+                sweep, target, workers=given.jobs, scheduler=given.scheduler, overwrite=given.overwrite, progress=update
             )
         except KeyboardInterrupt:
             kept = f"stopped; finished parts are in {target}.parts, the same command continues"
@@ -328,11 +304,7 @@ map_ = AfterRobot(
     For the options of a kind use `pkm-twin map ROBOT KIND --help`.
     """,
     Extensible(
-        "pkm_twin.maps",
-        Kind,
-        ["show", *OWN],
-        lambda name: show if name == "show" else offered(OWN[name]),
-        offered,
+        "pkm_twin.maps", Kind, ["show", *OWN], lambda name: show if name == "show" else offered(OWN[name]), offered
     ),
     "Stiffness, workspace and vibration",
     "ROBOT KIND [OPTIONS]",

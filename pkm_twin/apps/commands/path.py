@@ -12,14 +12,7 @@ import click
 import numpy as np
 
 from pkm_twin.apps.frame import command
-from pkm_twin.apps.options import (
-    AwayFromSingular,
-    Carries,
-    Draws,
-    ReadsTables,
-    Writes,
-    payload_fact,
-)
+from pkm_twin.apps.options import AwayFromSingular, Carries, Draws, ReadsTables, Writes, payload_fact
 from pkm_twin.console import writing
 from pkm_twin.errors import check_limit
 from pkm_twin.recordings.tables import ENDINGS
@@ -71,15 +64,8 @@ class Motion(Carries, ReadsTables, AwayFromSingular, Writes, Draws):
         metavar="HEIGHT,WIDTH[,DROP]",
     )
     circle: float | None = setting(None, "follow a circle of this radius, m, or rad for angles")
-    at: tuple[float, ...] | None = setting(
-        None,
-        "pose at the centre of --cycle or --circle; default: home",
-        count=0,
-    )
-    direction: float | None = setting(
-        None,
-        "direction of the cycle, degrees from x towards y; default: x, else y",
-    )
+    at: tuple[float, ...] | None = setting(None, "pose at the centre of --cycle or --circle; default: home", count=0)
+    direction: float | None = setting(None, "direction of the cycle, degrees from x towards y; default: x, else y")
     blend: float | None = setting(
         None,
         "distance from corners at which rounding begins, m; 0: stop at waypoints; default: a smooth curve",
@@ -103,9 +89,7 @@ class Motion(Carries, ReadsTables, AwayFromSingular, Writes, Draws):
     law: str = setting("quintic", "motion law without --fastest: quintic or s-curve, from stop to stop")
     duration: float | None = setting(None, "duration of the motion, s; default: the shortest")
     effort: tuple[float, ...] | None = setting(
-        None,
-        "effort limits, one or one per joint, N m or N; default: the file's",
-        count=0,
+        None, "effort limits, one or one per joint, N m or N; default: the file's", count=0
     )
     velocity: tuple[float, ...] | None = setting(None, "velocity limits, rad/s or m/s; default: the file's", count=0)
     acceleration: tuple[float, ...] | None = setting(
@@ -118,16 +102,8 @@ class Motion(Carries, ReadsTables, AwayFromSingular, Writes, Draws):
         "programmed feed; default: none",
     )
     share: float = setting(1.0, "fraction of the file's effort and velocity limits to use", low=1e-3, high=1.0)
-    shaper: str | None = setting(
-        None,
-        "input shaper for the first natural frequency: zv, or zvd (more robust)",
-    )
-    damping: float | None = setting(
-        None,
-        "its damping ratio; default: the robot file's",
-        low=0.0,
-        high=0.99,
-    )
+    shaper: str | None = setting(None, "input shaper for the first natural frequency: zv, or zvd (more robust)")
+    damping: float | None = setting(None, "its damping ratio; default: the robot file's", low=0.0, high=0.99)
     rate: float = setting(1000.0, "samples per second in the file", low=1.0, high=1e5)
     out: Path | None = setting(
         None,
@@ -235,12 +211,7 @@ def path(given: Motion) -> Report:
     ]
     if isinstance(motion, ShapedPath):
         low, high = motion.frequencies
-        shaper = {
-            "kind": motion.shaper,
-            "added_s": motion.added,
-            "lowest_hz": low,
-            "highest_hz": high,
-        }
+        shaper = {"kind": motion.shaper, "added_s": motion.added, "lowest_hz": low, "highest_hz": high}
         words = f"{motion.shaper} for {low:.4g} to {high:.4g} Hz, adds {motion.added:.4g} s"
         facts.append(Fact("shaper", shaper, text="shaper", shown=words))
     draw: Any = draw_limits
@@ -266,13 +237,7 @@ def path(given: Motion) -> Report:
     ]
     if used:
         tables.append(Table("", [Column("", "%", "used")], used, head="limit"))
-    return Report(
-        answer,
-        facts,
-        tables,
-        {"": lambda: draw(motion, answer)},
-        files={"out": given.out},
-    )
+    return Report(answer, facts, tables, {"": lambda: draw(motion, answer)}, files={"out": given.out})
 
 
 def _read_path(given: Motion, machine: Robot) -> tuple[Way, list[float] | None]:

@@ -12,13 +12,7 @@ import click
 import numpy as np
 
 from pkm_twin.apps.frame import command
-from pkm_twin.apps.options import (
-    AwayFromSingular,
-    CarriesAtTimes,
-    Draws,
-    ReadsMotions,
-    payload_fact,
-)
+from pkm_twin.apps.options import AwayFromSingular, CarriesAtTimes, Draws, ReadsMotions, payload_fact
 from pkm_twin.errors import LEAST_LIMIT, ParameterError, check_limit
 from pkm_twin.report import Column, Fact, Report, Table, plots
 from pkm_twin.settings import setting
@@ -55,25 +49,14 @@ class Size(CarriesAtTimes, ReadsMotions, AwayFromSingular, Draws):
     motion: Path | None = setting(None, "a recording or a path: MCAP, rosbag2 folder or table", argument=True)
     drives: Path | None = setting(None, "YAML of motors to compare, or `shipped`")
     motor: tuple[str, ...] = setting((), "compare only this motor; may be repeated")
-    ratio: float | None = setting(
-        None,
-        "gear ratio of turning joints without a drive in the file",
-        low=1e-6,
-        high=1e6,
-    )
+    ratio: float | None = setting(None, "gear ratio of turning joints without a drive in the file", low=1e-6, high=1e6)
     lead: float | None = setting(
-        None,
-        "lead of sliding joints without a drive in the file, m per turn of the motor",
-        low=1e-6,
-        high=1e6,
+        None, "lead of sliding joints without a drive in the file, m per turn of the motor", low=1e-6, high=1e6
     )
     ratios: str | None = setting(None, "gear ratios to choose from: LOW:HIGH, or numbers with commas")
     leads: str | None = setting(None, "leads to choose from, likewise")
     efficiency: float | None = setting(
-        None,
-        "efficiency of the gears; default: the robot file's, or 1",
-        low=1e-3,
-        high=1.0,
+        None, "efficiency of the gears; default: the robot file's, or 1", low=1e-3, high=1.0
     )
     over_workspace: tuple[float, ...] | None = setting(
         None,
@@ -172,13 +155,7 @@ def size(given: Size) -> Report:
         own = ", ".join(f"{name} {fit or none}" for name, fit in each.items())
         notes += [best, f"smallest for each drive: {own}"]
         title = f"{title}; {best}"
-    return Report(
-        answer,
-        facts,
-        _make_tables(duties),
-        {"": lambda: draw(taken, duties, title)},
-        notes,
-    )
+    return Report(answer, facts, _make_tables(duties), {"": lambda: draw(taken, duties, title)}, notes)
 
 
 def net_energy(duties: Sequence[Duty]) -> float:
@@ -204,10 +181,7 @@ def gears(given: Size, robot: Robot) -> tuple[list[Gear], list[Gears]]:
         raise click.UsageError("drives of the file have several efficiencies; give --efficiency")
     share = given.efficiency or next(iter(shares), 1.0)
     one, choices = [], []
-    for key, value, values in (
-        ("ratio", given.ratio, given.ratios),
-        ("lead", given.lead, given.leads),
-    ):
+    for key, value, values in (("ratio", given.ratio, given.ratios), ("lead", given.lead, given.leads)):
         if value is not None:
             one.append(Gear(efficiency=share).sized(key, value))
         if values is not None:

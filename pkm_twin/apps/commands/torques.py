@@ -12,14 +12,7 @@ import click
 import numpy as np
 
 from pkm_twin.apps.frame import command
-from pkm_twin.apps.options import (
-    AtPose,
-    CarriesAtTimes,
-    Draws,
-    ReadsMotions,
-    Writes,
-    payload_fact,
-)
+from pkm_twin.apps.options import AtPose, CarriesAtTimes, Draws, ReadsMotions, Writes, payload_fact
 from pkm_twin.console import progress, writing
 from pkm_twin.recordings.tables import ENDINGS, check_target, write_table
 from pkm_twin.report import Column, Fact, Report, Table, plots
@@ -57,16 +50,10 @@ class Torques(CarriesAtTimes, ReadsMotions, AtPose, Writes, Draws):
     motion: Path | None = setting(None, "a recording or a path: MCAP, rosbag2 folder or table", argument=True)
     at: str | None = setting(None, "pose at rest, in place of a motion")
     wrench: tuple[float, ...] | None = setting(
-        None,
-        "with --at: wrench on the platform, N and N m, base axes",
-        count=6,
-        metavar="fx,fy,fz,mx,my,mz",
+        None, "with --at: wrench on the platform, N and N m, base axes", count=6, metavar="fx,fy,fz,mx,my,mz"
     )
     out: Path | None = setting(
-        None,
-        "table to write, .csv, .parquet or .mat; default: torques.csv",
-        writes=True,
-        endings=ENDINGS,
+        None, "table to write, .csv, .parquet or .mat; default: torques.csv", writes=True, endings=ENDINGS
     )
 
     def __post_init__(self) -> None:
