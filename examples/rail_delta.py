@@ -4,8 +4,9 @@
     python examples/rail_delta.py
 
 Write one if a few lengths describe a family of machines. The file has a schema and a function from
-its parameters to a graph; everything else, closed forms too, follows from the graph. For use in
-robot files add one line to ``pkm_twin/mechanisms/catalogue.py``.
+its parameters to a graph, with beams and compliances if the machine is elastic; everything else,
+closed forms too, follows from these. For use in robot files add one line to
+``pkm_twin/mechanisms/catalogue.py``.
 """
 
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ import numpy as np
 from pkm_twin.kinematics.pose import COORDINATES
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import BASE, Body, Graph, Joint, Rod, array
+from pkm_twin.machine.members import Parts
 from pkm_twin.machine.sections import check_azimuths, length, mass
 from pkm_twin.robot.robot import Robot
 
@@ -61,19 +63,14 @@ class RailDelta(Robot):
     coordinates: ClassVar = tuple(COORDINATES[name] for name in "xyz")
     limb_names: ClassVar = ("limb 1", "limb 2", "limb 3")
 
-    @property
-    def size(self):
-        """The platform's radius, m."""
-        return self.geometry.platform_radius
-
     def limbs(self):
         """For each limb: the outward direction, and that of the pair's width."""
         for azimuth in self.geometry.azimuths:
             out = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
             yield out, np.cross(UP, out)
 
-    def make_graph(self):
-        """At home the carriages are at zero and the platform is below the origin."""
+    def make_parts(self):
+        """Make the machine at home: carriages at zero, the platform below the origin."""
         g, m = self.geometry, self.inertia
         drop = np.sqrt(g.rod_length**2 - (g.carriage_radius - g.platform_radius) ** 2)
         platform = -drop * UP
@@ -97,7 +94,7 @@ class RailDelta(Robot):
                 shift = side * g.width * along
                 ends = array([ball + shift, platform + g.platform_radius * out + shift])
                 rods[f"{name}_{i}"] = Rod(f"{name}_{i}", carriage, "platform", ends, m.rod_mass)
-        return Graph(bodies, joints, rods, "platform", array(platform))
+        return Parts(Graph(bodies, joints, rods, "platform", array(platform)))
 
 
 def main():
