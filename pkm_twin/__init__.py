@@ -11,11 +11,7 @@ if TYPE_CHECKING:
     from delta_dynamics.torques.transmission import transmission
     from pkm_twin.design.variants import variants
     from pkm_twin.mechanisms.catalogue import load, robot_names
-    from pkm_twin.robot.derivatives import (
-        forward_derivatives,
-        inverse_derivatives,
-        platform_derivatives,
-    )
+    from pkm_twin.robot.derivatives import forward_derivatives, inverse_derivatives, platform_derivatives
     from pkm_twin.robot.robot import Robot
 
 __all__ = [

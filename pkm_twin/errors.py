@@ -256,12 +256,7 @@ class BagError(PkmTwinError):
     """
 
     def __init__(
-        self,
-        message: str,
-        *,
-        path: str | Path | None = None,
-        reason: str = "damaged",
-        offset: int | None = None,
+        self, message: str, *, path: str | Path | None = None, reason: str = "damaged", offset: int | None = None
     ) -> None:
         where = f"{path}: " if path is not None else ""
         at = f" (byte {offset})" if offset is not None else ""

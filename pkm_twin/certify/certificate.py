@@ -20,13 +20,7 @@ from delta_dynamics import inverse_dynamics, mass_matrix
 from pkm_twin.certify.description import UnfitError
 from pkm_twin.certify.maximal import Maximal, States, random_states
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.errors import (
-    ParameterError,
-    PkmTwinError,
-    SingularityError,
-    UnreachableError,
-    install,
-)
+from pkm_twin.errors import ParameterError, PkmTwinError, SingularityError, UnreachableError, install
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.robot_urdf import robot_description
 from pkm_twin.robot.variation import KINDS, varied
@@ -214,9 +208,7 @@ def certify_variants(
         by_name.setdefault((item.engine, item.what), []).append(item)
     items = [
         replace(
-            same[0],
-            worst=max(item.worst for item in same),
-            median=float(np.median([item.median for item in same])),
+            same[0], worst=max(item.worst for item in same), median=float(np.median([item.median for item in same]))
         )
         for same in by_name.values()
     ]
@@ -270,17 +262,11 @@ def _compare_with_itself(robot: Any, states: States) -> list[Item]:
     trip = np.abs(back - motion[0]).max(-1)
     batch = inverse_dynamics(robot, *motion)
     single = np.array([inverse_dynamics(robot, *state) for state in zip(*motion, strict=True)])
-    return [
-        _make_item("twin", "round_trip", trip),
-        _make_item("twin", "batch", np.abs(batch - single)),
-    ]
+    return [_make_item("twin", "round_trip", trip), _make_item("twin", "batch", np.abs(batch - single))]
 
 
 def _compare_engines(
-    robot: Any,
-    judges: Mapping[str, Judge],
-    states: States,
-    progress: Callable[[int], None],
+    robot: Any, judges: Mapping[str, Judge], states: States, progress: Callable[[int], None]
 ) -> list[Item]:
     place, rates, changes = _expand_to_all_joints(robot, states.q, states.qd, states.qdd)
     tau = inverse_dynamics(robot, place, rates, changes, states.wrench)

@@ -262,9 +262,7 @@ def combine_bodies(one: Body, other: Body) -> Body:
 
 def _read_body(entry: Mapping[str, Any]) -> Body:
     return Body(
-        float(entry.get("mass", 0.0)),
-        vector(entry.get("com", (0, 0, 0))),
-        tensor(entry.get("inertia", (0, 0, 0))),
+        float(entry.get("mass", 0.0)), vector(entry.get("com", (0, 0, 0))), tensor(entry.get("inertia", (0, 0, 0)))
     )
 
 

@@ -17,13 +17,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
 
-from pkm_twin.certify.description import (
-    Array,
-    Description,
-    UnfitError,
-    cross,
-    read,
-)
+from pkm_twin.certify.description import Array, Description, UnfitError, cross, read
 from pkm_twin.certify.rows import SINGULAR, Frame, Moving
 
 FIRST_STEP: Final = 1.0 / 16.0
@@ -90,9 +84,7 @@ class Maximal(Moving):
         self._coms = np.array([body.com for body in self.machine.bodies.values()])
         self._columns = np.split(np.eye(self.size), len(self.names))
         self._start = State(
-            np.tile(np.eye(3), (len(self.names), 1, 1)),
-            self._coms.copy(),
-            np.zeros((len(self.names), 6)),
+            np.tile(np.eye(3), (len(self.names), 1, 1)), self._coms.copy(), np.zeros((len(self.names), 6))
         )
         self._state = self._start
         self._assembled: dict[bytes, State] = {}
@@ -277,10 +269,7 @@ def extent(judge: Maximal) -> float:
 
 
 def random_states(
-    judge: Maximal,
-    rng: np.random.Generator,
-    count: int,
-    reaches: Callable[[Array], bool] = lambda _: True,
+    judge: Maximal, rng: np.random.Generator, count: int, reaches: Callable[[Array], bool] = lambda _: True
 ) -> States:
     """Draw states inside the limits, connected to home and clear of singularities.
 

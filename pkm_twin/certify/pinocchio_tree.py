@@ -82,12 +82,7 @@ class PinocchioTree(Tree):
             columns = np.array(pin.getJointJacobian(*given, world))
             bias = pin.getClassicalAcceleration(*given, world).vector
             self._frames[body] = Frame(
-                origin,
-                place.translation.copy(),
-                place.rotation.copy(),
-                columns,
-                columns @ self._state[1],
-                bias,
+                origin, place.translation.copy(), place.rotation.copy(), columns, columns @ self._state[1], bias
             )
         return self._frames[body]
 

@@ -20,17 +20,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from pkm_twin.certify.description import (
-    BASE,
-    Array,
-    Joint,
-    Machine,
-    Rod,
-    UnfitError,
-    across,
-    cross,
-    with_laws,
-)
+from pkm_twin.certify.description import BASE, Array, Joint, Machine, Rod, UnfitError, across, cross, with_laws
 
 SINGULAR: Final = 1e-9
 """Smallest ratio of singular values: below it the rows do not determine the motion."""

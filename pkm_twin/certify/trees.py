@@ -15,17 +15,7 @@ from typing import Final
 
 import numpy as np
 
-from pkm_twin.certify.description import (
-    BASE,
-    Array,
-    Body,
-    Description,
-    Joint,
-    Rod,
-    UnfitError,
-    across,
-    read,
-)
+from pkm_twin.certify.description import BASE, Array, Body, Description, Joint, Rod, UnfitError, across, read
 from pkm_twin.certify.rows import Moving, Rows
 
 STEPS: Final = 64

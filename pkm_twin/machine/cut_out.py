@@ -70,9 +70,7 @@ def cut_out(tree: LoopTree, base: str, platform: str, *, carry: bool = False) ->
     if ground not in part:
         near = [link for link in tree.links if bodies[link] in part and link != platform]
         raise ParameterError(
-            "base",
-            base,
-            f"a link that joints connect to platform {platform!r}, as {', '.join(near[:MAX_NAMES])}",
+            "base", base, f"a link that joints connect to platform {platform!r}, as {', '.join(near[:MAX_NAMES])}"
         )
     circles = find_circles(pairs, ground, tool)
     kept = {body for pair in circles.values() for body in pair}

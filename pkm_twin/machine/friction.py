@@ -118,10 +118,7 @@ class Stribeck(FrictionLaw):
     """
 
     name = "stribeck"
-    parameters: ClassVar = {
-        "stribeck": Parameter("{effort}"),
-        "stribeck_speed": Parameter("{joint}/s", linear=False),
-    }
+    parameters: ClassVar = {"stribeck": Parameter("{effort}"), "stribeck_speed": Parameter("{joint}/s", linear=False)}
 
     @staticmethod
     def dry(values: Values, q: Any, speed: Any) -> Any:
@@ -226,10 +223,7 @@ class Dahl(FrictionLaw):
 
     name = "dahl"
     memory = True
-    parameters: ClassVar = {
-        "coulomb": BASIC.parameters["coulomb"],
-        "presliding": Parameter("{joint}", linear=False),
-    }
+    parameters: ClassVar = {"coulomb": BASIC.parameters["coulomb"], "presliding": Parameter("{joint}", linear=False)}
 
     @staticmethod
     def states(q: Array, rates: Array, distance: Array) -> Memory:

@@ -149,10 +149,7 @@ class Rod:
     @property
     def joint_names(self) -> tuple[str, str]:
         """Names of the joints at the inner and the outer end."""
-        return (
-            self.joints[0] or f"{self.name} at {self.inner}",
-            self.joints[1] or f"{self.name} at {self.outer}",
-        )
+        return (self.joints[0] or f"{self.name} at {self.inner}", self.joints[1] or f"{self.name} at {self.outer}")
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,11 +27,7 @@ def graph_description(graph: Graph) -> dict[str, Any]:
     }
     if graph.rods:
         data["rods"] = {
-            name: {
-                "between": [rod.inner, rod.outer],
-                "ends": [_numbers(end) for end in rod.ends],
-                "mass": rod.mass,
-            }
+            name: {"between": [rod.inner, rod.outer], "ends": [_numbers(end) for end in rod.ends], "mass": rod.mass}
             for name, rod in graph.rods.items()
         }
     return data
@@ -45,11 +41,7 @@ def _body_entry(body: Body) -> dict[str, Any]:
 
 
 def _joint_entry(joint: Joint) -> dict[str, Any]:
-    data: dict[str, Any] = {
-        "type": joint.kind,
-        "between": [joint.inner, joint.outer],
-        "at": _numbers(joint.at),
-    }
+    data: dict[str, Any] = {"type": joint.kind, "between": [joint.inner, joint.outer], "at": _numbers(joint.at)}
     if len(joint.axes) == 1:
         data["axis"] = _numbers(joint.axes[0])
     elif len(joint.axes) == 2:

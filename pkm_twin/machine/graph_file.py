@@ -19,14 +19,7 @@ from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.machine import schema
 from pkm_twin.machine.formulas import Written
 from pkm_twin.machine.friction import all_keys, check_laws
-from pkm_twin.machine.graph import (
-    Body,
-    Graph,
-    Joint,
-    Rod,
-    array,
-    rotation_about_z,
-)
+from pkm_twin.machine.graph import Body, Graph, Joint, Rod, array, rotation_about_z
 from pkm_twin.machine.joints import TURN, TYPES, Freedom, unit
 from pkm_twin.machine.members import Tube, compliances
 from pkm_twin.machine.places import Keys, number_in, path_of, placed
@@ -117,9 +110,7 @@ class LimitSpec:
         text="largest angle of `axis` from its direction at home, in the other body's frame",
     )
     axis: Array | None = schema.vector(
-        3,
-        text="base axes; default: the attached bar; of a universal joint the normal of its axes",
-        default=None,
+        3, text="base axes; default: the attached bar; of a universal joint the normal of its axes", default=None
     )
 
     def verify(self, path: str) -> None:
@@ -280,10 +271,7 @@ class Source:
     azimuth: float = 0.0
 
 
-PER_COPY: Final = (
-    ["rotor_inertia"],
-    *(["friction", key] for key in all_keys()),
-)
+PER_COPY: Final = (["rotor_inertia"], *(["friction", key] for key in all_keys()))
 """Keys of a limb's numbers that may be lists, one number a copy."""
 KINDS: Final[Mapping[str, type]] = {"bodies": BodySpec, "joints": JointSpec, "rods": RodSpec}
 """The three mappings of a graph, and the schema of their entries."""

@@ -23,17 +23,7 @@ Objects = NDArray[Any]
 TEN: Final = ("mass", "mx", "my", "mz", "ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 """A body's ten standard inertial parameters: mass, kg; first moments, kg m; inertia, kg m2."""
 TEN_UNITS: Final = ("kg", *["kg m"] * 3, *["kg m2"] * 6)
-PARTS: Final = (
-    "bodies",
-    "rods",
-    "gravity",
-    "viscous",
-    "coulomb",
-    "offset",
-    "laws",
-    "rotors",
-    "passive",
-)
+PARTS: Final = ("bodies", "rods", "gravity", "viscous", "coulomb", "offset", "laws", "rotors", "passive")
 """Parts of the parameter vector, in order."""
 GRAVITY: Final = 2
 LAW_VALUES: Final = 6

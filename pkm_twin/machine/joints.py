@@ -227,17 +227,7 @@ class Free(JointType):
 
 TYPES: Final = {
     kind.name: kind
-    for kind in (
-        Fixed,
-        Revolute,
-        Prismatic,
-        Cylindrical,
-        Universal,
-        Spherical,
-        Translation,
-        Helical,
-        Planar,
-    )
+    for kind in (Fixed, Revolute, Prismatic, Cylindrical, Universal, Spherical, Translation, Helical, Planar)
 }
 """Joint types by name."""
 

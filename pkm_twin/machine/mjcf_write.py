@@ -35,11 +35,7 @@ HOME: Final = "home"
 """The keyframe's name."""
 
 
-def write_mjcf(
-    tree: LoopTree,
-    gravity: Array,
-    efforts: Sequence[float] | None = None,
-) -> str:
+def write_mjcf(tree: LoopTree, gravity: Array, efforts: Sequence[float] | None = None) -> str:
     """Write the MJCF of a tree.
 
     Actuators are motors named as their joints, in the robot's order; the site ``platform`` stands
@@ -51,13 +47,7 @@ def write_mjcf(
     tree, welds = _split(tree)
     top = ET.Element("mujoco", model=tree.name)
     ET.SubElement(top, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
-    ET.SubElement(
-        top,
-        "option",
-        gravity=number_text(gravity),
-        timestep=number_text([TIMESTEP]),
-        integrator="RK4",
-    )
+    ET.SubElement(top, "option", gravity=number_text(gravity), timestep=number_text([TIMESTEP]), integrator="RK4")
     default = ET.SubElement(top, "default")
     ET.SubElement(default, "geom", contype="0", conaffinity="0", group="1", rgba="0.6 0.65 0.7 1")
     ET.SubElement(default, "equality", solref=number_text(SOLREF), solimp=number_text(SOLIMP))
@@ -188,11 +178,7 @@ def _joint(part: Single, place: Array) -> dict[str, str]:
         found["range"] = number_text(limits["position"])
     if "effort" in limits:
         found["actuatorfrcrange"] = number_text([-limits["effort"], limits["effort"]])
-    for key, value in (
-        ("damping", joint.viscous),
-        ("frictionloss", joint.coulomb),
-        ("armature", joint.rotor_inertia),
-    ):
+    for key, value in (("damping", joint.viscous), ("frictionloss", joint.coulomb), ("armature", joint.rotor_inertia)):
         if value and part.whole:
             found[key] = number_text([value])
     return found

@@ -53,10 +53,7 @@ class PoseGrid:
         if self.zero_torsion:
             # The tilt, without the loss of digits that its cosine has near zero.
             return np.asarray(
-                np.arctan2(
-                    np.hypot(np.sin(first) * np.cos(second), np.sin(second)),
-                    np.cos(first) * np.cos(second),
-                )
+                np.arctan2(np.hypot(np.sin(first) * np.cos(second), np.sin(second)), np.cos(first) * np.cos(second))
             )
         return np.asarray(np.hypot(first, second))
 

@@ -33,8 +33,5 @@ def rounding_error(words: Iterable[str]) -> float:
             powers.append(number.adjusted())
     if not digits:
         return 0.0
-    power = max(
-        max(powers) + 1 - math.floor(statistics.median(digits)),
-        -math.floor(statistics.median(decimals)),
-    )
+    power = max(max(powers) + 1 - math.floor(statistics.median(digits)), -math.floor(statistics.median(decimals)))
     return 0.5 * 10.0**power

@@ -87,10 +87,7 @@ def position_box(
 
 
 def _shortest(
-    graph: Graph,
-    hops: list[tuple[tuple[str, Array], tuple[str, Array], float]],
-    start: tuple[str, Array],
-    begun: float,
+    graph: Graph, hops: list[tuple[tuple[str, Array], tuple[str, Array], float]], start: tuple[str, Array], begun: float
 ) -> float:
     """Length of the shortest chain from a point of a body to the reference point."""
     order = itertools.count()

@@ -446,11 +446,7 @@ def _pitch(part: ET.Element, where: str) -> float:
 
 
 def _axis(
-    element: ET.Element | None,
-    where: str,
-    place: Pose,
-    turn: Callable[[str], Array],
-    version: tuple[int, int],
+    element: ET.Element | None, where: str, place: Pose, turn: Callable[[str], Array], version: tuple[int, int]
 ) -> Array:
     """Read a unit vector, in the world."""
     stated = None if element is None else urdf_xml.single(element, "xyz", where)

@@ -76,22 +76,13 @@ def payload_margins(mass: Any, com: Any, inertia: Any) -> list[Any]:
 
     :param com: shape (3,), m; ``inertia``: shape (3, 3), kg m2. Numbers or expressions.
     """
-    return [
-        mass,
-        MAX_MASS - mass,
-        *(MAX_LENGTH - absolute(value) for value in com),
-        *schema.inertia_margins(inertia),
-    ]
+    return [mass, MAX_MASS - mass, *(MAX_LENGTH - absolute(value) for value in com), *schema.inertia_margins(inertia)]
 
 
 def check_angles(angle: float, path: str) -> None:
     """Reject an angle that was probably meant in degrees."""
     if abs(angle) > 4 * math.pi:
-        raise ParameterError(
-            path,
-            angle,
-            f"an angle in rad; degrees? {angle:g} degrees are {math.radians(angle):.6g}",
-        )
+        raise ParameterError(path, angle, f"an angle in rad; degrees? {angle:g} degrees are {math.radians(angle):.6g}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,10 +136,7 @@ class Redundancy:
         "times the machine's size; rates: this in 10 ms",
     )
     preload: Array = schema.vector(
-        0,
-        unit="{effort}",
-        default=[],
-        text="one effort per joint: the efforts of a motion are those nearest to these",
+        0, unit="{effort}", default=[], text="one effort per joint: the efforts of a motion are those nearest to these"
     )
 
 

@@ -53,15 +53,7 @@ READ: Final = (
     "sensor",
 )
 """Elements of a robot that are read, or do not act on its motion."""
-PARTS: Final = (
-    "parent",
-    "parent_origin",
-    "parent_axis",
-    "child",
-    "child_origin",
-    "child_axis",
-    "dynamics",
-)
+PARTS: Final = ("parent", "parent_origin", "parent_axis", "child", "child_origin", "child_axis", "dynamics")
 LOOPS: Final = {name: CONSTRAINTS[name] for name in ("revolute", "continuous", "prismatic", "fixed", "spherical")}
 
 
@@ -134,9 +126,7 @@ def read(path: Path, robot: ET.Element, actuated: Sequence[str] | None = None) -
     offsets = _parameters(robot, motors, "friction_offset")
     for joint in [joints[key] for key in (*rotors, *offsets)]:
         joints[joint.name] = replace(
-            joint,
-            rotor_inertia=rotors.get(joint.name, 0.0),
-            offset=offsets.get(joint.name, 0.0),
+            joint, rotor_inertia=rotors.get(joint.name, 0.0), offset=offsets.get(joint.name, 0.0)
         )
     weight = dict.fromkeys(links, True)
     for element in robot.findall("gazebo"):
@@ -266,11 +256,7 @@ def _take_screw(element: ET.Element, joints: dict[str, Joint], links: dict[str, 
         raise ParameterError(where, "<mimic>", UNCOUPLED)
     along = Pose(position=pose.position + offset * slide.axes[0])
     joints[turn.name] = replace(
-        turn,
-        kind="helical",
-        outer=slide.outer,
-        frames=(turn.frames[0] @ along, Pose()),
-        pitch=pitch,
+        turn, kind="helical", outer=slide.outer, frames=(turn.frames[0] @ along, Pose()), pitch=pitch
     )
     del joints[slide.name], links[slide.inner]
 
@@ -424,13 +410,7 @@ def _pairs(beside: Mapping[str, Any], links: Collection[str], joints: Mapping[st
     return closures
 
 
-def _closure(
-    name: str,
-    kind: str,
-    links: Sequence[str],
-    frames: Sequence[Pose],
-    axes: Sequence[Array],
-) -> Joint:
+def _closure(name: str, kind: str, links: Sequence[str], frames: Sequence[Pose], axes: Sequence[Array]) -> Joint:
     if links[0] == links[1]:
         raise ParameterError(name, links[0], "a closure between two links")
     rows = np.reshape(axes if TYPES[kind].count else (), (-1, 3))
@@ -455,25 +435,15 @@ def _parameters(robot: ET.Element, actuated: tuple[str, ...], key: str) -> dict[
 def _warn_of_units(path: Path, robot: ET.Element, joints: dict[str, Joint], closures: dict[str, Joint]) -> None:
     offsets = {f"joint.{n}.origin": j.frames[0] for n, j in joints.items()}
     offsets |= {f"{n}.{i}": f for n, c in closures.items() for i, f in enumerate(c.frames)}
-    where, pose = max(
-        offsets.items(),
-        key=lambda item: float(np.abs(item[1].position).max()),
-        default=("", Pose()),
-    )
+    where, pose = max(offsets.items(), key=lambda item: float(np.abs(item[1].position).max()), default=("", Pose()))
     size = float(np.abs(pose.position).max())
     if size > LARGE:
-        warn(
-            path,
-            f"{where}: an offset of {size:g} m; a URDF uses metres; are these millimetres?",
-        )
+        warn(path, f"{where}: an offset of {size:g} m; a URDF uses metres; are these millimetres?")
     for top in robot:
         angles = [word for e in top.iter() for word in e.get("rpy", "").split()]
         largest = max((abs(urdf_xml.number(word, "rpy")) for word in angles), default=0.0)
         if largest > 2.0 * math.pi + 1e-6:
-            warn(
-                path,
-                f"{top.tag}.{top.get('name')}.rpy: {largest:g} rad; a URDF uses radians; are these degrees?",
-            )
+            warn(path, f"{top.tag}.{top.get('name')}.rpy: {largest:g} rad; a URDF uses radians; are these degrees?")
 
 
 def visuals(path: Path, robot: ET.Element, places: Mapping[str, Pose], bodies: Mapping[str, str]) -> Iterator[Visual]:

@@ -158,13 +158,7 @@ def _joint(robot: ET.Element, part: Single, places: Mapping[str, Array]) -> ET.E
     return element
 
 
-def _drive(
-    robot: ET.Element,
-    part: Single,
-    control: Control,
-    places: dict[str, Array],
-    follower: ET.Element,
-) -> None:
+def _drive(robot: ET.Element, part: Single, control: Control, places: dict[str, Array], follower: ET.Element) -> None:
     """Write the joint of a controller, with a link without mass, and the joint that follows it."""
     link = urdf_xml.free_name(control.name + DRIVE, {PLATFORM, *places})
     places[link] = part.joint.at

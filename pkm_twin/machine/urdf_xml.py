@@ -23,12 +23,7 @@ MAX_FILE_SIZE: Final = 4 * 1024 * 1024
 """Largest URDF that is read, bytes."""
 MAX_DEPTH: Final = 64
 """Deepest nesting of elements that is read."""
-UNLIMITED: Final = {
-    "revolute": 2.0 * math.pi - 1e-6,
-    "prismatic": 10.0,
-    "velocity": 1e6,
-    "effort": 1e6,
-}
+UNLIMITED: Final = {"revolute": 2.0 * math.pi - 1e-6, "prismatic": 10.0, "velocity": 1e6, "effort": 1e6}
 """From here on a limit is none, as a URDF needs numbers: rad, m, per second, N m or N."""
 
 

@@ -246,11 +246,7 @@ class _Reader:
             if len(free) == 1:
                 return ("revolute" if free[0][0] == "r" else "prismatic"), free[0][-1]
             kind += f" free in {', '.join(free)}"
-        raise ParameterError(
-            where,
-            kind,
-            "a revolute, prismatic, spherical or fixed joint, or one that is free alike",
-        )
+        raise ParameterError(where, kind, "a revolute, prismatic, spherical or fixed joint, or one that is free alike")
 
     def _numbers(self, prim: Any, kind: str) -> dict[str, Any]:
         """Return limits and the rotor of a joint of one axis."""

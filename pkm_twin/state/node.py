@@ -124,12 +124,7 @@ class MachineStateNode(TwinNode):
             "tool": self._declare_frame("tool_frame", "tool0", "of the tool"),
         }
         self._tool = Mount.of(
-            triple(
-                self,
-                "tool.xyz",
-                "position of the tool from the platform's reference point, platform axes",
-                "m",
-            ),
+            triple(self, "tool.xyz", "position of the tool from the platform's reference point, platform axes", "m"),
             triple(self, "tool.rpy", "roll, pitch and yaw of the tool relative to the platform", "rad"),
         )
         mounts = declare_mounts(self, self._frames["platform"])
@@ -168,10 +163,7 @@ class MachineStateNode(TwinNode):
             self._markers = self.create_guarded_publisher("~/markers")
             self.create_guarded_timer(1.0 / rate, self._publish_markers)
         self.create_guarded_subscription(
-            "joint_states",
-            self._on_joint_state,
-            refuse=partial(self.core.refuse, self.core.states),
-            expected=True,
+            "joint_states", self._on_joint_state, refuse=partial(self.core.refuse, self.core.states), expected=True
         )
         self.create_guarded_subscription("wrench", lambda m: self.core.wrench(m, self.now()))
         self.follow(

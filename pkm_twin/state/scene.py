@@ -204,12 +204,7 @@ class Scene:
         )
         return [
             Shape(
-                "arrow",
-                "wrench",
-                k,
-                colour,
-                size,
-                points=np.array([state.position, state.position + scale * vector]),
+                "arrow", "wrench", k, colour, size, points=np.array([state.position, state.position + scale * vector])
             )
             for k, (vector, scale, colour) in enumerate(parts)
             if vector.any()
