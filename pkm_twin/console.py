@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""What every command says and reads alike: progress, numbers with commas, JSON, ends of output."""
+"""Input and output that all commands have in common: progress, number lists, JSON, closed output."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from pkm_twin.files import STANDARD, parse_numbers, require_replaceable
 def progress(what: str, total: int | None) -> Iterator[Callable[[int], None]]:
     """Draw a progress bar on stderr, if that is a terminal; yield a function that takes the count.
 
-    The bar has what is left at the first count, so that it knows the time left of resumed work.
+    The bar's length is what remains at the first count, so that it estimates resumed work correctly.
     """
     with ExitStack() as stack:
         bar, first = None, 0
@@ -41,9 +41,9 @@ def progress(what: str, total: int | None) -> Iterator[Callable[[int], None]]:
 
 
 def numbers(text: str, count: int, expected: str = "") -> list[float]:
-    """``count`` finite numbers of a command line, with commas between; any count for 0.
+    """Parse ``count`` finite numbers separated by commas; any count for 0.
 
-    :param expected: what is right, in words; by default that count of numbers.
+    :param expected: description of a valid text, for the error.
     """
     values = parse_numbers(text)
     if len(values) != (count or max(len(values), 1)):
@@ -53,17 +53,17 @@ def numbers(text: str, count: int, expected: str = "") -> list[float]:
 
 
 def print_json(data: Any, *, err: bool = False) -> None:
-    """JSON proper: a number that is not finite is a mistake here."""
+    """Print data as JSON; a number that is not finite is a programming error."""
     click.echo(json.dumps(data, indent=2, allow_nan=False), err=err)
 
 
 def refuse_existing(path: Path, overwrite: bool, source: Path | None = None) -> None:
-    """Refuse a target that is there, a dangling link too, unless it may be replaced.
+    """Reject an existing target, including a dangling link, unless it may be replaced.
 
-    What is read from is never replaced, nor is a FIFO, a device or a folder; and a folder that is
-    not there is told before the work, not after it.
+    The source, a FIFO, a device or a folder is never replaced. A missing folder is reported before the
+    work instead of after it.
 
-    :raises PkmTwinError: such a target.
+    :raises PkmTwinError: the target cannot or may not be written.
     """
     if str(path) == STANDARD:
         return
@@ -81,7 +81,7 @@ def refuse_existing(path: Path, overwrite: bool, source: Path | None = None) -> 
 
 @contextmanager
 def writing(path: Path | None) -> Iterator[None]:
-    """Convert errors of the system to one line with the file's name.
+    """Convert errors of the operating system to one line with the file's name.
 
     :raises PkmTwinError: in place of any ``OSError``.
     """
@@ -92,18 +92,18 @@ def writing(path: Path | None) -> Iterator[None]:
 
 
 def tell(text: str) -> None:
-    """One line on stderr, whatever names and values are in it."""
+    """Print a text as one line on stderr, with unprintable characters escaped."""
     print(f"pkm-twin: {one_line(text, 2000)}", file=sys.stderr)
 
 
 def system_error(error: OSError) -> str:
-    """Return an error of the system as a line."""
+    """Describe an error of the operating system in one line."""
     what = error.strerror or str(error)
     return f"{error.filename}: {what}" if error.filename else what
 
 
 def flush_output() -> OSError | None:
-    """Write out what stdout still holds; what then fails is returned, and can fail no more."""
+    """Flush stdout; return an error and discard the rest, so that it cannot fail again."""
     try:
         sys.stdout.flush()
     except OSError as error:
@@ -113,7 +113,7 @@ def flush_output() -> OSError | None:
 
 
 def silence_output() -> None:
-    """Send what stdout still holds nowhere: the interpreter writes it out once more at its end."""
+    """Discard the content of stdout's buffer, which the interpreter would flush again at its end."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, sys.stdout.fileno())
     os.close(nowhere)

@@ -47,12 +47,8 @@ class FileError(ParameterError):
         self.args = (one_line(f"{path}: {text}", 2000),)
 
 
-NOUNS: Final = ("robot", "mechanism", "map", "launch argument", "command")
-"""Fields whose value is a name of this kind of thing."""
-
-
 MOST_NAMES: Final = 60
-"""Valid names that an error lists; of more it lists the nearest."""
+"""Most valid names that an error lists; of more names it lists the closest."""
 
 
 class UnknownNameError(ParameterError):
@@ -73,7 +69,7 @@ class UnknownNameError(ParameterError):
         self.valid = names
         if field == str(name) or field.endswith(f".{name}"):
             what = f"unknown key {field!r}"
-        elif field in NOUNS:
+        elif field in ("robot", "mechanism", "map", "launch argument", "command"):
             what = f"unknown {field} {short(name)}"
         else:
             what = f"{field}: {short(name)}"
@@ -84,7 +80,7 @@ class UnknownNameError(ParameterError):
 def unknown_number(path: str, names: Iterable[str]) -> ParameterError:
     """Return the error for a path without a number in the file; it names the closest paths."""
     known = list(names)
-    # What has the path's words in a row, first at the end; else what is spelt alike.
+    # Paths that contain the given one, those that end with it first; else similar spellings.
     close = [n for n in known if f".{path}.".replace("[", ".[") in f".{n}.".replace("[", ".[")]
     close = sorted(close, key=lambda name: not name.endswith(path))
     close = close[:3] or difflib.get_close_matches(path, known, 1)
@@ -115,14 +111,13 @@ _warned: dict[str, dict[Any, Any]] = {}
 
 
 LEAST_LIMIT: Final = 1e-9
-MOST_LIMIT: Final = 1e12
-"""Least and greatest limit that a machine can have, in any unit."""
+"""Smallest limit that a machine can have, in any unit."""
 
 
-def check_limit(field: str, value: float, unit: str = "", least: float = LEAST_LIMIT, most: float = MOST_LIMIT) -> None:
-    """Reject a value that no machine has: NaN, or one out of range; by default zero and below too.
+def check_limit(field: str, value: float, unit: str = "", least: float = LEAST_LIMIT, most: float = 1e12) -> None:
+    """Reject NaN and values out of range; by default also zero and below.
 
-    :raises ParameterError: by the field.
+    :raises ParameterError: the value is invalid; the error names the field.
     """
     if not least <= value <= most:
         raise ParameterError(field, value, f"{least:g} to {most:g} {unit}".strip())
@@ -165,8 +160,8 @@ class UnreachableError(PkmTwinError, ValueError):
     ``limb`` is the name of the limb or joint, ``index`` the sample's index in the batch (``()`` for
     one sample), ``miss`` the gap that remains (m), ``reached`` the fraction of the straight line
     from home up to which there is an assembly, None if no line was followed.
-    ``question``: which coordinate is far beyond the machine and which unit it may have, in place of
-    limb and gap. ``how``: why the limb has no place, in place of the gap.
+    ``question``: the coordinate that is far outside the machine and the unit it may have, instead of
+    limb and gap. ``how``: why the limb cannot be placed, instead of the gap.
     """
 
     def __init__(
@@ -181,7 +176,7 @@ class UnreachableError(PkmTwinError, ValueError):
     ) -> None:
         where = f" at sample {index if len(index) != 1 else index[0]}" if index else ""
         way = "" if reached is None else f", beyond {100 * reached:.3g} % of the way from home"
-        # A limb of no length at all misses nothing, and points nowhere.
+        # A limb of length zero has no gap and no direction.
         gap = f"misses by {miss:.6g} m" if miss else "has no direction there"
         text = f" is unreachable: {limb} {how or gap}{way}"
         super().__init__(f"{what}{where}{question or text}")
@@ -197,9 +192,8 @@ class SingularityError(PkmTwinError, ValueError):
 
     ``measure`` is the dimensionless reciprocal condition number, ``bound`` the least valid one;
     ``reached`` the fraction of the straight line from home at which the singularity occurs, None at
-    the pose itself; ``beyond`` whether the pose is on the other side of one;
-    ``question``: which coordinate is far beyond the machine and which unit it may have; all that is
-    said then.
+    the pose itself; ``beyond``: true if the pose is on the other side of a singularity; ``question``:
+    the coordinate that is far outside the machine and the unit it may have, instead of all else.
     """
 
     def __init__(
@@ -271,7 +265,7 @@ def one_line(text: str, limit: int = 400) -> str:
 
     ``limit`` is the largest number of characters of the result.
     """
-    # Each character may become ten: what cannot be shown is not escaped first.
+    # Cut first: escaping may turn each character into ten.
     half = limit // 2
     if len(text) > 2 * limit:
         text = f"{text[:limit]}{text[-limit:]}"
@@ -280,7 +274,7 @@ def one_line(text: str, limit: int = 400) -> str:
 
 
 def short(value: object, limit: int = 80) -> str:
-    """Write a value for an error message: its end is cut, numpy's types are left out."""
+    """Write a value for an error message, without numpy's types and at most ``limit`` characters."""
     if isinstance(value, Exception):
         return str(value)
     text = repr(_plain(value))

@@ -16,7 +16,7 @@ T = TypeVar("T")
 
 
 class Extensible(Mapping[str, T], Generic[T]):
-    """Objects by name, each loaded when it is asked for: the package's own, then entry points.
+    """Objects by name, loaded on demand: the package's own, then entry points.
 
     Entry points are read only for a name that is not the package's own, or to list all names: this
     opens a file of every installed package. An entry point cannot replace one of the package's own.
@@ -30,9 +30,10 @@ class Extensible(Mapping[str, T], Generic[T]):
         load: Callable[[str], Any],
         convert: Callable[[Any], Any] = lambda found: found,
     ) -> None:
-        """``kind``: what entry points of ``group`` name; ``convert``: makes the object of it.
+        """Set the functions that load objects.
 
-        ``load``: returns the object of a name of ``own``.
+        ``load``: returns the object of a name of ``own``. ``kind``: type of the entry points of
+        ``group``; ``convert``: makes the object from an entry point.
         """
         self.group, self.kind, self._own = group, kind, dict.fromkeys(own)
         self._load, self._convert = load, convert

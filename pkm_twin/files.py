@@ -38,7 +38,7 @@ def open_regular(path: Path) -> BinaryIO:
     :raises OSError: it cannot be opened; or it is no regular file, ``strerror`` then says what.
     """
     _require_regular(os.stat(path).st_mode, path)
-    # Something else may stand there by now: opening must not wait, and what was opened is asked.
+    # The file may have been replaced meanwhile: do not wait, and check the opened file again.
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
     try:
         _require_regular(os.fstat(descriptor).st_mode, path)
@@ -81,7 +81,7 @@ def decimal(text: str) -> float:
 
 
 def parse_numbers(text: str) -> list[float]:
-    """Finite numbers separated by commas; an empty list for any other text."""
+    """Parse finite numbers separated by commas; return an empty list for any other text."""
     try:
         numbers = [decimal(word) for word in text.split(",")]
     except ValueError:
@@ -90,11 +90,11 @@ def parse_numbers(text: str) -> list[float]:
 
 
 def require_replaceable(path: Path) -> None:
-    """Refuse a target that is there and no regular file, nor a link to one.
+    """Reject an existing target that is not a regular file or a link to one.
 
-    Opening a FIFO would wait for a reader, and a device is nobody's to replace.
+    Opening a FIFO would wait for a reader, and a device must not be replaced.
 
-    :raises OSError: such a target; ``strerror`` says what it is.
+    :raises OSError: the target cannot be replaced; ``strerror`` says what it is.
     """
     with suppress(FileNotFoundError):
         _require_regular(os.stat(path).st_mode, path)
@@ -123,7 +123,7 @@ def replacing(path: Path) -> Iterator[Path]:
         yield hidden
         os.replace(hidden, path)
     except OSError as error:
-        # A write that fails names no file, and of the hidden name nobody knows.
+        # A failed write names no file, and users do not know the temporary name.
         if error.filename is None or os.fspath(error.filename) == str(hidden):
             raise OSError(error.errno, error.strerror, str(path)) from None
         raise
@@ -142,7 +142,7 @@ def replace_file(path: Path, data: bytes) -> None:
 
 
 def replace_files(files: Mapping[Path, bytes]) -> None:
-    """Write small files all or none: each is whole before the first takes its place.
+    """Write all small files or none: all are complete before the first replaces its target.
 
     :raises OSError: as :func:`replace_file`.
     """
@@ -152,10 +152,10 @@ def replace_files(files: Mapping[Path, bytes]) -> None:
 
 
 def open_standard_streams() -> None:
-    """Let stdin, stdout and stderr lead nowhere where the parent closed them.
+    """Open stdin, stdout and stderr on the null device where the parent process closed them.
 
-    Else the next file or socket gets one of their numbers, and what is printed goes into it. What a
-    terminal's encoding cannot show, such as a file's name that is no text, is escaped.
+    Otherwise the next file or socket would get one of their descriptors, and receive printed text.
+    Characters that the terminal's encoding does not have are escaped.
     """
     nowhere = os.open(os.devnull, os.O_RDWR)
     while nowhere <= 2:

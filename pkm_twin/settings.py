@@ -49,7 +49,7 @@ class Setting:
 
     @property
     def span(self) -> str:
-        """The bounds in words, to stand behind what they bound."""
+        """Description of the bounds, to be appended to the name of the quantity."""
         words = "" if self.above is None else f" above {self.above:g}"
         if self.high == math.inf:
             return f"{words}{self._least}, or .inf"
@@ -62,7 +62,7 @@ class Setting:
         return "" if self.low is None else f", {self.low:g} or more"
 
     def allows(self, number: float) -> bool:
-        """Whether a number is within the bounds."""
+        """Return whether a number is within the bounds."""
         low = -math.inf if self.low is None else self.low
         high = math.inf if self.high is None else self.high
         return low <= number <= high and (self.above is None or number > self.above)
@@ -101,13 +101,9 @@ def setting(default: Any, text: str, **more: Any) -> Any:
     return field(default=default, metadata={"setting": Setting(text, **more)})
 
 
+@cache
 def settings_of(kind: Any) -> Mapping[str, tuple[str, Any]]:
     """Return the field's name and its setting by parameter name."""
-    return _settings_of(kind)
-
-
-@cache
-def _settings_of(kind: Any) -> Mapping[str, tuple[str, Any]]:
     found = {f.name: f.metadata["setting"] for f in dataclasses.fields(kind) if f.metadata}
     return {row.name or name: (name, row) for name, row in found.items()}
 

@@ -10,13 +10,13 @@ from contextlib import contextmanager
 from typing import Final
 
 VARIABLES: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-"""What the libraries read when they are loaded."""
+"""Environment variables that the libraries read when they are loaded."""
 
 
 def one_blas_thread() -> None:
-    """For this process, libraries that it loads later, and its children, unless told otherwise.
+    """Limit BLAS to one thread in this process and its children, unless the environment sets it.
 
-    Of libraries that are loaded by now only with threadpoolctl.
+    Libraries that are already loaded are limited only if threadpoolctl is installed.
     """
     for name in VARIABLES:
         os.environ.setdefault(name, "1")
@@ -31,7 +31,7 @@ def one_blas_thread() -> None:
 
 @contextmanager
 def one_blas_thread_for_children() -> Iterator[None]:
-    """For processes that are started here, unless the environment says otherwise."""
+    """Limit BLAS to one thread in processes started here, unless the environment sets it."""
     new = [name for name in VARIABLES if name not in os.environ]
     os.environ.update(dict.fromkeys(new, "1"))
     try:

@@ -43,8 +43,6 @@ BOUNDS: Final = {
 all others relative."""
 VARIANT_DEVIATION: Final = 0.02
 """Relative standard deviation of the parameters of random machines."""
-MIN_SCALE_FRACTION: Final = 1e-3
-"""Smallest scale of a state's relative error, as a fraction of the largest effort of all states."""
 
 
 class Judge(Protocol):
@@ -75,7 +73,7 @@ class Item:
 
     @property
     def good(self) -> bool:
-        """Whether the largest difference keeps the bound."""
+        """True if the largest difference is within the bound."""
         return self.worst <= self.bound
 
 
@@ -105,7 +103,7 @@ class Certificate:
 
     @property
     def good(self) -> bool:
-        """Whether every comparison keeps its bound."""
+        """True if every comparison is within its bound."""
         return all(item.good for item in self.items)
 
     @property
@@ -146,7 +144,13 @@ def certify(
             return False
         return True
 
-    description = _actuate_independent_joints(robot, description)
+    if _is_redundant(robot):
+        idle = set(robot.joint_names) - set(robot.graph.leads)
+        joints = {
+            name: {**joint, "actuated": False, "limits": {}} if name in idle else joint
+            for name, joint in description["joints"].items()
+        }
+        description = {**description, "joints": joints}
     try:
         first = Maximal(description)
         drawn = random_states(first, np.random.default_rng(seed), states, reaches)
@@ -168,7 +172,15 @@ def certify(
             missing[name] = f"{ENGINES[name][1]} is not installed; {install('certificate')}"
         except UnfitError as error:
             missing[name] = str(error)
-    items = [*_compare_with_itself(robot, drawn), *_compare_engines(robot, judges, drawn, progress)]
+    # The inverse with the forward kinematics, and single samples with a batch.
+    motion = *_expand_to_all_joints(robot, drawn.q, drawn.qd, drawn.qdd), drawn.wrench
+    trip = np.abs(robot.inverse(robot.forward(motion[0])) - motion[0]).max(-1)
+    single = np.array([inverse_dynamics(robot, *state) for state in zip(*motion, strict=True)])
+    items = [
+        _make_item("twin", "round_trip", trip),
+        _make_item("twin", "batch", np.abs(inverse_dynamics(robot, *motion) - single)),
+        *_compare_engines(robot, judges, drawn, progress),
+    ]
     return Certificate(
         robot.name,
         seed,
@@ -212,10 +224,14 @@ def certify_variants(
         )
         for same in by_name.values()
     ]
-    missing = {name: reason for one in found for name, reason in one.missing.items()}
-    states = sum(one.drawn for one in found)
-    skipped = sum(one.skipped for one in found)
-    return replace(found[0], items=items, missing=missing, drawn=states, skipped=skipped, variants=count)
+    return replace(
+        found[0],
+        items=items,
+        missing={name: reason for one in found for name, reason in one.missing.items()},
+        drawn=sum(one.drawn for one in found),
+        skipped=sum(one.skipped for one in found),
+        variants=count,
+    )
 
 
 def drawn(robot: Robot, seed: int) -> Robot:
@@ -225,18 +241,6 @@ def drawn(robot: Robot, seed: int) -> Robot:
         return varied(robot, dict.fromkeys(KINDS, VARIANT_DEVIATION), seed).robot
     except ParameterError:
         return varied(robot, dict.fromkeys(kinds, VARIANT_DEVIATION), seed).robot
-
-
-def _actuate_independent_joints(robot: Any, description: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the description with only the independent joints of a redundant machine actuated."""
-    if not _is_redundant(robot):
-        return description
-    idle = set(robot.joint_names) - set(robot.graph.leads)
-    joints = {
-        name: {**joint, "actuated": False, "limits": {}} if name in idle else joint
-        for name, joint in description["joints"].items()
-    }
-    return {**description, "joints": joints}
 
 
 def _is_redundant(robot: Any) -> bool:
@@ -251,18 +255,7 @@ def _expand_to_all_joints(robot: Any, *motion: Array) -> tuple[Array, ...]:
     whole = [np.zeros((*one.shape[:-1], robot.joints_count)) for one in motion]
     for one, leads in zip(whole, motion, strict=True):
         one[..., robot.graph.leading] = leads
-    made: tuple[Array, ...] = robot.project_redundant(*whole)
-    return made
-
-
-def _compare_with_itself(robot: Any, states: States) -> list[Item]:
-    """Compare the inverse with the forward kinematics, and single samples with a batch."""
-    motion = *_expand_to_all_joints(robot, states.q, states.qd, states.qdd), states.wrench
-    back = robot.inverse(robot.forward(motion[0]))
-    trip = np.abs(back - motion[0]).max(-1)
-    batch = inverse_dynamics(robot, *motion)
-    single = np.array([inverse_dynamics(robot, *state) for state in zip(*motion, strict=True)])
-    return [_make_item("twin", "round_trip", trip), _make_item("twin", "batch", np.abs(batch - single))]
+    return tuple(robot.project_redundant(*whole))
 
 
 def _compare_engines(
@@ -305,14 +298,13 @@ def _compare_engines(
 def effort_differences(got: Array, expected: Array) -> Array:
     """Return each state's largest difference relative to its largest effort, shape (states,).
 
-    If a state's efforts nearly vanish, the difference is relative to MIN_SCALE_FRACTION times the
-    largest effort of all states.
+    If a state's efforts nearly vanish, the difference is relative to a thousandth of the largest effort
+    of all states.
     """
     size = np.abs(expected).max(-1)
-    scale = np.maximum(size, MIN_SCALE_FRACTION * size.max())
+    scale = np.maximum(size, 1e-3 * size.max())
     apart = np.abs(got - expected).max(-1)
-    result: Array = np.divide(apart, scale, out=np.where(apart > 0, np.inf, 0.0), where=scale > 0)
-    return result
+    return np.asarray(np.divide(apart, scale, out=np.where(apart > 0, np.inf, 0.0), where=scale > 0))
 
 
 def relative_difference(got: Array, expected: Array) -> float:

@@ -22,10 +22,6 @@ Array = NDArray[np.float64]
 Description = Mapping[str, Any]
 
 BASE: Final = "base"
-STANDARD_GRAVITY: Final = (0.0, 0.0, -9.81)
-"""Gravity of a description without gravity, m/s2."""
-DEFAULT_ANGLES: Final = {"yaw": "z", "pitch": "y", "roll": "x"}
-"""Names and axes of the platform's angles, R = Rz(yaw) Ry(pitch) Rx(roll)."""
 
 
 class UnfitError(ValueError):
@@ -71,12 +67,12 @@ class Joint:
 
     @property
     def slides(self) -> bool:
-        """Whether the joint's value is a length."""
+        """True if the joint's value is a length."""
         return self.type.steps == ("slide",)
 
     @property
     def steps(self) -> list[tuple[bool, Array]]:
-        """Single freedoms from the inner to the outer body: whether it is a rotation, and its axis.
+        """Single freedoms from the inner to the outer body: true for a rotation, and the axis.
 
         A screw is a translation and a rotation that an additional equation couples.
         """
@@ -135,7 +131,7 @@ class Machine:
 
     @property
     def sequence(self) -> str:
-        """Axes of all three angles, as scipy names those of turned frames."""
+        """Axes of the three angles in scipy's notation of intrinsic rotations."""
         return "XYZ" if next(iter(self.angles.values())) == "x" else "ZYX"
 
     def select(self, places: Array, turns: Array) -> Array:
@@ -158,12 +154,6 @@ def tensor(value: Any) -> Array:
     return np.diag(result) if result.shape == (3,) else result.reshape(3, 3)
 
 
-def turn_about_z(angle: float) -> Array:
-    """Return the rotation about base z by an angle, rad, shape (3, 3)."""
-    c, s = math.cos(angle), math.sin(angle)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-
-
 def expand(description: Description) -> dict[str, Any]:
     """Expand the ``limbs`` of a description to bodies, joints and rods.
 
@@ -178,7 +168,7 @@ def expand(description: Description) -> dict[str, Any]:
     for section in sections:
         own = {name for name, _ in _section_items(section, "bodies")}
         for number, azimuth in enumerate(section["azimuths"], 1):
-            turn = turn_about_z(float(azimuth))
+            turn = Rotation.from_euler("z", float(azimuth)).as_matrix()
             for kind in ("bodies", "joints", "rods"):
                 for name, entry in _section_items(section, kind):
                     full = f"{name}_{number}"
@@ -222,27 +212,40 @@ def read(description: Description) -> Machine:
     :raises UnfitError: the mapping cannot be read; the package's own loader has better messages.
     """
     data = expand(description)
-    bodies = {name: _read_body(entry) for name, entry in data["bodies"].items()}
+    origin = (0.0, 0.0, 0.0)
+    bodies = {
+        name: Body(float(one.get("mass", 0.0)), vector(one.get("com", origin)), tensor(one.get("inertia", origin)))
+        for name, one in data["bodies"].items()
+    }
     known = {BASE, *bodies}
     joints = tuple(_read_joint(name, entry, known) for name, entry in data["joints"].items())
-    rods = tuple(_read_rod(name, entry, known) for name, entry in data["rods"].items())
+    rods = tuple(
+        Rod(
+            name,
+            *_read_ends(f"rods.{name}", one, known),
+            np.array([vector(end) for end in one["ends"]]),
+            float(one.get("mass", 0.0)),
+        )
+        for name, one in data["rods"].items()
+    )
     platform = str(data.get("platform", "platform"))
     if platform not in bodies:
         raise UnfitError(f"no body is named {platform!r}, the platform")
-    origin = vector(data.get("origin", bodies[platform].com))
+    reference = vector(data.get("origin", bodies[platform].com))
     load = data.get("payload") or {}
     if load.get("mass"):
         # The payload's centre is relative to the platform's reference point.
-        at = origin + vector(load.get("com", (0, 0, 0)))
-        payload = Body(float(load["mass"]), at, tensor(load.get("inertia", (0, 0, 0))))
+        at = reference + vector(load.get("com", origin))
+        payload = Body(float(load["mass"]), at, tensor(load.get("inertia", origin)))
         bodies[platform] = combine_bodies(bodies[platform], payload)
     return Machine(
-        vector(data.get("gravity", STANDARD_GRAVITY)),
+        vector(data.get("gravity", (0.0, 0.0, -9.81))),
         platform,
-        origin,
+        reference,
         # Without pose coordinates of its own only positions and rotations are compared.
         tuple(data.get("pose", ())),
-        data.get("angles") or DEFAULT_ANGLES,
+        # R = Rz(yaw) Ry(pitch) Rx(roll)
+        data.get("angles") or {"yaw": "z", "pitch": "y", "roll": "x"},
         bodies,
         joints,
         rods,
@@ -258,12 +261,6 @@ def combine_bodies(one: Body, other: Body) -> Body:
         arm = body.com - com
         inertia += body.inertia + body.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
     return Body(mass, com, inertia)
-
-
-def _read_body(entry: Mapping[str, Any]) -> Body:
-    return Body(
-        float(entry.get("mass", 0.0)), vector(entry.get("com", (0, 0, 0))), tensor(entry.get("inertia", (0, 0, 0)))
-    )
 
 
 def _read_ends(name: str, entry: Mapping[str, Any], known: set[str]) -> tuple[str, str]:
@@ -285,6 +282,10 @@ def _read_joint(name: str, entry: Mapping[str, Any], known: set[str]) -> Joint:
         raise UnfitError(f"joints.{name}: {len(axes)} axes, a {kind} joint has {count}")
     units = [vector(axis) / np.linalg.norm(vector(axis)) for axis in axes]
     friction, limits = entry.get("friction") or {}, entry.get("limits") or {}
+    rotor = float(entry.get("rotor_inertia", 0.0))
+    if drive := entry.get("drive"):
+        # A rotor's inertia acts at the joint with the squared gear ratio.
+        rotor = float(drive["inertia"] * (drive.get("ratio") or 2.0 * math.pi / drive["lead"]) ** 2)
     low, high = limits.get("position", (-math.inf, math.inf))
     return Joint(
         name,
@@ -299,25 +300,10 @@ def _read_joint(name: str, entry: Mapping[str, Any], known: set[str]) -> Joint:
         float(friction.get("viscous", 0.0)),
         float(friction.get("coulomb", 0.0)),
         float(friction.get("offset", 0.0)),
-        _reflected_inertia(entry),
+        rotor,
         friction,
         float(entry.get("lead", 0.0)) / (2.0 * math.pi),
     )
-
-
-def _reflected_inertia(entry: Mapping[str, Any]) -> float:
-    """Return a drive's inertia at its joint: given, or the rotor's times the squared gear ratio."""
-    drive = entry.get("drive")
-    if not drive:
-        return float(entry.get("rotor_inertia", 0.0))
-    turns = drive.get("ratio") or 2.0 * math.pi / drive["lead"]
-    return float(drive["inertia"] * turns**2)
-
-
-def _read_rod(name: str, entry: Mapping[str, Any], known: set[str]) -> Rod:
-    inner, outer = _read_ends(f"rods.{name}", entry, known)
-    ends = np.array([vector(end) for end in entry["ends"]])
-    return Rod(name, inner, outer, ends, float(entry.get("mass", 0.0)))
 
 
 def with_laws(drives: Sequence[Joint], q: Array, qd: Array, tau: Array) -> Array:

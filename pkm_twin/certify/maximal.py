@@ -20,16 +20,6 @@ from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
 from pkm_twin.certify.description import Array, Description, UnfitError, cross, read
 from pkm_twin.certify.rows import SINGULAR, Frame, Moving
 
-FIRST_STEP: Final = 1.0 / 16.0
-"""Length of the first step as a fraction of the line from home to the goal."""
-MIN_STEP: Final = 1e-5
-"""Shortest step as a fraction of the line; a shorter one means a singularity."""
-MAX_STEP: Final = 0.02
-"""Largest first correction of an accepted step, relative to the step's motion."""
-CACHED_ASSEMBLIES: Final = 64
-"""Number of cached assemblies: the continuation takes far longer than the computations there."""
-RANGE_FRACTION: Final = 0.8
-"""Fraction of the range between the joints' limits from which positions are drawn."""
 DEFAULT_HALF_RANGE: Final = 0.3
 """Half the range of a joint without limits, rad; for a prismatic joint half this times the size."""
 MIN_RELATIVE_CONDITION: Final = 0.1
@@ -62,11 +52,6 @@ class Home(NamedTuple):
     rows: int
     condition: float
     """Reciprocal condition number of all equations, including those of the actuated joints."""
-
-
-def rotation_of(turn: Array) -> Array:
-    """Return the rotations of rotation vectors (..., 3), shape (..., 3, 3)."""
-    return np.asarray(Rotation.from_rotvec(turn).as_matrix(), np.float64)
 
 
 class Maximal(Moving):
@@ -111,7 +96,8 @@ class Maximal(Moving):
         """
         q = np.asarray(q, dtype=float)
         if q.tobytes() not in self._assembled:
-            if len(self._assembled) == CACHED_ASSEMBLIES:
+            # The continuation takes far longer than the computations at a cached assembly.
+            if len(self._assembled) == 64:
                 self._assembled.clear()
             self._assembled[q.tobytes()] = self._follow(q - self.machine.home)
         self._state = self._assembled[q.tobytes()]
@@ -120,7 +106,8 @@ class Maximal(Moving):
     def _follow(self, way: Array) -> State:
         if self.home.condition < SINGULAR:
             raise UnfitError("the actuated joints do not determine the machine at home")
-        state, gone, step, least = self._start, 0.0, FIRST_STEP, 1.0
+        # Steps are fractions of the line from home to the goal.
+        state, gone, step, least = self._start, 0.0, 1.0 / 16.0, 1.0
         folds = []
         while gone < 1.0:
             step = min(step, 1.0 - gone)
@@ -133,10 +120,11 @@ class Maximal(Moving):
             size = float(np.abs(state.velocity).max())
             guess = self._moved(state, step * state.velocity.ravel() + step**2 / 2 * change)
             goal = 1.0 if step >= 1.0 - gone else gone + step
-            trial, condition = self._close(guess, goal * way, MAX_STEP * max(size * step, 1e-9))
+            # The first correction of an accepted step is at most a fiftieth of its motion.
+            trial, condition = self._close(guess, goal * way, 0.02 * max(size * step, 1e-9))
             if trial is None:
                 step /= 2
-                if step < MIN_STEP:
+                if step < 1e-5:
                     raise UnfitError(f"a singularity on the way from home, at {gone:.4g} of it")
                 continue
             state, gone, step = trial, goal, 1.5 * step
@@ -164,7 +152,7 @@ class Maximal(Moving):
 
     def _moved(self, state: State, change: Array) -> State:
         each = change.reshape(-1, 6)
-        turned = rotation_of(each[:, 3:]) @ state.rotation
+        turned = Rotation.from_rotvec(each[:, 3:]).as_matrix() @ state.rotation
         # One Newton step of the polar decomposition restores orthogonality after rounding.
         turned = turned @ (1.5 * np.eye(3) - 0.5 * turned.transpose(0, 2, 1) @ turned)
         return replace(state, rotation=turned, com=state.com + each[:, :3])
@@ -254,7 +242,8 @@ def ranges(judge: Maximal) -> Array:
         low, high = joint.position
         low = low if np.isfinite(low) else joint.home - reach
         high = high if np.isfinite(high) else joint.home + reach
-        middle, half = (low + high) / 2, RANGE_FRACTION * (high - low) / 2
+        # The outer tenths of the range are left out.
+        middle, half = (low + high) / 2, 0.8 * (high - low) / 2
         result.append((middle - half, middle + half))
     return np.array(result)
 

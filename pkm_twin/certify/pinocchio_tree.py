@@ -6,8 +6,6 @@ The tree consists of the actuated joints and those with the fewest freedoms.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pinocchio as pin
 
@@ -44,7 +42,8 @@ class PinocchioTree(Tree):
                 for turns, a in steps
             ]
         for number, model in enumerate(models):
-            carrier = self.model.addJoint(carrier, model, _translation(at - origin), f"{name}.{number}")
+            offset = pin.SE3(np.eye(3), np.asarray(at - origin, dtype=float))
+            carrier = self.model.addJoint(carrier, model, offset, f"{name}.{number}")
             origin = at
         self._carriers[name] = carrier, origin
         if carrier:
@@ -89,7 +88,3 @@ class PinocchioTree(Tree):
     def forces(self, change: Array) -> Array:
         """Compute the tree's inverse dynamics by recursive Newton-Euler, shape (size,)."""
         return np.array(pin.rnea(self.model, self.data, *self._state, change))
-
-
-def _translation(offset: Array) -> Any:
-    return pin.SE3(np.eye(3), np.asarray(offset, dtype=float))

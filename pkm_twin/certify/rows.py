@@ -308,8 +308,7 @@ def stacked(rows: list[Rows], size: int | None = None) -> Rows:
 
 def drag(joint: Joint, rates: Array) -> Array:
     """Return viscous friction, Coulomb friction and offset at each velocity, N m or N."""
-    result: Array = joint.viscous * rates + joint.coulomb * np.sign(rates) + joint.offset
-    return result
+    return np.asarray(joint.viscous * rates + joint.coulomb * np.sign(rates) + joint.offset)
 
 
 def skewed(v: Array) -> Array:

@@ -11,17 +11,14 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Iterable, Sequence
-from typing import Final
 
 import numpy as np
 
 from pkm_twin.certify.description import BASE, Array, Body, Description, Joint, Rod, UnfitError, across, read
 from pkm_twin.certify.rows import Moving, Rows
 
-STEPS: Final = 64
-"""Number of steps from home to a state."""
 Steps = Sequence[tuple[bool, Array]]
-"""Freedoms of a joint from parent to child: whether each is a rotation, and its axis at home."""
+"""Freedoms of a joint from parent to child: true for a rotation, and the axis at home."""
 
 
 class Tree(Moving):
@@ -31,7 +28,7 @@ class Tree(Moving):
     """
 
     widest: bool
-    """Whether the tree prefers joints with many freedoms; else actuated ones and few freedoms."""
+    """True if the tree prefers joints with many freedoms, else actuated ones and few freedoms."""
 
     def __init__(self, description: Description) -> None:
         self.machine = read(description)
@@ -121,14 +118,14 @@ class Tree(Moving):
         self.place(full, np.zeros(self.size))
 
     def _follow(self, way: Array) -> Array:
-        full = self.neutral()
-        for number in range(1, STEPS + 1):
+        full, steps = self.neutral(), 64
+        for number in range(1, steps + 1):
             self._at(full)
-            full = self.stepped(full, self.tangent() @ way / STEPS)
-            full = self._close(full, way * number / STEPS, number)
+            full = self.stepped(full, self.tangent() @ way / steps)
+            full = self._close(full, way * number / steps, f"{number} / {steps}")
         return full
 
-    def _close(self, full: Array, way: Array, number: int) -> Array:
+    def _close(self, full: Array, way: Array, fraction: str) -> Array:
         last = math.inf
         for _ in range(12):
             self._at(full)
@@ -140,7 +137,7 @@ class Tree(Moving):
             if length < 1e-15:
                 break
         if last > 1e-12:
-            raise UnfitError(f"loops stay open {number} / {STEPS} of the way from home")
+            raise UnfitError(f"loops stay open {fraction} of the way from home")
         return full
 
 

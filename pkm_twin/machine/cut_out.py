@@ -1,9 +1,9 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Cut a linkage out of a larger robot: what lies between a base and a platform, and its loops.
 
-Links that fixed joints hold together are one body. A joint belongs to the linkage if joints and
-loop closures make a circle through it, the platform and the base: then no body stands between them
-whose absence would part them (a block of the graph, found without one body after another).
+Links that fixed joints hold together are one body. A joint belongs to the linkage if it is on a
+circle of joints and loop closures through the platform and the base, that is in their block of the
+graph: no single body separates it from them. Leaving out each body in turn finds the block.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Bars, elasticity and passive limits of a machine, by the entries of its file."""
+"""Find bars, elasticity and passive limits of a machine in the entries of its file."""
 
 from __future__ import annotations
 
@@ -8,11 +8,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import norm, plain
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.graph import BASE, Graph, limb_numbers
-from pkm_twin.machine.graph_file import LimitSpec
 from pkm_twin.machine.joints import unit
 from pkm_twin.machine.members import Beam, Parts
 from pkm_twin.machine.reach import PassiveLimit
@@ -52,7 +50,7 @@ def find_parts(graph: Graph, specs: Specs) -> Parts:
 
 
 def find_passive_limits(graph: Graph, specs: Specs) -> tuple[PassiveLimit, ...]:
-    """Return positions and swivels of joints that are not actuated, and of rods at both ends.
+    """Return limits of position and swivel of passive joints, and of the swivel of rods at both ends.
 
     :raises ParameterError: a swivel without an axis.
     """
@@ -63,8 +61,16 @@ def find_passive_limits(graph: Graph, specs: Specs) -> tuple[PassiveLimit, ...]:
         if limits is None or joint.actuated:
             continue
         if limits.swivel is not None:
-            axis = unit(_swivel_axis(graph, specs, name, limits))
-            found.append(PassiveLimit(name, "swivel", *ends, axis, 0.0, limits.swivel))
+            axis = limits.axis
+            if axis is None and joint.kind == "universal":
+                axis = np.cross(*joint.axes)
+            for body in ends[:2] if axis is None else ():
+                member = None if body in (BASE, graph.platform) else specs["bodies"][body].member
+                axis = member.end - member.start if axis is None and member is not None else axis
+            if axis is None:
+                bound = "the direction in the middle of its range, base axes"
+                raise ParameterError(f"joints.{name}.limits.axis", None, bound)
+            found.append(PassiveLimit(name, "swivel", *ends, unit(axis), 0.0, limits.swivel))
         elif limits.position is not None:
             kind = "slide" if joint.slides else "turn"
             low, high = limits.position.tolist()
@@ -72,37 +78,7 @@ def find_passive_limits(graph: Graph, specs: Specs) -> tuple[PassiveLimit, ...]:
     for name, rod in specs["rods"].items():
         if rod.swivel is not None:
             for k, way in ((0, 1), (1, 0)):
-                axis = unit(rod.ends[way] - rod.ends[k])
-                body, other = rod.between[k], rod.between[way]
-                found.append(
-                    PassiveLimit(
-                        name,
-                        "rod",
-                        body,
-                        other,
-                        rod.ends[k],
-                        axis,
-                        0.0,
-                        rod.swivel,
-                        far=rod.ends[way],
-                    )
-                )
+                start, far = rod.ends[k], rod.ends[way]
+                ends = rod.between[k], rod.between[way], start
+                found.append(PassiveLimit(name, "rod", *ends, unit(far - start), 0.0, rod.swivel, far=far))
     return tuple(found)
-
-
-def _swivel_axis(graph: Graph, specs: Specs, name: str, limits: LimitSpec) -> Array:
-    """Return the direction that a ball joint swivels from."""
-    joint = graph.joints[name]
-    if limits.axis is not None:
-        return limits.axis
-    if joint.kind == "universal":
-        return np.cross(*joint.axes)
-    for body in (joint.inner, joint.outer):
-        member = None if body == BASE else specs["bodies"][body].member
-        if member is not None and body != graph.platform:
-            return np.asarray(member.end - member.start, np.float64)
-    raise ParameterError(
-        f"joints.{name}.limits.axis",
-        None,
-        "the direction in the middle of its range, base axes",
-    )

@@ -33,13 +33,7 @@ MAX_DEPTH: Final = 40
 MAX_SIZE: Final = 1e18
 """Largest number: beyond every quantity of a machine in SI units; products stay finite."""
 _NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
-_INVALID_CHARACTER: Final = re.compile(r"[^A-Za-z0-9_ \t.+\-*/(),]")
 _NUMBER: Final = re.compile(r"(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
-_WITH_UNIT: Final = re.compile(r"\s*[-+]?[\d.]+([eE][-+]?\d+)?\s*[A-Za-z]\S*\s*")
-_ANGLE_FUNCTIONS: Final = ("sin", "cos", "tan")
-"""Functions of an angle; their values have no unit."""
-_SQUARED_SUFFIX: Final = "^2"
-"""Suffix that marks the squared unit of a root's argument."""
 
 
 def _dispatch(numbers: Callable[..., float], expressions: Callable[..., Any]) -> Callable[..., Any]:
@@ -113,7 +107,7 @@ class Formula:
         """
         if len(text) > MAX_LENGTH:
             raise ParameterError(path, text, f"at most {MAX_LENGTH} characters")
-        if strange := _INVALID_CHARACTER.search(text):
+        if strange := re.search(r"[^A-Za-z0-9_ \t.+\-*/(),]", text):
             raise ParameterError(path, text, f"arithmetic; {strange[0]!r} is no part of it")
         try:
             with warnings.catch_warnings():
@@ -121,17 +115,20 @@ class Formula:
                 tree = ast.parse(text.strip(), mode="eval").body
         except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
             told = error.msg if isinstance(error, SyntaxError) else "too deep"
-            if _WITH_UNIT.fullmatch(text):
+            if re.fullmatch(r"\s*[-+]?[\d.]+([eE][-+]?\d+)?\s*[A-Za-z]\S*\s*", text):
                 raise ParameterError(path, text, "a number without unit, rad and m") from None
             raise ParameterError(path, text, f"arithmetic; {told}") from None
         names = set[str]()
-        for node, depth in _iterate_nodes(tree, 1):
+        nodes = [(tree, 1)]
+        while nodes:
+            node, depth = nodes.pop()
             if depth > MAX_DEPTH:
                 raise ParameterError(path, text, f"a nesting of at most {MAX_DEPTH}")
             if reason := _find_invalid_reason(node, text.strip()):
                 raise ParameterError(path, text, reason)
             if isinstance(node, ast.Name) and node.id != "pi":
                 names.add(node.id)
+            nodes += [(part, depth + 1) for part in _child_nodes(node)]
         return cls(path, text, tree, frozenset(names))
 
     def value(self, given: Mapping[str, Any]) -> Any:
@@ -165,15 +162,6 @@ class Formula:
     def units(self, unit: str) -> Iterator[tuple[str, str]]:
         """Derive units of parameters, where possible, from the unit of the expression's value."""
         return _derive_units(self.tree, unit)
-
-
-def _iterate_nodes(node: ast.expr, depth: int) -> Iterator[tuple[ast.expr, int]]:
-    """Iterate over all nodes of a syntax tree with their depths."""
-    rows = [(node, depth)]
-    while rows:
-        node, depth = rows.pop()
-        yield node, depth
-        rows += [(part, depth + 1) for part in _child_nodes(node)]
 
 
 def _child_nodes(node: ast.expr) -> list[ast.expr]:
@@ -224,17 +212,19 @@ def _evaluate(node: ast.expr, given: Mapping[str, Any]) -> Any:
 
 
 def _derive_units(node: ast.expr, unit: str) -> Iterator[tuple[str, str]]:
-    if isinstance(node, ast.Name) and node.id != "pi" and unit and not unit.endswith(_SQUARED_SUFFIX):
+    if isinstance(node, ast.Name) and node.id != "pi" and unit and not unit.endswith("^2"):
         yield node.id, unit
     parts = _child_nodes(node)
     if isinstance(node, ast.Call):
         called = node.func.id  # type: ignore[attr-defined]
-        inner = "rad" if called in _ANGLE_FUNCTIONS else unit + _SQUARED_SUFFIX if called == "sqrt" and unit else ""
+        # The argument of a root has the squared unit.
+        angles = called in ("sin", "cos", "tan")
+        inner = "rad" if angles else f"{unit}^2" if called == "sqrt" and unit else ""
         for part in parts:
             yield from _derive_units(part, inner)
     elif isinstance(node, ast.BinOp) and isinstance(node.op, ast.Pow):
         squared = isinstance(parts[1], ast.Constant) and parts[1].value == 2
-        yield from _derive_units(parts[0], unit.removesuffix(_SQUARED_SUFFIX) if squared else "")
+        yield from _derive_units(parts[0], unit.removesuffix("^2") if squared else "")
     elif isinstance(node, ast.BinOp) and isinstance(node.op, (ast.Mult, ast.Div)):
         # A factor has the unit of the product if the other factor has none.
         bare = [_has_no_unit(part) for part in parts]
@@ -249,7 +239,7 @@ def _has_no_unit(node: ast.expr) -> bool:
     """Return whether an expression contains only numbers, pi and angle functions (no unit)."""
     if isinstance(node, ast.Name):
         return node.id == "pi"
-    if isinstance(node, ast.Call) and node.func.id in _ANGLE_FUNCTIONS:  # type: ignore[attr-defined]
+    if isinstance(node, ast.Call) and node.func.id in ("sin", "cos", "tan"):  # type: ignore[attr-defined]
         return True
     return all(map(_has_no_unit, _child_nodes(node)))
 

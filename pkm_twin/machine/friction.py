@@ -60,9 +60,9 @@ class FrictionLaw:
     name: ClassVar[str]
     parameters: ClassVar[Mapping[str, Parameter]]
     turns: ClassVar[bool] = True
-    """Whether the effort changes sign with the velocity."""
+    """True if the effort changes sign with the velocity."""
     memory: ClassVar[bool] = False
-    """Whether the effort depends on the past motion; such laws are not in compiled programs."""
+    """True if the effort depends on the past motion; such laws are not in compiled programs."""
 
     @staticmethod
     def by_position(values: Values, q: Any) -> Any:

@@ -6,7 +6,7 @@ Masses and friction are in ``machine.inertia``.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -90,30 +90,19 @@ def pattern_of(tree: Tree) -> str:
         # The signs and zeros of a frame in base axes show how its axes were chosen.
         parts += [link.parent, marks(link.arm), marks(link.axes)]
         parts += [(marks(s.before), marks(s.local), marks([s.offset])) for s in link.steps]
-        for vector in _body_vectors(graph, body):
-            parts.append(marks(link.axes.T @ vector))
-        parts += [marks(link.axes.T @ (point - link.at)) for point in _body_points(graph, body)]
+        vectors: list[Array] = []
+        for joint in graph.joints.values():
+            if body in (joint.inner, joint.outer):
+                vectors += [held.inner if body == joint.inner else held.outer for held in joint.constraints]
+                vectors += list(joint.axes)
+            vectors += [d.vector for d in joint.directions if d.body == body]
+        vectors += [rod.pair for rod in graph.rods.values() if rod.pair is not None and rod.outer == body]
+        points = graph.joint_points(body) + ([graph.origin] if body == graph.platform else [])
+        parts += [marks(link.axes.T @ vector) for vector in (*vectors, *(point - link.at for point in points))]
     for joint in graph.joints.values():
         for held in joint.constraints:
             parts.append(marks([held.inner @ held.outer]))
     return repr(parts)
-
-
-def _body_points(graph: Graph, body: str) -> list[Array]:
-    own = [graph.origin] if body == graph.platform else []
-    return [*graph.joint_points(body), *own]
-
-
-def _body_vectors(graph: Graph, body: str) -> Iterator[Array]:
-    for joint in graph.joints.values():
-        if body in (joint.inner, joint.outer):
-            for held in joint.constraints:
-                yield held.inner if body == joint.inner else held.outer
-            yield from joint.axes
-        yield from (d.vector for d in joint.directions if d.body == body)
-    for rod in graph.rods.values():
-        if rod.pair is not None and rod.outer == body:
-            yield rod.pair
 
 
 def marks(values: Any) -> str:

@@ -29,8 +29,7 @@ POSE: Final = ("x", "y", "z", "roll", "pitch", "yaw")
 """Pose coordinates: the reference point, and R = Rz(yaw) Ry(pitch) Rx(roll) relative to home."""
 
 MIN_LENGTH: Final = 1e-6
-"""Least length that may be divided by, m."""
-_PARALLEL: Final = 1e-3
+"""Smallest length that may be a divisor, m."""
 
 
 def array(values: ArrayLike) -> Array:
@@ -66,14 +65,13 @@ class Body:
 class Joint:
     """A joint between an inner and an outer body, through the point ``at`` at home.
 
-    ``axes``: unit vectors, shape (k, 3), as many as its type has; of a universal joint the first is
-    fixed in the inner body. ``pitch``: of a screw, m a rad.
-    ``home``: the joint's value at home. ``viscous``, ``coulomb``: friction along its freedom;
-    ``rotor_inertia``: against its acceleration, kg m2 or kg.
-    ``virtual``: a joint that stands for what other parts hold: it carries no load itself.
-    ``follows``: an actuated joint whose value the other ones determine, see :attr:`Graph.leads`.
-    ``directions``: of reactions; without them the joint's own axes. ``normal``: name of a universal
-    joint's direction across both axes. ``label``: its name among the reactions, else its own.
+    ``axes``: unit vectors, shape (k, 3), as many as its type has; the first axis of a universal joint
+    is fixed in the inner body. ``pitch``: of a screw, m/rad. ``home``: the joint's value at home.
+    ``viscous``, ``coulomb``: friction along its freedom; ``rotor_inertia``: kg m2 or kg. ``virtual``:
+    a joint in place of other parts that hold the bodies; it carries no load. ``follows``: an actuated
+    joint whose value the others determine, see :attr:`Graph.leads`. ``directions``: of reactions;
+    default: the joint's axes. ``normal``: name of the direction normal to both axes of a universal
+    joint. ``label``: its name among the reactions; default: its own.
     """
 
     name: str
@@ -96,44 +94,43 @@ class Joint:
 
     @property
     def leads(self) -> bool:
-        """Whether it is actuated, and its value is none that others determine."""
+        """True for an actuated joint whose value the other joints do not determine."""
         return self.actuated and not self.follows
 
     @property
     def type(self) -> type[JointType]:
-        """What it lets move and holds."""
+        """The joint's type, with its freedoms and constraints."""
         return TYPES[self.kind]
 
     @property
     def freedoms(self) -> tuple[Freedom, ...]:
-        """Its elementary freedoms, from the inner body to the outer one."""
+        """The elementary freedoms, from the inner body to the outer one."""
         return self.type.freedoms(self.axes, self.pitch)
 
     @property
     def constraints(self) -> tuple[Constraint, ...]:
-        """What it holds."""
+        """The constraints of the joint."""
         return self.type.constraints(self.axes, self.pitch)
 
     @property
     def slides(self) -> bool:
-        """Whether it has one freedom, and its number is a length."""
+        """True for a joint of one freedom whose value is a length."""
         return [freedom.turns for freedom in self.freedoms] == [False]
 
     @property
     def loaded(self) -> bool:
-        """Whether a passive joint has friction or a rotor."""
+        """True for a passive joint with friction or a rotor."""
         return not self.actuated and bool(self.viscous or self.coulomb or self.rotor_inertia)
 
 
 @dataclass(frozen=True, eq=False)
 class Rod:
-    """A thin even straight bar with a ball joint at each end, without spin.
+    """A thin uniform straight bar with a ball joint at each end, without spin.
 
-    ``pair``: unit vector fixed in the outer body along which the two rods of a parallelogram
-    stand side by side; taken as one rod between the middles of its ends, the pair holds a couple
-    beside. ``width``: their distance, m. ``body``: name of its body; ``ends``: points at home;
-    ``joints``: names of the joints at its ends; ``label``: of the pair's
-    couple among the reactions.
+    ``ends``: points at home. ``pair``: unit vector fixed in the outer body along which the two rods
+    of a parallelogram stand side by side; they are modelled as one rod in the middle that also
+    transmits a couple. ``width``: their distance, m. ``joints``: names of the joints at the ends.
+    ``label``: name of the pair's couple among the reactions.
     """
 
     name: str
@@ -156,10 +153,9 @@ class Rod:
 class Graph:
     """Bodies, joints and rods by name; ``platform`` carries the tool at ``origin`` (at home).
 
-    ``laws``: of the drives' friction beside the basic one, see :mod:`~pkm_twin.machine.friction`.
-    ``sharing``: of a machine with more drives than freedoms, shape (1 + 2 n,): by how much
-    positions may contradict each other, effort limits (only their ratios count), preload. Else
-    empty.
+    ``laws``: friction laws of the drives besides the basic one, see :mod:`~pkm_twin.machine.friction`.
+    ``sharing``: of a machine with more drives than freedoms, shape (1 + 2 n,): the tolerance of
+    redundant positions, effort limits (only their ratios count), preload; else empty.
     """
 
     bodies: Mapping[str, Body]
@@ -187,19 +183,19 @@ class Graph:
 
     @property
     def leading(self) -> list[int]:
-        """Their places among the actuated joints."""
+        """Indices of the leading joints among the actuated joints."""
         return [k for k, name in enumerate(self.actuated) if self.joints[name].leads]
 
     @property
     def lead_home(self) -> Array:
-        """Their values at home, shape (m,)."""
+        """Values of the leading joints at home, shape (m,)."""
         return np.array([self.joints[name].home for name in self.leads])
 
     @property
     def size(self) -> float:
-        """Characteristic length, m: greatest distance of two joints' points, or of a rod's ends.
+        """Characteristic length, m: the largest extent of joints and rod ends along a base axis.
 
-        1 where all are one point, as in a spherical machine, whatever rounding makes of it.
+        1 where they are all one point but for rounding, as in a spherical machine.
         """
         points = [joint.at for joint in self.joints.values()]
         points += [end for rod in self.rods.values() for end in rod.ends]
@@ -210,17 +206,17 @@ class Graph:
 
     @property
     def rim(self) -> float:
-        """Greatest distance of a joint on the platform from its reference point, m."""
+        """Largest distance of a joint on the platform from the reference point, m."""
         points = self.joint_points(self.platform)
         far = reduce(maximum, [norm(plain(p - self.origin)) for p in points], 0.0)
         return far if reference(far) > 1e-6 * reference(self.size) else 0.1 * self.size
 
     def frame(self, body: str) -> tuple[Array, float]:
-        """Return the point of a body at home whose velocity counts, and the length of its turning.
+        """Return the point of a body at home and the length, m, that scale its velocity and rotation.
 
-        The point, m, is the middle of the body's joints. The length, m, is the distance of the
-        farthest of them, or that of the platform where this is longer. Where the platform's joints
-        are one point, a tenth of the machine's stands for it.
+        The point, m, is the middle of the body's joints; the length is the distance of the farthest
+        of them, and at least that of the platform. If the platform's joints are one point, its length
+        is a tenth of the machine's.
         """
         middle, reach = _extent(self._held_points(body))
         own = reach if body == self.platform else _extent(self._held_points(self.platform))[1]
@@ -229,12 +225,12 @@ class Graph:
         return middle, maximum(maximum(reach, own), MIN_LENGTH)
 
     def _held_points(self, body: str) -> list[Array]:
-        """Return where joints and rods meet a body at home, m; virtual joints hold nothing."""
+        """Return the points of a body's joints and rods at home, m, without virtual joints."""
         true = {name: joint for name, joint in self.joints.items() if not joint.virtual}
         return replace(self, joints=true).joint_points(body) or self.joint_points(body)
 
     def joint_points(self, body: str) -> list[Array]:
-        """Where joints and rods meet a body at home, m."""
+        """Return the points of a body's joints and rods at home, m."""
         points = [j.at for j in self.joints.values() if body in (j.inner, j.outer)]
         for rod in self.rods.values():
             bodies = (rod.inner, rod.outer)
@@ -243,7 +239,7 @@ class Graph:
 
     @property
     def links(self) -> list[tuple[str, str]]:
-        """Bodies and rods that a joint joins, from the base's side outwards."""
+        """Pairs of bodies and rods that a joint connects, inner one first."""
         pairs = [(joint.inner, joint.outer) for joint in self.joints.values()]
         for rod in self.rods.values():
             pairs += [(rod.inner, rod.name), (rod.name, rod.outer)]
@@ -251,7 +247,7 @@ class Graph:
 
     @property
     def topology(self) -> str:
-        """Text of what bodies, joints and rods there are, and how they meet: no number."""
+        """Text of the bodies, joints and rods and of their connections, without numbers."""
         joints = [
             (
                 j.name,
@@ -271,7 +267,7 @@ class Graph:
 
     @property
     def numbers(self) -> list[float]:
-        """All numbers of the geometry in a row, inertia and friction not."""
+        """All numbers of the geometry; inertia and friction are not among them."""
         found: list[float] = []
         for joint in self.joints.values():
             found += (*joint.at, *joint.axes.ravel(), joint.home)
@@ -285,28 +281,45 @@ class Graph:
 
     @property
     def key(self) -> str:
-        """Text of the geometry: all that compiled programs depend on."""
+        """Text of the geometry, on which compiled programs depend."""
         return f"{self.topology} {array(self.numbers).tolist()}"
 
     def check(self) -> None:
-        """Refuse what no machine can be, by the name of the field.
+        """Reject a graph that cannot be a machine.
 
-        :raises ParameterError: unknown bodies, axes that are none, bodies without connection.
+        :raises ParameterError: an unknown body, an invalid axis, or a body without connection; the
+            error names the field.
         """
         if self.platform not in self.bodies:
             raise ParameterError("platform", self.platform, f"one of {', '.join(self.bodies)}")
         if BASE in self.bodies:
             raise ParameterError(f"bodies.{BASE}", BASE, "another name, because base is the ground")
         for joint in self.joints.values():
-            self._check_ends(f"joints.{joint.name}", joint.inner, joint.outer)
-            self._check_axes(joint)
+            path = f"joints.{joint.name}"
+            self._check_ends(path, joint.inner, joint.outer)
+            if joint.kind not in TYPES:
+                raise ParameterError(f"{path}.type", joint.kind, f"one of {', '.join(TYPES)}")
+            count = joint.type.count
+            if len(joint.axes) != count:
+                name = "axes" if count == 2 else "axis"
+                raise ParameterError(f"{path}.{name}", joint.axes.tolist(), f"{count} for {joint.kind}")
+            # Below 0.001 rad the direction of the axes' normal is mostly the file's rounding.
+            if count == 2 and float(np.linalg.norm(np.cross(*joint.axes))) < 1e-3:
+                raise ParameterError(f"{path}.axes", joint.axes.tolist(), "two axes that are not parallel")
+            if joint.actuated and len(joint.freedoms) != 1:
+                raise ParameterError(f"{path}.actuated", joint.kind, "a joint with one degree of freedom")
         for rod in self.rods.values():
             self._check_ends(f"rods.{rod.name}", rod.inner, rod.outer)
             if not float(np.linalg.norm(rod.ends[1] - rod.ends[0])) > 1e-9:
                 raise ParameterError(f"rods.{rod.name}.ends", rod.ends.tolist(), "two points apart")
         if not self.actuated:
             raise ParameterError("joints", list(self.joints), "at least one with actuated: true")
-        self._check_connection()
+        pairs = [(joint.inner, joint.outer) for joint in self.joints.values()]
+        pairs += [(rod.inner, rod.outer) for rod in self.rods.values()]
+        reached = groups([BASE, *self.bodies], pairs)[0]
+        for name in self.bodies:
+            if name not in reached:
+                raise ParameterError(f"bodies.{name}", name, "a body that joints or rods connect to the base")
 
     def _check_ends(self, path: str, inner: str, outer: str) -> None:
         known = [BASE, *self.bodies]
@@ -316,28 +329,6 @@ class Graph:
         if inner == outer:
             raise ParameterError(f"{path}.between", [inner, outer], "two different bodies")
 
-    @staticmethod
-    def _check_axes(joint: Joint) -> None:
-        path = f"joints.{joint.name}"
-        if joint.kind not in TYPES:
-            raise ParameterError(f"{path}.type", joint.kind, f"one of {', '.join(TYPES)}")
-        count = joint.type.count
-        if len(joint.axes) != count:
-            name = "axes" if count == 2 else "axis"
-            raise ParameterError(f"{path}.{name}", joint.axes.tolist(), f"{count} for {joint.kind}")
-        if count == 2 and float(np.linalg.norm(np.cross(*joint.axes))) < _PARALLEL:
-            raise ParameterError(f"{path}.axes", joint.axes.tolist(), "two axes that are not parallel")
-        if joint.actuated and len(joint.freedoms) != 1:
-            raise ParameterError(f"{path}.actuated", joint.kind, "a joint with one degree of freedom")
-
-    def _check_connection(self) -> None:
-        pairs = [(joint.inner, joint.outer) for joint in self.joints.values()]
-        pairs += [(rod.inner, rod.outer) for rod in self.rods.values()]
-        reached = groups([BASE, *self.bodies], pairs)[0]
-        for name in self.bodies:
-            if name not in reached:
-                raise ParameterError(f"bodies.{name}", name, "a body that joints or rods connect to the base")
-
 
 def _extent(points: Sequence[Array]) -> tuple[Array, Any]:
     """Return the middle of points, and the distance of the farthest of them from it."""
@@ -346,7 +337,7 @@ def _extent(points: Sequence[Array]) -> tuple[Array, Any]:
 
 
 def rotation_about_z(angle: Any) -> Array:
-    """Rotation by an angle (rad) about base z, shape (3, 3)."""
+    """Return the rotation by an angle (rad) about base z, shape (3, 3)."""
     c, s = cos(angle), sin(angle)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
@@ -374,7 +365,7 @@ def spanning(things: Iterable[T], pairs: Mapping[K, tuple[T, T]]) -> list[K]:
 
 
 def _join(own: dict[T, list[T]], a: T, b: T) -> bool:
-    """Make the groups of two things one; whether they are there and were two."""
+    """Unite the groups of two things; return whether both are known and were in different groups."""
     if a not in own or b not in own or own[a] is own[b]:
         return False
     small, large = sorted((own[a], own[b]), key=len)
@@ -384,12 +375,12 @@ def _join(own: dict[T, list[T]], a: T, b: T) -> bool:
 
 
 def limbs(graph: Graph) -> list[list[str]]:
-    """Bodies and rods of each limb: what hangs together without base and platform."""
+    """Return the bodies and rods of each limb: those connected without the base and the platform."""
     parts = [name for name in (*graph.bodies, *graph.rods) if name not in (BASE, graph.platform)]
     return groups(parts, graph.links)
 
 
 def limb_numbers(graph: Graph) -> dict[str, int]:
-    """By body and rod the number of its limb, of the platform -1."""
+    """Return the number of the limb of each body and rod; -1 for the platform."""
     number = {name: k for k, limb in enumerate(limbs(graph)) for name in limb}
     return number | {graph.platform: -1}

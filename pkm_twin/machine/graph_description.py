@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""What a file says of a graph: bodies, joints and rods."""
+"""Describe a graph as sections of a robot file: bodies, joints and rods."""
 
 from __future__ import annotations
 
@@ -8,56 +8,47 @@ from typing import Any
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.machine.graph import Body, Graph, Joint
+from pkm_twin.machine.graph import Graph
 from pkm_twin.machine.joints import TURN
 
 
 def graph_description(graph: Graph) -> dict[str, Any]:
-    """Bodies, joints and rods of a graph.
+    """Describe a graph's bodies, joints and rods as sections of a robot file.
 
-    A pair of rods that the graph has as one rod is written as one: a joint of the graph has the
-    constraint that the pair adds.
+    A pair of rods that the graph has as one rod is written as one: the constraint that the pair adds
+    is in a joint of the graph.
     """
-    data: dict[str, Any] = {
-        "mechanism": "machine",
-        "platform": graph.platform,
-        "origin": _numbers(graph.origin),
-        "bodies": {name: _body_entry(body) for name, body in graph.bodies.items()},
-        "joints": {name: _joint_entry(joint) for name, joint in graph.joints.items()},
+    bodies: dict[str, Any] = {}
+    for name, body in graph.bodies.items():
+        diagonal = np.diag(body.inertia)
+        inertia: list[Any] = [_numbers(row) for row in body.inertia]
+        if not np.any(body.inertia - np.diag(diagonal)):
+            inertia = _numbers(diagonal)
+        bodies[name] = {"mass": body.mass, "com": _numbers(body.com), "inertia": inertia}
+    joints = {}
+    for name, joint in graph.joints.items():
+        entry: dict[str, Any] = {"type": joint.kind, "between": [joint.inner, joint.outer], "at": _numbers(joint.at)}
+        axes = [_numbers(axis) for axis in joint.axes]
+        if axes:
+            entry |= {"axis": axes[0]} if len(axes) == 1 else {"axes": axes}
+        if joint.pitch:
+            entry["lead"] = joint.pitch * TURN
+        if joint.actuated:
+            entry["actuated"] = True
+        # The file states where a slide counts from, so that a leg does not seem to have no length.
+        if joint.home or (joint.actuated and joint.kind == "prismatic"):
+            entry["home"] = float(joint.home)
+        if joint.rotor_inertia:
+            entry["rotor_inertia"] = joint.rotor_inertia
+        if joint.viscous or joint.coulomb:
+            entry["friction"] = {"viscous": joint.viscous, "coulomb": joint.coulomb}
+        joints[name] = entry
+    rods = {
+        name: {"between": [rod.inner, rod.outer], "ends": [_numbers(end) for end in rod.ends], "mass": rod.mass}
+        for name, rod in graph.rods.items()
     }
-    if graph.rods:
-        data["rods"] = {
-            name: {"between": [rod.inner, rod.outer], "ends": [_numbers(end) for end in rod.ends], "mass": rod.mass}
-            for name, rod in graph.rods.items()
-        }
-    return data
-
-
-def _body_entry(body: Body) -> dict[str, Any]:
-    inertia: list[Any] = [_numbers(row) for row in body.inertia]
-    if np.count_nonzero(body.inertia - np.diag(np.diag(body.inertia))) == 0:
-        inertia = _numbers(np.diag(body.inertia))
-    return {"mass": body.mass, "com": _numbers(body.com), "inertia": inertia}
-
-
-def _joint_entry(joint: Joint) -> dict[str, Any]:
-    data: dict[str, Any] = {"type": joint.kind, "between": [joint.inner, joint.outer], "at": _numbers(joint.at)}
-    if len(joint.axes) == 1:
-        data["axis"] = _numbers(joint.axes[0])
-    elif len(joint.axes) == 2:
-        data["axes"] = [_numbers(axis) for axis in joint.axes]
-    if joint.pitch:
-        data["lead"] = joint.pitch * TURN
-    if joint.actuated:
-        data["actuated"] = True
-    # Of a slide the file says where it counts from, lest a leg seems to have no length.
-    if joint.home or (joint.actuated and joint.kind == "prismatic"):
-        data["home"] = float(joint.home)
-    if joint.rotor_inertia:
-        data["rotor_inertia"] = joint.rotor_inertia
-    if joint.viscous or joint.coulomb:
-        data["friction"] = {"viscous": joint.viscous, "coulomb": joint.coulomb}
-    return data
+    data = {"mechanism": "machine", "platform": graph.platform, "origin": _numbers(graph.origin)}
+    return data | {"bodies": bodies, "joints": joints} | ({"rods": rods} if rods else {})
 
 
 def _numbers(values: Array) -> list[float]:

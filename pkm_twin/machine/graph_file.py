@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""A machine's file as a graph, and back: bodies, joints, rods, limbs written out, and drives."""
+"""Read a machine's file as a graph: bodies, joints, rods, copies of limbs, and drives."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, eq=False)
 class MemberSpec:
-    """A body as an elastic bar between two of its points, m; or as a capsule of a radius, m.
+    """A body as an elastic bar between two of its points, m, or as a rigid capsule of a radius, m.
 
-    ``section``: with the body's mass along the bar; without one the body is rigid.
+    ``section``: of the elastic bar, along which the body's mass is distributed.
     """
 
     start: Array = place(name="from")
@@ -52,7 +52,7 @@ class MemberSpec:
     radius: float | None = length(default=None)
 
     def verify(self, path: str) -> None:
-        """Check the length, and that a radius is stated somewhere."""
+        """Check the length, and that a section or a radius is given."""
         if not float(np.linalg.norm(self.end - self.start)) > 1e-9:
             raise ParameterError(f"{path}.to", self.end.tolist(), "a point apart from `from`")
         if self.section is None and self.radius is None:
@@ -74,7 +74,7 @@ class BodySpec:
     member: MemberSpec | None = schema.section(MemberSpec, default=None)
 
     def verify(self, path: str) -> None:
-        """Check that a mass has a place."""
+        """Check that a body with mass has a centre of mass."""
         if self.com is None and (self.mass > 0.0 or self.inertia.any()):
             raise ParameterError(f"{path}.com", None, "the centre of mass of a body with mass, m")
 
@@ -84,20 +84,20 @@ _Laws: Any = dataclasses.make_dataclass("_Laws", friction_fields(schema.number, 
 
 @dataclass(frozen=True, eq=False)
 class FrictionSpec(_Laws):  # type: ignore[misc]  # its fields are those of the laws
-    """Friction of a joint, opposite to the rate; of a named mechanism one number, or one per joint.
+    """Friction of a joint, opposite to its velocity; a named mechanism has one number, or one per joint.
 
-    ``viscous``: per rate. ``coulomb``: by the rate's sign. ``offset``: a constant effort of the
-    drive. The other keys are of further laws of drives, see docs/fit.md.
+    ``viscous``: per velocity. ``coulomb``: by the sign of the velocity. ``offset``: a constant effort
+    of the drive. The other keys belong to further friction laws of drives, see docs/fit.md.
     """
 
     def verify(self, path: str) -> None:
-        """Check that a law has all of its parameters."""
+        """Check that a friction law has all of its parameters."""
         check_laws(self, path)
 
 
 @dataclass(frozen=True, eq=False)
 class LimitSpec:
-    """Limits of one joint: position [min, max], rate and effort, or ``swivel``."""
+    """Limits of one joint: position [min, max], velocity and effort, or ``swivel``."""
 
     position: Array | None = schema.interval(unit="{joint}", default=None)
     velocity: float | None = schema.number(above=0.0, high=math.inf, unit="{joint}/s", default=None)
@@ -114,7 +114,7 @@ class LimitSpec:
     )
 
     def verify(self, path: str) -> None:
-        """Check that an axis has a length, and belongs to a swivel."""
+        """Check that an axis is not zero, and belongs to a swivel."""
         if self.axis is not None and self.swivel is None:
             raise ParameterError(f"{path}.axis", self.axis.tolist(), "none without swivel")
         if self.axis is not None and not float(np.linalg.norm(self.axis)) > 1e-9:
@@ -196,7 +196,7 @@ class JointSpec:
 
     @property
     def slides(self) -> bool:
-        """Whether it has one freedom, and its number is a length."""
+        """True for a joint of one freedom whose value is a length."""
         return [freedom.turns for freedom in self._freedoms()] == [False]
 
     def _freedoms(self) -> tuple[Freedom, ...]:
@@ -204,7 +204,7 @@ class JointSpec:
         return TYPES[self.type].freedoms(self._unit_axes(), pitch)
 
     def _free(self) -> NDArray[np.bool_]:
-        """Which of the six directions of ``compliance`` are freedoms alone."""
+        """Return which of the six directions of ``compliance`` are free."""
         free = np.zeros(6, bool)
         if self.actuated:
             return free
@@ -222,7 +222,7 @@ class JointSpec:
         return np.reshape(found, (-1, 3))
 
     def joint(self, name: str, path: str) -> Joint:
-        """As a joint of the graph."""
+        """Make the joint of the graph."""
         rub = self.friction or FrictionSpec()
         rotor = self.rotor_inertia
         if self.drive is not None:
@@ -262,7 +262,7 @@ class RodSpec:
 
 @dataclass(frozen=True)
 class Source:
-    """Where an entry stands in the file, its name there, and which copy of how many it is."""
+    """The path of an entry in the file, its name there, and the index and number of its copies."""
 
     path: Keys
     name: str
@@ -271,11 +271,10 @@ class Source:
     azimuth: float = 0.0
 
 
-PER_COPY: Final = (["rotor_inertia"], *(["friction", key] for key in all_keys()))
-"""Keys of a limb's numbers that may be lists, one number a copy."""
 KINDS: Final[Mapping[str, type]] = {"bodies": BodySpec, "joints": JointSpec, "rods": RodSpec}
-"""The three mappings of a graph, and the schema of their entries."""
-_TURNED: Final = ("com", "at", "axis", "axes", "ends")
+"""The three mappings of a graph, and the schemas of their entries."""
+PER_COPY: Final = (["rotor_inertia"], *(["friction", key] for key in all_keys()))
+"""Keys of a limb's numbers that may be lists, one number per copy."""
 
 
 def _raw() -> Any:
@@ -286,8 +285,8 @@ def _raw() -> Any:
 class LimbFile:
     """Bodies, joints and rods at azimuth 0, copied and turned about base z by each azimuth.
 
-    The copies' names get _1, _2 and so on. A copy has its own copies of the section's bodies; other
-    bodies are shared.
+    The copies' names get _1, _2 and so on. Each copy has its own copies of the section's bodies; all
+    copies have the other bodies in common.
     """
 
     azimuths: Array = schema.vector(0, unit="rad")
@@ -296,7 +295,7 @@ class LimbFile:
     rods: Mapping[str, Any] = _raw()
 
     def verify(self, path: str) -> None:
-        """Azimuths are in rad."""
+        """Check that azimuths are in rad."""
         for i, azimuth in enumerate(self.azimuths.tolist()):
             check_angles(azimuth, f"{path}.azimuths[{i}]")
 
@@ -311,7 +310,7 @@ class Limb:
 
 
 def limbs_of(field: str, value: Any) -> list[Limb]:
-    """One section or a list of them, checked."""
+    """Read and check one section of a limb or a list of them."""
     listed = isinstance(value, list)
     limbs = []
     for k, section in enumerate(value if listed else [value] if value else []):
@@ -335,7 +334,7 @@ def limbs_of(field: str, value: Any) -> list[Limb]:
 def written_out(
     kinds: Mapping[str, Mapping[str, Any]], limbs: Sequence[Limb]
 ) -> tuple[dict[str, dict[str, Any]], dict[tuple[str, str], Source]]:
-    """All entries by kind and name, the limbs' copies turned about base z; where each stands."""
+    """Return all entries by kind and name, with the rotated copies of limbs, and the source of each."""
     result = {kind: dict(entries) for kind, entries in kinds.items()}
     sources = {(kind, n): Source((kind, n), n) for kind, all_ in result.items() for n in all_}
     for limb in limbs:
@@ -362,7 +361,7 @@ def written_out(
 
 
 def _copies(entry: Any, count: int, path: str) -> list[Any]:
-    """Return a limb's entry for each azimuth: drives' numbers may be lists, one number a copy."""
+    """Return a limb's entry for each copy; numbers of drives may be lists, one number per copy."""
     result = [entry] * count
     if not isinstance(entry, Mapping):
         return result
@@ -384,13 +383,10 @@ def _copies(entry: Any, count: int, path: str) -> list[Any]:
 
 
 def _turned(entry: Any, azimuth: Any, own: set[str], number: int) -> Any:
-    """Turn a copy of a limb's entry about base z, and number the names of its own bodies."""
+    """Rotate a copy of a limb's entry about base z, and number the names of its own bodies."""
     rotation = rotation_about_z(azimuth)
-    new: dict[str, Any] = {}
-    for key in _TURNED:
-        value = getattr(entry, key, None)
-        if value is not None:
-            new[key] = array(value @ rotation.T)
+    vectors = {key: getattr(entry, key, None) for key in ("com", "at", "axis", "axes", "ends")}
+    new: dict[str, Any] = {key: array(value @ rotation.T) for key, value in vectors.items() if value is not None}
     if isinstance(entry, BodySpec):
         new["inertia"] = array(rotation @ entry.inertia @ rotation.T)
         m = entry.member
@@ -405,11 +401,10 @@ def _turned(entry: Any, azimuth: Any, own: set[str], number: int) -> Any:
 
 
 def numbered_entry(entry: T, values: Mapping[Keys, Any], azimuth: float, path: str) -> T:
-    """Return an entry with other numbers or expressions; nothing is checked.
+    """Return an entry with other numbers or expressions, without checks.
 
-    :param values: by keys of the number in the entry; ``azimuth`` alone: the limb's own, by which
-        it is turned on.
-    :param azimuth: the entry's vectors are turned by this: the numbers are those before the turn.
+    :param values: new numbers by their keys in the entry; ``azimuth`` alone: a new azimuth of the limb.
+    :param azimuth: rotation of the entry's vectors; the new numbers are those before the rotation.
     :param path: of the entry, for the error.
     """
     if ("azimuth",) in values:
@@ -432,7 +427,7 @@ def numbered_entry(entry: T, values: Mapping[Keys, Any], azimuth: float, path: s
 def number_of_entry(entry: Any, keys: tuple[str | int, ...], azimuth: float, path: str) -> float:
     """Return the number that :func:`numbered_entry` replaces.
 
-    :raises ParameterError: there is none.
+    :raises ParameterError: there is no number.
     """
     if keys == ("azimuth",):
         return azimuth
@@ -442,7 +437,7 @@ def number_of_entry(entry: Any, keys: tuple[str | int, ...], azimuth: float, pat
 
 
 def _spelled(entry: T, places: Iterable[Keys]) -> T:
-    """Return an entry with the zeros at some keys that a joint's entry may leave out."""
+    """Return a joint's entry with the zeros at some keys that a file may leave out."""
     if not isinstance(entry, JointSpec):
         return entry
     zeros: dict[str, Any] = {"home": 0.0}
@@ -473,10 +468,10 @@ def graph_of_entries(platform: str, specs: Mapping[str, Mapping[str, Any]], orig
 
 
 def shared_by(graph: Graph, leads: Sequence[str], how: Redundancy, effort: Any) -> Graph:
-    """Return the graph whose other actuated joints follow from the leading ones, and share efforts.
+    """Return the graph in which redundant actuated joints follow the leading ones, and share efforts.
 
-    :param effort: limits of all actuated joints, shape (n,); None, or all infinite: none has one.
-    :raises ParameterError: limits of some alone, or a preload of another number of joints.
+    :param effort: limits of all actuated joints, shape (n,); None, or all infinite, for no limits.
+    :raises ParameterError: only some joints have limits, or the preload has a wrong length.
     """
     names = graph.actuated
     if len(leads) == len(names):
@@ -509,7 +504,7 @@ def shared_by(graph: Graph, leads: Sequence[str], how: Redundancy, effort: Any) 
 
 
 def drives_of(graph: Graph, joints: Mapping[str, JointSpec]) -> dict[str, Any]:
-    """Friction and limits of the actuated joints."""
+    """Return the friction and limits of the actuated joints."""
     drives = graph.actuated
     limits = [joints[j].limits or LimitSpec() for j in drives]
     rubs = [joints[j].friction or FrictionSpec() for j in drives]
@@ -525,9 +520,9 @@ def drives_of(graph: Graph, joints: Mapping[str, JointSpec]) -> dict[str, Any]:
 
 
 def drive_numbers(friction: Any, limits: Any, k: int) -> tuple[dict[str, float], dict[str, Any]]:
-    """Friction and limits of the actuated joint k by key, of what :func:`drives_of` gives.
+    """Return friction and limits of the actuated joint k by key, from those of :func:`drives_of`.
 
-    A limit may be one for all joints; one that is infinite is left out.
+    Infinite limits are left out.
     """
     n = len(friction.viscous)
     found: dict[str, Any] = {}
@@ -548,7 +543,6 @@ def driven(joint: JointSpec, friction: Any, limits: Any, k: int) -> JointSpec:
 
 
 def _together(values: list[Any], absent: Any) -> Array | None:
-    """One array of what joints have; None where none has it."""
-    if all(value is None for value in values):
-        return None
-    return array([absent if value is None else value for value in values])
+    """Return one array of the joints' values; None if no joint has one."""
+    known = [absent if value is None else value for value in values]
+    return None if all(value is None for value in values) else array(known)

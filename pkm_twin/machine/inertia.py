@@ -22,6 +22,8 @@ Objects = NDArray[Any]
 
 TEN: Final = ("mass", "mx", "my", "mz", "ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 """A body's ten standard inertial parameters: mass, kg; first moments, kg m; inertia, kg m2."""
+_ENTRIES: Final = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+"""Rows and columns of an inertia matrix in the order of :data:`TEN`."""
 TEN_UNITS: Final = ("kg", *["kg m"] * 3, *["kg m2"] * 6)
 PARTS: Final = ("bodies", "rods", "gravity", "viscous", "coulomb", "offset", "laws", "rotors", "passive")
 """Parts of the parameter vector, in order."""
@@ -39,7 +41,8 @@ def standard_parameters(mass: float, com: Array, inertia: Array) -> Array:
     """
     # Symmetrise, so that a derivative by one off-diagonal entry is half of that by both.
     about = 0.5 * (inertia + inertia.T) + mass * (com @ com * np.eye(3) - np.outer(com, com))
-    return _pack_parameters(mass, mass * com, about)
+    upper = [about[i, k] for i, k in _ENTRIES]
+    return plain([mass, *(mass * com), *upper])
 
 
 def change_of_frame(axes: Array, lever: Array) -> Array:
@@ -51,11 +54,12 @@ def change_of_frame(axes: Array, lever: Array) -> Array:
     # One row per parameter: its mass, first moments and inertia.
     mass, first = np.eye(10)[:, :1], np.eye(10)[:, 1:4]
     crossed = lever[:, None] * first[:, None, :]
-    about = _UNIT_INERTIAS + 2.0 * (first @ lever)[:, None, None] * np.eye(3)
+    units = np.array([matrix_of(ten) for ten in np.eye(10)])
+    about = units + 2.0 * (first @ lever)[:, None, None] * np.eye(3)
     about = about - crossed - crossed.swapaxes(-1, -2)
     about = about + mass[..., None] * (lever @ lever * np.eye(3) - np.outer(lever, lever))
     turned = axes.T @ about @ axes
-    moved = [mass, (first + mass * lever) @ axes, turned[:, (0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)]]
+    moved = [mass, (first + mass * lever) @ axes, turned[:, *np.transpose(_ENTRIES)]]
     return plain(np.concatenate(moved, 1).T)
 
 
@@ -63,22 +67,6 @@ def matrix_of(ten: Array) -> Array:
     """Return the inertia matrix of ten standard inertial parameters, shape (3, 3)."""
     xx, yy, zz, xy, xz, yz = ten[4:]
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-
-
-_UNIT_INERTIAS: Final = np.array([matrix_of(ten) for ten in np.eye(10)])
-"""Inertia matrices for a unit of each of the ten standard inertial parameters."""
-
-
-def _pack_parameters(mass: float, first: Array, about: Array) -> Array:
-    i = about
-    return plain([mass, *first, i[0, 0], i[1, 1], i[2, 2], i[0, 1], i[0, 2], i[1, 2]])
-
-
-def _rotate_parameters(ten: Objects, axes: Objects) -> Objects:
-    """Rotate standard inertial parameters to other axes, given as columns in the old ones."""
-    about = axes.T @ matrix_of(ten) @ axes
-    upper = [about[i][k] for i, k in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
-    return np.array([ten[0], *(axes.T @ ten[1:4]), *upper])
 
 
 def loaded_joints(graph: Graph) -> tuple[Joint, ...]:
@@ -94,23 +82,16 @@ def drive_units(graph: Graph, joint: str) -> dict[str, str]:
 
 
 class Coefficients(Protocol):
-    """The friction coefficients of the actuated joints, shape (n,) each."""
+    """The friction coefficients of the actuated joints, shape (n,) each.
 
-    @property
-    def viscous(self) -> Array:
-        """Viscous friction, N m s/rad or N s/m."""
+    ``viscous``: N m s/rad or N s/m. ``coulomb``: N m or N. ``offset``: constant effort of the drive,
+    N m or N. ``presliding``: distance over which Coulomb friction builds up, rad or m; 0 if at once.
+    """
 
-    @property
-    def coulomb(self) -> Array:
-        """Coulomb friction, N m or N."""
-
-    @property
-    def offset(self) -> Array:
-        """Constant effort of the drive, independent of the motion, N m or N."""
-
-    @property
-    def presliding(self) -> Array:
-        """Distance over which Coulomb friction builds up, rad or m; 0 for an immediate change."""
+    viscous: Array
+    coulomb: Array
+    offset: Array
+    presliding: Array
 
 
 @dataclass(frozen=True)
@@ -175,7 +156,11 @@ class Layout:
         """Split a parameter vector into its parts; bodies (bodies, 10) in their links' axes."""
         parts = [p[self.part(k)] for k in range(len(PARTS))]
         bodies = zip(parts[0].reshape(-1, 10), self.tree.links.values(), strict=True)
-        parts[0] = np.array([_rotate_parameters(ten, link.axes) for ten, link in bodies])
+        turned = []
+        for ten, link in bodies:
+            about = link.axes.T @ matrix_of(ten) @ link.axes
+            turned.append([ten[0], *(link.axes.T @ ten[1:4]), *(about[i][k] for i, k in _ENTRIES)])
+        parts[0] = np.array(turned)
         return parts
 
     def pack(self, graph: Graph, gravity: Array, friction: Coefficients) -> Array:

@@ -1,18 +1,18 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Between a controller's joint numbers and the model's: name, sign, offset and ratio a joint.
+"""Convert joint names and numbers between a controller and the model: sign, offset and ratio.
 
-controller = offset + sign * ratio * model. So ``offset`` is what the controller reads where the
-model's joint is at zero, and ``ratio`` how many of the controller's units are one of the model's:
-turns of a motor a turn of the joint, millimetres a metre. Power is the same on both sides.
+controller = offset + sign * ratio * model. ``offset`` is the controller's position where the model's
+joint is at zero, and ``ratio`` the controller's units per unit of the model: revolutions of a motor
+per revolution of the joint, millimetres per metre. Power is the same on both sides.
 
-The effective radius of a spool changes with what is wound on it: the ratio is then
+The effective radius of a spool changes with the length wound on it: the ratio is then
 ``ratio * (1 + ratio_change * (model - ratio_at))``, and controller = offset + sign * ratio *
-(model + ratio_change / 2 * (model - ratio_at)^2). Only positions are converted by such a map: rates
-and efforts need the position beside them, so nodes, bags and trajectories reject it.
+(model + ratio_change / 2 * (model - ratio_at)^2). Such a map converts positions only: velocities and
+efforts also depend on the position, so nodes, bags and trajectories reject it.
 
-Messages and bags carry the controller's numbers, everything else computes with the model's. A joint
-number enters through :class:`pkm_twin.messages.reading.JointReader` and leaves as
-:data:`ControllerNumbers`, which only this module makes and which the publishers ask for.
+Messages and bags have the controller's numbers; all computations use the model's. Joint numbers enter
+through :class:`pkm_twin.messages.reading.JointReader` and leave as :data:`ControllerNumbers`, which
+publishers require and only this module makes.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.machine import schema
 
 ControllerNumbers = NewType("ControllerNumbers", np.ndarray[Any, np.dtype[np.float64]])
-"""Joint numbers as a controller has them, shape (..., n), in the robot's order."""
+"""Joint numbers of a controller, shape (..., n), in the robot's order."""
 
 
 @dataclass(frozen=True, eq=False)
 class JointMapEntry:
-    """From a joint's name and values in the model to those of the controller.
+    """The conversion of one joint's name and numbers from the model to the controller.
 
     Positions: controller = offset + sign * ratio * model; velocities and accelerations without the
     offset; efforts are divided by sign * ratio, so that power is the same. ``ratio_change``: the
@@ -59,8 +59,8 @@ class JointMapEntry:
 class JointMap:
     """The controller's names, and factors and offsets of its positions, shape (n,) each.
 
-    ``changes``: of the ratios, relative, per unit of the model's position from ``centres`` on.
-    ``units``: names of the controller's units, None where the file has none.
+    ``changes``: relative changes of the ratios per unit of the model's position from ``centres``.
+    ``units``: names of the controller's units, None where the file states none.
     """
 
     names: tuple[str, ...]
@@ -74,7 +74,7 @@ class JointMap:
     def of(cls, joints: Sequence[str], entries: Mapping[str, JointMapEntry]) -> JointMap:
         """Return the map of a robot's joints; joints without an entry are the same on both sides.
 
-        :raises ParameterError: an entry of a joint that there is not, or two joints of one name.
+        :raises ParameterError: an entry of an unknown joint, or two joints of one name.
         """
         for name in entries:
             if name not in joints:
@@ -83,27 +83,22 @@ class JointMap:
         names = tuple(row.name or name for row, name in zip(rows, joints, strict=True))
         if len(set(names)) < len(names):
             raise ParameterError("joint_map", list(names), "different names")
-        return cls(
-            names,
-            np.array([row.sign * row.ratio for row in rows]),
-            np.array([row.offset for row in rows]),
-            np.array([row.ratio_change for row in rows]),
-            np.array([row.ratio_at for row in rows]),
-            tuple(row.unit for row in rows),
-        )
+        numbers = np.array([(row.sign * row.ratio, row.offset, row.ratio_change, row.ratio_at) for row in rows])
+        factors, offsets, changes, centres = numbers.T.copy()
+        return cls(names, factors, offsets, changes, centres, tuple(row.unit for row in rows))
 
     @property
     def plain(self) -> bool:
-        """Whether numbers are the same on both sides."""
+        """True if numbers are the same on both sides."""
         return bool((self.factors == 1.0).all() and (self.offsets == 0.0).all() and self.even)
 
     @property
     def even(self) -> bool:
-        """Whether every ratio is the same at all positions."""
+        """True if no ratio depends on the position."""
         return bool((self.changes == 0.0).all())
 
     def check_even(self) -> None:
-        """Raise where rates and efforts depend on the position.
+        """Reject a map whose velocities and efforts depend on the position.
 
         :raises ParameterError: a ratio changes with travel.
         """
@@ -116,7 +111,7 @@ class JointMap:
             )
 
     def shown(self, joint: int, quantity: str, value: float, low: float, high: float) -> tuple[float, float, float]:
-        """Return a model's value and its bounds as the controller has them, for a message.
+        """Convert a value of the model and its bounds to the controller's, for a message.
 
         :param quantity: position, velocity, acceleration or effort.
         """

@@ -1,23 +1,24 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """A machine as description files have it: links on a tree of joints, and joints that close loops.
 
-URDF, MJCF and SDF are read into this one form, as drawn, and written from it, at home. Every point
-and direction is given in the root's axes as the machine is drawn, so that a joint stands once for
-both of its links; only a joint that closes a loop which is drawn open stands elsewhere on the one
-than on the other.
+URDF, MJCF, SDF and USD are read into this form, as drawn; files are written from it, at home. Every
+point and direction is given in the root's axes as the machine is drawn, so that both links of a joint
+share its frame. Only a joint that closes a loop drawn open has two different frames.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.errors import ParameterError
+from pkm_twin.errors import ParameterError, warn
+from pkm_twin.machine.graph import spanning
 from pkm_twin.machine.joints import TYPES, Free, Freedom, JointType, single_names
 from pkm_twin.machine.names import plain_name
 from pkm_twin.machine.rotations import Pose
@@ -25,10 +26,8 @@ from pkm_twin.machine.urdf_xml import free_name
 
 KINDS: Final[Mapping[str, type[JointType]]] = {**TYPES, Free.name: Free}
 """Types of joints, that of a body that closures alone hold among them."""
-ROUNDED_INERTIA: Final = 4.0
-"""How far rounding of a matrix of three rows may move a principal moment, rounding errors."""
-MAX_INERTIA_CHANGE: Final = 1e-2
-"""Part of a body's largest moment of which more is no rounding."""
+WORLD: Final = "world"
+"""Name of the root of a tree read from MJCF, SDF or USD."""
 SINGLE: Final = tuple(name for name, kind in TYPES.items() if len(kind.steps) == 1)
 """Joint types of one degree of freedom."""
 
@@ -54,39 +53,35 @@ class Link:
 
 
 def link_of(name: str, mass: float, pose: Pose, moment: Callable[[str], float], rounding: float) -> Link:
-    """Return a link of a mass, kg, and moments of inertia in the frame of its centre, ``ixx`` on.
+    """Make a link from its mass, kg, and its inertia in the frame ``pose`` of its centre of mass.
 
-    ``rounding``: the largest rounding error of the file's moments of inertia, kg m2.
+    ``moment``: returns an entry of the inertia, ``ixx`` to ``izz``, kg m2. ``rounding``: the largest
+    rounding error of the file's moments of inertia, kg m2.
     """
     if mass < 0.0:
         raise ParameterError(f"link.{name}.inertial.mass", mass, "zero or more, kg")
     xx, xy, xz, yy, yz, zz = (moment(key) for key in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"))
-    inertia = _possible(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]), rounding)
-    return Link(name, pose.inverse(), mass, np.zeros(3), inertia).moved(pose)
-
-
-def _possible(inertia: Array, rounding: float) -> Array:
-    """Return the nearest inertia that a body can have, if rounding made it impossible.
-
-    Of a thin rod a second moment of mass, trace(I) / 2 - I, is zero, or by rounding less.
-    """
+    inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    # A second moment of mass, an eigenvalue of trace(I) / 2 - I, is zero for a thin rod, and rounding
+    # makes it negative: by up to four rounding errors in a matrix of three rows. More than a hundredth
+    # of the largest moment is no rounding. The nearest possible inertia has zero in its place.
     moments, axes = np.linalg.eigh(np.trace(inertia) / 2.0 * np.eye(3) - inertia)
-    if not -min(ROUNDED_INERTIA * rounding, MAX_INERTIA_CHANGE * moments[2]) <= moments[0] < 0.0:
-        return inertia
-    kept = (axes * np.maximum(moments, 0.0)) @ axes.T
-    return np.asarray(np.trace(kept) * np.eye(3) - kept, np.float64)
+    if -min(4.0 * rounding, 1e-2 * moments[2]) <= moments[0] < 0.0:
+        second = (axes * np.maximum(moments, 0.0)) @ axes.T
+        inertia = np.trace(second) * np.eye(3) - second
+    return Link(name, pose.inverse(), mass, np.zeros(3), inertia).moved(pose)
 
 
 @dataclass(frozen=True, eq=False)
 class Joint:
-    """A joint between two links; its number is the motion of the outer one against the inner one.
+    """A joint between two links; its value is the motion of the outer link against the inner one.
 
-    ``frames``: where it stands on the inner and on the outer link. ``axes``: unit vectors; the
-    first is fixed in the inner link, the last in the outer one. ``drawn``: its value as drawn.
-    ``limits``: those of position, velocity and effort that the file states. ``viscous``,
-    ``coulomb``: friction, of one freedom. ``rotor_inertia``: kg m2 or kg. ``offset``: constant
-    friction. ``pitch``: of a screw, m a rad. ``cosine``: of the angle between the axes of a
-    universal joint that closes a loop.
+    ``frames``: its frames on the inner and on the outer link. ``axes``: unit vectors; the first is
+    fixed in the inner link, the last in the outer one. ``drawn``: its value as drawn. ``limits``:
+    position, velocity and effort, if the file states them. ``viscous``, ``coulomb``: friction of a
+    joint of one freedom. ``rotor_inertia``: kg m2 or kg. ``offset``: constant friction. ``pitch``:
+    of a screw, m/rad. ``cosine``: of the angle between the axes of a universal joint that closes a
+    loop.
     """
 
     name: str
@@ -104,25 +99,39 @@ class Joint:
     pitch: float = 0.0
     cosine: float = 0.0
 
+    @classmethod
+    def fixed(cls, name: str, inner: str, outer: str, frame: Pose) -> Joint:
+        """Make a fixed connection of two links at a frame."""
+        return cls(name, "fixed", inner, outer, (frame, frame))
+
     @property
     def type(self) -> type[JointType]:
-        """What it lets move and holds."""
+        """The joint's freedoms and constraints."""
         return KINDS[self.kind]
 
     @property
     def at(self) -> Array:
-        """Its point, (3,) m."""
+        """The joint's point on the inner link, (3,) m."""
         return self.frames[0].position
 
     def freedoms(self, parent: str) -> tuple[Freedom, ...]:
-        """Its elementary freedoms from one of its links to the other."""
+        """Return the joint's freedoms in order from the link ``parent`` to the other link."""
         found = self.type.freedoms(self.axes, self.pitch)
         if parent == self.inner or self.type.ball:
             return found
         return tuple(replace(one, axis=-one.axis) for one in found[::-1])
 
+    def closing(self) -> Joint:
+        """Convert the joint to one that closes a loop.
+
+        :raises ParameterError: the joint is a screw.
+        """
+        if self.type.threaded():
+            raise ParameterError(f"joint.{self.name}.type", "screw", "a loop with other joints too")
+        return replace(self, cosine=float(self.axes[0] @ self.axes[1]) if self.type.count == 2 else 0.0)
+
     def placed(self, inner: Pose, outer: Pose) -> Joint:
-        """Return the joint in the links' frames, from frames in those and axes in its own frame."""
+        """Convert frames in the links' frames, and axes in the joint's frames, to the root's axes."""
         first, second = inner @ self.frames[0], outer @ self.frames[1]
         axes = [f.rotation @ a for f, a in zip((first, second), self.axes, strict=False)]
         return replace(self, frames=(first, second), axes=np.reshape(axes, (-1, 3)))
@@ -130,7 +139,7 @@ class Joint:
 
 @dataclass(frozen=True, eq=False)
 class Capsule:
-    """A bar of a link to look at, from ``start`` to ``end``, (3,) m."""
+    """A bar of a link's picture, from ``start`` to ``end``, (3,) m."""
 
     link: str
     start: Array
@@ -139,19 +148,17 @@ class Capsule:
 
 
 Fault = tuple[tuple[str, ...], ParameterError]
-"""Joints, and the error of a machine that has one of them."""
+"""Names of joints, and the error of a machine that has one of them; no names: the file marks no motors."""
 
 
 @dataclass(frozen=True, eq=False)
 class LoopTree:
-    """A machine; ``root``: the link that is the ground; ``gravity``: m/s2, if the file tells.
+    """A machine; ``root``: the link that is the ground; ``gravity``: m/s2, if the file states it.
 
-    ``initial``: values that ``<ros2_control>`` begins with, of the joints for which it has them.
-    ``rounding``: the largest rounding error of a file's places and directions, m or rad.
-    ``marked``: what of the file marks the actuated joints. ``faults``: joints that follow others,
-    by name, and the error of a machine that has one of them; without names that of a file that
-    marks no motors. What is
-    written has ``capsules`` too, a ``platform``, the link, and its reference point ``origin``.
+    ``initial``: initial joint values of ``<ros2_control>``, by joint. ``rounding``: the largest
+    rounding error of the file's positions and directions, m or rad. ``marked``: what marks the
+    actuated joints in the file. A machine to be written also has ``capsules``, its ``platform``, a
+    link, and the platform's reference point ``origin``.
     """
 
     name: str
@@ -176,7 +183,7 @@ class LoopTree:
 
 
 class Hung(NamedTuple):
-    """A joint of the tree, with its link that is nearer to the root and the one beyond it."""
+    """A joint of the tree, its link ``parent`` on the root's side, and the link beyond it."""
 
     joint: Joint
     parent: str
@@ -192,21 +199,21 @@ class Single(NamedTuple):
     parent: str
     child: str
     joint: Joint
-    """What it is a part of."""
+    """The joint of which this is one freedom."""
 
     @property
     def whole(self) -> bool:
-        """Whether the joint's number, limits and friction are its own."""
+        """True if the joint has this freedom alone, so that its limits and friction belong here."""
         return self.name == self.joint.name
 
     @property
     def home(self) -> float:
-        """Its value as drawn."""
+        """The value as drawn."""
         return self.joint.drawn if self.whole else 0.0
 
 
 def hung(root: str, joints: Iterable[Joint]) -> list[Hung]:
-    """Joints from the root outwards, each level in their order; loops' last ones are left out."""
+    """List joints from the root outwards, breadth first, without those that close a loop."""
     meeting: dict[str, list[Joint]] = {}
     for joint in joints:
         for end in (joint.inner, joint.outer):
@@ -227,9 +234,9 @@ def hung(root: str, joints: Iterable[Joint]) -> list[Hung]:
 
 
 def singles(joint: Joint, parent: str, child: str, taken: set[str]) -> list[Single]:
-    """Replace a joint by single joints in a row outwards, with links between named for them.
+    """Replace a joint by joints of one freedom in series, with named links between them.
 
-    :param taken: names of links; those of these are added.
+    :param taken: names of links, to which those of the links between are added.
     """
     freedoms = joint.freedoms(parent)
     if not freedoms:
@@ -248,9 +255,42 @@ def singles(joint: Joint, parent: str, child: str, taken: set[str]) -> list[Sing
 
 
 def screws(parts: Sequence[Single]) -> list[tuple[str, str, float, float]]:
-    """Of each screw its slide, its turn, and the line between: slide = offset + factor turn."""
+    """Return slide, turn, factor and offset of each screw: slide = offset + factor turn."""
     return [
         (slide.name, turn.name, turn.joint.pitch, -turn.joint.pitch * turn.home)
         for turn, slide in pairwise(parts)
         if slide.joint.type.threaded() and not slide.whole
     ]
+
+
+def hold_in_world(path: Path, joints: dict[str, Joint], choose_link: Callable[[], Link]) -> None:
+    """Fix a link to the world, with a warning, if no joint holds the machine there."""
+    if any(WORLD in (joint.inner, joint.outer) for joint in joints.values()):
+        return
+    ground = choose_link()
+    warn(path, f"no joint holds the machine in the world: link {ground.name} is taken for the ground")
+    name = free_name("world_fixed", {*joints})
+    joints[name] = Joint.fixed(name, WORLD, ground.name, ground.frame)
+
+
+def span_tree(
+    links: Iterable[str], joints: Mapping[str, Joint], actuated: Sequence[str], excluded: Collection[str] = ()
+) -> tuple[dict[str, Joint], list[Joint]]:
+    """Choose a spanning tree of a graph of joints; return its joints by name, and those left over.
+
+    Fixed joints come first, then actuated ones, then those of fewest freedoms; ``excluded`` ones last.
+
+    :raises ParameterError: no joints connect a link to the world.
+    """
+
+    def rank(joint: Joint) -> tuple[bool, bool, bool, int]:
+        return joint.name in excluded, joint.kind != "fixed", joint.name not in actuated, joint.type.cost
+
+    pairs = {joint.name: (joint.inner, joint.outer) for joint in sorted(joints.values(), key=rank)}
+    chosen = set(spanning(links, pairs))
+    tree = {name: joint for name, joint in joints.items() if name in chosen}
+    reached = {WORLD, *(one.child for one in hung(WORLD, tree.values()))}
+    for name in links:
+        if name not in reached:
+            raise ParameterError(f"link.{name}", None, "a joint that connects it")
+    return tree, [joint for name, joint in joints.items() if name not in chosen]

@@ -25,7 +25,7 @@ NOTES: Final = {
     "pose": "of x y z roll pitch yaw (relative to home): as many as the mobility",
     "payload": "kg; com from the reference point, m; inertia about it, kg m2",
 }
-"""What stands behind a key of one line."""
+"""Comments at the end of a line, by key."""
 SECTIONS: Final = {
     "bodies": """\
 # mass: kg. com: centre of mass at home, m. inertia: about it, kg m2, three moments or 3x3.
@@ -46,7 +46,7 @@ SECTIONS: Final = {
 # Copied and turned about base z by each azimuth, rad; names get _1, _2, ...
 """,
 }
-"""What stands above a section."""
+"""Comments above a section, by key."""
 
 
 def describe_machine_yaml(data: Mapping[str, Any], parameters: Sequence[str] = ()) -> str:
@@ -54,8 +54,8 @@ def describe_machine_yaml(data: Mapping[str, Any], parameters: Sequence[str] = (
 
     Reading it gives the same numbers to the last bit.
 
-    :param data: a description, limbs written out or not, in any order of keys.
-    :param parameters: in words, what the numbers were worked out with.
+    :param data: a description, with limbs or with their copies, in any order of keys.
+    :param parameters: descriptions of the parameters for which the numbers were computed.
     """
     order = ("mechanism", *NOTES, *SECTIONS)
     keys = sorted(data, key=lambda key: order.index(key) if key in order else len(order))
@@ -63,14 +63,12 @@ def describe_machine_yaml(data: Mapping[str, Any], parameters: Sequence[str] = (
     lines += ["# Written out for these parameters:\n"] if parameters else []
     lines += [f"#   {one}\n" for one in parameters]
     for key in keys:
-        if key in SECTIONS and data[key] and isinstance(data[key], Mapping):
+        if key in SECTIONS and data[key]:
             lines.append(f"\n{SECTIONS[key]}{key}:\n")
-            lines += [_entry(name, value, "  ") for name, value in data[key].items()]
-        elif key in SECTIONS and data[key]:
-            lines.append(f"\n{SECTIONS[key]}{key}:\n")
-            for item in data[key]:
-                entries = "".join(_entry(name, value, "    ") for name, value in item.items())
-                lines.append("  - " + entries[4:])
+            listed = not isinstance(data[key], Mapping)
+            for item in data[key] if listed else [data[key]]:
+                entries = [_entry(name, value, "    " if listed else "  ") for name, value in item.items()]
+                lines += ["  - ", "".join(entries)[4:]] if listed else entries
         else:
             line, note = f"{key}: {_flow(data[key])}", NOTES.get(key, "")
             if len(line) + len(note) > WIDTH and note:
@@ -83,7 +81,7 @@ def describe_machine_yaml(data: Mapping[str, Any], parameters: Sequence[str] = (
 
 
 def _entry(name: object, value: Any, indent: str) -> str:
-    """One line if it fits, else a line a key."""
+    """Write an entry in one line if it fits, else one line per key."""
     line = f"{indent}{_flow(name)}: {_flow(value)}"
     if not isinstance(value, Mapping) or len(line) <= WIDTH:
         return line + "\n"
@@ -92,13 +90,13 @@ def _entry(name: object, value: Any, indent: str) -> str:
 
 
 def _flow(value: Any) -> str:
-    # In a list, so that names are quoted as they must be between brackets.
+    # In a list, because names between brackets may need quotes.
     text = yaml.safe_dump([_plain(value)], default_flow_style=True, sort_keys=False, width=math.inf)
     return text.strip()[1:-1]
 
 
 def _plain(value: Any) -> Any:
-    """Whole numbers without a point, no minus before zero, and no object twice."""
+    """Convert to plain YAML data: no point in whole numbers, no minus before zero, no shared objects."""
     if isinstance(value, Mapping):
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, str | bool) or value is None:
@@ -112,8 +110,8 @@ def _plain(value: Any) -> Any:
 def edit_yaml(text: str, values: Mapping[Path, Any], notes: Mapping[Path, str]) -> str:
     """Set values in a file's text, and write a comment above each that has a note.
 
-    :param values: by path (keys, and places in lists) numbers or lists of them; a key that is not
-        there is added to the deepest section that is.
+    :param values: numbers or lists of them by path (keys and list indices); a missing key is added to
+        the deepest section that exists.
     """
     for path, value in values.items():
         text = _set(text, path, value)
@@ -121,7 +119,11 @@ def edit_yaml(text: str, values: Mapping[Path, Any], notes: Mapping[Path, str]) 
     above: dict[int, list[str]] = {}
     for path, note in notes.items():
         node = _find(_root(text), path)
-        above.setdefault(_own_line(lines, node.start_mark.line), []).append(note)
+        number = node.start_mark.line
+        # Never inside the list that a number belongs to.
+        while number and lines[number].lstrip().startswith(("[", "]", ",")):
+            number -= 1
+        above.setdefault(number, []).append(note)
     for number in sorted(above, reverse=True):
         line = lines[number]
         indent = line[: len(line) - len(line.lstrip())]
@@ -129,19 +131,12 @@ def edit_yaml(text: str, values: Mapping[Path, Any], notes: Mapping[Path, str]) 
     return "".join(lines)
 
 
-def _own_line(lines: Sequence[str], number: int) -> int:
-    """Find the line that a note may stand above: never inside a number's list."""
-    while number and lines[number].lstrip().startswith(("[", "]", ",")):
-        number -= 1
-    return number
-
-
 def _root(text: str) -> Any:
     return yaml.compose(text, Loader=yaml.SafeLoader)
 
 
 def _child(node: Any, key: str | int) -> Any:
-    """Value of a key or place, None where it is not there."""
+    """Return the value of a key or index; None if there is none."""
     if isinstance(key, int):
         inside = isinstance(node, yaml.SequenceNode) and key < len(node.value)
         return node.value[key] if inside else None

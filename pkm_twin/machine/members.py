@@ -41,12 +41,12 @@ class Section:
 
     @property
     def area(self) -> float:
-        """Area, m2."""
+        """Area of the section, m2."""
         return math.pi / 4 * (self.outer_diameter**2 - self.inner_diameter**2)
 
     @property
     def second_moment(self) -> float:
-        """Second moment of area about a diameter, m4; the polar one is twice that."""
+        """Second moment of area about a diameter, m4; half of the polar one."""
         return math.pi / 64 * (self.outer_diameter**4 - self.inner_diameter**4)
 
     @property
@@ -59,7 +59,7 @@ class Section:
 
     @property
     def rotary_inertia(self) -> float:
-        """Moment of inertia per length about a diameter, kg m; about the axis twice that."""
+        """Moment of inertia per length about a diameter, kg m; half of that about the axis."""
         return self.mass_per_length * self.second_moment / self.area
 
 
@@ -74,12 +74,12 @@ def cowper(ratio: float) -> float:
 
 
 def modulus() -> Any:
-    """Field: an elastic modulus, Pa."""
+    """Make a field of an elastic modulus, Pa."""
     return schema.number(low=1e3, high=1e14, unit="Pa")
 
 
 def compliances(**options: Any) -> Any:
-    """Field: compliance of a joint along its three axes and about them; .inf where it is free."""
+    """Make a field of a joint's compliances along and about its three axes; .inf where it is free."""
     return schema.vector(6, low=0.0, high=math.inf, unit="m/N (3), rad/(N m) (3)", **options)
 
 
@@ -100,7 +100,7 @@ class Tube:
     shear_factor: float | None = schema.number(low=0.0, high=10.0, default=None)
 
     def verify(self, path: str) -> None:
-        """One of the two ways to tell the wall."""
+        """Check that exactly one of ``density`` and ``inner_diameter`` is given."""
         if (self.density is None) == (self.inner_diameter is None):
             given = "neither" if self.density is None else "both"
             raise ParameterError(path, given, "one of density and inner_diameter")
@@ -111,9 +111,9 @@ class Tube:
     def section(self, mass_per_length: float, path: str) -> Section:
         """Return the section of a tube with this mass per length, kg/m.
 
-        Of expressions one that cannot be is NaN where its numbers are.
+        For expressions an impossible section gives NaN at run time.
 
-        :raises ParameterError: at that density the mass is more than the whole circle's, or none.
+        :raises ParameterError: the mass is not above zero, or exceeds that of the solid bar.
         """
         outer = self.outer_diameter
         inner = self.inner_diameter
@@ -121,7 +121,7 @@ class Tube:
             raise ParameterError(path, mass_per_length, "a member with mass, kg/m above zero")
         if inner is None:
             square = outer * outer - 4 * mass_per_length / (math.pi * self.density)  # type: ignore[operator]
-            # A mass that was worked out from a solid bar may miss it by rounding.
+            # A mass computed from a solid bar may exceed it by rounding.
             spare = square + 1e-9 * outer * outer
             if reference(spare) < 0.0:
                 raise ParameterError(
@@ -132,19 +132,19 @@ class Tube:
                 )
             inner = number(sqrt(maximum(0.0, square)) * sqrt(sign(spare)))
         factor = cowper(inner / outer) if self.shear_factor is None else self.shear_factor
-        # One, or NaN without mass.
+        # The factor is 1, or NaN without mass.
         young = number(self.youngs_modulus * sqrt(2.0 * sign(mass_per_length) - 1.0))
         return Section(young, self.shear_modulus, outer, inner, mass_per_length, factor)
 
 
 @dataclass(frozen=True, eq=False)
 class Beam:
-    """A straight round bar between two points, ``limb`` the number of the limb that it is in.
+    """A straight round bar between two points; ``limb``: the number of its limb.
 
-    ``element``: the name that it has in the energy shares: two rods can be one forearm. ``parts``:
-    the bodies, or the rod, that it is; a telescope's are two. ``carries``: other bodies whose mass
-    it has. ``radius``: outer, m. ``section``: of an elastic beam, or the tube that makes it with
-    ``mass_per_length``, kg/m; ``path``: the tube's place in the file.
+    ``element``: its name in the energy shares, which the two rods of a forearm have in common.
+    ``parts``: the bodies, or the rod, that the bar models; two for a telescope. ``carries``: other
+    bodies whose mass it includes. ``radius``: outer, m. ``section``: of an elastic beam, or the
+    tube that makes it with ``mass_per_length``, kg/m; ``path``: the tube's path in the file.
     """
 
     name: str
@@ -165,8 +165,8 @@ class Structure:
     """Beams with their sections, and the compliance of joints, all by name.
 
     A joint's six compliances are along and about the directions of its reactions: m/N, rad/(N m);
-    what is not named is rigid. Freedoms of passive joints are free whatever stands here. ``order``:
-    all names that the energy shares have, where a mechanism has an order of its own.
+    joints that are not named are rigid. Freedoms of passive joints are always free. ``order``: names
+    of the energy shares in the order of the mechanism, if it has one.
     """
 
     beams: tuple[Beam, ...]
@@ -176,7 +176,7 @@ class Structure:
 
     @property
     def elements(self) -> tuple[str, ...]:
-        """Names of what is elastic: bars, then joints."""
+        """Names of the elastic parts: bars, then joints."""
         if self.order:
             return self.order
         soft = [name for name, values in self.compliances.items() if any(0.0 < value < math.inf for value in values)]
@@ -245,11 +245,10 @@ class Parts:
 
 
 def axial(across: Any, along: Any, axis: Array) -> Array:
-    """Inertia of what is round about a unit vector: across it and along it, shape (3, 3)."""
-    inertia: Array = across * np.eye(3) + (along - across) * np.outer(axis, axis)
-    return inertia
+    """Return the inertia of an axisymmetric body from its moments across and along a unit vector."""
+    return np.asarray(across * np.eye(3) + (along - across) * np.outer(axis, axis))
 
 
 def disc(mass: float, radius: float) -> Array:
-    """Inertia of a thin disc about its centre, axis z, shape (3, 3), kg m2."""
+    """Return the inertia of a thin disc about its centre, axis z, shape (3, 3), kg m2."""
     return mass * radius**2 / 4 * np.diag([1.0, 1.0, 2.0])

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""A robot's tree as an MJCF file, byte for byte the same.
+"""Write a robot's tree as an MJCF file; the same tree gives the same bytes.
 
 The model stands at home as it is: every body's frame is parallel to the base there, ``ref`` of a
 joint is its value at home. Loops are ``connect`` and ``weld`` constraints.
@@ -10,29 +10,12 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Final
 
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.machine.loop_tree import Capsule, Hung, Joint, Link, LoopTree, Single, screws, singles
+from pkm_twin.machine.loop_tree import Hung, Link, LoopTree, Single, screws, singles
 from pkm_twin.machine.urdf_write import GROUND, PLATFORM, number_text
-
-TIMESTEP: Final = 1e-3
-"""s."""
-SOLREF: Final = (2.0 * TIMESTEP, 1.0)
-"""Time constant, s, and damping ratio of the constraints: as stiff as the time step allows."""
-SOLIMP: Final = (0.9999, 0.9999, 0.001)
-"""Impedance of the constraints: how little they give way."""
-SPECK: Final = 1e-12
-"""Inertia that is added about every axis, part of the body's."""
-LEAST: Final = 3e-14
-"""Or this, kg m2: MuJoCo takes 1e-14 for none."""
-SPECK_MASS: Final = 1e-12
-"""Of a body that has none, kg."""
-TYPES: Final = {"revolute": "hinge", "prismatic": "slide"}
-HOME: Final = "home"
-"""The keyframe's name."""
 
 
 def write_mjcf(tree: LoopTree, gravity: Array, efforts: Sequence[float] | None = None) -> str:
@@ -44,13 +27,16 @@ def write_mjcf(tree: LoopTree, gravity: Array, efforts: Sequence[float] | None =
     :param gravity: (3,) m/s2.
     :param efforts: of the actuators at the keyframe ``home``, shape (n,), N m or N.
     """
+    timestep = 1e-3  # s
     tree, welds = _split(tree)
     top = ET.Element("mujoco", model=tree.name)
     ET.SubElement(top, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
-    ET.SubElement(top, "option", gravity=number_text(gravity), timestep=number_text([TIMESTEP]), integrator="RK4")
+    ET.SubElement(top, "option", gravity=number_text(gravity), timestep=number_text([timestep]), integrator="RK4")
     default = ET.SubElement(top, "default")
     ET.SubElement(default, "geom", contype="0", conaffinity="0", group="1", rgba="0.6 0.65 0.7 1")
-    ET.SubElement(default, "equality", solref=number_text(SOLREF), solimp=number_text(SOLIMP))
+    # Constraints: as stiff as the time step allows, critically damped, and an impedance near 1.
+    solref, solimp = number_text([2.0 * timestep, 1.0]), number_text([0.9999, 0.9999, 0.001])
+    ET.SubElement(default, "equality", solref=solref, solimp=solimp)
     elements = {GROUND: ET.SubElement(top, "worldbody")}
     places = {GROUND: np.zeros(3)}
     home: list[float] = []
@@ -66,7 +52,12 @@ def write_mjcf(tree: LoopTree, gravity: Array, efforts: Sequence[float] | None =
         parts += row
     for capsule in tree.capsules:
         if capsule.link in elements:
-            _capsule(elements[capsule.link], capsule, places[capsule.link])
+            element, (start, end) = elements[capsule.link], (capsule.start, capsule.end) - places[capsule.link]
+            size = number_text([capsule.radius])
+            if np.linalg.norm(capsule.end - capsule.start) > 0.0:
+                ET.SubElement(element, "geom", type="capsule", fromto=number_text([*start, *end]), size=size)
+            else:
+                ET.SubElement(element, "geom", type="sphere", pos=number_text(start), size=size)
     at = number_text(tree.origin - places[tree.platform])
     ET.SubElement(elements[tree.platform], "site", name=PLATFORM, pos=at, size="0.005")
     loops = ET.SubElement(top, "equality")
@@ -86,7 +77,7 @@ def write_mjcf(tree: LoopTree, gravity: Array, efforts: Sequence[float] | None =
     motors = ET.SubElement(top, "actuator")
     for name in tree.actuated:
         ET.SubElement(motors, "motor", name=name, joint=name)
-    key = ET.SubElement(ET.SubElement(top, "keyframe"), "key", name=HOME, qpos=number_text(home))
+    key = ET.SubElement(ET.SubElement(top, "keyframe"), "key", name="home", qpos=number_text(home))
     if efforts is not None:
         key.set("ctrl", number_text(efforts))
     ET.indent(top)
@@ -94,10 +85,10 @@ def write_mjcf(tree: LoopTree, gravity: Array, efforts: Sequence[float] | None =
 
 
 def rows(tree: LoopTree) -> list[tuple[str, str, list[Single]]]:
-    """Bodies depth first, as MuJoCo numbers joints: parent, child, single joints between.
+    """List bodies depth first, as MuJoCo numbers joints: parent, child, single joints between.
 
-    A link without mass is left out where one joint alone goes on from it, which then has its
-    joints too.
+    A link without mass is left out where one joint alone goes on from it: its joints then belong to
+    the next body.
     """
     after: dict[str, list[Hung]] = {}
     for one in tree.hung:
@@ -119,13 +110,16 @@ def rows(tree: LoopTree) -> list[tuple[str, str, list[Single]]]:
 
 
 def _split(tree: LoopTree) -> tuple[LoopTree, list[tuple[str, str]]]:
-    """Make closures tree joints, but balls and fixed ones; return the tree and what to weld.
+    """Cut a body at each closure that is neither a ball nor fixed; return the tree and the welds.
 
-    Such a joint leads to a part of the outer body, or of the inner one, that is welded to the rest
-    of it: mass and inertia are shared out evenly, so that their sums stay.
+    The joint then leads to a part of the outer body, or of the inner one if only that has mass, and
+    the part is welded to the rest. Parts have equal mass and inertia, so that their sums stay.
     """
     kept = [c for c in tree.closures if c.kind in ("spherical", "fixed")]
-    cut = [(c, _owner(c, tree)) for c in tree.closures if c not in kept]
+    cut = []
+    for closure in [c for c in tree.closures if c not in kept]:
+        ends = [end for end in (closure.outer, closure.inner) if end != tree.root]
+        cut.append((closure, max(ends, key=lambda end: tree.links[end].mass > 0.0)))
     shares = dict.fromkeys(tree.links, 1)
     for _, owner in cut:
         shares[owner] += 1
@@ -143,25 +137,19 @@ def _split(tree: LoopTree) -> tuple[LoopTree, list[tuple[str, str]]]:
     return replace(tree, links=links, joints=joints, closures=tuple(kept)), welds
 
 
-def _owner(closure: Joint, tree: LoopTree) -> str:
-    """Choose the body to split: the outer one, unless only the inner one has a mass."""
-    ends = [end for end in (closure.outer, closure.inner) if end != tree.root]
-    return max(ends, key=lambda end: tree.links[end].mass > 0.0)
-
-
 def _body(parent: ET.Element, link: Link, place: Array, before: Array) -> ET.Element:
-    """Write a body with some mass, and some inertia about every axis.
+    """Write a body; MuJoCo rejects a body without mass, or without inertia about an axis.
 
-    What is added is below the twelfth digit: a thin bar's inertia about itself is none.
+    What is added is below the twelfth digit. MuJoCo takes an inertia of 1e-14 kg m2 for none.
     """
     element = ET.SubElement(parent, "body", name=link.name, pos=number_text(place - before))
-    inertia = link.inertia + np.eye(3) * max(SPECK * float(np.trace(link.inertia)), LEAST)
+    inertia = link.inertia + np.eye(3) * max(1e-12 * float(np.trace(link.inertia)), 3e-14)
     order = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
     ET.SubElement(
         element,
         "inertial",
         pos=number_text(link.com - place),
-        mass=f"{link.mass or SPECK_MASS:.15g}",
+        mass=f"{link.mass or 1e-12:.15g}",
         fullinertia=" ".join(f"{inertia[i, k]:.15g}" for i, k in order),
     )
     return element
@@ -169,7 +157,11 @@ def _body(parent: ET.Element, link: Link, place: Array, before: Array) -> ET.Ele
 
 def _joint(part: Single, place: Array) -> dict[str, str]:
     joint, limits = part.joint, part.joint.limits if part.whole else {}
-    found = {"name": part.name, "type": TYPES[part.kind], "axis": number_text(part.axis)}
+    found = {
+        "name": part.name,
+        "type": {"revolute": "hinge", "prismatic": "slide"}[part.kind],
+        "axis": number_text(part.axis),
+    }
     if part.kind == "revolute":
         found["pos"] = number_text(joint.at - place)
     if part.home:
@@ -182,13 +174,3 @@ def _joint(part: Single, place: Array) -> dict[str, str]:
         if value and part.whole:
             found[key] = number_text([value])
     return found
-
-
-def _capsule(body: ET.Element, capsule: Capsule, place: Array) -> None:
-    ends = number_text([*(capsule.start - place), *(capsule.end - place)])
-    size = number_text([capsule.radius])
-    if np.linalg.norm(capsule.end - capsule.start) > 0.0:
-        ET.SubElement(body, "geom", type="capsule", fromto=ends, size=size)
-    else:
-        at = number_text(capsule.start - place)
-        ET.SubElement(body, "geom", type="sphere", pos=at, size=size)

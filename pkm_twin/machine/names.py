@@ -9,7 +9,6 @@ from typing import Final
 from pkm_twin.machine.joints import UNITS, Free, Freedom, single_names
 from pkm_twin.machine.tree import Tree
 
-ROMAN: Final = {"I": "1", "II": "2", "III": "3", "IV": "4", "V": "5", "VI": "6"}
 FREE: Final = Free.freedoms(UNITS, 0.0)
 """Freedoms of a body that only closures hold."""
 ROD: Final = (Freedom(UNITS[0]), Freedom(UNITS[1]))
@@ -18,7 +17,8 @@ ROD: Final = (Freedom(UNITS[0]), Freedom(UNITS[1]))
 
 def plain_name(name: str) -> str:
     """Return a name without spaces, Roman numerals as digits: ``arm I`` becomes ``arm_1``."""
-    words = re.sub(r" (I{1,3}|IV|VI?)(?![A-Za-z0-9])", lambda found: "_" + ROMAN[found[1]], name)
+    digits = {"I": 1, "II": 2, "III": 3, "IV": 4, "V": 5, "VI": 6}
+    words = re.sub(r" (I{1,3}|IV|VI?)(?![A-Za-z0-9])", lambda found: f"_{digits[found[1]]}", name)
     return re.sub(r"\s", "_", words)
 
 

@@ -7,7 +7,7 @@ import copy
 import dataclasses
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any, Final, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -17,7 +17,6 @@ from pkm_twin.machine import schema
 from pkm_twin.settings import settings_of
 
 T = TypeVar("T")
-_PATH_PART: Final = re.compile(r"([^.\[\]]+)|\[(\d+)\]")
 Key = str | int
 Keys = tuple[Key, ...]
 """Location of a number in a file: keys of mappings and indices of lists."""
@@ -29,7 +28,7 @@ def keys_of(path: str) -> list[Key]:
     :raises ParameterError: the path is not a text or has no key.
     """
     text = path if isinstance(path, str) else ""
-    keys = [name or int(place) for name, place in _PATH_PART.findall(text)]
+    keys = [name or int(place) for name, place in re.findall(r"([^.\[\]]+)|\[(\d+)\]", text)]
     if not keys:
         raise ParameterError("path", path, "a dotted path of a number of the robot's file")
     return keys
@@ -158,16 +157,13 @@ def number_in(data: Any, keys: Iterable[Key], path: str) -> float:
         except (KeyError, IndexError, TypeError):
             whole = keys_of(path)
             before = whole[: len(whole) - len(keys) + i]
-            names = list(there) if isinstance(there, Mapping) else _list_indices(there)
+            names: list[Key] = list(there) if isinstance(there, Mapping) else []
+            names += range(len(there)) if isinstance(there, list | tuple) else ()
             near = [path_of([*before, name, *keys[i + 1 :]]) for name in names]
             raise unknown_number(path, near) from None
     if isinstance(there, bool) or not isinstance(there, int | float):
         raise unknown_number(path, [])
     return float(there)
-
-
-def _list_indices(values: Any) -> list[int]:
-    return list(range(len(values))) if isinstance(values, list | tuple) else []
 
 
 def has_entry(data: Any, path: str) -> bool:

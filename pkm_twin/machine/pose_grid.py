@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""How the poses of a machine are laid out: about an axis, or along its pose coordinates."""
+"""Lay out the poses of a machine about an axis, or along its pose coordinates."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class PoseGrid:
     zero_torsion: bool = False
 
     def polar_pose(self, height: ArrayLike, distance: ArrayLike, azimuth: ArrayLike) -> Array:
-        """Poses of cylinder coordinates, shape (..., m).
+        """Convert cylinder coordinates to poses, shape (..., m).
 
         :param height: m, shape (...).
         :param distance: from the axis, m or rad.
@@ -59,9 +59,9 @@ class PoseGrid:
 
 
 def zero_torsion(tilt: ArrayLike, azimuth: ArrayLike) -> tuple[Array, Array]:
-    """Angles (alpha, beta), rad, of Rx(alpha) Ry(beta) Rz(.) whose z axis leans by a tilt.
+    """Return angles (alpha, beta), rad, of Rx(alpha) Ry(beta) whose z axis is tilted, rad.
 
-    The axis leans towards the azimuth: (sin t cos a, sin t sin a, cos t).
+    The z axis is (sin t cos a, sin t sin a, cos t) for a tilt t towards the azimuth a.
     """
     t, a = np.asarray(tilt, np.float64), np.asarray(azimuth, np.float64)
     x, y = np.sin(t) * np.cos(a), np.sin(t) * np.sin(a)

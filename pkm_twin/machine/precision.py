@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""How precisely a file's numbers are printed."""
+"""Estimate the rounding errors of a file's numbers."""
 
 from __future__ import annotations
 
@@ -7,27 +7,24 @@ import math
 import statistics
 from collections.abc import Iterable
 from decimal import Decimal, InvalidOperation
-from typing import Final
-
-MIN_DIGITS: Final = 4
-"""Significant digits of a number that is rounded; one with fewer may be meant so."""
 
 
 def rounding_error(words: Iterable[str]) -> float:
     """Estimate the largest error of rounded numbers: half a unit of their last digit.
 
-    Printed with a number of significant digits or of decimals, whichever is coarser. Numbers of
-    most files are printed alike: the median of each stands for all, so that one number with all its
-    digits, such as pi, does not make a rounded file exact. Zero where no number is long.
+    Numbers are printed with some significant digits or some decimals, whichever is coarser. The
+    medians over a file's numbers are used, so that one number with all its digits, such as pi, does
+    not make a rounded file exact. A number of fewer than four digits may be exact; without any longer
+    number the error is zero.
     """
     digits, decimals, powers = [], [], []
     for word in words:
         try:
             number = Decimal(word)
         except InvalidOperation:
-            continue  # No number: rejected where it is read, if it is.
+            continue  # Not a number: rejected where it is read.
         _, own, exponent = number.as_tuple()
-        if number.is_finite() and isinstance(exponent, int) and len(own) >= MIN_DIGITS and number:
+        if number.is_finite() and isinstance(exponent, int) and len(own) >= 4 and number:
             digits.append(len(own))
             decimals.append(-exponent)
             powers.append(number.adjusted())

@@ -1,10 +1,8 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Bounds of a workspace: limits of slides and lengths of bodies, ranges of passive joints."""
+"""Bound a workspace by the limits of slides, the lengths of bodies and the ranges of passive joints."""
 
 from __future__ import annotations
 
-import heapq
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,10 +19,9 @@ class PassiveLimit:
     """The range of one passive joint, from ``low`` to ``high``, rad or m; vectors at home.
 
     ``kind`` "swivel": the angle between two directions that are both along ``axis`` at home, one
-    fixed in the inner body and one in the outer. "rod": the same of the way from ``at`` on the
-    inner body to ``far`` on the outer one. "turn": about the axis. "slide": of the point ``at``
-    along it.
-    ``home``: the joint's value at home.
+    fixed in each body. "rod": the angle between ``axis`` in the inner body and the line from ``at``
+    on the inner body to ``far`` on the outer one. "turn": the rotation about the axis. "slide": the
+    travel of the point ``at`` along it. ``home``: the joint's value at home.
     """
 
     joint: str
@@ -42,11 +39,11 @@ class PassiveLimit:
 def position_box(
     graph: Graph, limits: Array | None, passive: Sequence[PassiveLimit] = (), paths: Sequence[str] = ()
 ) -> Array:
-    """Bounds that the platform's reference point cannot leave, shape (3, 2), m.
+    """Return bounds that the platform's reference point cannot leave, shape (3, 2), m.
 
-    Every joint on the base is the centre of a ball: its radius is the length of the shortest chain
-    of bodies from there to the reference point, slides at their limits. The box is where all
-    the balls' boxes meet.
+    Every joint on the base is the centre of a ball whose radius is the length of the shortest chain of
+    bodies from there to the reference point, with slides at their limits. The box is the intersection
+    of the balls' bounding boxes.
 
     :param limits: of the actuated joints, shape (n, 2), or None; ``passive``: of the others.
     :param paths: of the actuated joints' limits in the file, for the error.
@@ -62,21 +59,30 @@ def position_box(
         far = float(np.abs(np.subtract(ends[name], joint.home)).max()) if known else math.inf
         if slides:
             travel[name] = max(slides) * far
-    # Points of bodies: where joints and rods' ends are, and the reference point.
-    hops: list[tuple[tuple[str, Array], tuple[str, Array], float]] = []
+    # Nodes are points of bodies: the reference point, joints and ends of rods. A joint connects its points
+    # by its travel, a rod by its length, and a body those on it by their distance.
+    nodes: list[tuple[str, Array]] = [(graph.platform, graph.origin)]
+    hops: list[float] = []
     for joint in graph.joints.values():
-        slack = travel.get(joint.name, 0.0)
-        hops.append(((joint.inner, joint.at), (joint.outer, joint.at), slack))
+        nodes += [(joint.inner, joint.at), (joint.outer, joint.at)]
+        hops.append(travel.get(joint.name, 0.0))
     for rod in graph.rods.values():
-        length = float(np.linalg.norm(rod.ends[1] - rod.ends[0]))
-        hops.append(((rod.inner, rod.ends[0]), (rod.outer, rod.ends[1]), length))
+        nodes += [(rod.inner, rod.ends[0]), (rod.outer, rod.ends[1])]
+        hops.append(float(np.linalg.norm(rod.ends[1] - rod.ends[0])))
+    points = np.array([point for _, point in nodes])
+    lengths = np.linalg.norm(points[:, None] - points, axis=-1)
+    lengths[[[a != b or a == BASE for b, _ in nodes] for a, _ in nodes]] = math.inf
+    for k, length in enumerate(hops):
+        lengths[2 * k + 1, 2 * k + 2] = lengths[2 * k + 2, 2 * k + 1] = length
+    # Bellman and Ford: the shortest chains of up to 1, 2, 3, ... edges.
+    radii = np.where(np.arange(len(nodes)) == 0, 0.0, math.inf)
+    for _ in nodes:
+        radii = np.minimum(radii, (radii[:, None] + lengths).min(0))
     box = np.array([[-math.inf, math.inf]] * 3)
-    for inner, outer, slack in hops:
-        for start, after in ((inner, outer), (outer, inner)):
-            if start[0] == BASE:
-                radius = _shortest(graph, hops, after, slack)
-                box[:, 0] = np.maximum(box[:, 0], start[1] - radius)
-                box[:, 1] = np.minimum(box[:, 1], start[1] + radius)
+    for (body, point), radius in zip(nodes, radii, strict=True):
+        if body == BASE:
+            box[:, 0] = np.maximum(box[:, 0], point - radius)
+            box[:, 1] = np.minimum(box[:, 1], point + radius)
     if not np.isfinite(box).all():
         free = [graph.joints[name] for name, way in travel.items() if math.isinf(way)]
         # A screw goes as far as its slide.
@@ -84,29 +90,3 @@ def position_box(
         path = dict(zip(graph.actuated, paths, strict=False)).get(first.name, f"joints.{first.name}.limits.position")
         raise ParameterError(path, None, "limits of the slides; without them the workspace is unbounded")
     return box
-
-
-def _shortest(
-    graph: Graph, hops: list[tuple[tuple[str, Array], tuple[str, Array], float]], start: tuple[str, Array], begun: float
-) -> float:
-    """Length of the shortest chain from a point of a body to the reference point."""
-    order = itertools.count()
-    queue = [(begun, next(order), start)]
-    done: set[tuple[str, tuple[float, ...]]] = set()
-    while queue:
-        length, _, (body, point) = heapq.heappop(queue)
-        key = body, tuple(point.tolist())
-        if key in done or math.isinf(length):
-            continue
-        done.add(key)
-        if body == graph.platform and np.array_equal(point, graph.origin):
-            return length
-        if body == graph.platform:
-            far = length + float(np.linalg.norm(point - graph.origin))
-            heapq.heappush(queue, (far, next(order), (body, graph.origin)))
-        for inner, outer, slack in hops:
-            for here, there in ((inner, outer), (outer, inner)):
-                if here[0] == body and body != BASE:
-                    far = length + float(np.linalg.norm(here[1] - point)) + slack
-                    heapq.heappush(queue, (far, next(order), there))
-    return math.inf

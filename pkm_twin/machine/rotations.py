@@ -32,7 +32,7 @@ class Pose:
 
 
 def about(axis: Array, angle: ArrayLike) -> Array:
-    """Rotations by angles (...,), rad, about a unit vector (3,), shape (..., 3, 3)."""
+    """Return rotations by angles (...,), rad, about a unit vector (3,), shape (..., 3, 3)."""
     across = skew(np.asarray(axis, np.float64))
     sine, rest = np.sin(angle)[..., None, None], 1.0 - np.cos(angle)[..., None, None]
     rotation: Array = np.eye(3) + sine * across + rest * (across @ across)
@@ -57,7 +57,7 @@ def rotation_vector(rotation: Array) -> Array:
 
 
 def skew(vectors: Array) -> Array:
-    """Matrices (..., 3, 3) that take the cross product of vectors (..., 3) with what follows."""
+    """Return the cross product matrices (..., 3, 3) of vectors (..., 3)."""
     x, y, z = np.moveaxis(vectors, -1, 0)
     none = np.zeros_like(x)
     rows = ((none, -z, y), (z, none, -x), (-y, x, none))
@@ -73,7 +73,7 @@ def from_rpy(angles: Array) -> Array:
 
 
 def to_rpy(rotation: Array) -> Array:
-    """Roll, pitch and yaw (3,), rad; yaw is zero where the x axis stands upright."""
+    """Return roll, pitch and yaw (3,), rad; yaw is zero if the x axis is vertical."""
     level = math.hypot(rotation[0, 0], rotation[1, 0])
     pitch = math.atan2(-rotation[2, 0], level)
     if level < 1e-9:
@@ -92,9 +92,9 @@ def from_quaternion(x: float, y: float, z: float, w: float) -> Array:
 
 
 def to_quaternion(rotation: Array) -> Array:
-    """Return the unit quaternion x, y, z, w (4,) of a rotation, w >= 0 (Bar-Itzhack 2000, 1).
+    """Return the unit quaternion x, y, z, w (4,) of a rotation, w >= 0 (Bar-Itzhack 2000, method 1).
 
-    The eigenvector of the greatest eigenvalue: no case is near-singular.
+    It is the eigenvector of the largest eigenvalue, which is well separated for every rotation.
     """
     r = rotation
     k = np.array(

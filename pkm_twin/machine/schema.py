@@ -352,13 +352,9 @@ def _is_number(value: Any) -> bool:
 
 def _check_nested(field: str, value: Any, shape: Sequence[int], bounds: Key, least: int = 1) -> Any:
     """Check a number, or nested lists of numbers of a shape."""
-    if not shape:
-        return _check_single(field, value, bounds)
-    items = _check_list(field, value, shape[0], "numbers", least)
-    return [_check_nested(f"{field}[{i}]", item, shape[1:], bounds) for i, item in enumerate(items)]
-
-
-def _check_single(field: str, value: Any, bounds: Key) -> float:
+    if shape:
+        items = _check_list(field, value, shape[0], "numbers", least)
+        return [_check_nested(f"{field}[{i}]", item, shape[1:], bounds) for i, item in enumerate(items)]
     bound = f"a finite number{bounds.span}"
     if bounds.high is not None and "{" not in bounds.unit:
         bound += f" {bounds.unit}".rstrip()

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""An SDF model as links, joints and loop closures, as the SDFormat specification reads it.
+"""Read an SDF model as links, joints and loop closures, by the SDFormat specification.
 
 Versions 1.4 to 1.12: poses relative to frames, nested models, axes in any frame. The model stands
 as drawn where all joints are at zero. SDF has a graph of joints: a spanning tree is chosen, with
@@ -8,9 +8,10 @@ fixed and actuated joints first, and the other joints close loops.
 
 from __future__ import annotations
 
+import math
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -21,21 +22,16 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, UnknownNameError, warn
 from pkm_twin.machine import foreign, urdf_xml
-from pkm_twin.machine.foreign import gravity_of
-from pkm_twin.machine.graph import spanning
 from pkm_twin.machine.joints import TURN, TYPES
-from pkm_twin.machine.loop_tree import Joint, Link, LoopTree, hung, link_of
+from pkm_twin.machine.loop_tree import WORLD, Joint, Link, LoopTree, hold_in_world, link_of, span_tree
 from pkm_twin.machine.precision import rounding_error
 from pkm_twin.machine.rotations import Pose, from_rpy
-from pkm_twin.machine.urdf_control import actuated_joints, read_beside
+from pkm_twin.machine.urdf_control import actuated_joints, find_marked, read_beside
 
-WORLD: Final = "world"
-"""The root's name."""
 MODEL: Final = "__model__"
-NEWEST: Final = (1, 12)
-OLDEST: Final = (1, 4)
-NEAR: Final = 1e-6
-"""Distance of two points that are one, m."""
+"""Name of a model's own frame."""
+VERSIONS: Final = range(4, 13)
+"""Versions 1.x that are read."""
 KINDS: Final = {
     "fixed": "fixed",
     "revolute": "revolute",
@@ -46,9 +42,7 @@ KINDS: Final = {
     "revolute2": "universal",
     "ball": "spherical",
 }
-"""SDF's joint types and ours."""
-WELDS: Final = {"DetachableJoint": ("parent_link", "child_link"), "AttachLinks": ("parent", "child")}
-"""Gazebo's plugins that hold two links together as they are drawn, and where they name them."""
+"""Joint types by the name that SDF has for them."""
 
 
 def read(path: Path, top: ET.Element, actuated: Sequence[str] | None = None) -> LoopTree:
@@ -60,9 +54,12 @@ def read(path: Path, top: ET.Element, actuated: Sequence[str] | None = None) -> 
     """
     if any(str(part.tag).startswith("xacro:") for part in top.iter()):
         raise ParameterError(str(path), "xacro elements", "an SDF: run xacro on this file first")
-    version = _version(top)
+    text = top.get("version", "")
+    version = re.fullmatch(r"1\.(\d+)", text)
+    if not version or int(version[1]) not in VERSIONS:
+        raise ParameterError("sdf.version", text or None, "1.4 to 1.12")
     outside, element, gravity = _model(path, top)
-    title, world = urdf_xml.name(element, ()), Model(outside, version)
+    title, world = urdf_xml.name(element, ()), Model(outside, int(version[1]))
     model = world.models[title]
     links = {WORLD: Link(WORLD)}
     moments = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
@@ -78,8 +75,9 @@ def read(path: Path, top: ET.Element, actuated: Sequence[str] | None = None) -> 
             raise ParameterError(f"joint.{joint.name}", joint.name, "a unique name")
         joints[joint.name] = joint
     taken = set(joints)
-    for joint in world.own_joints(path):
-        # Names are of their own in the world.
+    for part in world.element.findall("joint"):
+        # Names are unique within the world only.
+        joint = _joint(path, part, world)
         own = urdf_xml.free_name(joint.name, taken, "_of_world")
         joints[own] = replace(joint, name=own)
     joints |= {joint.name: joint for joint in welds(path, top, title, places, taken)}
@@ -88,67 +86,32 @@ def read(path: Path, top: ET.Element, actuated: Sequence[str] | None = None) -> 
         if owner in links and name not in links:
             links[name] = Link(name).moved(model.place(name))
             own = urdf_xml.free_name(f"{name}_frame", taken)
-            joints[own] = _fixed(own, owner, name, links[name].frame)
-    if not any(WORLD in (joint.inner, joint.outer) for joint in joints.values()):
-        held = model.link(MODEL)
-        warn(path, f"no joint holds the model in the world: link {held} is taken for the ground")
-        own = urdf_xml.free_name("world_fixed", taken)
-        joints[own] = _fixed(own, WORLD, held, places[held])
+            joints[own] = Joint.fixed(own, owner, name, links[name].frame)
+    hold_in_world(path, joints, lambda: links[model.link(MODEL)])
     types = {name: joint.kind for name, joint in joints.items()}
     # Where only some joints have an effort limit, these are motors.
     limited = [name for name, joint in joints.items() if "effort" in joint.limits]
-    motors, marked = actuated_joints(path, top, read_beside(path), types, faults, others=limited, chosen=actuated)
-
-    def rank(joint: Joint) -> tuple[bool, bool, int]:
-        return joint.kind != "fixed", joint.name not in motors, joint.type.cost
-
-    pairs = {joint.name: (joint.inner, joint.outer) for joint in sorted(joints.values(), key=rank)}
-    tree = set(spanning(links, pairs))
-    spanned = {name: joint for name, joint in joints.items() if name in tree}
-    reached = {WORLD, *(one.child for one in hung(WORLD, spanned.values()))}
-    for name in [name for name in links if name not in reached]:
-        raise ParameterError(f"link.{name}", None, "a joint that connects it")
+    motors, marked = actuated_joints(
+        path, types, faults, actuated, lambda: find_marked(top, read_beside(path), limited)
+    )
+    tree, closures = span_tree(links, joints, motors)
+    positions = [part for part in element.iter() if part.tag in ("pose", "xyz")]
     return LoopTree(
         title,
         WORLD,
         links,
-        spanned,
-        tuple(closing(joint) for name, joint in joints.items() if name not in tree),
+        tree,
+        tuple(joint.closing() for joint in closures),
         motors,
-        gravity_of(path, weight, links, WORLD, joints.values(), gravity),
-        rounding=rounding_error(
-            word for part in element.iter() if part.tag in ("pose", "xyz") for word in (part.text or "").split()
-        ),
+        foreign.gravity_of(path, weight, links, WORLD, joints.values(), gravity),
+        rounding=rounding_error(word for part in positions for word in (part.text or "").split()),
         marked=marked,
         faults=tuple(faults),
     )
 
 
-def _fixed(name: str, inner: str, outer: str, place: Pose) -> Joint:
-    return Joint(name, "fixed", inner, outer, (place, place))
-
-
-def closing(joint: Joint) -> Joint:
-    """Convert a joint to one that closes a loop.
-
-    :raises ParameterError: a screw.
-    """
-    if joint.type.threaded():
-        raise ParameterError(f"joint.{joint.name}.type", "screw", "a loop with other joints too")
-    cosine = float(joint.axes[0] @ joint.axes[1]) if joint.type.count == 2 else 0.0
-    return replace(joint, cosine=cosine)
-
-
-def _version(top: ET.Element) -> tuple[int, int]:
-    text = top.get("version", "")
-    found = re.fullmatch(r"1\.(\d+)", text)
-    if not found or not OLDEST <= (1, int(found[1])) <= NEWEST:
-        raise ParameterError("sdf.version", text or None, "1.4 to 1.12")
-    return 1, int(found[1])
-
-
 def _model(path: Path, top: ET.Element) -> tuple[ET.Element, ET.Element, list[float] | None]:
-    """Find the only model that can move, after its parents, and a world's gravity if stated."""
+    """Find the only model that can move, its parent, and the gravity of a world if it is stated."""
     worlds = top.findall("world")
     gravity = None
     for world in worlds:
@@ -158,26 +121,27 @@ def _model(path: Path, top: ET.Element) -> tuple[ET.Element, ET.Element, list[fl
     models = [(root, one) for root in (top, *worlds) for one in root.findall("model")]
     moving = [(root, one) for root, one in models if not foreign.flag(one, "static", False)]
     if not moving:
-        for included in top.iter("include"):
-            raise _of_include(included)
+        _reject_includes(top.iter("include"))
     if len(moving) != 1:
         names = ", ".join(str(one.get("name")) for _, one in moving)
         raise ParameterError(str(path), names or "no <model>", "one <model> that is not static")
     return *moving[0], gravity
 
 
-def _of_include(element: ET.Element) -> ParameterError:
-    uri = (element.findtext("uri") or "").strip()
-    return ParameterError("include", uri, "one file: `gz sdf -p FILE` writes includes out")
+def _reject_includes(elements: Iterable[ET.Element]) -> None:
+    for element in elements:
+        uri = (element.findtext("uri") or "").strip()
+        raise ParameterError("include", uri, "one file: `gz sdf -p FILE` writes includes out")
 
 
 class Model:
-    """A model's frames by name, each relative to the model's own; ``::`` leads into nested ones.
+    """The frames of a model by name, relative to the model's own; ``::`` leads into nested models.
 
-    The outermost one is the world. Names of parts are those in the model that it holds.
+    The outermost model is the world. Names of parts are those in the model that holds them.
+    ``version``: the minor one of SDF.
     """
 
-    def __init__(self, element: ET.Element, version: tuple[int, int], outer: Model | None = None):
+    def __init__(self, element: ET.Element, version: int, outer: Model | None = None):
         self.element, self.version, self.outer = element, version, outer
         own = element.get("name", "")
         self.prefix: str = f"{outer.prefix}{own}::" if outer and outer.outer else ""
@@ -188,21 +152,28 @@ class Model:
         for part in sorted(element, key=lambda part: part.tag == "joint"):
             if part.tag in ("link", "joint", "frame", "model"):
                 # Until 1.6 a joint and a link could have one name; it meant the link.
-                name = urdf_xml.name(part, self.parts if version >= (1, 7) else ())
+                name = urdf_xml.name(part, self.parts if version >= 7 else ())
                 self.parts.setdefault(name, part)
         self.models: dict[str, Model] = {}
         for one in element.findall("model"):
             self.models[urdf_xml.name(one, self.models)] = Model(one, version, self)
-        for one in element.findall("include") if outer and not self.static else ():
-            raise _of_include(one)
+        if outer and not self.static:
+            _reject_includes(element.findall("include"))
         self._known: dict[str, Pose | None] = {}
 
     def all(self, tag: str) -> Iterator[tuple[str, ET.Element]]:
-        """Elements of that kind, nested models' too, with their names."""
+        """Iterate over elements of a tag, also of nested models, with their names."""
         for part in self.element.findall(tag):
             yield self.prefix + str(part.get("name")), part
         for one in self.models.values():
             yield from one.all(tag)
+
+    def joints(self, path: Path) -> Iterator[Joint]:
+        """Read the joints, also of nested models; the path is for warnings."""
+        for part in self.element.findall("joint"):
+            yield _joint(path, part, self)
+        for one in self.models.values():
+            yield from () if one.static else one.joints(path)
 
     def _in(self, name: str, where: str) -> tuple[Model, str]:
         """Find the nested model that a scoped name leads to, and the rest of the name."""
@@ -214,51 +185,48 @@ class Model:
         return self, name
 
     def place(self, name: str, where: str = "relative_to") -> Pose:
-        """Return a frame as drawn, in the world.
+        """Return a frame in the world, as drawn.
 
-        :raises ParameterError: no such frame, or one that leads back to itself.
+        :raises ParameterError: the frame is unknown, or depends on itself.
         """
-        found, scope = self.local(name, where), self
-        while scope.outer is not None:
-            found, scope = scope.pose() @ found, scope.outer
-        return found
+        return self._outwards(self.local(name, where), None)
+
+    def _outwards(self, frame: Pose, end: Model | None) -> Pose:
+        """Return a frame of this model in an outer model, by default in the world."""
+        scope = self
+        while scope is not end and scope.outer is not None:
+            frame, scope = scope.pose() @ frame, scope.outer
+        return frame
 
     def pose(self) -> Pose:
-        """Return the model's frame in the outer model's."""
+        """Return the model's frame in the outer model."""
         found = self._posed(self.element, MODEL, self.outer)
         placed = self.element.get("placement_frame")
         return found @ self.local(placed, "placement_frame").inverse() if placed else found
 
     def local(self, name: str, where: str) -> Pose:
-        """Return a frame in this model's."""
-        if name not in self._known:
-            self._known[name] = None
-            self._known[name] = self._local(name, where)
-        found = self._known[name]
-        if found is None:
-            raise ParameterError(f"{self.prefix}{name}.pose", where, "frames that do not lead back to themselves")
-        return found
-
-    def _local(self, name: str, where: str) -> Pose:
-        model, own = self._in(name, where)
-        if model is not self:
-            scope, found = model, model.local(own, where)
-            while scope is not self and scope.outer is not None:
-                found, scope = scope.pose() @ found, scope.outer
+        """Return a frame in this model."""
+        if name in self._known:
+            found = self._known[name]
+            if found is None:
+                raise ParameterError(f"{self.prefix}{name}.pose", where, "frames that do not lead back to themselves")
             return found
-        if name == WORLD and self.outer is not None:
-            return self.pose().inverse() @ self.outer.local(WORLD, where)
-        if name in (MODEL, WORLD):
-            return Pose()
-        part = self.parts[name]
-        if part.tag == "model":
-            return self.models[name].pose()
-        default = MODEL
-        if part.tag == "joint":
-            default = _end(part, "child")
-        elif part.tag == "frame":
-            default = part.get("attached_to") or MODEL
-        return self._posed(part, default, self)
+        self._known[name] = None
+        model, own = self._in(name, where)
+        part = None if own in (MODEL, WORLD) else model.parts[own]
+        if model is not self:
+            found = model._outwards(model.local(own, where), self)
+        elif part is None and name == WORLD and self.outer is not None:
+            found = self.pose().inverse() @ self.outer.local(WORLD, where)
+        elif part is None:
+            found = Pose()
+        elif part.tag == "model":
+            found = self.models[name].pose()
+        else:
+            default = _end(part, "child") if part.tag == "joint" else part.get("attached_to")
+            found = self._posed(part, MODEL if part.tag == "link" else default or MODEL, self)
+        self._known[name] = found
+        return found
 
     def _posed(self, part: ET.Element, default: str, scope: Model | None) -> Pose:
         where = f"{part.tag}.{part.get('name')}.pose"
@@ -293,17 +261,6 @@ class Model:
             own = end or MODEL
         raise ParameterError(where, name, "frames that do not lead back to themselves")
 
-    def joints(self, path: Path) -> Iterator[Joint]:
-        """Read the joints, nested models' too; the path is for warnings."""
-        yield from self.own_joints(path)
-        for one in self.models.values():
-            yield from () if one.static else one.joints(path)
-
-    def own_joints(self, path: Path) -> Iterator[Joint]:
-        """Read the model's own joints, without nested models'."""
-        for part in self.element.findall("joint"):
-            yield _joint(path, part, self)
-
 
 def _end(joint: ET.Element, tag: str) -> str:
     text = (joint.findtext(tag) or "").strip()
@@ -327,16 +284,14 @@ def pose(element: ET.Element | None, where: str) -> Pose:
     return Pose(from_rpy(np.radians(values[3:]) if degrees else values[3:]), values[:3])
 
 
-def _text(element: ET.Element | None, tag: str, where: str, default: float) -> float:
+def _number(element: ET.Element | None, tag: str, where: str, default: float, low: float = -math.inf) -> float:
     """Read a number that stands in an element of its own."""
-    stated = None if element is None else urdf_xml.single(element, tag, where)
-    if stated is None:
-        return default
-    return urdf_xml.number((stated.text or "").strip(), f"{where}.{tag}")
+    stated = urdf_xml.single(element, tag, where)
+    return default if stated is None else urdf_xml.number((stated.text or "").strip(), f"{where}.{tag}", low)
 
 
 def _link(path: Path, element: ET.Element, name: str, rounding: float) -> Link:
-    """Mass and inertia; what the file leaves out is 1 kg and 1 kg m2, as the format has it."""
+    """Read mass and inertia; SDF has 1 kg and 1 kg m2 where the file leaves them out."""
     where = f"link.{name}.inertial"
     inertial = urdf_xml.single(element, "inertial", f"link.{name}")
     if inertial is not None and urdf_xml.boolean(inertial.get("auto", "false"), f"{where}.auto"):
@@ -346,13 +301,12 @@ def _link(path: Path, element: ET.Element, name: str, rounding: float) -> Link:
     stated = set() if inertial is None else {part.tag for part in inertial.iter()}
     if missing := [key for key in ("mass", "ixx", "iyy", "izz") if key not in stated]:
         warn(path, f"link {name} has no {', '.join(missing)}: SDF then has 1 kg and 1 kg m2")
-    moments = None if inertial is None else urdf_xml.single(inertial, "inertia", where)
-    at = pose(None if inertial is None else urdf_xml.single(inertial, "pose", where), where)
+    inertia = urdf_xml.single(inertial, "inertia", where)
     return link_of(
         name,
-        _text(inertial, "mass", where, 1.0),
-        at,
-        lambda key: _text(moments, key, f"{where}.inertia", float(key[1] == key[2])),
+        _number(inertial, "mass", where, 1.0),
+        pose(urdf_xml.single(inertial, "pose", where), where),
+        lambda key: _number(inertia, key, f"{where}.inertia", float(key[1] == key[2])),
         rounding,
     )
 
@@ -372,7 +326,7 @@ def _joint(path: Path, part: ET.Element, model: Model) -> Joint:
     frame = model.parts.get(ends[0])
     if frame is not None and frame.tag == "frame":
         far = float(np.linalg.norm(place(ends[0]).position - at.position))
-        if far > NEAR:
+        if far > 1e-6:  # m; files are written with six decimals or more
             warn(
                 path,
                 f"{where}: the frame {ends[0]} is drawn {far:.3g} m from the joint; "
@@ -388,78 +342,50 @@ def joint_of(
     links: tuple[str, str],
     place: Pose,
     turn: Callable[[str], Array],
-    version: tuple[int, int] = NEWEST,
+    version: int = VERSIONS[-1],
 ) -> Joint:
     """Read a ``<joint>`` whose frame is known.
 
-    :param turn: gives the rotation of a frame in the world by its name.
+    :param turn: returns the rotation of a frame in the world by its name.
     :raises ParameterError: what is not supported, by name.
     """
     where = f"joint.{name}"
     if part.get("type") not in KINDS:
         raise UnknownNameError(f"{where}.type", part.get("type"), KINDS)
     kind = KINDS[str(part.get("type"))]
-    axes: list[Array] = []
-    limits: dict[str, Any] = {}
-    tags = ("axis", "axis2")[: 0 if kind == "spherical" else TYPES[kind].count]
-    viscous: list[float] = []
-    coulomb: list[float] = []
-    for tag in ("axis", "axis2"):
-        element = urdf_xml.single(part, tag, where)
-        if tag in tags:
-            axes.append(_axis(element, f"{where}.{tag}", place, turn, version))
-        dynamics = None if element is None else urdf_xml.single(element, "dynamics", where)
-        for values, key in ((viscous, "damping"), (coulomb, "friction")):
-            values.append(_text(dynamics, key, f"{where}.{tag}.dynamics", 0.0))
-            if values[-1] < 0.0:
-                raise ParameterError(f"{where}.{tag}.{key}", values[-1], "zero or more")
-        limit = None if element is None else urdf_xml.single(element, "limit", where)
+    count = 0 if kind == "spherical" else TYPES[kind].count
+    axes, limits = list[Array](), dict[str, Any]()
+    viscous = coulomb = pitch = 0.0
+    for k, tag in enumerate(("axis", "axis2")):
+        own, element = f"{where}.{tag}", urdf_xml.single(part, tag, where)
+        if k < count:
+            stated = urdf_xml.single(element, "xyz", own)
+            local = urdf_xml.direction("0 0 1" if stated is None else stated.text, f"{own}.xyz")
+            frame = "" if stated is None else stated.get("expressed_in", "")
+            old = None if element is None else element.findtext("use_parent_model_frame")
+            if version == VERSIONS[0] or (old and urdf_xml.boolean(old, f"{own}.use_parent_model_frame")):
+                frame = frame or MODEL
+            axes.append((turn(frame) if frame else place.rotation) @ local)
+        dynamics = urdf_xml.single(element, "dynamics", own)
+        viscous = max(viscous, _number(dynamics, "damping", f"{own}.dynamics", 0.0, 0.0))
+        coulomb = max(coulomb, _number(dynamics, "friction", f"{own}.dynamics", 0.0, 0.0))
+        limit = urdf_xml.single(element, "limit", where)
         if limit is not None and tag == "axis" and kind in ("revolute", "prismatic", "helical"):
-            stated = {child.tag: (child.text or "").strip() for child in limit}
+            given = {child.tag: (child.text or "").strip() for child in limit}
             # -1 is no limit, and one end of a range may stand alone.
-            stated = {k: v for k, v in stated.items() if k in ("lower", "upper") or v[:1] != "-"}
-            stated = {"lower": "-inf", "upper": "inf", **stated}
-            turns = "revolute" if kind == "helical" else kind
-            limits = urdf_xml.limits(stated, where, turns)
-    pitch = _pitch(part, where) if kind == "helical" else 0.0
-    return Joint(
-        name,
-        kind,
-        *links,
-        (place, place),
-        np.reshape(axes, (-1, 3)),
-        limits=limits,
-        viscous=max(viscous),
-        coulomb=max(coulomb),
-        pitch=pitch,
-    )
-
-
-def _pitch(part: ET.Element, where: str) -> float:
-    """Of a screw, m a rad: ``thread_pitch`` is rad/m of a left-handed one, its successor m/turn."""
-    if part.find("screw_thread_pitch") is not None or part.find("thread_pitch") is None:
-        return _text(part, "screw_thread_pitch", where, 1.0) / TURN
-    pitch = _text(part, "thread_pitch", where, 1.0)
-    if pitch == 0.0:
-        raise ParameterError(f"{where}.thread_pitch", pitch, "rad/m, not zero")
-    return -1.0 / pitch
-
-
-def _axis(
-    element: ET.Element | None, where: str, place: Pose, turn: Callable[[str], Array], version: tuple[int, int]
-) -> Array:
-    """Read a unit vector, in the world."""
-    stated = None if element is None else urdf_xml.single(element, "xyz", where)
-    text = "0 0 1" if stated is None else stated.text
-    value = urdf_xml.vector(text, f"{where}.xyz", 3)
-    size = float(np.linalg.norm(value))
-    if not size > 1e-9:
-        raise ParameterError(f"{where}.xyz", value.tolist(), "a vector that is not zero")
-    frame = "" if stated is None else stated.get("expressed_in", "")
-    old = None if element is None else element.findtext("use_parent_model_frame")
-    if version <= OLDEST or (old and urdf_xml.boolean(old, f"{where}.use_parent_model_frame")):
-        frame = frame or MODEL
-    return np.asarray((turn(frame) if frame else place.rotation) @ value / size)
+            given = {k: v for k, v in given.items() if k in ("lower", "upper") or v[:1] != "-"}
+            given = {"lower": "-inf", "upper": "inf", **given}
+            limits = urdf_xml.limits(given, where, "revolute" if kind == "helical" else kind)
+    if kind == "helical" and part.find("screw_thread_pitch") is None and part.find("thread_pitch") is not None:
+        # ``thread_pitch`` is in rad/m, positive for a left-handed thread; its successor is in m per turn.
+        thread = _number(part, "thread_pitch", where, 1.0)
+        if thread == 0.0:
+            raise ParameterError(f"{where}.thread_pitch", thread, "rad/m, not zero")
+        pitch = -1.0 / thread
+    elif kind == "helical":
+        pitch = _number(part, "screw_thread_pitch", where, 1.0) / TURN
+    rows = np.reshape(axes, (-1, 3))
+    return Joint(name, kind, *links, (place, place), rows, 0.0, limits, viscous, coulomb, pitch=pitch)
 
 
 def welds(path: Path, top: ET.Element, model: str, places: Mapping[str, Pose], taken: set[str]) -> Iterator[Joint]:
@@ -470,15 +396,16 @@ def welds(path: Path, top: ET.Element, model: str, places: Mapping[str, Pose], t
     """
     for plugin in top.iter("plugin"):
         kind = (plugin.get("name") or "").rpartition("::")[2]
-        if kind not in WELDS:
+        tags = {"DetachableJoint": ("parent_link", "child_link"), "AttachLinks": ("parent", "child")}.get(kind)
+        if tags is None:
             continue
-        ends = [(plugin.findtext(tag) or "").strip() for tag in WELDS[kind]]
+        ends = [(plugin.findtext(tag) or "").strip() for tag in tags]
         other = (plugin.findtext("child_model") or model).strip()
         if other not in (model, MODEL):
             warn(path, f"{kind} plugin: {ends[1]!r} of model {other!r} is not part of this machine")
             continue
-        for tag, end in zip(WELDS[kind], ends, strict=True):
+        for tag, end in zip(tags, ends, strict=True):
             if end not in places:
                 raise UnknownNameError(f"plugin.{kind}.{tag}", end, places)
         name = urdf_xml.free_name("_".join(ends), taken)
-        yield _fixed(name, ends[0], ends[1], places[ends[1]])
+        yield Joint.fixed(name, ends[0], ends[1], places[ends[1]])

@@ -2,10 +2,10 @@
 """The spanning tree of a graph, and the coordinates of its joints.
 
 Actuated joints come first, then those of fewest freedoms, so that there are fewest unknowns; a body
-that only rods hold hangs free on the base. A driven turn or slide, and a passive slide, is one
-number; a passive turn is its cosine and sine, so nothing that iterates computes an angle;
-a spherical joint's body and a free one have a unit quaternion of their absolute orientation, with
-the angular velocity in base axes as its rate: no chart, and nothing of the parents' turning.
+that only rods hold is free on the base. A driven rotation or slide and a passive slide have one
+coordinate. A passive rotation has its cosine and sine, so that no iteration computes an angle. The
+body of a spherical joint and a free body have a unit quaternion of their absolute orientation, whose
+rate is the angular velocity in base axes: no chart has a singularity, and no parent's rotation enters.
 """
 
 from __future__ import annotations
@@ -28,19 +28,12 @@ from pkm_twin.machine.joints import Freedom, across, unit
 BALL: Final = (1.0, 0.0, 0.0, 0.0)
 FREE: Final = (*BALL, 0.0, 0.0, 0.0)
 """Unknowns at home of a ball, and of a body that hangs free: a quaternion, and a place."""
-CIRCLE: Final = (1.0, 0.0)
-"""Unknowns at home of a passive turn."""
 PARALLEL: Final = 1e-6
-"""Sine of an angle, or part of the machine's size, that counts as zero for a choice of axes."""
-
-
-def is_parallel(first: Array, second: Array) -> bool:
-    """Whether two unit vectors are, for a choice of axes."""
-    return reference(norm(plain(np.cross(first, second)))) <= PARALLEL
+"""Sine of an angle, or length relative to the machine's size, that counts as zero in a choice of axes."""
 
 
 def axes_with_z(z: Array, hint: Array) -> Array:
-    """Axes whose z is given and whose x points towards a hint, as columns."""
+    """Return axes, as columns, with the given z; x points towards the hint."""
     x = hint - (hint @ z) * z
     size = norm(x)
     x = x / size if reference(size) > PARALLEL else across(z)[0]
@@ -51,12 +44,13 @@ def axes_with_z(z: Array, hint: Array) -> Array:
 class Step:
     """One elementary freedom of a tree joint, or a ball, or a free body (``ball``, ``free``).
 
-    ``axis``: at home, base axes; ``turns`` about it, ``slide`` along it per unit. ``sign``: -1
-    where the tree goes from the outer body to the inner one. ``position``, ``rate``: first index
-    among the unknowns, or of an actuated joint among q. ``before``: constant rotation from the body
-    frame before the step to the step's own, of a turn. ``local``: the axis in the body frame before
-    the step. ``beyond``: whether the axis is fixed in the body beyond it. ``offset``: of a driven
-    turn, its angle from ``before`` to the body's frame at home, rad.
+    ``axis``: at home, base axes; ``turns``: rotates about it; ``slide``: along it per unit. ``sign``:
+    -1 if the tree goes from the outer body to the inner one. ``position``, ``rate``: first index among
+    the unknowns, or among q for an actuated joint. ``before``: constant rotation from the body frame
+    before the step to the step's own frame. ``local``: the axis in the body frame before the step.
+    ``beyond``: the axis is fixed in the body beyond it. ``offset``: angle of a driven rotation from
+    ``before`` to the body's frame at home, rad. ``circle``: a passive rotation, whose unknowns are its
+    cosine and sine, 1 and 0 at home, and which has one rate.
     """
 
     axis: Array
@@ -74,7 +68,6 @@ class Step:
     ball: bool = False
     free: bool = False
     circle: bool = False
-    """A passive turn: its cosine and sine are unknowns, from 1 and 0 at home; its rate is one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,9 +103,9 @@ class Tree:
     home: list[float] = field(default_factory=list)
     """The unknowns at home."""
     owners: list[str] = field(default_factory=list)
-    """By rate: the joint it belongs to, or the free body."""
+    """The joint or the free body of each rate."""
     scales: list[float] = field(default_factory=list)
-    """By rate: what makes it of unit one, 1 or 1 / m."""
+    """A factor of each rate that makes it dimensionless, 1 or 1/m."""
 
     def __post_init__(self) -> None:
         graph = self.graph
@@ -133,24 +126,24 @@ class Tree:
 
     @property
     def unknown_rates(self) -> int:
-        """How many rates are unknown."""
+        """Number of unknown rates."""
         return len(self.owners)
 
     @cached_property
     def drives(self) -> list[Step]:
-        """The step of every actuated joint, those that follow too."""
+        """The steps of all actuated joints, including those that follow."""
         return [self.steps[name] for name in self.graph.actuated]
 
     def of_drives(self, leads: Any, rest: Any) -> list[Any]:
-        """Rates or accelerations of all drives, of those that lead, shape (m,), and the unknown."""
+        """Return rates or accelerations of all drives from the leading ones, shape (m,), and the unknowns."""
         return [(leads if step.actuated else rest)[step.rate] for step in self.drives]
 
     def values_of_drives(self, leads: Any, x: Any) -> list[Any]:
-        """Positions of all drives of those that lead; turns within half a turn of home."""
+        """Return positions of all drives from the leading ones; rotations within half a turn of home."""
         return [leads[step.position] if step.actuated else self._value(step, x) for step in self.drives]
 
     def values_of_joints(self, names: Sequence[str], x: Any) -> list[Any]:
-        """Positions of passive joints of one freedom; turns within half a turn of home."""
+        """Return positions of passive joints of one freedom; rotations within half a turn of home."""
         return [self._value(self.steps[name], x) for name in names]
 
     def _value(self, step: Step, x: Any) -> Any:
@@ -160,7 +153,7 @@ class Tree:
 
     @cached_property
     def steps(self) -> dict[str, Step]:
-        """The step of every joint of the tree, of several freedoms the last one."""
+        """The step of each joint of the tree, the last one of a joint with several freedoms."""
         return {step.joint: step for link in self.links.values() for step in link.steps}
 
     def chain_to_base(self, body: str) -> list[str]:
@@ -241,7 +234,13 @@ class Tree:
             before, local, offset = np.eye(3), snapped_all(frame.T @ axis), 0.0
             if freedom.turns:
                 turns = turns[1:]
-                hint = turns[0] if turns else self._next_axis(body, name, axis)
+                hint = turns[0] if turns else None
+                if not turns:
+                    # With an axis of another joint of the body most constant rotations become simple.
+                    others = [j for j in graph.joints.values() if j.name != name and body in (j.inner, j.outer)]
+                    hint = next((j.axes[0] for j in others if len(j.axes)), None)
+                    if hint is not None and reference(norm(plain(np.cross(axis, hint)))) <= PARALLEL:
+                        hint = None
                 turned = axes_with_z(axis, frame[:, 0] if hint is None else hint)
                 if actuated and hint is None:
                     offset = self._tilt(body, turned, at)
@@ -250,7 +249,7 @@ class Tree:
             if actuated:
                 position = rate = graph.leads.index(str(name))
             else:
-                position, rate = self._claim(CIRCLE if circle else (0.0,), str(name), 1)
+                position, rate = self._claim((1.0, 0.0) if circle else (0.0,), str(name), 1)
                 self.scales.append(1.0 if freedom.turns else 1.0 / graph.size)
             steps.append(
                 Step(
@@ -274,16 +273,16 @@ class Tree:
         self.links[body] = Link(body, parent, name, tuple(steps), at, frame, arm)
 
     def _claim(self, start: Sequence[float], owner: str, rates: int) -> tuple[int, int]:
-        """Unknowns and rates of a step; their first indices."""
+        """Add the unknowns and rates of a step; return their first indices."""
         position, rate = len(self.home), len(self.owners)
         self.home += start
         self.owners += [owner] * rates
         return position, rate
 
     def _tilt(self, body: str, frame: Array, at: Array) -> Any:
-        """Angle about z by which axes x or y of a frame lie along the body's first lever, rad.
+        """Return the rotation about z, rad, that puts x or y of a frame along the body's first lever.
 
-        Told by the joint's angle, it leaves a lever one number and the frame before it simple.
+        As part of the joint's angle it reduces the lever to one number and keeps the frame before simple.
         """
         size = reference(self.graph.size)
         for point in self.graph.joint_points(body):
@@ -293,13 +292,3 @@ class Tree:
                 quarters = round(reference(angle) / (math.pi / 2))
                 return snapped(angle - quarters * (math.pi / 2))
         return 0.0
-
-    def _next_axis(self, body: str, name: str | None, axis: Array) -> Array | None:
-        """Axis of another joint of the body: with it most constant rotations become simple.
-
-        None where there is none, or the first is parallel to this one.
-        """
-        for joint in self.graph.joints.values():
-            if joint.name != name and body in (joint.inner, joint.outer) and len(joint.axes):
-                return None if is_parallel(axis, joint.axes[0]) else joint.axes[0]
-        return None

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Which joints of a URDF or an SDF are actuated, and what a controller calls them.
+"""Find the actuated joints of a file, and the names and numbers that a controller has for them.
 
 A joint for which the controller has a name or numbers of its own stands twice. The joint of the
 tree has the model's numbers. The drive has the controller's name and numbers: a joint with a link
@@ -24,19 +24,9 @@ from pkm_twin.machine.strict_yaml import read_yaml
 from pkm_twin.machine.urdf_xml import UNLIMITED
 
 MODEL: Final = "_model"
-"""Behind the name of a joint of the tree whose own name is the controller's of a drive."""
-DRIVE: Final = "_drive"
-"""Behind the name of a drive: its link."""
-BESIDE: Final = ("closed_loop", "type", "name_mot", "joint_name", "joint_type")
-"""What a YAML file beside a description can say."""
-DRIVEN: Final = re.compile(r"(ApplyJointForce|Joint(Position|Trajectory|Force)?Controller)$")
-"""Names of Gazebo's plugins that move the joints they name."""
-WHERE: Final = (
-    "a joint marked by a <command_interface> in <ros2_control>, a <transmission>, "
-    'independent="true", a Gazebo plugin that moves it, or name_mot in a YAML file next to it'
-)
-
-
+"""Suffix of a joint of the tree whose own name is the controller's name of a drive."""
+MARKS: Final = ("ros2_control", "transmission", "independent", "plugin")
+"""What marks actuated joints after a YAML file's name_mot: the first that names any counts."""
 CHOOSE: Final = "`actuated=[...]` or --actuated"
 """How a user names the actuated joints of a file that marks none."""
 UNCOUPLED: Final = "joints without coupling; a base and a platform (--base) can leave them out"
@@ -44,102 +34,85 @@ UNCOUPLED: Final = "joints without coupling; a base and a platform (--base) can 
 
 
 def read_beside(path: Path) -> dict[str, Any]:
-    """Read the YAML file of the same name, if it has closures or motors, else nothing."""
+    """Read the YAML file of the same name if it has closures or motors; else return nothing."""
+    keys = ("closed_loop", "type", "name_mot", "joint_name", "joint_type")
     for suffix in (".yaml", ".yml"):
         other = path.with_suffix(suffix)
         # An empty one is the target of a conversion that reads this very URDF.
         if not other.is_file() or other.stat().st_size == 0:
             continue
         data = read_yaml(other)
-        if not any(key in data for key in BESIDE):
+        if not any(key in data for key in keys):
             continue
-        for key in BESIDE:
+        for key in keys:
             if not isinstance(data.get(key, []), list):
                 raise ParameterError(f"{other}: {key}", data[key], "a list")
-        return {key: data[key] for key in BESIDE if data.get(key)}
+        return {key: data[key] for key in keys if data.get(key)}
     return {}
 
 
-def _commanded(top: ET.Element) -> list[str]:
-    return [
-        urdf_xml.name(joint, ())
-        for system in top.iter("ros2_control")
-        for joint in system.findall("joint")
-        if joint.find("command_interface") is not None
-    ]
+def marked_joints(top: ET.Element, mark: str) -> list[str]:
+    """List the joints that are actuated by one of :data:`MARKS`, in the order of the file."""
+    if mark == "plugin":
+        moving = re.compile(r"(ApplyJointForce|Joint(Position|Trajectory|Force)?Controller)$")
+        plugins = [plugin for plugin in top.iter("plugin") if moving.search(plugin.get("name") or "")]
+        names = [(joint.text or "").strip() for plugin in plugins for joint in plugin.findall("joint_name")]
+        return list(dict.fromkeys(names))
+    if mark == "independent":
+        joints = [
+            joint
+            for joint in top.findall("joint")
+            if urdf_xml.boolean(joint.get("independent", "false"), f"joint.{joint.get('name')}.independent")
+        ]
+    else:
+        joints = [joint for owner in top.iter(mark) for joint in owner.findall("joint")]
+    if mark == "ros2_control":
+        joints = [joint for joint in joints if joint.find("command_interface") is not None]
+    names = [urdf_xml.name(joint, ()) for joint in joints]
+    # A joint may have several transmissions.
+    return list(dict.fromkeys(names)) if mark == "transmission" else names
 
 
-def _transmitted(top: ET.Element) -> list[str]:
-    joints = [joint for one in top.iter("transmission") for joint in one.findall("joint")]
-    return list(dict.fromkeys(urdf_xml.name(joint, ()) for joint in joints))
+def find_marked(
+    top: ET.Element, beside: Mapping[str, Any], others: Sequence[str] | None = None
+) -> tuple[Sequence[str], str, str]:
+    """Find the actuated joints of a URDF or an SDF, what marks them, and all possible marks in words.
 
-
-def _independent(top: ET.Element) -> list[str]:
-    return [
-        urdf_xml.name(joint, ())
-        for joint in top.findall("joint")
-        if urdf_xml.boolean(joint.get("independent", "false"), f"joint.{joint.get('name')}.independent")
-    ]
-
-
-def _moved(top: ET.Element) -> list[str]:
-    joints = [
-        (joint.text or "").strip()
-        for plugin in top.iter("plugin")
-        if DRIVEN.search(plugin.get("name") or "")
-        for joint in plugin.findall("joint_name")
-    ]
-    return list(dict.fromkeys(joints))
-
-
-SOURCES: Final[Mapping[str, Callable[[ET.Element], list[str]]]] = {
-    "ros2_control": _commanded,
-    "transmission": _transmitted,
-    "independent": _independent,
-    "plugin": _moved,
-}
-"""What marks actuated joints after a YAML file's name_mot: the first that names any."""
+    :param beside: the YAML file's entries. ``others``: joints of an SDF that have an effort limit, which
+        are actuated if nothing is marked.
+    """
+    ways = (
+        "a joint marked by a <command_interface> in <ros2_control>, a <transmission>, "
+        'independent="true", a Gazebo plugin that moves it, or name_mot in a YAML file next to it'
+    )
+    ways += "" if others is None else "; or by an <effort> in its <limit>"
+    if names := [str(name) for name in beside.get("name_mot", [])]:
+        return names, "name_mot", ways
+    for mark in MARKS:
+        if names := marked_joints(top, mark):
+            return names, mark, ways
+    return others or (), "limit.effort", ways
 
 
 def actuated_joints(
     path: Path,
-    top: ET.Element,
-    beside: Mapping[str, Any],
     types: Mapping[str, str],
     faults: list[Fault],
-    *,
-    others: Sequence[str] | None = None,
-    chosen: Sequence[str] | None = None,
+    chosen: Sequence[str] | None,
+    find: Callable[[], tuple[Sequence[str], str, str]],
 ) -> tuple[tuple[str, ...], str]:
     """List the actuated joints in the order in which the file marks them, and what marks them.
 
-    :param beside: the YAML file's entries. ``types``: of all joints, by name.
-    :param faults: takes the error of a file that marks none.
-    :param others: joints of an SDF that have an effort limit: taken where nothing is marked.
+    :param types: of all joints, by name. ``faults``: takes the error of a file that marks none.
     :param chosen: the actuated joints, in place of those that the file marks.
+    :param find: returns the joints that the file marks, what marks them, and the possible marks in words.
     :raises ParameterError: a joint that cannot be actuated.
     """
-    if chosen is not None:
-        return require_single(chosen, types), "actuated"
-    names, source = [str(name) for name in beside.get("name_mot", [])], "name_mot"
-    for key, marked in SOURCES.items():
-        if not names:
-            names, source = marked(top), key
-    if not names:
-        names, source = list(others or ()), "limit.effort"
-    if not names:
-        way = WHERE if others is None else f"{WHERE}; or by an <effort> in its <limit>"
-        way += f"; or joints that {CHOOSE} names"
-        faults.append(((), ParameterError(str(path), "no joint is marked as actuated", way)))
+    names, source, ways = find() if chosen is None else (chosen, "actuated", "")
+    if chosen is None and not names:
+        bound = f"{ways}; or joints that {CHOOSE} names"
+        faults.append(((), ParameterError(str(path), "no joint is marked as actuated", bound)))
         return (), ""
-    return require_single(names, types, source), source
-
-
-def require_single(names: Sequence[str], types: Mapping[str, str], source: str = "actuated") -> tuple[str, ...]:
-    """Return names of joints that can be actuated: of one axis, each once.
-
-    :raises ParameterError: by the name.
-    """
     if len(set(names)) != len(names) or not names:
         raise ParameterError(source, list(names), "one joint or more, each once")
     for name in names:
@@ -147,7 +120,7 @@ def require_single(names: Sequence[str], types: Mapping[str, str], source: str =
             raise UnknownNameError(source, name, types)
         if types[name] not in ("revolute", "prismatic", "helical"):
             raise ParameterError(f"{source}.{name}", types[name], "a revolute or prismatic joint")
-    return tuple(names)
+    return tuple(names), source
 
 
 @dataclass(frozen=True)
@@ -161,7 +134,7 @@ class Control:
 
     @property
     def same(self) -> bool:
-        """Whether the controller has the model's name and numbers."""
+        """True if the controller has the same name and numbers as the model."""
         return self == Control(self.joint, self.joint, factor=1.0, offset=0.0)
 
     def value(self, key: str, model: float) -> float:
@@ -197,7 +170,7 @@ def take_drives(robot: ET.Element) -> dict[str, dict[str, Any]]:
     Other ``<mimic>`` elements stay.
     """
     joints = {joint.get("name", ""): joint for joint in robot.findall("joint")}
-    commanded = SOURCES["ros2_control"](robot)
+    commanded = marked_joints(robot, "ros2_control")
     parents = {_end(joint, "parent") for joint in joints.values()}
     links = {link.get("name", ""): link for link in robot.findall("link")}
     followers: dict[str, list[ET.Element]] = {}

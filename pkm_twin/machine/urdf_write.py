@@ -1,10 +1,10 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""A tree of links and joints as a URDF that every parser reads, byte for byte the same.
+"""Write a tree of links and joints as a URDF that every parser reads; the same tree gives the same bytes.
 
 The machine is drawn at home: every link's frame stands on its joint, parallel to the base there. A
-joint of several freedoms is one of one axis for each, with links without mass between. Loops that
-the tree cuts are ``<constraint>`` elements (urdfdom pull request 264), which parsers of trees pass
-over; ``cylindrical_joint``, ``translation_joint``, ``<dynamics>`` and ``angle`` (between a
+joint of several freedoms is written as joints of one axis, with links without mass between. Loops
+that the tree cuts are ``<constraint>`` elements (urdfdom pull request 264), which parsers of trees
+ignore; ``cylindrical_joint``, ``translation_joint``, ``<dynamics>`` and ``angle`` (between a
 universal joint's axes, rad, where it is not a right one) are additions to that proposal.
 """
 
@@ -22,7 +22,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine import rotations, urdf_xml
 from pkm_twin.machine.loop_tree import Joint, Link, LoopTree, Single, screws, singles
 from pkm_twin.machine.rotations import Pose
-from pkm_twin.machine.urdf_control import DRIVE, Control, tree_names
+from pkm_twin.machine.urdf_control import Control, tree_names
 from pkm_twin.machine.urdf_xml import UNLIMITED
 
 GROUND: Final = "base_link"
@@ -31,8 +31,6 @@ MOCK: Final = "mock_components/GenericSystem"
 """The hardware of ros2_control that needs none."""
 PLATFORM: Final = "platform"
 """The link that stands on the platform's reference point."""
-NAMED: Final = ("link", "joint", "constraint", "ros2_control")
-"""Elements whose name is of one machine; those of interfaces and parameters are not."""
 
 
 def write_urdf(tree: LoopTree, hardware: str = MOCK, prefix: str = "", controls: Iterable[Control] = ()) -> str:
@@ -66,14 +64,29 @@ def write_urdf(tree: LoopTree, hardware: str = MOCK, prefix: str = "", controls:
     for closure in tree.closures:
         _closure(robot, closure, places)
     for part in parts:
-        if part.name in drives and not drives[part.name].same:
-            _drive(robot, part, drives[part.name], places, elements[part.name])
+        if part.name not in drives or drives[part.name].same:
+            continue
+        # The controller's joint, with a link without mass; the tree's joint follows it.
+        control = drives[part.name]
+        name = urdf_xml.free_name(f"{control.name}_drive", {PLATFORM, *places})
+        places[name] = part.joint.at
+        limits = control.limits(part.joint.limits, part.kind)
+        joint = replace(part.joint, name=control.name, drawn=0.0, viscous=0.0, coulomb=0.0, limits=limits)
+        # A motor rotates; only a controller that counts the metres of a slide has a slide.
+        slides = part.kind == "prismatic" and abs(control.factor) == 1.0
+        kind = "prismatic" if slides else "revolute"
+        _joint(robot, Single(control.name, kind, part.axis, part.parent, name, joint), places)
+        ET.SubElement(robot, "link", name=name)
+        back = control.inverse()
+        _follow(elements[part.name], control.name, back.factor, back.offset)
     if hardware:
         _control(robot, tree, hardware, drives)
     if prefix:
+        # Names of interfaces and parameters are the same in all machines.
+        named = ("link", "joint", "constraint", "ros2_control")
         for element in robot.iter():
             for key in ("name", "link", "joint"):
-                if key in element.attrib and (key != "name" or element.tag in NAMED):
+                if key in element.attrib and (key != "name" or element.tag in named):
                     element.set(key, prefix + element.attrib[key])
     ET.indent(robot)
     return '<?xml version="1.0"?>\n' + ET.tostring(robot, encoding="unicode") + "\n"
@@ -101,7 +114,7 @@ def _inertial(link: ET.Element, body: Link, place: Array) -> None:
 
 
 def _shapes(link: ET.Element, tree: LoopTree, name: str) -> None:
-    """Bars to look at, which are also what must not collide."""
+    """Write bars, which are both the picture and the collision geometry."""
     round_ends: list[Array] = []
     for capsule in [one for one in tree.capsules if one.link == name]:
         place = tree.links[name].frame.position
@@ -127,8 +140,8 @@ def _shapes(link: ET.Element, tree: LoopTree, name: str) -> None:
 
 
 def rpy_along(direction: Array) -> str:
-    """Roll, pitch and yaw of axes whose z is a unit vector."""
-    # Snapped, so that an angle does not hang on the sign of what is nearly zero.
+    """Return roll, pitch and yaw, as text, of axes whose z is a unit vector."""
+    # Rounded, so that an angle does not depend on the sign of a rounding error.
     x, y, z = np.round(direction, 12) + 0.0
     return number_text([0.0, math.atan2(math.hypot(x, y), z), math.atan2(y, x)])
 
@@ -156,27 +169,6 @@ def _joint(robot: ET.Element, part: Single, places: Mapping[str, Array]) -> ET.E
     if part.whole:
         _dynamics(element, part.joint)
     return element
-
-
-def _drive(robot: ET.Element, part: Single, control: Control, places: dict[str, Array], follower: ET.Element) -> None:
-    """Write the joint of a controller, with a link without mass, and the joint that follows it."""
-    link = urdf_xml.free_name(control.name + DRIVE, {PLATFORM, *places})
-    places[link] = part.joint.at
-    # A motor that turns, or a slide where the controller counts the metres of one.
-    slides = part.kind == "prismatic" and abs(control.factor) == 1.0
-    joint = replace(
-        part.joint,
-        name=control.name,
-        drawn=0.0,
-        viscous=0.0,
-        coulomb=0.0,
-        limits=control.limits(part.joint.limits, part.kind),
-    )
-    kind = "prismatic" if slides else "revolute"
-    _joint(robot, Single(control.name, kind, part.axis, part.parent, link, joint), places)
-    ET.SubElement(robot, "link", name=link)
-    back = control.inverse()
-    _follow(follower, control.name, back.factor, back.offset)
 
 
 def _follow(follower: ET.Element, joint: str, factor: float, offset: float) -> None:
@@ -217,8 +209,10 @@ def _control(robot: ET.Element, tree: LoopTree, plugin: str, drives: Mapping[str
         for interface in ("position", "effort"):
             ET.SubElement(element, "command_interface", name=interface)
         position = ET.SubElement(element, "state_interface", name="position")
-        start = number_text([control.value("", _start(joint))])
-        ET.SubElement(position, "param", name="initial_value").text = start
+        # Mock hardware begins at home, or in the middle of limits that exclude home.
+        low, high = joint.limits.get("position", (-math.inf, math.inf))
+        start = joint.drawn if low <= joint.drawn <= high else float(low + high) / 2
+        ET.SubElement(position, "param", name="initial_value").text = number_text([control.value("", start)])
         for interface in ("velocity", "effort"):
             ET.SubElement(element, "state_interface", name=interface)
         for key, value in (("rotor_inertia", joint.rotor_inertia), ("friction_offset", joint.offset)):
@@ -227,16 +221,10 @@ def _control(robot: ET.Element, tree: LoopTree, plugin: str, drives: Mapping[str
                 ET.SubElement(element, "param", name=key).text = text
 
 
-def _start(joint: Joint) -> float:
-    """Where mock hardware begins: at home, or amid the limits where these leave home out."""
-    low, high = joint.limits.get("position", (-math.inf, math.inf))
-    return joint.drawn if low <= joint.drawn <= high else float(low + high) / 2
-
-
 def number_text(values: Iterable[float], least: float = 1e-13) -> str:
-    """Numbers to 14 digits, so that the last bits of another machine's arithmetic do not show.
+    """Write numbers with 14 digits, which are the same on every computer.
 
-    Vectors to 14 decimals too: a short component may be a difference of longer ones.
+    Vectors have 14 decimals at most: a short component may be a difference of longer ones.
     """
     row = [float(value) for value in values]
     if len(row) > 1:

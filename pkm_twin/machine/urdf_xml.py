@@ -24,11 +24,11 @@ MAX_FILE_SIZE: Final = 4 * 1024 * 1024
 MAX_DEPTH: Final = 64
 """Deepest nesting of elements that is read."""
 UNLIMITED: Final = {"revolute": 2.0 * math.pi - 1e-6, "prismatic": 10.0, "velocity": 1e6, "effort": 1e6}
-"""From here on a limit is none, as a URDF needs numbers: rad, m, per second, N m or N."""
+"""Limits of this size count as none, because a URDF needs numbers: rad, m, per second, N m or N."""
 
 
 def elements(path: Path) -> ET.Element:
-    """Parse the file's top element; no document types, thus no entities, no namespaces needed.
+    """Parse an XML file without a document type, thus without entities; return its top element.
 
     :raises ParameterError: not readable, too large, too deep, or not well-formed.
     """
@@ -77,7 +77,7 @@ def name(element: ET.Element, taken: Container[str]) -> str:
 
 
 def free_name(name: str, taken: set[str], more: str = "_") -> str:
-    """Choose a free name for a part that the file does not name, and mark it as taken."""
+    """Choose a free name for a part without a name in the file, and mark it as taken."""
     while name in taken:
         name += more
     taken.add(name)
@@ -85,28 +85,28 @@ def free_name(name: str, taken: set[str], more: str = "_") -> str:
 
 
 def only(element: ET.Element | None, where: str, tags: Collection[str]) -> None:
-    """No child element but these; a misspelt one would be taken for a missing one.
+    """Reject child elements with other tags: a misspelt element would be taken for a missing one.
 
-    :raises UnknownNameError: another child, with the closest of these.
+    :raises UnknownNameError: another child; the error names the closest valid tag.
     """
     for child in element if element is not None else ():
         if child.tag not in tags and ":" not in child.tag:
             raise UnknownNameError(where, child.tag, tags)
 
 
-def single(element: ET.Element, tag: str, where: str) -> ET.Element | None:
-    """Find the only child element of a tag, None where there is none.
+def single(element: ET.Element | None, tag: str, where: str) -> ET.Element | None:
+    """Find the only child element of a tag; None if there is none, or no element.
 
     :raises ParameterError: there are several, of which a parser may take any.
     """
-    found = element.findall(tag)
+    found = [] if element is None else element.findall(tag)
     if len(found) > 1:
         raise ParameterError(f"{where}.{tag}", f"{len(found)} <{tag}> elements", "at most one")
     return found[0] if found else None
 
 
 def known_link(where: str, name: str, links: Collection[str]) -> str:
-    """Find a link by its name, or by the name of a robot's part that it is written out for.
+    """Find a link by its name, or by the name of the part of a robot file that it was written for.
 
     :raises UnknownNameError: there is none.
     """
@@ -129,15 +129,20 @@ def reference(element: ET.Element | None, where: str, links: Collection[str]) ->
 def axis(element: ET.Element, tag: str, where: str) -> Array:
     """Read a unit vector; a missing one is x, as in every URDF."""
     stated = single(element, tag, where)
-    value = vector("1 0 0" if stated is None else stated.get("xyz"), f"{where}.{tag}", 3)
+    return direction("1 0 0" if stated is None else stated.get("xyz"), f"{where}.{tag}")
+
+
+def direction(text: str | None, where: str) -> Array:
+    """Parse a vector that is not zero, and scale it to length 1; shape (3,)."""
+    value = vector(text, where, 3)
     size = float(np.linalg.norm(value))
     if not size > 1e-9:
-        raise ParameterError(f"{where}.{tag}", value.tolist(), "a vector that is not zero")
+        raise ParameterError(where, value.tolist(), "a vector that is not zero")
     return value / size
 
 
 def origin(element: ET.Element | None, where: str) -> Pose:
-    """Read the frame of an ``<origin>`` or its like; without one the identity."""
+    """Read the frame of an ``<origin>`` or a similar element; the identity without one."""
     if element is None:
         return Pose()
     position = vector(element.get("xyz", "0 0 0"), f"{where}.xyz", 3)
@@ -157,41 +162,34 @@ def quaternion(values: Array, where: str) -> Array:
 
 
 def vector(text: str | None, where: str, size: int) -> Array:
-    """``size`` finite numbers, shape (size,)."""
+    """Parse ``size`` finite numbers, shape (size,)."""
     items = (text or "").split()
     if len(items) != size:
         raise ParameterError(where, text, f"{size} numbers")
     return np.array([number(item, where) for item in items])
 
 
-def positive(text: str | None, where: str) -> float:
-    """Parse a finite number that is not negative."""
-    value = number(text, where)
-    if value < 0.0:
-        raise ParameterError(where, value, "zero or more")
-    return value
-
-
-def number(text: str | None, where: str) -> float:
-    """Parse a finite number."""
+def number(text: str | None, where: str, low: float = -math.inf) -> float:
+    """Parse a finite number; ``low``: zero if it may not be negative."""
     try:
         value = decimal(text or "")
     except (TypeError, ValueError):
         raise ParameterError(where, text, "a number") from None
     if not math.isfinite(value) or abs(value) > MAX_SIZE:
         raise ParameterError(where, text, "a finite number")
+    if value < low:
+        raise ParameterError(where, value, "zero or more")
     return value
 
 
 def friction(element: ET.Element, where: str) -> tuple[float, float]:
-    """Viscous and dry friction of a joint or closure, zero where it states none."""
+    """Read the viscous and Coulomb friction of a joint or closure; zero if not stated."""
     for tag in ("dynamics", "joint_properties"):
         dynamics = single(element, tag, where)
         if dynamics is not None:
-            return (
-                positive(dynamics.get("damping", "0"), f"{where}.{tag}.damping"),
-                positive(dynamics.get("friction", "0"), f"{where}.{tag}.friction"),
-            )
+            keys = ("damping", "friction")
+            viscous, coulomb = (number(dynamics.get(key, "0"), f"{where}.{tag}.{key}", 0.0) for key in keys)
+            return viscous, coulomb
     return 0.0, 0.0
 
 
@@ -204,7 +202,7 @@ def boolean(text: str, where: str) -> bool:
 
 
 def limits(limit: Mapping[str, str], where: str, kind: str) -> dict[str, Any]:
-    """Read the stated limits; zero and no width mean none, and so does what is far off."""
+    """Read stated limits; zero, an empty range and :data:`UNLIMITED` sizes mean no limit."""
     found: dict[str, Any] = {}
     if kind in UNLIMITED and (limit.get("lower") or limit.get("upper")):
         low, high = (_bound(limit.get(end, "0"), f"{where}.limit.{end}") for end in ("lower", "upper"))

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""A USD file as links, joints and loop closures: the prims of UsdPhysics.
+"""Read a USD file as links, joints and loop closures: the prims of UsdPhysics.
 
 Rigid bodies are links. Joints that are excluded from the articulation, and those that a spanning
 tree leaves over, close loops. Actuated are joints with a drive that has a stiffness or a damping.
@@ -19,22 +19,14 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, install, warn
-from pkm_twin.machine.graph import spanning
-from pkm_twin.machine.loop_tree import Fault, Joint, Link, LoopTree, hung
+from pkm_twin.machine.loop_tree import WORLD, Fault, Joint, Link, LoopTree, hold_in_world, hung, span_tree
 from pkm_twin.machine.rotations import Pose, about, from_quaternion
-from pkm_twin.machine.sdf_file import WORLD, closing
-from pkm_twin.machine.urdf_control import CHOOSE, UNCOUPLED, require_single
-from pkm_twin.machine.urdf_xml import free_name
+from pkm_twin.machine.urdf_control import UNCOUPLED, actuated_joints
 
 SUFFIXES: Final = (".usd", ".usda", ".usdc")
 ALIKE: Final = 1e-3
 """Largest distance of a joint's frames on its two bodies, m or rad, that is rounding: USD's numbers
 have single precision, and exporters add up many."""
-SINGLE_PRECISION: Final = 6e-8
-"""Rounding error of a number of single precision, relative."""
-FREEDOMS: Final = ("transX", "transY", "transZ", "rotX", "rotY", "rotZ")
-MIMIC: Final = ("PhysxMimicJointAPI", "NewtonMimicAPI")
-"""Beginnings of the names of schemas that couple joints."""
 
 
 def read(path: Path, actuated: Sequence[str] | None = None) -> LoopTree:
@@ -98,30 +90,18 @@ class _Reader:
                 rubbing.append(joint.name)
             if self._drives(prim):
                 driven.append(joint.name)
-            if any(str(s).startswith(MIMIC) for s in prim.GetAppliedSchemas()):
+            if any(str(s).startswith(("PhysxMimicJointAPI", "NewtonMimicAPI")) for s in prim.GetAppliedSchemas()):
                 error = ParameterError(str(prim.GetPath()), "a mimic joint", UNCOUPLED)
                 self.faults.append(((joint.name,), error))
         if rubbing:
             warn(self.path, f"jointFriction of PhysX is ignored, of {', '.join(rubbing)}")
-        if not any(WORLD in (joint.inner, joint.outer) for joint in joints.values()):
-            held = self.names[self.bodies[0].GetPath()]
-            warn(self.path, f"no joint holds a body in the world: {held} is taken for the ground")
-            label, frame = free_name("world_fixed", {*joints}), self.links[held].frame
-            joints[label] = Joint(label, "fixed", WORLD, held, (frame, frame))
+        hold_in_world(self.path, joints, lambda: self.links[self.names[self.bodies[0].GetPath()]])
         types = {name: joint.kind for name, joint in joints.items()}
-        if chosen is None and not driven:
-            way = f"a drive with a stiffness or a damping, or joints that {CHOOSE} names"
-            self.faults.append(((), ParameterError(str(self.path), "no driven joint", way)))
-        motors = tuple(driven) if chosen is None else require_single(chosen, types)
-
-        def rank(joint: Joint) -> tuple[bool, bool, bool, int]:
-            passive = joint.name not in motors
-            return joint.name in excluded, joint.kind != "fixed", passive, joint.type.cost
-
-        pairs = {j.name: (j.inner, j.outer) for j in sorted(joints.values(), key=rank)}
-        tree = set(spanning(self.links, pairs))
-        placed = self._placed({name: joint for name, joint in joints.items() if name in tree})
-        closures = [self._closure(joint) for name, joint in joints.items() if name not in tree]
+        marked = driven, "a drive", "a drive with a stiffness or a damping"
+        motors, source = actuated_joints(self.path, types, self.faults, chosen, lambda: marked)
+        tree, left = span_tree(self.links, joints, motors, excluded)
+        placed = self._placed(tree)
+        closures = [self._closure(joint) for joint in left]
         size = max(1.0, *(float(np.abs(link.frame.position).max()) for link in self.links.values()))
         return LoopTree(
             self.path.stem,
@@ -131,8 +111,8 @@ class _Reader:
             tuple(closures),
             motors,
             self._gravity(),
-            rounding=SINGLE_PRECISION * size,
-            marked="a drive" if chosen is None else "actuated",
+            rounding=float(np.finfo(np.float32).eps) / 2.0 * size,
+            marked=source,
             faults=tuple(self.faults),
         )
 
@@ -236,7 +216,7 @@ class _Reader:
             return types[kind], str(self._value(prim, "physics:axis", "X"))
         free = [
             freedom
-            for freedom in FREEDOMS
+            for freedom in ("transX", "transY", "transZ", "rotX", "rotY", "rotZ")
             if self._value(prim, f"limit:{freedom}:physics:low", -math.inf)
             <= self._value(prim, f"limit:{freedom}:physics:high", math.inf)
         ]
@@ -286,9 +266,10 @@ class _Reader:
         """
         moves = {WORLD: Pose()}
         placed: dict[str, Joint] = {}
-        order = hung(WORLD, joints.values())
-        for joint, parent, child in order:
-            first, second = joint.frames if parent == joint.inner else joint.frames[::-1]
+        for joint, parent, child in hung(WORLD, joints.values()):
+            inwards = parent == joint.inner
+            first, second = joint.frames if inwards else joint.frames[::-1]
+            own = joint.axes[0 if inwards else 1] if len(joint.axes) else np.zeros(3)
             meant = moves[parent] @ first
             apart = first.inverse() @ second
             if joint.kind == "spherical":
@@ -296,39 +277,29 @@ class _Reader:
             elif joint.kind == "fixed":
                 apart = Pose()
             else:
-                along = first.rotation.T @ joint.axes[0 if parent == joint.inner else 1]
+                along = first.rotation.T @ own
                 value = _value_between(joint.kind, along, first, second)
-                turns = joint.kind == "revolute"
-                apart = Pose(about(along, value)) if turns else Pose(position=value * along)
+                apart = Pose(about(along, value)) if joint.kind == "revolute" else Pose(position=value * along)
             target = first @ apart
             miss = np.linalg.norm(target.position - second.position)
             turned = np.abs(target.rotation - second.rotation).max()
             if max(miss, turned) > ALIKE:
-                raise ParameterError(
-                    f"joint.{joint.name}",
-                    f"frames {miss:.3g} m and {turned:.3g} rad apart",
-                    f"frames on {parent} and {child} that meet",
-                )
+                found = f"frames {miss:.3g} m and {turned:.3g} rad apart"
+                raise ParameterError(f"joint.{joint.name}", found, f"frames on {parent} and {child} that meet")
             moves[child] = meant @ apart @ second.inverse()
-            axes = (
-                moves[parent].rotation @ joint.axes[0 if parent == joint.inner else 1]
-                if len(joint.axes)
-                else np.zeros((0, 3))
-            )
             at = Pose(meant.rotation, (meant @ apart).position if joint.kind == "prismatic" else meant.position)
-            placed[joint.name] = replace(joint, frames=(at, at), axes=np.reshape(axes, (-1, 3)))
-        for name in [name for name in self.links if name not in moves]:
-            raise ParameterError(f"link.{name}", None, "a joint that connects it")
+            axes = np.reshape([moves[parent].rotation @ own] if len(joint.axes) else [], (-1, 3))
+            placed[joint.name] = replace(joint, frames=(at, at), axes=axes)
         self.moves = moves
         self.links = {name: link.moved(moves[name]) for name, link in self.links.items()}
         return {name: placed[name] for name in joints}
 
     def _closure(self, joint: Joint) -> Joint:
-        """Return a joint that closes a loop, where the placed links have it."""
+        """Return a joint that closes a loop, on the placed links."""
         first, second = (self.moves[end] for end in (joint.inner, joint.outer))
         axes = [m.rotation @ a for m, a in zip((first, second), joint.axes, strict=False)]
         frames = first @ joint.frames[0], second @ joint.frames[1]
-        return closing(replace(joint, frames=frames, axes=np.reshape(axes, (-1, 3))))
+        return replace(joint, frames=frames, axes=np.reshape(axes, (-1, 3))).closing()
 
     def _gravity(self) -> list[float]:
         """Return the scene's gravity, by default 9.81 m/s2 downwards, as PhysX."""

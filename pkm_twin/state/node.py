@@ -106,10 +106,6 @@ class Transforms:
             self._moving.publish(self._message(transforms=[found]))
 
 
-LIFETIME = 1.0
-"""Time for which a load's effects are drawn after the last marker, s."""
-
-
 class MachineStateNode(TwinNode):
     """The node ``machine_state``, for rviz2, Foxglove, robot_state_publisher and plots."""
 
@@ -140,8 +136,7 @@ class MachineStateNode(TwinNode):
             )
         )
         self._scene = Scene(robot, self.declare_settings(Scales, fixed=True))
-        self._elastic = _is_elastic(robot)
-        _warm_up(robot, self._elastic)
+        self._elastic = _warm_up(robot)
         self._joints = self.create_guarded_publisher("~/joint_states")
         self._pose = self.create_guarded_publisher("~/pose")
         self._twist = self.create_guarded_publisher("~/twist")
@@ -259,7 +254,7 @@ class MachineStateNode(TwinNode):
         self._drawn = state.stamp
         shapes = self._scene.shapes(state, self._load(state))
         own = header(state.stamp, self.core.settings.base_frame)
-        self._markers.publish(markers(own, shapes, Duration(seconds=LIFETIME).to_msg()))
+        self._markers.publish(markers(own, shapes, Duration(seconds=1.0).to_msg()))
 
     def _load(self, state: State) -> Load | None:
         """Compute the effects of the wrench on the machine; None if the wrench is unknown."""
@@ -282,23 +277,19 @@ class MachineStateNode(TwinNode):
             return None
 
 
-def _is_elastic(robot: Robot) -> bool:
+def _warm_up(robot: Robot) -> bool:
+    """Compile, or load, all programs before the node's topics exist; return whether the robot is elastic."""
+    for kernel in (state_kernel(robot), moving_state_kernel(robot)):
+        kernel.warm_up()
+    home = robot.inverse(robot.home())
+    robot.placements(home)
     try:
         for kernel in kernels(robot):
             kernel.warm_up()
     except ParameterError:
         return False
+    member_deflections(robot, home, np.zeros(6))
     return True
-
-
-def _warm_up(robot: Robot, elastic: bool) -> None:
-    """Compile, or load, all programs before the node's topics exist."""
-    for kernel in (state_kernel(robot), moving_state_kernel(robot)):
-        kernel.warm_up()
-    home = robot.inverse(robot.home())
-    robot.placements(home)
-    if elastic:
-        member_deflections(robot, home, np.zeros(6))
 
 
 NODE = MachineStateNode

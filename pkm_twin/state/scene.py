@@ -21,21 +21,17 @@ from pkm_twin.state.state import State
 Kind = Literal["cylinder", "sphere", "arrow", "line", "text"]
 Colour = tuple[float, float, float, float]
 
-NEUTRAL_COLOUR: Final[Colour] = (0.55, 0.57, 0.60, 1.0)
-DEFLECTED_COLOUR: Final[Colour] = (0.84, 0.37, 0.0, 0.9)
-ELLIPSOID_COLOUR: Final[Colour] = (0.0, 0.45, 0.70, 0.25)
-FORCE_COLOUR: Final[Colour] = (0.80, 0.47, 0.65, 1.0)
-MOMENT_COLOUR: Final[Colour] = (0.94, 0.89, 0.26, 1.0)
-TEXT_COLOUR: Final[Colour] = (1.0, 1.0, 1.0, 1.0)
-COLD: Final = (0.0, 0.45, 0.70)
-WARM: Final = (0.94, 0.89, 0.26)
-HOT: Final = (0.84, 0.37, 0.0)
+COLOURS: Final[Mapping[str, Colour]] = {
+    "neutral": (0.55, 0.57, 0.60, 1.0),
+    "deflected": (0.84, 0.37, 0.0, 0.9),
+    "ellipsoid": (0.0, 0.45, 0.70, 0.25),
+    "force": (0.80, 0.47, 0.65, 1.0),
+    "moment": (0.94, 0.89, 0.26, 1.0),
+    "text": (1.0, 1.0, 1.0, 1.0),
+}
 """Colours that can be distinguished with every kind of colour vision (Okabe and Ito 2008)."""
-LINE_WIDTH: Final = 0.004
-ARROW_WIDTH: Final = 0.012
-JOINT_WIDTH: Final = 0.02
-LETTER_HEIGHT: Final = 0.06
-"""Widths and heights as fractions of the machine's size."""
+SIZES: Final = {"line": 0.004, "arrow": 0.012, "joint": 0.02, "letter": 0.06}
+"""Widths and the height of letters as fractions of the machine's size."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,9 +90,8 @@ class Shape:
 
 def heat(share: float) -> Colour:
     """Return the colour of a fraction from 0 to 1: blue, yellow, vermilion."""
-    part = min(1.0, max(0.0, share))
-    low, high, at = (COLD, WARM, 2.0 * part) if part < 0.5 else (WARM, HOT, 2.0 * part - 1.0)
-    r, g, b = (a + at * (z - a) for a, z in zip(low, high, strict=True))
+    scale = (COLOURS["ellipsoid"], COLOURS["moment"], COLOURS["deflected"])
+    r, g, b = (float(np.interp(2.0 * share, (0.0, 1.0, 2.0), values)) for values in list(zip(*scale, strict=True))[:3])
     return r, g, b, 1.0
 
 
@@ -108,7 +103,15 @@ class Scene:
         self.bars = robot_bars(robot)
         self._size = robot.graph.size
         bodies = {bar.element for bar in self.bars}
-        self.joints = {name: place for name, place in _joint_places(robot).items() if name not in bodies}
+        self.joints: dict[str, Place] = {}
+        """Position of each joint, by its name among the elastic elements."""
+        for joint in robot.graph.joints.values():
+            if joint.kind != "translation":
+                self.joints.setdefault(joint.label or joint.name, (joint.outer, joint.at))
+        for rod in robot.graph.rods.values():
+            for name, body, end in zip(rod.joint_names, (rod.inner, rod.outer), rod.ends, strict=True):
+                self.joints.setdefault(name, (body, end))
+        self.joints = {name: place for name, place in self.joints.items() if name not in bodies}
 
     def shapes(self, state: State, load: Load | None = None) -> list[Shape]:
         """Return the shapes of the machine in a state, and of the load's effects."""
@@ -141,29 +144,22 @@ class Scene:
         shapes = []
         for k, (bar, (start, end)) in enumerate(zip(self.bars, places, strict=True)):
             share = shares.get(bar.element)
-            colour = NEUTRAL_COLOUR if share is None else heat(share)
-            span = end - start
+            colour = COLOURS["neutral"] if share is None else heat(share)
+            span, width = end - start, 2.0 * bar.radius
             length = float(np.linalg.norm(span))
-            width = 2.0 * bar.radius
-            shapes.append(
-                Shape(
-                    "cylinder",
-                    "bars",
-                    k,
-                    colour,
-                    (width, width, length),
-                    (start + end) / 2.0,
-                    _rotate_z_to(span),
-                    text=bar.part,
-                    lasting=True,
-                )
-            )
+            quaternion = (0.0, 0.0, 0.0, 1.0)
+            if length > 0.0:
+                z = span / length
+                x = across(z)[0]
+                quaternion = _to_quaternion(np.column_stack((x, np.cross(z, x), z)))
+            size, middle = (width, width, length), (start + end) / 2.0
+            shapes.append(Shape("cylinder", "bars", k, colour, size, middle, quaternion, text=bar.part, lasting=True))
         return shapes
 
     def _joints(self, q: Array, shares: Mapping[str, float]) -> list[Shape]:
         """Draw the elastic joints as spheres."""
         names = [name for name in self.joints if name in shares]
-        width = JOINT_WIDTH * self._size
+        width = SIZES["joint"] * self._size
         points = self._points(q, [self.joints[name] for name in names])
         return [
             Shape("sphere", "joints", k, heat(shares[name]), (1.5 * width,) * 3, point, text=name)
@@ -172,7 +168,7 @@ class Scene:
 
     def _deflected(self, places: Array, state: State, load: Load) -> list[Shape]:
         """Draw deflected members and the displaced platform, both enlarged by the same factor."""
-        scale, width = self.scales.deflection, (LINE_WIDTH * self._size, 0.0, 0.0)
+        scale, width = self.scales.deflection, (SIZES["line"] * self._size, 0.0, 0.0)
         lines = [(name, x + scale * u) for name, (x, u) in load.members.items()]
         shift, turn = load.deflection[:3], load.deflection[3:]
         for bar, ends in zip(self.bars, places, strict=True):
@@ -180,7 +176,7 @@ class Scene:
                 moved = shift + np.cross(turn, ends - state.position)
                 lines.append((bar.part, ends + scale * moved))
         return [
-            Shape("line", "deflected", k, DEFLECTED_COLOUR, width, points=points, text=name)
+            Shape("line", "deflected", k, COLOURS["deflected"], width, points=points, text=name)
             for k, (name, points) in enumerate(lines)
         ]
 
@@ -192,15 +188,15 @@ class Scene:
         reach = 2.0 * values * self.scales.ellipsoid_force * self.scales.deflection
         x, y, z = reach.tolist()
         turned = _to_quaternion(axes)
-        return Shape("sphere", "compliance", 0, ELLIPSOID_COLOUR, (x, y, z), state.position, turned)
+        return Shape("sphere", "compliance", 0, COLOURS["ellipsoid"], (x, y, z), state.position, turned)
 
     def _arrows(self, state: State, load: Load) -> list[Shape]:
         """Draw force and moment as arrows from the reference point."""
-        shaft = ARROW_WIDTH * self._size
+        shaft = SIZES["arrow"] * self._size
         size = (shaft, 2.0 * shaft, 3.0 * shaft)
         parts = (
-            (load.wrench[:3], self.scales.force, FORCE_COLOUR),
-            (load.wrench[3:], self.scales.moment, MOMENT_COLOUR),
+            (load.wrench[:3], self.scales.force, COLOURS["force"]),
+            (load.wrench[3:], self.scales.moment, COLOURS["moment"]),
         )
         return [
             Shape(
@@ -211,31 +207,9 @@ class Scene:
         ]
 
     def _text(self, state: State, name: str) -> Shape:
-        height = LETTER_HEIGHT * self._size
+        height = SIZES["letter"] * self._size
         at = state.position + np.array([0.0, 0.0, 2.0 * height])
-        return Shape("text", "dominant", 0, TEXT_COLOUR, (0.0, 0.0, height), at, text=name)
-
-
-def _joint_places(robot: Robot) -> dict[str, Place]:
-    """Return the position of each joint, by the joint's name among the elastic elements."""
-    places: dict[str, Place] = {}
-    for joint in robot.graph.joints.values():
-        if joint.kind != "translation":
-            places.setdefault(joint.label or joint.name, (joint.outer, joint.at))
-    for rod in robot.graph.rods.values():
-        for name, body, end in zip(rod.joint_names, (rod.inner, rod.outer), rod.ends, strict=True):
-            places.setdefault(name, (body, end))
-    return places
-
-
-def _rotate_z_to(span: Array) -> tuple[float, float, float, float]:
-    """Return the quaternion of a rotation that turns the z axis along a vector."""
-    length = float(np.linalg.norm(span))
-    if not length > 0.0:
-        return 0.0, 0.0, 0.0, 1.0
-    z = span / length
-    x = across(z)[0]
-    return _to_quaternion(np.column_stack((x, np.cross(z, x), z)))
+        return Shape("text", "dominant", 0, COLOURS["text"], (0.0, 0.0, height), at, text=name)
 
 
 def _to_quaternion(rotation: Array) -> tuple[float, float, float, float]:

@@ -152,7 +152,7 @@ REFUSED = {
         CONNECT,
         '<motor name="a2" joint="m2"/><motor name="a1" joint="m1" gear="3"/>',
         "",
-        "no actuator",
+        "no joint is marked as actuated",
     ),
     "broken": (CONNECT, 'type="capsule"', 'type="capsul"', "MuJoCo compiles"),
 }
