@@ -101,9 +101,13 @@ def setting(default: Any, text: str, **more: Any) -> Any:
     return field(default=default, metadata={"setting": Setting(text, **more)})
 
 
-@cache
 def settings_of(kind: Any) -> Mapping[str, tuple[str, Any]]:
     """Return the field's name and its setting by parameter name."""
+    return _settings_of(kind)
+
+
+@cache
+def _settings_of(kind: Any) -> Mapping[str, tuple[str, Any]]:
     found = {f.name: f.metadata["setting"] for f in dataclasses.fields(kind) if f.metadata}
     return {row.name or name: (name, row) for name, row in found.items()}
 

@@ -19,6 +19,7 @@ from pkm_twin.codegen.arrays import Array, Mask, doubles, vectors
 from pkm_twin.codegen.code import NOT_FINITE
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.errors import SingularityError
+from pkm_twin.robot.rejection import reject_joints
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor.programs import DEFLECTION_PARTS, NO_PARAMETERS, Elastic
 
@@ -76,7 +77,7 @@ def platform_response(robot: Robot, q: ArrayLike, wrench: ArrayLike) -> Platform
     """
     names = robot.cached(Elastic).names
     checked = partial(_evaluate_checked, robot)
-    row = robot.bound(_response_kernel, otherwise=checked)(q, wrench)
+    row = robot.function(_response_kernel, otherwise=checked)(q, wrench)
     if row.ndim == 1 and not row[-1] > MIN_PIVOT_RATIO:
         row = checked(q, wrench)
     row.setflags(write=False)
@@ -132,7 +133,7 @@ def check(robot: Robot, q: ArrayLike, wrench: ArrayLike, measure: Array, status:
             place = np.broadcast_to(np.asarray(q, float), (*codes.shape, robot.joints_count))
             load = np.broadcast_to(np.asarray(wrench, float), (*codes.shape, 6))[index]
             if codes[index] != NOT_FINITE or not np.isfinite(place[index]).all():
-                robot.refuse_joints(status, q)
+                reject_joints(robot, status, q)
             if not math.isfinite(sum(x * x for x in load.tolist())):
                 where = f" at sample {index}" if index else ""
                 raise ValueError(f"wrench, or its energy,{where} is not finite, or leads to a result that is not")

@@ -22,7 +22,8 @@ from numpy.typing import ArrayLike
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, SingularityError
 from pkm_twin.machine.members import Section
-from pkm_twin.robot.robot import SINGULARITY_BOUND, Robot
+from pkm_twin.robot.rejection import SINGULARITY_BOUND
+from pkm_twin.robot.robot import Robot
 from stiffness_monitor.frame import PLANES, Frame, bending_shape, deformations, rigid_offset
 from stiffness_monitor.structure import RigidBody, StructuralModel, structural_model
 

@@ -180,7 +180,7 @@ class Places:
     def at(self, q: Array) -> tuple[Array, Array, Array]:
         """Return positions (P, 3), Jacobians (P, n, 3) and bar directions (P, 3), base axes."""
         n, count = self.robot.joints_count, len(self.robot.graph.bodies)
-        flat = self.robot.bound(_twist_kernel)(q)
+        flat = self.robot.function(_twist_kernel)(q)
         placed = np.concatenate([flat[: 12 * count], np.append(np.eye(3), np.zeros(3))]).reshape(count + 1, 12)
         rates = np.zeros((n, count + 1, 6))
         rates[:, :count] = flat[12 * count :].reshape(n, count, 6)

@@ -60,7 +60,7 @@ class Equations:
         :raises ValueError: a value that is not finite.
         """
         robot = self.robot
-        flat = robot.bound(motion_kernel, robot.inertial)(q, qd)
+        flat = robot.function(motion_kernel, robot.inertial)(q, qd)
         mass, bias, energies, twists, rows, drift = self._parts
         n, _ = self._shapes[0]
         kinetic, height = flat[energies].tolist()

@@ -24,7 +24,8 @@ from pkm_twin.kinematics.motion import BaseMotion, cross, reaction_directions
 from pkm_twin.kinematics.traced import Traced
 from pkm_twin.machine.graph import BASE, Graph, Joint, Rod
 from pkm_twin.machine.inertia import Layout
-from pkm_twin.robot.robot import SINGULARITY_BOUND, Robot
+from pkm_twin.robot.rejection import SINGULARITY_BOUND
+from pkm_twin.robot.robot import Robot
 
 
 @dataclass(frozen=True)

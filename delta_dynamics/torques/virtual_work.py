@@ -61,11 +61,8 @@ def inverse_dynamics(
     """
     load = _NO_WRENCH if wrench is None else wrench
     if base is not None:
-        return robot.bound(moving_torques, robot.inertial)(q, qd, qdd, load, base)
-    # Without a call where it is made: a stream's sample takes a microsecond or two.
-    call = robot.calls.get(torques) or robot.bound(torques, robot.inertial)
-    tau: Array = call(q, qd, qdd, load)
-    return tau
+        return robot.function(moving_torques, robot.inertial)(q, qd, qdd, load, base)
+    return robot.function(torques, robot.inertial)(q, qd, qdd, load)
 
 
 def torques(robot: Robot) -> Kernel:
@@ -92,7 +89,7 @@ def stream_torques(robot: Robot) -> Kernel:
 def mass_matrix(robot: Robot, q: ArrayLike) -> Array:
     """Compute the mass matrix on the actuated joints, payload included, shape (..., n, n)."""
     # A simulation asks for one sample, several thousand times a second.
-    return _square(robot, robot.bound(masses_kernel, robot.inertial)(q))
+    return _square(robot, robot.function(masses_kernel, robot.inertial)(q))
 
 
 def masses_kernel(robot: Robot) -> Kernel:
@@ -126,8 +123,7 @@ def forward_dynamics(
         efforts = vectors(tau, robot.joints_count, "efforts")
         return robot.evaluate(accelerations(robot), robot.inertial, q, qd, efforts, load)[0]
 
-    call = robot.bound(accelerations, robot.inertial, checked)
-    return call(q, qd, tau, load)
+    return robot.function(accelerations, robot.inertial, checked)(q, qd, tau, load)
 
 
 def accelerations(robot: Robot) -> Kernel:
@@ -528,7 +524,7 @@ def null_efforts(robot: Robot, q: ArrayLike) -> Array:
     if not robot.redundant:
         batch = vectors(robot.forward(q), len(robot.pose_names), "pose").shape[:-1]
         return np.zeros((*batch, 0, robot.joints_count))
-    flat = robot.bound(null_kernel)(q)
+    flat = robot.function(null_kernel)(q)
     return flat.reshape(*flat.shape[:-1], -1, robot.joints_count)
 
 

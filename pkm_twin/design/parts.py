@@ -45,7 +45,8 @@ from pkm_twin.machine.graph import BASE, Graph, Joint, Rod, rotation_about_z
 from pkm_twin.machine.joints import across, unit
 from pkm_twin.machine.places import full_keys, keys_of, path_of
 from pkm_twin.machine.rotations import rotation_about, rotation_vector
-from pkm_twin.robot.robot import SINGULARITY_BOUND, Robot
+from pkm_twin.robot.rejection import SINGULARITY_BOUND
+from pkm_twin.robot.robot import Robot
 
 MAX_OPEN_FRACTION: Final = 1e-6
 """Largest fraction of an error's rows that may stay open if the parts can be assembled."""

@@ -23,6 +23,7 @@ from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.motion import cross
 from pkm_twin.kinematics.traced import Traced
 from pkm_twin.machine.members import Beam
+from pkm_twin.robot.rejection import reject_joints
 from pkm_twin.robot.robot import Robot
 
 _TINY = 1e-300
@@ -84,7 +85,7 @@ def member_gaps(robot: Robot, q: ArrayLike, refuse: bool = True) -> Array:
     """Return the distances of all :func:`member_pairs`, shape (..., pairs), m."""
     (gaps,), status = _kernel(robot)(_radii(robot), q)
     if status is not None and refuse:
-        robot.refuse_joints(status, q)
+        reject_joints(robot, status, q)
     return gaps
 
 

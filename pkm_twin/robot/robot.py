@@ -3,19 +3,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Final, Protocol, TypeVar
+from typing import Any, Final, Protocol, TypeVar, TypeVarTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from pkm_twin.codegen.arrays import Array, Mask
-from pkm_twin.codegen.code import GOOD, NOT_FINITE, REFUSED
+from pkm_twin.codegen.code import GOOD, REFUSED
 from pkm_twin.codegen.kernels import Kernel
-from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
-from pkm_twin.kinematics.drives import TIME
+from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.engine import Engine, engine_of
 from pkm_twin.kinematics.passive import (
     passive_names,
@@ -28,22 +27,16 @@ from pkm_twin.machine import schema
 from pkm_twin.machine.graph import Graph
 from pkm_twin.machine.inertia import Layout
 from pkm_twin.robot.mechanism import Mechanism
+from pkm_twin.robot.rejection import reject_joints, reject_poses
 
 T = TypeVar("T")
-
-FAR: Final = 10.0
-"""Sizes of the machine from home beyond which a pose is taken for one in mm."""
-SINGULARITY_BOUND: Final = 1e-9
-"""Least singularity index (0 singular, 1 best) at which a Jacobian is inverted."""
-
-JOINT_STATE: Final = ("q", "qd", "qdd")
-"""Inputs of programs that are a joint state; others are named in errors."""
+Options = TypeVarTuple("Options")
 
 _NONE: Final = np.zeros(0)
 
 
 class ControlLoop(Protocol):
-    """Arrays that stay where they are, and a call that fills ``tau`` and returns a status."""
+    """Preallocated arrays, and a call that fills ``tau`` and returns a status."""
 
     q: Array
     qd: Array
@@ -52,15 +45,7 @@ class ControlLoop(Protocol):
     tau: Array
 
     def __call__(self) -> int:
-        """0 all samples are good, 1 one has no assembly, 2 one is not finite."""
-
-
-def _forward(robot: Robot) -> Kernel:
-    return robot.engine.forward
-
-
-def _quick_inverse(robot: Robot) -> Kernel:
-    return robot.engine.quick_inverse
+        """Return 0 if all samples are good, 1 if one has no assembly, 2 if one is not finite."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -83,55 +68,47 @@ class Robot(Mechanism):
         return self._engine_on(self.with_laws(self.graph)) if self.laws else self.engine
 
     @cached_property
-    def calls(self) -> dict[Callable[[Any], Kernel], Callable[..., Array]]:
-        """What :meth:`bound` made, by the function that gives the program of a robot."""
+    def _cached(self) -> dict[object, Any]:
         return {}
 
-    @cached_property
-    def _cached(self) -> dict[tuple[object, ...], Any]:
-        return {}
-
-    def cached(self, make: Callable[..., T], *options: Hashable) -> T:
-        """Return what a function makes of this robot and other arguments, made once."""
+    def cached(self, make: Callable[[Any, *Options], T], *options: *Options) -> T:
+        """Return ``make(robot, *options)``, computed once per robot and options."""
         found: T | None = self._cached.get((make, *options))
         if found is None:
             found = self._cached[make, *options] = make(self, *options)
         return found
 
-    def bound(
+    def function(
         self,
-        kernel: Callable[[Any], Kernel],
+        program: Callable[[Any], Kernel],
         p: Array = _NONE,
         otherwise: Callable[..., Array] | None = None,
     ) -> Callable[..., Array]:
-        """Return a robot's program as a function of its inputs to its first output, made once.
+        """Return a program of the robot as a function from its inputs to its first output, made once.
 
-        One sample takes the fastest way, any other input that of :meth:`evaluate`.
+        One good sample takes the fastest path, all other inputs that of :meth:`evaluate`.
 
-        :param kernel: gives the program of a robot.
-        :param p: the program's parameters. ``otherwise``: in place of :meth:`evaluate`.
+        :param program: returns the compiled program of a robot.
+        :param p: the program's parameters. ``otherwise``: replaces :meth:`evaluate`.
         """
-        call = self.calls.get(kernel)
+        call: Callable[..., Array] | None = self._cached.get(program)
         if call is None:
-            made = kernel(self)
-
-            def whole(*inputs: ArrayLike) -> Array:
-                return self.evaluate(made, p, *inputs)[0]
-
-            call = self.calls[kernel] = made.bound(p, otherwise or whole)
+            kernel = program(self)
+            call = kernel.bound(p, otherwise or (lambda *inputs: self.evaluate(kernel, p, *inputs)[0]))
+            self._cached[program] = call
         return call
 
     def evaluate(self, kernel: Kernel, p: Array, q: ArrayLike, *inputs: ArrayLike) -> list[Array]:
         """Evaluate a program of joint positions and other inputs.
 
-        :raises UnreachableError: a joint state without an assembly, by limb, sample and miss.
+        :raises UnreachableError: a joint state without an assembly; limb, sample and gap are named.
         :raises SingularityError: a singularity on the way from home.
         :raises ValueError: a wrong last axis, or a value that is not finite.
         """
         outputs, status = kernel(p, q, *inputs)
         if status is not None:
             names = list(kernel.program.inputs)[1:]
-            self.refuse_joints(status, q, dict(zip(names, inputs, strict=True)))
+            reject_joints(self, status, q, dict(zip(names, inputs, strict=True)))
         return outputs
 
     @cached_property
@@ -173,12 +150,12 @@ class Robot(Mechanism):
         :raises UnreachableError: naming limb, sample and miss.
         :raises SingularityError: a pose beyond a singularity, or in one.
         """
-        return self.bound(_quick_inverse, otherwise=self._checked_inverse)(pose)
+        return self.function(_quick_inverse, otherwise=self._checked_inverse)(pose)
 
     def _checked_inverse(self, pose: ArrayLike) -> Array:
         q, status = self._invert(pose)
         if status is not None:
-            self._refuse_pose(status, pose)
+            reject_poses(self, status, pose)
         return q
 
     def _invert(self, pose: ArrayLike) -> tuple[Array, Array | None]:
@@ -198,55 +175,13 @@ class Robot(Mechanism):
         good = np.ones(q.shape[:-1], bool) if status is None else status[..., 0] == GOOD
         return q, np.asarray(good)
 
-    def _refuse_pose(self, status: Array, pose: ArrayLike) -> None:
-        index = _first(status[..., 0])
-        if index is None:
-            return
-        code, reached = status[index].tolist()
-        place = np.asarray(pose, float)
-        one = np.broadcast_to(place, (*status.shape[:-1], place.shape[-1]))[index]
-        if code == NOT_FINITE or not np.isfinite(one).all():
-            raise _not_finite("pose", index)
-        part, miss, met = self.engine.shortest_pose(one)
-        slip = self._slip(one)
-        if not met:
-            reached = self._reached_fraction(one)
-            raise UnreachableError("pose", self.name_limb(part), index, miss, reached, slip)
-        if reached < 1.0:
-            raise SingularityError("pose", index, 0.0, SINGULARITY_BOUND, reached, question=slip)
-        raise SingularityError("pose", index, 0.0, SINGULARITY_BOUND, None, True, slip)
-
-    def _reached_fraction(self, pose: Array) -> float:
-        """Return how much of the straight line from home to a rejected pose is reached."""
-        home, low, high = self.home(), 0.0, 1.0
-        for _ in range(3):
-            way = np.linspace(low, high, 65)
-            good = self.try_inverse(home + way[:, None] * (pose - home))[1]
-            first = int(np.argmin(good)) or 1
-            low, high = way[first - 1], way[first]
-        return float(low)
-
-    def _slip(self, pose: Array) -> str:
-        """Return which coordinate of a pose (m,) is far beyond, with a question about its unit."""
-        far = np.abs(pose - self.home())
-        for unit, most, other in (("m", FAR * self.graph.size, "mm"), ("rad", 2.0 * np.pi, "deg")):
-            own = np.where([one == unit for one in self.pose_units], far, 0.0)
-            k = int(own.argmax())
-            if own[k] > most:
-                name, word = self.pose_names[k], {"mm": "mm", "deg": "degrees"}[other]
-                return (
-                    f": {name} {pose[k]:.6g} {unit} cannot be reached. Did you give {word}? A "
-                    f"table's header is then `{name} [{other}]`"
-                )
-        return ""
-
     def forward(self, q: ArrayLike) -> Array:
         """Pose of joint positions q, shape (..., m), in the mechanism's documented assembly.
 
         :raises UnreachableError: naming limb, sample and miss.
         :raises SingularityError: a singularity on the way from home.
         """
-        return self.bound(_forward)(q)
+        return self.function(_forward)(q)
 
     def try_forward(self, q: ArrayLike) -> tuple[Array, Mask]:
         """Poses (..., m), NaN where there is no assembly; and which q are valid, (...)."""
@@ -395,7 +330,7 @@ class Robot(Mechanism):
         edge of the workspace); see ``kinematics.singularity``. It is dimensionless and independent
         of the machine's scale. Errors as :meth:`forward`.
         """
-        return np.asarray(self.bound(Robot.singularity_kernel)(q)[..., 0])
+        return np.asarray(self.function(Robot.singularity_kernel)(q)[..., 0])
 
     def singularity_kernel(self) -> Kernel:
         """Compile the program from q to the singularity index (1)."""
@@ -437,94 +372,13 @@ class Robot(Mechanism):
         kernel = self.engine.kernel("passive rates", passive_rates_program)
         return self.evaluate(kernel, _NONE, q, qd)[0]
 
-    def refuse_joints(self, status: Array, q: ArrayLike, inputs: Mapping[str, ArrayLike] | None = None) -> None:
-        """Raise the typed error of the first rejected sample, if there is one.
 
-        :param status: of a kernel, shape (..., 2).
-        :param inputs: everything else that the kernel was given, by name.
-        """
-        index = _first(status[..., 0])
-        if index is None:
-            return
-        batch = status.shape[:-1]
-        given: dict[str, Array] = {}
-        for name, value in {"q": q, **(inputs or {})}.items():
-            array = np.asarray(value, float)
-            given[name] = np.broadcast_to(array, (*batch, array.shape[-1]))[index]
-            if not np.isfinite(given[name]).all():
-                if name in JOINT_STATE:
-                    raise _not_finite("joint state", index)
-                field = f"{name}{_at_sample(index)}"
-                raise ParameterError(field, given[name].tolist(), "finite numbers")
-        code, reached = status[index].tolist()
-        if code == NOT_FINITE:
-            raise _not_finite("joint state", index)
-        sample = given["q"]
-        if self.redundant:
-            self._refuse_contradiction(given, index)
-            sample = sample[self.graph.leading]
-        start = self.engine.start
-        short = start.find_miss(self.engine.tree, sample) if start is not None else None
-        if short is not None:
-            raise UnreachableError("joint state", self.name_limb(short[0]), index, short[1])
-        drive, change = self._find_correction(sample)
-        if change < np.inf and self.graph.joints[drive].slides:
-            raise UnreachableError("joint state", self.name_limb(drive), index, change)
-        part, miss, measure = self.engine.ending(sample, reached)
-        if measure is not None:
-            question = ""
-            if self.redundant:
-                leads = ", ".join(self.graph.leads)
-                question = f"; it is one of {leads} alone, others may lead (redundancy.leads)"
-            raise SingularityError("joint state", index, measure, SINGULARITY_BOUND, reached, question=question)
-        limb = self.name_limb(drive if change < np.inf else part)
-        raise UnreachableError("joint state", limb, index, miss, reached)
+def _forward(robot: Robot) -> Kernel:
+    return robot.engine.forward
 
-    def _find_correction(self, q: Array) -> tuple[str, float]:
-        """Return the drive that alone comes back by the least, and by how much.
 
-        It is infinite if there is none, or if the limbs have no names.
-        """
-        if self.limb_names == self.joint_names:
-            return "", np.inf
-        size = self.joints_count
-        span = 2.0 * float(np.abs(q - self.graph.home).max())
-        low, high = np.zeros(2 * size), np.full(2 * size, span)
-        ways = np.concatenate([np.eye(size), -np.eye(size)])
-        for _ in range(4):
-            changes = low + np.linspace(0.0, 1.0, 129)[:, None] * (high - low)
-            good = self.try_forward(q + changes[..., None] * ways)[1]
-            first, found = np.maximum(good.argmax(0), 1)[None], np.asarray(good.any(0))
-            high = np.where(found, np.take_along_axis(changes, first, 0)[0], span)
-            low = np.where(found, np.take_along_axis(changes, first - 1, 0)[0], span)
-        best = int(np.argmin(high))
-        return self.joint_names[best % size], float(high[best]) if found[best] else np.inf
-
-    def _refuse_contradiction(self, given: Mapping[str, Array], index: tuple[int, ...]) -> None:
-        """Raise the error of drives that do not follow those that lead: q, or else qd, or qdd."""
-        graph, leads = self.graph, ", ".join(self.graph.leads)
-        still = np.zeros(self.joints_count)
-        state = [given.get(name, still) for name in ("q", "qd", "qdd")]
-        scales = self.joint_scales
-        ways = (
-            ("is", "where {} put it", ""),
-            ("has a velocity of {:.4g} {}, ", "what {} make it", "/s"),
-            ("has an acceleration of {:.4g} {}, ", "what {} make it", "/s2"),
-        )
-        found = self.projection_kernel(_NONE, *state)[0]
-        for k, (own, follows, (has, whence, per)) in enumerate(zip(state, found, ways, strict=True)):
-            apart = np.abs(own - follows)
-            worst = int(np.argmax(apart / scales))
-            bound = float(graph.sharing[0] * scales[worst]) / TIME**k
-            if not apart[worst] > bound:
-                continue
-            unit = self.joint_units[worst] + per
-            how = f"{has.format(own[worst], unit).strip()} {apart[worst]:.3g} {unit} from "
-            how += f"{whence.format(leads)}, allowed {bound:.3g} (redundancy.tolerance)"
-            if k == 0:
-                how += "; or these alone are past a singularity, where others may lead "
-                how += "(redundancy.leads)"
-            raise UnreachableError("joint state", self.joint_names[worst], index, 0.0, how=how)
+def _quick_inverse(robot: Robot) -> Kernel:
+    return robot.engine.quick_inverse
 
 
 def _tried(kernel: Kernel, given: ArrayLike) -> tuple[Array, Mask]:
@@ -532,20 +386,3 @@ def _tried(kernel: Kernel, given: ArrayLike) -> tuple[Array, Mask]:
     (result, *_), status = kernel(_NONE, given)
     good = np.ones(result.shape[:-1], bool) if status is None else status[..., 0] == 0.0
     return result, np.asarray(good)
-
-
-def _first(codes: Array) -> tuple[int, ...] | None:
-    """Index of the first sample whose code is not zero."""
-    if codes.ndim == 0:
-        return () if codes != 0.0 else None
-    bad = codes != 0.0
-    return tuple(int(i) for i in np.argwhere(bad)[0]) if bad.any() else None
-
-
-def _not_finite(what: str, index: tuple[int, ...]) -> ValueError:
-    text = f"{what}{_at_sample(index)} is not finite, or leads to a result that is not"
-    return ValueError(text)
-
-
-def _at_sample(index: tuple[int, ...]) -> str:
-    return f" at sample {index}" if index else ""

@@ -49,7 +49,7 @@ class Continuity:
         n, m = len(robot.joint_names), len(self._scales)
         self._state_size = n + m + m * m
         self._nothing = np.zeros(self._state_size + m + 1)
-        self._call = robot.bound(_stream, self._scales)
+        self._call = robot.function(_stream, self._scales)
         self.reset()
 
     def reset(self) -> None:
