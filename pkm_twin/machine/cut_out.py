@@ -122,14 +122,3 @@ def cut_out(tree: LoopTree, base: str, platform: str, *, carry: bool = False) ->
     actuated = tuple(name for name in tree.actuated if name in circles)
     made = replace(tree, root=base, links=links, joints=spanned, closures=closures, actuated=actuated)
     return CutOut(made, tuple(notes), tuple(carried))
-
-
-def check_faults(tree: LoopTree) -> None:
-    """Reject joints that follow others, if one of both belongs to the machine, and a lack of motors.
-
-    :raises ParameterError: as the reader of the file found.
-    """
-    own = {*tree.joints, *(joint.name for joint in tree.closures)}
-    for names, error in tree.faults:
-        if own.intersection(names) or not (names or tree.actuated):
-            raise error

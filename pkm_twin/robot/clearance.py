@@ -1,10 +1,10 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""How far members of different limbs stay apart.
+"""Compute the distances between members of different limbs.
 
-A member is a straight round bar, taken as a capsule: all points within its radius of the segment
-between its two joints. Members of one limb share joints, so they are not compared. Nor is anything
-whose shape no parameter tells: platform and base (rings of joints, no bodies), sliders and their
-guides, joints' housings, the crosspieces that carry a parallelogram's two rods.
+A member is a straight round bar, modelled as a capsule: all points within its radius of the segment
+between its two joints. Members of one limb share joints, so they are not compared. Parts without shape
+in the file are left out: platform and base, sliders and their guides, housings of joints, and the
+crosspieces of parallelograms.
 """
 
 from __future__ import annotations
@@ -26,23 +26,20 @@ from pkm_twin.machine.members import Beam
 from pkm_twin.robot.rejection import reject_joints
 from pkm_twin.robot.robot import Robot
 
-_TINY = 1e-300
-
 
 def distance(start: Any, span: Any, other: Any, other_span: Any) -> Any:
-    """Distance (m) of two segments, each from a point along a vector; either may be a point.
+    """Return the distance (m) of two segments, each from a point along a vector; either may be a point.
 
     The lines' nearest points, clamped to the first segment, then to the second, then to the
-    first again (Ericson, Real-Time Collision Detection, 5.1.9); on parallel lines any first guess
-    will do. The lines' common normal comes from a cross product, which stays accurate for
-    directions that are nearly parallel.
+    first again (Ericson, Real-Time Collision Detection, 5.1.9); parallel lines allow any first guess.
+    A cross product gives the lines' common normal accurately for directions that are nearly parallel.
     """
-    w = other - start
+    w, tiny = other - start, 1e-300
     uu, vv = span @ span, other_span @ other_span
     n = cross(span, other_span)
-    s = _clamped((cross(w, other_span) @ n) / maximum(n @ n, _TINY))
-    t = _clamped(((s * span - w) @ other_span) / maximum(vv, _TINY))
-    s = _clamped(((t * other_span + w) @ span) / maximum(uu, _TINY))
+    s = _clamped((cross(w, other_span) @ n) / maximum(n @ n, tiny))
+    t = _clamped(((s * span - w) @ other_span) / maximum(vv, tiny))
+    s = _clamped(((t * other_span + w) @ span) / maximum(uu, tiny))
     gap = w + t * other_span - s * span
     return sqrt(gap @ gap)
 
@@ -69,7 +66,7 @@ def clearance(robot: Robot, pose: ArrayLike) -> Array:
 
 
 def has_clearance(robot: Robot) -> bool:
-    """Whether :func:`clearance` is known: the robot's file tells the members' diameters."""
+    """Return whether the robot's file states the members' diameters, so that :func:`clearance` is known."""
     return len({beam.limb for beam in robot.beams}) > 1
 
 

@@ -32,14 +32,14 @@ class Derivatives:
 
 
 def joint_rates(robot: Robot, q: Array, rate: Array, change: Array) -> tuple[Array, Array]:
-    """First and second derivatives of joints (k, n) by those of the pose, shape (k, m) each."""
+    """Return first and second derivatives of joints (k, n) from those of the pose, shape (k, m) each."""
     back = robot.inverse_jacobian(q)
     first = (back @ rate[..., None])[..., 0]
     return first, joint_changes(robot, q, first, back, change)
 
 
 def joint_changes(robot: Robot, q: Array, qd: Array, back: Array, change: Array | float = 0.0) -> Array:
-    """Second derivatives of joints (k, n) by those of the pose, at joint rates (k, n).
+    """Return second derivatives of joints (k, n) from those of the pose, at joint rates (k, n).
 
     :param back: of :meth:`Robot.inverse_jacobian`, shape (k, n, m).
     """
@@ -49,10 +49,10 @@ def joint_changes(robot: Robot, q: Array, qd: Array, back: Array, change: Array 
 
 
 def nearest_motion(robot: Robot, q: Array, qd: Array, qdd: Array) -> tuple[Array, Array]:
-    """Rates and accelerations that all drives can have at q, nearest to these, shape (..., n) each.
+    """Return the possible rates and accelerations of all drives at q nearest to these, (..., n) each.
 
-    By least squares over all of them, slides over the machine's size: noise by which drives that
-    share contradict each other is evened out. The same where there are no more than freedoms.
+    Least squares, with slides relative to the machine's size, average out the noise by which redundant
+    drives contradict each other. Without redundancy nothing changes.
     """
     if not robot.redundant:
         return qd, qdd
@@ -95,17 +95,17 @@ def inverse_derivatives(robot: Robot, pose: ArrayLike, by: Sequence[str] = ()) -
 
 
 def platform_derivatives(robot: Robot, q: ArrayLike, by: Sequence[str] = ()) -> Derivatives:
-    """Twists of the platform: ``state`` per joint rate (..., 6, n), ``by[path]`` (..., 6).
+    """Return twists of the platform: ``state`` per joint rate (..., 6, n), ``by[path]`` (..., 6).
 
-    Translation of the reference point and rotation vector, base axes, by a change of one; arguments
-    and errors as of :func:`forward_derivatives`.
+    Translation of the reference point and rotation vector, base axes, per unit change. Arguments and
+    errors as in :func:`forward_derivatives`.
     """
     rows = twist_rows(len(robot.pose_names), robot.platform(q)[1])
     return Derivatives(robot.platform_jacobian(q), _by_numbers(robot, q, rows, by))
 
 
 def twist_rows(m: int, rotation: Array) -> Array:
-    """Weights over pose, position and rotation that give a twist's six parts.
+    """Return the weights of pose, position and rotation that give the six components of a twist.
 
     :param rotation: of the platform now, shape (..., 3, 3).
     :returns: shape (..., 6, m + 12).
@@ -113,7 +113,7 @@ def twist_rows(m: int, rotation: Array) -> Array:
     rows = np.zeros((*rotation.shape[:-2], 6, m + 12))
     rows[..., :3, m : m + 3] = np.eye(3)
     turns = np.zeros((*rotation.shape[:-2], 3, 3, 3))
-    # Of R' R^T, which is skew, the entry of each axis.
+    # The entry of each axis in R' R^T, which is skew.
     for axis, (i, j) in enumerate(((2, 1), (0, 2), (1, 0))):
         turns[..., axis, i, :] = rotation[..., j, :]
     rows[..., 3:, m + 3 :] = turns.reshape(*rotation.shape[:-2], 3, 9)
@@ -130,7 +130,7 @@ def _by_numbers(robot: Robot, q: ArrayLike, rows: Array, by: Sequence[str]) -> d
 
 
 def pose_by_geometry(robot: Robot, q: ArrayLike) -> Array:
-    """Of the pose by the engine's geometry, joints held, shape (..., m, k)."""
+    """Differentiate the pose by the engine's geometry, joints held, shape (..., m, k)."""
     return _by_geometry(robot, q, np.eye(len(robot.pose_names), len(robot.pose_names) + 12))
 
 
@@ -150,5 +150,5 @@ def _by_geometry(robot: Robot, q: ArrayLike, rows: Array) -> Array:
 
 
 def geometry_numbers(robot: Robot) -> list[Any]:
-    """Return the geometry as ``Engine.geometry`` has it, of numbers or expressions."""
+    """Return the numbers or expressions of ``Engine.geometry``."""
     return list(geometry_of(robot.graph))

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""One rule for joint states outside the limits, as the nodes have it: refused, or marked."""
+"""Find joint states outside the limits by one rule, which nodes and commands share."""
 
 from __future__ import annotations
 
@@ -16,15 +16,14 @@ from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import passive_values
 
 ROUNDING: Final = 1e-9
-"""A position this far beyond its limit, of unit one, is on it."""
-OPTION = "--beyond-limits"
+"""Relative rounding error within which a position is on its limit."""
 
 
 @dataclass(frozen=True)
 class Beyond:
-    """A joint's position, velocity or effort outside its range: the farthest of a motion.
+    """The position, velocity or effort of a joint that is farthest outside its range in a motion.
 
-    ``index`` is its sample, None of a single joint state.
+    ``index``: its sample; None for a single joint state.
     """
 
     joint: str
@@ -43,7 +42,7 @@ class Beyond:
 
 
 def ranges(robot: Robot) -> Iterator[tuple[str, Array, Array, list[str]]]:
-    """Quantity, lowest and highest values (n,) and units of what a robot's file bounds."""
+    """Yield quantity, lowest and highest values (n,) and units of each limit in a robot's file."""
     limits = robot.limits
     units = list(robot.joint_units)
     if limits.position is not None:
@@ -57,7 +56,7 @@ def ranges(robot: Robot) -> Iterator[tuple[str, Array, Array, list[str]]]:
 def beyond_limits(
     robot: Robot, q: ArrayLike, qd: ArrayLike | None = None, effort: ArrayLike | None = None
 ) -> tuple[NDArray[np.bool_], list[Beyond]]:
-    """Which joint states are outside the limits, shape (...), and the farthest of each joint.
+    """Return which joint states are outside the limits, shape (...), and the farthest of each joint.
 
     q, qd, effort: shape (..., n), rad or m, per s, N m or N; at most one leading axis.
     """
@@ -69,7 +68,7 @@ def beyond_limits(
     for quantity, low, high, units in ranges(robot):
         if quantity not in values:
             continue
-        # A rounding's breadth is no fault: a pose on the limit itself is within it.
+        # A pose on the limit is within it despite rounding.
         slack = ROUNDING * np.maximum(1.0, np.maximum(np.abs(low), np.abs(high)))
         excess = np.maximum(values[quantity] - high, low - values[quantity]) - slack
         outside |= (excess > 0).any(-1)
@@ -103,7 +102,7 @@ def first_beyond(robot: Robot, q: Array, *, actuated: bool = True) -> Beyond | N
 
 
 def _bounded(robot: Robot, q: Array, actuated: bool) -> Iterator[tuple[Sequence[str], Array, Array, Sequence[str]]]:
-    """Yield what a file bounds at q (p, n): names, values (p, k), bounds (k, 2), units."""
+    """Yield names, values (p, k), bounds (k, 2) and units of all bounded quantities at q (p, n)."""
     if actuated and robot.limits.position is not None:
         yield robot.joint_names, q, robot.limits.position, robot.joint_units
     most = getattr(robot.limits, "joint_angle", None)
@@ -117,10 +116,10 @@ def _bounded(robot: Robot, q: Array, actuated: bool) -> Iterator[tuple[Sequence[
 
 
 def refuse_beyond(found: list[Beyond], where: str = "") -> None:
-    """Refuse what :func:`beyond_limits` found, if anything.
+    """Reject a motion if :func:`beyond_limits` found a joint outside its limits.
 
-    :param where: the recording, where there may be several.
-    :raises ParameterError: naming the first joint, its value and its range.
+    :param where: name of the recording, if there are several.
+    :raises ParameterError: the first joint, its value and its range.
     """
     if not found:
         return
@@ -131,5 +130,5 @@ def refuse_beyond(found: list[Beyond], where: str = "") -> None:
     raise ParameterError(
         f"{where}{': ' if where else ''}{first.joint}.{first.quantity}{at}",
         round(first.value, 9),
-        f"{first.low:g} to {first.high:g} {first.unit}{others}; use {OPTION} to compute anyway",
+        f"{first.low:g} to {first.high:g} {first.unit}{others}; use --beyond-limits to compute anyway",
     )

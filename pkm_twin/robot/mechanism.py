@@ -26,25 +26,11 @@ from pkm_twin.machine.graph import Graph, limb_numbers
 from pkm_twin.machine.inertia import Coefficients
 from pkm_twin.machine.joint_map import JointMap, JointMapEntry
 from pkm_twin.machine.members import Beam, Parts, Structure
-from pkm_twin.machine.places import (
-    Key,
-    Keys,
-    check_number,
-    full_keys,
-    given,
-    merged,
-    number_in,
-    numbers_of,
-    placed,
-)
+from pkm_twin.machine.places import Key, Keys, check_number, full_keys, given, merged, number_in, numbers_of, placed
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.reach import PassiveLimit, position_box
 from pkm_twin.machine.sections import DriveSpec, JointLimits, Payload, friction_of, limits_of
-from pkm_twin.machine.uncertainty import (
-    Tolerance,
-    UncertaintyEntry,
-    causes_of,
-)
+from pkm_twin.machine.uncertainty import Tolerance, UncertaintyEntry, causes_of
 from pkm_twin.machine.urdf_file import Visual
 from pkm_twin.settings import settings_of
 

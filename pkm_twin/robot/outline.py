@@ -1,7 +1,7 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""What a machine looks like: bars and faces between points of its bodies, all given at home.
+"""Outline a machine by bars and faces between points of its bodies, given at home.
 
-The one source of every picture: drawings, URDF visuals, the page of ``pkm-twin view``.
+Drawings, visuals of URDF files and the page of ``pkm-twin view`` all use these shapes.
 """
 
 from __future__ import annotations
@@ -19,15 +19,16 @@ from pkm_twin.machine.members import Place
 from pkm_twin.robot.robot import Robot
 
 BAR: Final = 0.01
-"""Radius of the bars that stand for bodies, per size of the machine; of rods the half."""
+"""Radius of the bars that represent bodies, relative to the machine's size; rods have half of it."""
 _FLAT: Final = 1e-6
+"""Relative size below which points are on one line."""
 
 
 @dataclass(frozen=True, eq=False)
 class Bar:
-    """A straight round bar: ``part`` is the body or rod that it is of, ``radius`` in m.
+    """A straight round bar of the body or rod ``part``; ``radius`` in m.
 
-    ``element``: its name among the elements of strain energy; empty where it is none of them.
+    ``element``: its name among the elements of strain energy; empty if it is not elastic.
     """
 
     part: str
@@ -38,9 +39,9 @@ class Bar:
 
 
 class Posture:
-    """Where points and directions of bodies are at joint positions, shape (..., n).
+    """The positions of points and the directions of vectors of bodies at joint positions, shape (..., n).
 
-    ``rotations``: of bodies since home, shape (..., 3, 3). Errors as :meth:`Robot.forward`.
+    ``rotations``: of bodies from home, shape (..., 3, 3). Errors as :meth:`Robot.forward`.
     """
 
     def __init__(self, robot: Robot, q: ArrayLike) -> None:
@@ -52,21 +53,21 @@ class Posture:
         }
 
     def place(self, body: str, point: Array) -> Array:
-        """Return where a point of a body, given at home, (3,) m, is now, (..., 3)."""
+        """Return the position of a point of a body, given at home, (3,), m; shape (..., 3)."""
         return np.asarray(self.rotations[body] @ point + self._shifts[body], np.float64)
 
     def turn(self, body: str, vector: Array) -> Array:
-        """Return where a direction of a body, given at home, (3,), points now, (..., 3)."""
+        """Return the direction of a vector of a body, given at home, (3,); shape (..., 3)."""
         return np.asarray(self.rotations[body] @ vector, np.float64)
 
 
 def telescope(joint: Joint) -> bool:
-    """Whether a joint slides a ram in a tube that itself moves: their lengths are not known."""
+    """Return whether a joint slides a ram in a tube that also moves: their lengths are unknown."""
     return joint.kind == "prismatic" and joint.inner != BASE and joint.home != 0.0
 
 
 def tube_start(graph: Graph, joint: Joint) -> Array:
-    """Where the tube of a telescope begins at home: at its other joint, on the axis, (3,) m."""
+    """Return the start of a telescope's tube at home, (3,), m: at its other joint, on the axis."""
     axis = joint.axes[0]
     for other in graph.joints.values():
         if other is not joint and joint.inner in (other.inner, other.outer):
@@ -75,18 +76,18 @@ def tube_start(graph: Graph, joint: Joint) -> Array:
 
 
 def body_points(graph: Graph) -> dict[str, list[Array]]:
-    """Points of each body's joints and rods at home, the base's too, shape (3,) each.
+    """Return the points of each body's joints and rods at home, shape (3,) each, with the base's.
 
-    The platform's first one is its reference point.
+    The platform's first point is its reference point.
     """
     points: dict[str, list[Array]] = {name: [] for name in (BASE, *graph.bodies)}
     points[graph.platform].append(graph.origin)
     for joint in graph.joints.values():
-        if joint.kind == "translation":  # it has no place
+        if joint.kind == "translation":  # it has no point
             continue
         inner = outer = joint.at
         if telescope(joint):
-            # A tube of half the length at home; the ram begins amid it and stays in it.
+            # A tube of half the length at home; the ram starts in its middle.
             foot = tube_start(graph, joint)
             inner = foot + joint.home * joint.axes[0] / 2
             outer = foot + joint.home * joint.axes[0] / 4
@@ -100,14 +101,14 @@ def body_points(graph: Graph) -> dict[str, list[Array]]:
 
 
 def bars(graph: Graph) -> tuple[Bar, ...]:
-    """Rods, both of a pair with what holds them; a body as bars from one point to the others."""
+    """Return rods, both of a pair with their crosspieces, and bodies as bars from one point to the others."""
     radius = BAR * graph.size
     result = []
     for body, found in body_points(graph).items():
         if body == BASE:
             continue
-        # A body with one joint reaches from there to its centre of mass: else nothing is seen.
-        if not _apart(found, radius) and graph.bodies[body].mass > 0.0:
+        # A body with one joint is drawn from there to its centre of mass.
+        if not _others(found, radius) and graph.bodies[body].mass > 0.0:
             found = [*found[:1], graph.bodies[body].com]
         result += [Bar(body, (body, found[0]), (body, point), radius) for point in _others(found, radius)]
     for rod in graph.rods.values():
@@ -118,18 +119,24 @@ def bars(graph: Graph) -> tuple[Bar, ...]:
 
 
 def robot_bars(robot: Robot) -> tuple[Bar, ...]:
-    """Return the bars of a robot, with the members' diameters and the rails' lengths."""
+    """Return the bars of a robot, with the members' diameters, and the rails of slides on the base."""
     known = {part for beam in robot.beams for part in (*beam.parts, *beam.carries)}
     members = [Bar(beam.parts[0], beam.inner, beam.outer, beam.radius, beam.element) for beam in robot.beams]
     rest = [bar for bar in bars(robot.graph) if bar.part not in known]
     hidden = [bar for bar in crosspieces(robot.graph) if bar.part in known]
-    return (*members, *rest, *hidden, *_rails(robot))
+    graph, limits, rails = robot.graph, robot.limits.position, list[Bar]()
+    for k, name in enumerate(() if limits is None else graph.actuated):
+        joint = graph.joints[name]
+        if limits is not None and joint.kind == "prismatic" and joint.inner == BASE and np.isfinite(limits[k]).all():
+            low, high = (joint.at + (q - joint.home) * joint.axes[0] for q in limits[k])
+            rails.append(Bar(BASE, (BASE, low), (BASE, high), BAR * graph.size / 2))
+    return (*members, *rest, *hidden, *rails)
 
 
 def face(points: Sequence[Array]) -> Array:
-    """Corners of the convex plate that covers points, in their order around it, shape (k, 3).
+    """Return the corners of the convex plate that covers points, in their order around it, shape (k, 3).
 
-    Empty where fewer than three are given or they stand on one line.
+    Empty for fewer than three points, or points on one line.
     """
     corners = np.array(points).reshape(-1, 3)
     if len(corners) < 3:
@@ -144,7 +151,7 @@ def face(points: Sequence[Array]) -> Array:
 
 
 def _half_hull(flat: Array, order: NDArray[np.int64]) -> list[int]:
-    """One side of the hull of points in a plane, without its last point (Andrew 1979)."""
+    """Return one side of the convex hull of points in a plane, without its last point (Andrew 1979)."""
     least = _FLAT * float(np.abs(flat).max()) ** 2
     found: list[int] = []
     for k in order:
@@ -158,14 +165,14 @@ def _half_hull(flat: Array, order: NDArray[np.int64]) -> list[int]:
 
 
 def base_face(graph: Graph) -> Array:
-    """Corners of the plate that the base's joints stand on; slides stand on rails instead."""
+    """Return the corners of the plate under the base's joints, without slides, which have rails."""
     return face(list(_fixed(graph, BASE)))
 
 
 def base_line(graph: Graph) -> Array:
-    """Return the farthest two of the points that the base's joints stand on, (2, 3) or (0, 3).
+    """Return the farthest two points of the base's joints, (2, 3) or (0, 3).
 
-    The ground of a planar linkage, whose base has no face.
+    They are the ground of a planar linkage, whose base has no face.
     """
     points = np.array(list(_fixed(graph, BASE))).reshape(-1, 3)
     far = np.linalg.norm(points[:, None] - points, axis=-1)
@@ -175,17 +182,15 @@ def base_line(graph: Graph) -> Array:
 
 
 def platform_face(graph: Graph) -> Array:
-    """Corners of the platform: its joints and rods' ends, without what it slides along."""
+    """Return the corners of the platform: its joints and ends of rods, without slides."""
     return face(list(_fixed(graph, graph.platform)))
 
 
-_STANDING: Final = ("revolute", "universal", "spherical", "cylindrical", "fixed")
-
-
 def _fixed(graph: Graph, body: str) -> Iterable[Array]:
-    """Points of a body that its joints do not move along it."""
+    """Yield the points of a body that its joints do not move along it."""
+    standing = ("revolute", "universal", "spherical", "cylindrical", "fixed")
     for joint in graph.joints.values():
-        if joint.kind in _STANDING and body in (joint.inner, joint.outer):
+        if joint.kind in standing and body in (joint.inner, joint.outer):
             yield joint.at
     for rod in graph.rods.values():
         for name, end in zip((rod.inner, rod.outer), rod.ends, strict=True):
@@ -197,12 +202,8 @@ def _others(points: Sequence[Array], radius: float) -> list[Array]:
     return [p for p in points[1:] if float(np.linalg.norm(p - points[0])) > radius]
 
 
-def _apart(points: Sequence[Array], radius: float) -> bool:
-    return bool(points) and bool(_others(points, radius))
-
-
 def crosspieces(graph: Graph) -> Iterable[Bar]:
-    """Of a pair of rods: from one rod's end to the other's, on the bodies that they join."""
+    """Yield the bars between the ends of the two rods of each pair, on the bodies that they connect."""
     for rod in graph.rods.values():
         if rod.pair is None or not rod.width > 0.0:
             continue
@@ -210,15 +211,3 @@ def crosspieces(graph: Graph) -> Iterable[Bar]:
         for body, end in zip((rod.inner, rod.outer), rod.ends, strict=True):
             radius = BAR * graph.size / 2
             yield Bar(body, (body, end - aside), (body, end + aside), radius)
-
-
-def _rails(robot: Robot) -> Iterable[Bar]:
-    """Yield the rails of slides on the base, from limit to limit."""
-    graph, limits = robot.graph, robot.limits.position
-    if limits is None:
-        return
-    for k, name in enumerate(graph.actuated):
-        joint = graph.joints[name]
-        if joint.kind == "prismatic" and joint.inner == BASE and np.isfinite(limits[k]).all():
-            low, high = (joint.at + (q - joint.home) * joint.axes[0] for q in limits[k])
-            yield Bar(BASE, (BASE, low), (BASE, high), BAR * graph.size / 2)

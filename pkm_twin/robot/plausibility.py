@@ -1,60 +1,33 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Numbers of a robot's file that are possible and hardly meant, as millimetres for metres are.
+"""Find numbers of a robot's file that are possible but probably not meant, such as millimetres for metres.
 
-Each is compared with the machine itself, so that small and large machines are judged alike. What
-no machine can have is rejected by the schema; what is here is taken as it stands, with a warning.
+Each is compared with the machine itself, so that small and large machines are judged alike. The schema
+rejects impossible numbers; the numbers found here are used, with a warning.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Any, Final
+from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 
-from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.kinematics.singularity import singularity_at_home
 from pkm_twin.machine.graph import BASE, Graph, Joint, merged
 from pkm_twin.robot.robot import Robot
 
-LARGEST: Final = 20.0
-"""Extent of a machine, m, from which on its lengths look like millimetres."""
-SMALLEST: Final = 2e-3
-"""Extent below which its lengths look like kilometres, or like nothing known, m."""
-GYRATION: Final = 2.0
-"""A body's radius of gyration at most, in parts of the machine's extent."""
-DENSEST: Final = 4000.0
-"""All masses over the cube of the extent at most, kg/m3: between solid aluminium and steel."""
-LIGHTEST: Final = 0.01
-"""The same at least, kg/m3."""
-MAX_COM_DISTANCE: Final = 2.0
-"""How far a centre of mass is from the body's joints at most, in parts of the extent."""
-MAX_TURN_LIMIT: Final = 4.0 * math.pi
-"""Limits of a joint that turns at most, rad."""
-GRAVITY: Final = (1.0, 25.0)
-"""Gravity between that of the Moon and that of Jupiter, m/s2; or none."""
-LOADED: Final = 50.0
-"""A payload at most, in parts of all masses that move."""
-ROTOR: Final = 100.0
-"""A rotor's inertia at the joint, as a mass, at most in parts of all masses that move."""
-LEG: Final = 0.05
-"""A leg of no length is one between joints that are farther apart than this part of the extent."""
-LEVER: Final = 0.1
-"""A member's end from a joint of its body at most, in parts of the member's length."""
-SOFTEST: Final = 1e9
-"""Young's modulus below which it looks like MPa or GPa, Pa: plastics have more."""
-INDEX: Final = 0.005
-"""Singularity index at home below which a small motion may meet a singularity."""
+EXTENTS: Final = (2e-3, 20.0)
+"""Extents of a machine, m; beyond them its lengths look like another unit."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """An implausible number: its ``field``, the ``quantity`` that was made of it, and its bound.
+    """An implausible number: its ``field``, the ``quantity`` computed from it, and the bound.
 
-    ``likely``: what it would mean, in a few words.
+    ``likely``: the probable mistake, in a few words.
     """
 
     field: str
@@ -66,7 +39,7 @@ class Finding:
 
     @property
     def text(self) -> str:
-        """All in a line."""
+        """The finding in one line."""
         side = "above" if self.value > self.bound else "below"
         numbers = f"{self.value:.4g} {self.unit}".strip()
         bound = f"{self.bound:.4g} {self.unit}".strip()
@@ -85,30 +58,22 @@ def findings(robot: Robot) -> tuple[Finding, ...]:
         *_members(robot, graph),
         *_home(graph),
     ]
-    # Copies of a limb say the same.
-    alike: dict[tuple[Any, ...], list[Finding]] = {}
+    # Copies of a limb have the same finding.
+    alike: dict[tuple[str, ...], list[Finding]] = {}
     for one in found:
         alike.setdefault((one.quantity, one.likely, f"{one.value:.6g}"), []).append(one)
-    return tuple(_joined(group) for group in alike.values())
-
-
-def _joined(group: list[Finding]) -> Finding:
-    first = group[0]
-    others = "" if len(group) == 1 else f" (and {len(group) - 1} more)"
-    return Finding(f"{first.field}{others}", first.quantity, first.value, first.bound, first.unit, first.likely)
+    others = [f" (and {len(group) - 1} more)" * (len(group) > 1) for group in alike.values()]
+    return tuple(
+        replace(group[0], field=f"{group[0].field}{more}") for group, more in zip(alike.values(), others, strict=True)
+    )
 
 
 def _outside(
-    field: str,
-    quantity: str,
-    value: float,
-    bounds: tuple[float, float],
-    unit: str,
-    likely: tuple[str, str],
+    field: str, quantity: str, value: float, bounds: tuple[float, float], unit: str, likely: tuple[str, str]
 ) -> Iterator[Finding]:
     """Yield a finding if a quantity is out of its bounds; zero counts as absent.
 
-    :param likely: what it means below and above them.
+    :param likely: the probable mistake below and above the bounds.
     """
     if value > bounds[1]:
         yield Finding(field, quantity, value, bounds[1], unit, likely[1])
@@ -125,7 +90,7 @@ def _size(graph: Graph) -> Iterator[Finding]:
         "geometry",
         "extent of the machine",
         _extent(graph),
-        (SMALLEST, LARGEST),
+        EXTENTS,
         "m",
         ("lengths in another unit than metres?", "lengths in millimetres?"),
     )
@@ -135,16 +100,16 @@ def _masses(robot: Robot, graph: Graph) -> Iterator[Finding]:
     total = _total(graph)
     if not total > 0.0:
         return
-    # As dense as a box of the machine's extent would be: grams or tonnes change it a thousandfold.
-    # Lengths in another unit are reported alone.
+    # All masses over the cube of the extent: at most between solid aluminium and steel. Grams or tonnes
+    # change it a thousandfold. Lengths in another unit are reported alone.
     extent = _extent(graph)
-    density = total / extent**3 if SMALLEST <= extent <= LARGEST else 0.0
+    density = total / extent**3 if EXTENTS[0] <= extent <= EXTENTS[1] else 0.0
     whole = f"{total:.4g} kg in all; masses in"
     yield from _outside(
         "masses",
         "all that moves over the cube of the extent",
         density,
-        (LIGHTEST, DENSEST),
+        (0.01, 4000.0),
         "kg/m3",
         (f"{whole} tonnes?", f"{whole} grams?"),
     )
@@ -167,25 +132,27 @@ def payload_findings(robot: Robot) -> Iterator[Finding]:
     total, mass = _total(robot.graph), robot.payload.mass
     if total > 0.0:
         likely = f"{total:.4g} kg move it; a mass in grams?"
-        yield from _above("payload.mass", "payload", mass, LOADED * total, "kg", likely)
+        yield from _above("payload.mass", "payload", mass, 50.0 * total, "kg", likely)
 
 
 def _bodies(robot: Robot, graph: Graph) -> Iterator[Finding]:
     extent = _extent(graph) or graph.size
     load = robot.payload
-    parts = [(name, b.mass, b.inertia, _nearest(graph, name, b.com)) for name, b in graph.bodies.items()]
+    parts = []
+    for name, body in graph.bodies.items():
+        nearest = [float(np.linalg.norm(body.com - point)) for point in graph.joint_points(name)]
+        parts.append((name, body.mass, body.inertia, min(nearest, default=0.0)))
     parts.append(("payload", load.mass, load.inertia, float(np.linalg.norm(load.com))))
     for name, mass, inertia, far in parts:
         if not mass > 0.0:
             continue
         radius = math.sqrt(max(float(np.linalg.eigvalsh(inertia)[-1]), 0.0) / mass)
         likely = f"inertia in {'g mm2' if radius > 3e3 * extent else 'kg mm2'}?"
-        most = GYRATION * extent
-        yield from _above(f"{name}: inertia", "radius of gyration", radius, most, "m", likely)
+        yield from _above(f"{name}: inertia", "radius of gyration", radius, 2.0 * extent, "m", likely)
         what = "its joints" if name != "payload" else "the reference point"
         what = f"distance of the centre of mass from {what}"
         likely = "a place in millimetres, or in other axes?"
-        yield from _above(f"{name}: com", what, far, MAX_COM_DISTANCE * extent, "m", likely)
+        yield from _above(f"{name}: com", what, far, 2.0 * extent, "m", likely)
 
 
 def _drives(robot: Robot, graph: Graph) -> Iterator[Finding]:
@@ -198,15 +165,10 @@ def _drives(robot: Robot, graph: Graph) -> Iterator[Finding]:
         if positions is not None:
             low, high = (float(v) for v in positions[k])
             widest = max((abs(v) for v in (low, high) if math.isfinite(v)), default=0.0)
-            if turns and widest > MAX_TURN_LIMIT:
-                yield Finding(
-                    f"{name}: limits.position",
-                    "limit",
-                    widest,
-                    MAX_TURN_LIMIT,
-                    "rad",
-                    f"{widest / (2 * math.pi):.3g} turns; degrees?",
-                )
+            most = 4.0 * math.pi
+            if turns and widest > most:
+                likely = f"{widest / (2 * math.pi):.3g} turns; degrees?"
+                yield Finding(f"{name}: limits.position", "limit", widest, most, "rad", likely)
             elif not low <= home[k] <= high:
                 bound = low if home[k] < low else high
                 yield Finding(
@@ -219,7 +181,7 @@ def _drives(robot: Robot, graph: Graph) -> Iterator[Finding]:
                 )
         if not turns and not joint.home and name in robot.without_home:
             length = _leg(graph, joint)
-            if length > LEG * graph.size:
+            if length > 0.05 * graph.size:
                 yield Finding(
                     f"{name}: home",
                     "length of the leg at home by its joint",
@@ -230,17 +192,15 @@ def _drives(robot: Robot, graph: Graph) -> Iterator[Finding]:
                 )
         weight = joint.rotor_inertia / (graph.size**2 if turns else 1.0)
         if total > 0.0:
-            what, likely = (
-                "rotor as a mass at the machine's extent",
-                "an inertia in kg mm2 or g cm2?",
-            )
-            yield from _above(f"{name}: rotor_inertia", what, weight, ROTOR * total, "kg", likely)
+            what, likely = ("rotor as a mass at the machine's extent", "an inertia in kg mm2 or g cm2?")
+            yield from _above(f"{name}: rotor_inertia", what, weight, 100.0 * total, "kg", likely)
 
 
 def _gravity(robot: Robot) -> Iterator[Finding]:
     size = float(np.linalg.norm(robot.gravity))
     times = f"{size / 9.81:.4g} times the Earth's; in mm/s2 or cm/s2?"
-    yield from _outside("gravity", "gravity", size, GRAVITY, "m/s2", ("in km/s2?", times))
+    # Between the Moon and Jupiter.
+    yield from _outside("gravity", "gravity", size, (1.0, 25.0), "m/s2", ("in km/s2?", times))
     if size == 1.0:
         yield Finding("gravity", "gravity", size, 1.62, "m/s2", "in units of the Earth's?")
 
@@ -252,14 +212,13 @@ def _members(robot: Robot, graph: Graph) -> Iterator[Finding]:
         return
     for beam in structure.beams:
         name, modulus = beam.name, structure.sections[beam.name].youngs_modulus
-        if modulus < SOFTEST:
-            likely = "in MPa or GPa?"
-            yield Finding(f"{name}: youngs_modulus", "modulus", modulus, SOFTEST, "Pa", likely)
+        if modulus < 1e9:  # Pa; plastics have more
+            yield Finding(f"{name}: youngs_modulus", "modulus", modulus, 1e9, "Pa", "in MPa or GPa?")
         ends = [np.asarray(at, np.float64) for _, at in (beam.inner, beam.outer)]
-        most = LEVER * float(np.linalg.norm(ends[1] - ends[0]))
+        most = 0.1 * float(np.linalg.norm(ends[1] - ends[0]))
         for joint in graph.joints.values():
             outside = (joint.inner in beam.parts) != (joint.outer in beam.parts)
-            # The platform is rigid in the elastic frame: its member says how thick it is.
+            # The platform is rigid in the elastic frame: its member only states its thickness.
             outside = outside and graph.platform not in beam.parts
             if outside and joint.type.placed and not joint.virtual:
                 far = min(float(np.linalg.norm(joint.at - end)) for end in ends)
@@ -272,25 +231,19 @@ def _home(graph: Graph) -> Iterator[Finding]:
         index = singularity_at_home(graph)
     except (PkmTwinError, np.linalg.LinAlgError):
         return
-    if index < INDEX:
-        yield Finding(
-            "home",
-            "singularity index",
-            index,
-            INDEX,
-            "",
-            "a small motion may meet a singularity; is another home meant?",
-        )
+    if index < 0.005:
+        likely = "a small motion may meet a singularity; is another home meant?"
+        yield Finding("home", "singularity index", index, 0.005, "", likely)
 
 
 def _extent(graph: Graph) -> float:
-    """Extent of the joints and rods, m; where they are one point, of most bodies about it."""
+    """Return the extent of joints and rods, m; if they are one point, that of most bodies about it."""
     points = [j.at for j in graph.joints.values() if j.kind != "translation"]
     points += [end for rod in graph.rods.values() for end in rod.ends]
     points.append(graph.origin)
     extent = float(np.ptp(np.array(points), axis=0).max())
     about = [float(np.linalg.norm(b.com - graph.origin)) for b in graph.bodies.values() if b.mass]
-    # The median, as half of the bodies may have a wrong place: numpy's loads masked arrays first.
+    # The median, because some positions may be wrong; numpy's median would import masked arrays.
     middle = sorted(about)[(len(about) - 1) // 2 : len(about) // 2 + 1]
     extent = max(extent, 2.0 * sum(middle) / len(middle) if middle else 0.0)
     return extent if extent > 1e-9 else 0.0
@@ -300,14 +253,8 @@ def _total(graph: Graph) -> float:
     return sum(b.mass for b in graph.bodies.values()) + sum(r.mass for r in graph.rods.values())
 
 
-def _nearest(graph: Graph, body: str, point: Array) -> float:
-    """Distance of a point from the nearest joint of a body, m; 0 where it has none."""
-    points = graph.joint_points(body)
-    return min((float(np.linalg.norm(point - p)) for p in points), default=0.0)
-
-
 def _leg(graph: Graph, slide: Joint) -> float:
-    """Length between the joints beyond a slide that stand along its axis, m; 0 for no leg."""
+    """Return the distance of the joints beyond a slide that are along its axis, m; 0 for no leg."""
     if BASE in (slide.inner, slide.outer):
         return 0.0
     lengths = [0.0]
@@ -322,7 +269,7 @@ def _leg(graph: Graph, slide: Joint) -> float:
 
 
 def why_no_torques(robot: Robot) -> str:
-    """Why the model has no torques for this robot; empty where it has."""
+    """Return why the model has no torques for this robot; empty if it has."""
     try:
         robot.massive()
     except ParameterError as error:

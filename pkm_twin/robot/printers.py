@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Linear Delta printers: what their firmware prints and stores, read and written.
+"""Read the logs and configurations of linear Delta printers, and write their configurations.
 
 Formats by the documentation of Klipper (``[delta_calibrate]``), Marlin (G33, M665, M666),
 RepRapFirmware (G32, height maps, M665, M666) and Smoothieware (G29.1).
@@ -24,16 +24,12 @@ ANGLES: Final = np.array([210.0, 330.0, 90.0])
 """Nominal angles of the towers, degrees."""
 G33: Final = {"x": 210, "y": 330, "z": 90, "yz": 30, "zx": 150, "xy": 270}
 """Angles of the points that G33 reports, degrees; c is the centre."""
-FULL_STEPS: Final = 200.0
 _NUMBER: Final = r"[-+]?\d*\.?\d+"
-_POINT: Final = re.compile(r"\b" + r"[,\s]+".join(rf"{a}[:=]?\s*({_NUMBER})" for a in "XYZ"))
 _G33: Final = re.compile(rf"\b(c|xy|yz|zx|x|y|z)\s*:\s*({_NUMBER})")
-# Never across lines: what begins at each of many lines would be looked for in all that follow.
-_G30: Final = re.compile(rf"^[ \t]*G30\s+P\d+\s+X({_NUMBER})\s*Y({_NUMBER})", re.M)
 
 
 class Firmware(StrEnum):
-    """Of a printer."""
+    """The firmware of a printer."""
 
     KLIPPER = "klipper"
     MARLIN = "marlin"
@@ -43,11 +39,11 @@ class Firmware(StrEnum):
 
 @dataclass(frozen=True, eq=False)
 class Printer:
-    """A printer's geometry and probings: mm, degrees.
+    """A printer's geometry and probed points: mm, degrees.
 
-    ``ends``: height of each carriage's rod ends above the bed, at its endstop, shape (3,).
-    ``heights``: carriages below their endstops, negative, and the nozzle's height, (k, 4);
-    ``distances``: of two nozzle places likewise, (d, 7).
+    ``ends``: height of each carriage's rod ends above the bed at its endstop, shape (3,). ``heights``:
+    positions of the carriages below their endstops, negative, and the nozzle's height, (k, 4).
+    ``distances``: positions of the carriages at two points, and their distance, (d, 7).
     """
 
     radius: float
@@ -58,7 +54,7 @@ class Printer:
     distances: Array
 
     def yaml(self, head: str) -> str:
-        """Its robot file: joints are carriages below their endstops, m."""
+        """Write the robot file; joint positions are those of the carriages below their endstops, m."""
         numbers = [f"{value:.9g}" for value in np.radians(self.angles)]
         arms = [f"{value / 1e3:.9g}" for value in self.arms]
         lines = [
@@ -77,34 +73,24 @@ class Printer:
         return "\n".join([*lines, ""])
 
     def table(self) -> str:
-        """Its measurements as a CSV for ``calibrate``, m."""
+        """Write the measurements as a CSV for ``calibrate``, m."""
         names = [f"stepper_{limb}.position" for limb in "abc"]
-        head = [*names]
-        paired = len(self.distances) > 0
-        if paired:
-            head += [f"{name}_2" for name in names]
-        head += ["height"] if len(self.heights) else []
-        head += ["distance"] if paired else []
-        rows = []
-        for row in self.heights / 1e3:
-            cells = [f"{v:.9g}" for v in row]
-            rows.append([*cells[:3], *([""] * 3 if paired else []), cells[3], *[""] * paired])
-        for row in self.distances / 1e3:
-            cells = [f"{v:.9g}" for v in row]
-            rows.append([*cells[:6], *([""] if len(self.heights) else []), cells[6]])
+        high, paired = len(self.heights) > 0, len(self.distances) > 0
+        head = [*names, *(f"{name}_2" for name in names if paired), *["height"] * high, *["distance"] * paired]
+        heights, distances = ([[f"{v:.9g}" for v in row] for row in t / 1e3] for t in (self.heights, self.distances))
+        rows = [[*row[:3], *[""] * 3 * paired, row[3], *[""] * paired] for row in heights]
+        rows += [[*row[:6], *[""] * high, row[6]] for row in distances]
         return "\n".join([",".join(head), *(",".join(row) for row in rows), ""])
 
 
 def printer_of(robot: Robot) -> Printer:
-    """Return the printer of a robot file, turned so that its third tower is at 90 degrees.
+    """Return the printer of a robot file, rotated so that its third tower is at 90 degrees.
 
-    :raises ParameterError: no linear Delta, leaning towers, or joints with a ratio.
+    :raises ParameterError: not a linear Delta, leaning towers, or joints with a ratio.
     """
     if robot.mechanism != "linear_delta":
         raise ParameterError(
-            f"{robot.name}: mechanism",
-            robot.mechanism,
-            "linear_delta, as in a file that `pkm-twin convert` writes",
+            f"{robot.name}: mechanism", robot.mechanism, "linear_delta, as in a file that `pkm-twin convert` writes"
         )
     g: Any = vars(robot)["geometry"]
     own = robot.controller
@@ -156,7 +142,14 @@ def read_printer(text: str, firmware: Firmware | None, probe_radius: float | Non
     :param probe_radius: of G33's points, mm, where no M665 B gives it.
     :raises ParameterError: the geometry or the probings are missing.
     """
-    firmware = firmware or _firmware(text)
+    if firmware is None and re.search(r"^[^\w\n]*\[(printer|delta_calibrate|stepper_a)\]", text, re.M):
+        firmware = Firmware.KLIPPER
+    elif firmware is None and re.search(r"bed probe heights|height map|^[ \t]*G30\s+P\d", text, re.M | re.I):
+        firmware = Firmware.REPRAPFIRMWARE
+    elif firmware is None:
+        table = re.search(r"G33|M666 X-?[\d.]+ Y", text) and _G33.search(text)
+        smooth = not table and ("G29.1" in text or "G32" in text)
+        firmware = Firmware.SMOOTHIEWARE if smooth else Firmware.MARLIN
     if firmware is Firmware.KLIPPER:
         return _klipper(text)
     m665, m666 = _words(text, "M665"), _words(text, "M666")
@@ -186,31 +179,17 @@ def read_printer(text: str, firmware: Firmware | None, probe_radius: float | Non
 
 
 def _rise(arms: Array, radius: float, where: str) -> Array:
-    """Height of the carriages over the nozzle in the middle, mm, shape (3,).
+    """Return the height of the carriages above the nozzle at the centre, mm, shape (3,).
 
-    :raises ParameterError: an arm that does not reach the middle.
+    :raises ParameterError: an arm does not reach the centre.
     """
     if not 0.0 < radius < arms.min():
-        raise ParameterError(
-            where,
-            float(arms.min()),
-            f"arms longer than the radius, {radius:g} mm (above 0)",
-        )
+        raise ParameterError(where, float(arms.min()), f"arms longer than the radius, {radius:g} mm (above 0)")
     return np.sqrt(arms**2 - radius**2)
 
 
-def _firmware(text: str) -> Firmware:
-    if re.search(r"^[^\w\n]*\[(printer|delta_calibrate|stepper_a)\]", text, re.M):
-        return Firmware.KLIPPER
-    if re.search(r"bed probe heights|height map|^[ \t]*G30\s+P\d", text, re.M | re.I):
-        return Firmware.REPRAPFIRMWARE
-    if re.search(r"G33|M666 X-?[\d.]+ Y", text) and _G33.search(text):
-        return Firmware.MARLIN
-    return Firmware.SMOOTHIEWARE if "G29.1" in text or "G32" in text else Firmware.MARLIN
-
-
 def _words(text: str, code: str) -> dict[str, list[float]]:
-    """Numbers by letter of the lines of a G-code; a later line replaces what it repeats."""
+    """Read the numbers by letter in all lines of a G-code; later lines replace earlier numbers."""
     found: dict[str, list[float]] = {}
     for line in re.findall(rf"\b{code}\b([^;\n]*)", text):
         for letter, values in re.findall(rf"([A-Z])\s*({_NUMBER}(?::{_NUMBER})*)", line):
@@ -219,9 +198,9 @@ def _words(text: str, code: str) -> dict[str, list[float]]:
 
 
 def _points(text: str, firmware: Firmware, radius: float) -> Array:
-    """Probed places and heights, mm, (k, 3).
+    """Read the probed points and their heights, mm, (k, 3).
 
-    :raises ParameterError: there are none, or their places are not known.
+    :raises ParameterError: there are none, or their positions are unknown.
     """
     found: list[tuple[float, float, float]] = []
     heights = re.findall(r"bed probe heights:((?:\s+" + _NUMBER + r")+)", text, re.I)
@@ -229,7 +208,7 @@ def _points(text: str, firmware: Firmware, radius: float) -> Array:
     if firmware is Firmware.MARLIN and re.search(r"\bc\s*:", text):
         seen: set[str] = set()
         for name, value in _G33.findall(text[re.search(r"\bc\s*:", text).start() :]):  # type: ignore[union-attr]
-            # The first table: a later one has been probed with other numbers.
+            # Only the first table: later ones were probed with other parameters.
             if name in seen:
                 break
             seen.add(name)
@@ -241,15 +220,18 @@ def _points(text: str, firmware: Firmware, radius: float) -> Array:
     elif firmware is Firmware.MARLIN and "G33" in text:
         raise ParameterError("G33", "no table of points", "a log of `G33 V3`, which prints one")
     elif heights:
-        places, values = _G30.findall(text), heights[0].split()
+        # Not across lines: the search from each of many lines would read all lines that follow.
+        point = rf"^[ \t]*G30\s+P\d+\s+X({_NUMBER})\s*Y({_NUMBER})"
+        places, values = re.findall(point, text, re.M), heights[0].split()
         if len(places) < len(values):
             raise ParameterError("G30 P", len(places), f"a line `G30 Pn Xx Yy` for each of {len(values)} heights")
         found = [(float(x), float(y), float(z)) for (x, y), z in zip(places, values, strict=False)]
     elif rows:
         found = rows
     else:
+        point = r"\b" + r"[,\s]+".join(rf"{axis}[:=]?\s*({_NUMBER})" for axis in "XYZ")
         for line in text.splitlines():
-            match = _POINT.search(line)
+            match = re.search(point, line)
             if match and not re.match(r"\W*[GM]\d", line):
                 found.append((float(match[1]), float(match[2]), float(match[3])))
     if len(found) < 3:
@@ -258,7 +240,7 @@ def _points(text: str, firmware: Firmware, radius: float) -> Array:
 
 
 def _height_map(text: str) -> Iterator[tuple[float, float, float]]:
-    """Of RepRapFirmware's heightmap.csv: points that were probed."""
+    """Read the probed points of RepRapFirmware's heightmap.csv."""
     lines = text.splitlines()
     heads = (k for k, line in enumerate(lines) if line.startswith(("xmin,", "axis0,")))
     start = next(heads, None)
@@ -271,13 +253,13 @@ def _height_map(text: str) -> Iterator[tuple[float, float, float]]:
     x0, y0, dx, dy = (float(given.get(key, given.get("spacing", "nan"))) for key in keys)
     for row, line in enumerate(lines[start + 2 :]):
         for column, cell in enumerate(line.split(",")):
-            # A point beyond the radius was not probed and is a bare 0.
+            # A point outside the radius is not probed and written as 0.
             if cell.strip() not in ("", "0"):
                 yield x0 + column * dx, y0 + row * dy, float(cell)
 
 
 def _klipper(text: str) -> Printer:
-    """Of a printer.cfg, with the block that SAVE_CONFIG appends.
+    """Read a printer.cfg, with the block that SAVE_CONFIG appends.
 
     :raises ParameterError: an entry is missing.
     """
@@ -294,7 +276,7 @@ def _klipper(text: str) -> Printer:
     steppers = [sections.get(f"stepper_{limb}", {}) for limb in "abc"]
 
     def number(stepper: int, key: str, default: float | None = None) -> float:
-        # What b and c leave out is as it is for a.
+        # Entries that b and c leave out are those of a.
         value = steppers[stepper].get(key, steppers[0].get(key))
         if value is None and default is None:
             raise ParameterError(f"[stepper_{'abc'[stepper]}] {key}", None, "a value")
@@ -338,7 +320,7 @@ def _klipper(text: str) -> Printer:
 
 
 def _step(number: Callable[..., float], steppers: list[dict[str, str]], k: int) -> float:
-    """Carriage travel of a step, mm."""
+    """Return the carriage's travel per step, mm."""
     if "step_distance" in {**steppers[0], **steppers[k]}:
         return float(number(k, "step_distance"))
     gear = steppers[k].get("gear_ratio", steppers[0].get("gear_ratio", "1:1"))
@@ -346,7 +328,7 @@ def _step(number: Callable[..., float], steppers: list[dict[str, str]], k: int) 
     for pair in gear.split(","):
         driven, _, driving = pair.partition(":")
         turns *= _number(driven, "gear_ratio") / _number(driving or "1", "gear_ratio")
-    full = number(k, "full_steps_per_rotation", FULL_STEPS)
+    full = number(k, "full_steps_per_rotation", 200.0)
     return float(number(k, "rotation_distance") / (full * number(k, "microsteps") * turns))
 
 

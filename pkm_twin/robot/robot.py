@@ -16,11 +16,7 @@ from pkm_twin.codegen.code import GOOD, REFUSED
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.engine import Engine, engine_of
-from pkm_twin.kinematics.passive import (
-    passive_names,
-    passive_program,
-    passive_rates_program,
-)
+from pkm_twin.kinematics.passive import passive_names, passive_program, passive_rates_program
 from pkm_twin.kinematics.programs import projection_program
 from pkm_twin.kinematics.singularity import singularity_kernel
 from pkm_twin.machine import schema
@@ -79,10 +75,7 @@ class Robot(Mechanism):
         return found
 
     def function(
-        self,
-        program: Callable[[Any], Kernel],
-        p: Array = _NONE,
-        otherwise: Callable[..., Array] | None = None,
+        self, program: Callable[[Any], Kernel], p: Array = _NONE, otherwise: Callable[..., Array] | None = None
     ) -> Callable[..., Array]:
         """Return a program of the robot as a function from its inputs to its first output, made once.
 

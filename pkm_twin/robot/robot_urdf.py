@@ -83,7 +83,7 @@ def robot_sdf(robot: Robot) -> str:
 
 
 def _warn_of_losses(robot: Robot, where: str) -> None:
-    """Of what efforts depend on and a format has no place for."""
+    """Warn of numbers that efforts depend on and that a format cannot state."""
     lost = [f"{law} friction" for law in robot.laws]
     if where != "MJCF":
         lost += [
@@ -103,9 +103,15 @@ def _warn_of_losses(robot: Robot, where: str) -> None:
 
 
 def robot_tree(robot: Robot) -> LoopTree:
-    """Return the robot as description formats have it, drawn at home, with bars to look at."""
+    """Return the robot in the form of description files, drawn at home, with bars for pictures."""
     graph, tree, load = robot.graph, robot.engine.tree, robot.payload
-    names = _link_names([BASE, *graph.bodies, *graph.rods])
+    names = {BASE: GROUND}
+    # Names that need no change come first and stay; none is a link of the file itself.
+    for name in sorted([*graph.bodies, *graph.rods], key=lambda name: plain_name(name) != name):
+        own = plain_name(name)
+        while own in (GROUND, PLATFORM, PAYLOAD, *names.values()):
+            own += "_body"
+        names[name] = own
     labels = joint_labels(tree)
     links, joints = {GROUND: Link(GROUND)}, dict[str, Joint]()
 
@@ -173,22 +179,10 @@ def robot_tree(robot: Robot) -> LoopTree:
     )
 
 
-def _link_names(names: Sequence[str]) -> dict[str, str]:
-    """Return a link's name for each part, none of them one that the file has of its own."""
-    links = {BASE: GROUND}
-    # What needs no change keeps its name, whatever else would come to have it.
-    for name in sorted(names, key=lambda name: plain_name(name) != name):
-        link = plain_name(name)
-        while name not in links and link in (GROUND, PLATFORM, PAYLOAD, *links.values()):
-            link += "_body"
-        links.setdefault(name, link)
-    return links
-
-
 def robot_description(robot: Robot) -> dict[str, Any]:
     """Return the robot as a description of ``mechanism: machine``, with limits and payload.
 
-    Members and compliances stay where the robot has them as such a description tells them.
+    Members and compliances are included if the robot's file states them in the same form.
     """
     data = graph_description(robot.graph)
     elastic = robot.elastic_entries()
@@ -227,7 +221,7 @@ def robot_description(robot: Robot) -> dict[str, Any]:
         told = {
             name: {field: value for field, value in entry.items() if value is not None}
             for name, entry in schema.plain(getattr(robot, key)).items()
-            # Numbers that the graph does not have are unsure no more.
+            # The uncertainty of numbers that the description does not have is dropped.
             if key == "joint_map"
             or has_entry(data, name)
             or (key == "tolerances" and name.partition(".")[0] in ("bodies", "joints", "rods"))
@@ -244,9 +238,9 @@ def robot_description(robot: Robot) -> dict[str, Any]:
 
 
 def copied_tolerances(robot: Robot) -> dict[str, list[str]]:
-    """Paths by names of ``tolerances`` of a limb's parts, of all copies, which have one error.
+    """Return the paths in all copies of a limb's parts, by names of ``tolerances``: they share one error.
 
-    Errors along axes are left out: those of the copies are turned.
+    Errors along axes are left out, because the copies are rotated.
     """
     copies: dict[str, list[str]] = {}
     for (kind, name), source in getattr(robot, "sources", {}).items():

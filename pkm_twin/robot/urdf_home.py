@@ -1,12 +1,12 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""The home of a tree with loop closures: which of its assemblies the robot starts from.
+"""Choose the home of a tree with loop closures among its assemblies.
 
-The actuated joints stand where the file wants them: at the initial values of ``<ros2_control>``,
-else at zero, else, where the limits leave zero out, amid the limits. Of several such assemblies the
-one as drawn is taken, else the best conditioned; where there is none, the best conditioned near it.
+The actuated joints are at the initial values of ``<ros2_control>``, else at zero, or in the middle of
+limits that exclude zero. Of several such assemblies the drawn one is taken, else the best conditioned;
+if there is none, the best conditioned one nearby.
 
-Every joint is a row of single steps, along or about one axis each, whose values count from the
-drawing: a graph of driven joints to the kinematics. A closure compares two frames.
+For the kinematics every joint is a series of driven joints of one freedom, whose values count from the
+drawing. A closure compares two frames.
 """
 
 from __future__ import annotations
@@ -37,60 +37,27 @@ from pkm_twin.machine.tree import Tree
 
 MAX_ITERATIONS: Final = 100
 """Most corrections of one closing, and most steps towards the zeros."""
-MAX_SLOW_STEPS: Final = 10
-"""Corrections in a row that gain less than 2 %: a minimum that is not zero."""
-MAX_STEP: Final = 0.5
-"""Largest change of a joint in one correction, rad or m."""
 RANK_BOUNDS: Final = (1e-4, 1e-6, 1e-8)
 """Singular values below this part of the largest count as zero; the next one if loops stay open."""
-MAX_REDUNDANT_MISS: Final = 1e-2
-"""Loops that miss by more do not close with another bound of RANK_BOUNDS, m or rad."""
 EXACT: Final = 1e-9
 """Loops that miss by less are closed for all purposes, m or rad."""
-CLOSED: Final = 1e-5
-"""A loop that misses by more is open, m or rad, unless the file's rounding is coarser."""
-MAX_SLIGHT_MOTION: Final = 1e-2
-"""Largest motion of a joint, rad or m, that closes a loop which is closed but for rounding."""
-MAX_DRAWN_DISTANCE: Final = 0.1
-"""A closed assembly is as drawn where no joint is farther from zero, rad or parts of the size."""
-MIN_GOOD_INDEX: Final = 0.01
-"""Least singularity index of a home that is taken as drawn."""
 MIN_HOME_INDEX: Final = 1e-4
-"""Least singularity index of a home: below, the machine can hardly move from it."""
-SAME_INDEX_RATIO: Final = 1.05
-"""Of assemblies whose indices differ by less than this factor the nearest to zero is taken."""
-SAME_PLACE_DISTANCE: Final = 1e-4
-"""Assemblies are one where no link is farther apart, parts of the size."""
-STARTS: Final = 12
-"""Random starts from which other assemblies are looked for."""
-REACHES: Final = (0.05, 0.1, 0.2, 0.4, 0.8)
-"""How far from the wanted values the actuated joints may be, rad or parts of the size."""
-STARTS_PER_REACH: Final = 6
-"""Random starts within each."""
+"""Smallest singularity index of a home: below it the machine can hardly move from there."""
 LEAST_ROUNDING: Final = 1e-6
-"""Deviation of axes and points that is rounding in any file, rad or parts of the size."""
-UNSPIN_STEPS: Final = 8
-"""Steps in which a part that only spins is turned back to zero."""
-HOME_TEXTS: Final = {
-    "drawn": "as drawn, the actuated joints at {place}",
-    "wanted": "the actuated joints at {place}, not as drawn",
-    "near": "the best conditioned assembly near {place}, as there is none at it",
-}
-"""How a home was chosen, in words."""
+"""Deviation of axes and points that is rounding in any file, rad or relative to the size."""
 
 
 class Assembly:
-    """The tree of a file, placed by its joint values, with its closures' residuals.
+    """The tree of a file at given joint values, with the residuals of its closures.
 
-    ``steps``: the joint of each single step, in the order of the values; ``turns``: whether it is a
-    turn. ``size``: of the drawing, m.
+    ``steps``: the joint of each value; ``turns``: true for a rotation. ``size``: of the drawing, m.
     """
 
     def __init__(self, tree: LoopTree) -> None:
         self.tree = tree
         self.rounding = min(MAX_ROUNDING, CHAIN * tree.rounding)
         """A loop that misses by less is drawn closed: the file has no more digits, m or rad."""
-        self.closed = max(CLOSED, self.rounding)
+        self.closed = max(1e-5, self.rounding)
         """A loop that misses by more is open, m or rad."""
         self._bodies, self.steps = {tree.root: BASE}, list[str]()
         joints: dict[str, graphs.Joint] = {}
@@ -190,11 +157,11 @@ class Assembly:
         return values, np.vstack(table)
 
     def close(self, values: Array, held: Mask | bool = False) -> tuple[Array, float]:
-        """Close the loops by least steps; return the values and the greatest miss left.
+        """Close the loops by smallest steps; return the values and the largest remaining gap.
 
-        Redundant closures of a rounded file contradict each other by that rounding: directions that
-        only they have are left alone at first, as steps along them lead anywhere, and are not taken
-        to close a loop that is closed but for rounding.
+        Redundant closures of a rounded file contradict each other by the rounding. Directions in which
+        only they act are excluded at first, because steps along them are arbitrary; they are not used to
+        close a loop that is closed but for rounding.
 
         :param held: steps that keep their values, shape (count,); by default none does.
         """
@@ -202,9 +169,11 @@ class Assembly:
         for rank in RANK_BOUNDS:
             new, left = self._close(best, rank, held)
             gone = float(np.abs(new - best).max(initial=0.0))
-            if left < 0.5 * miss and (miss > self.closed or gone < MAX_SLIGHT_MOTION):
+            # A loop that is closed but for rounding moves no joint by 0.01 rad or m.
+            if left < 0.5 * miss and (miss > self.closed or gone < 1e-2):
                 best, miss = new, left
-            if miss < max(1e-14, self.rounding) or miss > MAX_REDUNDANT_MISS:
+            # A gap of more than 0.01 m or rad does not close with another rank.
+            if miss < max(1e-14, self.rounding) or miss > 1e-2:
                 break
         self.place(best)
         return best, miss
@@ -220,11 +189,12 @@ class Assembly:
             """Return a truncated step, halved until it closes the loops further; zero if none does."""
             nonlocal slow
             miss = float(np.linalg.norm(residual))
-            if miss < 1e-15 or slow > MAX_SLOW_STEPS:
+            # Ten corrections in a row that gain less than 2 %: a minimum that is not zero.
+            if miss < 1e-15 or slow > 10:
                 return np.zeros(len(values))
             rates = np.where(held, 0.0, self.residuals()[1])
             step = np.where(held, 0.0, -np.linalg.lstsq(rates, residual, rcond=rank)[0])
-            step *= min(1.0, MAX_STEP / max(float(np.abs(step).max(initial=0.0)), 1e-300))
+            step *= min(1.0, 0.5 / max(float(np.abs(step).max(initial=0.0)), 1e-300))
             for _ in range(12):
                 less = float(np.linalg.norm(look(values + step)[0]))
                 if less < miss:
@@ -251,7 +221,7 @@ class Assembly:
         for spread in (0.05, 0.1, 0.2, 0.4, 0.8) * 2:
             if miss <= self.closed:
                 break
-            # The drawing may be a place from which no small step helps.
+            # No small step may help from the drawing.
             start = rng.uniform(-spread, spread, len(self.steps))
             other, less = self.close(start)
             if less < miss:
@@ -262,7 +232,7 @@ class Assembly:
         return values, miss
 
     def relaxed(self, values: Array, held: Mask | bool = False) -> Array:
-        """Place and return the values nearest to the drawing that closed loops can move to.
+        """Return, and set, the values nearest to the drawing that the closed loops can reach.
 
         :param held: steps that keep their values, shape (count,); by default none does.
         """
@@ -287,10 +257,7 @@ class Assembly:
 
     def _open(self) -> ParameterError:
         """Return the error of loops that do not close, with the one that misses the most."""
-        closure = max(
-            self.tree.closures,
-            key=lambda one: max(abs(float(e.value)) for e in self._equations(one)),
-        )
+        closure = max(self.tree.closures, key=lambda one: max(abs(float(e.value)) for e in self._equations(one)))
         a, b = (self.frame(closure, end) for end in (0, 1))
         apart = 1e3 * float(np.linalg.norm(b.position - a.position))
         turned = float(np.linalg.norm(rotation_vector(b.rotation @ a.rotation.T)))
@@ -314,7 +281,7 @@ def _list_constraints(closure: Joint) -> Iterator[tuple[Constraint, Array]]:
         apart = np.eye(3)
         if key == "turns":
             apart = closure.frames[1].rotation @ closure.frames[0].rotation.T
-            # Perpendicular vectors alone would let a frame be turned over.
+            # Perpendicular vectors alone would also allow the frame turned over.
             yield from ((Constraint("angle", one, one), apart) for one in np.eye(3))
         elif closure.type.count == 1:
             apart = _align(closure.axes[0], closure.axes[-1])
@@ -330,11 +297,11 @@ def _align(first: Array, second: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Home:
-    """An assembly: the steps' ``values``, and how far the loops ``miss`` (m or rad).
+    """An assembly: the steps' ``values``, and the gap ``miss`` of the loops (m or rad).
 
-    ``how``: key of HOME_TEXTS; ``place``: where the actuated joints were wanted. ``graph``:
-    idealised, with spins held by the joints ``held`` (each with the greatest mass times offset of
-    what it holds, kg m); None if its mobility is wrong. ``repair``: of the file's rounding.
+    ``how``: "drawn", "wanted" or "near"; ``place``: the wanted values of the actuated joints, in words.
+    ``graph``: idealised, with spins held by the joints ``held`` (each with the largest mass times
+    offset of the held parts, kg m); None if its mobility is wrong. ``repair``: of the file's rounding.
     ``index``: the singularity index.
     """
 
@@ -349,14 +316,19 @@ class Home:
 
     @property
     def text(self) -> str:
-        """How it was chosen, in words."""
-        return HOME_TEXTS[self.how].format(place=self.place)
+        """Description of the choice."""
+        texts = {
+            "drawn": f"as drawn, the actuated joints at {self.place}",
+            "wanted": f"the actuated joints at {self.place}, not as drawn",
+            "near": f"the best conditioned assembly near {self.place}, as there is none at it",
+        }
+        return texts[self.how]
 
 
 class HomeSearch:
     """Search for the home of an assembly.
 
-    :param graph: gives the machine at the assembly's placed values, no spin held.
+    :param graph: returns the machine at the assembly's values, without held spins.
     """
 
     def __init__(self, assembly: Assembly, graph: Callable[[], Graph]) -> None:
@@ -382,29 +354,25 @@ class HomeSearch:
             self.place = "zero or amid their limits"
 
         self._known: list[Array] = []
-        """Where the links are in the assemblies that were looked at, shape (links, 3), m."""
+        """Positions of the links in the known assemblies, shape (links, 3), m."""
         self._hinges: dict[str, float] | None = None
-        """The joints that hold the spins of an assembly, which hold those of others too."""
+        """The joints that hold the spins of one assembly, and of the others too."""
 
     def home(self) -> Home:
-        """Find the home, with parts that only spin at the file's zero where they can be.
+        """Find the home, with parts that only spin at the file's zero where possible.
 
-        :raises ParameterError: the loops close nowhere, by how much they are open.
+        The search leaves the angle of such parts to chance, but it matters if their masses are off the
+        axis.
+
+        :raises ParameterError: the loops close nowhere; the error states the gap.
         """
-        return self._unspun(self._best())
-
-    def _unspun(self, home: Home) -> Home:
-        """Turn parts that only spin back towards zero.
-
-        Where they stand is left to chance by the search, and where their masses are off the axis it
-        counts.
-        """
+        home = self._best()
         if not home.held or home.graph is None:
             return home
         values = self.assembly.relaxed(home.values, self.held)
         steps = list(self.assembly.steps)
         zero = np.array([name in home.held and steps.count(name) == 1 for name in steps], bool)
-        for left in range(UNSPIN_STEPS, 0, -1):
+        for left in range(8, 0, -1):
             values = np.where(zero, values * (left - 1) / left, values)
             values, miss = self.assembly.close(values, self.held | zero)
         if miss > max(home.miss, EXACT):
@@ -413,14 +381,21 @@ class HomeSearch:
         return turned if turned.index >= MIN_HOME_INDEX else home
 
     def _best(self) -> Home:
-        """Find the home, with parts that only spin wherever they are."""
+        """Find the home, with parts that only spin at any angle."""
         drawn = self._drawn()
-        if drawn is not None and drawn.how == "drawn" and drawn.index >= MIN_GOOD_INDEX:
+        if drawn is not None and drawn.how == "drawn" and drawn.index >= 0.01:
             return drawn
         if drawn is None:
-            # What closes nowhere is rejected before much is tried.
+            # Loops that close nowhere are rejected before the search.
             closed = self.assembly.anywhere()[0]
-        chosen = self._chosen([home for home in (drawn, *self._others()) if home is not None])
+        found = [home for home in (drawn, *self._others()) if home is not None]
+        inside = [home for home in found if self._inside(home.values)] or found
+        chosen = None
+        if inside:
+            # The best conditioned; of indices within 5 % the nearest to all joints' zeros.
+            best = max(home.index for home in inside)
+            good = [home for home in inside if home.index * 1.05 >= best]
+            chosen = min(good, key=lambda home: float(np.linalg.norm(home.values / self.units)))
         if chosen is not None and chosen.index >= MIN_HOME_INDEX:
             return chosen
         near = self._near()
@@ -428,7 +403,7 @@ class HomeSearch:
             return near
         if chosen is not None:
             return chosen
-        # No assembly is sound: the reason is the machine's, and told where it is looked at whole.
+        # No assembly is sound: the machine is rejected, with the reason, when it becomes a robot.
         values = self.assembly.relaxed(closed)
         return self._home(values, self.assembly.miss(), "near")
 
@@ -443,14 +418,15 @@ class HomeSearch:
             return None
         self._known.append(self.assembly.places())
         far = float((np.abs(values) / self.units)[~self.held].max(initial=0.0))
-        return self._home(values, miss, "drawn" if far <= MAX_DRAWN_DISTANCE else "wanted")
+        # As drawn if no passive joint moves by more than 0.1 rad or a tenth of the size.
+        return self._home(values, miss, "drawn" if far <= 0.1 else "wanted")
 
     def _reached(self, start: Array, how: str) -> Home | None:
         """Close the loops from a start; None if they stay open or the assembly is known."""
         values, miss = self.assembly.close(start, self.held)
         if miss > self.assembly.closed and how == "near":
             values, miss = self.assembly.close(values)
-        places, apart = self.assembly.places(), SAME_PLACE_DISTANCE * self.assembly.size
+        places, apart = self.assembly.places(), 1e-4 * self.assembly.size
         known = any(float(np.abs(places - other).max()) <= apart for other in self._known)
         if miss > self.assembly.closed or known:
             return None
@@ -460,7 +436,7 @@ class HomeSearch:
     def _others(self) -> list[Home | None]:
         """Find assemblies with the actuated joints at the same values, from random starts."""
         rng, reach = np.random.default_rng(0), np.where(self.turns, math.pi, self.units / 2)
-        starts = rng.uniform(-reach, reach, (0 if self.held.all() else STARTS, len(reach)))
+        starts = rng.uniform(-reach, reach, (0 if self.held.all() else 12, len(reach)))
         return [self._reached(np.where(self.held, self.wanted, s), "wanted") for s in starts]
 
     def _wrapped(self, values: Array) -> Array:
@@ -468,30 +444,22 @@ class HomeSearch:
         turned = (values + math.pi) % (2 * math.pi) - math.pi
         return np.where(self.turns & ~self.held, turned, values)
 
-    def _chosen(self, found: list[Home]) -> Home | None:
-        """Choose the best conditioned home; of equal ones the nearest to all joints' zeros."""
-        inside = [home for home in found if self._inside(home.values)] or found
-        if not inside:
-            return None
-        best = max(home.index for home in inside)
-        good = [home for home in inside if home.index * SAME_INDEX_RATIO >= best]
-        return min(good, key=lambda home: float(np.linalg.norm(home.values / self.units)))
-
     def _inside(self, values: Array) -> bool:
         """Return whether all joints, passive ones too, are inside the file's limits."""
         return bool(((values >= self.low - 1e-6) & (values <= self.high + 1e-6)).all())
 
     def _near(self) -> Home | None:
-        """Return the best conditioned assembly of the least reach that has a good one.
+        """Return the best conditioned assembly of the smallest reach that has a good one.
 
-        Its index is at least half of the best that any reach has: it is far from the edge of the
-        workspace.
+        Its index is at least half of the best of all reaches: it is far from the edge of the workspace.
+        The reach is the distance of the actuated joints from the wanted values, rad or relative to the
+        size.
         """
         rng = np.random.default_rng(1)
         tried: list[Home] = []
         best: list[Home] = []
-        for reach in REACHES:
-            for _ in range(STARTS_PER_REACH):
+        for reach in (0.05, 0.1, 0.2, 0.4, 0.8):
+            for _ in range(6):
                 start = self.wanted + rng.uniform(-reach, reach, len(self.wanted)) * self.units
                 start = np.where(self.held, np.clip(start, self.low, self.high), start)
                 home = self._reached(start, "near")
@@ -499,7 +467,7 @@ class HomeSearch:
             good = [h for h in tried if self._inside(np.where(self.held, h.values, self.low))]
             best += [max(good, key=lambda home: home.index)] if good else []
             if tried and (not best or best[-1].index < MIN_HOME_INDEX):
-                # All that close are singular, and not for where they are.
+                # All closed assemblies are singular, wherever they are.
                 break
         most = best[-1].index if best else 0.0
         return next((home for home in best if home.index >= max(0.5 * most, MIN_HOME_INDEX)), None)
@@ -508,9 +476,14 @@ class HomeSearch:
         self.assembly.place(values)
         try:
             settled = self._settle(self.graph(), miss)
-            index = 0.0 if settled is None else singularity_at_home(_led(settled[0]))
+            index = 0.0
+            if settled is not None:
+                # Redundant drives follow those that lead.
+                leads, joints = choose_leads(settled[0]), settled[0].joints
+                led = {n: replace(j, follows=j.actuated and n not in leads) for n, j in joints.items()}
+                index = singularity_at_home(replace(settled[0], joints=led))
         except (ParameterError, SingularityError, np.linalg.LinAlgError):
-            # The machine is looked at again by whoever makes a robot of it.
+            # The machine is checked again when it becomes a robot.
             settled, index = None, 0.0
         sound, held, repaired = settled or (None, {}, None)
         return Home(values, miss, how, self.place, sound, held, repaired, index)
@@ -538,16 +511,7 @@ class HomeSearch:
 
 
 def _is_driven(graph: Graph) -> bool:
-    """Return whether the actuated joints determine the machine at home, be it redundantly."""
+    """Return whether the actuated joints determine the machine at home, perhaps redundantly."""
     linkage = Linkage(graph)
     locked = null(linkage.scaled_at_home()[0], RANK, absolute=True)
     return not locked.shape[1] and 0 < linkage.mobility.freedoms <= linkage.joints
-
-
-def _led(graph: Graph) -> Graph:
-    """Return the graph whose redundant drives follow those that lead."""
-    leads = choose_leads(graph)
-    joints = {
-        name: replace(joint, follows=joint.actuated and name not in leads) for name, joint in graph.joints.items()
-    }
-    return replace(graph, joints=joints)

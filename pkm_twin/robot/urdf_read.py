@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""URDF, MJCF and SDF with loop closures as plain data of a ``mechanism: machine`` description."""
+"""Read URDF, MJCF, SDF and USD with loop closures as a ``mechanism: machine`` description."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from pkm_twin.kinematics.linkage import Linkage
 from pkm_twin.kinematics.rounding import repair_rounded
 from pkm_twin.machine import graph as graphs
 from pkm_twin.machine import mjcf_file, sdf_file, urdf_file, urdf_xml, usd_file
-from pkm_twin.machine.cut_out import check_faults, cut_out, find_circles
-from pkm_twin.machine.graph import Graph
+from pkm_twin.machine.cut_out import cut_out, find_circles
+from pkm_twin.machine.graph import BASE, Graph
 from pkm_twin.machine.graph_description import graph_description
 from pkm_twin.machine.loop_tree import SINGLE, Joint, Link, LoopTree
 from pkm_twin.machine.rotations import Pose
@@ -42,20 +42,14 @@ PLATFORMS: Final = (
     "tcp",
 )
 """Names of links that are taken for the platform, the first that is there."""
-MOST_MOVING: Final = 1000
-"""Most joints that are not fixed: assembling takes the cube of their number."""
-BALANCED: Final = 1e-6
-"""Mass times distance from the axis of a part that is balanced, kg m."""
-GROUND: Final = "base"
-"""The ground's name in a description."""
 
 
 @dataclass(frozen=True, eq=False)
 class UrdfReading:
-    """A file as a ``mechanism: machine`` description, and how it came to be.
+    """A file as a ``mechanism: machine`` description, and how it was read.
 
-    ``home``: how the home was chosen, in words. ``notes``: what was done to the file's machine.
-    ``marked``: what of the file marks the actuated joints. ``visuals``: the meshes of its links.
+    ``home``: how the home was chosen, in words. ``notes``: changes of the file's machine. ``marked``:
+    what marks the actuated joints in the file. ``visuals``: the meshes of its links.
     """
 
     description: dict[str, Any]
@@ -67,15 +61,15 @@ class UrdfReading:
 
 @dataclass(frozen=True)
 class Part:
-    """What of a file with links and joints is the machine.
+    """The part of a file with links and joints that is the machine.
 
     ``platform``: the link that carries the tool; default: the first of ``PLATFORMS``. ``base``: the
     link that is the ground and gives the base axes; default: the root. ``actuated``: joints with
     motors, in the order of q; default: those that the file marks. ``pose``: names of the pose
-    coordinates. ``carry``: what hangs on moving bodies is carried, fixed as drawn.
+    coordinates. ``carry``: links that hang on moving bodies are carried, fixed as drawn.
 
     With ``base`` or ``actuated`` everything is left out that is neither between base and platform
-    nor in a loop with that.
+    nor in a loop with these.
     """
 
     platform: str | None = None
@@ -97,16 +91,13 @@ class Part:
             names = getattr(self, field)
             if names is None:
                 continue
-            if (
-                isinstance(names, str)
-                or not isinstance(names, Collection)
-                or not all(isinstance(n, str) for n in names)
-            ):
+            listed = isinstance(names, Collection) and not isinstance(names, str)
+            if not listed or not all(isinstance(name, str) for name in names):
                 raise ParameterError(field, names, "a list of names")
 
     @property
     def cuts(self) -> bool:
-        """Whether other parts of the file are left out."""
+        """True if other parts of the file are left out."""
         return self.base is not None or self.actuated is not None or self.carry
 
 
@@ -154,7 +145,11 @@ def read_tree(path: str | Path, part: Part = Part()) -> UrdfReading:
         _require_motors(part, tree, cut.tree, ground, tool)
         tree, carried = cut.tree, cut.carried
         notes += cut.notes
-    check_faults(tree)
+    # Reject joints that follow others, if one of both belongs to the machine, and a lack of motors.
+    own = {*tree.joints, *(joint.name for joint in tree.closures)}
+    for names, error in tree.faults:
+        if own.intersection(names) or not (names or tree.actuated):
+            raise error
     _require_closed(path, tree)
     bodies = _bodies(tree, tool, ground)
     _require_open(tree, bodies, tool, ground)
@@ -171,14 +166,22 @@ def read_tree(path: str | Path, part: Part = Part()) -> UrdfReading:
         data["payload"] = {"mass": mass, "com": com, "inertia": inertia.tolist()}
     if part.pose is not None:
         data["pose"] = list(part.pose)
-    notes += _left_out(tree)
+    ignored = [
+        f"{key} {value:g} of {one.name}"
+        for one in (*tree.joints.values(), *tree.closures)
+        for key, value in (("damping", one.viscous), ("friction", one.coulomb), ("rotor inertia", one.rotor_inertia))
+        if value and one.kind not in (*SINGLE, "fixed")
+    ]
+    if ignored:
+        notes.append(f"ignored, because the joint has several degrees of freedom: {', '.join(ignored)}")
     if home.miss > EXACT:
         notes.append(f"the loops close within {home.miss:.1g} only (m or rad)")
     if home.repair and home.repair.moves:
         notes.append(home.repair.text)
     if home.held:
         notes.append(f"held, as they only let a part spin about itself: {', '.join(home.held)}")
-    heavy = {name: value for name, value in home.held.items() if value > BALANCED}
+    # Mass times distance from the axis, kg m, of a part that is not balanced.
+    heavy = {name: value for name, value in home.held.items() if value > 1e-6}
     if heavy:
         notes.append(
             "efforts depend on the angle at which parts with their mass off the axis are held: "
@@ -194,13 +197,14 @@ def read_tree(path: str | Path, part: Part = Part()) -> UrdfReading:
 
 
 def _require_closed(path: Path, tree: LoopTree) -> None:
-    """Reject what is too large to be assembled, and passive joints that no closure holds.
+    """Reject too many joints to be assembled, and passive joints that no closure holds.
 
-    :raises ParameterError: by their number, or by name.
+    :raises ParameterError: their number, or their names.
     """
     moving = [joint.name for joint in tree.joints.values() if joint.kind != "fixed"]
-    if len(moving) > MOST_MOVING:
-        raise ParameterError(str(path), f"{len(moving)} joints that move", f"at most {MOST_MOVING}")
+    # Assembling takes the cube of their number.
+    if len(moving) > 1000:
+        raise ParameterError(str(path), f"{len(moving)} joints that move", "at most 1000")
     idle = [name for name in moving if name not in tree.actuated]
     if idle and not tree.closures:
         raise ParameterError(
@@ -211,23 +215,21 @@ def _require_closed(path: Path, tree: LoopTree) -> None:
 
 
 def _require_motors(part: Part, whole: LoopTree, tree: LoopTree, base: str, tool: str) -> None:
-    """Reject a linkage without motors, and motors that are elsewhere.
+    """Reject a linkage without motors, and motors outside it.
 
-    :raises ParameterError: by name, with the joints that can be driven.
+    :raises ParameterError: the motors outside, and the joints that can be driven.
     """
     way = f"joints between base {base!r} and platform {tool!r}"
     drivable = [n for n, j in tree.joints.items() if j.kind in ("revolute", "prismatic", "helical")]
     away = [name for name in whole.actuated if name not in tree.joints]
     if not tree.actuated or (part.actuated is not None and away):
         raise ParameterError(
-            "actuated",
-            ", ".join(away) or None,
-            f"{way}, of which these can be driven: {', '.join(drivable)}",
+            "actuated", ", ".join(away) or None, f"{way}, of which these can be driven: {', '.join(drivable)}"
         )
 
 
 def _require_open(tree: LoopTree, bodies: dict[str, str], tool: str, ground: str) -> None:
-    """Reject loops of which every joint is marked as actuated: the last one is a closure.
+    """Reject loops in which every joint is marked as actuated: the last one is a closure.
 
     :raises ParameterError: the actuated joints and the degrees of freedom.
     """
@@ -245,7 +247,7 @@ def _require_open(tree: LoopTree, bodies: dict[str, str], tool: str, ground: str
 
 
 def _require_moving(tree: LoopTree, bodies: dict[str, str], tool: str) -> None:
-    """Reject actuated joints that do not move the platform, before a home is looked for.
+    """Reject actuated joints that do not move the platform, before the search for a home.
 
     :raises ParameterError: such joints, with the joints at which they can be cut out.
     """
@@ -253,7 +255,7 @@ def _require_moving(tree: LoopTree, bodies: dict[str, str], tool: str) -> None:
     joints += tree.closures
     pairs = {joint.name: (bodies[joint.inner], bodies[joint.outer]) for joint in joints}
     pairs = {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
-    moving, target = find_circles(pairs, GROUND, bodies[tool]), {GROUND, bodies[tool]}
+    moving, target = find_circles(pairs, BASE, bodies[tool]), {BASE, bodies[tool]}
     apart = [name for name in tree.actuated if name not in moving]
     if not apart:
         return
@@ -266,22 +268,6 @@ def _require_moving(tree: LoopTree, bodies: dict[str, str], tool: str) -> None:
         f"missing loop, or leave out the other parts, at {', '.join(cuts)}, with their motors "
         "(`base=LINK` or --base)",
     )
-
-
-def _left_out(tree: LoopTree) -> list[str]:
-    """Of friction and rotors in joints that the engine has none for."""
-    found = []
-    for part in (*tree.joints.values(), *tree.closures):
-        values = {
-            "damping": part.viscous,
-            "friction": part.coulomb,
-            "rotor inertia": part.rotor_inertia,
-        }
-        if part.kind not in (*SINGLE, "fixed"):
-            found += [f"{key} {value:g} of {part.name}" for key, value in values.items() if value]
-    if not found:
-        return []
-    return [f"ignored, because the joint has several degrees of freedom: {', '.join(found)}"]
 
 
 def _seen(assembly: Assembly, ground: str) -> dict[str, Pose]:
@@ -359,7 +345,7 @@ def _platform(tree: LoopTree, asked: str | None) -> str:
 
 
 def _bodies(tree: LoopTree, tool: str, ground: str) -> dict[str, str]:
-    """Each link's body, named by its link nearest to the root; the tool's is named by the tool.
+    """Return the body of each link, named by its link nearest to the root; the tool's by the tool.
 
     :raises ParameterError: the tool is fixed to the ground.
     """
@@ -369,7 +355,7 @@ def _bodies(tree: LoopTree, tool: str, ground: str) -> dict[str, str]:
             group[child] = group[parent]
     if group[tool] == group[ground]:
         raise ParameterError("platform", tool, "a link that can move")
-    names, taken = {group[ground]: GROUND}, {GROUND}
+    names, taken = {group[ground]: BASE}, {BASE}
     for first, wanted in ((group[tool], tool), *((first, first) for first in group.values())):
         if first in names:
             continue
@@ -378,9 +364,9 @@ def _bodies(tree: LoopTree, tool: str, ground: str) -> dict[str, str]:
 
 
 def _masses(tree: LoopTree, bodies: dict[str, str], moves: dict[str, Pose]) -> dict[str, graphs.Body]:
-    """All bodies but the ground, base axes."""
+    """Return all bodies except the ground, in base axes."""
     result: dict[str, graphs.Body] = {}
-    for body in dict.fromkeys(body for body in bodies.values() if body != GROUND):
+    for body in dict.fromkeys(body for body in bodies.values() if body != BASE):
         links = [link.moved(moves[name]) for name, link in tree.links.items() if bodies[name] == body]
         mass, com, inertia = _sum_masses(links)
         result[body] = graphs.Body(body, mass, _snapped(com), inertia)
@@ -398,7 +384,7 @@ def _sum_masses(links: Sequence[Link]) -> tuple[float, Array, Array]:
         arm = link.com - com
         inertia += link.inertia
         inertia += link.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
-    # Rounding left over by rotations is dropped.
+    # Remove the rounding of rotations.
     inertia = (inertia + inertia.T) / 2
     clean = np.where(np.abs(inertia) > 1e-14 * float(np.abs(inertia).max()), inertia, 0.0)
     return mass, com, np.array([[float(f"{x:.15g}") for x in row] for row in clean.tolist()])

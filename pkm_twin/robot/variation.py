@@ -1,10 +1,12 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""A machine beside its model: the same robot with parameters that differ by a stated spread."""
+"""Draw a robot whose parameters differ randomly from the model's by a stated relative deviation."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import reduce
+from operator import getitem
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -17,23 +19,10 @@ from pkm_twin.robot.robot import Robot
 Distribution = Literal["normal", "uniform"]
 
 MAX_SPREAD: Final = 0.3
-"""Greatest relative spread: three of it still leave a mass that is above zero."""
-FARTHEST: Final = 3.0
-"""Normal deviates are drawn anew beyond so many standard deviations."""
+"""Largest relative standard deviation: three of them leave a mass above zero."""
 KINDS: Final = ("masses", "inertias", "friction", "lengths")
 POINTS: Final = ("at", "ends")
-"""Places of a machine's joints and rods."""
-_LEFT_ALONE: Final = (
-    "limits",
-    "payload",
-    "joint_map",
-    "members",
-    "member",
-    "section",
-    "uncertainty",
-    "tolerances",
-)
-"""What is told of the machine beside its rigid bodies."""
+"""Keys of the points of a machine's joints and rods."""
 
 
 @dataclass(frozen=True)
@@ -42,12 +31,12 @@ class Variation:
 
     robot: Robot
     drawn: Mapping[str, float]
-    """By parameter, dotted: its factor; of a place's coordinates (``.x``) the shift, m."""
+    """The factor of each parameter by its dotted path; for coordinates (``.x``) the shift, m."""
 
 
 @dataclass(frozen=True)
 class _Number:
-    """A parameter that is varied: where it stands, and what it is."""
+    """A parameter that is varied: its path, kind and value."""
 
     path: tuple[str, ...]
     kind: str
@@ -57,16 +46,15 @@ class _Number:
 def varied(robot: Robot, spread: Mapping[str, float], seed: int, distribution: Distribution = "normal") -> Variation:
     """Draw a robot with other masses, inertias, friction and lengths.
 
-    Every number gets a factor 1 + s d of its own, an inertia one for all entries, with d
-    standard normal within three deviations or uniform between -1 and 1. The joints and rods of a
-    machine that is described by their places are each shifted by s d of the platform's radius
-    along each axis instead. What a parameter file leaves to be derived (as rods' inertias)
-    follows. Limits and payload stay; angles and directions too.
+    Every number gets its own factor 1 + s d, an inertia one factor for all entries; d is standard
+    normal within three deviations, or uniform between -1 and 1. Points of joints and rods are shifted
+    by s d times the platform's radius along each axis instead. Derived numbers, such as the inertias of
+    rods, follow. Limits, payload, angles and directions stay.
 
-    :param spread: s by kind, see :data:`KINDS`; a kind that is left out stays.
-    :param seed: of the draws; the same on every machine.
-    :raises ParameterError: a spread out of range, or a machine that closes with its own lengths
-        alone, as overconstrained ones do.
+    :param spread: s by kind, see :data:`KINDS`; kinds without one stay.
+    :param seed: of the random numbers, which are the same on every computer.
+    :raises ParameterError: a deviation out of range, or a machine that closes with its own lengths
+        only, as overconstrained ones do.
     """
     for kind, size in spread.items():
         if kind not in KINDS or not 0.0 <= size <= MAX_SPREAD:
@@ -75,7 +63,7 @@ def varied(robot: Robot, spread: Mapping[str, float], seed: int, distribution: D
     data = given(robot.parameter_sections())
     drawn: dict[str, float] = {}
     for number in _numbers(data, robot.parameter_units(), ()):
-        # Drawn for every number: a spread of one kind leaves the draws of the others.
+        # Draw for every number, so that a kind's deviation does not change the draws of other kinds.
         size, path = spread.get(number.kind, 0.0), ".".join(number.path)
         if number.path[-1] in POINTS:
             shift = size * robot.size * _draw(rng, distribution, np.shape(number.value))
@@ -92,24 +80,20 @@ def varied(robot: Robot, spread: Mapping[str, float], seed: int, distribution: D
             value = (np.asarray(number.value) * factors).tolist()
             told = {path + "".join(f"[{i}]" for i in k): float(f) for k, f in np.ndenumerate(factors)}
         if size > 0.0:
-            _section_of(data, number.path)[number.path[-1]] = value
+            reduce(getitem, number.path[:-1], data)[number.path[-1]] = value
             drawn |= told
-    return Variation(robot if not drawn else _built(robot, data, spread), drawn)
-
-
-def _built(robot: Robot, data: dict[str, Any], spread: Mapping[str, float]) -> Robot:
+    if not drawn:
+        return Variation(robot, drawn)
     try:
         made = type(robot).from_data(data, robot.name)
         made.forward(made.inverse(made.home()))
     except ValueError as error:
         if spread.get("lengths", 0.0) > 0.0:
             raise ParameterError(
-                "spread.lengths",
-                spread["lengths"],
-                f"0 for this robot, because its loops do not close ({error})",
+                "spread.lengths", spread["lengths"], f"0 for this robot, because its loops do not close ({error})"
             ) from error
         raise
-    return made
+    return Variation(made, drawn)
 
 
 def _numbers(data: Any, units: Any, path: tuple[str, ...]) -> Iterator[_Number]:
@@ -117,7 +101,8 @@ def _numbers(data: Any, units: Any, path: tuple[str, ...]) -> Iterator[_Number]:
     for key, value in data.items():
         here = (*path, key)
         unit = units.get(key, "") if isinstance(units, Mapping) else ""
-        if key in _LEFT_ALONE:
+        # Only the rigid bodies are varied.
+        if key in ("limits", "payload", "joint_map", "members", "member", "section", "uncertainty", "tolerances"):
             continue
         if isinstance(value, Mapping):
             yield from _numbers(value, unit, here)
@@ -139,16 +124,10 @@ def _kind(path: tuple[str, ...], unit: str) -> str | None:
     return None
 
 
-def _section_of(data: Any, path: tuple[str, ...]) -> Any:
-    for key in path[:-1]:
-        data = data[key]
-    return data
-
-
 def _draw(rng: np.random.Generator, distribution: Distribution, shape: tuple[int, ...]) -> Array:
     if distribution == "uniform":
         return np.asarray(rng.uniform(-1.0, 1.0, shape))
     values = np.asarray(rng.standard_normal(shape))
-    while (far := np.abs(values) > FARTHEST).any():
+    while (far := np.abs(values) > 3.0).any():
         values = np.where(far, rng.standard_normal(shape), values)
     return values

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Reachable workspace of a machine, and the regular one of a height and two tilts."""
+"""Find the reachable workspace of a machine, and the regular workspace of a height and two tilts."""
 
 from __future__ import annotations
 
@@ -46,49 +46,35 @@ def passive_values(robot: Robot, q: ArrayLike) -> Array:
     return np.stack(values, -1)
 
 
-def within_passive_limits(robot: Robot, q: ArrayLike) -> Mask:
-    """Whether passive joints keep their limits, shape (...); a robot without any keeps them.
-
-    :param q: joint positions with an assembly, shape (..., n).
-    """
-    if not robot.passive_limits:
-        return np.ones(np.shape(q)[:-1], bool)
-    values = passive_values(robot, q)
-    low, high = np.array([[one.low, one.high] for one in robot.passive_limits]).T
-    return np.asarray(((values >= low) & (values <= high)).all(-1))
-
-
 RAYS: Final = 360
 """Rays of a circle about the axis."""
-REFINEMENTS: Final = 32
 BLOCK: Final = 16
-AT_ONCE: Final = 2**16
-"""Poses, about, that are tried at a time."""
+"""Steps along a ray that are tried at a time."""
 CLEAR: Final = 0.01
-"""Singularity measure (0 in one, 1 at best) that regular workspaces stay above."""
+"""Singularity index (0 singular, 1 best) above which regular workspaces stay."""
 LEAST_TILT: Final = math.radians(10.0)
 """Radius, rad, below which a circle of tilts is left out (2UPR-RPU paper, section 4)."""
 INSIDE: Final = 0.05
-"""The same of random joint positions."""
+"""Singularity index above which random joint positions stay."""
 
 
 def try_inverse(robot: Robot, pose: ArrayLike) -> tuple[Array, Mask]:
-    """Joint positions of poses, shape (..., n), and where there are any, shape (...).
+    """Return joint positions of poses, shape (..., n), and which poses are valid, shape (...).
 
-    Where there are none, or the pose is not finite, they are those at home.
+    Invalid poses, also those that are not finite, get the joint positions at home.
     """
     q, good = robot.try_inverse(pose)
     return np.where(good[..., None], q, robot.graph.home), good
 
 
 def try_forward(robot: Robot, q: ArrayLike) -> tuple[Array, Mask]:
-    """Poses of joint positions, shape (..., m), and where there are any; zero elsewhere."""
+    """Return poses of joint positions, shape (..., m), zero if invalid, and which are valid."""
     pose, good = robot.try_forward(q)
     return np.where(good[..., None], pose, 0.0), good
 
 
 def singularity_at(robot: Robot, pose: ArrayLike) -> Array:
-    """``Robot.singularity`` at poses: 0 in a singularity or where no joints reach, shape (...).
+    """Return ``Robot.singularity`` at poses, shape (...): 0 in a singularity or out of reach.
 
     :param pose: shape (..., m), m and rad.
     """
@@ -99,14 +85,14 @@ def singularity_at(robot: Robot, pose: ArrayLike) -> Array:
 
 
 def has_joint_angles(robot: Robot) -> bool:
-    """Whether the machine bounds the angles of its passive joints."""
+    """Return whether the machine bounds the angles of its passive joints."""
     return robot.limit_angles(np.zeros(len(robot.pose_names))) is not None
 
 
 def joint_angle_at(robot: Robot, pose: ArrayLike) -> Array:
-    """Largest angle of a passive joint, rad, shape (...); NaN where no joints reach the pose.
+    """Return the largest angle of a passive joint, rad, shape (...); NaN if a pose is out of reach.
 
-    Between a limb and the vertical, or a limb and the platform's normal (2UPR-RPU paper, equation
+    The angles are between a limb and the vertical, or the platform's normal (2UPR-RPU paper, equation
     40).
 
     :raises ParameterError: a machine whose passive joints have no such angles.
@@ -120,7 +106,7 @@ def joint_angle_at(robot: Robot, pose: ArrayLike) -> Array:
 
 
 def within_limits(robot: Robot, q: ArrayLike) -> Mask:
-    """Whether joint positions keep the limits of the actuators, shape (...); absent ones hold."""
+    """Return whether joint positions are within the actuators' limits, shape (...); True without limits."""
     values, limits = doubles(q), robot.limits.position
     if limits is None:
         return np.ones(values.shape[:-1], bool)
@@ -142,14 +128,8 @@ def reachable(robot: Robot, pose: ArrayLike, least_clearance: float = 0.0) -> Ma
     return inside & keeps_limits(robot, q, poses, least_clearance, inside)
 
 
-def keeps_limits(
-    robot: Robot,
-    q: Array,
-    pose: Array,
-    least_clearance: float = 0.0,
-    known: Mask | bool = True,
-) -> Mask:
-    """Whether joint positions keep all limits, and limbs apart, shape (...); see `reachable`.
+def keeps_limits(robot: Robot, q: Array, pose: Array, least_clearance: float = 0.0, known: Mask | bool = True) -> Mask:
+    """Return whether joint positions are within all limits without limb interference, shape (...).
 
     :param q: shape (..., n); ``pose``: theirs, shape (..., m).
     :param least_clearance: as in :func:`reachable`.
@@ -161,15 +141,17 @@ def keeps_limits(
         # NaN is not below.
         inside &= joint_angle_at(robot, pose) <= bound
     if robot.passive_limits:
-        inside[inside] = within_passive_limits(robot, q[inside])
+        values = passive_values(robot, q[inside])
+        low, high = np.array([[one.low, one.high] for one in robot.passive_limits]).T
+        inside[inside] = ((values >= low) & (values <= high)).all(-1)
     if has_clearance(robot) and least_clearance > -math.inf:
-        # The dearest test, so only where all others hold.
+        # The most expensive test, so only where all others hold.
         inside[inside] = joint_clearance(robot, q[inside], refuse=False) > least_clearance
     return inside
 
 
 def counts(robot: Robot, q: Array, pose: Array, known: Mask, least: float, least_clearance: float) -> Mask:
-    """Which joint positions (k, n) and poses (k, m) count in a workspace, shape (k,).
+    """Return which joint positions (k, n) and poses (k, m) belong to a workspace, shape (k,).
 
     :param known: where there is an assembly.
     :param least: singularity index, and ``least_clearance``: clearance (m), that are too little.
@@ -199,10 +181,10 @@ def regular_workspace(
     directions: int = 360,
     step: float = math.radians(0.25),
 ) -> RegularWorkspace:
-    """Largest circle of reachable tilts about the axis at each height.
+    """Find the largest circle of reachable tilts about the axis at each height.
 
-    Clear of singularities by ``CLEAR``. Heights whose circle is smaller than ``least_radius`` are
-    left out (2UPR-RPU paper, section 4).
+    The singularity index stays above ``CLEAR``. Heights whose circle is smaller than ``least_radius``
+    are left out (2UPR-RPU paper, section 4).
 
     :param z: heights, shape (n,), m.
     :param least_radius: rad.
@@ -228,15 +210,15 @@ def circle_radii(
     least: float = CLEAR,
     least_clearance: float = 0.0,
 ) -> Array:
-    """Radii of the largest circles about the axis that are reachable with all their inside, (n,).
+    """Find the radii of the largest circles about the axis with reachable insides, (n,), m or rad.
 
-    0 where the axis itself is out of reach; m or rad.
+    A radius is 0 if the axis itself is out of reach.
 
     :param heights: shape (n,), m.
     :param step: first search along each ray, ``steps`` of them; a bisection refines it.
     :param least: singularity measure below which a pose counts as out of reach.
-    :param least_clearance: what the limbs' clearance has to be above, m.
-    :raises ValueError: a robot whose poses lie about no axis.
+    :param least_clearance: clearance of the limbs below which a pose counts as out of reach, m.
+    :raises ValueError: the robot's poses have no axis.
     """
     grid = robot.grid()
     turn = np.asarray(np.arange(rays) * (2 * np.pi / rays), np.float64)
@@ -248,7 +230,8 @@ def circle_radii(
         return ~kept
 
     rung, left = np.zeros(len(heights), np.int64), np.zeros((len(heights), rays), bool)
-    at_once = max(1, AT_ONCE // (BLOCK * rays))
+    # About 65536 poses at a time.
+    at_once = max(1, 2**16 // (BLOCK * rays))
     for start in range(0, len(heights), at_once):
         part = slice(start, start + at_once)
         rung[part], left[part] = _first_rungs(outside, heights[part], turn, step, steps)
@@ -256,7 +239,7 @@ def circle_radii(
     # The nearest end of all rays of a height: a ray that goes on beyond another's end is dropped.
     row, ray = np.nonzero(left & (rung > 0)[:, None])
     ends = np.isin(np.arange(len(heights)), row)
-    for _ in range(REFINEMENTS):
+    for _ in range(32):
         middle = (low + high) / 2
         gone = outside(heights[row], middle[row], turn[ray])
         nearer = np.isin(np.arange(len(heights)), row[gone])
@@ -267,15 +250,11 @@ def circle_radii(
 
 
 def _first_rungs(
-    outside: Callable[[Array, Array, Array], Mask],
-    heights: Array,
-    turn: Array,
-    step: float,
-    steps: int,
+    outside: Callable[[Array, Array, Array], Mask], heights: Array, turn: Array, step: float, steps: int
 ) -> tuple[NDArray[np.int64], Mask]:
-    """First multiple of a step that any ray leaves, shape (n,), and which rays do, (n, rays).
+    """Find the first multiple of a step outside on any ray, shape (n,), and these rays, (n, rays).
 
-    What is beyond does not matter. The last multiple, and no ray, where all hold.
+    Without such a ray it is the last multiple.
     """
     rung = np.zeros(len(heights), np.int64)
     left = outside(heights[:, None], np.zeros(1), turn)
@@ -294,7 +273,7 @@ def _first_rungs(
 
 
 def passing_singularity(index: float, bound: str = "--singularity ") -> str:
-    """Return a bound that a singularity index passes, the index rounded down, after its name."""
+    """Return a bound's name with a value that a singularity index passes: the index, rounded down."""
     if not index > 0.0:
         return f"{bound}0"
     digits = 1 - math.floor(math.log10(index))
@@ -335,7 +314,7 @@ def causes(robot: Robot, q: Array, pose: Array, known: Mask, least: float, least
 
 
 def position_range(robot: Robot) -> tuple[Array, Array]:
-    """Middle and half width of the joints' positions, shape (n,) each: the limits, or near home."""
+    """Return middle and half width of the joints' limits, or of a range about home, shape (n,) each."""
     home, size = robot.graph.home, robot.engine.tree.size
     half = np.array([0.15 * size if unit == "m" else 0.3 for unit in robot.joint_units])
     low, high = home - half, home + half
@@ -347,11 +326,11 @@ def position_range(robot: Robot) -> tuple[Array, Array]:
 
 
 def random_joints(robot: Robot, rng: np.random.Generator, count: int) -> Array:
-    """Joint positions clear of singularities, within limits where there are some, (count, n)."""
+    """Draw joint positions clear of singularities and within the limits, shape (count, n)."""
     home, (middle, reach) = robot.graph.home, position_range(robot)
     low, high = middle - reach, middle + reach
     kept, share = np.empty((0, len(home))), 1.0
-    # A machine with much gear has a small index everywhere.
+    # A machine with a large transmission ratio has a small index everywhere.
     least = min(INSIDE, 0.5 * float(robot.singularity(home)))
     while len(kept) < count:
         drawn = rng.uniform(middle - share * reach, middle + share * reach, (2 * count, len(home)))
@@ -360,6 +339,6 @@ def random_joints(robot: Robot, rng: np.random.Generator, count: int) -> Array:
         good = good & (measure > least) & ((low <= drawn) & (drawn <= high)).all(-1)
         kept = np.concatenate([kept, drawn[good]])
         if good.mean() < 0.05:
-            # Few joint positions together make an assembly: nearer to home more of them do.
+            # Few joint positions have an assembly; nearer to home there are more.
             middle, share = (middle + home) / 2, 0.7 * share
     return kept[:count]
