@@ -237,7 +237,13 @@ def read(description: Description) -> Machine:
         # The payload's centre is relative to the platform's reference point.
         at = reference + vector(load.get("com", origin))
         payload = Body(float(load["mass"]), at, tensor(load.get("inertia", origin)))
-        bodies[platform] = combine_bodies(bodies[platform], payload)
+        one = bodies[platform]
+        mass = one.mass + payload.mass
+        com, inertia = (one.mass * one.com + payload.mass * payload.com) / mass, np.zeros((3, 3))
+        for body in (one, payload):
+            arm = body.com - com
+            inertia += body.inertia + body.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+        bodies[platform] = Body(mass, com, inertia)
     return Machine(
         vector(data.get("gravity", (0.0, 0.0, -9.81))),
         platform,
@@ -250,17 +256,6 @@ def read(description: Description) -> Machine:
         joints,
         rods,
     )
-
-
-def combine_bodies(one: Body, other: Body) -> Body:
-    """Combine two rigid bodies; ``other`` must have mass."""
-    mass = one.mass + other.mass
-    com = (one.mass * one.com + other.mass * other.com) / mass
-    inertia = np.zeros((3, 3))
-    for body in (one, other):
-        arm = body.com - com
-        inertia += body.inertia + body.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
-    return Body(mass, com, inertia)
 
 
 def _read_ends(name: str, entry: Mapping[str, Any], known: set[str]) -> tuple[str, str]:

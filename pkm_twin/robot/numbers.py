@@ -1,8 +1,8 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""What programs take of a robot, as a function of some numbers of its file.
+"""Compute a robot's geometry and masses as functions of numbers of its file.
 
-The functions that make a robot's graph and masses of its file are run once on expressions of the
-numbers; arrays of numbers then take microseconds each, and no robot is built.
+The functions that derive a robot's graph and masses from its file run once on expressions of the
+numbers. Arrays of numbers then take microseconds each, without building a robot.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from pkm_twin.robot.robot import Robot
 
 
 class FileNumbers:
-    """What is computed of a robot, as expressions of numbers of its file.
+    """A function from numbers of a robot's file to results.
 
-    :param paths: dotted, as of :meth:`Robot.numbered`.
-    :param of: of a robot a row of numbers, or of expressions.
+    :param paths: dotted paths of the numbers, as in :meth:`Robot.numbered`.
+    :param of: returns the results of a robot, numbers or expressions.
     :raises ParameterError: an unknown path.
     """
 
@@ -44,12 +44,12 @@ class FileNumbers:
 
     @cached_property
     def slopes(self) -> Array:
-        """Derivatives of the row by the numbers, at the file's own values, shape (row, paths)."""
+        """Derivatives of the results by the numbers, at the file's values, shape (results, paths)."""
         return references(self._tangents).reshape(len(self._results), len(self._given))
 
     @cached_property
     def _slopes_run(self) -> tuple[list[tuple[int, int]], Callable[..., tuple[Any, ...]]]:
-        """Places of the derivatives that are not zero, and the function of these."""
+        """Indices of the nonzero derivatives, and the function that computes them."""
         tape = Tape() if not self._results else self._results[0].tape
         found = [
             (i, k, tape.lift(value))
@@ -61,7 +61,7 @@ class FileNumbers:
         return [(i, k) for i, k, _ in found], run
 
     def slopes_at(self, values: Array) -> Array:
-        """Return the slopes at values, shape (k, paths): (k, row, paths)."""
+        """Compute the derivatives at values, shape (k, paths); shape (k, results, paths)."""
         places, run = self._slopes_run
         table = np.zeros((len(values), len(self._results), len(self._given)))
         with np.errstate(all="ignore"):
@@ -70,7 +70,7 @@ class FileNumbers:
         return table
 
     def __call__(self, values: Array) -> Array:
-        """Of values, shape (k, paths): (k, row); NaN where a machine's numbers lead to none."""
+        """Compute results for values (k, paths), shape (k, results); NaN for an impossible machine."""
         with np.errstate(all="ignore"):
             rows = self._run(**{GEOMETRY: list(values.T)})
         table = np.empty((len(values), len(rows)))
@@ -80,11 +80,11 @@ class FileNumbers:
 
 
 class CauseSlopes:
-    """What one standard deviation of each of a robot's causes of doubt adds to a row's numbers.
+    """The change of each result per standard deviation of each uncertainty of a robot's file.
 
-    ``chosen``: places of the numbers that any cause changes; ``slopes``: shape (chosen, causes).
+    ``chosen``: indices of the results that change; ``slopes``: shape (chosen, causes).
 
-    :param of: as of :class:`FileNumbers`.
+    :param of: as in :class:`FileNumbers`.
     """
 
     def __init__(self, robot: Robot, of: Callable[[Robot], Sequence[Any]]) -> None:
@@ -98,7 +98,7 @@ class CauseSlopes:
 
 
 def geometry_and_masses(robot: Robot) -> list[Any]:
-    """Return the geometry as ``Engine.geometry``, then the masses as ``Robot.inertial``."""
+    """Return the numbers of ``Engine.geometry``, then those of ``Robot.inertial``."""
     graph, load = robot.with_laws(robot.graph), robot.payload
     layout = Layout(Tree(graph))
     inertial = layout.pack(graph, robot.gravity, robot.friction)

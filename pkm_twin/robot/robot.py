@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""What every robot computes: kinematics by the engine of its graph, masses as run-time inputs."""
+"""Compute the kinematics of a robot with the engine of its graph; masses are inputs at run time."""
 
 from __future__ import annotations
 
@@ -106,13 +106,13 @@ class Robot(Mechanism):
 
     @cached_property
     def inertial(self) -> Array:
-        """Run-time inputs of the dynamics, payload included, see ``machine.inertia``."""
+        """Parameter vector of the dynamics with the payload, see ``machine.inertia``."""
         load = self.payload
         return schema.frozen(self.own_inertial + self._layout.payload(load.mass, load.com, load.inertia))
 
     @cached_property
     def own_inertial(self) -> Array:
-        """The same without the payload."""
+        """Parameter vector of the dynamics without the payload."""
         return schema.frozen(self._layout.pack(self.graph, self.gravity, self.friction))
 
     @property
@@ -120,9 +120,9 @@ class Robot(Mechanism):
         return Layout(self._massive.tree)
 
     def massive(self) -> Engine:
-        """Return the engine of a robot with masses; its programs have the friction laws.
+        """Return the engine of a robot with masses, whose programs include the friction laws.
 
-        :raises ParameterError: the robot's file gives none: it leaves out a section ``inertia``.
+        :raises ParameterError: the robot's file states no masses.
         """
         if getattr(self, "inertia", True) is None:
             raise ParameterError("inertia", None, "a section with the masses and inertias")
@@ -130,7 +130,7 @@ class Robot(Mechanism):
 
     @property
     def has_masses(self) -> bool:
-        """Whether the robot's file gives masses."""
+        """True if the robot's file states masses."""
         try:
             self.massive()
         except ParameterError:
@@ -138,10 +138,10 @@ class Robot(Mechanism):
         return True
 
     def inverse(self, pose: ArrayLike) -> Array:
-        """Joint positions q (..., n) of poses (..., m); ``forward(q)`` is the pose.
+        """Compute joint positions q (..., n) of poses (..., m); ``forward(q)`` is the pose.
 
-        :raises UnreachableError: naming limb, sample and miss.
-        :raises SingularityError: a pose beyond a singularity, or in one.
+        :raises UnreachableError: a pose out of reach; limb, sample and gap are named.
+        :raises SingularityError: a pose at or beyond a singularity.
         """
         return self.function(_quick_inverse, otherwise=self._checked_inverse)(pose)
 
@@ -163,39 +163,39 @@ class Robot(Mechanism):
         return q, status if status[..., 0].any() else None
 
     def try_inverse(self, pose: ArrayLike) -> tuple[Array, Mask]:
-        """Joint positions (..., n), NaN for an invalid pose; and which poses are valid, (...)."""
+        """Return joint positions (..., n), NaN for an invalid pose, and which poses are valid, (...)."""
         q, status = self._invert(pose)
         good = np.ones(q.shape[:-1], bool) if status is None else status[..., 0] == GOOD
         return q, np.asarray(good)
 
     def forward(self, q: ArrayLike) -> Array:
-        """Pose of joint positions q, shape (..., m), in the mechanism's documented assembly.
+        """Compute the pose of joint positions q, shape (..., m), in the mechanism's documented assembly.
 
-        :raises UnreachableError: naming limb, sample and miss.
+        :raises UnreachableError: a joint state without an assembly; limb, sample and gap are named.
         :raises SingularityError: a singularity on the way from home.
         """
         return self.function(_forward)(q)
 
     def try_forward(self, q: ArrayLike) -> tuple[Array, Mask]:
-        """Poses (..., m), NaN where there is no assembly; and which q are valid, (...)."""
+        """Return poses (..., m), NaN without an assembly, and which q are valid, (...)."""
         return _tried(self.engine.forward, q)
 
     def platform(self, q: ArrayLike) -> tuple[Array, Array]:
-        """Position (..., 3) of the platform's reference point, and its rotation (..., 3, 3).
+        """Compute position (..., 3) of the platform's reference point and rotation (..., 3, 3) from home.
 
-        Base axes; the rotation is relative to home. Errors as :meth:`forward`.
+        Both are in base axes. Errors as in :meth:`forward`.
         """
         return self.placed(q)[1:]
 
     def placed(self, q: ArrayLike) -> tuple[Array, Array, Array]:
-        """Pose as :meth:`forward`, then position and rotation as :meth:`platform`, solved once."""
+        """Compute the pose of :meth:`forward` and position and rotation of :meth:`platform` together."""
         pose, position, rotation = self.evaluate(self.engine.forward, _NONE, q)
         return pose, position, rotation.reshape(*rotation.shape[:-1], 3, 3)
 
     def placements(self, q: ArrayLike) -> tuple[dict[str, Array], dict[str, Array]]:
-        """Rotation from home (..., 3, 3) and position of the frame's origin (..., 3) of each body.
+        """Compute rotation from home (..., 3, 3) and position of the frame's origin (..., 3) of each body.
 
-        ``engine.tree.at`` has the origins at home. Errors as :meth:`forward`.
+        ``engine.tree.at`` has the origins at home. Errors as in :meth:`forward`.
         """
         (flat,) = self.evaluate(self.engine.placement, _NONE, q)
         rows = flat.reshape(*flat.shape[:-1], len(self.graph.bodies), 12)
@@ -206,9 +206,9 @@ class Robot(Mechanism):
         return rotations, origins
 
     def rotation(self, pose: ArrayLike) -> Array:
-        """Platform axes as columns in base axes, shape (..., 3, 3), of a pose.
+        """Return the platform's axes as columns in base axes, shape (..., 3, 3), for a pose.
 
-        Errors as :meth:`inverse`.
+        Errors as in :meth:`inverse`.
         """
         return self.platform(self.inverse(pose))[1]
 
@@ -249,13 +249,13 @@ class Robot(Mechanism):
         return [m.reshape(*m.shape[:-1], m.shape[-1] // n, n) for m in tables]
 
     def try_jacobian(self, q: ArrayLike) -> tuple[Array, Mask]:
-        """Pose rates per joint rate (..., m, n), NaN without an assembly; which q are valid."""
+        """Return pose rates per joint rate (..., m, n), NaN without an assembly, and which q are valid."""
         rates, good = _tried(self.engine.jacobian, q)
         n = self.joints_count
         return rates.reshape(*rates.shape[:-1], rates.shape[-1] // n, n), good
 
     def inverse_jacobian(self, q: ArrayLike) -> Array:
-        """Joint rates per pose rate, shape (..., n, m)."""
+        """Return joint rates per pose rate, shape (..., n, m)."""
         jacobian = self.jacobian(q)
         if not self.redundant:
             return np.asarray(np.linalg.inv(jacobian), np.float64)
@@ -264,7 +264,7 @@ class Robot(Mechanism):
         return np.asarray(back @ np.linalg.inv(jacobian @ back), np.float64)
 
     def following(self, q: ArrayLike) -> Array:
-        """Rates of all drives by those that lead, shape (..., n, m); one where all lead."""
+        """Return rates of all drives per rate of the leading ones, (..., n, m); the identity if all lead."""
         if not self.redundant:
             n = self.joints_count
             return np.broadcast_to(np.eye(n), (*np.shape(q)[:-1], n, n))
@@ -273,20 +273,20 @@ class Robot(Mechanism):
 
     @cached_property
     def joint_scales(self) -> Array:
-        """What makes positions of unit one, shape (n,): the size for slides."""
+        """Scales that make joint positions dimensionless, shape (n,): the machine's size for slides."""
         return np.where(np.array(self.joint_units) == "m", self.engine.tree.size, 1.0)
 
     @property
     def effort_scale(self) -> Array:
-        """What efforts of drives that share are compared by, shape (n,)."""
+        """Scales by which redundant drives share efforts, shape (n,)."""
         return np.asarray(self.graph.sharing[1 : 1 + self.joints_count])
 
     def project_redundant(
         self, q: ArrayLike, qd: ArrayLike | None = None, qdd: ArrayLike | None = None
     ) -> tuple[Array, Array, Array]:
-        """Positions, rates and accelerations of all actuated joints, by the leading ones.
+        """Compute positions, rates and accelerations of all actuated joints from the leading ones.
 
-        Unchanged where all joints lead; errors as :meth:`forward`.
+        They are unchanged if all joints lead. Errors as in :meth:`forward`.
 
         :param q: joint positions, shape (..., n), with ``qd`` and ``qdd``; None: zero.
         :returns: shape (..., n) each.
@@ -300,7 +300,7 @@ class Robot(Mechanism):
         return first, second, third
 
     def try_project_redundant(self, q: Array) -> Array:
-        """Project positions alone; NaN where there is no assembly."""
+        """Project positions only; NaN without an assembly."""
         if not self.redundant:
             return q
         still = np.zeros(self.joints_count)
@@ -312,7 +312,7 @@ class Robot(Mechanism):
         return self.engine.kernel("project_redundant", projection_program)
 
     def pose_acceleration(self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike) -> Array:
-        """Second derivative of the pose in time, shape (..., m) (Delta-CU paper, equation 6)."""
+        """Compute the second time derivative of the pose, shape (..., m) (Delta-CU paper, equation 6)."""
         return self.evaluate(self.engine.acceleration, _NONE, q, qd, qdd)[0]
 
     def singularity(self, q: ArrayLike) -> Array:
@@ -335,7 +335,7 @@ class Robot(Mechanism):
         return np.where(good, measure[..., 0], 0.0), good
 
     def torque_loop(self, samples: int = 1) -> ControlLoop:
-        """Inverse dynamics for a control loop, with preallocated arrays.
+        """Prepare inverse dynamics for a control loop, with preallocated arrays.
 
         Write ``q, qd, qdd, wrench``, call it, and read ``tau`` and the returned status; see
         :class:`delta_dynamics.torques.virtual_work.TorqueLoop`.
@@ -351,14 +351,14 @@ class Robot(Mechanism):
         return passive_names(self.engine)
 
     def passive(self, q: ArrayLike) -> Array:
-        """Values of the passive joints, shape (..., k), rad or m, in a URDF's convention.
+        """Compute the passive joints' values, shape (..., k), rad or m, in a URDF's convention.
 
-        Angles are within half a turn of their value at home.
+        Angles are within half a turn of their values at home.
         """
         return self.evaluate(self.engine.kernel("passive", passive_program), _NONE, q)[0]
 
     def passive_rates(self, q: ArrayLike, qd: ArrayLike) -> Array:
-        """Rates of the passive joints, shape (..., k), rad/s or m/s, as :meth:`passive` has them.
+        """Compute the rates of the passive joints of :meth:`passive`, shape (..., k), rad/s or m/s.
 
         :param qd: joint rates, shape (..., n), rad/s or m/s.
         """
@@ -375,7 +375,7 @@ def _quick_inverse(robot: Robot) -> Kernel:
 
 
 def _tried(kernel: Kernel, given: ArrayLike) -> tuple[Array, Mask]:
-    """First output of a program, NaN where a sample is rejected; and which are not, (...)."""
+    """Return the first output of a program, NaN for rejected samples, and which are valid, (...)."""
     (result, *_), status = kernel(_NONE, given)
     good = np.ones(result.shape[:-1], bool) if status is None else status[..., 0] == 0.0
     return result, np.asarray(good)

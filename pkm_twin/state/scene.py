@@ -125,10 +125,17 @@ class Scene:
             return shapes
         shapes += self._joints(state.q, shares)
         shapes += self._deflected(places, state, load)
-        shapes.append(self._ellipsoid(state, load))
+        # The deflections under forces of one size: an ellipsoid with the axes of C.
+        values, axes = np.linalg.eigh(load.compliance[:3, :3])
+        axes = axes if np.linalg.det(axes) > 0.0 else -axes
+        x, y, z = (2.0 * values * self.scales.ellipsoid_force * self.scales.deflection).tolist()
+        turned = _to_quaternion(axes)
+        shapes.append(Shape("sphere", "compliance", 0, COLOURS["ellipsoid"], (x, y, z), state.position, turned))
         shapes += self._arrows(state, load)
         if load.dominant != "none":
-            shapes.append(self._text(state, load.dominant))
+            height = SIZES["letter"] * self._size
+            at, size = state.position + np.array([0.0, 0.0, 2.0 * height]), (0.0, 0.0, height)
+            shapes.append(Shape("text", "dominant", 0, COLOURS["text"], size, at, text=load.dominant))
         return shapes
 
     def placed(self, q: Array) -> Array:
@@ -180,16 +187,6 @@ class Scene:
             for k, (name, points) in enumerate(lines)
         ]
 
-    def _ellipsoid(self, state: State, load: Load) -> Shape:
-        """Draw the deflections under forces of one size: an ellipsoid with the axes of C."""
-        values, axes = np.linalg.eigh(load.compliance[:3, :3])
-        if np.linalg.det(axes) < 0.0:
-            axes = -axes
-        reach = 2.0 * values * self.scales.ellipsoid_force * self.scales.deflection
-        x, y, z = reach.tolist()
-        turned = _to_quaternion(axes)
-        return Shape("sphere", "compliance", 0, COLOURS["ellipsoid"], (x, y, z), state.position, turned)
-
     def _arrows(self, state: State, load: Load) -> list[Shape]:
         """Draw force and moment as arrows from the reference point."""
         shaft = SIZES["arrow"] * self._size
@@ -205,11 +202,6 @@ class Scene:
             for k, (vector, scale, colour) in enumerate(parts)
             if vector.any()
         ]
-
-    def _text(self, state: State, name: str) -> Shape:
-        height = SIZES["letter"] * self._size
-        at = state.position + np.array([0.0, 0.0, 2.0 * height])
-        return Shape("text", "dominant", 0, COLOURS["text"], (0.0, 0.0, height), at, text=name)
 
 
 def _to_quaternion(rotation: Array) -> tuple[float, float, float, float]:
