@@ -54,6 +54,11 @@ class Home(NamedTuple):
     """Reciprocal condition number of all equations, including those of the actuated joints."""
 
 
+def rotation_of(turn: Array) -> Array:
+    """Return the rotations of rotation vectors (..., 3), shape (..., 3, 3)."""
+    return np.asarray(Rotation.from_rotvec(turn).as_matrix(), np.float64)
+
+
 class Maximal(Moving):
     """A machine in maximal coordinates.
 
@@ -152,7 +157,7 @@ class Maximal(Moving):
 
     def _moved(self, state: State, change: Array) -> State:
         each = change.reshape(-1, 6)
-        turned = Rotation.from_rotvec(each[:, 3:]).as_matrix() @ state.rotation
+        turned = rotation_of(each[:, 3:]) @ state.rotation
         # One Newton step of the polar decomposition restores orthogonality after rounding.
         turned = turned @ (1.5 * np.eye(3) - 0.5 * turned.transpose(0, 2, 1) @ turned)
         return replace(state, rotation=turned, com=state.com + each[:, :3])

@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 
 from pkm_twin.certify.description import across
-from pkm_twin.certify.maximal import Maximal
+from pkm_twin.certify.maximal import Maximal, rotation_of
 from pkm_twin.design import drawn, tolerances
 from pkm_twin.design.parts import Assembly, part_of
 from pkm_twin.design.tolerance import rms, workspace_states
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.identification.calibration import calibrate, geometric, left_by_calibration
 from pkm_twin.identification.calibration_state import Poses
-from pkm_twin.machine.rotations import rotation_about
 from pkm_twin.machine.uncertainty import Tolerance
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.robot.numbers import FileNumbers
@@ -163,7 +162,10 @@ def states_of(robot, rng, count):
     return robot.graph.home + 0.05 * units * rng.uniform(-1.0, 1.0, (count, robot.joints_count))
 
 
-@pytest.mark.parametrize("name", partly_long(NAMES, "rrr3_planar", "rsur"))
+@pytest.mark.parametrize(
+    "name",
+    partly_long(NAMES, "rrr3_planar", "rsur"),
+)
 def test_an_error_of_a_part_is_a_drive_that_makes_it(name, rng):
     data = variant(name, rng)
     data.setdefault("platform", "platform")
@@ -199,7 +201,7 @@ def test_an_error_of_a_part_is_a_drive_that_makes_it(name, rng):
         place, turn = judge.platform(state + 3e-3 * way)
         before, from_ = judge.platform(state)
         np.testing.assert_allclose(exact[:3], place - before, atol=1e-9)
-        np.testing.assert_allclose(rotation_about(exact[3:]), turn @ from_.T, atol=1e-9)
+        np.testing.assert_allclose(rotation_of(exact[3:]), turn @ from_.T, atol=1e-9)
     assert fitting
 
 
@@ -403,7 +405,10 @@ def test_what_a_calibration_leaves_is_what_it_leaves():
     found = calibrate(robot, Poses(q, place + moved[:, :3], turn), geometric(robot, q))
     there, _ = found.robot.platform(found.joint_map.positions(q))
     left = left_by_calibration(
-        robot, lambda s: error * tolerances(robot, {path: error}, s).sensitivity[path][..., None], q, q
+        robot,
+        lambda s: error * tolerances(robot, {path: error}, s).sensitivity[path][..., None],
+        q,
+        q,
     )
     assert rms(left[:, :3, 0]) == pytest.approx(rms(place + moved[:, :3] - there), rel=0.03)
     assert rms(left[:, :3, 0]) < 0.9 * rms(moved[:, :3])
@@ -411,7 +416,11 @@ def test_what_a_calibration_leaves_is_what_it_leaves():
 
 def test_numbers_of_a_file_without_parts_vary_as_the_file_says():
     robot = load("delta_cu")
-    sigma = {"geometry.arm_length": 2e-5, "geometry.base_radius": 1e-5, "geometry.platform_radius": 3e-5}
+    sigma = {
+        "geometry.arm_length": 2e-5,
+        "geometry.base_radius": 1e-5,
+        "geometry.platform_radius": 3e-5,
+    }
     q = workspace_states(robot, 20)
     found, errors = tolerances(robot, sigma, q), drawn(robot, sigma, q, 4000)
     np.testing.assert_allclose(np.sqrt((errors[..., :3] ** 2).mean(0)), found.deviation[:, :3], rtol=0.06)
