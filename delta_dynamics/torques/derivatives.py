@@ -79,7 +79,7 @@ def _derivatives(
     rows: bool,
 ) -> TorqueDerivatives:
     inputs = _inputs(motion, wrench, weights, rows=rows)
-    by_q, by_qd, by_qdd = robot.evaluate(motion_gradient(robot), robot.inertial, *inputs)
+    by_q, by_qd, by_qdd = robot.evaluate(motion_gradient(robot), *inputs, p=robot.inertial)
     found: dict[str, Array] = {}
     if by:
         table = _numbers_table(robot, inputs) @ numbers_slopes(robot, by)
@@ -92,7 +92,7 @@ def torque_effects(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wr
     causes = robot.cached(CauseSlopes, geometry_and_masses)
     kernel = robot.cached(_effects_kernel)
     inputs = _inputs((q, qd, qdd), wrench, np.eye(robot.joints_count), rows=True)
-    (table,) = robot.evaluate(kernel, robot.inertial, *inputs)
+    (table,) = robot.evaluate(kernel, *inputs, p=robot.inertial)
     return np.asarray(table @ causes.slopes, np.float64)
 
 
@@ -135,7 +135,7 @@ def torques_by_numbers(
 
 def _numbers_table(robot: Robot, inputs: Sequence[Array]) -> Array:
     """Return the derivatives by geometry and masses, side by side on the last axis."""
-    return np.concatenate(robot.evaluate(numbers_gradient(robot), robot.inertial, *inputs), -1)
+    return np.concatenate(robot.evaluate(numbers_gradient(robot), *inputs, p=robot.inertial), -1)
 
 
 def motion_gradient(robot: Robot) -> Kernel:

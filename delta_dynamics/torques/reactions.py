@@ -353,10 +353,10 @@ def least_norm_reactions(
 def balance(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None = None) -> Balance:
     """Solve the balances of a motion; arguments and errors as :func:`reactions`."""
     load = np.zeros(6) if wrench is None else wrench
-    loads = robot.evaluate(loads_kernel(robot), robot.inertial, q, qd, qdd, load)
+    loads = robot.evaluate(loads_kernel(robot), q, qd, qdd, load, p=robot.inertial)
     found = balanced(robot, loads)
     if robot.redundant:
-        efforts = robot.evaluate(body_efforts(robot), robot.inertial, q, qd, qdd, load)[0]
+        efforts = robot.evaluate(body_efforts(robot), q, qd, qdd, load, p=robot.inertial)[0]
         found = _set_efforts(found, efforts)
     finite(found.value, "the motion or the wrench")
     return found

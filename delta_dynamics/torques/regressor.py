@@ -90,7 +90,7 @@ def regressor(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench:
     robot.check_independent("parameters of efforts", SHARED)
     load = np.zeros(6) if wrench is None else wrench
     kernel, gravity = robot.massive().kernel("regressor", _regressor), robot.gravity
-    bodies, others = robot.evaluate(kernel, np.ascontiguousarray(gravity), q, qd, qdd, load)
+    bodies, others = robot.evaluate(kernel, q, qd, qdd, load, p=np.ascontiguousarray(gravity))
     n, batch, graph = robot.joints_count, bodies.shape[:-1], robot.graph
     links = robot.engine.tree.links
     ten = _body_columns(bodies.reshape(*batch, len(links), 3 + 2 * n, 3), n)

@@ -51,7 +51,7 @@ def efforts_without_friction(
     p = _set_zero(robot.inertial, layout.friction)
     if not weight:
         p = _set_zero(p, layout.part(GRAVITY))
-    return robot.evaluate(torques(robot), p, q, qd, qdd, np.zeros(6))[0]
+    return robot.evaluate(torques(robot), q, qd, qdd, np.zeros(6), p=p)[0]
 
 
 def _set_zero(p: Array, part: slice | Indices) -> Array:
@@ -84,7 +84,7 @@ def dynamics_terms(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wr
     none = np.zeros(6)
 
     def whole(p: Array, qd: Array, qdd: Array, wrench: Array) -> Array:
-        return robot.evaluate(kernel, p, place, qd, qdd, wrench)[0]
+        return robot.evaluate(kernel, place, qd, qdd, wrench, p=p)[0]
 
     layout = Layout(robot.massive().tree)
     held = _set_zero(robot.inertial, layout.friction)

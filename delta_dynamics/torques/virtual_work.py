@@ -106,7 +106,7 @@ def body_mass_matrix(robot: Robot, q: ArrayLike, body: str) -> Array:
     """Return one body's part of the mass matrix, (..., n, n); the platform's with payload."""
     p, where = np.zeros_like(robot.inertial), Layout(robot.massive().tree).body(body)
     p[where] = robot.inertial[where]
-    return _square(robot, robot.evaluate(masses_kernel(robot), p, q)[0])
+    return _square(robot, robot.evaluate(masses_kernel(robot), q, p=p)[0])
 
 
 def forward_dynamics(
@@ -121,7 +121,7 @@ def forward_dynamics(
 
     def checked(q: ArrayLike, qd: ArrayLike, tau: ArrayLike, load: ArrayLike) -> Array:
         efforts = vectors(tau, robot.joints_count, "efforts")
-        return robot.evaluate(accelerations(robot), robot.inertial, q, qd, efforts, load)[0]
+        return robot.evaluate(accelerations(robot), q, qd, efforts, load, p=robot.inertial)[0]
 
     return robot.function(accelerations, robot.inertial, checked)(q, qd, tau, load)
 
@@ -147,7 +147,7 @@ class Energy:
 def energy(robot: Robot, q: ArrayLike, qd: ArrayLike) -> Energy:
     """Compute the mechanical energy of all bodies and rotors, payload included."""
     kernel = robot.massive().kernel("energy", _energy)
-    (both,) = robot.evaluate(kernel, robot.inertial, q, qd)
+    (both,) = robot.evaluate(kernel, q, qd, p=robot.inertial)
     return Energy(both[..., 0].copy(), both[..., 1].copy())
 
 

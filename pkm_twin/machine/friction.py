@@ -67,13 +67,11 @@ class FrictionLaw:
     @staticmethod
     def by_position(values: Values, q: Any) -> Any:
         """Return the effort that depends on the position alone."""
-        del values, q
         return 0.0
 
     @staticmethod
     def potential(values: Values, q: Any) -> Any:
         """Return the energy, J, whose derivative by q is :meth:`by_position`."""
-        del values, q
         return 0.0
 
     @staticmethod
@@ -82,13 +80,11 @@ class FrictionLaw:
 
         :param speed: absolute value of the velocity.
         """
-        del values, q, speed
         return 0.0
 
     @staticmethod
     def share(values: Values, q: Any, speed: Any) -> Any:
         """Return the effort against the motion as a fraction of the load's magnitude, below one."""
-        del values, q, speed
         return 0.0
 
     @classmethod
@@ -123,7 +119,6 @@ class Stribeck(FrictionLaw):
     @staticmethod
     def dry(values: Values, q: Any, speed: Any) -> Any:
         """Return F exp(-(v / vs)^2)."""
-        del q
         ratio = speed / maximum(values["stribeck_speed"], MIN_DIVISOR)
         return values["stribeck"] * exp(-(ratio * ratio))
 
@@ -137,7 +132,6 @@ class LoadDependent(FrictionLaw):
     @staticmethod
     def share(values: Values, q: Any, speed: Any) -> Any:
         """Return the friction coefficient, below one: self-locking drives are not modelled."""
-        del q, speed
         return values["load_dependent"]
 
 

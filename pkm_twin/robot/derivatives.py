@@ -16,8 +16,6 @@ from pkm_twin.machine.geometry import geometry_of
 from pkm_twin.robot.numbers import CauseSlopes, FileNumbers
 from pkm_twin.robot.robot import Robot
 
-_NONE = np.zeros(0)
-
 
 @dataclass(frozen=True, eq=False)
 class Derivatives:
@@ -146,7 +144,7 @@ def position_effects(robot: Robot, q: ArrayLike) -> Array:
 
 def _by_geometry(robot: Robot, q: ArrayLike, rows: Array) -> Array:
     states = vectors(q, robot.joints_count, "q")[..., None, :]
-    return robot.evaluate(platform_gradient(robot.engine), _NONE, states, rows)[0]
+    return robot.evaluate(platform_gradient(robot.engine), states, rows)[0]
 
 
 def geometry_numbers(robot: Robot) -> list[Any]:

@@ -87,12 +87,14 @@ class Robot(Mechanism):
         call: Callable[..., Array] | None = self._cached.get(program)
         if call is None:
             kernel = program(self)
-            call = kernel.bound(p, otherwise or (lambda *inputs: self.evaluate(kernel, p, *inputs)[0]))
+            call = kernel.bound(p, otherwise or (lambda *inputs: self.evaluate(kernel, *inputs, p=p)[0]))
             self._cached[program] = call
         return call
 
-    def evaluate(self, kernel: Kernel, p: Array, q: ArrayLike, *inputs: ArrayLike) -> list[Array]:
-        """Evaluate a program of joint positions and other inputs.
+    def evaluate(self, kernel: Kernel, q: ArrayLike, *inputs: ArrayLike, p: Array = _NONE) -> list[Array]:
+        """Evaluate a program of joint positions and other inputs; return all its outputs.
+
+        :param p: the program's parameters.
 
         :raises UnreachableError: a joint state without an assembly; limb, sample and gap are named.
         :raises SingularityError: a singularity on the way from home.
@@ -189,7 +191,7 @@ class Robot(Mechanism):
 
     def placed(self, q: ArrayLike) -> tuple[Array, Array, Array]:
         """Compute the pose of :meth:`forward` and position and rotation of :meth:`platform` together."""
-        pose, position, rotation = self.evaluate(self.engine.forward, _NONE, q)
+        pose, position, rotation = self.evaluate(self.engine.forward, q)
         return pose, position, rotation.reshape(*rotation.shape[:-1], 3, 3)
 
     def placements(self, q: ArrayLike) -> tuple[dict[str, Array], dict[str, Array]]:
@@ -197,7 +199,7 @@ class Robot(Mechanism):
 
         ``engine.tree.at`` has the origins at home. Errors as in :meth:`forward`.
         """
-        (flat,) = self.evaluate(self.engine.placement, _NONE, q)
+        (flat,) = self.evaluate(self.engine.placement, q)
         rows = flat.reshape(*flat.shape[:-1], len(self.graph.bodies), 12)
         rotations, origins = {}, {}
         for k, name in enumerate(self.graph.bodies):
@@ -238,14 +240,14 @@ class Robot(Mechanism):
         pose rates, by :meth:`inverse_jacobian`: the link matrices J_Hij of the 3-PRRU paper
         (equation 30), whose frames are at the slider joints. Rods have no frame.
         """
-        (flat,) = self.evaluate(self.engine.body_jacobian, _NONE, q)
+        (flat,) = self.evaluate(self.engine.body_jacobian, q)
         n = self.joints_count
         table = flat.reshape(*flat.shape[:-1], len(self.graph.bodies), 6, n)
         return {name: table[..., k, :, :] for k, name in enumerate(self.graph.bodies)}
 
     def _jacobians(self, q: ArrayLike) -> list[Array]:
         n = self.joints_count
-        tables = self.evaluate(self.engine.jacobian, _NONE, q)
+        tables = self.evaluate(self.engine.jacobian, q)
         return [m.reshape(*m.shape[:-1], m.shape[-1] // n, n) for m in tables]
 
     def try_jacobian(self, q: ArrayLike) -> tuple[Array, Mask]:
@@ -296,7 +298,7 @@ class Robot(Mechanism):
         if not self.redundant:
             arrays = np.broadcast_arrays(*(np.asarray(one, np.float64) for one in given))
             return arrays[0], arrays[1], arrays[2]
-        first, second, third = self.evaluate(self.projection_kernel, _NONE, *given)
+        first, second, third = self.evaluate(self.projection_kernel, *given)
         return first, second, third
 
     def try_project_redundant(self, q: Array) -> Array:
@@ -313,7 +315,7 @@ class Robot(Mechanism):
 
     def pose_acceleration(self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike) -> Array:
         """Compute the second time derivative of the pose, shape (..., m) (Delta-CU paper, equation 6)."""
-        return self.evaluate(self.engine.acceleration, _NONE, q, qd, qdd)[0]
+        return self.evaluate(self.engine.acceleration, q, qd, qdd)[0]
 
     def singularity(self, q: ArrayLike) -> Array:
         """Return the singularity index of joint positions: 0 in a singularity, 1 at best, (...).
@@ -355,7 +357,7 @@ class Robot(Mechanism):
 
         Angles are within half a turn of their values at home.
         """
-        return self.evaluate(self.engine.kernel("passive", passive_program), _NONE, q)[0]
+        return self.evaluate(self.engine.kernel("passive", passive_program), q)[0]
 
     def passive_rates(self, q: ArrayLike, qd: ArrayLike) -> Array:
         """Compute the rates of the passive joints of :meth:`passive`, shape (..., k), rad/s or m/s.
@@ -363,7 +365,7 @@ class Robot(Mechanism):
         :param qd: joint rates, shape (..., n), rad/s or m/s.
         """
         kernel = self.engine.kernel("passive rates", passive_rates_program)
-        return self.evaluate(kernel, _NONE, q, qd)[0]
+        return self.evaluate(kernel, q, qd)[0]
 
 
 def _forward(robot: Robot) -> Kernel:

@@ -56,10 +56,6 @@ STATE: Final = table(
 )
 
 
-NO_PARAMETERS: Final = np.zeros(0)
-"""Parameters of the programs: none besides the geometry."""
-
-
 @dataclass(frozen=True, eq=False)
 class State:
     """The state of the machine at one stamp, ns, in base axes.
@@ -149,9 +145,9 @@ class MachineState(TimeSynchronizer):
         robot, q, qd = self.robot, sample.q, sample.qd
         rates = twist = None
         if qd is None:
-            position, flat, passive = robot.evaluate(state_kernel(robot), NO_PARAMETERS, q)
+            position, flat, passive = robot.evaluate(state_kernel(robot), q)
         else:
-            found = robot.evaluate(moving_state_kernel(robot), NO_PARAMETERS, q, qd)
+            found = robot.evaluate(moving_state_kernel(robot), q, qd)
             position, flat, passive, passive_rates, twist = found
             rates = np.concatenate((qd, passive_rates))
         rotation, joints = flat.reshape(3, 3), np.concatenate((q, passive))
