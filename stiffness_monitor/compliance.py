@@ -133,7 +133,7 @@ def check(robot: Robot, q: ArrayLike, wrench: ArrayLike, measure: Array, status:
             place = np.broadcast_to(np.asarray(q, float), (*codes.shape, robot.joints_count))
             load = np.broadcast_to(np.asarray(wrench, float), (*codes.shape, 6))[index]
             if codes[index] != NOT_FINITE or not np.isfinite(place[index]).all():
-                reject_joints(robot, status, q)
+                reject_joints(robot, robot.engine, status, q)
             if not math.isfinite(sum(x * x for x in load.tolist())):
                 where = f" at sample {index}" if index else ""
                 raise ValueError(f"wrench, or its energy,{where} is not finite, or leads to a result that is not")

@@ -82,7 +82,7 @@ def member_gaps(robot: Robot, q: ArrayLike, refuse: bool = True) -> Array:
     """Return the distances of all :func:`member_pairs`, shape (..., pairs), m."""
     (gaps,), status = _kernel(robot)(_radii(robot), q)
     if status is not None and refuse:
-        reject_joints(robot, status, q)
+        reject_joints(robot, robot.engine, status, q)
     return gaps
 
 

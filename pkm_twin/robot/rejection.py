@@ -3,28 +3,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable, Mapping
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pkm_twin.codegen.arrays import Array
+from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.codegen.code import NOT_FINITE
+from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
 from pkm_twin.kinematics.drives import TIME
-
-if TYPE_CHECKING:
-    from pkm_twin.robot.robot import Robot
+from pkm_twin.kinematics.engine import Engine
+from pkm_twin.kinematics.programs import projection_program
+from pkm_twin.robot.mechanism import Mechanism
 
 SINGULARITY_BOUND: Final = 1e-9
 """Smallest singularity index (0 singular, 1 best) at which a Jacobian is inverted."""
 
 
-def reject_poses(robot: Robot, status: Array, pose: ArrayLike) -> None:
+def try_program(kernel: Kernel, given: ArrayLike) -> tuple[Array, Mask]:
+    """Return the first output of a program, NaN for rejected samples, and which are valid, (...)."""
+    (result, *_), status = kernel(np.zeros(0), given)
+    good = np.ones(result.shape[:-1], bool) if status is None else status[..., 0] == 0.0
+    return result, np.asarray(good)
+
+
+def reject_poses(
+    robot: Mechanism, engine: Engine, status: Array, pose: ArrayLike, try_inverse: Callable[[Array], tuple[Array, Mask]]
+) -> None:
     """Raise the error of the first rejected pose, if there is one.
 
     :param status: of the inverse kinematics, shape (..., 2). ``pose``: shape (..., m).
+    :param try_inverse: returns joint positions of poses, and which poses are valid.
     """
     index = _find_first(status[..., 0])
     if index is None:
@@ -34,25 +45,25 @@ def reject_poses(robot: Robot, status: Array, pose: ArrayLike) -> None:
     one = np.broadcast_to(poses, (*status.shape[:-1], poses.shape[-1]))[index]
     if code == NOT_FINITE or not np.isfinite(one).all():
         raise _not_finite("pose", index)
-    part, miss, met = robot.engine.shortest_pose(one)
-    question = _ask_for_unit(robot, one)
+    part, miss, met = engine.shortest_pose(one)
+    question = _ask_for_unit(robot, one, engine.home_pose)
     if met and reached < 1.0:
         raise SingularityError("pose", index, 0.0, SINGULARITY_BOUND, reached, question=question)
     if met:
         raise SingularityError("pose", index, 0.0, SINGULARITY_BOUND, None, True, question)
     # How much of the straight line from home is reached: three refinements by 64.
-    home, low, high = robot.home(), 0.0, 1.0
+    home, low, high = engine.home_pose, 0.0, 1.0
     for _ in range(3):
         fractions = np.linspace(low, high, 65)
-        good = robot.try_inverse(home + fractions[:, None] * (one - home))[1]
+        good = try_inverse(home + fractions[:, None] * (one - home))[1]
         first = int(np.argmin(good)) or 1
         low, high = fractions[first - 1], fractions[first]
     raise UnreachableError("pose", robot.name_limb(part), index, miss, float(low), question)
 
 
-def _ask_for_unit(robot: Robot, pose: Array) -> str:
+def _ask_for_unit(robot: Mechanism, pose: Array, home: Array) -> str:
     """Name the coordinate of a pose (m,) that is far outside, and ask for its unit; else empty."""
-    far = np.abs(pose - robot.home())
+    far = np.abs(pose - home)
     # Ten sizes of the machine from home were meant in mm.
     for unit, most, other, word in (("m", 10.0 * robot.graph.size, "mm", "mm"), ("rad", 2.0 * np.pi, "deg", "degrees")):
         own = np.where([one == unit for one in robot.pose_units], far, 0.0)
@@ -64,7 +75,9 @@ def _ask_for_unit(robot: Robot, pose: Array) -> str:
     return ""
 
 
-def reject_joints(robot: Robot, status: Array, q: ArrayLike, inputs: Mapping[str, ArrayLike] | None = None) -> None:
+def reject_joints(
+    robot: Mechanism, engine: Engine, status: Array, q: ArrayLike, inputs: Mapping[str, ArrayLike] | None = None
+) -> None:
     """Raise the error of the first rejected joint state, if there is one.
 
     :param status: of a kernel, shape (..., 2).
@@ -87,15 +100,14 @@ def reject_joints(robot: Robot, status: Array, q: ArrayLike, inputs: Mapping[str
         raise _not_finite("joint state", index)
     sample, question = given["q"], ""
     if robot.redundant:
-        _reject_contradiction(robot, given, index)
+        _reject_contradiction(robot, engine, given, index)
         sample = sample[robot.graph.leading]
         leads = ", ".join(robot.graph.leads)
         question = f"; it is one of {leads} alone, others may lead (redundancy.leads)"
-    engine = robot.engine
     gap = None if engine.start is None else engine.start.find_miss(engine.tree, sample)
     if gap is not None:
         raise UnreachableError("joint state", robot.name_limb(gap[0]), index, gap[1])
-    drive, change = _find_correction(robot, sample)
+    drive, change = _find_correction(robot, engine, sample)
     if change < np.inf and robot.graph.joints[drive].slides:
         raise UnreachableError("joint state", robot.name_limb(drive), index, change)
     part, miss, measure = engine.ending(sample, reached)
@@ -105,7 +117,7 @@ def reject_joints(robot: Robot, status: Array, q: ArrayLike, inputs: Mapping[str
     raise UnreachableError("joint state", limb, index, miss, reached)
 
 
-def _find_correction(robot: Robot, q: Array) -> tuple[str, float]:
+def _find_correction(robot: Mechanism, engine: Engine, q: Array) -> tuple[str, float]:
     """Return the drive that alone restores the assembly by the smallest change, and the change.
 
     The change is infinite if there is no such drive, or if the limbs have no names.
@@ -118,7 +130,7 @@ def _find_correction(robot: Robot, q: Array) -> tuple[str, float]:
     directions = np.concatenate([np.eye(size), -np.eye(size)])
     for _ in range(4):
         changes = low + np.linspace(0.0, 1.0, 129)[:, None] * (high - low)
-        good = robot.try_forward(q + changes[..., None] * directions)[1]
+        good = try_program(engine.forward, q + changes[..., None] * directions)[1]
         first, found = np.maximum(good.argmax(0), 1)[None], np.asarray(good.any(0))
         high = np.where(found, np.take_along_axis(changes, first, 0)[0], span)
         low = np.where(found, np.take_along_axis(changes, first - 1, 0)[0], span)
@@ -126,7 +138,7 @@ def _find_correction(robot: Robot, q: Array) -> tuple[str, float]:
     return robot.joint_names[best % size], float(high[best]) if found[best] else np.inf
 
 
-def _reject_contradiction(robot: Robot, given: Mapping[str, Array], index: tuple[int, ...]) -> None:
+def _reject_contradiction(robot: Mechanism, engine: Engine, given: Mapping[str, Array], index: tuple[int, ...]) -> None:
     """Raise the error of a drive that contradicts the leading ones, by position, velocity or acceleration."""
     graph, leads = robot.graph, ", ".join(robot.graph.leads)
     still = np.zeros(robot.joints_count)
@@ -137,7 +149,7 @@ def _reject_contradiction(robot: Robot, given: Mapping[str, Array], index: tuple
         ("has a velocity of {:.4g} {}, ", "what {} make it", "/s"),
         ("has an acceleration of {:.4g} {}, ", "what {} make it", "/s2"),
     )
-    found = robot.projection_kernel(np.zeros(0), *state)[0]
+    found = engine.kernel("project_redundant", projection_program)(np.zeros(0), *state)[0]
     for k, (own, follows, (has, whence, per)) in enumerate(zip(state, found, words, strict=True)):
         apart = np.abs(own - follows)
         worst = int(np.argmax(apart / scales))

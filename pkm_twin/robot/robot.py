@@ -23,7 +23,7 @@ from pkm_twin.machine import schema
 from pkm_twin.machine.graph import Graph
 from pkm_twin.machine.inertia import Layout
 from pkm_twin.robot.mechanism import Mechanism
-from pkm_twin.robot.rejection import reject_joints, reject_poses
+from pkm_twin.robot.rejection import reject_joints, reject_poses, try_program
 
 T = TypeVar("T")
 Options = TypeVarTuple("Options")
@@ -103,7 +103,7 @@ class Robot(Mechanism):
         outputs, status = kernel(p, q, *inputs)
         if status is not None:
             names = list(kernel.program.inputs)[1:]
-            reject_joints(self, status, q, dict(zip(names, inputs, strict=True)))
+            reject_joints(self, self.engine, status, q, dict(zip(names, inputs, strict=True)))
         return outputs
 
     @cached_property
@@ -150,7 +150,7 @@ class Robot(Mechanism):
     def _checked_inverse(self, pose: ArrayLike) -> Array:
         q, status = self._invert(pose)
         if status is not None:
-            reject_poses(self, status, pose)
+            reject_poses(self, self.engine, status, pose, self.try_inverse)
         return q
 
     def _invert(self, pose: ArrayLike) -> tuple[Array, Array | None]:
@@ -180,7 +180,7 @@ class Robot(Mechanism):
 
     def try_forward(self, q: ArrayLike) -> tuple[Array, Mask]:
         """Return poses (..., m), NaN without an assembly, and which q are valid, (...)."""
-        return _tried(self.engine.forward, q)
+        return try_program(self.engine.forward, q)
 
     def platform(self, q: ArrayLike) -> tuple[Array, Array]:
         """Compute position (..., 3) of the platform's reference point and rotation (..., 3, 3) from home.
@@ -252,7 +252,7 @@ class Robot(Mechanism):
 
     def try_jacobian(self, q: ArrayLike) -> tuple[Array, Mask]:
         """Return pose rates per joint rate (..., m, n), NaN without an assembly, and which q are valid."""
-        rates, good = _tried(self.engine.jacobian, q)
+        rates, good = try_program(self.engine.jacobian, q)
         n = self.joints_count
         return rates.reshape(*rates.shape[:-1], rates.shape[-1] // n, n), good
 
@@ -333,7 +333,7 @@ class Robot(Mechanism):
 
     def try_singularity(self, q: ArrayLike) -> tuple[Array, Mask]:
         """Return the singularity index (...), 0 without an assembly; and which q are valid."""
-        measure, good = _tried(self.singularity_kernel(), q)
+        measure, good = try_program(self.singularity_kernel(), q)
         return np.where(good, measure[..., 0], 0.0), good
 
     def torque_loop(self, samples: int = 1) -> ControlLoop:
@@ -374,10 +374,3 @@ def _forward(robot: Robot) -> Kernel:
 
 def _quick_inverse(robot: Robot) -> Kernel:
     return robot.engine.quick_inverse
-
-
-def _tried(kernel: Kernel, given: ArrayLike) -> tuple[Array, Mask]:
-    """Return the first output of a program, NaN for rejected samples, and which are valid, (...)."""
-    (result, *_), status = kernel(_NONE, given)
-    good = np.ones(result.shape[:-1], bool) if status is None else status[..., 0] == 0.0
-    return result, np.asarray(good)
