@@ -143,7 +143,7 @@ def _reject_contradiction(robot: Mechanism, engine: Engine, given: Mapping[str, 
     graph, leads = robot.graph, ", ".join(robot.graph.leads)
     still = np.zeros(robot.joints_count)
     state = [given.get(name, still) for name in ("q", "qd", "qdd")]
-    scales = robot.joint_scales
+    scales = np.where(np.array(robot.joint_units) == "m", engine.tree.size, 1.0)
     words = (
         ("is", "where {} put it", ""),
         ("has a velocity of {:.4g} {}, ", "what {} make it", "/s"),
