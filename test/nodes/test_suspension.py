@@ -46,6 +46,9 @@ def sent(messages):
 
 def suspended(node, wait, *topics, send=None):
     """The node stands still for longer than any pose is good: what it sends from then on."""
+    # The node finishes what it has begun: stopped between its two messages, it would send the second one late.
+    begin = time.monotonic() + wait / 15.0
+    node.peer.until(lambda: time.monotonic() > begin)
     node.process.process.send_signal(signal.SIGSTOP)
     try:
         end = time.monotonic() + wait
