@@ -1,11 +1,11 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Coordinates and elastic columns of a frame in a pose, on numbers and on expressions alike.
 
-Every displacement of a member's ends is written as that of the body it stands on plus what its
-joint lets through: u_end = X u_body + A s. So releases and springs need no constraint equations:
-a free direction is a coordinate s, an elastic one a coordinate s with a spring, a rigid one none.
+The displacement of a member's end is that of the body it is attached to plus the relative
+displacement in the joint: u_end = X u_body + A s. So releases and springs need no constraint
+equations: a free direction is a coordinate s, an elastic one a coordinate s with a spring.
 
-Stiffness is a sum of columns d b b': of a spring, and of a beam's six ways to deform, which are
+Stiffness is a sum of columns d b b': of springs, and of a beam's six deformation modes, which are
 stretch, twist, and in both planes a bend to a circle and one to an S. Each has the energy
 d (b . x)^2 / 2.
 

@@ -2,11 +2,11 @@
 """The elastic frame of a robot as compiled programs of q.
 
 K = sum of d b b' over the frame's columns is factorised once, the platform's six displacements
-last: what is left there is the platform's stiffness, C its inverse, and the displacements x under a
-wrench follow without another solution. An element has the energy sum of d (b . x)^2 / 2.
+last: their Schur complement is the platform's stiffness, C its inverse, and the displacements x
+under a wrench follow without another solution. An element has the energy sum of d (b . x)^2 / 2.
 
-Points, lengths, moduli, diameters and compliances are run-time inputs; only whether a compliance is
-zero, finite or free is part of a program, and what a machine's structure is made of.
+Points, lengths, moduli, diameters and compliances are run-time inputs; a program depends only on
+the machine's structure, and on which compliances are zero, finite or free.
 """
 
 from __future__ import annotations

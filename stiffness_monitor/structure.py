@@ -1,14 +1,14 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The structural model of a robot: elastic beams, joints, rigid bodies, locked actuators.
 
-It follows from the graph: every beam and every body that is no beam is carried by its parent
-through the joint between them, whose freedoms let go and whose compliances give; the platform keeps
-its six displacements, and what closes a loop between bodies that hang already is a closure.
+The graph determines it: each beam and each other body is attached to its parent by the joint
+between them, which is free along its freedoms and elastic by its compliances. The platform has six
+displacements of its own; a joint between two bodies that are already attached is a closure.
 
-What carries what is decided once, at home: that is the plan. In it a point or direction is a pair
+The plan states which part is attached to which, once, at home. In it a point or direction is a pair
 of its body and its vector at home, a section is its beam's name, and a compliance is 0, infinite or
-the joint's name and the entry. :func:`place_plan` puts numbers, or expressions, in their place. A
-plan of a geometry on expressions is that of its known case.
+the joint's name and the entry. :func:`place_plan` replaces these by numbers or expressions. For a
+geometry of expressions the plan is that of their known values.
 """
 
 from __future__ import annotations

@@ -38,18 +38,18 @@ class Stepper:
         on, damping = self._on, self._damping
         half, drift, lift, whole, far, v0, v1, v2, q0, q1, q2 = self._weights
 
-        def rest(q: Array, v: Array) -> Array:
+        def undamped_part(q: Array, v: Array) -> Array:
             a = accelerations(q, v)
             return a if damping is None else a + damping @ v
 
-        def moved(q: Array, v: Array, n: Array) -> tuple[Array, Array]:
+        def move_half(q: Array, v: Array, n: Array) -> tuple[Array, Array]:
             return q + on(drift, v) + on(lift, n), on(half, v) + on(drift, n)
 
-        first = rest(q, v)
-        a = moved(q, v, first)
-        second = rest(*a)
-        third = rest(*moved(q, v, second))
-        fourth = rest(*moved(*a, 2.0 * third - first))
+        first = undamped_part(q, v)
+        a = move_half(q, v, first)
+        second = undamped_part(*a)
+        third = undamped_part(*move_half(q, v, second))
+        fourth = undamped_part(*move_half(*a, 2.0 * third - first))
         inner = second + third
         return (
             q + on(far, v) + on(q0, first) + on(q1, inner) + on(q2, fourth),
@@ -67,7 +67,7 @@ def damped(span: float, modes: Array, back: Array, decays: Array) -> Stepper:
     """Return the method that is exact in a damping.
 
     :param modes: of the damping, columns, shape (n, r); other directions are undamped.
-    :param back: takes rates to the modes, shape (r, n).
+    :param back: from rates to modes, shape (r, n).
     :param decays: of the modes, 1/s, shape (r,).
     """
     plain = np.array(_undamped(span))

@@ -91,7 +91,7 @@ class Transmission:
         moved = None if velocity is None else _apply(ratio, self._joint(velocity, "velocity"))
         given = None
         if effort is not None:
-            given = _apply(self._back(q, ratio).swapaxes(-1, -2), self._joint(effort, "effort"))
+            given = _apply(self._joint_per_actuator(q, ratio).swapaxes(-1, -2), self._joint(effort, "effort"))
         return TransmissionState(self.robot.controller.controller_positions(q), moved, given)
 
     def actuator_to_joint(
@@ -110,7 +110,7 @@ class Transmission:
         if velocity is not None or effort is not None:
             ratio = self.ratio(pose)
             if velocity is not None:
-                moved = _apply(self._back(q, ratio), _vector(velocity, n, "velocity"))
+                moved = _apply(self._joint_per_actuator(q, ratio), _vector(velocity, n, "velocity"))
             if effort is not None:
                 given = _apply(ratio.swapaxes(-1, -2), _vector(effort, n, "effort"))
         return TransmissionState(pose, moved, given)
@@ -135,7 +135,7 @@ class Transmission:
         :param effort: efforts that the actuators carry at the position, (..., n); default: none.
         :returns: Ka and Da, shape (..., n, n) each: their coupling is a part of the result.
         """
-        back = self._back(*self._solve(position))
+        back = self._joint_per_actuator(*self._solve(position))
         wanted = self._matrix(stiffness, "stiffness")
         if effort is not None:
             load = _vector(effort, self.robot.joints_count, "effort")
@@ -239,8 +239,8 @@ class Transmission:
         ratio = flat.reshape(*q.shape, len(self.joints))
         return q, ratio * self.robot.controller.slopes(q)[..., None]
 
-    def _back(self, q: Array, ratio: Array) -> Array:
-        """Return P, joint rates per actuator rate, shape (..., m, n)."""
+    def _joint_per_actuator(self, q: Array, ratio: Array) -> Array:
+        """Return P, the joint rates per actuator rate, shape (..., m, n)."""
         if not self.robot.redundant:
             return np.asarray(np.linalg.inv(ratio))
         weights = (self.robot.effort_scale / self.robot.controller.slopes(q)) ** 2

@@ -27,7 +27,7 @@ from pkm_twin.robot.robot import Robot
 
 _NO_WRENCH: Final = np.zeros(6)
 MASSLESS: Final = 1e-12
-"""Least pivot of the mass matrix over its diagonal entry, at which accelerations are computed."""
+"""Smallest pivot of the mass matrix over its diagonal entry for which accelerations are computed."""
 
 
 def inverse_dynamics(
@@ -152,7 +152,7 @@ def energy(robot: Robot, q: ArrayLike, qd: ArrayLike) -> Energy:
 
 
 class Forces:
-    """The force and moment that each body needs at its origin, base axes: minus the papers' Q.
+    """The force and moment that each body needs at its origin, base axes: minus Q of the papers.
 
     :meth:`generalised` sums up their virtual work (Delta-CU paper, step 4, equation 22).
     """
