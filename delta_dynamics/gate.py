@@ -25,7 +25,7 @@ OnStop = Literal["zeros", "gravity"]
 
 @dataclass(frozen=True)
 class GateSettings:
-    """When the gate closes, and what it sends while it is closed."""
+    """Settings of the gate: when it closes, and its command while closed."""
 
     on_stop: OnStop = setting(
         "zeros",
@@ -98,8 +98,8 @@ class Gate(Core):
             try:
                 check_order(sample.stamp, self._last_stamp + 1)
             except MessageError:
-                # The torque of a stop has a later stamp than the states that the next torques answer:
-                # these are compared with this one. Two sources in turns are still rejected.
+                # The torque of a stop has a later stamp than the joint states of the next torques, which are
+                # therefore compared with this one. Torques of two sources in turns are still rejected.
                 self._last_stamp = sample.stamp
                 raise
             efforts, _ = self._limits.apply(sample.given, "reject")

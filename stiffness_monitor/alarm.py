@@ -255,7 +255,7 @@ class StiffnessAlarm:
         if not self._samples:
             return None
         sizes = np.array([np.linalg.norm(sample.moved[:3]) for sample in self._samples])
-        # 20 samples with a load, which predicts a twentieth of the largest deflection at least.
+        # At least 20 samples must be loaded: predicted to deflect by a twentieth of the largest deflection.
         if int((sizes > 0.05 * sizes.max()).sum()) < 20 or not sizes.max() > 0.0:
             return None
         window, alike, loudest = self._build_window()

@@ -111,7 +111,7 @@ def _inputs(motion: Sequence[ArrayLike], wrench: ArrayLike | None, weights: Arra
     load = np.zeros(6) if wrench is None else wrench
     inputs = [doubles(value) for value in (*motion, load)]
     if rows:
-        # One sample without the axis is the quick way of a small batch.
+        # Without the axis a single sample takes the fast path.
         inputs = [array if array.ndim == 1 else array[..., None, :] for array in inputs]
     return [*inputs, weights]
 

@@ -311,7 +311,7 @@ def independent(table: Array, preference: ArrayLike = 1.0) -> tuple[tuple[int, .
     :param preference: shape (p,): greater ones are taken first.
     :returns: indices, rising, and the matrix B, shape (b, p), with table = table[:, indices] B.
     """
-    # Here, as a stream's start would pay for what it does not need.
+    # Imported here, because a stream does not need it.
     from scipy.linalg import qr  # type: ignore[import-untyped]
 
     norms = np.linalg.norm(table, axis=0)
