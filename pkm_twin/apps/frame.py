@@ -103,7 +103,7 @@ class Option(click.Option):
             [name, field],
             type=Value(kind, row),
             metavar=row.metavar or metavar,
-            help=inspect.cleandoc(text),
+            help=text,
             multiple=repeated,
             required=default is MISSING,
             show_default=bool(self.shown),
