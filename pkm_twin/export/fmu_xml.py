@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -100,7 +100,71 @@ def quoted(name: str) -> str:
 
 def text_of(d: Description, version: int) -> str:
     """Write modelDescription.xml of FMI 2 or 3."""
-    top = _second(d) if version == 2 else _third(d)
+    second = version == 2
+    # FMI 2 counts variables from 1, references of FMI 3 begin at 0.
+    first = 1 if second else 0
+    token = {"guid" if second else "instantiationToken": d.token}
+    top = ET.Element(
+        "fmiModelDescription",
+        {"fmiVersion": f"{version}.0", "modelName": d.name, **token},
+        description=d.text,
+        generationTool=TOOL,
+        variableNamingConvention="structured",
+    )
+    if second:
+        top.set("numberOfEventIndicators", str(len(d.indicators)))
+    step = {"completedIntegratorStepNotNeeded": "true"} if second else {"needsCompletedIntegratorStep": "false"}
+    state = "FMUstate" if second else "FMUState"
+    for kind, more in (("ModelExchange", step), ("CoSimulation", {"canHandleVariableCommunicationStepSize": "true"})):
+        more |= {f"canGetAndSet{state}": "true", f"canSerialize{state}": "true"}
+        element = ET.SubElement(top, kind, {"modelIdentifier": d.identifier, **more})
+        if second:
+            files = ET.SubElement(element, "SourceFiles")
+            for name in d.sources:
+                ET.SubElement(files, "File", name=name)
+    units = ET.SubElement(top, "UnitDefinitions")
+    for name in sorted({v.unit for v in d.variables if v.unit}):
+        unit = ET.SubElement(units, "Unit", name=name)
+        ET.SubElement(unit, "BaseUnit", {key: str(k) for key, k in UNITS[name].items()})
+    ET.SubElement(top, "DefaultExperiment", startTime="0", stopTime="1", stepSize="0.001")
+    variables = ET.SubElement(top, "ModelVariables")
+    for k, v in enumerate(d.variables):
+        entry = {
+            "name": v.name,
+            "valueReference": str(k),
+            "description": v.description,
+            "causality": v.causality,
+            "variability": v.variability,
+            "initial": v.initial,
+        }
+        entry = {key: text for key, text in entry.items() if text}
+        own = {"start": repr(v.start)} if v.start is not None else {}
+        if v.unit:
+            own["unit"] = v.unit
+        if v.kind == "s" and d.resets:
+            own["reinit"] = "true"
+        if v.derivative is not None:
+            own["derivative"] = str(v.derivative + first)
+        if second:
+            scalar = ET.SubElement(variables, "ScalarVariable", entry)
+            ET.SubElement(scalar, "Integer" if v.whole else "Real", own)
+        else:
+            ET.SubElement(variables, "Int32" if v.whole else "Float64", entry | own)
+    structure = ET.SubElement(top, "ModelStructure")
+    for group, tag, kinds in (
+        ("Outputs", "Output", "so"),
+        ("Derivatives", "ContinuousStateDerivative", "d"),
+        ("InitialUnknowns", "InitialUnknown", "od"),
+    ):
+        rows = d.unknowns(kinds)
+        part = ET.SubElement(structure, group) if second and rows else structure
+        for k, v in rows:
+            needs = " ".join(str(i + first) for i in v.needs)
+            place = {"index" if second else "valueReference": str(k + first)}
+            ET.SubElement(part, "Unknown" if second else tag, place, dependencies=needs)
+    for k in () if second else d.indicators:
+        needs = " ".join(map(str, d.variables[k].needs))
+        ET.SubElement(structure, "EventIndicator", valueReference=str(k), dependencies=needs)
     ET.indent(top)
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(top, encoding="unicode") + "\n"
 
@@ -115,116 +179,3 @@ def build_of(d: Description) -> str:
     ET.SubElement(build, "Library", name="m")
     ET.indent(top)
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(top, encoding="unicode") + "\n"
-
-
-def _units(top: ET.Element, d: Description) -> None:
-    units = ET.SubElement(top, "UnitDefinitions")
-    for name in sorted({v.unit for v in d.variables if v.unit}):
-        unit = ET.SubElement(units, "Unit", name=name)
-        ET.SubElement(unit, "BaseUnit", {key: str(k) for key, k in UNITS[name].items()})
-
-
-def _attributes(d: Description, v: Variable) -> dict[str, str]:
-    found = {"start": repr(v.start)} if v.start is not None else {}
-    if v.unit:
-        found["unit"] = v.unit
-    if v.kind == "s" and d.resets:
-        found["reinit"] = "true"
-    return found
-
-
-def _second(d: Description) -> ET.Element:
-    top = ET.Element(
-        "fmiModelDescription",
-        fmiVersion="2.0",
-        modelName=d.name,
-        guid=d.token,
-        description=d.text,
-        generationTool=TOOL,
-        variableNamingConvention="structured",
-        numberOfEventIndicators=str(len(d.indicators)),
-    )
-    for kind, more in (
-        ("ModelExchange", {"completedIntegratorStepNotNeeded": "true"}),
-        ("CoSimulation", {"canHandleVariableCommunicationStepSize": "true"}),
-    ):
-        more |= {"canGetAndSetFMUstate": "true", "canSerializeFMUstate": "true"}
-        element = ET.SubElement(top, kind, {"modelIdentifier": d.identifier, **more})
-        files = ET.SubElement(element, "SourceFiles")
-        for name in d.sources:
-            ET.SubElement(files, "File", name=name)
-    _units(top, d)
-    ET.SubElement(top, "DefaultExperiment", startTime="0", stopTime="1", stepSize="0.001")
-    variables = ET.SubElement(top, "ModelVariables")
-    for k, v in enumerate(d.variables):
-        entry = {
-            "name": v.name,
-            "valueReference": str(k),
-            "description": v.description,
-            "causality": v.causality,
-            "variability": v.variability,
-            "initial": v.initial,
-        }
-        scalar = ET.SubElement(variables, "ScalarVariable", {a: b for a, b in entry.items() if b})
-        more = _attributes(d, v)
-        if v.derivative is not None:
-            more["derivative"] = str(v.derivative + 1)
-        ET.SubElement(scalar, "Integer" if v.whole else "Real", more)
-    structure = ET.SubElement(top, "ModelStructure")
-
-    def unknowns(tag: str, entries: Iterable[tuple[int, Variable]]) -> None:
-        rows = list(entries)
-        if rows:
-            part = ET.SubElement(structure, tag)
-            for k, v in rows:
-                needs = " ".join(str(i + 1) for i in v.needs)
-                ET.SubElement(part, "Unknown", index=str(k + 1), dependencies=needs)
-
-    unknowns("Outputs", d.unknowns("so"))
-    unknowns("Derivatives", d.unknowns("d"))
-    unknowns("InitialUnknowns", d.unknowns("od"))
-    return top
-
-
-def _third(d: Description) -> ET.Element:
-    top = ET.Element(
-        "fmiModelDescription",
-        fmiVersion="3.0",
-        modelName=d.name,
-        instantiationToken=d.token,
-        description=d.text,
-        generationTool=TOOL,
-        variableNamingConvention="structured",
-    )
-    for kind, more in (
-        ("ModelExchange", {"needsCompletedIntegratorStep": "false"}),
-        ("CoSimulation", {"canHandleVariableCommunicationStepSize": "true"}),
-    ):
-        more |= {"canGetAndSetFMUState": "true", "canSerializeFMUState": "true"}
-        ET.SubElement(top, kind, {"modelIdentifier": d.identifier, **more})
-    _units(top, d)
-    ET.SubElement(top, "DefaultExperiment", startTime="0", stopTime="1", stepSize="0.001")
-    variables = ET.SubElement(top, "ModelVariables")
-    for k, v in enumerate(d.variables):
-        entry = {
-            "name": v.name,
-            "valueReference": str(k),
-            "description": v.description,
-            "causality": v.causality,
-            "variability": v.variability,
-            "initial": v.initial,
-            **_attributes(d, v),
-        }
-        if v.derivative is not None:
-            entry["derivative"] = str(v.derivative)
-        kind = "Int32" if v.whole else "Float64"
-        ET.SubElement(variables, kind, {a: b for a, b in entry.items() if b})
-    structure = ET.SubElement(top, "ModelStructure")
-    for tag, kinds in (("Output", "so"), ("ContinuousStateDerivative", "d"), ("InitialUnknown", "od")):
-        for k, v in d.unknowns(kinds):
-            needs = " ".join(map(str, v.needs))
-            ET.SubElement(structure, tag, valueReference=str(k), dependencies=needs)
-    for k in d.indicators:
-        needs = " ".join(map(str, d.variables[k].needs))
-        ET.SubElement(structure, "EventIndicator", valueReference=str(k), dependencies=needs)
-    return top
