@@ -163,7 +163,7 @@ class Machine(TwinRobot):
             **common,
             **own,
         )
-        robot = robot._with(uncertainty=robot.resolved(robot.uncertainty))
+        robot = dataclasses.replace(robot, uncertainty=robot.resolved(robot.uncertainty))
         robot.check_laws()
         _ = robot.controller
         robot.engine.check()
@@ -186,7 +186,7 @@ class Machine(TwinRobot):
             return made
         drives = not {"friction", "limits", "redundancy"}.isdisjoint(sections)
         told = {key: schema.plain(getattr(made, key)) for key in sections if not drives}
-        made = made._with(book=made.book.told_anew(told))
+        made = dataclasses.replace(made, book=made.book.told_anew(told))
         if not drives:
             return made
         joints = dict(made.specs["joints"])
@@ -196,7 +196,7 @@ class Machine(TwinRobot):
         described = graph_of_entries(made.described.platform, specs, made.described.origin)
         leads = choose_leads(described, made.redundancy.leads or made.described.leads)
         described = shared_by(described, leads, made.redundancy, made.limits.effort)
-        made = made._with(specs=specs, described=described)
+        made = dataclasses.replace(made, specs=specs, described=described)
         made.check_laws()
         return made
 
@@ -246,7 +246,7 @@ class Machine(TwinRobot):
         own = drives_of(described, specs["joints"])
         leads, sharing = self.described.leads, made.redundancy
         described = shared_by(described, leads, sharing, own["limits"].effort)
-        return made._with(described=described, specs=specs, sources=sources, book=book, **own)
+        return dataclasses.replace(made, described=described, specs=specs, sources=sources, book=book, **own)
 
     def with_file_values(self, values: Mapping[str, Any]) -> Any:
         """Return the machine of the same file with other numbers, where possible with its expressions."""
