@@ -19,6 +19,7 @@ COLLISION = REPOSITORY / "bags/delta_cu_collision.mcap"
 MILLING = REPOSITORY / "bags/prru_milling.mcap"
 STIFFNESS = REPOSITORY / "bags/upr_rpu_milling.mcap"
 JOINTS = "/joint_states"
+CYCLE = ("path", "delta", "--cycle", "25,305,25", "--fastest")
 
 
 @pytest.fixture(scope="session")

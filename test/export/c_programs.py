@@ -30,6 +30,10 @@ from test.support.robots import has
 COMPILERS = [name for name in ("gcc", "clang") if shutil.which(name)]
 STRICT = ("-std=c++17", "-O0", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror")
 """Of C++."""
+CLOSE = {"compliance": 1e-11, "strain_energy": 1e-11}
+"""Of the largest value; by default 1e-12. The frame's stiffness has a condition of 1e4 to 1e6."""
+PLAIN = ("-O0",)
+"""What compiles in a moment."""
 ARM64 = ("aarch64-linux-gnu-gcc", "qemu-aarch64")
 """Compiler and emulator."""
 REALTIME = next((name for k in range(29, 19, -1) if shutil.which(name := f"clang-{k}")), "")

@@ -3,6 +3,7 @@
 
 import pytest
 
+from pkm_twin import load
 from pkm_twin.codegen.code import compiled
 
 
@@ -18,3 +19,8 @@ def quickly_compiled():
             yield
     else:
         yield
+
+
+@pytest.fixture(scope="module")
+def planar():
+    return load("examples/machines/rrr4_planar.yaml")
