@@ -21,7 +21,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from pkm_twin.codegen.arrays import Array
+from pkm_twin.codegen.arrays import ROUNDING_NOISE, Array
 from pkm_twin.kinematics.constraints import (
     Equation,
     Placement,
@@ -31,7 +31,7 @@ from pkm_twin.kinematics.constraints import (
     rotate,
 )
 from pkm_twin.kinematics.iterations import newton
-from pkm_twin.machine.graph import Graph, array
+from pkm_twin.machine.graph import Graph, Joint, array
 from pkm_twin.machine.joints import HELD
 
 CHAIN: Final = 20.0
@@ -131,6 +131,10 @@ def repair(graph: Graph, precision: float) -> Repair | None:
     # Rounding may show at home or only beside it.
     if loops.are_exact(rank, loops.walk(rank, 2, 1)) and not (sizes[rank:] > EXACT).any():
         return Repair(graph, {})
+    # Of a plane linkage least changes alone make axes that meet in a point far away.
+    loops.graph = align_axes(graph, precision)
+    if loops.are_exact(rank, loops.walk(rank, CHECKED, STEPS, seed=1)):
+        return loops.repair()
     for count in POSITIONS:
         loops = _Loops(graph)
         positions = loops.walk(rank, count, STEPS)
@@ -142,6 +146,41 @@ def repair(graph: Graph, precision: float) -> Repair | None:
         if loops.are_exact(rank, loops.walk(rank, CHECKED, STEPS, seed=1)):
             return loops.repair()
     return None
+
+
+def align_axes(graph: Graph, precision: float) -> Graph:
+    """Return the graph with axes exactly parallel, and hinges in one line, that are so within a precision.
+
+    :param precision: rad, or parts of the machine's size.
+    """
+    means: list[Array] = []
+    for axis in (axis for joint in graph.joints.values() for axis in joint.axes):
+        for mean in means:
+            if np.linalg.norm(np.cross(axis, mean)) < precision * np.linalg.norm(mean):
+                mean += axis if axis @ mean > 0.0 else -axis
+                break
+        else:
+            means.append(np.array(axis))
+    units = [mean / np.linalg.norm(mean) for mean in means]
+
+    def find_direction(axis: Array) -> Array:
+        unit = min(units, key=lambda unit: float(np.linalg.norm(np.cross(axis, unit))))
+        return unit if axis @ unit > 0.0 else -unit
+
+    joints: dict[str, Joint] = {}
+    lines: list[tuple[Array, Array]] = []
+    for name, joint in graph.joints.items():
+        axes, at = array(np.reshape([find_direction(axis) for axis in joint.axes], (-1, 3))), joint.at
+        if joint.type.count == 1 and not joint.slides:
+            for unit, point in lines:
+                apart = np.cross(unit, at - point)
+                if abs(unit @ axes[0]) > 1.0 - ROUNDING_NOISE and np.linalg.norm(apart) < precision * graph.size:
+                    at = at + np.cross(unit, apart)
+                    break
+            else:
+                lines.append((axes[0], at))
+        joints[name] = replace(joint, at=array(at), axes=axes)
+    return replace(graph, joints=joints)
 
 
 def repair_few(graph: Graph, freedoms: int) -> Repair | None:

@@ -1,9 +1,10 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """How far a machine is from a singularity of any kind: 0 in one, 1 at best.
 
-The lesser of two numbers. A body moves by (v, L omega): v of the middle of its joints, L the
-distance of the farthest of them from there, at least the platform's. Closures err in lengths,
-angles times the platform's L. Hence neither units, scale nor the reference point count.
+The lesser of two numbers. Bodies that fixed joints hold together are one. A body moves by
+(v, L omega): v of the middle of its joints, L the distance of the farthest of them from there, at
+least the platform's. Closures err in lengths, angles times the platform's L. Hence neither units,
+scale nor the reference point count.
 
 **Held**: the actuated joints are locked, and a closure errs by one. A = d(closures)/d(rates), k
 rates and r closures of which some may be redundant, B = d(bodies)/d(rates), all bodies':
@@ -52,7 +53,7 @@ from pkm_twin.kinematics.motion import (
     numbers,
 )
 from pkm_twin.kinematics.traced import Traced
-from pkm_twin.machine.graph import BASE, Graph, groups
+from pkm_twin.machine.graph import BASE, Graph, groups, weld
 from pkm_twin.machine.tree import Tree
 
 
@@ -107,7 +108,7 @@ class Placed(Motion):
     """
 
     def __init__(self, motion: Motion) -> None:
-        graph = motion.graph
+        graph = weld(motion.graph)
         # Locked are all drives, those that follow too.
         true = {n: replace(j, follows=False) for n, j in graph.joints.items() if not j.virtual}
         self.graph: Graph = replace(graph, joints=true)
@@ -224,8 +225,8 @@ def _moved(t: Traced | _Numbers, point: bool) -> Any:
 
     :param point: the pose has no angle, so the platform counts as its reference point.
     """
-    n, graph = t.joints, t.graph
-    rates = _Rates(t)
+    n, graph = t.joints, weld(t.graph)
+    rates = _Rates(t, graph)
     tool = (graph.origin, 0.0) if point else graph.frame(graph.platform)
     twist = rates.motion_of(graph.platform, tool)[: 3 if point else 6]
     table = _gram([{("u", j): v for j, v in enumerate(row)} for row in twist], n)
@@ -247,8 +248,8 @@ class _Rates:
     S: a body's motion by the rates between the base and the body. U: these by the joint rates.
     """
 
-    def __init__(self, t: Traced | _Numbers) -> None:
-        self.motion, self.graph, self.n = t.motion, t.graph, t.joints
+    def __init__(self, t: Traced | _Numbers, graph: Graph) -> None:
+        self.motion, self.graph, self.n = t.motion, graph, t.joints
         columns, own = t.rate_columns(), np.eye(t.joints)
         unknown = t.motion.tree.unknown_rates
         self._by_joints: dict[tuple[str, int], Any] = {("q", k): own[k] for k in range(t.joints)}

@@ -23,6 +23,8 @@ class SizedGraph(Graph):
     """A graph whose scale lengths (size, rim and frames) are given instead of computed."""
 
     given: Sequence[Any] = field(default=())
+    names: tuple[str, ...] = ()
+    """Of the bodies whose frames are given, in order."""
 
     @property
     def size(self) -> Any:
@@ -36,7 +38,7 @@ class SizedGraph(Graph):
 
     def frame(self, body: str) -> tuple[Array, Any]:
         """Return the given frame of a body: its middle, shape (3,), and its reach, m."""
-        k = 2 + 4 * list(self.bodies).index(body)
+        k = 2 + 4 * self.names.index(body)
         return plain(self.given[k : k + 3]), self.given[k + 3]
 
 
@@ -76,7 +78,9 @@ def graph_on(graph: Graph, numbers: Numbers) -> SizedGraph:
         rods[name] = replace(rod, ends=ends, pair=None if rod.pair is None else take(rod.pair))
     origin = take(graph.origin)
     sharing = take(graph.sharing)
-    return SizedGraph(graph.bodies, joints, rods, graph.platform, origin, graph.laws, sharing, list(left))
+    return SizedGraph(
+        graph.bodies, joints, rods, graph.platform, origin, graph.laws, sharing, list(left), tuple(graph.bodies)
+    )
 
 
 def pattern_of(tree: Tree) -> str:

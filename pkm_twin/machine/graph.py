@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import reduce
+from functools import cached_property, reduce
 from typing import Any, Final, TypeVar
 
 import numpy as np
@@ -225,9 +225,17 @@ class Graph:
         return middle, maximum(maximum(reach, own), MIN_LENGTH)
 
     def _held_points(self, body: str) -> list[Array]:
-        """Return the points of a body's joints and rods at home, m, without virtual joints."""
-        true = {name: joint for name, joint in self.joints.items() if not joint.virtual}
-        return replace(self, joints=true).joint_points(body) or self.joint_points(body)
+        """Return where joints and rods meet a body at home, with all that is welded to it, m.
+
+        Virtual joints hold nothing.
+        """
+        whole, own = self._welded, merged(self)[body]
+        true = {name: joint for name, joint in whole.joints.items() if not joint.virtual}
+        return replace(whole, joints=true).joint_points(own) or whole.joint_points(own)
+
+    @cached_property
+    def _welded(self) -> Graph:
+        return weld(self)
 
     def joint_points(self, body: str) -> list[Array]:
         """Return the points of a body's joints and rods at home, m."""
@@ -344,8 +352,25 @@ def groups(things: Iterable[T], pairs: Iterable[tuple[T, T]]) -> list[list[T]]:
 
 def merged(graph: Graph) -> dict[str, str]:
     """Return for each body, the ground too, the first of those that fixed joints unite with it."""
-    fixed = ((j.inner, j.outer) for j in graph.joints.values() if j.kind == "fixed")
+    fixed = [(j.inner, j.outer) for j in graph.joints.values() if j.kind == "fixed"]
+    if not fixed:
+        return {name: name for name in (BASE, *graph.bodies)}
     return {name: one[0] for one in groups([BASE, *graph.bodies], fixed) for name in one}
+
+
+def weld(graph: Graph) -> Graph:
+    """Return the graph with the bodies that fixed joints unite as one body, by the first one's name."""
+    own = merged(graph)
+    if all(name == first for name, first in own.items()):
+        return graph
+    joints = {n: replace(j, inner=own[j.inner], outer=own[j.outer]) for n, j in graph.joints.items()}
+    return replace(
+        graph,
+        bodies={name: body for name, body in graph.bodies.items() if own[name] == name},
+        joints={name: joint for name, joint in joints.items() if joint.inner != joint.outer},
+        rods={n: replace(r, inner=own[r.inner], outer=own[r.outer]) for n, r in graph.rods.items()},
+        platform=own[graph.platform],
+    )
 
 
 def spanning(things: Iterable[T], pairs: Mapping[K, tuple[T, T]]) -> list[K]:

@@ -296,7 +296,7 @@ def test_states_without_an_assembly_are_refused_by_their_sample(name, far):
 
 
 PROGRAM = """
-import json, sys
+import json, re, sys
 from delta_dynamics import inverse_dynamics
 from pkm_twin.codegen.code import compiled
 from pkm_twin.errors import PkmTwinError
@@ -312,7 +312,7 @@ for name, far in json.loads(sys.stdin.read()).items():
     try:
         load(name).forward(far)
     except PkmTwinError as error:
-        found[name, "refusal"] = leaves(str(error))
+        found[name, "refusal"] = leaves(re.sub(r"\\d+\\.\\d+", lambda m: f"{float(m[0]):.4g}", str(error)))
 print(json.dumps({"compiled": found.pop("compiled")}
     | {" ".join(key): [leaf.tolist() for leaf in value] for key, value in found.items()}))
 """

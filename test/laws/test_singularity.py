@@ -17,12 +17,13 @@ from pkm_twin.certify.rows import stacked
 from pkm_twin.errors import SingularityError
 from pkm_twin.kinematics.linkage import Linkage
 from pkm_twin.kinematics.singularity import Placed, singularity_on_numbers
+from pkm_twin.machine.graph import weld
 from pkm_twin.machine.graph_description import graph_description
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.robot.robot_urdf import robot_description
 from stiffness_monitor import compliance
 from test.machine.random_machines import GALLERY, NAMES, plain, rotation_of, variant
-from test.support.robots import joint_range, load, random_joints
+from test.support.robots import joint_range, load, partly_long, random_joints
 
 SURFACE = np.array([-0.08871, 0.34395, -0.18159])
 """A pose of the Delta-CU, inside its limits and its reach, where its platform is free to turn."""
@@ -74,9 +75,9 @@ def twists(judge, graph):
 
 def expected(robot, judge, q):
     """The measure by its definition, on numbers, from a matrix of all bodies' free motion."""
-    graph = robot.graph
+    placed = Placed(robot.engine.at(robot.engine.tree.home, robot.graph.home)[0])
+    graph = weld(robot.graph)
     judge.assemble(q)
-    placed = Placed(robot.engine.at(robot.engine.tree.home, graph.home)[0])
     bodies, radius = twists(judge, graph), frame(graph, graph.platform)[1]
     exact = [judge.drives().columns]
     wrong = [judge.rod_rows(rod).columns / rod.length for rod in judge.machine.rods]
@@ -324,6 +325,24 @@ class TestWays:
         inside = measure[good]
         assert inside.max() > 0.1
         assert inside.min() < 0.01
+
+
+@pytest.mark.parametrize("name", partly_long(("four_bar", "elbow_motors", "rsur"), "four_bar"))
+def test_how_a_body_is_welded_together_does_not_count(name):
+    """Each joint of a body that moves stands on a part of its own, bolted on."""
+    data = plain(name)
+    joints, bolts = data["joints"], {}
+    for own, joint in joints.items():
+        for k, body in enumerate(joint["between"]):
+            if body != "base":
+                part = f"{own}_part_{k}"
+                data["bodies"][part] = {}
+                joint["between"][k] = part
+                bolts[f"{part}_bolt"] = {"type": "fixed", "between": [body, part], "at": joint["at"]}
+    data["joints"] = {**joints, **bolts}
+    whole, parts = robot_of_data(plain(name), name), robot_of_data(data, name)
+    q = random_joints(whole, np.random.default_rng(5), 4, clear=0.01)
+    np.testing.assert_allclose(parts.singularity(q), whole.singularity(q), rtol=1e-9)
 
 
 @pytest.mark.parametrize("name", robot_names())

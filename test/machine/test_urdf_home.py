@@ -10,6 +10,7 @@ import yaml
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin.errors import ParameterError
+from pkm_twin.kinematics.singularity import singularity_at_home
 from pkm_twin.mechanisms.machine import Machine
 from pkm_twin.robot.urdf_home import Assembly
 from pkm_twin.robot.urdf_read import read_tree
@@ -116,6 +117,13 @@ def test_a_drawing_with_spheres_is_the_machine_that_pinocchio_has(drawing, expor
         qd, qdd = rng.normal(size=(2, len(home)))
         expected = tree.torques(full, qd, qdd)
         np.testing.assert_allclose(inverse_dynamics(robot, q, qd, qdd), expected, atol=accuracy)
+
+
+@pytest.mark.long
+def test_the_index_is_that_of_the_machine_however_its_closures_are_written(tmp_path):
+    """Of spheres at frames that are links of their own, and of hinges."""
+    found = [singularity_at_home(read(rrr3().save(tmp_path, way))[1].graph) for way in ("spheres", "constraint")]
+    assert found[0] == pytest.approx(found[1], rel=1e-9)
 
 
 @pytest.mark.parametrize("tries", often(2, 12))
