@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cached_property
-from typing import Final, Protocol
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -24,6 +24,9 @@ from pkm_twin.robot.robot import Robot
 from stiffness_monitor.derivatives import compliance_gradient
 from stiffness_monitor.numbers import list_numbers
 from stiffness_monitor.programs import Elastic
+
+if TYPE_CHECKING:
+    from pkm_twin.design.variants import Variants
 
 
 class NumberFunctions:
@@ -46,43 +49,27 @@ class NumberFunctions:
         return FileNumbers(self.robot, self.paths, lambda made: list_numbers(made.elastic))
 
 
-class Rows(Protocol):
-    """Define the programs' inputs of machines, a row each, shape (k, size)."""
-
-    @property
-    def geometry(self) -> Array:
-        """Numbers of joints, rods and bodies."""
-
-    @property
-    def masses(self) -> Array:
-        """Masses, centres of mass, inertias and rotors."""
-
-    @property
-    def elasticity(self) -> Array:
-        """Stiffness of members and joints."""
-
-
-Asked = tuple[Kernel, Callable[[Rows], Array]]
+Asked = tuple[Kernel, Callable[["Variants"], Array]]
 """A program, and the function that returns its inputs of machines, shape (k, size)."""
 Ask = Callable[[Robot], Asked]
 
 
-def of_geometry(many: Rows) -> Array:
+def of_geometry(many: Variants) -> Array:
     """Return the geometry of the machines."""
     return many.geometry
 
 
-def of_masses(many: Rows) -> Array:
+def of_masses(many: Variants) -> Array:
     """Return masses, then geometry."""
     return np.concatenate([many.masses, many.geometry], 1)
 
 
-def of_elasticity(many: Rows) -> Array:
+def of_elasticity(many: Variants) -> Array:
     """Return geometry, then elasticity."""
     return np.concatenate([many.geometry, many.elasticity], 1)
 
 
-def asks(kernel: Callable[[Robot], Kernel], numbers: Callable[[Rows], Array] = of_geometry) -> Ask:
+def asks(kernel: Callable[[Robot], Kernel], numbers: Callable[[Variants], Array] = of_geometry) -> Ask:
     """Return a program of a robot with its inputs, by default the geometry alone."""
     return lambda robot: (kernel(robot), numbers)
 

@@ -381,7 +381,9 @@ def design(
         search = Search(problem, aim, bounds)
         values, misses, _ = search.evaluate(tries)
         rejected = max(rejected, int(np.isinf(misses).sum()))
-        order = sorted(np.flatnonzero(np.isfinite(misses)).tolist(), key=lambda k: _ranking(values, misses, k))
+        # Machines that keep the bounds by their aims, before others by their misses.
+        ranks = np.where(misses <= MISS_TOLERANCE, -np.inf, misses), values
+        order = [k for k in np.lexsort(ranks[::-1]).tolist() if np.isfinite(misses[k])]
         found: tuple[Array, float, float] | None = None
         for k in order[: LOCAL_SEARCHES + 1]:
             result = search.descend(tries[k])
@@ -424,11 +426,6 @@ def design(
 def searches(aims: int, points: int = DEFAULT_FRONT_POINTS) -> int:
     """Return the largest number of searches that :func:`design` runs."""
     return (LOCAL_SEARCHES + 1) * (1 if aims == 1 else points)
-
-
-def _ranking(aims: Array, misses: Array, k: int) -> tuple[float, float]:
-    kept = misses[k] <= MISS_TOLERANCE
-    return (0.0, float(aims[k])) if kept else (float(misses[k]), 0.0)
 
 
 def sobol(dimensions: int, count: int, seed: int) -> Array:

@@ -161,8 +161,8 @@ class Kind:
         return replace(self.cases(robot)[0], name=name, wrench=tuple(map(float, wrench)))
 
     def elements(self, robot: Robot) -> tuple[str, ...]:
-        """Return the names that ``element`` indexes."""
-        return ()
+        """Return the names that ``element`` indexes; those of the drives for an element "drive"."""
+        return robot.joint_names if self.element == "drive" else ()
 
     def axes(self, robot: Robot) -> tuple[str, ...]:
         """Return the names of a direction's components."""

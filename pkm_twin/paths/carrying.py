@@ -81,13 +81,6 @@ def split_at_payloads(
     return replace(path, stretches=tuple(stretches)), tuple(result)
 
 
-def loaded_robots(carried: Sequence[PayloadChange], stretch: int, pieces: int) -> tuple[Robot, ...]:
-    """Return the robot with its payload for each piece of a stretch."""
-    return tuple(
-        next(c.robot for c in reversed(carried) if (c.stretch, c.piece) <= (stretch, k)) for k in range(pieces)
-    )
-
-
 def compute_efforts(
     robots: Sequence[Robot],
     which: NDArray[np.int64],

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
-from pkm_twin.paths.carrying import PayloadChange, compute_efforts, loaded_robots
+from pkm_twin.paths.carrying import PayloadChange, compute_efforts
 from pkm_twin.paths.geometry import Path, Stretch
 from pkm_twin.robot.derivatives import joint_rates
 from pkm_twin.robot.limits import first_beyond
@@ -296,7 +296,8 @@ def joint_paths(
     begin, robot = 0.0, carried[0].robot
     for k, stretch in enumerate(path.stretches):
         share = max(2 * MIN_POINTS, round(points * stretch.length / path.length))
-        robots = loaded_robots(carried, k, len(stretch.pieces))
+        changes = [[c.robot for c in carried if (c.stretch, c.piece) <= (k, n)] for n in range(len(stretch.pieces))]
+        robots = tuple(robots[-1] for robots in changes)
         curve = Curve(robot, path, stretch, begin, 0.0, robots, slowdown)
         try:
             result.append(curve.at(curve.grid(share)))

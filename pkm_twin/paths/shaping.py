@@ -171,7 +171,8 @@ def shaped(
     weights *= float(np.exp(-np.pi * damping / root)) ** np.arange(len(weights))
     amplitudes = tuple((weights / weights.sum()).tolist())
 
-    def shape_path(plain: TimedPath) -> ShapedPath:
+    plain = motion
+    for _ in range(8):
         looked, tails = plain, np.zeros(len(plain.runs))
         # Frequencies of the motion, then of the shaped one.
         for _ in range(3):
@@ -195,7 +196,7 @@ def shaped(
             base = replace(plain, rests=tuple(rests))
             tails = np.array(base.rests[1:]) - plain.rests[1:]
             low, high = float(rate.min()), float(rate.max())
-            looked = shaped_path = ShapedPath(
+            looked = result = ShapedPath(
                 **{field.name: getattr(base, field.name) for field in fields(TimedPath)},
                 phase=phase,
                 amplitudes=amplitudes,
@@ -203,11 +204,6 @@ def shaped(
                 frequencies=(low / root / (2.0 * np.pi), high / root / (2.0 * np.pi)),
                 added=base.duration - motion.duration,
             )
-        return shaped_path
-
-    plain = motion
-    for _ in range(8):
-        result = shape_path(plain)
         over = max(result.worst.values(), default=0.0)
         if over <= 1.0 + 1e-9:
             fine = result.fine

@@ -36,10 +36,6 @@ class Acceleration(Kind):
         """Return the case, with angular acceleration for a pose of angles alone."""
         return (replace(super().cases(robot)[0], unit=f"{unit_of_motion(robot)}/s2"),)
 
-    def elements(self, robot: Robot) -> tuple[str, ...]:
-        """Return the names of the drives."""
-        return robot.joint_names
-
     def found(self, robot: Robot, q: Array, case: Case) -> Found:
         """Return the smallest acceleration over directions at which a drive reaches its limit.
 

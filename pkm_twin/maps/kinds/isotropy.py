@@ -49,10 +49,6 @@ class Isotropy(Kind):
         what = f"driving {'force' if robot.effort_unit == 'N' else 'torque'} at {self.energy:g} J"
         return TRANSFER, Case("force", what, robot.effort_unit, "needs most drive")
 
-    def elements(self, robot: Robot) -> tuple[str, ...]:
-        """Return the names of the drives."""
-        return robot.joint_names
-
     def axes(self, robot: Robot) -> tuple[str, ...]:
         """Return the components of directions, which are unit vectors of pose rates."""
         return tuple(f"d{name}/dt" for name in robot.pose_names)

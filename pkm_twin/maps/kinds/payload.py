@@ -24,10 +24,6 @@ class Payload(Kind):
     element = "drive"
     takes_wrench = True
 
-    def elements(self, robot: Robot) -> tuple[str, ...]:
-        """Return the names of the drives."""
-        return robot.joint_names
-
     def axes(self, robot: Robot) -> tuple[str, ...]:
         """Return no axes: weight acts along gravity."""
         return ()

@@ -28,10 +28,6 @@ class Speeds(Kind):
         """Return the case, with angular velocity for a pose of angles alone."""
         return (replace(super().cases(robot)[0], unit=f"{unit_of_motion(robot)}/s"),)
 
-    def elements(self, robot: Robot) -> tuple[str, ...]:
-        """Return the names of the drives."""
-        return robot.joint_names
-
     def found(self, robot: Robot, q: Array, case: Case) -> Found:
         """Return velocity limits over joint rates of unit motions; the element is at its limit."""
         back, axes = unit_motions(robot, q)
