@@ -330,7 +330,8 @@ class TestWays:
 @pytest.mark.parametrize("name", partly_long(("four_bar", "elbow_motors", "rsur"), "four_bar"))
 def test_how_a_body_is_welded_together_does_not_count(name):
     """Each joint of a body that moves stands on a part of its own, bolted on."""
-    data = plain(name)
+    whole = robot_of_data(plain(name), name)
+    data = robot_description(whole)
     joints, bolts = data["joints"], {}
     for own, joint in joints.items():
         for k, body in enumerate(joint["between"]):
@@ -340,7 +341,7 @@ def test_how_a_body_is_welded_together_does_not_count(name):
                 joint["between"][k] = part
                 bolts[f"{part}_bolt"] = {"type": "fixed", "between": [body, part], "at": joint["at"]}
     data["joints"] = {**joints, **bolts}
-    whole, parts = robot_of_data(plain(name), name), robot_of_data(data, name)
+    parts = robot_of_data(data, name)
     q = random_joints(whole, np.random.default_rng(5), 4, clear=0.01)
     np.testing.assert_allclose(parts.singularity(q), whole.singularity(q), rtol=1e-9)
 
