@@ -4,7 +4,12 @@
 from delta_dynamics.estimates.contact import Contact, ContactMonitor, MomentumObserver, platform_wrench
 from delta_dynamics.estimates.isolation import ContactPlace
 from delta_dynamics.estimates.payload import PayloadEstimate, PayloadEstimator
-from delta_dynamics.torques.at_pose import PoseMotion, inverse_dynamics_at_pose
+from delta_dynamics.torques.at_pose import (
+    PoseMotion,
+    forward_dynamics_at_pose,
+    inverse_dynamics_at_pose,
+    mass_matrix_at_pose,
+)
 from delta_dynamics.torques.derivatives import TorqueDerivatives, torque_derivatives, torque_gradient
 from delta_dynamics.torques.elastic_reactions import elastic_reactions
 from delta_dynamics.torques.isotropy import (
@@ -66,11 +71,13 @@ __all__ = [
     "energy_transfer",
     "energy_transfer_range",
     "forward_dynamics",
+    "forward_dynamics_at_pose",
     "inverse_dynamics",
     "inverse_dynamics_at_pose",
     "joint_motion",
     "least_norm_reactions",
     "mass_matrix",
+    "mass_matrix_at_pose",
     "max_driving_force",
     "max_driving_force_range",
     "null_efforts",

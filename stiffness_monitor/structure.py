@@ -25,6 +25,7 @@ from numpy.typing import ArrayLike
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import SNAP, reference, references
 from pkm_twin.codegen.operations import maximum, sign, sqrt
+from pkm_twin.kinematics.constraints import cross
 from pkm_twin.kinematics.motion import reaction_directions
 from pkm_twin.machine.graph import BASE, Graph, Joint
 from pkm_twin.machine.members import Beam, Structure
@@ -38,13 +39,6 @@ Turn = Callable[[str, Array], Any]
 RIGID: Final = (0.0,) * 6
 """Compliance of a joint that holds all six directions."""
 FREE: Final = math.inf
-
-
-def cross(a: Any, b: Any) -> Any:
-    """Return the vector product of two vectors, (3,), ten times faster than numpy's."""
-    ax, ay, az = a.tolist()
-    bx, by, bz = b.tolist()
-    return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
 
 
 def size(vector: Any) -> Any:

@@ -1,42 +1,60 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Inverse dynamics of a motion that is given by the platform's pose, without forward kinematics."""
+"""Dynamics of a motion that is given by the platform's pose, without forward kinematics."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from delta_dynamics.torques.virtual_work import Forces, add_friction_and_rotors, efforts_of_motion
-from pkm_twin.codegen.arrays import Array
+from delta_dynamics.torques.virtual_work import (
+    Forces,
+    add_friction_and_rotors,
+    efforts_left,
+    efforts_of_motion,
+    leading_accelerations,
+    mass_entries,
+    solve_massive,
+)
+from pkm_twin.codegen.arrays import Array, vectors
 from pkm_twin.codegen.code import GOOD
-from pkm_twin.codegen.expressions import PARAMETERS, snapped_all
+from pkm_twin.codegen.expressions import PARAMETERS, Numbers, Objects, snapped_all
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.lu import SparseLU
 from pkm_twin.codegen.program import Program
+from pkm_twin.kinematics import programs
 from pkm_twin.kinematics.motion import BaseMotion
 from pkm_twin.kinematics.posed import CarriedScheme
-from pkm_twin.kinematics.programs import certify_assembly, follow_pose, pose_accelerations, pose_factors, solve_pose
+from pkm_twin.kinematics.programs import certify_assembly, follow_pose, pose_factors, solve_pose
 from pkm_twin.kinematics.traced import Traced
-from pkm_twin.machine.inertia import Layout, change_of_frame, loaded_joints
+from pkm_twin.machine.inertia import ROTORS, Layout, change_of_frame, loaded_joints
 from pkm_twin.robot.robot import Robot
 
 
 @dataclass(frozen=True)
 class PoseMotion:
-    """Joint positions, rates, accelerations and efforts of a motion of the pose, (..., n) each."""
+    """Joint positions, rates, accelerations and efforts of a motion of the pose, (..., n) each.
+
+    ``acceleration``: second derivatives of the pose coordinates in time, shape (..., m).
+    """
 
     q: Array
     qd: Array
     qdd: Array
     tau: Array
+    acceleration: Array
 
 
 def inverse_dynamics_at_pose(
-    robot: Robot, pose: ArrayLike, rate: ArrayLike, acceleration: ArrayLike, wrench: ArrayLike | None = None
+    robot: Robot,
+    pose: ArrayLike,
+    rate: ArrayLike,
+    acceleration: ArrayLike,
+    wrench: ArrayLike | None = None,
 ) -> PoseMotion:
     """Compute joint motion and actuator efforts for a motion of the platform.
 
@@ -55,27 +73,66 @@ def inverse_dynamics_at_pose(
     """
     load = np.zeros(6) if wrench is None else wrench
     given = pose, rate, acceleration, load
-    found = evaluate_at_pose(robot, pose_torques, unjudged_pose_torques, robot.inertial, *given)
-    return PoseMotion(*found)
+    q, qd, qdd, tau = evaluate_at_pose(robot, pose_torques, robot.inertial, *given)
+    return PoseMotion(q, qd, qdd, tau, np.broadcast_to(acceleration, (*q.shape[:-1], len(robot.pose_names))))
 
 
-def evaluate_at_pose(
-    robot: Robot, certified: Callable[[Robot], Kernel], accepted: Callable[[Robot], Kernel], p: Array, *given: ArrayLike
-) -> list[Array]:
+def forward_dynamics_at_pose(
+    robot: Robot,
+    pose: ArrayLike,
+    rate: ArrayLike,
+    tau: ArrayLike,
+    wrench: ArrayLike | None = None,
+) -> PoseMotion:
+    """Compute the accelerations of platform and joints that efforts cause at a pose.
+
+    The inverse of :func:`inverse_dynamics_at_pose`, with the accelerations of
+    :func:`forward_dynamics`. The equations are solved in the pose coordinates x, with joint rates
+    B x': B' M B x'' = B' (tau - efforts at x'' = 0).
+
+    :param tau: efforts of the actuators, shape (..., n), N m or N. Other parameters and errors as
+        in :func:`inverse_dynamics_at_pose`.
+    """
+    load = np.zeros(6) if wrench is None else wrench
+    efforts = vectors(tau, robot.joints_count, "efforts")
+    q, qd, qdd, acceleration = evaluate_at_pose(robot, pose_accelerations, robot.inertial, pose, rate, efforts, load)
+    return PoseMotion(q, qd, qdd, np.broadcast_to(efforts, q.shape), acceleration)
+
+
+def mass_matrix_at_pose(robot: Robot, pose: ArrayLike) -> Array:
+    """Compute the mass matrix on the actuated joints, as :func:`mass_matrix`, shape (..., n, n).
+
+    Parameters and errors as in :func:`inverse_dynamics_at_pose`.
+    """
+    n = robot.joints_count
+    flat = evaluate_at_pose(robot, pose_masses, robot.inertial, pose)[0]
+    return flat.reshape(*flat.shape[:-1], n, n)
+
+
+class PoseKernel(Protocol):
+    """Gives a robot's program of poses and other inputs."""
+
+    def __call__(self, robot: Robot, *, certified: bool) -> Kernel:
+        """Return the program.
+
+        :param certified: whether it accepts poses as the quick inverse kinematics does; else those
+            are given that the inverse kinematics has accepted.
+        """
+
+
+def evaluate_at_pose(robot: Robot, kernel: PoseKernel, p: Array, *given: ArrayLike) -> list[Array]:
     """Evaluate a program of poses and other inputs; which poses are reached is judged as always.
 
-    :param certified: gives the program that accepts poses that are certainly right, and
-        ``accepted`` that of poses which the inverse kinematics has accepted.
-    :param p: the programs' parameters. ``given``: poses, shape (..., m), and the other inputs.
+    :param p: the program's parameters. ``given``: poses, shape (..., m), and the other inputs.
     :raises UnreachableError: as the inverse kinematics, and SingularityError.
     :raises ValueError: an input that is not finite.
     """
-    found, status = certified(robot)(p, *given)
+    found, status = kernel(robot, certified=True)(p, *given)
     if status is not None:
         rows = [np.broadcast_to(a, (*status.shape[:-1], np.shape(a)[-1])) for a in given]
         robot.inverse(rows[0])
         left = status[..., 0] != GOOD
-        again, status = accepted(robot)(p, *(row[left] for row in rows))
+        again, status = kernel(robot, certified=False)(p, *(row[left] for row in rows))
         if status is not None:
             raise ValueError("an input in addition to the pose is not finite, or too large")
         for values, new in zip(found, again, strict=True):
@@ -83,24 +140,20 @@ def evaluate_at_pose(
     return found
 
 
-def pose_torques(robot: Robot) -> Kernel:
-    """Return the program from pose, rate, acceleration and wrench to q, qd, qdd and efforts.
-
-    Poses are accepted as by the quick inverse kinematics.
+def _kernel(robot: Robot, name: str, write: Callable[..., Program], *, certified: bool) -> Kernel:
+    """Return the kernel of a program; a machine that is followed has one for all poses.
 
     :raises ParameterError: a robot whose file gives no masses.
     """
     engine = robot.massive()
-    write = partial(_pose_torques, certified=True) if engine.posed else _followed_pose_torques
-    return engine.posed_kernel("torques at pose", write)
+    certified = certified or engine.posed is None
+    place = "pose" if certified else "accepted pose"
+    return engine.posed_kernel(f"{name} at {place}", partial(write, certified=certified))
 
 
-def unjudged_pose_torques(robot: Robot) -> Kernel:
-    """Return the program of :func:`pose_torques` for poses that the inverse kinematics accepted."""
-    if robot.massive().posed is None:
-        return pose_torques(robot)
-    write = partial(_pose_torques, certified=False)
-    return robot.massive().posed_kernel("torques at accepted pose", write)
+def pose_torques(robot: Robot, *, certified: bool) -> Kernel:
+    """Return the program from pose, rate, acceleration and wrench to q, qd, qdd and efforts."""
+    return _kernel(robot, "torques", _pose_torques, certified=certified)
 
 
 def followed_pose_torques(robot: Robot) -> Kernel:
@@ -109,77 +162,203 @@ def followed_pose_torques(robot: Robot) -> Kernel:
     Poses are accepted as by :attr:`.engine.Engine.followed_inverse`.
     """
     engine = robot.massive()
-    write = partial(_followed_pose_torques, scheme=None)
+    write = partial(_pose_torques, scheme=None, certified=True)
     return engine.kernel("followed torques at pose", write, repr(engine.inverse_pivots))
 
 
-def _pose_torques(t: Traced, scheme: CarriedScheme, *, certified: bool) -> Program:
-    posed, q = solve_pose(t, scheme)
-    m = len(posed.q)
-    layout = Layout(t.tree)
-    parts = layout.split(t.tape.inputs(PARAMETERS, layout.size))
-    rods, gravity, passive = parts[1], parts[2], parts[-1]
-    rate, acceleration = (t.tape.inputs(name, m) for name in ("rate", "acceleration"))
-    posed.set_rates(rate)
-    posed.set_accelerations(acceleration, BaseMotion.at_rest(gravity))
+def pose_masses(robot: Robot, *, certified: bool) -> Kernel:
+    """Return the program from a pose to the mass matrices of joints and of pose coordinates."""
+    return _kernel(robot, "mass matrix", _pose_masses, certified=certified)
 
-    # Inertial parameters of all bodies, in frames of the tree that the pose drives.
-    p, bodies = t.tape.inputs(PARAMETERS, layout.size), np.zeros((len(posed.tree.links), 10), dtype=object)
-    for row, (name, link) in enumerate(posed.tree.links.items()):
-        if name in t.tree.links:
+
+def pose_accelerations(robot: Robot, *, certified: bool) -> Kernel:
+    """Return the program from pose, rate, efforts and wrench to q, qd, qdd and x''."""
+    return _kernel(robot, "accelerations", _pose_accelerations, certified=certified)
+
+
+class _Carried:
+    """A machine that is driven by its pose, on expressions: motion and forces on the pose."""
+
+    def __init__(self, t: Traced, scheme: CarriedScheme, *, certified: bool) -> None:
+        self.t, self.scheme, self.certified = t, scheme, certified
+        self.posed, self.q = solve_pose(t, scheme)
+        self.layout = Layout(t.tree)
+        self.parts = self.layout.split(t.tape.inputs(PARAMETERS, self.layout.size))
+        self.drives = self.posed.rates_of_reaches(t.graph.actuated)
+        self.lead = SparseLU(self.drives[t.drives.leading], scheme.drive_pivots)
+        t.drives.set_null_rows([self.lead.solve_transposed(self.drives[k]) for k in t.drives.others])
+
+    def program(self, outputs: dict[str, Numbers], **inputs: int) -> Program:
+        """Return the program; ``inputs``: sizes of those besides the pose."""
+        t, posed = self.t, self.posed
+        branch = certify_assembly(t, self.scheme, posed, self.q) if self.certified else []
+        return Program(
+            {"pose": len(posed.q)} | inputs,
+            self.layout.size,
+            {name: t.lift(values) for name, values in outputs.items()},
+            posed.equations(branch=t.lift(branch)),
+            single=self.certified,
+        )
+
+    @cached_property
+    def _bodies(self) -> Objects:
+        """The inertial parameters of all bodies in frames of the tree that the pose drives."""
+        t, layout, tree = self.t, self.layout, self.posed.tree
+        p = t.tape.inputs(PARAMETERS, layout.size)
+        rows: list[Any] = []
+        for name, link in tree.links.items():
+            if name not in t.tree.links:
+                rows.append(np.zeros(10))
+                continue
             lever = snapped_all(t.tree.at[name] - link.at)
-            bodies[row] = change_of_frame(link.axes, lever) @ p[layout.body(name)]
+            rows.append(change_of_frame(link.axes, lever) @ p[layout.body(name)])
+        return np.array(rows, dtype=object)
 
-    # J_M' Q_M + sum of J_Hij' Q_Hij, on the pose coordinates (3-PRRU paper, equation 40).
-    forces = Forces(posed.motion)
-    forces.inertia(bodies, rods)
-    for k, joint in enumerate(loaded_joints(t.graph)):
-        forces.joint(joint, passive[3 * k : 3 * k + 3])
-    forces.wrench(t.tape.inputs("wrench", 6))
-    unknown, on_pose = forces.generalised()
-    jq = posed.jq[scheme.independent]
-    on_pose = on_pose - jq.T @ posed.lu.solve_transposed(unknown[scheme.varying])
+    def joint(self, values: Objects) -> list[Any]:
+        """Return rates or accelerations of all drives, of those of all unknowns."""
+        return [values[self.posed.tree.steps[name].rate] for name in self.t.graph.actuated]
 
+    def add_inertia(self, add: Callable[[Forces, Objects, Objects], None]) -> Forces:
+        """Return forces with those that ``add`` makes of all bodies and rods."""
+        forces = Forces(self.posed.motion)
+        add(forces, self._bodies, self.parts[1])
+        return forces
+
+    def forces(self, rate: Numbers, acceleration: Numbers) -> Objects:
+        """Set the motion; return J_M' Q_M + sum of J_Hij' Q_Hij on the pose (3-PRRU paper, equation 40)."""
+        t, posed, passive = self.t, self.posed, self.parts[-1]
+        posed.set_rates(rate)
+        posed.set_accelerations(acceleration, BaseMotion.at_rest(self.parts[2]))
+        forces = self.add_inertia(Forces.inertia)
+        for k, joint in enumerate(loaded_joints(t.graph)):
+            forces.joint(joint, passive[3 * k : 3 * k + 3])
+        forces.wrench(t.tape.inputs("wrench", 6))
+        unknown, on_pose = forces.generalised()
+        jq: Objects = posed.jq[self.scheme.independent]
+        multipliers = posed.lu.solve_transposed(unknown[self.scheme.varying])
+        return np.asarray(on_pose - jq.T @ multipliers, object)
+
+    def masses(self) -> Objects:
+        """Return the mass matrix on the pose coordinates, rotors included.
+
+        With the mass matrix H of pose x and unknowns u as if the closures were open, and
+        u' = -Ju^-1 Jx x', it is Hxx - W Jx - (W Jx)' + Jx' Y Jx, W = Hxu Ju^-1, Y = Ju^-T Huu Ju^-1.
+        """
+        t, posed, passive = self.t, self.posed, self.parts[-1]
+        free, m = posed.tree.unknown_rates, len(posed.q)
+        table = np.zeros((m + free, m + free), dtype=object)
+        for k, unit in enumerate(np.eye(m + free)):
+            posed.motion.set_rates(unit[m:], unit[:m])
+            forces = self.add_inertia(Forces.momenta)
+            for j, joint in enumerate(loaded_joints(t.graph)):
+                forces.pair(joint, passive[3 * j + 2] * forces.relative(joint, accelerated=False)[0])
+            unknown, driven = forces.generalised()
+            # The column of the rate that is farther from the base moves fewer bodies.
+            table[: k + 1, k] = table[k, : k + 1] = [*driven, *unknown][: k + 1]
+        kept = [m + k for k in self.scheme.varying]
+        jq, lu = posed.jq[self.scheme.independent], posed.lu
+        left = np.array([lu.solve_transposed(table[kept, k]) for k in kept], dtype=object).T
+        both = [lu.solve_transposed(row) for row in left]
+        coupled = np.array([lu.solve_transposed(table[kept, k]) for k in range(m)], dtype=object) @ jq
+        by_rates = _mirrored(both) @ jq
+        mass = table[:m, :m] - coupled - coupled.T + jq.T @ by_rates
+        for rotor, row in zip(self.parts[ROTORS], self.drives, strict=True):
+            mass = mass + rotor * row[:, None] * row
+        return _mirrored(mass)
+
+
+def _mirrored(matrix: Any) -> Objects:
+    """Return a symmetric matrix of its lower triangle: the upper one is not computed."""
+    return np.array([[matrix[max(i, k)][min(i, k)] for k in range(len(matrix))] for i in range(len(matrix))], object)
+
+
+class _Followed:
+    """A machine whose pose is followed with its own tree, as of a screw, on expressions."""
+
+    def __init__(self, t: Traced) -> None:
+        self.t = t
+        self.equations, self.q = follow_pose(t)
+        self.layout = Layout(t.tree)
+        self.parts = self.layout.split(t.tape.inputs(PARAMETERS, self.layout.size))
+        self.lead = pose_factors(t)
+
+    def program(self, outputs: dict[str, Numbers], **inputs: int) -> Program:
+        """Return the program; ``inputs``: sizes of those besides the pose."""
+        made = {name: self.t.lift(values) for name, values in outputs.items()}
+        return Program({"pose": self.t.joints} | inputs, self.layout.size, made, self.equations)
+
+    def drift(self, rate: Numbers) -> tuple[Objects, Objects]:
+        """Return rates of the leading drives, and the pose's accelerations without theirs."""
+        t, qd = self.t, self.lead.solve(rate)
+        t.set_rates(qd)
+        t.set_accelerations(np.zeros(t.joints))
+        return qd, np.array(programs.pose_accelerations(t), dtype=object)
+
+    def motion(self, qd: Numbers, qdd: Numbers) -> dict[str, Numbers]:
+        """Return positions, rates and accelerations of all drives by those that lead."""
+        t, tree = self.t, self.t.tree
+        return {
+            "q": tree.values_of_drives(self.q, t.x),
+            "qd": tree.of_drives(qd, t.u),
+            "qdd": tree.of_drives(qdd, t.du),
+        }
+
+
+def _pose_torques(t: Traced, scheme: CarriedScheme | None, *, certified: bool) -> Program:
+    m = len(t.scheme.coordinates)
+    sizes = {"rate": m, "acceleration": m, "wrench": 6}
+    rate, acceleration = (t.tape.inputs(name, m) for name in ("rate", "acceleration"))
+    if scheme is None:
+        own = _Followed(t)
+        qd, drift = own.drift(rate)
+        qdd = own.lead.solve(acceleration - drift)
+        efforts, _ = efforts_of_motion(t, own.parts, qd, qdd)
+        return own.program(own.motion(qd, qdd) | {"tau": t.drives.shared(efforts, preload=True)}, **sizes)
+    made = _Carried(t, scheme, certified=certified)
     # F_d = -J^-T (J_M' Q_M + sum of J_Hij' Q_Hij) - Q_S with J = dq/dX (equations 24 and 41); needed forces
     # are minus Q.
-    steps = [posed.tree.steps[name] for name in t.graph.actuated]
-    rates, changes = ([values[step.rate] for step in steps] for values in (posed.u, posed.du))
-    drives = posed.rates_of_joints(t.graph.actuated)
-    jacobian = SparseLU(drives[t.drives.leading], scheme.drive_pivots)
-    t.drives.set_null_rows([jacobian.solve_transposed(drives[k]) for k in t.drives.others])
-    f_d = jacobian.solve_transposed(on_pose)
-    leads = add_friction_and_rotors(t, parts, f_d, q, rates, changes)
-    efforts = t.drives.shared(leads[0], preload=True)
-    branch = certify_assembly(t, scheme, posed, q) if certified else []
-    outputs = {"q": t.lift(q), "qd": t.lift(rates), "qdd": t.lift(changes), "tau": t.lift(efforts)}
-    return Program(
-        {"pose": m, "rate": m, "acceleration": m, "wrench": 6},
-        layout.size,
-        outputs,
-        posed.equations(branch=t.lift(branch)),
-        single=certified,
-    )
+    f_d = made.lead.solve_transposed(made.forces(rate, acceleration))
+    rates, changes = (made.joint(values) for values in (made.posed.u, made.posed.du))
+    leads = add_friction_and_rotors(t, made.parts, f_d, made.q, rates, changes)[0]
+    tau = t.drives.shared(leads, preload=True)
+    return made.program({"q": made.q, "qd": rates, "qdd": changes, "tau": tau}, **sizes)
 
 
-def _followed_pose_torques(t: Traced, scheme: None) -> Program:
-    """Write the program of a machine whose pose is followed with its own tree, as of a screw."""
-    del scheme
-    m = t.joints
-    equations, q = follow_pose(t)
-    layout = Layout(t.tree)
-    parts = layout.split(t.tape.inputs(PARAMETERS, layout.size))
-    rate, acceleration = (t.tape.inputs(name, m) for name in ("rate", "acceleration"))
-    lu = pose_factors(t)
-    qd = lu.solve(rate)
-    t.set_rates(qd)
-    t.set_accelerations(np.zeros(m))
-    qdd = lu.solve(acceleration - np.array(pose_accelerations(t), dtype=object))
-    efforts, _ = efforts_of_motion(t, parts, qd, qdd)
-    outputs = {
-        "q": t.lift(t.tree.values_of_drives(q, t.x)),
-        "qd": t.lift(t.tree.of_drives(qd, t.u)),
-        "qdd": t.lift(t.tree.of_drives(qdd, t.du)),
-        "tau": t.lift(t.drives.shared(efforts, preload=True)),
-    }
-    inputs = {"pose": m, "rate": m, "acceleration": m, "wrench": 6}
-    return Program(inputs, layout.size, outputs, equations)
+def _pose_masses(t: Traced, scheme: CarriedScheme | None, *, certified: bool) -> Program:
+    m = len(t.scheme.coordinates)
+    if scheme is None:
+        own: _Followed | _Carried = _Followed(t)
+        mass = np.reshape(mass_entries(t, own.parts), (m, m))
+        rates = np.array([own.lead.solve(unit) for unit in np.eye(m)], dtype=object)
+        on_pose = rates @ mass @ rates.T
+    else:
+        own = made = _Carried(t, scheme, certified=certified)
+        on_pose = made.masses()
+        half = np.array([made.lead.solve_transposed(row) for row in on_pose], dtype=object).T
+        mass = _mirrored([made.lead.solve_transposed(row) for row in half])
+    return own.program({"matrix": t.drives.shared_on_both(mass), "on pose": np.ravel(on_pose)})
+
+
+def _pose_accelerations(t: Traced, scheme: CarriedScheme | None, *, certified: bool) -> Program:
+    m = len(t.scheme.coordinates)
+    sizes = {"rate": m, "tau": t.drives.count, "wrench": 6}
+    rate, tau = t.tape.inputs("rate", m), t.tape.inputs("tau", t.drives.count)
+    if scheme is None:
+        own = _Followed(t)
+        qd, _ = own.drift(rate)
+        leads = leading_accelerations(t, own.parts, qd, tau)
+        t.set_rates(qd)
+        t.set_accelerations(leads)
+        found: dict[str, Numbers] = {"acceleration": programs.pose_accelerations(t)}
+        return own.program(own.motion(qd, leads) | found, **sizes)
+    made = _Carried(t, scheme, certified=certified)
+    on_pose = made.forces(rate, np.zeros(m))
+    rates, drift = (made.joint(values) for values in (made.posed.u, made.posed.du))
+    # Only friction by load needs what the bodies take of each drive.
+    by_load = bool(t.graph.laws) and not t.drives.others
+    loads = made.lead.solve_transposed(on_pose) if by_load else np.zeros(m)
+    rest = efforts_left(t, made.parts, t.drives.on_leads([*tau]), loads, made.q, rates, drift)
+    forces = made.drives[t.drives.leading].T @ rest - (0.0 if by_load else on_pose)
+    acceleration = np.array(solve_massive(made.masses(), forces), dtype=object)
+    outputs = {"q": made.q, "qd": rates, "qdd": made.drives @ acceleration + drift, "acceleration": acceleration}
+    return made.program(outputs, **sizes)

@@ -20,7 +20,8 @@ from pkm_twin.codegen.expressions import PARAMETERS
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
 from pkm_twin.errors import SingularityError
-from pkm_twin.kinematics.motion import BaseMotion, cross, reaction_directions
+from pkm_twin.kinematics.constraints import cross
+from pkm_twin.kinematics.motion import BaseMotion, reaction_directions
 from pkm_twin.kinematics.traced import Traced
 from pkm_twin.machine.graph import BASE, Graph, Joint, Rod
 from pkm_twin.machine.inertia import Layout

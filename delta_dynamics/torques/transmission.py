@@ -21,12 +21,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from delta_dynamics.torques.at_pose import evaluate_at_pose
-from delta_dynamics.torques.virtual_work import mass_matrix
-from pkm_twin.codegen.arrays import Array
+from delta_dynamics.torques.at_pose import evaluate_at_pose, pose_masses
+from pkm_twin.codegen.arrays import Array, vectors
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.errors import ParameterError
-from pkm_twin.kinematics.programs import transmission_program
+from pkm_twin.kinematics.programs import actuator_program, transmission_program
 from pkm_twin.robot.robot import Robot
 
 _NO_PARAMETERS: Final = np.zeros(0)
@@ -49,12 +48,6 @@ def transmission_kernel(robot: Robot, *, certified: bool, curved: bool) -> Kerne
     name = f"transmission{' curved' * curved}{' certified' * certified}"
     write = partial(transmission_program, certified=certified, curved=curved)
     return robot.engine.posed_kernel(name, write)
-
-
-_CERTIFIED, _ACCEPTED = (
-    {curved: partial(transmission_kernel, certified=certified, curved=curved) for curved in (False, True)}
-    for certified in (True, False)
-)
 
 
 class Transmission:
@@ -88,10 +81,10 @@ class Transmission:
         :returns: shape (..., n) each, in the controller's units.
         """
         q, ratio = self._solve(position)
-        moved = None if velocity is None else _apply(ratio, self._joint(velocity, "velocity"))
+        moved = None if velocity is None else _apply(ratio, self._joint(velocity, "velocities"))
         given = None
         if effort is not None:
-            given = _apply(self._joint_per_actuator(q, ratio).swapaxes(-1, -2), self._joint(effort, "effort"))
+            given = _apply(self._joint_per_actuator(q, ratio).swapaxes(-1, -2), self._joint(effort, "efforts"))
         return TransmissionState(self.robot.controller.controller_positions(q), moved, given)
 
     def actuator_to_joint(
@@ -103,17 +96,18 @@ class Transmission:
         :param velocity: their rates. ``effort``: their efforts; shape (..., n) each.
         :returns: shape (..., m) each.
         """
-        n = self.robot.joints_count
-        q = self.robot.controller.positions(_vector(position, n, "position"))
-        pose = self.robot.forward(q)
-        moved = given = None
-        if velocity is not None or effort is not None:
-            ratio = self.ratio(pose)
-            if velocity is not None:
-                moved = _apply(self._joint_per_actuator(q, ratio), _vector(velocity, n, "velocity"))
-            if effort is not None:
-                given = _apply(ratio.swapaxes(-1, -2), _vector(effort, n, "effort"))
-        return TransmissionState(pose, moved, given)
+        robot, n = self.robot, self.robot.joints_count
+        q = robot.controller.positions(vectors(position, n, "positions"))
+        if velocity is None and effort is None:
+            return TransmissionState(robot.forward(q))
+        rate, load = (
+            np.zeros(n) if given is None else vectors(given, n, name)
+            for given, name in ((velocity, "velocities"), (effort, "efforts"))
+        )
+        slopes = robot.controller.slopes(q)
+        kernel = robot.engine.kernel("actuator to joint", actuator_program)
+        pose, moved, carried = robot.evaluate(kernel, q, rate / slopes, load * slopes)
+        return TransmissionState(pose, None if velocity is None else moved, None if effort is None else carried)
 
     def ratio(self, position: ArrayLike) -> Array:
         """Return the actuators' rates per joint rate, B = d(actuator)/d(joint), (..., n, m)."""
@@ -135,22 +129,31 @@ class Transmission:
         :param effort: efforts that the actuators carry at the position, (..., n); default: none.
         :returns: Ka and Da, shape (..., n, n) each: their coupling is a part of the result.
         """
-        back = self._joint_per_actuator(*self._solve(position))
         wanted = self._matrix(stiffness, "stiffness")
-        if effort is not None:
-            load = _vector(effort, self.robot.joints_count, "effort")
-            wanted = wanted + np.einsum("...i,...ijk->...jk", load, self.curvature(position))
+        if effort is None:
+            q, ratio = self._solve(position)
+        else:
+            q, ratio, bend = self._solve_twice(position)
+            load = vectors(effort, self.robot.joints_count, "efforts")
+            wanted = wanted + np.einsum("...i,...ijk->...jk", load, bend)
+        back = self._joint_per_actuator(q, ratio)
         forth = back.swapaxes(-1, -2)
         return forth @ wanted @ back, forth @ self._matrix(damping, "damping") @ back
 
     def curvature(self, position: ArrayLike) -> Array:
         """Return the second derivatives d2(actuator)/d(joint)2, shape (..., n, m, m)."""
+        return self._solve_twice(position)[2]
+
+    def _solve_twice(self, position: ArrayLike) -> tuple[Array, Array, Array]:
+        """Return the results of :meth:`_solve`, and the curvature."""
         m, controller = len(self.joints), self.robot.controller
-        place = self._joint(position, "position")[..., None, :]
+        place = self._joint(position, "positions")[..., None, :]
         # The second derivative along a + b, less those along a and b, is twice that by a and b.
         pairs = [(j, k) for j in range(m) for k in range(j)]
         ways = np.array([*np.eye(m), *(np.eye(m)[j] + np.eye(m)[k] for j, k in pairs)])
-        q, flat, change = evaluate_at_pose(self.robot, _CERTIFIED[True], _ACCEPTED[True], _NO_PARAMETERS, place, ways)
+        q, flat, change = evaluate_at_pose(
+            self.robot, partial(transmission_kernel, curved=True), _NO_PARAMETERS, place, ways
+        )
         found = np.empty((*change.shape[:-2], change.shape[-1], m, m))
         for j in range(m):
             found[..., j, j] = change[..., j, :]
@@ -159,9 +162,10 @@ class Transmission:
             found[..., j, k] = found[..., k, j] = mixed
         by_pose = flat.reshape(*q.shape, m)[..., 0, :, :]
         q = q[..., 0, :]
-        found *= controller.slopes(q)[..., None, None]
+        slopes = controller.slopes(q)[..., None]
         bend = (controller.factors * controller.changes)[:, None, None]
-        return found + bend * by_pose[..., :, None] * by_pose[..., None, :]
+        found = found * slopes[..., None] + bend * by_pose[..., :, None] * by_pose[..., None, :]
+        return q, by_pose * slopes, found
 
     def effort_limits(self, position: ArrayLike) -> Array:
         """Return the least and largest effort of each joint alone, shape (..., m, 2), N m or N.
@@ -227,15 +231,14 @@ class Transmission:
 
         :raises ParameterError: the robot's file gives no masses.
         """
-        q, ratio = self._solve(position)
-        by_pose = ratio / self.robot.controller.slopes(q)[..., None]
-        found = by_pose.swapaxes(-1, -2) @ mass_matrix(self.robot, q) @ by_pose
-        return np.asarray(found)
+        place, m = self._joint(position, "positions"), len(self.joints)
+        found = evaluate_at_pose(self.robot, pose_masses, self.robot.inertial, place)[1]
+        return found.reshape(*found.shape[:-1], m, m)
 
     def _solve(self, position: ArrayLike) -> tuple[Array, Array]:
         """Return the model's q, shape (..., n), and the ratio, shape (..., n, m)."""
-        place = self._joint(position, "position")
-        q, flat = evaluate_at_pose(self.robot, _CERTIFIED[False], _ACCEPTED[False], _NO_PARAMETERS, place)
+        place = self._joint(position, "positions")
+        q, flat = evaluate_at_pose(self.robot, partial(transmission_kernel, curved=False), _NO_PARAMETERS, place)
         ratio = flat.reshape(*q.shape, len(self.joints))
         return q, ratio * self.robot.controller.slopes(q)[..., None]
 
@@ -256,7 +259,7 @@ class Transmission:
         return np.asarray(limits / slopes if name == "effort" else limits * slopes)
 
     def _joint(self, values: ArrayLike, name: str) -> Array:
-        return _vector(values, len(self.joints), name)
+        return vectors(values, len(self.joints), name)
 
     def _matrix(self, values: ArrayLike, name: str) -> Array:
         """Return matrices of the joint side, shape (..., m, m)."""
@@ -266,13 +269,6 @@ class Transmission:
         if given.shape[-2:] != (m, m) or not np.isfinite(given).all():
             raise ParameterError(name, values, f"finite numbers, shape (..., {m}, {m}) or ({m},)")
         return np.asarray(given, np.float64)
-
-
-def _vector(values: ArrayLike, size: int, name: str) -> Array:
-    given = np.asarray(values, np.float64)
-    if given.shape[-1:] != (size,) or not np.isfinite(given).all():
-        raise ParameterError(name, values, f"finite numbers, shape (..., {size})")
-    return given
 
 
 def _apply(matrix: Array, vector: Array) -> Array:

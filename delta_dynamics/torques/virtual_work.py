@@ -17,7 +17,8 @@ from pkm_twin.codegen.expressions import PARAMETERS, Numbers, Objects
 from pkm_twin.codegen.kernels import BoundCall, Kernel
 from pkm_twin.codegen.operations import absolute, maximum, minimum, sign
 from pkm_twin.codegen.program import Program
-from pkm_twin.kinematics.motion import BaseMotion, Motion, cross
+from pkm_twin.kinematics.constraints import cross
+from pkm_twin.kinematics.motion import BaseMotion, Motion
 from pkm_twin.kinematics.stream import following
 from pkm_twin.kinematics.traced import Traced
 from pkm_twin.machine import friction
@@ -425,29 +426,53 @@ def torque_program(t: Traced, *, on_bodies: bool = False, base: int = 0) -> Prog
 
 def _accelerations(t: Traced) -> Program:
     layout, parts = solve_and_split(t)
-    n = t.joints
-    qd, tau = t.drives.given("qd"), t.tape.inputs("tau", t.drives.count)
-    rest = np.array(t.drives.on_leads([*tau])) - efforts_of_motion(t, parts, qd, np.zeros(n))[0]
-    laws = _law_values(t, parts)
-    if laws and not t.drives.others:
-        loads, basic = driving_forces(t, parts, qd, np.zeros(n)), _basic_friction(parts, qd)
-        for k, values in enumerate(laws):
-            at_place, dry, share = friction.parts(t.graph.laws, values, t.q[k], absolute(qd[k]))
-            way = sign(qd[k])
-            driving = tau[k] - basic[k] - at_place - dry * way
-            rest[k] = friction.load_of(driving, share, way) - loads[k]
-    mass = np.reshape(mass_entries(t, parts), (n, n))
-    lower = {(i, j): mass[i, j] for i in range(n) for j in range(i + 1)}
-    root = SparseCholesky(lower, list(np.diag(mass)))
-    least: Any = 1.0
-    for index, pivot in zip(root.order, root.pivots, strict=True):
-        least = minimum(least, pivot / mass[index, index])
-    # Infinite where something would move without mass: the sample is rejected.
-    sound = 1.0 / sign(maximum(least - MASSLESS, 0.0))
-    leads = [value * sound for value in root.solve(rest)]
+    leads = leading_accelerations(t, parts, t.drives.given("qd"), t.tape.inputs("tau", t.drives.count))
     outputs = {"accelerations": t.lift(t.drives.followed(leads, t.du))}
     sizes = t.inputs("q", "qd", "tau", wrench=6)
     return Program(sizes, layout.size, outputs, t.equations())
+
+
+def leading_accelerations(t: Traced, parts: list[Objects], qd: Objects, tau: Objects) -> list[Any]:
+    """Return accelerations of the leading drives under efforts of all drives and a wrench.
+
+    The unknowns' accelerations are left as those at zero accelerations of the drives.
+    """
+    driving, still = t.drives.on_leads([*tau]), np.zeros(t.joints)
+    loads = driving_forces(t, parts, qd, still)
+    q, rates, changes = t.drives.variables("q"), t.tree.of_drives(qd, t.u), t.tree.of_drives(still, t.du)
+    rest = efforts_left(t, parts, driving, loads, q, rates, changes)
+    return solve_massive(np.reshape(mass_entries(t, parts), (t.joints, t.joints)), rest)
+
+
+def efforts_left(
+    t: Traced, parts: list[Objects], driving: Numbers, loads: Numbers, q: Numbers, rates: Numbers, changes: Numbers
+) -> Objects:
+    """Return what efforts of the leading drives leave for further accelerations.
+
+    :param loads: efforts that bodies take at accelerations ``changes`` of all drives, (n,); ``q``
+        and ``rates``: positions and rates of all drives.
+    """
+    rest: Objects = np.array(driving) - add_friction_and_rotors(t, parts, loads, q, rates, changes)[0]
+    laws = _law_values(t, parts)
+    if laws and not t.drives.others:
+        basic = _basic_friction(parts, rates)
+        for k, values in enumerate(laws):
+            at_place, dry, share = friction.parts(t.graph.laws, values, q[k], absolute(rates[k]))
+            way = sign(rates[k])
+            free = driving[k] - basic[k] - at_place - dry * way
+            rest[k] = friction.load_of(free, share, way) - (loads[k] + parts[ROTORS][k] * changes[k])
+    return rest
+
+
+def solve_massive(mass: Objects, rest: Objects) -> list[Any]:
+    """Solve M a = rest; infinite where something would move without mass: the sample is rejected."""
+    n = len(mass)
+    root = SparseCholesky({(i, j): mass[i, j] for i in range(n) for j in range(i + 1)}, list(np.diag(mass)))
+    least: Any = 1.0
+    for index, pivot in zip(root.order, root.pivots, strict=True):
+        least = minimum(least, pivot / mass[index, index])
+    sound = 1.0 / sign(maximum(least - MASSLESS, 0.0))
+    return [value * sound for value in root.solve(list(rest))]
 
 
 def mass_entries(t: Traced, parts: list[Objects], visit: Callable[[Forces], None] | None = None) -> list[Any]:
@@ -480,10 +505,8 @@ def mass_entries(t: Traced, parts: list[Objects], visit: Callable[[Forces], None
 
 def _masses(t: Traced) -> Program:
     layout, parts = solve_and_split(t)
-    rows: Any = np.reshape(mass_entries(t, parts), (t.joints, t.joints)).tolist()
-    for _ in range(2):
-        rows = [t.drives.shared(row) for row in zip(*rows, strict=True)]
-    outputs = {"matrix": t.lift([value for row in rows for value in row])}
+    mass = np.reshape(mass_entries(t, parts), (t.joints, t.joints))
+    outputs = {"matrix": t.lift(t.drives.shared_on_both(mass))}
     return Program(t.inputs("q"), layout.size, outputs, t.equations())
 
 

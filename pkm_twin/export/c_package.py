@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from delta_dynamics.torques.at_pose import pose_torques, unjudged_pose_torques
+from delta_dynamics.torques.at_pose import PoseKernel, pose_accelerations, pose_masses, pose_torques
 from delta_dynamics.torques.equations import motion_kernel
 from delta_dynamics.torques.transmission import transmission_kernel
 from delta_dynamics.torques.virtual_work import (
@@ -211,34 +211,19 @@ class Package:
             )
         add("forward", "Pose of joint positions.", q, lambda: engine.forward, pose="pose")
         if self._wants("inverse"):
-            quick: tuple[Routine, ...] = ()
+            whole: tuple[Routine, ...] = ()
             if engine.posed is not None:
-                whole = self._hidden("inverse_confirmed", {"pose": self.m}, engine.inverse, q="q")
-                quick = (whole,)
+                whole = (self._hidden("inverse_confirmed", {"pose": self.m}, engine.inverse, q="q"),)
             add(
                 "inverse",
                 "Joint positions of a pose, accepted only if _forward of them is the pose.",
                 {"pose": self.m},
                 lambda: engine.quick_inverse,
-                otherwise=quick,
+                otherwise=whole,
                 q="q",
             )
-            if self.massive and self._wants("torques_at_pose"):
-                motion = {"pose": self.m, "rate": self.m, "acceleration": self.m} | wrench
-                names = {name: name for name in ("q", "qd", "qdd", "tau")}
-                if quick:
-                    again = self._hidden("torques_at_accepted_pose", motion, unjudged_pose_torques(robot), p, **names)
-                    quick = (result[-1], again)
-                add(
-                    "torques_at_pose",
-                    "Joint motion q, qd, qdd and efforts tau for a motion of "
-                    "the pose: its rate and acceleration are those of the pose's coordinates.",
-                    motion,
-                    lambda: pose_torques(robot),
-                    p,
-                    otherwise=quick,
-                    **names,
-                )
+            if self.massive:
+                self._add_at_pose(result, p)
         add(
             "platform",
             "Position (m) of the platform's reference point in base axes, and the platform's "
@@ -319,6 +304,55 @@ class Package:
         if self.elastic is not None:
             self._add_elastic(self.elastic, result)
         return result
+
+    def _add_at_pose(self, result: list[Routine], own: Sequence[Any] | Array) -> None:
+        """Add the dynamics of a motion of the pose, after the inverse kinematics."""
+        motion = {"pose": self.m, "rate": self.m}
+        programs: tuple[tuple[str, str, Mapping[str, int], PoseKernel, Mapping[str, str]], ...] = (
+            (
+                "torques",
+                "Joint motion q, qd, qdd and efforts tau for a motion of "
+                "the pose: its rate and acceleration are those of the pose's coordinates.",
+                motion | {"acceleration": self.m, "wrench": 6},
+                pose_torques,
+                {name: name for name in ("q", "qd", "qdd", "tau")},
+            ),
+            (
+                "mass_matrix",
+                "Mass matrix of the actuated joints at a pose, row by row.",
+                {"pose": self.m},
+                pose_masses,
+                {"m": "matrix"},
+            ),
+            (
+                "accelerations",
+                "Accelerations of the pose's coordinates, and of the joints, that efforts tau cause.",
+                motion | {"tau": self.n, "wrench": 6},
+                pose_accelerations,
+                {"acceleration": "acceleration", "qdd": "qdd"},
+            ),
+        )
+        inverse = result[-1]
+        for name, summary, inputs, kernel, outputs in programs:
+            if not self._wants(f"{name}_at_pose"):
+                continue
+            otherwise: tuple[Routine, ...] = ()
+            if inverse.otherwise:
+                accepted = kernel(self.robot, certified=False)
+                otherwise = inverse, self._hidden(f"{name}_at_accepted_pose", inputs, accepted, own, **outputs)
+            rows, equations = self._read(kernel(self.robot, certified=True), own)
+            made = {key: rows[row] for key, row in outputs.items()}
+            result.append(
+                Routine(
+                    f"{name}_at_pose",
+                    inputs,
+                    made,
+                    equations,
+                    summary,
+                    single=bool(otherwise),
+                    otherwise=otherwise,
+                )
+            )
 
     def _hidden(
         self,

@@ -61,12 +61,16 @@ def dot(a: Any, b: Any) -> Any:
 
 
 def cross(a: Any, b: Any) -> NDArray[Any]:
-    """Return the vector product over the last axis, of numbers or of three expressions each."""
+    """Return the vector product over the last axis.
+
+    Of single vectors, whose numbers may be expressions, it is an array of objects.
+    """
+    a, b = np.asarray(a), np.asarray(b)
     if a.ndim != 1 or b.ndim != 1:
         return np.asarray(np.cross(a, b), np.float64)
-    (ax, ay, az), (bx, by, bz) = a, b
+    (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
     product = [ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx]
-    return np.array(product, np.result_type(a, b))
+    return np.array(product, object)
 
 
 def keep_angle(part: str, bodies: tuple[str, str], points: Pair, vectors: Pair, known: Any) -> Equation:
@@ -208,7 +212,7 @@ class Placement:
             return table.reshape(whole)[..., 6:]
 
         def stack(vectors: Iterable[Array]) -> Array:
-            return np.stack([np.broadcast_to(vector, (*shape, 3)) for vector in vectors], -2)
+            return np.stack([np.broadcast_to(np.asarray(vector, float), (*shape, 3)) for vector in vectors], -2)
 
         force = stack(one.scale * one.force for one in equations)
         moment = stack(one.scale * one.moment for one in equations)
@@ -229,6 +233,6 @@ def differentiate_by_frame(one: Equation, side: int, point: Array, rotation: Arr
         in base axes at home, shape (..., 3).
     """
     sign = (-1.0, 1.0)[side] * one.scale
-    moment = one.moment + np.cross(one.points[side] - point, one.force)
+    moment = np.asarray(one.moment, float) + np.cross(one.points[side] - point, one.force)
     by_shift, by_tilt = ((sign * vector[..., None, :] @ rotation)[..., 0, :] for vector in (one.force, moment))
     return by_shift, by_tilt

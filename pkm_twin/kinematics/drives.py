@@ -135,6 +135,13 @@ class Drives:
             efforts = [effort - amount * value for effort, value in zip(efforts, row, strict=True)]
         return efforts
 
+    def shared_on_both(self, matrix: Objects) -> list[Any]:
+        """Return a matrix from accelerations to efforts for all drives, (n n,) by row."""
+        rows: Any = matrix.tolist()
+        for _ in range(2):
+            rows = [self.shared(row) for row in zip(*rows, strict=True)]
+        return [value for row in rows for value in row]
+
     def on_leads(self, efforts: Sequence[Any]) -> list[Any]:
         """Return B' tau: efforts of the leading drives alone that act like these of all, shape (m,)."""
         result = [efforts[k] for k in self.leading]

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import Numbers, Objects, snapped_all
 from pkm_twin.codegen.operations import cos, sin, sqrt
-from pkm_twin.kinematics.constraints import Equation, constraint_equations, keep_distance
+from pkm_twin.kinematics.constraints import Equation, constraint_equations, cross, keep_distance
 from pkm_twin.machine.graph import BASE, Direction, Joint, Rod
 from pkm_twin.machine.joints import UNITS, Constraint
 from pkm_twin.machine.tree import Step, Tree
@@ -48,15 +48,6 @@ class BaseMotion(NamedTuple):
 _ZERO: Final = np.zeros(3)
 FIXED: Final = BaseMotion(_ZERO, _ZERO, _ZERO)
 """A base at rest, without gravity: the motion of all parts is relative to it."""
-
-
-def cross(a: Any, b: Any) -> Objects:
-    """Return the vector product of three numbers each."""
-    result = np.empty(3, dtype=object)
-    result[0] = a[1] * b[2] - a[2] * b[1]
-    result[1] = a[2] * b[0] - a[0] * b[2]
-    result[2] = a[0] * b[1] - a[1] * b[0]
-    return result
 
 
 def numbers(values: Any) -> Array:

@@ -14,7 +14,8 @@ from typing import Any, Final
 from pkm_twin.codegen.expressions import Numbers
 from pkm_twin.codegen.operations import atan2, cos, sin, sqrt
 from pkm_twin.errors import ParameterError
-from pkm_twin.kinematics.motion import Columns, Motion, cross
+from pkm_twin.kinematics.constraints import cross
+from pkm_twin.kinematics.motion import Columns, Motion
 
 Entry = tuple[int, int, float]
 """Row, column and sign of an entry of the rotation matrix."""

@@ -144,8 +144,8 @@ class Assembly:
             return values, np.zeros((len(values), 0))
         table = [np.zeros((0, len(self.steps)))]
         for closure, found in zip(self.tree.closures, closures, strict=True):
-            force = np.array([one.force for one in found])
-            moment = np.array([one.moment for one in found])
+            force = np.array([one.force for one in found], float)
+            moment = np.array([one.moment for one in found], float)
             part: Array = np.zeros((len(found), len(self.steps)))
             for side, link in enumerate((closure.inner, closure.outer)):
                 point = self.frame(closure, side).position

@@ -86,7 +86,7 @@ def build(robot, folder):
     sizes = {"q": robot.joints_count, "qd": robot.joints_count, "qdd": robot.joints_count}
     for name, call in calls.items():
         m = len(robot.pose_names)
-        own = sizes | {"pose": m} | ({"qd": m, "qdd": m} if name == "torques_at_pose" else {})
+        own = sizes | {"pose": m} | ({"qd": m, "qdd": m} if name.endswith("at_pose") else {})
         words = [f"{a} + {own[a]} * i" if a in own else a for a in arguments[name]]
         parts.append(TIMED % (name, call.format(", ".join(words))))
     if form is not None:

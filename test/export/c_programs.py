@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import operator
 import os
 import platform
 import re
@@ -18,9 +19,11 @@ import pytest
 
 from delta_dynamics import (
     forward_dynamics,
+    forward_dynamics_at_pose,
     inverse_dynamics,
     inverse_dynamics_at_pose,
     mass_matrix,
+    mass_matrix_at_pose,
 )
 from pkm_twin import Robot, transmission
 from pkm_twin.codegen.arrays import Array
@@ -79,7 +82,11 @@ def functions(robot: Robot) -> dict[str, Callable[..., Any]]:
             [result["torques"](q, *rest), robot.singularity(q)]
         )
         result["torques_at_pose"] = lambda pose, *rest: np.column_stack(
-            dataclasses.astuple(inverse_dynamics_at_pose(robot, pose, *rest))
+            dataclasses.astuple(inverse_dynamics_at_pose(robot, pose, *rest))[:4]
+        )
+        result["mass_matrix_at_pose"] = lambda pose: flat(mass_matrix_at_pose(robot, pose))
+        result["accelerations_at_pose"] = lambda *given: np.column_stack(
+            operator.attrgetter("acceleration", "qdd")(forward_dynamics_at_pose(robot, *given))
         )
         result["mass_matrix"] = lambda q: flat(mass_matrix(robot, q))
         result["accelerations"] = lambda q, qd, tau, w: forward_dynamics(robot, q, qd, tau, w)
@@ -124,6 +131,8 @@ def inputs_of(robot: Robot, motion: tuple[Array, ...]) -> dict[str, tuple[Array,
         result["torques_moving"] = (*motion, base)
         result["accelerations"] = (q, qd, 0.1 * qdd, wrench)
         result["torques_at_pose"] = (pose, qd[:, :m], qdd[:, :m], wrench)
+        result["mass_matrix_at_pose"] = (pose,)
+        result["accelerations_at_pose"] = (pose, qd[:, :m], 0.1 * qdd, wrench)
     if "strain_energy" in result:
         result["strain_energy"] = (q, wrench)
     return result

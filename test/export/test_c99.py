@@ -156,6 +156,8 @@ def test_verdicts_are_those_of_python(exported, count, rng):
         if name not in (
             "inverse",
             "torques_at_pose",
+            "mass_matrix_at_pose",
+            "accelerations_at_pose",
             "joint_to_actuator",
             "gains",
             "compliance",

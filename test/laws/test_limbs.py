@@ -8,12 +8,20 @@ from functools import partial
 import numpy as np
 import pytest
 
-from delta_dynamics import inverse_dynamics, inverse_dynamics_at_pose
+from delta_dynamics import (
+    forward_dynamics,
+    forward_dynamics_at_pose,
+    inverse_dynamics,
+    inverse_dynamics_at_pose,
+    mass_matrix,
+    mass_matrix_at_pose,
+)
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.kinematics.iterations import newton
 from pkm_twin.kinematics.motion import Motion, matrices, numbers
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from test.machine.random_machines import variant
+from test.machine.test_helical import slide
 from test.support.robots import load, partly_long
 
 NAMES = ("delta", "delta_cu", "five_bar", "linear_delta", "prru", "rps3", "stewart", "upr_rpu")
@@ -136,6 +144,43 @@ def test_a_machine_that_is_followed_has_no_torques_of_another_assembly(rng):
     for pose in poses[~good][:20]:
         with pytest.raises(PkmTwinError):
             inverse_dynamics_at_pose(robot, pose, np.zeros(3), np.zeros(3))
+
+
+MORE = ("screw", "load_dependent", "examples/machines/rrr4_planar.yaml")
+"""A machine that is followed, friction by load, and more drives than freedoms."""
+
+
+@pytest.mark.parametrize("name", partly_long([*ROBOTS, *MORE], "five_bar", *MORE))
+def test_mass_matrix_and_accelerations_at_a_pose_are_those_of_its_joints(name, rng):
+    robot = slide(0.02) if name == "screw" else load("five_bar" if name == MORE[1] else name)
+    if name == MORE[1]:
+        robot = robot.changed(friction={"coulomb": [0.5, 0.3], "load_dependent": [0.2, 0.1]})
+    pose = reached(robot, rng, 60, 0.15)
+    pose = pose[np.isfinite(pose).all(1)]
+    q = robot.inverse(pose)
+    mass = mass_matrix(robot, q)
+    np.testing.assert_allclose(mass_matrix_at_pose(robot, pose), mass, atol=1e-12 * np.abs(mass).max())
+    rate = rng.normal(size=pose.shape)
+    tau, wrench = 10.0 * rng.normal(size=q.shape), rng.normal(size=(len(pose), 6))
+    found = forward_dynamics_at_pose(robot, pose, rate, tau, wrench)
+    qdd = forward_dynamics(robot, q, found.qd, tau, wrench)
+    np.testing.assert_allclose(found.qdd, qdd, atol=1e-12 * np.abs(qdd).max())
+    back = inverse_dynamics_at_pose(robot, pose, rate, found.acceleration, wrench)
+    np.testing.assert_allclose(back.qdd, qdd, atol=1e-12 * np.abs(qdd).max())
+    one = forward_dynamics_at_pose(robot, pose[0], rate[0], tau[0], wrench[0])
+    np.testing.assert_array_equal(one.acceleration, found.acceleration[0])
+
+
+@pytest.mark.parametrize("name", ["prru", "rps3", "upr_rpu"])
+def test_slides_and_a_turn_of_the_platform_are_those_of_all_closures(name, rng):
+    posed = load(name).engine.posed
+    assert posed.platform_pivots
+    for x, q in posed.samples:
+        at = q + rng.uniform(-0.05, 0.05, len(q))
+        found = np.array(x, dtype=object)
+        found[posed.solved[0]] = posed.close_platform(posed.tree, at, posed.platform_pivots)
+        motion, _ = posed.place(posed.tree, found, at)
+        assert max(abs(row.value * row.scale) for row in motion.closures()) < 1e-12
 
 
 def test_a_pose_that_is_not_reached_has_no_torques():

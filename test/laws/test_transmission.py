@@ -199,9 +199,9 @@ def test_what_cannot_be_converted_is_rejected_by_name():
     for call in (t.effort_limits, t.velocity_limits, t.effort_polytope):
         with pytest.raises(ParameterError, match=r"limits\.(effort|velocity)"):
             call(x)
-    with pytest.raises(ParameterError, match=r"position.*shape"):
+    with pytest.raises(ValueError, match=r"positions.*shape"):
         t.ratio([0.0])
-    with pytest.raises(ParameterError, match=r"velocity: .*finite"):
+    with pytest.raises(ValueError, match=r"velocities.*finite"):
         t.joint_to_actuator(x, [np.nan, 0.0])
     with pytest.raises(ParameterError, match=r"stiffness: .*shape"):
         t.gains(x, np.eye(3), 1.0)
