@@ -13,20 +13,21 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.expressions import SNAP
-from pkm_twin.codegen.lu import Order, independent_rows, pivot_order
+from pkm_twin.codegen.expressions import SNAP, Numbers, Objects
+from pkm_twin.codegen.lu import Order, SparseLU, independent_rows, pivot_order
+from pkm_twin.codegen.operations import sqrt
 from pkm_twin.kinematics import pose as poses
 from pkm_twin.kinematics.diagnosis import mobility_error
 from pkm_twin.kinematics.iterations import newton
-from pkm_twin.kinematics.limb_pose import Limb, LimbPose, place_in_order
-from pkm_twin.kinematics.limbs import order_closed
+from pkm_twin.kinematics.limb_pose import Limb, LimbPose, place_in_order, sign_of
+from pkm_twin.kinematics.limbs import SAME_STATE, order_closed
 from pkm_twin.kinematics.linkage import REACH
-from pkm_twin.kinematics.motion import Motion, numbers
+from pkm_twin.kinematics.motion import Motion, matrices, numbers
 from pkm_twin.kinematics.pose import Coordinate
 from pkm_twin.kinematics.scheme import Scheme
 from pkm_twin.machine.graph import BASE, Body, Graph, Joint, array
@@ -310,6 +311,81 @@ class CarriedScheme(Scheme):
     def order(self) -> tuple[str | Limb, ...]:
         """Bodies in the order in which they are placed, limbs in closed form among them."""
         return order_closed(self)
+
+    @cached_property
+    def platform_pivots(self) -> Order | None:
+        """Equations and slides by which :meth:`close_platform` eliminates; None: it has no solution.
+
+        It is tried if limbs leave slides and at most one turn of the platform to Newton's method,
+        and holds if it gives the sampled states again.
+        """
+        places, rates = self.solved
+        steps = [self.tree.steps[name] for name in self.chain.joints] if self.by_pose else []
+        left = [step for step in steps if not step.actuated and step.rate in rates]
+        slides = [step.rate for step in left if not step.circle]
+        if not left or len(left) != len(rates) or len(slides) < len(left) - 1:
+            return None
+        tables = np.array([numbers(self._affine_rows(self.tree, q)[1])[:, slides] for _, q in self.samples])
+        kept = independent_rows(tables) if slides else []
+        if len(kept) < len(slides):
+            return None
+        order = pivot_order(tables[:, kept]) if slides else ()
+        pivots = tuple((kept[row], slides[column]) for row, column in order)
+        with np.errstate(all="ignore"):
+            apart = [
+                numbers(self.close_platform(self.tree, q, pivots)) - np.array(x, float)[places] for x, q in self.samples
+            ]
+        return pivots if (np.abs(apart) < SAME_STATE).all() else None
+
+    def _affine_rows(self, tree: Tree, q: Numbers) -> tuple[Objects, Objects, Objects]:
+        """Return what limbs leave to the platform: d + G slides + h cos + k sin = 0.
+
+        :returns: values at slides and turn of 0, shape (rows,), derivatives there by all unknown
+            rates, shape (rows, rates), and those after a quarter turn.
+        """
+        found = []
+        for cosine in (1.0, 0.0):
+            x = np.array(tree.home, dtype=object)
+            for step in (tree.steps[name] for name in self.chain.joints):
+                if not step.actuated and step.circle:
+                    x[step.position : step.position + 2] = cosine, 1.0 - cosine
+            motion, limbs = self.place(tree, x, q)
+            rows = self.solved_rows(motion.closures(), limbs)
+            found += [np.array([row.value for row in rows], object), matrices(tree, rows)[0]]
+        return found[0], found[1], found[3]
+
+    def close_platform(self, tree: Tree, q: Numbers, pivots: Order) -> list[Any]:
+        """Return the unknowns of the platform in closed form, on numbers and expressions alike.
+
+        Slides are eliminated; of both turns that solve the last equation, a cos + b sin = c, the
+        one on home's side is taken (of a 3-RPS: Lee and Shah 1988).
+        """
+        steps = {step.rate: step for step in tree.steps.values() if not step.actuated}
+        order, slides = [row for row, _ in pivots], [column for _, column in pivots]
+        turn = next((steps[rate] for rate in self.solved[1] if rate not in slides), None)
+
+        def eliminate(q: Numbers) -> tuple[Objects, SparseLU, Objects, Objects, list[Any]]:
+            values, table, quarter = self._affine_rows(tree, q)
+            lu = SparseLU(table[order][:, slides], tuple((k, k) for k in range(len(order))))
+            if turn is None:
+                return values, lu, values, values, []
+            last = next(k for k in range(len(values)) if k not in order)
+            weights = lu.solve_transposed(table[last, slides])
+            h, k = -quarter[:, turn.rate], table[:, turn.rate]
+            return values, lu, h, k, [row[last] - weights @ row[order] for row in (h, k, h - values)]
+
+        values, lu, h, k, last = eliminate(q)
+        x = np.array(tree.home, dtype=object)
+        if turn is not None:
+            a, b, c = last
+            at_home = eliminate(tree.graph.lead_home)[-1][1]
+            square, side = a * a + b * b, -sign_of(at_home) * sqrt(a * a + b * b - c * c)
+            cosine, sine = (a * c - b * side) / square, (b * c + a * side) / square
+            x[turn.position : turn.position + 2] = cosine, sine
+            values = values + h * (cosine - 1.0) + k * sine
+        for rate, value in zip(slides, lu.solve(-values[order]), strict=True):
+            x[steps[rate].position] = value
+        return list(x[self.solved[0]])
 
     @property
     def has_closed_limbs(self) -> bool:

@@ -27,11 +27,11 @@ from pkm_twin.kinematics.traced import POSED, Traced
 
 POSE_WEIGHT: Final = 100.0
 """What the pose weighs against closures where not all can be met: so a closure falls short."""
-CERTAIN: Final = 0.4
-"""Largest distance from a pose, of unit one, of the poses that home's derivatives give for it."""
-CERTAIN_MARGIN: Final = 3.0
+CERTAIN: Final = 0.5
+"""Largest distance from a pose, of unit one, of the poses that derivatives at both ends give for it."""
+CERTAIN_MARGIN: Final = 1.0
 """Smallest ratio of the closures' determinant to that distance, from far poses of many machines: it
-is less than 2 where ``forward`` of the joints is not the pose."""
+is less than 0.5 where ``forward`` of the joints is not the pose."""
 SAME_POSE: Final = 1e-7
 """Largest difference of two poses that are one: rounding of the two solutions, of unit one. Another
 assembly is farther away unless a singularity is nearer than that."""
@@ -277,9 +277,9 @@ def pose_accelerations(t: Traced) -> list[Any]:
 def certify_assembly(t: Traced, scheme: CarriedScheme, posed: Traced, q: Sequence[Any]) -> list[Any]:
     """Return numbers that are above zero if ``forward`` of q is certainly the pose.
 
-    With x the pose and A = dq/dx, q - q0 = A0 (x - x0) + ... is read in two ways: the pose that A0
-    gives for q, and the pose for which A0 gives the joints that A gives. Both lie near x where the
-    line from home is nearly straight.
+    With x the pose, A = dq/dx and home 0, the way from home is read from both ends: A0^-1 (q - q0)
+    and A^-1 (q - q0) lie near x - x0 where it is nearly straight. A closed start of ``forward`` is
+    compared with x itself.
     """
     names, order = t.graph.leads, scheme.drive_pivots
     rates, rates_home = (posed.rates_of_reaches(names, home=home) for home in (False, True))
@@ -294,12 +294,10 @@ def certify_assembly(t: Traced, scheme: CarriedScheme, posed: Traced, q: Sequenc
         apart = (position - goal) / t.tree.size
         turns = np.ravel(rotation - turned)
         # Of two rotations by an angle apart, these squares sum to 4 - 4 cos(angle).
-        distance = apart @ apart + 0.5 * (turns @ turns)
-    else:
-        move = posed.q - posed.graph.lead_home
-        read = [at_home.solve(lead - t.graph.lead_home), at_home.solve(rates @ move)]
-        first, second = ((x - move) * np.array(t.pose_scales, dtype=object) for x in read)
-        distance = 0.5 * (first @ first) + 0.125 * (second @ second)
+        return [closures - LEAST, SAME_POSE * SAME_POSE - (apart @ apart + 0.5 * (turns @ turns))]
+    move, way = posed.q - posed.graph.lead_home, lead - t.graph.lead_home
+    ends = ((lu.solve(way) - move) * np.array(t.pose_scales, dtype=object) for lu in (at_home, here))
+    distance = 0.5 * sum(apart @ apart for apart in ends)
     return [
         drives - LEAST,
         CERTAIN * CERTAIN - distance,

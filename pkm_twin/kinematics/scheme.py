@@ -82,6 +82,7 @@ class Scheme(Linkage):
                     self.pivots,
                     self.order,
                     self.solved_pivots,
+                    self.platform_pivots,
                 )
             ),
             type(self.start or self),
@@ -143,6 +144,15 @@ class Scheme(Linkage):
         limbs = find_hanging_limbs(self)
         inner = {body for limb in limbs for body in limb.bodies}
         return (*(body for body in self.tree.links if body not in inner), *limbs)
+
+    @property
+    def platform_pivots(self) -> Order | None:
+        """How the platform's unknowns are found in closed form; None: by Newton's method."""
+        return None
+
+    def close_platform(self, tree: Tree, q: Numbers, pivots: Order) -> list[Any]:
+        """Return the platform's unknowns in closed form."""
+        raise NotImplementedError
 
     @property
     def limbs(self) -> list[Limb]:

@@ -22,17 +22,10 @@ from pkm_twin.codegen.expressions import (
 )
 from pkm_twin.codegen.lu import SparseLU
 from pkm_twin.codegen.program import AT, LEAST, STATE, UNKNOWNS, Equations, previous
+from pkm_twin.kinematics.constraints import cross
 from pkm_twin.kinematics.drives import LEADS, TIME, Drives
 from pkm_twin.kinematics.limb_pose import LimbPose
-from pkm_twin.kinematics.motion import (
-    FIXED,
-    BaseMotion,
-    Columns,
-    Motion,
-    Row,
-    cross,
-    matrices,
-)
+from pkm_twin.kinematics.motion import FIXED, BaseMotion, Columns, Motion, Row, matrices
 from pkm_twin.kinematics.scheme import Scheme
 from pkm_twin.machine.geometry import graph_on
 from pkm_twin.machine.graph import Graph
@@ -112,7 +105,9 @@ class Traced:
     def solve(self) -> None:
         """Place the machine by its unknowns, and factor its closures."""
         scheme, tree = self.scheme, self.tree
-        self.unknowns = self.tape.inputs(self.unknowns_name, len(scheme.solved[0]))
+        self.unknowns: Numbers = self.tape.inputs(self.unknowns_name, len(scheme.solved[0]))
+        if scheme.platform_pivots is not None:
+            self.unknowns = scheme.close_platform(tree, self.q, scheme.platform_pivots)
         self.motion, self.limbs, self.x = self._placed(self.unknowns)
         self.rows = self.motion.closures()
         self.ju, self.jq = matrices(tree, self.rows)
@@ -151,15 +146,15 @@ class Traced:
             more["goal"] = self.lift(self.drives.given("q"))
             more["branch"] = [*more.pop("branch", ()), *self.lift(self.drives.tolerance_margins())]
         scheme, tree = self.scheme, self.tree
-        places, rates = scheme.solved
-        step = -self.newton.solve([row.value for row in self.solved])
+        places, rates = scheme.solved if scheme.platform_pivots is None else ([], [])
+        step: Numbers = -self.newton.solve([row.value for row in self.solved]) if places else []
         rows: list[Any] = [0.0] * tree.unknown_rates
         for k, value in zip(rates, step, strict=True):
             rows[k] = value
         moved = self.motion.retracted(self.x, rows)
         before = self.tape.inputs(previous(self.unknowns_name), len(places))
         state = self.tape.inputs(STATE, len(AT))
-        onward = self.unknowns + state[AT.onward] * (self.unknowns - before)
+        onward = [x + state[AT.onward] * (x - last) for x, last in zip(self.unknowns, before, strict=False)]
         branch, determinant = [], self.determinant
         if not places:
             # Nothing is corrected: the result alone is judged.
@@ -169,8 +164,8 @@ class Traced:
             self.target,
             self.lift([tree.home[k] for k in places]),
             self.lift(self.graph.lead_home),
-            self.lift(self._start()),
-            self.retracted(onward),
+            self.lift(self._start() if places else []),
+            self.retracted(onward) if places else [],
             self.lift([moved[k] for k in places]),
             self.square(step, [tree.scales[k] for k in rates]),
             self.tape.lift(determinant),
@@ -247,8 +242,6 @@ class Traced:
     def _start(self) -> Sequence[Any]:
         """Return the unknowns that Newton's method starts with: in closed form, or a guess."""
         closed = self.scheme.start
-        if not self.scheme.solved[0]:
-            return []
         return self._guess() if closed is None else closed.place(self.tree, self.q)
 
     def place_start(self) -> Motion:
