@@ -268,6 +268,11 @@ def _solve_stretch(part: JointPath, limits: Limits, wrench: Array | None) -> Run
             way = part.curve.begin + float(part.s[part.left[int(stopped.argmax())]])
             raise ParameterError("path", f"no motion after {way:.4g} m", "limits that let the machine pass")
         run = Run.of(part, x)
+        # Where the joints turn back and nothing bounds their acceleration, the path's speed has no bound.
+        unbounded = np.diff(run.knots) <= np.finfo(float).eps * run.duration
+        if unbounded.any():
+            way = part.curve.begin + float(part.s[part.left[int(unbounded.argmax())]])
+            raise ParameterError("path", f"no limit bounds the motion at {way:.4g} m", "acceleration or effort limits")
         used = run_peaks(run, limits, wrench)
         over = used.max(1)
         bad = over > 1.0 + MAX_EXCESS

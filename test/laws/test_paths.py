@@ -366,6 +366,11 @@ def test_what_cannot_be_is_rejected_by_its_place():
     assert len(str(why.value)) > 80
     assert str(why.value) in str(error.value), "the reason is cut"
     assert fastest(load("upr_rpu"), points_of(load("upr_rpu")), velocity=0.3).duration > 0.0
+    # The tool point of a circle of tilts turns back, and its speed alone bounds no motion there.
+    tilting = load("upr_rpu")
+    with pytest.raises(ParameterError) as error:
+        timed(tilting, circle(tilting, tilting.home(), 0.05), "fastest", speed=0.1)
+    assert "acceleration" in error.value.bound
 
 
 def test_a_path_keeps_the_ranges_of_passive_joints():
