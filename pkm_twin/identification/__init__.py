@@ -6,6 +6,6 @@
 :mod:`~pkm_twin.identification.calibration` geometry and offsets to poses, or to any of the
 :mod:`~pkm_twin.identification.measurements` of them.
 :mod:`~pkm_twin.identification.judge` judges a fit by its residual,
-:mod:`~pkm_twin.identification.plausible` judges a recording before it is fitted,
+:mod:`~pkm_twin.identification.hypotheses` says what explains a recording that contradicts the file,
 :mod:`~pkm_twin.identification.check` judges it against the file.
 """

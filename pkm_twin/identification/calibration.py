@@ -29,7 +29,6 @@ from pkm_twin.identification.calibration_fit import (
     Outlier,
     RejectedPosesError,
     UnsettledError,
-    cost_of,
     faults_of,
     fit,
     outliers_of,
@@ -49,7 +48,7 @@ from pkm_twin.identification.calibration_state import (
     start_of,
     written,
 )
-from pkm_twin.identification.lines import LINE_ENDS, line_slopes
+from pkm_twin.identification.lines import POSES, line_slopes
 from pkm_twin.identification.measurements import (
     PLACE,
     Measured,
@@ -65,26 +64,11 @@ from pkm_twin.robot.derivatives import geometry_numbers
 from pkm_twin.robot.numbers import FileNumbers
 from pkm_twin.robot.robot import Robot
 
-MOVES: Final = 1e-6
-"""A number that moves the platform less than this, per unit, is no number of the geometry."""
 HELD_OUT: Final = 4
 """Every so many whole poses one is held out."""
-UNSEEN: Final = 1e-8
-"""Least singular value, of the greatest, of a combination of numbers that poses tell."""
-STEP: Final = 1e-6
-"""By which a number is moved to see whether the machine can be assembled with another one."""
-SAME: Final = 1e-4
-"""Difference of joints that makes another pose, rad or m."""
 NOT_GEOMETRY: Final = ("limits.", "gravity", "payload.", "joint_map.")
-SCALED: Final = 0.5
-"""Part of its deviation before below which a scale is known; part of a number's variance from
-which on it depends on the scale."""
 KEPT: Final = 0.1
 """Part of its prior deviation to which a length is kept that is known worse, without a scale."""
-EXPLAINED: Final = 0.8
-"""Part of the sum of squares below which another place of the instrument is tried."""
-CURVED: Final = 1e-4
-"""Deviation of a scale below which no measured length is needed: 0.01 mm in 100 mm."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -263,10 +247,12 @@ def geometric(robot: Robot, q: Array, only: Sequence[str] = ()) -> tuple[str, ..
         own = np.array([robot.number(path) for path in paths])
         many = Variants(robot, dict(zip(paths, own, strict=True)))
         twists = many.platform_slopes(q)
-        beside = many.with_values(own + STEP * np.eye(len(paths)))
+        # Can the machine be assembled with another number?
+        beside = many.with_values(own + 1e-6 * np.eye(len(paths)))
         each = np.broadcast_to(q, (len(paths), *q.shape))
         possible = beside.run(programs.anywhere, each)[1].all((1, 2))
-        good = possible & (np.abs(twists).max((0, 1)) > MOVES)
+        # What does not move the platform is no number of the geometry.
+        good = possible & (np.abs(twists).max((0, 1)) > 1e-6)
         found = [path for path, one in zip(paths, good, strict=True) if one]
     known = [*found, *(f"joint_map.{joint}.offset" for joint in robot.joint_names)]
     for beginning in only:
@@ -293,7 +279,7 @@ def left_by_calibration(robot: Robot, errors: Callable[[Array], Array], states: 
 
     scale = np.repeat([1.0, robot.size], 3)[:, None]
     table, wanted = ((scale * of(states)).reshape(6 * len(states), -1) for of in (slopes, errors))
-    found = np.linalg.lstsq(table, wanted, rcond=UNSEEN)[0]
+    found = np.linalg.lstsq(table, wanted, rcond=1e-8)[0]
     return np.asarray(errors(q) - slopes(q) @ found, np.float64)
 
 
@@ -434,7 +420,14 @@ def _calibrated(
     """
     parameters = unknowns(robot, learnt, paths, free)
     if apart is not None:
-        _enough(learnt, apart, len(parameters))
+        # A pose that is measured again tells no more numbers.
+        different = len(np.unique(np.round(learnt.joints / 1e-4), axis=0))
+        if 3 * different * len(learnt.readings) < len(parameters) + 6 or not len(apart.joints):
+            raise ParameterError(
+                "poses",
+                f"{different} different ones to learn from",
+                f"enough for {len(parameters)} numbers to be fitted",
+            )
     beside = {p.name for p in parameters if p.name.startswith(BESIDE)} | learnt.own.keys()
     machine = [p.name for p in parameters if p.name not in beside]
     start = placed(robot, learnt, machine, free.frame)
@@ -482,25 +475,10 @@ def _calibrated(
         outliers=outliers,
         steps=steps,
         faults=tuple(faults),
-        cost=cost_of(changes),
+        cost=sum(((p.value - p.before) / p.prior) ** 2 for p in changes),
         placed=apart is not None and not free.frame and _looks_placed(robot, learnt, found, told),
         instrument=found.state.instrument,
     )
-
-
-def _enough(learnt: Measured, apart: Measured, count: int) -> None:
-    """Whole poses have to tell more than is fitted.
-
-    :raises ParameterError: they do not.
-    """
-    # A pose that is measured again tells no more numbers.
-    different = len(np.unique(np.round(learnt.joints / SAME), axis=0))
-    if 3 * different * len(learnt.readings) < count + 6 or not len(apart.joints):
-        raise ParameterError(
-            "poses",
-            f"{different} different ones to learn from",
-            f"enough for {count} numbers to be fitted",
-        )
 
 
 def _compared(
@@ -549,7 +527,7 @@ def _looks_placed(robot: Robot, measured: Measured, found: Fitted, told: Sequenc
     frame = over(measured.slopes(robot, found.state, FRAME))
     both = np.hstack([own, np.pad(frame, ((0, len(told)), (0, 0)))])
     left = [target - one @ np.linalg.lstsq(one, target, rcond=None)[0] for one in (own, both)]
-    return float(left[1] @ left[1]) < EXPLAINED * float(left[0] @ left[0])
+    return float(left[1] @ left[1]) < 0.8 * float(left[0] @ left[0])
 
 
 def _scaled(
@@ -559,17 +537,18 @@ def _scaled(
 
     And the scale's derivatives, where it is not determined.
     """
-    lines = line_slopes(robot, state.between(measured.joints, LINE_ENDS), [p.name for p in told])
+    lines = line_slopes(robot, state.between(measured.joints, POSES), [p.name for p in told])
     if lines is None:
         return None, told, None
     row = lines.scale
     prior = np.array([p.prior for p in told])
     before, after = (float(np.sqrt(row @ c @ row)) for c in (np.diag(prior**2), covariance))
     length = any(one.kind.length for one in measured.readings)
-    known = after < SCALED * before and (length or after < CURVED)
+    # Measured lengths tell the scale where they halve its deviation; else 0.01 mm in 100 mm is enough.
+    known = after < 0.5 * before and (length or after < 1e-4)
     scale = Scale(before, after, known, *lines.deviations(covariance))
     if known or not before > 0.0:
         return scale, told, None
     share = (covariance @ row) ** 2 / (after**2 * np.diag(covariance))
-    marked = [replace(p, scaled=bool(s > SCALED)) for p, s in zip(told, share, strict=True)]
+    marked = [replace(p, scaled=bool(s > 0.5)) for p, s in zip(told, share, strict=True)]
     return scale, marked, row

@@ -16,37 +16,18 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, PkmTwinError, one_line
 from pkm_twin.identification.calibration_state import (
     FRAME,
+    TARGET,
     Instrument,
     Parameter,
     State,
     moved,
-    value_of,
 )
 from pkm_twin.identification.measurements import Measured, Readings, Weights
 from pkm_twin.identification.samples import OUTLIER
 from pkm_twin.robot.robot import Robot
 
 STEPS: Final = 60
-WEIGHED: Final = 12
-"""Steps after which noise and weights stay: else they and the fit may go round in circles."""
-POOR: Final = 0.25
-GOOD: Final = 0.75
-"""Parts of what a linear machine would gain: below the one steps are damped more, above less."""
-SLOW: Final = 0.02
-"""Or so little in each of several steps, ``IDLE``: no number moves by its deviation any more."""
-IDLE: Final = 3
-LIGHT: Final = 0.01
-"""The least damping, in squares of prior standard deviations."""
-TRIALS: Final = 8
-"""Dampings of a step that are tried."""
-CONVERGED: Final = 1e-3
-"""Part of its deviation by which no parameter moves in the last step."""
-GAINED: Final = 1e-4
-"""Or by which the sum of squares over the noise falls."""
-WRONG: Final = 0.02
-"""Part of the machine's size that no fit may leave over: such poses are not its own."""
-TWISTED: Final = 0.05
-"""Angle an axis that no fit may leave over, rad: those are other angles, or other units."""
+"""Most steps of a fit."""
 MAX_CHANGE: Final = 5.0
 """Prior standard deviations by which no number changes."""
 MOVED: Final = 14.0
@@ -88,7 +69,9 @@ def fit(
     :raises ParameterError: it does not settle.
     """
     state = start
-    values = np.array([value_of(start, p.name, p.before) for p in parameters])
+    tool = start.instrument
+    known = dict(zip((*FRAME[:3], *TARGET), (*tool.place, *tool.target), strict=True)) | tool.own
+    values = np.array([known.get(p.name, p.before) for p in parameters])
     centre = np.array([p.before for p in parameters])
     prior = np.array([p.prior for p in parameters])
 
@@ -100,7 +83,8 @@ def fit(
     for steps in range(1, STEPS + 1):
         progress(1)
         columns = measured.slopes(robot, state, names)
-        if steps <= WEIGHED:
+        # From then on noise and weights stay: else they and the fit may go round in circles.
+        if steps <= 12:
             noise = measured.weighed(measured.parts(state), columns, prior)
         table = noise.over(columns)
         left, before = np.vstack([table, np.diag(1.0 / prior)]), right(state, values, noise)
@@ -109,32 +93,36 @@ def fit(
         spread = prior[:, None] * axes.T / sizes
         covariance = spread @ spread.T
         trial, gained = None, 0.0
-        for _ in range(TRIALS):
+        for _ in range(8):
             move = _move(left, before, np.sqrt(damping) / prior)
-            small = bool(np.all(np.abs(move) < CONVERGED * np.sqrt(np.diag(covariance))))
+            small = bool(np.all(np.abs(move) < 1e-3 * np.sqrt(np.diag(covariance))))
             sums = [float(row @ row) for row in (before, before - left @ move)]
-            settled = small or sums[0] - sums[1] < GAINED
+            settled = small or sums[0] - sums[1] < 1e-4
             try:
-                trial = _stepped(robot, state, measured, names, values, move)
+                new = dict(zip(names, (values + move).tolist(), strict=True))
+                turn = np.array([dict(zip(names, move.tolist(), strict=True)).get(name, 0.0) for name in FRAME[3:]])
+                trial = moved(robot, state, measured.joints, new, turn)
             except PkmTwinError as error:
                 # No machine has such numbers, or none of them is in these poses: a smaller step.
                 trial, problem = None, str(error)
             else:
                 row = right(trial, values + move, noise)
                 gained = (sums[0] - float(row @ row)) / max(sums[0] - sums[1], 1e-300)
-                if settled or gained > POOR:
+                if settled or gained > 0.25:
                     break
-            damping = max(10.0 * damping, LIGHT)
+            # The least damping, in squares of prior standard deviations.
+            damping = max(10.0 * damping, 0.01)
         if trial is None:
             break
         state, values = trial, values + move
-        idle = idle + 1 if gained * (sums[0] - sums[1]) < SLOW else 0
-        if settled or idle >= IDLE:
+        # Three steps of which none gains what one deviation would.
+        idle = idle + 1 if gained * (sums[0] - sums[1]) < 0.02 else 0
+        if settled or idle >= 3:
             return Fitted(state, values, covariance, table * prior, noise, steps)
         order = np.argsort(-np.abs(move) / np.sqrt(np.diag(covariance)))[:3]
         problem = f"{steps} steps, {', '.join(names[k] for k in order)} still move"
-        if gained > GOOD:
-            damping = 0.1 * damping if damping > LIGHT else 0.0
+        if gained > 0.75:
+            damping = 0.1 * damping if damping > 0.01 else 0.0
     raise UnsettledError("poses", problem, "poses for which the fit converges: measure more, or fit less (--only)")
 
 
@@ -149,13 +137,6 @@ def _move(left: Array, right: Array, damping: Array) -> Array:
         rows = np.vstack([left, np.diag(damping)])
         end = np.concatenate([right, np.zeros(len(damping))])
     return np.asarray(np.linalg.lstsq(rows, end, rcond=None)[0], np.float64)
-
-
-def _stepped(robot: Robot, state: State, measured: Measured, names: Sequence[str], values: Array, move: Array) -> State:
-    by = dict(zip(names, move.tolist(), strict=True))
-    turn = np.array([by.get(name, 0.0) for name in FRAME[3:]])
-    new = dict(zip(names, (values + move).tolist(), strict=True))
-    return moved(robot, state, measured.joints, new, turn)
 
 
 class Fault(NamedTuple):
@@ -233,10 +214,11 @@ def faults_of(
         machine's numbers. ``prior``: of lengths, m. ``size``: of the machine, m.
     """
     faults = []
+    # Poses that are off by more, 2 % of the machine's size or 50 mrad, are not its own.
     bounds = {
-        "m": (max(prior, WRONG * size), "poses of this machine in m and rad"),
+        "m": (max(prior, 0.02 * size), "poses of this machine in m and rad"),
         "rad": (
-            max(prior / size, TWISTED),
+            max(prior / size, 0.05),
             "rotations of this machine from its home, in rad and in the order and axes of the columns",
         ),
     }
@@ -265,11 +247,6 @@ def faults_of(
                 )
             )
     return faults
-
-
-def cost_of(changes: Sequence[Parameter]) -> float:
-    """Squares of the machine's changes over their prior standard deviations, summed."""
-    return sum(((p.value - p.before) / p.prior) ** 2 for p in changes)
 
 
 def place_fault(instrument: Instrument) -> Fault:

@@ -124,16 +124,6 @@ def place_frame(state: State, position: Array) -> None:
     tool.place = centres[0] - tool.frame.apply(centres[1])
 
 
-def value_of(state: State, name: str, otherwise: float) -> float:
-    """Return a number of the instrument as it is now, of any other name the given one."""
-    tool = state.instrument
-    if name in FRAME[:3]:
-        return float(tool.place[FRAME.index(name)])
-    if name in TARGET:
-        return float(tool.target[TARGET.index(name)])
-    return tool.own.get(name, otherwise)
-
-
 def moved(robot: Robot, state: State, joints: Array, values: Mapping[str, float], turn: Array) -> State:
     """Return the machine with new numbers.
 

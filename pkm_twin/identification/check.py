@@ -15,7 +15,6 @@ import numpy as np
 from delta_dynamics import inverse_dynamics, torque_deviation
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import PkmTwinError, SingularityError, UnreachableError, one_line
-from pkm_twin.identification.causes import agrees, cause_of, payload_hint
 from pkm_twin.identification.compare import (
     LEAST,
     MAX_RESIDUAL,
@@ -32,8 +31,11 @@ from pkm_twin.identification.compare import (
 )
 from pkm_twin.identification.fit import Fit, fit
 from pkm_twin.identification.friction_laws import fit_recordings
+from pkm_twin.identification.hypotheses import NO_MACHINE, Explanation, explain
 from pkm_twin.identification.judge import LOUD
-from pkm_twin.identification.plausible import LATEST
+from pkm_twin.identification.parameters import file_parameters
+from pkm_twin.identification.rows import rows_of
+from pkm_twin.identification.words import LATEST, listed, scale_text
 from pkm_twin.recordings import Recording
 from pkm_twin.report import Fact, Verdict, judged
 from pkm_twin.robot.limits import ranges
@@ -51,18 +53,12 @@ MEASURED: Final = "measured efforts"
 COMPARED: Final = "compared efforts"
 IDLE: Final = "drives off or braked"
 COMPUTED: Final = "the efforts of this table are the model's; expected columns JOINT.measured"
-ROUNDING: Final = 1e-6
-"""Part of the peak by which no sample of a plan differs from the model."""
-TICKS: Final = 10.0
-"""By how many of its least steps a signal has to change that is not stuck."""
-MAX_GAP: Final = 5.0
-"""Longest good time between joint states, in median periods."""
+DEVIATIONS: Final = (1, 2, 3)
+"""Of the model, inside which residuals are counted."""
 MIN_SINGULARITY: Final = 1e-3
 """Least good singularity index, 0 in a singularity, 1 at best."""
 MIN_COMPARED: Final = 0.1
 """Least part of the recording whose efforts are compared."""
-DEVIATIONS: Final = (1, 2, 3)
-"""Of the model, inside which residuals are counted."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +98,7 @@ class Checked:
         if c is None or r.qd is None or r.qdd is None:
             return False
         away = np.abs(by_held(r, inverse_dynamics, r.time, *r.motion) - r.measured)
-        return bool((away <= ROUNDING * c.peak).all())
+        return bool((away <= 1e-6 * c.peak).all())
 
     @property
     def agreement(self) -> str:
@@ -141,7 +137,11 @@ def checked(r: Recording, residual: float) -> Checked:
     items = [*_file(r), *_motion(r), *_limits(r), _singularity(r)]
     left_out = np.zeros(len(r.time), np.bool_)
     bound = f"RMS below {100 * residual:g} % of peak"
-    reason = why_no_torques(r.robot) or _why_no_efforts(r)
+    reason = why_no_torques(r.robot)
+    if not reason and r.effort is None:
+        reason = "joint states without efforts: the bag has none, or NaN, in some or all of them"
+        reason = "the table has no columns JOINT.effort" if r.bag is None else reason
+        reason = COMPUTED if r.efforts == "model" else reason
     fault = r.step_fault if r.steps.publishers else _play_of(r)
     if fault or reason:
         items.append(judged(RESIDUAL, fault or reason, bound, None))
@@ -165,17 +165,6 @@ def checked(r: Recording, residual: float) -> Checked:
             items.append(judged(MEASURED, stuck, "change as the model's", False))
         items += _residuals(r, compared, bands, bound)
     return Checked(r, items, bands, unjudged, compared, left_out)
-
-
-def _why_no_efforts(r: Recording) -> str:
-    """Say why a recording has no measured efforts; empty where it has."""
-    if r.effort is not None:
-        return ""
-    if r.efforts == "model":
-        return COMPUTED
-    if r.bag is None:
-        return "the table has no columns JOINT.effort"
-    return "joint states without efforts: the bag has none, or NaN, in some or all of them"
 
 
 def _play_of(r: Recording) -> str:
@@ -212,7 +201,7 @@ def _motion(r: Recording) -> list[Fact]:
     periods = np.diff(r.time)
     median, longest = float(np.median(periods)), float(periods.max())
     gap = f"{1e3 * longest:.3f} ms at {r.time[int(periods.argmax())]:.3f} s"
-    within, rate = MAX_GAP * median, f"{1 / median:.1f} Hz over {r.time[-1]:.3f} s"
+    within, rate = 5.0 * median, f"{1 / median:.1f} Hz over {r.time[-1]:.3f} s"
     fault = r.step_fault or _play_of(r)
     items = [
         judged("rate", rate, "", True, number=1 / median, unit="Hz"),
@@ -241,7 +230,8 @@ def stuck_from(time: Array, values: Array, told: Array, count: int = 1) -> tuple
         return None
     steps = np.abs(np.diff(values))
     tick = steps[steps > 0.0].min(initial=np.inf)
-    size = max(TICKS * tick, STANDSTILL_FRACTION * float(np.ptp(told[np.isfinite(told)])))
+    # A signal that changes by less than ten of its least steps is stuck.
+    size = max(10.0 * tick, STANDSTILL_FRACTION * float(np.ptp(told[np.isfinite(told)])))
     for begin, end in np.flatnonzero(np.diff(steps == 0.0, prepend=0, append=0)).reshape(-1, 2):
         known = told[begin : end + 1]
         known = known[np.isfinite(known)]
@@ -423,16 +413,8 @@ def _bands(r: Recording, c: Compared) -> dict[str, dict[str, Any]]:
     }
 
 
-BEFORE: Final = 0.2
-"""Part of a recording that agrees before something else acts on the machine,"""
-MOVED: Final = 0.5
-"""and part of the peak efforts that are seen in it."""
 FULL: Final = 0.01
 """Part of the samples whose effort is at its greatest where a sensor is saturated,"""
-TENS: Final = 30
-"""and how many they are at least."""
-FOUND: Final = 2
-"""Findings of a fit that are named."""
 
 
 def check(r: Recording, residual: float = MAX_RESIDUAL, thorough: bool = True) -> Checked:
@@ -446,7 +428,11 @@ def check(r: Recording, residual: float = MAX_RESIDUAL, thorough: bool = True) -
         return found
     c = found.compared
     if thorough and found.answer == "good" and c is not None:
-        return replace(found, hint=payload_hint(found.recording, c))
+        # Of a residual that is noise nothing is to be explained.
+        one = _explain(found) if (c.rms > LOUD * c.noise).any() else None
+        text = one.text.partition(" explains the efforts: use ") if one and one.load else ("",) * 3
+        hint = f"{text[0]} explains most of the residual: {text[2]}" if text[2] else ""
+        return replace(found, hint=hint)
     causes, findings = _causes_of(found, thorough)
     return replace(found, causes=causes, findings=findings)
 
@@ -463,15 +449,44 @@ def _causes_of(found: Checked, thorough: bool) -> Explained:
         return (), ()
     if c.good.all():
         return (c.delayed,) if c.delayed else (), ()
-    cause = cause_of(r, c, found.left_out)
-    if cause is not None:
+    cause = _explain(found)
+    if cause is not None and cause.text and not cause.text.startswith(NO_MACHINE):
         return (cause.text,), ()
     causes = _saturated(r, c) or tuple(
-        text for text, after in _contact(r, c) if agrees(r, found.left_out | after, c.bound)
+        text for text, after in _contact(r, c) if _agrees(r, found.left_out | after, c.bound)
     )
     if causes or not thorough:
         return causes, ()
     return _of_fit(found, c.bound)
+
+
+def _explain(found: Checked) -> Explanation | None:
+    """Return what explains a recording, as `fit` has it; None where it cannot be fitted."""
+    r, c = recorded_of(found.recording, found.left_out), found.compared
+    if r.robot.redundant and c is not None:
+        # Of drives that share: the signs of some, or the scale of all.
+        whole, opposed = found.recording, ~c.good & (np.sum(c.measured * c.expected, 0) < 0.0)
+        scale = float(np.sum(c.measured * c.expected) / max(float(np.sum(c.expected**2)), 1e-300))
+        names = listed(np.array(r.robot.joint_names)[opposed].tolist(), len(opposed))
+        tried = [(f"efforts of {names} have the wrong sign", np.where(opposed, -1.0, 1.0))] * bool(opposed.any())
+        for text, factors in (*tried, (scale_text("all joints", scale), np.full(len(opposed), 1.0 / scale))):
+            if _agrees(replace(whole, effort=factors * whole.measured), found.left_out, c.bound):
+                return Explanation(text, fault=True)
+    if r.robot.redundant:
+        return None
+    try:
+        return explain(rows_of(r.robot, file_parameters(r.robot), r))
+    except (PkmTwinError, ValueError, np.linalg.LinAlgError):
+        return None
+
+
+def _agrees(r: Recording, without: Mask, bound: float) -> bool:
+    """Return whether the efforts agree with the model, apart from some samples."""
+    try:
+        compared = compared_of(r, without, bound)
+    except (PkmTwinError, ValueError):
+        return False
+    return compared is not None and bool(compared.good.all()) and not compared.delayed
 
 
 def _contact(r: Recording, c: Compared) -> Iterator[tuple[str, Mask]]:
@@ -481,8 +496,9 @@ def _contact(r: Recording, c: Compared) -> Iterator[tuple[str, Mask]]:
         return
     before = c.time < begins
     # Before the motion is under way every machine agrees.
-    seen = np.abs(c.expected[before]).max(0, initial=0.0) > MOVED * np.abs(c.expected).max(0)
-    if before.mean() > BEFORE and seen.all():
+    seen = np.abs(c.expected[before]).max(0, initial=0.0) > 0.5 * np.abs(c.expected).max(0)
+    # What agrees before is a fifth of the recording, and shows half of the peak efforts.
+    if before.mean() > 0.2 and seen.all():
         text = (
             f"before {begins:.3f} s the efforts agree with the model, from then on something else "
             "acts on the machine (contact, collision or another load?)"
@@ -506,7 +522,7 @@ def _saturated(r: Recording, c: Compared) -> tuple[str, ...]:
         usual = float(estimate_deviation(less)) if len(less) else 0.0
         slack = limit[j] + 4.0 * usual
         enough = (
-            full.mean() > FULL and full.sum() >= TENS and (np.abs(expected[full, j]) > most - slack).mean() > 1.0 - FULL
+            full.mean() > FULL and full.sum() >= 30 and (np.abs(expected[full, j]) > most - slack).mean() > 1.0 - FULL
         )
         if not enough or (len(less) and rms(less) > slack):
             return ()
@@ -523,9 +539,9 @@ def _of_fit(found: Checked, bound: float) -> Explained:
     r = found.recording
     try:
         part = [recorded_of(r, found.left_out)]
-        first = fit(r.robot, part, ("friction",), accept=True, causes=[None])
+        first = fit(r.robot, part, ("friction",), accept=True, explained=[Explanation("")])
         rubbing = r.robot.with_file_values({one.name: one.after for one in first.numbers})
-        if not first.accepted and agrees(replace(r, robot=rubbing), found.left_out, bound):
+        if not first.accepted and _agrees(replace(r, robot=rubbing), found.left_out, bound):
             return (_fitted("friction other than the file's explains", first),), ()
         last, *_ = fit_recordings(r.robot, [r], accept=True)
         verdict = last.verdict
@@ -536,7 +552,7 @@ def _of_fit(found: Checked, bound: float) -> Explained:
     if verdict.answer == "explains":
         text = "friction, masses or payload other than the file's explain"
         return (_fitted(text, last),), ()
-    return (), tuple(map(str, verdict.findings[:FOUND]))
+    return (), tuple(map(str, verdict.findings[:2]))
 
 
 def _fitted(what: str, made: Fit) -> str:

@@ -20,10 +20,8 @@ from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.estimation import estimate
 from pkm_twin.identification.judge import LOUD
-from pkm_twin.identification.plausible import LATEST, late_text
 from pkm_twin.identification.rows import BLOCK
 from pkm_twin.identification.samples import (
-    SEGMENT,
     Filtering,
     Track,
     filtered,
@@ -33,6 +31,7 @@ from pkm_twin.identification.samples import (
     shaken_efforts,
     tracks,
 )
+from pkm_twin.identification.words import LATEST, late_text
 from pkm_twin.machine.friction import Dahl
 from pkm_twin.recordings import Load, Recording, at_rest, by_load
 from pkm_twin.report import Fact, judged
@@ -48,25 +47,12 @@ MAX_RESIDUAL: Final = 0.05
 """Largest good torque residual RMS, part of the joint's peak effort."""
 LEAST: Final = 40
 """Samples that a piece needs: fewer than for a fit, as nothing is fitted."""
-LOCAL: Final = 0.25
-"""Time over which a residual is judged by itself, s: a collision is shorter than a recording."""
 MORE: Final = 3.0
 """And how many times the bound of the whole recording it may be there."""
 STUCK: Final = 0.05
 """Time for which a joint, or an effort, stays the same before it counts as at rest, or stuck, s."""
-LIGHT: Final = 0.05
-"""Part of the greatest peak effort of its unit that a joint's peak is taken for at least."""
-HIDES: Final = 0.5
-"""Part of the greatest effort of its unit, RMS, above which a residual of noise hides efforts that
-are twice the model's."""
 NEAR: Final = 0.5
 """Around a pick or release the payload is neither held nor gone, s, at most;"""
-LENGTHS: Final = 4.0
-"""and so many lengths of the filter, which follows the motion: a short cycle has fast ones."""
-DELAY_SIGMAS: Final = 3.0
-"""Standard deviations from which efforts are late."""
-CLEAR: Final = 4
-"""Samples on each side of a jump that are left out: a gap that divides the recording."""
 PASSES: Final = 4
 """How often late efforts are put on time: the delay is found to the first order."""
 
@@ -141,7 +127,9 @@ class Compared:
         """Return the largest RMS over a short time and the time of its middle, s, (n,) each."""
         n = self.residual.shape[1]
         worst, at = np.zeros(n), np.full(n, self.time[0])
-        width = max(1, round(LOCAL / self.period))
+        # A collision is shorter than a recording: a residual is judged over a quarter of a second
+        # by itself.
+        width = max(1, round(0.25 / self.period))
         for begin, end in zip(self.starts, (*self.starts[1:], len(self.time)), strict=True):
             some = min(width, end - begin)
             total = np.cumsum(self.residual[begin:end] ** 2, 0)
@@ -260,7 +248,7 @@ def _compared(r: Recording, bound: float) -> Compared | None:
     late = _late(*(one[::every] for one in (left, change, rubs)))
     longest = max(pieces, key=lambda track: len(track.time))
     raw = [one["left"] for one in sharp]
-    long = [one for one in raw if len(one) >= SEGMENT] or [max(raw, key=len)]
+    long = [one for one in raw if len(one) >= 256] or [max(raw, key=len)]
     shaken = np.zeros_like(r.q) if rates is not None else shaken_efforts(r, longest, how, moved)
     density = noise_of(long, shaken, period, how)
     size = np.abs(expected).max(0)
@@ -271,6 +259,8 @@ def _compared(r: Recording, bound: float) -> Compared | None:
 
     residual = left + late * change
     noise = density * np.sqrt(passed_band(how, 1.0 / period) / period)
+    # A joint with next to no effort is judged as if it had a twentieth of the greatest of its unit.
+    # Noise as large as half of the efforts hides efforts that are twice the model's.
     return Compared(
         time,
         expected + residual,
@@ -279,8 +269,8 @@ def _compared(r: Recording, bound: float) -> Compared | None:
         residual,
         cut["left"] + late * cut["change"],
         noise,
-        np.maximum(size, LIGHT * greatest(size)),
-        LOUD * noise > HIDES * greatest(rms(expected + residual)),
+        np.maximum(size, 0.05 * greatest(size)),
+        LOUD * noise > 0.5 * greatest(rms(expected + residual)),
         r.late + late,
         period,
         tuple(starts),
@@ -300,7 +290,7 @@ def _late(left: Array, change: Array, rubs: Array) -> float:
     sizes = np.sqrt(np.mean(rubs**2, (0, 1)))
     scales = max(float(rms(left).max()), 1e-12) / np.maximum(sizes, 1e-12)
     found = estimate(table, left, np.zeros(table.shape[-1]), np.array([LATEST, *scales]))
-    late, sure = float(found.values[0]), DELAY_SIGMAS * np.sqrt(found.covariance[0, 0])
+    late, sure = float(found.values[0]), 3.0 * np.sqrt(found.covariance[0, 0])
     # At the bound it is another error's.
     return late if sure < abs(late) < LATEST else 0.0
 
@@ -332,7 +322,7 @@ def near_jumps(steps: Steps, count: int) -> Mask:
     """Find samples so near to a jump that no derivative holds there, shape (count,)."""
     found = np.zeros(count, np.bool_)
     for k in np.flatnonzero(steps.jumps.any(1)):
-        found[max(k - CLEAR, 0) : k + CLEAR + 2] = True
+        found[max(k - 4, 0) : k + 6] = True
     return found
 
 
@@ -360,10 +350,10 @@ def near_change(r: Recording, load: Load | None = None) -> tuple[Mask, float]:
         rates = None if r.qd is None or r.qdd is None else (r.qd, r.qdd)
         pieces, how = tracks(r.time, r.q, np.zeros_like(r.q), rates=rates, least=LEAST)
         if how.cutoff is not None:
-            within = min(NEAR, LENGTHS / how.cutoff)
+            within = min(NEAR, 4.0 / how.cutoff)
         elif any(piece.qd.any() for piece in pieces):
             # Not filtered from a fifth of the rate of the samples on.
-            within = min(NEAR, LENGTHS * 5.0 * pieces[0].period)
+            within = min(NEAR, 20.0 * pieces[0].period)
     return load.near_change(r.time, within), within
 
 

@@ -25,7 +25,6 @@ from pkm_twin.identification.fit import Judged, Result, refuse_faults
 from pkm_twin.identification.identifiable import above_zero
 from pkm_twin.identification.judge import Case, Suspect, Verdict, judge
 from pkm_twin.identification.parameters import FITTED_RATIO, Group, Number, groups_of, number_of
-from pkm_twin.identification.plausible import UNIT, Score, likeliest
 from pkm_twin.identification.rows import HELD_OUT
 from pkm_twin.messages.reading import in_base_axes
 from pkm_twin.recordings import Recording
@@ -39,29 +38,12 @@ AXES: Final = ("dx", "dy", "dz", "rx", "ry", "rz")
 UNITS: Final = ("m",) * 3 + ("rad",) * 3
 WRENCH: Final = ("fx", "fy", "fz", "mx", "my", "mz")
 LEAST_SAMPLES: Final = 12
-MOST_SAMPLES: Final = 2000
-"""Of a recording: of more, every so many are taken."""
 STIFFEST: Final = 0.02
 """Least factor at which the model is made linear."""
-STEPS: Final = 20
-CONVERGED: Final = 1e-2
-"""Part of its deviation by which no factor moves in the last step."""
 ALIKE: Final = 1e-3
 """Loads whose directions, and poses whose places, differ by no more of their size are one."""
 SCALE: Final = 50.0
 """How many times softer or stiffer than the file says a machine may be as a whole."""
-LIKE: Final = 0.5
-"""Correlation of deflections and loads from which the one speaks of the other's scale."""
-VARIES: Final = 4.0
-"""Variance over that of the noise from which on a direction says something of the elements."""
-HIDDEN: Final = 0.5
-"""The same of the variation that the robot's file makes of the loads."""
-UNEXPLAINED: Final = 0.9
-"""Part of the deflections' variation: a fit that leaves more explains nothing."""
-UNLIKE: Final = 0.3
-"""Part of it from which a fault of the recording is looked for."""
-SMOOTH: Final = 0.2
-"""Of neighbours' difference over the signal: below, what differs between neighbours is noise."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -120,7 +102,7 @@ class _Part:
         values = r.deflection[:, np.isfinite(r.deflection).any(0)]
         if not (np.nanmax(values, 0) > np.nanmin(values, 0)).any():
             raise PkmTwinError(f"{r.name}: no deflection, every one is the same")
-        few = slice(None, None, -(-len(r.time) // MOST_SAMPLES))
+        few = slice(None, None, -(-len(r.time) // 2000))
         q = r.q[few]
         return cls(
             r.name,
@@ -146,15 +128,15 @@ class _Part:
     def split(self) -> int:
         return round((1.0 - HELD_OUT) * len(self.time))
 
-    def judged(self) -> Score:
-        """How well the compliances that are fitted to it alone explain it."""
+    def left(self) -> float:
+        """Return the part of the variation that compliances fitted to it alone leave."""
         count = len(self.response.names)
         try:
             found, _ = _solve([self], count)
         except (PkmTwinError, np.linalg.LinAlgError):
-            return Score.of(np.inf)
+            return np.inf
         factors = np.maximum(found.values[:count], STIFFEST)
-        return Score.of(_part_left(self, factors, found.values[count:]))
+        return _part_left(self, factors, found.values[count:])
 
     def moved(self, factors: Array) -> tuple[Array, Array]:
         """Deflections by the model (k, 6), and their derivatives by the factors (k, 6, e)."""
@@ -278,7 +260,8 @@ def _scale_faults(parts: Sequence[_Part]) -> list[str]:
         seen, told = (v / np.where(size > 0.0, size, np.inf) for v in (seen, told))
         both, own, other = (float(np.nansum(v)) for v in (seen * told, seen**2, told**2))
         like = both / max(np.sqrt(own * other), 1e-300)
-        if abs(like) < LIKE:
+        # Deflections that go with the loads tell a wrong scale.
+        if abs(like) < 0.5:
             continue
         if both < 0.0:
             faults.append(f"{part.name}: the platform moves against its loads: signs, or the axes of either")
@@ -303,7 +286,8 @@ def _part_left(part: _Part, factors: Array, zero: Array) -> float:
     noise = 0.5 * np.nanmean(np.diff(told, axis=0) ** 2, 0)
     expected, _ = part.moved(np.ones(len(factors)))
     due = np.nanvar(expected[: part.split, part.measured], 0)
-    good = (size > VARIES * noise) | (due > HIDDEN * noise)
+    # A direction that varies more than its noise tells of the elements, and one that should.
+    good = (size > 4.0 * noise) | (due > 0.5 * noise)
     if not good.any():
         return 0.0
     return float(np.sqrt(np.mean(np.nanmean(left**2, 0)[good] / size[good])))
@@ -319,7 +303,7 @@ def _unexplained(robot: Robot, parts: Sequence[_Part], factors: Array, zeros: Ar
     faults = []
     for part, zero in zip(parts, zeros, strict=True):
         left = _part_left(part, factors, zero)
-        if left < UNLIKE and not odd:
+        if left < 0.3 and not odd:
             continue
         cause, best = _best_repair(robot, part, left)
         if cause:
@@ -327,7 +311,7 @@ def _unexplained(robot: Robot, parts: Sequence[_Part], factors: Array, zeros: Ar
                 f"{part.name}: {cause}: put right, elastic elements leave "
                 f"{100 * best:.2g} % of the deflections' variation, as recorded {100 * left:.2g} %"
             )
-        elif left > UNEXPLAINED:
+        elif left > 0.9:
             faults.append(
                 f"{part.name}: no compliance of this robot explains the deflections: "
                 "other loads, poses or axes than the recording's?"
@@ -336,10 +320,13 @@ def _unexplained(robot: Robot, parts: Sequence[_Part], factors: Array, zeros: Ar
 
 
 def _best_repair(robot: Robot, part: _Part, most: float) -> tuple[str, float]:
-    """Find the fault without which a recording is likeliest, and how much is left of it then."""
-    repairs = ((text, other.judged, UNIT) for text, other in _repairs(robot, part))
-    cause, best, _ = likeliest(Score.of(most), repairs)
-    return cause, best.left
+    """Return the fault without which a recording is explained best, and what is left then."""
+    cause, best = "", 0.8 * most
+    for text, other in _repairs(robot, part):
+        left = other.left()
+        if left < best:
+            cause, best = text, left
+    return cause, best
 
 
 def _solve(parts: Sequence[_Part], count: int) -> tuple[Estimate, Array]:
@@ -348,7 +335,7 @@ def _solve(parts: Sequence[_Part], count: int) -> tuple[Estimate, Array]:
     scales = np.concatenate([np.full(count, PRIOR), *(np.maximum(part.size, 1e-12) for part in parts)])
     start = np.concatenate([factors, np.zeros(6 * len(parts))])
     cones = [(slice(k, k + 1), above_zero(0, 1)) for k in range(count)]
-    for _ in range(STEPS):
+    for _ in range(20):
         rows = [part.rows(factors) for part in parts]
         tables = [
             np.concatenate([slopes, _zeros(i, len(parts), counts)], -1) for i, (slopes, _, counts) in enumerate(rows)
@@ -360,10 +347,10 @@ def _solve(parts: Sequence[_Part], count: int) -> tuple[Estimate, Array]:
         new = np.maximum(found.values[:count], STIFFEST)
         moved = np.abs(new - factors) / np.sqrt(np.diag(found.covariance)[:count])
         factors = new
-        if moved.max() < CONVERGED:
+        if moved.max() < 1e-2:
             return found, table
     raise PkmTwinError(
-        f"the compliances do not converge in {STEPS} steps: no compliance of this robot explains "
+        "the compliances do not converge in 20 steps: no compliance of this robot explains "
         "the deflections, or loads in more directions are needed"
     )
 
@@ -451,7 +438,8 @@ def _noise(left: Array, moved: Array, fitted: int) -> Array:
         result[k] = np.sqrt(np.sum((values - values.mean()) ** 2) / free)
         # Of second differences, which are of no slope, the variance is six times the noise's.
         apart = np.sqrt(np.mean(np.diff(signal, 2) ** 2) / 6.0)
-        if apart < SMOOTH * max(float(np.std(signal)), 1e-300):
+        # Of a signal that is smooth, what differs between neighbours is noise.
+        if apart < 0.2 * max(float(np.std(signal)), 1e-300):
             rough = np.sqrt(np.mean(np.diff(values, 2) ** 2) / 6.0)
             result[k] = min(result[k], float(rough))
     return result

@@ -26,8 +26,7 @@ from delta_dynamics import inverse_dynamics
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.identification.compare import by_held
-from pkm_twin.identification.rows import next_window
-from pkm_twin.identification.samples import low_pass, tracks
+from pkm_twin.identification.samples import WINDOWS, low_pass, tracks
 from pkm_twin.machine.friction import all_keys
 from pkm_twin.recordings import Recording, Table
 from pkm_twin.robot.robot import Robot
@@ -35,12 +34,6 @@ from pkm_twin.robot.robot import Robot
 FIT: Final = "fit"
 GRAVITY: Final = 9.80665
 """Standard gravity, m/s2."""
-KNOWN: Final = 0.1
-"""Relative standard deviation from which on a constant is not known."""
-LEVEL: Final = 0.05
-"""Probability by chance below which a law with one number more is accepted."""
-SEEN: Final = 0.02
-"""Part of a term that no other term has, below which the runs do not determine it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,8 +80,8 @@ def fitted_constants(robot: Robot, recordings: Sequence[Recording]) -> TorqueCon
     :raises PkmTwinError: recordings that do not show a constant.
     """
     values, deviations, windows = _constants(robot, recordings, None)
-    # What another differentiation changes is uncertain too.
-    other, _, _ = _constants(robot, recordings, [next_window(window) for window in windows])
+    # What the next shorter window of the differentiation changes is uncertain too.
+    other, _, _ = _constants(robot, recordings, [WINDOWS[abs(WINDOWS.index(window) - 1)] for window in windows])
     return TorqueConstants(values, np.hypot(deviations, other - values))
 
 
@@ -126,7 +119,7 @@ def _constants(
         # Neighbouring rows are not independent: by blocks.
         blocks = np.array([inverse[0, part] @ left[part] for part in _parts(len(left))])
         deviation = float(np.sqrt(np.sum(blocks**2)))
-        if not deviation < KNOWN * abs(sizes[0]):
+        if not deviation < 0.1 * abs(sizes[0]):
             raise PkmTwinError(
                 f"the current of {name} does not follow the load ({sizes[0]:.3g} +- "
                 f"{deviation:.2g} A per unit of it): move a known payload, or give "
@@ -245,12 +238,15 @@ def drive_friction(
             more = {**terms, name: columns[name]}
             if count > len(more) and _determined(np.stack(list(more.values()), -1)):
                 law = _law(more, friction, which, told)
-                richer.append((_chance(chosen, law, count), law))
+                # The F test of one more term.
+                freedoms, square = count - len(more), max(law.residual**2, 1e-300)
+                ratio = freedoms * (chosen.residual**2 - law.residual**2) / square
+                richer.append((float(scipy.stats.f.sf(ratio, len(more) - len(terms), freedoms)), law))
         if not richer:
             break
         chance, law = min(richer, key=lambda one: one[0])
         laws.append(law)
-        if not (chance < LEVEL and law.held_out < chosen.held_out):
+        if not (chance < 0.05 and law.held_out < chosen.held_out):
             break
         chosen, terms = law, {name: columns.get(name, terms["Coulomb"]) for name in law.terms}
     deviation = float(np.sqrt(covariance[0, 0]) * constant**2)
@@ -262,7 +258,7 @@ def _determined(table: Array) -> bool:
     norms = np.linalg.norm(table, axis=0)
     if len(table) < table.shape[1] or not norms.all():
         return False
-    return bool(np.linalg.svd(table / norms, compute_uv=False)[-1] > SEEN)
+    return bool(np.linalg.svd(table / norms, compute_uv=False)[-1] > 0.02)
 
 
 def _line(table: Array, values: Array) -> tuple[Array, Array]:
@@ -297,11 +293,3 @@ def _law(terms: dict[str, Array], friction: Array, drive: Array, told: bool) -> 
         missed(np.arange(len(friction))),
         missed(drive),
     )
-
-
-def _chance(simple: Law, richer: Law, count: int) -> float:
-    """Of the F test of one more term."""
-    freedoms = count - len(richer.terms)
-    more = simple.residual**2 - richer.residual**2
-    ratio = freedoms * more / max(richer.residual**2, 1e-300)
-    return float(scipy.stats.f.sf(ratio, len(richer.terms) - len(simple.terms), freedoms))

@@ -25,17 +25,6 @@ Cones = Sequence[tuple[slice, Array]]
 Bound = tuple[tuple[int, ...], ...]
 
 MAX_ITERATIONS: Final = 15
-DATA_RATIO: Final = 5.0
-"""A direction is the data's where they tell it by this much better than the prior."""
-MODEL: Final = 1e-5
-"""Part of the efforts that no model is better than: a direction that shows less is not seen."""
-WIDEN: Final = 1.2
-"""On all deviations: the residual's autocorrelation is itself an estimate, and a truncated one.
-
-By fits of drawn machines (``test/laws/test_fit_judges.py``): without it errors are up to 1.2
-deviations rms."""
-PSD: Final = 1e-9
-"""Least eigenvalue of a cone, over the sizes in it, that counts as not negative."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,13 +85,16 @@ def estimate(
         root = np.sqrt(weights) / noise
         rows = (scaled * root[..., None]).reshape(-1, k)
         gram, side = rows.T @ rows, rows.T @ (change * root).ravel()
-        least = MODEL**2 * samples * float(np.sum((size / noise) ** 2))
-        told = _directions(gram, side, max(DATA_RATIO**2, least))
+        # No model is better than 1e-5 of the efforts: a direction that shows less is not seen.
+        least = 1e-5**2 * samples * float(np.sum((size / noise) ** 2))
+        # A direction is the data's where they tell it five times better than the prior.
+        told = _directions(gram, side, max(5.0**2, least))
         before, z = z, told[0]
         residual = change - scaled @ z
-        new = np.array([_robust(residual[used[:, j], j], floor) for j in range(n)])
+        parts = [residual[used[:, j], j] for j in range(n)]
+        new = np.array([float(estimate_deviation(r - np.median(r))) if len(r) else 0.0 for r in parts])
         settled = np.abs(scaled @ (z - before) / noise).max(initial=0.0) < 1e-3
-        noise = new
+        noise = np.maximum(new, floor)
         weights = counts * huber(np.abs(residual) / noise)
         if settled:
             break
@@ -134,13 +126,6 @@ def estimate(
 def _mean(values: Array, counts: Array) -> Array:
     """Over the samples that count, shape (n,)."""
     return np.asarray(np.sum(values * counts, 0) / np.maximum(np.sum(counts, 0), 1.0), np.float64)
-
-
-def _robust(residual: Array, floor: float) -> float:
-    """Deviation by the median absolute one."""
-    if not len(residual):
-        return floor
-    return max(float(estimate_deviation(residual - np.median(residual))), floor)
 
 
 def _directions(gram: Array, side: Array, least: float) -> tuple[Array, Array, Array, Any]:
@@ -180,7 +165,10 @@ def _factor(
         cross = taper * (behind.T @ ahead) / pairs
         part = np.einsum("sia,ij,sjb->ab", modes[: samples - lag], cross, modes[lag:], optimize=True)
         meat += part if lag == 0 else part + part.T
-    meat *= WIDEN**2 * samples * n / max(samples * n - int(np.sum(kept)), 1)
+    # On all deviations: the residual's autocorrelation is itself an estimate, and a truncated one.
+    # By fits of drawn machines (``test/laws/test_fit_judges.py``): without it errors are up to 1.2
+    # deviations rms.
+    meat *= 1.2**2 * samples * n / max(samples * n - int(np.sum(kept)), 1)
     inverse = 1.0 / values[kept]
     inner = inverse[:, None] * ((meat + meat.T) / 2) * inverse
     # Never surer than independent samples would be.
@@ -195,8 +183,11 @@ def beyond(values: Array, cones: Cones) -> Bound:
     """Columns of each cone whose matrix is not positive semidefinite, but for rounding."""
     found = []
     for where, cone in cones:
-        block = _equilibrated(cone @ values[where])
-        if np.linalg.eigvalsh(block)[0] < -PSD:
+        block = cone @ values[where]
+        # Scaled to a diagonal of ones, where that is above zero.
+        diagonal = np.abs(np.diag(block))
+        scale = 1.0 / np.sqrt(np.maximum(diagonal, 1e-9 * max(float(diagonal.max(initial=0.0)), 1e-290)))
+        if np.linalg.eigvalsh(scale[:, None] * block * scale)[0] < -1e-9:
             found.append(tuple(np.arange(len(values))[where][cone.any((0, 1))].tolist()))
     return tuple(found)
 
@@ -204,16 +195,6 @@ def beyond(values: Array, cones: Cones) -> Bound:
 def possible(values: Array, cones: Cones) -> bool:
     """Whether every cone's matrix is positive semidefinite, but for rounding."""
     return not beyond(values, cones)
-
-
-def _equilibrated(block: Array) -> Array:
-    """Scale a matrix to a diagonal of ones, where that is above zero."""
-    diagonal = np.abs(np.diag(block))
-    most = float(diagonal.max(initial=0.0))
-    if most == 0.0:
-        return block
-    scale = 1.0 / np.sqrt(np.maximum(diagonal, 1e-9 * most))
-    return scale[:, None] * block * scale
 
 
 def nearest(z: Array, factor: Array, start: Array, scales: Array, cones: Cones) -> Array:

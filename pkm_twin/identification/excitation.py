@@ -27,34 +27,15 @@ from pkm_twin.identification.parameters import FileParameters
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import passing_singularity, position_range, reachable
 
-SAMPLES: Final = 120
-"""States of a trial at which the information is taken."""
-DENSE: Final = 1200
-"""Least number of states at which limits are checked."""
-PER_PERIOD: Final = 20
-"""States in a period of the highest harmonic at which limits are checked."""
-PLAYED: Final = 10.0
-"""Least number of points in a period of the highest harmonic of a written trajectory."""
-BLOCK: Final = 4096
-THIN: Final = 4
-"""Of the states, each of which the workspace is asked about."""
 SHRINK: Final = 0.85
-FREQUENCY: Final = 1.0
-"""Highest frequency, Hz, of a robot whose file has no velocity limits."""
 SLOWEST: Final = 20.0
 """How many times as fast as the lowest harmonic the highest one is at most."""
-FASTEST: Final = 5.0
-"""Highest frequency, Hz, whatever the limits."""
 SPEEDS: Final = (1.0, 4.0, 16.0)
 """Of the sweeps, over the slowest; ramps may ask for less."""
-POINTS: Final = 10.0
-"""Least number of points of a ramp."""
 RAMP: Final = 0.1
 """Part of a full traverse that is accelerated, at each end."""
 LENGTH: Final = 4.0 + 8.0 * RAMP
 """Time of a sweep, up and down, by that of half a traverse."""
-SHRINKINGS: Final = 30
-"""How often a range that is not clear is made smaller."""
 STATES: Final = 200
 """Of one sweep, at which limits are checked."""
 
@@ -176,7 +157,7 @@ def excite(
     basis = _resting(harmonics)
     rng = np.random.default_rng(seed)
     shape = (len(centre), basis.shape[1])
-    coarse = np.linspace(0.0, duration, SAMPLES, endpoint=False)
+    coarse = np.linspace(0.0, duration, 120, endpoint=False)
     best: tuple[float, Array, Array] | None = None
     step = 1.0
     for trial in range(trials):
@@ -206,25 +187,27 @@ def excite(
             "the best trajectory leaves the limits between the states of the trials; try another "
             "--seed or a smaller --singularity"
         )
-    few = whole.time[:: -(-len(whole.time) // (2 * DENSE))]
+    few = whole.time[:: -(-len(whole.time) // 2400)]
     condition = judge.condition(*_series(few, duration, harmonics, centre, final))
     return Excitation(duration, harmonics, centre, final[0], final[1], condition)
 
 
 def _harmonics(robot: Robot, duration: float, terms: int, reach: Array, keep: Bounds) -> Array:
     """Different multiples of 1 / duration, up to where velocity and position limits meet."""
-    highest = keep.rate / PLAYED
+    # Ten points or more in a period of the highest harmonic.
+    highest = keep.rate / 10.0
     if terms / duration > highest:
         raise PkmTwinError(
             f"{terms} harmonics in {duration:g} s reach {terms / duration:.3g} Hz; {keep.rate:g} "
             f"points per second allow {highest:.3g} Hz: use fewer --harmonics, a longer --duration "
             "or a higher --rate"
         )
-    top = min(FREQUENCY, highest)
+    # Without velocity limits 1 Hz, and never above 5 Hz.
+    top = min(1.0, highest)
     if robot.limits.velocity is not None:
         velocity = np.where(np.isfinite(robot.limits.velocity), robot.limits.velocity, np.inf)
         meeting = keep.share * velocity / (2 * np.pi * reach)
-        top = float(np.min(meeting, initial=min(FASTEST, highest)))
+        top = float(np.min(meeting, initial=min(5.0, highest)))
     most = max(terms, int(top * duration))
     # In a long trajectory the slowest harmonic would take all of the position range.
     least = max(1, min(round(most / SLOWEST), most - terms + 1))
@@ -239,12 +222,8 @@ def _resting(harmonics: Array) -> Array:
     rows /= np.linalg.norm(rows, axis=1, keepdims=True)
     # High harmonics begin small: they are what velocity limits bind first.
     damped = np.concatenate([1.0 / harmonics, 1.0 / harmonics])
-    free = np.linalg.svd(rows)[2][2:].T
-    return np.asarray(_projected(rows, damped[:, None] * free), np.float64)
-
-
-def _projected(rows: Array, basis: Array) -> Array:
-    return basis - rows.T @ (rows @ basis)
+    basis = damped[:, None] * np.linalg.svd(rows)[2][2:].T
+    return np.asarray(basis - rows.T @ (rows @ basis), np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -263,7 +242,7 @@ class _Fine:
     @classmethod
     def of(cls, duration: float, harmonics: Array) -> _Fine:
         """By the highest harmonic."""
-        count = max(DENSE, PER_PERIOD * round(float(harmonics[-1])))
+        count = max(1200, 20 * round(float(harmonics[-1])))
         time = np.asarray(np.arange(count) * (duration / count), np.float64)
         eye = np.eye(2 * len(harmonics)).reshape(-1, 2, len(harmonics))
         q, qd, qdd = _series(time, duration, harmonics, np.zeros(len(eye)), np.moveaxis(eye, 1, 0))
@@ -293,7 +272,7 @@ def _clear_of(
 ) -> Array | None:
     """Shrink the series until it keeps clear of everything; None where it never does."""
     for _ in range(20):
-        blocks = (time[k : k + BLOCK] for k in range(0, len(time), BLOCK))
+        blocks = (time[k : k + 4096] for k in range(0, len(time), 4096))
         if all(clear(robot, keep, *_series(some, duration, harmonics, centre, pair), margin) for some in blocks):
             return pair
         pair = SHRINK * pair
@@ -309,7 +288,7 @@ def clear(robot: Robot, keep: Bounds, q: Array, qd: Array, qdd: Array, margin: f
     if not good.all() or (measure < keep.singularity).any():
         return False
     # Passive joints and limbs that meet: dear, so at some of the states.
-    if not reachable(robot, robot.forward(q[::THIN])).all():
+    if not reachable(robot, robot.forward(q[::4])).all():
         return False
     if robot.limits.effort is None:
         return True
@@ -411,11 +390,11 @@ def sweeps(judge: Judge, duration: float, bounds: Bounds | None = None) -> Sweep
             change = keep.share * keep.acceleration
             fastest = min(fastest, np.sqrt(4.0 * RAMP * reach[j] * change / np.pi))
         slowest = min(lengths * reach[j], fastest / ratios[-1])
-        # So many points a ramp: a faster one is a step of the written positions.
-        return np.asarray(np.minimum(slowest * ratios, 2.0 * RAMP * reach[j] * keep.rate / POINTS))
+        # A ramp has ten points or more: a faster one is a step of the written positions.
+        return np.asarray(np.minimum(slowest * ratios, 2.0 * RAMP * reach[j] * keep.rate / 10.0))
 
     for j in range(n):
-        for _ in range(SHRINKINGS):
+        for _ in range(30):
             alone = Sweeps(centre[j : j + 1], reach[j : j + 1], speeds(j)[None])
             ends = np.append(0.0, np.cumsum(np.tile(alone.lengths, 2)))
             time = np.concatenate([np.linspace(*pair, STATES) for pair in pairwise(ends)])

@@ -9,15 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
 
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError
-from pkm_twin.identification.causes import Cause, number_that_explains, usual
 from pkm_twin.identification.compare import MAX_RESIDUAL, PASSES
 from pkm_twin.identification.estimation import Estimate, beyond, nearest
+from pkm_twin.identification.hypotheses import Explanation, explain
 from pkm_twin.identification.identifiable import KINDS, Kind
 from pkm_twin.identification.judge import Verdict, basis_of
 from pkm_twin.identification.parameters import (
@@ -26,18 +25,12 @@ from pkm_twin.identification.parameters import (
     Status,
     numbers_of_group,
 )
-from pkm_twin.identification.plausible import LATEST, late_text, recording_fault
 from pkm_twin.identification.rows import Problem, Rows
 from pkm_twin.identification.samples import EXACT, Filtering
-from pkm_twin.identification.suspects import scaled_efforts, verdict_of
+from pkm_twin.identification.suspects import verdict_of
+from pkm_twin.identification.words import LATEST, late_text
 from pkm_twin.recordings import Recording
 from pkm_twin.robot.robot import Robot
-
-ROUNDING: Final = 1e-6
-"""Share of the efforts below which a residual is that of numbers in a file."""
-WORSE: Final = 1.2
-"""Held-out residual of a joint over that of the file's values that a machine like the file's does
-not leave."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,38 +120,35 @@ def fit(
     *,
     accept: bool = False,
     progress: Callable[[int], None] | None = None,
-    causes: Sequence[Cause | None] | None = None,
+    explained: Sequence[Explanation | None] | None = None,
+    known: Sequence[Rows] = (),
 ) -> Fit:
     """Fit some kinds of numbers of a robot's file.
 
     :param what: of ``friction``, ``rotor``, ``payload``, ``inertia``.
     :param accept: fit recordings that this machine cannot have made, too.
     :param progress: called with the number of recordings that are read.
-    :param causes: what :func:`~pkm_twin.identification.causes.number_that_explains` says of each.
+    :param explained: of each recording, where it is known, what
+        :func:`~pkm_twin.identification.hypotheses.explain` returns; ``known``: rows that are read.
     :raises PkmTwinError: recordings that are too short, that show nothing, or that this machine
         cannot have made.
     """
-    problem = Problem.of(robot, recordings, what, progress=progress)
-    if causes is None:
-        own = [replace(made.recording, robot=made.model.robot) for made in problem.whole]
-        causes = [number_that_explains(r) for r in own]
+    problem = Problem.of(robot, recordings, what, progress=progress, known=known)
+    told = explained or [None] * len(recordings)
     moved = on_time(problem)
-    faults = _faults_of(moved, causes)
-    if faults and moved is not problem:
+    why = [one or explain(made) for one, made in zip(told, moved.whole, strict=True)]
+    if moved is not problem and any(one.fault for one in why):
         # Of another machine's recording the delay says nothing.
-        faults = _faults_of(problem, causes)
+        why = [one or explain(made) for one, made in zip(told, problem.whole, strict=True)]
+    names = [made.recording.name for made in problem.whole]
+    faults = [f"{name}: {one.text}" for name, one in zip(names, why, strict=True) if one.fault]
     problem = moved if not faults else problem
-    faults = faults or _late(problem, causes)
+    faults = faults or _late(problem)
     refuse_faults(faults, accept)
     problem.check_count()
-    faults = faults or _worse(problem, causes)
+    faults = faults or _worse(problem)
     refuse_faults(faults, accept)
-    result = fitted(problem, tuple(faults))
-    scaled = None if faults else scaled_efforts(problem, result.verdict)
-    if scaled is None:
-        return result
-    refuse_faults([scaled], accept)
-    return fitted(problem, (scaled,))
+    return fitted(problem, tuple(faults))
 
 
 def delays(problem: Problem) -> tuple[float, ...]:
@@ -251,52 +241,30 @@ def fitted(problem: Problem, accepted: tuple[str, ...] = ()) -> Fit:
     )
 
 
-def _faults_of(problem: Problem, causes: Sequence[Cause | None]) -> list[str]:
-    """Why this machine cannot have made recordings."""
-    both = zip(problem.whole, causes, strict=True)
-    return [fault for made, cause in both for fault in _faults(made, cause)]
-
-
-def _late(problem: Problem, causes: Sequence[Cause | None]) -> list[str]:
-    """Efforts that are too late; as the file's machine says where it explains them.
+def _late(problem: Problem) -> list[str]:
+    """Return recordings whose efforts are too late.
 
     What was not put on time has no delay that the efforts show.
     """
-    each = zip(problem.whole, delays(problem), causes, strict=True)
-    found = ((made, late if cause is None else cause.late) for made, late, cause in each)
     return [
         f"{made.recording.name}: {late_text('all joints', late)}"
-        for made, late in found
+        for made, late in zip(problem.whole, delays(problem), strict=True)
         if abs(late) > LATEST and made.recording.late
     ]
 
 
-def _faults(made: Rows, cause: Cause | None) -> list[str]:
-    """Why this machine cannot have made a recording.
-
-    Of efforts that one number explains: their scale, or a payload that is held for a while.
-    """
-    r = made.recording
-    fault = recording_fault(made) if cause is None else cause.text
-    if cause is not None and usual(cause.scale):
-        load = cause.recording.load
-        fault = fault if r.load is None and load is not None and load.times else None
-    return [] if fault is None else [f"{r.name}: {fault}"]
-
-
-def _worse(problem: Problem, causes: Sequence[Cause | None]) -> list[str]:
+def _worse(problem: Problem) -> list[str]:
     """List recordings whose held-out part the fitted values predict worse than the file's.
 
     Where the file's explain it, the fitted follow noise: the machine is not at fault.
     """
     robot, told = problem.robot, []
     values = problem.parameters.values, problem.estimate.values
-    for end, cause in zip(problem.held_out, causes, strict=True):
+    for end in problem.held_out:
         old, new = (np.sqrt(np.mean(end.counts * (end.target - end.table @ v) ** 2, 0)) for v in values)
         j = int(np.argmax(new / np.maximum(old, 1e-300)))
-        if new[j] > WORSE * old[j] and new[j] > EXACT * np.std(end.effort[:, j]):
-            named = cause.text if cause is not None else ""
-            why = named or "another machine, or a motion that is too short or changes?"
+        if new[j] > 1.2 * old[j] and new[j] > EXACT * np.std(end.effort[:, j]):
+            why = "another machine, or a motion that is too short or changes?"
             if (old <= MAX_RESIDUAL * np.abs(end.effort).max(0)).all():
                 why = (
                     "these explain the recording; it does not excite the numbers enough, condition "
@@ -318,7 +286,7 @@ def find_worse(result: Result) -> str:
     """
     sums = np.zeros((3, len(result.channels)))
     for one in result.judged:
-        parts = one.measured - one.before, one.measured - one.after, ROUNDING * one.measured
+        parts = one.measured - one.before, one.measured - one.after, 1e-6 * one.measured
         sums += [np.nansum(part**2, 0) for part in parts]
     before, after, floor = sums
     some = before + after > 2.0 * floor

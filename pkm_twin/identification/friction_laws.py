@@ -18,16 +18,16 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import BagError, ParameterError, PkmTwinError, UnknownNameError
-from pkm_twin.identification.causes import number_that_explains, usual
 from pkm_twin.identification.compare import missing_samples, recorded_of
 from pkm_twin.identification.drives import FIT, fitted_constants, given_constants
 from pkm_twin.identification.fit import Fit, fit, fitted, on_time, refuse_faults
+from pkm_twin.identification.hypotheses import Explanation, explain
 from pkm_twin.identification.identifiable import KINDS, LOAD, Kind, of_drives
 from pkm_twin.identification.judge import SIGMAS, Verdict, basis_of
 from pkm_twin.identification.parameters import Number, file_parameters
-from pkm_twin.identification.rows import Problem
+from pkm_twin.identification.rows import Problem, Rows, rows_of
 from pkm_twin.identification.samples import EXACT, filtered
-from pkm_twin.identification.suspects import RESONANCE
+from pkm_twin.identification.suspects import LINE
 from pkm_twin.machine.friction import BASIC, KNOWN_FRACTION, LAWS, Dahl, compiled
 from pkm_twin.recordings import Recording
 from pkm_twin.robot.robot import Robot
@@ -38,14 +38,8 @@ SPEEDS: Final = np.geomspace(0.01, 1.0, 17)
 """Stribeck speeds that are tried, over the rms speed."""
 PARTS: Final = np.geomspace(1e-4, 0.1, 24)
 """Presliding distances that are tried, over the travel."""
-WAVES: Final = 200.0
-"""Most periods in the travel that are tried."""
-CHUNK: Final = 24
-"""Values that are tried at once."""
 WORSE: Final = 1.02
 """Held-out residual of a joint over that without a law, from which the law is not the joint's."""
-GOLDEN: Final = 14
-"""Steps of the search between two of them."""
 
 
 @dataclass(frozen=True)
@@ -154,7 +148,11 @@ def fit_with_laws(
         problem.check_count()
         result = fitted(problem, best.accepted)
         more += _searched(best.robot, result, choice.law, found)
-        wider |= _widened(result, found)
+        # What the uncertainty of the searched parameters adds to that of the others.
+        for searched in found.values():
+            for word, values in searched.others.items():
+                own_keys = [n.key for n in result.numbers if word in n.key]
+                wider |= {key: float(values[_joint_of(result.robot, key)]) for key in own_keys}
         own = (replace(n, deviation=float(np.hypot(n.deviation, wider.get(n.key, 0.0)))) for n in result.numbers)
         best = replace(result, numbers=(*own, *more))
     file = {
@@ -201,21 +199,26 @@ def fit_recordings(
             gaps = missing_samples(r.time)
             notes.append(f"{r.name}: {gaps.text} {gaps.value}, {gaps.bound}: {gaps.verdict}")
     made = [recorded_of(r) for r in recordings]
-    causes, seen = None, robot
+    explained: list[Explanation | None] = [None] * len(made)
+    rows = list[Rows]()
     if constant is None:
+        seen = robot
         if "friction" in what and Dahl.name in (laws or ()):
             # What a memory does at reversals is no payload.
             seen = _remembering(robot, made, what)
-        causes = [number_that_explains(replace(r, robot=seen)) for r in made]
-    for k, cause in enumerate(causes or ()):
-        if cause is None or not cause.text or not usual(cause.scale):
+        parameters = file_parameters(seen)
+        rows = [rows_of(seen, parameters, r) for r in made]
+        explained = [explain(one) for one in rows]
+    for k, one in enumerate(explained):
+        if one is None or not one.text or (one.fault and one.load is None):
             continue
-        note, load = cause.text, cause.recording.load
+        note, load = one.text, one.load
         # Of several recordings each has another estimate.
-        if "payload" in what and len(made) == 1 and made[k].load is None and load is not None:
-            made[k] = cause.recording
+        if "payload" in what and len(made) == 1 and load is not None:
+            made[k] = replace(made[k], load=load)
             spans = ", ".join(f"from {a:.2f} to {b:.2f} s" for a, b in load.times)
             note = f"the payload is held {spans or 'throughout'}"
+            explained[k] = None
         notes.append(f"{made[k].name}: {note}")
     if "payload" in what:
         loads = [r.load for r in made if r.load is not None]
@@ -237,7 +240,7 @@ def fit_recordings(
         else:
             constants = fitted_constants(robot, made)
         made, notes = [constants.applied(r) for r in made], constants.lines(robot) + notes
-    options = {"accept": accept, "progress": progress, "causes": causes}
+    options = {"accept": accept, "progress": progress, "explained": explained, "known": rows}
     result, choices = fit_with_laws(robot, made, what, laws, **options)
     return result if robot is file else _beside(file, result), choices, notes
 
@@ -265,7 +268,7 @@ def _unexplained(result: Fit) -> bool:
         return False
     verdict = result.verdict
     kinds = {one.suspect.kind for one in verdict.findings}
-    return bool(kinds - {RESONANCE}) or any(channel.left_ratio > 1.0 for channel in verdict.channels)
+    return bool(kinds - {LINE}) or any(channel.left_ratio > 1.0 for channel in verdict.channels)
 
 
 def _compared(name: str, verdict: Verdict, before: Problem, after: Problem) -> Choice:
@@ -339,17 +342,6 @@ def _searched(robot: Robot, result: Fit, name: str, found: dict[str, Searched]) 
     return more
 
 
-def _widened(result: Fit, found: dict[str, Searched]) -> dict[tuple[str | int, ...], float]:
-    """By number what the uncertainty of the searched parameters adds to its standard deviation."""
-    return {
-        number.key: float(values[_joint_of(result.robot, number.key)])
-        for one in found.values()
-        for word, values in one.others.items()
-        for number in result.numbers
-        if word in number.key
-    }
-
-
 def _joint_of(robot: Robot, key: tuple[str | int, ...]) -> int:
     """Return the actuated joint of a number of friction: by its group, in order."""
     groups = [g for g in of_drives(robot) if g.kind == "friction"]
@@ -388,7 +380,7 @@ class _Search:
             self._basic.append(basis_of(own))
         cutoffs = [rows.how.cutoff for rows in self._rows if rows.how.cutoff is not None]
         fastest = self._travel * min(cutoffs, default=np.inf) / np.maximum(self._speed, 1e-300)
-        self._waves = np.minimum(WAVES, fastest)
+        self._waves = np.minimum(200.0, fastest)
 
     def _filtered(self, columns: Callable[[Array, Array], Array]) -> Array:
         """Columns of positions and rates of tracks, (samples, n, c), at the fitted rows."""
@@ -408,8 +400,14 @@ class _Search:
         if not keys:
             return {}
         (key,) = keys
-        grid = self._grid(key)
-        gains = np.concatenate([self._gains(key, grid[a : a + CHUNK])[0] for a in range(0, len(grid), CHUNK)])
+        if self.law.memory:
+            grid = PARTS[:, None] * np.maximum(self._travel, 1e-12)
+        elif self.law.parameters[key].unit.endswith("/s"):
+            grid = SPEEDS[:, None] * np.maximum(self._speed, 1e-12)
+        else:
+            waves = np.linspace(1.0, max(float(self._waves.max()), 2.0), 800)
+            grid = np.maximum(self._travel, 1e-12) / waves[:, None]
+        gains = np.concatenate([self._gains(key, grid[a : a + 24])[0] for a in range(0, len(grid), 24)])
         best = gains.argmax(0)
         joints = np.arange(gains.shape[1])
         seen = gains[best, joints] > 0.0
@@ -424,7 +422,7 @@ class _Search:
         high = np.log(grid[np.minimum(best + 1, len(grid) - 1), joints])
         low, high = np.minimum(low, high), np.maximum(low, high)
         part = (np.sqrt(5.0) - 1.0) / 2.0
-        for _ in range(GOLDEN):
+        for _ in range(14):
             pair = np.stack([high - part * (high - low), low + part * (high - low)])
             left, right = self._gains(key, np.exp(pair))[0]
             high = np.where(left > right, pair[1], high)
@@ -444,15 +442,6 @@ class _Search:
         slopes = np.abs(sizes[1] - sizes[2]) * (relative / (2.0 * step))[:, None]
         words = [word for word, one in self.law.parameters.items() if one.linear]
         return {key: Searched(value, value * relative, dict(zip(words, slopes.T, strict=True)))}
-
-    def _grid(self, key: str) -> Array:
-        """Values to try, (values, n)."""
-        if self.law.memory:
-            return np.asarray(PARTS[:, None] * np.maximum(self._travel, 1e-12))
-        if self.law.parameters[key].unit.endswith("/s"):
-            return np.asarray(SPEEDS[:, None] * np.maximum(self._speed, 1e-12))
-        waves = np.linspace(1.0, max(float(self._waves.max()), 2.0), 4 * int(WAVES))
-        return np.asarray(np.maximum(self._travel, 1e-12) / waves[:, None])
 
     def _gains(self, key: str, grid: Array) -> tuple[Array, Array]:
         """Return how far chi square falls for values (g, n) of a parameter, (g, n).

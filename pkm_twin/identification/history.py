@@ -23,14 +23,8 @@ from pkm_twin.identification.friction_laws import fit_recordings
 from pkm_twin.recordings import ReadOptions, Recording, read
 from pkm_twin.robot.plausibility import why_no_torques
 
-WAIT: Final = 60.0
-"""How long a writer waits for the others, s."""
-SINCE: Final = 1e17
-"""Stamps above this, ns, are since 1970; smaller ones are since a start."""
 MAX_NUMBER: Final = 1e9
 """Largest size of a number: N, N m, kg, Hz or a factor."""
-MAX_TIME: Final = 253_402_300_799.0
-"""Last second of the year 9999, s since 1970."""
 APPLICATION: Final = 0x706B6D74
 """SQLite's application_id of a history: "pkmt"."""
 FEWEST: Final = 6
@@ -150,13 +144,14 @@ def _elasticity(r: Recording) -> list[Measured]:
 def recorded_at(recording: Recording, path: Path) -> float:
     """When a recording began, s since 1970: by its stamps, else by the file's age."""
     first = float(recording.stamps[0])
-    return first / 1e9 if first > SINCE else path.stat().st_mtime
+    # Smaller stamps, ns, are since a start, not since 1970.
+    return first / 1e9 if first > 1e17 else path.stat().st_mtime
 
 
 @contextmanager
 def _opened(path: Path) -> Iterator[sqlite3.Connection]:
     try:
-        with closing(sqlite3.connect(path, timeout=WAIT, isolation_level=None)) as base:
+        with closing(sqlite3.connect(path, timeout=60.0, isolation_level=None)) as base:
             yield base
     except sqlite3.Error as error:
         raise FileError(path, error, HISTORY) from None
@@ -185,7 +180,7 @@ def _check_row(where: str, time: Any, value: Any, deviation: Any) -> None:
     """
     known = None if deviation is None or deviation != deviation else deviation
     for what, number, low, high in (
-        ("time", time, 0.0, MAX_TIME),
+        ("time", time, 0.0, 253_402_300_799.0),
         ("value", value, -MAX_NUMBER, MAX_NUMBER),
         ("deviation", 0.0 if known is None else known, 0.0, MAX_NUMBER),
     ):

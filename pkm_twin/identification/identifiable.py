@@ -27,12 +27,6 @@ Kind = Literal["friction", "rotor", "payload", "inertia"]
 KINDS: Final[tuple[Kind, ...]] = ("friction", "rotor", "payload", "inertia")
 LOAD: Final = "payload"
 """Name of the payload among the bodies."""
-UPPER: Final = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-"""Entries of an inertia matrix among ten numbers."""
-EMPTY: Final = 1e-12
-"""Part of the greatest entry below which one is zero."""
-LONG: Final = 0.3
-"""Of the machine's size: a length of the payload; and where a body has no joint apart, a third."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,9 +165,15 @@ def of_masses(robot: Robot) -> Iterator[Identifiable]:
     coms = [*(body.com for body in graph.bodies.values()), graph.origin + load.com]
     moved = zip(coms, tens, strict=True)
     own = np.array([change_of_frame(np.eye(3), -com) @ ten for com, ten in moved])
-    own[np.abs(own) < EMPTY * np.abs(own).max((1, 2), keepdims=True, initial=1e-300)] = 0.0
+    own[np.abs(own) < 1e-12 * np.abs(own).max((1, 2), keepdims=True, initial=1e-300)] = 0.0
     touched = np.vstack([own.any(1), slopes[10 * len(names) :] != 0.0]).astype(float)
     linked = np.linalg.matrix_power(touched.T @ touched > 0.0, 4)
+    extents = list[float]()
+    for name, body in graph.bodies.items():
+        # The greatest distance of a body's joints and rods from its centre.
+        far = max((float(np.linalg.norm(p - body.com)) for p in graph.joint_points(name)), default=0.0)
+        extents.append(far if far > 1e-3 * graph.size else 0.1 * graph.size)
+    extents.append(0.3 * graph.size)
     for chosen in dict.fromkeys(tuple(np.flatnonzero(row).tolist()) for row in linked):
         part = list(chosen)
         inside = [b for b in range(len(names)) if own[b][:, part].any()]
@@ -186,7 +186,7 @@ def of_masses(robot: Robot) -> Iterator[Identifiable]:
             tuple(map(path_of, group.keys)),
             tuple(_unit(key) for key in group.keys),
             group.begin,
-            group.scales([_length(robot, names[b]) for b in inside]),
+            group.scales([extents[b] for b in inside]),
             group.numbers,
             {graph.platform if payload else names[b]: tens[b][:, part] for b in inside},
             {f"{rod}.mass": row[part] for rod, row in rods.items() if row[part].any()},
@@ -237,7 +237,10 @@ class _Group:
             table, target = self.own[:, 4:, self.inertias], []
             for m, d, rows in zip(mass, away, table, strict=True):
                 about = m * (d @ d * np.eye(3) - np.outer(d, d))
-                target.append(rows @ new[self.inertias] - [about[i, j] for i, j in UPPER])
+                target.append(
+                    rows @ new[self.inertias]
+                    - [about[i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))]
+                )
             flat = table.reshape(-1, len(self.inertias))
             found = np.linalg.lstsq(flat, np.concatenate(target), rcond=None)[0]
             result[self.inertias] = possible_inertia(found) if whole > 0.0 else 0.0
@@ -257,7 +260,7 @@ class _Group:
         for ten in {tuple(ten[0].tolist()): ten for ten in self.own[::-1]}.values():
             cone = np.einsum("ijt,tk->ijk", pseudo_inertia(), ten)
             axes, sizes, _ = np.linalg.svd(cone.reshape(4, -1), full_matrices=False)
-            axes = axes[:, sizes > EMPTY * sizes[0]]
+            axes = axes[:, sizes > 1e-12 * sizes[0]]
             yield np.einsum("ia,ijk,jb->abk", axes, cone, axes)
 
 
@@ -276,16 +279,6 @@ def possible_inertia(inertia: Array) -> Array:
         second = (vectors * np.maximum(values, 0.0)) @ vectors.T
         whole = np.trace(second) * np.eye(3) - second
     return np.asarray(whole[upper], np.float64)
-
-
-def _length(robot: Robot, name: str) -> float:
-    """Return a body's extent: greatest distance of its joints and rods from its centre, m."""
-    graph = robot.graph
-    if name == LOAD:
-        return LONG * graph.size
-    points = graph.joint_points(name)
-    far = max((float(np.linalg.norm(p - graph.bodies[name].com)) for p in points), default=0.0)
-    return far if far > 1e-3 * graph.size else LONG / 3.0 * graph.size
 
 
 def _mirrored(key: Keys) -> Keys:

@@ -38,31 +38,12 @@ PRESENT: Final = 0.2
 """Prior probability that a machine or a recording has any error of one kind."""
 FOUND: Final = float(np.log(99.0))
 """Log odds from which an error is found: 99 %."""
-POSSIBLE: Final = 0.0
-"""Log odds from which an error is not excluded: it is as likely as not."""
 ALTERNATIVE: Final = 3.0
 """Log evidence below the best error's up to which another one is named with it: one in 20."""
-ALTERNATIVES: Final = 3
-"""Most errors that are named in the place of a found one."""
-FINDINGS: Final = 12
-"""Most errors that are looked for."""
-RARE_SHARE: Final = 0.03
-"""Prior standard deviation of an error without a usual size, as a part of the efforts."""
-MAX_RARE: Final = 3
-"""Found errors without a usual size that may be absent; more are taken for certain."""
-MAX_VARIANCE: Final = 1.0 / 26.0
-"""Variance over the prior's up to which a combination of numbers is the recordings': known by noise
-five times better than before."""
-MIN_WEIGHT: Final = 1e-3
-"""Probability, over that of the likeliest set of errors, below which a set does not count."""
 LOUD: Final = 1.5
 """Residual over noise, in the band of the motion, from which more than noise is left."""
 MAX_UNEXPLAINED: Final = 0.2
 """Part of a channel's measured variation that may stay unexplained."""
-ABSURD: Final = 10.0
-"""Times its usual size from which an error, beyond doubt, is another model's."""
-RANK: Final = 1e-7
-"""Least singular value, of columns of norm one, that counts."""
 ALL: Final = "all joints"
 """Where an error is that all of them share."""
 UNKNOWN: Final = "no known error"
@@ -286,7 +267,15 @@ class Fitted:
 
     def __init__(self, errors: Sequence[Suspect], cases: Sequence[Case], sizes: Array) -> None:
         self.errors, self.cases, self.count = errors, cases, len(sizes)
-        usual = [one.usual or self._rare_size(k) for k, one in enumerate(errors)]
+        # An error without a usual size makes up 3 % of the efforts.
+        rms, size = (
+            np.sqrt(sum(np.mean(part**2, 0) for part in parts))
+            for parts in ([np.moveaxis(c.errors, -1, 1) for c in cases], [c.measured for c in cases])
+        )
+        usual = list[float]()
+        for one, own in zip(errors, rms, strict=True):
+            j = int(np.argmax(own / np.maximum(size, 1e-300)))
+            usual.append(one.usual or (0.03 * float(size[j] / own[j]) if own[j] > 0.0 else 0.0))
         first = self.count + len(errors)
         self.places, deviations = [], [sizes, np.array(usual, np.float64)]
         for case in cases:
@@ -309,13 +298,6 @@ class Fitted:
             if one.usual and not one.known:
                 own = self.kinds.setdefault((one.kind, one.where == ALL), [])
                 own.append(self.count + k)
-
-    def _rare_size(self, k: int) -> float:
-        """Return the size of an error that makes up a usual part of the efforts."""
-        rms = np.sqrt(sum(np.mean(c.errors[..., k] ** 2, 0) for c in self.cases))
-        size = np.sqrt(sum(np.mean(c.measured**2, 0) for c in self.cases))
-        j = int(np.argmax(rms / np.maximum(size, 1e-300)))
-        return float(RARE_SHARE * size[j] / rms[j]) if rms[j] > 0.0 else 0.0
 
     def with_columns(self, used: Mask, places: Sequence[int]) -> Mask:
         """Return a mask of columns with some more of them."""
@@ -350,7 +332,7 @@ class Fitted:
         :returns: also the columns of those that are found.
         """
         used, chosen = certain.copy(), list[Selected]()
-        while len(chosen) < FINDINGS:
+        while len(chosen) < 12:
             more = np.zeros(len(used), np.bool_)
             more[self.count : self.count + len(self.errors)] = True
             gains, sizes = self.whole.gains(used, more & ~used)
@@ -367,7 +349,7 @@ class Fitted:
                     wide = self.with_columns(used, places)
                     odds.append(self.whole.log_evidence(wide) - before + prior)
             best = int(np.argmax(odds))
-            if not odds[best] > POSSIBLE:
+            if not odds[best] > 0.0:
                 break
             near = [
                 k
@@ -377,7 +359,7 @@ class Fitted:
                 and not {*self.candidates[best][0]} & {*self.candidates[k][0]}
             ]
             places = self.candidates[best][0]
-            others = tuple(self.candidates[k][0] for k in near[:ALTERNATIVES])
+            others = tuple(self.candidates[k][0] for k in near[:3])
             chosen.append(Selected(places, odds[best], others))
             if odds[best] < FOUND:
                 break
@@ -401,8 +383,9 @@ class Fitted:
             for one in chosen
             if not usual & set(one.places)
         ]
-        kinds += rare[:MAX_RARE]
-        for places in rare[MAX_RARE:]:
+        # Three may be absent; more are taken for certain.
+        kinds += rare[:3]
+        for places in rare[3:]:
             always[places] = True
         shares = self.model.logs(used)
         logs, masks = [], []
@@ -412,7 +395,7 @@ class Fitted:
             prior = [PRESENT if on else 1.0 - PRESENT for on in which]
             logs.append(self.model.log_evidence(masks[-1], shares) + float(np.log(prior).sum()))
         weights = np.exp(np.array(logs) - max(logs))
-        weights[weights < MIN_WEIGHT] = 0.0
+        weights[weights < 1e-3] = 0.0
         weights /= weights.sum()
         some = slice(0, self.count)
         mean = self.model.posterior(used).mean[some]
@@ -425,7 +408,8 @@ class Fitted:
         plain = self.model.posterior(used).covariance[some, some]
         sizes = self.model.deviation[some]
         values, vectors = np.linalg.eigh(plain / np.outer(sizes, sizes))
-        told = vectors[:, values < MAX_VARIANCE]
+        # The recordings tell a combination where they know it five times better than the prior.
+        told = vectors[:, values < 1.0 / 26.0]
         change = sizes * (told @ (told.T @ (mean / sizes)))
         return change, covariance + np.outer(mean - change, mean - change)
 
@@ -480,8 +464,9 @@ def judge(
     taken = fitted.count + sum(len(one.places) for one in chosen)
     both = [fitted.residuals(one) for one in (first, last)]
     told = tuple(_channel(name, k, cases, both, taken) for k, name in enumerate(channels))
+    # Ten times its usual size an error, beyond doubt, is another model's.
     absurd = [
-        one for one in found[:sure] if abs(one.size) - SIGMAS * one.deviation > ABSURD * (one.suspect.usual or np.inf)
+        one for one in found[:sure] if abs(one.size) - SIGMAS * one.deviation > 10.0 * (one.suspect.usual or np.inf)
     ]
     answer: Answer = "explains"
     if absurd or max(channel.left for channel in told) > MAX_UNEXPLAINED:
@@ -507,7 +492,7 @@ def basis_of(table: Array) -> Array:
     """Return an orthonormal basis of a table's columns."""
     norms = np.linalg.norm(table, axis=0)
     vectors, sizes, _ = np.linalg.svd(table[:, norms > 0.0] / norms[norms > 0.0], False)
-    return np.asarray(vectors[:, sizes > RANK * sizes.max(initial=0.0)], np.float64)
+    return np.asarray(vectors[:, sizes > 1e-7 * sizes.max(initial=0.0)], np.float64)
 
 
 def _channel(name: str, j: int, cases: Sequence[Case], both: Sequence[Sequence[Array]], taken: int) -> Channel:

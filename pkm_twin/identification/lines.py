@@ -14,12 +14,8 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.identification.calibration_state import State, derivatives
 from pkm_twin.robot.robot import Robot
 
-LINE_ENDS: Final = 24
+POSES: Final = 24
 """Poses between which distances and angles are taken."""
-SHORT_LINE: Final = 0.3
-"""Part of the longest distance below which one is not taken."""
-MIN_SINE: Final = 0.5
-"""Angles from 30 to 150 degrees are taken."""
 
 
 class LineSlopes(NamedTuple):
@@ -50,17 +46,16 @@ class LineSlopes(NamedTuple):
 def line_slopes(robot: Robot, state: State, names: Sequence[str]) -> LineSlopes | None:
     """Differentiate distances of poses and angles between them; None: the platform stays there.
 
-    Lines shorter than ``SHORT_LINE`` of the longest, and angles closer to 0 or pi than
-    ``MIN_SINE``, are left out.
+    Lines shorter than 0.3 of the longest, and angles within 30 degrees of 0 or pi, are left out.
     """
-    some = np.unique(np.linspace(0, len(state.q) - 1, LINE_ENDS).astype(int))
+    some = np.unique(np.linspace(0, len(state.q) - 1, POSES).astype(int))
     position = state.instrument.seen(*state.platform)[0][some]
     columns = derivatives(
         robot, replace(state, q=state.q[some], platform=(state.platform[0][some], state.platform[1][some])), names
     )[:, :3]
     ways = position[:, None] - position
     lengths = np.linalg.norm(ways, axis=-1)
-    far = lengths > max(SHORT_LINE * float(lengths.max(initial=0.0)), 1e-6)
+    far = lengths > max(0.3 * float(lengths.max(initial=0.0)), 1e-6)
     if not far.any():
         return None
     first, second = np.nonzero(np.triu(far))
@@ -70,7 +65,7 @@ def line_slopes(robot: Robot, state: State, names: Sequence[str]) -> LineSlopes 
     corners = [(k, i, j) for k in range(len(some)) for i, j in combinations(np.flatnonzero(far[k]), 2)]
     k, i, j = np.array(corners, np.intp).reshape(-1, 3).T
     cosine = np.sum(units[k, i] * units[k, j], -1)
-    wide = np.sqrt(np.maximum(1.0 - cosine**2, 0.0)) > MIN_SINE
+    wide = np.sqrt(np.maximum(1.0 - cosine**2, 0.0)) > 0.5
     k, i, j, cosine = k[wide], i[wide], j[wide], cosine[wide, None]
     sine = np.sqrt(1.0 - cosine**2)
     angles = sum(

@@ -18,11 +18,6 @@ from pkm_twin.identification.samples import CLEAR, FINEST, huber
 from pkm_twin.recordings.tables import PLAIN, Dialect, Table, read_table
 from pkm_twin.robot.robot import Robot
 
-BELIEVED: Final = 4.0
-"""Measurements that the usual noise of a kind counts for against the residuals."""
-MEDIANS: Final = {1: 0.6745, 3: 0.888}
-"""Median, by the number of axes, of the root mean square of normal variables of deviation one."""
-MAX_ITERATIONS: Final = 5
 COORDINATES: Final = ("x", "y", "z", "roll", "pitch", "yaw")
 UNKNOWN_DEVIATION: Final = 10.0
 """Standard deviation of a place, m, and a slope that nothing is known of."""
@@ -45,7 +40,8 @@ class Kind:
     length: bool = False
     pair: bool = False
     own: Mapping[str, tuple[str, float]] = field(default_factory=dict)
-    believed: float = BELIEVED
+    # Measurements that the usual noise of a kind counts for against the residuals.
+    believed: float = 4.0
 
     def value(self, p: Array, r: Array, own: Mapping[str, float]) -> Array:
         """At positions (m, 3) and rotations (m, 3, 3): (m, a); here coordinates of the position."""
@@ -359,12 +355,13 @@ class Measured:
         kinds = [one.kind for one in self.readings]
         usual = [self.noise.get(kind.name, kind.noise) for kind in kinds]
         sizes = [np.sqrt(np.mean(part**2, 1)) for part in parts]
+        # By the number of axes the median of the root mean square of normal variables.
         noise = [
-            s if kind.name in self.noise else max(s, float(np.median(size)) / MEDIANS[part.shape[1]])
+            s if kind.name in self.noise else max(s, float(np.median(size)) / {1: 0.6745, 3: 0.888}[part.shape[1]])
             for kind, s, size, part in zip(kinds, usual, sizes, parts, strict=True)
         ]
         weights = [np.ones(len(part)) for part in parts]
-        for _ in range(MAX_ITERATIONS):
+        for _ in range(5):
             away = [size / s for size, s in zip(sizes, noise, strict=True)]
             weights = [huber(one) for one in away]
             left = left_over(slopes, noise, prior)
@@ -441,8 +438,6 @@ def measured_of(
 POSITIONS: Final = COORDINATES[:3]
 ANGLES: Final = COORDINATES[3:]
 QUATERNION: Final = ("qx", "qy", "qz", "qw")
-FARTHEST: Final = 1e4
-"""No instrument stands farther from what it measures, m."""
 _PLACE: Final = re.compile(r"(?:\w*_)?(?:pos|position|translation|point)_([xyz])")
 _TURN: Final = re.compile(r"(?:\w*_)?(?:ori|orientation|quat|quaternion|rotation|rot)_([xyzw])")
 _MEASURED: Final = re.compile(r"meas\w*_|actual_|mocap_")
@@ -465,7 +460,8 @@ def read_poses(path: Path, robot: Robot, dialect: Dialect = PLAIN) -> Poses:
     table = _read(path, joints, QUATERNION, dialect)
     _find(table, joints, dialect)
     q, position = table.stack(joints), table.stack(POSITIONS)
-    for names, bound, its in ((POSITIONS, FARTHEST, "m"), (ANGLES, 2.0 * np.pi, "rad")):
+    # No instrument stands farther from what it measures, m.
+    for names, bound, its in ((POSITIONS, 1e4, "m"), (ANGLES, 2.0 * np.pi, "rad")):
         for name in names:
             values = table.get(name, np.zeros(1))
             if np.abs(values).max() > bound:

@@ -33,17 +33,11 @@ Status = Literal["fitted", "combination", "not excited"]
 
 COMPLIANCE: Final = "compliance"
 """What is fitted to deflections, not to efforts."""
-FITTED_RATIO: Final = 0.2
-"""A number that is known this much better than before is fitted."""
 OBSERVED: Final = 0.5
 """One that is known this much better is observed: the measurements, not the prior, say most of it.
 """
-UNSURE: Final = 0.98
-"""One that is known no better than this is not excited."""
-NO_CHANGE: Final = 1e-3
-"""Change over the standard deviation before that says nothing."""
-ROUNDING: Final = 1e-12
-"""Part of the greatest moment by which an inertia may be beyond what a body can have."""
+FITTED_RATIO: Final = 0.2
+"""A number that is known this much better than before is fitted."""
 SHOWN: Final = 0.1
 """Part of the greatest weight below which an element is no part of a combination."""
 
@@ -173,7 +167,7 @@ def number_of(
     """
     plain, wide = deviations
     share = plain / prior if prior > 0.0 else 1.0
-    if share > UNSURE and abs(value - before) <= NO_CHANGE * prior:
+    if share > 0.98 and abs(value - before) <= 1e-3 * prior:
         return Number(key, unit, before, before, plain, "not excited")
     status: Status = "fitted" if share < FITTED_RATIO else "combination"
     return Number(key, unit, before, value, wide, status)
@@ -207,7 +201,7 @@ def numbers_of_group(
     for places in moments.values():
         inertia = np.array([numbers[k].after for k in places])
         off = np.abs(possible_inertia(inertia) - inertia).max()
-        for k in places if off > ROUNDING * np.abs(inertia).max() else ():
+        for k in places if off > 1e-12 * np.abs(inertia).max() else ():
             numbers[k] = numbers[k] if numbers[k].status != "not excited" else whole[k]
     return numbers
 
@@ -245,7 +239,22 @@ def groups_of(names: Sequence[str], factors: Array, covariance: Array, wide: Arr
     open_ = np.flatnonzero(np.diag(shared) > SHOWN**2).tolist()
     pairs = ((i, j) for i, j in combinations(open_, 2) if shared[i, j] > SHOWN)
     found = [sorted(members) for members in groups(open_, pairs)]
-    return tuple(_group(one, names, factors, (own, full)) for one in found if len(one) > 1)
+    result = list[Group]()
+    for members in found:
+        if len(members) < 2:
+            continue
+        values, vectors = np.linalg.eigh(own[np.ix_(members, members)])
+        told = []
+        for vector in vectors[:, values <= FITTED_RATIO**2].T:
+            named = weights_of(range(len(members)), vector)
+            weights = np.zeros(len(members))
+            weights[list(named)] = list(named.values())
+            weights /= np.linalg.norm(weights)
+            deviation = float(np.sqrt(weights @ full[np.ix_(members, members)] @ weights))
+            each = {names[members[k]]: float(weights[k]) for k in named}
+            told.append(Combination(each, float(weights @ factors[members]), deviation))
+        result.append(Group(tuple(names[k] for k in members), tuple(told)))
+    return tuple(result)
 
 
 def weights_of(names: Sequence[T], vector: Array) -> dict[T, float]:
@@ -253,23 +262,6 @@ def weights_of(names: Sequence[T], vector: Array) -> dict[T, float]:
     vector = vector * np.sign(vector[np.argmax(np.abs(vector))])
     least = SHOWN * float(np.abs(vector).max())
     return {n: w for n, w in zip(names, vector.tolist(), strict=True) if abs(w) > least}
-
-
-def _group(members: list[int], names: Sequence[str], factors: Array, covariances: tuple[Array, Array]) -> Group:
-    own, wide = covariances
-    values, vectors = np.linalg.eigh(own[np.ix_(members, members)])
-    told = []
-    for value, vector in zip(values, vectors.T, strict=True):
-        if value > FITTED_RATIO**2:
-            continue
-        named = weights_of(range(len(members)), vector)
-        weights = np.zeros(len(members))
-        weights[list(named)] = list(named.values())
-        weights /= np.linalg.norm(weights)
-        deviation = float(np.sqrt(weights @ wide[np.ix_(members, members)] @ weights))
-        each = {names[members[k]]: float(weights[k]) for k in named}
-        told.append(Combination(each, float(weights @ factors[members]), deviation))
-    return Group(tuple(names[k] for k in members), tuple(told))
 
 
 def fitted_yaml(text: str, fitted: Sequence[Number], recordings: Sequence[str]) -> str:

@@ -26,11 +26,8 @@ from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import within_limits
 
 CANDIDATES: Final = 300
-DRAWN: Final = 20
-"""Times as many are drawn, at most, where few can be reached."""
 MAX_MEASUREMENTS: Final = 150
 """Measurements of a plan."""
-USUAL: Final = 12
 
 
 def parse_within(text: str | None) -> dict[str, tuple[float, float]]:
@@ -110,8 +107,7 @@ def plan(
     if len(pair) > 1:
         raise ParameterError("--measure", "distance", "distance alone, or other kinds, in a plan")
     q = _candidates(robot, measured, dict(within or {}), kinds)
-    free = Free(**options)
-    paths = geometric(robot, q, free.only)
+    paths = geometric(robot, q, (free := Free(**options)).only)
     joints = np.asarray(robot.controller.controller_positions(q))
     first = np.arange(len(q))
     second = np.roll(first, len(q) // 2) if pair == {True} else None
@@ -138,12 +134,10 @@ def plan(
     flat = places.reshape(len(rigid), -1)
     places = (flat - rigid @ np.linalg.lstsq(rigid, flat, rcond=1e-9)[0]).reshape(places.shape)
     lines = line_slopes(robot, state, names)
-    order: list[int] = []
-    told: list[tuple[float, float, float, Array]] = []
-    most = min(count or (MAX_MEASUREMENTS if accuracy else USUAL), MAX_MEASUREMENTS, len(q))
+    order, told = list[int](), list[tuple[float, float, float, Array]]()
+    most = min(count or (MAX_MEASUREMENTS if accuracy else 12), MAX_MEASUREMENTS, len(q))
     while True:
-        axes = np.sqrt(np.mean(_variances(places, covariance), 0))
-        seen = np.sqrt(np.mean(_variances(rows, covariance), 0))
+        axes, seen = (np.sqrt(np.mean(np.sum((one @ covariance) * one, -1), 0)) for one in (places, rows))
         apart = (0.0, 0.0) if lines is None else lines.deviations(covariance * np.outer(prior, prior))
         told.append((float(axes.max()), *apart, seen))
         if len(order) == most or (accuracy and not count and told[-1][0] <= accuracy):
@@ -154,11 +148,10 @@ def plan(
         gain[order] = -1.0
         best = int(np.argmax(gain))
         order.append(best)
-        taken = moved[best]
-        covariance = covariance - taken.T @ np.linalg.solve(inner[best], taken)
+        covariance = covariance - moved[best].T @ np.linalg.solve(inner[best], moved[best])
     axis, distance, angle, seen_all = zip(*told, strict=True)
-    seen_by = zip(kinds, usual, np.array(seen_all).T, strict=True)
-    quantity = {kind.name: size * seen for kind, size, seen in seen_by}
+    told_by = zip(kinds, usual, np.array(seen_all).T, strict=True)
+    quantity = {kind.name: size * deviations for kind, size, deviations in told_by}
     deviations = prior * np.sqrt(np.maximum(np.diag(covariance), 0.0))
     numbers = tuple(replace(p, value=p.before, deviation=float(d)) for p, d in zip(parameters, deviations, strict=True))
     return Plan(
@@ -171,10 +164,6 @@ def plan(
         angle=np.array(angle),
         known=Estimate(robot=robot, parameters=numbers, covariance=covariance * np.outer(prior, prior)),
     )
-
-
-def _variances(rows: Array, covariance: Array) -> Array:
-    return np.asarray(np.sum((rows @ covariance) * rows, -1), np.float64)
 
 
 def _over(parts: Sequence[Array], prior: Array, noise: Sequence[float]) -> list[Array]:
@@ -199,7 +188,7 @@ def _candidates(
         poses = robot.forward(robot.controller.positions(measured.joints))
         box = np.stack([poses.min(0), poses.max(0)], -1)
     elif limits is not None and np.isfinite(limits).all():
-        drawn = rng.uniform(limits[:, 0], limits[:, 1], (DRAWN * CANDIDATES, len(limits)))
+        drawn = rng.uniform(limits[:, 0], limits[:, 1], (20 * CANDIDATES, len(limits)))
         poses, good = robot.try_forward(drawn)
         if good.any():
             box = np.stack([poses[good].min(0), poses[good].max(0)], -1)
@@ -217,7 +206,7 @@ def _candidates(
             None,
             f"the range of {missing}, as {missing}=-0.1:0.1: the file has no joint limits",
         )
-    poses = rng.uniform(box[:, 0], box[:, 1], (DRAWN * CANDIDATES, len(box)))
+    poses = rng.uniform(box[:, 0], box[:, 1], (20 * CANDIDATES, len(box)))
     q, good = robot.try_inverse(poses)
     good &= within_limits(robot, q)
     if good.sum() < len(names):

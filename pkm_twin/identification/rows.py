@@ -23,18 +23,17 @@ from pkm_twin.identification.parameters import FileParameters, file_parameters
 from pkm_twin.identification.samples import (
     EXACT,
     LEAST,
-    WINDOWS,
     Filtering,
+    Line,
     Motion,
-    Resonance,
     Track,
     by_blocks,
     calm,
     filtered,
+    find_lines,
     in_motion,
     noise_of,
     passed_band,
-    resonances_of,
     shaken_efforts,
     tracks,
 )
@@ -44,23 +43,10 @@ from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.noise import estimate_deviation
 
 BLOCK: Final = 2048
-OUTLIER: Final = 8.0
-"""Robust deviations beyond which a measured effort is no measurement."""
-IN_A_ROW: Final = 10
-"""Samples in a row that are no outliers, but something that the model lacks."""
-LEAST_EFFORT: Final = 1e-9
-"""Efforts that change by less are no measurement, N m or N."""
 LARGEST: Final = 1e9
 """Effort that no drive has, N m or N."""
-LATE: Final = 2.0
-"""Samples by which efforts may well be late."""
 HELD_OUT: Final = 1 / 3
 """Part of each recording, its end, that is judged and not fitted."""
-
-STRIBECK: Final = (0.05, 0.1, 0.2)
-"""Speeds below which static friction shows, over the rms speed."""
-MOTION: Final = 0.4
-"""Part of the filter's cut-off in which nearly all of the motion is."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +135,7 @@ class Signals:
     and second derivative, (k, n) each. ``effort``: what a first fit predicts, (k, n).
     ``own``: friction of other laws, a unit of each, (k, n, laws). ``noise``: deviation of a row's
     noise as if rows were independent, (n,). ``band``: the part of the rows' rate that the filter
-    passes. ``resonances``: of the residual above the band.
+    passes. ``lines``: in the spectrum of the residual above the band.
     """
 
     motion: Motion
@@ -159,7 +145,7 @@ class Signals:
     own: Array
     noise: Array
     band: float
-    resonances: tuple[Resonance, ...] = ()
+    lines: tuple[Line, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,12 +214,6 @@ class Rows:
         return rows_of(self.model.robot, parameters, self.recording, window)
 
 
-def next_window(window: int) -> int:
-    """Return the next shorter window of the differentiation, of the shortest the next longer."""
-    k = WINDOWS.index(window)
-    return WINDOWS[k - 1] if k else WINDOWS[1]
-
-
 def rows_of(robot: Robot, parameters: FileParameters, recording: Recording, window: int | None = None) -> Rows:
     """Return a recording's filtered rows.
 
@@ -243,7 +223,13 @@ def rows_of(robot: Robot, parameters: FileParameters, recording: Recording, wind
     r = recording
     if len(r.time) < LEAST:
         raise PkmTwinError(f"{r.name}: too short to fit, {len(r.time)} samples; {LEAST} or more in a row")
-    _check_efforts(robot, r)
+    for joint, effort in zip(robot.joint_names, r.measured.T, strict=True):
+        worst = float(effort[np.argmax(~(np.abs(effort) < LARGEST))])
+        if not abs(worst) < LARGEST:
+            raise PkmTwinError(f"{r.name}: effort of {joint} is {worst:g}; below {LARGEST:g} is what a drive has")
+        if np.ptp(effort) < 1e-9:
+            only = effort[0] + 0.0  # no minus before zero
+            raise PkmTwinError(f"{r.name}: effort of {joint} is {only:g} throughout: nothing was measured")
     pieces, how = tracks(r.time, r.q, r.measured, r.wrench, r.held, window)
     if not pieces:
         raise PkmTwinError(f"{r.name}: too short to fit, no {LEAST // 2} samples without a gap")
@@ -294,7 +280,7 @@ def _signals(r: Recording, model: Model, how: Filtering, told: Sequence[_Told], 
     shaken = shaken_efforts(r, longest, how, lambda track: model.efforts(track, first, model.memory(track, how)))
     noise = noise_of(left, shaken, longest.period, how)
     size = np.sqrt(np.mean(np.concatenate([track.effort for track in tracks]) ** 2, 0))
-    rings = resonances_of(left, longest.period, how, size, longest.wrench)
+    spectral = find_lines(left, longest.period, how, size, longest.wrench)
     rate = 1.0 / (longest.period * how.keep_every)
     missed, load = (np.moveaxis(f[name], -1, 0) for name in ("missed", "load"))
     return Signals(
@@ -305,7 +291,7 @@ def _signals(r: Recording, model: Model, how: Filtering, told: Sequence[_Told], 
         f["own"],
         noise * np.sqrt(rate),
         passed_band(how, rate),
-        rings,
+        spectral,
     )
 
 
@@ -371,9 +357,10 @@ class _Told:
         """
         track, load, sign = self.track, self.load, np.sign(self.track.qd)
         laws = [np.abs(load) * sign, track.qd * np.abs(track.qd)]
-        for share in STRIBECK:
+        for share in (0.05, 0.1, 0.2):
             laws.append(np.exp(-((track.qd / np.maximum(share * speed, 1e-300)) ** 2)) * sign)
-        cutoff = None if how.cutoff is None else MOTION * how.cutoff
+        # Nearly all of the motion is below this part of the filter's cut-off.
+        cutoff = None if how.cutoff is None else 0.4 * how.cutoff
         motion, force = (calm(values, track.period, cutoff) for values in (track.q, load))
         return {
             "effort": self.efforts,
@@ -386,16 +373,6 @@ class _Told:
             "wrench": track.wrench,
             "held": track.held,
         }
-
-
-def _check_efforts(robot: Robot, r: Recording) -> None:
-    for joint, effort in zip(robot.joint_names, r.measured.T, strict=True):
-        worst = float(effort[np.argmax(~(np.abs(effort) < LARGEST))])
-        if not abs(worst) < LARGEST:
-            raise PkmTwinError(f"{r.name}: effort of {joint} is {worst:g}; below {LARGEST:g} is what a drive has")
-        if len(effort) and np.ptp(effort) < LEAST_EFFORT:
-            only = effort[0] + 0.0  # no minus before zero
-            raise PkmTwinError(f"{r.name}: effort of {joint} is {only:g} throughout: nothing was measured")
 
 
 def _drop_outliers(parts: list[_Piece], parameters: FileParameters, every: int) -> tuple[Array, int]:
@@ -413,11 +390,11 @@ def _drop_outliers(parts: list[_Piece], parameters: FileParameters, every: int) 
     for part in parts:
         told = part.table @ first
         away = np.abs(part.target - told)
-        bound = OUTLIER * estimate_deviation(part.target - told)
+        bound = 8.0 * estimate_deviation(part.target - told)
         # Where friction turns over, an effort that is some samples late is no outlier.
         near = scipy.ndimage.maximum_filter1d(np.abs(np.diff(told, axis=0, prepend=told[:1])), 7, axis=0)
-        far = (away > bound + LATE * near) & (bound > 1e-6 * np.abs(part.target).max(0))
-        far &= ~scipy.ndimage.binary_opening(far, np.ones((IN_A_ROW, 1)))
+        far = (away > bound + 2.0 * near) & (bound > 1e-6 * np.abs(part.target).max(0))
+        far &= ~scipy.ndimage.binary_opening(far, np.ones((10, 1)))
         if far.mean() > 0.05:
             continue
         part.target[far] = told[far]
@@ -442,7 +419,6 @@ def prior_scales(parameters: FileParameters, table: Array, effort: Array) -> Arr
     return scales
 
 
-LOAD_PASSES: Final = 2
 FEW: Final = 5.0
 """Independent measured values for each fitted number, below which there are too few."""
 
@@ -466,19 +442,22 @@ class Problem:
         robot: Robot,
         recordings: Sequence[Recording],
         what: Sequence[Kind],
-        passes: int = LOAD_PASSES,
+        passes: int = 2,
         progress: Callable[[int], None] | None = None,
+        known: Sequence[Rows] = (),
     ) -> Problem:
         """Filter recordings.
 
         :param passes: in which friction that grows with the load, or a memory that is open, is
             taken by the fitted numbers, not by the file's.
         :param progress: called with the number of recordings that are done.
+        :param known: rows of the same robot, which are not read again.
         """
-        everything, whole = file_parameters(robot), []
+        everything, whole = file_parameters(robot), list[Rows]()
         for i, recording in enumerate(recordings):
+            same = (one for one in known if one.recording is recording and one.model.robot is robot)
             try:
-                whole.append(rows_of(robot, everything, recording))
+                whole.append(next(same, None) or rows_of(robot, everything, recording))
             except (UnreachableError, SingularityError) as error:
                 raise PkmTwinError(f"{recording.name}: {error} (positions of this machine, in rad and m?)") from None
             if progress is not None:
@@ -529,7 +508,7 @@ class Problem:
             table,
             target,
             np.append(p.values, np.zeros(count)),
-            np.append(scales, [LATE * made.period for made in used]),
+            np.append(scales, [2.0 * made.period for made in used]),
             p.cones,
             counts,
         )

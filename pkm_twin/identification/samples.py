@@ -27,21 +27,10 @@ DEGREE: Final = 4
 """Of the local polynomial."""
 WINDOWS: Final = (7, 9, 11, 15, 19, 25, 33, 43, 57, 75, 99, 131)
 """Samples that may be fitted."""
-GAP: Final = 5.0
-"""Median periods without a sample that divide a recording."""
-UNEVEN: Final = 0.02
-"""Part of a period by which stamps may be off before they are interpolated."""
 BAND: Final = 10.0
 """Cut-off of the low-pass filter, by the motion's mean frequency."""
 LEAST: Final = 200
 """Samples that a recording needs."""
-SMOOTH: Final = 5
-"""Degree of the splines that have the motion below it."""
-CENTRAL: Final = (7, 6)
-"""Samples and degree of the polynomial whose derivatives in its middle are central differences of
-sixth order."""
-ENDS: Final = (9, 4)
-"""And of the one that is differentiated at the ends of a piece: there are no samples beyond."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +70,8 @@ class Track(Motion):
 
     def moves(self, how: Filtering) -> Mask:
         """Where a joint moves, clear of what noise makes of its rates, shape (k, n)."""
-        slow = SIGMAS * rate_noise(how, self.period)
+        weights = scipy.signal.savgol_coeffs(how.window, DEGREE, 1, self.period)
+        slow = SIGMAS * np.array(how.position_noise) * np.linalg.norm(weights)
         mean = (self.qd[:-2] + self.qd[1:-1] + self.qd[2:]) / 3.0
         rough = SIGMAS * np.abs(self.qd[1:-1] - mean).sum(0) / len(self.qd)
         return np.asarray(np.abs(self.qd) > np.maximum(np.maximum(rough, slow), 1e-9))
@@ -99,12 +89,6 @@ class Filtering:
     position_noise: tuple[float, ...]
     cutoff: float | None
     keep_every: int
-
-
-def rate_noise(how: Filtering, period: float) -> Array:
-    """Return the standard deviation that position noise leaves in differentiated rates, (n,)."""
-    weights = scipy.signal.savgol_coeffs(how.window, DEGREE, 1, period)
-    return np.asarray(np.array(how.position_noise) * np.linalg.norm(weights), np.float64)
 
 
 def choose_window(pieces: list[Array], period: float, noise: Array) -> int:
@@ -148,19 +132,18 @@ def calm(values: Array, period: float, cutoff: float | None) -> list[Array]:
     """
     if cutoff is None:
         return [values, *(derivative(values, order, period) for order in (1, 2))]
-    last = (len(values) - 1) * period
+    last, degree = (len(values) - 1) * period, 5
     places = np.linspace(0.0, last, 1 + max(1, round(2.0 * cutoff * last)))
-    knots = np.concatenate([np.zeros(SMOOTH), places, np.full(SMOOTH, last)])
+    knots = np.concatenate([np.zeros(degree), places, np.full(degree, last)])
     time = np.linspace(0.0, last, len(values))
-    spline = scipy.interpolate.make_lsq_spline(time, values, knots, SMOOTH)
+    spline = scipy.interpolate.make_lsq_spline(time, values, knots, degree)
     return [np.asarray(spline(time, order), np.float64) for order in range(3)]
 
 
 def derivative(values: Array, order: int, period: float) -> Array:
     """Along the first axis: central differences of sixth order, polynomials at the ends."""
-    inner, ends = (local_fit(values, points, degree, order, period) for points, degree in (CENTRAL, ENDS))
-    beside = CENTRAL[0] // 2
-    return np.concatenate([ends[:beside], inner[beside:-beside], ends[-beside:]])
+    inner, ends = (local_fit(values, points, degree, order, period) for points, degree in ((7, 6), (9, 4)))
+    return np.concatenate([ends[:3], inner[3:-3], ends[-3:]])
 
 
 def even_pieces(time: Array, columns: list[Array], least: int = LEAST // 2) -> list[tuple[Array, list[Array]]]:
@@ -169,14 +152,14 @@ def even_pieces(time: Array, columns: list[Array], least: int = LEAST // 2) -> l
     :param least: samples that a piece needs.
     """
     period = float(np.median(np.diff(time)))
-    edges = [0, *(np.flatnonzero(np.diff(time) > GAP * period) + 1).tolist(), len(time)]
+    edges = [0, *(np.flatnonzero(np.diff(time) > 5.0 * period) + 1).tolist(), len(time)]
     pieces = []
     for begin, end in pairwise(edges):
         if end - begin < least:
             continue
         t = time[begin:end]
         own = [c[begin:end] for c in columns]
-        if np.abs(np.diff(t) - period).max() > UNEVEN * period:
+        if np.abs(np.diff(t) - period).max() > 0.02 * period:
             even = np.arange(t[0], t[-1], period)
             own = [np.asarray(scipy.interpolate.CubicSpline(t, c)(even), np.float64) for c in own]
             t = even
@@ -268,27 +251,16 @@ def by_blocks(rows: int, block: int, evaluate: Callable[[slice], Array]) -> Arra
 
 EXACT: Final = 1e-3
 """Noise, as part of the measured rms, below which no recording is judged more strictly."""
-HUBER: Final = 1.5
-"""Standard deviations up to which a residual counts with its square."""
 OUTLIER: Final = 6.0
 """Distance from which a pose is an outlier."""
 CLEAR: Final = 3.0
 """Distance up to which poses count for the noise: of 100,000 good ones one is farther off."""
 FINEST: Final = 1e-9
 """Noise that no instrument is below, m or rad."""
-NOISE_BAND: Final = 0.898
-"""Width of the low-pass filter for white noise, over its cut-off: a Butterworth filter of fourth
-order, forwards and backwards."""
 UNFILTERED: Final = 0.25
 """Part of the samples' rate above which there is noise alone, where nothing is filtered."""
 HIGHEST: Final = 0.48
 """Part of the samples' rate up to which the noise is looked at."""
-SEGMENT: Final = 256
-"""Samples of a spectrum."""
-RESOLVED: Final = 1024
-"""And of one in which resonances are looked for."""
-PASSED: Final = 1.2
-"""Times the filter's cut-off, from where on they are."""
 AROUND: Final = 12
 """Frequencies on each side that a peak is held against."""
 PEAK: Final = 4.0
@@ -297,14 +269,15 @@ LIKELY: Final = -16.0
 """Logarithm of the probability by chance below which it is."""
 
 
-def huber(away: Array, bound: float = HUBER) -> Array:
+def huber(away: Array, bound: float = 1.5) -> Array:
     """Weights of residuals by their sizes over the noise, of any shape."""
     return np.asarray(bound / np.maximum(away, bound), np.float64)
 
 
 def passed_band(how: Filtering, rate: float) -> float:
     """Return the part of white noise at a sampling rate that the filter passes."""
-    return 1.0 if how.cutoff is None else min(1.0, 2.0 * NOISE_BAND * how.cutoff / rate)
+    # The width for white noise of a Butterworth filter of fourth order, forwards and backwards.
+    return 1.0 if how.cutoff is None else min(1.0, 2.0 * 0.898 * how.cutoff / rate)
 
 
 def in_motion(values: Sequence[Array], moves: Sequence[Array | Mask]) -> list[Array]:
@@ -320,19 +293,17 @@ def in_motion(values: Sequence[Array], moves: Sequence[Array | Mask]) -> list[Ar
 
 
 @dataclass(frozen=True)
-class Resonance:
-    """A peak in the spectrum of a joint's residual: frequency, half width, Hz; rms of the effort.
+class Line:
+    """A line in the spectrum of a joint's residual: frequency, its resolution, Hz; RMS of the effort.
 
-    ``sigmas``: how clearly it stands above its surroundings. ``line``: no wider than the spectrum
-    resolves, so it may be interference.
+    ``sigmas``: how clearly it stands above its surroundings.
     """
 
     joint: int
     frequency: float
-    width: float
+    resolution: float
     rms: float
     sigmas: float
-    line: bool
 
 
 def noise_of(residual: Sequence[Array], shaken: Array, period: float, how: Filtering) -> Array:
@@ -351,7 +322,7 @@ def noise_of(residual: Sequence[Array], shaken: Array, period: float, how: Filte
     # Half of the samples are in pieces of a segment or more, so that all pieces have one grid.
     lengths = np.sort([len(piece) for piece in residual])
     half = int(np.searchsorted(np.cumsum(lengths), 0.5 * lengths.sum()))
-    segment = min(SEGMENT, int(lengths[half]), len(shaken))
+    segment = min(256, int(lengths[half]), len(shaken))
     frequency, density = _spectrum(residual, rate, segment)
     _, passed = _spectrum([shaken], rate, segment)
     while begin < 0.9 * HIGHEST * rate:
@@ -365,71 +336,49 @@ def noise_of(residual: Sequence[Array], shaken: Array, period: float, how: Filte
     return np.asarray(np.sqrt(loudest + np.mean(passed[inside], 0)), np.float64)
 
 
-def resonances_of(
+def find_lines(
     residual: Sequence[Array],
     period: float,
     how: Filtering,
     size: Array,
     wrench: Array | None = None,
-) -> tuple[Resonance, ...]:
-    """Find the lowest clear peak above the motion's band of each joint's residual, if any.
+) -> tuple[Line, ...]:
+    """Find the strongest line above the motion's band in each joint's residual, if there is one.
 
-    A frequency at which the measured wrench has a peak, too, is that of a force on the platform,
-    such as a cutter's, and no drive's.
+    Lines of the measured wrench are those of a force on the platform, such as a cutter's.
 
     :param residual: measured less fitted, every sample, (samples, n) by piece. ``size``: RMS of
-        the measured efforts, (n,): a peak below :data:`EXACT` of it is rounding. ``wrench``: of the
+        the measured efforts, (n,): a line below :data:`EXACT` of it is rounding. ``wrench``: of the
         longest piece, (samples, 6), where it is measured.
     """
     whole, rate = max(residual, key=len), 1.0 / period
-    segment = min(RESOLVED, len(whole) // 4)
+    segment = min(1024, len(whole) // 4)
     if segment < 64:
         return ()
     frequency, density = _spectrum([whole], rate, segment)
     # Segments overlap by half, with a Hann window: so many independent ones.
     freedoms = 2.0 * 0.95 * max(1.0, 2.0 * len(whole) / segment - 1.0)
-    begin = UNFILTERED * rate if how.cutoff is None else PASSED * how.cutoff
+    begin = UNFILTERED * rate if how.cutoff is None else 1.2 * how.cutoff
     inside = np.flatnonzero((frequency > begin) & (frequency < HIGHEST * rate))
     if len(inside) < 2 * AROUND:
         return ()
-    step, found = frequency[1] - frequency[0], []
-
-    def stand_out(own: Array) -> tuple[Array, Array, Array]:
-        """Return the surroundings' density, its ratio, and the logarithm of chance, (k,) each."""
-        ground = scipy.ndimage.median_filter(own, 2 * AROUND + 1, mode="nearest")
-        ratio = own / np.maximum(ground, 1e-300)
-        # The mean of a chi square over its median.
-        chance = scipy.stats.chi2.logsf(0.9 * ratio * freedoms, freedoms) + np.log(len(inside))
-        return ground, ratio, chance
-
-    forced = np.zeros(len(inside), np.bool_)
-    forces = () if wrench is None else _spectrum([wrench], rate, segment)[1][inside].T
-    for own in forces:
-        _, ratio, chance = stand_out(own)
-        forced |= (chance < LIKELY) & (ratio > PEAK)
-    # The residual's peak may be a frequency of the spectrum beside the wrench's.
-    forced = scipy.ndimage.binary_dilation(forced)
-    for j in range(whole.shape[1]):
-        own = density[inside, j]
-        ground, ratio, chance = stand_out(own)
-        clear = np.flatnonzero((chance < LIKELY) & (ratio > PEAK) & ~forced)
-        if not len(clear):
-            continue
-        last = clear[0]
-        while last + 1 < len(own) and ratio[last + 1] > PEAK:
-            last += 1
-        peak = clear[0] + int(own[clear[0] : last + 1].argmax())
+    forces = np.zeros((len(frequency), 0)) if wrench is None else _spectrum([wrench], rate, segment)[1]
+    own = np.concatenate([density, forces], 1)[inside]
+    ground = scipy.ndimage.median_filter(own, (2 * AROUND + 1, 1), mode="nearest")
+    ratio = own / np.maximum(ground, 1e-300)
+    # A chi square whose mean is a tenth above its median; the best of so many frequencies.
+    chance = scipy.stats.chi2.logsf(0.9 * ratio * freedoms, freedoms) + np.log(len(inside))
+    clear = (chance < LIKELY) & (ratio > PEAK)
+    # The residual's line may be at the frequency of the spectrum next to the wrench's.
+    clear &= ~scipy.ndimage.binary_dilation(clear[:, len(size) :].any(1))[:, None]
+    found, step = list[Line](), float(frequency[1] - frequency[0])
+    for j in np.flatnonzero(clear[:, : len(size)].any(0)).tolist():
+        peak = int(np.where(clear[:, j], own[:, j], 0.0).argmax())
         near = slice(max(peak - AROUND // 2, 0), peak + AROUND // 2 + 1)
-        above = np.maximum(own - ground, 0.0)[near]
-        place = frequency[inside][near]
-        centre = float(np.sum(place * above) / np.sum(above))
-        wide = np.flatnonzero(own[near] - ground[near] > 0.5 * above.max())
-        width = 0.5 * step * (wide[-1] - wide[0] + 1)
-        sigmas = float(scipy.stats.norm.isf(np.exp(max(chance[peak], -700.0))))
-        rms = float(np.sqrt(2.0 * step * np.sum(above)))
-        if not rms > EXACT * size[j]:
-            continue
-        found.append(Resonance(j, centre, float(width), rms, sigmas, bool(width < 1.25 * step)))
+        rms = float(np.sqrt(2.0 * step * np.sum(np.maximum(own - ground, 0.0)[near, j])))
+        sigmas = float(scipy.stats.norm.isf(np.exp(max(chance[peak, j], -700.0))))
+        if rms > EXACT * size[j]:
+            found.append(Line(j, float(frequency[inside[peak]]), step, rms, sigmas))
     return tuple(found)
 
 
@@ -444,10 +393,6 @@ def _spectrum(pieces: Sequence[Array], rate: float, segment: int) -> tuple[Array
     return np.asarray(both[0][0], np.float64), np.asarray(0.5 * density, np.float64)
 
 
-SHAKEN: Final = 3000
-"""Samples that show what the positions' noise does."""
-
-
 def shaken_efforts(r: Recording, track: Track, how: Filtering, efforts: Callable[[Track], Array]) -> Array:
     """Return how much noise of the positions changes the efforts, (samples, n).
 
@@ -456,7 +401,7 @@ def shaken_efforts(r: Recording, track: Track, how: Filtering, efforts: Callable
     noise, rng = np.array(how.position_noise), np.random.default_rng(0)
     edge = (how.window // 2 + 0.5) * track.period
     inside = (r.time > track.time[0] - edge) & (r.time < track.time[-1] + edge)
-    some = np.flatnonzero(inside)[:SHAKEN]
+    some = np.flatnonzero(inside)[:3000]
     time, q = r.time[some], r.q[some]
     told = []
     for shake in (np.zeros_like(q), noise * rng.normal(size=q.shape)):
@@ -472,12 +417,6 @@ def shaken_efforts(r: Recording, track: Track, how: Filtering, efforts: Callable
     return in_motion([change], [track.moves(how)[: len(change)]])[0]
 
 
-BLOCK: Final = 0.25
-"""Time over which a payload is held or is not, s,"""
-BLOCKS: Final = 400
-"""and at most so many of them in a recording."""
-
-
 def held_payload(
     time: Array, column: Array, residual: Array, weight: Array
 ) -> tuple[float, list[tuple[float, float]], Mask]:
@@ -490,7 +429,8 @@ def held_payload(
         the weights of its squares.
     :returns: kg, 0 where nothing is explained; spans of time, s; the samples of these, (k,).
     """
-    span = max(BLOCK, float(time[-1] - time[0]) / BLOCKS)
+    # Held or not for a quarter of a second; at most 400 times.
+    span = max(0.25, float(time[-1] - time[0]) / 400)
     block = np.floor((time - time[0]) / span).astype(np.int64)
     rows = [np.sum(weight * column * one, 1) for one in (residual, column)]
     pull, size = (np.bincount(block, one) for one in rows)

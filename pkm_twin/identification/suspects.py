@@ -19,7 +19,6 @@ import numpy as np
 from delta_dynamics.torques.derivatives import numbers_slopes, torques_by_numbers
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import ParameterError
-from pkm_twin.identification.identifiable import KINDS
 from pkm_twin.identification.judge import (
     ALL,
     ALTERNATIVE,
@@ -35,9 +34,8 @@ from pkm_twin.identification.judge import (
     judge,
 )
 from pkm_twin.identification.parameters import FileParameters
-from pkm_twin.identification.plausible import MASSES, scale_text
 from pkm_twin.identification.rows import BLOCK, Problem, Rows
-from pkm_twin.identification.samples import EXACT, Resonance, by_blocks
+from pkm_twin.identification.samples import EXACT, by_blocks
 from pkm_twin.machine.friction import turning_keys
 from pkm_twin.machine.places import path_of
 from pkm_twin.machine.uncertainty import numbers_below
@@ -51,14 +49,11 @@ STATIC: Final = "static friction above Coulomb friction"
 OFFSET: Final = "sensor offset"
 ELASTIC: Final = "elastic drive"
 SPEED: Final = "time at another rate"
-RESONANCE: Final = "drive resonance"
-INTERFERENCE: Final = "interference at one frequency"
+LINE: Final = "line in the spectrum"
 OFF: Final = 0.05
 """Usual size of a gain: constants of drives and current sensors are known to some per cent."""
 DELAY: Final = 0.02
 """Usual delay of efforts, s: what buses and controllers buffer."""
-CLEAR: Final = 0.1
-"""Standard deviation of a factor on the file's numbers from which it is known."""
 STEP: Final = 1e-4
 """Of difference quotients by an offset or a give, rad or machine sizes."""
 USUAL: Final = 5e-3
@@ -82,7 +77,8 @@ def errors_of(rows: Rows, values: Array) -> tuple[Errors, Array]:
     robot, s = rows.model.robot, rows.signals
     names, efforts, motion = robot.joint_names, robot.effort_units, s.motion
     pairs = list(zip(robot.joint_units, efforts, strict=True))
-    eye, lengths = np.eye(len(names)), lengths_of(robot)
+    # A radian for joints that turn, the machine's size for those that slide.
+    eye, lengths = np.eye(len(names)), np.array([robot.size if u == "m" else 1.0 for u in robot.joint_units])
     # Without dry friction: its sign has no derivative, and turns where a rate is near zero.
     dry = turning_keys()
     own = [name.rpartition(".")[2] for name in rows.model.parameters.names]
@@ -124,11 +120,6 @@ def errors_of(rows: Rows, values: Array) -> tuple[Errors, Array]:
         (Suspect(SPEED, ALL), (fast - slow) / (2.0 * STEP)),
     ]
     return found, (need(0.0, *s.missed) - here)[..., None] * eye
-
-
-def lengths_of(robot: Robot) -> Array:
-    """Return a radian for joints that turn, the machine's size for those that slide, (n,)."""
-    return np.array([robot.size if unit == "m" else 1.0 for unit in robot.joint_units])
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,13 +168,15 @@ class Lengths:
 
         :param values: of all parameters of the file.
         """
-        carried, motion = rows.model.carried, rows.signals.motion
-        machine = _weighing(rows.model.robot, rows.model.parameters, values, carried is None)
-        if carried is not None:
-            machine = machine.numbered(_payload(carried))
+        model, motion = rows.model, rows.signals.motion
+        machine = _weighing(model.robot, model.parameters, values, "inertia")
+        if model.carried is None:
+            machine = _weighing(machine, model.parameters, values, "payload")
+        else:
+            machine = machine.numbered(_payload(model.carried))
         bare = machine.numbered(dict.fromkeys(_payload(machine), 0.0))
         held = motion.held[:, None, None]
-        away = bool((held != 1.0).any())
+        away = bool((np.abs(held - 1.0) > EXACT).any())
         slopes, of_bare = (
             numbers_slopes(one, self.paths) @ self.mixing if needed else np.zeros(0)
             for one, needed in ((machine, True), (bare, away))
@@ -200,11 +193,11 @@ class Lengths:
         return by_blocks(len(held), BLOCK, block)
 
 
-def _weighing(robot: Robot, parameters: FileParameters, values: Array, loaded: bool) -> Robot:
-    """Return the robot with fitted masses, its geometry as it is."""
+def _weighing(robot: Robot, parameters: FileParameters, values: Array, kind: str) -> Robot:
+    """Return the robot with fitted masses, or payload, its geometry as it is."""
     numbers: dict[str, float] = {}
     for where, group in zip(parameters.slices, parameters.groups, strict=True):
-        if group.kind == "inertia" or (loaded and group.kind == "payload"):
+        if group.kind == kind and (values[where] != group.values).any():
             new = group.keys(values[where])
             numbers |= {path_of(key): value for key, value in new.items()}
             numbers |= {
@@ -212,6 +205,8 @@ def _weighing(robot: Robot, parameters: FileParameters, values: Array, loaded: b
                 for key, value in new.items()
                 if isinstance(key[-1], int) and isinstance(key[-2], int)
             }
+    if not numbers:
+        return robot
     return robot.numbered({path: v for path, v in numbers.items() if _given(robot, path)})
 
 
@@ -239,14 +234,6 @@ OF_THE_FILE: Final = {
     "inertia": "mass or inertia other than the file's",
 }
 """Suspects that were not fitted, by the kind of the file's numbers."""
-OF_INERTIA: Final = ("rotor", "payload", "inertia")
-"""Kinds of numbers that only an accelerated motion tells."""
-RATE: Final = 8.0 / 3.0 * SIGMAS
-"""Deviations by which the rate of time has to show. Twice the rate takes three quarters of the
-efforts of inertia, 3/8 of their derivative by the rate: that is a finding's."""
-INERTIA: Final = 0.1
-"""And the part of the efforts' variation that is inertia: of less, other masses and offsets of the
-sensors, within their priors, take up three quarters."""
 
 
 def verdict_of(problem: Problem) -> Verdict:
@@ -284,7 +271,7 @@ def verdict_of(problem: Problem) -> Verdict:
         Suspect(OF_THE_FILE[kinds[k]], everything.names[k], everything.units[k]) for k in np.flatnonzero(~chosen)
     ]
     verdict, fitted = judge(robot.joint_names, errors, cases, problem.both.prior[: chosen.sum()])
-    slow = bool((chosen & np.isin(kinds, OF_INERTIA)).any()) and not _shows_inertia(
+    slow = bool((chosen & np.isin(kinds, ("rotor", "payload", "inertia"))).any()) and not _shows_inertia(
         cases, errors, kinds[chosen] == "friction"
     )
     verdict = replace(verdict, slow=slow)
@@ -292,9 +279,14 @@ def verdict_of(problem: Problem) -> Verdict:
         verdict = _compare_file_masses(verdict, fitted, kinds[chosen] == "inertia")
     if not {one.suspect.kind for one in verdict.findings} & {ELASTIC, LATE}:
         verdict = _compare_elastic_drives(verdict, fitted)
-    rings = _resonances(problem)
-    verdict = replace(verdict, findings=(*verdict.findings, *rings))
-    if (slow or rings) and verdict.answer == "explains":
+    # Of each joint the clearest line: above the band, so that no number changes.
+    lines = sorted((one for rows in problem.whole for one in rows.signals.lines), key=lambda one: one.sigmas)
+    told = []
+    for j, line in sorted({one.joint: one for one in lines}.items()):
+        where = f"{robot.joint_names[j]}, {line.rms:.2g} {robot.effort_units[j]} rms"
+        told.append(Finding(Suspect(LINE, where, "Hz"), line.frequency, line.resolution, line.sigmas))
+    verdict = replace(verdict, findings=(*verdict.findings, *told))
+    if (slow or told) and verdict.answer == "explains":
         verdict = replace(verdict, answer="explains partly")
     return verdict
 
@@ -375,54 +367,6 @@ def _shows_inertia(cases: Sequence[Case], errors: Sequence[Suspect], friction: M
         own = 0.5 * left.reshape(case.target.shape) * floor
         part += float(np.sum((own / np.maximum(np.std(case.measured, 0), 1e-300)) ** 2))
         count += float(case.counts.sum())
-    return square > RATE**2 and part > INERTIA**2 * count
-
-
-def _resonances(problem: Problem) -> tuple[Finding, ...]:
-    """Of each joint the clearest of all recordings: above the band, so that no number changes."""
-    robot, best = problem.robot, dict[int, Resonance]()
-    for one in (ring for made in problem.whole for ring in made.signals.resonances):
-        if one.joint not in best or one.sigmas > best[one.joint].sigmas:
-            best[one.joint] = one
-    found = []
-    for j, ring in sorted(best.items()):
-        where = f"{robot.joint_names[j]}, {ring.rms:.2g} {robot.effort_units[j]} rms"
-        other = (Suspect(INTERFERENCE, robot.joint_names[j], "Hz"),) if ring.line else ()
-        suspect = Suspect(RESONANCE, where, "Hz")
-        found.append(Finding(suspect, ring.frequency, ring.width, ring.sigmas, other))
-    return tuple(found)
-
-
-def scaled_efforts(problem: Problem, verdict: Verdict) -> str | None:
-    """Efforts that are scaled beyond what a drive's constant may be off by, in words; or None.
-
-    A heavier machine has the friction of its file, efforts of another scale do not. Without
-    friction in the file both look alike.
-    """
-    gains = [one for one in verdict.findings if one.suspect.kind == GAIN and one.size < 1.0]
-    gains = [g for g in gains if abs(g.size) > SIGMAS * np.hypot(OFF, g.deviation)]
-    if not gains:
-        return None
-    if set(problem.what) != set(KINDS):
-        # A payload, or other masses, may be what is there.
-        whole = replace(problem, what=KINDS)
-        return scaled_efforts(whole, verdict_of(whole))
-    factor, where = 1.0 / (1.0 - gains[0].size), gains[0].suspect.where
-    if where != ALL:
-        return scale_text(where, factor)
-    rubs = _friction(problem)
-    if rubs is not None and abs(rubs - 1.0) < abs(rubs - factor):
-        return None
-    others = () if rubs is not None else (MASSES.format(factor),)
-    return scale_text("all joints", factor, *others)
-
-
-def _friction(problem: Problem) -> float | None:
-    """How many times the file's the fitted friction is; None where the recordings do not tell."""
-    file, e, chosen = problem.everything.values, problem.estimate, problem.chosen
-    kinds = np.array([g.kind for g in problem.everything.groups for _ in g.names])
-    some = (kinds == "friction") & (file != 0.0) & chosen
-    rows = np.flatnonzero(some[chosen])
-    known = np.linalg.pinv(e.covariance[np.ix_(rows, rows)], hermitian=True) @ file[some]
-    sure = float(known @ file[some])
-    return float(known @ problem.values[some]) / sure if sure > CLEAR**-2 else None
+    # Twice the rate takes three quarters of the efforts of inertia, 3/8 of their derivative by the
+    # rate. Of less than a tenth of the efforts other masses and offsets take that up.
+    return square > (8.0 / 3.0 * SIGMAS) ** 2 and part > 0.1**2 * count

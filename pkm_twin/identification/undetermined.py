@@ -21,14 +21,7 @@ from pkm_twin.machine.graph import Graph, limbs
 from pkm_twin.machine.places import keys_of
 
 LINES: Final = 10
-INSIDE: Final = 0.8
-"""Part of a change, squared, that lies in what is not determined."""
-NEW: Final = 0.1
-"""Part of it that no change before has named."""
-FEW: Final = 4
-"""Numbers of a combination that is named by all of them."""
-SHOWN: Final = 0.1
-"""Part of the greatest weight below which a number is not named."""
+"""Most lines in which what is not determined is told."""
 NAMED: Final = 6
 """Names in a list before the others are counted."""
 AXES: Final = "xyz"
@@ -223,10 +216,10 @@ def undetermined(graph: Graph, names: Sequence[str], scales: Array, directions: 
         if not left.shape[1] or size == 0.0:
             continue
         unit = change.vector / size
-        if np.sum((directions.T @ unit) ** 2) < INSIDE:
+        if np.sum((directions.T @ unit) ** 2) < 0.8:
             continue
         inner = left.T @ unit
-        if inner @ inner < NEW:
+        if inner @ inner < 0.1:
             continue
         found.setdefault((change.kind, change.axis), []).append(change.item)
         # What is orthogonal to it, in the space that is left.
@@ -257,7 +250,7 @@ def _combinations(names: Sequence[str], left: Array) -> Iterator[str]:
     """Describe combinations of numbers that no named change explains."""
     for vector in left.T:
         shown = _greatest(names, np.abs(vector))
-        if len(shown) > FEW:
+        if len(shown) > 4:
             weights = np.sqrt(np.sum(left**2, 1))
             many = "further combinations" if left.shape[1] > 1 else "further combination"
             yield f"{left.shape[1]} {many}, mostly of {_listed(_greatest(names, weights))}"
@@ -269,7 +262,7 @@ def _combinations(names: Sequence[str], left: Array) -> Iterator[str]:
 
 def _greatest(names: Sequence[str], weights: Array) -> list[str]:
     order = np.argsort(-weights, kind="stable")
-    return [names[k] for k in order if weights[k] > SHOWN * weights.max()]
+    return [names[k] for k in order if weights[k] > 0.1 * weights.max()]
 
 
 def _listed(items: Sequence[str]) -> str:

@@ -12,7 +12,7 @@ from delta_dynamics import inverse_dynamics
 from pkm_twin.apps.commands.excite import LARGE, Excite, excite
 from pkm_twin.bags.reader import open_bag
 from pkm_twin.identification.identifiable import identifiable
-from pkm_twin.identification.samples import Filtering, resonances_of
+from pkm_twin.identification.samples import Filtering, find_lines
 from pkm_twin.mechanisms.entries import robot_text
 from stiffness_monitor import compliance
 from test.commands.conftest import DELTA, MILLING, STIFFNESS, rewrite
@@ -231,15 +231,15 @@ def test_values_that_predict_the_held_out_part_worse_are_not_written(twin, tmp_p
     assert not out.exists()
     data = twin.told(*line, "--accept")
     assert out.exists() and "worse" in out.read_text()
-    assert not [one for one in data["verdict"]["findings"] if "resonance" in one["kind"]]
+    assert not [one for one in data["verdict"]["findings"] if "line" in one["kind"]]
 
 
 @pytest.mark.parametrize("forced", [True, False])
-def test_a_line_of_the_measured_wrench_is_no_drive_s_resonance(forced, rng):
+def test_a_line_of_the_measured_wrench_is_not_the_machine_s(forced, rng):
     time, how = np.arange(8192) / 1000.0, Filtering(9, (), 5.0, 1)
     line = np.sin(2.0 * np.pi * 47.3 * time)
     residual = line[:, None] * [1.0, 0.0] + 0.1 * rng.normal(size=(len(time), 2))
     wrench = rng.normal(size=(len(time), 6))
     wrench[:, 1] += 30.0 * line * forced
-    found = resonances_of([residual], 1e-3, how, np.ones(2), wrench)
+    found = find_lines([residual], 1e-3, how, np.ones(2), wrench)
     assert [ring.joint for ring in found] == ([] if forced else [0])

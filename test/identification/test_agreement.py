@@ -208,33 +208,6 @@ def test_fit_and_check_name_one_cause(name: str) -> None:
         assert abs(payload.after - mass) < 3.0 * payload.deviation
 
 
-@pytest.mark.parametrize("name", partly_long(["delta", "five_bar", "stewart"], "five_bar"))
-def test_two_numbers_are_not_told_as_one(name: str) -> None:
-    """A payload, throughout or for a while, with a scale; a scale with a sign."""
-    m = machine(load(name), np.random.default_rng(6), 8.0, 200.0)
-    light, heavy = (m.robot.changed(payload={"mass": mass}) for mass in (0.0, 1.0))
-    bare, loaded = (inverse_dynamics(one, m.q, m.qd, m.qdd) for one in (light, heavy))
-    picked = ((m.time > 2.0) & (m.time < 5.0))[:, None]
-    turned = np.where(np.arange(light.joints_count) == 0, -1.0, 1.0)
-    for scale in (0.6, 1.3):
-        for made in (loaded, np.where(picked, loaded, bare), turned * bare):
-            recorded = noisy(m.recorded(effort=scale * made), np.random.default_rng(8))
-            recorded = replace(recorded, robot=light)
-            judged = check(recorded)
-            (cause,) = judged.causes
-            first, _, second = cause.partition("; put right, ")
-            told = re.search(r"all joints are (\S+) times", cause)
-            assert judged.answer == "bad" and second
-            assert told is not None and float(told[1]) == pytest.approx(scale, rel=0.03)
-            if "sign" in first:
-                assert light.joint_names[0] in first
-            else:
-                payload = re.search(r"--payload (\S+)", second)
-                assert payload is not None and float(payload[1]) == pytest.approx(1.0, rel=0.04)
-            with pytest.raises(PkmTwinError, match=re.escape(cause)):
-                fit_recordings(light, [recorded])
-
-
 @pytest.mark.parametrize("name", partly_long(["delta_cu", "linear_delta"], "delta_cu"))
 def test_a_payload_that_is_picked_is_fitted_with_its_times(name: str) -> None:
     m = machine(load(name), np.random.default_rng(5), 12.0, 200.0)

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Friction laws, torque constants and resonances of recordings; sweeps that show friction."""
+"""Friction laws, torque constants and lines in the spectra of recordings; sweeps that show friction."""
 
 from dataclasses import replace
 
@@ -13,7 +13,7 @@ from pkm_twin.identification.excitation import Bounds, Judge, sweeps
 from pkm_twin.identification.fit import fit
 from pkm_twin.identification.friction_laws import fit_with_laws, laws_of
 from pkm_twin.identification.parameters import file_parameters
-from pkm_twin.identification.samples import Filtering, resonances_of
+from pkm_twin.identification.samples import Filtering, find_lines
 from pkm_twin.recordings import Recording
 from pkm_twin.recordings.payload import Load
 from test.identification.machines import machine, noisy
@@ -109,14 +109,14 @@ def test_torque_constants_follow_from_known_masses(name, rng):
             given_constants(robot, wrong)
 
 
-def test_a_resonance_is_found_with_its_frequency_and_no_other(rng):
+def test_a_line_is_found_with_its_frequency_and_no_other(rng):
     from scipy.signal import lfilter
 
     period, how = 1e-3, Filtering(7, (1e-6, 1e-6), 15.0, 10)
     count = 12000
     for _ in range(20):
         noise = rng.normal(size=(count, 2)) * [0.1, 0.02]
-        assert resonances_of([noise], period, how, np.ones(2)) == ()
+        assert find_lines([noise], period, how, np.ones(2)) == ()
     damping = 0.02
     for frequency in (62.0, 140.0):
         # A lightly damped oscillator that noise excites.
@@ -126,13 +126,12 @@ def test_a_resonance_is_found_with_its_frequency_and_no_other(rng):
         ring[:, 1] = lfilter([1.0], poles, rng.normal(size=count))
         ring *= 0.02 / ring[:, 1].std()
         noise = rng.normal(size=(count, 2)) * [0.1, 0.02]
-        (found,) = resonances_of([noise + ring], period, how, np.ones(2))
+        (found,) = find_lines([noise + ring], period, how, np.ones(2))
         assert found.joint == 1
         assert abs(found.frequency - frequency) < 3.0
         assert found.rms == pytest.approx(0.02, rel=0.4)
-        assert not found.line
         # What is nothing beside the efforts is rounding.
-        assert resonances_of([noise + ring], period, how, np.full(2, 100.0)) == ()
+        assert find_lines([noise + ring], period, how, np.full(2, 100.0)) == ()
 
 
 @pytest.mark.parametrize("name", ["five_bar", "delta_cu"])
@@ -182,7 +181,7 @@ def test_sweeps_alone_show_the_friction_of_every_joint(name):
         effort = inverse_dynamics(truth, *motion)
         record = noisy(Recording(robot, time, motion[0], effort=effort), rng, 0.01, 1e4)
         assert record.step_fault == ""
-        numbers = fit(robot, [record], ("friction",), causes=[None]).numbers
+        numbers = fit(robot, [record], ("friction",)).numbers
         for key, values in friction.items():
             own = [one for one in numbers if key in one.name][: len(values)]
             after, deviations = np.array([(one.after, one.deviation) for one in own]).T

@@ -1,0 +1,504 @@
+# Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
+"""Find what is most probably wrong with a recording: hypotheses by their posterior odds.
+
+Every hypothesis is the Gaussian model of :mod:`pkm_twin.identification.evidence` around the robot's
+file, with another gain, sign, order or time of the efforts, or other positions, rates or wrenches.
+All have the same columns: the numbers of the file, a delay, and the usual errors. What differs from
+the file is averaged over a few classes: nothing, friction, a payload, masses. Without them, priors
+wide enough for a heavy payload would prefer a wrong scale to a sound recording (Lindley, 1957).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import combinations
+from typing import Any, Final
+
+import numpy as np
+import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
+
+from pkm_twin.codegen.arrays import Array
+from pkm_twin.errors import PkmTwinError
+from pkm_twin.identification.columns import OFFSET_SHARE, Columns
+from pkm_twin.identification.evidence import Model, Spectra
+from pkm_twin.identification.judge import ALTERNATIVE, SIGMAS
+from pkm_twin.identification.rows import LARGEST, Rows, rows_of
+from pkm_twin.identification.samples import Motion, held_payload
+from pkm_twin.identification.words import LATEST, UNITS, late_text, listed, scale_text, usual_scale
+from pkm_twin.messages.reading import in_base_axes
+from pkm_twin.recordings import Load, Recording
+
+HEAVY: Final = 30.0
+"""Deviation of a heavy payload over that of a usual one."""
+CLASSES: Final = {
+    "": 0.0,
+    "payload": 2.0,
+    "friction": 2.0,
+    "friction masses payload": 3.0,
+    "heavy payload": 4.0,
+    "friction heavy payload": 5.0,
+}
+"""Kinds of numbers that differ from the file, and the log prior odds against it."""
+SHARES: Final = np.geomspace(0.01, 1.0, 7)
+"""Shares of the discrepancy: no model of a machine is better than 1 % of its efforts."""
+UNIT: Final = 5.0
+"""Log prior odds against another unit, scale or rate: one recording in 150."""
+RARE: Final = 8.0
+"""Log prior odds against any other cause: one in 3,000."""
+CERTAIN: Final = 0.99
+"""Probability from which a cause is named,"""
+ODDS: Final = float(np.log(CERTAIN / (1.0 - CERTAIN)))
+"""and its log odds."""
+SEARCHED: Final = 1.5
+"""Longest delay that is looked for, s."""
+RATES: Final = (2.0, 0.5, 3.0, 1 / 3, 4.0, 0.25, 5.0, 0.2, 10.0, 0.1, 1e3, 1e-3)
+"""Rates of time: wrong periods, and ms."""
+ANGLES: Final = {
+    "positions are in degrees": np.pi / 180.0,
+    "positions are in rad, and were taken for degrees": 180.0 / np.pi,
+    "positions are in mm": 1e-3,
+}
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A cause in words: its log posterior odds, the discrepancy that it leaves, its class.
+
+    No words: the recording is sound. ``classes``: probability of each. ``load``: the payload that
+    explains the efforts. ``late``: the delay of the efforts of all joints, s; ``scale``: theirs.
+    """
+
+    text: str
+    log: float
+    share: float
+    kinds: str = ""
+    load: Load | None = None
+    late: float = 0.0
+    classes: tuple[float, ...] = ()
+    scale: float = 1.0
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """What explains a recording, in words; empty where the file does, or several numbers together.
+
+    ``fault``: this machine cannot have made the recording, or not with the payload that is given.
+    ``load``: the payload that explains the efforts.
+    """
+
+    text: str
+    fault: bool = False
+    load: Load | None = None
+
+
+class Search:
+    """The hypotheses of one recording.
+
+    :param rows: with all parameters of the file.
+    """
+
+    def __init__(self, rows: Rows) -> None:
+        self.rows, self.columns = rows, Columns.of(rows)
+        self.joints = rows.model.robot.joint_names
+        self.late = self.columns.kinds.index("error")
+        self.spectra = self.columns.spectra()
+        self.first: float | None = None
+        self.sound = self.weigh("", 0.0, self.spectra)
+
+    def weigh(
+        self,
+        text: str,
+        price: float,
+        spectra: Spectra,
+        classes: Sequence[str] = tuple(CLASSES),
+        shares: Array = SHARES,
+        *,
+        gains: Array | None = None,
+        order: Sequence[int] | None = None,
+        factors: Array | None = None,
+        bounded: bool = True,
+        screened: bool = True,
+    ) -> Hypothesis:
+        """Return a hypothesis with its log posterior odds, over all classes of machines.
+
+        :param price: log prior odds against it. ``gains``, ``order``: of the efforts. ``factors``:
+            on the prior's deviations, (c,). ``screened``: whether few classes are compared first.
+        """
+        c = self.columns
+        base = c.deviation if factors is None else c.deviation * factors
+        kinds = np.array(c.kinds)
+        of_file = np.isin(kinds, ("friction", "masses", "payload"))
+        if gains is not None and gains.any():
+            # Errors are as large in the efforts as before: a scale is of what the machine needs.
+            power = np.einsum("jbcc->jc", spectra.grams)[:, 1 : len(base) + 1]
+            more = np.sqrt((gains[:, None] ** 2 * power).sum(0) / np.maximum(power.sum(0), 1e-300))
+            base = np.where(of_file | (more == 0.0), base, base / np.where(more > 0.0, more, 1.0))
+        places = [np.arange(len(base))]
+        if screened and len(classes) > len(FEW):
+            # Few classes and one share show whether a hypothesis can be probable.
+            few = Model.of([spectra], places, base, SHARES[1:2], gains, order)
+            log = max(self._find_logs(few, name, False)[0] for name in FEW)
+            self.first = log if self.first is None else self.first
+            if log < self.first - 40.0:
+                return Hypothesis(text, log - price, 1.0)
+        model = Model.of([spectra], places, base, shares, gains, order)
+        logs, found = [], []
+        for name in classes:
+            own = self._find_logs(model, name, bounded)
+            logs.append(own.max() + np.log(np.mean(np.exp(own - own.max()))) - CLASSES[name])
+            found.append(float(shares[int(own.argmax())]))
+        best = int(np.argmax(logs))
+        log = float(scipy.special.logsumexp(logs)) - price
+        odds = tuple(scipy.special.softmax(logs).tolist())
+        return Hypothesis(text, log, found[best], classes[best], classes=odds)
+
+    def _find_logs(self, model: Model, name: str, bounded: bool) -> Array:
+        """Return a class's log evidence at each share, less what possible numbers cost."""
+        kinds = np.array(self.columns.kinds)
+        free = ~np.isin(kinds, ("friction", "masses", "payload")) | np.isin(kinds, name.split())
+        # Numbers that are as the file's are so within a tenth of the prior's deviations.
+        wide = np.where(free, 1.0, 0.1)
+        wide = np.where((kinds == "payload") & ("heavy" in name), HEAVY, wide)
+        model = model.widened(wide)
+        used = np.ones(len(model.deviation), np.bool_)
+        logs = model.logs(used)
+        low = self.columns.low
+        bound = np.isfinite(low) & (model.deviation > 0.0)
+        if not bounded or not bound.any():
+            return logs
+        for k in np.flatnonzero(logs > logs.max() - 2.0 * ODDS):
+            one = model.posterior(used, np.where(np.arange(len(logs)) == k, 0.0, -np.inf))
+            mean, inner = one.mean[bound], one.covariance[np.ix_(bound, bound)]
+            if (mean >= low[bound]).all():
+                continue
+            size = np.maximum(np.sqrt(np.diag(inner)), 1e-150)
+            root = np.linalg.cholesky(inner / np.outer(size, size) + 1e-9 * np.eye(len(size)))
+            back = scipy.linalg.solve_triangular(root, np.eye(len(size)), lower=True) / size
+            aim = back @ (mean - low[bound])
+            logs[k] -= 0.5 * scipy.optimize.nnls(back * size, aim)[1] ** 2
+        return logs
+
+    @cached_property
+    def all(self) -> list[Hypothesis]:
+        """The hypotheses, the most probable first."""
+        if self.sound.share <= SHARES[1] and not self.sound.kinds:
+            # No cause can gain what it costs.
+            return [self.sound]
+        found = [self.sound, *self._weigh_efforts(), *self._weigh_delays(), *self._weigh_loads()]
+        best = max(found, key=lambda one: one.log)
+        pushed = self.rows.recording.wrench is not None and self.rows.recording.wrench.any()
+        if best.share > SHARES[0] or best.log > self.sound.log + ODDS or pushed:
+            found += self._weigh_positions()
+        return sorted(found, key=lambda one: -one.log)
+
+    def _weigh_efforts(self) -> Iterator[Hypothesis]:
+        """Weigh other signs, scales and orders of the efforts, no relation, and time."""
+        n, eye, sp = len(self.joints), np.eye(len(self.joints)), self.spectra
+        offset = np.array([kind == "offset" for kind in self.columns.kinds])
+        none = np.where(offset, 1.0 / OFFSET_SHARE, 0.0)
+        yield self.weigh(NO_MACHINE, RARE, sp, ("",), gains=np.zeros(n), factors=none)
+        whole = [np.ones(n), *eye] if n > 1 else [np.ones(1)]
+        signs = [1.0 - 2.0 * one for one in whole]
+        if n > 2:
+            each = np.array([self.weigh("", 0.0, sp, FEW, gains=s).log for s in signs[1:]])
+            signs += [1.0 - 2.0 * (eye[np.argsort(each)[-k:]].sum(0)) for k in range(2, n)]
+        for sign in signs:
+            turned = [self.joints[j] for j in np.flatnonzero(sign < 0.0)]
+            text = f"efforts of {listed(turned, n)} have the wrong sign"
+            price = RARE + 2.0 * (len(turned) - 1 if len(turned) < n else 0)
+            yield self.weigh(text, price, sp, gains=sign)
+        for which in whole:
+            names = listed([self.joints[j] for j in np.flatnonzero(which)], n)
+            for way in (1.0, -1.0):
+                yield from self._weigh_scales(names, which, way)
+        orders = [np.arange(n) for _ in combinations(range(n), 2)]
+        for order, (i, k) in zip(orders, combinations(range(n), 2), strict=True):
+            order[[i, k]] = k, i
+            text = f"efforts of {self.joints[i]} and {self.joints[k]} are exchanged"
+            yield self.weigh(text, RARE, self.columns.spectra(order=order.tolist()))
+        for order in [np.roll(range(n), 1), np.roll(range(n), -1)] if n > 2 else []:
+            text = "columns of the efforts are in another order"
+            yield self.weigh(text, RARE, self.columns.spectra(order=order.tolist()))
+        back = np.where(self.columns.turning, -1.0, 1.0)
+        p = self.rows.model.parameters
+        rubs = np.array([g.kind == "friction" for g in p.groups for _ in g.names])
+        certain = self.columns.certain - 2.0 * (self.rows.table[..., rubs] @ p.values[rubs])
+        backwards = replace(self.columns, columns=self.columns.columns * back, certain=certain)
+        yield self.weigh("time runs backwards", RARE, backwards.spectra())
+        for rate in RATES:
+            text = f"the motion was {rate:.3g} times as fast as its time stamps are ("
+            text += "ms for s?)" if rate >= 1e3 or rate <= 1e-3 else "time steps?)"
+            yield self.weigh(text, UNIT, self.columns.spectra(rate=rate))
+
+    def _weigh_scales(self, names: str, which: Array, way: float) -> Iterator[Hypothesis]:
+        """Weigh the most probable scale of some drives' efforts."""
+
+        def gains(scale: float) -> Array:
+            return np.where(which > 0.0, scale, 1.0)
+
+        def log(x: float) -> float:
+            some = gains(way * float(np.exp(x)))
+            return self.weigh("", 0.0, self.spectra, classes, SHARES[2:3], gains=some, bounded=False).log
+
+        # Heavier masses would be in the place of a scale.
+        classes = ("", "friction") if which.all() and way > 0.0 else FEW
+        grid = np.log(2.0) * np.arange(-12.0, 12.5)
+        logs = [log(x) for x in grid]
+        k = int(np.argmax(logs))
+        ends = grid[max(k - 1, 0)], grid[min(k + 1, len(grid) - 1)]
+        best = scipy.optimize.minimize_scalar(
+            lambda x: -log(x), bounds=ends, method="bounded", options={"xatol": 0.005}
+        )
+        scale = way * float(np.exp(best.x))
+        if way < 0.0 or not usual_scale(scale):
+            # A unit that has a name is likelier than any scale.
+            units = [u for u in UNITS.values() if way > 0.0 and 0.5 < u / scale < 2.0]
+            for size, price in ((scale, UNIT + (RARE if way < 0.0 else 0.0)), *((u, UNIT - 2.0) for u in units)):
+                one = self.weigh("", price, self.spectra, gains=gains(size))
+                if one.kinds in ("", "friction") and size == scale:
+                    own = float(np.mean(self._find_gains(gains(size), one.kinds)[0][which > 0.0]))
+                    size /= 1.0 - size * own
+                yield replace(one, text=scale_text(names, size), scale=size if which.all() else 1.0)
+
+    def _find_gains(self, gains: Array | None = None, kinds: str = "") -> tuple[Array, Array]:
+        """Return each joint's gain, a part of its efforts, beside a delay; its deviation.
+
+        :param gains: factors on the model's efforts beside it. ``kinds``: numbers beside it.
+        """
+        c, n = self.columns, len(self.joints)
+        used = np.arange(len(c.kinds)) >= len(c.kinds) - c.gains
+        deviation = np.where(used, 1.0, c.deviation)
+        used |= np.isin(c.kinds, kinds.split())
+        used[self.late] = True
+        model = Model.of([self.spectra], [np.arange(len(used))], deviation, SHARES, gains)
+        found = model.posterior(used)
+        some = slice(len(used) - c.gains, None)
+        each = found.mean[some]
+        # A joint's gain is its own and that of all.
+        tie = np.concatenate([np.eye(n), np.ones((n, c.gains - n))], 1)
+        deviations = np.sqrt(np.diag(tie @ found.covariance[some, some] @ tie.T))
+        return np.asarray(tie @ each, np.float64), np.asarray(deviations, np.float64)
+
+    def _weigh_delays(self) -> Iterator[Hypothesis]:
+        """Weigh efforts of all joints, or of one, that belong to another time."""
+        r, c = self.rows, self.columns
+        n, k, period = len(self.joints), len(r.time), float(np.median(np.diff(r.time)))
+        most = min(int(SEARCHED / period), k // 4)
+        if most * period < LATEST:
+            return
+        inner = slice(most, k - most)
+        own = np.array([kind not in ("offset", "error") for kind in c.kinds])
+        left = np.empty((2 * most + 1, n))
+        for j in range(n):
+            table = np.concatenate([c.columns[inner, j][:, own], c.certain[inner, j, None]], 1)
+            table = table[:, np.abs(table).max(0) > 0.0]
+            basis = np.linalg.qr(table / np.linalg.norm(table, axis=0))[0]
+            moved = np.stack([r.effort[s : k - 2 * most + s, j] for s in range(2 * most + 1)])
+            left[:, j] = np.sum(moved**2, 1) - np.sum((moved @ basis) ** 2, 1)
+        left /= np.maximum(np.var(r.effort, 0), 1e-300)
+        choices: list[tuple[list[int], int]] = [([*range(n)], int(left.sum(1).argmin()))]
+        choices += [([j], int(left[:, j].argmin())) for j in range(n)] if n > 1 else []
+        before: Hypothesis | None = None
+        for which, place in choices:
+            step = place - most
+            if abs(step) * period < 0.03:
+                continue
+            before = before or self.weigh("", 0.0, c.spectra(inner=inner), screened=False)
+            effort = r.effort.copy()
+            effort[inner, which] = r.effort[place : k - 2 * most + place, which]
+            spectra = c.spectra(effort, inner)
+            one = self.weigh("", 0.0, spectra, screened=False)
+            late = float(step * period) + self._find_mean(spectra, one.kinds)[self.late]
+            text = late_text(listed([self.joints[j] for j in which], n), late)
+            one = replace(one, text=text, late=late if len(which) == n else 0.0)
+            # As if all rows had been compared.
+            gain = (one.log - before.log) * k / (k - 2 * most)
+            yield replace(one, log=self.sound.log + gain - RARE)
+
+    def _find_mean(self, spectra: Spectra, kinds: str | None = None, more: int = 0) -> Array:
+        """Return the posterior mean of the columns, (c,).
+
+        :param kinds: which numbers differ from the file; beside them only a delay, offsets, and the
+            column ``more``; default all columns.
+        """
+        c = self.columns
+        used = np.ones(len(c.kinds), np.bool_)
+        if kinds is not None:
+            used = np.isin(c.kinds, ["offset", *kinds.split()])
+            used[[self.late, more or self.late]] = True
+        deviation = c.deviation * np.where(c.payload, HEAVY, 1.0)
+        return Model.of([spectra], [np.arange(len(used))], deviation, SHARES).posterior(used).mean
+
+    def _weigh_loads(self) -> Iterator[Hypothesis]:
+        """Weigh a payload that is held for a while only."""
+        r, c, payload = self.rows, self.columns, self.columns.payload
+        if not payload.any() or r.recording.load is not None:
+            return
+        left = r.effort - c.certain - c.columns @ np.where(payload, 0.0, self._find_mean(self.spectra))
+        weight = r.counts / np.maximum(np.var(r.effort, 0), 1e-300)
+        kilogram = c.columns[..., int(payload.argmax())]
+        _, spans, held = held_payload(r.time, kilogram, left, weight)
+        if spans and not held.all():
+            part = replace(c, columns=np.where(payload, held[:, None, None], 1.0) * c.columns)
+            yield self._weigh_payload(part.spectra(), UNIT + 3.0 * len(spans), tuple(spans))
+
+    def _weigh_payload(self, spectra: Spectra, price: float, spans: tuple[tuple[float, float], ...] = ()) -> Hypothesis:
+        """Weigh a payload, with the mass that it has at the file's centre."""
+        one, robot = self.weigh("", price, spectra), self.rows.model.robot
+        first = self.columns.kinds.index("payload")
+        beside = one.kinds.replace("payload", "")
+        mass = robot.payload.mass + float(self._find_mean(spectra, beside, first)[first])
+        load = Load(float(f"{max(mass, 0.0):.3g}"), None, spans)
+        com = robot.payload.com
+        at = ", ".join(f"{v:g}" for v in com) + " m" if np.any(com) else "the reference point"
+        text = f"a payload of {load.mass:.3g} kg with its centre at {at} explains the efforts: use "
+        text += f"--payload {load.mass:g}"
+        if spans:
+            text += " --load-times " + ",".join(f"{edge:.2f}" for pair in spans for edge in pair)
+        return replace(one, text=text, load=load)
+
+    def explain(self) -> Explanation:
+        """Return what explains the recording most probably."""
+        best, sound = self.all[0], self.sound
+        unknown = (
+            f"{NO_MACHINE}: {100 * sound.share:.2g} % of their variation is left (another "
+            "machine, another motion, an unknown load, or noise?)"
+        )
+        scaled = next((one for one in self.all if one.scale > 0.0 and one.scale != 1.0), best)
+        if (
+            scaled.scale != 1.0
+            and scaled.share <= 0.12
+            and abs(scaled.log - sound.log) <= ODDS >= best.log - scaled.log
+        ):
+            told = self._tell_scale(scaled.scale, scaled.kinds)
+            if told is not None:
+                return told
+            best = next(one for one in self.all if one is not scaled)
+        if best.text and best.log - sound.log > ODDS:
+            if best.text == NO_MACHINE or best.share > 0.12:
+                return Explanation(unknown, fault=True)
+            if 0.0 < abs(best.late) < LATEST and not self.rows.recording.late:
+                r = self.rows.recording.on_time(best.late)
+                return explain(rows_of(self.rows.model.robot, self.rows.model.parameters, r))
+            return Explanation(best.text, fault=True, load=best.load)
+        if sound.share > 0.3:
+            return Explanation(unknown, fault=True)
+        gains, deviations = self._find_gains()
+        j, mean = int(np.abs(gains).argmax()), float(gains.mean())
+        clear = 0.0
+        for kinds, part in zip(CLASSES, sound.classes, strict=True):
+            each, sizes = self._find_gains(kinds=kinds) if part > 1e-3 else (0.0 * gains, deviations)
+            # A gain of 10 %, two usual deviations, is named.
+            clear += part * bool(abs(each[j]) > 0.1 + SIGMAS * sizes[j])
+        if not sound.kinds and clear > CERTAIN:
+            if (np.abs(gains - mean) < 0.5 * abs(mean)).all():
+                told = self._tell_scale(1.0 / (1.0 - mean))
+                return told or Explanation("")
+            scale = 1.0 / (1.0 - float(gains[j]))
+            return Explanation(scale_text(self.joints[j], scale), not usual_scale(scale))
+        if sound.kinds in ("payload", "heavy payload") and self.rows.recording.load is None:
+            held = self._weigh_payload(self.spectra, 0.0)
+            return Explanation(held.text, load=held.load)
+        return Explanation("")
+
+    def _tell_scale(self, scale: float, kinds: str = "") -> Explanation | None:
+        """Return that all efforts are scaled; None where heavier masses explain them better.
+
+        A heavier machine has the friction of its file, efforts of another scale have not. Friction
+        may be less than the other hypotheses' discrepancy of 1 %. Where it is not the file's both are
+        as likely.
+
+        :param kinds: numbers that differ from the file.
+        """
+        c, p, rows = self.columns, self.rows.model.parameters, self.rows
+        rubs = np.array([g.kind == "friction" for g in p.groups for _ in g.names])
+        smooth = c.certain - rows.table[..., rubs] @ p.values[rubs]
+        beside = np.flatnonzero([kind == "offset" or k == self.late for k, kind in enumerate(c.kinds)])
+        table = np.concatenate([c.columns[..., beside], c.certain[..., None], smooth[..., None]], -1)
+        spectra = replace(c, columns=table, fast=0.0 * table).spectra()
+        places, deviation = np.arange(len(beside) + 2), np.append(c.deviation[beside], [1.0, 1.0])
+        model = Model.of([spectra], [places], deviation)
+        masses, efforts = (model.log_evidence(places != len(beside) + k) for k in (0, 1))
+        if "friction" not in kinds and masses > efforts + ALTERNATIVE:
+            return None
+        clear = "friction" not in kinds and efforts > masses + ALTERNATIVE
+        others = [] if clear else [f"all masses are {scale:.3g} times the file's"]
+        names = listed([*self.joints], len(self.joints))
+        return Explanation(scale_text(names, scale, *others), not usual_scale(scale))
+
+    def _weigh_positions(self) -> Iterator[Hypothesis]:
+        """Weigh other positions, with the efforts as they are or turned alike, and wrenches."""
+        r, robot, motion = self.rows, self.rows.model.robot, self.rows.signals.motion
+        n, names, eye = len(self.joints), self.joints, np.eye(len(self.joints))
+        ones, q = np.ones(n), motion.q
+        for text, wrench in wrenches(r.recording, motion):
+            yield from self._weigh_motion(text, replace(motion, wrench=wrench), ones)
+        for text, scale in ANGLES.items():
+            other = replace(motion, q=scale * q, qd=scale * motion.qd, qdd=scale * motion.qdd)
+            yield from self._weigh_motion(text, other, ones)
+        if n > 1:
+            other = replace(motion, q=-q, qd=-motion.qd, qdd=-motion.qdd)
+            yield from self._weigh_motion("positions of all joints have the wrong sign", other, -ones)
+        for name, e in zip(names, eye, strict=True):
+            t, text = 1.0 - 2.0 * e, f"of {name} have the wrong sign (joint_map?)"
+            # A drive that counts the wrong way is mirrored at zero, at home, or anywhere.
+            for middle in (0.0 * robot.graph.home, robot.graph.home, q.mean(0)):
+                other = replace(motion, q=middle + t * (q - middle), qd=t * motion.qd, qdd=t * motion.qdd)
+                both = f"positions and efforts {text}"
+                yield from self._weigh_motion(f"positions {text}", other, t, both)
+        for i, k in combinations(range(n), 2):
+            order = np.arange(n)
+            order[[i, k]] = k, i
+            other = replace(motion, q=q[:, order], qd=motion.qd[:, order], qdd=motion.qdd[:, order])
+            text = f"{names[i]} and {names[k]} are exchanged"
+            yield from self._weigh_motion(f"positions of {text}", other, ones, text, order.tolist())
+
+    def _weigh_motion(
+        self, text: str, motion: Motion, turned: Array, both: str = "", order: Any = None
+    ) -> Iterator[Hypothesis]:
+        """Weigh another motion; and with the efforts turned or exchanged alike, ``both``."""
+        try:
+            made = self.columns.with_motion(motion, turned, order)
+        except (PkmTwinError, ValueError, np.linalg.LinAlgError):
+            return
+        if not np.isfinite(made.columns).all() or not np.abs(made.certain).max() < LARGEST:
+            return
+        spectra = made.spectra()
+        yield self.weigh(text, RARE, spectra)
+        if both and order is None:
+            yield self.weigh(both, RARE, spectra, gains=turned)
+        elif both:
+            yield self.weigh(both, RARE, made.spectra(order=order))
+
+
+FEW: Final = ("", "friction masses payload")
+"""Classes by which a scale or sign is searched."""
+NO_MACHINE: Final = "no machine like the file's explains the efforts, and no single mistake does"
+
+
+def explain(rows: Rows) -> Explanation:
+    """Return what explains a recording most probably: the file, one number, or a fault.
+
+    :param rows: with all parameters of the file.
+    """
+    period = float(np.median(np.diff(rows.recording.time)))
+    if period > 1.0:
+        text = f"samples {period:.3g} s apart show no motion (is the time in ms?)"
+        return Explanation(text, fault=True)
+    return Search(rows).explain()
+
+
+def wrenches(r: Recording, motion: Motion) -> Iterator[tuple[str, Array]]:
+    """Yield faults of a recording's wrenches, and the wrenches of a motion without each."""
+    if r.wrench is None or not r.wrench.any():
+        return
+    rotation, axes = r.robot.rotation(r.robot.forward(motion.q)), "platform"
+    if r.topics.turns:
+        rotation, axes = rotation.swapaxes(-1, -2), "base"
+    yield f"the wrench has {axes} axes", in_base_axes(motion.wrench, rotation)
+    text = "the wrench has the opposite sign: it is what the platform applies to its surroundings"
+    yield text, -motion.wrench
+    text = "without the wrench the efforts agree: it does not act on the platform"
+    yield text, 0.0 * motion.wrench
