@@ -316,7 +316,7 @@ def read_bearings(path: Path, names: tuple[str, ...], robot: Robot) -> dict[str,
     for pattern, entry in read_entries(path, "bearings", "joints").items():
         fitting = fnmatch.filter(names, str(pattern))
         if not fitting:
-            raise ParameterError(f"{path}: bearings", f"{pattern} matches no joint", f"of {', '.join(names)}")
+            raise ParameterError(f"{path}: bearings", pattern, f"a name or pattern of the joints {', '.join(names)}")
         spec = schema.build(BearingSpec, entry, f"{path}: bearings.{pattern}")
         left = {}
         for name in fitting:
