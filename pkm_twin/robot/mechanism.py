@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""What every robot has of its file: parameters, the graph that follows, names and units.
+"""Describe a robot by its file: parameters, the graph that follows from them, names and units.
 
 A mechanism is a schema and a function from its parameters to :class:`Parts`.
 """
@@ -35,9 +35,9 @@ from pkm_twin.machine.urdf_file import Visual
 from pkm_twin.settings import settings_of
 
 SHARED: Final = "a controller may share efforts in any way"
-"""Why measured efforts of drives that share them have no one explanation."""
+"""Why measured efforts of redundant drives have no unique explanation."""
 FREE_FALL: Final = (0.0, 0.0, -9.81)
-"""Of files without gravity, base axes, m/s2."""
+"""Gravity of files without one, base axes, m/s2."""
 R = TypeVar("R", bound="Mechanism")
 
 
@@ -67,15 +67,15 @@ class Common:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Mechanism(Common):
-    """What a robot file says of a machine of n actuated joints and m pose coordinates.
+    """The description of a machine with n actuated joints and m pose coordinates by its file.
 
     Frozen; :meth:`changed` gives a copy with other parameters.
     """
 
     name: str = ""
-    """The name that the robot was loaded by."""
+    """The name by which the robot was loaded."""
     home_choice: str = ""
-    """How the home was chosen, of a file that leaves it open."""
+    """How the home was chosen, if the file leaves it open."""
     visuals: tuple[Visual, ...] = ()
     """Meshes of a URDF's links."""
     friction: Coefficients = schema.section(friction_of(3), default={})
@@ -86,12 +86,12 @@ class Mechanism(Common):
         DriveSpec, text="of every actuated joint, in place of `inertia.rotor_inertia`", default=None
     )
     home_joint: Any = None
-    """Value of every actuated joint at home, where a mechanism chooses it: kept by copies, so that
-    other limits do not move the home."""
+    """Value of every actuated joint at home, if the mechanism chooses it; copies keep it, so that other
+    limits do not move the home."""
     book: Book = dataclasses.field(default_factory=Book)
     """The file's parameters, and its expressions."""
     open_laws: tuple[str, ...] = ()
-    """Friction laws that a fit may find, although the file's parameters of them are zero."""
+    """Friction laws that a fit may find, although their parameters in the file are zero."""
 
     coordinates: ClassVar[tuple[Coordinate, ...]]
     layout: ClassVar[PoseGrid | None] = None
@@ -99,7 +99,7 @@ class Mechanism(Common):
     limit_key: ClassVar[str] = "limits.position"
     """Path of the actuated joints' limits in the file."""
     start: ClassVar[Start | None] = None
-    """A closed form of the forward kinematics that no structure tells."""
+    """A closed form of the forward kinematics that does not follow from the graph."""
     changeable: ClassVar[tuple[str, ...]] = (
         "payload",
         "friction",
@@ -111,9 +111,9 @@ class Mechanism(Common):
 
     @classmethod
     def from_data(cls: type[R], data: Mapping[str, Any], name: str) -> R:
-        """Make a robot of a parameter file's data.
+        """Make a robot from a parameter file's data.
 
-        :raises ParameterError: by the field.
+        :raises ParameterError: an invalid value; the error names its field.
         """
         robot = schema.build(cls, data)
         robot = dataclasses.replace(robot, name=name, home_joint=robot.chosen_home())
@@ -124,12 +124,12 @@ class Mechanism(Common):
 
     @property
     def description(self) -> str:
-        """What machine it is, in words."""
+        """The kind of machine, in words."""
         raise NotImplementedError
 
     @property
     def mobility(self) -> str:
-        """Number and kind of the platform's freedoms, in words."""
+        """Number and kind of the platform's degrees of freedom, in words."""
         raise NotImplementedError
 
     @property
@@ -142,11 +142,11 @@ class Mechanism(Common):
 
     @property
     def limb_names(self) -> tuple[str, ...]:
-        """Names of the limbs, one an actuated joint."""
+        """Names of the limbs, one per actuated joint."""
         raise NotImplementedError
 
     def name_limb(self, part: str) -> str:
-        """Return the limb of a joint, rod or body, the part itself where limbs have no names."""
+        """Return the limb of a joint, rod or body, or the part itself if limbs have no names."""
         if self.limb_names == self.joint_names:
             return part
         ends = self.graph.rods.get(part) or self.graph.joints.get(part)
@@ -157,9 +157,9 @@ class Mechanism(Common):
         return part if limb is None else self.limb_names[limb]
 
     def chosen_home(self) -> float | None:
-        """Value of every actuated joint at home, of a mechanism whose file does not give it.
+        """Choose the value of every actuated joint at home if the file does not state it.
 
-        The middle of the range that the limits of all joints share, where the mechanism can be
+        It is the middle of the range common to the limits of all joints, if the mechanism can be
         assembled there; else the mechanism's own choice.
         """
         return None
@@ -180,12 +180,11 @@ class Mechanism(Common):
 
     @cached_property
     def beams(self) -> tuple[Beam, ...]:
-        """The bars that limb interference and elasticity are about; none: not known."""
+        """The bars for limb interference and elasticity; empty if they are unknown."""
         return self.parts.beams
 
     def limit_angles(self, pose: ArrayLike) -> Array | None:
-        """Angles that ``limits.joint_angle`` bounds, shape (..., k), rad; None where it is none."""
-        del pose
+        """Return the angles that ``limits.joint_angle`` bounds, shape (..., k), rad; None without any."""
         return None
 
     def limb_wrenches(self, pose: ArrayLike) -> Array | None:
@@ -193,16 +192,15 @@ class Mechanism(Common):
 
         Elastic elements are then in the order of the limbs, as many in each.
         """
-        del pose
         return None
 
     @property
     def passive_limits(self) -> tuple[PassiveLimit, ...]:
-        """Ranges of passive joints that bound the workspace; none: the file states none."""
+        """Ranges of passive joints that bound the workspace, if the file states any."""
         return ()
 
     def passive_entries(self) -> dict[str, dict[str, dict[str, Any]]]:
-        """Passive limits of the file, at joints and rods: plain data, by kind and name."""
+        """Return the passive limits of joints and rods as plain data, by kind and name."""
         return {}
 
     def structure(self) -> Structure:
@@ -216,28 +214,28 @@ class Mechanism(Common):
     def elastic_entries(self) -> dict[str, dict[str, dict[str, Any]]]:
         """Return the elastic entries of bodies, joints and rods as plain data, by kind and name.
 
-        Empty where the file has other words for it, which a file of those has not.
+        They are empty if the file states elasticity in other keys.
         """
         return {}
 
     def sharing_entries(self) -> dict[str, Any]:
-        """How more actuated joints than freedoms share the effort, as in a file; else empty."""
+        """Return how redundant drives share the effort, as entries of a file; empty without redundancy."""
         return {}
 
     @property
     def without_home(self) -> frozenset[str]:
-        """Joints of which the file should say where they count from, and does not."""
+        """Joints whose zero the file should state and does not."""
         return frozenset()
 
     @property
     def without_point(self) -> frozenset[str]:
-        """Joints that have no point of their own in the file."""
+        """Joints without a point of their own in the file."""
         return frozenset()
 
     def named(self, keys: Sequence[Key]) -> Iterator[tuple[str, str, Keys, float]]:
-        """Entries of the graph that a path's keys are about: kind, name, keys in it, azimuth.
+        """Yield kind, name, keys and azimuth of each entry of the graph that a path's keys name.
 
-        The azimuth is a limb's, by which the entry's vectors are turned about base z.
+        The entry's vectors are rotated about base z by the azimuth of its limb.
         """
         kind, name, *where = [*keys, "", ""][: max(2, len(keys))]
         if kind in ("bodies", "joints", "rods") and name in getattr(self.graph, str(kind)):
@@ -245,7 +243,7 @@ class Mechanism(Common):
 
     @property
     def drives(self) -> tuple[DriveSpec | None, ...]:
-        """Rotor and gear of each actuated joint, None where the file does not give them."""
+        """Rotor and gear of each actuated joint, None if the file does not state them."""
         return (self.drive,) * self.joints_count
 
     def default_inertia(self) -> dict[str, Any]:
@@ -254,29 +252,28 @@ class Mechanism(Common):
 
     @property
     def spelled(self: R) -> R:
-        """The same with every inertia that its file may leave out."""
+        """The robot with every inertia that its file may leave out."""
         own: Any = getattr(self, "inertia", None)
         usual = {} if own is None else self.default_inertia()
         left = {key: value for key, value in usual.items() if getattr(own, key) is None}
         return self._with(inertia=dataclasses.replace(own, **left)) if left else self
 
     def mass_keys(self) -> Iterator[Keys]:
-        """Where its file has masses, centres and inertias, of one that is :attr:`spelled` out."""
+        """Yield the keys of masses, centres and inertias in the file of a :attr:`spelled` robot."""
         for name, value in self.parameter_sections()["inertia"].items():
             if name != "rotor_inertia":
                 yield from (("inertia", name, *index) for index in np.ndindex(np.shape(value)))
 
     def friction_key(self, joint: str, what: str) -> Keys:
-        """Where its file has a joint's friction."""
+        """Return the keys of a joint's friction in the file."""
         return ("friction", what, self.joint_names.index(joint))
 
     def rotor_key(self, joint: str) -> Keys:
-        """Where its file has a joint's rotor."""
-        del joint
+        """Return the keys of a joint's rotor in the file."""
         return ("inertia", "rotor_inertia") if self.drive is None else ("drive", "inertia")
 
     def reflected_rotor(self, given: float, slides: bool) -> float:
-        """Rotor inertia at the joints, kg m2 or kg: of the file's ``drive``, else as given.
+        """Return the rotor inertia at the joints, kg m2 or kg: of the file's ``drive``, or as given.
 
         :raises ParameterError: both are given, or a gear for another type of joint.
         """
@@ -292,13 +289,13 @@ class Mechanism(Common):
         return law_names(self.friction, self.open_laws)
 
     def with_laws(self, graph: Graph) -> Graph:
-        """Add the robot's friction laws to a graph; programs of efforts are made from it."""
+        """Add the robot's friction laws to a graph, from which programs of efforts are made."""
         laws = compiled(self.laws)
         return dataclasses.replace(graph, laws=laws) if laws else graph
 
     @cached_property
     def causes(self) -> Mapping[str, Mapping[str, float]]:
-        """By cause of doubt: by path of a number, what one standard deviation adds to it."""
+        """The changes of numbers, by path, for one standard deviation of each uncertainty."""
         return causes_of(self.uncertainty, self.file_numbers())
 
     def __getstate__(self) -> dict[str, Any]:
@@ -329,12 +326,12 @@ class Mechanism(Common):
 
     @property
     def joint_unit(self) -> str:
-        """Unit of q where the joints are of one kind, else ``rad or m``."""
+        """Unit of q if all joints have the same, else ``rad or m``."""
         return _common(self.joint_units)
 
     @property
     def effort_unit(self) -> str:
-        """Unit of the efforts where the joints are of one kind, else ``N m or N``."""
+        """Unit of the efforts if all joints have the same, else ``N m or N``."""
         return _common(self.effort_units)
 
     def parameter_sections(self) -> dict[str, Any]:
@@ -342,14 +339,14 @@ class Mechanism(Common):
         return {name: schema.plain(getattr(self, name)) for name in settings_of(type(self))}
 
     def parameter_units(self) -> dict[str, Any]:
-        """Units of the same, by section; empty where a parameter has none."""
+        """Return the units of the parameters by section; empty for a parameter without unit."""
         words = {"joint": self.joint_unit, "effort": self.effort_unit}
         return schema.units(type(self), self.parameter_sections(), words)
 
     def file_numbers(self) -> dict[str, tuple[float, str]]:
-        """List every number that the file gives, by dotted path, with its unit.
+        """List every number of the file, by dotted path, with its unit.
 
-        Of a machine with a ``drive``, ``inertia.rotor_inertia`` is none: only 0 is valid.
+        With a ``drive``, ``inertia.rotor_inertia`` is left out, because only 0 is valid.
         """
         found = numbers_of(self.parameter_sections(), self.parameter_units())
         if self.drive is not None:
@@ -358,7 +355,7 @@ class Mechanism(Common):
 
     @cached_property
     def controller(self) -> JointMap:
-        """Between the controller's joints and the model's.
+        """The conversion between the joints of the controller and of the model.
 
         :raises ParameterError: ``joint_map`` names an unknown joint.
         """
@@ -366,12 +363,12 @@ class Mechanism(Common):
 
     @cached_property
     def elastic(self) -> Structure:
-        """Elastic beams and joints with the elements' factors; errors as :meth:`structure`."""
+        """Elastic beams and joints with the elements' factors; errors as in :meth:`structure`."""
         return self.structure().scaled(self.element_compliance)
 
     @property
     def element_names(self) -> tuple[str, ...]:
-        """Valid names in ``element_compliance``, bars first; errors as :meth:`structure`.
+        """Valid names in ``element_compliance``, bars first; errors as in :meth:`structure`.
 
         Results of energies and factors have their own order, in their attribute ``elements``.
         """
@@ -380,7 +377,7 @@ class Mechanism(Common):
     def check_elements(self) -> None:
         """Reject factors of unknown elements.
 
-        :raises ParameterError: by the name, or nothing is elastic.
+        :raises ParameterError: an unknown name, or nothing is elastic.
         """
         for name in self.element_compliance:
             if name not in self.element_names:
@@ -388,24 +385,24 @@ class Mechanism(Common):
 
     @cached_property
     def joints_count(self) -> int:
-        """How many joints are actuated, n."""
+        """Number n of actuated joints."""
         return len(self.joint_names)
 
     @property
     def redundant(self) -> bool:
-        """Whether there are more actuated joints than degrees of freedom."""
+        """True if there are more actuated joints than degrees of freedom."""
         return len(self.graph.leads) < self.joints_count
 
     @property
     def led(self: R) -> R:
-        """The machine whose leading drives are its only ones; the others are passive joints."""
+        """The machine in which only the leading drives are actuated; the others are passive joints."""
         return self
 
     def check_independent(self, what: str, why: str = "they are not defined for more") -> None:
-        """Reject what needs as many actuated joints as degrees of freedom.
+        """Reject a computation that needs as many actuated joints as degrees of freedom.
 
-        :param what: in the plural, in words; ``why``: the reason.
-        :raises ParameterError: there are more.
+        :param what: name of the results, in the plural; ``why``: the reason.
+        :raises ParameterError: there are more actuated joints.
         """
         if self.redundant:
             raise ParameterError(
@@ -423,16 +420,16 @@ class Mechanism(Common):
 
     @property
     def pose_units(self) -> tuple[str, ...]:
-        """Their units, ``m`` or ``rad``."""
+        """Units of the pose coordinates, ``m`` or ``rad``."""
         return tuple(c.unit for c in self.coordinates)
 
     @property
     def body_names(self) -> tuple[str, ...]:
-        """Bodies and rods, and the payload last."""
+        """Names of bodies and rods, and the payload last."""
         return (*self.graph.bodies, *self.graph.rods, "payload")
 
     def numbered(self: R, values: Mapping[str, Any]) -> R:
-        """Copy the robot with other numbers or expressions at dotted paths; nothing is checked.
+        """Copy the robot with other numbers or expressions at dotted paths, without checks.
 
         :raises ParameterError: an unknown path.
         """
@@ -441,13 +438,13 @@ class Mechanism(Common):
         return self._with(**{f.name: getattr(made, f.name) for f in dataclasses.fields(self)})
 
     def own_path(self, path: str) -> str:
-        """Where the robot's file has a number that another path names too."""
+        """Return the path in the robot's file of a number that several paths name."""
         return path
 
     def resolved(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Values by :meth:`own_path`.
+        """Return values by :meth:`own_path`.
 
-        :raises ParameterError: two paths of one number.
+        :raises ParameterError: two paths name the same number.
         """
         found: dict[str, Any] = {}
         told: dict[Keys, str] = {}
@@ -460,7 +457,7 @@ class Mechanism(Common):
         return found
 
     def number(self, path: str) -> float:
-        """Return the number at a dotted path of the robot's file, as :meth:`numbered` takes it.
+        """Return the number at a dotted path of the robot's file, as in :meth:`numbered`.
 
         :raises ParameterError: an unknown path.
         """
@@ -478,21 +475,21 @@ class Mechanism(Common):
         return type(self).from_data(data, self.name)
 
     def check_number(self, path: str) -> None:
-        """Judge a number of :meth:`numbered` as a file's is.
+        """Check a number of :meth:`numbered` like a number of a file.
 
-        :raises ParameterError: by the path.
+        :raises ParameterError: the number is invalid; the error names the path.
         """
         check_number(self, full_keys(path), path)
 
     def _with(self: R, **values: Any) -> R:
-        """Copy the robot with other fields or derived values; nothing is checked."""
+        """Copy the robot with other fields or derived values, without checks."""
         made = object.__new__(type(self))
         vars(made).update(self.__getstate__() | values)
         return made
 
     @cached_property
     def pose_scales(self) -> Array:
-        """What makes lengths of pose coordinates, shape (m,): 1, or the platform's radius."""
+        """Factors that convert pose coordinates to lengths, shape (m,): 1, or the platform's radius."""
         return np.array([1.0 if unit == "m" else self.size for unit in self.pose_units])
 
     def grid(self) -> PoseGrid:
@@ -515,7 +512,7 @@ class Mechanism(Common):
         return np.array(rows)
 
     def changed(self: R, **sections: Mapping[str, object] | object) -> R:
-        """Copy with new values: ``payload={"mass": 0.2}, geometry={"arm_length": 0.3}``.
+        """Copy the robot with new values: ``payload={"mass": 0.2}, geometry={"arm_length": 0.3}``.
 
         All values are checked as in a file; one invalid value rejects all. A change of geometry,
         masses or members is like a new file: the home is chosen again.
