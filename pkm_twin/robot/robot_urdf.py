@@ -105,13 +105,7 @@ def _warn_of_losses(robot: Robot, where: str) -> None:
 def robot_tree(robot: Robot) -> LoopTree:
     """Return the robot in the form of description files, drawn at home, with bars for pictures."""
     graph, tree, load = robot.graph, robot.engine.tree, robot.payload
-    names = {BASE: GROUND}
-    # Names that need no change come first and stay; none is a link of the file itself.
-    for name in sorted([*graph.bodies, *graph.rods], key=lambda name: plain_name(name) != name):
-        own = plain_name(name)
-        while own in (GROUND, PLATFORM, PAYLOAD, *names.values()):
-            own += "_body"
-        names[name] = own
+    names = _link_names([*graph.bodies, *graph.rods])
     labels = joint_labels(tree)
     links, joints = {GROUND: Link(GROUND)}, dict[str, Joint]()
 
@@ -177,6 +171,18 @@ def robot_tree(robot: Robot) -> LoopTree:
         platform=platform,
         origin=graph.origin,
     )
+
+
+def _link_names(names: Sequence[str]) -> dict[str, str]:
+    """Return a link's name for each body and rod, and the ground; none is a link of the file itself."""
+    links = {BASE: GROUND}
+    # Names that need no change come first and stay.
+    for name in sorted(names, key=lambda name: plain_name(name) != name):
+        link = plain_name(name)
+        while link in (GROUND, PLATFORM, PAYLOAD, *links.values()):
+            link += "_body"
+        links[name] = link
+    return links
 
 
 def robot_description(robot: Robot) -> dict[str, Any]:
