@@ -89,7 +89,7 @@ def part_of(robot: Robot, path: str) -> Part | None:
 
     :raises ParameterError: the machine's entry has no such error.
     """
-    effects: dict[Effect, Array] = {}
+    keys, effects = full_keys(path), dict[Effect, Array]()
     if "," in path:
         found: list[Part] = []
         for word in path.split(","):
@@ -101,7 +101,6 @@ def part_of(robot: Robot, path: str) -> Part | None:
             for what, vector in part.effects.items():
                 effects[what] = effects.get(what, 0.0) + (-vector if one.startswith("-") else vector)
         return Part(effects, f"{found[0].text}, and {len(found) - 1} more alike", found[0].unit)
-    keys = full_keys(path)
     if keys[0] not in (*ERROR_KEYS, "limbs"):
         numbers = robot.file_numbers()
         if keys[0] in {keys_of(number)[0] for number in numbers}:

@@ -152,13 +152,8 @@ class Motor:
         """Rising speeds (k,), rad/s, and the largest torque at them, N m."""
         rows = self.curve
         if rows is None:
-            rows = np.array(
-                [
-                    [0.0, self.peak_torque],
-                    [self.rated_speed, self.peak_torque],
-                    [self.max_speed, self.continuous_torque],
-                ]
-            )
+            peak, last = self.peak_torque, [self.max_speed, self.continuous_torque]
+            rows = np.array([[0.0, peak], [self.rated_speed, peak], last])
         return RPM * rows[:, 0], rows[:, 1]
 
     def most(self, speed: Array) -> Array:
@@ -384,12 +379,7 @@ class Fit:
     def choice(self) -> dict[str, Any]:
         """Motor and gear as plain data."""
         gear = self.gear
-        return {
-            "motor": self.name,
-            "gear": gear.name or None,
-            "ratio": gear.ratio,
-            "lead_m": gear.lead,
-        }
+        return {"motor": self.name, "gear": gear.name or None, "ratio": gear.ratio, "lead_m": gear.lead}
 
     def __str__(self) -> str:
         return f"{self.name} with {self.gear}"
