@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from pkm_twin import load
-from pkm_twin.export.c_package import c_package
+from pkm_twin.export.c_package import Package
 from test.benchmarks.textbook import TEXTBOOK
 from test.support.pages import write_section
 from test.support.robots import joint_range
@@ -42,7 +42,9 @@ CALLS = {
     "torques_at_pose": ("pose", "qd", "qdd", "wrench", "q_out", "v_out", "a_out", "tau"),
     "forward": ("q", "pose_out"),
     "mass_matrix": ("q", "matrix"),
+    "mass_matrix_at_pose": ("pose", "matrix"),
     "accelerations": ("q", "qd", "qdd", "wrench", "tau"),
+    "accelerations_at_pose": ("pose", "qd", "efforts", "wrench", "v_out", "a_out"),
 }
 """Arguments of each function: a row of an input for each state, or one output."""
 TABLES = "q", "qd", "qdd", "pose"
@@ -60,7 +62,7 @@ static double now(void)
 TIMED = r"""
 double time_%s(const double *q, const double *qd, const double *qdd, const double *pose, long count)
 {
-    double tau[6], q_out[6], v_out[6], a_out[6], pose_out[6], matrix[36], wrench[6] = {0.0}, begun;
+    double tau[6], q_out[6], v_out[6], a_out[6], pose_out[6], matrix[36], wrench[6] = {0.0}, efforts[6] = {1.0}, begun;
     long i;
     int bad = 0;
     begun = now();
@@ -91,8 +93,9 @@ def build(robot, folder):
         parts.append(TIMED % (name, call.format(", ".join(words))))
     if form is not None:
         parts.append("int textbook_one(const double *pose, double *q)\n{\n    return textbook(pose, q);\n}\n")
-    for file, text in c_package(robot).items():
-        (folder / file).write_text(text)
+    made = Package(robot, list(CALLS))
+    (folder / f"{prefix}.h").write_text(made.header())
+    (folder / f"{prefix}.c").write_text(made.source())
     (folder / "loop.c").write_text("".join(parts))
     command = ["gcc", *FLAGS, "loop.c", f"{prefix}.c", "-o", f"{prefix}.so", "-lm"]
     subprocess.run(command, cwd=folder, check=True)
@@ -164,7 +167,7 @@ def main(arguments):
     robots = [load(name) for name in (arguments or ROBOTS)]
     with tempfile.TemporaryDirectory() as folder:
         found, unit = measure(robots, Path(folder))
-    names = ["inverse", "textbook", "torques_at_pose", "torques", "forward", "mass_matrix", "accelerations"]
+    names = ["inverse", "textbook", *(name for name in CALLS if name != "inverse")]
     lines = [
         f"Exported C, `gcc -O3 -march=native`, {STATES:,} states over the whole joint range, in "
         f"units of a Delta's `_torques` ({unit:.0f} ns) in the same process; the least of {ROUNDS} "
