@@ -5,16 +5,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Final
-
-import numpy as np
+from typing import Final, Literal
 
 from delta_dynamics.torques.at_pose import followed_pose_torques
 from delta_dynamics.torques.derivatives import motion_gradient, numbers_gradient
 from delta_dynamics.torques.reactions import loads_kernel
 from delta_dynamics.torques.virtual_work import masses_kernel
 from delta_dynamics.torques.virtual_work import torques as torques_kernel
-from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.kinematics.gradients import free_forward, platform_gradient, pose_motion_gradient
 from pkm_twin.kinematics.singularity import singularity_gradient
@@ -24,9 +21,6 @@ from pkm_twin.robot.robot import Robot
 from stiffness_monitor.derivatives import compliance_gradient
 from stiffness_monitor.numbers import list_numbers
 from stiffness_monitor.programs import Elastic
-
-if TYPE_CHECKING:
-    from pkm_twin.design.variants import Variants
 
 
 class NumberFunctions:
@@ -49,29 +43,15 @@ class NumberFunctions:
         return FileNumbers(self.robot, self.paths, lambda made: list_numbers(made.elastic))
 
 
-Asked = tuple[Kernel, Callable[["Variants"], Array]]
-"""A program, and the function that returns its inputs of machines, shape (k, size)."""
+Numbers = Literal["geometry", "masses", "elasticity"]
+Asked = tuple[Kernel, tuple[Numbers, ...]]
+"""A program, and the attributes of :class:`Variants` that are its inputs, in this order."""
 Ask = Callable[[Robot], Asked]
 
 
-def of_geometry(many: Variants) -> Array:
-    """Return the geometry of the machines."""
-    return many.geometry
-
-
-def of_masses(many: Variants) -> Array:
-    """Return masses, then geometry."""
-    return np.concatenate([many.masses, many.geometry], 1)
-
-
-def of_elasticity(many: Variants) -> Array:
-    """Return geometry, then elasticity."""
-    return np.concatenate([many.geometry, many.elasticity], 1)
-
-
-def asks(kernel: Callable[[Robot], Kernel], numbers: Callable[[Variants], Array] = of_geometry) -> Ask:
+def asks(kernel: Callable[[Robot], Kernel], *numbers: Numbers) -> Ask:
     """Return a program of a robot with its inputs, by default the geometry alone."""
-    return lambda robot: (kernel(robot), numbers)
+    return lambda robot: (kernel(robot), numbers or ("geometry",))
 
 
 forward: Final = asks(lambda robot: robot.engine.own_forward)
@@ -88,19 +68,19 @@ acceleration: Final = asks(lambda robot: robot.engine.acceleration)
 """From q, qd, qdd to the pose's second derivative."""
 singularity: Final = asks(lambda robot: robot.singularity_kernel())
 """From q to the singularity index."""
-torques: Final = asks(torques_kernel, of_masses)
+torques: Final = asks(torques_kernel, "masses", "geometry")
 """From q, qd, qdd and wrench to efforts."""
-torques_at_pose: Final = asks(followed_pose_torques, of_masses)
+torques_at_pose: Final = asks(followed_pose_torques, "masses", "geometry")
 """From pose, rate, acceleration and wrench to q, qd, qdd and efforts."""
-loads: Final = asks(loads_kernel, of_masses)
+loads: Final = asks(loads_kernel, "masses", "geometry")
 """From q, qd, qdd and wrench to the joints' loads and positions."""
-masses: Final = asks(masses_kernel, of_masses)
+masses: Final = asks(masses_kernel, "masses", "geometry")
 """From q to the mass matrix."""
-compliance: Final = asks(lambda robot: robot.cached(Elastic).compliance, of_elasticity)
+compliance: Final = asks(lambda robot: robot.cached(Elastic).compliance, "geometry", "elasticity")
 """From q to the compliance and its frame's pivot ratio."""
-torque_gradient: Final = asks(motion_gradient, of_masses)
+torque_gradient: Final = asks(motion_gradient, "masses", "geometry")
 """Derivatives of the torques by q, qd and qdd."""
-torque_numbers: Final = asks(numbers_gradient, of_masses)
+torque_numbers: Final = asks(numbers_gradient, "masses", "geometry")
 """Derivatives of the torques by geometry and masses."""
 platform_slopes: Final = asks(lambda robot: platform_gradient(robot.engine))
 """Derivatives of pose, position and rotation by geometry."""
@@ -108,5 +88,5 @@ pose_motion: Final = asks(lambda robot: pose_motion_gradient(robot.engine))
 """Derivatives of pose, rate and acceleration by q, qd and geometry."""
 singularity_slopes: Final = asks(lambda robot: singularity_gradient(robot.engine))
 """Derivatives of the index by q and geometry."""
-compliance_slopes: Final = asks(lambda robot: compliance_gradient(robot.cached(Elastic)), of_elasticity)
+compliance_slopes: Final = asks(lambda robot: compliance_gradient(robot.cached(Elastic)), "geometry", "elasticity")
 """Derivatives of the compliance by q and all numbers."""

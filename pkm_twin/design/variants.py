@@ -312,7 +312,7 @@ class Variants:
         code = kernel.code
         found = self._prepared.get(id(code))
         if found is None:
-            rows = numbers(self)
+            rows = np.concatenate([getattr(self, name) for name in numbers], 1)
             prepared = code.prepare(rows) if len(rows) else np.zeros((0, 1))
             found = self._prepared[id(code)] = code, prepared
         return found
@@ -354,7 +354,7 @@ class Variants:
     def _programs_by_structure(self, ask: programs.Ask) -> Iterator[tuple[Code, Array, NDArray[np.intp]]]:
         """Yield each structure's program with the machines that it is valid for."""
         # Without an assembly at home there are no inputs for any program.
-        left = np.asarray(~np.isnan(ask(self.robot)[1](self)).any(1))
+        left = ~np.isnan(np.concatenate([getattr(self, name) for name in ask(self.robot)[1]], 1)).any(1)
         others = self.functions.others
         robots = itertools.chain([self.robot, *others], self._build_robots(left))
         for robot in robots:
