@@ -32,7 +32,7 @@ from launch.launch_context import LaunchContext
 from launch.launch_description_entity import LaunchDescriptionEntity
 from launch_ros.actions import Node
 
-from delta_dynamics.simulation.machine import tuned
+from delta_dynamics.simulation.machine import tune_position_control
 from launch import LaunchDescription
 from pkm_twin import Robot
 from pkm_twin.export.ros2_control import CONTROLLER as FEEDFORWARD
@@ -222,7 +222,7 @@ def _controllers(given: dict[str, str], space: str) -> dict[str, dict[str, dict[
     """The settings with the robot's joints, each section under its node's full name."""
     robot = load_robot(given["robot"])
     try:
-        strong, damped = tuned(robot, float(given["bandwidth"] or 0.0))
+        strong, damped = tune_position_control(robot, float(given["bandwidth"] or 0.0))
     except ValueError as error:
         raise RuntimeError(f"bandwidth {given['bandwidth']!r}: {error}") from None
     path = Path(given["controllers"] or _settings_file(given, robot))

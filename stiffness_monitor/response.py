@@ -46,13 +46,14 @@ class ElementResponse:
 
         :raises ValueError: factors of another shape, or that are not finite.
         """
-        size, given = len(self.names), np.asarray(factors)
-        if np.iscomplexobj(given):
+        size = len(self.names)
+        if np.iscomplexobj(factors):
             # Complex factors serve complex-step derivatives.
+            given: Any = np.asarray(factors)
             one_vector(given.real, size, "factors")
             one_vector(given.imag, size, "factors")
         else:
-            given = one_vector(given, size, "factors")
+            given = one_vector(factors, size, "factors")
         change = (given - 1.0)[self.owner]
         matrix = np.eye(len(self.owner)) + self.rest * change
         columns = np.linalg.solve(matrix, np.swapaxes(self.reach, -1, -2))

@@ -255,7 +255,7 @@ def _joint_axes(given: Sequence[tuple[str, Array]], turn: Turn) -> Any:
         normal = cross(*columns)
         normal = normal * (1.0 / size(normal))
         columns = [columns[0], cross(normal, columns[0]), normal]
-    return np.array(columns).T
+    return np.array([[*column] for column in columns]).T
 
 
 def plan_structure(graph: Graph, structure: Structure) -> StructuralModel:

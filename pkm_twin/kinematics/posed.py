@@ -316,14 +316,15 @@ class CarriedScheme(Scheme):
     def platform_pivots(self) -> Order | None:
         """Equations and slides by which :meth:`close_platform` eliminates; None: it has no solution.
 
-        It is tried if limbs leave slides and at most one turn of the platform to Newton's method,
-        and holds if it gives the sampled states again.
+        It is tried if limbs leave one turn and slides of the platform to Newton's method, and
+        holds if it gives the sampled states again. Slides alone stay with Newton's method, which
+        rejects poses at a singularity, where a pivot may vanish.
         """
         places, rates = self.solved
         steps = [self.tree.steps[name] for name in self.chain.joints] if self.by_pose else []
         left = [step for step in steps if not step.actuated and step.rate in rates]
         slides = [step.rate for step in left if not step.circle]
-        if not left or len(left) != len(rates) or len(slides) < len(left) - 1:
+        if len(left) != len(rates) or len(slides) != len(left) - 1:
             return None
         tables = np.array([numbers(self._affine_rows(self.tree, q)[1])[:, slides] for _, q in self.samples])
         kept = independent_rows(tables) if slides else []
@@ -362,13 +363,11 @@ class CarriedScheme(Scheme):
         """
         steps = {step.rate: step for step in tree.steps.values() if not step.actuated}
         order, slides = [row for row, _ in pivots], [column for _, column in pivots]
-        turn = next((steps[rate] for rate in self.solved[1] if rate not in slides), None)
+        turn = next(steps[rate] for rate in self.solved[1] if rate not in slides)
 
         def eliminate(q: Numbers) -> tuple[Objects, SparseLU, Objects, Objects, list[Any]]:
             values, table, quarter = self._affine_rows(tree, q)
             lu = SparseLU(table[order][:, slides], tuple((k, k) for k in range(len(order))))
-            if turn is None:
-                return values, lu, values, values, []
             last = next(k for k in range(len(values)) if k not in order)
             weights = lu.solve_transposed(table[last, slides])
             h, k = -quarter[:, turn.rate], table[:, turn.rate]
@@ -376,13 +375,12 @@ class CarriedScheme(Scheme):
 
         values, lu, h, k, last = eliminate(q)
         x = np.array(tree.home, dtype=object)
-        if turn is not None:
-            a, b, c = last
-            at_home = eliminate(tree.graph.lead_home)[-1][1]
-            square, side = a * a + b * b, -sign_of(at_home) * sqrt(a * a + b * b - c * c)
-            cosine, sine = (a * c - b * side) / square, (b * c + a * side) / square
-            x[turn.position : turn.position + 2] = cosine, sine
-            values = values + h * (cosine - 1.0) + k * sine
+        a, b, c = last
+        at_home = eliminate(tree.graph.lead_home)[-1][1]
+        square, side = a * a + b * b, -sign_of(at_home) * sqrt(a * a + b * b - c * c)
+        cosine, sine = (a * c - b * side) / square, (b * c + a * side) / square
+        x[turn.position : turn.position + 2] = cosine, sine
+        values = values + h * (cosine - 1.0) + k * sine
         for rate, value in zip(slides, lu.solve(-values[order]), strict=True):
             x[steps[rate].position] = value
         return list(x[self.solved[0]])

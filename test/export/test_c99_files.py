@@ -186,7 +186,7 @@ def test_a_compliance_that_is_missing_leaves_the_rest(tmp_path):
 
 def test_sections_that_contradict_masses_leave_elasticity_out_with_the_reason(variant):
     heavy, _ = variant("delta_cu", inertia={"forearm_mass": 5.0})
-    with pytest.warns(RobotWarning, match=r"elasticity: members\.forearm\.density: "):
+    with pytest.warns(RobotWarning, match=r"elasticity: .*members\.forearm\.density"):
         made = c_package(heavy)
     assert "_torques(" in made["pkm_delta_cu.h"] and "_compliance(" not in made["pkm_delta_cu.h"]
 

@@ -171,7 +171,7 @@ def test_mass_matrix_and_accelerations_at_a_pose_are_those_of_its_joints(name, r
     np.testing.assert_array_equal(one.acceleration, found.acceleration[0])
 
 
-@pytest.mark.parametrize("name", ["prru", "rps3", "upr_rpu"])
+@pytest.mark.parametrize("name", ["prru", "rps3"])
 def test_slides_and_a_turn_of_the_platform_are_those_of_all_closures(name, rng):
     posed = load(name).engine.posed
     assert posed.platform_pivots
