@@ -260,15 +260,15 @@ class _Carried:
         left = np.array([lu.solve_transposed(table[kept, k]) for k in kept], dtype=object).T
         both = [lu.solve_transposed(row) for row in left]
         coupled = np.array([lu.solve_transposed(table[kept, k]) for k in range(m)], dtype=object) @ jq
-        by_rates = _mirrored(both) @ jq
+        by_rates = _complete_symmetric(both) @ jq
         mass = table[:m, :m] - coupled - coupled.T + jq.T @ by_rates
         for rotor, row in zip(self.parts[ROTORS], self.drives, strict=True):
             mass = mass + rotor * row[:, None] * row
-        return _mirrored(mass)
+        return _complete_symmetric(mass)
 
 
-def _mirrored(matrix: Any) -> Objects:
-    """Return a symmetric matrix of its lower triangle: the upper one is not computed."""
+def _complete_symmetric(matrix: Any) -> Objects:
+    """Return the whole symmetric matrix whose lower triangle is given."""
     return np.array([[matrix[max(i, k)][min(i, k)] for k in range(len(matrix))] for i in range(len(matrix))], object)
 
 
@@ -335,7 +335,7 @@ def _pose_masses(t: Traced, scheme: CarriedScheme | None, *, certified: bool) ->
         own = made = _Carried(t, scheme, certified=certified)
         on_pose = made.masses()
         half = np.array([made.lead.solve_transposed(row) for row in on_pose], dtype=object).T
-        mass = _mirrored([made.lead.solve_transposed(row) for row in half])
+        mass = _complete_symmetric([made.lead.solve_transposed(row) for row in half])
     return own.program({"matrix": t.drives.shared_on_both(mass), "on pose": np.ravel(on_pose)})
 
 

@@ -306,13 +306,18 @@ class Variants:
             return False
         return True
 
+    def _join(self, names: Sequence[programs.Numbers]) -> Array:
+        """Return a program's inputs of each machine, shape (k, size)."""
+        parts: list[Array] = [getattr(self, name) for name in names]
+        return np.concatenate(parts, 1)
+
     def _prepare(self, ask: programs.Ask, robot: Robot) -> tuple[Code, Array]:
         """Return a robot's program, and its inputs of each machine, shape (k, prepared + 1)."""
         kernel, numbers = ask(robot)
         code = kernel.code
         found = self._prepared.get(id(code))
         if found is None:
-            rows = np.concatenate([getattr(self, name) for name in numbers], 1)
+            rows = self._join(numbers)
             prepared = code.prepare(rows) if len(rows) else np.zeros((0, 1))
             found = self._prepared[id(code)] = code, prepared
         return found
@@ -354,7 +359,7 @@ class Variants:
     def _programs_by_structure(self, ask: programs.Ask) -> Iterator[tuple[Code, Array, NDArray[np.intp]]]:
         """Yield each structure's program with the machines that it is valid for."""
         # Without an assembly at home there are no inputs for any program.
-        left = ~np.isnan(np.concatenate([getattr(self, name) for name in ask(self.robot)[1]], 1)).any(1)
+        left = ~np.isnan(self._join(ask(self.robot)[1])).any(1)
         others = self.functions.others
         robots = itertools.chain([self.robot, *others], self._build_robots(left))
         for robot in robots:

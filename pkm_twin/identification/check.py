@@ -54,7 +54,7 @@ COMPARED: Final = "compared efforts"
 IDLE: Final = "drives off or braked"
 COMPUTED: Final = "the efforts of this table are the model's; expected columns JOINT.measured"
 DEVIATIONS: Final = (1, 2, 3)
-"""Of the model, inside which residuals are counted."""
+"""Multiples of the model's standard deviation within which residuals are counted."""
 MIN_SINGULARITY: Final = 1e-3
 """Least good singularity index, 0 in a singularity, 1 at best."""
 MIN_COMPARED: Final = 0.1
@@ -301,7 +301,7 @@ def _singularity(r: Recording) -> Fact:
 
 
 def _shares(r: Recording, idle: Mask, compared: Compared | None) -> tuple[list[Fact], str]:
-    """State what is left out, and why there is no verdict, if there is none."""
+    """Return the samples that are left out, and the reason where too few remain for a verdict."""
     items, total = [], max(float(r.time[-1]), 1e-9)
     used = 0 if compared is None else sum(len(track.time) for track in compared.tracks)
     share = used / len(r.time)

@@ -46,7 +46,7 @@ class Columns:
     turning: Mask
     """Friction, whose sign is that of the velocity, (c,)."""
     gains: int = 0
-    """How many of the last columns are gains of the efforts, of each joint and of all."""
+    """Number of gain columns, which stand last: one for each joint, and one for all joints."""
 
     @classmethod
     def of(cls, rows: Rows) -> Columns:

@@ -186,7 +186,7 @@ def fit_elements(
     verdict = _verdict(robot, parts, found, factors, zeros)
     if not faults:
         odd = verdict.answer == "does not explain"
-        faults = _unexplained(robot, parts, factors, zeros, odd)
+        faults = _list_unexplained(robot, parts, factors, zeros, odd)
         refuse_faults(faults, accept)
     numbers = _numbers(robot, names, factors, found, verdict)
     if all(number.status == "not excited" for number in numbers):
@@ -286,14 +286,14 @@ def _part_left(part: _Part, factors: Array, zero: Array) -> float:
     noise = 0.5 * np.nanmean(np.diff(told, axis=0) ** 2, 0)
     expected, _ = part.moved(np.ones(len(factors)))
     due = np.nanvar(expected[: part.split, part.measured], 0)
-    # A direction that varies more than its noise tells of the elements, and one that should.
+    # Only directions that vary more than their noise, or should, have information on the elements.
     good = (size > 4.0 * noise) | (due > 0.5 * noise)
     if not good.any():
         return 0.0
     return float(np.sqrt(np.mean(np.nanmean(left**2, 0)[good] / size[good])))
 
 
-def _unexplained(robot: Robot, parts: Sequence[_Part], factors: Array, zeros: Array, odd: bool) -> list[str]:
+def _list_unexplained(robot: Robot, parts: Sequence[_Part], factors: Array, zeros: Array, odd: bool) -> list[str]:
     """List recordings that no compliance of this robot explains, each with the likely fault.
 
     A direction of noise alone is no fault where others are explained.
@@ -320,7 +320,7 @@ def _unexplained(robot: Robot, parts: Sequence[_Part], factors: Array, zeros: Ar
 
 
 def _best_repair(robot: Robot, part: _Part, most: float) -> tuple[str, float]:
-    """Return the fault without which a recording is explained best, and what is left then."""
+    """Return the fault whose repair leaves the smallest residual, and that residual."""
     cause, best = "", 0.8 * most
     for text, other in _repairs(robot, part):
         left = other.left()

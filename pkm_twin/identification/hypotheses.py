@@ -82,7 +82,7 @@ class Hypothesis:
 
 @dataclass(frozen=True)
 class Explanation:
-    """What explains a recording, in words; empty where the file does, or several numbers together.
+    """Name the cause of a recording's deviations; empty if the file or several numbers explain them.
 
     ``fault``: this machine cannot have made the recording, or not with the payload that is given.
     ``load``: the payload that explains the efforts.
@@ -265,7 +265,7 @@ class Search:
     def _find_gains(self, gains: Array | None = None, kinds: str = "") -> tuple[Array, Array]:
         """Return each joint's gain, a part of its efforts, beside a delay; its deviation.
 
-        :param gains: factors on the model's efforts beside it. ``kinds``: numbers beside it.
+        :param gains: factors that multiply the model's efforts. ``kinds``: numbers estimated too.
         """
         c, n = self.columns, len(self.joints)
         used = np.arange(len(c.kinds)) >= len(c.kinds) - c.gains

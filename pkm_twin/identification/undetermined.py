@@ -21,7 +21,7 @@ from pkm_twin.machine.graph import Graph, limbs
 from pkm_twin.machine.places import keys_of
 
 LINES: Final = 10
-"""Most lines in which what is not determined is told."""
+"""Largest number of lines that list undetermined numbers."""
 NAMED: Final = 6
 """Names in a list before the others are counted."""
 AXES: Final = "xyz"

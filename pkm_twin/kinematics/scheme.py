@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""How a graph's equations are solved: independent closures, their pivots, pose coordinates."""
+"""Choose how a graph's equations are solved: independent closures, pivots, pose coordinates."""
 
 from __future__ import annotations
 
@@ -147,7 +147,7 @@ class Scheme(Linkage):
 
     @property
     def platform_pivots(self) -> Order | None:
-        """How the platform's unknowns are found in closed form; None: by Newton's method."""
+        """Pivots of the platform's closed form; None: Newton's method finds its unknowns."""
         return None
 
     def close_platform(self, tree: Tree, q: Numbers, pivots: Order) -> list[Any]:

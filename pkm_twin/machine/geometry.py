@@ -24,7 +24,7 @@ class SizedGraph(Graph):
 
     given: Sequence[Any] = field(default=())
     names: tuple[str, ...] = ()
-    """Of the bodies whose frames are given, in order."""
+    """Names of the bodies whose frames are given, in order."""
 
     @property
     def size(self) -> Any:

@@ -23,6 +23,7 @@ from test.support.robots import load, parameters_of, without
 from test.support.tables import joined, read_columns
 
 GEAR = {"inertia": 1.73e-5, "ratio": 10.0, "efficiency": 0.9}
+MOTOR = {"inertia": 1.73e-5, "continuous_torque": 9.0, "peak_torque": 9.0, "rated_speed": 3000.0}
 
 
 @pytest.fixture
@@ -204,14 +205,7 @@ def test_the_ratio_is_that_of_a_search_by_brute_force(twin, tmp_path, geared):
 def test_listed_gears_have_inertia_limits_and_cost(twin, tmp_path, geared):
     out, drives = tmp_path / "cycle.csv", tmp_path / "drives.yaml"
     twin.good("path", geared, "--cycle", "25,200", "--out", out, "--no-picture")
-    motor = {
-        "inertia": 1.73e-5,
-        "continuous_torque": 9.0,
-        "peak_torque": 9.0,
-        "cost": 100.0,
-        "rated_speed": 3000.0,
-        "max_speed": 9000.0,
-    }
+    motor = MOTOR | {"cost": 100.0, "max_speed": 9000.0}
     gears = {
         "weak": {"ratio": 20.0, "peak_torque": 1.0},
         "tight": {
@@ -250,13 +244,7 @@ def test_listed_gears_have_inertia_limits_and_cost(twin, tmp_path, geared):
 def test_a_motor_is_limited_by_its_curve(twin, tmp_path, geared):
     out, drives = tmp_path / "cycle.csv", tmp_path / "drives.yaml"
     twin.good("path", geared, "--cycle", "25,200", "--out", out, "--no-picture")
-    motor = {
-        "inertia": 1.73e-5,
-        "continuous_torque": 9.0,
-        "peak_torque": 9.0,
-        "rated_speed": 3000.0,
-        "max_speed": 5000.0,
-    }
+    motor = MOTOR | {"max_speed": 5000.0}
     drives.write_text(
         yaml.safe_dump({"drives": {"flat": motor, "slow": {**motor, "curve": [[0.0, 9.0], [200.0, 9.0]]}}})
     )
