@@ -308,8 +308,7 @@ class Variants:
 
     def _join(self, names: Sequence[programs.Numbers]) -> Array:
         """Return a program's inputs of each machine, shape (k, size)."""
-        parts: list[Array] = [getattr(self, name) for name in names]
-        return np.concatenate(parts, 1)
+        return np.concatenate([getattr(self, name) for name in names], 1)
 
     def _prepare(self, ask: programs.Ask, robot: Robot) -> tuple[Code, Array]:
         """Return a robot's program, and its inputs of each machine, shape (k, prepared + 1)."""
@@ -359,7 +358,7 @@ class Variants:
     def _programs_by_structure(self, ask: programs.Ask) -> Iterator[tuple[Code, Array, NDArray[np.intp]]]:
         """Yield each structure's program with the machines that it is valid for."""
         # Without an assembly at home there are no inputs for any program.
-        left = ~np.isnan(self._join(ask(self.robot)[1])).any(1)
+        left = np.asarray(~np.isnan(self._join(ask(self.robot)[1])).any(1))
         others = self.functions.others
         robots = itertools.chain([self.robot, *others], self._build_robots(left))
         for robot in robots:
