@@ -22,8 +22,8 @@ from pkm_twin.codegen.cholesky import SparseCholesky
 from pkm_twin.codegen.expressions import GEOMETRY
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.lu import Order, SparseLU, independent_rows, pivot_order
-from pkm_twin.codegen.operations import absolute, maximum, minimum, sqrt
-from pkm_twin.codegen.program import Program
+from pkm_twin.codegen.operations import absolute, less, maximum, minimum, select, sqrt
+from pkm_twin.codegen.program import MAX_GROWTH, Program
 from pkm_twin.kinematics.motion import Motion
 from pkm_twin.kinematics.traced import Traced
 from pkm_twin.robot.robot import Robot
@@ -192,12 +192,14 @@ class SymbolicFrame:
             known = Motion(t.tree, *self.elastic.robot.engine.samples[chosen.sample])
             # The sample state belongs to this geometry only.
             assumed += [(e, e.value) for e in t.tape.inputs(GEOMETRY, len(t.tape.reference))]
-        follow, inverse, _ = solve_dependents(self.frame, chosen)
+        follow, lu, _ = solve_dependents(self.frame, chosen)
         _, there, left = solve_dependents(self._frame(known), chosen)
         # With other numbers a redundant closure could become independent; numbers agree to 1e-9, residuals to 1e-6.
         assumed += [(e * 1e-3, 0.0) for e in t.lift(left)]
         # Zero where the closures no longer determine the chosen coordinates.
-        self.measure = 1.0 / maximum(absolute(inverse / there), _TINY)
+        self.measure = 1.0 / maximum(absolute(lu.inverse_determinant / there.inverse_determinant), _TINY)
+        growth = lu.find_growth(there.inverse_pivots, np.ones(lu.size))
+        self.measure = select(less(growth, MAX_GROWTH), self.measure, 0.0)
         return follow
 
     def factorise(self) -> None:
@@ -266,11 +268,11 @@ class SymbolicFrame:
         return Program(sizes, 0, rows, t.equations())
 
 
-def solve_dependents(frame: Frame, chosen: DependentCoordinates) -> tuple[dict[int, Row], Any, list[Any]]:
+def solve_dependents(frame: Frame, chosen: DependentCoordinates) -> tuple[dict[int, Row], SparseLU, list[Any]]:
     """Solve the closures for the chosen coordinates.
 
-    :returns: their rows of the other coordinates, the reciprocal determinant of the system, and the
-    residuals of the redundant closures, which must be zero.
+    :returns: their rows of the other coordinates, the factors of the system, and the residuals of
+        the redundant closures, which must be zero.
     """
     table = frame.table()[list(chosen.rows)]
     lu = SparseLU(table[:, list(chosen.chosen)], chosen.pivots)
@@ -279,7 +281,7 @@ def solve_dependents(frame: Frame, chosen: DependentCoordinates) -> tuple[dict[i
     follow = {c: sum_forms((rest, [one[i] for one in solved])) for i, c in enumerate(chosen.chosen)}
     others = (row for r, row in enumerate(frame.held) if r not in chosen.rows)
     left = [value for row in others for value in _substitute(row, follow).values()]
-    return follow, lu.inverse_determinant, left
+    return follow, lu, left
 
 
 def _substitute(row: Row, follow: dict[int, Row]) -> Row:

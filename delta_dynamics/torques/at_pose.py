@@ -21,7 +21,7 @@ from delta_dynamics.torques.virtual_work import (
     solve_massive,
 )
 from pkm_twin.codegen.arrays import Array, vectors
-from pkm_twin.codegen.code import GOOD
+from pkm_twin.codegen.code import GOOD, REFUSED
 from pkm_twin.codegen.expressions import PARAMETERS, Numbers, Objects, snapped_all
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.lu import SparseLU
@@ -32,6 +32,7 @@ from pkm_twin.kinematics.posed import CarriedScheme
 from pkm_twin.kinematics.programs import certify_assembly, follow_pose, pose_factors, solve_pose
 from pkm_twin.kinematics.traced import Traced
 from pkm_twin.machine.inertia import ROTORS, Layout, change_of_frame, loaded_joints
+from pkm_twin.robot.rejection import report_lost_digits
 from pkm_twin.robot.robot import Robot
 
 
@@ -134,7 +135,12 @@ def evaluate_at_pose(robot: Robot, kernel: PoseKernel, p: Array, *given: ArrayLi
         left = status[..., 0] != GOOD
         again, status = kernel(robot, certified=False)(p, *(row[left] for row in rows))
         if status is not None:
-            raise ValueError("an input in addition to the pose is not finite, or too large")
+            lost = np.flatnonzero(status[:, 0] == REFUSED)
+            if not len(lost):
+                raise ValueError("an input in addition to the pose is not finite, or too large")
+            index = tuple(int(k) for k in np.argwhere(left)[lost[0]])
+            q = robot.inverse(rows[0][index])[robot.graph.leading]
+            raise report_lost_digits("pose", index, robot.engine.reach(q)[2])
         for values, new in zip(found, again, strict=True):
             values[left] = new
     return found
@@ -191,7 +197,8 @@ class _Carried:
     def program(self, outputs: dict[str, Numbers], **inputs: int) -> Program:
         """Return the program; ``inputs``: sizes of those besides the pose."""
         t, posed = self.t, self.posed
-        branch = certify_assembly(t, self.scheme, posed, self.q) if self.certified else []
+        branch: list[Any] = t.limit_growth(self.lead, t.drive_scales, t.pose_scales)
+        branch += certify_assembly(t, self.scheme, posed, self.q) if self.certified else []
         return Program(
             {"pose": len(posed.q)} | inputs,
             self.layout.size,
@@ -277,7 +284,7 @@ class _Followed:
 
     def __init__(self, t: Traced) -> None:
         self.t = t
-        self.equations, self.q = follow_pose(t)
+        self.equations, self.q = follow_pose(t, rates=True)
         self.layout = Layout(t.tree)
         self.parts = self.layout.split(t.tape.inputs(PARAMETERS, self.layout.size))
         self.lead = pose_factors(t)

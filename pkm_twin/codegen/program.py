@@ -37,6 +37,8 @@ NEXT: Final = 0.01
 """Largest first correction of a stream's sample, which starts from the sample before."""
 LEAST: Final = 1e-8
 """Smallest determinant, relative to the determinant at home."""
+MAX_GROWTH: Final = LEAST**-2
+"""Largest :meth:`.SparseLU.find_growth`: results keep half of their digits."""
 MARGIN: Final = 5.0
 """Smallest ratio of determinant to correction for a guess in a single step: a longer correction may
 cross two singularities, to a determinant of the same sign. In several steps the first corrections

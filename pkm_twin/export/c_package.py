@@ -402,6 +402,7 @@ class Package:
                 found = [self._read(kernel, rate=way) for way in ways]
                 rows, equations = found[0]
                 terms = TransmissionTerms(robot, self.fold, rows["ratio"])
+                equations = terms.limit_growth(equations)
                 if curved:
                     changes = [rows["change"] for rows, _ in found]
                     outputs = terms.gains(changes)

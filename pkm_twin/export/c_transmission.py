@@ -10,6 +10,7 @@ The joint side has the pose coordinates, the actuator side q. With the ratio B =
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ import numpy as np
 from pkm_twin.codegen.cholesky import SparseCholesky
 from pkm_twin.codegen.expressions import Expression, Objects
 from pkm_twin.codegen.lu import SparseLU, pivot_order
+from pkm_twin.codegen.program import MAX_GROWTH, Equations
 from pkm_twin.export.c99 import Folding
 from pkm_twin.robot.robot import Robot
 
@@ -40,11 +42,20 @@ class TransmissionTerms:
         else:
             near = np.array([q for _, q in robot.engine.samples])
             self._lu = SparseLU(self.ratio, pivot_order(robot.inverse_jacobian(near)))
+            sizes = [[1.0 / robot.size if u == "m" else 1.0 for u in v] for v in (robot.joint_units, robot.pose_units)]
+            self._growth = self._lu.find_growth(*sizes)
 
     def actuator_side(self) -> dict[str, list[Expression]]:
         """Return rates and efforts of the actuators by the inputs ``velocity`` and ``effort``."""
         velocity, effort = (self.tape.inputs(name, self.m) for name in ("velocity", "effort"))
         return {"qd": self._lift(self.ratio @ velocity), "tau": self._lift(self._efforts(effort))}
+
+    def limit_growth(self, equations: Sequence[Equations]) -> list[Equations]:
+        """Return equations that also reject poses where a pivot of B vanishes."""
+        *first, last = equations
+        if self.robot.redundant or not isinstance(self._growth, Expression):
+            return [*equations]
+        return [*first, replace(last, branch=[*last.branch, self.tape.lift(MAX_GROWTH - self._growth)])]
 
     def gains(self, changes: Sequence[Sequence[Expression]]) -> dict[str, list[Expression]]:
         """Return Ka and Da by the inputs ``stiffness``, ``damping`` and ``tau``.

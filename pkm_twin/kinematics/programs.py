@@ -159,10 +159,12 @@ def inverse_program(t: Traced, scheme: CarriedScheme | None) -> Program:
     return Program({"pose": len(pose)}, 0, {"q": t.lift(q)}, equations)
 
 
-def confirm_pose(t: Traced, leads: Numbers) -> tuple[Equations, ...]:
+def confirm_pose(t: Traced, leads: Numbers, *, rates: bool = False) -> tuple[Equations, ...]:
     """Return the closures of the leading joints as ``forward`` solves them, with its pose as verdict.
 
     The joints of a pose may belong to another assembly too; such a pose is rejected.
+
+    :param rates: whether results depend on :func:`pose_factors` too.
     """
     t.solve()
     pose = t.tape.inputs("pose", len(t.scheme.coordinates))
@@ -175,6 +177,8 @@ def confirm_pose(t: Traced, leads: Numbers) -> tuple[Equations, ...]:
             same.append(cos(apart))
             apart = sin(apart)
         same.append(SAME_POSE - absolute(apart) * scale)
+    if rates:
+        same += t.limit_growth(pose_factors(t), t.pose_scales, t.drive_scales)
     return t.equations(branch=t.lift(same), goal=t.lift(leads), stage=1)
 
 
@@ -206,7 +210,7 @@ def transmission_program(t: Traced, scheme: CarriedScheme | None, *, certified: 
     m = len(t.scheme.coordinates)
     rate = t.tape.inputs("rate", m) if curved else None
     if scheme is None:
-        equations, leads = follow_pose(t)
+        equations, leads = follow_pose(t, rates=True)
         q = t.tree.values_of_drives(leads, t.x)
         lu = pose_factors(t)
         follow = np.array(t.rate_columns(), dtype=object).T
@@ -242,13 +246,15 @@ def actuator_program(t: Traced) -> Program:
     twists = t.twists(t.graph.platform, position, t.rate_columns())
     rows = zip(*[poses.rates(t.scheme.coordinates, rotation, v, w) for v, w in twists], strict=True)
     velocity = [np.array(t.drives.shared(row), dtype=object) @ qd for row in rows]
-    effort = pose_factors(t).solve_transposed(t.drives.on_leads([*tau]))
+    factors = pose_factors(t)
+    effort = factors.solve_transposed(t.drives.on_leads([*tau]))
     outputs = {
         "pose": t.lift(poses.values(t.scheme.coordinates, position, rotation)),
         "velocity": t.lift(velocity),
         "effort": t.lift(effort),
     }
-    return Program(t.inputs("q", "qd", "tau"), 0, outputs, t.equations())
+    sound = t.limit_growth(factors, t.pose_scales, t.drive_scales)
+    return Program(t.inputs("q", "qd", "tau"), 0, outputs, t.equations(branch=sound))
 
 
 def pose_factors(t: Traced) -> SparseLU:
@@ -305,10 +311,12 @@ def certify_assembly(t: Traced, scheme: CarriedScheme, posed: Traced, q: Sequenc
     ]
 
 
-def follow_pose(t: Traced) -> tuple[tuple[Equations, ...], Objects]:
+def follow_pose(t: Traced, *, rates: bool = False) -> tuple[tuple[Equations, ...], Objects]:
     """Solve the machine's own tree for a pose, and return the equations and the leading joints.
 
     Newton's method finds all unknowns and joints; :func:`confirm_pose` judges them.
+
+    :param rates: as of :func:`confirm_pose`.
     """
     scheme, tree, tape = t.scheme, t.tree, t.tape
     goal = tape.inputs("pose", len(scheme.coordinates))
@@ -348,4 +356,4 @@ def follow_pose(t: Traced) -> tuple[tuple[Equations, ...], Objects]:
         unknowns=POSED,
     )
     leads = everything[size:]
-    return (solved, *confirm_pose(t, leads)), leads
+    return (solved, *confirm_pose(t, leads, rates=rates)), leads

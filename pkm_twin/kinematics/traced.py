@@ -21,7 +21,7 @@ from pkm_twin.codegen.expressions import (
     snapped_all,
 )
 from pkm_twin.codegen.lu import SparseLU
-from pkm_twin.codegen.program import AT, LEAST, STATE, UNKNOWNS, Equations, previous
+from pkm_twin.codegen.program import AT, LEAST, MAX_GROWTH, STATE, UNKNOWNS, Equations, previous
 from pkm_twin.kinematics.constraints import cross
 from pkm_twin.kinematics.drives import LEADS, TIME, Drives
 from pkm_twin.kinematics.limb_pose import LimbPose
@@ -146,6 +146,12 @@ class Traced:
             more["goal"] = self.lift(self.drives.given("q"))
             more["branch"] = [*more.pop("branch", ()), *self.lift(self.drives.tolerance_margins())]
         scheme, tree = self.scheme, self.tree
+        branch: list[Expression] = []
+        if self.lu.used:
+            # Results depend on these factors, not corrections alone.
+            scales = [self.rows[k].scale for k in scheme.independent]
+            branch = self.limit_growth(self.lu, scales, [tree.scales[k] for k in scheme.varying])
+        determinant = self.determinant
         places, rates = scheme.solved if scheme.platform_pivots is None else ([], [])
         step: Numbers = -self.newton.solve([row.value for row in self.solved]) if places else []
         rows: list[Any] = [0.0] * tree.unknown_rates
@@ -155,10 +161,9 @@ class Traced:
         before = self.tape.inputs(previous(self.unknowns_name), len(places))
         state = self.tape.inputs(STATE, len(AT))
         onward = [x + state[AT.onward] * (x - last) for x, last in zip(self.unknowns, before, strict=False)]
-        branch, determinant = [], self.determinant
         if not places:
             # Nothing is corrected: the result alone is judged.
-            branch, determinant = self.lift([determinant - LEAST]), 1.0
+            branch, determinant = [*branch, *self.lift([determinant - LEAST])], 1.0
         judged = [self.rows[k] for k in scheme.judged]
         solved = Equations(
             self.target,
@@ -176,6 +181,14 @@ class Traced:
             **more,
         )
         return (solved,)
+
+    def limit_growth(self, lu: SparseLU, rows: Numbers, columns: Numbers) -> list[Expression]:
+        """Return numbers that are above zero where no pivot of factors vanishes.
+
+        :param rows: factors that make rows and ``columns`` of the matrix of unit one.
+        """
+        growth = lu.find_growth(rows, columns)
+        return self.lift([MAX_GROWTH - growth]) if isinstance(growth, Expression) else []
 
     def retracted(self, values: Numbers, rates: Numbers = ()) -> list[Expression]:
         """Return Newton's unknowns after a step of small rates; turns are normalised."""

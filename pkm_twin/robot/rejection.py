@@ -107,6 +107,8 @@ def reject_joints(
     gap = None if engine.start is None else engine.start.find_miss(engine.tree, sample)
     if gap is not None:
         raise UnreachableError("joint state", robot.name_limb(gap[0]), index, gap[1])
+    if reached == 1.0 and try_program(engine.forward, given["q"])[1]:
+        raise report_lost_digits("joint state", index, engine.reach(sample)[2])
     drive, change = _find_correction(robot, engine, sample)
     if change < np.inf and robot.graph.joints[drive].slides:
         raise UnreachableError("joint state", robot.name_limb(drive), index, change)
@@ -115,6 +117,15 @@ def reject_joints(
         raise SingularityError("joint state", index, measure, SINGULARITY_BOUND, reached, question=question)
     limb = robot.name_limb(drive if change < np.inf else part)
     raise UnreachableError("joint state", limb, index, miss, reached)
+
+
+def report_lost_digits(what: str, index: tuple[int, ...], measure: float) -> SingularityError:
+    """Return the error of a state whose equations lose a pivot, :meth:`.SparseLU.find_growth`.
+
+    :param measure: reciprocal condition of the closures, dimensionless.
+    """
+    text = f": a pivot of the compiled equations vanishes at reciprocal condition {measure:.3g}"
+    return SingularityError(what, index, measure, SINGULARITY_BOUND, question=f"{text}; a state 1e-6 away has results")
 
 
 def _find_correction(robot: Mechanism, engine: Engine, q: Array) -> tuple[str, float]:

@@ -6,13 +6,14 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
-from delta_dynamics import inverse_dynamics, least_norm_reactions, mass_matrix, reactions
+from delta_dynamics import inverse_dynamics, inverse_dynamics_at_pose, least_norm_reactions, mass_matrix, reactions
 from pkm_twin import load, variants
-from pkm_twin.errors import ParameterError
+from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.robot.robot_urdf import robot_description, robot_urdf
 from pkm_twin.robot.workspace import INSIDE, random_joints
 from stiffness_monitor import platform_response
+from test.support.robots import data_of
 
 GRAVITY = 9.81
 SCREW, CARRIAGE, ROTOR = 4e-5, 2.5, 1.2e-5
@@ -209,3 +210,32 @@ def test_screws_of_other_leads_have_their_own_reactions(rng):
     for k, lead in enumerate(leads):
         own = reactions(slide(lead), q, qd, qdd, wrench)
         np.testing.assert_allclose(found.wrenches[k], own.wrenches, atol=1e-12 * 40)
+
+
+def test_a_pose_of_another_assembly_of_a_machine_with_a_screw_is_rejected(rng):
+    """A screw lifts a carriage, whose link pushes a table: its place on the other side has the same joint position."""
+    right, high = 0.3, 0.4
+    data = data_of(slide(0.02))
+    data |= {"platform": "table", "origin": [right, 0, 0], "pose": ["x"]}
+    data["bodies"] |= {
+        "link": {"mass": 0.3, "com": [right / 2, 0, high / 2], "inertia": [0.006, 0.006, 0.001]},
+        "table": {"mass": 1.0, "com": [right, 0, 0], "inertia": [0.01, 0.01, 0.01]},
+    }
+    pin = {"type": "revolute", "axis": [0, 1, 0]}
+    data["joints"] |= {
+        "upper": pin | {"between": ["carriage", "link"], "at": [0, 0, high]},
+        "lower": pin | {"between": ["link", "table"], "at": [right, 0, 0]},
+        "bed": {"type": "prismatic", "between": ["base", "table"], "axis": [1, 0, 0]},
+    }
+    robot = robot_of_data(data, "toggle")
+    x = rng.uniform(-0.49, 0.49, (400, 1))
+    good = robot.try_inverse(x)[1]
+    assert not good[x[:, 0] < 0.0].any()
+    assert good[x[:, 0] > 0.02].all()
+    still = np.zeros(1)
+    found = inverse_dynamics_at_pose(robot, x[good], still, still)
+    np.testing.assert_allclose(robot.forward(found.q), x[good], atol=1e-9)
+    np.testing.assert_allclose(found.tau, inverse_dynamics(robot, found.q, still, still), rtol=1e-9)
+    for pose in x[~good][:10]:
+        with pytest.raises(PkmTwinError):
+            inverse_dynamics_at_pose(robot, pose, still, still)
