@@ -131,7 +131,7 @@ class SparseLU:
         for _, _, inverse in self._pivots:
             self.inverse_determinant = inverse * self.inverse_determinant
 
-    def find_growth(self, rows: Numbers | Mapping[int, Any], columns: Numbers) -> Any:
+    def find_growth(self, rows: Numbers | Mapping[int, Any], columns: Numbers, *, every: bool = False) -> Any:
         """Return a bound of the square by which elimination magnifies rounding.
 
         Pivots are fixed, and one may vanish although the matrix is regular: what it eliminates then
@@ -139,10 +139,11 @@ class SparseLU:
         9.3). It is the sum of 1 / pivot^2, of unit one, of the pivots that eliminate others.
 
         :param rows: factors that make rows of unit one, (n,). ``columns``: the same of unknowns.
+        :param every: whether pivots that eliminate nothing, small where the matrix is singular, count.
         """
         growth: Any = 0.0
         for (row, column, inverse), lower, upper in zip(self._pivots, self._lower, self._upper, strict=True):
-            if lower and upper:
+            if every or (lower and upper):
                 unit = inverse * (columns[column] / rows[row])
                 growth = growth + unit * unit
         return growth

@@ -316,15 +316,14 @@ class CarriedScheme(Scheme):
     def platform_pivots(self) -> Order | None:
         """Equations and slides by which :meth:`close_platform` eliminates; None: it has no solution.
 
-        It is tried if limbs leave one turn and slides of the platform to Newton's method, and
-        holds if it gives the sampled states again. Slides alone stay with Newton's method, which
-        rejects poses at a singularity, where a pivot may vanish.
+        It is tried if limbs leave slides and at most one turn of the platform to Newton's method,
+        and holds if it gives the sampled states again.
         """
         places, rates = self.solved
         steps = [self.tree.steps[name] for name in self.chain.joints] if self.by_pose else []
         left = [step for step in steps if not step.actuated and step.rate in rates]
         slides = [step.rate for step in left if not step.circle]
-        if len(left) != len(rates) or len(slides) != len(left) - 1:
+        if not left or len(left) != len(rates) or len(slides) < len(left) - 1:
             return None
         tables = np.array([numbers(self._affine_rows(self.tree, q)[1])[:, slides] for _, q in self.samples])
         kept = independent_rows(tables) if slides else []
@@ -334,7 +333,8 @@ class CarriedScheme(Scheme):
         pivots = tuple((kept[row], slides[column]) for row, column in order)
         with np.errstate(all="ignore"):
             apart = [
-                numbers(self.close_platform(self.tree, q, pivots)) - np.array(x, float)[places] for x, q in self.samples
+                numbers(self.close_platform(self.tree, q, pivots)[0]) - np.array(x, float)[places]
+                for x, q in self.samples
             ]
         return pivots if (np.abs(apart) < SAME_STATE).all() else None
 
@@ -355,35 +355,44 @@ class CarriedScheme(Scheme):
             found += [np.array([row.value for row in rows], object), matrices(tree, rows)[0]]
         return found[0], found[1], found[3]
 
-    def close_platform(self, tree: Tree, q: Numbers, pivots: Order) -> list[Any]:
-        """Return the unknowns of the platform in closed form, on numbers and expressions alike.
+    def close_platform(self, tree: Tree, q: Numbers, pivots: Order) -> tuple[list[Any], Any]:
+        """Find the unknowns of the platform in closed form, on numbers and expressions alike.
 
         Slides are eliminated; of both turns that solve the last equation, a cos + b sin = c, the
         one on home's side is taken (of a 3-RPS: Lee and Shah 1988).
+
+        :returns: the unknowns, and the square by which rounding grows: where a pivot or the root
+            vanishes, any unknowns would meet the equations.
         """
         steps = {step.rate: step for step in tree.steps.values() if not step.actuated}
         order, slides = [row for row, _ in pivots], [column for _, column in pivots]
-        turn = next(steps[rate] for rate in self.solved[1] if rate not in slides)
+        turn = next((steps[rate] for rate in self.solved[1] if rate not in slides), None)
 
         def eliminate(q: Numbers) -> tuple[Objects, SparseLU, Objects, Objects, list[Any]]:
             values, table, quarter = self._affine_rows(tree, q)
             lu = SparseLU(table[order][:, slides], tuple((k, k) for k in range(len(order))))
+            if turn is None:
+                return values, lu, values, values, []
             last = next(k for k in range(len(values)) if k not in order)
             weights = lu.solve_transposed(table[last, slides])
             h, k = -quarter[:, turn.rate], table[:, turn.rate]
             return values, lu, h, k, [row[last] - weights @ row[order] for row in (h, k, h - values)]
 
-        values, lu, h, k, last = eliminate(q)
+        (values, lu, h, k, last), (_, lu_home, _, _, last_home) = (eliminate(p) for p in (q, tree.graph.lead_home))
+        growth = lu.find_growth(lu_home.inverse_pivots, np.ones(lu.size), every=True)
         x = np.array(tree.home, dtype=object)
-        a, b, c = last
-        at_home = eliminate(tree.graph.lead_home)[-1][1]
-        square, side = a * a + b * b, -sign_of(at_home) * sqrt(a * a + b * b - c * c)
-        cosine, sine = (a * c - b * side) / square, (b * c + a * side) / square
-        x[turn.position : turn.position + 2] = cosine, sine
-        values = values + h * (cosine - 1.0) + k * sine
+        if turn is not None:
+            (a, b, c), (_, root_home, _) = last, last_home
+            square = a * a + b * b
+            left = square - c * c
+            side = -sign_of(root_home) * sqrt(left)
+            growth = growth + root_home * root_home / left
+            cosine, sine = (a * c - b * side) / square, (b * c + a * side) / square
+            x[turn.position : turn.position + 2] = cosine, sine
+            values = values + h * (cosine - 1.0) + k * sine
         for rate, value in zip(slides, lu.solve(-values[order]), strict=True):
             x[steps[rate].position] = value
-        return list(x[self.solved[0]])
+        return list(x[self.solved[0]]), growth
 
     @property
     def has_closed_limbs(self) -> bool:

@@ -32,6 +32,9 @@ CERTAIN: Final = 0.5
 CERTAIN_MARGIN: Final = 1.0
 """Smallest ratio of the closures' determinant to that distance, from far poses of many machines: it
 is less than 0.5 where ``forward`` of the joints is not the pose."""
+CERTAIN_REGULAR: Final = 1e-5
+"""Smallest closures' determinant where a closed start is the pose: ``forward`` computes its own from
+other pivots, and refuses it below 1e-8. The two agree to fewer digits the nearer a singularity is."""
 SAME_POSE: Final = 1e-7
 """Largest difference of two poses that are one: rounding of the two solutions, of unit one. Another
 assembly is farther away unless a singularity is nearer than that."""
@@ -300,7 +303,7 @@ def certify_assembly(t: Traced, scheme: CarriedScheme, posed: Traced, q: Sequenc
         apart = (position - goal) / t.tree.size
         turns = np.ravel(rotation - turned)
         # Of two rotations by an angle apart, these squares sum to 4 - 4 cos(angle).
-        return [closures - LEAST, SAME_POSE * SAME_POSE - (apart @ apart + 0.5 * (turns @ turns))]
+        return [closures - CERTAIN_REGULAR, SAME_POSE * SAME_POSE - (apart @ apart + 0.5 * (turns @ turns))]
     move, way = posed.q - posed.graph.lead_home, lead - t.graph.lead_home
     ends = ((lu.solve(way) - move) * np.array(t.pose_scales, dtype=object) for lu in (at_home, here))
     distance = 0.5 * sum(apart @ apart for apart in ends)

@@ -150,8 +150,8 @@ class Scheme(Linkage):
         """Pivots of the platform's closed form; None: Newton's method finds its unknowns."""
         return None
 
-    def close_platform(self, tree: Tree, q: Numbers, pivots: Order) -> list[Any]:
-        """Return the platform's unknowns in closed form."""
+    def close_platform(self, tree: Tree, q: Numbers, pivots: Order) -> tuple[list[Any], Any]:
+        """Find the platform's unknowns in closed form, and the square by which rounding grows."""
         raise NotImplementedError
 
     @property

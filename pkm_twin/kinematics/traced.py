@@ -105,9 +105,11 @@ class Traced:
     def solve(self) -> None:
         """Place the machine by its unknowns, and factor its closures."""
         scheme, tree = self.scheme, self.tree
+        self.margins: list[Expression] = []
         self.unknowns: Numbers = self.tape.inputs(self.unknowns_name, len(scheme.solved[0]))
         if scheme.platform_pivots is not None:
-            self.unknowns = scheme.close_platform(tree, self.q, scheme.platform_pivots)
+            self.unknowns, growth = scheme.close_platform(tree, self.q, scheme.platform_pivots)
+            self.margins = self.lift([MAX_GROWTH - growth])
         self.motion, self.limbs, self.x = self._placed(self.unknowns)
         self.rows = self.motion.closures()
         self.ju, self.jq = matrices(tree, self.rows)
@@ -146,11 +148,11 @@ class Traced:
             more["goal"] = self.lift(self.drives.given("q"))
             more["branch"] = [*more.pop("branch", ()), *self.lift(self.drives.tolerance_margins())]
         scheme, tree = self.scheme, self.tree
-        branch: list[Expression] = []
+        branch = self.margins
         if self.lu.used:
             # Results depend on these factors, not corrections alone.
             scales = [self.rows[k].scale for k in scheme.independent]
-            branch = self.limit_growth(self.lu, scales, [tree.scales[k] for k in scheme.varying])
+            branch = branch + self.limit_growth(self.lu, scales, [tree.scales[k] for k in scheme.varying])
         determinant = self.determinant
         places, rates = scheme.solved if scheme.platform_pivots is None else ([], [])
         step: Numbers = -self.newton.solve([row.value for row in self.solved]) if places else []

@@ -171,14 +171,14 @@ def test_mass_matrix_and_accelerations_at_a_pose_are_those_of_its_joints(name, r
     np.testing.assert_array_equal(one.acceleration, found.acceleration[0])
 
 
-@pytest.mark.parametrize("name", ["prru", "rps3"])
+@pytest.mark.parametrize("name", ["prru", "rps3", "upr_rpu"])
 def test_slides_and_a_turn_of_the_platform_are_those_of_all_closures(name, rng):
     posed = load(name).engine.posed
     assert posed.platform_pivots
     for x, q in posed.samples:
         at = q + rng.uniform(-0.05, 0.05, len(q))
         found = np.array(x, dtype=object)
-        found[posed.solved[0]] = posed.close_platform(posed.tree, at, posed.platform_pivots)
+        found[posed.solved[0]] = posed.close_platform(posed.tree, at, posed.platform_pivots)[0]
         motion, _ = posed.place(posed.tree, found, at)
         assert max(abs(row.value * row.scale) for row in motion.closures()) < 1e-12
 

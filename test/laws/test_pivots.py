@@ -107,3 +107,28 @@ def test_a_state_where_a_pivot_vanishes_is_right_or_rejected(name, rng):
             found[int(by_pose)] += rejected
     assert found[1] > 0 or name not in (PAR4, ANKLE)
     assert found[0] > 0 or name != PAR4
+
+
+@pytest.mark.parametrize("apart", [-1e-9, 1e-12, 1e-8, 1e-7])
+def test_a_pose_at_a_singularity_is_that_of_forward_or_rejected(apart, rng):
+    """Of the 2UPR-RPU, whose third limb's end is in the base there: the slide of its platform loses its pivot."""
+    robot = load("upr_rpu")
+    a, b = robot.geometry.platform_radius, robot.geometry.base_radius
+    beta, gamma = rng.uniform(0.1, 1.4, 4000), rng.uniform(-0.3, 0.3, 4000)
+    pose = np.stack([-a * np.sin(beta) - apart, beta, gamma], -1)
+    q, good = robot.try_inverse(pose)
+    back, known = robot.try_forward(q[good])
+    assert known.all()
+    np.testing.assert_allclose(back, pose[good], atol=1e-7)
+    rate = rng.normal(size=3)
+    for place, found in zip(pose[good][:20], q[good][:20], strict=True):
+        z, beta, _ = place
+        rho, along = z / np.cos(beta), b * np.cos(beta) - a
+        across = b * np.sin(beta) + rho
+        change = b * np.cos(beta) * rate[1] + rate[0] / np.cos(beta) + rho * np.tan(beta) * rate[1]
+        wanted = (across * change - along * b * np.sin(beta) * rate[1]) / found[2]
+        try:
+            given = inverse_dynamics_at_pose(robot, place, rate, rate).qd[2]
+        except SingularityError:
+            continue
+        assert given == pytest.approx(wanted, abs=1e-6)
