@@ -106,6 +106,7 @@ class LimbPose:
             self._reach(tree.links[limb.reach], at, centre, top.at, square)
             motion.place(before, x, q)
             self._keep_ends(limb, at, top.parent, centre)
+            self.ends = self.ends[::-1]
             target = motion.point(limb.tip, at)
         else:
             target = motion.point(limb.beyond, at)
@@ -154,12 +155,13 @@ class LimbPose:
     def reach_rates(self) -> Columns:
         """Return the rate of the reach by the rates of the bodies at the limb's ends.
 
-        The distance is set by the reach: slope rate = distance vector . difference of velocities.
+        The distance is set by the reach: slope rate = distance vector . difference of velocities. In
+        the plane of a turn, both are velocities at one place, relative to the carrier of the plane.
         """
         (body, target), (carrier, place) = self.ends
         vector = target - place
         if self.normal is not None:
-            vector = _across(vector, self.normal)
+            vector, place = _across(vector, self.normal), target
         vector = vector / self.slope
         moving = (
             self.motion.linear_jacobian(body, target),

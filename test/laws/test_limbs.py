@@ -20,6 +20,7 @@ from pkm_twin.errors import PkmTwinError
 from pkm_twin.kinematics.iterations import newton
 from pkm_twin.kinematics.motion import Motion, matrices, numbers
 from pkm_twin.mechanisms.catalogue import robot_of_data
+from test.machine.random_machines import NAMES as MACHINES
 from test.machine.random_machines import variant
 from test.machine.test_helical import slide
 from test.support.robots import load, partly_long
@@ -129,6 +130,20 @@ def test_torques_of_a_motion_of_the_pose_are_those_of_its_joints(name, rng):
     np.testing.assert_allclose(second, 10.0 * change, atol=1e-7)
     one = inverse_dynamics_at_pose(robot, pose[0], rate[0], 10.0 * change[0], wrench[0])
     np.testing.assert_array_equal(one.tau, found.tau[0])
+
+
+@pytest.mark.parametrize("name", partly_long(MACHINES, "upr_rpu"))
+def test_torques_and_mass_matrix_at_a_pose_of_random_machines_are_those_of_their_joints(name, rng):
+    """Their limbs do not stay in the planes that they turn in."""
+    robot = robot_of_data(variant(name, rng), "variant")
+    pose = reached(robot, rng, 40, 0.15)
+    pose = pose[np.isfinite(pose).all(1)]
+    pose = pose[robot.try_inverse(pose)[1]]
+    rate, change = rng.normal(size=(2, *pose.shape))
+    found = inverse_dynamics_at_pose(robot, pose, rate, 10.0 * change)
+    tau, mass = inverse_dynamics(robot, found.q, found.qd, found.qdd), mass_matrix(robot, found.q)
+    np.testing.assert_allclose(found.tau, tau, atol=1e-11 * np.abs(tau).max())
+    np.testing.assert_allclose(mass_matrix_at_pose(robot, pose), mass, atol=1e-11 * np.abs(mass).max())
 
 
 def test_a_machine_that_is_followed_has_no_torques_of_another_assembly(rng):
