@@ -101,7 +101,7 @@ def page() -> str:
         "",
         "Every command has `--json` and `--help`, every one that takes a robot `--platform`,",
         "`--base`, `--actuated`, `--pose` and `--carry`, every one that writes a file",
-        "`--overwrite`. Ranges and defaults are in brackets.",
+        "`--overwrite`. Ranges and defaults are in brackets; `pkm-twin COMMAND --help` explains the rest.",
         "",
     ]
     lines += [f"## {SHARED}", ""]
@@ -161,7 +161,8 @@ def section(name: str, command: Any, inner: dict[str, Any], own: Sequence[Word],
         typed = words if alone else f"{name} {command.show(words.split()[-1])}"
         usage = " ".join(w.name for w in every if w.argument and w.name not in typed.split())
         lines += [f"`{f'pkm-twin {typed} {usage}'.rstrip()}`: {first(one.help)}", ""]
-        lines += [*map(str, told), ""] if told else []
+        options = ", ".join(f"`{word.name}`" for word in told if not word.argument)
+        lines += [f"Options: {options}.", ""] if options else []
         lines += names
     if plain:
         lines += [f"Without options of their own: {', '.join(plain)}.", ""]
