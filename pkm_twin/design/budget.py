@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
@@ -37,6 +37,28 @@ class Contribution:
     share: float
     text: str
     moves: bool
+
+
+@dataclass(frozen=True)
+class ErrorSizes:
+    """Hold RMS and largest length of position errors, m, and of rotations, rad, over the states."""
+
+    rms_position: float
+    greatest_position: float
+    rms_angle: float
+    greatest_angle: float
+
+
+@dataclass(frozen=True)
+class ExactErrors:
+    """Hold the errors of random machines that were assembled exactly, and their first order."""
+
+    machines: int
+    states: int
+    rms_position_m: float
+    greatest_position_m: float
+    rms_angle_rad: float
+    first_order_rms_position_m: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +100,18 @@ class ErrorBudget:
         return shift, turn
 
     @cached_property
+    def sizes(self) -> ErrorSizes:
+        """Sizes of the standard deviations over all states."""
+        shift, turn = self.deviations
+        return ErrorSizes(rms(shift), greatest(shift), rms(turn), greatest(turn))
+
+    @property
+    def rms_deflection(self) -> float | None:
+        """RMS displacement under the wrench without errors, m; None without wrench or elasticity."""
+        bent = self.errors.deflection
+        return None if bent is None else rms(bent[..., :3])
+
+    @cached_property
     def bounds(self) -> tuple[float, float]:
         """Largest displacement (m) and rotation (rad) by all bounds, over all states."""
         shift, turn = self.errors.farthest.round(DECIMALS).max(0).tolist()
@@ -103,12 +137,9 @@ class ErrorBudget:
         return rms(np.sqrt(squares))
 
 
-def draw_machines(
-    budget: ErrorBudget, sigma: Mapping[str, float | Tolerance], count: int, seed: int
-) -> tuple[Sequence[int], Array]:
-    """Assemble random machines exactly at 25 of the budget's states.
-
-    :returns: the indices of the states, and the errors as of :func:`~pkm_twin.design.drawn`.
-    """
+def draw_machines(budget: ErrorBudget, sigma: Mapping[str, float | Tolerance], count: int, seed: int) -> ExactErrors:
+    """Assemble random machines exactly at 25 of the budget's states, and measure their errors."""
     chosen = np.unique(np.linspace(0, len(budget.q) - 1, 25).round().astype(int))
-    return chosen.tolist(), drawn(budget.robot, sigma, budget.q[chosen], count, seed)
+    shift, turn = np.split(drawn(budget.robot, sigma, budget.q[chosen], count, seed), 2, -1)
+    first_order, _ = budget.deviations
+    return ExactErrors(count, len(chosen), rms(shift), greatest(shift), rms(turn), rms(first_order[chosen]))

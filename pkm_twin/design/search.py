@@ -326,6 +326,14 @@ class Design:
     rejected: int
     """Number of starts that cannot follow the path."""
 
+    def peak_efforts(self, path: PosePath) -> Array:
+        """Return the largest magnitude of each joint's effort on the path, shape (n,), N m or N."""
+        return np.asarray(np.abs(PathMotion(Variants(self.robot, {}), path).efforts[0]).max(0), np.float64)
+
+    def least_singularity(self, path: PosePath) -> float:
+        """Return the smallest singularity index on the path."""
+        return float(PathMotion(Variants(self.robot, {}), path).singularity.min())
+
 
 def design(
     robot: Robot,

@@ -24,6 +24,7 @@ from delta_dynamics.torques.virtual_work import inverse_dynamics
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError, check_limit
 from pkm_twin.identification.parameters import FileParameters
+from pkm_twin.identification.samples import tracks
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import passing_singularity, position_range, reachable
 
@@ -130,6 +131,19 @@ class Judge:
         """Condition number of a motion; infinite where it does not show a base parameter."""
         values = self.singular_values(q, qd, qdd)
         return float(values[0] / values[-1]) if values[-1] > 1e-12 * values[0] else np.inf
+
+    def recorded_condition(self, time: Array, q: Array) -> float | None:
+        """Return the condition number of recorded positions; None if too few follow one another.
+
+        :param time: shape (k,), s; ``q``: joint positions, shape (k, n).
+        """
+        pieces, _ = tracks(time, q, np.zeros_like(q))
+        if not pieces:
+            return None
+        states = [np.concatenate([getattr(piece, name) for piece in pieces]) for name in ("q", "qd", "qdd")]
+        # About 2000 samples determine the condition number; more only take time.
+        step = max(1, len(states[0]) // 2000)
+        return self.condition(*(rows[::step] for rows in states))
 
 
 def excite(

@@ -14,7 +14,9 @@ from delta_dynamics.torques.stiction import friction_reach, zero_resting_rates
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, PkmTwinError, SingularityError, UnreachableError
 from pkm_twin.machine.friction import Dahl
-from pkm_twin.paths.joint_path import only_turns
+from pkm_twin.paths.joint_path import only_turns, reference_velocity
+from pkm_twin.paths.motion import Samples
+from pkm_twin.paths.sizing import rms
 from pkm_twin.recordings.origin import origin_columns
 from pkm_twin.recordings.payload import by_load
 from pkm_twin.recordings.recording import Recording
@@ -161,6 +163,38 @@ class SoftCut:
     def slowdown(self, q: Array, way: Array) -> Array:
         """Return the divisor of the feed that keeps the deflection within the tolerance, (p,)."""
         return np.maximum(1.0, self.feed / self.tolerance * self.deflection_per_feed(q, way))
+
+    def along(self, samples: Samples) -> tuple[Array, float]:
+        """Return the deflection along a motion, shape (k,), m, and the largest constant feed, m/s.
+
+        The constant feed keeps the deflection within the tolerance everywhere on the motion.
+        """
+        directions = reference_velocity(self.robot, samples.q, samples.qd) / np.maximum(samples.speed, 1e-300)[:, None]
+        per_feed = self.deflection_per_feed(samples.q, directions)
+        softest = float(per_feed.max())
+        constant = min(self.feed, self.tolerance / softest) if softest > 0.0 else self.feed
+        return per_feed * samples.speed, constant
+
+
+@dataclass(frozen=True)
+class EffortPeak:
+    """Hold a joint's effort of the largest magnitude, its time (s), and the RMS of the effort."""
+
+    effort: float
+    time: float
+    rms: float
+
+
+def find_peaks(robot: Robot, columns: dict[str, Array]) -> dict[str, EffortPeak]:
+    """Return the effort's peak of each joint in a table of :func:`torque_table`."""
+    time, found = columns["time"], {}
+    for joint in robot.joint_names:
+        effort = columns[f"{joint}.effort"]
+        k = int(abs(effort).argmax())
+        # A single sample is its own root mean square.
+        root = rms(time, effort) if time[-1] > time[0] else float(abs(effort[k]))
+        found[joint] = EffortPeak(float(effort[k]), float(time[k]), root)
+    return found
 
 
 def torque_table(m: Recording, progress: Callable[[int], None] | None = None) -> dict[str, Array]:

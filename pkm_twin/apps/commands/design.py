@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -208,7 +208,7 @@ def optimised(given: Design, path: Path) -> Report:
             Fact("machines", found.machines),
             Fact("rejected_starts", found.rejected),
             Fact("beyond_position_limits", limits),
-            *against_limits(found, way),
+            *judge_limits(found, way),
         ],
         tables,
         {"": lambda: draw(robot, found, way, answer)},
@@ -217,22 +217,19 @@ def optimised(given: Design, path: Path) -> Report:
     )
 
 
-def against_limits(found: Found, path: PosePath) -> Iterator[Fact]:
+def judge_limits(found: Found, path: PosePath) -> Iterator[Fact]:
     """Judge the best machine's efforts and singularity index on the path by their limits."""
-    from pkm_twin.design.pose_path import PathMotion
     from pkm_twin.design.tolerance import MIN_SINGULARITY_INDEX
-    from pkm_twin.design.variants import Variants
 
     robot, limit = found.robot, found.robot.limits.effort
-    followed = PathMotion(Variants(robot, {}), path)
     if limit is not None and "peak-effort" in found.best.quantities:
-        peaks = np.abs(followed.efforts[0]).max(0)
+        peaks = found.peak_efforts(path)
         k = int((peaks / limit).argmax())
         unit, good = robot.effort_units[k], bool(peaks[k] <= limit[k])
         what = f"effort of {robot.joint_names[k]} on the path"
         numbers = {"number": float(peaks[k]), "limit": float(limit[k]), "unit": unit}
         yield judged(what, f"{peaks[k]:.4g} {unit}", f"{limit[k]:g} {unit}", good, **numbers)
-    index = float(followed.singularity.min())
+    index = found.least_singularity(path)
     what = "singularity index on the path"
     numbers = {"number": index, "limit": MIN_SINGULARITY_INDEX, "unit": ""}
     yield judged(what, f"{index:.4g}", f"{MIN_SINGULARITY_INDEX:g} or more", index >= MIN_SINGULARITY_INDEX, **numbers)
@@ -356,7 +353,7 @@ def budget(given: Design) -> Report:
     """
     from pkm_twin.design import tolerances
     from pkm_twin.design.budget import ErrorBudget, draw_machines
-    from pkm_twin.design.tolerance import greatest, rms, workspace_states
+    from pkm_twin.design.tolerance import workspace_states
     from pkm_twin.design.variables import parse_tolerances
     from pkm_twin.identification.calibration import calibrated_errors
 
@@ -399,24 +396,25 @@ def budget(given: Design) -> Report:
         Column("varied", text="what varies"),
         Column("", text=" "),
     ]
-    moves, turns = summary.deviations
+    sizes = summary.sizes
     turning, (shift, bound) = found.only_turns, summary.bounds
     at, bound_at = (f" at {_place(robot, pose)}" for pose in (summary.worst_pose, summary.bound_pose))
-    most = greatest(turns)
     case = "worst case of all bounds" if found.is_exact else "upper bound of the worst case"
     facts = [
         Fact("robot", robot.name),
         Fact("states", len(q)),
         Fact("path", None if given.path is None else str(given.path)),
-        _report_length("rms_position_m", rms(moves)),
-        _report_length("greatest_position_m", greatest(moves), None if turning else "largest standard deviation", at),
-        Fact("rms_angle_rad", rms(turns), "rad", "RMS rotation", f"{1e3 * rms(turns):.4g} mrad"),
+        _report_length("rms_position_m", sizes.rms_position),
+        _report_length(
+            "greatest_position_m", sizes.greatest_position, None if turning else "largest standard deviation", at
+        ),
+        Fact("rms_angle_rad", sizes.rms_angle, "rad", "RMS rotation", f"{1e3 * sizes.rms_angle:.4g} mrad"),
         Fact(
             "greatest_angle_rad",
-            most,
+            sizes.greatest_angle,
             "rad",
             "largest standard deviation" if turning else None,
-            f"{1e3 * most:.4g} mrad{at}",
+            f"{1e3 * sizes.greatest_angle:.4g} mrad{at}",
         ),
         Fact("worst_pose", summary.worst_pose),
         _report_length("bound_position_m", shift, None if turning else case, bound_at),
@@ -428,29 +426,18 @@ def budget(given: Design) -> Report:
         ),
     ]
     if given.monte_carlo:
-        chosen, errors = draw_machines(summary, sigma, given.monte_carlo, given.seed)
-        exact = {
-            "machines": given.monte_carlo,
-            "states": len(chosen),
-            "rms_position_m": rms(errors[..., :3]),
-            "greatest_position_m": greatest(errors[..., :3]),
-            "rms_angle_rad": rms(errors[..., 3:]),
-            "first_order_rms_position_m": rms(moves[chosen]),
-        }
+        exact = draw_machines(summary, sigma, given.monte_carlo, given.seed)
         words = (
-            f"RMS {1e3 * exact['rms_position_m']:.4g} mm in {len(chosen)} of the states "
-            f"({1e3 * exact['first_order_rms_position_m']:.4g} mm to first order), largest error "
-            f"{1e3 * exact['greatest_position_m']:.4g} mm"
+            f"RMS {1e3 * exact.rms_position_m:.4g} mm in {exact.states} of the states "
+            f"({1e3 * exact.first_order_rms_position_m:.4g} mm to first order), largest error "
+            f"{1e3 * exact.greatest_position_m:.4g} mm"
         )
         label = f"{given.monte_carlo} random machines, assembled exactly"
-        facts.append(Fact("monte_carlo", exact, text=label, shown=words))
-    if found.deflection is not None:
-        bent = rms(found.deflection[..., :3])
+        facts.append(Fact("monte_carlo", asdict(exact), text=label, shown=words))
+    if (bent := summary.rms_deflection) is not None:
         label = "deflection under the wrench, not in the table: RMS"
         facts.append(_report_length("rms_deflection_m", bent, label))
-    what = f"position {1e3 * rms(moves):.4g} mm"
-    if turning:
-        what = f"rotation {1e3 * rms(turns):.4g} mrad"
+    what = f"rotation {1e3 * sizes.rms_angle:.4g} mrad" if turning else f"position {1e3 * sizes.rms_position:.4g} mm"
     held = f"{', '.join(robot.graph.leads)}" if robot.redundant else "actuated joints"
     return Report(
         f"{robot.name}: standard deviation of the platform's {what} RMS over {where}, {len(q)} states, {held} held",

@@ -69,7 +69,6 @@ def excite(given: Excite) -> Report:
     from pkm_twin.identification.excitation import Bounds, Judge, sweeps
     from pkm_twin.identification.excitation import excite as design
     from pkm_twin.identification.parameters import file_parameters, kinds_of
-    from pkm_twin.identification.samples import tracks
     from pkm_twin.recordings import Recording, read
     from pkm_twin.recordings.bags import write_motion
 
@@ -78,12 +77,9 @@ def excite(given: Excite) -> Report:
     other = None
     if given.compare is not None:
         recorded = read(given.compare, machine)
-        pieces, _ = tracks(recorded.time, recorded.q, np.zeros_like(recorded.q))
-        if not pieces:
+        other = judge.recorded_condition(recorded.time, recorded.q)
+        if other is None:
             raise BagError("too few joint states in a row", path=given.compare, reason="too short")
-        parts = [np.concatenate([getattr(p, k) for p in pieces]) for k in ("q", "qd", "qdd")]
-        step = max(1, len(parts[0]) // 2000)
-        other = judge.condition(*(part[::step] for part in parts))
     bounds = Bounds(given.share, given.acceleration, given.singularity, given.rate)
     best: Any
     if given.friction:

@@ -311,14 +311,9 @@ def draw_limits(motion: TimedPath, title: str) -> Any:
 
 def _report_cut(cut: SoftCut, motion: TimedPath) -> tuple[list[Fact], Any]:
     """Report feed and deflection of a cut with their bounds, and draw them."""
-    from pkm_twin.paths.joint_path import reference_velocity
-
     s, speed, tolerance = motion.fine, cut.feed, cut.tolerance
-    way = reference_velocity(motion.robot, s.q, s.qd) / np.maximum(s.speed, 1e-300)[:, None]
-    bend = cut.deflection_per_feed(s.q, way)
-    soft, most = float(bend.max()), float((bend * s.speed).max())
-    # The largest constant feed within the tolerance.
-    even = min(speed, tolerance / soft) if soft > 0.0 else speed
+    deflection, constant_feed = cut.along(s)
+    most = float(deflection.max())
     facts = [
         Fact("greatest_feed_m_s", float(s.speed.max()), "m/s", "greatest feed"),
         Fact(
@@ -328,7 +323,7 @@ def _report_cut(cut: SoftCut, motion: TimedPath) -> tuple[list[Fact], Any]:
             "greatest deflection",
             f"{1e6 * most:.4g} µm (tolerance {1e6 * tolerance:.4g} µm)",
         ),
-        Fact("constant_feed_m_s", even, "m/s", "largest constant feed within the tolerance"),
+        Fact("constant_feed_m_s", constant_feed, "m/s", "largest constant feed within the tolerance"),
         Fact("tolerance_m", tolerance, "m"),
     ]
 
@@ -336,7 +331,7 @@ def _report_cut(cut: SoftCut, motion: TimedPath) -> tuple[list[Fact], Any]:
         figure, axes = plots.columns(1, 2)
         curves = (
             (1e3 * s.speed, "feed (mm/s)", 1e3 * speed),
-            (1e6 * bend * s.speed, "deflection (µm)", 1e6 * tolerance),
+            (1e6 * deflection, "deflection (µm)", 1e6 * tolerance),
         )
         for ax, (values, label, limit) in zip(axes[0], curves, strict=True):
             ax.plot(s.time, values, color=plots.COLOURS[0], lw=1.2)

@@ -19,7 +19,7 @@ from pkm_twin.settings import setting
 
 if TYPE_CHECKING:
     from pkm_twin.paths.along import EffortComparison
-    from pkm_twin.paths.sizing import DriveDuty, Duty, Fit, Gear, Gears
+    from pkm_twin.paths.sizing import DriveDuty, Fit, Gear, Gears
     from pkm_twin.robot.robot import Robot
 
 MOST_PERCENT: Final = 1000.0
@@ -81,7 +81,7 @@ class Size(CarriesAtTimes, ReadsMotions, AwayFromSingular, Draws):
 def size(given: Size) -> Report:
     """Compute what each drive must give, and which motors can."""
     from pkm_twin.paths.along import EFFORT_TOLERANCE, compare_efforts
-    from pkm_twin.paths.sizing import find_smallest, read_motors, size_drives
+    from pkm_twin.paths.sizing import find_smallest, net_energy, read_motors, size_drives
 
     if (given.motion is None) == (given.over_workspace is None):
         raise click.UsageError("give a recording or path, or --over-workspace")
@@ -158,14 +158,6 @@ def size(given: Size) -> Report:
     return Report(answer, facts, _make_tables(duties), {"": lambda: draw(taken, duties, title)}, notes)
 
 
-def net_energy(duties: Sequence[Duty]) -> float:
-    """Return the energy that drives take, J: 0 for a closed cycle, which gives back all of it."""
-    net = sum(duty.energy for duty in duties)
-    # Part of the regenerated energy below which the net energy is an integration error: one
-    # drive of a fastest cycle errs by 1.3e-5 at 1 kHz, as its effort steps within an interval.
-    return net if abs(net) > 1e-4 * sum(duty.returned for duty in duties) else 0.0
-
-
 def gears(given: Size, robot: Robot) -> tuple[list[Gear], list[Gears]]:
     """Return the gears of the joints, and those to choose from.
 
@@ -195,6 +187,8 @@ def gears(given: Size, robot: Robot) -> tuple[list[Gear], list[Gears]]:
 
 
 def _make_tables(duties: Sequence[DriveDuty]) -> list[Table]:
+    from pkm_twin.paths.sizing import net_energy
+
     tables = []
     sides = [("joint", True), ("joint", False), ("motor", False)]
     for side, slides in sides:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -76,8 +75,7 @@ class Torques(CarriesAtTimes, ReadsMotions, AtPose, Writes, Draws):
 @command("Torques, paths and drives")
 def torques(given: Torques) -> Report:
     """Peak and RMS effort of each joint, and the table."""
-    from pkm_twin.paths.along import torque_table
-    from pkm_twin.paths.sizing import integral
+    from pkm_twin.paths.along import find_peaks, torque_table
     from pkm_twin.robot.limits import beyond_limits
 
     if given.out is not None:
@@ -105,12 +103,8 @@ def torques(given: Torques) -> Report:
     beyond += over
     units = dict(zip(robot.joint_names, robot.effort_units, strict=True))
     rows: dict[str, list[Any]] = {}
-    for joint, unit in units.items():
-        effort = columns[f"{joint}.effort"]
-        at, whole = int(abs(effort).argmax()), float(time[-1] - time[0])
-        peak = float(abs(effort[at]))
-        rms = math.sqrt(integral(time, effort**2) / whole) if whole > 0.0 else peak
-        rows[joint] = [peak, float(effort[at]), rms, unit, float(time[at])]
+    for joint, peak in find_peaks(robot, columns).items():
+        rows[joint] = [abs(peak.effort), peak.effort, peak.rms, units[joint], peak.time]
     # Forces and moments have no common size.
     alike = [name for name in rows if units[name] == robot.effort_units[0]]
     worst = max(alike, key=lambda name: rows[name][0])
