@@ -16,7 +16,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MessageError, ParameterError
 from pkm_twin.machine.friction import KNOWN_FRACTION, Dahl, Memory
 from pkm_twin.machine.joint_map import ControllerNumbers
-from pkm_twin.messages.reading import ExtraJoints, JointReader, JointSample, Trajectory, as_message_error
+from pkm_twin.messages.reading import ExtraJoints, JointReader, JointSample, as_message_error
 from pkm_twin.messages.stamps import SECOND, StampRules
 from pkm_twin.robot.derivatives import nearest_motion
 from pkm_twin.robot.effort_limits import NON_FINITE, EffortLimits, LimitedEfforts, LimitPolicy
@@ -273,7 +273,13 @@ class Feedforward(Core):
                 raise MessageError("base motion", f"{text}; with base_imu only joint states are answered")
             t = reader.trajectory(message, now)
             yield
-            qd, qdd = _differentiate_points(t, settings.differentiate)
+            for what, values in (("velocities", t.qd), ("accelerations", t.qdd)):
+                if values is None and not settings.differentiate:
+                    raise MessageError(f"no {what}", f"the points carry no {what}; set acceleration to differentiate")
+            if (t.qd is None or t.qdd is None) and len(t.times) < 3:
+                raise MessageError("too short", f"{len(t.times)} points; 3 to differentiate")
+            qd = np.gradient(t.q, t.times, axis=0, edge_order=2) if t.qd is None else t.qd
+            qdd = np.gradient(qd, t.times, axis=0, edge_order=2) if t.qdd is None else t.qdd
             reader.check_derived(qd, qdd)
             if t.qd is None and self._reach.any():
                 doubt = velocity_error_bound(t.times, t.q, gradient_gain(t.times))
@@ -516,18 +522,3 @@ def _evaluate_points(first: int, call: Callable[P, R], *arguments: P.args, **opt
         if first == 0:
             raise
         raise MessageError(error.reason, f"in the points from point {first} on: {error}") from error
-
-
-def _differentiate_points(t: Trajectory, differentiate: bool) -> tuple[Array, Array]:
-    """Return rates and accelerations of a trajectory's points, (p, n), by differences if absent.
-
-    :raises MessageError: some are absent and must not, or cannot, be differentiated.
-    """
-    for what, values in (("velocities", t.qd), ("accelerations", t.qdd)):
-        if values is None and not differentiate:
-            raise MessageError(f"no {what}", f"the points carry no {what}; set acceleration to differentiate")
-    if (t.qd is None or t.qdd is None) and len(t.times) < 3:
-        raise MessageError("too short", f"{len(t.times)} points; 3 to differentiate")
-    qd = np.gradient(t.q, t.times, axis=0, edge_order=2) if t.qd is None else t.qd
-    qdd = np.gradient(qd, t.times, axis=0, edge_order=2) if t.qdd is None else t.qdd
-    return qd, qdd

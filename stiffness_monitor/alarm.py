@@ -151,17 +151,6 @@ class _Window:
         added = reach @ (change * amounts)[..., None]
         return added[..., 0], (columns * amounts[:, None]) @ mine
 
-    def estimate_each(self, count: int) -> tuple[Array, Array]:
-        """Return each element's factor alone to first order, and standard error, (elements,)."""
-        _, slopes = self.predict_change(range(count), np.ones(count))
-        rows, columns = slopes.reshape(-1, count), self.common.reshape(-1, len(self.prior))
-        columns = np.concatenate([columns, np.diag(np.sqrt(self.prior))])
-        basis = np.linalg.qr(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300))[0]
-        basis = basis[: len(rows)]
-        rows = rows - basis @ (basis.T @ rows)
-        information = np.maximum(np.sum(rows**2, 0), 1e-300)
-        return 1.0 + rows.T @ self.residual.ravel() / information, 1.0 / np.sqrt(information)
-
     def fit(self, chosen: Sequence[int], start: Array) -> _Fit:
         """Fit the factors of chosen elements to the window by Gauss-Newton, from ``start``."""
         factors, e = start, len(chosen)
@@ -263,7 +252,16 @@ class StiffnessAlarm:
             # The wrenches may be the sensor's noise.
             return None
         yield
-        values, deviations = window.estimate_each(len(self.names))
+        # Each element's factor alone, to first order, and its standard error, without common causes.
+        count = len(self.names)
+        _, slopes = window.predict_change(range(count), np.ones(count))
+        rows, columns = slopes.reshape(-1, count), window.common.reshape(-1, len(window.prior))
+        columns = np.concatenate([columns, np.diag(np.sqrt(window.prior))])
+        basis = np.linalg.qr(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300))[0]
+        basis = basis[: len(rows)]
+        rows = rows - basis @ (basis.T @ rows)
+        information = np.maximum(np.sum(rows**2, 0), 1e-300)
+        values, deviations = 1.0 + rows.T @ window.residual.ravel() / information, 1.0 / np.sqrt(information)
         bounds = self._departure_bounds(np.sqrt(alike) * deviations, range(len(self.names)))
         if not (np.abs(values - 1.0) > 0.5 * bounds).any():
             # To first order no factor comes near its bound: the full search would find none.

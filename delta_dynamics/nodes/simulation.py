@@ -70,7 +70,23 @@ class MachineSim(TwinNode):
             choices=("normal", "uniform"),
         )
         self._variation = varied(robot, dict.fromkeys(kinds, size), seed, distribution)
-        self._declare_clock()
+        self._clock_kind = self.declare(
+            "clock",
+            "wall",
+            "wall: the computer's clock; simulated: publishes /clock at "
+            "real_time_factor; lockstep: publishes /clock, one period per effort command",
+            choices=("wall", "simulated", "lockstep"),
+        )
+        self._factor = self.declare(
+            "real_time_factor", 1.0, "speed of the simulated clock; 0: as fast as possible", low=0.0, high=1000.0
+        )
+        self._simulated = self._clock_kind != "wall"
+        self._lockstep = self._clock_kind == "lockstep"
+        if self.get_parameter("use_sim_time").value:
+            raise ParameterError("use_sim_time", True, OWN_CLOCK)
+        self.add_on_set_parameters_callback(_refuse_sim_time)
+        if not self._simulated:
+            self._factor = 1.0
         settings = self._declare_settings(robot)
         begin = BEGIN if self._simulated else self.now()
         self.core = Simulation(self._variation.robot, settings, begin)
@@ -93,7 +109,17 @@ class MachineSim(TwinNode):
             # At most 1 kHz: more turns of the executor would cost more than the simulation.
             self.create_guarded_timer(max(1e-3, step), self._catch_up)
         self.start()
-        self._publish_drawn()
+        # A transient local topic and the log keep what was drawn.
+        drawn = self._variation.drawn
+        values = [KeyValue(key=name, value=short(value)) for name, value in drawn.items()]
+        status = DiagnosticStatus(name=self.get_fully_qualified_name(), values=values)
+        status.message = f"{len(drawn)} parameters drawn"
+        status.hardware_id = self.core.robot.name
+        message = DiagnosticArray(status=[status])
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._drawn.publish(message)
+        for name, value in drawn.items():
+            self.get_logger().info(f"drawn: {name} {value:.6g}")
 
     def details(self) -> str:
         """Return the diagnostics' text: the number of drawn parameters, and the clock."""
@@ -134,25 +160,6 @@ class MachineSim(TwinNode):
             **sim.wrenches.counts("applied wrenches"),
         }
 
-    def _declare_clock(self) -> None:
-        self._clock_kind = self.declare(
-            "clock",
-            "wall",
-            "wall: the computer's clock; simulated: publishes /clock at "
-            "real_time_factor; lockstep: publishes /clock, one period per effort command",
-            choices=("wall", "simulated", "lockstep"),
-        )
-        self._factor = self.declare(
-            "real_time_factor", 1.0, "speed of the simulated clock; 0: as fast as possible", low=0.0, high=1000.0
-        )
-        self._simulated = self._clock_kind != "wall"
-        self._lockstep = self._clock_kind == "lockstep"
-        if self.get_parameter("use_sim_time").value:
-            raise ParameterError("use_sim_time", True, OWN_CLOCK)
-        self.add_on_set_parameters_callback(_refuse_sim_time)
-        if not self._simulated:
-            self._factor = 1.0
-
     def _declare_settings(self, robot: Robot) -> MachineSettings:
         """Declare drives and sensors, whose defaults come from the unperturbed robot."""
         bandwidth = self.declare(
@@ -160,6 +167,28 @@ class MachineSim(TwinNode):
         )
         stiffness, damping = tune_position_control(robot, bandwidth)
         home = robot.inverse(robot.home())
+        # By default the robot's own payload, from the start.
+        own = robot.payload
+        times = self.declare("payload.times", [0.0], "times at which the payload changes, s after the start")
+        masses = self.declare("payload.masses", [own.mass], "payload from each time on, kg", usual="the robot's")
+        coms = self.declare(
+            "payload.coms",
+            own.com.tolist(),
+            "centre of mass of the payload, m from the platform's reference point, three numbers per time",
+            usual="the robot's",
+        )
+        if len(masses) != len(times) or len(coms) != 3 * len(times):
+            raise ParameterError(
+                "payload.masses", list(masses), f"{len(times)} numbers, and three for each in payload.coms"
+            )
+        events = tuple(
+            PayloadEvent(float(t), float(m), tuple(map(float, coms[3 * i : 3 * i + 3])))
+            for i, (t, m) in enumerate(zip(times, masses, strict=True))
+        )
+        for event in events:
+            if not 0.0 <= event.time < np.inf:
+                raise ParameterError("payload.times", event.time, "0 or more, finite")
+            robot.changed(payload=event.load)
         return self.declare_settings(
             MachineSettings,
             fixed=True,
@@ -177,7 +206,7 @@ class MachineSim(TwinNode):
                 "resolution of the encoders, rad or m; velocities are then differences of steps; 0: exact",
                 0.0,
             ),
-            payloads=self._declare_payloads(robot),
+            payloads=events,
             wrench=WrenchSignal(
                 self._declare_array("wrench.constant", np.zeros(6), "wrench on the platform, N and N m, base axes"),
                 self._declare_array("wrench.amplitude", np.zeros(6), "amplitude of a sine added to wrench.constant"),
@@ -204,31 +233,6 @@ class MachineSim(TwinNode):
                 period = sim.settings.period
                 raise ParameterError(name, value, f"{right}, stable at period {period:g} s")
         self.report_limitation(f"trajectories are rejected: {sim.control_fault()}")
-
-    def _declare_payloads(self, robot: Robot) -> tuple[PayloadEvent, ...]:
-        """Declare payload events as three lists; by default the robot's own payload from the start."""
-        own = robot.payload
-        times = self.declare("payload.times", [0.0], "times at which the payload changes, s after the start")
-        masses = self.declare("payload.masses", [own.mass], "payload from each time on, kg", usual="the robot's")
-        coms = self.declare(
-            "payload.coms",
-            own.com.tolist(),
-            "centre of mass of the payload, m from the platform's reference point, three numbers per time",
-            usual="the robot's",
-        )
-        if len(masses) != len(times) or len(coms) != 3 * len(times):
-            raise ParameterError(
-                "payload.masses", list(masses), f"{len(times)} numbers, and three for each in payload.coms"
-            )
-        events = tuple(
-            PayloadEvent(float(t), float(m), tuple(map(float, coms[3 * i : 3 * i + 3])))
-            for i, (t, m) in enumerate(zip(times, masses, strict=True))
-        )
-        for event in events:
-            if not 0.0 <= event.time < np.inf:
-                raise ParameterError("payload.times", event.time, "0 or more, finite")
-            robot.changed(payload=event.load)
-        return events
 
     def _declare_array(self, name: str, default: Array, text: str, low: float | None = None, usual: str = "") -> Array:
         """Declare a parameter with one number per joint or component; one number stands for all."""
@@ -330,19 +334,6 @@ class MachineSim(TwinNode):
             own.controller_rates(measured.qd),
             own.controller_efforts(measured.effort),
         )
-
-    def _publish_drawn(self) -> None:
-        """Log the drawn parameters, and publish them on a transient local topic."""
-        drawn = self._variation.drawn
-        values = [KeyValue(key=name, value=short(value)) for name, value in drawn.items()]
-        status = DiagnosticStatus(name=self.get_fully_qualified_name(), values=values)
-        status.message = f"{len(drawn)} parameters drawn"
-        status.hardware_id = self.core.robot.name
-        message = DiagnosticArray(status=[status])
-        message.header.stamp = self.get_clock().now().to_msg()
-        self._drawn.publish(message)
-        for name, value in drawn.items():
-            self.get_logger().info(f"drawn: {name} {value:.6g}")
 
 
 def _refuse_sim_time(changes: Sequence[Parameter]) -> SetParametersResult:

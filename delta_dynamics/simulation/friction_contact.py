@@ -221,18 +221,14 @@ class Resistance:
         """Return the velocities of all rows by joint velocities, shape (n + k, n)."""
         return np.concatenate([self._drives, here.rows]) if self._passive else self._drives
 
-    def row_rates(self, here: Terms) -> Array:
-        """Return the velocities of all rows, shape (n + k,)."""
-        qd = here.qd
-        return np.concatenate([qd, here.rows @ qd]) if self._passive else qd
-
     def arrive(self, q: Array, qd: Array) -> Terms:
         """Return the terms of a new state, after an impact if there is one."""
         return self._apply_impact(self._classify_rows(self.at(q, qd)))
 
     def _classify_rows(self, here: Terms) -> Terms:
         """Determine which rows move, and in which direction."""
-        rates = self.row_rates(here)
+        qd = here.qd
+        rates = np.concatenate([qd, here.rows @ qd]) if self._passive else qd
         self._still = np.abs(rates) <= ZERO_VELOCITY * np.abs(self.rows(here) * here.qd).max(1)
         self._states = np.where(self._still, 0.0, np.sign(rates)).astype(np.int8)
         self._law = None

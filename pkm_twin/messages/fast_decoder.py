@@ -237,7 +237,24 @@ class RawTrajectory:
         table = _Points(begin, points, tuple(lengths))
         if points * 8 > len(data) or at > len(data):
             raise MessageError("cdr", f"{points} points in {len(data)} bytes")
-        table.check_lengths(data, order)
+        # A point with arrays of another length shifts all later ones: read only points that fit.
+        fitting = table
+        while fitting.end > len(data) and fitting.points > 1:
+            fitting = _Points(begin, (fitting.points + 1) // 2, table.lengths)
+        odd = []
+        for i, length in enumerate(table.lengths):
+            given = fitting.read(data, i, f"{order}u4", 1, of_length=True)[:, 0]
+            other = given != length
+            if other.any():
+                point = int(other.argmax())
+                odd.append((point, i, int(given[point])))
+        if odd:
+            point, i, length = min(odd)
+            raise MessageError(
+                "length", f"point {point}: {length} {POINT_ARRAYS[i]}, the first point has {table.lengths[i]}"
+            )
+        if table.end > len(data):
+            raise MessageError("cdr", f"{points} points take {table.end} bytes, {len(data)} are given")
         times = table.read(data, TIME_INDEX, f"{order}u4", 2)
         columns: dict[str, Array | Ragged | None] = {
             what: table.read(data, i, f"{order}f8", lengths[i]) if lengths[i] else None
@@ -302,26 +319,6 @@ class _Points:
         """Write an array of all points."""
         for which, view in self._views(data, array, kind, values.shape[1], of_length):
             view[...] = values[which]
-
-    def check_lengths(self, data: bytes, order: str) -> None:
-        """Reject points whose arrays differ in length from those of the first point."""
-        fitting = self
-        while fitting.end > len(data) and fitting.points > 1:
-            fitting = _Points(self._groups[0][1], (fitting.points + 1) // 2, self.lengths)
-        odd = []
-        for i, length in enumerate(self.lengths):
-            given = fitting.read(data, i, f"{order}u4", 1, of_length=True)[:, 0]
-            other = given != length
-            if other.any():
-                point = int(other.argmax())
-                odd.append((point, i, int(given[point])))
-        if odd:
-            point, i, length = min(odd)
-            raise MessageError(
-                "length", f"point {point}: {length} {POINT_ARRAYS[i]}, the first point has {self.lengths[i]}"
-            )
-        if self.end > len(data):
-            raise MessageError("cdr", f"{self.points} points take {self.end} bytes, {len(data)} are given")
 
     def _views(
         self, data: Any, array: int, kind: str, columns: int, of_length: bool

@@ -245,7 +245,26 @@ class JointReader:
         index = self._match_points(names, given.times.shape[1] if given else len(message.points))
         fields = given or TrajectoryFields.of(message)
         stamp = stamp_of(fields.header)
-        nanoseconds = _times_from_start(fields.times)
+        times = fields.times
+        bad = (times[1] < 0) | (times[1] >= SECOND)
+        if bad.any():
+            raise MessageError("time", f"nanosec is {times[1, bad.argmax()]}, allowed 0 to {SECOND - 1}")
+        nanoseconds: NDArray[np.int64] = times[0] * SECOND + times[1]
+        if nanoseconds[0] < 0:
+            raise MessageError("time", f"time_from_start begins at {nanoseconds[0] / SECOND:g} s")
+        # Beyond MAX_DURATION seconds as floats do not resolve nanoseconds.
+        if nanoseconds[-1] > MAX_DURATION:
+            raise MessageError(
+                "bounds", f"time_from_start ends at {nanoseconds[-1] / SECOND:g} s, at most {MAX_DURATION / SECOND:g} s"
+            )
+        falls = np.diff(nanoseconds) <= 0
+        if falls.any():
+            i = int(falls.argmax()) + 1
+            raise MessageError(
+                "time",
+                f"time_from_start of point {i} is {nanoseconds[i] / SECOND:g} s, not after "
+                f"{nanoseconds[i - 1] / SECOND:g} s",
+            )
         end = stamp + int(nanoseconds[-1])
         if stamp != 0 and end < now:
             raise MessageError(
@@ -404,30 +423,6 @@ def as_message_error(call: Callable[P, R], *arguments: P.args, **options: P.kwar
     except ValueError as error:
         # The input was finite: the model overflowed.
         raise MessageError("non-finite result", str(error)) from error
-
-
-def _times_from_start(times: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Convert seconds and nanoseconds (2, p) to nanoseconds; check that they rise from zero."""
-    bad = (times[1] < 0) | (times[1] >= SECOND)
-    if bad.any():
-        raise MessageError("time", f"nanosec is {times[1, bad.argmax()]}, allowed 0 to {SECOND - 1}")
-    nanoseconds: NDArray[np.int64] = times[0] * SECOND + times[1]
-    if nanoseconds[0] < 0:
-        raise MessageError("time", f"time_from_start begins at {nanoseconds[0] / SECOND:g} s")
-    # Beyond MAX_DURATION seconds as floats do not resolve nanoseconds.
-    if nanoseconds[-1] > MAX_DURATION:
-        raise MessageError(
-            "bounds", f"time_from_start ends at {nanoseconds[-1] / SECOND:g} s, at most {MAX_DURATION / SECOND:g} s"
-        )
-    falls = np.diff(nanoseconds) <= 0
-    if falls.any():
-        i = int(falls.argmax()) + 1
-        raise MessageError(
-            "time",
-            f"time_from_start of point {i} is {nanoseconds[i] / SECOND:g} s, not after "
-            f"{nanoseconds[i - 1] / SECOND:g} s",
-        )
-    return nanoseconds
 
 
 MAX_LOAD: Final = 1e7

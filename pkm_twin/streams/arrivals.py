@@ -65,21 +65,6 @@ class Arrivals:
         self.late += age > self.deadline * SECOND
         if self.topic.received(number, sent):
             self.topic.count_missed()
-        for fault in self._faults(names, efforts, stamp):
-            self.faults[fault] += 1
-        self._last_stamp = max(self._last_stamp, stamp)
-
-    def ended(self, steady: int) -> None:
-        """End the count; the silence until ``steady``, ns, counts, too."""
-        if self.count:
-            self._silence(steady - self.last)
-            self.last = steady
-
-    def _silence(self, silent: int) -> None:
-        self.longest_silence = max(self.longest_silence, silent)
-        self.silences += silent > self.deadline * SECOND
-
-    def _faults(self, names: Sequence[str], efforts: Sequence[float], stamp: int) -> list[str]:
         found = []
         if stamp == 0:
             found.append("zero stamp")
@@ -94,4 +79,16 @@ class Arrivals:
         if self._names and self._names != frozenset(names):
             found.append("other joints")
         self._names = self._names or frozenset(names)
-        return found
+        for fault in found:
+            self.faults[fault] += 1
+        self._last_stamp = max(self._last_stamp, stamp)
+
+    def ended(self, steady: int) -> None:
+        """End the count; the silence until ``steady``, ns, counts, too."""
+        if self.count:
+            self._silence(steady - self.last)
+            self.last = steady
+
+    def _silence(self, silent: int) -> None:
+        self.longest_silence = max(self.longest_silence, silent)
+        self.silences += silent > self.deadline * SECOND
