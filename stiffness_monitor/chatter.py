@@ -23,7 +23,7 @@ from pkm_twin.errors import ParameterError, check_limit
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor.vibration import Complex, ToolModes, responses, tool_modes
 
-MAX_WAVES: Final = 20.0
+MAX_WAVES_PER_TOOTH: Final = 20.0
 """Largest number of vibrations of a mode per tooth period; process damping governs below."""
 STEPS_PER_WAVE: Final = 20
 """Time steps per vibration; a tooth period has at least twice as many."""
@@ -309,7 +309,7 @@ def stability_lobes(
     :param damping, tool: as of :func:`~stiffness_monitor.vibration.tool_modes`; so are errors.
     :param deepest: depth up to which to look, m; default :data:`DEFAULT_DEPTH_RATIO` times the
         depth that is stable at every speed.
-    :raises ParameterError: a speed with more than :data:`MAX_WAVES` vibrations from tooth to tooth.
+    :raises ParameterError: a speed with more than :data:`MAX_WAVES_PER_TOOTH` vibrations from tooth to tooth.
     """
     return lobes_of(tool_modes(robot, pose, damping=damping, tool=tool), milling, speeds, deepest)
 
@@ -363,8 +363,8 @@ def _check_range(plane: _CuttingPlane, milling: Milling, at: Array, deepest: flo
     for speed in (at.min(), at.max()) if at.size else ():
         check_limit("speeds", float(speed), "rpm", 1e-3, 1e6)
     waves = plane.waves(milling, at)
-    if len(at) and waves.max() > MAX_WAVES * (1.0 + 1e-12):
-        bound = f"{at.min() * waves.max() / MAX_WAVES:.4g} rpm or more: process damping governs below"
+    if len(at) and waves.max() > MAX_WAVES_PER_TOOTH * (1.0 + 1e-12):
+        bound = f"{at.min() * waves.max() / MAX_WAVES_PER_TOOTH:.4g} rpm or more: process damping governs below"
         raise ParameterError("speeds", at.min(), bound)
     safe, _ = plane.stable_depth(milling)
     if deepest is None and not np.isfinite(safe):

@@ -85,7 +85,7 @@ def platform_response(robot: Robot, q: ArrayLike, wrench: ArrayLike) -> Platform
     factors, energies, deflection = row[..., :n], row[..., n : 2 * n], row[..., 2 * n : 2 * n + 6]
     matrix = row[..., 2 * n + 7 : 2 * n + 43].reshape(*row.shape[:-1], 6, 6)
     if row.ndim == 1:
-        # One sample, without numpy.
+        # Python floats: for one sample numpy's calls would take most of the time.
         shares = factors.tolist()
         bound = max(shares) * (1.0 - TIE_TOLERANCE)
         close = [k for k, share in enumerate(shares) if share > bound]

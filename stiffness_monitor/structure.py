@@ -229,7 +229,7 @@ def place_plan(
         at = None if support.at is None else place(*support.at)
         return replace(support, axes=axes, compliance=tuple(values), at=at)
 
-    def part_of(part: Member | Carried) -> Member | Carried:
+    def as_part(part: Member | Carried) -> Member | Carried:
         if isinstance(part, Carried):
             return replace(part, at=place(*part.at), support=stood(part.support))
         made = replace(part, start=place(*part.start), end=place(*part.end), section=section(part.section))
@@ -239,7 +239,7 @@ def place_plan(
     return replace(
         plan,
         origin=place(*plan.origin),
-        parts=tuple(part_of(part) for part in plan.parts),
+        parts=tuple(as_part(part) for part in plan.parts),
         closures=tuple(replace(c, at=place(*c.at), support=stood(c.support)) for c in plan.closures),
     )
 

@@ -129,9 +129,9 @@ def platform_wrench(robot: Robot, q: ArrayLike, external: ArrayLike) -> Array:
     return finite(least, "an effort")
 
 
-SIGMAS: Final = 6.0
+CONTACT_SIGMAS: Final = 6.0
 """Standard deviations of model and noise together that indicate a contact."""
-LEARNING: Final = 0.2
+LEARNING_TIME: Final = 0.2
 """Time after the start in which only the noise is estimated, s."""
 MIN_NOISE_FRACTION: Final = 1e-3
 """Smallest standard deviation of an effort, relative to the largest effort of the stream."""
@@ -186,7 +186,7 @@ class Drag:
                 means[k] += min(1.0, step / min(times[k], AVERAGED)) * (opposing - means[k])
                 if not touching:
                     alone[k] = means[k]
-            if min(times) > LEARNING:
+            if min(times) > LEARNING_TIME:
                 known.append(max(0.0, min(means)))
             elif max(times) > 0.1:  # s of motion: a shorter one is an onset
                 known.append(max(0.0, alone[int(times[1] > times[0])]))
@@ -205,7 +205,7 @@ class ContactMonitor:
     same delay as the estimate.
     """
 
-    def __init__(self, robot: Robot, bandwidth: float = 60.0, sigmas: float = SIGMAS) -> None:
+    def __init__(self, robot: Robot, bandwidth: float = 60.0, sigmas: float = CONTACT_SIGMAS) -> None:
         """Start without samples.
 
         :raises ValueError: a bandwidth or a number of standard deviations that is not positive.
@@ -225,7 +225,7 @@ class ContactMonitor:
         self.drives = DriveWatch()
         self._rest = VelocityErrorEstimator(0.0)
         # Squares are clipped at 9 times the average, so that a contact is not learnt as noise.
-        self._noise = self._kept = Noise(np.zeros(n), LEARNING, 9.0)
+        self._noise = self._kept = Noise(np.zeros(n), LEARNING_TIME, 9.0)
         self._unsure, self._slack, self._impulse, self._friction = np.zeros((4, n))
         self._greatest = usual_effort(self.robot)
         self._last: float | None = None
@@ -293,7 +293,7 @@ class ContactMonitor:
                 self._touching = False
             return self._verdict(q, external, idle)
         drag = self._drag.learn(step, external, np.where(still, 0.0, qd), touching=self._touching)
-        # What is learnt is bounded: a larger opposing effort is a contact.
+        # The learnt friction is bounded: a larger opposing effort is a contact.
         friction = np.minimum(drag, 0.2 * self._greatest) + np.where(still, self._reach + holds, 0.0)
         # Uncertainties pass the observer's filter, as the estimate does.
         deviation = parts.default_deviation(self._greatest)

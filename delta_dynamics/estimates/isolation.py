@@ -30,19 +30,19 @@ UNKNOWN: Final = "unknown"
 """Class of efforts that no single force or clamping explains best, or that several explain."""
 PRIOR: Final = {PLATFORM: 0.4, "limbs": 0.4, CLAMPING: 0.15, UNKNOWN: 0.05}
 """Prior probabilities of a contact's class; the limbs share theirs."""
-NAMED: Final = 0.5
+MIN_CONFIDENCE: Final = 0.5
 """Smallest posterior probability of a class that is named."""
-PLACES: Final = 5
+POSITIONS_PER_BAR: Final = 5
 """Positions along a bar that are compared."""
-GRIP: Final = 0.3
+CONTACT_FRICTION: Final = 0.3
 """Coefficient of friction of a contact: a thin body transmits little force along itself."""
-MODEL: Final = 0.05
+MODEL_DEVIATION: Final = 0.05
 """Standard deviation of an external effort relative to it: gains of the drives, geometry."""
-CORRELATION: Final = 0.02
+CORRELATION_TIME: Final = 0.02
 """Correlation time of the efforts' errors, s."""
-MEMORY: Final = 0.1
+DECAY_TIME: Final = 0.1
 """Time after which a sample's weight has decayed to 1/e, s."""
-SIZES: Final = np.array([0.1, 0.3, 1.0, 3.0, 10.0])
+FORCE_RATIOS: Final = np.array([0.1, 0.3, 1.0, 3.0, 10.0])
 """Forces that are compared, relative to that of a typical position."""
 
 
@@ -51,7 +51,7 @@ class ContactPlace:
     """Hold the class of a contact, with its posterior probability, and its position.
 
     ``where``: ``platform``, a limb's name, ``clamping A and B`` (opposite forces on two bodies), or
-    ``unknown`` where no class has the probability ``NAMED``. ``confidence``: of the most likely
+    ``unknown`` where no class has the probability ``MIN_CONFIDENCE``. ``confidence``: of the most likely
     class. ``classes``: of all, by name; clamping is one. ``body``: the most likely body,
     or two. ``point``: where on it, base axes, (3,), m, of clamping between both. ``deviation``:
     standard deviation along the body, m; that of an even distribution, 0.29 of the length, where
@@ -84,7 +84,7 @@ def limbs_of(robot: Robot) -> dict[str, str]:
     return {name: names.get(root, root) for name, root in limb.items()} | {graph.platform: PLATFORM}
 
 
-def joined_bodies(graph: Graph) -> list[tuple[str, str]]:
+def list_joined_bodies(graph: Graph) -> list[tuple[str, str]]:
     """List the pairs of bodies and rods that a joint connects, in both orders."""
     return [*graph.links, *((b, a) for a, b in graph.links)]
 
@@ -138,10 +138,10 @@ class Places:
             length = float(np.linalg.norm(end[1] - start[1]))
             for body, point in (start, end):
                 ends.append((bodies.index(body), point - (at[body] if body != BASE else 0.0)))
-            number = PLACES if length else 1
+            number = POSITIONS_PER_BAR if length else 1
             for i in range(number):
-                # Of the platform's bars the ends count, too: it is wide there.
-                s = i / (PLACES - 1) if part == graph.platform else (i + 0.5) / PLACES
+                # On the platform's bars the ends are candidates too, as the platform is wide there.
+                s = i / (POSITIONS_PER_BAR - 1) if part == graph.platform else (i + 0.5) / POSITIONS_PER_BAR
                 mix.append((k, s * (number > 1)))
                 lengths.append(length / number)
                 self.parts.append(part)
@@ -157,7 +157,7 @@ class Places:
         self.names = tuple(dict.fromkeys(name for name in self.limbs if name != PLATFORM))
         owners = np.array(self.limbs)
         one, other = np.triu_indices(len(owners), 1)
-        joined = {*joined_bodies(graph)}
+        joined = {*list_joined_bodies(graph)}
         # A force on the platform explains three efforts and fewer as well as any clamping.
         apart = (owners[one] != owners[other]) & (robot.joints_count > 3)
         apart &= [(self.parts[a], self.parts[b]) not in joined for a, b in zip(one, other, strict=True)]
@@ -190,7 +190,7 @@ class Places:
         rows = np.empty((n + 1, 3, len(ends)))
         rows[0] = ends.T
         for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-            # Of omega x lever.
+            # Component i of omega x lever.
             rows[1:, i] = rates[..., i] + rates[..., 3 + j] * lever[:, k]
             rows[1:, i] -= rates[..., 3 + k] * lever[:, j]
         found = (rows.reshape(-1, len(ends)) @ self._mix).reshape(n + 1, 3, -1)
@@ -223,7 +223,7 @@ class ContactLocator:
     def __init__(self, robot: Robot) -> None:
         self.places = Places(robot)
         # Thin bars pass little of a force along them on.
-        self._slim = np.where(self.places.thin, 1.0 - GRIP, 0.0)
+        self._slim = np.where(self.places.thin, 1.0 - CONTACT_FRICTION, 0.0)
         self.reset()
 
     def reset(self) -> None:
@@ -238,7 +238,7 @@ class ContactLocator:
         :param q: joint positions (n,), with rates ``qd`` and external efforts (n,), N m or N.
         :param deviation: standard deviations of the efforts, (n,).
         """
-        sure = 1.0 / np.hypot(deviation, MODEL * np.abs(external))
+        sure = 1.0 / np.hypot(deviation, MODEL_DEVIATION * np.abs(external))
         y = external * sure
         if not y.any():
             return
@@ -249,8 +249,8 @@ class ContactLocator:
             self._begin(jacobian, sure, qd)
         # The force is proportional to the efforts, in the units of the first sample.
         sure = float(np.linalg.norm(external * self._unit)) * sure
-        fade = math.exp(-step / MEMORY)
-        weight = min(1.0, step / CORRELATION)
+        fade = math.exp(-step / DECAY_TIME)
+        weight = min(1.0, step / CORRELATION_TIME)
         one = jacobian * sure[:, None, None]
         one -= (self._slim * np.einsum("nip,ip->np", one, way))[:, None] * way
         # Derivatives of the pairs' distances by joint positions, (n, pairs).
@@ -313,17 +313,17 @@ class ContactLocator:
         line, sides = sums[ends : ends + 2 * pairs].reshape(2, pairs)
         other, others = sums[-2 * n :].reshape(2, n)
         places = self.places
-        precision = ((self._force * SIZES) ** -2.0)[:, None]
+        precision = ((self._force * FORCE_RATIOS) ** -2.0)[:, None]
         one = _mean(_force_evidence(forces[:3], forces[3], precision))
         # Clamping efforts are off by the spacing of the positions: 0.15 of their size.
         noise = 1.0 + 0.15**2 * square * n / counted
         pair = _mean(_component_evidence(line / noise, sides / noise, precision, one_sided=True))
         pair += 0.5 * (square * (1.0 - 1.0 / noise) - counted * math.log(noise))
-        nothing = float(_mean(_component_evidence(other, others, SIZES[:, None] ** -2.0).sum(-1)))
+        nothing = float(_mean(_component_evidence(other, others, FORCE_RATIOS[:, None] ** -2.0).sum(-1)))
         top = max(one.max(), pair.max(initial=-np.inf), nothing)
         likely = places.prior * np.exp(one - top)
         # Clamping is less likely if fewer places can clamp.
-        clamped = PRIOR[CLAMPING] * np.exp(pair - top) / max(len(pair), PLACES**2)
+        clamped = PRIOR[CLAMPING] * np.exp(pair - top) / max(len(pair), POSITIONS_PER_BAR**2)
         odd = float(PRIOR[UNKNOWN] * np.exp(nothing - top))
         by_class = places.of_class @ likely
         shares = np.array([*by_class, clamped.sum(), odd])
@@ -347,7 +347,9 @@ class ContactLocator:
         point = share @ at
         deviation = math.sqrt(float(share @ ((at - point) ** 2).sum(1)))
         confidence = classes[best]
-        return ContactPlace(where if confidence >= NAMED else UNKNOWN, confidence, classes, body, point, deviation)
+        return ContactPlace(
+            where if confidence >= MIN_CONFIDENCE else UNKNOWN, confidence, classes, body, point, deviation
+        )
 
 
 def _force_evidence(matrix: Array, vector: Array, precision: Array) -> Array:

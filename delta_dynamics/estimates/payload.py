@@ -23,13 +23,13 @@ from pkm_twin.streams.rest import VelocityErrorEstimator
 
 FOUND: Final = ("mass", "mx", "my", "mz")
 """Estimated parameters: mass and first moments about the platform's reference point."""
-CORRELATION: Final = 0.02
+CORRELATION_TIME: Final = 0.02
 """Correlation time of the residual's errors, s."""
-MEMORY: Final = 20.0
+DECAY_TIME: Final = 20.0
 """Time after which a sample's weight has decayed to 1/e, s."""
-STEADY: Final = 0.4
+SETTLING_TIME: Final = 0.4
 """Time after the start in which no jump is detected, s."""
-JUMP: Final = 0.06
+JUMP_AVERAGING_TIME: Final = 0.06
 """Averaging time of the residual for detecting a jump, s."""
 
 
@@ -87,7 +87,7 @@ class PayloadEstimator:
         self._rest = VelocityErrorEstimator(0.0)
         self.resets = 0
         # Squares are clipped at 4 times the average, so that a jump is not learnt as noise.
-        self._noise = Noise(np.full(robot.joints_count, 4.0 * self._least**2), STEADY, 4.0)
+        self._noise = Noise(np.full(robot.joints_count, 4.0 * self._least**2), SETTLING_TIME, 4.0)
         self.reset()
         self.resets = 0
 
@@ -156,16 +156,16 @@ class PayloadEstimator:
         target = effort - computed + columns @ self._own
         left = beyond_friction(target - columns @ self._solution(), still, reach)
         self._since += step
-        self._average = self._average + min(1.0, step / JUMP) * (left - self._average)
+        self._average = self._average + min(1.0, step / JUMP_AVERAGING_TIME) * (left - self._average)
         # Errors that last for their correlation time have this deviation in the average; 6 of it are a jump.
-        spread = np.sqrt(self._noise.variance * CORRELATION / (CORRELATION + JUMP))
-        if self._since >= STEADY and (np.abs(self._average) > 6.0 * spread).any():
+        spread = np.sqrt(self._noise.variance * CORRELATION_TIME / (CORRELATION_TIME + JUMP_AVERAGING_TIME))
+        if self._since >= SETTLING_TIME and (np.abs(self._average) > 6.0 * spread).any():
             self.reset()
             self._last = time
             return self.estimate()
-        fade = math.exp(-step / MEMORY)
+        fade = math.exp(-step / DECAY_TIME)
         rubs = still & (reach > 0.0)
-        share = np.where(rubs, min(1.0, step / MEMORY), min(1.0, step / CORRELATION))
+        share = np.where(rubs, min(1.0, step / DECAY_TIME), min(1.0, step / CORRELATION_TIME))
         variance = self._noise.variance + np.where(rubs, reach**2, 0.0)
         rows = columns * (share / variance)[:, None]
         prior = np.diag(self._prior**-2.0)

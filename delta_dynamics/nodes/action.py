@@ -34,14 +34,14 @@ Place = Callable[[], "Mapping[str, float] | None"]
 Result = FollowJointTrajectory.Result
 
 NAME = "~/follow_joint_trajectory"
-LOOK = 0.1
+CHECK_PERIOD = 0.1
 """Period of the checks of goals, s."""
-PING = 5
-MAX_SILENT_LOOKS = 18
+ASKING_CHECKS = 5
+MAX_SILENT_CHECKS = 18
 """Checks without a sign of the controller until it is asked for one, and until its goals are aborted: 1.8 s."""
-MATCHING = 5.0
+MAX_DISCOVERY_TIME = 5.0
 """Longest time to find the controller's action, s."""
-REST = 1e-3
+REST_VELOCITY = 1e-3
 """Joint velocity below which the machine rests, rad/s or m/s."""
 
 
@@ -127,7 +127,7 @@ class EffortAction:
         self._silent = 0
         """Number of checks since the controller's last sign of life."""
         self._settling: _Settling | None = None
-        node.create_guarded_timer(LOOK, self._look)
+        node.create_guarded_timer(CHECK_PERIOD, self._look)
         self._server = ActionServer(
             node,
             FollowJointTrajectory,
@@ -185,7 +185,7 @@ class EffortAction:
                 continue
             if goal.handle.is_cancel_requested:
                 self._finish(goal, GoalStatus.STATUS_CANCELED, Result())
-            elif time.monotonic() - goal.filled > MATCHING:
+            elif time.monotonic() - goal.filled > MAX_DISCOVERY_TIME:
                 self._abort(goal, f"no action server at {self._controller}")
         self._check_controller()
         self._check_rest()
@@ -197,12 +197,12 @@ class EffortAction:
         """
         sent = [goal for goal in self._goals.values() if goal.sent]
         self._silent = self._silent + 1 if sent else 0
-        if self._silent >= MAX_SILENT_LOOKS:
+        if self._silent >= MAX_SILENT_CHECKS:
             for goal in sent:
                 if goal.controller is not None:
                     goal.controller.cancel_goal_async()
                 self._abort(goal, f"{self._controller} disappeared during the goal")
-        elif self._silent and self._silent % PING == 0:
+        elif self._silent and self._silent % ASKING_CHECKS == 0:
             # Cancelling an unknown goal changes nothing, but the controller answers.
             request = CancelGoal.Request()
             request.goal_info.goal_id.uuid = np.frombuffer(os.urandom(16), np.uint8)
@@ -381,14 +381,14 @@ class EffortAction:
         if not measured.keys() >= set(settling.names):
             return
         place = [measured[name] for name in settling.names]
-        elapsed = (now - settling.since) or LOOK
+        elapsed = (now - settling.since) or CHECK_PERIOD
         speed = float(np.abs(np.subtract(place, settling.place)).max()) / elapsed
         before = settling.speed
         # The first interval may be too short to recognise rest.
-        if before is not None and speed < REST:
+        if before is not None and speed < REST_VELOCITY:
             if np.abs(np.subtract(place, settling.held)).max() > 1e-4:
                 self._send_point(settling.names, measured, lambda _: None)
-        elif before is None or speed <= before + REST:
+        elif before is None or speed <= before + REST_VELOCITY:
             self._settling = replace(settling, place=place, since=now, speed=speed)
 
     def _abort(self, goal: _Goal, text: str) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from geometry_msgs.msg import Inertia, InertiaStamped, Point, PointStamped, Vector3
 from std_msgs.msg import Bool, String
 
-from delta_dynamics.estimates.contact import SIGMAS, Contact, ContactMonitor
+from delta_dynamics.estimates.contact import CONTACT_SIGMAS, Contact, ContactMonitor
 from delta_dynamics.estimates.isolation import ContactPlace
 from delta_dynamics.estimates.payload import PayloadEstimator
 from delta_dynamics.feedforward import Torques
@@ -69,7 +69,7 @@ class Estimates:
         )
         sigmas = node.declare(
             "observer.sigmas",
-            SIGMAS,
+            CONTACT_SIGMAS,
             "contact threshold in standard deviations of model and noise together",
             low=1.0,
             high=1e3,

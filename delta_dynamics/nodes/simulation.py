@@ -42,7 +42,7 @@ BEGIN: Final = SECOND
 """Simulated time at the start, ns: a stamp of zero would be none."""
 MAX_TICK_TIME: Final = 5e-3
 """Longest time that one tick of the clock may simulate, s: messages are taken between ticks."""
-LOOK: Final = 0.05
+CHECK_PERIOD: Final = 0.05
 """In lockstep: period of the checks for a silent commander, s."""
 WRENCH: Final = "geometry_msgs/msg/WrenchStamped"
 OWN_CLOCK: Final = "false, because machine_sim has its own clock"
@@ -103,7 +103,7 @@ class MachineSim(TwinNode):
         self._heard = self._due
         self._flying = 0
         if self._lockstep:
-            self.create_guarded_timer(LOOK, self._go_alone)
+            self.create_guarded_timer(CHECK_PERIOD, self._go_alone)
         else:
             step = settings.period / self._factor if self._factor else 0.0
             # At most 1 kHz: more turns of the executor would cost more than the simulation.

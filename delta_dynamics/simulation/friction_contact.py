@@ -304,7 +304,7 @@ class Resistance:
         law.given, law.wrench = effort - self._offset, wrench
         law.effort = law.given - law.pull[: len(effort)]
         if self._laws and len(law.held):
-            # What friction can hold grows with the load.
+            # The load that friction can hold grows with the load on the joint.
             low, high = (one[law.held] for one in self._bounds(here, law.given))
             law.low = np.where(np.isfinite(law.low), low, law.low)
             law.high = np.where(np.isfinite(law.high), high, law.high)

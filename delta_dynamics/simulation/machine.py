@@ -30,11 +30,11 @@ from pkm_twin.streams.path import JointPath
 
 TimeoutAction = Literal["zeros", "hold"]
 
-SINGULAR: Final = 1e-3
+MIN_SINGULARITY_INDEX: Final = 1e-3
 """Singularity index below which rigid bodies no longer describe the machine."""
-MARGIN: Final = 1.25
+GAIN_MARGIN: Final = 1.25
 """Factor of all gains with which the position control must still be stable."""
-DELAYS: Final = 20
+MAX_MODELLED_DELAYS: Final = 20
 """Periods of a delay that are modelled one by one; a longer delay is divided into as many."""
 
 
@@ -118,7 +118,7 @@ def stable_share(robot: Robot, settings: MachineSettings) -> float:
 
     Stable: in the discrete loop of the sampled control and the machine's masses, linear about rest,
     no error grows, at the start and in the pose where the loop is fastest, with every payload, and
-    with gains that are higher by :data:`MARGIN`. The bandwidth is that of :func:`tune_position_control`:
+    with gains that are higher by :data:`GAIN_MARGIN`. The bandwidth is that of :func:`tune_position_control`:
     stiffness goes by its square, damping by itself.
     """
     q = np.vstack([settings.start, random_joints(robot, np.random.default_rng(0), 64)])
@@ -137,7 +137,7 @@ def stable_share(robot: Robot, settings: MachineSettings) -> float:
         return all(
             error_growth(inertia, settings, gain * share**2, gain * share, rates) <= 1.0 + 1e-6
             for inertia, rates in inertias
-            for gain in (1.0, MARGIN)
+            for gain in (1.0, GAIN_MARGIN)
         )
 
     if stable(1.0):
@@ -165,9 +165,9 @@ def error_growth(
     n, s = len(inertia), settings
     turn = np.eye(n) if follow is None else follow
     delay = math.ceil(s.delay / s.period)
-    period = s.period if delay <= DELAYS else s.delay / DELAYS
+    period = s.period if delay <= MAX_MODELLED_DELAYS else s.delay / MAX_MODELLED_DELAYS
     # Every row block of the unit matrix is one quantity, in terms of the state.
-    unit = np.eye(n * (3 + min(delay, DELAYS)))
+    unit = np.eye(n * (3 + min(delay, MAX_MODELLED_DELAYS)))
     q, qd, before, *waiting = unit.reshape(-1, n, len(unit))
     rates = np.where(s.resolution[:, None] > 0.0, turn @ (q - before) / period, turn @ qd)
     effort = -stiffness * s.stiffness[:, None] * (turn @ q) - damping * s.damping[:, None] * rates
@@ -219,7 +219,9 @@ class Simulation(Core):
         s = self.settings
         self.braked, self.failure = True, ""
         self.plant = Plant(self.robot, s.start)
-        self._continuity = Continuity(self.robot, SINGULAR, SINGULAR, [MAX_RATE] * self.robot.joints_count)
+        self._continuity = Continuity(
+            self.robot, MIN_SINGULARITY_INDEX, MIN_SINGULARITY_INDEX, [MAX_RATE] * self.robot.joints_count
+        )
         self._begun = self.now
         self._payloads = deque(sorted(s.payloads, key=lambda event: event.time))
         self._coming: deque[tuple[int, Array]] = deque()

@@ -21,14 +21,14 @@ from pkm_twin.errors import PkmTwinError
 from pkm_twin.machine.inertia import loaded_joints
 from pkm_twin.robot.robot import Robot
 
-PARTS: Final = 100
+MAX_EXPLICIT_PARTS: Final = 100
 """Parts of a step from which on it is integrated implicitly, as changes accumulate."""
-RESOLUTION: Final = 0.5**12
+MIN_RELATIVE_SPAN: Final = 0.5**12
 """Shortest part of a step, relative to it: the one in which what sticks or slides changes."""
-GROWTH: Final = 1e-9
+MAX_ENERGY_GROWTH: Final = 1e-9
 """Energy that the method may add in a part, relative to the kinetic energy; it is removed
 afterwards."""
-ROUNDING: Final = 1e-14
+ENERGY_ROUNDING: Final = 1e-14
 """Rounding error of energies, relative to the largest summand."""
 
 
@@ -102,10 +102,10 @@ class Plant:
         q, qd = self.q[self._leading], self.qd[self._leading]
         if here is None or here.q.tobytes() + here.qd.tobytes() != q.tobytes() + qd.tobytes():
             here = self._resistance.arrive(q, qd)
-        least, span, changes = step * RESOLUTION, step, False
+        least, span, changes = step * MIN_RELATIVE_SPAN, step, False
         for part in itertools.count():
             # Where changes accumulate, implicit parts get longer.
-            least *= 4.0 if part > PARTS else 1.0
+            least *= 4.0 if part > MAX_EXPLICIT_PARTS else 1.0
             law, taken = self._resistance.find_law(here, effort, load), left
             if changes and not law.stands:
                 here, taken = self._cross(here, law, min(left, least))
@@ -134,7 +134,9 @@ class Plant:
                 end, work = self._flow(here, law, span)
                 part = resistance.lasting_part(here, end, law)
                 growth = _energy_growth(here, end, law, work)
-                if part == 1.0 and growth <= GROWTH * (here.kinetic + end.kinetic) + _energy_rounding(here, end, law):
+                if part == 1.0 and growth <= MAX_ENERGY_GROWTH * (here.kinetic + end.kinetic) + _energy_rounding(
+                    here, end, law
+                ):
                     settled = resistance.settle(end, law)
                     if settled is not end or growth > 0.0:
                         settled = _remove_growth(here, settled, law, work)
@@ -146,7 +148,7 @@ class Plant:
 
     def _cross(self, here: Terms, law: Law, span: float) -> tuple[Terms, float]:
         """Integrate at most ``span`` s implicitly, whatever sticks or slides; return state and time."""
-        shortest = RESOLUTION * span
+        shortest = MIN_RELATIVE_SPAN * span
         while True:
             end = self._resistance.step_implicitly(here, law, span)
             sound = _energy_growth(here, end, law, 0.0) <= end.kinetic + _energy_rounding(here, end, law)
@@ -183,7 +185,7 @@ def _energy_rounding(here: Terms, end: Terms, law: Law) -> float:
     """Bound the rounding error of the energy growth, J, including that of positions."""
     forces = np.abs(law.given) + np.abs(here.bias)
     size = here.kinetic + end.kinetic + abs(here.potential) + abs(end.potential)
-    return ROUNDING * (size + float(forces @ np.abs(here.q)))
+    return ENERGY_ROUNDING * (size + float(forces @ np.abs(here.q)))
 
 
 def _remove_growth(here: Terms, end: Terms, law: Law, work: float = 0.0) -> Terms:

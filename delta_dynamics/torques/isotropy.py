@@ -68,7 +68,7 @@ def minimax_direction(forms: Array) -> Array:
     for cone in (*forms, *(cone for _, cone in cones)):
         values, vectors = np.linalg.eigh(cone)
         if values[0] < 0.0 < values[-1]:
-            # Of two coordinates both lines of the cone, of three some.
+            # Directions on the cone y' G y = 0: all of them for two coordinates, two of them for three.
             x = math.sqrt(values[-1]) * vectors[:, 0]
             z = math.sqrt(-values[0]) * vectors[:, -1]
             found.append(np.stack([x + z, x - z]))

@@ -391,7 +391,7 @@ def balanced(robot: Robot, loads: Sequence[Array], *, strict: bool = True) -> Ba
     points = np.stack([joint.point for joint in joints], -2)
     centred = points - points.mean(-2, keepdims=True)
     size = np.sqrt(np.mean(np.sum(centred**2, -1), -1))
-    # Of joints that are all in one point the machine's own size is left.
+    # Joints that are all in one point have no distance: use the machine's size.
     size = np.where(size > POINT_FRACTION * engine.graph.size, size, engine.graph.size)
 
     origin, needed = needs(engine.graph, list(engine.tree.links), bodies, rods)

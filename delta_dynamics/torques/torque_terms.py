@@ -93,7 +93,7 @@ def dynamics_terms(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wr
     rubbing = _set_zero(robot.own_inertial, layout.part(GRAVITY))
     preload = np.zeros((*shape, n))
     if robot.redundant:
-        # What is left at rest, without gravity, friction and wrench.
+        # The effort that remains at rest without gravity, friction and wrench.
         preload = whole(weightless, still, still, none)
 
     def efforts(p: Array, qd: Array, qdd: Array, wrench: Array) -> Array:
@@ -101,7 +101,7 @@ def dynamics_terms(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wr
 
     bent, linear = still, change
     if robot.redundant:
-        # Of dependent drives, the part of the accelerations that the mass matrix takes.
+        # Accelerations of dependent drives are counted in the mass matrix's term.
         onto = robot.inverse_jacobian(place) @ robot.jacobian(place)
         bent = robot.project_redundant(place, rate)[2]
         bent = bent - np.einsum("...ij,...j->...i", onto, bent)
@@ -109,7 +109,7 @@ def dynamics_terms(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wr
     velocity = efforts(weightless, rate, bent, none)
     friction = efforts(rubbing, rate, bent, none) - velocity
     if robot.laws:
-        # It may grow with the load of the motion itself.
+        # Friction may grow with the load of the motion itself.
         both = (efforts(p, rate, change, load) for p in (robot.inertial, held))
         friction = next(both) - next(both)
     return Terms(

@@ -349,7 +349,7 @@ def unpack_chunk(chunk: mcap.Chunk, offset: int, budget: Budget) -> bytes:
     _check_size("chunk", len(data), size, offset)
     if compression:
         budget.spend(size, offset)
-        # One byte more than declared is let out, to tell a longer content from an exact one.
+        # Ask for one byte more than declared, to detect longer content.
         data = _decompress(compression, data, size + 1, offset)
     if len(data) != size:
         more = "more" if len(data) > size else str(len(data))

@@ -50,8 +50,8 @@ __all__ = [
 
 MAX_WAITING_BYTES = 256 * 1024**2
 """Most that is held in memory to put messages into the order of their log times."""
-# What a message takes beside its data.
-_MESSAGE_COST = 512
+# Memory of a message's Python objects in addition to its data, bytes.
+_MESSAGE_OVERHEAD_BYTES = 512
 
 
 class DamagedBagError(BagError):
@@ -211,12 +211,12 @@ class Bag:
                 # that time stays, since the segment may stand before it in the file.
                 while waiting and waiting[0][0] < segment.messages.start:
                     message = heapq.heappop(waiting)[-1]
-                    held -= len(message.data) + _MESSAGE_COST
+                    held -= len(message.data) + _MESSAGE_OVERHEAD_BYTES
                     yield message
                 for index, message in enumerate(self._parts[number].parse(segment, reader, wanted)):
                     entry = (message.log_time, number, segment.offset, index, message)
                     heapq.heappush(waiting, entry)
-                    held += len(message.data) + _MESSAGE_COST
+                    held += len(message.data) + _MESSAGE_OVERHEAD_BYTES
                 if held > MAX_WAITING_BYTES:
                     text = f"more than {MAX_WAITING_BYTES} bytes of messages overlap in time"
                     text += ": they cannot be put in order; read them in the order of the file"

@@ -63,13 +63,13 @@ def recover(source: str | Path, target: str | Path, *, overwrite: bool = False) 
     try:
         with replacing(target) as hidden:
             with hidden.open("xb", buffering=0) as output:
-                # What the system refuses here is the target's: a source is being read around it.
+                # An OSError here concerns the target; those of the source are handled where it is read.
                 profile = next((check.header.profile for check in found), "ros2")
                 writer = McapWriter(output, target, 256 * 1024, profile)
                 for file, check in checks.items():
                     for title, entries, verified in check.metadata:
-                        # Where it had no CRC of its own it gets none: doubt is not made proof.
-                        # rosbag2's record of its own files is not true of the new one.
+                        # Metadata without a CRC gets none, as a new CRC would certify what nobody checked.
+                        # rosbag2's record describes the old files, not this one.
                         if title != "rosbag2":
                             writer.put_metadata(title, entries, verified)
                     if check.segments:

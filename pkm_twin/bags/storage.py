@@ -113,7 +113,7 @@ def find_storage(path: Path) -> Storage:
     :raises BagError: a folder without ``metadata.yaml``, or one that is not plain, names files
         outside the folder, or is of another storage than MCAP.
     """
-    # Unlike Path.is_dir, these never raise: what the system refuses is told at the opening.
+    # Unlike Path.is_dir, these never raise: errors of the system are reported when the file is opened.
     if not os.path.isdir(path):
         return Storage((BagFile(path),))
     file = path / METADATA_FILE
@@ -126,7 +126,7 @@ def find_storage(path: Path) -> Storage:
     if storage.text() == "sqlite3":
         text = f"is an SQLite bag, not MCAP; {write_conversion(path)} converts it"
         raise BagError(text, path=path, reason="not_mcap")
-    # `ros2 bag reindex` leaves it empty; what the files are is seen when they are opened.
+    # `ros2 bag reindex` leaves it empty; the files' kind is determined when they are opened.
     if storage.text() != "mcap" and storage.value != "":
         raise storage.error("'mcap'")
     packing = facts.get("compression_format")
@@ -145,7 +145,7 @@ def find_storage(path: Path) -> Storage:
         entry.get("topic_metadata").get("name").text(): entry.get("message_count").count()
         for entry in facts.get("topics_with_message_count").items(optional=True)
     }
-    # Of a file that is packed as a whole rosbag2 states the name before the packing.
+    # For a compressed file rosbag2 states the name of the uncompressed one.
     names = {file.path.name.removesuffix(".zstd"): file.path.name for file in files}
     parts = {
         names.get(name.removesuffix(".zstd"), name): entry.get("message_count").count()

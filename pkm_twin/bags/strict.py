@@ -137,7 +137,7 @@ class Check:
         except FormatError as error:
             self._note(error)
         if self.fault and (self._trusted.chunks or any(part.is_chunk for part in self.segments)):
-            # What looks like a message beside chunks is a damaged record of another kind.
+            # In a file with chunks, a message outside of them is a damaged record of another kind.
             loose = [part for part in self.segments if not part.is_chunk]
             self.bytes_lost += sum(part.length for part in loose)
             self.segments = [part for part in self.segments if part.is_chunk]
@@ -329,7 +329,7 @@ class Check:
         for position, message in self.records.iterate_messages(data, at, self._reader.budget):
             number, time = message.channel_id, message.log_time
             self._entries.setdefault(number, []).append((time, position))
-            # A message that is packed by itself must unpack; it costs itself alone.
+            # A message compressed by itself must decompress; a failure loses that message alone.
             if message.data.startswith(ZSTD_MAGIC):
                 try:
                     self.records.unpack_message(message, at, self._reader.budget)
@@ -496,7 +496,7 @@ def check_files(files: Sequence[BagFile]) -> dict[BagFile, Check | BagError]:
             with file.open() as reader:
                 found[file] = check = Check(reader).run()
             fault = check.fault
-            # Of a bag of several files an empty one is damage to the bag.
+            # An empty file among several files of a bag is damage.
             reasons = (TOTAL_CAP, "empty", "not_mcap") if alone else (TOTAL_CAP,)
             if fault and fault.reason in reasons:
                 raise BagError(fault.text, path=file.path, reason=fault.reason, offset=fault.offset)

@@ -237,7 +237,7 @@ class BagWriter:
         self._sequences[topic] += 1
         sequence = self._sequences[topic]
         self._queue.put(lambda: self._add(topic, logged, data, published, sequence))
-        # What the writer may hold in memory before it slows its caller down.
+        # Bytes that the writer may hold in memory before its caller waits.
         while self._queue.qsize() > 20_000 and self._error is None:
             time.sleep(0.001)
 
@@ -291,7 +291,7 @@ class BagWriter:
 
     def _work(self) -> None:
         try:
-            # Do what is in the queue until it is closed, flushing in time.
+            # Process the queue until it is closed; flush at the interval.
             due: float | None = None
             while True:
                 if due is not None and time.monotonic() >= due:
@@ -330,7 +330,7 @@ def whole_bag(path: Path, overwrite: bool, metadata: Mapping[str, Mapping[str, s
     except OSError as error:
         raise write_error(error, path) from error
     except BagError as error:
-        # Of the hidden name nobody knows.
+        # Users do not know the temporary name.
         if error.path is None or error.path == path:
             raise
         text = str(error).removeprefix(f"{error.path}: ")

@@ -83,7 +83,7 @@ def cut_out(tree: LoopTree, base: str, platform: str, *, carry: bool = False) ->
     notes, carried = list[str](), list[Link]()
     bridges = [pair for name, pair in pairs.items() if name not in circles]
     for host in kept:
-        # What hangs on a body is connected to it without the linkage.
+        # Links below a body are connected to it without the linkage.
         away = [body for body in dict.fromkeys(bodies.values()) if body not in kept or body == host]
         hanging = next(group for group in groups(away, bridges) if host in group)
         own = [link for name, link in tree.links.items() if bodies[name] in hanging and bodies[name] != host]

@@ -309,7 +309,7 @@ class Limb:
     entries: Mapping[str, Mapping[str, Sequence[Any]]]
 
 
-def limbs_of(field: str, value: Any) -> list[Limb]:
+def read_limbs(field: str, value: Any) -> list[Limb]:
     """Read and check one section of a limb or a list of them."""
     listed = isinstance(value, list)
     limbs = []

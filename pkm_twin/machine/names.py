@@ -9,9 +9,9 @@ from typing import Final
 from pkm_twin.machine.joints import UNITS, Free, Freedom, single_names
 from pkm_twin.machine.tree import Tree
 
-FREE: Final = Free.freedoms(UNITS, 0.0)
+FREE_BODY: Final = Free.freedoms(UNITS, 0.0)
 """Freedoms of a body that only closures hold."""
-ROD: Final = (Freedom(UNITS[0]), Freedom(UNITS[1]))
+FREE_ROD: Final = (Freedom(UNITS[0]), Freedom(UNITS[1]))
 """Freedoms of a rod about its inner end, if it lies along z."""
 
 
@@ -32,10 +32,10 @@ def joint_labels(tree: Tree) -> dict[tuple[str, str], str]:
     """
     graph = tree.graph
     wanted = {("joints", name): (name, joint.freedoms) for name, joint in graph.joints.items()}
-    wanted |= {("rods", name): (name, ROD) for name in graph.rods}
+    wanted |= {("rods", name): (name, FREE_ROD) for name in graph.rods}
     for link in tree.links.values():
         if link.joint is None:
-            wanted["bodies", link.body] = f"{link.body}_free", FREE
+            wanted["bodies", link.body] = f"{link.body}_free", FREE_BODY
     labels = {("joints", name): name for name in graph.actuated}
     taken = {single for name in graph.actuated for single in single_names(name, graph.joints[name].freedoms)}
     # Names that need no change come first and stay.

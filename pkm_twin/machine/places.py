@@ -47,7 +47,7 @@ def full_keys(path: str) -> list[Key]:
     return [*keys, keys[-1]] if moment else keys
 
 
-def numbers_of(sections: Mapping[str, Any], units: Mapping[str, Any]) -> dict[str, tuple[float, str]]:
+def list_file_numbers(sections: Mapping[str, Any], units: Mapping[str, Any]) -> dict[str, tuple[float, str]]:
     """Return every number in sections of a file, by dotted path, with its unit."""
     data = {k: v for k, v in given(sections).items() if k not in ("uncertainty", "tolerances")}
     return dict(_iterate_numbers(data, units, ""))

@@ -19,7 +19,7 @@ from pkm_twin.machine.loop_tree import Capsule, Link, LoopTree, Single, singles
 from pkm_twin.machine.rotations import Pose
 from pkm_twin.machine.urdf_write import GROUND, PLATFORM, number_text, rpy_along
 
-SMALL: Final = 1e-6
+MIN_RELATIVE_MASS: Final = 1e-6
 """Mass of a link that has none, relative to the machine's; inertia added about every axis, relative to
 the body's. SDF takes no zeros, and simulators nothing much smaller."""
 KINDS: Final = {
@@ -54,7 +54,7 @@ def write_sdf(tree: LoopTree) -> str:
             rows.append((part.name, part.kind, part.parent, part.child, joint.at, [part]))
     taken = {name for name, *_ in rows} | {PLATFORM}
     names = {name: urdf_xml.free_name(name, taken, "_link") for name in links}
-    mass = SMALL * (sum(link.mass for link in tree.links.values()) or 1.0)
+    mass = MIN_RELATIVE_MASS * (sum(link.mass for link in tree.links.values()) or 1.0)
     inertia = mass * max(1e-3, *(float(np.abs(joint.at - tree.origin).max()) for joint in joints)) ** 2
     for link in links.values():
         bars = [bar for bar in tree.capsules if bar.link == link.name]
@@ -101,7 +101,7 @@ def _write_link(link: ET.Element, body: Link, bars: Sequence[Capsule], mass: flo
     """Write inertia and bars; ``mass``, ``least``: mass and inertia of a link without any."""
     place = body.frame.position
     _write_pose(link, place)
-    inertia = body.inertia + np.eye(3) * (SMALL * float(np.trace(body.inertia)) or least)
+    inertia = body.inertia + np.eye(3) * (MIN_RELATIVE_MASS * float(np.trace(body.inertia)) or least)
     inertial = ET.SubElement(link, "inertial")
     _write_pose(inertial, body.com - place, "")
     ET.SubElement(inertial, "mass").text = f"{body.mass or mass:.15g}"

@@ -28,7 +28,7 @@ from pkm_twin.machine.joints import Freedom, across, unit
 BALL: Final = (1.0, 0.0, 0.0, 0.0)
 FREE: Final = (*BALL, 0.0, 0.0, 0.0)
 """Unknowns at home of a ball, and of a body that hangs free: a quaternion, and a place."""
-PARALLEL: Final = 1e-6
+PARALLEL_TOLERANCE: Final = 1e-6
 """Sine of an angle, or length relative to the machine's size, that counts as zero in a choice of axes."""
 
 
@@ -36,7 +36,7 @@ def axes_with_z(z: Array, hint: Array) -> Array:
     """Return axes, as columns, with the given z; x points towards the hint."""
     x = hint - (hint @ z) * z
     size = norm(x)
-    x = x / size if reference(size) > PARALLEL else across(z)[0]
+    x = x / size if reference(size) > PARALLEL_TOLERANCE else across(z)[0]
     return np.array([x, np.cross(z, x), z]).T
 
 
@@ -239,7 +239,7 @@ class Tree:
                     # With an axis of another joint of the body most constant rotations become simple.
                     others = [j for j in graph.joints.values() if j.name != name and body in (j.inner, j.outer)]
                     hint = next((j.axes[0] for j in others if len(j.axes)), None)
-                    if hint is not None and reference(norm(plain(np.cross(axis, hint)))) <= PARALLEL:
+                    if hint is not None and reference(norm(plain(np.cross(axis, hint)))) <= PARALLEL_TOLERANCE:
                         hint = None
                 turned = axes_with_z(axis, frame[:, 0] if hint is None else hint)
                 if actuated and hint is None:
@@ -287,7 +287,7 @@ class Tree:
         size = reference(self.graph.size)
         for point in self.graph.joint_points(body):
             x, y, _ = frame.T @ (point - at)
-            if math.hypot(reference(x), reference(y)) > PARALLEL * size:
+            if math.hypot(reference(x), reference(y)) > PARALLEL_TOLERANCE * size:
                 angle = atan2(y, x)
                 quarters = round(reference(angle) / (math.pi / 2))
                 return snapped(angle - quarters * (math.pi / 2))

@@ -375,7 +375,7 @@ def visuals(path: Path, robot: ET.Element, places: Mapping[str, Pose], bodies: M
     for link in robot.findall("link"):
         name = link.get("name", "")
         if name not in bodies:
-            continue  # It is no part of the linkage that is cut out.
+            continue  # The mesh's link is not in the linkage that is cut out.
         for number, visual in enumerate(link.findall("visual")):
             mesh = visual.find("geometry/mesh")
             if mesh is None:

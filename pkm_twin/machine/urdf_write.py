@@ -101,13 +101,13 @@ def parts_of(tree: LoopTree) -> list[Single]:
 
 
 def _inertial(link: ET.Element, body: Link, place: Array) -> None:
-    # Also where there is no mass: some simulators take a kilogram for what is not said.
+    # Written for massless links too: some simulators assume 1 kg for a missing inertia.
     inertial = ET.SubElement(link, "inertial")
     ET.SubElement(inertial, "origin", xyz=number_text(body.com - place), rpy="0 0 0")
     ET.SubElement(inertial, "mass", value=f"{body.mass:.15g}")
     keys = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
     upper = body.inertia[np.triu_indices(3)]
-    # Rounding that turned axes leave behind says nothing.
+    # Drop the rounding error of rotated axes.
     upper = np.where(np.abs(upper) > 1e-14 * float(np.abs(upper).max()), upper, 0.0)
     values = {key: f"{value:.12g}" for key, value in zip(keys, upper, strict=True)}
     ET.SubElement(inertial, "inertia", values)

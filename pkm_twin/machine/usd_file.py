@@ -24,7 +24,7 @@ from pkm_twin.machine.rotations import Pose, about, from_quaternion
 from pkm_twin.machine.urdf_control import UNCOUPLED, actuated_joints
 
 SUFFIXES: Final = (".usd", ".usda", ".usdc")
-ALIKE: Final = 1e-3
+FRAME_ROUNDING: Final = 1e-3
 """Largest distance of a joint's frames on its two bodies, m or rad, that is rounding: USD's numbers
 have single precision, and exporters add up many."""
 
@@ -138,7 +138,7 @@ class _Reader:
         table = np.array(self.cache.GetLocalToWorldTransform(prim), np.float64)
         scales = np.linalg.norm(table[:3, :3], axis=1)
         axes = (table[:3, :3] / scales[:, None]).T
-        if np.abs(axes.T @ axes - np.eye(3)).max() > ALIKE or np.linalg.det(axes) < 0.0:
+        if np.abs(axes.T @ axes - np.eye(3)).max() > FRAME_ROUNDING or np.linalg.det(axes) < 0.0:
             raise ParameterError(str(prim.GetPath()), "a skew or mirrored frame", "a rotation")
         u, _, vt = np.linalg.svd(axes)
         return Pose(u @ vt, self.length * table[3, :3]), scales
@@ -283,7 +283,7 @@ class _Reader:
             target = first @ apart
             miss = np.linalg.norm(target.position - second.position)
             turned = np.abs(target.rotation - second.rotation).max()
-            if max(miss, turned) > ALIKE:
+            if max(miss, turned) > FRAME_ROUNDING:
                 found = f"frames {miss:.3g} m and {turned:.3g} rad apart"
                 raise ParameterError(f"joint.{joint.name}", found, f"frames on {parent} and {child} that meet")
             moves[child] = meant @ apart @ second.inverse()

@@ -40,9 +40,9 @@ from pkm_twin.machine.graph_file import (
     driven,
     drives_of,
     graph_of_entries,
-    limbs_of,
     number_of_entry,
     numbered_entry,
+    read_limbs,
     shared_by,
     written_out,
 )
@@ -100,7 +100,7 @@ class MachineFile(Common):
     joints: Mapping[str, JointSpec] = schema.mapping(JointSpec, default={})
     rods: Mapping[str, RodSpec] = schema.mapping(RodSpec, default={})
     redundancy: Redundancy = schema.section(Redundancy, default={})
-    limbs: Sequence[Limb] = schema.key(limbs_of, "a section or a list of them", default=[])
+    limbs: Sequence[Limb] = schema.key(read_limbs, "a section or a list of them", default=[])
     parameters: Mapping[str, Any] = schema.key(
         lambda _, value: value,
         "names to numbers or [expressions](new_machine.md#parameters)",
@@ -223,7 +223,7 @@ class Machine(TwinRobot):
         sources = dict(self.sources)
         specs = {kind: dict(entries) for kind, entries in self.specs.items()}
         rest, origin = {}, self.described.origin
-        # Of an entry: numbers of its limb, then its azimuth, then the copy's own, each at once.
+        # Set a limb entry's numbers in this order: the limb's, its azimuth, the copy's own.
         changes: dict[tuple[str, str, int, str, float], dict[Keys, Any]] = {}
         for path, value in values.items():
             keys = full_keys(path)

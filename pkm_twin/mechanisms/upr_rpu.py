@@ -44,14 +44,14 @@ from pkm_twin.machine.sections import length, mass, shared_middle
 from pkm_twin.machine.tree import Tree
 from pkm_twin.mechanisms import TwinRobot
 
-LEVEL: Final = 1e-2
-"""Least that a limb at home is longer than it is wide, as a part: else limbs lie in the base."""
-_PATTERN: Final = array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+MIN_HEIGHT_RATIO: Final = 1e-2
+"""Smallest height of a limb at home relative to its width: below it the limbs lie in the base."""
+_LIMB_DIRECTIONS: Final = array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 _X: Final = array([1.0, 0.0, 0.0])
 _Y: Final = array([0.0, 1.0, 0.0])
 
 
-FREE: Final = {
+FREE_AXES: Final = {
     "upr_revolute": (4,),
     "upr_universal": (3, 4),
     "rpu_universal": (3, 4),
@@ -105,7 +105,7 @@ class JointsCompliance:
 
     def verify(self, path: str) -> None:
         """Free exactly where the joint turns; a number in every direction that carries load."""
-        for joint, free in FREE.items():
+        for joint, free in FREE_AXES.items():
             for i, value in enumerate(getattr(self, joint).tolist()):
                 field = f"{path}.{joint}[{i}]"
                 if i in free and value != math.inf:
@@ -207,7 +207,7 @@ class LargestRoot:
             if i < 2:
                 turns |= {f"U joint {limb}": [beta, turned], f"R joint {limb}": [gamma - turned]}
             else:
-                # Limb 3's plane is told in axes that turn by beta.
+                # The plane of limb 3 is given in axes rotated by beta.
                 turns[f"R joint {limb}"] = [beta - turned]
         result = list(tree.home)
         for link in tree.links.values():
@@ -265,7 +265,7 @@ class UprRpu(TwinRobot):
         """
         a, b = self._radii
         aside, middle = abs(a - b), shared_middle(self.limits.position)
-        if middle is not None and middle > aside * (1.0 + LEVEL):
+        if middle is not None and middle > aside * (1.0 + MIN_HEIGHT_RATIO):
             return middle
         deep = 1.5 * max(a, b)
         return math.sqrt(aside * aside + deep * deep)
@@ -277,8 +277,8 @@ class UprRpu(TwinRobot):
         normal = np.cross(x, y)
         angles = []
         for i in range(3):
-            arm = _PATTERN[i, 0] * x + _PATTERN[i, 1] * y
-            up = b * _PATTERN[i] - origin - a * arm
+            arm = _LIMB_DIRECTIONS[i, 0] * x + _LIMB_DIRECTIONS[i, 1] * y
+            up = b * _LIMB_DIRECTIONS[i] - origin - a * arm
             up /= np.linalg.norm(up, axis=-1, keepdims=True)
             angles.append(np.arctan2(np.hypot(up[..., 0], up[..., 1]), up[..., 2]))
             along = np.clip((up * normal).sum(-1), -1.0, 1.0)
@@ -309,8 +309,8 @@ class UprRpu(TwinRobot):
         tau = np.cross(axis, y)
         limbs = []
         for i in range(3):
-            arm = a * (_PATTERN[i, 0] * x + _PATTERN[i, 1] * y)
-            foot = b * _PATTERN[i] - origin
+            arm = a * (_LIMB_DIRECTIONS[i, 0] * x + _LIMB_DIRECTIONS[i, 1] * y)
+            foot = b * _LIMB_DIRECTIONS[i] - origin
             along = (arm - foot) * (1.0 if i < 2 else -1.0)
             along /= np.linalg.norm(along, axis=-1, keepdims=True)
             point, forces = (foot, (along, y)) if i < 2 else (arm, (along, axis))
@@ -349,7 +349,7 @@ class UprRpu(TwinRobot):
         beams: list[Beam] = []
         compliances: dict[str, Sequence[float]] = {}
         for i, limb in enumerate("123"):
-            foot, head = array(b * _PATTERN[i]), array(origin + a * _PATTERN[i])
+            foot, head = array(b * _LIMB_DIRECTIONS[i]), array(origin + a * _LIMB_DIRECTIONS[i])
             reach = norm(head - foot)
             d = (head - foot) / reach
             low, high = f"lower tube {limb}", f"upper tube {limb}"

@@ -29,8 +29,8 @@ from pkm_twin.messages.reading import (
 )
 from pkm_twin.messages.stamps import SECOND, StampRules
 from pkm_twin.recordings.origin import Origin, origin_columns, origin_facts
-from pkm_twin.recordings.payload import metadata_error, told_load
-from pkm_twin.recordings.recording import MAPPED, ReadOptions, Recording
+from pkm_twin.recordings.payload import metadata_error, read_load
+from pkm_twin.recordings.recording import MODEL_VALUES_NOTE, ReadOptions, Recording
 from pkm_twin.recordings.tables import write_table
 from pkm_twin.recordings.topics import DEFINITIONS, JOINT_STATE, TRAJECTORY, Topics, choose_topics
 from pkm_twin.robot.robot import Robot
@@ -69,7 +69,7 @@ def read_bag(
         if recorded not in robot_names():
             raise metadata_error(bag, "robot", recorded, f"one of {', '.join(robot_names())}; or give --robot")
         machine = load(recorded)
-    held = how.load or told_load(bag)
+    held = how.load or read_load(bag)
     kinds = {topic.type for topic in bag.report.topics.values()}
     if (how.trajectory or how.planned) and JOINT_STATE not in kinds and TRAJECTORY in kinds:
         plan = read_trajectory(bag, machine)
@@ -88,7 +88,7 @@ def read_bag(
     if found.others:
         notes.append(f"left alone: {found.others} messages of other joints on {topics.joint_states}")
     if not machine.controller.plain:
-        notes.append(MAPPED)
+        notes.append(MODEL_VALUES_NOTE)
     stamps = np.array([s.stamp for s in found.samples], np.int64)
     r = Recording(
         machine,

@@ -163,7 +163,7 @@ MASS, PICKED, RELEASED, CENTRE = ("payload_mass_kg", "payload_picked_s", "payloa
 """Keys of a bag's metadata on its payload; several intervals have blanks between."""
 
 
-def told_load(bag: Bag) -> Load | None:
+def read_load(bag: Bag) -> Load | None:
     """Read the payload from the bag's metadata.
 
     :raises BagError: a value is missing or no number.

@@ -20,7 +20,7 @@ from pkm_twin.messages.reading import MAX_EFFORT, MAX_LOAD, MAX_SHIFT, MAX_TURN,
 from pkm_twin.recordings.bags import read_bag
 from pkm_twin.recordings.origin import Origin, states_origin
 from pkm_twin.recordings.payload import load_of_table
-from pkm_twin.recordings.recording import MAPPED, ReadOptions, Recording
+from pkm_twin.recordings.recording import MODEL_VALUES_NOTE, ReadOptions, Recording
 from pkm_twin.recordings.tables import (
     DEFLECTION,
     EFFORTS,
@@ -38,7 +38,7 @@ from pkm_twin.robot.limits import beyond_limits
 from pkm_twin.robot.robot import Robot
 
 RECORDING: Final = "an MCAP file, a rosbag2 folder, or a table with columns time, JOINT.position ..."
-FOLLOW: Final = ("joints", "pose")
+FOLLOWED: Final = ("joints", "pose")
 SIDES: Final = ("joint", "controller", "motor")
 TERM: Final = "effort_gravity"
 """In every table that `torques` writes."""
@@ -76,8 +76,8 @@ def read(
         cannot have.
     """
     path = Path(path)
-    if how.follow not in (None, *FOLLOW):
-        raise UnknownNameError("follow", str(how.follow), FOLLOW)
+    if how.follow not in (None, *FOLLOWED):
+        raise UnknownNameError("follow", str(how.follow), FOLLOWED)
     try:
         bag = is_bag(path)
     except OSError as error:
@@ -122,7 +122,7 @@ def _read_table_recording(path: Path, name: str | Robot | None, how: ReadOptions
         if values is None or side is None:
             return values
         if word == "current":
-            # It is made an effort at the joint by one factor, which has the gear.
+            # One factor, which includes the gear, converts it to an effort at the joint.
             return np.asarray(values * np.sign(side.factors))
         if word == "position":
             return side.positions(values)
@@ -144,7 +144,7 @@ def _read_table_recording(path: Path, name: str | Robot | None, how: ReadOptions
         needed = ", ".join(f"{joint}.position" for joint in joints)
         or_pose = f"; or time, {', '.join(robot.pose_names)}"
         raise ParameterError(str(path), ", ".join(table), f"columns time, {needed}{or_pose}")
-    time, notes, effort, word = times_of(path, times), [], None, how.efforts[0]
+    time, notes, effort, word = read_times(path, times), [], None, how.efforts[0]
     origin = Origin.of_table(table)
     # Beside the terms of a model the efforts are their sum.
     computed = any(f"{joint}.{TERM}" in table for joint in robot.joint_names)
@@ -196,7 +196,7 @@ def _read_table_recording(path: Path, name: str | Robot | None, how: ReadOptions
             if values is None:
                 raise ParameterError(str(path), f"no {what}", f"a column {axes[0]} or more of {', '.join(axes)}")
     efforts = (f"{joint}.{what}" for joint in joints for what in EFFORTS)
-    # As for messages: impossible numbers, and numbers below every measurement, are rejected.
+    # As in messages, reject impossible numbers and numbers below every sensor's resolution.
     for name, bound in (SIZES | dict.fromkeys(efforts, MAX_EFFORT)).items():
         sizes = np.abs(table.get(name, np.zeros(1)))
         bad = np.flatnonzero((sizes > bound) | ((sizes < TINY) & (sizes > 0.0)))
@@ -223,7 +223,7 @@ def _read_table_recording(path: Path, name: str | Robot | None, how: ReadOptions
         notes=(
             *notes,
             *([] if side is None else [f"values read as the {how.side}'s; results: the model's"]),
-            *([] if robot.controller.plain or side is not None else [MAPPED]),
+            *([] if robot.controller.plain or side is not None else [MODEL_VALUES_NOTE]),
         ),
         start=round(1e9 * float(times[0])),
     )
@@ -273,12 +273,12 @@ def _refuse_misspelt(table: Table, robot: Robot, joints: Sequence[str], how: Rea
                 raise UnknownNameError(f"{table.path}: column", name, known)
 
 
-def times_of(path: Path, values: Array) -> Array:
+def read_times(path: Path, values: Array) -> Array:
     """Return a column of times, s from its first.
 
     :raises ParameterError: they do not rise, or farther than a recording lasts.
     """
-    # Between the greatest numbers there is none.
+    # The difference of the largest floats overflows; the checks below reject it.
     with np.errstate(over="ignore"):
         time: Array = np.asarray(values - values[0], np.float64)
         flat = np.flatnonzero(~(np.diff(values) >= MIN_STEP))
@@ -305,7 +305,7 @@ def check_pose(path: Path, robot: Robot, q: Array, pose: Array, how: str = "") -
         off = found - pose[rows]
         turns = [i for i, unit in enumerate(robot.pose_units) if unit != "m"]
         off[:, turns] = (off[:, turns] + np.pi) % (2.0 * np.pi) - np.pi
-        # What has no pose is rejected with its own reason later.
+        # Joint positions without a pose are rejected later, with their reason.
         size = np.where(good, np.linalg.norm(off * robot.pose_scales, axis=1), 0.0)
         worst = int(size.argmax())
         # A pose may miss that of the joints by 1e-3 of the machine's size.

@@ -27,11 +27,11 @@ from pkm_twin.streams.rest import gradient_gain, velocity_error_bound
 from pkm_twin.streams.steps import MAX_GAP_PERIODS, Steps, repeats_of, steps_of
 from pkm_twin.streams.wrench import WrenchSettings
 
-MAPPED: Final = "tables use the model's joint values; joint_map applies to messages and bags only"
+MODEL_VALUES_NOTE: Final = "tables use the model's joint values; joint_map applies to messages and bags only"
 """Printed for a robot that has a map."""
 MAX_LISTED_JUMPS: Final = 4
 """Largest number of listed jumps."""
-# Of the differentiator: degree of the velocity's polynomial, samples.
+# Differentiator: degree of the velocity's polynomial, and samples.
 _ORDER, _WINDOW = 3, 9
 
 
@@ -150,7 +150,7 @@ class Recording:
         if self.qd is None or not steps.jumps.any():
             return steps
         alone = steps_of(self.time, self.q, None, limit)
-        # What jumps by wrong velocities only is not the positions' fault.
+        # Jumps that appear only with the measured velocities are the velocities' fault.
         return steps if alone.jumps.any() else alone
 
     @cached_property
@@ -272,7 +272,7 @@ class Recording:
             the positions by more than `check` allows.
         """
         if self.qd is not None and len(self.time) > 2:
-            # What overflows is not finite, which the model refuses in one line.
+            # An overflow gives numbers that are not finite, which the model rejects.
             with np.errstate(all="ignore"):
                 jumps = self.steps.jumps
                 _, faults = rate_faults(self.robot, self.stamps, self.q, self.qd, jumps)

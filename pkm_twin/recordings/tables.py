@@ -65,7 +65,7 @@ WRENCH: Final = ("fx", "fy", "fz", "mx", "my", "mz")
 DEFLECTION: Final = ("dx", "dy", "dz", "rx", "ry", "rz")
 PAYLOAD: Final = ("payload.mass", "payload.x", "payload.y", "payload.z")
 """Mass (kg) and centre (m) of what the platform holds."""
-OTHERS: Final = {"payload": PAYLOAD[0]}
+COLUMN_ALIASES: Final = {"payload": PAYLOAD[0]}
 """Other names of columns."""
 _UNIT: Final = re.compile(r"(.*?)(?:\s*[\[(]\s*(\w+)(?:/s2?)?\s*[\])]|_(mm|cm|[uµ]m|deg|mrad|ms|us|ns))")
 
@@ -341,7 +341,7 @@ def _split_rows(path: Path, lines: Iterator[str], first: str, dialect: Dialect) 
     """Yield rows with decimal points; a separator or comma that is detected is reported."""
     separator = dialect.separator
     if separator is None:
-        # Names hold no separators: one that is there, and no other, is certain.
+        # Column names contain no separators, so a single kind of them in the header is certain.
         there = [mark for mark in (";", "\t") if mark in first]
         separator = there[0] if len(there) == 1 and "," not in first else ","
         if separator != ",":
@@ -364,13 +364,13 @@ def _name_columns(header: Sequence[str], kinds: Mapping[str, str], dialect: Dial
     :raises ParameterError: a unit of another kind.
     :raises UnknownNameError: a name that no column has, or a header that is not there.
     """
-    ours = {cell: (OTHERS[cell], "") for cell in header if OTHERS.get(cell) in kinds}
+    ours = {cell: (COLUMN_ALIASES[cell], "") for cell in header if COLUMN_ALIASES.get(cell) in kinds}
     for cell in header:
         match = _UNIT.fullmatch(cell)
         if match is not None and match[1] in kinds:
             ours[cell] = match[1], match[2] or match[3]
     for given, text in dialect.columns.items():
-        name = OTHERS.get(given, given)
+        name = COLUMN_ALIASES.get(given, given)
         match = _UNIT.fullmatch(text) if text not in header else None
         stem, unit = (match[1], match[2] or match[3]) if match else (text, "")
         pattern = re.compile(re.escape(stem).replace(r"\*", "(.+)"))

@@ -125,7 +125,7 @@ def choose_topics(bag: Bag, robot: Robot, wanted: Sequence[str] = (), deflected:
         raise _make_choice_error(bag, text, "no joint states")
     for name in filled:
         require_definition(bag, name)
-    # As the controller calls them, which recorded them.
+    # Joint names are the controller's, which published them.
     own = robot.controller.names
     seen = _read_joint_names(bag, filled, set(own))
     fit = [name for name in filled if set(own) <= seen[name]]

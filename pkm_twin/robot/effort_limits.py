@@ -51,7 +51,7 @@ class EffortLimits:
         :raises MessageError: an effort is not finite, or beyond its limit with ``reject``.
         """
         if efforts.ndim == 1:
-            # One sample, the stream's case, without numpy.
+            # One sample of a stream: Python floats are faster than numpy's calls.
             values = efforts.tolist()
             finite = all(map(math.isfinite, values))
             beyond = finite and any(map(gt, map(abs, values), self._listed))

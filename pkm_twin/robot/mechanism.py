@@ -26,7 +26,17 @@ from pkm_twin.machine.graph import Graph, limb_numbers
 from pkm_twin.machine.inertia import Coefficients
 from pkm_twin.machine.joint_map import JointMap, JointMapEntry
 from pkm_twin.machine.members import Beam, Parts, Structure
-from pkm_twin.machine.places import Key, Keys, check_number, full_keys, given, merged, number_in, numbers_of, placed
+from pkm_twin.machine.places import (
+    Key,
+    Keys,
+    check_number,
+    full_keys,
+    given,
+    list_file_numbers,
+    merged,
+    number_in,
+    placed,
+)
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.reach import PassiveLimit, position_box
 from pkm_twin.machine.sections import DriveSpec, JointLimits, Payload, friction_of, limits_of
@@ -348,7 +358,7 @@ class Mechanism(Common):
 
         With a ``drive``, ``inertia.rotor_inertia`` is left out, because only 0 is valid.
         """
-        found = numbers_of(self.parameter_sections(), self.parameter_units())
+        found = list_file_numbers(self.parameter_sections(), self.parameter_units())
         if self.drive is not None:
             found.pop("inertia.rotor_inertia", None)
         return found

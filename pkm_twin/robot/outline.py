@@ -18,9 +18,9 @@ from pkm_twin.machine.graph import BASE, Graph, Joint
 from pkm_twin.machine.members import Place
 from pkm_twin.robot.robot import Robot
 
-BAR: Final = 0.01
+BAR_RADIUS_RATIO: Final = 0.01
 """Radius of the bars that represent bodies, relative to the machine's size; rods have half of it."""
-_FLAT: Final = 1e-6
+_COLLINEAR_TOLERANCE: Final = 1e-6
 """Relative size below which points are on one line."""
 
 
@@ -102,7 +102,7 @@ def body_points(graph: Graph) -> dict[str, list[Array]]:
 
 def bars(graph: Graph) -> tuple[Bar, ...]:
     """Return rods, both of a pair with their crosspieces, and bodies as bars from one point to the others."""
-    radius = BAR * graph.size
+    radius = BAR_RADIUS_RATIO * graph.size
     result = []
     for body, found in body_points(graph).items():
         if body == BASE:
@@ -129,7 +129,7 @@ def robot_bars(robot: Robot) -> tuple[Bar, ...]:
         joint = graph.joints[name]
         if limits is not None and joint.kind == "prismatic" and joint.inner == BASE and np.isfinite(limits[k]).all():
             low, high = (joint.at + (q - joint.home) * joint.axes[0] for q in limits[k])
-            rails.append(Bar(BASE, (BASE, low), (BASE, high), BAR * graph.size / 2))
+            rails.append(Bar(BASE, (BASE, low), (BASE, high), BAR_RADIUS_RATIO * graph.size / 2))
     return (*members, *rest, *hidden, *rails)
 
 
@@ -143,7 +143,7 @@ def face(points: Sequence[Array]) -> Array:
         return np.zeros((0, 3))
     middle = corners.mean(0)
     spans, axes = np.linalg.svd(corners - middle)[1:]
-    if not spans[1] > _FLAT * spans[0]:
+    if not spans[1] > _COLLINEAR_TOLERANCE * spans[0]:
         return np.zeros((0, 3))
     flat = (corners - middle) @ axes[:2].T
     order = np.lexsort(flat.T)
@@ -152,7 +152,7 @@ def face(points: Sequence[Array]) -> Array:
 
 def _half_hull(flat: Array, order: NDArray[np.int64]) -> list[int]:
     """Return one side of the convex hull of points in a plane, without its last point (Andrew 1979)."""
-    least = _FLAT * float(np.abs(flat).max()) ** 2
+    least = _COLLINEAR_TOLERANCE * float(np.abs(flat).max()) ** 2
     found: list[int] = []
     for k in order:
         while len(found) > 1:
@@ -209,5 +209,5 @@ def crosspieces(graph: Graph) -> Iterable[Bar]:
             continue
         aside = rod.width / 2 * rod.pair
         for body, end in zip((rod.inner, rod.outer), rod.ends, strict=True):
-            radius = BAR * graph.size / 2
+            radius = BAR_RADIUS_RATIO * graph.size / 2
             yield Bar(body, (body, end - aside), (body, end + aside), radius)

@@ -53,7 +53,7 @@ def findings(robot: Robot) -> tuple[Finding, ...]:
         *_size(graph),
         *_masses(robot, graph),
         *_bodies(robot, graph),
-        *_drives(robot, graph),
+        *_check_drives(robot, graph),
         *_gravity(robot),
         *_members(robot, graph),
         *_home(graph),
@@ -155,7 +155,7 @@ def _bodies(robot: Robot, graph: Graph) -> Iterator[Finding]:
         yield from _above(f"{name}: com", what, far, 2.0 * extent, "m", likely)
 
 
-def _drives(robot: Robot, graph: Graph) -> Iterator[Finding]:
+def _check_drives(robot: Robot, graph: Graph) -> Iterator[Finding]:
     total = _total(graph) + robot.payload.mass
     positions, home = robot.limits.position, graph.home.tolist()
     for k, name in enumerate(graph.actuated):
@@ -180,7 +180,7 @@ def _drives(robot: Robot, graph: Graph) -> Iterator[Finding]:
                     "left out, or counted from elsewhere than the limits?",
                 )
         if not turns and not joint.home and name in robot.without_home:
-            length = _leg(graph, joint)
+            length = _measure_leg(graph, joint)
             if length > 0.05 * graph.size:
                 yield Finding(
                     f"{name}: home",
@@ -253,7 +253,7 @@ def _total(graph: Graph) -> float:
     return sum(b.mass for b in graph.bodies.values()) + sum(r.mass for r in graph.rods.values())
 
 
-def _leg(graph: Graph, slide: Joint) -> float:
+def _measure_leg(graph: Graph, slide: Joint) -> float:
     """Return the distance of the joints beyond a slide that are along its axis, m; 0 for no leg."""
     if BASE in (slide.inner, slide.outer):
         return 0.0

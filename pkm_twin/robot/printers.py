@@ -22,7 +22,7 @@ from pkm_twin.robot.robot import Robot
 
 ANGLES: Final = np.array([210.0, 330.0, 90.0])
 """Nominal angles of the towers, degrees."""
-G33: Final = {"x": 210, "y": 330, "z": 90, "yz": 30, "zx": 150, "xy": 270}
+G33_ANGLES: Final = {"x": 210, "y": 330, "z": 90, "yz": 30, "zx": 150, "xy": 270}
 """Angles of the points that G33 reports, degrees; c is the centre."""
 _NUMBER: Final = r"[-+]?\d*\.?\d+"
 _G33: Final = re.compile(rf"\b(c|xy|yz|zx|x|y|z)\s*:\s*({_NUMBER})")
@@ -107,7 +107,7 @@ def printer_of(robot: Robot) -> Printer:
 def written(printer: Printer, firmware: Firmware) -> str:
     """Write the lines of a firmware's configuration."""
     radius, arms = printer.radius, printer.arms
-    above = printer.ends - _rise(arms, radius, "geometry.arm_lengths")
+    above = printer.ends - _find_carriage_heights(arms, radius, "geometry.arm_lengths")
     if firmware is Firmware.KLIPPER:
         lines = ["[printer]", f"delta_radius: {radius:.6f}"]
         for k, limb in enumerate("abc"):
@@ -166,7 +166,7 @@ def read_printer(text: str, firmware: Firmware | None, probe_radius: float | Non
     if firmware is Firmware.MARLIN:
         arms = arms + [m665.get(axis, [0.0])[0] for axis in "ABC"]
     sign = 1.0 if firmware is Firmware.REPRAPFIRMWARE else -1.0
-    ends = height + _rise(arms, radius, "M665 L") + sign * trims
+    ends = height + _find_carriage_heights(arms, radius, "M665 L") + sign * trims
     points = _points(text, firmware, probe_radius or m665.get("B", [0.0])[0])
     turned = np.radians(angles)
     towers = radius * np.stack([np.cos(turned), np.sin(turned)], -1)
@@ -178,7 +178,7 @@ def read_printer(text: str, firmware: Firmware | None, probe_radius: float | Non
     return Printer(radius, angles, arms, ends, heights, np.zeros((0, 7)))
 
 
-def _rise(arms: Array, radius: float, where: str) -> Array:
+def _find_carriage_heights(arms: Array, radius: float, where: str) -> Array:
     """Return the height of the carriages above the nozzle at the centre, mm, shape (3,).
 
     :raises ParameterError: an arm does not reach the centre.
@@ -214,7 +214,7 @@ def _points(text: str, firmware: Firmware, radius: float) -> Array:
             seen.add(name)
             if name != "c" and not radius > 0.0:
                 raise ParameterError("--probe-radius", None, "the radius of G33's points, mm")
-            turn = np.radians(G33.get(name, 0))
+            turn = np.radians(G33_ANGLES.get(name, 0))
             away = 0.0 if name == "c" else radius
             found.append((away * np.cos(turn), away * np.sin(turn), float(value)))
     elif firmware is Firmware.MARLIN and "G33" in text:
@@ -293,7 +293,7 @@ def _klipper(text: str) -> Printer:
         [_number(s["angle"], "angle") if "angle" in s else a for s, a in zip(steppers, ANGLES, strict=True)]
     )
     ends = np.array([number(k, "position_endstop") for k in range(3)])
-    ends = ends + _rise(arms, radius, "arm_length")
+    ends = ends + _find_carriage_heights(arms, radius, "arm_length")
     steps = np.array([_step(number, steppers, k) for k in range(3)])
     stored = sections.get("delta_calibrate", {})
 

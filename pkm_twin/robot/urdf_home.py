@@ -39,7 +39,7 @@ MAX_ITERATIONS: Final = 100
 """Most corrections of one closing, and most steps towards the zeros."""
 RANK_BOUNDS: Final = (1e-4, 1e-6, 1e-8)
 """Singular values below this part of the largest count as zero; the next one if loops stay open."""
-EXACT: Final = 1e-9
+MAX_LOOP_GAP: Final = 1e-9
 """Loops that miss by less are closed for all purposes, m or rad."""
 MIN_HOME_INDEX: Final = 1e-4
 """Smallest singularity index of a home: below it the machine can hardly move from there."""
@@ -337,7 +337,7 @@ class HomeSearch:
         self.held = np.array([name in tree.actuated for name in steps], bool)
         self.turns = assembly.turns
         self.units = np.where(self.turns, 1.0, assembly.size)
-        # Values count from the drawing.
+        # Joint values are measured from the pose in which the file draws the machine.
         drawn = np.array([tree.joints[name].drawn for name in steps])
         bounds = [tree.joints[name].limits.get("position", (-math.inf, math.inf)) for name in steps]
         self.low, self.high = np.reshape(bounds, (-1, 2)).T - drawn
@@ -375,7 +375,7 @@ class HomeSearch:
         for left in range(8, 0, -1):
             values = np.where(zero, values * (left - 1) / left, values)
             values, miss = self.assembly.close(values, self.held | zero)
-        if miss > max(home.miss, EXACT):
+        if miss > max(home.miss, MAX_LOOP_GAP):
             return home
         turned = self._home(self._wrapped(values), miss, home.how)
         return turned if turned.index >= MIN_HOME_INDEX else home
@@ -412,7 +412,7 @@ class HomeSearch:
         values = self.wanted.copy()
         self.assembly.place(values)
         miss = self.assembly.miss()
-        if miss > max(EXACT, self.assembly.rounding):
+        if miss > max(MAX_LOOP_GAP, self.assembly.rounding):
             values, miss = self.assembly.close(values, self.held)
         if miss > self.assembly.closed:
             return None

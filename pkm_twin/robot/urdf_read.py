@@ -23,7 +23,7 @@ from pkm_twin.machine.loop_tree import SINGLE, Joint, Link, LoopTree
 from pkm_twin.machine.rotations import Pose
 from pkm_twin.machine.urdf_control import take_drives
 from pkm_twin.machine.urdf_file import Visual, visuals
-from pkm_twin.robot.urdf_home import EXACT, LEAST_ROUNDING, Assembly, HomeSearch
+from pkm_twin.robot.urdf_home import LEAST_ROUNDING, MAX_LOOP_GAP, Assembly, HomeSearch
 
 PLATFORMS: Final = (
     "platform",
@@ -160,7 +160,7 @@ def read_tree(path: str | Path, part: Part = Part()) -> UrdfReading:
     graph = home.graph or _graph(assembly, bodies, tool, ground)
     data = _description(assembly, graph, ground)
     if carried:
-        move = _seen(assembly, ground)[tool]
+        move = _find_placed_links(assembly, ground)[tool]
         mass, com, inertia = _sum_masses([link.moved(move) for link in carried])
         com = _snapped(com - graph.origin).tolist()
         data["payload"] = {"mass": mass, "com": com, "inertia": inertia.tolist()}
@@ -174,7 +174,7 @@ def read_tree(path: str | Path, part: Part = Part()) -> UrdfReading:
     ]
     if ignored:
         notes.append(f"ignored, because the joint has several degrees of freedom: {', '.join(ignored)}")
-    if home.miss > EXACT:
+    if home.miss > MAX_LOOP_GAP:
         notes.append(f"the loops close within {home.miss:.1g} only (m or rad)")
     if home.repair and home.repair.moves:
         notes.append(home.repair.text)
@@ -189,7 +189,7 @@ def read_tree(path: str | Path, part: Part = Part()) -> UrdfReading:
         )
     if controller:
         data["joint_map"] = controller
-    frames = {name: move @ tree.links[name].frame for name, move in _seen(assembly, ground).items()}
+    frames = {name: move @ tree.links[name].frame for name, move in _find_placed_links(assembly, ground).items()}
     shown = list[Visual]()
     if top is not None and top.tag == "robot":
         shown += visuals(path, top, frames, bodies)
@@ -270,7 +270,7 @@ def _require_moving(tree: LoopTree, bodies: dict[str, str], tool: str) -> None:
     )
 
 
-def _seen(assembly: Assembly, ground: str) -> dict[str, Pose]:
+def _find_placed_links(assembly: Assembly, ground: str) -> dict[str, Pose]:
     """Return each link's motion from where it is drawn to its place in the base's axes."""
     view = (assembly.move(ground) @ assembly.tree.links[ground].frame).inverse()
     return {name: view @ assembly.move(name) for name in assembly.tree.links}
@@ -281,7 +281,7 @@ def _description(assembly: Assembly, graph: Graph, ground: str) -> dict[str, Any
     tree = assembly.tree
     data = graph_description(graph)
     if tree.gravity is not None:
-        gravity = _seen(assembly, ground)[tree.root].rotation @ tree.gravity
+        gravity = _find_placed_links(assembly, ground)[tree.root].rotation @ tree.gravity
         data["gravity"] = _snapped(gravity).tolist()
     for name, entry in data["joints"].items():
         ends = tree.joints[name].limits.get("position") if name in tree.joints else None
@@ -299,7 +299,7 @@ def _description(assembly: Assembly, graph: Graph, ground: str) -> dict[str, Any
 
 def _graph(assembly: Assembly, bodies: dict[str, str], tool: str, ground: str) -> Graph:
     """Return the graph of the machine at the placed values."""
-    tree, moves = assembly.tree, _seen(assembly, ground)
+    tree, moves = assembly.tree, _find_placed_links(assembly, ground)
     home = dict(zip(assembly.steps, assembly.values.tolist(), strict=True))
     passive = [n for n, j in tree.joints.items() if j.kind != "fixed" and n not in tree.actuated]
     joints = [tree.joints[name] for name in (*tree.actuated, *passive)]

@@ -46,15 +46,15 @@ def passive_values(robot: Robot, q: ArrayLike) -> Array:
     return np.stack(values, -1)
 
 
-RAYS: Final = 360
+RAYS_PER_CIRCLE: Final = 360
 """Rays of a circle about the axis."""
-BLOCK: Final = 16
+STEPS_PER_BLOCK: Final = 16
 """Steps along a ray that are tried at a time."""
-CLEAR: Final = 0.01
+MIN_WORKSPACE_INDEX: Final = 0.01
 """Singularity index (0 singular, 1 best) above which regular workspaces stay."""
 LEAST_TILT: Final = math.radians(10.0)
 """Radius, rad, below which a circle of tilts is left out (2UPR-RPU paper, section 4)."""
-INSIDE: Final = 0.05
+MIN_SAMPLED_INDEX: Final = 0.05
 """Singularity index above which random joint positions stay."""
 
 
@@ -183,7 +183,7 @@ def regular_workspace(
 ) -> RegularWorkspace:
     """Find the largest circle of reachable tilts about the axis at each height.
 
-    The singularity index stays above ``CLEAR``. Heights whose circle is smaller than ``least_radius``
+    The singularity index stays above ``MIN_WORKSPACE_INDEX``. Heights whose circle is smaller than ``least_radius``
     are left out (2UPR-RPU paper, section 4).
 
     :param z: heights, shape (n,), m.
@@ -206,8 +206,8 @@ def circle_radii(
     heights: Array,
     step: float,
     steps: int,
-    rays: int = RAYS,
-    least: float = CLEAR,
+    rays: int = RAYS_PER_CIRCLE,
+    least: float = MIN_WORKSPACE_INDEX,
     least_clearance: float = 0.0,
 ) -> Array:
     """Find the radii of the largest circles about the axis with reachable insides, (n,), m or rad.
@@ -231,7 +231,7 @@ def circle_radii(
 
     rung, left = np.zeros(len(heights), np.int64), np.zeros((len(heights), rays), bool)
     # About 65536 poses at a time.
-    at_once = max(1, 2**16 // (BLOCK * rays))
+    at_once = max(1, 2**16 // (STEPS_PER_BLOCK * rays))
     for start in range(0, len(heights), at_once):
         part = slice(start, start + at_once)
         rung[part], left[part] = _first_rungs(outside, heights[part], turn, step, steps)
@@ -259,10 +259,10 @@ def _first_rungs(
     rung = np.zeros(len(heights), np.int64)
     left = outside(heights[:, None], np.zeros(1), turn)
     inner = np.flatnonzero(~left.any(-1))
-    for start in range(1, steps + 1, BLOCK):
+    for start in range(1, steps + 1, STEPS_PER_BLOCK):
         if not len(inner):
             break
-        block = np.arange(start, min(start + BLOCK, steps + 1))
+        block = np.arange(start, min(start + STEPS_PER_BLOCK, steps + 1))
         gone = outside(heights[inner, None, None], np.multiply(step, block)[:, None], turn)
         hit = gone.any(-1)
         ended = hit.any(-1)
@@ -331,7 +331,7 @@ def random_joints(robot: Robot, rng: np.random.Generator, count: int) -> Array:
     low, high = middle - reach, middle + reach
     kept, share = np.empty((0, len(home))), 1.0
     # A machine with a large transmission ratio has a small index everywhere.
-    least = min(INSIDE, 0.5 * float(robot.singularity(home)))
+    least = min(MIN_SAMPLED_INDEX, 0.5 * float(robot.singularity(home)))
     while len(kept) < count:
         drawn = rng.uniform(middle - share * reach, middle + share * reach, (2 * count, len(home)))
         drawn = robot.try_project_redundant(drawn)

@@ -193,10 +193,10 @@ class TopicStatistics:
         self.overruns += 0.0 < self._period < took
 
 
-CAUGHT_UP: Final = 0.5
+CAUGHT_UP_FRACTION: Final = 0.5
 """Fraction of the longest wait below which a node has caught up: on a busy computer every message
 waits for some milliseconds, so that a smaller bound would drop all."""
-RELIEF: Final = 1.0
+RELIEF_TIME: Final = 1.0
 """Time without a dropped message that ends an overload, s."""
 
 
@@ -223,11 +223,11 @@ class Backlog:
             that is answered, s; ``now``: the steady clock, s.
         """
         self.longest = max(self.longest, waited)
-        if waited > (CAUGHT_UP * max_wait if self._behind else max_wait):
+        if waited > (CAUGHT_UP_FRACTION * max_wait if self._behind else max_wait):
             self._behind, self._last_drop = True, now
             self.dropped += 1
             return True
-        if self.every or now - self._last_drop > RELIEF:
+        if self.every or now - self._last_drop > RELIEF_TIME:
             self._behind = False
         return False
 

@@ -14,7 +14,16 @@ from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine.graph import BASE, Joint
 from pkm_twin.machine.members import Place
-from pkm_twin.robot.outline import BAR, Bar, Posture, base_face, platform_face, robot_bars, telescope, tube_start
+from pkm_twin.robot.outline import (
+    BAR_RADIUS_RATIO,
+    Bar,
+    Posture,
+    base_face,
+    platform_face,
+    robot_bars,
+    telescope,
+    tube_start,
+)
 from pkm_twin.robot.robot import Robot
 
 Colour = tuple[int, int, int]
@@ -105,7 +114,7 @@ class Scene:
         self.size = graph.size
         # What slides on an axis stays on a pin along it.
         pins = [
-            Bar(j.name, (j.inner, j.at), (j.outer, j.at), BAR * graph.size / 2)
+            Bar(j.name, (j.inner, j.at), (j.outer, j.at), BAR_RADIUS_RATIO * graph.size / 2)
             for j in graph.joints.values()
             if j.kind == "cylindrical"
         ]
@@ -115,7 +124,7 @@ class Scene:
         """Straight pieces that each bar is drawn of: members bend."""
         self.base = base_face(graph)
         self.platform = platform_face(graph) - graph.origin
-        self._thin = BAR * graph.size
+        self._thin = BAR_RADIUS_RATIO * graph.size
         self._elements = {bar.element for bar in self.bars if bar.element}
         self._joints = [j for j in graph.joints.values() if j.kind not in ("translation", "fixed")]
         self._drives = {j.name: self._make_motor(j) for j in self._joints if j.actuated}

@@ -9,7 +9,7 @@ from functools import lru_cache
 import numpy as np
 
 from delta_dynamics import ContactMonitor, inverse_dynamics
-from delta_dynamics.estimates.isolation import CLAMPING, PLATFORM, joined_bodies, limbs_of
+from delta_dynamics.estimates.isolation import CLAMPING, PLATFORM, limbs_of, list_joined_bodies
 from delta_dynamics.torques.regressor import PAYLOAD, parameter_names, parameter_values, regressor
 from pkm_twin import Robot
 from pkm_twin.codegen.arrays import Array
@@ -237,7 +237,9 @@ def strike(robot: Robot, rng: np.random.Generator, motion: tuple[Array, ...], ki
     far = near
     bodies: tuple[str, ...] = (body,)
     if kind == CLAMPING:
-        apart = [p for p, name in limbs.items() if name != limbs[body] and (p, body) not in joined_bodies(robot.graph)]
+        apart = [
+            p for p, name in limbs.items() if name != limbs[body] and (p, body) not in list_joined_bodies(robot.graph)
+        ]
         if not apart:
             return None
         other, far, _ = spot(robot, rng, apart)

@@ -136,7 +136,7 @@ def test_a_number_has_an_effect_or_is_refused(name):
     robot = robot.changed(payload=carried)
     own = taken(robot)
     drives = {key: schema.plain(getattr(robot, key)) for key in ("friction", "limits")}
-    for path in robot.file_numbers() | places.numbers_of(drives, {}):
+    for path in robot.file_numbers() | places.list_file_numbers(drives, {}):
         try:
             value = robot.number(path)
             other = 1.07 * value + 0.011 if np.isfinite(value) else 3.0

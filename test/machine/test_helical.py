@@ -11,7 +11,7 @@ from pkm_twin import load, variants
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.robot.robot_urdf import robot_description, robot_urdf
-from pkm_twin.robot.workspace import INSIDE, random_joints
+from pkm_twin.robot.workspace import MIN_SAMPLED_INDEX, random_joints
 from stiffness_monitor import platform_response
 from test.support.robots import data_of
 
@@ -120,7 +120,7 @@ def test_its_torque_is_that_of_a_screw(lead, rng):
 
 def test_a_fine_thread_has_random_states_though_its_index_is_small(rng):
     robot = slide(0.001)
-    assert robot.singularity(robot.graph.home) < INSIDE
+    assert robot.singularity(robot.graph.home) < MIN_SAMPLED_INDEX
     assert random_joints(robot, rng, 5).shape == (5, 1)
 
 

@@ -14,7 +14,7 @@ from pkm_twin.maps.search import workspace_box
 from pkm_twin.maps.store import open_map
 from pkm_twin.maps.sweep import map_of
 from pkm_twin.robot.clearance import clearance
-from pkm_twin.robot.workspace import CLEAR, RAYS, singularity_at
+from pkm_twin.robot.workspace import MIN_WORKSPACE_INDEX, RAYS_PER_CIRCLE, singularity_at
 from stiffness_monitor import reachable
 from test.support.robots import load, parameters_of, partly_long
 
@@ -90,13 +90,13 @@ def test_circles_end_where_the_first_ray_does(name):
     heights = np.linspace(*heights_of(robot), 31)
     found = circles(robot, heights)
     assert (found > 0.0).sum() > 4
-    turn = np.arange(RAYS) * (2 * np.pi / RAYS)
+    turn = np.arange(RAYS_PER_CIRCLE) * (2 * np.pi / RAYS_PER_CIRCLE)
     lateral = [robot.pose_names.index(name) for name in robot.grid().lateral]
     step = np.abs(robot.search_box()[lateral]).max() / 340
 
     def clear(z, distance):
         poses = robot.grid().polar_pose(z, distance, turn)
-        return ((singularity_at(robot, poses) >= CLEAR) & reachable(robot, poses)).all()
+        return ((singularity_at(robot, poses) >= MIN_WORKSPACE_INDEX) & reachable(robot, poses)).all()
 
     for z, radius in zip(heights.tolist(), found.tolist(), strict=True):
         if radius == 0.0:

@@ -243,7 +243,7 @@ def test_goals_wait_for_the_controller_to_be_found_in_their_order_and_not_for_ev
     action.controller.there = False
     late, cancelled = action.accept(Goal(3)), action.accept(Goal(4))
     cancelled.is_cancel_requested = True
-    action.now += action.code.MATCHING - 0.1
+    action.now += action.code.MAX_DISCOVERY_TIME - 0.1
     action.node.look(1)
     assert cancelled.how == CANCELED and not late.ends
     action.now += 0.2

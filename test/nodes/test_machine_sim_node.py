@@ -17,7 +17,7 @@ from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
 from delta_dynamics import inverse_dynamics
-from delta_dynamics.nodes.simulation import LOOK
+from delta_dynamics.nodes.simulation import CHECK_PERIOD
 from delta_dynamics.simulation.machine import MachineSettings, Simulation, WrenchSignal, tune_position_control
 from pkm_twin.robot.variation import varied
 from test.nodes.harness import SECOND, counts_of, stamp_of
@@ -124,7 +124,7 @@ def test_a_bad_command_is_refused_and_time_stands(peer, machine):
     array = peer.diagnostics("/machine_sim", lambda a: refused(a).get("length", 0) > greeted)
     assert refused(array) == {"not finite": 1, "length": greeted + 1}
     # It goes alone, a period of 1 ms in each time between two looks, and no other way.
-    looks = (peer.now() - begun) / (LOOK * SECOND)
+    looks = (peer.now() - begun) / (CHECK_PERIOD * SECOND)
     assert stamp_of(peer.received("/joint_states")[-1]) - before <= 1_000_000 * (looks + 2)
 
 

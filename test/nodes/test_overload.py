@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from pkm_twin.errors import MessageError
 from pkm_twin.messages.stamps import SECOND, StampRules
-from pkm_twin.streams.monitor import CAUGHT_UP, RELIEF, Backlog
+from pkm_twin.streams.monitor import CAUGHT_UP_FRACTION, RELIEF_TIME, Backlog
 from test.nodes.harness import text_of, values_of
 
 MAX_WAIT = 0.05
@@ -51,15 +51,15 @@ def test_no_answer_is_of_a_message_that_waited_too_long_and_all_are_counted(peri
         assert len(answered) > 0.5 * most
         if not every:
             # The newest, as long as it lasts.
-            assert max(answered[before:]) <= CAUGHT_UP * MAX_WAIT
+            assert max(answered[before:]) <= CAUGHT_UP_FRACTION * MAX_WAIT
 
 
 def test_after_an_overload_a_node_takes_every_message_again():
     backlog = Backlog()
     assert backlog.drop(1.0, MAX_WAIT, 100.0)
     assert backlog.drop(0.9 * MAX_WAIT, MAX_WAIT, 100.1)
-    assert not backlog.drop(0.0, MAX_WAIT, 100.2 + RELIEF)
-    assert not backlog.drop(0.9 * MAX_WAIT, MAX_WAIT, 100.3 + RELIEF)
+    assert not backlog.drop(0.0, MAX_WAIT, 100.2 + RELIEF_TIME)
+    assert not backlog.drop(0.9 * MAX_WAIT, MAX_WAIT, 100.3 + RELIEF_TIME)
     assert (backlog.dropped, backlog.take_longest(), backlog.take_longest()) == (2, 1.0, 0.0)
 
 

@@ -26,7 +26,7 @@ from pkm_twin.maps.kind import (
 from pkm_twin.robot.clearance import has_clearance, member_gaps, member_pairs
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import (
-    CLEAR,
+    MIN_WORKSPACE_INDEX,
     circle_radii,
     distance_unit,
     has_joint_angles,
@@ -186,13 +186,13 @@ def circles(
 
     :param heights: shape (n,), m.
     :param steps: first search along each of 360 rays; a bisection refines it.
-    :param least: singularity index below which a pose counts as out of reach; ``CLEAR`` at least.
+    :param least: singularity index below which a pose counts as out of reach; ``MIN_WORKSPACE_INDEX`` at least.
     :param least_clearance: smallest clearance of the limbs, m.
     """
     z = np.atleast_1d(np.asarray(heights, np.float64))
     lateral = [robot.pose_names.index(name) for name in robot.grid().lateral]
     step = float(np.abs(robot.search_box()[lateral]).max()) / steps
-    return circle_radii(robot, z, step, steps, least=max(least, CLEAR), least_clearance=least_clearance)
+    return circle_radii(robot, z, step, steps, least=max(least, MIN_WORKSPACE_INDEX), least_clearance=least_clearance)
 
 
 @dataclass(frozen=True)
