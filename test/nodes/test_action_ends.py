@@ -204,14 +204,14 @@ def test_a_goal_whose_controller_was_killed_is_aborted_within_two_seconds(action
     handle = action.controller.take() if answered else Accepted()
     feedback = told_of([], [])
     for _ in range(3):
-        action.node.look(action.code.MAX_SILENT_LOOKS - 1)
+        action.node.look(action.code.MAX_SILENT_CHECKS - 1)
         # Feedback is a sign of life, and so is an answer to a question.
         action.controller.feedback(SimpleNamespace(feedback=feedback))
-        action.node.look(action.code.MAX_SILENT_LOOKS - 1)
+        action.node.look(action.code.MAX_SILENT_CHECKS - 1)
         action.node.asked[-1].tell(None)
     assert not goal.ends
-    assert action.code.MAX_SILENT_LOOKS * action.code.LOOK < 2.0
-    action.node.look(action.code.MAX_SILENT_LOOKS)
+    assert action.code.MAX_SILENT_CHECKS * action.code.CHECK_PERIOD < 2.0
+    action.node.look(action.code.MAX_SILENT_CHECKS)
     (result,) = goal.ends
     assert goal.how == ABORTED
     assert "/controller" in result.error_string
@@ -226,7 +226,7 @@ def test_a_goal_whose_controller_was_killed_is_aborted_within_two_seconds(action
 def test_a_controller_that_was_started_again_has_lost_the_goal(action):
     goal = action.accept(Goal(1))
     handle = action.controller.take()
-    action.node.look(action.code.PING)
+    action.node.look(action.code.ASKING_CHECKS)
     assert len(handle.results) == 2
     handle.end(UNKNOWN)
     assert goal.how == ABORTED and "lost the goal" in goal.ends[0].error_string
