@@ -62,8 +62,8 @@ app = Tasks(
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point: errors are one line on stderr and exit code 1, Ctrl-C is code 130."""
-    # What is loaded stays: to look at it while it is loaded is a tenth of a short command's time.
+    """Run the command line; report an error as one line with exit code 1, Ctrl-C with code 130."""
+    # Loaded modules are never garbage; collecting while they load takes a tenth of a short command's time.
     gc.disable()
     open_standard_streams()
     one_blas_thread()
@@ -76,14 +76,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
             _end(f"cannot write the output: {system_error(failed)}")
         raise
     except BrokenPipeError:
-        # Whoever read the output has seen enough.
+        # The reader of the pipe has closed it, as `head` does.
         silence_output()
         sys.exit(REFUSED)
     except PkmTwinError as error:
         _end(str(error))
     except OSError as error:
         flush_output()
-        # Every file that a command opens has a name, the output has none.
+        # An error without a file name is one of the output.
         _end(f"{'' if error.filename else 'cannot write the output: '}{system_error(error)}")
 
 

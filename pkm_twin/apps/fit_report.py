@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""What a fit says: its answer, numbers, verdict, what was held out, and pictures."""
+"""Report a fit: its answer, parameters, verdict, held-out residuals, and pictures."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from pkm_twin.report import Column, Fact, Report, Table, plots
 
 COMBINED: Final = "known only in combination with others"
 BY_AXIS: Final = "m_m_m_rad_rad_rad"
-"""The end of a key in JSON: units of a deflection's directions."""
+"""Ending of keys in JSON: the units of a deflection's six components."""
 
 
 def report_of(result: Result, marks: Sequence[str] = ()) -> tuple[Report, list[Table]]:
@@ -63,7 +63,7 @@ def report_of(result: Result, marks: Sequence[str] = ()) -> tuple[Report, list[T
         notes.append(f"not excited, the file's value stays: {', '.join(idle)}")
     if e.bound:
         what = "a negative compliance" if elastic else "negative friction or an impossible body"
-        # Of a body, which several numbers give, its name.
+        # A bound of a body concerns several of its numbers: name the body.
         which = ", ".join(dict.fromkeys(names[k] if not more else names[k].rpartition(".")[0] for k, *more in e.bound))
         notes.append(f"at a physical bound, without which the fit would give {what}: {which}")
     parameters = [
@@ -229,7 +229,7 @@ def _draw_residuals(judged: Judged, units: Mapping[str, str]) -> Any:
         if np.isfinite(judged.measured[:, k]).any():
             rows[name] = [one[::step, k] for one in series]
     time = judged.time[::step]
-    # No line over what was left out.
+    # Lines are broken where samples were left out.
     gaps = 1 + np.flatnonzero(np.diff(time) > 5.0 * np.median(np.diff(time)))
     figure, ((*axes,),) = plots.columns(1, len(rows))
     for ax, (name, (before, now, deviation)) in zip(axes, rows.items(), strict=True):
@@ -254,7 +254,7 @@ def _draw_changes(shown: Mapping[str, Number]) -> Any:
         name: (n.after - n.before) / (n.deviation if known else max(abs(n.before), abs(n.after), 1e-300))
         for name, n in shown.items()
     }
-    # The twenty that changed most.
+    # Draw the twenty parameters that changed most.
     order = sorted(moved, key=lambda name: -abs(moved[name]))[:20]
     figure, ((ax,),) = plots.columns(1, 1, 1.6 + 0.28 * len(order))
     places = np.arange(len(order))[::-1]

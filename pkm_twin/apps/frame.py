@@ -40,7 +40,7 @@ class Value(click.ParamType):  # type: ignore[type-arg]
     name = "value"
 
     def __init__(self, kind: Any, row: Setting) -> None:
-        """``kind``: the field's type without None, of a repeated option that of one value."""
+        """Set the type ``kind`` of one value (the field's without None) and the field's setting."""
         self.kind, self.row = kind, row
 
     def convert(self, value: Any, param: Any, ctx: click.Context | None) -> Any:
@@ -77,13 +77,13 @@ class Value(click.ParamType):  # type: ignore[type-arg]
 
 
 class Option(click.Option):
-    """An option for a field: with older spellings, and the opposite of one that begins with no.
+    """Option of a field: also accepts older spellings, and --X as the opposite of --no-X.
 
     ``shown``: the default as help has it, empty for none.
     """
 
     def __init__(self, field: str, kind: Any, row: Setting, default: Any) -> None:
-        """``kind``: the field's type."""
+        """Read the field's type ``kind``, its setting and default."""
         self.row, self.shown, name = row, "", f"--{row.name or field.replace('_', '-')}"
         kind, repeated = _read_type(kind, row)
         if kind is bool:
@@ -122,10 +122,10 @@ class Option(click.Option):
 
 
 class Argument(click.Argument):
-    """An argument for a field, which help explains; ``shown``: its default in help."""
+    """Argument of a field, explained in the help; ``shown``: its default there."""
 
     def __init__(self, field: str, kind: Any, row: Setting, default: Any) -> None:
-        """``kind``: the field's type."""
+        """Read the field's type ``kind``, its setting and default."""
         kind, repeated = _read_type(kind, row)
         self.shown, known = _write_default(row, default)
         super().__init__(
@@ -140,10 +140,13 @@ class Argument(click.Argument):
 
 
 class Command(click.Command):
-    """A command: a class of settings, whose docstring is the help, and the function ``run``."""
+    """Command of a class of settings, whose docstring is the help, and of a function ``run``."""
 
     def __init__(self, given: type[Any], run: Callable[[Any], Report], task: str = "") -> None:
-        """``task``: the heading in the list of commands; empty for a command of a group."""
+        """Declare the options of a class of settings.
+
+        :param task: the heading in the list of commands; empty for a command of a group.
+        """
         self.given, self.run, self.task = given, run, task
         self.fields = list(_find_parameters(given))
         as_json = click.Option(["--json", "as_json"], is_flag=True, help="print JSON")
@@ -258,10 +261,10 @@ def command(task: str = "") -> Callable[[Callable[[Any], Report]], Command]:
 
 
 class Group(click.Group):
-    """Commands under one name; a wrong name is answered with the closest one."""
+    """Group of commands under one name; the error of a wrong name has the closest one."""
 
     noun = ""
-    """What its commands are, in errors; by default the group's name."""
+    """Word for a command of the group in errors; by default the group's name."""
 
     def __init__(
         self,
@@ -272,7 +275,7 @@ class Group(click.Group):
         metavar: str = "COMMAND [OPTIONS]",
         **more: Any,
     ) -> None:
-        """``commands``: in the order of the help. ``metavar``: what follows the name, in help."""
+        """Set the commands, in the order of the help; ``metavar`` follows the name in the usage line."""
         super().__init__(
             name,
             help=inspect.cleandoc(text),
@@ -289,7 +292,7 @@ class Group(click.Group):
         return list(self.commands)
 
     def show(self, name: str) -> str:
-        """Return a command's name as it is typed, with arguments that stand before it."""
+        """Return a command's name as typed, with the arguments before it."""
         return name
 
     def resolve_command(
@@ -308,7 +311,7 @@ class Group(click.Group):
 
 
 def spell(one: click.Parameter) -> str:
-    """Return an option's or argument's name as help has it."""
+    """Return the name of an option or argument as the help prints it."""
     return one.human_readable_name if isinstance(one, click.Argument) else one.opts[0]
 
 
@@ -371,7 +374,7 @@ def _read_type(kind: Any, row: Setting) -> tuple[Any, bool]:
 
 
 def _write_default(row: Setting, default: Any) -> tuple[str, dict[str, Any]]:
-    """Return a default as help has it, and the words that give it as a keyword of click."""
+    """Return a default as text for the help, and as keyword arguments for click."""
     if default in (MISSING, None, ()):
         return "", {}
     if row.choices:

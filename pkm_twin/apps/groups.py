@@ -19,7 +19,7 @@ from pkm_twin.errors import PkmTwinError
 from pkm_twin.extensions import Extensible
 
 WIDE: Final = 200
-"""Characters of a command's purpose, never cut."""
+"""Characters allowed for a command's purpose: more than any has, so that none is cut."""
 
 TASKS: Final = (
     "Robots",

@@ -49,7 +49,7 @@ machine_sim = partial(_run, "machine_sim")
 
 
 def composed() -> None:
-    """Entry point of ``ros2 run pkm_twin composed NODE... --ros-args ...``."""
+    """Run several nodes in one process: ``ros2 run pkm_twin composed NODE... --ros-args ...``."""
     leave_at_once()
     open_standard_streams()
     words = sys.argv[1:]

@@ -28,15 +28,15 @@ REFUSED, USAGE, SALVAGED, NOT_JUDGED = 1, 2, 3, 4
 """Exit codes: rejected; wrong usage; damaged, with messages that `recover` saves; no verdict."""
 
 PICTURES = (".png", ".svg", ".pdf")
-"""What a picture's name may end in."""
+"""Allowed endings of a picture's name."""
 BESIDE = "auto"
-"""The picture's name where --picture has none."""
+"""Value of --picture without a name: next to --out."""
 ROBOT_HELP = "a robot's name (see `pkm-twin robots`), or its YAML, URDF, MJCF, SDF, USD"
 
 
 @dataclass(frozen=True, kw_only=True)
 class OfPlatform:
-    """The platform of a description that names none, and what of a larger robot is the machine."""
+    """Options that cut a machine out of a URDF, MJCF, SDF or USD: platform, base, motors, pose."""
 
     platform: str | None = setting(None, "for a URDF, MJCF, SDF or USD: the link that carries the tool")
     base: str | None = setting(
@@ -52,7 +52,7 @@ class OfPlatform:
 
     @property
     def part(self) -> dict[str, Any]:
-        """What of a file is the machine, as ``load`` takes it."""
+        """Keyword arguments of ``load`` that cut the machine out of its file."""
         lists = {"actuated": self.actuated, "pose": self.pose_names}
         split = {key: [n for text in some for n in text.split(",")] for key, some in lists.items()}
         chosen = {key: names or None for key, names in split.items()}
@@ -61,7 +61,7 @@ class OfPlatform:
 
 @dataclass(frozen=True, kw_only=True)
 class OfRobot(OfPlatform):
-    """A command on a robot."""
+    """Argument of a command on a robot."""
 
     robot: str = setting(..., ROBOT_HELP, argument=True)
 
@@ -77,7 +77,7 @@ class OfRobot(OfPlatform):
 
 @dataclass(frozen=True, kw_only=True)
 class Carries(OfRobot):
-    """A payload on the platform."""
+    """Option of a payload on the platform."""
 
     payload: str | None = setting(
         None,
@@ -108,7 +108,7 @@ class Carries(OfRobot):
 
 @dataclass(frozen=True, kw_only=True)
 class CarriesAtTimes(Carries):
-    """A payload that is held in intervals."""
+    """Options of a payload that is held in intervals of time."""
 
     load_times: str | None = setting(None, "times at which --payload is held: FROM,TO[,FROM,TO...], s; default: always")
 
@@ -119,7 +119,7 @@ class CarriesAtTimes(Carries):
 
 @dataclass(frozen=True, kw_only=True)
 class ReadsTables:
-    """How tables are written."""
+    """Options of the format of tables that are read."""
 
     separator: str | None = setting(None, "column separator: , ; or tab; default: detected")
     decimal: str | None = setting(None, "decimal mark: . or ,; default: detected")
@@ -134,7 +134,7 @@ class ReadsTables:
 
     @property
     def dialect(self) -> Dialect:
-        """As the readers of tables take it.
+        """Format of tables for the readers.
 
         :raises ParameterError: an option that is none.
         """
@@ -145,7 +145,7 @@ class ReadsTables:
 
 @dataclass(frozen=True, kw_only=True)
 class ReadsRecordings(ReadsTables):
-    """Which topics of a recording are read, and how its tables are written."""
+    """Options of topics and of the format of recordings."""
 
     topic: tuple[str, ...] = setting((), "topic of joint states or wrenches; default: by joint names")
     side: str = setting(
@@ -171,7 +171,7 @@ class ReadsRecordings(ReadsTables):
         return read(path, robot, self.reading(**more), progress)
 
     def reading(self, **more: Any) -> ReadOptions:
-        """How its recordings are read; ``more``: other fields of ``ReadOptions``."""
+        """Return the options of reading; ``more``: other fields of ``ReadOptions``."""
         from pkm_twin.recordings import ReadOptions
 
         names = ("load", "follow", "dialect", "side", "wrench_frame", "base_frame")
@@ -181,7 +181,7 @@ class ReadsRecordings(ReadsTables):
 
 @dataclass(frozen=True, kw_only=True)
 class ReadsMotions(ReadsRecordings):
-    """A recording or a path as a motion."""
+    """Option of the coordinates that a motion is read from."""
 
     follow: str | None = setting(
         None,
@@ -203,12 +203,12 @@ class ReadsMotions(ReadsRecordings):
 
 @dataclass(frozen=True, kw_only=True)
 class BeyondLimitsToo:
-    """Work outside the joint limits."""
+    """Option to compute outside the joint limits, too."""
 
     beyond_limits: bool = setting(False, "also compute outside the joint limits, marked")
 
     def admitted(self, machine: Robot, q: Array, qd: Array | None = None, where: str = "") -> list[Beyond]:
-        """Describe what joint states (..., n) have beyond the joint limits.
+        """Return the joints that joint states (..., n) take beyond their limits.
 
         :param where: the recording, where there may be several.
         :raises ParameterError: something, and it is not allowed.
@@ -223,7 +223,7 @@ class BeyondLimitsToo:
 
 @dataclass(frozen=True, kw_only=True)
 class AtPose(Carries, BeyondLimitsToo):
-    """A pose of the platform."""
+    """Option of a pose of the platform."""
 
     at: str | None = setting(None, "the pose's coordinates, separated by commas; default: home")
 
@@ -243,7 +243,7 @@ class AtPose(Carries, BeyondLimitsToo):
 
 @dataclass(frozen=True, kw_only=True)
 class OfTool:
-    """The modes of the tool point."""
+    """Options of the tool point and of modal damping."""
 
     tool: tuple[float, ...] = setting(
         (0.0, 0.0, 0.0), "tool point from the reference point, platform axes, m", count=3, metavar="x,y,z"
@@ -257,7 +257,7 @@ class OfTool:
 
 @dataclass(frozen=True, kw_only=True)
 class OfMilling:
-    """A milling process."""
+    """Options of a milling process."""
 
     teeth: int = setting(..., "teeth of the tool")
     tangential: float = setting(..., "tangential cutting coefficient Kt, N/m2, e.g. 600e6 for 600 MPa")
@@ -268,7 +268,7 @@ class OfMilling:
 
     @property
     def milling(self) -> Milling:
-        """The process.
+        """Milling process of the options.
 
         :raises ParameterError: a number out of range.
         """
@@ -279,28 +279,28 @@ class OfMilling:
 
 @dataclass(frozen=True, kw_only=True)
 class Accepts:
-    """Data that the machine cannot have produced."""
+    """Option to use data that the machine cannot have produced."""
 
     accept: bool = setting(False, "also use a recording that contradicts the machine, marked")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Overwrites:
-    """Files that are there may be replaced."""
+    """Option to replace existing files."""
 
     overwrite: bool = setting(False, "replace files that exist")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Writes(Overwrites):
-    """A file to write; a command says which by its own field ``out``."""
+    """Option of a file to write; a command describes it by its own field ``out``."""
 
     out: Path | None = setting(None, "file to write", writes=True)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Draws(Overwrites):
-    """A picture of the result: asked for, or beside ``--out``."""
+    """Options of a picture of the result: named, or next to ``--out``."""
 
     picture: str | None = setting(
         None,
@@ -335,21 +335,21 @@ class Draws(Overwrites):
 
 @dataclass(frozen=True, kw_only=True)
 class Parallel:
-    """Processes that work at the same time."""
+    """Option of the number of parallel processes."""
 
     jobs: int | None = setting(None, "processes on this computer; default: one per core", low=1, high=10**4)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Seeded:
-    """Random numbers."""
+    """Option of the seed of random numbers."""
 
     seed: int = setting(0, "seed of the random numbers", low=0, high=2**32 - 1)
 
 
 @dataclass(frozen=True, kw_only=True)
 class AwayFromSingular:
-    """The singularity index below which a pose does not count."""
+    """Option of the smallest singularity index of poses that count."""
 
     singularity: float = setting(0.05, "least singularity index of a pose", low=0.0, high=1.0)
 

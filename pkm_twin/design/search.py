@@ -48,7 +48,7 @@ class DesignPoint:
 
     @property
     def feasible(self) -> bool:
-        """Whether the machine follows the path and keeps all bounds."""
+        """True if the machine follows the path and keeps all bounds."""
         return self.miss <= MISS_TOLERANCE
 
 

@@ -127,7 +127,7 @@ class Tolerances:
 
     @cached_property
     def only_turns(self) -> bool:
-        """Whether the errors rotate the platform about its reference point without moving it."""
+        """True if the errors only rotate the platform about its reference point."""
         moves, turns = np.split(self.deviation, 2, -1)
         return bool(np.linalg.norm(moves) < 1e-9 * np.linalg.norm(turns))
 

@@ -98,7 +98,7 @@ class Variants:
 
     @cached_property
     def valid(self) -> Mask:
-        """Which machines can be assembled at home and near it, shape (k,)."""
+        """Mask of the machines that can be assembled at home and near it, shape (k,)."""
         home, graph = self.robot.graph.home, self.robot.graph
         reach = [graph.size if graph.joints[name].slides else 1.0 for name in graph.actuated]
         steps = np.linspace(-1.0, 1.0, len(home)) + 0.3
@@ -274,7 +274,7 @@ class Variants:
 
     @property
     def whole_box_fits(self) -> bool:
-        """Whether a file may have all numbers between each path's smallest and largest value."""
+        """True if a file may have all numbers between each path's smallest and largest value."""
         return all(self._is_box_valid(columns, self.values[:, columns]) for columns in self._sections)
 
     @property

@@ -74,7 +74,7 @@ HEAD: Final = """\
 
 
 def bare(text: str) -> str:
-    """Without the brackets around the whole, where it has some."""
+    """Remove the brackets around a whole expression, if it has any."""
     if not (text.startswith("(") and text.endswith(")")):
         return text
     depth = 0
@@ -103,7 +103,7 @@ class Lines:
         self.results = [self._text[e.number] for e in results]
 
     def _turn(self, angles: Mapping[int, Sequence[Expression]]) -> None:
-        """Sines and cosines of angles, by the number of the angle, all at once."""
+        """Write sines and cosines of several angles in one call, by the number of the angle."""
         k, size = self._turns, len(angles)
         self._turns += 1
         self._write([x for turn in angles.values() for x in turn[0].args])
@@ -145,7 +145,7 @@ class Lines:
 
 
 def _angles(results: Sequence[Expression], known: Mapping[int, str]) -> list[dict[int, list[Expression]]]:
-    """Sines and cosines by their angle, those first whose angles need no others."""
+    """Group sines and cosines by their angle; first those whose angles depend on no others."""
     depth: dict[int, int] = {}
     groups: dict[int, dict[int, list[Expression]]] = {}
     for e in ordered(results, known):
@@ -325,7 +325,7 @@ class Unit:
         """Most of a public one."""
 
     def text(self) -> str:
-        """Helpers and all functions."""
+        """Return the source: helpers and all functions."""
         needed = (op.helpers for op in OPERATIONS if op in self._needed)
         steps = ", ".join(map(str, LADDER))
         ladder = f"""\
@@ -376,7 +376,7 @@ static const int @_steps[{len(LADDER)}] = {{{steps}}};
         return f"@_{name}({', '.join([*((called or {}).get(a, a) for a in arguments), '%s'])})"
 
     def solver(self, q: Equations) -> tuple[str, dict[int, int]]:
-        """Newton's method for the unknowns, in so many steps, written once.
+        """Write Newton's method for the unknowns with a number of steps, once per program.
 
         :returns: its name, and places in its table ``h`` by the expression's number.
         """

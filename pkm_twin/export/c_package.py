@@ -462,7 +462,7 @@ class Package:
         result += [routine for routine in (compliance, energy) if self._wants(routine.name)]
 
     def _inertial(self) -> Array:
-        """Run-time inputs of the dynamics, by the payload's numbers."""
+        """Return the run-time inputs of the dynamics as functions of the payload's numbers."""
         mass, com, inertia = self.payload[0], self.payload[1:4], self.payload[4:].reshape(3, 3)
         layout = Layout(self.robot.massive().tree)
         return np.asarray(self.robot.own_inertial + layout.payload(mass, com, inertia))
@@ -518,7 +518,7 @@ int @_parameters(double mass, const double *com, const double *inertia, double *
 """)
 
     def source(self) -> str:
-        """All functions."""
+        """Return the source file with all functions."""
         return (
             f"/* SPDX-License-Identifier: Apache-2.0 */\n/* {self._title} */\n"
             f'#include "{self.prefix}.h"\n\n{HEAD}\n{self.unit.text()}'
@@ -636,7 +636,7 @@ int @_parameters(double mass, const double *com, const double *inertia, double *
 
 
 def _has(ask: Callable[[], object]) -> bool:
-    """Whether the robot's file gives what is asked for."""
+    """Return whether the robot's file has the data of a property."""
     try:
         ask()
     except ParameterError:

@@ -81,7 +81,7 @@ class Description:
     sources: Sequence[str]
 
     def states(self) -> list[int]:
-        """Places of the continuous states."""
+        """Return the indices of the continuous states."""
         return [k for k, v in enumerate(self.variables) if v.kind == "s"]
 
     def unknowns(self, kinds: str) -> list[tuple[int, Variable]]:
@@ -170,7 +170,7 @@ def text_of(d: Description, version: int) -> str:
 
 
 def build_of(d: Description) -> str:
-    """``sources/buildDescription.xml`` of FMI 3.0."""
+    """Write ``sources/buildDescription.xml`` of FMI 3.0."""
     top = ET.Element("fmiBuildDescription", fmiVersion="3.0")
     build = ET.SubElement(top, "BuildConfiguration", modelIdentifier=d.identifier)
     files = ET.SubElement(build, "SourceFileSet", language="C99")

@@ -175,7 +175,7 @@ def accelerations(robot: Robot) -> list[float]:
 
 
 def _held(tree: LoopTree, parts: Sequence[Single]) -> list[tuple[str, str]]:
-    """Pairs of links that joints, or a loop that the tree cuts, hold together.
+    """Return pairs of links that a joint, or a cut loop, connects.
 
     A link without mass and shape stands between the axes of one joint: it joins its neighbours.
     """

@@ -175,7 +175,7 @@ def _words(robot: Robot, package: str) -> dict[str, str]:
 
 
 def _directions(robot: Robot) -> list[int]:
-    """Rows of the platform's twist that are the pose's.
+    """Return the indices of the twist's components that belong to the pose's coordinates.
 
     Of a pose with coordinates of its own, those in which the joints move the platform best at home.
     """

@@ -248,7 +248,7 @@ class Space:
 
     @property
     def by_joints(self) -> bool:
-        """Whether finite limits bound the joint positions."""
+        """True if finite limits bound the joint positions."""
         limits = self.robot.limits.position
         return limits is not None and bool(np.isfinite(limits).all())
 

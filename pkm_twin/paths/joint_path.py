@@ -287,7 +287,7 @@ def joint_paths(
     singularity: float,
     slowdown: Slowdown | None = None,
 ) -> list[JointPath]:
-    """All stretches of a path, checked; ``points`` shared by their lengths.
+    """Check all stretches of a path; return their joint paths, ``points`` split by their lengths.
 
     :param carried: by :func:`~pkm_twin.paths.carrying.carry`.
     :raises ParameterError: a place beyond a limit or too close to a singularity.

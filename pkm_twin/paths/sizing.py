@@ -345,7 +345,7 @@ class Fit:
 
     @property
     def good(self) -> bool:
-        """Whether all bounds are kept."""
+        """True if all bounds are kept."""
         return self.used <= 1.0
 
     @property

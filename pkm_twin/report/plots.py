@@ -15,16 +15,16 @@ import numpy as np
 from pkm_twin.console import writing
 from pkm_twin.files import replace_file
 
-# Okabe and Ito's colours, told apart by colour-blind readers too.
+# Colours of Okabe and Ito (2008), which colour-blind readers can distinguish.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#F0E442", "#000000")
 TERMS: Final = ("gravity", "inertia", "velocity", "payload", "friction", "external")
-"""Of an effort."""
+"""Terms of an effort, in the order of the plots."""
 MAX_SINGLE_COLUMN_TIME: Final = 5.0
 """A motion that lasts longer, s, has a picture of its largest effort beside the whole."""
 DASHES: Final = ("-", "--", ":", "-.")
 """Styles of lines that can lie on one another."""
 WIDTH: Final = 9.0
-"""Of every figure, inches: letters of 8 points are 11 pixels high where it is 900 pixels wide."""
+"""Width of every figure, inches: on a page of 900 pixels, letters of 8 points are 11 pixels high."""
 DPI: Final = 200
 STYLE: Final[Any] = {"font.size": 10, "axes.titlesize": 11, "legend.fontsize": 9, "figure.titlesize": 12}
 

@@ -31,7 +31,7 @@ class Camera:
     """
 
     def __init__(self, low: Array, high: Array) -> None:
-        """:param low: least base coordinates in the picture, ``high`` the greatest, (3,) m."""
+        """Set the corners of the box to show: ``low`` and ``high``, base axes, (3,) m."""
         away = -LOOK / np.linalg.norm(LOOK)
         right = np.cross(away, [0.0, 0.0, 1.0])
         right /= np.linalg.norm(right)

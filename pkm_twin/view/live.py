@@ -38,7 +38,7 @@ _ANY: Final = StampRules(accept_zero=True, future_tolerance=2**62)
 
 @dataclass(frozen=True, eq=False)
 class Heard:
-    """The latest of everything; ``None`` or empty where nothing came.
+    """Hold the latest values that nodes published; ``None`` or empty without a message.
 
     ``q`` (n,); ``traces``: by name, times (k,) s before the latest, and values (k, n), N m or N;
     ``shares``: of the strain energy by element; ``deflection``: in platform axes, (6,), m and rad.
@@ -128,7 +128,7 @@ class Live:
         self._deflection = np.concatenate([numbers[:3], vector])
 
     def heard(self) -> Heard:
-        """All of it, as it is now."""
+        """Return a copy of the latest values."""
         with self._lock:
             newest = max((t[-1][0] for t in self._traces.values() if t), default=0)
             traces = {

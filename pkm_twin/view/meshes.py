@@ -21,7 +21,7 @@ LARGEST: Final = 64 * 1024 * 1024
 
 
 def body_meshes(robot: Robot) -> dict[str, tuple[Array, NDArray[np.int64]]]:
-    """Corners (k, 3) at home, m, base axes, and triangles (j, 3) of each body that has meshes.
+    """Read each body's meshes: corners (k, 3) at home, m, base axes, and triangles (j, 3).
 
     A mesh that cannot be read is left out with a warning.
     """

@@ -78,7 +78,7 @@ class Numbers:
 
 
 class Model:
-    """A robot's sliders and what they lead to."""
+    """Compute a robot's state, limits and quantities from the positions of the page's sliders."""
 
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
@@ -270,7 +270,7 @@ class Model:
         return moved if moved.refusal else self.loaded(moved, rows[1])
 
     def softest(self, wrench: Array, tell: Callable[[float], object] = abs) -> tuple[Array, str]:
-        """Joint positions of the softest pose, or of the one that a wrench (6,) moves most.
+        """Find the joint positions of the softest pose, or of the one that a wrench (6,) moves most.
 
         The second part is the answer in words, with its units. The search is that of
         ``pkm-twin map``; ``tell`` gets the part that is done, 0 to 1.

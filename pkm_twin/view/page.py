@@ -42,7 +42,7 @@ def serving(port: int) -> Iterator[Any]:
         """Without the tunnel to a host outside that any visitor could ask for."""
 
         def request_share_url(self, verbose: bool = True) -> None:
-            """Share nothing."""
+            """Refuse viser's public link: the page is for this computer alone."""
 
     # A visitor that breaks off is no error of this program's.
     logging.getLogger("websockets").setLevel(logging.CRITICAL)
@@ -74,7 +74,7 @@ class Page:
     """A robot on a server; all connected browsers share it."""
 
     def __init__(self, server: Any, model: Model, first: str = "") -> None:
-        """:param first: name of a tab before the others, ``self.first``, for a bag or nodes."""
+        """Build the page; ``first`` names a tab before the others, ``self.first``, for a bag or nodes."""
         self.server, self.model, self.state = server, model, model.start
         lowest = min((r.low for r in model.pose_ranges if r.name == "z"), default=0.0)
         self.stage = Stage(server, Scene(model.robot), model.start.q, lowest)
@@ -123,7 +123,7 @@ class Page:
         self._show()
 
     def ask(self, react: Any, what: str, call: Callable[[], None]) -> None:
-        """Let the loop make the call when a visitor does what ``react`` is of.
+        """Make the call in the page's loop when a visitor triggers the event of ``react``.
 
         :param react: ``on_update`` or ``on_click`` of a handle; of many calls with one name,
             ``what``, the last one is made.

@@ -107,7 +107,7 @@ RIGID: Final = Deflection(np.zeros(6), {})
 
 
 class Scene:
-    """The shapes of a robot in any state: how many they are never changes."""
+    """Compute the shapes of a robot in any state; their number is constant."""
 
     def __init__(self, robot: Robot) -> None:
         self.robot, graph = robot, robot.graph
@@ -141,7 +141,7 @@ class Scene:
         self._members: dict[tuple[str, bytes], str] = {}
 
     def _find_member(self, place: Place) -> str:
-        """Return the member that ends at a point, else that it lies on; empty without one."""
+        """Return the member that ends at a point, else one that contains the point; empty if none does."""
         body, point = place
         key = body, point.tobytes()
         if key in self._members:
@@ -181,7 +181,7 @@ class Scene:
         return max(at_end, default=self._thin)
 
     def shapes(self, q: Array, moved: Deflection = RIGID, shares: Mapping[str, float] | None = None) -> Shapes:
-        """Shapes at joint positions, shape (n,).
+        """Return the shapes at joint positions, shape (n,).
 
         :param moved: the deflection as it is to be drawn, already enlarged.
         :param shares: of the strain energy by element, which colour members and joints.
@@ -353,7 +353,7 @@ def anchors(spots: Array, sizes: Array, window: tuple[float, float]) -> list[str
 
 
 def seen(points: Array, camera: Any) -> tuple[Array, Array]:
-    """Pixels (k, 2), right and down, and distances (k,) along the view, of points (k, 3).
+    """Project points (k, 3) to pixels (k, 2), right and down, and distances (k,) along the view.
 
     :param camera: ``position``, ``wxyz`` (z ahead, y down), ``fov`` of the height in rad,
         ``image_width`` and ``image_height``.
@@ -366,7 +366,7 @@ def seen(points: Array, camera: Any) -> tuple[Array, Array]:
 
 
 def round_mesh(sides: int = 24, rings: int = 12) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    """Vertices and triangles of a cylinder (radius and length 1, along z) and of a ball."""
+    """Return vertices and triangles of a cylinder (radius and length 1, along z) and of a ball."""
     angle = np.arange(sides) * 2 * np.pi / sides
     ring = np.column_stack([np.cos(angle), np.sin(angle)])
     k, n = np.arange(sides), np.roll(np.arange(sides), -1)
@@ -390,7 +390,7 @@ def round_mesh(sides: int = 24, rings: int = 12) -> tuple[tuple[Array, Array], t
 
 
 def plate(corners: Array, thickness: float) -> tuple[Array, NDArray[np.int64]]:
-    """Vertices and triangles of a plate of convex outline, both sides and the rim."""
+    """Return vertices and triangles of a plate of convex outline, both sides and the rim."""
     count = len(corners)
     normal = np.linalg.svd(corners - corners.mean(0))[2][2]
     aside = normal * thickness / 2

@@ -33,7 +33,7 @@ class Stage:
     """A machine on a server; all who look at it see the same."""
 
     def __init__(self, server: Any, scene: Scene, q: Array, lowest: float) -> None:
-        """:param lowest: where the platform may go at least, z in m: the ground is below."""
+        """Draw the ground below ``lowest``, the smallest z of the platform, m."""
         self._server, self._scene = server, scene
         draw, size, shapes = server.scene, scene.size, scene.shapes(q)
         draw.set_up_direction("+z")
@@ -146,7 +146,7 @@ class Stage:
         )
 
     async def _frame(self, client: Any) -> None:
-        """Let the machine be seen whole in this window, and after its size has changed.
+        """Fit the camera to the whole machine, now and after each change of the window's size.
 
         A camera that the visitor has turned or moved stays where it is.
         """
@@ -244,7 +244,7 @@ class Stage:
                 label.text, label.anchor, label.position = text, placed[text], self._places[text]
 
     def draw_wrench(self, at: Array, part: Array) -> None:
-        """Draw a wrench's arrows at the reference point: the force ends there, the moment begins.
+        """Draw a wrench at the reference point: the force's arrow ends there, the moment's begins.
 
         :param part: of the greatest wrench, (6,), base axes.
         """
@@ -277,7 +277,7 @@ def _axes(length: float, size: float) -> dict[str, float]:
 
 
 def _to_linear(colours: NDArray[Any]) -> NDArray[np.uint8]:
-    """Convert a screen's colours to amounts of light, as viser takes those of batches."""
+    """Convert sRGB colours to linear ones, which viser expects for batches."""
     part = np.asarray(colours) / 255.0
     light = np.where(part <= 0.04045, part / 12.92, ((part + 0.055) / 1.055) ** 2.4)
     return np.round(255 * light).astype(np.uint8)

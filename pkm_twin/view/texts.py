@@ -78,12 +78,12 @@ _STYLE: Final = "font-size:0.82em;line-height:1.5;padding:0.15em 0.9em 0.4em"
 
 
 def number(value: float) -> str:
-    """Four digits, as the page shows a number; what is zero but for rounding is 0."""
+    """Format a number with four digits; rounding errors of zero are shown as 0."""
     return f"{value:.4g}" if abs(value) > 1e-12 else "0"
 
 
 def buttons(name: str) -> str:
-    """Buttons that the browser itself obeys: copy the link, save the scene as a PNG."""
+    """Write buttons that the browser handles itself: copy the link, save the scene as a PNG."""
     return (
         f'<div style="{_STYLE}">'
         f'<button id="copy" style="{_BUTTON}" onclick="{escape(_COPY)}">Copy link</button>'
@@ -98,7 +98,7 @@ def note(text: str) -> str:
 
 
 def status(model: Model, state: State, numbers: Numbers) -> str:
-    """Singularity measure, clearance, joints with their efforts at rest, and a refusal in words."""
+    """Describe singularity index, clearance, joints with their efforts at rest, and why a state is rejected."""
     gap = None if numbers.clearance is None else 1e3 * numbers.clearance
     rows = [
         _judged(
@@ -164,7 +164,7 @@ def load(numbers: Numbers) -> str:
 
 
 def bars(shares: Mapping[str, float]) -> str:
-    """Elements by their share, the greatest first, in the colours of the scene."""
+    """Draw bars of the elements' shares, the largest first, in the colours of the scene."""
     colours = share_colours(shares)
     order = sorted(colours, key=lambda name: -shares[name])
     rows = []
@@ -198,7 +198,7 @@ def instant(robot: Robot, timeline: Timeline, at: Instant) -> str:
 
 
 def heard(robot: Robot, live: Heard, waiting: str) -> str:
-    """Describe what running nodes say: efforts, residuals, dominant element, rejections."""
+    """Describe the messages of running nodes: efforts, residuals, dominant element, rejections."""
     rows = [_write_head("joint", "torque", "residual")]
     for k, name in enumerate(robot.joint_names):
         cells = []

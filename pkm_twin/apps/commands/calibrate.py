@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""``pkm-twin calibrate``: the geometry of one's own machine from measurements of its platform."""
+"""``pkm-twin calibrate``: a machine's geometry from measurements of its platform."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ if TYPE_CHECKING:
     from pkm_twin.robot.robot import Robot
 
 WIDTH: Final = 100
-"""Columns of a line of text."""
+"""Characters of a printed line."""
 MOST_SHOWN: Final = 10
-"""Outliers that are printed."""
+"""Largest number of outliers that are printed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,12 +87,12 @@ class Calibrate(OfRobot, ReadsTables, BeyondLimitsToo, Accepts, Overwrites):
 
     @property
     def files(self) -> dict[str, Path]:
-        """What is written, but for a plan."""
+        """Files that a calibration writes, by key; none for a plan, which names its own file."""
         read = self.plan is None and self.poses is not None
         return {"out": self.out or Path("calibrated.yaml")} if read else {}
 
     def words(self) -> tuple[tuple[Kind, ...], dict[str, float], dict[str, tuple[float, float]]]:
-        """Kinds of measurements, their known noise, and where a plan measures.
+        """Return the kinds of measurements, their known noise, and the bounds of a plan's poses.
 
         :raises ParameterError: other words, or the noise of what is not measured.
         """
@@ -105,7 +105,7 @@ class Calibrate(OfRobot, ReadsTables, BeyondLimitsToo, Accepts, Overwrites):
 
     @property
     def free(self) -> dict[str, Any]:
-        """What is fitted beside the file's numbers."""
+        """Options of the fit: what is fitted in addition to the file's numbers, and the prior."""
         return {
             "offsets": not self.no_offsets,
             "frame": self.frame,
@@ -173,7 +173,7 @@ def calibrate(given: Calibrate) -> Report:
 def report_of(
     machine: Robot, source: str, result: Calibration, notes: Sequence[str], marks: Sequence[str], out: Path | None
 ) -> Report:
-    """Parameters, errors by kind of measurement, and what stays open."""
+    """Report the parameters, the errors by kind of measurement, and the undetermined changes."""
     first, scale = result.agreements[0], result.scale
     whole = {a.unit: a for a in result.agreements if a.name in ("position", "rotation")}
     before, after = (f"{1e3 * one.rms:.4f} m{first.unit}" for one in first.held_out)
@@ -287,7 +287,7 @@ def _open(result: Estimate) -> list[str]:
 
 
 def planned(robot: Robot, plan: Plan, accuracy: float | None, out: Path) -> Report:
-    """How well the machine will be known after so many measurements."""
+    """Report the predicted standard deviations by the number of measurements of a plan."""
     last, needed = len(plan.position) - 1, None if accuracy is None else plan.needed(accuracy)
     known = f"{1e3 * plan.position[-1]:.3g} mm*"
     reached = f"the position is known to {known} after {last} measurements"

@@ -89,7 +89,7 @@ def check_one(given: Check, path: Path, update: Any = None, thorough: bool = Tru
         append(given.history, name, r.robot.name, path, recorded_at(r, path), good, measure(r))
     bad, unknown = found.named(Verdict.BAD), found.named(Verdict.UNKNOWN)
     if found.answer == "not judged":
-        # The reason is in the answer.
+        # The answer already says why the efforts are not judged.
         unknown = [what for what in unknown if what not in (COMPARED, IDLE, RESIDUAL)]
     why, findings = "; ".join(found.causes), "; ".join(found.findings)
     what = ", ".join(bad) or found.unjudged or found.agreement
@@ -124,7 +124,7 @@ def check_one(given: Check, path: Path, update: Any = None, thorough: bool = Tru
 
 
 def _check_safely(given: Check, path: Path) -> dict[str, Any]:
-    """Judge a recording of a folder, as plain data; a damaged one is no error."""
+    """Judge a recording of a folder; return plain data, of a damaged file its error."""
     try:
         return check_one(given, path, thorough=False).data
     except (PkmTwinError, OSError) as error:

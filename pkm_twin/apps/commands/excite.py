@@ -56,7 +56,7 @@ class Excite(OfRobot, AwayFromSingular, Seeded, Writes):
 
     @property
     def files(self) -> dict[str, Path]:
-        """What is written."""
+        """Files that the command writes, by key."""
         return {"out": self.out, "table": self.out.with_suffix(".csv")}
 
 
@@ -131,7 +131,7 @@ def excite(given: Excite) -> Report:
 
 
 def _span(machine: Robot, speeds: Any) -> str:
-    """Write the range of the speeds (n, speeds) of joints that turn, and of those that slide."""
+    """Format the range of the speeds (n, speeds), of rotary and of sliding joints apart."""
     units = np.array(machine.joint_units)
     rows = {unit: speeds[units == unit] for unit in machine.joint_units}
     return " and ".join(f"{one.min():.2g} to {one.max():.2g} {u}/s" for u, one in rows.items())

@@ -96,14 +96,14 @@ class Fit(CarriesAtTimes, ReadsRecordings, BeyondLimitsToo, Accepts):
 
     @property
     def files(self) -> dict[str, Path | None]:
-        """What is written."""
+        """Files that the command writes, by key; None for no report, empty if nothing is fitted."""
         if self.drive is not None or not self.robot or not self.recordings:
             return {}
         out = self.out or Path("fitted.yaml")
         return {"out": out, "report": None if self.no_report else out.with_suffix(".html")}
 
     def words(self) -> tuple[tuple[Kind, ...] | None, tuple[str, ...] | None]:
-        """Kinds of numbers, None: compliances; and friction laws, None: those that show.
+        """Return the kinds of parameters (None: compliances) and the friction laws (None: automatic).
 
         :raises ParameterError: unknown words, or options that do not go together.
         """

@@ -96,7 +96,7 @@ def frf(given: FrequencyResponse) -> Report:
 
 
 def of_modes(machine: Robot, pose: list[float], frequencies: Array, damping: Array | None = None) -> list[Fact]:
-    """Return the robot, the pose, and its lowest modes."""
+    """Report the robot, the pose, and its six lowest modes."""
     found = [{"frequency_hz": f} for f in frequencies[:6].tolist()]
     texts = [f"{f:.4g} Hz" for f in frequencies[:6].tolist()]
     for k, ratio in enumerate([] if damping is None else damping[:6].tolist()):
@@ -111,7 +111,7 @@ def of_modes(machine: Robot, pose: list[float], frequencies: Array, damping: Arr
 
 
 def draw(grid: Any, response: Any, modes: ToolModes, title: str) -> Any:
-    """Size and phase along each axis over the frequency."""
+    """Draw magnitude and phase of the response along each axis over the frequency."""
     figure, axes = plots.columns(1, 2)
     size, phase = axes[0]
     for k, name in enumerate(AXES):

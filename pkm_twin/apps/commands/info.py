@@ -25,7 +25,7 @@ from pkm_twin.robot.plausibility import findings, why_no_torques
 from pkm_twin.robot.robot import Robot
 
 MOST_NAMES: Final = 6
-"""Most names that a line has."""
+"""Largest number of names in a printed line."""
 
 
 @dataclass(frozen=True, kw_only=True)

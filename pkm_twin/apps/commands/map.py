@@ -33,14 +33,14 @@ SIX: Final = "six numbers separated by commas, N and N m; or NAME=six numbers"
 
 @dataclass(frozen=True, kw_only=True)
 class Pages:
-    """A page of the result."""
+    """Option of an interactive page of the result."""
 
     html: bool = setting(False, "also an offline interactive HTML page")
 
 
 @dataclass(frozen=True, kw_only=True)
 class OfMap(Carries, Pages, Writes, Draws, Parallel):
-    """The options of all maps."""
+    """Options that all kinds of maps have."""
 
     kind: str = ""
     points: int | None = setting(None, "approximate number of poses; default: by kind", low=1, high=10**11)
@@ -60,7 +60,7 @@ class OfMap(Carries, Pages, Writes, Draws, Parallel):
 
     @property
     def target(self) -> Path:
-        """The file of the map."""
+        """File that the map is written to."""
         return self.out or Path(f"{Path(self.robot).stem}_{self.kind}.nc")
 
     def drawing(self, command: str) -> Path | None:
@@ -87,7 +87,7 @@ class OfMap(Carries, Pages, Writes, Draws, Parallel):
 
 @dataclass(frozen=True, kw_only=True)
 class Loads:
-    """The option of kinds with load cases."""
+    """Option of the kinds that take a wrench: the load cases."""
 
     wrench: tuple[str, ...] = setting(
         (),
@@ -260,7 +260,7 @@ def kind_of(given: OfMap) -> Kind:
 
 
 def offered(kind: type[Kind]) -> Command:
-    """Return a kind as a command, with its own options and those of all maps."""
+    """Make the command that computes a kind, with its own options and those of all maps."""
     milling = kind is CuttingDepth
     own = [] if milling else [(f.name, get_type_hints(kind)[f.name], f) for f in dataclasses.fields(kind)]
     more: list[type[Any]] = [Loads] if kind.takes_wrench else []
@@ -277,7 +277,7 @@ def offered(kind: type[Kind]) -> Command:
 
 
 class AfterRobot(Group):
-    """Kinds as commands after the robot; ``show`` stands in its place."""
+    """Group whose commands (kinds) are typed after the robot; ``show`` alone comes first."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Exchange the robot and the kind, so that the kind is the command's name."""

@@ -42,7 +42,7 @@ class MonitorTorques:
 
 @dataclass(frozen=True)
 class Offer:
-    """What the topic's publishers promise: how many they are, and the weakest promise, s."""
+    """Hold the number of a topic's publishers, and the longest deadline and lifespan offered, s."""
 
     publishers: int = 0
     deadline: float = math.inf
@@ -60,7 +60,7 @@ def judge(topic: str, arrivals: Arrivals, offer: Offer) -> Report:
     beyond = f", {a.silences} beyond it" if a.silences else ""
 
     def item(name: str, value: Any, unit: str, text: str, words: str, bound: str, good: bool) -> Fact:
-        # Nothing is known of torques that never came.
+        # Without a message the property is unknown.
         verdict = Verdict.UNKNOWN if not count else Verdict.GOOD if good else Verdict.BAD
         return Fact(name, value, unit, text, words if count else "no message", bound, verdict)
 
@@ -84,7 +84,7 @@ def judge(topic: str, arrivals: Arrivals, offer: Offer) -> Report:
     ]
     for what, value in (("deadline", offer.deadline), ("lifespan", offer.lifespan)):
         if offer.publishers:
-            # A hair for what the middleware rounds.
+            # The middleware rounds times to nanoseconds.
             good = value <= a.deadline * (1.0 + 1e-9)
             words = f"{1e3 * value:g} ms" if math.isfinite(value) else "none"
             items.append(judged(f"{what} offered", words, most, good))
@@ -136,7 +136,10 @@ def monitor_torques(given: MonitorTorques) -> Report:
                     profiles = [info.qos_profile for info in node.get_publishers_info_by_topic(name)]
 
                     def weakest(promises: tuple[Any, ...]) -> float:
-                        """In s; the middleware's largest number means no promise."""
+                        """Return the longest promised time, s; infinite if one publisher promises none.
+
+                        The middleware states no promise as 0 or as its largest number.
+                        """
                         seconds = [promise.nanoseconds / SECOND for promise in promises]
                         return max(one if 0.0 < one < 1e9 else math.inf for one in seconds)
 
@@ -150,13 +153,13 @@ def monitor_torques(given: MonitorTorques) -> Report:
                     if arrivals.count and time.monotonic_ns() > end:
                         break
         except KeyboardInterrupt:
-            pass  # What was seen until then is the report.
+            pass  # Report the messages received so far.
         arrivals.ended(time.monotonic_ns())
     return judge(name, arrivals, offer)
 
 
 def _subscribe(node: Any, topic: str, take: Any) -> bool:
-    """Subscribe as the topic's publishers offer it; False while there are none.
+    """Subscribe with the QoS that the publishers offer; return False if there is none yet.
 
     :raises PkmTwinError: the topic carries something else.
     """

@@ -260,7 +260,7 @@ def _read_path(given: Motion, machine: Robot) -> tuple[Way, list[float] | None]:
         home = machine.home() if given.at is None else np.array(given.at)
         return paths.circle(machine, home, given.circle), None
     lengths = given.cycle or ()
-    # Less than a millimetre looks like metres.
+    # A length below 1 mm was probably given in metres.
     if len(lengths) not in (2, 3) or min(lengths) < 1.0:
         found = ",".join(f"{length:g}" for length in lengths)
         raise click.UsageError(f"--cycle {found}: HEIGHT,WIDTH[,DROP] in millimetres, for example 25,305,25")
@@ -279,7 +279,7 @@ def draw_limits(motion: TimedPath, title: str) -> Any:
     used, time = motion.used, motion.fine.time
     top, low = axes[0]
     names = limit_names(motion.robot)
-    # A limit has its line if the motion uses 30 % of it.
+    # At most eight limits are drawn, those of which the motion uses more than 30 %.
     shown = [i for i in np.argsort(-used.max(0)) if used[:, i].max() > 0.3][:8]
     colours = {names[i]: plots.COLOURS[k] for k, i in enumerate(shown)}
     for i in shown:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from pkm_twin.robot.robot import Robot
 
 MOST_PERCENT: Final = 1000.0
-"""A used part of more is printed as more."""
+"""Percentage of a motor's limit above which only `over 1000 %` is printed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -263,7 +263,7 @@ def over_workspace(given: Size) -> Report:
 
     speed, change = given.over_workspace or (0.0, 0.0)
     for value in (speed, change):
-        # The other alone may be asked for.
+        # 0 is allowed for one of the two: only the other is asked for.
         check_limit("over-workspace", value or LEAST_LIMIT)
     robot, held = given.machine(), given.load
     robot = robot if held is None else held.on(robot)
@@ -283,7 +283,7 @@ def over_workspace(given: Size) -> Report:
         ):
             entry[f"{what}_{unit}"] = float(value)
             entry[f"{what.split('_')[0]}_pose"] = dict(zip(names, pose.tolist(), strict=True))
-            at = (pose.round(9) + 0.0).tolist()  # No rounding of a zero, nor its sign.
+            at = (pose.round(9) + 0.0).tolist()  # Zeros have no rounding error and no sign.
             where = ", ".join(f"{n} {v:.4g}" for n, v in zip(names, at, strict=True))
             words = unit.replace("_m", " m").replace("m_s", "m/s").replace("rad_s", "rad/s")
             rows[f"{joint} {what.replace('_', ' ')}"] = [float(value), words, where]
@@ -327,7 +327,7 @@ def near(duty: DriveDuty) -> list[Fit]:
 
 
 def draw(taken: EffortComparison, duties: Sequence[DriveDuty], answer: str) -> Any:
-    """Torque against speed, an axes for each drive, with the curves of motors or the limits."""
+    """Draw torque over speed, one axes per drive, with the curves of motors or the file's limits."""
     from pkm_twin.paths.sizing import RPM
 
     shown = duties[:4]

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from pkm_twin.robot.robot import Robot
 
 RESTING: Final = ("gravity", "payload", "friction", "external", "preload")
-"""Terms of an effort at rest."""
+"""Terms of an effort that can differ from zero at rest."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +60,7 @@ class Torques(CarriesAtTimes, ReadsMotions, AtPose, Writes, Draws):
             object.__setattr__(self, "out", Path("torques.csv"))
 
     def resting(self, machine: Robot) -> Recording:
-        """One sample at rest at the pose.
+        """Return a motion of one sample at rest at the pose.
 
         :raises PkmTwinError: out of reach or of limits.
         """
@@ -74,7 +74,7 @@ class Torques(CarriesAtTimes, ReadsMotions, AtPose, Writes, Draws):
 
 @command("Torques, paths and drives")
 def torques(given: Torques) -> Report:
-    """Peak and RMS effort of each joint, and the table."""
+    """Report peak and RMS effort of each joint, and write the table."""
     from pkm_twin.paths.along import find_peaks, torque_table
     from pkm_twin.robot.limits import beyond_limits
 
@@ -105,7 +105,7 @@ def torques(given: Torques) -> Report:
     rows: dict[str, list[Any]] = {}
     for joint, peak in find_peaks(robot, columns).items():
         rows[joint] = [abs(peak.effort), peak.effort, peak.rms, units[joint], peak.time]
-    # Forces and moments have no common size.
+    # Forces and moments cannot be compared: only joints of the first joint's unit count.
     alike = [name for name in rows if units[name] == robot.effort_units[0]]
     worst = max(alike, key=lambda name: rows[name][0])
     _, effort, rms, unit, when = rows[worst]

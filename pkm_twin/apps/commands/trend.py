@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""``pkm-twin trend``: what of a machine drifts from night to night."""
+"""``pkm-twin trend``: values of a machine that drift from recording to recording."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""``pkm-twin view``: the options, and what is opened, in which order."""
+"""``pkm-twin view``: a robot, a recording or running nodes in the browser."""
 
 from __future__ import annotations
 
