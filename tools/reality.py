@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from pkm_twin import Robot, load
-from pkm_twin.apps.fit_report import drive_report
+from pkm_twin.apps.fit_report import report_drive
 from pkm_twin.identification.calibration import HELD_OUT, Calibration, Errors, calibrate, geometric
 from pkm_twin.identification.calibration_state import Poses, rotations
 from pkm_twin.identification.drives import GRAVITY, drive_friction
@@ -117,7 +117,7 @@ def section() -> str:
     halves = _transfer(robot, poses)
     columns = read_table(DATA / "leg_currents.csv")
     drive = drive_friction(GRAVITY * SPOOL * columns["mass_kg"], columns["iq_up_A"], columns["iq_down_A"])
-    told = text_of(drive_report(drive))
+    told = text_of(report_drive(drive))
     return SECTION.format(count=count, table=table, halves=halves, drive=told)
 
 

@@ -22,7 +22,7 @@ BY_AXIS: Final = "m_m_m_rad_rad_rad"
 """Ending of keys in JSON: the units of a deflection's six components."""
 
 
-def report_of(result: Result, marks: Sequence[str] = ()) -> tuple[Report, list[Table]]:
+def report_fit(result: Result, marks: Sequence[str] = ()) -> tuple[Report, list[Table]]:
     """Return a fit's report, and tables for its page alone.
 
     :param marks: notes that come first.
@@ -285,7 +285,7 @@ def _write_terms(law: Law) -> str:
     )
 
 
-def drive_report(found: DriveFriction) -> Report:
+def report_drive(found: DriveFriction) -> Report:
     """Report a drive's torque constant and friction law."""
     rows: dict[str, dict[str, Any]] = {}
     for law in found.laws:

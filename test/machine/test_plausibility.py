@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 import pkm_twin
-from pkm_twin.apps.commands.info import members_fault
+from pkm_twin.apps.commands.info import find_members_fault
 from pkm_twin.certify.description import expand
 from pkm_twin.errors import ParameterError, RobotWarning
 from pkm_twin.mechanisms.machine import Machine
@@ -173,10 +173,10 @@ def test_members_that_maps_reject_are_named_by_info(data):
         made = copy.deepcopy(data)
         barred(density=density)(made)
         del made["bodies"]["crank_2"]["member"]["section"]["inner_diameter"]
-        assert members_fault(machine(made)).partition(";")[0] == field
-    assert members_fault(machine(data)) == ""
+        assert find_members_fault(machine(made)).partition(";")[0] == field
+    assert find_members_fault(machine(data)) == ""
     made["bodies"]["crank_3"]["member"] = made["bodies"]["crank_2"]["member"]
-    assert "bodies.crank_3.member.section.density" in members_fault(machine(made))
+    assert "bodies.crank_3.member.section.density" in find_members_fault(machine(made))
 
 
 def legs(data, **more):

@@ -145,7 +145,7 @@ def calibrate(given: Calibrate) -> Report:
             **given.free,
         )
         replace_file(given.plan, chosen.table(machine).encode())
-        return planned(machine, chosen, given.accuracy, given.plan)
+        return report_plan(machine, chosen, given.accuracy, given.plan)
     if given.poses is None or measured is None:
         raise ParameterError("poses", None, "a CSV of measured poses, or --plan FILE.csv")
     paths = geometric(machine, q, given.only)
@@ -167,10 +167,10 @@ def calibrate(given: Calibrate) -> Report:
     out = given.files["out"]
     text = edited_yaml(machine, given.robot, result.fitted(machine, source))
     marks += write_edited(out, [*head, *marks], text, machine)
-    return report_of(machine, source, result, notes, marks, out)
+    return report_calibration(machine, source, result, notes, marks, out)
 
 
-def report_of(
+def report_calibration(
     machine: Robot, source: str, result: Calibration, notes: Sequence[str], marks: Sequence[str], out: Path | None
 ) -> Report:
     """Report the parameters, the errors by kind of measurement, and the undetermined changes."""
@@ -275,18 +275,18 @@ def report_of(
                 "every fourth whole pose, else each measurement against a fit to all others",
             ),
         ],
-        notes=[*lines, *_open(result), *marks],
+        notes=[*lines, *_list_undetermined(result), *marks],
         files={"out": out},
     )
 
 
-def _open(result: Estimate) -> list[str]:
+def _list_undetermined(result: Estimate) -> list[str]:
     lines = [fill(line, WIDTH, initial_indent="  ", subsequent_indent="    ") for line in result.undetermined]
     told = "the poses do not determine these changes, and the calibration makes none of them; a "
     return [f"{told}number in one may still change with others:", *lines] if lines else []
 
 
-def planned(robot: Robot, plan: Plan, accuracy: float | None, out: Path) -> Report:
+def report_plan(robot: Robot, plan: Plan, accuracy: float | None, out: Path) -> Report:
     """Report the predicted standard deviations by the number of measurements of a plan."""
     last, needed = len(plan.position) - 1, None if accuracy is None else plan.needed(accuracy)
     known = f"{1e3 * plan.position[-1]:.3g} mm*"
@@ -334,6 +334,6 @@ def planned(robot: Robot, plan: Plan, accuracy: float | None, out: Path) -> Repo
             ),
         ],
         [Table("", columns, rows, title, "measurements")],
-        notes=["* apart from a rigid motion of the whole workspace", *_open(plan.known)],
+        notes=["* apart from a rigid motion of the whole workspace", *_list_undetermined(plan.known)],
         files={"out": out},
     )

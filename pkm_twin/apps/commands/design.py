@@ -87,20 +87,20 @@ def design(given: Design) -> Report:
             raise click.UsageError(
                 "--tolerance can only be combined with --path, --wrench, --monte-carlo, --seed and --json"
             )
-        return budget(given)
+        return report_budget(given)
     if given.monte_carlo:
         raise click.UsageError("--monte-carlo needs --tolerance")
     if given.path is None:
         raise click.UsageError("give the motion with --path, see `pkm-twin path`")
     if given.sweep is not None:
-        return swept(given, given.path, given.sweep)
+        return report_sweep(given, given.path, given.sweep)
     if given.scheduler is not None:
         raise click.UsageError("--scheduler needs --sweep")
     if not given.minimise:
         raise click.UsageError("give --minimise, --sweep or --tolerance")
     if given.out is not None and given.out.suffix not in (".yaml", ".yml"):
         raise ParameterError("out", str(given.out), "a name that ends in .yaml or .yml")
-    return optimised(given, given.path)
+    return report_optimum(given, given.path)
 
 
 def read_path(given: Design, path: Path, *, efforts: bool = True) -> tuple[Robot, PosePath]:
@@ -127,7 +127,7 @@ def read_path(given: Design, path: Path, *, efforts: bool = True) -> tuple[Robot
     return robot, PosePath.of_joints(robot, motion.time, q, qd, qdd, load)
 
 
-def optimised(given: Design, path: Path) -> Report:
+def report_optimum(given: Design, path: Path) -> Report:
     """Find the machine that is best for a path."""
     from pkm_twin.design import QUANTITIES
     from pkm_twin.design import design as find
@@ -162,7 +162,13 @@ def optimised(given: Design, path: Path) -> Report:
             "variables",
             [*both, Column("low", text=None), Column("high", text=None), unit, Column("", text=" ")],
             {
-                name: [before.variables[name], value, *bounds[name], units.get(name, ""), at_bound(value, bounds[name])]
+                name: [
+                    before.variables[name],
+                    value,
+                    *bounds[name],
+                    units.get(name, ""),
+                    describe_bound(value, bounds[name]),
+                ]
                 for name, value in best.variables.items()
             },
         ),
@@ -211,7 +217,7 @@ def optimised(given: Design, path: Path) -> Report:
             *judge_limits(found, way),
         ],
         tables,
-        {"": lambda: draw(robot, found, way, answer)},
+        {"": lambda: draw_design(robot, found, way, answer)},
         notes,
         {"out": given.out},
     )
@@ -235,7 +241,7 @@ def judge_limits(found: Found, path: PosePath) -> Iterator[Fact]:
     yield judged(what, f"{index:.4g}", f"{MIN_SINGULARITY_INDEX:g} or more", index >= MIN_SINGULARITY_INDEX, **numbers)
 
 
-def at_bound(value: float, bound: tuple[float, float]) -> str:
+def describe_bound(value: float, bound: tuple[float, float]) -> str:
     """Describe the bound that a value is at; empty if it is at none."""
     near = 1e-6 * (bound[1] - bound[0])
     low, high = abs(value - bound[0]) < near, abs(value - bound[1]) < near
@@ -262,7 +268,7 @@ def write_robot(robot: Robot, source: str, found: Found, path: Path, out: Path) 
     return write_edited(out, head, edited_yaml(robot, source, values), robot)
 
 
-def draw(robot: Robot, found: Found, path: PosePath, answer: str) -> Any:
+def draw_design(robot: Robot, found: Found, path: PosePath, answer: str) -> Any:
     """Draw the Pareto front, or the efforts before and after."""
     from pkm_twin.design import QUANTITIES
     from pkm_twin.design.pose_path import PathMotion
@@ -300,7 +306,7 @@ def draw(robot: Robot, found: Found, path: PosePath, answer: str) -> Any:
     return figure
 
 
-def swept(given: Design, path: Path, kind: str) -> Report:
+def report_sweep(given: Design, path: Path, kind: str) -> Report:
     """Compute all quantities of machines within bounds, as NetCDF.
 
     :raises MissingExtraError: h5netcdf or xarray is not installed.
@@ -346,7 +352,7 @@ def swept(given: Design, path: Path, kind: str) -> Report:
     )
 
 
-def budget(given: Design) -> Report:
+def report_budget(given: Design) -> Report:
     """Report the pose error budget over a path, or over the workspace without one.
 
     :raises ParameterError: as :func:`~pkm_twin.design.tolerances`, or a file without limits.
@@ -398,7 +404,7 @@ def budget(given: Design) -> Report:
     ]
     sizes = summary.sizes
     turning, (shift, bound) = found.only_turns, summary.bounds
-    at, bound_at = (f" at {_place(robot, pose)}" for pose in (summary.worst_pose, summary.bound_pose))
+    at, bound_at = (f" at {_format_pose(robot, pose)}" for pose in (summary.worst_pose, summary.bound_pose))
     case = "worst case of all bounds" if found.is_exact else "upper bound of the worst case"
     facts = [
         Fact("robot", robot.name),
@@ -446,7 +452,7 @@ def budget(given: Design) -> Report:
     )
 
 
-def _place(robot: Robot, pose: Any) -> str:
+def _format_pose(robot: Robot, pose: Any) -> str:
     return ", ".join(f"{n} {value:.4g}" for n, value in zip(robot.pose_names, pose, strict=True))
 
 

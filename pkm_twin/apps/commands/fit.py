@@ -129,7 +129,7 @@ def fit(given: Fit) -> Report:
     :raises PkmTwinError: recordings that show nothing, or that the machine cannot have made.
     """
     from pkm_twin import load
-    from pkm_twin.apps.fit_report import report_of
+    from pkm_twin.apps.fit_report import report_fit
     from pkm_twin.identification.deflections import fit_elements
     from pkm_twin.identification.fit import find_worse, refuse_faults
     from pkm_twin.identification.friction_laws import fit_recordings
@@ -140,12 +140,12 @@ def fit(given: Fit) -> Report:
 
     if given.drive is not None:
         # Fit a drive's torque constant and friction to weights that it lifts.
-        from pkm_twin.apps.fit_report import drive_report
+        from pkm_twin.apps.fit_report import report_drive
         from pkm_twin.identification.drives import drive_friction, runs_of
         from pkm_twin.recordings import read_table
 
         runs = runs_of(read_table(given.drive, dialect=given.dialect), given.lever)
-        return drive_report(drive_friction(*runs))
+        return report_drive(drive_friction(*runs))
     if not given.robot or not given.recordings:
         raise click.UsageError("a robot and recordings are missing; give both, or --drive TABLE")
     (kinds, laws), options = given.words(), {"accept": given.accept}
@@ -172,7 +172,7 @@ def fit(given: Fit) -> Report:
     told = [note if len(read) == 1 else f"{r.name}: {note}" for r in read for note in r.notes]
     accepted = [f"accepted by --accept: {line}" for line in (*result.accepted, worse) if line]
     marks = [*map(str, choices), *accepted, *marks, *beyond, *told]
-    report, more = report_of(result, marks)
+    report, more = report_fit(result, marks)
     facts = [
         Fact("beyond_limits", beyond),
         Fact("friction_laws", [dataclasses.asdict(choice) for choice in choices]),

@@ -58,7 +58,7 @@ def frf(given: FrequencyResponse) -> Report:
         found = natural_frequencies(machine, pose)
         return Report(
             f"{machine.name}: lowest natural frequency {found[0]:.4g} Hz",
-            of_modes(machine, pose, found),
+            report_modes(machine, pose, found),
             notes=["the response needs --damping, or modal_damping in the robot file"],
         )
     modes = tool_modes(machine, pose, damping=given.damping, tool=given.tool)
@@ -86,7 +86,7 @@ def frf(given: FrequencyResponse) -> Report:
     return Report(
         answer,
         [
-            *of_modes(machine, pose, modes.frequencies, modes.damping),
+            *report_modes(machine, pose, modes.frequencies, modes.damping),
             Fact("static_compliance_m_per_n", static),
             Fact("most", most),
         ],
@@ -95,7 +95,7 @@ def frf(given: FrequencyResponse) -> Report:
     )
 
 
-def of_modes(machine: Robot, pose: list[float], frequencies: Array, damping: Array | None = None) -> list[Fact]:
+def report_modes(machine: Robot, pose: list[float], frequencies: Array, damping: Array | None = None) -> list[Fact]:
     """Report the robot, the pose, and its six lowest modes."""
     found = [{"frequency_hz": f} for f in frequencies[:6].tolist()]
     texts = [f"{f:.4g} Hz" for f in frequencies[:6].tolist()]

@@ -51,9 +51,9 @@ def info(given: Info) -> Report:
     home_joints = dict(zip(robot.joint_names, q.tolist(), strict=True))
     bodies = list(robot.body_names[:-1])
     assumed = [joint.name for joint in robot.graph.joints.values() if joint.virtual]
-    undetermined = overconstraint(robot)
+    undetermined = list_undetermined(robot)
     gap = float(clearance(robot, home)) if has_clearance(robot) else None
-    odd, fault = findings(robot), members_fault(robot)
+    odd, fault = findings(robot), find_members_fault(robot)
     equations = f"{engine.closures} loop equations, {engine.rank} independent"
     if engine.redundant and assumed and not undetermined:
         # A joint that stands for what several limbs hold repeats what one of them holds alone.
@@ -108,7 +108,7 @@ def info(given: Info) -> Report:
         Fact("overconstrained", undetermined),
         *(
             Fact("", text, text="overconstrained")
-            for text in grouped_reactions(undetermined) or ["no: rigid-body equations determine every reaction"]
+            for text in group_reactions(undetermined) or ["no: rigid-body equations determine every reaction"]
         ),
         Fact("plausibility", [dataclasses.asdict(finding) for finding in odd]),
         *(
@@ -141,7 +141,7 @@ def info(given: Info) -> Report:
     )
 
 
-def members_fault(robot: Robot) -> str:
+def find_members_fault(robot: Robot) -> str:
     """Return why maps reject the file's members; empty if they do not, or there are none."""
     try:
         robot.structure()
@@ -152,7 +152,7 @@ def members_fault(robot: Robot) -> str:
     return ""
 
 
-def overconstraint(robot: Robot) -> list[str]:
+def list_undetermined(robot: Robot) -> list[str]:
     """Name what rigid-body statics cannot determine; empty if it determines all."""
     if not why_no_torques(robot):
         zero = np.zeros(len(robot.joint_names))
@@ -164,7 +164,7 @@ def overconstraint(robot: Robot) -> list[str]:
     return [f"{count} are redundant, among {', '.join(mobility.parts)}"]
 
 
-def grouped_reactions(names: Sequence[str]) -> list[str]:
+def group_reactions(names: Sequence[str]) -> list[str]:
     """Shorten reactions: what is not determined of each joint, joints that are alike in one line.
 
     :param names: as :func:`delta_dynamics.reactions` has them, "JOINT: force along DIRECTION".

@@ -59,7 +59,7 @@ def loads(given: Loads) -> Report:
     if given.spectrum is not None:
         replace_file(given.spectrum, format_spectra(found).encode())
     robot, duration = motion.robot, float(motion.time[-1] - motion.time[0])
-    joints = {load.name: of_joint(load, given.exponent, duration) for load in found}
+    joints = {load.name: describe_joint(load, given.exponent, duration) for load in found}
     worst = max(found, key=lambda load: load.peaks[2])
     answer = f"{robot.name}: no joint's force is determined"
     if worst.peaks[2] > 0.0:
@@ -96,7 +96,7 @@ def loads(given: Loads) -> Report:
     )
 
 
-def of_joint(load: Summary, exponent: float, duration: float) -> dict[str, Any]:
+def describe_joint(load: Summary, exponent: float, duration: float) -> dict[str, Any]:
     """Return what is reported of one joint, units in the keys."""
     open_axes = [axis for axis, good in zip(WRENCH, load.determined, strict=True) if not good]
     entry: dict[str, Any] = {"undetermined": open_axes, "turned_rad": load.turned}

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pkm_twin.apps.commands.frf import of_modes
+from pkm_twin.apps.commands.frf import report_modes
 from pkm_twin.apps.frame import command
 from pkm_twin.apps.options import AtPose, Draws, OfMilling, OfTool, Writes
 from pkm_twin.errors import ParameterError
@@ -62,8 +62,8 @@ def lobes(given: Lobes) -> Report:
     best, least = found.steady(), int(found.depths.argmin())
     worst = found.speeds[least], found.depths[least], found.open[least]
     answer = (
-        f"{machine.name}: stable up to {_depth(*worst)} at every speed from {low:g} to {high:g} "
-        f"rpm (least at {worst[0]:.0f} rpm); up to {_depth(*best)} at {best[0]:.0f} rpm "
+        f"{machine.name}: stable up to {_format_depth(*worst)} at every speed from {low:g} to {high:g} "
+        f"rpm (least at {worst[0]:.0f} rpm); up to {_format_depth(*best)} at {best[0]:.0f} rpm "
         f"± {100 * SPEED_MARGIN:g} %"
     )
     if given.out is not None:
@@ -72,9 +72,9 @@ def lobes(given: Lobes) -> Report:
     return Report(
         answer,
         [
-            *of_modes(machine, pose, modes.frequencies, modes.damping),
-            Fact("best", _place(*best) | {"speed_margin": SPEED_MARGIN}),
-            Fact("least", _place(*worst)),
+            *report_modes(machine, pose, modes.frequencies, modes.damping),
+            Fact("best", _limit_data(*best) | {"speed_margin": SPEED_MARGIN}),
+            Fact("least", _limit_data(*worst)),
             Fact("zero_order_depth_m", found.safe),
             Fact("speeds_rpm", found.speeds),
             Fact("depths_m", found.depths),
@@ -84,11 +84,11 @@ def lobes(given: Lobes) -> Report:
     )
 
 
-def _depth(_speed: float, depth: float, is_open: bool) -> str:
+def _format_depth(_speed: float, depth: float, is_open: bool) -> str:
     return f"{'more than ' if is_open else ''}{1e3 * depth:.3g} mm"
 
 
-def _place(speed: float, depth: float, is_open: bool) -> dict[str, Any]:
+def _limit_data(speed: float, depth: float, is_open: bool) -> dict[str, Any]:
     return {"speed_rpm": float(speed), "depth_m": float(depth), "open": bool(is_open)}
 
 

@@ -111,7 +111,7 @@ class Show(Pages, Overwrites):
 @command()
 def show(given: Show) -> Report:
     """Show what a stored map answers, with its pictures."""
-    return stored(given.file, given.drawing(""), given.html, given.overwrite)
+    return report_stored_map(given.file, given.drawing(""), given.html, given.overwrite)
 
 
 def compute(given: OfMap) -> Report:
@@ -123,7 +123,7 @@ def compute(given: OfMap) -> Report:
     from pkm_twin.maps.store import write_arrays
     from pkm_twin.maps.sweep import map_of
 
-    kind, machine = kind_of(given), given.machine()
+    kind, machine = make_kind(given), given.machine()
     cases = given.cases(kind, machine)
     if given.along is not None:
         # Evaluate the kind along a path; report the worst of each case.
@@ -205,14 +205,14 @@ def compute(given: OfMap) -> Report:
         except KeyboardInterrupt:
             kept = f"stopped; finished parts are in {target}.parts, the same command continues"
             return Report(error=f"{kept} from there", code=INTERRUPTED)
-    report = stored(target, given.drawing(""), given.html, given.overwrite)
+    report = report_stored_map(target, given.drawing(""), given.html, given.overwrite)
     if arrays is not None:
         write_arrays(arrays, target, kind, machine)
         report = dataclasses.replace(report, files={**report.files, "arrays": arrays})
     return report
 
 
-def stored(file: Path, drawing: Path | None, html: bool, overwrite: bool) -> Report:
+def report_stored_map(file: Path, drawing: Path | None, html: bool, overwrite: bool) -> Report:
     """Report what a stored map answers.
 
     :param drawing: the pictures' common name; None for none.
@@ -251,7 +251,7 @@ def stored(file: Path, drawing: Path | None, html: bool, overwrite: bool) -> Rep
         return Report(first, facts, figures=pictures, notes=rest, files={"file": file, "page": page})
 
 
-def kind_of(given: OfMap) -> Kind:
+def make_kind(given: OfMap) -> Kind:
     """Return the kind with its own options."""
     if isinstance(given, OfMilling) and isinstance(given, OfTool):
         return CuttingDepth(given.milling, given.damping, given.tool)
@@ -259,7 +259,7 @@ def kind_of(given: OfMap) -> Kind:
     return kind(**{field.name: getattr(given, field.name) for field in dataclasses.fields(kind)})
 
 
-def offered(kind: type[Kind]) -> Command:
+def make_kind_command(kind: type[Kind]) -> Command:
     """Make the command that computes a kind, with its own options and those of all maps."""
     milling = kind is CuttingDepth
     own = [] if milling else [(f.name, get_type_hints(kind)[f.name], f) for f in dataclasses.fields(kind)]
@@ -304,7 +304,11 @@ map_ = AfterRobot(
     For the options of a kind use `pkm-twin map ROBOT KIND --help`.
     """,
     Extensible(
-        "pkm_twin.maps", Kind, ["show", *OWN], lambda name: show if name == "show" else offered(OWN[name]), offered
+        "pkm_twin.maps",
+        Kind,
+        ["show", *OWN],
+        lambda name: show if name == "show" else make_kind_command(OWN[name]),
+        make_kind_command,
     ),
     "Stiffness, workspace and vibration",
     "ROBOT KIND [OPTIONS]",

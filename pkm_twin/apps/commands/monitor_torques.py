@@ -135,7 +135,7 @@ def monitor_torques(given: MonitorTorques) -> Report:
                     # The offered QoS of the present publishers; None without any.
                     profiles = [info.qos_profile for info in node.get_publishers_info_by_topic(name)]
 
-                    def weakest(promises: tuple[Any, ...]) -> float:
+                    def find_longest(promises: tuple[Any, ...]) -> float:
                         """Return the longest promised time, s; infinite if one publisher promises none.
 
                         The middleware states no promise as 0 or as its largest number.
@@ -147,7 +147,7 @@ def monitor_torques(given: MonitorTorques) -> Report:
                         offered = None
                     else:
                         deadline, lifespan = zip(*((one.deadline, one.lifespan) for one in profiles), strict=True)
-                        offered = Offer(len(profiles), weakest(deadline), weakest(lifespan))
+                        offered = Offer(len(profiles), find_longest(deadline), find_longest(lifespan))
                     offer = offered or offer
                     end = arrivals.first + given.duration * SECOND
                     if arrivals.count and time.monotonic_ns() > end:

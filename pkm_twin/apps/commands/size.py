@@ -94,7 +94,7 @@ def size(given: Size) -> Report:
     if given.over_workspace is not None and (geared or given.drives is not None):
         raise click.UsageError("--over-workspace reports joints; leave out --drives, --ratio and --lead")
     if given.motion is None:
-        return over_workspace(given)
+        return report_workspace(given)
     motors = {} if given.drives is None else read_motors(given.drives, given.motor)
     motion = given.read_motion(given.motion, given.machine())
     taken, notes = compare_efforts(motion, given.efforts or "file"), list(motion.notes)
@@ -106,7 +106,7 @@ def size(given: Size) -> Report:
                 "--efforts file uses the file's"
             )
         taken = compare_efforts(motion, "model")
-    duties = size_drives(motion, taken.effort, motors, *gears(given, motion.robot))
+    duties = size_drives(motion, taken.effort, motors, *read_gear_options(given, motion.robot))
     duration = float(motion.time[-1] - motion.time[0])
     energy = sum(d.at_joint.energy for d in duties)
     returned = sum(d.at_joint.returned for d in duties)
@@ -158,7 +158,7 @@ def size(given: Size) -> Report:
     return Report(answer, facts, _make_tables(duties), {"": lambda: draw(taken, duties, title)}, notes)
 
 
-def gears(given: Size, robot: Robot) -> tuple[list[Gear], list[Gears]]:
+def read_gear_options(given: Size, robot: Robot) -> tuple[list[Gear], list[Gears]]:
     """Return the gears of the joints, and those to choose from.
 
     :raises ParameterError: numbers that no gear has.
@@ -256,7 +256,7 @@ def _format_percent(part: float) -> str:
     return f"{value:.4g} %" if value <= MOST_PERCENT else f"over {MOST_PERCENT:.0f} %"
 
 
-def over_workspace(given: Size) -> Report:
+def report_workspace(given: Size) -> Report:
     """Compute the largest efforts and speeds over the workspace."""
     from pkm_twin.paths.joint_path import only_turns
     from pkm_twin.paths.worst import worst_over_workspace
@@ -319,7 +319,7 @@ def over_workspace(given: Size) -> Report:
     )
 
 
-def near(duty: DriveDuty) -> list[Fit]:
+def select_motors(duty: DriveDuty) -> list[Fit]:
     """Return the motors to draw: the smallest that fits, or the largest, and the three below it."""
     fits = sorted(duty.fits, key=lambda fit: fit.motor.continuous_torque)
     first = next((k for k, fit in enumerate(fits) if fit.good), len(fits) - 1)
@@ -334,7 +334,7 @@ def draw(taken: EffortComparison, duties: Sequence[DriveDuty], answer: str) -> A
     figure, axes = plots.columns(1, len(shown))
     m = taken.motion
     for k, (ax, d) in enumerate(zip(axes[0], shown, strict=True)):
-        chosen = near(d)[-1] if d.fits else d
+        chosen = select_motors(d)[-1] if d.fits else d
         if chosen.torques is not None and chosen.speeds is not None:
             speeds, torques, words = chosen.speeds / RPM, chosen.torques, "motor"
             labels = "speed of the motor (1/min)", "torque (N m)"
@@ -355,7 +355,7 @@ def draw(taken: EffortComparison, duties: Sequence[DriveDuty], answer: str) -> A
             words = f"uses {', '.join(used)} (dashed: limits of the file)" if used else "no limits"
         ax.plot(speeds, torques, color="black", lw=1.5, label="motion")
         most = float(np.abs(torques).max())
-        for colour, fit in zip(plots.COLOURS, near(d), strict=False):
+        for colour, fit in zip(plots.COLOURS, select_motors(d), strict=False):
             speed, torque = fit.motor.limits
             most = max(most, float(torque.max()))
             for sign in (1.0, -1.0):
@@ -363,7 +363,7 @@ def draw(taken: EffortComparison, duties: Sequence[DriveDuty], answer: str) -> A
                     label = fit.name if sign == way == 1.0 else None
                     ax.plot(way * speed / RPM, sign * torque, color=colour, lw=1, label=label)
         if d.fits:
-            fit = near(d)[-1]
+            fit = select_motors(d)[-1]
             for sign in (1.0, -1.0):
                 level = sign * fit.motor.continuous_torque
                 ax.axhline(level, color="0.5", ls="--", lw=1, label="continuous" if sign > 0 else None)
