@@ -16,9 +16,9 @@ MODULES: Final = (delta_cu, prru, upr_rpu)
 """Each has ``find_rows``, which computes the paper's values and returns a ``Paper``."""
 HEAD: Final = """# The three papers, compared
 
-`make papers` writes this page. Tables of numbers have the printed and the computed value in each
-cell; a unit is one of the last printed digit. Links lead to the source, in which the equation's
-number stands, and to the test.
+`make papers` writes this page. Each item has its content, what differs from print, and links to the
+source, in which the equation's number stands, and to the test. Tables of numbers have the printed and
+the computed value in each cell; a unit is one of the last printed digit.
 
 """
 
@@ -52,8 +52,7 @@ def _write_paper(paper: Paper) -> str:
         rows = [row for row in paper.rows if row.kind == kind]
         if not rows:
             continue
-        parts.append(f"\n| {kind} | content, compared with print | computed, tested in |\n")
-        parts.append("|---|---|---|\n")
+        parts.append(f"\n**{kind.capitalize()}s**\n\n")
         parts += map(_write_row, rows)
         for row in rows:
             parts += [_write_comparison(one) for one in row.comparisons]
@@ -62,12 +61,9 @@ def _write_paper(paper: Paper) -> str:
 
 
 def _write_row(row: Row) -> str:
-    cells = (
-        row.label,
-        "; ".join(filter(None, (row.content, row.note, *map(_link_comparison, row.comparisons)))),
-        "<br>".join((*map(_link_function, row.functions), *map(_link_test, row.tests))),
-    )
-    return f"| {' | '.join(cells)} |\n"
+    content = "; ".join(filter(None, (row.content, row.note, *map(_link_comparison, row.comparisons))))
+    links = (*map(_link_function, row.functions), *map(_link_test, row.tests))
+    return f"* {row.label}: {'<br>'.join((content, *links))}\n"
 
 
 def _link_function(name: str) -> str:
