@@ -58,8 +58,11 @@ def rows_of(node: str) -> dict[str, tuple[Any, Setting]]:
 
 def row(name: str, default: Any, setting: Setting) -> str:
     """Write a parameter's line."""
-    values = [setting.usual or _value(default), _values(setting), "" if setting.fixed else "live"]
-    return f"* `{name}` ({'; '.join(filter(None, values))}): {setting.text}\n"
+    given, values = setting.usual or _value(default), _values(setting)
+    if isinstance(default, int | float) and not setting.usual and values:
+        given, values = f"{given} {values}", ""
+    parts = [given, values, "" if setting.fixed else "live"]
+    return f"* `{name}` ({'; '.join(filter(None, parts))}): {setting.text}\n"
 
 
 def topic_row(row: Topic) -> str:
@@ -85,10 +88,7 @@ def _values(setting: Setting) -> str:
     if setting.choices:
         told = all(re.search(rf"\b{word}\b", setting.text) for word in setting.choices)
         return "" if told else ", ".join(f"`{word}`" for word in setting.choices)
-    if setting.low is None or setting.high is None:
-        return setting.unit
-    low, high = (str(int(v)) if v == int(v) < 1e8 else f"{v:g}" for v in (setting.low, setting.high))
-    return f"{low} to {high} {setting.unit}".strip()
+    return setting.unit
 
 
 def parts() -> dict[str, str]:

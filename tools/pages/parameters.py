@@ -26,7 +26,8 @@ HEAD = """# Robot files
 The keys of a robot's YAML with their valid values and defaults. SI units, angles in rad, z up.
 Anything else is rejected, with the name of the key. A unit such as `rad or m` is rad for joints
 that turn, m for joints that slide. Bold keys are required, defaults are in brackets; `pkm-twin info
-ROBOT` prints all values.
+ROBOT` prints all values. Where no values are stated, lengths are 1e-06 to 100 m, masses 0 to
+100000 kg, moduli 1000 to 1e+14 Pa, coordinates -1e+06 to 1e+06 m.
 An inertia is three principal moments or a symmetric 3x3 matrix whose moments are not negative and
 keep the triangle rule.
 """
@@ -37,6 +38,8 @@ UNITS = {
     "{effort}": "N m or N",
     "{rotor}": "kg m2 or kg",
 }
+STATED = {"m": "1e-06 to 100", "kg": "0 to 100000", "Pa": "1000 to 1e+14"}
+"""Values of a unit that the head of the page states for all keys."""
 ROBOTS = {
     "delta": delta.Delta,
     "linear_delta": linear_delta.LinearDelta,
@@ -87,7 +90,8 @@ def rows(kind, without=(), prefix=""):
             anchor = other.lower().replace(".", "")
             bound = f"[{other}](#{anchor})"
         else:
-            bound = re.sub("^number(, | )", "", row.bound)
+            bound = re.sub("^number(, | )", "", row.bound).removesuffix(", -1e+06 to 1e+06")
+            bound = "" if bound == STATED.get(row.unit) else bound
         unit, values = UNITS.get(row.unit, row.unit), "; ".join(filter(None, (bound, row.text)))
         if values != "a section":
             given = default(fields[own])
@@ -95,7 +99,7 @@ def rows(kind, without=(), prefix=""):
             if given == "required":
                 key, given = f"**{key}**", ""
             given = f" [{given}]" if given else ""
-            yield f"* {key}{f' ({unit})' if unit else ''}: {values}{given}"
+            yield f"* {key}{f' ({unit})' if unit else ''}{f': {values}' if values else ''}{given}"
         inner = row.section or row.entries
         if inner and not other:
             yield from rows(inner, (), f"{prefix}{name}.")
