@@ -16,7 +16,6 @@ from delta_dynamics.torques.equations import motion_kernel
 from delta_dynamics.torques.transmission import transmission_kernel
 from delta_dynamics.torques.virtual_work import (
     accelerations,
-    inverse_dynamics,
     masses_kernel,
     moving_torques,
     null_kernel,
@@ -26,20 +25,18 @@ from delta_dynamics.torques.virtual_work import (
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import GEOMETRY, PARAMETERS, Expression, edge
 from pkm_twin.codegen.kernels import Kernel
-from pkm_twin.codegen.program import LAST, MAX_ITERATIONS, Equations
+from pkm_twin.codegen.program import LAST, Equations
 from pkm_twin.errors import ParameterError, warn
-from pkm_twin.export.c99 import CORRECTIONS, HEAD, HOT, LADDER, Folding, Routine, Unit, table
+from pkm_twin.export.c99 import HEAD, HOT, Folding, Routine, Unit, table
 from pkm_twin.export.c_templates import (
     ABOUT,
     BESIDE,
     CMAKE,
-    EXAMPLE,
-    MASSLESS,
     PARAMETERS_OF,
-    PAYLOAD,
-    README,
     STATELESS,
     WORST,
+    write_example,
+    write_readme,
 )
 from pkm_twin.export.c_transmission import TransmissionTerms, directions
 from pkm_twin.kinematics.programs import actuator_program
@@ -67,9 +64,9 @@ def c_package(robot: Robot) -> dict[str, str]:
     return {
         f"{made.prefix}.h": made.header(),
         f"{made.prefix}.c": made.source(),
-        "example.c": made.example(),
-        "CMakeLists.txt": made.cmake(),
-        "README.md": made.readme(),
+        "example.c": write_example(made),
+        "CMakeLists.txt": CMAKE.format(name=made.prefix),
+        "README.md": write_readme(made),
     }
 
 
@@ -88,7 +85,7 @@ class Package:
         self.prefix = f"pkm_{identifier(robot.name)}"
         self.macro = self.prefix.upper()
         self.n, self.m = robot.joints_count, len(robot.pose_names)
-        self.massive = _has(robot.massive)
+        self.massive = robot.has_masses
         self.elastic: Elastic | None = None
         if self._wants("compliance") or self._wants("strain_energy"):
             try:
@@ -520,12 +517,13 @@ int @_parameters(double mass, const double *com, const double *inertia, double *
     def source(self) -> str:
         """Return the source file with all functions."""
         return (
-            f"/* SPDX-License-Identifier: Apache-2.0 */\n/* {self._title} */\n"
+            f"/* SPDX-License-Identifier: Apache-2.0 */\n/* {self.title} */\n"
             f'#include "{self.prefix}.h"\n\n{HEAD}\n{self.unit.text()}'
         )
 
     @property
-    def _title(self) -> str:
+    def title(self) -> str:
+        """First line of the header, the source and the example."""
         name = self.prefix.removeprefix("pkm_")
         return f"{name}: written by pkm-twin export c, which overwrites changes."
 
@@ -564,7 +562,7 @@ int @_parameters(double mass, const double *com, const double *inertia, double *
         text = "\n".join(
             [
                 "/* SPDX-License-Identifier: Apache-2.0 */",
-                f"/* {self._title} */",
+                f"/* {self.title} */",
                 f"#ifndef {guard}",
                 f"#define {guard}",
                 "",
@@ -582,66 +580,6 @@ int @_parameters(double mass, const double *com, const double *inertia, double *
             ]
         )
         return text.replace("@", self.prefix)
-
-    # Beside it.
-
-    def example(self) -> str:
-        """Home, checked against the Python functions."""
-        robot, home = self.robot, self.robot.graph.home
-        rates, changes = robot.project_redundant(home, *np.full((2, self.n), 0.1))[1:]
-        tests = {
-            "pose": ("forward(q, pose)", robot.forward(home)),
-            "joints": ("inverse(pose, joints)", home),
-        }
-        given = {"q": home}
-        if self.massive:
-            tau = inverse_dynamics(robot, home, rates, changes)
-            tests["tau"] = "torques(q, rates, changes, wrench, tau)", tau
-            given |= {"rates": rates, "changes": changes, "wrench": np.zeros(6)}
-        for name, (_, values) in tests.items():
-            given[f"right_{name}"] = np.round(values, 9) + 0.0
-        rows = [table(name, values.tolist()).removeprefix("static ") for name, values in given.items()]
-        sizes = ", ".join(f"{name}[{len(values)}]" for name, (_, values) in tests.items())
-        calls = [
-            f'bad |= differs("{name}", @_{call}, {name}, right_{name}, {len(values)});\n'
-            for name, (call, values) in tests.items()
-        ]
-        declared = textwrap.indent("".join(rows) + f"double {sizes};", "    ")
-        return EXAMPLE.format(
-            title=self._title,
-            name=self.prefix,
-            declared=declared,
-            calls=textwrap.indent("".join(calls), "    ").rstrip().replace("@", self.prefix),
-        )
-
-    def cmake(self) -> str:
-        """Write the CMake file: a static library, and the example as a test."""
-        return CMAKE.format(name=self.prefix)
-
-    def readme(self) -> str:
-        """Write the README: the functions, and their largest stack and number of corrections."""
-        largest = (self.unit.rooms + max(self.unit.doubles.values())) * 8
-        names = list(self.robot.joint_names)
-        return README.format(
-            name=self.prefix,
-            robot=self.prefix.removeprefix("pkm_"),
-            joints=", ".join(names),
-            corrections=f"{CORRECTIONS:,}",
-            attempts=len(LADDER),
-            turns=MAX_ITERATIONS,
-            stack=largest // 1000 + 3,
-            dynamics="" if self.massive else MASSLESS,
-            payload=PAYLOAD.format(name=self.prefix, macro=self.macro) if self.massive else "",
-        )
-
-
-def _has(ask: Callable[[], object]) -> bool:
-    """Return whether the robot's file has the data of a property."""
-    try:
-        ask()
-    except ParameterError:
-        return False
-    return True
 
 
 def _listed(pairs: Any) -> str:

@@ -1,9 +1,19 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Files beside the exported C: what is the same for every robot."""
+"""Texts of the exported C, and the files next to it: example, CMakeLists.txt and README."""
 
 from __future__ import annotations
 
-from typing import Final
+import textwrap
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from delta_dynamics.torques.virtual_work import inverse_dynamics
+from pkm_twin.codegen.program import MAX_ITERATIONS
+from pkm_twin.export.c99 import CORRECTIONS, LADDER, table
+
+if TYPE_CHECKING:
+    from pkm_twin.export.c_package import Package
 
 ABOUT: Final = """\
 Joints q: {joints}. Pose: {pose}. SI units, base axes, z up. wrench: force (N) and moment (N m)
@@ -136,3 +146,49 @@ most {turns} corrections, but valid states far from home may be rejected with st
 
 Stack: at most about {stack} kB without optimisation, less with it.
 """
+
+
+def write_example(package: Package) -> str:
+    """Write the example: functions at home, compared with the results of Python."""
+    robot, home = package.robot, package.robot.graph.home
+    rates, changes = robot.project_redundant(home, *np.full((2, package.n), 0.1))[1:]
+    tests = {
+        "pose": ("forward(q, pose)", robot.forward(home)),
+        "joints": ("inverse(pose, joints)", home),
+    }
+    given = {"q": home}
+    if package.massive:
+        tau = inverse_dynamics(robot, home, rates, changes)
+        tests["tau"] = "torques(q, rates, changes, wrench, tau)", tau
+        given |= {"rates": rates, "changes": changes, "wrench": np.zeros(6)}
+    for name, (_, values) in tests.items():
+        given[f"right_{name}"] = np.round(values, 9) + 0.0
+    rows = [table(name, values.tolist()).removeprefix("static ") for name, values in given.items()]
+    sizes = ", ".join(f"{name}[{len(values)}]" for name, (_, values) in tests.items())
+    calls = [
+        f'bad |= differs("{name}", @_{call}, {name}, right_{name}, {len(values)});\n'
+        for name, (call, values) in tests.items()
+    ]
+    declared = textwrap.indent("".join(rows) + f"double {sizes};", "    ")
+    return EXAMPLE.format(
+        title=package.title,
+        name=package.prefix,
+        declared=declared,
+        calls=textwrap.indent("".join(calls), "    ").rstrip().replace("@", package.prefix),
+    )
+
+
+def write_readme(package: Package) -> str:
+    """Write the README: the functions, and their largest stack and number of corrections."""
+    largest = (package.unit.rooms + max(package.unit.doubles.values())) * 8
+    return README.format(
+        name=package.prefix,
+        robot=package.prefix.removeprefix("pkm_"),
+        joints=", ".join(package.robot.joint_names),
+        corrections=f"{CORRECTIONS:,}",
+        attempts=len(LADDER),
+        turns=MAX_ITERATIONS,
+        stack=largest // 1000 + 3,
+        dynamics="" if package.massive else MASSLESS,
+        payload=PAYLOAD.format(name=package.prefix, macro=package.macro) if package.massive else "",
+    )

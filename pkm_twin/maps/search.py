@@ -21,6 +21,12 @@ GRID_SIDE: Final = 33
 """Poses along each coordinate of the grid that bounds a workspace, or a plane's visible part."""
 MAX_GRID_DIMENSIONS: Final = 3
 """Largest number of pose coordinates of a full grid."""
+EDGE_WALKERS: Final = 1024
+"""Largest number of poses, those of the smallest singularity index, that walk to the border."""
+EDGE_STEPS: Final = 24
+"""Steps of a walk: three decades of step size, each step 0.74 times the one before."""
+EDGE_STARTS: Final = 128
+"""Largest number of poses on the border from which the search for the worst pose starts."""
 
 
 def find_worst(space: Space, case: Case, starts: Array, tell: Callable[[float], object] = abs) -> Worst:
@@ -117,18 +123,19 @@ def _edge_states(
     index = index_at(x)
     if not len(x) or space.least <= 0.0 or not (index_at(tried) < space.least).any():
         return x[:0]
-    order = np.argsort(index, kind="stable")[:1024]
+    order = np.argsort(index, kind="stable")[:EDGE_WALKERS]
     x, index = x[order], index[order]
-    for size in np.geomspace(0.1, 1e-4, 24):
+    for size in np.geomspace(0.1, 1e-4, EDGE_STEPS):
         moved = np.clip(x + size * (high - low) * rng.normal(size=x.shape), low, high)
         moved = _pull_inside(x, moved, inside)
         nearer = index_at(moved) < index
         x = np.where(nearer[:, None], moved, x)
         index = np.where(nearer, index_at(moved), index)
+    # Walkers that did not come near the border are dropped.
     x = x[index < 2.0 * space.least]
     chosen: list[int] = [0] if len(x) else []
     apart = np.full(len(x), np.inf)
-    while chosen and len(chosen) < min(128, len(x)):
+    while chosen and len(chosen) < min(EDGE_STARTS, len(x)):
         apart = np.minimum(apart, np.linalg.norm((x - x[chosen[-1]]) / (high - low), axis=1))
         chosen.append(int(apart.argmax()))
     return x[chosen]
@@ -189,6 +196,7 @@ def _pull_inside(x: Array, moved: Array, inside: Callable[[Array], NDArray[np.bo
     """
     share = inside(moved).astype(float)
     step = np.where(share < 1.0, 0.5, 0.0)
+    # 12 halvings find the border to 1/4096 of the step.
     for _ in range(12):
         good = inside(x + (share + step)[:, None] * (moved - x))
         share, step = share + np.where(good, step, 0.0), 0.5 * step

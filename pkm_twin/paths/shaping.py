@@ -31,6 +31,10 @@ HALF_PERIODS: Final = {"zv": 1, "zvd": 2}
 """Half vibration periods by which each shaper lengthens a stretch."""
 POSES_PER_STRETCH: Final = 16
 """Poses of a stretch at which the frequency is computed."""
+SHAPED_SAMPLES: Final = 4001
+"""Samples of a shaped motion at which limits and singularities are checked: 2 ms apart in 8 s."""
+MAX_SLOWDOWNS: Final = 8
+"""Largest number of times that a motion is slowed down: frequencies change with the time scale."""
 MIN_TIME_STEP: Final = 1e-9
 """Difference below which two times are the same, s."""
 
@@ -90,7 +94,7 @@ class ShapedPath(TimedPath):
 
     @cached_property
     def _sample_times(self) -> Array:
-        return np.linspace(0.0, self.duration, 4001)
+        return np.linspace(0.0, self.duration, SHAPED_SAMPLES)
 
     @cached_property
     def _peak_usage(self) -> Array:
@@ -172,7 +176,7 @@ def shaped(
     amplitudes = tuple((weights / weights.sum()).tolist())
 
     plain = motion
-    for _ in range(8):
+    for _ in range(MAX_SLOWDOWNS):
         looked, tails = plain, np.zeros(len(plain.runs))
         # Frequencies of the motion, then of the shaped one.
         for _ in range(3):
