@@ -140,17 +140,17 @@ def test_what_is_no_history(twin, tmp_path):
 
 
 @pytest.mark.parametrize("tables", [["photos"], ["photos", "checks", "numbers"], ["checks"]])
-def test_another_program_s_database_is_rejected_and_stays_as_it_is(tables, twin, tmp_path, sample):
+def test_another_program_s_database_is_rejected_and_stays_as_it_is(tables, twin, tmp_path, tiny):
     path = tmp_path / "photos.db"
     with sqlite3.connect(path) as base:
         for table in tables:
             base.execute(f"CREATE TABLE {table} (a)")
     before = path.read_bytes()
     assert tables[0] in twin.refused("trend", path)
-    assert "history" in twin.refused("check", sample, "--history", path)
+    assert "history" in twin.refused("check", tiny, "--history", path)
     with sqlite3.connect(path) as base:
         base.execute(f"PRAGMA application_id = {0x12345678}")
-    assert "history" in twin.refused("check", sample, "--history", path)
+    assert "history" in twin.refused("check", tiny, "--history", path)
     with sqlite3.connect(path) as base:
         base.execute("PRAGMA application_id = 0")
         assert {n for (n,) in base.execute("SELECT name FROM sqlite_master")} == {*tables}

@@ -12,7 +12,7 @@ import yaml
 from pkm_twin.recordings import ReadOptions, read
 from pkm_twin.recordings.origin import COMPUTED_WITH, GRAVITY
 from pkm_twin.recordings.tables import PAYLOAD, WRENCH
-from test.support.robots import load, parameters_of
+from test.support.robots import load, parameters_of, partly_long
 from test.support.tables import of_joints, read_columns, write_columns
 
 ENDINGS = ("csv", *(["parquet"] if importlib.util.find_spec("pyarrow") else []))
@@ -85,7 +85,7 @@ def test_a_table_of_torques_gives_the_answers_of_its_source(name, ending, twin, 
 
 
 @pytest.mark.parametrize("ending", [*ENDINGS, "mcap"])
-@pytest.mark.parametrize("name", ["delta", "linear_delta"])
+@pytest.mark.parametrize("name", partly_long(["delta", "linear_delta"], "linear_delta"))
 def test_a_planned_cycle_gives_the_same_answers_in_every_format(name, ending, twin, tmp_path):
     first, out = tmp_path / "first.csv", tmp_path / f"again.{ending}"
     for path in (first, out):

@@ -19,7 +19,7 @@ from pkm_twin.identification.friction_laws import fit_recordings
 from pkm_twin.machine.friction import Dahl
 from pkm_twin.recordings import Load, Recording
 from pkm_twin.streams.rates import rms
-from test.identification.machines import IMPOSSIBLE, WRONG, machine, noisy, shifted
+from test.identification.machines import IMPOSSIBLE, WRONG, Drawn, machine, noisy, shifted
 from test.support.robots import load, partly_long
 
 MACHINES = (
@@ -162,37 +162,55 @@ def test_neither_stale_samples_nor_noise_make_twice_the_efforts_good() -> None:
     assert check(replace(shaken, effort=2.0 * shaken.measured)).answer == "not judged"
 
 
-@pytest.mark.parametrize("name", partly_long(MACHINES, "delta_cu"))
-def test_fit_and_check_name_one_cause(name: str) -> None:
-    """The scale of all drives or of one, and a payload that is held throughout, in noise of 1 %."""
+def rubbing(name: str) -> tuple[Drawn, Recording, np.random.Generator]:
+    """A machine whose file has its friction, and its recording in noise of 1 %."""
     m = machine(load(path_of(name)), np.random.default_rng([3, *name.encode()]), 8.0, 200.0)
     rubs = {key: getattr(m.truth.friction, key).tolist() for key in ("viscous", "coulomb")}
-    robot, rng = m.robot.changed(friction=rubs), np.random.default_rng(8)
-    m = replace(m, robot=robot)
-    sound = noisy(m.recorded(effort=inverse_dynamics(robot, m.q, m.qd, m.qdd)), rng)
-    assert check(sound).answer == "good"
-    whole, one = np.ones(robot.joints_count), np.eye(robot.joints_count)[0]
-    for which in (whole, one):
-        made = replace(sound, effort=sound.effort * (-1.0) ** which)
-        (cause,) = check(made).causes
-        with pytest.raises(PkmTwinError, match=re.escape(cause)):
-            fit_recordings(robot, [made])
-    for factor, which in ((0.5, whole), (0.8, one), (1.25, whole), (2.0, one)):
-        made = replace(sound, effort=sound.effort * factor**which)
-        (cause,) = check(made).causes
+    m, rng = replace(m, robot=m.robot.changed(friction=rubs)), np.random.default_rng(8)
+    return m, noisy(m.recorded(effort=inverse_dynamics(m.robot, m.q, m.qd, m.qdd)), rng), rng
+
+
+SCALES = [(-1.0, True), (-1.0, False), (0.5, True), (0.8, False), (1.25, True), (2.0, False)]
+"""A factor of the efforts, and whether it is that of all drives."""
+
+
+@pytest.mark.parametrize("scale", partly_long(SCALES, SCALES[1], SCALES[4]))
+@pytest.mark.parametrize("name", partly_long(MACHINES, "delta_cu"))
+def test_fit_and_check_name_one_scale(name: str, scale: tuple[float, bool]) -> None:
+    (factor, whole), (m, sound, _) = scale, rubbing(name)
+    count = m.robot.joints_count
+    which = np.ones(count) if whole else np.eye(count)[0]
+    made = replace(sound, effort=sound.effort * np.where(which > 0.0, factor, 1.0))
+    (cause,) = check(made).causes
+    with pytest.raises(PkmTwinError, match=re.escape(cause)):
+        fit_recordings(m.robot, [made])
+    if factor > 0.0:
         told = re.search(r"efforts of (.*) are (.*) times what", cause)
         assert told is not None and ("all" in told[1]) == bool(which.all())
         assert float(told[2]) == pytest.approx(factor, rel=0.02)
-        with pytest.raises(PkmTwinError, match=re.escape(cause)):
-            fit_recordings(robot, [made])
-    # Less than what is no machine's, and more noise: fitted or not, both name the drive.
-    made = noisy(replace(made, effort=sound.effort * 0.85**one), np.random.default_rng(8), 0.05)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", MACHINES)
+def test_fit_and_check_name_one_drive_in_more_noise(name: str) -> None:
+    """Its scale may be a machine's: both name the drive, whether it is fitted or not."""
+    m, sound, _ = rubbing(name)
+    less = replace(sound, effort=sound.effort * 0.85 ** np.eye(m.robot.joints_count)[0])
+    made = noisy(less, np.random.default_rng(8), 0.05)
     (cause,) = check(made).causes
     try:
-        (note,) = fit_recordings(robot, [made])[-1]
+        (note,) = fit_recordings(m.robot, [made])[-1]
     except PkmTwinError as error:
         note = str(error)
     assert cause in note
+
+
+@pytest.mark.parametrize("name", partly_long(MACHINES, "delta_cu"))
+def test_fit_and_check_name_one_payload(name: str) -> None:
+    """It is held throughout."""
+    m, sound, rng = rubbing(name)
+    robot = m.robot
+    assert check(sound).answer == "good"
     for mass in (0.2, 5.0):
         mass += robot.payload.mass
         heavy = robot.changed(payload={"mass": mass})

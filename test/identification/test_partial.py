@@ -103,7 +103,11 @@ def test_numbers_that_are_reported_are_right_and_the_rest_is_named(count: int, p
 
 @pytest.mark.parametrize(
     ("name", "kinds", "rows"),
-    [("printer", "height,distance", 20), ("delta", "distance", 40), ("delta_cu", "position", 30)],
+    [
+        ("printer", "height,distance", 20),
+        pytest.param("delta", "distance", 40, marks=pytest.mark.long),
+        pytest.param("delta_cu", "position", 30, marks=pytest.mark.long),
+    ],
 )
 def test_distances_and_angles_of_new_poses_err_by_what_is_stated(
     name: str, kinds: str, rows: int, printer: Robot

@@ -13,7 +13,7 @@ from pkm_twin.certify.maximal import Maximal, random_states, rotation_of
 from pkm_twin.errors import ParameterError
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from test.machine.random_machines import plain, variant
-from test.support.robots import load
+from test.support.robots import load, partly_long
 
 BOUND = 1e-11
 """Largest difference, relative to the largest effort."""
@@ -99,7 +99,7 @@ def test_a_hexapod_on_a_shaking_base(name):
     check(robot, plain("stewart"), engine(name), rng)
 
 
-@pytest.mark.parametrize("name", MACHINES)
+@pytest.mark.parametrize("name", partly_long(MACHINES, "rps3", "hinged_platform", "platform_motor"))
 def test_random_machines_on_a_moving_base(name):
     rng = np.random.default_rng([20261128, MACHINES.index(name)])
     description = variant(name, rng)

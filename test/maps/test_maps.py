@@ -380,6 +380,7 @@ def test_a_search_finds_what_is_best_at_the_border(rng):
     assert 1.04**0.5 - best[0] < 1e-3 and best[0] > best[1]
 
 
+@pytest.mark.long
 def test_kinds_of_one_machine_agree(rng):
     """No kind's worst pose is worse in another kind than the worst that this one found.
 
