@@ -98,7 +98,7 @@ def test_stiff_members_on_soft_drives_are_the_rigid_body_model_on_springs(name, 
     assert natural_frequencies(robot, poses, 3) == pytest.approx(rigid, rel=1e-3)
 
 
-@elastic
+@pytest.mark.parametrize("name", ["delta", "delta_cu", "prru", "upr_rpu"])
 def test_locked_drives_carry_what_virtual_work_says(name, rng):
     """Their efforts under a wrench on the platform: end forces of beams against J' P."""
     robot = load(name)

@@ -205,12 +205,12 @@ def recorded(name, seed, reversals=True, memory=True):
     [("five_bar", 1), *(pytest.param(one, 20, marks=pytest.mark.long) for one in ("five_bar", "delta_cu"))],
 )
 def test_slow_reversals_give_level_and_distance_within_their_deviations(name, seeds):
-    away = {"coulomb": [], "presliding": []}
+    away, answers = {"coulomb": [], "presliding": []}, []
     for seed in range(seeds):
         record, coulomb, distance = recorded(name, seed)
         result, (choice,) = fit_with_laws(record.robot, [record], ("friction",), ["dahl"])
         assert choice.sigmas > 4.5 and choice.after < 0.3 * choice.before
-        assert result.verdict.answer == "explains"
+        answers.append(result.verdict.answer)
         found = []
         for key, exact in (("coulomb", coulomb), ("presliding", distance)):
             own = [record.robot.friction_key(joint, key) for joint in record.robot.joint_names]
@@ -219,6 +219,8 @@ def test_slow_reversals_give_level_and_distance_within_their_deviations(name, se
             found.append([n.after for n in numbers])
             away[key] += [(n.after - e) / n.deviation for n, e in zip(numbers, exact, strict=True)]
         assert (np.abs(np.array(found) / [coulomb, distance] - 1.0) < 0.05).all()
+    # One recording in twenty may show a further cause at five standard deviations; none is rejected.
+    assert set(answers) <= {"explains", "explains partly"} and answers.count("explains") >= 0.95 * seeds
     for errors in away.values():
         # Nearly all of so many normal numbers are below both.
         assert np.sum(np.square(errors)) < chi2.ppf(0.999, len(errors))
