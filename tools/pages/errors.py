@@ -13,15 +13,14 @@ from test.support.pages import write_section
 
 ROOT = Path(__file__).parents[2]
 HEAD = """All errors are subclasses of `PkmTwinError`, one line each: what is wrong, where, what is
-expected. Commands print it on stderr and end with exit code 1, or 2 for a wrong option or value.
-Nodes reject the message and count it by its reason in `/diagnostics`. [Python](api.md#errors) has
-their attributes. Examples:
+expected ([attributes](api.md#errors)). Nodes reject the message and count it by its reason in
+`/diagnostics`. Examples:
 
 """
 ERRORS = {
     errors.ParameterError: (
         errors.ParameterError("geometry.arm_length", -0.2, "a finite number, 1e-06 to 100 m"),
-        "correct the value; [robot files](parameters.md) lists all keys with their bounds",
+        "see [robot files](parameters.md)",
     ),
     errors.FileError: (
         errors.FileError("poses.csv", FileNotFoundError(), "a CSV file"),
@@ -29,7 +28,7 @@ ERRORS = {
     ),
     errors.UnknownNameError: (
         errors.UnknownNameError("robot", "delt", robot_names()),
-        "use the suggested name; `pkm-twin robots` lists the robots",
+        "use the suggested name",
     ),
     errors.MissingExtraError: (
         errors.MissingExtraError("h5netcdf", "maps"),
@@ -37,8 +36,7 @@ ERRORS = {
     ),
     errors.MobilityError: (
         errors.MobilityError(2, 1, ["elbow_2's axis is 1e-05 rad from parallel to motor_1's axis"]),
-        "correct the named joint, or the number of `actuated` joints "
-        "([new machine](new_machine.md#cross-check-and-errors-of-a-file))",
+        "correct the joint ([new machine](new_machine.md#cross-check-and-errors-of-a-file))",
     ),
     errors.UnreachableError: (
         errors.UnreachableError("pose", "limb 2", (3,), 0.0125),
@@ -46,7 +44,7 @@ ERRORS = {
     ),
     errors.SingularityError: (
         errors.SingularityError("joint state", (), 2e-9, 1e-6),
-        "keep `robot.singularity(q)` above 0.05 or more ([singularity index](concepts.md#singularity-index))",
+        "keep the [singularity index](concepts.md#singularity-index) above 0.05",
     ),
     errors.MessageError: (
         errors.MessageError("not finite", "position of arm_1 is nan"),
@@ -54,7 +52,7 @@ ERRORS = {
     ),
     errors.BagError: (
         errors.BagError("no topic /wrench", path="run.mcap", reason="no_topic"),
-        "choose topics with `--topic`; the attribute `reason` is a stable code",
+        "the attribute `reason` is a stable code",
     ),
     DamagedBagError: (
         DamagedBagError(
@@ -64,44 +62,44 @@ ERRORS = {
             offset=1_000_000,
             salvageable=1200,
         ),
-        "save the intact messages with `pkm-twin recover` ([recordings](recordings.md))",
+        "use `pkm-twin recover` ([recordings](recordings.md))",
     ),
 }
 """An example of each class, and what a user can do."""
 REASONS = {
-    "base motion": "only its present motion is known; send joint states in place of trajectories",
-    "bounds": "beyond the bounds of any real machine; check the units",
-    "busy": "too many requests are waiting; send trajectories more slowly",
-    "cdr": "the bytes are not a message of this type; use the same message definitions",
+    "base motion": "only its present motion is known; send joint states",
+    "bounds": "beyond any real machine; check the units",
+    "busy": "send trajectories more slowly",
+    "cdr": "not a message of this type",
     "duplicated joint": "send each joint once",
     "effort limit": "slow the motion, or see `limit_policy`",
-    "empty": "no joints, points, positions or efforts; fill the arrays",
+    "empty": "no joints, points, positions or efforts",
     "frame": "set `wrench_frame`, or `accept_empty_frame`",
-    "future stamp": "the stamp is ahead of the clock; synchronise the clocks",
-    "jump": "a joint or the platform moved faster than it can; check encoders and stamps",
-    "late answer": "computed for longer than `stale_after`; reduce the load",
+    "future stamp": "synchronise the clocks",
+    "jump": "faster than the machine can move; check encoders and stamps",
+    "late answer": "took longer than `stale_after`; reduce the load",
     "length": "an array and the names differ; send one value per joint",
-    "limit": "beyond the robot's position or velocity limits; check `limits`",
+    "limit": "beyond position or velocity `limits`",
     "missing joint": "check the names, or use `joint_map`",
     "no base motion": "no fresh `base_imu`, or none with gravity; check its stamps and driver",
     "no pose": "no joint state within `max_state_age` of the wrench; check `joint_states`",
-    "no velocities": "derivatives are missing; set `acceleration` to `differentiate`",
-    "no wrench": "none fresh; check the topic `wrench` and its stamps",
+    "no velocities": "set `acceleration` to `differentiate`",
+    "no wrench": "none fresh; check topic and stamps",
     "non-finite result": "check the input and the robot file",
-    "not finite": "NaN or infinity in the message; check the sensor",
-    "not measured": "a covariance of the IMU begins with -1; use a sensor that measures it",
+    "not finite": "NaN or infinity; check the sensor",
+    "not measured": "a covariance of the IMU begins with -1",
     "over": "the trajectory has already ended; use `use_sim_time` for a replayed bag",
-    "pose": "joint positions of a deflection are not usable; check `joint_states`",
-    "singular": "too close to a singularity; plan away from it, see `singularity_stop`",
+    "pose": "of a deflection: check `joint_states`",
+    "singular": "see `singularity_stop`",
     "stale stamp": "use `use_sim_time` for a replayed bag",
     "stamp order": "send samples in order",
-    "time": "times do not increase, or are invalid; correct `time_from_start` or the stamp",
+    "time": "times do not increase, or are invalid",
     "too short": "send at least 3 points to differentiate",
     "transform": "none for the sensor; publish it, or use `sensor.xyz`, `sensor.rpy`",
-    "uneven stamps": "too uneven to differentiate; check the sender's timing",
+    "uneven stamps": "too uneven to differentiate",
     "unknown joint": "the robot lacks a joint of the trajectory; see `extra_joints`",
-    "unreachable": "the joint positions cannot be assembled; check the robot file and offsets",
-    "unstable control": "of `machine_sim`; see its message for `bandwidth`, or shorten `period`",
+    "unreachable": "cannot be assembled; check the robot file and offsets",
+    "unstable control": "of `machine_sim`: lower `bandwidth`, or shorten `period`",
     "zero stamp": "stamp the message, or set `accept_zero_stamp`",
 }
 """Reason of a rejected message to its meaning, where the reason does not say it, and the remedy."""
