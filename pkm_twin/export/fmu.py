@@ -12,6 +12,7 @@ import tempfile
 import zipfile
 from collections.abc import Sequence
 from dataclasses import replace
+from importlib.resources import files
 from pathlib import Path
 from typing import Final
 
@@ -19,7 +20,6 @@ from delta_dynamics.torques.virtual_work import MASSLESS
 from pkm_twin.errors import ParameterError
 from pkm_twin.export.c99 import table
 from pkm_twin.export.c_package import Package
-from pkm_twin.export.fmu_interface import read_source, write_interface
 from pkm_twin.export.fmu_xml import Description, Variable, build_of, quoted, text_of
 from pkm_twin.machine.inertia import loaded_joints
 from pkm_twin.robot.robot import Robot
@@ -324,3 +324,32 @@ class Fmu:
 def find_compiler() -> str | None:
     """Find the first C compiler on the PATH."""
     return next((path for name in ("cc", "gcc", "clang") if (path := shutil.which(name))), None)
+
+
+def read_source(name: str) -> str:
+    """Read a part of the wrapper's sources, without its first line."""
+    text = (files(__package__) / "fmu_sources" / f"{name}.c").read_text(encoding="utf-8")
+    return text.partition("\n")[2]
+
+
+def write_interface(version: int) -> str:
+    """Write the functions of FMI 2.0 or 3.0 in C99.
+
+    The types are those of the standard's headers (fmi-standard.org), so that a binary fits every
+    importer, and the sources compile without its headers.
+    """
+    call = {
+        2: "c->log(c->environment, c->name, status, category[status], what)",
+        3: "c->log(c->environment, status, category[status], what)",
+    }
+    shared = read_source("shared").replace("LOGGER\n", read_source(f"logger{version}") + "\n", 1)
+    macro = f"""\
+/* Sources that are linked with others are compiled with FMI{version}_FUNCTION_PREFIX=@_; a library
+   has the standard's names. */
+#if defined(FMI{version}_FUNCTION_PREFIX) && !defined(FMI{version}_OVERRIDE_FUNCTION_PREFIX)
+#define FMI(name) JOINED(FMI{version}_FUNCTION_PREFIX, fmi{version}##name)
+#else
+#define FMI(name) fmi{version}##name
+#endif
+"""
+    return "\n".join([shared.replace("CALL_LOGGER", call[version]), macro, read_source(f"fmi{version}")])

@@ -26,3 +26,304 @@ EXPORT void FMI(FreeInstance)(void *instance)
 {
     free(instance);
 }
+
+EXPORT Status FMI(EnterEventMode)(void *instance)
+{
+    (void)instance;
+    return STATUS_OK;
+}
+
+EXPORT Status FMI(EnterContinuousTimeMode)(void *instance)
+{
+    (void)instance;
+    return STATUS_OK;
+}
+
+EXPORT Status FMI(Terminate)(void *instance)
+{
+    (void)instance;
+    return STATUS_OK;
+}
+
+EXPORT Status FMI(Reset)(void *instance)
+{
+    Instance *c = (Instance *)instance;
+    begin(&c->model);
+    return STATUS_OK;
+}
+
+EXPORT Status FMI(ExitInitializationMode)(void *instance)
+{
+    Instance *c = (Instance *)instance;
+    int changed;
+    return update(c, &changed);
+}
+
+EXPORT Status FMI(SetTime)(void *instance, double time)
+{
+    Instance *c = (Instance *)instance;
+    c->model.v[0] = time;
+    return STATUS_OK;
+}
+
+EXPORT Status FMI(GetNominalsOfContinuousStates)(void *instance, double *values, size_t count)
+{
+    (void)instance;
+    return nominals(values, count);
+}
+
+EXPORT Status FMI(SetContinuousStates)(void *instance, const double *x, size_t count)
+{
+    Instance *c = (Instance *)instance;
+    return set_states(c, x, count);
+}
+
+EXPORT Status FMI(GetContinuousStates)(void *instance, double *x, size_t count)
+{
+    Instance *c = (Instance *)instance;
+    return get_states(c, x, count);
+}
+
+EXPORT Status FMI(GetEventIndicators)(void *instance, double *values, size_t count)
+{
+    Instance *c = (Instance *)instance;
+    return get_indicators(c, values, count);
+}
+
+EXPORT Status FMI(GetFMUstate)(void *instance, void **state)
+{
+    Instance *c = (Instance *)instance;
+    return copy_state(c, state);
+}
+
+EXPORT Status FMI(SetFMUstate)(void *instance, void *state)
+{
+    Instance *c = (Instance *)instance;
+    return restore(c, state, sizeof c->model);
+}
+
+EXPORT Status FMI(FreeFMUstate)(void *instance, void **state)
+{
+    (void)instance;
+    return forget(state);
+}
+
+EXPORT Status FMI(SerializedFMUstateSize)(void *instance, void *state, size_t *size)
+{
+    Instance *c = (Instance *)instance;
+    (void)state;
+    *size = sizeof c->model;
+    return STATUS_OK;
+}
+
+EXPORT Status FMI(SerializeFMUstate)(void *instance, void *state, unsigned char *bytes, size_t size)
+{
+    Instance *c = (Instance *)instance;
+    return save(c, state, bytes, size);
+}
+
+EXPORT Status FMI(SetDebugLogging)(void *instance, int on, size_t count, const char *const *categories)
+{
+    (void)instance;
+    (void)on;
+    (void)count;
+    (void)categories;
+    return STATUS_OK;
+}
+
+EXPORT Status FMI(SetupExperiment)(void *instance, int tolerant, double tolerance, double start, int stops, double stop)
+{
+    Instance *c = (Instance *)instance;
+    (void)tolerant;
+    (void)tolerance;
+    (void)stops;
+    (void)stop;
+    c->model.v[0] = start;
+    return STATUS_OK;
+}
+
+EXPORT Status FMI(EnterInitializationMode)(void *instance)
+{
+    (void)instance;
+    return STATUS_OK;
+}
+
+EXPORT Status FMI(GetReal)(void *instance, const Reference *vr, size_t count, double *values)
+{
+    Instance *c = (Instance *)instance;
+    return get_reals(c, vr, count, values);
+}
+
+EXPORT Status FMI(SetReal)(void *instance, const Reference *vr, size_t count, const double *values)
+{
+    Instance *c = (Instance *)instance;
+    return set_reals(c, vr, count, values);
+}
+
+EXPORT Status FMI(GetInteger)(void *instance, const Reference *vr, size_t count, int *values)
+{
+    Instance *c = (Instance *)instance;
+    return get_status(c, vr, count, values);
+}
+
+EXPORT Status FMI(GetBoolean)(void *instance, const Reference *vr, size_t count, int *values)
+{
+    Instance *c = (Instance *)instance;
+    (void)vr;
+    (void)values;
+    return unsupported(c, count);
+}
+
+EXPORT Status FMI(GetString)(void *instance, const Reference *vr, size_t count, char * *values)
+{
+    Instance *c = (Instance *)instance;
+    (void)vr;
+    (void)values;
+    return unsupported(c, count);
+}
+
+EXPORT Status FMI(SetInteger)(void *instance, const Reference *vr, size_t count, const int *values)
+{
+    Instance *c = (Instance *)instance;
+    (void)vr;
+    (void)values;
+    return unsupported(c, count);
+}
+
+EXPORT Status FMI(SetBoolean)(void *instance, const Reference *vr, size_t count, const int *values)
+{
+    Instance *c = (Instance *)instance;
+    (void)vr;
+    (void)values;
+    return unsupported(c, count);
+}
+
+EXPORT Status FMI(SetString)(void *instance, const Reference *vr, size_t count, const char * *values)
+{
+    Instance *c = (Instance *)instance;
+    (void)vr;
+    (void)values;
+    return unsupported(c, count);
+}
+
+EXPORT Status FMI(DeSerializeFMUstate)(void *instance, const unsigned char *bytes, size_t size, void **state)
+{
+    Instance *c = (Instance *)instance;
+    if (size != sizeof c->model) {
+        return restore(c, NULL, 0);
+    }
+    if (copy_state(c, state) != STATUS_OK) {
+        return STATUS_ERROR;
+    }
+    memcpy(*state, bytes, size);
+    return STATUS_OK;
+}
+
+EXPORT Status FMI(GetDirectionalDerivative)(void *instance, const Reference *unknowns, size_t count, const Reference *knowns, size_t n, const double *seed, double *values)
+{
+    Instance *c = (Instance *)instance;
+    (void)unknowns;
+    (void)count;
+    (void)knowns;
+    (void)n;
+    (void)seed;
+    (void)values;
+    return unsupported(c, 1);
+}
+
+EXPORT Status FMI(NewDiscreteStates)(void *instance, EventInfo *info)
+{
+    Instance *c = (Instance *)instance;
+    memset(info, 0, sizeof *info);
+    return update(c, &info->values_changed);
+}
+
+EXPORT Status FMI(CompletedIntegratorStep)(void *instance, int kept, int *event_mode, int *terminate)
+{
+    (void)instance;
+    (void)kept;
+    *event_mode = 0;
+    *terminate = 0;
+    return STATUS_OK;
+}
+
+EXPORT Status FMI(GetDerivatives)(void *instance, double *values, size_t count)
+{
+    Instance *c = (Instance *)instance;
+    return get_rates(c, values, count);
+}
+
+EXPORT Status FMI(SetRealInputDerivatives)(void *instance, const Reference *vr, size_t count, const int *orders, const double *values)
+{
+    Instance *c = (Instance *)instance;
+    (void)vr;
+    (void)orders;
+    (void)values;
+    return unsupported(c, count);
+}
+
+EXPORT Status FMI(GetRealOutputDerivatives)(void *instance, const Reference *vr, size_t count, const int *orders, double *values)
+{
+    Instance *c = (Instance *)instance;
+    (void)vr;
+    (void)orders;
+    (void)values;
+    return unsupported(c, count);
+}
+
+EXPORT Status FMI(DoStep)(void *instance, double time, double span, int kept)
+{
+    Instance *c = (Instance *)instance;
+    (void)kept;
+    return do_step(c, time, span);
+}
+
+EXPORT Status FMI(CancelStep)(void *instance)
+{
+    Instance *c = (Instance *)instance;
+    return unsupported(c, 1);
+}
+
+EXPORT Status FMI(GetStatus)(void *instance, int kind, Status *value)
+{
+    Instance *c = (Instance *)instance;
+    (void)kind;
+    (void)value;
+    return unsupported(c, 1);
+}
+
+EXPORT Status FMI(GetRealStatus)(void *instance, int kind, double *value)
+{
+    Instance *c = (Instance *)instance;
+    if (kind != 2) {
+        return unsupported(c, 1);
+    }
+    *value = c->model.v[0];
+    return STATUS_OK;
+}
+
+EXPORT Status FMI(GetIntegerStatus)(void *instance, int kind, int *value)
+{
+    Instance *c = (Instance *)instance;
+    (void)kind;
+    (void)value;
+    return unsupported(c, 1);
+}
+
+EXPORT Status FMI(GetBooleanStatus)(void *instance, int kind, int *value)
+{
+    Instance *c = (Instance *)instance;
+    if (kind != 3) {
+        return unsupported(c, 1);
+    }
+    *value = 0;
+    return STATUS_OK;
+}
+
+EXPORT Status FMI(GetStringStatus)(void *instance, int kind, const char **value)
+{
+    Instance *c = (Instance *)instance;
+    (void)kind;
+    (void)value;
+    return unsupported(c, 1);
+}

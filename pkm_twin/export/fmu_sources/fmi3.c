@@ -52,3 +52,593 @@ EXPORT void FMI(FreeInstance)(void *instance)
 {
     free(instance);
 }
+
+EXPORT Status FMI(EnterEventMode)(void *instance)
+{
+    (void)instance;
+    return STATUS_OK;
+}
+
+EXPORT Status FMI(EnterContinuousTimeMode)(void *instance)
+{
+    (void)instance;
+    return STATUS_OK;
+}
+
+EXPORT Status FMI(Terminate)(void *instance)
+{
+    (void)instance;
+    return STATUS_OK;
+}
+
+EXPORT Status FMI(Reset)(void *instance)
+{
+    Instance *c = (Instance *)instance;
+    begin(&c->model);
+    return STATUS_OK;
+}
+
+EXPORT Status FMI(ExitInitializationMode)(void *instance)
+{
+    Instance *c = (Instance *)instance;
+    int changed;
+    return update(c, &changed);
+}
+
+EXPORT Status FMI(SetTime)(void *instance, double time)
+{
+    Instance *c = (Instance *)instance;
+    c->model.v[0] = time;
+    return STATUS_OK;
+}
+
+EXPORT Status FMI(GetNominalsOfContinuousStates)(void *instance, double *values, size_t count)
+{
+    (void)instance;
+    return nominals(values, count);
+}
+
+EXPORT Status FMI(SetContinuousStates)(void *instance, const double *x, size_t count)
+{
+    Instance *c = (Instance *)instance;
+    return set_states(c, x, count);
+}
+
+EXPORT Status FMI(GetContinuousStates)(void *instance, double *x, size_t count)
+{
+    Instance *c = (Instance *)instance;
+    return get_states(c, x, count);
+}
+
+EXPORT Status FMI(GetEventIndicators)(void *instance, double *values, size_t count)
+{
+    Instance *c = (Instance *)instance;
+    return get_indicators(c, values, count);
+}
+
+EXPORT Status FMI(GetFMUState)(void *instance, void **state)
+{
+    Instance *c = (Instance *)instance;
+    return copy_state(c, state);
+}
+
+EXPORT Status FMI(SetFMUState)(void *instance, void *state)
+{
+    Instance *c = (Instance *)instance;
+    return restore(c, state, sizeof c->model);
+}
+
+EXPORT Status FMI(FreeFMUState)(void *instance, void **state)
+{
+    (void)instance;
+    return forget(state);
+}
+
+EXPORT Status FMI(SerializedFMUStateSize)(void *instance, void *state, size_t *size)
+{
+    Instance *c = (Instance *)instance;
+    (void)state;
+    *size = sizeof c->model;
+    return STATUS_OK;
+}
+
+EXPORT Status FMI(SerializeFMUState)(void *instance, void *state, unsigned char *bytes, size_t size)
+{
+    Instance *c = (Instance *)instance;
+    return save(c, state, bytes, size);
+}
+
+EXPORT Status FMI(SetDebugLogging)(void *instance, bool on, size_t count, const char *const *categories)
+{
+    (void)instance;
+    (void)on;
+    (void)count;
+    (void)categories;
+    return STATUS_OK;
+}
+
+EXPORT Status FMI(EnterInitializationMode)(void *instance, bool tolerant, double tolerance, double start, bool stops, double stop)
+{
+    Instance *c = (Instance *)instance;
+    (void)tolerant;
+    (void)tolerance;
+    (void)stops;
+    (void)stop;
+    c->model.v[0] = start;
+    return STATUS_OK;
+}
+
+EXPORT Status FMI(GetFloat64)(void *instance, const Reference *vr, size_t count, double *values, size_t size)
+{
+    Instance *c = (Instance *)instance;
+    if (size != count) {
+        return unsupported(c, 1);
+    }
+    return get_reals(c, vr, count, values);
+}
+
+EXPORT Status FMI(SetFloat64)(void *instance, const Reference *vr, size_t count, const double *values, size_t size)
+{
+    Instance *c = (Instance *)instance;
+    if (size != count) {
+        return unsupported(c, 1);
+    }
+    return set_reals(c, vr, count, values);
+}
+
+EXPORT Status FMI(GetInt32)(void *instance, const Reference *vr, size_t count, int32_t *values, size_t size)
+{
+    Instance *c = (Instance *)instance;
+    if (size != count) {
+        return unsupported(c, 1);
+    }
+    return get_status(c, vr, count, values);
+}
+
+EXPORT Status FMI(SetInt32)(void *instance, const Reference *vr, size_t count, const int32_t *values, size_t size)
+{
+    Instance *c = (Instance *)instance;
+    (void)vr;
+    (void)values;
+    (void)size;
+    return unsupported(c, count);
+}
+
+EXPORT Status FMI(GetFloat32)(void *instance, const Reference *vr, size_t count, float *values, size_t size)
+{
+    Instance *c = (Instance *)instance;
+    (void)vr;
+    (void)values;
+    (void)size;
+    return unsupported(c, count);
+}
+
+EXPORT Status FMI(GetInt8)(void *instance, const Reference *vr, size_t count, int8_t *values, size_t size)
+{
+    Instance *c = (Instance *)instance;
+    (void)vr;
+    (void)values;
+    (void)size;
+    return unsupported(c, count);
+}
+
+EXPORT Status FMI(GetUInt8)(void *instance, const Reference *vr, size_t count, uint8_t *values, size_t size)
+{
+    Instance *c = (Instance *)instance;
+    (void)vr;
+    (void)values;
+    (void)size;
+    return unsupported(c, count);
+}
+
+EXPORT Status FMI(GetInt16)(void *instance, const Reference *vr, size_t count, int16_t *values, size_t size)
+{
+    Instance *c = (Instance *)instance;
+    (void)vr;
+    (void)values;
+    (void)size;
+    return unsupported(c, count);
+}
+
+EXPORT Status FMI(GetUInt16)(void *instance, const Reference *vr, size_t count, uint16_t *values, size_t size)
+{
+    Instance *c = (Instance *)instance;
+    (void)vr;
+    (void)values;
+    (void)size;
+    return unsupported(c, count);
+}
+
+EXPORT Status FMI(GetUInt32)(void *instance, const Reference *vr, size_t count, uint32_t *values, size_t size)
+{
+    Instance *c = (Instance *)instance;
+    (void)vr;
+    (void)values;
+    (void)size;
+    return unsupported(c, count);
+}
+
+EXPORT Status FMI(GetInt64)(void *instance, const Reference *vr, size_t count, int64_t *values, size_t size)
+{
+    Instance *c = (Instance *)instance;
+    (void)vr;
+    (void)values;
+    (void)size;
+    return unsupported(c, count);
+}
+
+EXPORT Status FMI(GetUInt64)(void *instance, const Reference *vr, size_t count, uint64_t *values, size_t size)
+{
+    Instance *c = (Instance *)instance;
+    (void)vr;
+    (void)values;
+    (void)size;
+    return unsupported(c, count);
+}
+
+EXPORT Status FMI(GetBoolean)(void *instance, const Reference *vr, size_t count, bool *values, size_t size)
+{
+    Instance *c = (Instance *)instance;
+    (void)vr;
+    (void)values;
+    (void)size;
+    return unsupported(c, count);
+}
+
+EXPORT Status FMI(GetString)(void *instance, const Reference *vr, size_t count, char * *values, size_t size)
+{
+    Instance *c = (Instance *)instance;
+    (void)vr;
+    (void)values;
+    (void)size;
+    return unsupported(c, count);
+}
+
+EXPORT Status FMI(SetFloat32)(void *instance, const Reference *vr, size_t count, const float *values, size_t size)
+{
+    Instance *c = (Instance *)instance;
+    (void)vr;
+    (void)values;
+    (void)size;
+    return unsupported(c, count);
+}
+
+EXPORT Status FMI(SetInt8)(void *instance, const Reference *vr, size_t count, const int8_t *values, size_t size)
+{
+    Instance *c = (Instance *)instance;
+    (void)vr;
+    (void)values;
+    (void)size;
+    return unsupported(c, count);
+}
+
+EXPORT Status FMI(SetUInt8)(void *instance, const Reference *vr, size_t count, const uint8_t *values, size_t size)
+{
+    Instance *c = (Instance *)instance;
+    (void)vr;
+    (void)values;
+    (void)size;
+    return unsupported(c, count);
+}
+
+EXPORT Status FMI(SetInt16)(void *instance, const Reference *vr, size_t count, const int16_t *values, size_t size)
+{
+    Instance *c = (Instance *)instance;
+    (void)vr;
+    (void)values;
+    (void)size;
+    return unsupported(c, count);
+}
+
+EXPORT Status FMI(SetUInt16)(void *instance, const Reference *vr, size_t count, const uint16_t *values, size_t size)
+{
+    Instance *c = (Instance *)instance;
+    (void)vr;
+    (void)values;
+    (void)size;
+    return unsupported(c, count);
+}
+
+EXPORT Status FMI(SetUInt32)(void *instance, const Reference *vr, size_t count, const uint32_t *values, size_t size)
+{
+    Instance *c = (Instance *)instance;
+    (void)vr;
+    (void)values;
+    (void)size;
+    return unsupported(c, count);
+}
+
+EXPORT Status FMI(SetInt64)(void *instance, const Reference *vr, size_t count, const int64_t *values, size_t size)
+{
+    Instance *c = (Instance *)instance;
+    (void)vr;
+    (void)values;
+    (void)size;
+    return unsupported(c, count);
+}
+
+EXPORT Status FMI(SetUInt64)(void *instance, const Reference *vr, size_t count, const uint64_t *values, size_t size)
+{
+    Instance *c = (Instance *)instance;
+    (void)vr;
+    (void)values;
+    (void)size;
+    return unsupported(c, count);
+}
+
+EXPORT Status FMI(SetBoolean)(void *instance, const Reference *vr, size_t count, const bool *values, size_t size)
+{
+    Instance *c = (Instance *)instance;
+    (void)vr;
+    (void)values;
+    (void)size;
+    return unsupported(c, count);
+}
+
+EXPORT Status FMI(SetString)(void *instance, const Reference *vr, size_t count, const char * *values, size_t size)
+{
+    Instance *c = (Instance *)instance;
+    (void)vr;
+    (void)values;
+    (void)size;
+    return unsupported(c, count);
+}
+
+EXPORT Status FMI(GetBinary)(void *instance, const Reference *vr, size_t count, size_t *sizes, const unsigned char **values, size_t size)
+{
+    Instance *c = (Instance *)instance;
+    (void)vr;
+    (void)sizes;
+    (void)values;
+    (void)size;
+    return unsupported(c, count);
+}
+
+EXPORT Status FMI(SetBinary)(void *instance, const Reference *vr, size_t count, const size_t *sizes, const unsigned char *const *values, size_t size)
+{
+    Instance *c = (Instance *)instance;
+    (void)vr;
+    (void)sizes;
+    (void)values;
+    (void)size;
+    return unsupported(c, count);
+}
+
+EXPORT Status FMI(GetClock)(void *instance, const Reference *vr, size_t count, bool *values)
+{
+    Instance *c = (Instance *)instance;
+    (void)vr;
+    (void)values;
+    return unsupported(c, count);
+}
+
+EXPORT Status FMI(SetClock)(void *instance, const Reference *vr, size_t count, const bool *values)
+{
+    Instance *c = (Instance *)instance;
+    (void)vr;
+    (void)values;
+    return unsupported(c, count);
+}
+
+EXPORT Status FMI(GetNumberOfVariableDependencies)(void *instance, Reference vr, size_t *count)
+{
+    Instance *c = (Instance *)instance;
+    (void)vr;
+    (void)count;
+    return unsupported(c, 1);
+}
+
+EXPORT Status FMI(GetVariableDependencies)(void *instance, Reference vr, size_t *elements, Reference *independents, size_t *others, int *kinds, size_t count)
+{
+    Instance *c = (Instance *)instance;
+    (void)vr;
+    (void)elements;
+    (void)independents;
+    (void)others;
+    (void)kinds;
+    (void)count;
+    return unsupported(c, 1);
+}
+
+EXPORT Status FMI(DeserializeFMUState)(void *instance, const unsigned char *bytes, size_t size, void **state)
+{
+    Instance *c = (Instance *)instance;
+    if (size != sizeof c->model) {
+        return restore(c, NULL, 0);
+    }
+    if (copy_state(c, state) != STATUS_OK) {
+        return STATUS_ERROR;
+    }
+    memcpy(*state, bytes, size);
+    return STATUS_OK;
+}
+
+EXPORT Status FMI(GetDirectionalDerivative)(void *instance, const Reference *unknowns, size_t count, const Reference *knowns, size_t n, const double *seed, size_t seeds, double *values, size_t size)
+{
+    Instance *c = (Instance *)instance;
+    (void)unknowns;
+    (void)count;
+    (void)knowns;
+    (void)n;
+    (void)seed;
+    (void)seeds;
+    (void)values;
+    (void)size;
+    return unsupported(c, 1);
+}
+
+EXPORT Status FMI(GetAdjointDerivative)(void *instance, const Reference *unknowns, size_t count, const Reference *knowns, size_t n, const double *seed, size_t seeds, double *values, size_t size)
+{
+    Instance *c = (Instance *)instance;
+    (void)unknowns;
+    (void)count;
+    (void)knowns;
+    (void)n;
+    (void)seed;
+    (void)seeds;
+    (void)values;
+    (void)size;
+    return unsupported(c, 1);
+}
+
+EXPORT Status FMI(EnterConfigurationMode)(void *instance)
+{
+    Instance *c = (Instance *)instance;
+    return unsupported(c, 1);
+}
+
+EXPORT Status FMI(ExitConfigurationMode)(void *instance)
+{
+    Instance *c = (Instance *)instance;
+    return unsupported(c, 1);
+}
+
+EXPORT Status FMI(GetIntervalDecimal)(void *instance, const Reference *vr, size_t count, double *values, int *kinds)
+{
+    Instance *c = (Instance *)instance;
+    (void)vr;
+    (void)values;
+    (void)kinds;
+    return unsupported(c, count);
+}
+
+EXPORT Status FMI(GetIntervalFraction)(void *instance, const Reference *vr, size_t count, uint64_t *counters, uint64_t *resolutions, int *kinds)
+{
+    Instance *c = (Instance *)instance;
+    (void)vr;
+    (void)counters;
+    (void)resolutions;
+    (void)kinds;
+    return unsupported(c, count);
+}
+
+EXPORT Status FMI(GetShiftDecimal)(void *instance, const Reference *vr, size_t count, double *values)
+{
+    Instance *c = (Instance *)instance;
+    (void)vr;
+    (void)values;
+    return unsupported(c, count);
+}
+
+EXPORT Status FMI(GetShiftFraction)(void *instance, const Reference *vr, size_t count, uint64_t *counters, uint64_t *resolutions)
+{
+    Instance *c = (Instance *)instance;
+    (void)vr;
+    (void)counters;
+    (void)resolutions;
+    return unsupported(c, count);
+}
+
+EXPORT Status FMI(SetIntervalDecimal)(void *instance, const Reference *vr, size_t count, const double *values)
+{
+    Instance *c = (Instance *)instance;
+    (void)vr;
+    (void)values;
+    return unsupported(c, count);
+}
+
+EXPORT Status FMI(SetShiftDecimal)(void *instance, const Reference *vr, size_t count, const double *values)
+{
+    Instance *c = (Instance *)instance;
+    (void)vr;
+    (void)values;
+    return unsupported(c, count);
+}
+
+EXPORT Status FMI(SetIntervalFraction)(void *instance, const Reference *vr, size_t count, const uint64_t *counters, const uint64_t *resolutions)
+{
+    Instance *c = (Instance *)instance;
+    (void)vr;
+    (void)counters;
+    (void)resolutions;
+    return unsupported(c, count);
+}
+
+EXPORT Status FMI(SetShiftFraction)(void *instance, const Reference *vr, size_t count, const uint64_t *counters, const uint64_t *resolutions)
+{
+    Instance *c = (Instance *)instance;
+    (void)vr;
+    (void)counters;
+    (void)resolutions;
+    return unsupported(c, count);
+}
+
+EXPORT Status FMI(EvaluateDiscreteStates)(void *instance)
+{
+    (void)instance;
+    return STATUS_OK;
+}
+
+EXPORT Status FMI(UpdateDiscreteStates)(void *instance, bool *need_update, bool *terminate, bool *nominals_changed, bool *values_changed, bool *time_defined, double *time)
+{
+    Instance *c = (Instance *)instance;
+    int changed;
+    const Status status = update(c, &changed);
+    *need_update = *terminate = *nominals_changed = *time_defined = false;
+    *values_changed = (changed != 0);
+    *time = 0.0;
+    return status;
+}
+
+EXPORT Status FMI(CompletedIntegratorStep)(void *instance, bool kept, bool *event_mode, bool *terminate)
+{
+    (void)instance;
+    (void)kept;
+    *event_mode = false;
+    *terminate = false;
+    return STATUS_OK;
+}
+
+EXPORT Status FMI(GetContinuousStateDerivatives)(void *instance, double *values, size_t count)
+{
+    Instance *c = (Instance *)instance;
+    return get_rates(c, values, count);
+}
+
+EXPORT Status FMI(GetNumberOfEventIndicators)(void *instance, size_t *count)
+{
+    (void)instance;
+    *count = DRY;
+    return STATUS_OK;
+}
+
+EXPORT Status FMI(GetNumberOfContinuousStates)(void *instance, size_t *count)
+{
+    (void)instance;
+    *count = STATES;
+    return STATUS_OK;
+}
+
+EXPORT Status FMI(EnterStepMode)(void *instance)
+{
+    (void)instance;
+    return STATUS_OK;
+}
+
+EXPORT Status FMI(GetOutputDerivatives)(void *instance, const Reference *vr, size_t count, const int32_t *orders, double *values, size_t size)
+{
+    Instance *c = (Instance *)instance;
+    (void)vr;
+    (void)orders;
+    (void)values;
+    (void)size;
+    return unsupported(c, count);
+}
+
+EXPORT Status FMI(DoStep)(void *instance, double time, double span, bool kept, bool *event_needed, bool *terminate, bool *early, double *last)
+{
+    Instance *c = (Instance *)instance;
+    (void)kept;
+    const Status status = do_step(c, time, span);
+    *event_needed = *terminate = *early = false;
+    *last = (status == STATUS_OK) ? (time + span) : time;
+    return status;
+}
+
+EXPORT Status FMI(ActivateModelPartition)(void *instance, Reference clock, double time)
+{
+    Instance *c = (Instance *)instance;
+    (void)clock;
+    (void)time;
+    return unsupported(c, 1);
+}
