@@ -133,7 +133,7 @@ def write(name: str, header: Mapping[str, Any], code: bytes) -> None:
         with os.fdopen(handle, "wb") as file:
             file.write(_MARK + hashlib.sha256(body).digest() + body)
         os.replace(temporary, place / name)
-        _shrink(place)
+        _shrink(place, len(_MARK) + 32 + len(body))
     except OSError as error:
         say_once(error)
         if temporary is not None:
@@ -169,15 +169,26 @@ def alone(name: str) -> Iterator[None]:
             os.close(handle)
 
 
-def _shrink(place: Path) -> None:
-    """Delete the least recently used programs until half of :data:`MAX_BYTES` is left."""
+_sizes: Final[dict[Path, int]] = {}
+"""Size of each cache when this process listed it, and what it has written since, bytes."""
+
+
+def _shrink(place: Path, written: int) -> None:
+    """Delete the least recently used programs until half of :data:`MAX_BYTES` is left.
+
+    The folder, which may hold many thousands, is listed at a process's first write and when what
+    the process knows of is above the limit.
+    """
+    if place in _sizes and _sizes[place] + written <= MAX_BYTES:
+        _sizes[place] += written
+        return
     files = []
     with os.scandir(place) as entries:
         for entry in entries:
             with suppress(OSError):
                 status = entry.stat(follow_symlinks=False)
                 files.append((status.st_mtime_ns, status.st_size, entry.path))
-    left = sum(size for _, size, _ in files)
+    left = _sizes[place] = sum(size for _, size, _ in files)
     if left <= MAX_BYTES:
         return
     for _, size, path in sorted(files):
@@ -186,4 +197,4 @@ def _shrink(place: Path) -> None:
         # Another process may have deleted the file already.
         with suppress(OSError):
             os.unlink(path)
-        left -= size
+        left = _sizes[place] = left - size

@@ -172,6 +172,16 @@ def _check_base(path: Path, base: sqlite3.Connection, new: bool) -> None:
     raise ParameterError(str(path), one_line(found, 100), HISTORY)
 
 
+def check_file(path: Path) -> None:
+    """Reject a file that exists and is no history, before anything is computed for it.
+
+    :raises ParameterError: by the file.
+    """
+    if path.exists():
+        with _opened(path) as base:
+            _check_base(path, base, new=True)
+
+
 def _check_row(where: str, time: Any, value: Any, deviation: Any) -> None:
     """Reject numbers that no recording gives.
 

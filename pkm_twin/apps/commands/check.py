@@ -74,6 +74,10 @@ def check_one(given: Check, path: Path, update: Any = None, thorough: bool = Tru
     from pkm_twin.identification.check import COMPARED, IDLE, RESIDUAL
     from pkm_twin.identification.check import check as checked
 
+    if given.history is not None:
+        from pkm_twin.identification.history import append, check_file, measure, recorded_at
+
+        check_file(given.history)
     robot: Any = given.robot
     if any(given.part.values()):
         if robot is None:
@@ -83,8 +87,6 @@ def check_one(given: Check, path: Path, update: Any = None, thorough: bool = Tru
     found = checked(r, given.residual, thorough)
     good = found.answer == "good"
     if given.history is not None:
-        from pkm_twin.identification.history import append, measure, recorded_at
-
         name = given.machine_name or r.robot.name
         append(given.history, name, r.robot.name, path, recorded_at(r, path), good, measure(r))
     bad, unknown = found.named(Verdict.BAD), found.named(Verdict.UNKNOWN)
