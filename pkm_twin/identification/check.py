@@ -35,7 +35,7 @@ from pkm_twin.identification.hypotheses import NO_MACHINE, Explanation, explain
 from pkm_twin.identification.judge import LOUD
 from pkm_twin.identification.parameters import file_parameters
 from pkm_twin.identification.rows import rows_of
-from pkm_twin.identification.words import LATEST, listed, scale_text
+from pkm_twin.identification.words import LATEST, listed, position_text, scale_text
 from pkm_twin.recordings import Recording
 from pkm_twin.report import Fact, Verdict, judged
 from pkm_twin.robot.limits import ranges
@@ -153,7 +153,9 @@ def checked(r: Recording, residual: float) -> Checked:
         bands = {} if compared is None else _bands(r, compared)
     # ValueError: numbers within bounds whose result is not finite.
     except (UnreachableError, SingularityError, ValueError) as error:
-        return Checked(r, [*items, judged(RESIDUAL, one_line(str(error)), bound, False)])
+        text = one_line(str(error))
+        causes = (position_text(error),) if isinstance(error, (UnreachableError, SingularityError)) else ()
+        return Checked(r, [*items, judged(RESIDUAL, text, bound, False)], causes=causes)
     shares, unjudged = _shares(r, idle, compared)
     items += shares
     if compared is not None and compared.hidden.any() and compared.good.all():

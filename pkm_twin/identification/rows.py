@@ -37,6 +37,7 @@ from pkm_twin.identification.samples import (
     shaken_efforts,
     tracks,
 )
+from pkm_twin.identification.words import position_text
 from pkm_twin.machine.friction import KNOWN_FRACTION, Dahl, Memory, all_keys, compiled, not_shared
 from pkm_twin.recordings.recording import Recording
 from pkm_twin.robot.robot import Robot
@@ -218,7 +219,8 @@ def rows_of(robot: Robot, parameters: FileParameters, recording: Recording, wind
     """Return a recording's filtered rows.
 
     :param window: of the differentiation, samples; None chooses it.
-    :raises PkmTwinError: it is too short, its joints stand still, or its efforts are none.
+    :raises PkmTwinError: it is too short, its joints stand still, its efforts are none, or the
+        machine cannot take its positions.
     """
     r = recording
     if len(r.time) < LEAST:
@@ -236,7 +238,10 @@ def rows_of(robot: Robot, parameters: FileParameters, recording: Recording, wind
     # With the friction laws on trial, as the robot has them.
     carried = None if r.carried is None else replace(robot, payload=r.carried.payload)
     model = Model(robot, parameters, carried)
-    parts = [_Piece.of(model, track, how) for track in pieces]
+    try:
+        parts = [_Piece.of(model, track, how) for track in pieces]
+    except (UnreachableError, SingularityError) as error:
+        raise PkmTwinError(f"{r.name}: {position_text(error)}") from None
     if all(not part.moves.any() for part in parts):
         raise PkmTwinError(f"{r.name}: no excitation, the joints stand still")
     first, outliers = _drop_outliers(parts, parameters, how.keep_every)
@@ -456,10 +461,7 @@ class Problem:
         everything, whole = file_parameters(robot), list[Rows]()
         for i, recording in enumerate(recordings):
             same = (one for one in known if one.recording is recording and one.model.robot is robot)
-            try:
-                whole.append(next(same, None) or rows_of(robot, everything, recording))
-            except (UnreachableError, SingularityError) as error:
-                raise PkmTwinError(f"{recording.name}: {error} (positions of this machine, in rad and m?)") from None
+            whole.append(next(same, None) or rows_of(robot, everything, recording))
             if progress is not None:
                 progress(i + 1)
         problem = cls(robot, tuple(what), everything, tuple(whole))

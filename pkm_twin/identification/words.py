@@ -6,6 +6,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
+from pkm_twin.errors import one_line
+
 USUAL_SCALE: Final = 1.22
 """Scale, or its inverse, up to which a drive's constant is usual: 4.5 deviations of 5 %."""
 LATEST: Final = 0.05
@@ -17,6 +19,11 @@ UNITS: Final = {"N mm or mN m": 1e3, "kgf or kgf m": 1.0 / 9.80665}
 def usual_scale(scale: float) -> bool:
     """Return whether efforts of a scale can be a machine's: it is nearly right."""
     return 1.0 / USUAL_SCALE < scale < USUAL_SCALE
+
+
+def position_text(error: Exception) -> str:
+    """Return words for positions that the machine cannot take, by its error."""
+    return one_line(f"{error} (positions of this machine, in rad and m?)")
 
 
 def late_text(names: str, late: float) -> str:

@@ -270,6 +270,16 @@ def test_fit_and_check_agree(name: str) -> None:
         agree(bare, made)
 
 
+@pytest.mark.parametrize("name", ["five_bar", "upr_rpu"])
+def test_fit_and_check_say_that_the_machine_cannot_take_the_positions(name: str) -> None:
+    m = machine(load(name), np.random.default_rng([5, *name.encode()]), 3.0)
+    record = m.recorded(q=-m.q)
+    with pytest.raises(PkmTwinError, match="positions of this machine"):
+        fit_recordings(m.robot, [record])
+    (cause,) = check(record).causes
+    assert "positions of this machine" in cause
+
+
 def test_friction_that_may_hold_a_payload_at_rest_does_not_lighten_it() -> None:
     """Strokes of 0.4 s, and rests as long where dry friction is larger than the payload's share."""
     robot = load("delta").changed(friction={"coulomb": [1.0] * 3}, payload={"mass": 0.0})
