@@ -149,10 +149,11 @@ class Traced:
             more["branch"] = [*more.pop("branch", ()), *self.lift(self.drives.tolerance_margins())]
         scheme, tree = self.scheme, self.tree
         branch = self.margins
-        if self.lu.used:
-            # Results depend on these factors, not corrections alone.
-            scales = [self.rows[k].scale for k in scheme.independent]
-            branch = branch + self.limit_growth(self.lu, scales, [tree.scales[k] for k in scheme.varying])
+        whole = self.lu, [self.rows[k] for k in scheme.independent], scheme.varying
+        for lu, own, rates in (whole, (self.newton, self.solved, scheme.solved[1]))[: 2 if self.limbs else 1]:
+            # Results depend on factors that are used before, not corrections alone.
+            if lu.used:
+                branch = branch + self.limit_growth(lu, [row.scale for row in own], [tree.scales[k] for k in rates])
         determinant = self.determinant
         places, rates = scheme.solved if scheme.platform_pivots is None else ([], [])
         step: Numbers = -self.newton.solve([row.value for row in self.solved]) if places else []
