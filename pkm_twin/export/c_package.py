@@ -64,9 +64,9 @@ def c_package(robot: Robot) -> dict[str, str]:
     return {
         f"{made.prefix}.h": made.header(),
         f"{made.prefix}.c": made.source(),
-        "example.c": write_example(made),
+        "example.c": write_example(robot, made.prefix, made.title),
         "CMakeLists.txt": CMAKE.format(name=made.prefix),
-        "README.md": write_readme(made),
+        "README.md": write_readme(robot, made.prefix, made.unit.rooms + max(made.unit.doubles.values())),
     }
 
 

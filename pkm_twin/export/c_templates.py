@@ -4,16 +4,14 @@
 from __future__ import annotations
 
 import textwrap
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 
 from delta_dynamics.torques.virtual_work import inverse_dynamics
 from pkm_twin.codegen.program import MAX_ITERATIONS
 from pkm_twin.export.c99 import CORRECTIONS, LADDER, table
-
-if TYPE_CHECKING:
-    from pkm_twin.export.c_package import Package
+from pkm_twin.robot.robot import Robot
 
 ABOUT: Final = """\
 Joints q: {joints}. Pose: {pose}. SI units, base axes, z up. wrench: force (N) and moment (N m)
@@ -148,16 +146,16 @@ Stack: at most about {stack} kB without optimisation, less with it.
 """
 
 
-def write_example(package: Package) -> str:
+def write_example(robot: Robot, prefix: str, title: str) -> str:
     """Write the example: functions at home, compared with the results of Python."""
-    robot, home = package.robot, package.robot.graph.home
-    rates, changes = robot.project_redundant(home, *np.full((2, package.n), 0.1))[1:]
+    home = robot.graph.home
+    rates, changes = robot.project_redundant(home, *np.full((2, robot.joints_count), 0.1))[1:]
     tests = {
         "pose": ("forward(q, pose)", robot.forward(home)),
         "joints": ("inverse(pose, joints)", home),
     }
     given = {"q": home}
-    if package.massive:
+    if robot.has_masses:
         tau = inverse_dynamics(robot, home, rates, changes)
         tests["tau"] = "torques(q, rates, changes, wrench, tau)", tau
         given |= {"rates": rates, "changes": changes, "wrench": np.zeros(6)}
@@ -171,24 +169,23 @@ def write_example(package: Package) -> str:
     ]
     declared = textwrap.indent("".join(rows) + f"double {sizes};", "    ")
     return EXAMPLE.format(
-        title=package.title,
-        name=package.prefix,
+        title=title,
+        name=prefix,
         declared=declared,
-        calls=textwrap.indent("".join(calls), "    ").rstrip().replace("@", package.prefix),
+        calls=textwrap.indent("".join(calls), "    ").rstrip().replace("@", prefix),
     )
 
 
-def write_readme(package: Package) -> str:
-    """Write the README: the functions, and their largest stack and number of corrections."""
-    largest = (package.unit.rooms + max(package.unit.doubles.values())) * 8
+def write_readme(robot: Robot, prefix: str, doubles: int) -> str:
+    """Write the README: the functions, their largest stack (``doubles`` numbers) and number of corrections."""
     return README.format(
-        name=package.prefix,
-        robot=package.prefix.removeprefix("pkm_"),
-        joints=", ".join(package.robot.joint_names),
+        name=prefix,
+        robot=prefix.removeprefix("pkm_"),
+        joints=", ".join(robot.joint_names),
         corrections=f"{CORRECTIONS:,}",
         attempts=len(LADDER),
         turns=MAX_ITERATIONS,
-        stack=largest // 1000 + 3,
-        dynamics="" if package.massive else MASSLESS,
-        payload=PAYLOAD.format(name=package.prefix, macro=package.macro) if package.massive else "",
+        stack=doubles * 8 // 1000 + 3,
+        dynamics="" if robot.has_masses else MASSLESS,
+        payload=PAYLOAD.format(name=prefix, macro=prefix.upper()) if robot.has_masses else "",
     )
