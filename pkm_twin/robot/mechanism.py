@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pkm_twin.codegen.arrays import Array
+from pkm_twin.codegen.expressions import reference
 from pkm_twin.errors import ParameterError, UnknownNameError, unknown_number
 from pkm_twin.kinematics.pose import Coordinate
 from pkm_twin.kinematics.scheme import Start
@@ -290,7 +291,8 @@ class Mechanism(Common):
         if self.drive is None:
             return given
         if given:
-            raise ParameterError("inertia.rotor_inertia", given, "0, because the section drive has the rotor")
+            bound = "no value, fixed or varied, because the section drive has the rotor: drive.inertia"
+            raise ParameterError("inertia.rotor_inertia", reference(given), bound)
         return self.drive.reflected(slides, "drive")
 
     @cached_property

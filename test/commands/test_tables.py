@@ -248,9 +248,9 @@ def test_columns_that_nobody_asked_for_are_left_alone(kind, motion):
     path, joints = Path(f"a.{kind}"), [f"{joint}.position" for joint in robot.joint_names]
     others = {"state": ["RUN"] * len(time), "wheel.position": [math.inf] * len(time)}
     if kind == "parquet":
-        pyarrow = pytest.importorskip("pyarrow")
+        pyarrow, parquet = map(pytest.importorskip, ("pyarrow", "pyarrow.parquet"))
         columns = dict(zip(["time", *joints], [time, *q.T], strict=True)) | others
-        pyarrow.parquet.write_table(pyarrow.table(columns), path)
+        parquet.write_table(pyarrow.table(columns), path)
     else:
         head, *lines = plain(*motion).splitlines()
         more = [",".join(map(str, row)) for row in zip(*others.values(), strict=True)]

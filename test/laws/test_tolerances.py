@@ -9,6 +9,7 @@ import itertools
 import numpy as np
 import pytest
 
+from pkm_twin import variants
 from pkm_twin.certify.description import across
 from pkm_twin.certify.maximal import Maximal, rotation_of
 from pkm_twin.design import drawn, tolerances
@@ -591,5 +592,9 @@ def test_every_number_of_a_file_with_a_drive_is_a_variable(name):
     paths = list(robot.file_numbers())
     assert "inertia.rotor_inertia" not in paths
     assert np.isfinite(FileNumbers(robot, paths, lambda made: made.graph.numbers).slopes).all()
+    if "drive" in data:
+        with pytest.raises(ParameterError, match=r"inertia\.rotor_inertia") as error:
+            variants(robot, {"inertia.rotor_inertia": np.array([0.1, 0.2])})
+        assert isinstance(error.value.value, float)
     part = f"joints.{robot.joint_names[0]}.offset"
     assert tolerances(robot, {part: 1e-5}, robot.graph.home).deviation.any()
