@@ -143,7 +143,9 @@ def _read_table_recording(path: Path, name: str | Robot | None, how: ReadOptions
     if (pose is None and posed) or times is None:
         needed = ", ".join(f"{joint}.position" for joint in joints)
         or_pose = f"; or time, {', '.join(robot.pose_names)}"
-        raise ParameterError(str(path), ", ".join(table), f"columns time, {needed}{or_pose}")
+        raise ParameterError(
+            str(path), ", ".join(table), f"columns time, {needed}{or_pose}; other names: --columns OURS=THEIRS"
+        )
     time, notes, effort, word = read_times(path, times), [], None, how.efforts[0]
     origin = Origin.of_table(table)
     # Beside the terms of a model the efforts are their sum.
