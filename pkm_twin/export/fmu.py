@@ -338,11 +338,20 @@ def write_interface(version: int) -> str:
     The types are those of the standard's headers (fmi-standard.org), so that a binary fits every
     importer, and the sources compile without its headers.
     """
-    call = {
-        2: "c->log(c->environment, c->name, status, category[status], what)",
-        3: "c->log(c->environment, status, category[status], what)",
+    words = {
+        2: {
+            "CALL_LOGGER": "c->log(c->environment, c->name, status, category[status], what)",
+            "FMUSTATE": "FMUstate",
+            "DESERIALIZE": "DeSerializeFMUstate",
+            "DERIVATIVES": "Derivatives",
+        },
+        3: {
+            "CALL_LOGGER": "c->log(c->environment, status, category[status], what)",
+            "FMUSTATE": "FMUState",
+            "DESERIALIZE": "DeserializeFMUState",
+            "DERIVATIVES": "ContinuousStateDerivatives",
+        },
     }
-    shared = read_source("shared").replace("LOGGER\n", read_source(f"logger{version}") + "\n", 1)
     macro = f"""\
 /* Sources that are linked with others are compiled with FMI{version}_FUNCTION_PREFIX=@_; a library
    has the standard's names. */
@@ -352,4 +361,8 @@ def write_interface(version: int) -> str:
 #define FMI(name) fmi{version}##name
 #endif
 """
-    return "\n".join([shared.replace("CALL_LOGGER", call[version]), macro, read_source(f"fmi{version}")])
+    shared = read_source("shared").replace("LOGGER\n", read_source(f"logger{version}") + "\n", 1)
+    text = "\n".join([shared, macro, read_source("functions"), read_source(f"fmi{version}")])
+    for word, spelling in words[version].items():
+        text = text.replace(word, spelling)
+    return text

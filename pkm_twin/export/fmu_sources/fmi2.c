@@ -27,101 +27,6 @@ EXPORT void FMI(FreeInstance)(void *instance)
     free(instance);
 }
 
-EXPORT Status FMI(EnterEventMode)(void *instance)
-{
-    (void)instance;
-    return STATUS_OK;
-}
-
-EXPORT Status FMI(EnterContinuousTimeMode)(void *instance)
-{
-    (void)instance;
-    return STATUS_OK;
-}
-
-EXPORT Status FMI(Terminate)(void *instance)
-{
-    (void)instance;
-    return STATUS_OK;
-}
-
-EXPORT Status FMI(Reset)(void *instance)
-{
-    Instance *c = (Instance *)instance;
-    begin(&c->model);
-    return STATUS_OK;
-}
-
-EXPORT Status FMI(ExitInitializationMode)(void *instance)
-{
-    Instance *c = (Instance *)instance;
-    int changed;
-    return update(c, &changed);
-}
-
-EXPORT Status FMI(SetTime)(void *instance, double time)
-{
-    Instance *c = (Instance *)instance;
-    c->model.v[0] = time;
-    return STATUS_OK;
-}
-
-EXPORT Status FMI(GetNominalsOfContinuousStates)(void *instance, double *values, size_t count)
-{
-    (void)instance;
-    return nominals(values, count);
-}
-
-EXPORT Status FMI(SetContinuousStates)(void *instance, const double *x, size_t count)
-{
-    Instance *c = (Instance *)instance;
-    return set_states(c, x, count);
-}
-
-EXPORT Status FMI(GetContinuousStates)(void *instance, double *x, size_t count)
-{
-    Instance *c = (Instance *)instance;
-    return get_states(c, x, count);
-}
-
-EXPORT Status FMI(GetEventIndicators)(void *instance, double *values, size_t count)
-{
-    Instance *c = (Instance *)instance;
-    return get_indicators(c, values, count);
-}
-
-EXPORT Status FMI(GetFMUstate)(void *instance, void **state)
-{
-    Instance *c = (Instance *)instance;
-    return copy_state(c, state);
-}
-
-EXPORT Status FMI(SetFMUstate)(void *instance, void *state)
-{
-    Instance *c = (Instance *)instance;
-    return restore(c, state, sizeof c->model);
-}
-
-EXPORT Status FMI(FreeFMUstate)(void *instance, void **state)
-{
-    (void)instance;
-    return forget(state);
-}
-
-EXPORT Status FMI(SerializedFMUstateSize)(void *instance, void *state, size_t *size)
-{
-    Instance *c = (Instance *)instance;
-    (void)state;
-    *size = sizeof c->model;
-    return STATUS_OK;
-}
-
-EXPORT Status FMI(SerializeFMUstate)(void *instance, void *state, unsigned char *bytes, size_t size)
-{
-    Instance *c = (Instance *)instance;
-    return save(c, state, bytes, size);
-}
-
 EXPORT Status FMI(SetDebugLogging)(void *instance, int on, size_t count, const char *const *categories)
 {
     (void)instance;
@@ -166,57 +71,12 @@ EXPORT Status FMI(GetInteger)(void *instance, const Reference *vr, size_t count,
     return get_status(c, vr, count, values);
 }
 
-EXPORT Status FMI(GetBoolean)(void *instance, const Reference *vr, size_t count, int *values)
-{
-    Instance *c = (Instance *)instance;
-    (void)vr;
-    (void)values;
-    return unsupported(c, count);
-}
-
-EXPORT Status FMI(GetString)(void *instance, const Reference *vr, size_t count, char * *values)
-{
-    Instance *c = (Instance *)instance;
-    (void)vr;
-    (void)values;
-    return unsupported(c, count);
-}
-
 EXPORT Status FMI(SetInteger)(void *instance, const Reference *vr, size_t count, const int *values)
 {
     Instance *c = (Instance *)instance;
     (void)vr;
     (void)values;
     return unsupported(c, count);
-}
-
-EXPORT Status FMI(SetBoolean)(void *instance, const Reference *vr, size_t count, const int *values)
-{
-    Instance *c = (Instance *)instance;
-    (void)vr;
-    (void)values;
-    return unsupported(c, count);
-}
-
-EXPORT Status FMI(SetString)(void *instance, const Reference *vr, size_t count, const char * *values)
-{
-    Instance *c = (Instance *)instance;
-    (void)vr;
-    (void)values;
-    return unsupported(c, count);
-}
-
-EXPORT Status FMI(DeSerializeFMUstate)(void *instance, const unsigned char *bytes, size_t size, void **state)
-{
-    Instance *c = (Instance *)instance;
-    if (size != sizeof c->model) {
-        return restore(c, NULL, 0);
-    }
-    if (copy_state(c, state) != STATUS_OK) {
-        return STATUS_ERROR;
-    }
-    memcpy(*state, bytes, size);
-    return STATUS_OK;
 }
 
 EXPORT Status FMI(GetDirectionalDerivative)(void *instance, const Reference *unknowns, size_t count, const Reference *knowns, size_t n, const double *seed, double *values)
@@ -245,12 +105,6 @@ EXPORT Status FMI(CompletedIntegratorStep)(void *instance, int kept, int *event_
     *event_mode = 0;
     *terminate = 0;
     return STATUS_OK;
-}
-
-EXPORT Status FMI(GetDerivatives)(void *instance, double *values, size_t count)
-{
-    Instance *c = (Instance *)instance;
-    return get_rates(c, values, count);
 }
 
 EXPORT Status FMI(SetRealInputDerivatives)(void *instance, const Reference *vr, size_t count, const int *orders, const double *values)
@@ -327,3 +181,23 @@ EXPORT Status FMI(GetStringStatus)(void *instance, int kind, const char **value)
     (void)value;
     return unsupported(c, 1);
 }
+
+/* Getter and setter of a type that no variable of the model has. */
+#define NO_VARIABLES(kind, type)                                                                    \
+EXPORT Status FMI(Get##kind)(void *instance, const Reference *vr, size_t count, type *values)       \
+{                                                                                                   \
+    Instance *c = (Instance *)instance;                                                             \
+    (void)vr;                                                                                       \
+    (void)values;                                                                                   \
+    return unsupported(c, count);                                                                   \
+}                                                                                                   \
+EXPORT Status FMI(Set##kind)(void *instance, const Reference *vr, size_t count, const type *values) \
+{                                                                                                   \
+    Instance *c = (Instance *)instance;                                                             \
+    (void)vr;                                                                                       \
+    (void)values;                                                                                   \
+    return unsupported(c, count);                                                                   \
+}
+
+NO_VARIABLES(Boolean, int)
+NO_VARIABLES(String, char *)

@@ -53,101 +53,6 @@ EXPORT void FMI(FreeInstance)(void *instance)
     free(instance);
 }
 
-EXPORT Status FMI(EnterEventMode)(void *instance)
-{
-    (void)instance;
-    return STATUS_OK;
-}
-
-EXPORT Status FMI(EnterContinuousTimeMode)(void *instance)
-{
-    (void)instance;
-    return STATUS_OK;
-}
-
-EXPORT Status FMI(Terminate)(void *instance)
-{
-    (void)instance;
-    return STATUS_OK;
-}
-
-EXPORT Status FMI(Reset)(void *instance)
-{
-    Instance *c = (Instance *)instance;
-    begin(&c->model);
-    return STATUS_OK;
-}
-
-EXPORT Status FMI(ExitInitializationMode)(void *instance)
-{
-    Instance *c = (Instance *)instance;
-    int changed;
-    return update(c, &changed);
-}
-
-EXPORT Status FMI(SetTime)(void *instance, double time)
-{
-    Instance *c = (Instance *)instance;
-    c->model.v[0] = time;
-    return STATUS_OK;
-}
-
-EXPORT Status FMI(GetNominalsOfContinuousStates)(void *instance, double *values, size_t count)
-{
-    (void)instance;
-    return nominals(values, count);
-}
-
-EXPORT Status FMI(SetContinuousStates)(void *instance, const double *x, size_t count)
-{
-    Instance *c = (Instance *)instance;
-    return set_states(c, x, count);
-}
-
-EXPORT Status FMI(GetContinuousStates)(void *instance, double *x, size_t count)
-{
-    Instance *c = (Instance *)instance;
-    return get_states(c, x, count);
-}
-
-EXPORT Status FMI(GetEventIndicators)(void *instance, double *values, size_t count)
-{
-    Instance *c = (Instance *)instance;
-    return get_indicators(c, values, count);
-}
-
-EXPORT Status FMI(GetFMUState)(void *instance, void **state)
-{
-    Instance *c = (Instance *)instance;
-    return copy_state(c, state);
-}
-
-EXPORT Status FMI(SetFMUState)(void *instance, void *state)
-{
-    Instance *c = (Instance *)instance;
-    return restore(c, state, sizeof c->model);
-}
-
-EXPORT Status FMI(FreeFMUState)(void *instance, void **state)
-{
-    (void)instance;
-    return forget(state);
-}
-
-EXPORT Status FMI(SerializedFMUStateSize)(void *instance, void *state, size_t *size)
-{
-    Instance *c = (Instance *)instance;
-    (void)state;
-    *size = sizeof c->model;
-    return STATUS_OK;
-}
-
-EXPORT Status FMI(SerializeFMUState)(void *instance, void *state, unsigned char *bytes, size_t size)
-{
-    Instance *c = (Instance *)instance;
-    return save(c, state, bytes, size);
-}
-
 EXPORT Status FMI(SetDebugLogging)(void *instance, bool on, size_t count, const char *const *categories)
 {
     (void)instance;
@@ -196,186 +101,6 @@ EXPORT Status FMI(GetInt32)(void *instance, const Reference *vr, size_t count, i
 }
 
 EXPORT Status FMI(SetInt32)(void *instance, const Reference *vr, size_t count, const int32_t *values, size_t size)
-{
-    Instance *c = (Instance *)instance;
-    (void)vr;
-    (void)values;
-    (void)size;
-    return unsupported(c, count);
-}
-
-EXPORT Status FMI(GetFloat32)(void *instance, const Reference *vr, size_t count, float *values, size_t size)
-{
-    Instance *c = (Instance *)instance;
-    (void)vr;
-    (void)values;
-    (void)size;
-    return unsupported(c, count);
-}
-
-EXPORT Status FMI(GetInt8)(void *instance, const Reference *vr, size_t count, int8_t *values, size_t size)
-{
-    Instance *c = (Instance *)instance;
-    (void)vr;
-    (void)values;
-    (void)size;
-    return unsupported(c, count);
-}
-
-EXPORT Status FMI(GetUInt8)(void *instance, const Reference *vr, size_t count, uint8_t *values, size_t size)
-{
-    Instance *c = (Instance *)instance;
-    (void)vr;
-    (void)values;
-    (void)size;
-    return unsupported(c, count);
-}
-
-EXPORT Status FMI(GetInt16)(void *instance, const Reference *vr, size_t count, int16_t *values, size_t size)
-{
-    Instance *c = (Instance *)instance;
-    (void)vr;
-    (void)values;
-    (void)size;
-    return unsupported(c, count);
-}
-
-EXPORT Status FMI(GetUInt16)(void *instance, const Reference *vr, size_t count, uint16_t *values, size_t size)
-{
-    Instance *c = (Instance *)instance;
-    (void)vr;
-    (void)values;
-    (void)size;
-    return unsupported(c, count);
-}
-
-EXPORT Status FMI(GetUInt32)(void *instance, const Reference *vr, size_t count, uint32_t *values, size_t size)
-{
-    Instance *c = (Instance *)instance;
-    (void)vr;
-    (void)values;
-    (void)size;
-    return unsupported(c, count);
-}
-
-EXPORT Status FMI(GetInt64)(void *instance, const Reference *vr, size_t count, int64_t *values, size_t size)
-{
-    Instance *c = (Instance *)instance;
-    (void)vr;
-    (void)values;
-    (void)size;
-    return unsupported(c, count);
-}
-
-EXPORT Status FMI(GetUInt64)(void *instance, const Reference *vr, size_t count, uint64_t *values, size_t size)
-{
-    Instance *c = (Instance *)instance;
-    (void)vr;
-    (void)values;
-    (void)size;
-    return unsupported(c, count);
-}
-
-EXPORT Status FMI(GetBoolean)(void *instance, const Reference *vr, size_t count, bool *values, size_t size)
-{
-    Instance *c = (Instance *)instance;
-    (void)vr;
-    (void)values;
-    (void)size;
-    return unsupported(c, count);
-}
-
-EXPORT Status FMI(GetString)(void *instance, const Reference *vr, size_t count, char * *values, size_t size)
-{
-    Instance *c = (Instance *)instance;
-    (void)vr;
-    (void)values;
-    (void)size;
-    return unsupported(c, count);
-}
-
-EXPORT Status FMI(SetFloat32)(void *instance, const Reference *vr, size_t count, const float *values, size_t size)
-{
-    Instance *c = (Instance *)instance;
-    (void)vr;
-    (void)values;
-    (void)size;
-    return unsupported(c, count);
-}
-
-EXPORT Status FMI(SetInt8)(void *instance, const Reference *vr, size_t count, const int8_t *values, size_t size)
-{
-    Instance *c = (Instance *)instance;
-    (void)vr;
-    (void)values;
-    (void)size;
-    return unsupported(c, count);
-}
-
-EXPORT Status FMI(SetUInt8)(void *instance, const Reference *vr, size_t count, const uint8_t *values, size_t size)
-{
-    Instance *c = (Instance *)instance;
-    (void)vr;
-    (void)values;
-    (void)size;
-    return unsupported(c, count);
-}
-
-EXPORT Status FMI(SetInt16)(void *instance, const Reference *vr, size_t count, const int16_t *values, size_t size)
-{
-    Instance *c = (Instance *)instance;
-    (void)vr;
-    (void)values;
-    (void)size;
-    return unsupported(c, count);
-}
-
-EXPORT Status FMI(SetUInt16)(void *instance, const Reference *vr, size_t count, const uint16_t *values, size_t size)
-{
-    Instance *c = (Instance *)instance;
-    (void)vr;
-    (void)values;
-    (void)size;
-    return unsupported(c, count);
-}
-
-EXPORT Status FMI(SetUInt32)(void *instance, const Reference *vr, size_t count, const uint32_t *values, size_t size)
-{
-    Instance *c = (Instance *)instance;
-    (void)vr;
-    (void)values;
-    (void)size;
-    return unsupported(c, count);
-}
-
-EXPORT Status FMI(SetInt64)(void *instance, const Reference *vr, size_t count, const int64_t *values, size_t size)
-{
-    Instance *c = (Instance *)instance;
-    (void)vr;
-    (void)values;
-    (void)size;
-    return unsupported(c, count);
-}
-
-EXPORT Status FMI(SetUInt64)(void *instance, const Reference *vr, size_t count, const uint64_t *values, size_t size)
-{
-    Instance *c = (Instance *)instance;
-    (void)vr;
-    (void)values;
-    (void)size;
-    return unsupported(c, count);
-}
-
-EXPORT Status FMI(SetBoolean)(void *instance, const Reference *vr, size_t count, const bool *values, size_t size)
-{
-    Instance *c = (Instance *)instance;
-    (void)vr;
-    (void)values;
-    (void)size;
-    return unsupported(c, count);
-}
-
-EXPORT Status FMI(SetString)(void *instance, const Reference *vr, size_t count, const char * *values, size_t size)
 {
     Instance *c = (Instance *)instance;
     (void)vr;
@@ -438,19 +163,6 @@ EXPORT Status FMI(GetVariableDependencies)(void *instance, Reference vr, size_t 
     (void)kinds;
     (void)count;
     return unsupported(c, 1);
-}
-
-EXPORT Status FMI(DeserializeFMUState)(void *instance, const unsigned char *bytes, size_t size, void **state)
-{
-    Instance *c = (Instance *)instance;
-    if (size != sizeof c->model) {
-        return restore(c, NULL, 0);
-    }
-    if (copy_state(c, state) != STATUS_OK) {
-        return STATUS_ERROR;
-    }
-    memcpy(*state, bytes, size);
-    return STATUS_OK;
 }
 
 EXPORT Status FMI(GetDirectionalDerivative)(void *instance, const Reference *unknowns, size_t count, const Reference *knowns, size_t n, const double *seed, size_t seeds, double *values, size_t size)
@@ -589,12 +301,6 @@ EXPORT Status FMI(CompletedIntegratorStep)(void *instance, bool kept, bool *even
     return STATUS_OK;
 }
 
-EXPORT Status FMI(GetContinuousStateDerivatives)(void *instance, double *values, size_t count)
-{
-    Instance *c = (Instance *)instance;
-    return get_rates(c, values, count);
-}
-
 EXPORT Status FMI(GetNumberOfEventIndicators)(void *instance, size_t *count)
 {
     (void)instance;
@@ -642,3 +348,33 @@ EXPORT Status FMI(ActivateModelPartition)(void *instance, Reference clock, doubl
     (void)time;
     return unsupported(c, 1);
 }
+
+/* Getter and setter of a type that no variable of the model has. */
+#define NO_VARIABLES(kind, type)                                                                                 \
+EXPORT Status FMI(Get##kind)(void *instance, const Reference *vr, size_t count, type *values, size_t size)       \
+{                                                                                                                \
+    Instance *c = (Instance *)instance;                                                                          \
+    (void)vr;                                                                                                    \
+    (void)values;                                                                                                \
+    (void)size;                                                                                                  \
+    return unsupported(c, count);                                                                                \
+}                                                                                                                \
+EXPORT Status FMI(Set##kind)(void *instance, const Reference *vr, size_t count, const type *values, size_t size) \
+{                                                                                                                \
+    Instance *c = (Instance *)instance;                                                                          \
+    (void)vr;                                                                                                    \
+    (void)values;                                                                                                \
+    (void)size;                                                                                                  \
+    return unsupported(c, count);                                                                                \
+}
+
+NO_VARIABLES(Float32, float)
+NO_VARIABLES(Int8, int8_t)
+NO_VARIABLES(UInt8, uint8_t)
+NO_VARIABLES(Int16, int16_t)
+NO_VARIABLES(UInt16, uint16_t)
+NO_VARIABLES(UInt32, uint32_t)
+NO_VARIABLES(Int64, int64_t)
+NO_VARIABLES(UInt64, uint64_t)
+NO_VARIABLES(Boolean, bool)
+NO_VARIABLES(String, char *)
