@@ -125,7 +125,7 @@ class SparseLU:
         self.inverse_pivots: dict[int, Any] = {row: inverse for row, _, inverse in self._pivots}
         """Reciprocals of the pivots, by their rows."""
         self.used = False
-        """Whether a system has been solved."""
+        """True if a system has been solved with the factors."""
         self.inverse_determinant: Any = sign
         """Reciprocal of the determinant."""
         for _, _, inverse in self._pivots:

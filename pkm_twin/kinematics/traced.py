@@ -148,12 +148,14 @@ class Traced:
             more["goal"] = self.lift(self.drives.given("q"))
             more["branch"] = [*more.pop("branch", ()), *self.lift(self.drives.tolerance_margins())]
         scheme, tree = self.scheme, self.tree
-        branch = self.margins
-        whole = self.lu, [self.rows[k] for k in scheme.independent], scheme.varying
-        for lu, own, rates in (whole, (self.newton, self.solved, scheme.solved[1]))[: 2 if self.limbs else 1]:
+        branch = list(self.margins)
+        systems = [(self.lu, [self.rows[k] for k in scheme.independent], scheme.varying)]
+        if self.limbs:
+            systems.append((self.newton, self.solved, scheme.solved[1]))
+        for lu, own, columns in systems:
             # Results depend on factors that are used before, not corrections alone.
             if lu.used:
-                branch = branch + self.limit_growth(lu, [row.scale for row in own], [tree.scales[k] for k in rates])
+                branch += self.limit_growth(lu, [row.scale for row in own], [tree.scales[k] for k in columns])
         determinant = self.determinant
         places, rates = scheme.solved if scheme.platform_pivots is None else ([], [])
         step: Numbers = -self.newton.solve([row.value for row in self.solved]) if places else []
