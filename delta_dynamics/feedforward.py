@@ -23,7 +23,7 @@ from pkm_twin.robot.effort_limits import NON_FINITE, EffortLimits, LimitedEffort
 from pkm_twin.robot.limits import first_beyond
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import passing_singularity
-from pkm_twin.settings import COUNT, FUTURE, LATE, SECONDS, SHARE, ZERO_STAMP, setting
+from pkm_twin.settings import AGE_BOUNDS, COUNT_BOUNDS, FRACTION_BOUNDS, FUTURE, SECONDS, ZERO_STAMP, setting
 from pkm_twin.streams.base_motion import BaseImu
 from pkm_twin.streams.continuity import Continuity
 from pkm_twin.streams.differentiator import Differentiator
@@ -67,12 +67,12 @@ class Settings:
         0.1,
         "largest age of a joint state, and longest gap before the stream stops; also lifespan and "
         "deadline of published torques, so at most command_gate's deadline",
-        **LATE,
+        **AGE_BOUNDS,
     )
     future_tolerance: float = setting(0.1, FUTURE, **SECONDS)
     accept_zero_stamp: bool = setting(False, ZERO_STAMP)
-    trip_count: int = setting(5, "rejected joint states in a row that stop the stream", **COUNT)
-    recovery_count: int = setting(5, "accepted joint states in a row that restart it", **COUNT)
+    trip_count: int = setting(5, "rejected joint states in a row that stop the stream", **COUNT_BOUNDS)
+    recovery_count: int = setting(5, "accepted joint states in a row that restart it", **COUNT_BOUNDS)
     extra_joints: ExtraJoints = setting(
         "refuse",
         "joints of a trajectory that the model does not have: reject the trajectory, or give them zero effort",
@@ -85,8 +85,8 @@ class Settings:
         "stale_after or the effort exceeds effort_limits); with publish_commands not nothing",
         choices=("nothing", "zeros", "gravity"),
     )
-    singularity_warn: float = setting(0.05, "warn below this singularity index", **SHARE)
-    singularity_stop: float = setting(0.01, "stop below this singularity index", **SHARE)
+    singularity_warn: float = setting(0.05, "warn below this singularity index", **FRACTION_BOUNDS)
+    singularity_stop: float = setting(0.01, "stop below this singularity index", **FRACTION_BOUNDS)
 
     def __post_init__(self) -> None:
         if not self.singularity_stop <= self.singularity_warn:
@@ -116,7 +116,7 @@ class Torques(NamedTuple):
     """Efforts for one joint state; ``measured``: those of the sensors, None without.
 
     ``wrench``: the external wrench in these efforts, base axes at the platform's reference point,
-    shape (6,). ``doubt``: error bounds of the rates, shape (n,), None if they are not needed.
+    shape (6,). ``rate_error``: error bounds of the rates, shape (n,), None if they are not needed.
     ``memory``: the part of ``effort`` that friction with memory adds, shape (n,); 0 without.
     """
 
@@ -130,7 +130,7 @@ class Torques(NamedTuple):
     measured: Array | None
     saturated: bool
     wrench: Array | None = None
-    doubt: Array | None = None
+    rate_error: Array | None = None
     memory: Array | float = 0.0
 
     @property
@@ -190,7 +190,7 @@ class Feedforward(Core):
         self._continuity.robot = robot
 
     def change_settings(self, settings: Settings) -> None:
-        """Answer by other settings from the next sample on."""
+        """Use other settings from the next sample on."""
         before, self.settings = self.settings, settings
         self.stream.trip_count = settings.trip_count
         self.stream.recovery_count = settings.recovery_count
@@ -282,8 +282,8 @@ class Feedforward(Core):
             qdd = np.gradient(qd, t.times, axis=0, edge_order=2) if t.qdd is None else t.qdd
             reader.check_derived(qd, qdd)
             if t.qd is None and self._reach.any():
-                doubt = velocity_error_bound(t.times, t.q, gradient_gain(t.times))
-                qd = zero_resting_rates(qd, np.abs(qd) <= doubt, self._reach)
+                rate_error = velocity_error_bound(t.times, t.q, gradient_gain(t.times))
+                qd = zero_resting_rates(qd, np.abs(qd) <= rate_error, self._reach)
             efforts = np.empty_like(t.q)
             saturated = False
             for first in range(0, len(t.q), SLICE):
@@ -416,9 +416,9 @@ class Feedforward(Core):
             raise
         try:
             rates = self._differentiate(sample)
-            doubt = None
+            rate_error = None
             if self.uncertain or self._reach.any():
-                doubt = self._rest.push(sample.stamp, sample.q, sample.qd, None if rates is None else rates[0])
+                rate_error = self._rest.push(sample.stamp, sample.q, sample.qd, None if rates is None else rates[0])
             measured, external = sample.effort, None
             if self.wrenches is not None:
                 self.wrenches.push(sample, self.robot.platform(sample.q)[1], wrench)
@@ -426,7 +426,7 @@ class Feedforward(Core):
                 self._reader.check_derived(*rates)
                 if self.wrenches is not None:
                     external, measured = self.wrenches.through()
-                motion, sure, change = as_message_error(self._resolve_motion, sample, rates, doubt)
+                motion, sure, change = as_message_error(self._resolve_motion, sample, rates, rate_error)
                 solved = as_message_error(inverse_dynamics, self.robot, sample.q, sure, change, external, base)
                 memory, added = self._add_friction_memory(sample.q, sure)
                 controller, effort = self.robot.controller, solved + added
@@ -450,7 +450,7 @@ class Feedforward(Core):
         if rates is None:
             return None
         self._last_good, self._memory = sample.q, memory
-        return Torques(sample.stamp, motion, effort, sent, measured, saturated, external, doubt, added)
+        return Torques(sample.stamp, motion, effort, sent, measured, saturated, external, rate_error, added)
 
     def _add_friction_memory(self, q: Array, rates: Array) -> tuple[Memory | None, Array | float]:
         """Return friction's memory after a sample, and its part of the efforts, (n,)."""
@@ -462,7 +462,7 @@ class Feedforward(Core):
         return memory, Dahl.beyond(friction, memory.z, rates)
 
     def _resolve_motion(
-        self, sample: JointSample, rates: tuple[Array, Array], doubt: Array | None
+        self, sample: JointSample, rates: tuple[Array, Array], rate_error: Array | None
     ) -> tuple[tuple[Array, Array, Array], Array, Array]:
         """Return the measured motion, and the rates and accelerations to compute efforts for.
 
@@ -472,8 +472,8 @@ class Feedforward(Core):
         rate, change = nearest_motion(self.robot, sample.q, *rates)
         motion = sample.q, rate, change
         sure = rate if sample.qd is None else rates[0]
-        if doubt is not None:
-            sure = zero_resting_rates(sure, np.abs(sure) <= doubt, self._reach)
+        if rate_error is not None:
+            sure = zero_resting_rates(sure, np.abs(sure) <= rate_error, self._reach)
         if self.robot.redundant:
             _, own, change = self.robot.project_redundant(sample.q, sure, change)
             sure = own if sample.qd is None else sure

@@ -16,7 +16,7 @@ from pkm_twin.messages.reading import JointReader
 from pkm_twin.messages.stamps import SECOND, StampRules
 from pkm_twin.robot.effort_limits import EffortLimits, LimitedEfforts
 from pkm_twin.robot.robot import Robot
-from pkm_twin.settings import COUNT, FUTURE, LATE, SECONDS, setting
+from pkm_twin.settings import AGE_BOUNDS, COUNT_BOUNDS, FUTURE, SECONDS, setting
 from pkm_twin.streams.monitor import Core, StreamMonitor, counting
 from pkm_twin.streams.wrench import check_order
 
@@ -38,11 +38,11 @@ class GateSettings:
         0.1,
         "largest age of a torque, and longest gap between torques, checked four times per "
         "deadline; stale_after of delta_dynamics must not exceed it",
-        **LATE,
+        **AGE_BOUNDS,
     )
     future_tolerance: float = setting(0.1, FUTURE, **SECONDS)
-    trip_count: int = setting(1, "rejected torques in a row that close the gate", **COUNT)
-    recovery_count: int = setting(5, "accepted torques in a row that open the gate", **COUNT)
+    trip_count: int = setting(1, "rejected torques in a row that close the gate", **COUNT_BOUNDS)
+    recovery_count: int = setting(5, "accepted torques in a row that open the gate", **COUNT_BOUNDS)
 
 
 @dataclass

@@ -47,7 +47,7 @@ class FileError(ParameterError):
         self.args = (one_line(f"{path}: {text}", 2000),)
 
 
-MOST_NAMES: Final = 60
+MAX_NAMES: Final = 60
 """Most valid names that an error lists; of more names it lists the closest."""
 
 
@@ -62,7 +62,7 @@ class UnknownNameError(ParameterError):
         match = difflib.get_close_matches(str(name), names, n=1, cutoff=0.5)
         self.closest: str | None = match[0] if match else None
         shown, more = names, ""
-        if len(names) > MOST_NAMES:
+        if len(names) > MAX_NAMES:
             shown = difflib.get_close_matches(str(name), names, n=5, cutoff=0.0)
             more = f" or {len(names) - len(shown)} others"
         super().__init__(field, name, f"one of {', '.join(shown)}{more}")

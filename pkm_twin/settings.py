@@ -81,10 +81,10 @@ class Setting:
 
 
 SECONDS: Final[Mapping[str, Any]] = {"unit": "s", "low": 0.0, "high": 3600.0}
-LATE: Final[Mapping[str, Any]] = {**SECONDS, "low": 1e-3}
-COUNT: Final[Mapping[str, Any]] = {"low": 1, "high": 10**6}
-SHARE: Final[Mapping[str, Any]] = {"low": 0.0, "high": 1.0}
-LARGE: Final[Mapping[str, Any]] = {"low": 0.0, "high": 1e9}
+AGE_BOUNDS: Final[Mapping[str, Any]] = {**SECONDS, "low": 1e-3}
+COUNT_BOUNDS: Final[Mapping[str, Any]] = {"low": 1, "high": 10**6}
+FRACTION_BOUNDS: Final[Mapping[str, Any]] = {"low": 0.0, "high": 1.0}
+SCALE_BOUNDS: Final[Mapping[str, Any]] = {"low": 0.0, "high": 1e9}
 """Bounds of settings of one kind."""
 FUTURE: Final = "how far time stamps may be ahead of the clock"
 ZERO_STAMP: Final = "accept a zero stamp, as the arrival time"

@@ -129,7 +129,7 @@ def _solve_least_norm(matrix: Array, target: Array, best: Array) -> tuple[Array,
     """
     u, values, vt = np.linalg.svd(matrix, full_matrices=False)
     greatest = np.linalg.svd(best, compute_uv=False)[..., :1]
-    # Directions that the joints hardly move would cost offsets of fifty times the deflection.
+    # Below a ratio of 0.02 a direction would need joint offsets of fifty times the deflection.
     held = values > 0.02 * greatest
     along = np.where(held, _multiply(u.swapaxes(-1, -2), target) / np.where(held, values, 1.0), 0.0)
     kept = np.where(held[..., None], vt, 0.0)

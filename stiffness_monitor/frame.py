@@ -106,7 +106,7 @@ def deformations(length: Any, stretch: Any, twist: Any, bend: Any, shear: Any) -
 
 
 def bending_shape(share: float, length: Any, phi: Any) -> tuple[tuple[Any, Any], tuple[Any, Any]]:
-    """Return a beam's deflection and rotation relative to its chord, for circle and S."""
+    """Return a beam's deflection and rotation from its chord, for symmetric and S-shaped bending."""
     arc, bow = 0.5 * share * (1.0 - share), 1.0 / (1.0 + phi)
     across = -arc * length, arc * (1.0 - 2.0 * share) * length * bow
     return across, (share - 0.5, 0.5 - 6.0 * arc * bow)
@@ -138,7 +138,7 @@ class Frame:
                 self._add_member(part)
         self.last = self.size
         for closure in model.closures:
-            # The joint lets the second body move against the first one; other directions stay closed.
+            # The joint's free directions become coordinates; the other directions are constrained.
             support = closure.support
             first = self._point_on_body(*closure.inner, closure.at)
             second = self._point_on_body(support.body, support.end, closure.at)

@@ -44,7 +44,7 @@ def substitute_numbers(structure: Structure, graph: Graph, numbers: Numbers) -> 
         values = np.empty(3, dtype=object)
         values[:] = [next(left) for _ in range(3)]
         k = _find_point(places, values)
-        # On a free tape the end is a number of its own: it may be differentiated by.
+        # A free tape has each end as an input of its own, so that derivatives by it exist.
         if k is not None and not values[0].tape.free:
             for known, value in zip(places[k], values, strict=True):
                 snapped(value - known)

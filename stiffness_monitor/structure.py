@@ -223,24 +223,24 @@ def place_plan(
     :param section: of a beam by its name. ``compliance``: of a joint by its name and entry.
     """
 
-    def stood(support: Support, own: Any = None) -> Support:
+    def place_support(support: Support, own: Any = None) -> Support:
         values = (v if isinstance(v, float) else compliance(*v) for v in support.compliance)
         axes = own if support.axes is None else _joint_axes(support.axes, turn)
         at = None if support.at is None else place(*support.at)
         return replace(support, axes=axes, compliance=tuple(values), at=at)
 
-    def as_part(part: Member | Carried) -> Member | Carried:
+    def place_part(part: Member | Carried) -> Member | Carried:
         if isinstance(part, Carried):
-            return replace(part, at=place(*part.at), support=stood(part.support))
+            return replace(part, at=place(*part.at), support=place_support(part.support))
         made = replace(part, start=place(*part.start), end=place(*part.end), section=section(part.section))
-        outer = None if made.outer is None else stood(made.outer, made.axes)
-        return replace(made, inner=stood(made.inner, made.axes), outer=outer)
+        outer = None if made.outer is None else place_support(made.outer, made.axes)
+        return replace(made, inner=place_support(made.inner, made.axes), outer=outer)
 
     return replace(
         plan,
         origin=place(*plan.origin),
-        parts=tuple(as_part(part) for part in plan.parts),
-        closures=tuple(replace(c, at=place(*c.at), support=stood(c.support)) for c in plan.closures),
+        parts=tuple(place_part(part) for part in plan.parts),
+        closures=tuple(replace(c, at=place(*c.at), support=place_support(c.support)) for c in plan.closures),
     )
 
 
@@ -349,7 +349,7 @@ class _Planner:
     def _member_support(self, joint: Joint, body: str, end: tuple[str, Array]) -> Support:
         """Return the support of a member's end by a joint, which may be away from that end."""
         lever = joint.at - end[1]
-        # On a free tape either place may be differentiated by.
+        # A free tape has both positions as inputs, so that derivatives by either exist.
         apart = getattr(getattr(lever[0], "tape", None), "free", False)
         if not joint.type.placed or not (apart or np.abs(references(lever)).max() >= SNAP):
             return self._joint_support(joint, body, end[1])

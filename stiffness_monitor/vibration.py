@@ -77,7 +77,7 @@ class ToolModes:
         tried = np.concatenate([grid, peaks[(peaks >= grid[0]) & (peaks <= grid[-1])]])
         _, size, ways = np.linalg.svd(self.receptance(tried)[:, :3, :3])
         k = int(size[:, 0].argmax())
-        # A complex vector is that of a straight direction up to its phase.
+        # Remove the common phase of the complex vector: a direction is real.
         way = ways[k, 0] / np.exp(1j * np.angle(ways[k, 0][np.abs(ways[k, 0]).argmax()]))
         return float(tried[k]), float(size[k, 0]), np.asarray(way.real)
 

@@ -154,7 +154,7 @@ class Contact:
     place: ContactPlace | None = None
 
 
-class Drag:
+class FrictionLearner:
     """Estimate friction that the model lacks: effort that opposes a joint in both directions.
 
     A contact opposes motion in one direction only, so that friction is learnt all the time, also
@@ -167,7 +167,7 @@ class Drag:
     def __init__(self, joints: int) -> None:
         # By joint and direction, [backwards, forwards]: the mean, and the time of the motion.
         self._known = [[[0.0, 0.0], [0.0, 0.0]] for _ in range(joints)]
-        # Up to the last sample without contact.
+        # The same means at the last sample without contact.
         self._alone = [[0.0, 0.0] for _ in range(joints)]
 
     def learn(self, step: float, external: Array, qd: Array, *, touching: bool = False) -> Array:
@@ -200,7 +200,7 @@ class ContactMonitor:
 
     The bound is ``sigmas`` standard deviations: those of the model's efforts, from the robot's file
     or :meth:`.EffortParts.default_deviation`, and the noise of the estimate without contact.
-    Friction at rest (:class:`Drag`) and the effect of the rates' uncertainty on the momentum are
+    Friction at rest (:class:`FrictionLearner`) and the effect of the rates' uncertainty on the momentum are
     added. All parts except the noise pass the observer's low-pass filter, so that the bound has the
     same delay as the estimate.
     """
@@ -232,7 +232,7 @@ class ContactMonitor:
         self._touching, self._since = False, 0.0
         self._place: ContactPlace | None = None
         self._placed = 0.0
-        self._drag = Drag(n)
+        self._learner = FrictionLearner(n)
 
     def change_robot(self, robot: Robot) -> None:
         """Use a robot with another payload, gravity or friction."""
@@ -249,7 +249,7 @@ class ContactMonitor:
         motion: tuple[Array, Array, Array],
         effort: Array,
         wrench: Array | None = None,
-        doubt: Array | None = None,
+        rate_error: Array | None = None,
     ) -> Contact | None:
         """Add a sample; return the contact state, or None until the noise is known.
 
@@ -258,7 +258,7 @@ class ContactMonitor:
             model alone.
         :param effort: measured, shape (n,).
         :param wrench: on the platform, known otherwise, base axes at its reference point, (6,).
-        :param doubt: error bounds of the rates, (n,); by default from their own noise.
+        :param rate_error: error bounds of the rates, (n,); by default from their own noise.
         :raises ValueError: a sample that is not later than the last one, has another shape or is
             not finite; it moves nothing, nor does one without an assembly.
         """
@@ -266,9 +266,9 @@ class ContactMonitor:
         time = later(time, last)
         q, qd, qdd, effort = (one_vector(v, n, "a sample") for v in (*motion, effort))
         mass = mass_matrix(self.robot, q)
-        if doubt is None:
-            doubt = self._rest.push(round(time * SECOND), q, qd, qd)
-        still = np.abs(qd) <= doubt
+        if rate_error is None:
+            rate_error = self._rest.push(round(time * SECOND), q, qd, qd)
+        still = np.abs(qd) <= rate_error
         sure = zero_resting_rates(qd, still, self._reach + self._share.share)
         effort, holds = self._share.remove(q, sure, effort)
         parts = effort_parts(self.robot, q, sure, qdd, wrench, mass)
@@ -292,15 +292,15 @@ class ContactMonitor:
                 # The brake has taken the weight; there was no contact.
                 self._touching = False
             return self._verdict(q, external, idle)
-        drag = self._drag.learn(step, external, np.where(still, 0.0, qd), touching=self._touching)
+        learnt = self._learner.learn(step, external, np.where(still, 0.0, qd), touching=self._touching)
         # The learnt friction is bounded: a larger opposing effort is a contact.
-        friction = np.minimum(drag, 0.2 * self._greatest) + np.where(still, self._reach + holds, 0.0)
+        friction = np.minimum(learnt, 0.2 * self._greatest) + np.where(still, self._reach + holds, 0.0)
         # Uncertainties pass the observer's filter, as the estimate does.
         deviation = parts.default_deviation(self._greatest)
         if self.stated:
             deviation = torque_deviation(self.robot, q, sure, qdd, wrench)
         part, self._friction = self.observer.bandwidth * step, friction
-        self._impulse = self.observer.bandwidth * np.abs(mass) @ doubt
+        self._impulse = self.observer.bandwidth * np.abs(mass) @ rate_error
         slack = friction + self.observer.jump + self._impulse
         self._unsure = (self._unsure + part * deviation) / (1.0 + part)
         self._slack = (self._slack + part * slack) / (1.0 + part)

@@ -147,7 +147,7 @@ class Places:
                 self.parts.append(part)
         self._body, self._arm = map(np.array, zip(*ends, strict=True))
         self._bar = np.array([k for k, _ in mix])
-        # Each place as a mean of its bar's two ends.
+        # Each candidate position is a weighted mean of its bar's two ends.
         self._mix = np.zeros((len(ends), len(mix)))
         for i, (k, s) in enumerate(mix):
             self._mix[2 * k : 2 * k + 2, i] = 1.0 - s, s
@@ -222,7 +222,7 @@ class ContactLocator:
 
     def __init__(self, robot: Robot) -> None:
         self.places = Places(robot)
-        # Thin bars pass little of a force along them on.
+        # A contact force on a thin bar is mostly across it: along it only friction acts.
         self._slim = np.where(self.places.thin, 1.0 - CONTACT_FRICTION, 0.0)
         self.reset()
 
@@ -277,7 +277,7 @@ class ContactLocator:
         whole = np.sqrt(((jacobian * sure[:, None, None]) ** 2).sum((0, 1)))
         felt = whole[whole > 0.0]
         self._force = 1.0 / float(np.median(felt)) if len(felt) else math.inf
-        # Efforts that no place explains: any of the sizes that others have.
+        # Unknown contacts: efforts of any size that known contacts can cause.
         self._usual = self._force * np.sqrt(np.mean(jacobian**2, (1, 2)))
         a, b = self.places.pairs
         apart = self._at[a] - self._at[b]
@@ -295,7 +295,7 @@ class ContactLocator:
         if self._sums is None:
             return None
         if not np.isfinite(np.concatenate([self._sums, self._usual, self._at.ravel()])).all():
-            # Sums that are not finite would remain so.
+            # Sums that are not finite cannot recover.
             self.reset()
             return None
         found = self._found(self._sums)
@@ -305,7 +305,7 @@ class ContactLocator:
     def _found(self, sums: Array) -> ContactPlace:
         """Return the estimate from finite sums; not finite only beyond the range of doubles."""
         n, count, pairs = len(self._usual), len(self._at), len(self._couple)
-        # Errors of the model last: more samples show more directions, none of them more exactly.
+        # Model errors persist: more samples add directions, not accuracy in one direction.
         sums = sums / max(sums[0] / n, 1.0)
         counted, square = sums[:2]
         ends = 2 + 12 * count

@@ -120,14 +120,14 @@ class PayloadEstimator:
         qdd: Array,
         effort: Array,
         wrench: Array | None = None,
-        doubt: Array | None = None,
+        rate_error: Array | None = None,
     ) -> PayloadEstimate | None:
         """Add a sample; return None for the first one, and while efforts are uninformative.
 
         :param time: of the sample, s, later than the last one's.
         :param q: joint positions (n,), with rates, accelerations and measured efforts (n,).
         :param wrench: on the platform at its reference point, base axes, (6,), where it is known.
-        :param doubt: error bounds of the rates, (n,); by default from their own noise.
+        :param rate_error: error bounds of the rates, (n,); by default from their own noise.
         :raises ValueError: a sample that is not later than the last one, has another shape or is
             not finite; it moves nothing, nor does one without an assembly.
         """
@@ -136,9 +136,9 @@ class PayloadEstimator:
         q, qd, qdd, effort = (one_vector(v, n, "a sample") for v in (q, qd, qdd, effort))
         held = inverse_dynamics(self.robot, q, 0.0 * q, 0.0 * q, wrench)
         self._last = time
-        if doubt is None:
-            doubt = self._rest.push(round(time * SECOND), q, qd, qd)
-        still = np.abs(qd) <= doubt
+        if rate_error is None:
+            rate_error = self._rest.push(round(time * SECOND), q, qd, qd)
+        still = np.abs(qd) <= rate_error
         was_idle = self.drives.idle
         idle = self.drives.push(time, still, effort, held)
         if idle and not was_idle:

@@ -124,12 +124,16 @@ class Estimates:
             self.reset()
         self._last = torques.stamp
         if self._contact is not None:
-            found = self._contact.push(torques.stamp / SECOND, torques.motion, effort, torques.wrench, torques.doubt)
+            found = self._contact.push(
+                torques.stamp / SECOND, torques.motion, effort, torques.wrench, torques.rate_error
+            )
             if found is not None:
                 self._publish_contact(torques.stamp, found)
         if self._payload is not None and self._pace.due(torques.stamp):
             self._pace.answered(torques.stamp)
-            load = self._payload.push(torques.stamp / SECOND, *torques.motion, effort, torques.wrench, torques.doubt)
+            load = self._payload.push(
+                torques.stamp / SECOND, *torques.motion, effort, torques.wrench, torques.rate_error
+            )
             if load is not None:
                 own = header(torques.stamp, self._frames[1])
                 for publisher, mass, com in (

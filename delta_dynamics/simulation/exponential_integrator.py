@@ -22,7 +22,7 @@ from pkm_twin.codegen.arrays import Array
 class Stepper:
     """Apply the method for one span of time.
 
-    :param weights: see :func:`_damped`; matrices, shape (11, n, n), where something is damped.
+    :param weights: see :func:`_damped_weights`; matrices, shape (11, n, n), where something is damped.
     :param damping: shape (n, n), 1/s; None: none.
     """
 
@@ -58,32 +58,32 @@ class Stepper:
 
 
 @lru_cache(64)
-def undamped(span: float) -> Stepper:
+def make_undamped_stepper(span: float) -> Stepper:
     """Return the classical method of order four."""
-    return Stepper(_undamped(span))
+    return Stepper(_undamped_weights(span))
 
 
-def damped(span: float, modes: Array, back: Array, decays: Array) -> Stepper:
-    """Return the method that is exact in a damping.
+def make_damped_stepper(span: float, modes: Array, back: Array, decays: Array) -> Stepper:
+    """Return the method of order four that integrates viscous damping exactly.
 
     :param modes: of the damping, columns, shape (n, r); other directions are undamped.
     :param back: from rates to modes, shape (r, n).
     :param decays: of the modes, 1/s, shape (r,).
     """
-    plain = np.array(_undamped(span))
-    deltas = _damped(span, decays) - plain[:, None]
+    plain = np.array(_undamped_weights(span))
+    deltas = _damped_weights(span, decays) - plain[:, None]
     weights = plain[:, None, None] * np.eye(len(modes)) + (modes * deltas[:, None, :]) @ back
     return Stepper(weights, (modes * decays) @ back)
 
 
-def _undamped(h: float) -> list[float]:
-    """Return the weights of :func:`_damped` without damping."""
+def _undamped_weights(h: float) -> list[float]:
+    """Return the weights of :func:`_damped_weights` without damping."""
     sixth = h / 6.0
     return [1.0, 0.5 * h, h * h / 8.0, 1.0, h, sixth, 2.0 * sixth, sixth, h * sixth, h * sixth, 0.0]
 
 
-def _damped(h: float, decays: Array) -> Array:
-    """Return the weights by mode, shape (11, r).
+def _damped_weights(h: float, decays: Array) -> Array:
+    """Return the method's weights for each damped mode, shape (11, r).
 
     For half a span: velocity by velocity, position by velocity (also velocity by acceleration),
     position by acceleration. For the whole span: velocity by velocity, position by velocity. Then

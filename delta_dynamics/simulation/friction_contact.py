@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv  # type: ignore[import-untyped]
 
-from delta_dynamics.simulation.exponential_integrator import Stepper, damped, undamped
+from delta_dynamics.simulation.exponential_integrator import Stepper, make_damped_stepper, make_undamped_stepper
 from delta_dynamics.torques.equations import Equations, Terms
 from pkm_twin.codegen.arrays import Array, Indices, Mask
 from pkm_twin.machine.friction import Memory, bounds, friction_values, parts, potential
@@ -155,7 +155,7 @@ class Resistance:
         self._passive = bool(passive)
         self._dry = np.array([*friction.coulomb, *(joint.coulomb for joint in passive)])
         self._laws, self._numbers = robot.laws, friction_values(robot.laws, robot.friction)
-        # With memory it holds like a spring, and no joint sticks by it.
+        # Friction with memory acts like a spring at rest, so no joint sticks by it.
         self._distance = np.array(friction.presliding)
         self._level = np.where(self._distance > 0.0, friction.coulomb, 0.0)
         self._dry[:n] -= self._level
@@ -195,7 +195,7 @@ class Resistance:
         return before.after(q[None], np.sign(q - before.q), self._distance).last
 
     def store_memory(self, here: Terms) -> None:
-        """Store the friction memory at a part's end."""
+        """Store the friction memory at the end of a part of the step."""
         if self._level.any():
             self.memory = self._move_memory(here.q)
 
@@ -221,8 +221,8 @@ class Resistance:
         """Return the velocities of all rows by joint velocities, shape (n + k, n)."""
         return np.concatenate([self._drives, here.rows]) if self._passive else self._drives
 
-    def arrive(self, q: Array, qd: Array) -> Terms:
-        """Return the terms of a new state, after an impact if there is one."""
+    def enter_state(self, q: Array, qd: Array) -> Terms:
+        """Return the terms of a new state, after the impact of joints that reach their stops."""
         return self._apply_impact(self._classify_rows(self.at(q, qd)))
 
     def _classify_rows(self, here: Terms) -> Terms:
@@ -343,20 +343,20 @@ class Resistance:
     def stepper(self, here: Terms, law: Law, span: float) -> Stepper:
         """Return the integrator of a part of a step, with the viscous friction at its start."""
         if not self._damped:
-            return undamped(span)
+            return make_undamped_stepper(span)
         damping = self._damping(here)
         # A decay below a tenth is no stiffness for the classical method.
         if span * dposv(here.mass, damping)[1].trace() < 0.1:
-            return undamped(span)
+            return make_undamped_stepper(span)
         free = self._drives
         if len(law.held):
-            # Rates that the held rows leave.
+            # Joint velocities that the held rows allow.
             free = np.linalg.svd(self.rows(here)[law.held])[2][len(law.held) :].T
             free[law.held[law.held < len(free)]] = 0.0
         root = np.linalg.inv(np.linalg.cholesky(free.T @ here.mass @ free))
         decays, turned = np.linalg.eigh(root @ (free.T @ damping @ free) @ root.T)
         modes = free @ root.T @ turned
-        return damped(span, modes, modes.T @ here.mass, np.maximum(decays, 0.0))
+        return make_damped_stepper(span, modes, modes.T @ here.mass, np.maximum(decays, 0.0))
 
     def _damping(self, here: Terms) -> Array:
         """Return the viscous friction of all joints by joint velocities, shape (n, n)."""

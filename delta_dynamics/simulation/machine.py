@@ -123,10 +123,10 @@ def stable_share(robot: Robot, settings: MachineSettings) -> float:
     """
     q = np.vstack([settings.start, random_joints(robot, np.random.default_rng(0), 64)])
     inertias = []
-    follow = robot.following(q)
+    follow = robot.drive_jacobian(q)
     for event in settings.payloads or (None,):
         loaded = robot if event is None else robot.changed(payload=event.load)
-        inertia = mass_matrix(loaded.led, q[:, robot.graph.leading])
+        inertia = mass_matrix(loaded.leading_machine, q[:, robot.graph.leading])
         gains = settings.damping + 0.5 * settings.period * settings.stiffness
         gains = follow.swapaxes(-1, -2) @ (gains[:, None] * follow)
         speeds = np.abs(np.linalg.eigvals(np.linalg.solve(inertia, gains))).max(-1)
@@ -229,7 +229,7 @@ class Simulation(Core):
         self._commanded: int | None = None
         self._path: tuple[int, JointPath] | None = None
         self._pushed = np.zeros(6)
-        self._seen = self._encoder()
+        self._seen = self._read_encoders()
         self._seen_rate = np.zeros_like(self._seen)
 
     def restart(self) -> None:
@@ -291,7 +291,7 @@ class Simulation(Core):
         )
 
     def push(self, message: Any, frame: str) -> None:
-        """Apply a geometry_msgs/WrenchStamped in the base frame until the next one.
+        """Apply the wrench of a geometry_msgs/WrenchStamped, base frame, until the next message.
 
         :raises MessageError: the message is rejected, and counted.
         """
@@ -301,7 +301,7 @@ class Simulation(Core):
 
     def measured(self) -> Measured:
         """Return the sensors' present measurements."""
-        force = self._wrench()
+        force = self._applied_wrench()
         rotation = self.robot.platform(self.plant.q)[1]
         turned = np.concatenate([force[:3] @ rotation, force[3:] @ rotation])
         return Measured(self.now, self._seen, self._seen_rate, self._effort, turned)
@@ -333,12 +333,12 @@ class Simulation(Core):
                 self.plant.rest()
                 self.failure = f"{error.reason}: {error}"
                 self.stream.stop(error.reason, str(error))
-                self._tick()
+                self._end_period()
                 raise
-        self._tick()
+        self._end_period()
 
     def _move(self) -> None:
-        s, wrench = self.settings, self._wrench()
+        s, wrench = self.settings, self._applied_wrench()
         q = self.plant.q
         for _ in range(s.substeps):
             self.plant.advance(self._effort, wrench, s.period / s.substeps)
@@ -358,16 +358,16 @@ class Simulation(Core):
             self.plant.q = q
             raise
 
-    def _tick(self) -> None:
+    def _end_period(self) -> None:
         """End the period: advance the clock, and sample the encoders."""
         s = self.settings
         self.now += round(s.period * SECOND)
-        before, self._seen = self._seen, self._encoder()
+        before, self._seen = self._seen, self._read_encoders()
         self._seen_rate = self.plant.qd
         if s.resolution.any():
             self._seen_rate = np.where(s.resolution > 0.0, (self._seen - before) / s.period, self.plant.qd)
 
-    def _encoder(self) -> Array:
+    def _read_encoders(self) -> Array:
         q, step = self.plant.q, self.settings.resolution
         if not step.any():
             return q
@@ -382,5 +382,5 @@ class Simulation(Core):
         self.saturations += bool((np.abs(effort) > limits).any())
         self._effort = np.clip(effort, -limits, limits)
 
-    def _wrench(self) -> Array:
+    def _applied_wrench(self) -> Array:
         return self.settings.wrench.at(self.time) + self._pushed

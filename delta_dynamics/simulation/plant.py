@@ -61,14 +61,14 @@ class Plant:
         """
         self.robot, self._leading = robot, robot.graph.leading
         self.others = [k for k in range(robot.joints_count) if k not in self._leading]
-        names = [joint.name for joint in loaded_joints(robot.led.graph)] if self.others else []
+        names = [joint.name for joint in loaded_joints(robot.leading_machine.graph)] if self.others else []
         pushed = [names.index(robot.joint_names[k]) for k in self.others]
         before: Resistance | None = vars(self).get("_resistance")
         memory = None if before is None else before.memory
-        self._resistance = Resistance(robot.led, pushed, memory)
+        self._resistance = Resistance(robot.leading_machine, pushed, memory)
         self._here: Terms | None = None
 
-    def _all_drives(self, here: Terms) -> tuple[Array, Array]:
+    def _find_drive_states(self, here: Terms) -> tuple[Array, Array]:
         if not self.others:
             return here.q.copy(), here.qd.copy()
         q, qd = self.q.copy(), np.zeros_like(self.q)
@@ -101,25 +101,25 @@ class Plant:
         here, left = self._here, step
         q, qd = self.q[self._leading], self.qd[self._leading]
         if here is None or here.q.tobytes() + here.qd.tobytes() != q.tobytes() + qd.tobytes():
-            here = self._resistance.arrive(q, qd)
+            here = self._resistance.enter_state(q, qd)
         least, span, changes = step * MIN_RELATIVE_SPAN, step, False
         for part in itertools.count():
             # Where changes accumulate, implicit parts get longer.
             least *= 4.0 if part > MAX_EXPLICIT_PARTS else 1.0
             law, taken = self._resistance.find_law(here, effort, load), left
             if changes and not law.stands:
-                here, taken = self._cross(here, law, min(left, least))
+                here, taken = self._step_implicitly(here, law, min(left, least))
                 changes, span = False, step
             elif not law.stands:
-                here, taken, changes = self._follow(here, law, min(left, span), least)
+                here, taken, changes = self._integrate_law(here, law, min(left, span), least)
                 span = 2.0 * taken
             self._resistance.store_memory(here)
-            self._here, (self.q, self.qd) = here, self._all_drives(here)
+            self._here, (self.q, self.qd) = here, self._find_drive_states(here)
             left -= taken
             if left <= 0.0:
                 return
 
-    def _follow(self, here: Terms, law: Law, span: float, least: float) -> tuple[Terms, float, bool]:
+    def _integrate_law(self, here: Terms, law: Law, span: float, least: float) -> tuple[Terms, float, bool]:
         """Integrate at most ``span`` s, as long as the law lasts.
 
         A span in which the law changes is cut before the change; one in which the method adds
@@ -131,7 +131,7 @@ class Plant:
         while True:
             part = 1.0
             with contextlib.suppress(PkmTwinError, ValueError):  # the law may change before
-                end, work = self._flow(here, law, span)
+                end, work = self._step_explicitly(here, law, span)
                 part = resistance.lasting_part(here, end, law)
                 growth = _energy_growth(here, end, law, work)
                 if part == 1.0 and growth <= MAX_ENERGY_GROWTH * (here.kinetic + end.kinetic) + _energy_rounding(
@@ -146,8 +146,8 @@ class Plant:
             changes = part < 1.0
             span = max(part * span - 0.5 * least, least) if changes else 0.5 * span
 
-    def _cross(self, here: Terms, law: Law, span: float) -> tuple[Terms, float]:
-        """Integrate at most ``span`` s implicitly, whatever sticks or slides; return state and time."""
+    def _step_implicitly(self, here: Terms, law: Law, span: float) -> tuple[Terms, float]:
+        """Integrate at most ``span`` s implicitly, through changes of sticking; return state and time."""
         shortest = MIN_RELATIVE_SPAN * span
         while True:
             end = self._resistance.step_implicitly(here, law, span)
@@ -156,7 +156,7 @@ class Plant:
                 return _remove_growth(here, end, law), span
             span *= 0.5
 
-    def _flow(self, here: Terms, law: Law, span: float) -> tuple[Terms, float]:
+    def _step_explicitly(self, here: Terms, law: Law, span: float) -> tuple[Terms, float]:
         """Return the state after a part, and the work of the wrench in it, J."""
         resistance, powers = self._resistance, []
 

@@ -122,7 +122,7 @@ class PoseKernel(Protocol):
 
 
 def evaluate_at_pose(robot: Robot, kernel: PoseKernel, p: Array, *given: ArrayLike) -> list[Array]:
-    """Evaluate a program of poses and other inputs; which poses are reached is judged as always.
+    """Evaluate a program of poses and other inputs; reject the poses that inverse kinematics rejects.
 
     :param p: the program's parameters. ``given``: poses, shape (..., m), and the other inputs.
     :raises UnreachableError: as the inverse kinematics, and SingularityError.
@@ -147,7 +147,7 @@ def evaluate_at_pose(robot: Robot, kernel: PoseKernel, p: Array, *given: ArrayLi
 
 
 def _kernel(robot: Robot, name: str, write: Callable[..., Program], *, certified: bool) -> Kernel:
-    """Return the kernel of a program; a machine that is followed has one for all poses.
+    """Return the compiled program of a pose; without a closed form, one program for all poses.
 
     :raises ParameterError: a robot whose file gives no masses.
     """
@@ -162,8 +162,8 @@ def pose_torques(robot: Robot, *, certified: bool) -> Kernel:
     return _kernel(robot, "torques", _pose_torques, certified=certified)
 
 
-def followed_pose_torques(robot: Robot) -> Kernel:
-    """Return the same program with the machine's own tree, which holds for other dimensions too.
+def iterated_pose_torques(robot: Robot) -> Kernel:
+    """Return :func:`pose_torques` by iteration on the machine's own tree, valid for other dimensions.
 
     Poses are accepted as by :attr:`.engine.Engine.followed_inverse`.
     """
@@ -182,8 +182,8 @@ def pose_accelerations(robot: Robot, *, certified: bool) -> Kernel:
     return _kernel(robot, "accelerations", _pose_accelerations, certified=certified)
 
 
-class _Carried:
-    """A machine that is driven by its pose, on expressions: motion and forces on the pose."""
+class _PoseDrivenMachine:
+    """Write motion and forces of a machine whose tree is driven by the pose, as expressions."""
 
     def __init__(self, t: Traced, scheme: CarriedScheme, *, certified: bool) -> None:
         self.t, self.scheme, self.certified = t, scheme, certified
@@ -222,11 +222,11 @@ class _Carried:
         return np.array(rows, dtype=object)
 
     def joint(self, values: Objects) -> list[Any]:
-        """Return rates or accelerations of all drives, of those of all unknowns."""
+        """Select the rates or accelerations of all drives from those of all unknowns."""
         return [values[self.posed.tree.steps[name].rate] for name in self.t.graph.actuated]
 
     def add_inertia(self, add: Callable[[Forces, Objects, Objects], None]) -> Forces:
-        """Return forces with those that ``add`` makes of all bodies and rods."""
+        """Return the forces after ``add`` has added those of all bodies and rods."""
         forces = Forces(self.posed.motion)
         add(forces, self._bodies, self.parts[1])
         return forces
@@ -279,8 +279,8 @@ def _complete_symmetric(matrix: Any) -> Objects:
     return np.array([[matrix[max(i, k)][min(i, k)] for k in range(len(matrix))] for i in range(len(matrix))], object)
 
 
-class _Followed:
-    """A machine whose pose is followed with its own tree, as of a screw, on expressions."""
+class _IteratedMachine:
+    """Write a machine whose joints are iterated from the pose, on its own tree, as expressions."""
 
     def __init__(self, t: Traced) -> None:
         self.t = t
@@ -295,19 +295,19 @@ class _Followed:
         return Program({"pose": self.t.joints} | inputs, self.layout.size, made, self.equations)
 
     def drift(self, rate: Numbers) -> tuple[Objects, Objects]:
-        """Return rates of the leading drives, and the pose's accelerations without theirs."""
+        """Return the leading drives' rates, and the pose's accelerations while they keep these rates."""
         t, qd = self.t, self.lead.solve(rate)
         t.set_rates(qd)
         t.set_accelerations(np.zeros(t.joints))
         return qd, np.array(programs.pose_accelerations(t), dtype=object)
 
     def motion(self, qd: Numbers, qdd: Numbers) -> dict[str, Numbers]:
-        """Return positions, rates and accelerations of all drives by those that lead."""
+        """Return positions, rates and accelerations of all drives, from the leading drives' ones."""
         t, tree = self.t, self.t.tree
         return {
-            "q": tree.values_of_drives(self.q, t.x),
-            "qd": tree.of_drives(qd, t.u),
-            "qdd": tree.of_drives(qdd, t.du),
+            "q": tree.drive_positions(self.q, t.x),
+            "qd": tree.drive_rates(qd, t.u),
+            "qdd": tree.drive_rates(qdd, t.du),
         }
 
 
@@ -316,12 +316,12 @@ def _pose_torques(t: Traced, scheme: CarriedScheme | None, *, certified: bool) -
     sizes = {"rate": m, "acceleration": m, "wrench": 6}
     rate, acceleration = (t.tape.inputs(name, m) for name in ("rate", "acceleration"))
     if scheme is None:
-        own = _Followed(t)
+        own = _IteratedMachine(t)
         qd, drift = own.drift(rate)
         qdd = own.lead.solve(acceleration - drift)
         efforts, _ = efforts_of_motion(t, own.parts, qd, qdd)
         return own.program(own.motion(qd, qdd) | {"tau": t.drives.shared(efforts, preload=True)}, **sizes)
-    made = _Carried(t, scheme, certified=certified)
+    made = _PoseDrivenMachine(t, scheme, certified=certified)
     # F_d = -J^-T (J_M' Q_M + sum of J_Hij' Q_Hij) - Q_S with J = dq/dX (equations 24 and 41); needed forces
     # are minus Q.
     f_d = made.lead.solve_transposed(made.forces(rate, acceleration))
@@ -334,12 +334,12 @@ def _pose_torques(t: Traced, scheme: CarriedScheme | None, *, certified: bool) -
 def _pose_masses(t: Traced, scheme: CarriedScheme | None, *, certified: bool) -> Program:
     m = len(t.scheme.coordinates)
     if scheme is None:
-        own: _Followed | _Carried = _Followed(t)
+        own: _IteratedMachine | _PoseDrivenMachine = _IteratedMachine(t)
         mass = np.reshape(mass_entries(t, own.parts), (m, m))
         rates = np.array([own.lead.solve(unit) for unit in np.eye(m)], dtype=object)
         on_pose = rates @ mass @ rates.T
     else:
-        own = made = _Carried(t, scheme, certified=certified)
+        own = made = _PoseDrivenMachine(t, scheme, certified=certified)
         on_pose = made.masses()
         half = np.array([made.lead.solve_transposed(row) for row in on_pose], dtype=object).T
         mass = _complete_symmetric([made.lead.solve_transposed(row) for row in half])
@@ -351,17 +351,17 @@ def _pose_accelerations(t: Traced, scheme: CarriedScheme | None, *, certified: b
     sizes = {"rate": m, "tau": t.drives.count, "wrench": 6}
     rate, tau = t.tape.inputs("rate", m), t.tape.inputs("tau", t.drives.count)
     if scheme is None:
-        own = _Followed(t)
+        own = _IteratedMachine(t)
         qd, _ = own.drift(rate)
         leads = leading_accelerations(t, own.parts, qd, tau)
         t.set_rates(qd)
         t.set_accelerations(leads)
         found: dict[str, Numbers] = {"acceleration": programs.pose_accelerations(t)}
         return own.program(own.motion(qd, leads) | found, **sizes)
-    made = _Carried(t, scheme, certified=certified)
+    made = _PoseDrivenMachine(t, scheme, certified=certified)
     on_pose = made.forces(rate, np.zeros(m))
     rates, drift = (made.joint(values) for values in (made.posed.u, made.posed.du))
-    # Only friction by load needs what the bodies take of each drive.
+    # Only friction that grows with the load needs the drives' loads.
     by_load = bool(t.graph.laws) and not t.drives.others
     loads = made.lead.solve_transposed(on_pose) if by_load else np.zeros(m)
     rest = efforts_left(t, made.parts, t.drives.on_leads([*tau]), loads, made.q, rates, drift)

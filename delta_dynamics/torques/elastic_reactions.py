@@ -36,13 +36,13 @@ def elastic_reactions(
     try:
         matrices = energy_forms(robot, q, found).values()
     except ParameterError:
-        # Without members nothing decides.
+        # Without elastic members no energy selects a solution.
         return known_alone(found.reactions(found.value, found.null))
     energy = np.asarray(sum(matrices, start=np.zeros_like(found.null)), np.float64)
     own = found.null * found.unit[..., None]
     stiff = own.swapaxes(-1, -2) @ energy @ own
     values, ways = np.linalg.eigh(stiff)
-    # A self-stress with less than a part of 1e-9 of the largest energy stores none.
+    # Energies below 1e-9 of the largest are rounding: such a self-stress is not determined.
     sound = values > 1e-9 * np.maximum(values[..., -1:], 1e-300)
     inverse = np.where(sound, 1.0 / np.where(sound, values, 1.0), 0.0)
     pull = own.swapaxes(-1, -2) @ (energy @ found.value[..., None])

@@ -74,28 +74,28 @@ def minimax_direction(forms: Array) -> Array:
             found.append(np.stack([x + z, x - z]))
     if size == 3:
         # At y = (1, u, v): rows G y as polynomials, and the polynomial y' G y of each form.
-        rows = {a: np.einsum("ij,juv->iuv", _scaled(_TURN.T @ forms[a] @ _TURN), _LINES) for a in range(count)}
+        rows = {a: np.einsum("ij,juv->iuv", _scaled(_ROTATION.T @ forms[a] @ _ROTATION), _LINES) for a in range(count)}
         curves = []
         for a, cone in cones:
-            g, h = rows[a], np.einsum("ij,juv->iuv", _scaled(_TURN.T @ cone @ _TURN), _LINES)
+            g, h = rows[a], np.einsum("ij,juv->iuv", _scaled(_ROTATION.T @ cone @ _ROTATION), _LINES)
             conic = np.sum([_product(_LINES[i], h[i]) for i in range(3)], axis=0)
             # det(y, G y, H y): zero where y' G y is stationary along y' H y = 0.
             stationary = np.zeros((4, 4))
             for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
                 stationary += _product(_LINES[i], _product(g[j], h[k]) - _product(g[k], h[j]))
-            found.append(_common_points(conic, stationary) @ _TURN.T)
+            found.append(_common_points(conic, stationary) @ _ROTATION.T)
             curves.append(conic)
         for one, other in itertools.combinations(curves, 2):
-            found.append(_common_points(one, other) @ _TURN.T)
+            found.append(_common_points(one, other) @ _ROTATION.T)
     points = np.concatenate(found)
-    # Points that are no minimum do no harm: each is judged by the forms themselves.
+    # Points that are no minimum may be among them: the forms are evaluated at all points.
     points = points[np.isfinite(points).all(-1) & points.any(-1)]
     points /= np.linalg.norm(points, axis=-1, keepdims=True)
     return np.asarray(points[largest(forms, points).argmin()], np.float64)
 
 
-_TURN: Final = np.linalg.qr([[1.0, 0.3, -0.4], [0.2, 0.9, 0.7], [-0.5, 0.6, 1.1]])[0]
-"""An arbitrary rotation, so that planes of symmetry are no lines u = constant, and no minimum lies at
+_ROTATION: Final = np.linalg.qr([[1.0, 0.3, -0.4], [0.2, 0.9, 0.7], [-0.5, 0.6, 1.1]])[0]
+"""An arbitrary rotation, so that no plane of symmetry is a line u = constant and no minimum is at
 infinity."""
 _LINES: Final = np.zeros((3, 2, 2))
 """y = (1, u, v) as polynomials: entry (i, j) of each is the coefficient of u^i v^j."""
@@ -142,10 +142,10 @@ def _common_points(conic: Array, curve: Array) -> Array:
     return np.stack([np.ones(len(v)), np.concatenate([u, u]), v], -1)
 
 
-ENERGY: Final = 100.0
+PAPER_ENERGY: Final = 100.0
 """The platform's kinetic energy in the paper's equation 48, J."""
-STRETCHED: Final = 1e-6
-"""Least singular value of the pose's Jacobian, of its greatest or of one, that is inverted."""
+MIN_SINGULAR_VALUE_RATIO: Final = 1e-6
+"""Smallest singular value of dq/dX, relative to the largest one or 1 m/rad, that is inverted."""
 
 
 class JointMotion(NamedTuple):
@@ -241,7 +241,7 @@ def energy_transfer_range(robot: Robot, pose: ArrayLike) -> Extremes:
 
 
 def max_driving_force(
-    robot: Robot, pose: ArrayLike, direction: ArrayLike, energy: float = ENERGY, acceleration: ArrayLike = 0.0
+    robot: Robot, pose: ArrayLike, direction: ArrayLike, energy: float = PAPER_ENERGY, acceleration: ArrayLike = 0.0
 ) -> Array:
     """Compute F_max, the largest |F_d| over the actuators (equation 47), N or N m.
 
@@ -264,7 +264,7 @@ def max_driving_force(
 
 
 def max_driving_force_range(
-    robot: Robot, pose: ArrayLike, energy: float = ENERGY, acceleration: ArrayLike = 0.0
+    robot: Robot, pose: ArrayLike, energy: float = PAPER_ENERGY, acceleration: ArrayLike = 0.0
 ) -> Extremes:
     """Find the extremes of F_max over all directions at the platform's energy E_M, N or N m.
 
@@ -288,7 +288,7 @@ def max_driving_force_range(
 
 
 def driving_force_peak(
-    robot: Robot, pose: ArrayLike, energy: float = ENERGY, acceleration: ArrayLike = 0.0
+    robot: Robot, pose: ArrayLike, energy: float = PAPER_ENERGY, acceleration: ArrayLike = 0.0
 ) -> tuple[Array, Array, NDArray[np.int64]]:
     """Find the greatest F_max over all directions, its direction (..., m), and its actuator's index.
 
@@ -324,7 +324,7 @@ def _driving_forms(robot: Robot, pose: ArrayLike, energy: float, acceleration: A
 
 
 def _peak(forms: Array) -> tuple[Array, Array, NDArray[np.int64]]:
-    """Return the largest absolute value of forms on the unit sphere, its place and its form's index."""
+    """Return the largest absolute value of forms on the unit sphere, its direction and the form's index."""
     values, vectors = np.linalg.eigh(forms)
     ends = np.abs(values[..., [0, -1]])
     flat = ends.reshape(*ends.shape[:-2], ends.shape[-2] * ends.shape[-1])
@@ -356,10 +356,10 @@ def _inverse_jacobian(robot: Robot, pose: ArrayLike) -> tuple[Array, Array]:
     s = np.linalg.svd(robot.jacobian(q), compute_uv=False)
     # Against one m/rad at least: where all limbs are stretched the whole Jacobian vanishes.
     measure = s[..., -1] / np.maximum(s[..., 0], 1.0)
-    bad = np.argwhere(~(measure > STRETCHED))
+    bad = np.argwhere(~(measure > MIN_SINGULAR_VALUE_RATIO))
     if len(bad):
         index = tuple(int(i) for i in bad[0])
-        raise SingularityError("pose", index, float(measure[index]), STRETCHED)
+        raise SingularityError("pose", index, float(measure[index]), MIN_SINGULAR_VALUE_RATIO)
     return q, robot.inverse_jacobian(q)
 
 

@@ -49,7 +49,7 @@ class Transmitter:
 
 
 def transmitters(graph: Graph, rods: Array, places: Array) -> list[Transmitter]:
-    """All joints that transmit something, those of the graph first, then the rods' ends."""
+    """List all joints that transmit a wrench: the graph's joints, then the rods' ends."""
     result = []
     for k, joint in enumerate(graph.joints.values()):
         if not joint.virtual:
@@ -62,7 +62,7 @@ def transmitters(graph: Graph, rods: Array, places: Array) -> list[Transmitter]:
 
 
 def _graph_joint(joint: Joint, vectors: Array) -> Transmitter:
-    """Directions across its slides hold forces, those across its turns hold moments.
+    """Return a joint's wrenches: forces across its slides, moments across its rotations.
 
     A screw's force along its axis comes with the moment that its thread makes of it.
     """
@@ -80,7 +80,7 @@ def _graph_joint(joint: Joint, vectors: Array) -> Transmitter:
             forces[direction.name] = vector
             if own and joint.pitch:
                 threads[direction.name] = -vectors[..., 4, :1] * vector
-        # The directions of two axes stand in their plane, whose normal is held.
+        # The directions of two crossing axes span a plane; rotation about its normal is blocked.
         if not pair and not any(f.turns for f in own):
             moments[direction.name] = vector
         if joint.actuated and own:
@@ -102,7 +102,7 @@ def _graph_joint(joint: Joint, vectors: Array) -> Transmitter:
 
 
 def _rod_joints(rod: Rod, vectors: Array) -> list[Transmitter]:
-    """Ball joints at both ends.
+    """Return the ball joints at both ends of a rod.
 
     A parallelogram's two equal thin rods, side by side along t: their end forces add up to one
     force at each end; the difference of the two axial forces is a couple along e = t x w that
@@ -177,7 +177,7 @@ def _place_columns(joint: Transmitter, names: tuple[str, ...], batch: tuple[int,
 
 
 def moments(joints: Sequence[Transmitter], names: tuple[str, ...]) -> Mask:
-    """Which unknowns are moments, shape (unknowns,)."""
+    """Return which unknowns are moments, shape (unknowns,)."""
     result = np.zeros(len(names), bool)
     for joint in joints:
         pure = np.logical_not(np.any(joint.basis[..., :3, :], -2))
@@ -192,7 +192,7 @@ def transmission(
     origin: dict[str, Array],
     batch: tuple[int, ...],
 ) -> Array:
-    """Wrench on each body about its own point per unknown, shape (..., 6 bodies, unknowns)."""
+    """Return the wrench on each body about its point per unknown, (..., 6 bodies, unknowns)."""
     result = np.zeros((*batch, len(origin), 6, len(names)))
     order = list(origin)
     for joint in joints:
@@ -271,7 +271,7 @@ class Reactions:
 
 
 def reactions(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None = None) -> Reactions:
-    """Constraint forces and moments at every joint, for a motion.
+    """Compute constraint forces and moments at every joint, for a motion.
 
     Force and moment balance of each body (d'Alembert's principle; Delta-CU paper, equations 17 to
     21, at A, B and C of each limb), the payload fixed to the platform. The actuated components are
@@ -320,7 +320,7 @@ class Balance:
 
     def reactions(self, value: Array, null: Array) -> Reactions:
         """Return the reactions of a solution and its null space."""
-        # Moments and forces of the null space in one unit again, so that one bound holds.
+        # Scale the null space's moments to forces, so that one bound applies to both.
         reach = np.einsum("...jik,...kn->...jin", self.spread, null * self.unit[..., None])
         reach[..., 3:, :] /= self.size[..., None, None, None]
         joints = self.joints
@@ -417,7 +417,7 @@ def balanced(robot: Robot, loads: Sequence[Array], *, strict: bool = True) -> Ba
 
 
 def loads_kernel(robot: Robot) -> Kernel:
-    """Program of q, qd, qdd and wrench: what bodies and rods need, and where the joints are.
+    """Return the program from a motion and a wrench to the needed wrenches and the joints' places.
 
     :raises ParameterError: a robot without masses.
     """
@@ -438,7 +438,7 @@ def _loads(t: Traced) -> Program:
     t.set_accelerations(t.drives.given("qdd"), BaseMotion.at_rest(gravity))
     motion, graph = t.motion, t.graph
     forces = Forces(motion)
-    # Rods stand for themselves here.
+    # Each rod is a body of its own here.
     for name, ten in zip(t.tree.links, bodies, strict=True):
         forces.body(name, ten)
     forces.passive(passive)
@@ -479,7 +479,7 @@ def _scale_unknowns(moment: Mask, size: Array) -> Array:
 
 
 def _solve(a: Array, b: Array, moment: Mask, size: Array, *, strict: bool) -> tuple[Array, Array, Array]:
-    """Least-norm solution, orthonormal null space and relative imbalance.
+    """Return the least-norm solution, an orthonormal null space and the relative imbalance.
 
     Moments and lengths are divided by the mechanism's size, so that all numbers are forces. The
     columns of the null space, shape (..., unknowns, unknowns), are zero beyond its dimension.
@@ -508,7 +508,7 @@ def _solve(a: Array, b: Array, moment: Mask, size: Array, *, strict: bool) -> tu
 
 
 def _regular(matrix: Array, right: Array) -> tuple[Array, Mask]:
-    """Solve where the columns are clearly independent, by QR; which samples these are.
+    """Solve by QR where the columns are clearly independent; return also where they are.
 
     Ten times cheaper than the singular values that decide the other samples.
     """
@@ -525,7 +525,7 @@ def _regular(matrix: Array, right: Array) -> tuple[Array, Mask]:
 
 
 def _deficient(matrix: Array, right: Array) -> tuple[Array, Array]:
-    """Least-norm solution and null space by singular values."""
+    """Return the least-norm solution and the null space by singular values."""
     equations, unknowns = matrix.shape[-2:]
     # Empty equations, so that there is a singular value for every unknown.
     missing = max(0, unknowns - equations)
@@ -539,7 +539,7 @@ def _deficient(matrix: Array, right: Array) -> tuple[Array, Array]:
 
 
 def _small(reach: Array) -> Mask:
-    """Whether the null space does not reach an entry, over the last axis."""
+    """Return whether the null space leaves an entry unchanged, over the last axis."""
     result: Mask = np.linalg.norm(reach, axis=-1) < DETERMINATE_BOUND
     result.setflags(write=False)
     return result

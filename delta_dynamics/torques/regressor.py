@@ -193,7 +193,7 @@ def _columns(robot: Robot) -> list[tuple[str, str]]:
 
 
 def _regressor(t: Traced) -> Program:
-    """Write the bodies' motion in their axes at home, and columns of rods, joints and wrench."""
+    """Write the program of all bodies' motion, and of the columns of rods, joints and wrench."""
     t.solve()
     graph, motion, n = t.graph, t.motion, t.joints
     gravity = t.tape.inputs(PARAMETERS, 3)

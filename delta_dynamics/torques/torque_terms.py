@@ -48,13 +48,13 @@ def efforts_without_friction(
     :param weight: False leaves gravity out, too.
     """
     layout = Layout(robot.massive().tree)
-    p = _set_zero(robot.inertial, layout.friction)
+    p = _zero_part(robot.inertial, layout.friction)
     if not weight:
-        p = _set_zero(p, layout.part(GRAVITY))
+        p = _zero_part(p, layout.part(GRAVITY))
     return robot.evaluate(torques(robot), q, qd, qdd, np.zeros(6), p=p)[0]
 
 
-def _set_zero(p: Array, part: slice | Indices) -> Array:
+def _zero_part(p: Array, part: slice | Indices) -> Array:
     result = p.copy()
     result[part] = 0.0
     return result
@@ -87,10 +87,10 @@ def dynamics_terms(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wr
         return robot.evaluate(kernel, place, qd, qdd, wrench, p=p)[0]
 
     layout = Layout(robot.massive().tree)
-    held = _set_zero(robot.inertial, layout.friction)
-    empty = _set_zero(robot.own_inertial, layout.friction)
-    weightless = _set_zero(empty, layout.part(GRAVITY))
-    rubbing = _set_zero(robot.own_inertial, layout.part(GRAVITY))
+    held = _zero_part(robot.inertial, layout.friction)
+    empty = _zero_part(robot.own_inertial, layout.friction)
+    weightless = _zero_part(empty, layout.part(GRAVITY))
+    rubbing = _zero_part(robot.own_inertial, layout.part(GRAVITY))
     preload = np.zeros((*shape, n))
     if robot.redundant:
         # The effort that remains at rest without gravity, friction and wrench.

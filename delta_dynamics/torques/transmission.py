@@ -148,7 +148,7 @@ class Transmission:
         """Return the results of :meth:`_solve`, and the curvature."""
         m, controller = len(self.joints), self.robot.controller
         place = self._joint(position, "positions")[..., None, :]
-        # The second derivative along a + b, less those along a and b, is twice that by a and b.
+        # Polarisation: f''(a + b) - f''(a) - f''(b) is twice the mixed second derivative.
         pairs = [(j, k) for j in range(m) for k in range(j)]
         ways = np.array([*np.eye(m), *(np.eye(m)[j] + np.eye(m)[k] for j, k in pairs)])
         q, flat, change = evaluate_at_pose(

@@ -19,7 +19,7 @@ from pkm_twin.codegen.operations import absolute, maximum, minimum, sign
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics.constraints import cross
 from pkm_twin.kinematics.motion import BaseMotion, Motion
-from pkm_twin.kinematics.stream import following
+from pkm_twin.kinematics.stream import start_from_last
 from pkm_twin.kinematics.traced import Traced
 from pkm_twin.machine import friction
 from pkm_twin.machine.graph import BASE, Joint, Rod
@@ -27,7 +27,7 @@ from pkm_twin.machine.inertia import LAW_VALUES, ROTORS, Layout, loaded_joints
 from pkm_twin.robot.robot import Robot
 
 _NO_WRENCH: Final = np.zeros(6)
-MASSLESS: Final = 1e-12
+MASSLESS_RATIO: Final = 1e-12
 """Smallest pivot of the mass matrix over its diagonal entry for which accelerations are computed."""
 
 
@@ -84,7 +84,7 @@ def moving_torques(robot: Robot) -> Kernel:
 
 def stream_torques(robot: Robot) -> Kernel:
     """Return the program of a stream's efforts, see :mod:`pkm_twin.kinematics.stream`."""
-    return robot.massive().kernel("stream torques", lambda t: following(t, torque_program(t)))
+    return robot.massive().kernel("stream torques", lambda t: start_from_last(t, torque_program(t)))
 
 
 def mass_matrix(robot: Robot, q: ArrayLike) -> Array:
@@ -202,7 +202,7 @@ class Forces:
         self.moment[name] = self.moment[name] + turned @ (inertia @ alpha + cross(omega, inertia @ omega))
 
     def _couples(self, bodies: Objects) -> list[tuple[str, Objects]]:
-        """Moments of inertia about the origins, summed over bodies that share a rotation."""
+        """Return inertia matrices about the origins, summed over bodies with the same rotation."""
         first: dict[int, str] = {}
         found: dict[str, Objects] = {}
         for name, ten in zip(self.motion.tree.links, bodies, strict=True):
@@ -265,7 +265,7 @@ class Forces:
             if accelerated:
                 second = axis @ (m.alpha[b] - m.alpha[a])
             return axis @ (m.omega[b] - m.omega[a]), second
-        # Against the point of the inner body that is where the outer one's is.
+        # Relative to the inner body's point that coincides with the joint.
         lever = m.point(b, joint.at) - m.origin[a]
         if accelerated:
             carried = m.change[a] + m.spin(a) @ lever
@@ -346,7 +346,7 @@ def efforts_of_motion(
     :returns: efforts of the leading drives, and the part of friction and rotor of all, shape (n,).
     """
     f_d = driving_forces(t, parts, qd, qdd, base)
-    rates, changes = t.tree.of_drives(qd, t.u), t.tree.of_drives(qdd, t.du)
+    rates, changes = t.tree.drive_rates(qd, t.u), t.tree.drive_rates(qdd, t.du)
     return add_friction_and_rotors(t, parts, f_d, t.drives.variables("q"), rates, changes)
 
 
@@ -439,7 +439,7 @@ def leading_accelerations(t: Traced, parts: list[Objects], qd: Objects, tau: Obj
     """
     driving, still = t.drives.on_leads([*tau]), np.zeros(t.joints)
     loads = driving_forces(t, parts, qd, still)
-    q, rates, changes = t.drives.variables("q"), t.tree.of_drives(qd, t.u), t.tree.of_drives(still, t.du)
+    q, rates, changes = t.drives.variables("q"), t.tree.drive_rates(qd, t.u), t.tree.drive_rates(still, t.du)
     rest = efforts_left(t, parts, driving, loads, q, rates, changes)
     return solve_massive(np.reshape(mass_entries(t, parts), (t.joints, t.joints)), rest)
 
@@ -447,7 +447,7 @@ def leading_accelerations(t: Traced, parts: list[Objects], qd: Objects, tau: Obj
 def efforts_left(
     t: Traced, parts: list[Objects], driving: Numbers, loads: Numbers, q: Numbers, rates: Numbers, changes: Numbers
 ) -> Objects:
-    """Return what efforts of the leading drives leave for further accelerations.
+    """Return the leading drives' efforts that remain for accelerations.
 
     :param loads: efforts that bodies take at accelerations ``changes`` of all drives, (n,); ``q``
         and ``rates``: positions and rates of all drives.
@@ -471,7 +471,7 @@ def solve_massive(mass: Objects, rest: Objects) -> list[Any]:
     least: Any = 1.0
     for index, pivot in zip(root.order, root.pivots, strict=True):
         least = minimum(least, pivot / mass[index, index])
-    sound = 1.0 / sign(maximum(least - MASSLESS, 0.0))
+    sound = 1.0 / sign(maximum(least - MASSLESS_RATIO, 0.0))
     return [value * sound for value in root.solve(list(rest))]
 
 
@@ -484,7 +484,7 @@ def mass_entries(t: Traced, parts: list[Objects], visit: Callable[[Forces], None
     columns = t.rate_columns()
     n = t.joints
     table: list[list[Any]] = [[0.0] * n for _ in range(n)]
-    rates = [t.tree.of_drives(own, column) for own, column in zip(np.eye(n), columns, strict=True)]
+    rates = [t.tree.drive_rates(own, column) for own, column in zip(np.eye(n), columns, strict=True)]
     for j in range(n):
         t.motion.set_rates(columns[j], np.eye(n)[j])
         forces = Forces(t.motion)
@@ -530,7 +530,7 @@ def _energy(t: Traced) -> Program:
     forces.momenta(bodies, rods)
     forces.passive_momenta(passive)
     unknown, driven = forces.generalised()
-    rates = t.tree.of_drives(qd, u)
+    rates = t.tree.drive_rates(qd, u)
     double = driven @ qd + u @ unknown
     double = double + sum((r * v * v for r, v in zip(rotors, rates, strict=True)), 0.0)
     outputs = {"energy": t.lift([double * 0.5, potential(t, bodies, rods, gravity)])}

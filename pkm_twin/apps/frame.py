@@ -111,7 +111,7 @@ class Option(click.Option):
         )
 
     def add_to_parser(self, parser: Any, ctx: click.Context) -> None:
-        """Accept spellings that help does not list."""
+        """Add the option with its older spellings, which the help does not list."""
         shown, others = self.opts, {name for one in ctx.command.params for name in one.opts}
         self.opts = [*shown, *self.row.older]
         if self.is_flag:

@@ -35,7 +35,7 @@ ROBOT_HELP = "a robot's name (see `pkm-twin robots`), or its YAML, URDF, MJCF, S
 
 
 @dataclass(frozen=True, kw_only=True)
-class OfPlatform:
+class CutOutOptions:
     """Options that cut a machine out of a URDF, MJCF, SDF or USD: platform, base, motors, pose."""
 
     platform: str | None = setting(None, "for a URDF, MJCF, SDF or USD: the link that carries the tool")
@@ -60,7 +60,7 @@ class OfPlatform:
 
 
 @dataclass(frozen=True, kw_only=True)
-class OfRobot(OfPlatform):
+class RobotArgument(CutOutOptions):
     """Argument of a command on a robot."""
 
     robot: str = setting(..., ROBOT_HELP, argument=True)
@@ -76,7 +76,7 @@ class OfRobot(OfPlatform):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Carries(OfRobot):
+class PayloadOption(RobotArgument):
     """Option of a payload on the platform."""
 
     payload: str | None = setting(
@@ -107,18 +107,18 @@ class Carries(OfRobot):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CarriesAtTimes(Carries):
+class TimedPayloadOptions(PayloadOption):
     """Options of a payload that is held in intervals of time."""
 
     load_times: str | None = setting(None, "times at which --payload is held: FROM,TO[,FROM,TO...], s; default: always")
 
     def machine(self) -> Robot:
         """Load the robot alone: the recording knows what it carries and when."""
-        return OfRobot.machine(self)
+        return RobotArgument.machine(self)
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReadsTables:
+class TableOptions:
     """Options of the format of tables that are read."""
 
     separator: str | None = setting(None, "column separator: , ; or tab; default: detected")
@@ -144,7 +144,7 @@ class ReadsTables:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReadsRecordings(ReadsTables):
+class RecordingOptions(TableOptions):
     """Options of topics and of the format of recordings."""
 
     topic: tuple[str, ...] = setting((), "topic of joint states or wrenches; default: by joint names")
@@ -180,7 +180,7 @@ class ReadsRecordings(ReadsTables):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReadsMotions(ReadsRecordings):
+class MotionOptions(RecordingOptions):
     """Option of the coordinates that a motion is read from."""
 
     follow: str | None = setting(
@@ -202,7 +202,7 @@ class ReadsMotions(ReadsRecordings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class BeyondLimitsToo:
+class BeyondLimitsOption:
     """Option to compute outside the joint limits, too."""
 
     beyond_limits: bool = setting(False, "also compute outside the joint limits, marked")
@@ -222,7 +222,7 @@ class BeyondLimitsToo:
 
 
 @dataclass(frozen=True, kw_only=True)
-class AtPose(Carries, BeyondLimitsToo):
+class PoseOption(PayloadOption, BeyondLimitsOption):
     """Option of a pose of the platform."""
 
     at: str | None = setting(None, "the pose's coordinates, separated by commas; default: home")
@@ -242,7 +242,7 @@ class AtPose(Carries, BeyondLimitsToo):
 
 
 @dataclass(frozen=True, kw_only=True)
-class OfTool:
+class ToolOptions:
     """Options of the tool point and of modal damping."""
 
     tool: tuple[float, ...] = setting(
@@ -256,7 +256,7 @@ class OfTool:
 
 
 @dataclass(frozen=True, kw_only=True)
-class OfMilling:
+class MillingOptions:
     """Options of a milling process."""
 
     teeth: int = setting(..., "teeth of the tool")
@@ -278,28 +278,28 @@ class OfMilling:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Accepts:
+class AcceptOption:
     """Option to use data that the machine cannot have produced."""
 
     accept: bool = setting(False, "also use a recording that contradicts the machine, marked")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Overwrites:
+class OverwriteOption:
     """Option to replace existing files."""
 
     overwrite: bool = setting(False, "replace files that exist")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Writes(Overwrites):
+class OutputOption(OverwriteOption):
     """Option of a file to write; a command describes it by its own field ``out``."""
 
     out: Path | None = setting(None, "file to write", writes=True)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Draws(Overwrites):
+class PictureOptions(OverwriteOption):
     """Options of a picture of the result: named, or next to ``--out``."""
 
     picture: str | None = setting(
@@ -334,21 +334,21 @@ class Draws(Overwrites):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Parallel:
+class ProcessesOption:
     """Option of the number of parallel processes."""
 
     jobs: int | None = setting(None, "processes on this computer; default: one per core", low=1, high=10**4)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Seeded:
+class SeedOption:
     """Option of the seed of random numbers."""
 
     seed: int = setting(0, "seed of the random numbers", low=0, high=2**32 - 1)
 
 
 @dataclass(frozen=True, kw_only=True)
-class AwayFromSingular:
+class SingularityOption:
     """Option of the smallest singularity index of poses that count."""
 
     singularity: float = setting(0.05, "least singularity index of a pose", low=0.0, high=1.0)

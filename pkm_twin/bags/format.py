@@ -93,7 +93,7 @@ class RecordReader:
         self.crc = 0
 
     def read_at(self, position: int, count: int, what: str) -> bytes:
-        """Read exactly ``count`` bytes anywhere; where the reader stands does not change."""
+        """Read exactly ``count`` bytes at a position, without moving the reader."""
         left = self.size - position
         if count > left:
             text = f"the {what} needs {count} bytes, the file has {left} left: it is cut short"
@@ -298,7 +298,7 @@ class Records:
             raise FormatError(f"{what} {record.id} is defined twice, differently", offset)
 
     def replace(self, records: Iterable[mcap.Schema | mcap.Channel]) -> int:
-        """Put in what is known to be right; return the bytes of the records that were not."""
+        """Replace damaged schemas and channels by intact ones; return the damaged bytes."""
         wrong = 0
         for record in records:
             numbers: dict[int, Any] = self.schemas if type(record) is mcap.Schema else self.channels

@@ -86,7 +86,7 @@ def make_report(path: Path, storage: Storage, checks: Sequence[Check]) -> BagRep
             fault = ""
             if known.type != info.type:
                 fault = f"two types, {known.type} and {info.type}"
-            elif not _one_form(known, info):
+            elif not _have_same_format(known, info):
                 fault = f"two forms of the type {info.type}: definition or encoding differ"
             if fault:
                 raise BagError(f"topic {name} has {fault}", path=file.path, reason="type")
@@ -149,7 +149,7 @@ def _find_warnings(check: Check) -> Iterator[str]:
         yield f"{unknown} records of unknown kinds were passed over"
 
 
-def _one_form(one: TopicInfo, other: TopicInfo) -> bool:
+def _have_same_format(one: TopicInfo, other: TopicInfo) -> bool:
     """Return whether messages of both topics can be read alike; comments of definitions may differ."""
     if (one.encoding, one.schema_encoding) != (other.encoding, other.schema_encoding):
         return False

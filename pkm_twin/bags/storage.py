@@ -49,7 +49,7 @@ class BagFile:
                 if not head.startswith(ZSTD_MAGIC):
                     yield RecordReader(file)
                     return
-            # The budget is that of the bytes on the disk.
+            # Limit the unpacked size by the size on the disk.
             yield RecordReader(self._unpacked, Budget(size))
         except FileNotFoundError as error:
             text = "no such file; expected an MCAP file or a rosbag2 folder"
@@ -61,7 +61,7 @@ class BagFile:
     @cached_property
     def _unpacked(self) -> IO[bytes]:
         """Return the unpacked file; what does not unpack is found missing at its end."""
-        # Closed, and so gone, with the bag that holds it.
+        # The file is deleted when it is closed with its bag.
         target = tempfile.TemporaryFile()  # noqa: SIM115
         with open_regular(self.path) as file:
             budget = Budget(os.fstat(file.fileno()).st_size)

@@ -230,7 +230,7 @@ class Check:
                 if error.reason == TOTAL_CAP:
                     raise
                 if self.fault:
-                    # Go on behind the damaged record at ``at``, which should stop at ``end``.
+                    # Continue after the damaged record at ``at``, which should end at ``end``.
                     data_end, _, chunks = self._trusted
                     if at in chunks:
                         end = at + chunks[at]

@@ -78,12 +78,12 @@ class McapWriter(Writer):
         """Return the number of a channel, whose own numbers do not count."""
         number = 0
         if schema is not None:
-            number = self._once(self.register_schema, schema.name, schema.encoding, schema.data)
+            number = self._register_once(self.register_schema, schema.name, schema.encoding, schema.data)
         facts = (channel.topic, channel.message_encoding, number, channel.metadata)
-        number = self._once(self.register_channel, *facts)
+        number = self._register_once(self.register_channel, *facts)
         return int(number)
 
-    def _once(self, act: Callable[..., Any], *facts: Any) -> Any:
+    def _register_once(self, act: Callable[..., Any], *facts: Any) -> Any:
         key = repr(facts)
         if key not in self._numbers:
             self._numbers[key] = act(*facts)
@@ -92,7 +92,7 @@ class McapWriter(Writer):
     def put_metadata(self, name: str, entries: Mapping[str, str], verified: bool = True) -> None:
         """Write texts by name, with a CRC of their own where they are ``verified``."""
         crc = {METADATA_CRC: metadata_crc(name, entries)} if verified else {}
-        self._once(self.add_metadata, name, {**entries, **crc})
+        self._register_once(self.add_metadata, name, {**entries, **crc})
 
 
 class _Target:
@@ -175,7 +175,7 @@ class BagWriter:
         except BagError:
             self._file.close()
             raise
-        self._thread = threading.Thread(target=self._work, name="bag writer", daemon=True)
+        self._thread = threading.Thread(target=self._run_thread, name="bag writer", daemon=True)
         self._thread.start()
 
     def add_topic(
@@ -289,7 +289,7 @@ class BagWriter:
         number = self._numbers[topic]
         self._writer.add_message(number, log_time, data, published, sequence)
 
-    def _work(self) -> None:
+    def _run_thread(self) -> None:
         try:
             # Process the queue until it is closed; flush at the interval.
             due: float | None = None
@@ -318,8 +318,8 @@ class BagWriter:
 
 
 @contextmanager
-def whole_bag(path: Path, overwrite: bool, metadata: Mapping[str, Mapping[str, str]]) -> Iterator[BagWriter]:
-    """Write a bag that is made at once: it has its name only when it is complete.
+def write_whole_bag(path: Path, overwrite: bool, metadata: Mapping[str, Mapping[str, str]]) -> Iterator[BagWriter]:
+    """Write a bag under a temporary name, and rename it when it is complete.
 
     :raises BagError: the file exists and ``overwrite`` is false, or it cannot be written.
     """

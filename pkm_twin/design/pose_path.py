@@ -170,7 +170,7 @@ class PathMotion:
             by_qd = by_qd + rates
         if changes is not None:
             by_qdd = by_qdd + changes
-        held = self._held(by_q, (by_qd, by_qdd))
+        held = self._add_constant_poses(by_q, (by_qd, by_qdd))
         rows = np.concatenate([of_geometry + held, of_masses], -1)
         return np.asarray(rows[0] @ self.many.rigid_slopes)
 
@@ -178,7 +178,7 @@ class PathMotion:
         """Return the derivatives of each sample's index, shape (t, d)."""
         ones = np.ones((1, len(self.path.time), 1))
         (by_q, by_geometry), _ = self.many.run(programs.singularity_slopes, self.q, ones)
-        return self._by_geometry(by_geometry + self._held(by_q))
+        return self._by_geometry(by_geometry + self._add_constant_poses(by_q))
 
     def compliance_slopes(self, weights: Array) -> Array:
         """Return the derivatives of each sample's weighted sum of C's entries, (t, d).
@@ -188,14 +188,14 @@ class PathMotion:
         flat = weights.reshape(1, len(weights), 36)
         (by_q, numbers), _ = self.many.run(programs.compliance_slopes, self.q, flat)
         count = len(self.many.robot.engine.geometry)
-        by_geometry = self._by_geometry(numbers[..., :count] + self._held(by_q))
+        by_geometry = self._by_geometry(numbers[..., :count] + self._add_constant_poses(by_q))
         elastic = self.many.functions.elastic.slopes_at(self.many.values)[0]
         return np.asarray(by_geometry + numbers[0, :, count:] @ elastic)
 
     def _by_geometry(self, rows: Array) -> Array:
         return np.asarray(rows[0] @ self.many.geometry_slopes)
 
-    def _held(self, by_q: Array, by_rates: tuple[Array, Array] | None = None) -> Array:
+    def _add_constant_poses(self, by_q: Array, by_rates: tuple[Array, Array] | None = None) -> Array:
         """Return what constant poses add to derivatives by the geometry, shape (1, t, g).
 
         :param by_rates: derivatives by qd and qdd; None for zero.

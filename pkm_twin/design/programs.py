@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Final, Literal
 
-from delta_dynamics.torques.at_pose import followed_pose_torques
+from delta_dynamics.torques.at_pose import iterated_pose_torques
 from delta_dynamics.torques.derivatives import motion_gradient, numbers_gradient
 from delta_dynamics.torques.reactions import loads_kernel
 from delta_dynamics.torques.virtual_work import masses_kernel
@@ -70,7 +70,7 @@ singularity: Final = asks(lambda robot: robot.singularity_kernel())
 """From q to the singularity index."""
 torques: Final = asks(torques_kernel, "masses", "geometry")
 """From q, qd, qdd and wrench to efforts."""
-torques_at_pose: Final = asks(followed_pose_torques, "masses", "geometry")
+torques_at_pose: Final = asks(iterated_pose_torques, "masses", "geometry")
 """From pose, rate, acceleration and wrench to q, qd, qdd and efforts."""
 loads: Final = asks(loads_kernel, "masses", "geometry")
 """From q, qd, qdd and wrench to the joints' loads and positions."""

@@ -16,7 +16,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Final
 
-from delta_dynamics.torques.virtual_work import MASSLESS
+from delta_dynamics.torques.virtual_work import MASSLESS_RATIO
 from pkm_twin.errors import ParameterError
 from pkm_twin.export.c99 import table
 from pkm_twin.export.c_package import Package
@@ -28,7 +28,7 @@ VERSIONS: Final = (2, 3)
 KINDS: Final = ("dynamics", "torques")
 MODEL: Final = "fmu.c"
 CONSTANTS: Final = f"""\
-#define LEAST {MASSLESS!r}
+#define LEAST {MASSLESS_RATIO!r}
 /* Of the plant: a rate that is none, forces and motions that are equal, rows that depend. */
 #define STILL 1e-12
 #define TOLERANCE 1e-9

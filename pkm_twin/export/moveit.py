@@ -79,7 +79,7 @@ def moveit_package(robot: Robot, kinematics: str = "") -> dict[str, str]:
     for joint in robot.passive_joints:
         ET.SubElement(root, "passive_joint", name=joint)
     touching = dict.fromkeys(_touching(tree), "Default")
-    touching |= dict.fromkeys(_held(tree, parts), "Adjacent")
+    touching |= dict.fromkeys(_list_joined_links(tree, parts), "Adjacent")
     for (first, second), reason in touching.items():
         ET.SubElement(root, "disable_collisions", link1=first, link2=second, reason=reason)
     ET.indent(root)
@@ -174,7 +174,7 @@ def accelerations(robot: Robot) -> list[float]:
         return list(0.5 * np.maximum(limits - weight, 0.0) / inertia)
 
 
-def _held(tree: LoopTree, parts: Sequence[Single]) -> list[tuple[str, str]]:
+def _list_joined_links(tree: LoopTree, parts: Sequence[Single]) -> list[tuple[str, str]]:
     """Return pairs of links that a joint, or a cut loop, connects.
 
     A link without mass and shape stands between the axes of one joint: it joins its neighbours.

@@ -271,7 +271,7 @@ def left_by_calibration(robot: Robot, errors: Callable[[Array], Array], states: 
 
     def slopes(rows: Array) -> Array:
         """By the numbers that it fits, and by the zeros of the joints."""
-        zeros = robot.platform_jacobian(rows) @ robot.following(rows)
+        zeros = robot.platform_jacobian(rows) @ robot.drive_jacobian(rows)
         if not paths:
             return zeros
         many = Variants(robot, {path: robot.number(path) for path in paths})

@@ -132,9 +132,9 @@ def projection_program(t: Traced) -> Program:
     t.set_rates(qd)
     t.set_accelerations(qdd)
     outputs = {
-        "q": t.lift(t.tree.values_of_drives(q, t.x)),
-        "qd": t.lift(t.tree.of_drives(qd, t.u)),
-        "qdd": t.lift(t.tree.of_drives(qdd, t.du)),
+        "q": t.lift(t.tree.drive_positions(q, t.x)),
+        "qd": t.lift(t.tree.drive_rates(qd, t.u)),
+        "qdd": t.lift(t.tree.drive_rates(qdd, t.du)),
     }
     return Program(t.inputs("q", "qd", "qdd"), 0, outputs, t.equations(goal=t.lift(q)))
 
@@ -154,7 +154,7 @@ def inverse_program(t: Traced, scheme: CarriedScheme | None) -> Program:
     pose = t.tape.inputs("pose", len(t.scheme.coordinates))
     if scheme is None:
         equations, leads = follow_pose(t)
-        q = t.tree.values_of_drives(leads, t.x)
+        q = t.tree.drive_positions(leads, t.x)
     else:
         posed, q = solve_pose(t, scheme)
         t = t.ahead
@@ -200,7 +200,7 @@ def solve_pose(t: Traced, scheme: CarriedScheme) -> tuple[Traced, list[Any]]:
     """Return the machine that is driven by its pose, solved, and all its drives' positions."""
     posed = t.carried(scheme)
     posed.solve()
-    return posed, posed.tree.values_of_joints(t.graph.actuated, posed.x)
+    return posed, posed.tree.joint_positions(t.graph.actuated, posed.x)
 
 
 def transmission_program(t: Traced, scheme: CarriedScheme | None, *, certified: bool, curved: bool) -> Program:
@@ -214,17 +214,17 @@ def transmission_program(t: Traced, scheme: CarriedScheme | None, *, certified: 
     rate = t.tape.inputs("rate", m) if curved else None
     if scheme is None:
         equations, leads = follow_pose(t, rates=True)
-        q = t.tree.values_of_drives(leads, t.x)
+        q = t.tree.drive_positions(leads, t.x)
         lu = pose_factors(t)
         follow = np.array(t.rate_columns(), dtype=object).T
         leading = [lu.solve(unit) for unit in np.eye(m)]
-        by_pose = np.array([t.tree.of_drives(own, follow @ own) for own in leading], object).T
+        by_pose = np.array([t.tree.drive_rates(own, follow @ own) for own in leading], object).T
         if rate is not None:
             t.set_rates(lu.solve(rate))
             t.set_accelerations(np.zeros(m))
             change = lu.solve(-np.array(pose_accelerations(t), dtype=object))
             t.set_accelerations(change)
-            changes = t.tree.of_drives(change, t.du)
+            changes = t.tree.drive_rates(change, t.du)
     else:
         posed, q = solve_pose(t, scheme)
         branch = certify_assembly(t, scheme, posed, q) if certified else []

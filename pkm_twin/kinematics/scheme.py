@@ -396,7 +396,7 @@ def check_masses(scheme: Scheme, graph: Graph) -> None:
     table = []
     for j in range(n):
         motion.set_rates(moved[:, j], np.eye(n)[j])
-        rates = scheme.tree.of_drives(np.eye(n)[j], moved[:, j])
+        rates = scheme.tree.drive_rates(np.eye(n)[j], moved[:, j])
         column = [
             np.sqrt(graph.joints[name].rotor_inertia) * rate for name, rate in zip(graph.actuated, rates, strict=True)
         ]

@@ -58,7 +58,7 @@ def _stream(t: Traced) -> Program:
     return Program(t.inputs("q", before=len(before)), m, {"sample": row}, t.equations())
 
 
-def following(t: Traced, program: Program) -> Program:
+def start_from_last(t: Traced, program: Program) -> Program:
     """Make a program of motion start from the sample before: input and output ``last``.
 
     The row has 1 where the sample is valid, the joints that were solved from home last, q, qd, and

@@ -15,7 +15,7 @@ from typing import Final
 
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.graph import groups
-from pkm_twin.machine.loop_tree import Joint, Link, LoopTree, hung
+from pkm_twin.machine.loop_tree import Joint, Link, LoopTree, order_from_root
 from pkm_twin.machine.urdf_xml import free_name
 
 MAX_NAMES: Final = 6
@@ -83,7 +83,7 @@ def cut_out(tree: LoopTree, base: str, platform: str, *, carry: bool = False) ->
     notes, carried = list[str](), list[Link]()
     bridges = [pair for name, pair in pairs.items() if name not in circles]
     for host in kept:
-        # Links below a body are connected to it without the linkage.
+        # Links that hang on a body are connected to it by joints outside the linkage.
         away = [body for body in dict.fromkeys(bodies.values()) if body not in kept or body == host]
         hanging = next(group for group in groups(away, bridges) if host in group)
         own = [link for name, link in tree.links.items() if bodies[name] in hanging and bodies[name] != host]
@@ -110,14 +110,14 @@ def cut_out(tree: LoopTree, base: str, platform: str, *, carry: bool = False) ->
     motors = [name for name in tree.actuated if name not in circles]
     if motors:
         notes.append(f"left out, with their motors: {', '.join(motors)}")
-    reached = {base, *(one.child for one in hung(base, spanned.values()))}
+    reached = {base, *(one.child for one in order_from_root(base, spanned.values()))}
     for name in links:
         # Loop closures alone hold this body; a free joint places it.
         if name not in reached:
             label = free_name(f"{name}_free", {*tree.joints, *spanned})
             frame = links[name].frame
             spanned[label] = Joint(label, "free", base, name, (frame, frame))
-            reached |= {name, *(one.child for one in hung(name, spanned.values()))}
+            reached |= {name, *(one.child for one in order_from_root(name, spanned.values()))}
     closures = tuple(joint for joint in tree.closures if joint.name in circles)
     actuated = tuple(name for name in tree.actuated if name in circles)
     made = replace(tree, root=base, links=links, joints=spanned, closures=closures, actuated=actuated)

@@ -314,7 +314,7 @@ class Book:
             reason = f"no circle: {', '.join(circle)}"
             raise ParameterError(path, own[circle[0]].text, reason) from None
         numbers = {name: given[name] for name in order if name not in own}
-        return cls(dict.fromkeys(order, 0.0), own, {}, data)._with(numbers)
+        return cls(dict.fromkeys(order, 0.0), own, {}, data)._replace_numbers(numbers)
 
     def marked(self, data: Any) -> Any:
         """Convert all texts of data to :class:`Written`, so that they may be expressions."""
@@ -324,7 +324,7 @@ class Book:
             return [self.marked(value) for value in data]
         return Written.of(data, self) if isinstance(data, str) else data
 
-    def _with(self, numbers: Mapping[str, Any]) -> Book:
+    def _replace_numbers(self, numbers: Mapping[str, Any]) -> Book:
         """Return the book with numbers in place of some parameters."""
         own = {name: formula for name, formula in self.own.items() if name not in numbers}
         values: dict[str, Any] = {}
@@ -348,10 +348,10 @@ class Book:
             raise unknown_number(start + name, [start + known for known in self.values])
         if not values:
             return self, rest
-        book = replace(self._with(new), formulas=kept, data={})
+        book = replace(self._replace_numbers(new), formulas=kept, data={})
         return book, {**{one.path: one.value(book.values) for one in book.moving(new)}, **rest}
 
-    def told_anew(self, sections: Mapping[str, Any]) -> Book:
+    def replace_sections(self, sections: Mapping[str, Any]) -> Book:
         """Return the book of the file with other sections, without their expressions."""
         kept = {path: f for path, f in self.formulas.items() if path.split(".")[0] not in sections}
         data = {**self.data, **sections} if sections and self.data else {}
@@ -373,7 +373,7 @@ class Book:
         return found.text if found else ""
 
     def lost(self, other: Book) -> list[str]:
-        """Describe the expressions and dependences that another book lacks, in up to two lines."""
+        """Describe the expressions and dependences that are lost in another book, in up to two lines."""
         texts = [f"{path} was {formula.text}" for path, formula in self.formulas.items() if path not in other.formulas]
         kept = other.values.keys() - other.unused
         dead = [name for name in self.values if name not in kept and name not in self.unused]
@@ -386,7 +386,7 @@ class Book:
         used = {n for one in (*self.own.values(), *self.formulas.values()) for n in one.names}
         return [name for name in self.values if name not in used]
 
-    def told(self, units: Mapping[str, str] | None = None) -> list[str]:
+    def describe(self, units: Mapping[str, str] | None = None) -> list[str]:
         """Describe each parameter: value, unit and expression."""
         return [
             f"{name} = {value:.12g} {(units or {}).get(name, '')}".strip()

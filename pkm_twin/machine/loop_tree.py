@@ -177,12 +177,12 @@ class LoopTree:
     origin: Array = _zeros(3)
 
     @property
-    def hung(self) -> list[Hung]:
+    def tree_joints(self) -> list[TreeJoint]:
         """The joints of the tree from the root outwards, each level in the order of the file."""
-        return hung(self.root, self.joints.values())
+        return order_from_root(self.root, self.joints.values())
 
 
-class Hung(NamedTuple):
+class TreeJoint(NamedTuple):
     """A joint of the tree, its link ``parent`` on the root's side, and the link beyond it."""
 
     joint: Joint
@@ -212,13 +212,13 @@ class Single(NamedTuple):
         return self.joint.drawn if self.whole else 0.0
 
 
-def hung(root: str, joints: Iterable[Joint]) -> list[Hung]:
+def order_from_root(root: str, joints: Iterable[Joint]) -> list[TreeJoint]:
     """List joints from the root outwards, breadth first, without those that close a loop."""
     meeting: dict[str, list[Joint]] = {}
     for joint in joints:
         for end in (joint.inner, joint.outer):
             meeting.setdefault(end, []).append(joint)
-    order: list[Hung] = []
+    order: list[TreeJoint] = []
     reached, level = {root}, [root]
     while level:
         after = []
@@ -227,7 +227,7 @@ def hung(root: str, joints: Iterable[Joint]) -> list[Hung]:
                 child = joint.outer if link == joint.inner else joint.inner
                 if child not in reached:
                     reached.add(child)
-                    after.append(Hung(joint, link, child))
+                    after.append(TreeJoint(joint, link, child))
         order += after
         level = [one.child for one in after]
     return order
@@ -289,7 +289,7 @@ def span_tree(
     pairs = {joint.name: (joint.inner, joint.outer) for joint in sorted(joints.values(), key=rank)}
     chosen = set(spanning(links, pairs))
     tree = {name: joint for name, joint in joints.items() if name in chosen}
-    reached = {WORLD, *(one.child for one in hung(WORLD, tree.values()))}
+    reached = {WORLD, *(one.child for one in order_from_root(WORLD, tree.values()))}
     for name in links:
         if name not in reached:
             raise ParameterError(f"link.{name}", None, "a joint that connects it")

@@ -102,7 +102,7 @@ def _require_bounded(path: Path, top: ET.Element, folder: Path, depth: int = 0) 
     words = [word for _, key, text in pairs if key in positions for word in text.split()]
     endless = re.compile(r"(?:^|\s)[-+]?(?:nan(?:\(\S*\))?|inf|infinity)(?:\s|$)", re.IGNORECASE)
     for element, key, text in pairs:
-        # MuJoCo takes these for numbers; a part may be called so.
+        # MuJoCo reads these words as numbers; as a name they are allowed.
         if endless.search(text) and key != "name" and text not in names:
             where = ".".join(filter(None, (element.tag, element.get("name"), key)))
             raise ParameterError(where, text, "finite numbers")
@@ -119,23 +119,23 @@ def _require_bounded(path: Path, top: ET.Element, folder: Path, depth: int = 0) 
                     inner = urdf_xml.elements(included)
                     words += _require_bounded(included, inner, folder, depth + 1)
         repeated = key in ("count", "nrow", "ncol", "width", "height")
-        if repeated and math.prod(map(_whole, text.split())) > MAX_PARTS:
+        if repeated and math.prod(map(_read_count, text.split())) > MAX_PARTS:
             raise ParameterError(f"{element.tag}.{key}", text, f"at most {MAX_PARTS}")
     if _copies(top) > MAX_PARTS:
         raise ParameterError("replicate", "nested copies", f"at most {MAX_PARTS} bodies")
     return words
 
 
-def _whole(text: str) -> int:
+def _read_count(text: str) -> int:
     try:
         return max(1, math.ceil(float(text)))
     except (ValueError, OverflowError):
-        return 1  # Which MuJoCo refuses.
+        return 1  # MuJoCo rejects the text with its own error.
 
 
 def _copies(element: ET.Element) -> int:
     """Count the parts that an element stands for, with everything replicated in it."""
-    count = _whole(element.get("count", "1")) if element.tag == "replicate" else 1
+    count = _read_count(element.get("count", "1")) if element.tag == "replicate" else 1
     return count * (1 + sum(map(_copies, element)))
 
 

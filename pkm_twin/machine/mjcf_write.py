@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.machine.loop_tree import Hung, Link, LoopTree, Single, screws, singles
+from pkm_twin.machine.loop_tree import Link, LoopTree, Single, TreeJoint, screws, singles
 from pkm_twin.machine.urdf_write import GROUND, PLATFORM, number_text
 
 
@@ -90,8 +90,8 @@ def rows(tree: LoopTree) -> list[tuple[str, str, list[Single]]]:
     A link without mass is left out where one joint alone goes on from it: its joints then belong to
     the next body.
     """
-    after: dict[str, list[Hung]] = {}
-    for one in tree.hung:
+    after: dict[str, list[TreeJoint]] = {}
+    for one in tree.tree_joints:
         after.setdefault(one.parent, []).append(one)
     held = {end for one in tree.closures for end in (one.inner, one.outer)} | {tree.platform}
     found: list[tuple[str, str, list[Single]]] = []

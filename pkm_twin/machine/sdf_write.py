@@ -41,7 +41,7 @@ def write_sdf(tree: LoopTree) -> str:
     top = ET.Element("sdf", version="1.9")
     model = ET.SubElement(top, "model", name=tree.name)
     links, joints = dict(tree.links), [*tree.joints.values(), *tree.closures]
-    ends = {one.joint.name: one[1:] for one in tree.hung}
+    ends = {one.joint.name: one[1:] for one in tree.tree_joints}
     rows: list[tuple[str, str, str, str, Array, Sequence[Single]]] = []
     for joint in joints:
         parent, child = ends.get(joint.name, (joint.inner, joint.outer))

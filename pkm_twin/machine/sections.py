@@ -160,7 +160,7 @@ def friction_fields(kind: Any, *size: int, **options: Any) -> list[tuple[str, An
 
 @remembered
 def limits_of(joints: int) -> Any:
-    """Make the schema of limits of this number of joints: absent is None, one value sets all."""
+    """Make the schema of limits for this number of joints: None if absent; one value sets all."""
     above: dict[str, Any] = {"above": 0.0, "high": math.inf, "spread": True, "default": None}
     entries = [
         ("position", Any, schema.interval(count=joints, unit="{joint}", default=None)),

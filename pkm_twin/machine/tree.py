@@ -120,7 +120,7 @@ class Tree:
                 if parents.get(parent) == body:
                     continue
                 parents[body] = parent
-                self._hang(parent, body, joint)
+                self._attach_body(parent, body, joint)
                 todo.append(body)
         self.size = graph.size
 
@@ -134,15 +134,15 @@ class Tree:
         """The steps of all actuated joints, including those that follow."""
         return [self.steps[name] for name in self.graph.actuated]
 
-    def of_drives(self, leads: Any, rest: Any) -> list[Any]:
+    def drive_rates(self, leads: Any, rest: Any) -> list[Any]:
         """Return rates or accelerations of all drives from the leading ones, shape (m,), and the unknowns."""
         return [(leads if step.actuated else rest)[step.rate] for step in self.drives]
 
-    def values_of_drives(self, leads: Any, x: Any) -> list[Any]:
+    def drive_positions(self, leads: Any, x: Any) -> list[Any]:
         """Return positions of all drives from the leading ones; rotations within half a turn of home."""
         return [leads[step.position] if step.actuated else self._value(step, x) for step in self.drives]
 
-    def values_of_joints(self, names: Sequence[str], x: Any) -> list[Any]:
+    def joint_positions(self, names: Sequence[str], x: Any) -> list[Any]:
         """Return positions of passive joints of one freedom; rotations within half a turn of home."""
         return [self._value(self.steps[name], x) for name in names]
 
@@ -185,13 +185,13 @@ class Tree:
         self.cut = tuple(name for name in graph.joints if name not in spanned)
         for name in self.cut:
             if graph.joints[name].type.threaded():
-                # Its turn is known but for whole ones.
+                # The rotation is known up to whole turns only.
                 raise ParameterError(f"joints.{name}.type", "helical", "a loop that has other joints too")
             if graph.joints[name].actuated:
                 raise ParameterError(f"joints.{name}.actuated", True, "actuated joints that close no loop of their own")
         return neighbours
 
-    def _hang(self, parent: str, body: str, name: str | None) -> None:
+    def _attach_body(self, parent: str, body: str, name: str | None) -> None:
         graph = self.graph
         if name is None:
             # A point of the geometry, which programs have at run time; a centre of mass is none.

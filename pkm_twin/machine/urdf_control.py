@@ -152,7 +152,7 @@ class Control:
         return {"position": sorted(ends), "velocity": size * velocity, "effort": effort / size}
 
     def inverse(self) -> Control:
-        """From the controller's numbers to the model's."""
+        """Return the conversion from the controller's numbers to the model's."""
         return Control(self.joint, self.name, 1.0 / self.factor, -self.offset / self.factor)
 
 
@@ -165,7 +165,7 @@ def tree_names(joints: Iterable[str], controls: Iterable[Control]) -> dict[str, 
 
 
 def take_drives(robot: ET.Element) -> dict[str, dict[str, Any]]:
-    """Take a URDF for a controller to one in the model's numbers, in place; entries of a joint map.
+    """Convert a controller's URDF to the model's numbers, in place; return entries of a joint map.
 
     Other ``<mimic>`` elements stay.
     """

@@ -22,7 +22,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, UnknownNameError, warn
 from pkm_twin.machine import foreign, sdf_file, urdf_xml
 from pkm_twin.machine.joints import TYPES
-from pkm_twin.machine.loop_tree import Fault, Joint, Link, LoopTree, hung, link_of
+from pkm_twin.machine.loop_tree import Fault, Joint, Link, LoopTree, link_of, order_from_root
 from pkm_twin.machine.precision import rounding_error
 from pkm_twin.machine.rotations import Pose
 from pkm_twin.machine.urdf_control import UNCOUPLED, actuated_joints, find_marked, read_beside
@@ -87,7 +87,7 @@ def read(path: Path, robot: ET.Element, actuated: Sequence[str] | None = None) -
     closures = _closures(robot, beside, links, joints)
     _warn_of_units(path, robot, joints, closures)
     frames = {root: Pose()}
-    for joint, parent, child in hung(root, joints.values()):
+    for joint, parent, child in order_from_root(root, joints.values()):
         frames[child] = frames[parent] @ joint.frames[0]
     links = {n: link.moved(frames[n]) for n, link in links.items()}
     joints, closures = (
@@ -229,7 +229,7 @@ def _root(links: dict[str, Link], joints: dict[str, Joint]) -> str:
     roots = [name for name in links if name not in parents]
     if len(roots) != 1:
         raise ParameterError("robot", roots, "exactly one root link (a link that is not a child)")
-    reached = {roots[0], *(one.child for one in hung(roots[0], joints.values()))}
+    reached = {roots[0], *(one.child for one in order_from_root(roots[0], joints.values()))}
     if circle := sorted(set(links) - reached):
         where = f"joint.{parents[circle[0]].name}"
         raise ParameterError(where, circle, "a tree; these links form a circle or depend on one")
@@ -269,12 +269,12 @@ def _closures(
     for i, (pair, kind) in enumerate(zip(pairs, kinds, strict=True)):
         if not isinstance(pair, list) or len(pair) != 2:
             raise ParameterError(f"closed_loop[{i}]", pair, "a pair of frame names")
-        # Two frames that meet wholly, or in their origins only.
+        # Frames coincide (6d), or their origins do (3d).
         meeting = {"6d": "fixed", "3d": "spherical"}
         if str(kind).lower() not in meeting:
             raise UnknownNameError(f"type[{i}]", kind, meeting)
         known = [urdf_xml.known_link(f"closed_loop[{i}]", name, [*links, *joints]) for name in pair]
-        # A joint's frame moves with its child, so that the child link's frame is the same.
+        # A joint's frame is its child link's frame.
         ends = [joints[name].outer if name in joints else name for name in known]
         name = "_".join(pair)
         if name in taken:

@@ -96,7 +96,7 @@ def parts_of(tree: LoopTree) -> list[Single]:
     """List the joints of the URDF, from the ground outwards; the last leads to ``platform``."""
     place, taken = Pose(position=tree.origin), {PLATFORM, *tree.links}
     tool = Joint(f"{PLATFORM}_frame", "fixed", tree.platform, PLATFORM, (place, place))
-    hung = (*tree.hung, (tool, tree.platform, PLATFORM))
+    hung = (*tree.tree_joints, (tool, tree.platform, PLATFORM))
     return [part for one in hung for part in singles(*one, taken)]
 
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, install, warn
-from pkm_twin.machine.loop_tree import WORLD, Fault, Joint, Link, LoopTree, hold_in_world, hung, span_tree
+from pkm_twin.machine.loop_tree import WORLD, Fault, Joint, Link, LoopTree, hold_in_world, order_from_root, span_tree
 from pkm_twin.machine.rotations import Pose, about, from_quaternion
 from pkm_twin.machine.urdf_control import UNCOUPLED, actuated_joints
 
@@ -266,7 +266,7 @@ class _Reader:
         """
         moves = {WORLD: Pose()}
         placed: dict[str, Joint] = {}
-        for joint, parent, child in hung(WORLD, joints.values()):
+        for joint, parent, child in order_from_root(WORLD, joints.values()):
             inwards = parent == joint.inner
             first, second = joint.frames if inwards else joint.frames[::-1]
             own = joint.axes[0 if inwards else 1] if len(joint.axes) else np.zeros(3)

@@ -13,7 +13,7 @@ class TwinRobot(Robot):
     """A robot whose dynamics are at hand as a method."""
 
     def torque_loop(self, samples: int = 1) -> ControlLoop:
-        """As :meth:`Robot.torque_loop`."""
+        """Prepare inverse dynamics for a control loop, see :meth:`Robot.torque_loop`."""
         # Here: a command that needs no torques does not load them.
         from delta_dynamics.torques.virtual_work import TorqueLoop
 

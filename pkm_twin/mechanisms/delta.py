@@ -58,7 +58,7 @@ class Geometry:
     closures: tuple[str, ...] = schema.words("rod", "rcu", size=3, distinct=False)
 
     def verify(self, path: str) -> None:
-        """Limbs apart, and at most one of them an rcu."""
+        """Check that limbs have different azimuths, and that at most one is an rcu."""
         if self.closures.count("rcu") > 1:
             raise ParameterError(f"{path}.closures", list(self.closures), "at most one rcu limb")
         check_azimuths(self.azimuths, f"{path}.azimuths")
@@ -120,7 +120,7 @@ class Delta(TwinRobot):
 
     @property
     def description(self) -> str:
-        """What machine it is, with its closures."""
+        """Name of the machine, with its limbs' closures."""
         kinds = ", ".join(self.geometry.closures)
         return f"Delta robot, the platform translates; forearms of limbs 1 to 3: {kinds}"
 
@@ -131,12 +131,12 @@ class Delta(TwinRobot):
         return [(out, np.cross(UP, out)) for out in outwards]
 
     def _elbow(self, i: int, q: Any) -> Any:
-        """Elbow of limb i; of an rcu, where its axis meets the plane of the arm."""
+        """Return the elbow of limb i; of an rcu, where its axis meets the plane of the arm."""
         g, (out, _) = self.geometry, self._directions[i]
         return g.base_radius * out + g.arm_length * (cos(q) * out - sin(q) * UP)
 
     def _forearm(self, i: int, q: Any, platform: Any) -> Any:
-        """Forearm of limb i from elbow to platform joint; of an rcu, without its slide.
+        """Return the forearm of limb i from elbow to platform joint; of an rcu, without its slide.
 
         Delta-CU paper, equation 9.
         """

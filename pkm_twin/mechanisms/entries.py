@@ -78,7 +78,7 @@ def edited_yaml(robot: Robot, source: str, values: Mapping[str, Fitted | Chosen]
 
 
 def write_edited(path: Path, head: Sequence[str], text: str, before: Robot) -> list[str]:
-    """Write a robot's file with lines of comment at its head, whole or not at all.
+    """Write a robot's file under a comment, atomically; return the expressions that are lost.
 
     :param before: the robot of the file that was edited.
     :returns: what the text has lost of its expressions, in lines, which the head has too.

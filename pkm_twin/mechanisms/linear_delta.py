@@ -44,7 +44,7 @@ class Geometry:
     leans: Array | None = schema.vector(6, unit="rad", default=None)
 
     def verify(self, path: str) -> None:
-        """Towers apart, rods longer than the radius."""
+        """Check that towers have different azimuths, and that rods are longer than the radius."""
         check_azimuths(self.angles, f"{path}.angles")
         for i, arm in enumerate(self.arm_lengths):
             if not arm > self.radius:
@@ -78,7 +78,7 @@ class LinearDelta(TwinRobot):
 
     @property
     def size(self) -> float:
-        """The radius, m: no angle moves the nozzle by more."""
+        """Radius of the towers, m: the scale of lengths."""
         return self.geometry.radius
 
     def make_parts(self) -> Parts:

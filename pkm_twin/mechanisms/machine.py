@@ -186,7 +186,7 @@ class Machine(TwinRobot):
             return made
         drives = not {"friction", "limits", "redundancy"}.isdisjoint(sections)
         told = {key: schema.plain(getattr(made, key)) for key in sections if not drives}
-        made = dataclasses.replace(made, book=made.book.told_anew(told))
+        made = dataclasses.replace(made, book=made.book.replace_sections(told))
         if not drives:
             return made
         joints = dict(made.specs["joints"])
@@ -294,7 +294,7 @@ class Machine(TwinRobot):
         return path_of(["joints", self.joint_names[int(k)], section, key, *rest[:-2]])
 
     def named(self, keys: Sequence[str | int]) -> Iterator[tuple[str, str, Keys, float]]:
-        """Yield the entries that keys name; of a limb all copies, keys ``azimuth`` for a limb's own."""
+        """Yield the entries that keys name: all copies of a limb's entry, with its azimuth."""
         keys = list(keys)
         for (kind, name), source in self.sources.items():
             if keys[:2] == [kind, name]:
@@ -335,7 +335,7 @@ class Machine(TwinRobot):
 
     @property
     def without_home(self) -> frozenset[str]:
-        """Joints of which the file does not say where they count from."""
+        """Joints whose zero position the file does not state."""
         return frozenset(n for n, joint in self.specs["joints"].items() if joint.home is None)
 
     @property
@@ -429,7 +429,7 @@ class Machine(TwinRobot):
         return {kind: entries for kind, entries in told.items() if entries}
 
     @cached_property
-    def led(self) -> Machine:
+    def leading_machine(self) -> Machine:
         """The machine whose leading drives alone are actuated; the others keep friction and rotor.
 
         :raises ParameterError: a friction law that passive joints do not have.
@@ -482,7 +482,7 @@ class Machine(TwinRobot):
 def _without_rounding(
     data: Any, graph: Graph, specs: Mapping[str, Mapping[str, Any]], name: str
 ) -> Mapping[str, Mapping[str, Any]]:
-    """Return the entries of a file with the vectors that a repair of its rounding gives.
+    """Return the file's entries with vectors corrected for the rounding of their digits.
 
     Warns by how much vectors were moved. Entries that no small change repairs stay as they are.
     """

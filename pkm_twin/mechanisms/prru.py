@@ -49,7 +49,7 @@ class Geometry:
     branch: str = schema.choice("above", "below")
 
     def verify(self, path: str) -> None:
-        """Limbs apart, and long enough for the level platform."""
+        """Check that limbs have different azimuths and reach the level platform."""
         check_azimuths(self.azimuths, f"{path}.azimuths")
         out = abs(self.base_radius - self.platform_radius)
         if not self.limb_length > out * (1 + 1e-6):
@@ -83,7 +83,7 @@ class Inertia:
     rotor_inertia: float = schema.number(low=0.0, unit="kg", default=0.0)
 
     def verify(self, path: str) -> None:
-        """Axial moments within the triangle rule."""
+        """Check that axial moments of inertia satisfy the triangle inequality."""
         for key in ("lower_link_inertia", "upper_link_inertia"):
             value = getattr(self, key)
             if value is not None and value[1] > 2 * value[0] * (1 + 1e-9):

@@ -83,7 +83,7 @@ class Members:
     shear_factor: float = schema.number(low=0.0, high=10.0, default=1.0)
 
     def verify(self, path: str) -> None:
-        """Diameters whose fourth power is a number to compute with."""
+        """Check that the diameters' fourth powers neither overflow nor vanish."""
         for i, value in enumerate(self.diameter.tolist()):
             if not 1e-6 <= value <= 10.0:
                 raise ParameterError(f"{path}.diameter[{i}]", value, "1e-6 to 10 m")
@@ -104,7 +104,7 @@ class JointsCompliance:
     rpu_revolute: Array = compliances()
 
     def verify(self, path: str) -> None:
-        """Free exactly where the joint turns; a number in every direction that carries load."""
+        """Check that a joint is free exactly about its axes, and elastic in the other directions."""
         for joint, free in FREE_AXES.items():
             for i, value in enumerate(getattr(self, joint).tolist()):
                 field = f"{path}.{joint}[{i}]"

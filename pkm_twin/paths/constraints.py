@@ -173,13 +173,13 @@ class Forces:
 class Rows:
     """Hold limits at points of a path, scaled to 1, and the largest x there.
 
-    -1 <= alpha u + beta x + drag v + fixed + dry <= 1, shape (p, r), and x <= most, shape (p,).
+    -1 <= alpha u + beta x + viscous v + fixed + dry <= 1, shape (p, r), and x <= most, shape (p,).
     ``dry``: dry friction, which changes sign where a joint reverses.
     """
 
     alpha: Array
     beta: Array
-    drag: Array
+    viscous: Array
     fixed: Array
     dry: Array
     most: Array

@@ -51,7 +51,7 @@ def smooth_profile(
     rows = Rows(
         rows.alpha * unit,
         rows.beta * unit,
-        rows.drag * np.sqrt(unit),
+        rows.viscous * np.sqrt(unit),
         rows.fixed,
         rows.dry,
         rows.most / unit,

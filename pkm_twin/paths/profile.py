@@ -122,8 +122,8 @@ def interval_rows(
             v = np.sqrt(x)
             # The friction's slope is infinite at rest.
             about = np.maximum(v[end], 0.01 * v.max())[:, None]
-            beta = beta + rows.drag[k] / (2.0 * about)
-            fixed = fixed + 0.5 * rows.drag[k] * about
+            beta = beta + rows.viscous[k] / (2.0 * about)
+            fixed = fixed + 0.5 * rows.viscous[k] * about
         alphas.append(rows.alpha[k] / double)
         betas.append(beta)
         # Rest stays feasible when limits are reduced.
@@ -150,7 +150,7 @@ def fastest_profile(rows: Rows, left: Index, steps: Array, part: Array, about: A
     :param part: of each interval's limits that is used, shape (i,).
     :param about: a profile close to the result, about which viscous friction is linear first.
     """
-    viscous = rows.drag.any()
+    viscous = rows.viscous.any()
     x = about if viscous else None
     # With viscous friction until the speeds change by less than 3e-4.
     for _ in range(8 if viscous else 1):

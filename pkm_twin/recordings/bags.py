@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pkm_twin.bags.reader import Bag, open_bag
 from pkm_twin.bags.storage import METADATA_FILE
-from pkm_twin.bags.writer import whole_bag
+from pkm_twin.bags.writer import write_whole_bag
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import BagError, MessageError, ParameterError, one_line
 from pkm_twin.mechanisms.catalogue import load, robot_names
@@ -314,7 +314,7 @@ def write_motion(path: Path, r: Recording, facts: Mapping[str, Any], overwrite: 
     }
     told = {**facts, **origin_facts(r.robot, r.load)}
     metadata = {"pkm_twin": {key: str(value) for key, value in told.items()}}
-    with whole_bag(path, overwrite, metadata) as bag:
+    with write_whole_bag(path, overwrite, metadata) as bag:
         bag.add_topic(TOPIC, TRAJECTORY, definition=DEFINITIONS[TRAJECTORY])
         bag.write(TOPIC, message, 0)
 

@@ -81,7 +81,7 @@ class Origin:
         return cls(facts.get("robot", ""), int(digest), tuple(gravity))
 
     def differs_from(self, robot: Robot) -> str:
-        """Say how the origin differs from a robot; empty where all numbers are the same."""
+        """Describe how the origin differs from a robot; empty if all numbers are equal."""
         own = Origin.of(robot)
         if self.digest == own.digest:
             return ""

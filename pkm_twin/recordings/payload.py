@@ -60,7 +60,7 @@ class Load:
         return [(*span, mass) for span, mass in zip(times, masses, strict=True)]
 
     def carried(self, time: Array) -> Array:
-        """Mass at times (n,), kg; NaN where the payload is that of the robot's file."""
+        """Return the mass at times (n,), kg; NaN where the robot file's payload applies."""
         if not self.times:
             return np.full(len(time), self.mass)
         found = np.full(len(time), np.nan)
@@ -69,7 +69,7 @@ class Load:
         return found
 
     def held(self, time: Array) -> Mask:
-        """When it is on the platform, shape (n,)."""
+        """Return at which times the payload is on the platform, shape (n,)."""
         return np.isfinite(self.carried(time))
 
     def farthest(self, own: float) -> float:
@@ -100,7 +100,7 @@ class Load:
         return loaded
 
     def as_json(self) -> dict[str, Any]:
-        """Plain data, units in the keys; no times where it is held all the time."""
+        """Return plain data with units in the keys; without times if it is always held."""
         several = {"masses_kg": list(self.masses)} if self.masses else {}
         return several | {
             "mass_kg": self.mass,
@@ -171,7 +171,7 @@ def read_load(bag: Bag) -> Load | None:
     facts = bag.report.metadata.get("pkm_twin", {})
     if PICKED not in facts:
         return None
-    masses, picked, released = (_fact(bag, facts, name) for name in (MASS, PICKED, RELEASED))
+    masses, picked, released = (_read_numbers(bag, facts, name) for name in (MASS, PICKED, RELEASED))
     if min(masses) < 0.0:
         raise metadata_error(bag, MASS, facts[MASS], "0 or more")
     before = -math.inf
@@ -191,7 +191,7 @@ def read_load(bag: Bag) -> Load | None:
     return Load.of(list(zip(picked, released, each, strict=True)), "bag", com)
 
 
-def _fact(bag: Bag, facts: Mapping[str, str], name: str) -> list[float]:
+def _read_numbers(bag: Bag, facts: Mapping[str, str], name: str) -> list[float]:
     """Read the numbers of a value; only the last release may be infinite."""
     try:
         values = [float(word) for word in facts[name].split()]
@@ -212,7 +212,7 @@ def metadata_error(bag: Bag, name: str, value: str | None, expected: str) -> Bag
 
 
 def parse_payload(text: str) -> tuple[float, tuple[float, float, float] | None]:
-    """Mass (kg) and, where given, centre (m) of ``MASS[,x,y,z]``.
+    """Parse ``MASS[,x,y,z]``: mass, kg, and the centre, m, if given.
 
     :raises ParameterError: it is not 1 or 4 finite numbers, or the mass is negative.
     """
@@ -223,7 +223,7 @@ def parse_payload(text: str) -> tuple[float, tuple[float, float, float] | None]:
 
 
 def parse_times(text: str) -> tuple[tuple[float, float], ...]:
-    """Spans of ``FROM,TO[,FROM,TO...]``, s.
+    """Parse the intervals of ``FROM,TO[,FROM,TO...]``, s.
 
     :raises ParameterError: the numbers are not pairs, finite and rising.
     """

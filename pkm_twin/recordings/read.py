@@ -107,7 +107,7 @@ def _read_table_recording(path: Path, name: str | Robot | None, how: ReadOptions
     robot = name if isinstance(name, Robot) else load(name)
     table, side = (read_table(path, kinds_of(robot, how.side), how.dialect), _find_map(robot, how.side))
     joints = robot.joint_names if side is None else side.names
-    _refuse_misspelt(table, robot, joints, how)
+    _reject_misspelt_columns(table, robot, joints, how)
 
     def stack(word: str) -> Array | None:
         values = table.stack_if([f"{joint}.{word}" for joint in joints])
@@ -148,7 +148,7 @@ def _read_table_recording(path: Path, name: str | Robot | None, how: ReadOptions
         )
     time, notes, effort, word = read_times(path, times), [], None, how.efforts[0]
     origin = Origin.of_table(table)
-    # Beside the terms of a model the efforts are their sum.
+    # In a table of a model's terms the efforts are their sum.
     computed = any(f"{joint}.{TERM}" in table for joint in robot.joint_names)
     if computed:
         # Reject computed efforts without the wrench or payload that they were computed with.
@@ -171,7 +171,7 @@ def _read_table_recording(path: Path, name: str | Robot | None, how: ReadOptions
         assert pose is not None  # noqa: S101  one of the two is there
         # Joint positions of a pose, and their rates where the table has those of the pose.
         q = robot.inverse(pose)
-        # Joint rates in the table are those of the machine whose joint positions it has.
+        # Velocities of joints belong to a table of joints, those of coordinates to one of poses.
         qd, qdd = (table.stack_if([f"{name}.{what}" for name in robot.pose_names]) for what in RATES[1:])
         if set(robot.joint_names) & set(robot.pose_names) or qd is None or qdd is None:
             q, qd, qdd = q, None, None
@@ -254,8 +254,8 @@ def _require_drives(robot: Robot) -> list[DriveSpec]:
     return [drive for drive in robot.drives if drive is not None]
 
 
-def _refuse_misspelt(table: Table, robot: Robot, joints: Sequence[str], how: ReadOptions) -> None:
-    """Reject what would be read if its name were right, where nothing else may be there.
+def _reject_misspelt_columns(table: Table, robot: Robot, joints: Sequence[str], how: ReadOptions) -> None:
+    """Reject columns with a misspelt name, instead of ignoring them.
 
     :raises UnknownNameError: by the column.
     """
@@ -321,7 +321,7 @@ def check_pose(path: Path, robot: Robot, q: Array, pose: Array, how: str = "") -
 
 
 def check_units(path: Path, robot: Robot, time: Array, q: Array, qd: Array | None, dialect: Dialect) -> None:
-    """Units of a motion: the steps of its times are short, its velocities those of its positions.
+    """Reject times and velocities that are probably in other units than the positions.
 
     Positions that may be in degrees give a warning.
 

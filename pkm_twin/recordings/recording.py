@@ -155,7 +155,7 @@ class Recording:
 
     @cached_property
     def step_fault(self) -> str:
-        """Jumps of the positions with their times; empty where there are none."""
+        """Description of the positions' jumps with their times; empty without any."""
         steps, found = self.steps, self.steps.first
         if steps.publishers:
             counts = " and ".join(map(str, steps.publishers))
@@ -200,7 +200,7 @@ class Recording:
 
     @property
     def measured(self) -> Array:
-        """The efforts, shape (samples, n).
+        """Measured efforts, shape (samples, n).
 
         :raises PkmTwinError: there are none.
         """
@@ -248,7 +248,7 @@ class Recording:
         return replace(self, notes=(*self.notes, text)).part(~again)
 
     def on_time(self, late: float) -> Recording:
-        """Efforts that are so late, s, put on time by whole samples, where none is missing then.
+        """Return the recording with efforts shifted back by a delay, s, in whole samples.
 
         A remainder of half a sample at most is left: copied efforts keep their noise.
         """
@@ -317,7 +317,7 @@ def _differentiate(values: Array, time: Array) -> Array:
 
 
 def at_rest(r: Recording, qd: Array) -> Mask:
-    """Which joints stand still, shape (samples, n), as far as their rates ``qd`` can tell."""
+    """Return which joints are at rest within the error of rates ``qd``, (samples, n)."""
     if r.qd is not None:
         return np.asarray(np.abs(qd) <= SIGMAS * estimate_noise(r.time, r.qd))
     if len(r.time) < 3:
@@ -328,7 +328,7 @@ def at_rest(r: Recording, qd: Array) -> Mask:
 
 
 def differentiated(r: Recording) -> tuple[Array, Array, Mask]:
-    """Rates and accelerations (samples, n) by the differentiator's middle, and where they are."""
+    """Return rates and accelerations (samples, n) by the differentiator, and where they are known."""
     late = _WINDOW // 2
     differentiator = Differentiator(order=_ORDER, window=_WINDOW, middle=True)
     gap = 10 * float(np.median(np.diff(r.time))) if len(r.time) > 1 else 1.0

@@ -159,7 +159,7 @@ class Table(dict[str, Array]):
                 )
 
     def stack(self, names: Sequence[str]) -> Array:
-        """Columns side by side, shape (rows, names).
+        """Return columns side by side, shape (rows, names).
 
         :raises ParameterError: by the first that is missing.
         """
@@ -167,7 +167,7 @@ class Table(dict[str, Array]):
         return np.stack([self[name] for name in names], -1)
 
     def stack_if(self, names: Sequence[str]) -> Array | None:
-        """Columns side by side, None where all are missing.
+        """Return columns side by side; None if all are missing.
 
         :raises ParameterError: some are missing.
         """
@@ -205,7 +205,7 @@ def kinds_of(robot: Robot, side: str = "joint") -> dict[str, str]:
 def read_table(
     path: Path, kinds: Mapping[str, str] | None = None, dialect: Dialect = PLAIN, *, blank: bool = False
 ) -> Table:
-    """Columns of a CSV or, by its ending, Parquet file with a header row, in SI units.
+    """Read the columns of a CSV or, by its ending, Parquet file with a header row, in SI units.
 
     Lines above the header row that begin with # are comments. Left out are columns without any
     number and, where ``kinds`` are known, other columns with a cell that is no number: a state in
@@ -359,7 +359,7 @@ def _split_rows(path: Path, lines: Iterator[str], first: str, dialect: Dialect) 
 
 
 def _name_columns(header: Sequence[str], kinds: Mapping[str, str], dialect: Dialect) -> tuple[list[str], list[float]]:
-    """Our names of a table's columns, and the sizes in SI of their numbers.
+    """Return the columns' names in this package, and their units in SI.
 
     :raises ParameterError: a unit of another kind.
     :raises UnknownNameError: a name that no column has, or a header that is not there.
@@ -396,7 +396,7 @@ def _name_columns(header: Sequence[str], kinds: Mapping[str, str], dialect: Dial
 
 
 def require_pyarrow(path: Path) -> None:
-    """Refuse Parquet before the work where it cannot be read or written.
+    """Reject a Parquet file early if pyarrow is missing.
 
     :raises ParameterError: pyarrow is missing.
     """
@@ -405,7 +405,7 @@ def require_pyarrow(path: Path) -> None:
 
 
 def check_target(path: Path) -> None:
-    """Refuse a table's name before the work, not after it.
+    """Reject a table's name that cannot be written, before the computation.
 
     :raises ParameterError: the ending is none of :data:`ENDINGS`, or pyarrow is missing for it.
     """

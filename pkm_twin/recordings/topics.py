@@ -239,13 +239,13 @@ def _read_joint_names(bag: Bag, topics: list[str], joints: set[str]) -> dict[str
 
 
 def require_definition(bag: Bag, topic: str) -> None:
-    """Refuse a type whose recorded fields are not the ones that are read.
+    """Reject a type whose recorded fields differ from the expected ones.
 
     :raises BagError: naming the field.
     """
     info = bag.report.topics[topic]
     if info.schema_encoding != "ros2msg":
-        return  # the first message's decoding tells
+        return  # decoding the first message reports the fault
     try:
         recorded = parse_definition(info.type, info.definition)
     except BagError as error:

@@ -49,7 +49,7 @@ def _clamped(value: Any) -> Any:
 
 
 def clearance(robot: Robot, pose: ArrayLike) -> Array:
-    """Least distance between the surfaces of members of different limbs, shape (...), m.
+    """Compute the least distance between the surfaces of members of different limbs, shape (...), m.
 
     Members are round bars between their joints, with the outer diameters in the robot's file: the
     bars of the 2UPR-RPU, the limbs of the 3-PRRU, arms and rods of a Delta. The value is the

@@ -74,7 +74,7 @@ def forward_derivatives(robot: Robot, q: ArrayLike, by: Sequence[str] = ()) -> D
     :raises ParameterError: an unknown path. Other errors as of ``forward``.
     """
     rows = np.eye(len(robot.pose_names), len(robot.pose_names) + 12)
-    return Derivatives(robot.jacobian(q), _by_numbers(robot, q, rows, by))
+    return Derivatives(robot.jacobian(q), _differentiate_by_numbers(robot, q, rows, by))
 
 
 def inverse_derivatives(robot: Robot, pose: ArrayLike, by: Sequence[str] = ()) -> Derivatives:
@@ -99,7 +99,7 @@ def platform_derivatives(robot: Robot, q: ArrayLike, by: Sequence[str] = ()) -> 
     errors as in :func:`forward_derivatives`.
     """
     rows = twist_rows(len(robot.pose_names), robot.platform(q)[1])
-    return Derivatives(robot.platform_jacobian(q), _by_numbers(robot, q, rows, by))
+    return Derivatives(robot.platform_jacobian(q), _differentiate_by_numbers(robot, q, rows, by))
 
 
 def twist_rows(m: int, rotation: Array) -> Array:
@@ -118,8 +118,8 @@ def twist_rows(m: int, rotation: Array) -> Array:
     return rows
 
 
-def _by_numbers(robot: Robot, q: ArrayLike, rows: Array, by: Sequence[str]) -> dict[str, Array]:
-    """Differentiate sums over pose, position and rotation by numbers of the file."""
+def _differentiate_by_numbers(robot: Robot, q: ArrayLike, rows: Array, by: Sequence[str]) -> dict[str, Array]:
+    """Differentiate weighted sums of pose, position and rotation by numbers of the file."""
     if not by:
         return {}
     slopes = robot.cached(FileNumbers, tuple(by), geometry_numbers).slopes

@@ -406,7 +406,7 @@ class Mechanism(Common):
         return len(self.graph.leads) < self.joints_count
 
     @property
-    def led(self: R) -> R:
+    def leading_machine(self: R) -> R:
         """The machine in which only the leading drives are actuated; the others are passive joints."""
         return self
 

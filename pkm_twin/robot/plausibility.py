@@ -50,13 +50,13 @@ def findings(robot: Robot) -> tuple[Finding, ...]:
     """Return the implausible numbers of a robot."""
     graph = robot.graph
     found = [
-        *_size(graph),
-        *_masses(robot, graph),
-        *_bodies(robot, graph),
+        *_check_size(graph),
+        *_check_masses(robot, graph),
+        *_check_bodies(robot, graph),
         *_check_drives(robot, graph),
-        *_gravity(robot),
-        *_members(robot, graph),
-        *_home(graph),
+        *_check_gravity(robot),
+        *_check_members(robot, graph),
+        *_check_home(graph),
     ]
     # Copies of a limb have the same finding.
     alike: dict[tuple[str, ...], list[Finding]] = {}
@@ -85,7 +85,7 @@ def _above(field: str, quantity: str, value: float, most: float, unit: str, like
     yield from _outside(field, quantity, value, (0.0, most), unit, ("", likely))
 
 
-def _size(graph: Graph) -> Iterator[Finding]:
+def _check_size(graph: Graph) -> Iterator[Finding]:
     yield from _outside(
         "geometry",
         "extent of the machine",
@@ -96,7 +96,7 @@ def _size(graph: Graph) -> Iterator[Finding]:
     )
 
 
-def _masses(robot: Robot, graph: Graph) -> Iterator[Finding]:
+def _check_masses(robot: Robot, graph: Graph) -> Iterator[Finding]:
     total = _total(graph)
     if not total > 0.0:
         return
@@ -135,7 +135,7 @@ def payload_findings(robot: Robot) -> Iterator[Finding]:
         yield from _above("payload.mass", "payload", mass, 50.0 * total, "kg", likely)
 
 
-def _bodies(robot: Robot, graph: Graph) -> Iterator[Finding]:
+def _check_bodies(robot: Robot, graph: Graph) -> Iterator[Finding]:
     extent = _extent(graph) or graph.size
     load = robot.payload
     parts = []
@@ -196,7 +196,7 @@ def _check_drives(robot: Robot, graph: Graph) -> Iterator[Finding]:
             yield from _above(f"{name}: rotor_inertia", what, weight, 100.0 * total, "kg", likely)
 
 
-def _gravity(robot: Robot) -> Iterator[Finding]:
+def _check_gravity(robot: Robot) -> Iterator[Finding]:
     size = float(np.linalg.norm(robot.gravity))
     times = f"{size / 9.81:.4g} times the Earth's; in mm/s2 or cm/s2?"
     # Between the Moon and Jupiter.
@@ -205,7 +205,7 @@ def _gravity(robot: Robot) -> Iterator[Finding]:
         yield Finding("gravity", "gravity", size, 1.62, "m/s2", "in units of the Earth's?")
 
 
-def _members(robot: Robot, graph: Graph) -> Iterator[Finding]:
+def _check_members(robot: Robot, graph: Graph) -> Iterator[Finding]:
     try:
         structure = robot.structure()
     except PkmTwinError:
@@ -226,7 +226,7 @@ def _members(robot: Robot, graph: Graph) -> Iterator[Finding]:
                 yield from _above(f"{name}: member", what, far, most, "m", likely)
 
 
-def _home(graph: Graph) -> Iterator[Finding]:
+def _check_home(graph: Graph) -> Iterator[Finding]:
     try:
         index = singularity_at_home(graph)
     except (PkmTwinError, np.linalg.LinAlgError):

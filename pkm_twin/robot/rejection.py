@@ -64,7 +64,7 @@ def reject_poses(
 def _ask_for_unit(robot: Mechanism, pose: Array, home: Array) -> str:
     """Name the coordinate of a pose (m,) that is far outside, and ask for its unit; else empty."""
     far = np.abs(pose - home)
-    # Ten sizes of the machine from home were meant in mm.
+    # A coordinate beyond ten sizes of the machine was probably given in mm.
     for unit, most, other, word in (("m", 10.0 * robot.graph.size, "mm", "mm"), ("rad", 2.0 * np.pi, "deg", "degrees")):
         own = np.where([one == unit for one in robot.pose_units], far, 0.0)
         k = int(own.argmax())

@@ -145,7 +145,7 @@ class Robot(Mechanism):
         :raises UnreachableError: a pose out of reach; limb, sample and gap are named.
         :raises SingularityError: a pose at or beyond a singularity.
         """
-        return self.function(_quick_inverse, otherwise=self._checked_inverse)(pose)
+        return self.function(_closed_form_inverse_kernel, otherwise=self._checked_inverse)(pose)
 
     def _checked_inverse(self, pose: ArrayLike) -> Array:
         q, status = self._invert(pose)
@@ -265,8 +265,8 @@ class Robot(Mechanism):
         back = (jacobian / self.effort_scale**2).swapaxes(-1, -2)
         return np.asarray(back @ np.linalg.inv(jacobian @ back), np.float64)
 
-    def following(self, q: ArrayLike) -> Array:
-        """Return rates of all drives per rate of the leading ones, (..., n, m); the identity if all lead."""
+    def drive_jacobian(self, q: ArrayLike) -> Array:
+        """Return all drives' rates per rate of the leading drives, (..., n, m); the identity if all lead."""
         if not self.redundant:
             n = self.joints_count
             return np.broadcast_to(np.eye(n), (*np.shape(q)[:-1], n, n))
@@ -372,5 +372,5 @@ def _forward(robot: Robot) -> Kernel:
     return robot.engine.forward
 
 
-def _quick_inverse(robot: Robot) -> Kernel:
+def _closed_form_inverse_kernel(robot: Robot) -> Kernel:
     return robot.engine.quick_inverse

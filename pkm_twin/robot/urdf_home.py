@@ -61,7 +61,7 @@ class Assembly:
         """A loop that misses by more is open, m or rad."""
         self._bodies, self.steps = {tree.root: BASE}, list[str]()
         joints: dict[str, graphs.Joint] = {}
-        for joint, parent, child in tree.hung:
+        for joint, parent, child in tree.tree_joints:
             body = self._bodies[parent]
             for k, freedom in enumerate(joint.freedoms(parent)):
                 inner, body = body, f"{joint.name} {k}"
@@ -221,7 +221,7 @@ class Assembly:
         for spread in (0.05, 0.1, 0.2, 0.4, 0.8) * 2:
             if miss <= self.closed:
                 break
-            # No small step may help from the drawing.
+            # From the drawing small steps may not help: start away from it.
             start = rng.uniform(-spread, spread, len(self.steps))
             other, less = self.close(start)
             if less < miss:
@@ -403,7 +403,7 @@ class HomeSearch:
             return near
         if chosen is not None:
             return chosen
-        # No assembly is sound: the machine is rejected, with the reason, when it becomes a robot.
+        # No assembly is regular: creating the robot rejects it with the reason.
         values = self.assembly.relaxed(closed)
         return self._home(values, self.assembly.miss(), "near")
 

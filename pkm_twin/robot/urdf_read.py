@@ -202,7 +202,7 @@ def _require_closed(path: Path, tree: LoopTree) -> None:
     :raises ParameterError: their number, or their names.
     """
     moving = [joint.name for joint in tree.joints.values() if joint.kind != "fixed"]
-    # Assembling takes the cube of their number.
+    # The time to close the loops grows with the cube of this number.
     if len(moving) > 1000:
         raise ParameterError(str(path), f"{len(moving)} joints that move", "at most 1000")
     idle = [name for name in moving if name not in tree.actuated]
@@ -350,7 +350,7 @@ def _bodies(tree: LoopTree, tool: str, ground: str) -> dict[str, str]:
     :raises ParameterError: the tool is fixed to the ground.
     """
     group = {name: name for name in tree.links}
-    for joint, parent, child in tree.hung:
+    for joint, parent, child in tree.tree_joints:
         if joint.kind == "fixed":
             group[child] = group[parent]
     if group[tool] == group[ground]:

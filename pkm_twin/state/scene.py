@@ -15,7 +15,7 @@ from pkm_twin.machine.joints import across
 from pkm_twin.machine.members import Place
 from pkm_twin.robot.outline import Posture, robot_bars
 from pkm_twin.robot.robot import Robot
-from pkm_twin.settings import LARGE, setting
+from pkm_twin.settings import SCALE_BOUNDS, setting
 from pkm_twin.state.state import State
 
 Kind = Literal["cylinder", "sphere", "arrow", "line", "text"]
@@ -59,10 +59,14 @@ class Scales:
     N.
     """
 
-    deflection: float = setting(1000.0, "factor by which deflections are enlarged", name="deflection_scale", **LARGE)
-    force: float = setting(1e-3, "length of force arrows", name="force_scale", unit="m/N", **LARGE)
-    moment: float = setting(1e-2, "length of moment arrows", name="moment_scale", unit="m/(N m)", **LARGE)
-    ellipsoid_force: float = setting(100.0, "force whose deflections the compliance ellipsoid shows", unit="N", **LARGE)
+    deflection: float = setting(
+        1000.0, "factor by which deflections are enlarged", name="deflection_scale", **SCALE_BOUNDS
+    )
+    force: float = setting(1e-3, "length of force arrows", name="force_scale", unit="m/N", **SCALE_BOUNDS)
+    moment: float = setting(1e-2, "length of moment arrows", name="moment_scale", unit="m/(N m)", **SCALE_BOUNDS)
+    ellipsoid_force: float = setting(
+        100.0, "force whose deflections the compliance ellipsoid shows", unit="N", **SCALE_BOUNDS
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MessageError
 from pkm_twin.messages.reading import read_imu
 from pkm_twin.messages.stamps import SECOND, StampRules
-from pkm_twin.settings import LATE, setting
+from pkm_twin.settings import AGE_BOUNDS, setting
 from pkm_twin.streams.differentiator import Differentiator
 from pkm_twin.streams.monitor import Core, StreamMonitor, counting
 from pkm_twin.streams.wrench import ZERO, Mount, TimeCache, Triple, check_mount, check_order
@@ -30,7 +30,7 @@ class ImuSettings:
     xyz: Triple = setting(ZERO, "position of the IMU from the base's origin, base axes", name="imu.xyz", unit="m")
     rpy: Triple = setting(ZERO, "roll, pitch and yaw of the IMU relative to the base", name="imu.rpy", unit="rad")
     max_age: float = setting(
-        0.02, "largest time between a joint state and the nearest message of base_imu", name="imu.max_age", **LATE
+        0.02, "largest time between a joint state and the nearest message of base_imu", name="imu.max_age", **AGE_BOUNDS
     )
 
     def __post_init__(self) -> None:

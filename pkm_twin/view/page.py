@@ -262,13 +262,13 @@ class Search:
 
         def work() -> None:
             try:
-                found.set_result(self._page.model.softest(wrench, self._tell))
+                found.set_result(self._page.model.softest(wrench, self._show_progress))
             except BaseException as error:
                 found.set_exception(error)
 
         threading.Thread(target=work, name="softest", daemon=True).start()
 
-    def _tell(self, done: float) -> None:
+    def _show_progress(self, done: float) -> None:
         self._done = done
 
     def step(self) -> None:

@@ -9,7 +9,7 @@ import click
 import pytest
 
 from pkm_twin.apps.frame import Group, command
-from pkm_twin.apps.options import Draws, OfRobot, Writes
+from pkm_twin.apps.options import OutputOption, PictureOptions, RobotArgument
 from pkm_twin.errors import ParameterError
 from pkm_twin.report import Column, Fact, Report, Table, Verdict, judged, plots
 from pkm_twin.report.terminal import WIDTH, table_lines, text_of
@@ -17,7 +17,7 @@ from pkm_twin.settings import setting
 
 
 @dataclass(frozen=True, kw_only=True)
-class Weigh(OfRobot, Writes, Draws):
+class Weigh(RobotArgument, OutputOption, PictureOptions):
     """Weigh a robot."""
 
     times: tuple[int, ...] = setting((), "how often", argument=True)

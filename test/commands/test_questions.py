@@ -79,7 +79,7 @@ def how_fast(a: Asked) -> None:
     assert a.table["time"][-1] == pytest.approx(told["duration_s"], abs=1e-3)
     # The efforts of an engine of its own; of shared ones what they do at the joints that lead.
     robot, description = a.robot, a.robot.parameter_sections()
-    lead, by = robot.graph.leading, robot.following(a.column("position"))
+    lead, by = robot.graph.leading, robot.drive_jacobian(a.column("position"))
     for joint in set(robot.joint_names) - set(robot.graph.leads):
         description["joints"][joint] |= {"actuated": False, "limits": {}}
     engine, done = Maximal(description), a.column("effort")
@@ -226,7 +226,7 @@ def how_exact(a: Asked) -> None:
     """Zeros of the joints by 0.1 mrad or mm: the Jacobian's columns, squared and added."""
     told = a.twin.told("design", a.file, "--tolerance", "joints.*.offset=1e-4", "--path", a.motion)
     q = a.robot.inverse(np.stack([a.table[name] for name in a.robot.pose_names], -1))
-    twist = 1e-4 * a.robot.platform_jacobian(q) @ a.robot.following(q)
+    twist = 1e-4 * a.robot.platform_jacobian(q) @ a.robot.drive_jacobian(q)
     squares = (twist**2).sum(-1)
     for key, rows in (("rms_position_m", squares[:, :3]), ("rms_angle_rad", squares[:, 3:])):
         assert told[key] == pytest.approx(np.sqrt(rows.sum(1).mean()), rel=1e-6, abs=1e-11)

@@ -89,8 +89,8 @@ def test_a_rate_beyond_its_doubt_has_the_true_sign(jitter: float, size: float) -
     q, true = stops_and_goes(rng, time, 6)
     seen = q + size * rng.normal(size=q.shape)
     rate = np.gradient(seen, time, axis=0, edge_order=2)
-    doubt = velocity_error_bound(time, seen, gradient_gain(time))
-    beyond = np.abs(rate) > doubt
+    rate_error = velocity_error_bound(time, seen, gradient_gain(time))
+    beyond = np.abs(rate) > rate_error
     wrong = beyond & (np.sign(rate) != np.sign(true))
     # At rest a few in ten thousand are beyond four standard deviations.
     assert wrong.mean() < (1e-3 if size else 1e-4)
@@ -116,9 +116,9 @@ def test_a_streams_rate_beyond_its_doubt_has_the_true_sign(measured: bool, size:
     for k, t in enumerate((SECOND * time).round().astype(int).tolist()):
         qd = speeds[k] if measured else None
         rates = differentiator.push(t, seen[k], qd)
-        doubt = watch.push(t, seen[k], qd, None if rates is None else rates[0])
+        rate_error = watch.push(t, seen[k], qd, None if rates is None else rates[0])
         if rates is not None and k > 30:
-            beyond = np.abs(rates[0]) > doubt
+            beyond = np.abs(rates[0]) > rate_error
             wrong.append(beyond & (np.sign(rates[0]) != np.sign(true[k])))
             known.append(beyond[np.abs(true[k]) > 0.1])
     assert np.mean(wrong) < (1e-2 if size else 1e-3)

@@ -11,7 +11,7 @@ from textwrap import fill
 from typing import TYPE_CHECKING, Any, Final
 
 from pkm_twin.apps.frame import command
-from pkm_twin.apps.options import Accepts, BeyondLimitsToo, OfRobot, Overwrites, ReadsTables
+from pkm_twin.apps.options import AcceptOption, BeyondLimitsOption, OverwriteOption, RobotArgument, TableOptions
 from pkm_twin.console import progress
 from pkm_twin.errors import ParameterError, one_line
 from pkm_twin.files import replace_file
@@ -31,12 +31,12 @@ if TYPE_CHECKING:
 
 WIDTH: Final = 100
 """Characters of a printed line."""
-MOST_SHOWN: Final = 10
+MAX_SHOWN: Final = 10
 """Largest number of outliers that are printed."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Calibrate(OfRobot, ReadsTables, BeyondLimitsToo, Accepts, Overwrites):
+class Calibrate(RobotArgument, TableOptions, BeyondLimitsOption, AcceptOption, OverwriteOption):
     """Fit a robot's geometry and joint offsets to poses that an instrument measured.
 
     A robust least-squares fit with the machine's closures. A pose that does not fit the others gets
@@ -246,9 +246,9 @@ def report_calibration(
         sums = p.before + one.sign * other.before, p.value + one.sign * other.value
         pairs[name] = [*sums, one.deviation, p.unit]
     lines = [] if scale is None else [fill(str(scale), WIDTH)]
-    lines += [f"outlier, with a small weight: {one}" for one in result.outliers[:MOST_SHOWN]]
-    if len(result.outliers) > MOST_SHOWN:
-        lines.append(f"{len(result.outliers) - MOST_SHOWN} more outliers: see --json")
+    lines += [f"outlier, with a small weight: {one}" for one in result.outliers[:MAX_SHOWN]]
+    if len(result.outliers) > MAX_SHOWN:
+        lines.append(f"{len(result.outliers) - MAX_SHOWN} more outliers: see --json")
     return Report(
         f"{machine.name}, {source}: held-out {first.name} error {after} RMS "
         f"({before} before); {found} of {len(rows)} numbers determined",

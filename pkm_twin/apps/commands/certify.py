@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from pkm_twin.apps.frame import command
-from pkm_twin.apps.options import OfRobot, Seeded
+from pkm_twin.apps.options import RobotArgument, SeedOption
 from pkm_twin.console import progress
 from pkm_twin.report import Column, Fact, Report, Table, Verdict
 from pkm_twin.settings import setting
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Certify(OfRobot, Seeded):
+class Certify(RobotArgument, SeedOption):
     """Cross-check a robot with independent engines.
 
     Three engines compute the machine from its description and share no mechanics code with

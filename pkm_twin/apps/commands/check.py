@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from pkm_twin.apps.frame import command
-from pkm_twin.apps.options import NOT_JUDGED, REFUSED, SALVAGED, CarriesAtTimes, ReadsRecordings, payload_fact
+from pkm_twin.apps.options import NOT_JUDGED, REFUSED, SALVAGED, RecordingOptions, TimedPayloadOptions, payload_fact
 from pkm_twin.console import progress
 from pkm_twin.errors import ParameterError, PkmTwinError, one_line
 from pkm_twin.report import Fact, Report, Verdict
@@ -21,7 +21,7 @@ from pkm_twin.settings import setting
 
 
 @dataclass(frozen=True, kw_only=True)
-class Check(CarriesAtTimes, ReadsRecordings):
+class Check(TimedPayloadOptions, RecordingOptions):
     """Compare a recording, or a folder of them, with the model.
 
     Checks that the file is complete, that a node would accept every joint state and wrench, that
@@ -62,7 +62,7 @@ def check(given: Check) -> Report:
             return check_one(given, given.bag, update)
     except PkmTwinError as error:
         if isinstance(error, ParameterError) and error.field.startswith("--") and error.value:
-            raise  # words of an option are wrong, not the recording
+            raise  # the option's value is wrong, not the recording
         saved = error.salvageable if isinstance(error, DamagedBagError) else 0
         facts = [Fact("bag", str(given.bag)), Fact("good", False), Fact("salvageable", saved)]
         return Report(facts=facts, code=SALVAGED if saved else REFUSED, error=str(error))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import click
 
 from pkm_twin.apps.frame import command
-from pkm_twin.apps.options import BeyondLimitsToo, OfRobot
+from pkm_twin.apps.options import BeyondLimitsOption, RobotArgument
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.report import Column, Fact, Report, Table
 from pkm_twin.settings import setting
@@ -17,7 +17,7 @@ AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Compliance(OfRobot, BeyondLimitsToo):
+class Compliance(RobotArgument, BeyondLimitsOption):
     """Compute compliance and strain energy at a pose.
 
     Example: `pkm-twin compliance upr_rpu -0.6 0 0 --wrench 30,-50,-40,10,-20,50`.

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pkm_twin.apps.frame import command
-from pkm_twin.apps.options import ROBOT_HELP, OfPlatform, Writes
+from pkm_twin.apps.options import ROBOT_HELP, CutOutOptions, OutputOption
 from pkm_twin.console import refuse_existing
 from pkm_twin.errors import FileError, UnknownNameError, one_line
 from pkm_twin.files import open_regular, replace_file
@@ -18,7 +18,7 @@ from pkm_twin.settings import setting
 
 
 @dataclass(frozen=True, kw_only=True)
-class Convert(OfPlatform, Writes):
+class Convert(CutOutOptions, OutputOption):
     """Convert a robot, a URDF with its loops, or a printer's configuration to a YAML.
 
     For a robot it prints a commented YAML of bodies, joints and rods. It is a complete robot: edit
@@ -89,7 +89,7 @@ def convert(given: Convert) -> Report:
         described = read_urdf(Path(first), **given.part)
     else:
         robot = load(first, **given.part)
-        described, told = robot_description(robot), robot.book.told()
+        described, told = robot_description(robot), robot.book.describe()
         carried = {*described.get("tolerances", ())} | {*copied_tolerances(robot)}
         lost = sorted({*robot.tolerances} - carried)
         if lost:

@@ -13,7 +13,7 @@ import click
 import numpy as np
 
 from pkm_twin.apps.frame import command
-from pkm_twin.apps.options import Carries, Draws, ReadsMotions, Seeded, Writes
+from pkm_twin.apps.options import MotionOptions, OutputOption, PayloadOption, PictureOptions, SeedOption
 from pkm_twin.console import progress, writing
 from pkm_twin.errors import ParameterError, UnknownNameError, warn
 from pkm_twin.report import Column, Fact, Report, Table, judged, plots
@@ -25,13 +25,13 @@ if TYPE_CHECKING:
     from pkm_twin.robot.robot import Robot
 
 SWEEPS: Final = ("grid", "sobol")
-OF_FILE: Final = "file"
+FILE_VALUE: Final = "file"
 """In place of a tolerance: those of the robot's file."""
 Box = Mapping[str, tuple[float, float]]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Design(Carries, ReadsMotions, Writes, Draws, Seeded):
+class Design(PayloadOption, MotionOptions, OutputOption, PictureOptions, SeedOption):
     """Optimise values of a robot's file for a path.
 
     The platform of every machine follows the same path. Machines that cannot follow it are
@@ -364,8 +364,8 @@ def report_budget(given: Design) -> Report:
     from pkm_twin.identification.calibration import calibrated_errors
 
     robot, where = given.machine(), "the workspace"
-    sigma = parse_tolerances([text for text in given.tolerance if text != OF_FILE])
-    if OF_FILE in given.tolerance:
+    sigma = parse_tolerances([text for text in given.tolerance if text != FILE_VALUE])
+    if FILE_VALUE in given.tolerance:
         if not robot.tolerances:
             raise ParameterError("tolerances", None, "a section tolerances in the robot file")
         sigma = {**robot.tolerances, **sigma}

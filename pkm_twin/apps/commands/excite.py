@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from pkm_twin.apps.frame import command
-from pkm_twin.apps.options import AwayFromSingular, OfRobot, Seeded, Writes
+from pkm_twin.apps.options import OutputOption, RobotArgument, SeedOption, SingularityOption
 from pkm_twin.console import progress, writing
 from pkm_twin.errors import BagError
 from pkm_twin.report import Fact, Report
@@ -19,12 +19,12 @@ from pkm_twin.settings import setting
 if TYPE_CHECKING:
     from pkm_twin.robot.robot import Robot
 
-LARGE: Final = 1e3
+MAX_CONDITION: Final = 1e3
 """Condition number from which on a fit knows some parameters badly."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Excite(OfRobot, AwayFromSingular, Seeded, Writes):
+class Excite(RobotArgument, SingularityOption, SeedOption, OutputOption):
     """Design a motion that excites the parameters to identify.
 
     Every joint follows a finite Fourier series that starts and ends at rest. The trajectory is
@@ -100,9 +100,9 @@ def excite(given: Excite) -> Report:
     if other is not None:
         told = f"{other:.4g}" if np.isfinite(other) else "infinite, it does not excite all of them"
         notes.append(f"condition number of {given.compare}: {told}")
-    if not best.condition < LARGE and not given.friction:
+    if not best.condition < MAX_CONDITION and not given.friction:
         notes.append(
-            f"a condition number above {LARGE:g}: a fit will know some parameters badly; try a "
+            f"a condition number above {MAX_CONDITION:g}: a fit will know some parameters badly; try a "
             "longer --duration, more --harmonics or --trials, a smaller --singularity, wider "
             "limits in the robot file, or fewer kinds with --what"
         )

@@ -12,7 +12,7 @@ from typing import Final
 import click
 
 from pkm_twin.apps.frame import Group, command
-from pkm_twin.apps.options import OfRobot, Overwrites
+from pkm_twin.apps.options import OverwriteOption, RobotArgument
 from pkm_twin.console import refuse_existing, tell
 from pkm_twin.errors import ParameterError
 from pkm_twin.extensions import Extensible
@@ -23,7 +23,7 @@ from pkm_twin.settings import setting
 
 
 @dataclass(frozen=True, kw_only=True)
-class ToFolder(OfRobot, Overwrites):
+class ToFolder(RobotArgument, OverwriteOption):
     """A package of several files."""
 
     out: Path = setting(..., "folder of the new package", metavar="FOLDER")
@@ -41,7 +41,7 @@ class ToFolder(OfRobot, Overwrites):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ToFile(OfRobot, Overwrites):
+class ToFile(RobotArgument, OverwriteOption):
     """One file."""
 
     out: Path = setting(..., "the file to write", writes=True)
@@ -53,7 +53,7 @@ class ToFile(OfRobot, Overwrites):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Printed(OfRobot, Overwrites):
+class TextOutput(RobotArgument, OverwriteOption):
     """A text that is printed, or a file."""
 
     out: Path | None = setting(None, "a file; default: print", writes=True)
@@ -215,7 +215,7 @@ def sdf(given: Sdf) -> Report:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Urdf(Printed):
+class Urdf(TextOutput):
     """Print a robot as a URDF, with its loops as constraints.
 
     The URDF is a tree with all joints, actuated and passive, and a <constraint> element for each
@@ -249,7 +249,7 @@ def urdf(given: Urdf) -> Report:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ToPrinter(Printed):
+class ToPrinter(TextOutput):
     """Write a linear Delta's geometry as a printer's configuration.
 
     Towers are turned about z so that the third is at 90 degrees.

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import click
 
 from pkm_twin.apps.frame import command
-from pkm_twin.apps.options import ROBOT_HELP, Accepts, BeyondLimitsToo, CarriesAtTimes, ReadsRecordings
+from pkm_twin.apps.options import ROBOT_HELP, AcceptOption, BeyondLimitsOption, RecordingOptions, TimedPayloadOptions
 from pkm_twin.console import progress, writing
 from pkm_twin.errors import ParameterError
 from pkm_twin.files import replace_file
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Fit(CarriesAtTimes, ReadsRecordings, BeyondLimitsToo, Accepts):
+class Fit(TimedPayloadOptions, RecordingOptions, BeyondLimitsOption, AcceptOption):
     """Fit friction, masses or compliance to recordings.
 
     Fits friction, rotors, payload and masses to recorded efforts, or compliance to measured

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pkm_twin.apps.frame import command
-from pkm_twin.apps.options import AtPose, Draws, OfTool, Writes
+from pkm_twin.apps.options import OutputOption, PictureOptions, PoseOption, ToolOptions
 from pkm_twin.errors import ParameterError
 from pkm_twin.recordings.tables import ENDINGS, write_table
 from pkm_twin.report import Fact, Report, plots
@@ -25,7 +25,7 @@ AXES = "xyz"
 
 
 @dataclass(frozen=True, kw_only=True)
-class FrequencyResponse(AtPose, OfTool, Writes, Draws):
+class FrequencyResponse(PoseOption, ToolOptions, OutputOption, PictureOptions):
     """Compute the frequency response of the tool point at a pose.
 
     The response is the displacement per harmonic force (receptance), actuators locked, of the

@@ -13,7 +13,7 @@ import numpy as np
 
 from delta_dynamics import reactions
 from pkm_twin.apps.frame import command
-from pkm_twin.apps.options import Draws, OfRobot
+from pkm_twin.apps.options import PictureOptions, RobotArgument
 from pkm_twin.codegen.code import slowness
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.scheme import list_coordinates
@@ -24,12 +24,12 @@ from pkm_twin.robot.clearance import clearance, has_clearance
 from pkm_twin.robot.plausibility import findings, why_no_torques
 from pkm_twin.robot.robot import Robot
 
-MOST_NAMES: Final = 6
+MAX_NAMES: Final = 6
 """Largest number of names in a printed line."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Info(OfRobot, Draws):
+class Info(RobotArgument, PictureOptions):
     """Show a robot's parameters, with units.
 
     Prints dimensions, masses, limits, home pose and mobility. For an overconstrained mechanism it
@@ -66,8 +66,8 @@ def info(given: Info) -> Report:
     other_poses = []
     if robot.mechanism == "machine":
         found = [list(names) for names in list_coordinates(robot.graph) if names != robot.pose_names]
-        shown = "; ".join(", ".join(names) for names in found[:MOST_NAMES])
-        shown += f" and {len(found) - MOST_NAMES} more" if len(found) > MOST_NAMES else ""
+        shown = "; ".join(", ".join(names) for names in found[:MAX_NAMES])
+        shown += f" and {len(found) - MAX_NAMES} more" if len(found) > MAX_NAMES else ""
         text = "other pose coordinates" if found else None
         other_poses = [Fact("other_poses", found, text=text, shown=f"{shown} (`pose`, --pose)")]
     # Of more actuated joints than degrees of freedom those that lead.
@@ -119,7 +119,7 @@ def info(given: Info) -> Report:
         Fact("speed", slowness() or None, text="speed" if slowness() else None),
         Fact("parameters", sections),
         Fact("parameter_units", units),
-        *(Fact("", text, text="parameter") for text in robot.book.told(units.get(PARAMETERS))),
+        *(Fact("", text, text="parameter") for text in robot.book.describe(units.get(PARAMETERS))),
     ]
     for section, value in sections.items():
         listed = section == "joints" and isinstance(value, list)
@@ -184,8 +184,8 @@ def group_reactions(names: Sequence[str]) -> list[str]:
         alike.setdefault(" and ".join(words), []).append(joint)
     lines = []
     for what, joined in alike.items():
-        more = f" and {len(joined) - MOST_NAMES} more" if len(joined) > MOST_NAMES else ""
-        lines.append(f"{', '.join(joined[:MOST_NAMES])}{more}: not determined: {what}")
+        more = f" and {len(joined) - MAX_NAMES} more" if len(joined) > MAX_NAMES else ""
+        lines.append(f"{', '.join(joined[:MAX_NAMES])}{more}: not determined: {what}")
     return lines + others
 
 

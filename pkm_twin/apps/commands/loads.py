@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from pkm_twin.apps.frame import command
-from pkm_twin.apps.options import CarriesAtTimes, Draws, ReadsMotions, Writes, payload_fact
+from pkm_twin.apps.options import MotionOptions, OutputOption, PictureOptions, TimedPayloadOptions, payload_fact
 from pkm_twin.console import progress, writing
 from pkm_twin.files import replace_file
 from pkm_twin.recordings.tables import WRENCH
@@ -28,7 +28,7 @@ IDLE: Final = "no life, because the bearing bears a load and does not move"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Loads(CarriesAtTimes, ReadsMotions, Writes, Draws):
+class Loads(TimedPayloadOptions, MotionOptions, OutputOption, PictureOptions):
     """Report forces and moments in the joints along a motion.
 
     For each joint it prints peak and RMS of force and moment, without what the drive bears: the

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from pkm_twin.apps.commands.frf import report_modes
 from pkm_twin.apps.frame import command
-from pkm_twin.apps.options import AtPose, Draws, OfMilling, OfTool, Writes
+from pkm_twin.apps.options import MillingOptions, OutputOption, PictureOptions, PoseOption, ToolOptions
 from pkm_twin.errors import ParameterError
 from pkm_twin.recordings.tables import ENDINGS, write_table
 from pkm_twin.report import Fact, Report, plots
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Lobes(OfMilling, AtPose, OfTool, Writes, Draws):
+class Lobes(MillingOptions, PoseOption, ToolOptions, OutputOption, PictureOptions):
     """Compute the axial depth above which milling chatters, over spindle speeds.
 
     Example: `pkm-twin lobes upr_rpu --teeth 2 --tangential 600e6 --radial 0.3 --immersion 0.5

@@ -12,7 +12,16 @@ from typing import TYPE_CHECKING, Any, Final, get_type_hints
 import click
 
 from pkm_twin.apps.frame import Command, Group, command
-from pkm_twin.apps.options import Carries, Draws, OfMilling, OfTool, Overwrites, Parallel, Writes, payload_fact
+from pkm_twin.apps.options import (
+    MillingOptions,
+    OutputOption,
+    OverwriteOption,
+    PayloadOption,
+    PictureOptions,
+    ProcessesOption,
+    ToolOptions,
+    payload_fact,
+)
 from pkm_twin.console import numbers, progress, refuse_existing
 from pkm_twin.errors import ParameterError
 from pkm_twin.extensions import Extensible
@@ -28,18 +37,18 @@ if TYPE_CHECKING:
     from pkm_twin.maps.kind import Case
     from pkm_twin.robot.robot import Robot
 
-SIX: Final = "six numbers separated by commas, N and N m; or NAME=six numbers"
+WRENCH_HELP: Final = "six numbers separated by commas, N and N m; or NAME=six numbers"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Pages:
+class PageOption:
     """Option of an interactive page of the result."""
 
     html: bool = setting(False, "also an offline interactive HTML page")
 
 
 @dataclass(frozen=True, kw_only=True)
-class OfMap(Carries, Pages, Writes, Draws, Parallel):
+class MapOptions(PayloadOption, PageOption, OutputOption, PictureOptions, ProcessesOption):
     """Options that all kinds of maps have."""
 
     kind: str = ""
@@ -68,7 +77,7 @@ class OfMap(Carries, Pages, Writes, Draws, Parallel):
         if self.along is not None and self.out is None and self.picture is None:
             return None
         beside = dataclasses.replace(self, out=self.target)
-        return super(OfMap, beside).drawing(command)
+        return super(MapOptions, beside).drawing(command)
 
     def cases(self, kind: Kind, machine: Robot) -> list[Case]:
         """Return the load cases, if the kind has any.
@@ -81,7 +90,7 @@ class OfMap(Carries, Pages, Writes, Draws, Parallel):
             name = name.strip() if given else text
             if name in found:
                 raise ParameterError("wrench", text, "another name for each load case")
-            found[name] = kind.loaded(machine, name, numbers(values, 6, SIX))
+            found[name] = kind.loaded(machine, name, numbers(values, 6, WRENCH_HELP))
         return list(found.values())
 
 
@@ -91,13 +100,13 @@ class Loads:
 
     wrench: tuple[str, ...] = setting(
         (),
-        f"force and moment on the platform, base axes: {SIX}; several times for several load "
+        f"force and moment on the platform, base axes: {WRENCH_HELP}; several times for several load "
         "cases; default with --along: the path's, if it has one",
     )
 
 
 @dataclass(frozen=True, kw_only=True)
-class Show(Pages, Overwrites):
+class Show(PageOption, OverwriteOption):
     """Plot a stored map: PNGs, and with --html an offline interactive HTML page."""
 
     file: Path = setting(..., "a file that `pkm-twin map` wrote", argument=True)
@@ -114,7 +123,7 @@ def show(given: Show) -> Report:
     return report_stored_map(given.file, given.drawing(""), given.html, given.overwrite)
 
 
-def compute(given: OfMap) -> Report:
+def compute(given: MapOptions) -> Report:
     """Compute a map, or values along a path.
 
     :raises PkmTwinError: what the kind or the file rejects.
@@ -251,9 +260,9 @@ def report_stored_map(file: Path, drawing: Path | None, html: bool, overwrite: b
         return Report(first, facts, figures=pictures, notes=rest, files={"file": file, "page": page})
 
 
-def make_kind(given: OfMap) -> Kind:
+def make_kind(given: MapOptions) -> Kind:
     """Return the kind with its own options."""
-    if isinstance(given, OfMilling) and isinstance(given, OfTool):
+    if isinstance(given, MillingOptions) and isinstance(given, ToolOptions):
         return CuttingDepth(given.milling, given.damping, given.tool)
     kind = KINDS[given.kind]
     return kind(**{field.name: getattr(given, field.name) for field in dataclasses.fields(kind)})
@@ -264,11 +273,11 @@ def make_kind_command(kind: type[Kind]) -> Command:
     milling = kind is CuttingDepth
     own = [] if milling else [(f.name, get_type_hints(kind)[f.name], f) for f in dataclasses.fields(kind)]
     more: list[type[Any]] = [Loads] if kind.takes_wrench else []
-    more += [OfMilling, OfTool] if milling else []
+    more += [MillingOptions, ToolOptions] if milling else []
     given = dataclasses.make_dataclass(
         kind.__name__,
         [*own, ("kind", str, kind.name)],
-        bases=(*more, OfMap),
+        bases=(*more, MapOptions),
         namespace={"__doc__": kind.__doc__, "__module__": __name__},
         frozen=True,
         kw_only=True,
@@ -276,8 +285,8 @@ def make_kind_command(kind: type[Kind]) -> Command:
     return Command(given, compute)
 
 
-class AfterRobot(Group):
-    """Group whose commands (kinds) are typed after the robot; ``show`` alone comes first."""
+class RobotFirstGroup(Group):
+    """Group whose commands (kinds) follow the robot: ``map ROBOT KIND``; ``show`` comes first."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Exchange the robot and the kind, so that the kind is the command's name."""
@@ -292,7 +301,7 @@ class AfterRobot(Group):
         return name if name == "show" else f"ROBOT {name}"
 
 
-map_ = AfterRobot(
+map_ = RobotFirstGroup(
     "map",
     """Map a quantity over the workspace, find its worst pose, and draw planes through it.
 

@@ -12,7 +12,14 @@ import click
 import numpy as np
 
 from pkm_twin.apps.frame import command
-from pkm_twin.apps.options import AwayFromSingular, Carries, Draws, ReadsTables, Writes, payload_fact
+from pkm_twin.apps.options import (
+    OutputOption,
+    PayloadOption,
+    PictureOptions,
+    SingularityOption,
+    TableOptions,
+    payload_fact,
+)
 from pkm_twin.console import writing
 from pkm_twin.errors import check_limit
 from pkm_twin.recordings.tables import ENDINGS
@@ -27,7 +34,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Motion(Carries, ReadsTables, AwayFromSingular, Writes, Draws):
+class Motion(PayloadOption, TableOptions, SingularityOption, OutputOption, PictureOptions):
     """Plan a motion along a path: by a law, the fastest, or slower where the machine is soft.
 
     The table of waypoints has a header row and the pose's coordinates (m, rad) or JOINT.position of

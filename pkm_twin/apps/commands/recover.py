@@ -7,13 +7,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from pkm_twin.apps.frame import command
-from pkm_twin.apps.options import SALVAGED, Overwrites
+from pkm_twin.apps.options import SALVAGED, OverwriteOption
 from pkm_twin.report import Fact, Report
 from pkm_twin.settings import setting
 
 
 @dataclass(frozen=True, kw_only=True)
-class Recover(Overwrites):
+class Recover(OverwriteOption):
     """Save the intact messages of a damaged bag.
 
     Copies every intact message of a damaged or truncated bag into a new bag. The old bag does not

@@ -12,7 +12,7 @@ import click
 import numpy as np
 
 from pkm_twin.apps.frame import command
-from pkm_twin.apps.options import AwayFromSingular, CarriesAtTimes, Draws, ReadsMotions, payload_fact
+from pkm_twin.apps.options import MotionOptions, PictureOptions, SingularityOption, TimedPayloadOptions, payload_fact
 from pkm_twin.errors import LEAST_LIMIT, ParameterError, check_limit
 from pkm_twin.report import Column, Fact, Report, Table, plots
 from pkm_twin.settings import setting
@@ -22,12 +22,12 @@ if TYPE_CHECKING:
     from pkm_twin.paths.sizing import DriveDuty, Fit, Gear, Gears
     from pkm_twin.robot.robot import Robot
 
-MOST_PERCENT: Final = 1000.0
+MAX_PERCENT: Final = 1000.0
 """Percentage of a motor's limit above which only `over 1000 %` is printed."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Size(CarriesAtTimes, ReadsMotions, AwayFromSingular, Draws):
+class Size(TimedPayloadOptions, MotionOptions, SingularityOption, PictureOptions):
     """Size the drives for a motion.
 
     Prints for each drive: peak and RMS effort (RMS heats the motor), speed, power, net energy
@@ -253,7 +253,7 @@ def _make_tables(duties: Sequence[DriveDuty]) -> list[Table]:
 
 def _format_percent(part: float) -> str:
     value = 100.0 * part
-    return f"{value:.4g} %" if value <= MOST_PERCENT else f"over {MOST_PERCENT:.0f} %"
+    return f"{value:.4g} %" if value <= MAX_PERCENT else f"over {MAX_PERCENT:.0f} %"
 
 
 def report_workspace(given: Size) -> Report:

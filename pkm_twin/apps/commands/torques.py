@@ -11,7 +11,14 @@ import click
 import numpy as np
 
 from pkm_twin.apps.frame import command
-from pkm_twin.apps.options import AtPose, CarriesAtTimes, Draws, ReadsMotions, Writes, payload_fact
+from pkm_twin.apps.options import (
+    MotionOptions,
+    OutputOption,
+    PictureOptions,
+    PoseOption,
+    TimedPayloadOptions,
+    payload_fact,
+)
 from pkm_twin.console import progress, writing
 from pkm_twin.recordings.tables import ENDINGS, check_target, write_table
 from pkm_twin.report import Column, Fact, Report, Table, plots
@@ -26,7 +33,7 @@ RESTING: Final = ("gravity", "payload", "friction", "external", "preload")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Torques(CarriesAtTimes, ReadsMotions, AtPose, Writes, Draws):
+class Torques(TimedPayloadOptions, MotionOptions, PoseOption, OutputOption, PictureOptions):
     """Compute torques, their terms and joint reactions.
 
     Example: `pkm-twin torques delta --at 0,0,-0.4 --payload 0.5`, at rest at a pose.

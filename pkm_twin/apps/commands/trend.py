@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pkm_twin.apps.frame import command
-from pkm_twin.apps.options import Draws
+from pkm_twin.apps.options import PictureOptions
 from pkm_twin.errors import ParameterError
 from pkm_twin.report import Fact, Report, Verdict
 from pkm_twin.settings import setting
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Trend(Draws):
+class Trend(PictureOptions):
     """Report which values of a machine drift from night to night.
 
     Compares residuals, friction, payload, compliance factors and frequencies of all recordings of a

@@ -13,14 +13,14 @@ from typing import Any
 import click
 
 from pkm_twin.apps.frame import command
-from pkm_twin.apps.options import CarriesAtTimes, ReadsRecordings
+from pkm_twin.apps.options import RecordingOptions, TimedPayloadOptions
 from pkm_twin.console import progress
 from pkm_twin.report import Report
 from pkm_twin.settings import setting
 
 
 @dataclass(frozen=True, kw_only=True)
-class View(CarriesAtTimes, ReadsRecordings):
+class View(TimedPayloadOptions, RecordingOptions):
     """Show a robot in the browser, with sliders for pose and load.
 
     The page shows joint positions and their limits, the singularity index, the clearance between

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from delta_dynamics.torques.isotropy import ENERGY, driving_force_peak, energy_transfer_range
+from delta_dynamics.torques.isotropy import PAPER_ENERGY, driving_force_peak, energy_transfer_range
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.maps import spheres
@@ -27,7 +27,7 @@ TRANSFER = Case("energy", "least share of the kinetic energy in the platform", "
 class Isotropy(Kind):
     """Map kinetic energy and driving force in the worst direction of motion."""
 
-    energy: float = setting(ENERGY, "the platform's kinetic energy for the driving force (J)")
+    energy: float = setting(PAPER_ENERGY, "the platform's kinetic energy for the driving force (J)")
     spheres: bool = setting(False, "also both indices in every direction, on spheres")
 
     name = "isotropy"
