@@ -51,12 +51,13 @@ def limb_stiffness(robot: Robot, pose: ArrayLike) -> LimbStiffness:
     :raises ParameterError: a mechanism other than ``upr_rpu``.
     :raises UnreachableError: a pose that is none of the mechanism's.
     """
+    q = robot.inverse(pose)
     wrenches = robot.limb_wrenches(pose)
     if wrenches is None:
         what = "a mechanism whose limbs' wrenches are known (upr_rpu)"
         raise ParameterError("mechanism", robot.mechanism, what)
     whole = compliance(robot, pose)
-    columns, owner = elastic_columns(robot, robot.inverse(pose))
+    columns, owner = elastic_columns(robot, q)
     count = wrenches.shape[-3]
     limb = owner // (len(robot.cached(Elastic).names) // count)
     found = []

@@ -54,11 +54,15 @@ def check_elements(
     faults: list[Fault] = []
     for part in parts:
         tag, name = str(part.tag), part.get("name") or part.get("reference")
+        if tag in ("visual", "collision"):
+            continue
         where = ".".join(filter(None, (owner, tag, name)))
         if tag in REJECTED and _acts(part):
             raise ParameterError(where, f"<{tag}>", REJECTED[tag])
         if tag in IGNORED and _acts(part):
             warn(path, f"{where}: {IGNORED[tag]} is ignored")
+        elif tag.partition(":")[0] in ("drake", "isaac") and owner:
+            warn(path, f"{where} is not read")
         if tag == "plugin":
             plugin = f"{part.get('name', '')} {part.get('filename', '')}".strip()
             if "mimic" in plugin.lower():

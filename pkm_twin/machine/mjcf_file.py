@@ -313,10 +313,17 @@ class _Reader:
         return limits
 
     def _drives(self, joint: int) -> list[int]:
-        """Find the actuators of a joint."""
+        """Find the actuators of a joint.
+
+        :raises ParameterError: an actuator with a gear of zero, which moves nothing.
+        """
         m, kinds = self.model, self.mj.mjtTrn
         own = kinds.mjTRN_JOINT, kinds.mjTRN_JOINTINPARENT
-        return [i for i in range(m.nu) if int(m.actuator_trntype[i]) in own and m.actuator_trnid[i][0] == joint]
+        found = [i for i in range(m.nu) if int(m.actuator_trntype[i]) in own and m.actuator_trnid[i][0] == joint]
+        for i in found:
+            if m.actuator_gear[i][0] == 0.0:
+                raise ParameterError(f"actuator.{self._name('ACTUATOR', i)}.gear", 0, "a gear that is not zero")
+        return found
 
     def _resistance(self, joint: int) -> dict[str, Any]:
         """Return the friction and rotor inertia of a joint, with those of its actuators at the joint."""

@@ -116,6 +116,8 @@ def _model(path: Path, top: ET.Element) -> tuple[ET.Element, ET.Element, list[fl
     gravity = None
     for world in worlds:
         stated = urdf_xml.single(world, "gravity", "world")
+        if stated is None:
+            stated = world.find("physics/gravity")  # Where SDF had it until 1.5.
         if stated is not None:
             gravity = urdf_xml.vector(stated.text, "world.gravity", 3).tolist()
     models = [(root, one) for root in (top, *worlds) for one in root.findall("model")]

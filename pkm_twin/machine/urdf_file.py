@@ -35,6 +35,23 @@ _CONSTRAINTS: Final = {
     "link": "fixed",  # a link that was cut in two
 }
 """Types of ``<constraint>`` elements, without ``_joint``."""
+_KNOWN: Final = {
+    "link": "name type inertial visual collision contact self_collision_checking material",
+    "inertial": "origin mass inertia",
+    "mass": "value",
+    "inertia": "ixx ixy ixz iyy iyz izz",
+    "joint": "name type independent dont_collapse parent child origin axis limit dynamics joint_properties mimic "
+    "calibration",
+    "parent": "link",
+    "child": "link",
+    "origin": "xyz rpy quat_xyzw",
+    "axis": "xyz",
+    "limit": "lower upper velocity effort",
+    "dynamics": "damping friction",
+    "joint_properties": "damping friction",
+    "mimic": "joint multiplier offset",
+}
+"""Attributes and elements in links and joints that are read, or do not change the motion, by element."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,9 +96,15 @@ def read(path: Path, robot: ET.Element, actuated: Sequence[str] | None = None) -
             faults.append(((element.get("name", ""), leader), error))
     root = _root(links, joints)
     others = [element for element in robot if element.tag not in ("link", "joint")]
-    foreign.check_elements(path, others)
+    inside = [part for element in robot if element.tag in ("link", "joint") for part in element if part.tag != "mimic"]
+    foreign.check_elements(path, [*others, *inside])
     known = {"constraint", "loop", "loop_joint", "gazebo", "ros2_control", "transmission", "material", "sensor"}
-    if unknown := {str(element.tag) for element in others} - known - {*foreign.REJECTED}:
+    unknown = {str(element.tag) for element in others} - known - {*foreign.REJECTED}
+    for element in robot:
+        unknown.update(_find_unread(element))
+        if element.tag == "gazebo" and "reference" not in element.attrib and element.find("gravity") is not None:
+            unknown.add("gazebo.gravity")
+    if unknown:
         warn(path, f"elements that are not read: {', '.join(sorted(unknown))}")
     beside = read_beside(path)
     closures = _closures(robot, beside, links, joints)
@@ -148,6 +171,16 @@ def _of_gazebo(path: Path, robot: ET.Element, frames: Mapping[str, Pose], taken:
         found.append(sdf_file.joint_of(path, element, name, (first, second), place, turn))
     found += sdf_file.welds(path, robot, robot.get("name", ""), frames, taken)
     return {joint.name: joint.closing() for joint in found}
+
+
+def _find_unread(element: ET.Element) -> Iterator[str]:
+    """Iterate over the attributes and elements of a link or joint that nothing reads, as dotted tags."""
+    if element.tag not in _KNOWN:
+        return
+    tag, known = str(element.tag), _KNOWN[element.tag].split()
+    yield from (f"{tag}.{key}" for key in (*element.keys(), *(str(part.tag) for part in element)) if key not in known)
+    for part in element:
+        yield from (f"{tag}.{key}" for key in _find_unread(part))
 
 
 def _link(element: ET.Element, name: str, rounding: float) -> Link:

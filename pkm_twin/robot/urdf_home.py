@@ -343,7 +343,7 @@ class HomeSearch:
         self.low, self.high = np.reshape(bounds, (-1, 2)).T - drawn
         self.wanted = np.where(self.held, -drawn, 0.0)
         self.place = "zero"
-        if all(name in tree.initial for name in tree.actuated):
+        if any(name in tree.initial for name in tree.actuated):
             start = np.array([tree.initial.get(name, 0.0) for name in steps])
             if start.any():
                 self.wanted = np.where(self.held, start - drawn, 0.0)

@@ -197,7 +197,7 @@ def read_tree(path: str | Path, part: Part = Part()) -> UrdfReading:
 
 
 def _require_closed(path: Path, tree: LoopTree) -> None:
-    """Reject too many joints to be assembled, and passive joints that no closure holds.
+    """Reject too many joints to be assembled, and passive joints and free links that no closure holds.
 
     :raises ParameterError: their number, or their names.
     """
@@ -205,6 +205,11 @@ def _require_closed(path: Path, tree: LoopTree) -> None:
     # The time to close the loops grows with the cube of this number.
     if len(moving) > 1000:
         raise ParameterError(str(path), f"{len(moving)} joints that move", "at most 1000")
+    ends = [(one.inner, one.outer) for one in (*tree.joints.values(), *tree.closures) if one.kind != "free"]
+    for part in graphs.groups(tree.links, ends):
+        if tree.root not in part:
+            bound = "a joint or closure that connects it; a base and a platform (--base) can leave it out"
+            raise ParameterError(f"link.{part[0]}", "not connected", bound)
     idle = [name for name in moving if name not in tree.actuated]
     if idle and not tree.closures:
         raise ParameterError(

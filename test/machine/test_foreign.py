@@ -40,6 +40,15 @@ URDF = {
     '<loop_joint name="l" type="gear"/>': "loop_joint.l.type",
     '<loop_joint name="l" type="spherical"><link1 link="arm_left"/></loop_joint>': "l.link2",
     "<wormhole/>": "wormhole",
+    "<gazebo><gravity>0 0 0</gravity></gazebo>": "gazebo.gravity",
+    '<joint name="j" type="fixed"><parent link="arm_left"/><child link="l"/><safety_controller/></joint>'
+    '<link name="l"/>': "joint.safety_controller",
+    '<joint name="j" type="fixed"><parent link="arm_left"/><child link="l"/><dynamics spring_stiffness="1"/></joint>'
+    '<link name="l"/>': "joint.dynamics.spring_stiffness",
+    '<joint name="j" type="fixed"><parent link="arm_left"/><child link="l"/><drake:mimic joint="x"/></joint>'
+    '<link name="l"/>': "drake:mimic",
+    '<joint name="j" type="fixed"><parent link="arm_left"/><child link="l"/><origin xyz="0 0 0"/></joint>'
+    '<link name="l"><visual><drake:x/></visual><contact/></link>': "read",
 }
 SDF = {
     "<link><gravity>false</gravity></link>": "gravity",
@@ -56,6 +65,8 @@ SDF = {
     "<model><drake:ball_constraint/></model>": "drake:ball_constraint",
     f"<model>{PLUGIN.format('gz::sim::systems::Hydrodynamics')}</model>": "Hydrodynamics",
     f"<model>{PLUGIN.format('MimicJointSystem')}</model>": "Mimic",
+    '<model><drake:tendon_constraint name="t"/></model>': "drake:tendon_constraint",
+    "<link><collision name='c'><drake:proximity_properties/></collision></link>": "read",
 }
 MJCF = {
     '<option><flag gravity="disable"/></option>': "gravity",
@@ -63,6 +74,9 @@ MJCF = {
     '<option density="1.2"/>': "fluid",
     '<default><joint stiffness="2"/></default>': "spring",
     '<worldbody><body gravcomp="1"><geom size="0.1" mass="1"/></body></worldbody>': "gravcomp",
+    '<worldbody><body name="ball"><freejoint/><inertial pos="0 0 0" mass="1" '
+    'diaginertia="1 1 1"/></body></worldbody>': "link.ball",
+    f'<actuator><motor name="none" joint="{FIRST}" gear="0"/></actuator>': "actuator.none.gear",
 }
 
 

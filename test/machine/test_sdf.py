@@ -335,6 +335,10 @@ FRAME = """<frame name="F"><pose>1 0 0 0.4 0 0</pose></frame>
 M1 = """<joint name="m1" type="revolute"><parent>world</parent><child>arm_1</child>
  <axis><xyz>0 0 1</xyz></axis></joint>"""
 SAME = {
+    "gravity where SDF had it until 1.5": (
+        {"<gravity>0 -9.81 0</gravity>": "<physics><gravity>1 2 3</gravity></physics>"},
+        {"0 -9.81 0": "1 2 3"},
+    ),
     "a frame of the world": (
         {MODEL: f'{FRAME}{MODEL}<pose relative_to="G">0 0 3 0 0 0.2</pose>'},
         {MODEL: f"{MODEL}<pose>{{}}</pose>"},
