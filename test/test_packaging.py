@@ -252,6 +252,7 @@ class TestColcon:
         listed = run(COLCON, "list", cwd=workspace).split()
         assert listed == ["pkm_twin", "src/pkm_twin", "(ros.ament_python)"]
 
+    @pytest.mark.long
     def test_build(self, copy, tmp_path):
         workspace = copy.parents[1]
         # The build's Python is this one, as an unactivated venv needs to be told.

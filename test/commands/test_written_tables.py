@@ -23,7 +23,6 @@ READERS = (
     ("map", "--along"),
     ("torques", "--out", "-"),
 )
-NAMES = ("delta", "five_bar", "upr_rpu", "stewart")
 
 
 def answers(twin, robot, path):
@@ -63,7 +62,7 @@ def swings(robot, rng, count=101):
 
 
 @pytest.mark.parametrize("ending", ENDINGS)
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", partly_long(["delta", "five_bar", "upr_rpu", "stewart"], "delta", "upr_rpu"))
 def test_a_table_of_torques_gives_the_answers_of_its_source(name, ending, twin, tmp_path, rng):
     """Of positions under a wrench, with a payload for a part of the time."""
     robot, source, out = load(name), tmp_path / "source.csv", tmp_path / f"written.{ending}"

@@ -20,7 +20,7 @@ from pkm_twin.machine.friction import Dahl
 from pkm_twin.recordings import Load, Recording
 from pkm_twin.streams.rates import rms
 from test.identification.machines import IMPOSSIBLE, WRONG, Drawn, machine, noisy, shifted
-from test.support.robots import load, partly_long
+from test.support.robots import load, often, partly_long
 
 MACHINES = (
     "delta",
@@ -99,34 +99,40 @@ def test_efforts_that_are_late_leave_noise_alone() -> None:
 
 
 @pytest.mark.parametrize("name", partly_long(["delta", "five_bar", "linear_delta"], "five_bar"))
-def test_fit_and_check_say_the_same_of_late_efforts(name: str) -> None:
-    """Up to 50 ms both take the delay out, and no friction is in its place; of more it is told."""
+@pytest.mark.parametrize("late", often(0.045, -0.03))
+def test_fit_and_check_say_the_same_of_late_efforts(name: str, late: float) -> None:
+    """Up to 50 ms both take the delay out, and no friction is in its place."""
     m = machine(load(name), np.random.default_rng([3, *name.encode()]), 6.0, 250.0)
-    for late in (-0.03, 0.045):
-        effort = shifted(m.efforts, m.time, late)
-        made = replace(noisy(m.recorded(effort=effort), np.random.default_rng(7)), robot=m.truth)
-        found, (result, *_) = check(made), fit_recordings(m.truth, [made])
-        assert found.answer == "good" and found.compared is not None
-        assert result.verdict.answer == "explains"
-        assert result.verdict.findings == result.verdict.hints == ()
-        deviation = np.sqrt(result.problem.both.covariance[-1, -1])
-        assert result.delays[0] == pytest.approx(late, abs=3.0 * deviation)
-        assert found.compared.late == pytest.approx(late, abs=3.0 * deviation)
+    effort = shifted(m.efforts, m.time, late)
+    made = replace(noisy(m.recorded(effort=effort), np.random.default_rng(7)), robot=m.truth)
+    found, (result, *_) = check(made), fit_recordings(m.truth, [made])
+    assert found.answer == "good" and found.compared is not None
+    assert result.verdict.answer == "explains"
+    assert result.verdict.findings == result.verdict.hints == ()
+    deviation = np.sqrt(result.problem.both.covariance[-1, -1])
+    assert result.delays[0] == pytest.approx(late, abs=3.0 * deviation)
+    assert found.compared.late == pytest.approx(late, abs=3.0 * deviation)
     # Also where the file has no friction.
     bare = m.truth.changed(friction={"viscous": 0.0, "coulomb": 0.0})
     made = replace(made, robot=bare)
     (cause,), (result, *_) = check(made).causes, fit_recordings(bare, [made])
     told = re.search(r"(\S+) ms late", cause)
     assert told is not None and float(told[1]) == pytest.approx(1e3 * result.delays[0], abs=0.5)
-    for late, robot in ((0.054, m.truth), (0.08, m.robot)):
-        effort = shifted(m.efforts, m.time, late)
-        made = noisy(m.recorded(effort=effort), np.random.default_rng(7))
-        text = f"efforts of all joints are {late:g} s late"
-        judged = check(replace(made, robot=robot))
-        assert judged.answer == "bad"
-        assert (*judged.causes, *judged.findings)[0].startswith(text)
-        with pytest.raises(PkmTwinError, match=text):
-            fit_recordings(robot, [made])
+
+
+@pytest.mark.parametrize("name", partly_long(["delta", "five_bar", "linear_delta"], "five_bar"))
+@pytest.mark.parametrize(("late", "known"), [(0.054, True), pytest.param(0.08, False, marks=pytest.mark.long)])
+def test_fit_and_check_tell_of_efforts_that_are_later(name: str, late: float, known: bool) -> None:
+    """Whether friction and payload are known or not."""
+    m = machine(load(name), np.random.default_rng([3, *name.encode()]), 6.0, 250.0)
+    robot = m.truth if known else m.robot
+    made = noisy(m.recorded(effort=shifted(m.efforts, m.time, late)), np.random.default_rng(7))
+    text = f"efforts of all joints are {late:g} s late"
+    judged = check(replace(made, robot=robot))
+    assert judged.answer == "bad"
+    assert (*judged.causes, *judged.findings)[0].startswith(text)
+    with pytest.raises(PkmTwinError, match=text):
+        fit_recordings(robot, [made])
 
 
 def test_drives_that_are_off_before_the_motion_are_left_out_of_both() -> None:
@@ -228,7 +234,7 @@ def test_fit_and_check_name_one_payload(name: str) -> None:
 
 @pytest.mark.parametrize("name", partly_long(["delta_cu", "linear_delta"], "delta_cu"))
 def test_a_payload_that_is_picked_is_fitted_with_its_times(name: str) -> None:
-    m = machine(load(name), np.random.default_rng(5), 12.0, 200.0)
+    m = machine(load(name), np.random.default_rng(5), 12.0, 100.0)
     light, heavy = (m.robot.changed(payload={"mass": mass}) for mass in (0.0, 0.5))
     held = (m.time > 4.0) & (m.time < 9.0)
     efforts = [inverse_dynamics(one, m.q, m.qd, m.qdd) for one in (light, heavy)]
@@ -283,7 +289,7 @@ def test_fit_and_check_say_that_the_machine_cannot_take_the_positions(name: str)
 def test_friction_that_may_hold_a_payload_at_rest_does_not_lighten_it() -> None:
     """Strokes of 0.4 s, and rests as long where dry friction is larger than the payload's share."""
     robot = load("delta").changed(friction={"coulomb": [1.0] * 3}, payload={"mass": 0.0})
-    time = np.arange(0.0, 8.0, 1e-3)
+    time = np.arange(0.0, 8.0, 2e-3)
     stroke = np.clip(np.abs((time + 0.4) % 1.6 - 0.8) / 0.4 - 0.5, 0.0, 1.0)
     size = np.array([0.5, 0.3, -0.4])
     q = robot.inverse(robot.home()) + size * (stroke**3 * (10 - stroke * (15 - 6 * stroke)))[:, None]
@@ -307,7 +313,7 @@ def test_a_fit_is_compared_with_the_file_wherever_it_starts() -> None:
     light, heavy = (m.robot.changed(payload={"mass": mass}) for mass in (0.1, 0.5))
     made = noisy(m.recorded(effort=inverse_dynamics(heavy, m.q, m.qd, m.qdd)), np.random.default_rng(8))
     sizes = []
-    for start in (None, Load(0.4), Load(0.6, (0.05, 0.0, 0.02))):
+    for start in (None, Load(0.6, (0.05, 0.0, 0.02))):
         found, *_ = fit_recordings(light, [replace(made, robot=light, load=start)], ("payload",))
         (payload,) = (n for n in found.numbers if n.name == "payload.mass")
         assert payload.before == 0.1

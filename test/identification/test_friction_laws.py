@@ -17,7 +17,7 @@ from pkm_twin.identification.samples import Filtering, find_lines
 from pkm_twin.recordings import Recording
 from pkm_twin.recordings.payload import Load
 from test.identification.machines import machine, noisy
-from test.support.robots import load, partly_long
+from test.support.robots import load, often, partly_long
 
 CASES = [
     f"{name} {law}"
@@ -165,7 +165,8 @@ def test_sweeps_stay_inside_the_limits_and_move_one_joint_at_a_time(name):
 
 
 @pytest.mark.parametrize("name", partly_long(["delta", "five_bar", "upr_rpu"], "delta"))
-def test_sweeps_alone_show_the_friction_of_every_joint(name):
+@pytest.mark.parametrize("seeds", often(2, 6))
+def test_sweeps_alone_show_the_friction_of_every_joint(name, seeds):
     """Fast ones, too, whose ramps a coarse encoder smooths: errors are as large as they say."""
     robot, errors, away = load(name), [], []
     found = sweeps(Judge.of(robot, file_parameters(robot, ("friction",))), 20.0, Bounds(rate=200.0))
@@ -173,7 +174,7 @@ def test_sweeps_alone_show_the_friction_of_every_joint(name):
     motion = found.at(time)
     size = np.abs(inverse_dynamics(robot, *motion)).max(0)
     fastest = np.abs(motion[1]).max(0)
-    for seed in range(4):
+    for seed in range(seeds):
         rng = np.random.default_rng([seed, *name.encode()])
         viscous, coulomb = rng.uniform([[0.05], [0.05]], [[0.5], [0.3]], (2, len(size)))
         friction = {"viscous": viscous * size / fastest, "coulomb": coulomb * size}

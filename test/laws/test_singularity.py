@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -158,9 +159,9 @@ def law_machines():
     yield from robot_names()
     yield from sorted(GALLERY.glob("*.yaml"))
     for k, name in enumerate(NAMES):
-        yield pytest.param(plain(name), id=name)
-        random = pytest.param(variant(name, np.random.default_rng(k)), id=f"random {name}")
-        yield pytest.param(*random.values, id=random.id, marks=pytest.mark.long)
+        yield pytest.param(partial(plain, name), id=name)
+        made = partial(variant, name, np.random.default_rng(k))
+        yield pytest.param(made, id=f"random {name}", marks=pytest.mark.long)
 
 
 class TestOneMachineOneMeasure:
@@ -175,8 +176,7 @@ class TestOneMachineOneMeasure:
 
     @pytest.mark.parametrize("machine", list(law_machines()), ids=lambda m: Path(m).stem)
     def test_measure(self, machine):
-        data = isinstance(machine, dict)
-        robot = robot_of_data(machine, "machine") if data else load(machine)
+        robot = robot_of_data(machine(), "machine") if callable(machine) else load(machine)
         graph, rng = robot.graph, np.random.default_rng(7)
         point = "rad" not in robot.pose_units
         slides = {name: graph.joints[name].slides for name in graph.leads}
