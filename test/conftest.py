@@ -58,13 +58,16 @@ def pytest_collection():
 def pytest_collection_modifyitems(items):
     """Files that wait for nodes stand evenly among those that compute, and end before them.
 
-    Workers take files in this order; a waiting one leaves its core to another. Short ones are last.
+    Workers take files in this order; a waiting one leaves its core to another. Short ones are last,
+    the shorter the later, so that no worker is left alone with a long one.
     """
     files = list(dict.fromkeys(item.path for item in items))
     waiting = [path for path in files if path.parent.name == "nodes"]
     place = {path: k / len(waiting) * 0.85 for k, path in enumerate(waiting)}
     others = [path for path in files if path not in place]
-    others.sort(key=lambda path: path.parent.name == "laws")
+    short = [path for path in others if path.parent.name == "laws"]
+    short.sort(key=lambda path: -path.stat().st_size)
+    others = [path for path in others if path not in short] + short
     place |= {path: k / len(others) for k, path in enumerate(others)}
     items.sort(key=lambda item: place[item.path])
 

@@ -9,7 +9,7 @@ import yaml
 
 from pkm_twin.mechanisms.catalogue import config_folder, load
 from test.support.command import forked
-from test.support.robots import parameters_of
+from test.support.robots import parameters_of, partly_long
 
 VARY = ("--vary", "geometry.arm_length=0.15:0.3", "--vary", "geometry.forearm_length=0.3:0.6")
 TOLERANCES = ("--tolerance", "geometry.arm_length=1e-4", "--tolerance", "geometry.base_radius=5e-5")
@@ -82,7 +82,7 @@ def test_a_budget_names_each_contribution(twin, pick):
     assert machines["rms_position_m"] == pytest.approx(machines["first_order_rms_position_m"], rel=0.15)
 
 
-@pytest.mark.parametrize("name", ["delta", "linear_delta"])
+@pytest.mark.parametrize("name", partly_long(["delta", "linear_delta"], "linear_delta"))
 def test_a_file_has_tolerances_of_its_parts(twin, tmp_path, name):
     path, data = tmp_path / "loose.yaml", parameters_of(name)
     actuated = load(name).joint_names

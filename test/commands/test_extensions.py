@@ -66,6 +66,7 @@ def test_its_command_and_export_have_options_json_and_errors(run):
     assert wrong.code == 2 and "'-11'" in wrong.one_line_error()
 
 
+@pytest.mark.long
 def test_its_map_is_computed_and_plotted_again(run):
     if not all(map(find_spec, ("xarray", "h5netcdf", "h5py"))):
         pytest.skip("maps need xarray, h5netcdf and h5py")
@@ -82,6 +83,7 @@ def test_help_lists_it_and_warns_of_what_cannot_be_loaded(run):
     assert re.search(r"^  height +Print the height", robots, re.M)
     assert [name for name in ("ABSENT", "setting") if name in found.err] == ["ABSENT", "setting"]
     assert len(found.err.splitlines()) == 2
+    assert "height" in run("map", "delta", "--help").out
     error = run("absent").one_line_error()
     assert "my_tools:ABSENT" in error and "click" in error
     assert "height of the floor" not in run("info", "--help").out

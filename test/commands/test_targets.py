@@ -270,16 +270,16 @@ def test_closed_outputs_lead_nowhere(tmp_path, closed):
     assert done.stdout == "" and "Traceback" not in done.stderr
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
-        ("path", "five_bar", "--circle", "0.02", "--out", "out.mcap", "--no-picture"),
-        ("path", "five_bar", "--circle", "0.02", "--out", "out.csv", "--no-picture"),
-        ("export", "c", "delta", "--out", "c"),
-        ("export", "ros2-control", "five_bar", "--out", "control"),
-    ],
-    ids=lambda line: " ".join(line[:3]),
-)
+PATH = "path five_bar --circle 0.02 --no-picture --out"
+FULL = [
+    f"{PATH} out.mcap",
+    f"{PATH} out.csv",
+    "export c five_bar --out c",
+    "export ros2-control five_bar --out control",
+]
+
+
+@pytest.mark.parametrize("line", partly_long(FULL, FULL[0], FULL[2]))
 def test_a_full_disk_leaves_no_part_under_a_final_name(line, tmp_path):
     """Neither of a file nor of a folder's files: what is there has all of it."""
     program = (
@@ -289,7 +289,7 @@ def test_a_full_disk_leaves_no_part_under_a_final_name(line, tmp_path):
         "cli.main(sys.argv[1:])\n"
     )
     done = subprocess.run(
-        [sys.executable, "-c", program, *line],
+        [sys.executable, "-c", program, *line.split()],
         cwd=tmp_path,
         capture_output=True,
         text=True,

@@ -119,12 +119,13 @@ def test_nights_to_a_verdict(twin, tmp_path, monkeypatch, rng):
     assert (tmp_path / "trend.png").stat().st_size
 
 
-def test_a_folder_is_judged_bag_by_bag(twin, tmp_path, sample):
+@pytest.mark.parametrize("jobs", often(1, 2))
+def test_a_folder_is_judged_bag_by_bag(jobs, twin, tmp_path, sample):
     folder = tmp_path / "night"
     folder.mkdir()
     (folder / "good.mcap").write_bytes(sample.read_bytes())
     (folder / "bad.mcap").write_bytes(sample.read_bytes()[:5000])
-    line = ("check", folder, "--jobs", 2, "--history", tmp_path / "h.db")
+    line = ("check", folder, "--jobs", jobs, "--history", tmp_path / "h.db")
     told = twin.told(*line, code=1)["recordings"]
     assert [(r["bag"].rpartition("/")[2], r["good"]) for r in told] == [("bad.mcap", False), ("good.mcap", True)]
     (folder / "bad.mcap").unlink()

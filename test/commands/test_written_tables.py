@@ -83,7 +83,7 @@ def test_a_table_of_torques_gives_the_answers_of_its_source(name, ending, twin, 
     np.testing.assert_allclose(np.where(np.isnan(carried), robot.payload.mass, carried), 0.7 * held)
 
 
-@pytest.mark.parametrize("ending", [*ENDINGS, "mcap"])
+@pytest.mark.parametrize("ending", partly_long([*ENDINGS, "mcap"], "csv", "mcap"))
 @pytest.mark.parametrize("name", partly_long(["delta", "linear_delta"], "linear_delta"))
 def test_a_planned_cycle_gives_the_same_answers_in_every_format(name, ending, twin, tmp_path):
     first, out = tmp_path / "first.csv", tmp_path / f"again.{ending}"

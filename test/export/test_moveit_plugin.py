@@ -146,7 +146,7 @@ class Plugin:
 
 @pytest.fixture(
     scope="module",
-    params=partly_long(("delta_cu", "five_bar", "rps3", "upr_rpu", "stewart"), "delta_cu", "five_bar"),
+    params=partly_long(("delta_cu", "five_bar", "rps3", "upr_rpu", "stewart"), "five_bar"),
 )
 def plugin(request, tmp_path_factory):
     return Plugin(load(request.param), tmp_path_factory.mktemp("plugin"))

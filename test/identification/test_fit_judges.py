@@ -169,7 +169,7 @@ def test_others_are_rejected_too(what: str, name: str) -> None:
     assert rejected(what, name, 5)
 
 
-@pytest.mark.parametrize("what", ["gains", "sensors", "lengths"])
+@pytest.mark.parametrize("what", partly_long(["gains", "sensors", "lengths"], "lengths"))
 def test_another_machine_of_the_file_s_kind_is_not_rejected(what: str) -> None:
     assert not rejected(what, "linear_delta", 4)
 
@@ -231,7 +231,7 @@ def test_rotors_that_the_file_does_not_have_are_no_other_rate_of_time(name: str,
 
 @pytest.mark.parametrize(
     "what",
-    [pytest.param(w, marks=pytest.mark.long) if w in ("sensor", "elastic") else w for w in LIKELY],
+    partly_long(LIKELY, "load_friction", "stribeck", "lengths"),
 )
 def test_what_the_model_leaves_out_is_found(what: str) -> None:
     result = judged(what, "delta_cu", 2)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from pkm_twin.identification.judge import Case, Suspect, Verdict, judge
+from test.support.robots import partly_long
 
 ROWS, CHANNELS, FITTED, ERRORS = 300, 2, 3, 12
 
@@ -49,7 +50,7 @@ def drawn(rng, scale: float) -> tuple[Verdict, np.ndarray, np.ndarray]:
     return judged(explained, columns, usual, noise + columns @ (usual * rng.normal(size=ERRORS)))
 
 
-@pytest.mark.parametrize("scale", [0.01, 0.1, 1.0])
+@pytest.mark.parametrize("scale", partly_long([0.01, 0.1, 1.0], 1.0))
 def test_what_errors_of_usual_size_do_is_within_the_deviations(scale: float) -> None:
     errors, plain = [], []
     for seed in range(60):

@@ -152,7 +152,7 @@ def thicker(robot, much):
     return other
 
 
-@pytest.mark.parametrize("name", partly_long(ROBOTS, "delta_cu", "upr_rpu"))
+@pytest.mark.parametrize("name", partly_long(ROBOTS, "delta_cu"))
 def test_poses_where_limbs_meet_are_refused(name):
     shipped = load(name)
     poses = box(shipped, 11)

@@ -184,7 +184,7 @@ def test_joints_that_stick_are_no_contact() -> None:
         assert found is None or not found.touching
 
 
-@pytest.mark.parametrize("braked", [0.0, 0.3])
+@pytest.mark.parametrize("braked", partly_long([0.0, 0.3], 0.3))
 def test_drives_that_are_off_or_braked_are_no_contact(braked: float) -> None:
     """Off from the first sample on; then on; then off at once."""
     robot, rng = load("delta_cu"), np.random.default_rng(4)

@@ -17,18 +17,15 @@ from delta_dynamics import (
     max_driving_force,
     max_driving_force_range,
     sphere_directions,
-    spread,
     tilted_pose,
 )
 from delta_dynamics.torques.isotropy import largest, minimax_direction
 from pkm_twin.errors import ParameterError
 from test.support import robots
-from test.support.robots import load, loaded, loaded_like, partly_long, random_joints
+from test.support.robots import load, loaded, partly_long, random_joints
 
 MASSIVE = [name for name in robots.MASSIVE if len(robots.SHIPPED[name].joint_names) == 3]
 """Directions are on a sphere: machines of three freedoms."""
-THIRD = 2 * np.pi / 3
-TURN = np.array([[np.cos(THIRD), -np.sin(THIRD), 0], [np.sin(THIRD), np.cos(THIRD), 0], [0, 0, 1]])
 
 massive = pytest.mark.parametrize("name", partly_long(MASSIVE, "delta_cu", "prru", "rps3", "upr_rpu"))
 
@@ -77,17 +74,6 @@ def test_energy_matrices_are_the_robots_energy(name, robot, rng):
     np.testing.assert_allclose(form, kinetic, rtol=1e-11)
     assert (np.linalg.eigvalsh(platform) > 0).all()
     assert (np.linalg.eigvalsh(everything - platform) > 0).all()
-
-
-@massive
-def test_a_payload_moves_with_the_platform(name, rng):
-    """It adds the same energy to the platform as to the whole machine."""
-    robot = load(name)
-    pose = robot.forward(random_joints(robot, rng, 20))
-    empty, loaded = energy_matrices(robot, pose), energy_matrices(loaded_like(robot), pose)
-    added = loaded[0] - empty[0]
-    np.testing.assert_allclose(added, loaded[1] - empty[1], atol=1e-12 * np.abs(empty[1]).max())
-    assert (np.linalg.eigvalsh(added) > 0).all()
 
 
 @massive
@@ -158,7 +144,7 @@ def descended(forms, start):
 SCALES = ([1.0, 1.0, 1.0], [1.0, 1e-3, 30.0], [1e4, 1.0, 1e-4])
 
 
-@pytest.mark.parametrize("scales", SCALES)
+@pytest.mark.parametrize("scales", partly_long(SCALES, SCALES[1]))
 @pytest.mark.parametrize("shift", [0.0, 2.0, 5.0, [[[4.0]], [[0.0]], [[-1.0]]]])
 def test_the_least_direction_is_global(shift, scales):
     """Never above a dense sphere's best nor what descents from there find; forms of any scale.
@@ -228,20 +214,6 @@ def test_ranges_of_machines_of_two_and_six_freedoms(name, rng):
         np.testing.assert_allclose(at, [ends.least, ends.greatest], rtol=1e-9)
 
 
-def axis_of(pose):
-    a, b = pose[..., 1], pose[..., 2]
-    return np.stack([np.sin(b), -np.sin(a) * np.cos(b), np.cos(a) * np.cos(b)], -1)
-
-
-def test_tilted_pose_leans_the_axis(rng):
-    azimuth, tilt = rng.uniform(-np.pi, np.pi, 50), rng.uniform(0, 1.2, 50)
-    out = np.sin(tilt)
-    lean = np.stack([out * np.cos(azimuth), out * np.sin(azimuth), np.cos(tilt)], -1)
-    pose = tilted_pose(0.9, azimuth, tilt)
-    np.testing.assert_allclose(axis_of(pose), lean, atol=1e-15)
-    assert (pose[:, 0] == 0.9).all()
-
-
 def test_zero_torsion_is_the_prrus_own_motion(head):
     azimuth, tilt = 0.7, 0.5
     c, s = np.cos(azimuth), np.sin(azimuth)
@@ -266,21 +238,6 @@ def test_prru_poses_60_180_and_300_degrees_have_the_same_sphere(head):
     # Other azimuths differ from these.
     other = energy_transfer_range(head, tilted_pose(0.9, 0.0, np.radians(45)))
     assert abs(other.greatest - eta.greatest[0]) > 0.05
-
-
-@pytest.mark.parametrize("azimuth", [0.0, 0.5, np.pi / 3, np.pi])
-def test_prru_spread_grows_with_tilt(head, azimuth):
-    """F_max from the level pose on; eta_KE from 25 degrees on, for with these masses the level
-    pose itself is not isotropic and a small tilt evens it out a little."""
-    tilt = np.radians([0, 10, 20, 25, 30, 35, 40, 45])
-    poses = tilted_pose(0.9, azimuth, tilt)
-    force = max_driving_force_range(head, poses).spread
-    assert (np.diff(force) > 0).all()
-    eta = energy_transfer_range(head, poses).spread
-    assert (np.diff(eta[3:]) > 0).all()
-    assert eta[-1] > 1.5 * eta[:4].max()
-    sampled = spread(energy_transfer(head, poses[:, None], sphere_directions(1000)))
-    np.testing.assert_allclose(sampled, eta, rtol=5e-2)
 
 
 def test_sphere_directions_are_even_unit_vectors():

@@ -17,6 +17,7 @@ from test.support.robots import (
     load,
     loaded,
     random_joints,
+    some_robots,
 )
 
 MACHINES = Path(__file__).parents[1] / "machine" / "machines"
@@ -243,7 +244,7 @@ def test_home_is_its_own_forward_and_needs_no_motion(name):
     assert np.abs(robot.passive(graph.home)).max(initial=0.0) < 1e-12
 
 
-@every_robot
+@some_robots
 def test_far_joints_are_refused_in_one_line_with_limb_sample_and_miss(name, rng):
     """Whatever the joints are: an assembly whose closures hold, or one of the typed refusals."""
     robot = load(name)

@@ -33,7 +33,7 @@ def kernels(robot):
     return found
 
 
-@pytest.mark.parametrize("name", partly_long(MASSIVE, "delta_cu", "five_bar", "prru"))
+@pytest.mark.parametrize("name", partly_long(MASSIVE, "five_bar"))
 def test_a_key_has_all_sources_that_write_its_program(name):
     """Whose functions run while a program is written, and whose the key has."""
     for kernel in kernels(load(name)).values():

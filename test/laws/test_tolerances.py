@@ -163,10 +163,7 @@ def states_of(robot, rng, count):
     return robot.graph.home + 0.05 * units * rng.uniform(-1.0, 1.0, (count, robot.joints_count))
 
 
-@pytest.mark.parametrize(
-    "name",
-    partly_long(NAMES, "rrr3_planar", "rsur"),
-)
+@pytest.mark.parametrize("name", partly_long(NAMES, "rsur"))
 def test_an_error_of_a_part_is_a_drive_that_makes_it(name, rng):
     data = variant(name, rng)
     data.setdefault("platform", "platform")

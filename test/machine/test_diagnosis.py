@@ -18,7 +18,7 @@ from test.support.robots import partly_long
 
 from .random_machines import changed, plain
 
-PLANAR = ("rrr3_planar", "four_bar", "slider_crank", "bolted", "five_bar")
+PLANAR = partly_long(("rrr3_planar", "four_bar", "slider_crank", "bolted", "five_bar"), "rrr3_planar", "bolted")
 DEVIATIONS = partly_long((1e-7, 1e-5, 1e-3), 1e-5)
 
 

@@ -15,7 +15,7 @@ from pkm_twin.export.moveit import GROUP, LIMB, moveit_package
 from test.support.robots import load, parameters_of, partly_long
 
 
-@pytest.fixture(params=partly_long(robot_names(), "delta_cu", "five_bar", "rps3", "upr_rpu"), scope="module")
+@pytest.fixture(params=partly_long(robot_names(), "delta_cu", "five_bar"), scope="module")
 def exported(request, tmp_path_factory):
     folder = tmp_path_factory.mktemp("moveit") / "package"
     with pytest.raises(SystemExit) as ended:

@@ -59,7 +59,7 @@ def cell(request):
     return dataclasses.replace(both, mapped=mapped, names=list(mapped.controller.names))
 
 
-@pytest.fixture(params=partly_long(robot_names(), "delta_cu", "five_bar", "rps3", "upr_rpu"), scope="module")
+@pytest.fixture(params=partly_long(robot_names(), "delta_cu", "rps3"), scope="module")
 def robot(request):
     return load(request.param).changed(payload={"mass": 0.3, "com": [0.01, 0.02, -0.05]})
 

@@ -20,7 +20,7 @@ pytest.importorskip("pinocchio")
 
 import pinocchio as pin
 
-from .sketches import SKETCHES, Tree, delta, five_bar, palletizer, rrr3, stewart
+from .sketches import SKETCHES, Tree, delta, five_bar, palletizer, rrr3
 
 pytestmark = pytest.mark.usefixtures("quickly_compiled")
 DRAWINGS = (palletizer, five_bar, SKETCHES["four_bar"])
@@ -126,7 +126,7 @@ def test_the_index_is_that_of_the_machine_however_its_closures_are_written(tmp_p
     assert found[0] == pytest.approx(found[1], rel=1e-9)
 
 
-@pytest.mark.parametrize("tries", often(2, 12))
+@pytest.mark.parametrize("tries", often(1, 12))
 def test_of_several_assemblies_the_best_conditioned_is_home(tries, tmp_path):
     """Those that Pinocchio's tree has with the motors at zero, each made a drawing of its own."""
     path = spheres(palletizer(), tmp_path)
@@ -180,11 +180,10 @@ def test_where_no_assembly_is_at_zero_a_good_one_near_it_is_home(tmp_path):
 
 
 def test_initial_values_of_the_controllers_are_home(tmp_path):
-    sketch = stewart()
-    path = sketch.save(tmp_path)
+    path = five_bar().save(tmp_path)
     text = path.read_text()
     # A joint without an initial value starts at zero.
-    start = {f"m{i}": 0.02 * i - 0.05 for i in range(5)} | {"m5": 0.0}
+    start = {"m1": -0.05, "m2": 0.0}
     for name, value in start.items():
         old = f'<joint name="{name}"><command_interface name="effort"/>'
         assert old in text
@@ -209,6 +208,7 @@ def test_limits_that_leave_zero_out_are_kept(tmp_path):
     assert home == pytest.approx({"m1": 0.2, "m2": 0.0}, abs=1e-12)
 
 
+@pytest.mark.long
 def test_bars_between_two_balls_are_kept_from_spinning(tmp_path):
     """A Delta whose bars hang on ball joints at both ends: universal joints at one of them."""
     sketch = delta()

@@ -19,7 +19,7 @@ from pkm_twin.maps.sweep import map_of
 from pkm_twin.robot.workspace import reachable
 from stiffness_monitor import regular_workspace, strain_energy
 from test.maps.conftest import shorten
-from test.support.robots import load
+from test.support.robots import load, partly_long
 
 
 def stored(folder, robot, kind, **options):
@@ -37,7 +37,7 @@ def lean(azimuth, tilt):
     return turn @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]) @ turn.T
 
 
-@pytest.fixture(scope="module", params=["prru", "upr_rpu", "rps3"])
+@pytest.fixture(scope="module", params=partly_long(["prru", "upr_rpu", "rps3"], "prru"))
 def balls(request, tmp_path_factory):
     """A machine and its map with spheres."""
     folder = tmp_path_factory.mktemp("balls")
@@ -155,7 +155,7 @@ def test_poses_count_inside_the_largest_circles_alone(shares):
     assert (np.hypot(pose[:, 1], pose[:, 2]) <= circles.radius * (1 + 1e-3) + 1e-3).all()
 
 
-@pytest.mark.parametrize(("name", "unit"), [("prru", "rad"), ("delta", "m")])
+@pytest.mark.parametrize(("name", "unit"), [("prru", "rad"), pytest.param("delta", "m", marks=pytest.mark.long)])
 def test_circles_of_other_machines(name, unit):
     """Tilts without torsion count by the tilt itself, places by their distance from the axis."""
     robot = load(name)

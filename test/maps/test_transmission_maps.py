@@ -10,7 +10,7 @@ import pytest
 
 from pkm_twin import load, transmission
 from pkm_twin.maps.kinds import KINDS
-from test.support.robots import loaded
+from test.support.robots import loaded, partly_long
 
 HUMANOID = Path(__file__).resolve().parents[2] / "examples/humanoid.xml"
 
@@ -42,7 +42,7 @@ def test_ratios_efforts_and_inertias_are_those_of_the_worst_direction(rng):
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("kind", ["ratio", "joint-effort", "joint-inertia"])
+@pytest.mark.parametrize("kind", partly_long(["ratio", "joint-effort", "joint-inertia"], "ratio"))
 def test_a_map_s_poses_and_arrays_are_written_for_training(kind, twin, tmp_path):
     out, part = tmp_path / "ankle.npz", {"base": "shank", "platform": "foot"}
     options = [f"--{key}={value}" for key, value in part.items()]

@@ -160,6 +160,7 @@ def test_a_bound_on_clearance_takes_away(name, small_maps, tmp_path):
     assert left.circle.values == pytest.approx(circles(robot, left.height.values, least_clearance=bound))
 
 
+@pytest.mark.long
 def test_the_box_holds_what_interference_takes_away(variant):
     """Limbs so thick that they meet wherever the head tilts far."""
     thin = load("prru")
