@@ -17,6 +17,7 @@ import delta_dynamics
 import stiffness_monitor
 from pkm_twin import design, paths, robot_names
 from pkm_twin import errors as module
+from test.commands.conftest import coarse_pictures  # noqa: F401
 from test.support.command import typed_line
 from test.support.pages import assert_output, read_section
 from tools.pages import errors, notebooks, parameters, public, trend

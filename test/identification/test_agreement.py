@@ -306,7 +306,8 @@ def test_friction_that_may_hold_a_payload_at_rest_does_not_lighten_it() -> None:
         assert float(text.split()[-1]) == pytest.approx(0.5, rel=0.01)
     for gain in (0.97, 1.03):
         whole = replace(made, robot=heavy, effort=gain * made.measured)
-        assert check(whole).answer == "good" and not check(whole).hint
+        judged = check(whole)
+        assert judged.answer == "good" and not judged.hint
 
 
 def test_a_fit_is_compared_with_the_file_wherever_it_starts() -> None:

@@ -158,6 +158,7 @@ def test_a_cause_that_does_not_explain_the_efforts_is_not_named(wrong_way: bool)
     assert fault is not None and fault.startswith(named)
 
 
+@pytest.mark.long
 def test_half_its_speed_is_rejected_though_weight_makes_up_the_efforts() -> None:
     assert rejected("half_speed", "prru", 5)
 

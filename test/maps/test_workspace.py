@@ -83,7 +83,7 @@ def test_the_cylinder_is_reachable_and_no_wider_one_is(reach_map):
     assert not whole(1.002)
 
 
-@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("name", partly_long(ROBOTS, "prru"))
 def test_circles_end_where_the_first_ray_does(name):
     """Each height alone, its rays one test at a time: whole inside, not whole a hair beyond."""
     robot = load(name)
@@ -138,6 +138,7 @@ def test_a_bound_on_singularity_takes_away(small_maps, tmp_path):
 
 
 @pytest.mark.parametrize("name", partly_long(ROBOTS, "delta_cu"))
+@pytest.mark.long
 def test_a_bound_on_clearance_takes_away(name, small_maps, tmp_path):
     """Volume, circles and cylinder are those of what is left; the rest is in the file."""
     robot = load(name)
