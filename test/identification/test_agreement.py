@@ -328,7 +328,7 @@ def test_a_fit_is_compared_with_the_file_wherever_it_starts() -> None:
 def test_a_payload_is_looked_for_with_the_memory_of_friction() -> None:
     """It is held throughout, though no effort tells at first what friction does."""
     robot, rng = load("five_bar"), np.random.default_rng(5)
-    time = np.arange(0.0, 24.0, 0.005)
+    time = np.arange(0.0, 24.0, 0.01)
     w = 2.0 * np.pi * np.array([[0.11, 0.23, 0.31], [0.13, 0.19, 0.37]])
     turn = w * time[:, None, None] + rng.uniform(0.0, 6.0, (2, 3))
     q = robot.inverse(robot.home()) + 0.05 * np.sin(turn).sum(-1)

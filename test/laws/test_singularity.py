@@ -24,7 +24,7 @@ from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.robot.robot_urdf import robot_description
 from stiffness_monitor import compliance
 from test.machine.random_machines import GALLERY, NAMES, plain, rotation_of, variant
-from test.support.robots import joint_range, load, partly_long, random_joints
+from test.support.robots import KINDS, joint_range, load, partly_long, random_joints
 
 SURFACE = np.array([-0.08871, 0.34395, -0.18159])
 """A pose of the Delta-CU, inside its limits and its reach, where its platform is free to turn."""
@@ -155,11 +155,12 @@ def shuffled(entries, rng):
 
 
 def law_machines():
-    """Shipped robots, templates of the gallery, machines of tests and random ones."""
-    yield from robot_names()
-    yield from sorted(GALLERY.glob("*.yaml"))
+    """Shipped robots, templates of the gallery, machines of tests and random ones; by default some of each."""
+    yield from partly_long(robot_names(), *KINDS)
+    templates = sorted(GALLERY.glob("*.yaml"))
+    yield from partly_long(templates, *templates[::4])
     for k, name in enumerate(NAMES):
-        yield pytest.param(partial(plain, name), id=name)
+        yield pytest.param(partial(plain, name), id=name, marks=[pytest.mark.long] if k % 4 else [])
         made = partial(variant, name, np.random.default_rng(k))
         yield pytest.param(made, id=f"random {name}", marks=pytest.mark.long)
 
