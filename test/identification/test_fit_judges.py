@@ -80,7 +80,7 @@ def rejected(what: str, name: str, seed: int) -> bool:
         return True
 
 
-@pytest.mark.parametrize("name", ["linear_delta", "delta_cu"])
+@pytest.mark.parametrize("name", partly_long(["linear_delta", "delta_cu"], "linear_delta"))
 def test_a_sound_recording_is_explained(name: str) -> None:
     result = judged("sound", name, 3)
     assert result.verdict.answer == "explains"
@@ -105,7 +105,9 @@ def test_a_recording_with_gaps_is_fitted_like_the_whole_one() -> None:
         assert k.deviation < 4.0 * n.deviation or n.status != "fitted"
 
 
-@pytest.mark.parametrize("what", ["time_reversed", "milliseconds", "efforts_late"])
+@pytest.mark.parametrize(
+    "what", partly_long(["time_reversed", "milliseconds", "efforts_late"], "time_reversed", "milliseconds")
+)
 def test_what_no_machine_of_the_file_makes_is_rejected(what: str) -> None:
     assert rejected(what, "linear_delta", 4)
 
@@ -131,7 +133,7 @@ def test_a_known_payload_that_the_efforts_do_not_show_is_rejected() -> None:
     assert fault_of(m.robot, record) is not None
 
 
-@pytest.mark.parametrize(("who", "late"), [([0, 1, 2], 0.06), ([0], 0.04)])
+@pytest.mark.parametrize(("who", "late"), [pytest.param([0, 1, 2], 0.06, marks=pytest.mark.long), ([0], 0.04)])
 def test_a_short_delay_is_named_by_its_length(who: list[int], late: float) -> None:
     """Up to 50 ms the efforts of all joints may be late."""
     m = drawn("delta_cu", 4)

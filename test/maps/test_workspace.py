@@ -123,6 +123,7 @@ def test_no_cylinder_where_nothing_is_reachable():
     assert singularity_at(load("delta"), [[0.0, 0.0, -5.0]]) == [0.0]
 
 
+@pytest.mark.long
 def test_a_bound_on_singularity_takes_away(small_maps, tmp_path):
     sweep = map_of(load("upr_rpu"), Workspace(), 4000, least_singularity=0.28)
     file = run(sweep, tmp_path / "a.nc", workers=1)

@@ -24,7 +24,7 @@ from stiffness_monitor import strain_energy
 from test.commands.conftest import DELTA, REPOSITORY
 from test.maps.browser import Browser, find_browser
 from test.nodes.harness import end_with_parent
-from test.support.robots import load
+from test.support.robots import load, partly_long
 from test.support.waiting import wait_until
 
 needs_viser = pytest.mark.usefixtures("viser")
@@ -95,7 +95,7 @@ def serving(*arguments):
         running.communicate()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", partly_long([signal.SIGINT, signal.SIGTERM], signal.SIGTERM))
 @needs_viser
 def test_a_signal_ends_it_quietly(number):
     with serving("five_bar") as (running, _):
