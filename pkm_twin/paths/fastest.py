@@ -17,7 +17,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.paths.carrying import split_at_payloads
 from pkm_twin.paths.constraints import Forces, Limits, Rows
-from pkm_twin.paths.geometry import Path, through
+from pkm_twin.paths.geometry import MAX_LENGTH, Path, through
 from pkm_twin.paths.jerk import MAX_PROGRAMS, smooth_profile, smooth_run
 from pkm_twin.paths.joint_path import JointPath, Slowdown, describe_place, joint_paths
 from pkm_twin.paths.motion import Run, TimedPath, needs_forces, run_peaks, sample_run
@@ -242,8 +242,9 @@ def timed(
         return result
     moving = sum(run.duration for run in result.runs)
     least = moving + sum(result.rests)
-    if not (np.isfinite(duration) and duration >= least * (1.0 - 1e-9)):
-        raise ParameterError("duration", duration, f"{least:.6g} s or more, within the limits by law {law}")
+    if not least * (1.0 - 1e-9) <= duration <= MAX_LENGTH:
+        bound = f"{least:.6g} s or more, within the limits by law {law}, at most {MAX_LENGTH:g} s"
+        raise ParameterError("duration", duration, bound)
     factor = (duration - sum(result.rests)) / moving
     result = replace(result, runs=tuple(run.slower(factor) for run in result.runs))
     over = max(result.worst.values(), default=0.0)

@@ -25,6 +25,8 @@ Space = Literal["pose", "joint"]
 
 MIN_DISTANCE: Final = 1e-9
 """Distance below which two waypoints coincide, m."""
+MAX_LENGTH: Final = 1e6
+"""Largest coordinate, m, and rest, s, of a path: the largest of a robot file and of a recording."""
 TANGENT_TOLERANCE: Final = 1e-6
 """Difference of two unit directions below which a path continues without a stop."""
 
@@ -89,9 +91,10 @@ def _check_waypoints(robot: Robot, points: ArrayLike, space: Space) -> tuple[Arr
     names = robot.pose_names if space == "pose" else robot.joint_names
     if values.ndim != 2 or values.shape[1] != len(names) or len(values) < 2:
         raise ParameterError("waypoints", f"shape {values.shape}", f"2 or more rows of {', '.join(names)}")
-    if not np.isfinite(values).all():
-        row = int(np.argwhere(~np.isfinite(values))[0, 0])
-        raise ParameterError(f"waypoint {row}", values[row].tolist(), "finite numbers")
+    bad = ~(np.abs(values) <= MAX_LENGTH).all(1)
+    if bad.any():
+        row = int(bad.argmax())
+        raise ParameterError(f"waypoint {row}", values[row].tolist(), f"numbers up to {MAX_LENGTH:g}")
     steps = np.linalg.norm(np.diff(values, axis=0) * scales_of(robot, space), axis=1)
     if not (steps > MIN_DISTANCE).any():
         raise ParameterError("waypoints", "all equal", "two or more different waypoints")
@@ -141,10 +144,10 @@ def lines(
     blends, dwells = (np.broadcast_to(np.asarray(v, float), count).copy() for v in (blend, dwell))
     arcs = np.broadcast_to(np.asarray(arc, bool), count).copy()
     for name, numbers in (("blend", blends), ("dwell", dwells)):
-        bad = ~(np.isfinite(numbers) & (numbers >= 0.0))
+        bad = ~((numbers >= 0.0) & (numbers <= MAX_LENGTH))
         if bad.any():
             row = int(bad.argmax())
-            raise ParameterError(f"waypoint {row}: {name}", numbers[row], "0 or more")
+            raise ParameterError(f"waypoint {row}: {name}", numbers[row], f"0 to {MAX_LENGTH:g}")
     # A repeated waypoint only adds its rest.
     rested = np.zeros(count)
     for k in np.flatnonzero(np.logical_not(new)):
@@ -235,8 +238,10 @@ def circle(robot: Robot, centre: ArrayLike, radius: float, *, turns: float = 1.0
     places = next((found for found in both if len(found) == 2), None)
     if places is None:
         raise ParameterError("circle", robot.name, "a pose with two positions or two angles")
-    if not (radius > 0.0 and turns):
-        raise ParameterError("circle", radius, "a radius above 0 and turns other than 0")
+    if not (0.0 < radius <= MAX_LENGTH and 0.0 < abs(turns) <= MAX_LENGTH):
+        raise ParameterError(
+            "circle", [radius, turns], f"a radius above 0 and turns other than 0, up to {MAX_LENGTH:g}"
+        )
     across, along = np.zeros(len(middle)), np.zeros(len(middle))
     scale = float(scales_of(robot, "pose")[places[0]])
     across[places[0]], along[places[1]] = 1.0 / scale, float(np.sign(turns)) / scale

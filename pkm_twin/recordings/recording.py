@@ -22,7 +22,7 @@ from pkm_twin.robot.derivatives import nearest_motion
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.differentiator import Differentiator
 from pkm_twin.streams.noise import SIGMAS, estimate_noise
-from pkm_twin.streams.rates import MAX_RATE, rate_faults
+from pkm_twin.streams.rates import MAX_ACCELERATION_ERROR, MAX_RATE, rate_faults
 from pkm_twin.streams.rest import gradient_gain, velocity_error_bound
 from pkm_twin.streams.steps import MAX_GAP_PERIODS, Steps, repeats_of, steps_of
 from pkm_twin.streams.wrench import WrenchSettings
@@ -268,8 +268,8 @@ class Recording:
         If the recording has both, they stay. In a table the missing ones are second-order
         differences; in a bag, a node's differentiator gives them in the middle of its window.
 
-        :raises PkmTwinError: too few samples in a row, or velocities that differ from the rate of
-            the positions by more than `check` allows.
+        :raises PkmTwinError: too few samples in a row, velocities that differ from the rate of the
+            positions by more than `check` allows, or accelerations that contradict the velocities.
         """
         if self.qd is not None and len(self.time) > 2:
             # An overflow gives numbers that are not finite, which the model rejects.
@@ -281,6 +281,17 @@ class Recording:
                     f"{self.source}: velocities differ from the rate of the positions by "
                     f"{', '.join(faults)}; expected at most {100 * MAX_RATE:g} %, or no velocities"
                 )
+            if self.qdd is not None:
+                names = ("velocity", "acceleration")
+                with np.errstate(all="ignore"):
+                    _, faults = rate_faults(
+                        self.robot, self.stamps, self.qd, self.qdd, jumps, MAX_ACCELERATION_ERROR, names
+                    )
+                if faults:
+                    raise PkmTwinError(
+                        f"{self.source}: accelerations differ from the rate of the velocities by "
+                        f"{', '.join(faults)}; expected at most {100 * MAX_ACCELERATION_ERROR:g} %, or no accelerations"
+                    )
             if self.step_fault:
                 self = replace(self, notes=(*self.notes, f"positions jump: {self.step_fault}"))
         if self.qd is not None and self.qdd is not None:

@@ -27,6 +27,9 @@ STANDSTILL_FRACTION: Final = 0.03
 """Moves below this fraction of the other quantity's moves count as standing still."""
 MAX_RATE: Final = 0.15
 """Largest relative RMS difference of the moves of a whole recording."""
+MAX_ACCELERATION_ERROR: Final = 0.6
+"""The same of changes of the velocities: a step of the acceleration between two samples is up to 0.2 of a block
+of five steps, and filters delay accelerations; wrong signs, units and zeros leave 1 or more."""
 SCALE_TOLERANCE: Final = 0.1
 """Largest relative difference that a factor between both may leave to be named as the cause."""
 
@@ -36,18 +39,21 @@ def rms(values: Array) -> Array:
     return np.asarray(np.sqrt(np.mean(values**2, 0)), np.float64)
 
 
-def find_likely_cause(moved: Array, told: Array) -> str:
-    """Name the likely cause of a difference of both moves, (blocks,); may be empty."""
+def find_likely_cause(moved: Array, told: Array, names: tuple[str, str] = ("position", "velocity")) -> str:
+    """Name the likely cause of a difference of both moves, (blocks,); may be empty.
+
+    :param names: of the quantity that moves, and of its rate.
+    """
     by_q, by_qd = float(rms(moved)), float(rms(told))
     scale = float(np.sum(told * moved) / max(np.sum(moved**2), 1e-300))
-    if by_q < STANDSTILL_FRACTION * by_qd:
-        return " (the position stands still: encoder?)"
     if by_qd < STANDSTILL_FRACTION * by_q:
-        return " (the velocity is zero)"
+        return f" (the {names[1]} is zero)"
     if abs(scale + 1.0) < SCALE_TOLERANCE:
         return " (wrong sign?)"
     if rms(told - scale * moved) < SCALE_TOLERANCE * by_qd:
-        return f" ({scale:.3g} times the positions' rate: time stamps, ratio or unit?)"
+        return f" ({scale:.3g} times the rate of the {names[0]}: time stamps, ratio or unit?)"
+    if by_q < STANDSTILL_FRACTION * by_qd:
+        return f" (the {names[0]} stands still: encoder?)"
     return ""
 
 
@@ -127,16 +133,23 @@ class RateAgreement:
 
 
 def rate_faults(
-    robot: Robot, stamps: np.ndarray[Any, np.dtype[np.int64]], q: Array, qd: Array, jumps: Mask | None = None
+    robot: Robot,
+    stamps: np.ndarray[Any, np.dtype[np.int64]],
+    q: Array,
+    qd: Array,
+    jumps: Mask | None = None,
+    most: float = MAX_RATE,
+    names: tuple[str, str] = ("position", "velocity"),
 ) -> tuple[Array, list[str]]:
-    """Compare the velocities of a recording with its positions.
+    """Compare the velocities of a recording with its positions, or its accelerations with its velocities.
 
     :param stamps: rising, ns, shape (k,); q and qd, shape (k, n).
     :param jumps: steps that are not motions of the machine, (k - 1, n).
+    :param most: largest relative RMS difference. ``names``: of ``q`` and ``qd``, for the descriptions.
     :returns: relative RMS difference of the moves, (n,), empty if the recording is too short; and
         descriptions of the joints that disagree.
     """
-    names, time = robot.joint_names, 1e-9 * (stamps - stamps[0])
+    time = 1e-9 * (stamps - stamps[0])
     span = np.diff(time)
     period = float(np.median(span))
     apart = span > MAX_GAP_PERIODS * period
@@ -150,12 +163,13 @@ def rate_faults(
     if len(moved) < 2:
         return np.zeros(0), []
     # The moves of a joint that hardly moves are noise.
-    units, most = np.array(robot.joint_units), np.maximum(rms(moved), rms(told))
-    floor = np.array([STANDSTILL_FRACTION * most[units == unit].max() for unit in units])
+    units, sizes = np.array(robot.joint_units), np.maximum(rms(moved), rms(told))
+    floor = np.array([STANDSTILL_FRACTION * sizes[units == unit].max() for unit in units])
     size, width = rms(told - moved), max(MIN_STEPS, MIN_BLOCK_TIME / period)
     noisy = 2.0 * estimate_noise(time, q) + np.sqrt(width) * period * estimate_noise(time, qd)
-    part = size / np.maximum(np.maximum(most, floor), 1e-300)
-    bad = (part > MAX_RATE) & (size > SIGMAS * noisy)
+    part = size / np.maximum(np.maximum(sizes, floor), 1e-300)
+    bad = (part > most) & (size > SIGMAS * noisy)
     return part, [
-        f"{names[j]} {100 * part[j]:.3g} %{find_likely_cause(moved[:, j], told[:, j])}" for j in np.flatnonzero(bad)
+        f"{robot.joint_names[j]} {100 * part[j]:.3g} %{find_likely_cause(moved[:, j], told[:, j], names)}"
+        for j in np.flatnonzero(bad)
     ]

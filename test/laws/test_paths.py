@@ -355,6 +355,15 @@ def test_what_cannot_be_is_rejected_by_its_place():
     with pytest.raises(ParameterError) as error:
         fastest(robot, [home, up], singularity=0.99)
     assert "singularity" in error.value.field
+    for make in (
+        lambda: cycle(robot, 0.025, 1e300),
+        lambda: circle(robot, home, 1e300),
+        lambda: lines(robot, [home, up], dwell=1e300),
+    ):
+        with pytest.raises(ParameterError, match=r"1e\+?06"):
+            fastest(robot, make())
+    with pytest.raises(ParameterError, match=r"1e\+06 s"):
+        timed(robot, lines(robot, [home, up]), "quintic", duration=1e300)
     with pytest.raises(ParameterError):
         fastest(load("upr_rpu"), points_of(load("upr_rpu")))
     rails = load("linear_delta")

@@ -229,6 +229,12 @@ def test_velocities_that_contradict_the_positions_are_rejected():
         for scale in (-1.0, 0.0, 57.3):
             with pytest.raises(PkmTwinError, match=r"\d %"):
                 Recording(robot, time, q, scale * qd, change).with_rates()
+    for scale in (1.2, 0.7):
+        motion = Recording(robot, time, q, qd, scale * qdd).with_rates()
+        np.testing.assert_array_equal(motion.qdd, scale * qdd)
+    for scale in (-1.0, 0.0, 57.3, 1e3, 1e-3):
+        with pytest.raises(PkmTwinError, match=r"accelerations .*\d %"):
+            Recording(robot, time, q, qd, scale * qdd).with_rates()
 
 
 @pytest.mark.parametrize("turn", [0.1, 0.5, 1.0, 1.5, 2.0, 3.0])
