@@ -202,7 +202,14 @@ def assemble(model: StructuralModel, elements: int, kept: int | None = None) -> 
         rigidity = np.array([[spring.rigidity]])
         whole.append(Part(spring.element, list(spring.row), row, rigidity, np.zeros((1, 1))))
     if frame.held:
-        basis = _null_space(frame, size)
+        # A basis of the closures' null space, (size, fewer); the first six rows are unit.
+        table = np.zeros((len(frame.held), size))
+        table[:, : frame.size] = frame.table()
+        dependent, chosen = frame.dependents(table[None, :, : frame.size])
+        free = [k for k in range(size) if k not in chosen]
+        null = np.eye(size)[:, free]
+        null[chosen] = -np.linalg.solve(table[np.ix_(dependent, chosen)], table[np.ix_(dependent, free)])
+        basis = null
         size = basis.shape[1]
         every = list(range(size))
         whole = [Part(p.name, every, p.map @ basis[p.own], p.stiffness, p.mass) for p in whole]
@@ -213,17 +220,6 @@ def assemble(model: StructuralModel, elements: int, kept: int | None = None) -> 
         mass[at] += part.map.T @ part.mass @ part.map
     where = np.concatenate(positions)
     return System(stiffness, mass, tuple(whole), tuple(names), where, tuple(members))
-
-
-def _null_space(frame: Frame, size: int) -> Array:
-    """Return a basis of the closures' null space, (size, fewer); the first six rows are unit."""
-    table = np.zeros((len(frame.held), size))
-    table[:, : frame.size] = frame.table()
-    rows, chosen = frame.dependents(table[None, :, : frame.size])
-    free = [k for k in range(size) if k not in chosen]
-    basis = np.eye(size)[:, free]
-    basis[chosen] = -np.linalg.solve(table[np.ix_(rows, chosen)], table[np.ix_(rows, free)])
-    return basis
 
 
 ELEMENTS: Final = 8

@@ -81,6 +81,47 @@ class ToolModes:
         way = ways[k, 0] / np.exp(1j * np.angle(ways[k, 0][np.abs(ways[k, 0]).argmax()]))
         return float(tried[k]), float(size[k, 0]), np.asarray(way.real)
 
+    def respond(self, low: float, high: float, points: int) -> ToolResponse:
+        """Compute the translational response to forces at ``points`` frequencies from low to high, Hz.
+
+        :raises ParameterError: the range is empty or negative.
+        """
+        if not 0.0 <= low < high:
+            raise ParameterError("frequencies", f"{low:g},{high:g}", "Hz, 0 or more, rising")
+        grid = np.linspace(low, high, points)
+        static = self.receptance([0.0])[0, :3, :3].real
+        return ToolResponse(grid, self.receptance(grid)[:, :3, :3], static, *self.strongest(grid))
+
+
+@dataclass(frozen=True, eq=False)
+class ToolResponse:
+    """Hold the tool point's displacement per force, m/N, base axes.
+
+    ``response``: at ``frequencies`` (k,), Hz, shape (k, 3, 3); ``static``: at rest, (3, 3). The
+    response is largest, ``peak``, at ``peak_frequency`` along the unit vector ``direction`` (3,).
+    """
+
+    frequencies: Array
+    response: Complex
+    static: Array
+    peak_frequency: float
+    peak: float
+    direction: Array
+
+    @property
+    def amplification(self) -> float:
+        """Largest response over the largest static compliance."""
+        return self.peak / float(np.linalg.eigvalsh(self.static).max())
+
+    def columns(self) -> dict[str, Array]:
+        """Return a table's columns: the frequency, real and imaginary parts of each component."""
+        columns = {"frequency": self.frequencies}
+        for i, row in enumerate("xyz"):
+            for j, column in enumerate("xyz"):
+                columns[f"{row}{column}.real"] = self.response[:, i, j].real
+                columns[f"{row}{column}.imag"] = self.response[:, i, j].imag
+        return columns
+
 
 def tool_modes(
     robot: Robot,

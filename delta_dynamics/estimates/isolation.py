@@ -314,7 +314,21 @@ class ContactLocator:
         other, others = sums[-2 * n :].reshape(2, n)
         places = self.places
         precision = ((self._force * FORCE_RATIOS) ** -2.0)[:, None]
-        one = _mean(_force_evidence(forces[:3], forces[3], precision))
+        # Log marginal likelihoods, (sizes, hypotheses), up to a common constant.
+        (a, b, c), (_, d, e), (_, _, f) = forces[:3]
+        x, y, z = forces[3]
+        # B' B has no negative eigenvalue, except by rounding.
+        first = a + precision
+        left, far = b / first, c / first
+        second = np.maximum(d + precision - left * b, precision)
+        below = e - left * c
+        low = below / second
+        third = np.maximum(f + precision - far * c - low * below, precision)
+        y = y - left * x
+        z = z - far * x - low * y
+        norms = x * x / first + y * y / second + z * z / third
+        size = (first / precision) * (second / precision) * (third / precision)
+        one = _mean(np.asarray(0.5 * (norms - np.log(size)), np.float64))
         # Clamping efforts are off by the spacing of the positions: 0.15 of their size.
         noise = 1.0 + 0.15**2 * square * n / counted
         pair = _mean(_component_evidence(line / noise, sides / noise, precision, one_sided=True))
@@ -350,30 +364,6 @@ class ContactLocator:
         return ContactPlace(
             where if confidence >= MIN_CONFIDENCE else UNKNOWN, confidence, classes, body, point, deviation
         )
-
-
-def _force_evidence(matrix: Array, vector: Array, precision: Array) -> Array:
-    """Return log marginal likelihoods, (sizes, hypotheses), up to a common constant.
-
-    Of y = B f + noise with f normal of mean zero, by the factors of B' B + precision.
-
-    :param matrix: B' B, (3, 3, hypotheses); ``vector``: B' y, (3, hypotheses).
-    :param precision: inverse variance of f, (sizes, 1).
-    """
-    (a, b, c), (_, d, e), (_, _, f) = matrix
-    x, y, z = vector
-    # B' B has no negative eigenvalue, except by rounding.
-    first = a + precision
-    left, far = b / first, c / first
-    second = np.maximum(d + precision - left * b, precision)
-    below = e - left * c
-    low = below / second
-    third = np.maximum(f + precision - far * c - low * below, precision)
-    y = y - left * x
-    z = z - far * x - low * y
-    square = x * x / first + y * y / second + z * z / third
-    size = (first / precision) * (second / precision) * (third / precision)
-    return np.asarray(0.5 * (square - np.log(size)), np.float64)
 
 
 def _component_evidence(squares: Array, parts: Array, precision: Array, *, one_sided: bool = False) -> Array:

@@ -71,7 +71,18 @@ def make_damped_stepper(span: float, modes: Array, back: Array, decays: Array) -
     :param decays: of the modes, 1/s, shape (r,).
     """
     plain = np.array(_undamped_weights(span))
-    deltas = _damped_weights(span, decays) - plain[:, None]
+    # Method's weights for each damped mode, shape (11, r).
+    z = -span * decays
+    near, far = _phi(0.5 * z), _phi(z)
+
+    def stages(k: int) -> list[Array]:
+        a, b, c = far[k : k + 3]
+        return [a - 3.0 * b + 4.0 * c, 2.0 * (b - 2.0 * c), 4.0 * c - b]
+
+    rows = [near[0], 0.5 * span * near[1], 0.25 * span * span * near[2], far[0], span * far[1]]
+    rows += [span * row for row in stages(1)]
+    rows += [span * span * row for row in stages(2)]
+    deltas = np.array(rows) - plain[:, None]
     weights = plain[:, None, None] * np.eye(len(modes)) + (modes * deltas[:, None, :]) @ back
     return Stepper(weights, (modes * decays) @ back)
 
@@ -80,26 +91,6 @@ def _undamped_weights(h: float) -> list[float]:
     """Return the weights of :func:`_damped_weights` without damping."""
     sixth = h / 6.0
     return [1.0, 0.5 * h, h * h / 8.0, 1.0, h, sixth, 2.0 * sixth, sixth, h * sixth, h * sixth, 0.0]
-
-
-def _damped_weights(h: float, decays: Array) -> Array:
-    """Return the method's weights for each damped mode, shape (11, r).
-
-    For half a span: velocity by velocity, position by velocity (also velocity by acceleration),
-    position by acceleration. For the whole span: velocity by velocity, position by velocity. Then
-    the stages' weights for velocity and for position.
-    """
-    z = -h * decays
-    near, far = _phi(0.5 * z), _phi(z)
-
-    def stages(k: int) -> list[Array]:
-        a, b, c = far[k : k + 3]
-        return [a - 3.0 * b + 4.0 * c, 2.0 * (b - 2.0 * c), 4.0 * c - b]
-
-    rows = [near[0], 0.5 * h * near[1], 0.25 * h * h * near[2], far[0], h * far[1]]
-    rows += [h * row for row in stages(1)]
-    rows += [h * h * row for row in stages(2)]
-    return np.array(rows)
 
 
 def _phi(z: Array) -> list[Array]:

@@ -23,8 +23,9 @@ from pkm_twin.errors import SingularityError
 from pkm_twin.kinematics.constraints import cross
 from pkm_twin.kinematics.motion import BaseMotion, reaction_directions
 from pkm_twin.kinematics.traced import Traced
-from pkm_twin.machine.graph import BASE, Graph, Joint, Rod
+from pkm_twin.machine.graph import BASE, Graph, Joint
 from pkm_twin.machine.inertia import Layout
+from pkm_twin.robot.plausibility import why_no_torques
 from pkm_twin.robot.rejection import SINGULARITY_BOUND
 from pkm_twin.robot.robot import Robot
 
@@ -57,7 +58,23 @@ def transmitters(graph: Graph, rods: Array, places: Array) -> list[Transmitter]:
             result.append(_graph_joint(joint, here.reshape(*here.shape[:-1], 5, 3)))
     for k, rod in enumerate(graph.rods.values()):
         here = rods[..., 15 * k : 15 * k + 15]
-        result += _rod_joints(rod, here.reshape(*here.shape[:-1], 5, 3))
+        # Ball joints at both ends of a rod.
+        vectors = here.reshape(*here.shape[:-1], 5, 3)
+        start, end, pair = vectors[..., 0, :], vectors[..., 1, :], vectors[..., 4, :]
+        couple: dict[str, Array] = {}
+        if rod.pair is None:
+            forces = {c: np.broadcast_to(np.eye(3)[i], start.shape) for i, c in enumerate("xyz")}
+        else:
+            w = (end - start) / np.linalg.norm(end - start, axis=-1, keepdims=True)
+            e = np.cross(pair, w)
+            e /= np.linalg.norm(e, axis=-1, keepdims=True)
+            forces = {"w": w, "e": e, "w x e": np.cross(w, e)}
+            couple = {f"{rod.label or rod.name}: moment along e": e}
+        inner, outer = rod.joint_names
+        result += [
+            _make_transmitter(inner, (rod.inner, rod.name), start, forces, {}, None, couple),
+            _make_transmitter(outer, (rod.name, rod.outer), end, forces, {}, None, couple),
+        ]
     return result
 
 
@@ -99,31 +116,6 @@ def _graph_joint(joint: Joint, vectors: Array) -> Transmitter:
         effort,
         threads=threads,
     )
-
-
-def _rod_joints(rod: Rod, vectors: Array) -> list[Transmitter]:
-    """Return the ball joints at both ends of a rod.
-
-    A parallelogram's two equal thin rods, side by side along t: their end forces add up to one
-    force at each end; the difference of the two axial forces is a couple along e = t x w that
-    passes from the inner to the outer body, the same at both ends, whatever the distance of the
-    rods. The rods' spin about themselves is idle.
-    """
-    start, end, pair = vectors[..., 0, :], vectors[..., 1, :], vectors[..., 4, :]
-    couple: dict[str, Array] = {}
-    if rod.pair is None:
-        forces = {c: np.broadcast_to(np.eye(3)[i], start.shape) for i, c in enumerate("xyz")}
-    else:
-        w = (end - start) / np.linalg.norm(end - start, axis=-1, keepdims=True)
-        e = np.cross(pair, w)
-        e /= np.linalg.norm(e, axis=-1, keepdims=True)
-        forces = {"w": w, "e": e, "w x e": np.cross(w, e)}
-        couple = {f"{rod.label or rod.name}: moment along e": e}
-    inner, outer = rod.joint_names
-    return [
-        _make_transmitter(inner, (rod.inner, rod.name), start, forces, {}, None, couple),
-        _make_transmitter(outer, (rod.name, rod.outer), end, forces, {}, None, couple),
-    ]
 
 
 def _make_transmitter(
@@ -289,6 +281,21 @@ def reactions(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench:
     return known_alone(least_norm_reactions(robot, q, qd, qdd, wrench))
 
 
+def list_undetermined(robot: Robot) -> list[str]:
+    """List the reactions at home that rigid-body statics does not determine; empty if none.
+
+    Without masses in the file: the redundant closure equations.
+    """
+    if not why_no_torques(robot):
+        zero = np.zeros(len(robot.joint_names))
+        return list(reactions(robot, robot.inverse(robot.home()), zero, zero).indeterminate)
+    mobility = robot.engine.mobility
+    if not mobility.redundant:
+        return []
+    count = f"{mobility.redundant} of {mobility.closures} closure equations"
+    return [f"{count} are redundant, among {', '.join(mobility.parts)}"]
+
+
 def known_alone(full: Reactions) -> Reactions:
     """Return the reactions with NaN for indeterminate components."""
     return replace(
@@ -358,24 +365,20 @@ def balance(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: A
     found = balanced(robot, loads)
     if robot.redundant:
         efforts = robot.evaluate(body_efforts(robot), q, qd, qdd, load, p=robot.inertial)[0]
-        found = _set_efforts(found, efforts)
+        # Balances with given efforts, shape (..., n), of a redundant machine's drives.
+        names = [joint.actuated for joint in found.joints if joint.actuated is not None]
+        rows = [found.components.index(name) for name in names]
+        unit = found.unit[..., rows]
+        u, s, vt = np.linalg.svd(found.null[..., rows, :])
+        used, turned = s > RANK_BOUND, found.null @ vt.swapaxes(-1, -2)
+        apart = np.einsum("...ij,...i->...j", u, (efforts - found.value[..., rows]) / unit)
+        along = np.where(used, apart / np.where(used, s, 1.0), 0.0)
+        n = len(rows)
+        moved = np.einsum("...kj,...j->...k", turned[..., :n], along)
+        turned[..., :n] = np.where(used[..., None, :], 0.0, turned[..., :n])
+        found = replace(found, value=found.value + moved * found.unit, null=turned)
     finite(found.value, "the motion or the wrench")
     return found
-
-
-def _set_efforts(found: Balance, efforts: Array) -> Balance:
-    """Return the balances with given efforts, shape (..., n), of a redundant machine's drives."""
-    names = [joint.actuated for joint in found.joints if joint.actuated is not None]
-    rows = [found.components.index(name) for name in names]
-    unit = found.unit[..., rows]
-    u, s, vt = np.linalg.svd(found.null[..., rows, :])
-    used, turned = s > RANK_BOUND, found.null @ vt.swapaxes(-1, -2)
-    apart = np.einsum("...ij,...i->...j", u, (efforts - found.value[..., rows]) / unit)
-    along = np.where(used, apart / np.where(used, s, 1.0), 0.0)
-    n = len(rows)
-    moved = np.einsum("...kj,...j->...k", turned[..., :n], along)
-    turned[..., :n] = np.where(used[..., None, :], 0.0, turned[..., :n])
-    return replace(found, value=found.value + moved * found.unit, null=turned)
 
 
 def balanced(robot: Robot, loads: Sequence[Array], *, strict: bool = True) -> Balance:

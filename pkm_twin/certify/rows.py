@@ -121,7 +121,9 @@ class Moving(ABC):
         value, spin = frame.rotation @ vector, frame.rate[3:]
         rate = cross(spin, value)
         bias = cross(frame.bias[3:], value) + cross(spin, rate)
-        return Jet(value, -skewed(value) @ frame.columns[3:], rate, bias)
+        # Matrix of the cross product v x, shape (3, 3).
+        x, y, z = value.tolist()
+        return Jet(value, -np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ frame.columns[3:], rate, bias)
 
     def _still(self, value: Array) -> Jet:
         return Jet(value, np.zeros((3, self.size)), np.zeros(3), np.zeros(3))
@@ -309,9 +311,3 @@ def stacked(rows: list[Rows], size: int | None = None) -> Rows:
 def drag(joint: Joint, rates: Array) -> Array:
     """Return viscous friction, Coulomb friction and offset at each velocity, N m or N."""
     return np.asarray(joint.viscous * rates + joint.coulomb * np.sign(rates) + joint.offset)
-
-
-def skewed(v: Array) -> Array:
-    """Return the matrix of the cross product v x, shape (3, 3)."""
-    x, y, z = v.tolist()
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

@@ -9,7 +9,7 @@ as the other back ends.
 from __future__ import annotations
 
 import struct
-from collections.abc import Container, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from textwrap import indent
 from typing import Any, Final
@@ -123,7 +123,16 @@ class Lines:
             elif e.op is None:
                 text = c_number(e.value)
             else:
-                text = self._operation(e, e.op)
+                parts = fused(e, self._used, self._known)
+                if parts is None:
+                    self.needed.add(e.op)
+                    text = e.op.text([self._text[x.number] for x in e.args], in_c=True)
+                else:
+                    first, product, rest = parts
+                    x, y, z = (self._text[v.number] for v in (*product.args, rest))
+                    if e.op is sub:
+                        x, z = (x, f"-{z}") if first else (f"-{x}", z)
+                    text = f"PKM_FMA({x}, {y}, {z})"
                 once = self._used.get(e.number, 2) == 1
                 # A product that is used once becomes part of a fused operation.
                 if not once or (e.op is not mul and len(text) > LONGEST):
@@ -131,17 +140,6 @@ class Lines:
                     text = f"v{self.doubles}"
                     self.doubles += 1
             self._text[e.number] = text
-
-    def _operation(self, e: Expression, op: Operation) -> str:
-        parts = fused(e, self._used, self._known)
-        if parts is None:
-            self.needed.add(op)
-            return op.text([self._text[x.number] for x in e.args], in_c=True)
-        first, product, rest = parts
-        x, y, z = (self._text[v.number] for v in (*product.args, rest))
-        if op is sub:
-            x, z = (x, f"-{z}") if first else (f"-{x}", z)
-        return f"PKM_FMA({x}, {y}, {z})"
 
 
 def _angles(results: Sequence[Expression], known: Mapping[int, str]) -> list[dict[int, list[Expression]]]:
@@ -387,7 +385,16 @@ static const int @_steps[{len(LADDER)}] = {{{steps}}};
             others = sum(known.startswith(name) for known, _ in self._solvers.values())
             name += str(others + 1) if others else ""
             # What does not change in a step is computed once, and the last serves the results.
-            ahead = _without((q.unknowns, STATE), q.correct)
+            # Find values that do not depend on the named inputs, but are read by values that do.
+            names = (q.unknowns, STATE)
+            moved: set[int] = set()
+            found: dict[int, Expression] = {}
+            for error in ordered(q.correct):
+                if (error.source or ("",))[0] in names or any(x.number in moved for x in error.args):
+                    moved.add(error.number)
+                    still = (x for x in error.args if x.number not in moved and x.op is not None)
+                    found |= {x.number: x for x in still}
+            ahead = list(found.values())
             self._solvers[key] = name, {e.number: k for k, e in enumerate(ahead)}
             self._write_solver(name, q, ahead)
         return self._solvers[key]
@@ -546,16 +553,4 @@ def _read_of(body: Sequence[Expression], above: Iterable[Sequence[Expression]]) 
         beyond = [e for e in ordered(results, known) if e.number not in inner]
         read = [*results, *(x for e in beyond for x in e.args)]
         found |= {e.number: e for e in read if e.number in inner - known}
-    return list(found.values())
-
-
-def _without(names: Container[str], results: Sequence[Expression]) -> list[Expression]:
-    """Find values that do not depend on the named inputs, but are read by values that do."""
-    moved: set[int] = set()
-    found: dict[int, Expression] = {}
-    for e in ordered(results):
-        if (e.source or ("",))[0] in names or any(x.number in moved for x in e.args):
-            moved.add(e.number)
-            still = (x for x in e.args if x.number not in moved and x.op is not None)
-            found |= {x.number: x for x in still}
     return list(found.values())

@@ -64,7 +64,14 @@ class TransmissionTerms:
         """
         m = self.m
         wanted, damping = (self.tape.inputs(name, m * m).reshape(m, m) for name in ("stiffness", "damping"))
-        bend = self._second_derivative(changes, self.tape.inputs("tau", len(self.ratio)))
+        # Sum_i w_i d2q_i/dx2, shape (m, m).
+        weights = self.tape.inputs("tau", len(self.ratio))
+        along = [np.array(change, dtype=object) @ weights for change in changes]
+        result = np.empty((self.m, self.m), dtype=object)
+        for value, (j, k) in zip(along, _pairs(self.m), strict=True):
+            # The second derivative along a + b, less those along a and b, is twice that by both.
+            result[j, k] = result[k, j] = value if j == k else 0.5 * (value - result[j, j] - result[k, k])
+        bend = result
         return {
             "ka": self._lift(self._congruent(wanted + bend)),
             "da": self._lift(self._congruent(damping)),
@@ -83,15 +90,6 @@ class TransmissionTerms:
         """Return P' A P, shape (n, n)."""
         half = np.array([self._efforts(column) for column in matrix.T], dtype=object)
         return np.array([self._efforts(column) for column in half.T], dtype=object)
-
-    def _second_derivative(self, changes: Sequence[Sequence[Expression]], weights: Objects) -> Objects:
-        """Return sum_i w_i d2q_i/dx2, shape (m, m)."""
-        along = [np.array(change, dtype=object) @ weights for change in changes]
-        result = np.empty((self.m, self.m), dtype=object)
-        for value, (j, k) in zip(along, _pairs(self.m), strict=True):
-            # The second derivative along a + b, less those along a and b, is twice that by both.
-            result[j, k] = result[k, j] = value if j == k else 0.5 * (value - result[j, j] - result[k, k])
-        return result
 
 
 def _pairs(m: int) -> list[tuple[int, int]]:

@@ -285,6 +285,11 @@ class Judged:
     after: float
 
     @property
+    def known(self) -> bool:
+        """True if the series has enough recordings to be judged."""
+        return len(self.series.value) >= FEWEST
+
+    @property
     def drifts(self) -> bool:
         """The mean has changed, or the last recording is outside the limits."""
         return self.change is not None or bool(self.beyond[-1])
@@ -299,7 +304,7 @@ class Judged:
         """The series in a line."""
         s = self.series
         text = f"{s.label}: {s.value[-1]:.4g} {s.unit}"
-        if len(s.value) < FEWEST:
+        if not self.known:
             return f"{text}, not judged"
         text += f", control limits {self.low:.4g} to {self.high:.4g}"
         if self.change is not None:
@@ -328,6 +333,19 @@ class Judged:
             "after": self.after,
             "drifts": self.drifts,
         }
+
+
+def judge_history(path: Path, machine: str | None, baseline: int, false_alarm: float) -> list[Judged]:
+    """Judge every series of a history, or of one machine in it, as :func:`judged`.
+
+    :param false_alarm: chance of a false alarm in any series, shared evenly (Bonferroni).
+    :raises ParameterError: no history, or one without numbers of this machine.
+    """
+    found = read_history(path, machine)
+    if not found:
+        wanted = f" of a machine {machine!r}" if machine else ""
+        raise ParameterError(str(path), "no numbers", f"recordings with efforts{wanted}")
+    return [judged(one, baseline, false_alarm / len(found)) for one in found]
 
 
 def judged(series: Series, baseline: int, alarm: float) -> Judged:

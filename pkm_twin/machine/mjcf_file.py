@@ -58,29 +58,22 @@ def read(path: Path, top: ET.Element, actuated: Sequence[str] | None = None) -> 
     except ValueError as error:
         text = " ".join(str(error).split())
         try:
-            model = _compile_without_meshes(mujoco, path)
+            # Compile the model without meshes, textures and height fields.
+            spec = mujoco.MjSpec.from_file(str(path))
+            derived = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+            for geom in list(spec.geoms):
+                geom.material = ""
+                if geom.meshname or geom.hfieldname:
+                    if derived or not geom.parent.explicitinertial:
+                        raise ValueError("a mesh has the mass of a body")
+                    spec.delete(geom)
+            for part in [*spec.meshes, *spec.hfields, *spec.materials, *spec.textures]:
+                spec.delete(part)
+            model = spec.compile()
         except (ValueError, AttributeError):
             raise ParameterError(str(path), ValueError(text), "a model that MuJoCo compiles") from None
         warn(path, f"read without its meshes, as its bodies have inertias: {text}")
     return _Reader(mujoco, model, path).tree(rounding_error(words), actuated)
-
-
-def _compile_without_meshes(mujoco: Any, path: Path) -> Any:
-    """Compile the model without meshes, textures and height fields.
-
-    :raises ValueError: the inertia of a body follows from them.
-    """
-    spec = mujoco.MjSpec.from_file(str(path))
-    derived = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
-    for geom in list(spec.geoms):
-        geom.material = ""
-        if geom.meshname or geom.hfieldname:
-            if derived or not geom.parent.explicitinertial:
-                raise ValueError("a mesh has the mass of a body")
-            spec.delete(geom)
-    for part in [*spec.meshes, *spec.hfields, *spec.materials, *spec.textures]:
-        spec.delete(part)
-    return spec.compile()
 
 
 def _require_bounded(path: Path, top: ET.Element, folder: Path, depth: int = 0) -> list[str]:

@@ -103,6 +103,15 @@ class _Reader:
         placed = self._placed(tree)
         closures = [self._closure(joint) for joint in left]
         size = max(1.0, *(float(np.abs(link.frame.position).max()) for link in self.links.values()))
+        # Scene's gravity, by default 9.81 m/s2 downwards, as PhysX.
+        down = -np.eye(3)["XYZ".index(self.up)]
+        size = 9.81
+        for prim in self.prims:
+            if prim.IsA(self.physics.Scene):
+                way = np.array(self._value(prim, "physics:gravityDirection", (0.0,) * 3), float)
+                down = way / np.linalg.norm(way) if way.any() else down
+                stated = float(self._value(prim, "physics:gravityMagnitude", -math.inf))
+                size = stated * self.length if stated >= 0.0 else size
         return LoopTree(
             self.path.stem,
             WORLD,
@@ -110,7 +119,7 @@ class _Reader:
             placed,
             tuple(closures),
             motors,
-            self._gravity(),
+            [float(x) for x in size * down],
             rounding=float(np.finfo(np.float32).eps) / 2.0 * size,
             marked=source,
             faults=tuple(self.faults),
@@ -300,18 +309,6 @@ class _Reader:
         axes = [m.rotation @ a for m, a in zip((first, second), joint.axes, strict=False)]
         frames = first @ joint.frames[0], second @ joint.frames[1]
         return replace(joint, frames=frames, axes=np.reshape(axes, (-1, 3))).closing()
-
-    def _gravity(self) -> list[float]:
-        """Return the scene's gravity, by default 9.81 m/s2 downwards, as PhysX."""
-        down = -np.eye(3)["XYZ".index(self.up)]
-        size = 9.81
-        for prim in self.prims:
-            if prim.IsA(self.physics.Scene):
-                way = np.array(self._value(prim, "physics:gravityDirection", (0.0,) * 3), float)
-                down = way / np.linalg.norm(way) if way.any() else down
-                stated = float(self._value(prim, "physics:gravityMagnitude", -math.inf))
-                size = stated * self.length if stated >= 0.0 else size
-        return [float(x) for x in size * down]
 
 
 def _rotation(quaternion: Any) -> Array:

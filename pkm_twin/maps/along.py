@@ -26,7 +26,8 @@ from pkm_twin.robot.workspace import counts
 class Along:
     """Hold a kind's values along a path: ``time`` (k,), s; ``pose`` (k, m); ``found`` per case.
 
-    ``counted``: which samples keep all limits and a singularity index of ``least``, shape (k,).
+    ``counted``: which samples keep all limits and a singularity index of ``least``, shape (k,);
+    ``near_singular``: how many have a smaller index. ``loaded``: whether the path's wrench acts.
     ``elements``: names that ``found`` indexes.
     """
 
@@ -39,6 +40,13 @@ class Along:
     counted: NDArray[np.bool_]
     found: Sequence[Found]
     elements: tuple[str, ...]
+    near_singular: int
+    loaded: bool
+
+    @property
+    def beyond(self) -> int:
+        """Number of samples that would not count in a map."""
+        return int((~self.counted).sum())
 
     @property
     def worst(self) -> list[dict[str, Any]]:
@@ -129,10 +137,15 @@ def along(
     :param cases: load cases; by default the kind's own.
     :param least: singularity index below which a sample does not count; by default the kind's.
     :param parts: the robot with its payload, and for which samples, in order.
-    :param wrench: on the platform instead of the cases', base axes, N and N m, shape (k, 6).
+    :param wrench: on the platform, base axes, N and N m, shape (k, 6); it replaces the kind's own
+        load case if the kind takes wrenches and no cases are given.
     :raises ParameterError: the robot's file lacks what the quantity needs.
     """
     chosen = tuple(cases) or kind.cases(robot)
+    if cases or not kind.takes_wrench or wrench is None or not wrench.any():
+        wrench = None
+    else:
+        chosen = (kind.loaded(robot, "wrench of the path", wrench[wrench.any(1)][0].tolist()),)
     check(robot, kind, chosen)
     pose = robot.forward(q)
     known = np.ones(len(pose), bool)
@@ -155,4 +168,5 @@ def along(
             values = evaluate_kind(kind, loaded, q[begin:end], under)
             pieces.append([one if one.element is None else one._replace(element=index[one.element]) for one in values])
     found = [concatenate_found(each) for each in zip(*pieces, strict=True)]
-    return Along(robot, kind, chosen, time, pose, least, counted, found, tuple(elements))
+    low = int((robot.try_singularity(q)[0] < least).sum())
+    return Along(robot, kind, chosen, time, pose, least, counted, found, tuple(elements), low, wrench is not None)

@@ -213,7 +213,32 @@ def workspace_box(robot: Robot) -> Array:
     """
     bounds = np.asarray(robot.search_box(), np.float64)
     # Poses with interference are included: maps show them.
-    found = _poses_from_joints(robot)
+    # Reachable poses of joint states between the limits, (k, m); none without limits.
+    limits = robot.limits.position
+    count = len(robot.joint_names)
+    if limits is None or not np.isfinite(limits).all():
+        found = np.empty((0, len(robot.pose_names)))
+    else:
+        # Imported here, because loading it in every process takes longer than many sweeps.
+        from scipy.stats import qmc  # type: ignore[import-untyped]
+
+        # Extremes are mostly where joints are at a limit or in the middle of their range.
+        corners = np.stack(np.meshgrid(*[[0.0, 0.5, 1.0]] * count, indexing="ij"), -1)
+        inner = qmc.Halton(count, scramble=False).random(2**14)
+        share = np.concatenate([corners.reshape(-1, count), inner])
+        q = robot.try_project_redundant(limits[:, 0] + share * np.ptp(limits, axis=1))
+        poses, good = try_forward(robot, q)
+        good[good] = reachable(robot, poses[good], -math.inf)
+        poses, q = poses[good], q[good]
+        if len(robot.pose_names) > MAX_GRID_DIMENSIONS and len(q):
+            # With many joints, so few states are sparse: climb to the ends.
+            ends = [
+                _climb(robot, limits, q[np.argsort(-sign * poses[:, k])[:32]], k, sign)
+                for k in range(poses.shape[1])
+                for sign in (-1.0, 1.0)
+            ]
+            poses = np.concatenate([poses, *ends])
+        found = poses
     grid = robot.grid()
     lateral = [robot.pose_names.index(name) for name in grid.lateral]
     box = bounds
@@ -239,34 +264,6 @@ def workspace_box(robot: Robot) -> Array:
 def _bounding_box(poses: Array, margin: Array, bounds: Array) -> Array:
     low, high = poses.min(0) - margin, poses.max(0) + margin
     return np.stack([np.maximum(low, bounds[:, 0]), np.minimum(high, bounds[:, 1])], -1)
-
-
-def _poses_from_joints(robot: Robot) -> Array:
-    """Return reachable poses of joint states between the limits, (k, m); none without limits."""
-    limits = robot.limits.position
-    count = len(robot.joint_names)
-    if limits is None or not np.isfinite(limits).all():
-        return np.empty((0, len(robot.pose_names)))
-    # Imported here, because loading it in every process takes longer than many sweeps.
-    from scipy.stats import qmc  # type: ignore[import-untyped]
-
-    # Extremes are mostly where joints are at a limit or in the middle of their range.
-    corners = np.stack(np.meshgrid(*[[0.0, 0.5, 1.0]] * count, indexing="ij"), -1)
-    inner = qmc.Halton(count, scramble=False).random(2**14)
-    share = np.concatenate([corners.reshape(-1, count), inner])
-    q = robot.try_project_redundant(limits[:, 0] + share * np.ptp(limits, axis=1))
-    poses, good = try_forward(robot, q)
-    good[good] = reachable(robot, poses[good], -math.inf)
-    poses, q = poses[good], q[good]
-    if len(robot.pose_names) > MAX_GRID_DIMENSIONS and len(q):
-        # With many joints, so few states are sparse: climb to the ends.
-        ends = [
-            _climb(robot, limits, q[np.argsort(-sign * poses[:, k])[:32]], k, sign)
-            for k in range(poses.shape[1])
-            for sign in (-1.0, 1.0)
-        ]
-        poses = np.concatenate([poses, *ends])
-    return poses
 
 
 def _climb(robot: Robot, limits: Array, q: Array, k: int, sign: float) -> Array:

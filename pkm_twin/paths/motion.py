@@ -307,7 +307,20 @@ class TimedPath:
     @cached_property
     def bounds(self) -> list[Bound]:
         """Intervals with the limit that binds, in order."""
-        return merge_bounds(self.fine.time, find_binding(self.used), limit_names(self.robot), self.used)
+        # Binding column of each row of used fractions (k, l), -1 for none.
+        active = self.used >= BINDING_USE
+        lasts = np.zeros(self.used.shape, np.int64)
+        count = np.zeros(self.used.shape[1], np.int64)
+        for row in range(len(self.used) - 1, -1, -1):
+            count = np.where(active[row], count + 1, 0)
+            lasts[row] = count
+        result: list[int] = []
+        for row in range(len(self.used)):
+            now = result[-1] if result else -1
+            if now < 0 or not active[row, now]:
+                now = int(lasts[row].argmax()) if active[row].any() else -1
+            result.append(now)
+        return merge_bounds(self.fine.time, result, limit_names(self.robot), self.used)
 
     def check_rests(self) -> None:
         """Reject payloads that the drives cannot hold while the machine rests.
@@ -447,27 +460,6 @@ def run_peaks(run: Run, limits: Limits, wrench: Array | None) -> Array:
         return effort, qd, qdd, felt
 
     return peaks(limits, run.times, sample)
-
-
-def find_binding(used: Array) -> list[int]:
-    """Return the binding column of each row of used fractions (k, l), -1 for none.
-
-    Changes are as few as possible: of several limits that bind, the one that binds longest is
-    taken.
-    """
-    active = used >= BINDING_USE
-    lasts = np.zeros(used.shape, np.int64)
-    count = np.zeros(used.shape[1], np.int64)
-    for row in range(len(used) - 1, -1, -1):
-        count = np.where(active[row], count + 1, 0)
-        lasts[row] = count
-    result: list[int] = []
-    for row in range(len(used)):
-        now = result[-1] if result else -1
-        if now < 0 or not active[row, now]:
-            now = int(lasts[row].argmax()) if active[row].any() else -1
-        result.append(now)
-    return result
 
 
 def merge_bounds(time: Array, columns: list[int], names: list[str], used: Array) -> list[Bound]:

@@ -17,6 +17,7 @@ import numpy as np
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.kinematics.singularity import singularity_at_home
 from pkm_twin.machine.graph import BASE, Graph, Joint, merged
+from pkm_twin.machine.members import RigidError
 from pkm_twin.robot.robot import Robot
 
 EXTENTS: Final = (2e-3, 20.0)
@@ -272,6 +273,17 @@ def why_no_torques(robot: Robot) -> str:
     """Return why the model has no torques for this robot; empty if it has."""
     try:
         robot.massive()
+    except ParameterError as error:
+        return str(error)
+    return ""
+
+
+def find_members_fault(robot: Robot) -> str:
+    """Return why maps reject the file's members; empty if they do not, or there are none."""
+    try:
+        robot.structure()
+    except RigidError:
+        return ""
     except ParameterError as error:
         return str(error)
     return ""

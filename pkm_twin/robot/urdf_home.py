@@ -228,7 +228,19 @@ class Assembly:
                 values, miss = other, less
         self.place(values)
         if miss > self.closed:
-            raise self._open()
+            # Error of loops that do not close, with the one that misses the most.
+            closure = max(self.tree.closures, key=lambda one: max(abs(float(e.value)) for e in self._equations(one)))
+            a, b = (self.frame(closure, end) for end in (0, 1))
+            apart = 1e3 * float(np.linalg.norm(b.position - a.position))
+            turned = float(np.linalg.norm(rotation_vector(b.rotation @ a.rotation.T)))
+            what = f"{apart:.3g} mm"
+            if closure.kind == "fixed":
+                what += f" and {turned:.3g} rad"
+            raise ParameterError(
+                closure.name,
+                f"open by {what} between {closure.inner} and {closure.outer}",
+                f"loops that close within {self.closed:g} (m or rad)",
+            )
         return values, miss
 
     def relaxed(self, values: Array, held: Mask | bool = False) -> Array:
@@ -254,21 +266,6 @@ class Assembly:
             self.place(values)
         self.place(values)
         return values
-
-    def _open(self) -> ParameterError:
-        """Return the error of loops that do not close, with the one that misses the most."""
-        closure = max(self.tree.closures, key=lambda one: max(abs(float(e.value)) for e in self._equations(one)))
-        a, b = (self.frame(closure, end) for end in (0, 1))
-        apart = 1e3 * float(np.linalg.norm(b.position - a.position))
-        turned = float(np.linalg.norm(rotation_vector(b.rotation @ a.rotation.T)))
-        what = f"{apart:.3g} mm"
-        if closure.kind == "fixed":
-            what += f" and {turned:.3g} rad"
-        return ParameterError(
-            closure.name,
-            f"open by {what} between {closure.inner} and {closure.outer}",
-            f"loops that close within {self.closed:g} (m or rad)",
-        )
 
 
 def _list_constraints(closure: Joint) -> Iterator[tuple[Constraint, Array]]:
@@ -398,7 +395,23 @@ class HomeSearch:
             chosen = min(good, key=lambda home: float(np.linalg.norm(home.values / self.units)))
         if chosen is not None and chosen.index >= MIN_HOME_INDEX:
             return chosen
-        near = self._near()
+        # Best conditioned assembly of the smallest reach that has a good one.
+        rng = np.random.default_rng(1)
+        tried: list[Home] = []
+        candidates: list[Home] = []
+        for reach in (0.05, 0.1, 0.2, 0.4, 0.8):
+            for _ in range(6):
+                start = self.wanted + rng.uniform(-reach, reach, len(self.wanted)) * self.units
+                start = np.where(self.held, np.clip(start, self.low, self.high), start)
+                home = self._reached(start, "near")
+                tried += [] if home is None else [home]
+            good = [h for h in tried if self._inside(np.where(self.held, h.values, self.low))]
+            candidates += [max(good, key=lambda home: home.index)] if good else []
+            if tried and (not candidates or candidates[-1].index < MIN_HOME_INDEX):
+                # All closed assemblies are singular, wherever they are.
+                break
+        most = candidates[-1].index if candidates else 0.0
+        near = next((home for home in candidates if home.index >= max(0.5 * most, MIN_HOME_INDEX)), None)
         if near is not None:
             return near
         if chosen is not None:
@@ -447,30 +460,6 @@ class HomeSearch:
     def _inside(self, values: Array) -> bool:
         """Return whether all joints, passive ones too, are inside the file's limits."""
         return bool(((values >= self.low - 1e-6) & (values <= self.high + 1e-6)).all())
-
-    def _near(self) -> Home | None:
-        """Return the best conditioned assembly of the smallest reach that has a good one.
-
-        Its index is at least half of the best of all reaches: it is far from the edge of the workspace.
-        The reach is the distance of the actuated joints from the wanted values, rad or relative to the
-        size.
-        """
-        rng = np.random.default_rng(1)
-        tried: list[Home] = []
-        best: list[Home] = []
-        for reach in (0.05, 0.1, 0.2, 0.4, 0.8):
-            for _ in range(6):
-                start = self.wanted + rng.uniform(-reach, reach, len(self.wanted)) * self.units
-                start = np.where(self.held, np.clip(start, self.low, self.high), start)
-                home = self._reached(start, "near")
-                tried += [] if home is None else [home]
-            good = [h for h in tried if self._inside(np.where(self.held, h.values, self.low))]
-            best += [max(good, key=lambda home: home.index)] if good else []
-            if tried and (not best or best[-1].index < MIN_HOME_INDEX):
-                # All closed assemblies are singular, wherever they are.
-                break
-        most = best[-1].index if best else 0.0
-        return next((home for home in best if home.index >= max(0.5 * most, MIN_HOME_INDEX)), None)
 
     def _home(self, values: Array, miss: float, how: str) -> Home:
         self.assembly.place(values)

@@ -44,27 +44,6 @@ def body_meshes(robot: Robot) -> dict[str, tuple[Array, NDArray[np.int64]]]:
     return result
 
 
-def mesh_path(visual: Visual) -> Path:
-    """Return a mesh's file: a path from the URDF's folder, ``file://`` or ``package://``.
-
-    A package is a folder of that name above the URDF or beside one of those, else an installed
-    ROS package.
-
-    :raises FileNotFoundError: there is no such file.
-    """
-    kind, separator, rest = visual.mesh.partition("://")
-    folder = visual.urdf.resolve().parent
-    tried: Iterator[Path] = iter((folder / visual.mesh,))
-    if separator and kind == "file":
-        tried = iter((Path(unquote(rest)),))
-    elif separator and kind == "package":
-        tried = _in_package(*rest.partition("/")[::2], folder)
-    path = next((path for path in tried if path.is_file()), None)
-    if path is None:
-        raise FileNotFoundError("no such file")
-    return path
-
-
 def _in_package(package: str, rest: str, folder: Path) -> Iterator[Path]:
     for above in (folder, *folder.parents):
         if above.name == package:
@@ -81,7 +60,17 @@ def _in_package(package: str, rest: str, folder: Path) -> Iterator[Path]:
 def _read(visual: Visual) -> tuple[Array, NDArray[np.int64]]:
     import trimesh  # viser needs it as well
 
-    path = mesh_path(visual)
+    # A mesh's file: a path from the URDF's folder, file:// or package://.
+    kind, separator, rest = visual.mesh.partition("://")
+    folder = visual.urdf.resolve().parent
+    tried: Iterator[Path] = iter((folder / visual.mesh,))
+    if separator and kind == "file":
+        tried = iter((Path(unquote(rest)),))
+    elif separator and kind == "package":
+        tried = _in_package(*rest.partition("/")[::2], folder)
+    path = next((path for path in tried if path.is_file()), None)
+    if path is None:
+        raise FileNotFoundError("no such file")
     if path.stat().st_size > LARGEST:
         raise ValueError(f"more than {LARGEST} bytes")
     mesh: Any = trimesh.load(path, force="mesh")

@@ -11,11 +11,10 @@ import pytest
 import yaml
 
 import pkm_twin
-from pkm_twin.apps.commands.info import find_members_fault
 from pkm_twin.certify.description import expand
 from pkm_twin.errors import ParameterError, RobotWarning
 from pkm_twin.mechanisms.machine import Machine
-from pkm_twin.robot.plausibility import findings
+from pkm_twin.robot.plausibility import find_members_fault, findings
 from test.laws.conftest import changed as edited
 from test.support.robots import SHIPPED, partly_long
 

@@ -11,7 +11,6 @@ import numpy as np
 
 from pkm_twin.apps.frame import command
 from pkm_twin.apps.options import OutputOption, PictureOptions, PoseOption, ToolOptions
-from pkm_twin.errors import ParameterError
 from pkm_twin.recordings.tables import ENDINGS, write_table
 from pkm_twin.report import Fact, Report, plots
 from pkm_twin.settings import setting
@@ -19,9 +18,7 @@ from pkm_twin.settings import setting
 if TYPE_CHECKING:
     from pkm_twin.codegen.arrays import Array
     from pkm_twin.robot.robot import Robot
-    from stiffness_monitor.vibration import ToolModes
-
-AXES = "xyz"
+    from stiffness_monitor.vibration import ToolModes, ToolResponse
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,42 +52,31 @@ def frf(given: FrequencyResponse) -> Report:
     pose = given.pose(machine)
     damped = given.damping is not None or machine.modal_damping.size
     if not damped and given.out is None and given.picture is None:
-        found = natural_frequencies(machine, pose)
+        frequencies = natural_frequencies(machine, pose)
         return Report(
-            f"{machine.name}: lowest natural frequency {found[0]:.4g} Hz",
-            report_modes(machine, pose, found),
+            f"{machine.name}: lowest natural frequency {frequencies[0]:.4g} Hz",
+            report_modes(machine, pose, frequencies),
             notes=["the response needs --damping, or modal_damping in the robot file"],
         )
     modes = tool_modes(machine, pose, damping=given.damping, tool=given.tool)
     low, high = given.frequencies or (0.0, 1.2 * float(modes.frequencies[:6][-1]))
-    if not 0.0 <= low < high:
-        raise ParameterError("frequencies", f"{low:g},{high:g}", "Hz, 0 or more, rising")
-    grid = np.linspace(low, high, given.points)
-    response = modes.receptance(grid)[:, :3, :3]
-    frequency, size, way = modes.strongest(grid)
-    static = modes.receptance([0.0])[0, :3, :3].real
-    ratio = float(size / np.linalg.eigvalsh(static).max())
-    along = ", ".join(f"{v:.3g}" for v in way.round(3) + 0.0)
+    found = modes.respond(low, high, given.points)
+    along = ", ".join(f"{v:.3g}" for v in found.direction.round(3) + 0.0)
     answer = (
-        f"{machine.name}: the tool point responds most at {frequency:.4g} Hz along ({along}): "
-        f"{1e6 * size:.4g} µm/N, {ratio:.3g} times the static compliance"
+        f"{machine.name}: the tool point responds most at {found.peak_frequency:.4g} Hz along ({along}): "
+        f"{1e6 * found.peak:.4g} µm/N, {found.amplification:.3g} times the static compliance"
     )
     if given.out is not None:
-        columns = {"frequency": grid}
-        for i, row in enumerate(AXES):
-            for j, column in enumerate(AXES):
-                columns[f"{row}{column}.real"] = response[:, i, j].real
-                columns[f"{row}{column}.imag"] = response[:, i, j].imag
-        write_table(columns, given.out)
-    most = {"frequency_hz": frequency, "compliance_m_per_n": size, "direction": way}
+        write_table(found.columns(), given.out)
+    most = {"frequency_hz": found.peak_frequency, "compliance_m_per_n": found.peak, "direction": found.direction}
     return Report(
         answer,
         [
             *report_modes(machine, pose, modes.frequencies, modes.damping),
-            Fact("static_compliance_m_per_n", static),
+            Fact("static_compliance_m_per_n", found.static),
             Fact("most", most),
         ],
-        figures={"": lambda: draw(grid, response, modes, answer)},
+        figures={"": lambda: draw(found, modes, answer)},
         files={"out": given.out},
     )
 
@@ -110,12 +96,13 @@ def report_modes(machine: Robot, pose: list[float], frequencies: Array, damping:
     ]
 
 
-def draw(grid: Any, response: Any, modes: ToolModes, title: str) -> Any:
+def draw(found: ToolResponse, modes: ToolModes, title: str) -> Any:
     """Draw magnitude and phase of the response along each axis over the frequency."""
     figure, axes = plots.columns(1, 2)
     size, phase = axes[0]
-    for k, name in enumerate(AXES):
-        one, style = response[:, k, k], {"color": plots.COLOURS[k], "ls": plots.DASHES[k]}
+    grid = found.frequencies
+    for k, name in enumerate("xyz"):
+        one, style = found.response[:, k, k], {"color": plots.COLOURS[k], "ls": plots.DASHES[k]}
         size.semilogy(grid, 1e6 * np.abs(one), label=f"along {name}", **style)
         phase.plot(grid, np.degrees(np.angle(one)), **style)
     for frequency in modes.frequencies[modes.frequencies <= grid[-1]]:

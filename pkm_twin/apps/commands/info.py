@@ -11,18 +11,15 @@ from typing import Any, Final
 
 import numpy as np
 
-from delta_dynamics import reactions
+from delta_dynamics.torques.reactions import list_undetermined
 from pkm_twin.apps.frame import command
 from pkm_twin.apps.options import PictureOptions, RobotArgument
 from pkm_twin.codegen.code import slowness
-from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.scheme import list_coordinates
 from pkm_twin.machine.formulas import PARAMETERS
-from pkm_twin.machine.members import RigidError
 from pkm_twin.report import Fact, Report, number
 from pkm_twin.robot.clearance import clearance, has_clearance
-from pkm_twin.robot.plausibility import findings, why_no_torques
-from pkm_twin.robot.robot import Robot
+from pkm_twin.robot.plausibility import find_members_fault, findings, why_no_torques
 
 MAX_NAMES: Final = 6
 """Largest number of names in a printed line."""
@@ -139,29 +136,6 @@ def info(given: Info) -> Report:
         figures={"": lambda: import_module("pkm_twin.view.drawing").draw(robot, marked=True)},
         notes=notes,
     )
-
-
-def find_members_fault(robot: Robot) -> str:
-    """Return why maps reject the file's members; empty if they do not, or there are none."""
-    try:
-        robot.structure()
-    except RigidError:
-        return ""
-    except ParameterError as error:
-        return str(error)
-    return ""
-
-
-def list_undetermined(robot: Robot) -> list[str]:
-    """Name what rigid-body statics cannot determine; empty if it determines all."""
-    if not why_no_torques(robot):
-        zero = np.zeros(len(robot.joint_names))
-        return list(reactions(robot, robot.inverse(robot.home()), zero, zero).indeterminate)
-    mobility = robot.engine.mobility
-    if not mobility.redundant:
-        return []
-    count = f"{mobility.redundant} of {mobility.closures} closure equations"
-    return [f"{count} are redundant, among {', '.join(mobility.parts)}"]
 
 
 def group_reactions(names: Sequence[str]) -> list[str]:

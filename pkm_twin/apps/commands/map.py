@@ -147,31 +147,25 @@ def compute(given: MapOptions) -> Report:
         motion = read(path, machine, ReadOptions(planned=True, load=given.load))
         if motion.computed is not None and given.payload is None:
             check_computed(settle_rests(motion.with_rates()))
-        wrench = None if cases or not kind.takes_wrench else motion.wrench
-        if wrench is not None and wrench.any():
-            cases = [kind.loaded(machine, "wrench of the path", wrench[wrench.any(1)][0].tolist())]
-        else:
-            wrench = None
         found = along(
             kind,
             machine,
             motion.clock,
             motion.q,
             cases=cases,
-            wrench=wrench,
+            wrench=motion.wrench,
             parts=by_load(machine, motion.load, motion.time, len(motion.q)),
             least=given.singularity,
             least_clearance=given.least_clearance,
         )
         if given.out is not None:
             replace_file(given.out, found.table().encode())
-        beyond, least = int((~found.counted).sum()), found.least
+        beyond, least, low = found.beyond, found.least, found.near_singular
         first, *rest = found.sentences
         bound = f", singularity index {least:g} or more" if least > 0.0 else ""
-        under = [] if wrench is None else ["under the wrench of the path"]
+        under = ["under the wrench of the path"] if found.loaded else []
         notes = [*rest, *under, f"{len(found.time)} samples of {path}{bound if not beyond else ''}"]
         if beyond:
-            low = int((machine.try_singularity(motion.q)[0] < least).sum())
             alone = f"{low} have a singularity index below {least:g}"
             reason = alone if low == beyond else f"{alone}; others are beyond limits or limbs interfere"
             notes.append(f"{beyond} of {len(found.time)} samples would not count, but are included: {reason}")

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 from pkm_twin.apps.frame import command
 from pkm_twin.apps.options import PictureOptions
-from pkm_twin.errors import ParameterError
 from pkm_twin.report import Fact, Report, Verdict
 from pkm_twin.settings import setting
 
@@ -41,15 +40,11 @@ def trend(given: Trend) -> Report:
 
     :raises ParameterError: no history, or one without numbers of this machine.
     """
-    from pkm_twin.identification.history import FEWEST, judged, read_history
+    from pkm_twin.identification.history import FEWEST, judge_history
 
-    found = read_history(given.history, given.machine)
-    if not found:
-        wanted = f" of a machine {given.machine!r}" if given.machine else ""
-        raise ParameterError(str(given.history), "no numbers", f"recordings with efforts{wanted}")
-    results = [judged(one, given.baseline, given.false_alarm / len(found)) for one in found]
+    results = judge_history(given.history, given.machine, given.baseline, given.false_alarm)
     drifting = sum(one.drifts for one in results)
-    few = sum(len(one.series.value) < FEWEST for one in results)
+    few = sum(not one.known for one in results)
     answer = f"no drift in {len(results) - few} series"
     if drifting:
         answer = f"drift in {drifting} of {len(results)} series"
