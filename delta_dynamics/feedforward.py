@@ -20,7 +20,7 @@ from pkm_twin.messages.reading import ExtraJoints, JointReader, JointSample, as_
 from pkm_twin.messages.stamps import SECOND, StampRules
 from pkm_twin.robot.derivatives import nearest_motion
 from pkm_twin.robot.effort_limits import NON_FINITE, EffortLimits, LimitedEfforts, LimitPolicy
-from pkm_twin.robot.limits import first_beyond
+from pkm_twin.robot.limits import find_first_beyond
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import passing_singularity
 from pkm_twin.settings import AGE_BOUNDS, COUNT_BOUNDS, FRACTION_BOUNDS, FUTURE, SECONDS, ZERO_STAMP, setting
@@ -290,7 +290,7 @@ class Feedforward(Core):
                 yield
                 part = slice(first, first + SLICE)
                 q = t.q[part]
-                beyond = _evaluate_points(first, first_beyond, robot, q, actuated=False)
+                beyond = _evaluate_points(first, find_first_beyond, robot, q, actuated=False)
                 if beyond is not None:
                     where = f"point {first + (beyond.index or 0)}: {beyond.joint}"
                     text = f"is {beyond.value:g} {beyond.unit}, allowed {beyond.low:g} to {beyond.high:g}"

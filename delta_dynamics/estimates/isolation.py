@@ -20,7 +20,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics.traced import Traced
-from pkm_twin.machine.graph import BASE, Graph, limbs
+from pkm_twin.machine.graph import BASE, Graph, list_limbs
 from pkm_twin.robot.outline import body_points, robot_bars
 from pkm_twin.robot.robot import Robot
 
@@ -66,13 +66,13 @@ class ContactPlace:
     deviation: float
 
 
-def limbs_of(robot: Robot) -> dict[str, str]:
+def map_limbs(robot: Robot) -> dict[str, str]:
     """Return the limb of each moving body and rod: connected without base and platform.
 
     A limb has the name of its actuated joint's limb, or of its first body where it has none.
     """
     graph = robot.graph
-    limb = {name: names[0] for names in limbs(graph) for name in names}
+    limb = {name: names[0] for names in list_limbs(graph) for name in names}
     names: dict[str, str] = {}
     for joint_name, own in zip(graph.actuated, robot.limb_names, strict=True):
         joint = graph.joints[joint_name]
@@ -124,7 +124,7 @@ class Places:
         graph = robot.graph
         bodies = [*graph.bodies, BASE]
         at = robot.engine.tree.at
-        limb_of = limbs_of(robot)
+        limb_of = map_limbs(robot)
         found = [(bar.part, bar.start, bar.end) for bar in robot_bars(robot) if bar.part in limb_of]
         drawn = {part for part, _, _ in found}
         for body, points in body_points(graph).items():

@@ -32,7 +32,7 @@ from pkm_twin.messages.fast_decoder import DoublesTemplate, RawTrajectory
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.effort_limits import effort_limits
 from pkm_twin.robot.robot import Robot
-from pkm_twin.robot.variation import KINDS, MAX_SPREAD, varied
+from pkm_twin.robot.variation import KINDS, MAX_SPREAD, vary_robot
 from pkm_twin.ros import health
 from pkm_twin.ros.joints import FIELDS, JointPublisher
 from pkm_twin.ros.node import TwinNode, latched_qos
@@ -69,7 +69,7 @@ class MachineSim(TwinNode):
             "normal: spread is the standard deviation; uniform: the bound",
             choices=("normal", "uniform"),
         )
-        self._variation = varied(robot, dict.fromkeys(kinds, size), seed, distribution)
+        self._variation = vary_robot(robot, dict.fromkeys(kinds, size), seed, distribution)
         self._clock_kind = self.declare(
             "clock",
             "wall",

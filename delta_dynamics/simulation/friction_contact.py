@@ -18,7 +18,7 @@ from scipy.linalg.lapack import dposv  # type: ignore[import-untyped]
 from delta_dynamics.simulation.exponential_integrator import Stepper, make_damped_stepper, make_undamped_stepper
 from delta_dynamics.torques.equations import Equations, Terms
 from pkm_twin.codegen.arrays import Array, Indices, Mask
-from pkm_twin.machine.friction import Memory, bounds, friction_values, parts, potential
+from pkm_twin.machine.friction import Memory, bound_static_friction, friction_values, potential, sum_laws
 from pkm_twin.machine.inertia import loaded_joints
 from pkm_twin.robot.robot import Robot
 
@@ -162,7 +162,7 @@ class Resistance:
         self.memory = memory
         self._rubs = self._dry > 0.0
         if self._laws:
-            _, dry, share = parts(self._laws, self._numbers, robot.graph.home, np.zeros(n))
+            _, dry, share = sum_laws(self._laws, self._numbers, robot.graph.home, np.zeros(n))
             self._rubs[:n] |= (dry > 0.0) | (share > 0.0)
         limits = robot.limits.position
         limits = np.tile([-math.inf, math.inf], (n, 1)) if limits is None else limits
@@ -201,7 +201,7 @@ class Resistance:
 
     def _position_friction(self, q: Array) -> Array:
         """Return the drives' friction that does not depend on velocity, shape (n,)."""
-        own = parts(self._laws, self._numbers, q, np.zeros_like(q))[0]
+        own = sum_laws(self._laws, self._numbers, q, np.zeros_like(q))[0]
         return np.asarray(own + self._level * self._move_memory(q).z, np.float64)
 
     def _bounds(self, here: Terms, given: Array) -> tuple[Array, Array]:
@@ -212,9 +212,9 @@ class Resistance:
         low, high = -self._dry, self._dry.copy()
         if self._laws:
             n = len(given)
-            _, dry, share = parts(self._laws, self._numbers, here.q, np.abs(here.qd))
+            _, dry, share = sum_laws(self._laws, self._numbers, here.q, np.abs(here.qd))
             held = given - self._position_friction(here.q) - self._viscous * here.qd
-            low[:n], high[:n] = bounds(held, self._dry[:n] + dry, share)
+            low[:n], high[:n] = bound_static_friction(held, self._dry[:n] + dry, share)
         return low, high
 
     def rows(self, here: Terms) -> Array:

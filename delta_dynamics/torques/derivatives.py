@@ -82,7 +82,7 @@ def _derivatives(
     by_q, by_qd, by_qdd = robot.evaluate(motion_gradient(robot), *inputs, p=robot.inertial)
     found: dict[str, Array] = {}
     if by:
-        table = _numbers_table(robot, inputs) @ numbers_slopes(robot, by)
+        table = _numbers_table(robot, inputs) @ differentiate_numbers(robot, by)
         found = {path: np.ascontiguousarray(table[..., k]) for k, path in enumerate(by)}
     return TorqueDerivatives(by_q, by_qd, by_qdd, found)
 
@@ -116,7 +116,7 @@ def _inputs(motion: Sequence[ArrayLike], wrench: ArrayLike | None, weights: Arra
     return [*inputs, weights]
 
 
-def numbers_slopes(robot: Robot, by: Sequence[str]) -> Array:
+def differentiate_numbers(robot: Robot, by: Sequence[str]) -> Array:
     """Return the derivatives of geometry and masses by numbers of the file, (numbers, paths)."""
     return robot.cached(FileNumbers, tuple(by), geometry_and_masses).slopes
 
@@ -126,7 +126,7 @@ def torques_by_numbers(
 ) -> Array:
     """Compute the derivatives of the efforts by numbers of the file, shape (..., n, paths).
 
-    :param robot: also one of :meth:`Robot.numbered`; with ``slopes`` of :func:`numbers_slopes`.
+    :param robot: also one of :meth:`Robot.numbered`; with ``slopes`` of :func:`differentiate_numbers`.
         Others as of :func:`torque_derivatives`.
     """
     inputs = _inputs((q, qd, qdd), wrench, np.eye(robot.joints_count), rows=True)

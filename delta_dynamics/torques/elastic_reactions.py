@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from delta_dynamics.torques.reactions import Balance, Reactions, balance, known_alone
+from delta_dynamics.torques.reactions import Balance, Reactions, balance, hide_indeterminate
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.motion import reaction_directions
@@ -37,7 +37,7 @@ def elastic_reactions(
         matrices = energy_forms(robot, q, found).values()
     except ParameterError:
         # Without elastic members no energy selects a solution.
-        return known_alone(found.reactions(found.value, found.null))
+        return hide_indeterminate(found.reactions(found.value, found.null))
     energy = np.asarray(sum(matrices, start=np.zeros_like(found.null)), np.float64)
     own = found.null * found.unit[..., None]
     stiff = own.swapaxes(-1, -2) @ energy @ own
@@ -48,7 +48,7 @@ def elastic_reactions(
     pull = own.swapaxes(-1, -2) @ (energy @ found.value[..., None])
     amounts = -ways @ (inverse[..., None] * (ways.swapaxes(-1, -2) @ pull))
     left = found.null @ (ways * ~sound[..., None, :])
-    return known_alone(found.reactions(found.value + (own @ amounts)[..., 0], left))
+    return hide_indeterminate(found.reactions(found.value + (own @ amounts)[..., 0], left))
 
 
 def energy_forms(robot: Robot, q: ArrayLike, found: Balance) -> dict[str, Array]:

@@ -47,7 +47,7 @@ MAX_SIZE: Final = 3
 """Coordinates of which every minimum is known."""
 
 
-def largest(forms: Array, y: Array) -> Array:
+def evaluate_largest(forms: Array, y: Array) -> Array:
     """Return max_a |y' G_a y|, shape (...); forms (..., n, m, m), y (..., m)."""
     return np.asarray(np.abs(np.einsum("...i,...aij,...j->...a", y, forms, y)).max(-1), np.float64)
 
@@ -91,7 +91,7 @@ def minimax_direction(forms: Array) -> Array:
     # Points that are no minimum may be among them: the forms are evaluated at all points.
     points = points[np.isfinite(points).all(-1) & points.any(-1)]
     points /= np.linalg.norm(points, axis=-1, keepdims=True)
-    return np.asarray(points[largest(forms, points).argmin()], np.float64)
+    return np.asarray(points[evaluate_largest(forms, points).argmin()], np.float64)
 
 
 _ROTATION: Final = np.linalg.qr([[1.0, 0.3, -0.4], [0.2, 0.9, 0.7], [-0.5, 0.6, 1.1]])[0]
@@ -282,7 +282,7 @@ def max_driving_force_range(
     greatest, high, _ = _peak(forms)
     flat = forms.reshape(-1, *forms.shape[-3:])
     low = np.array([minimax_direction(form) for form in flat]).reshape(high.shape)
-    least = largest(forms, low)
+    least = evaluate_largest(forms, low)
     y = np.stack([low, high], -2)
     return Extremes(least, greatest, _directions(np.einsum("...ij,...kj->...ki", back, y)))
 

@@ -49,7 +49,7 @@ class Transmitter:
     actuated: str | None = None
 
 
-def transmitters(graph: Graph, rods: Array, places: Array) -> list[Transmitter]:
+def list_transmitters(graph: Graph, rods: Array, places: Array) -> list[Transmitter]:
     """List all joints that transmit a wrench: the graph's joints, then the rods' ends."""
     result = []
     for k, joint in enumerate(graph.joints.values()):
@@ -146,7 +146,9 @@ def _make_transmitter(
     return Transmitter(name, *bodies, point, tuple(names), basis, effort)
 
 
-def needs(graph: Graph, names: Sequence[str], bodies: Array, rods: Array) -> tuple[dict[str, Array], dict[str, Array]]:
+def compute_needed_wrenches(
+    graph: Graph, names: Sequence[str], bodies: Array, rods: Array
+) -> tuple[dict[str, Array], dict[str, Array]]:
     """Return a point of each body and rod, and the wrench about it that its joints apply."""
     origin: dict[str, Array] = {}
     needed: dict[str, Array] = {}
@@ -168,7 +170,7 @@ def _place_columns(joint: Transmitter, names: tuple[str, ...], batch: tuple[int,
     return result
 
 
-def moments(joints: Sequence[Transmitter], names: tuple[str, ...]) -> Mask:
+def mark_moments(joints: Sequence[Transmitter], names: tuple[str, ...]) -> Mask:
     """Return which unknowns are moments, shape (unknowns,)."""
     result = np.zeros(len(names), bool)
     for joint in joints:
@@ -178,7 +180,7 @@ def moments(joints: Sequence[Transmitter], names: tuple[str, ...]) -> Mask:
     return result
 
 
-def transmission(
+def assemble_transmission(
     joints: Sequence[Transmitter],
     names: tuple[str, ...],
     origin: dict[str, Array],
@@ -278,7 +280,7 @@ def reactions(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench:
     :raises SingularityError: also where the joints cannot hold the loads (a constraint
         singularity).
     """
-    return known_alone(least_norm_reactions(robot, q, qd, qdd, wrench))
+    return hide_indeterminate(least_norm_reactions(robot, q, qd, qdd, wrench))
 
 
 def list_undetermined(robot: Robot) -> list[str]:
@@ -296,7 +298,7 @@ def list_undetermined(robot: Robot) -> list[str]:
     return [f"{count} are redundant, among {', '.join(mobility.parts)}"]
 
 
-def known_alone(full: Reactions) -> Reactions:
+def hide_indeterminate(full: Reactions) -> Reactions:
     """Return the reactions with NaN for indeterminate components."""
     return replace(
         full,
@@ -362,7 +364,7 @@ def balance(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: A
     """Solve the balances of a motion; arguments and errors as :func:`reactions`."""
     load = np.zeros(6) if wrench is None else wrench
     loads = robot.evaluate(loads_kernel(robot), q, qd, qdd, load, p=robot.inertial)
-    found = balanced(robot, loads)
+    found = solve_balances(robot, loads)
     if robot.redundant:
         efforts = robot.evaluate(body_efforts(robot), q, qd, qdd, load, p=robot.inertial)[0]
         # Balances with given efforts, shape (..., n), of a redundant machine's drives.
@@ -381,7 +383,7 @@ def balance(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: A
     return found
 
 
-def balanced(robot: Robot, loads: Sequence[Array], *, strict: bool = True) -> Balance:
+def solve_balances(robot: Robot, loads: Sequence[Array], *, strict: bool = True) -> Balance:
     """Solve the balances of the loads of :func:`loads_kernel`, also of variants of the robot.
 
     :param strict: raise where there is no equilibrium; else ``residual`` is not below
@@ -389,7 +391,7 @@ def balanced(robot: Robot, loads: Sequence[Array], *, strict: bool = True) -> Ba
     """
     engine = robot.massive()
     bodies, rods, places = loads
-    joints = transmitters(engine.graph, rods, places)
+    joints = list_transmitters(engine.graph, rods, places)
     names = tuple(dict.fromkeys(name for joint in joints for name in joint.components))
     points = np.stack([joint.point for joint in joints], -2)
     centred = points - points.mean(-2, keepdims=True)
@@ -397,11 +399,11 @@ def balanced(robot: Robot, loads: Sequence[Array], *, strict: bool = True) -> Ba
     # Joints that are all in one point have no distance: use the machine's size.
     size = np.where(size > POINT_FRACTION * engine.graph.size, size, engine.graph.size)
 
-    origin, needed = needs(engine.graph, list(engine.tree.links), bodies, rods)
+    origin, needed = compute_needed_wrenches(engine.graph, list(engine.tree.links), bodies, rods)
     batch = bodies.shape[:-1]
-    a = transmission(joints, names, origin, batch)
+    a = assemble_transmission(joints, names, origin, batch)
     b = np.concatenate([needed[body] for body in origin], -1)
-    moment = moments(joints, names)
+    moment = mark_moments(joints, names)
     with np.errstate(over="ignore", invalid="ignore"):
         value, null, residual = _solve(a, b, moment, size, strict=strict)
 

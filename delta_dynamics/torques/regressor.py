@@ -21,7 +21,7 @@ from pkm_twin.codegen.expressions import PARAMETERS
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics.motion import BaseMotion
 from pkm_twin.kinematics.traced import Traced
-from pkm_twin.machine.friction import friction_values, linear_keys, taken
+from pkm_twin.machine.friction import evaluate_laws, friction_values, linear_keys
 from pkm_twin.machine.inertia import TEN, TEN_UNITS, change_of_frame, drive_units, loaded_joints, standard_parameters
 from pkm_twin.machine.schema import frozen
 from pkm_twin.robot.mechanism import SHARED
@@ -137,7 +137,7 @@ def law_columns(robot: Robot, q: Array, qd: Array, load: Array) -> Array:
     columns = np.zeros((*qd.shape, len(keys), n))
     for i, key in enumerate(keys):
         unit = values | {other: np.full(n, float(other == key)) for other in keys}
-        own = taken(robot.laws, unit, q, qd, load)
+        own = evaluate_laws(robot.laws, unit, q, qd, load)
         columns[..., np.arange(n), i, np.arange(n)] = own
     return columns.reshape(*qd.shape, len(keys) * n)
 
@@ -284,7 +284,7 @@ def base_parameters(robot: Robot, *, seed: int = 0) -> BaseParameters:
         preference[k] = (0.1 if owner == PAYLOAD else 1.0) * (0.3 if what in TEN[7:] else 1.0)
         if what in DRIVE:
             preference[k] = 10.0
-    columns, matrix = independent(table / units, preference)
+    columns, matrix = choose_independent_columns(table / units, preference)
     matrix = matrix * units / units[list(columns)][:, None]
     led = [combination_name(row, k, names) for k, row in zip(columns, matrix, strict=True)]
     unseen = [name for k, name in enumerate(names[:-1]) if not matrix[:, k].any()]
@@ -304,7 +304,7 @@ def random_states(robot: Robot, count: int, seed: int) -> tuple[Array, Array, Ar
     return q, unit * np.sqrt(g) * rng.normal(size=q.shape), unit * g * rng.normal(size=q.shape)
 
 
-def independent(table: Array, preference: ArrayLike = 1.0) -> tuple[tuple[int, ...], Array]:
+def choose_independent_columns(table: Array, preference: ArrayLike = 1.0) -> tuple[tuple[int, ...], Array]:
     """Choose columns that are independent of each other, and express all columns by them.
 
     :param table: shape (rows, p), columns of comparable units.

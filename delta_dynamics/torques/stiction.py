@@ -13,7 +13,7 @@ import numpy as np
 
 from delta_dynamics.torques.virtual_work import inverse_dynamics
 from pkm_twin.codegen.arrays import Array, Mask
-from pkm_twin.machine.friction import LoadDependent, friction_values, load_of, parts
+from pkm_twin.machine.friction import LoadDependent, friction_values, solve_load, sum_laws
 from pkm_twin.robot.robot import Robot
 
 SMALL_RATE: Final = 1e-6
@@ -70,9 +70,9 @@ class LoadShare:
             return effort, self.share
         laws, own = self._given.laws, self._given.friction
         way = np.sign(rates)
-        at_place, dry, share = parts(laws, friction_values(laws, own), q, np.abs(rates))
+        at_place, dry, share = sum_laws(laws, friction_values(laws, own), q, np.abs(rates))
         held = effort - own.viscous * rates - own.offset - at_place
-        load = load_of(held - (own.coulomb + dry) * way, share, way)
+        load = solve_load(held - (own.coulomb + dry) * way, share, way)
         holds = np.where(way == 0.0, share / (1.0 - share) * np.abs(held), 0.0)
         return effort - share * np.abs(load) * way, holds
 

@@ -363,7 +363,7 @@ def add_friction_and_rotors(
     for k, values in enumerate(_law_values(t, parts)):
         # No drive of several that share the effort has a law by load.
         load = 0.0 if t.drives.others else loads[k] + rotors[k]
-        basic[k] = basic[k] + friction.taken(t.graph.laws, values, q[k], rates[k], load)
+        basic[k] = basic[k] + friction.evaluate_laws(t.graph.laws, values, q[k], rates[k], load)
     rows = loads, t.drives.on_leads(basic), t.drives.on_leads(rotors)
     efforts = [load + rubs + rotor for load, rubs, rotor in zip(*rows, strict=True)]
     return efforts, [rubs + rotor for rubs, rotor in zip(basic, rotors, strict=True)]
@@ -457,10 +457,10 @@ def efforts_left(
     if laws and not t.drives.others:
         basic = _basic_friction(parts, rates)
         for k, values in enumerate(laws):
-            at_place, dry, share = friction.parts(t.graph.laws, values, q[k], absolute(rates[k]))
+            at_place, dry, share = friction.sum_laws(t.graph.laws, values, q[k], absolute(rates[k]))
             way = sign(rates[k])
             free = driving[k] - basic[k] - at_place - dry * way
-            rest[k] = friction.load_of(free, share, way) - (loads[k] + parts[ROTORS][k] * changes[k])
+            rest[k] = friction.solve_load(free, share, way) - (loads[k] + parts[ROTORS][k] * changes[k])
     return rest
 
 

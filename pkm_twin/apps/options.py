@@ -213,11 +213,11 @@ class BeyondLimitsOption:
         :param where: the recording, where there may be several.
         :raises ParameterError: something, and it is not allowed.
         """
-        from pkm_twin.robot.limits import beyond_limits, refuse_beyond
+        from pkm_twin.robot.limits import beyond_limits, reject_beyond_limits
 
         _, found = beyond_limits(machine, q, qd)
         if not self.beyond_limits:
-            refuse_beyond(found, where)
+            reject_beyond_limits(found, where)
         return found
 
 

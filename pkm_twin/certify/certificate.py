@@ -23,7 +23,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, PkmTwinError, SingularityError, UnreachableError, install
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.robot_urdf import robot_description
-from pkm_twin.robot.variation import KINDS, varied
+from pkm_twin.robot.variation import KINDS, vary_robot
 
 ENGINES: Final = {
     "maximal": ("pkm_twin.certify.maximal:Maximal", "numpy"),
@@ -238,9 +238,9 @@ def drawn(robot: Robot, seed: int) -> Robot:
     """Make a variant with perturbed parameters; perturb lengths only if the loops still close."""
     kinds = [kind for kind in KINDS if kind != "lengths"]
     try:
-        return varied(robot, dict.fromkeys(KINDS, VARIANT_DEVIATION), seed).robot
+        return vary_robot(robot, dict.fromkeys(KINDS, VARIANT_DEVIATION), seed).robot
     except ParameterError:
-        return varied(robot, dict.fromkeys(kinds, VARIANT_DEVIATION), seed).robot
+        return vary_robot(robot, dict.fromkeys(kinds, VARIANT_DEVIATION), seed).robot
 
 
 def _is_redundant(robot: Any) -> bool:

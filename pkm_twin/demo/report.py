@@ -17,7 +17,7 @@ from pkm_twin.bags.reader import inspect, read_messages
 from pkm_twin.codegen.arrays import Array, Indices, Mask
 from pkm_twin.messages.stamps import stamp_of
 from pkm_twin.recordings import ReadOptions, Recording, read
-from pkm_twin.recordings.recording import differentiated
+from pkm_twin.recordings.recording import differentiate_motion
 from pkm_twin.report import Fact, plots
 from pkm_twin.report import judged as judge
 
@@ -127,7 +127,7 @@ def _judge_payload(prefix: str, r: Recording, residual: Array, free: Mask, answe
     step = np.linalg.norm(change.mean(0))
     scatter = np.linalg.norm(np.std(residual[free], 0))
     # Efforts of one kilogram along the recorded motion.
-    qd, qdd, _ = differentiated(r)
+    qd, qdd, _ = differentiate_motion(r)
     state = [values[answered[held]] for values in (r.q, qd, qdd)]
     kilogram = inverse_dynamics(r.robot.changed(payload={"mass": 1.0}), *state)
     kilogram -= inverse_dynamics(r.robot, *state)

@@ -42,8 +42,8 @@ from pkm_twin.kinematics.constraints import (
 )
 from pkm_twin.kinematics.iterations import newton
 from pkm_twin.machine.graph import BASE, Graph, Joint, Rod, rotation_about_z
-from pkm_twin.machine.joints import across, unit
-from pkm_twin.machine.places import full_keys, keys_of, path_of
+from pkm_twin.machine.joints import perpendicular_axes, unit
+from pkm_twin.machine.places import full_keys, join_path, split_path
 from pkm_twin.machine.rotations import rotation_about, rotation_vector
 from pkm_twin.robot.rejection import SINGULARITY_BOUND
 from pkm_twin.robot.robot import Robot
@@ -103,9 +103,9 @@ def part_of(robot: Robot, path: str) -> Part | None:
         return Part(effects, f"{found[0].text}, and {len(found) - 1} more alike", found[0].unit)
     if keys[0] not in (*ERROR_KEYS, "limbs"):
         numbers = robot.file_numbers()
-        if keys[0] in {keys_of(number)[0] for number in numbers}:
+        if keys[0] in {split_path(number)[0] for number in numbers}:
             return None
-        raise unknown_number(path, [*map(path_of, _error_keys(robot)), *numbers])
+        raise unknown_number(path, [*map(join_path, _error_keys(robot)), *numbers])
     texts, unit_ = [], ""
     for kind, name, where, azimuth in robot.named(keys):
         entry = _part_effects(robot, kind, name, where, rotation_about_z(azimuth), path)
@@ -124,7 +124,7 @@ def part_of(robot: Robot, path: str) -> Part | None:
             raise UnknownNameError(path, keys[k], words)
         if not words or k == len(keys):
             rest = f"one of {', '.join(sorted(words))} behind it" if words else "no more keys"
-            raise ParameterError(path, path_of(keys[k:]) or None, rest)
+            raise ParameterError(path, join_path(keys[k:]) or None, rest)
     raise AssertionError(path)
 
 
@@ -135,7 +135,7 @@ def _error_keys(robot: Robot) -> Iterator[list[str | int]]:
         places |= {(kind, name): kind for name in getattr(robot.graph, kind)}
     for (kind, _), source in getattr(robot, "sources", {}).items():
         places[source.path] = kind
-    return ([*place, *keys_of(end)] for place, kind in places.items() for end in ERROR_KEYS[kind])
+    return ([*place, *split_path(end)] for place, kind in places.items() for end in ERROR_KEYS[kind])
 
 
 def error_of(path: str) -> str:
@@ -150,7 +150,7 @@ def matching(robot: Robot, pattern: str) -> list[str]:
     """
     fits = re.compile(".*".join(map(re.escape, pattern.split("*")))).fullmatch
     found = []
-    for path in map(path_of, _error_keys(robot)):
+    for path in map(join_path, _error_keys(robot)):
         if fits(error_of(path)):
             with contextlib.suppress(ParameterError):
                 part_of(robot, path)
@@ -188,7 +188,7 @@ def _part_effects(
                 raise ParameterError(path, joint.kind, "a joint with an axis")
             if name in robot.without_point:
                 raise ParameterError(f"joints.{name}.at", None, "the point about which it tilts")
-            about = np.asarray(turn @ across(unit(turn.T @ joint.axes[0]))[k])
+            about = np.asarray(turn @ perpendicular_axes(unit(turn.T @ joint.axes[0]))[k])
             return {("tilt", name): about}, f"axis of {name} on {joint.inner}", "rad"
     return None
 

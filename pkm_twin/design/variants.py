@@ -19,7 +19,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from delta_dynamics.torques.reactions import BALANCE_BOUND, Reactions, balanced, known_alone
+from delta_dynamics.torques.reactions import BALANCE_BOUND, Reactions, hide_indeterminate, solve_balances
 from pkm_twin.codegen.arrays import Array, common_batch, doubles
 from pkm_twin.codegen.code import Code
 from pkm_twin.codegen.kernels import MAX_GEOMETRY_MISMATCH
@@ -27,7 +27,7 @@ from pkm_twin.design import programs
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.machine.formulas import PARAMETERS
 from pkm_twin.machine.geometry import pattern_of
-from pkm_twin.machine.places import keys_of
+from pkm_twin.machine.places import split_path
 from pkm_twin.machine.tree import Tree
 from pkm_twin.robot.derivatives import twist_rows
 from pkm_twin.robot.robot import Robot
@@ -54,7 +54,7 @@ class Variants:
         self.paths = tuple(numbers)
         arrays = []
         for path, value in numbers.items():
-            _ = keys_of(path)
+            _ = split_path(path)
             try:
                 arrays.append(doubles(value, path))
             except ValueError:
@@ -141,8 +141,8 @@ class Variants:
         parts = []
         for start in range(0, max(1, len(at)), SAMPLES_PER_BALANCE):
             taken = [row[at[start : start + SAMPLES_PER_BALANCE]] for row in rows]
-            found = balanced(self.robot, taken, strict=False)
-            parts.append(known_alone(found.reactions(found.value, found.null)))
+            found = solve_balances(self.robot, taken, strict=False)
+            parts.append(hide_indeterminate(found.reactions(found.value, found.null)))
         kept = np.concatenate([part.residual <= BALANCE_BOUND for part in parts])
         made: dict[str, Any] = {}
         for name in ("points", "wrenches", "determinate", "values", "determinate_components", "residual"):
@@ -291,7 +291,7 @@ class Variants:
         """
         paths = [self.paths[column] for column in columns]
         # More numbers have too many corners.
-        if len(columns) > 5 or any(keys_of(path)[0] == PARAMETERS for path in paths):
+        if len(columns) > 5 or any(split_path(path)[0] == PARAMETERS for path in paths):
             return False
         ends = zip(rows.min(0).tolist(), rows.max(0).tolist(), strict=True)
         return all(self._is_valid(paths, row) for row in set(itertools.product(*ends)))

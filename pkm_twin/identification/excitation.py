@@ -19,7 +19,7 @@ from typing import Final
 
 import numpy as np
 
-from delta_dynamics.torques.regressor import independent, random_states, regressor
+from delta_dynamics.torques.regressor import choose_independent_columns, random_states, regressor
 from delta_dynamics.torques.virtual_work import inverse_dynamics
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError, check_limit
@@ -117,7 +117,7 @@ class Judge:
         scales = np.where(known > 0.0, known, 1.0 / np.where(norms > 0.0, norms, 1.0))
         if not (rows * scales).any():
             raise PkmTwinError("no motion of this robot excites the parameters to identify")
-        columns, _ = independent(rows * scales)
+        columns, _ = choose_independent_columns(rows * scales)
         return cls(robot, parameters, columns, scales, weights)
 
     def singular_values(self, q: Array, qd: Array, qdd: Array) -> Array:

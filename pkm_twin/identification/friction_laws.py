@@ -28,7 +28,7 @@ from pkm_twin.identification.parameters import Number, file_parameters
 from pkm_twin.identification.rows import Problem, Rows, rows_of
 from pkm_twin.identification.samples import EXACT, filtered
 from pkm_twin.identification.suspects import LINE
-from pkm_twin.machine.friction import BASIC, KNOWN_FRACTION, LAWS, Dahl, compiled
+from pkm_twin.machine.friction import BASIC, KNOWN_FRACTION, LAWS, Dahl, select_compiled_laws
 from pkm_twin.recordings import Recording
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.steps import sampling_of
@@ -123,7 +123,7 @@ def fit_with_laws(
         best = fit(robot, recordings, what, **options)
     recordings = [made.recording for made in best.problem.whole]
     while asked if laws is not None else _unexplained(best):
-        names = asked[:1] or [one for one in compiled(tuple(LAWS)) if one not in best.robot.laws]
+        names = asked[:1] or [one for one in select_compiled_laws(tuple(LAWS)) if one not in best.robot.laws]
         tried = []
         for name in names:
             try:

@@ -19,7 +19,7 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array, Indices
 from pkm_twin.machine.friction import LAWS, all_keys, linear_keys
 from pkm_twin.machine.inertia import change_of_frame, drive_units, matrix_of, standard_parameters
-from pkm_twin.machine.places import Keys, path_of
+from pkm_twin.machine.places import Keys, join_path
 from pkm_twin.robot.numbers import FileNumbers
 from pkm_twin.robot.robot import Robot
 
@@ -124,7 +124,7 @@ def of_drives(robot: Robot) -> tuple[Identifiable, ...]:
         if joint.actuated or joint.rotor_inertia:
             rotors.setdefault(robot.rotor_key(name), []).append(name)
     for key, names in rotors.items():
-        owner = names[0] if len(names) == 1 else path_of(key[:-1])
+        owner = names[0] if len(names) == 1 else join_path(key[:-1])
         value = graph.joints[names[0]].rotor_inertia
         number("rotor", f"{owner}.rotor_inertia", value, key, names)
     return tuple(found)
@@ -150,14 +150,14 @@ def of_masses(robot: Robot) -> Iterator[Identifiable]:
     keys = [key for key in every if key <= _mirrored(key)]
     both = [dict.fromkeys((key, _mirrored(key))) for key in keys]
     tie = np.repeat(np.eye(len(keys)), [len(pair) for pair in both], 0)
-    values = np.array([robot.number(path_of(key)) for key in keys])
+    values = np.array([robot.number(join_path(key)) for key in keys])
     # Masses above zero: as much as each may be off.
     masses = [body.mass for body in graph.bodies.values()]
     heavy = max(graph.bodies[graph.platform].mass, 0.1 * sum(masses))
     reference = values.copy()
     for k in _places(keys, "mass", "density"):
         reference[k] = max(values[k], heavy if keys[k][0] == LOAD or not values[k] else 0.0)
-    made = FileNumbers(robot, [path_of(key) for pair in both for key in pair], _tens)
+    made = FileNumbers(robot, [join_path(key) for pair in both for key in pair], _tens)
     slopes = made.slopes_at((tie @ reference)[None])[0] @ tie
     names = [*graph.bodies, LOAD]
     tens = slopes[: 10 * len(names)].reshape(len(names), 10, -1)
@@ -183,7 +183,7 @@ def of_masses(robot: Robot) -> Iterator[Identifiable]:
         payload = keys[part[0]][0] == LOAD
         yield Identifiable(
             "payload" if payload else "inertia",
-            tuple(map(path_of, group.keys)),
+            tuple(map(join_path, group.keys)),
             tuple(_unit(key) for key in group.keys),
             group.begin,
             group.scales([extents[b] for b in inside]),

@@ -22,10 +22,10 @@ from pkm_twin.identification.identifiable import (
     identifiable,
     possible_inertia,
 )
-from pkm_twin.machine.graph import groups
+from pkm_twin.machine.graph import group_connected
 from pkm_twin.machine.inertia import TEN, change_of_frame
 from pkm_twin.machine.machine_yaml import edit_yaml
-from pkm_twin.machine.places import Keys, path_of
+from pkm_twin.machine.places import Keys, join_path
 from pkm_twin.robot.robot import Robot
 
 T = TypeVar("T")
@@ -154,7 +154,7 @@ class Number:
     @property
     def name(self) -> str:
         """The key, with dots."""
-        return path_of(self.key)
+        return join_path(self.key)
 
 
 def number_of(
@@ -238,7 +238,7 @@ def groups_of(names: Sequence[str], factors: Array, covariance: Array, wide: Arr
     shared = np.abs(unknown @ unknown.T)
     open_ = np.flatnonzero(np.diag(shared) > SHOWN**2).tolist()
     pairs = ((i, j) for i, j in combinations(open_, 2) if shared[i, j] > SHOWN)
-    found = [sorted(members) for members in groups(open_, pairs)]
+    found = [sorted(members) for members in group_connected(open_, pairs)]
     result = list[Group]()
     for members in found:
         if len(members) < 2:

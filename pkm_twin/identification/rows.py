@@ -38,7 +38,14 @@ from pkm_twin.identification.samples import (
     tracks,
 )
 from pkm_twin.identification.words import position_text
-from pkm_twin.machine.friction import KNOWN_FRACTION, Dahl, Memory, all_keys, compiled, not_shared
+from pkm_twin.machine.friction import (
+    KNOWN_FRACTION,
+    Dahl,
+    Memory,
+    all_keys,
+    list_unshareable_laws,
+    select_compiled_laws,
+)
 from pkm_twin.recordings.recording import Recording
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.noise import estimate_deviation
@@ -465,8 +472,8 @@ class Problem:
             if progress is not None:
                 progress(i + 1)
         problem = cls(robot, tuple(what), everything, tuple(whole))
-        laws = (*compiled(robot.laws), *robot.open_laws)
-        for _ in range(passes if not_shared(laws) else 0):
+        laws = (*select_compiled_laws(robot.laws), *robot.open_laws)
+        for _ in range(passes if list_unshareable_laws(laws) else 0):
             opened = replace(everything, loads=problem.values)
             whole = [made.again(opened, made.how.window) for made in problem.whole]
             problem = replace(problem, everything=opened, whole=tuple(whole))

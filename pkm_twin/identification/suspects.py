@@ -16,7 +16,7 @@ from typing import Final
 
 import numpy as np
 
-from delta_dynamics.torques.derivatives import numbers_slopes, torques_by_numbers
+from delta_dynamics.torques.derivatives import differentiate_numbers, torques_by_numbers
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import ParameterError
 from pkm_twin.identification.judge import (
@@ -37,7 +37,7 @@ from pkm_twin.identification.parameters import FileParameters
 from pkm_twin.identification.rows import BLOCK, Problem, Rows
 from pkm_twin.identification.samples import EXACT, by_blocks
 from pkm_twin.machine.friction import turning_keys
-from pkm_twin.machine.places import path_of
+from pkm_twin.machine.places import join_path
 from pkm_twin.machine.uncertainty import numbers_below
 from pkm_twin.robot.robot import Robot
 
@@ -178,7 +178,7 @@ class Lengths:
         held = motion.held[:, None, None]
         away = bool((np.abs(held - 1.0) > EXACT).any())
         slopes, of_bare = (
-            numbers_slopes(one, self.paths) @ self.mixing if needed else np.zeros(0)
+            differentiate_numbers(one, self.paths) @ self.mixing if needed else np.zeros(0)
             for one, needed in ((machine, True), (bare, away))
         )
 
@@ -199,9 +199,9 @@ def _weighing(robot: Robot, parameters: FileParameters, values: Array, kind: str
     for where, group in zip(parameters.slices, parameters.groups, strict=True):
         if group.kind == kind and (values[where] != group.values).any():
             new = group.keys(values[where])
-            numbers |= {path_of(key): value for key, value in new.items()}
+            numbers |= {join_path(key): value for key, value in new.items()}
             numbers |= {
-                path_of((*key[:-2], key[-1], key[-2])): value
+                join_path((*key[:-2], key[-1], key[-2])): value
                 for key, value in new.items()
                 if isinstance(key[-1], int) and isinstance(key[-2], int)
             }

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.identification.parameters import OBSERVED
-from pkm_twin.machine.graph import Graph, limbs
-from pkm_twin.machine.places import keys_of
+from pkm_twin.machine.graph import Graph, list_limbs
+from pkm_twin.machine.places import split_path
 
 LINES: Final = 10
 """Largest number of lines that list undetermined numbers."""
@@ -100,7 +100,7 @@ class _Numbers:
         axes: dict[tuple[str, int], NDArray[np.int64]] = {}
         origin = np.full(3, -1)
         for place, name in enumerate(names):
-            keys = keys_of(name)
+            keys = split_path(name)
             if not isinstance(keys[-1], int) or not 0 <= keys[-1] < 3:
                 continue
             words, last = [str(k) for k in keys if isinstance(k, str)], keys[-1]
@@ -135,7 +135,9 @@ class _Numbers:
 
     def limbs(self) -> list[list[tuple[str, int]]]:
         """Points by the limb they are on: what hangs together without base and platform."""
-        found = [[point for point in self.points if set(self.bodies(point)) & set(limb)] for limb in limbs(self.graph)]
+        found = [
+            [point for point in self.points if set(self.bodies(point)) & set(limb)] for limb in list_limbs(self.graph)
+        ]
         return [one for one in found if one]
 
     def point(self, point: tuple[str, int]) -> Array:

@@ -19,7 +19,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import snapped
 from pkm_twin.codegen.operations import sqrt
 from pkm_twin.machine.graph import BASE, Graph, Joint
-from pkm_twin.machine.joints import UNITS, Constraint, across
+from pkm_twin.machine.joints import UNITS, Constraint, perpendicular_axes
 from pkm_twin.machine.rotations import rotation_about
 
 NONE: Final = np.zeros(3)
@@ -138,7 +138,7 @@ def drive_equation(joint: Joint, goal: Any, points: Pair, turns: Turns, size: An
     """
     bodies, (freedom,) = (joint.inner, joint.outer), joint.freedoms
     if freedom.turns:
-        first, second = across(joint.axes[0])
+        first, second = perpendicular_axes(joint.axes[0])
         goal = np.asarray(goal)[..., None]
         inner = turns[0](np.cos(goal) * second - np.sin(goal) * first)
         return keep_angle(joint.name, bodies, points, (inner, turns[1](first)), 0.0)

@@ -22,14 +22,14 @@ from pkm_twin.kinematics.constraints import cross
 from pkm_twin.kinematics.engine import Engine
 from pkm_twin.kinematics.traced import Traced
 from pkm_twin.machine.graph import Rod
-from pkm_twin.machine.joints import across, single_names, unit
+from pkm_twin.machine.joints import perpendicular_axes, single_names, unit
 from pkm_twin.machine.names import FREE_BODY, FREE_ROD, joint_labels
 from pkm_twin.machine.tree import Link
 
 
 def rod_axes(rod: Rod) -> tuple[Array, Array]:
     """Return the two axes that a rod turns about at its inner end, at home."""
-    return across(unit(rod.ends[1] - rod.ends[0]))
+    return perpendicular_axes(unit(rod.ends[1] - rod.ends[0]))
 
 
 def passive_names(engine: Engine) -> tuple[str, ...]:

@@ -53,7 +53,7 @@ from pkm_twin.kinematics.motion import (
     numbers,
 )
 from pkm_twin.kinematics.traced import Traced
-from pkm_twin.machine.graph import BASE, Graph, groups, weld
+from pkm_twin.machine.graph import BASE, Graph, group_connected, weld
 from pkm_twin.machine.tree import Tree
 
 
@@ -80,7 +80,7 @@ def find_carriers(graph: Graph) -> frozenset[str]:
     hangs on none: all of them may err. So nothing depends on the order of entries.
     """
     rigid = [j for j in graph.joints.values() if j.actuated or not j.type.cost]
-    parts = groups([BASE, *graph.bodies], [(j.inner, j.outer) for j in rigid])
+    parts = group_connected([BASE, *graph.bodies], [(j.inner, j.outer) for j in rigid])
     part = {body: k for k, bodies in enumerate(parts) for body in bodies}
     doors: list[list[tuple[int, str]]] = [[] for _ in parts]
     for joint in graph.joints.values():

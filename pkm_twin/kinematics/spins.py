@@ -16,8 +16,8 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.kinematics.linkage import Linkage
 from pkm_twin.kinematics.motion import Motion
-from pkm_twin.machine.graph import BASE, Graph, Joint, array, merged
-from pkm_twin.machine.joints import across, unit
+from pkm_twin.machine.graph import BASE, Graph, Joint, array, map_welded_bodies
+from pkm_twin.machine.joints import perpendicular_axes, unit
 
 SPIN: Final = 0.05
 """A part whose centre of mass moves less than this share of the machine a radian only spins."""
@@ -66,7 +66,7 @@ def without_spins(graph: Graph) -> tuple[Graph, dict[str, float]]:
         name, axes, way, lost = owners[k], np.zeros((0, 3)), spins @ spins[k], spins[k]
         if not shares[k] > MIN_MOTION:
             balls = (
-                (joint.name, np.array(across(axis)), spins @ way, way)
+                (joint.name, np.array(perpendicular_axes(axis)), spins @ way, way)
                 for bodies, axis, way in idle_bodies(graph, motion, spins)
                 for joint in graph.joints.values()
                 if joint.kind == "spherical" and {joint.inner, joint.outer} & set(bodies)
@@ -112,7 +112,7 @@ def idle_bodies(graph: Graph, motion: Motion, free: Array) -> list[tuple[list[st
     :returns: names of the bodies, the axis at home (unit vector), and the motion in ``free``.
     """
     groups: dict[str, list[str]] = {}
-    for body, lead in merged(graph).items():
+    for body, lead in map_welded_bodies(graph).items():
         groups.setdefault(lead, []).append(body)
     moved = {body: twist(motion, body, graph.bodies[body].com) @ free for body in graph.bodies}
     found = []

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.graph import groups
+from pkm_twin.machine.graph import group_connected
 from pkm_twin.machine.loop_tree import Joint, Link, LoopTree, order_from_root
 from pkm_twin.machine.urdf_xml import free_name
 
@@ -43,7 +43,7 @@ def find_circles(pairs: Mapping[str, tuple[str, str]], base: str, platform: str)
     degree = Counter(body for pair in every for body in pair)
     found = dict(pairs)
     for gone in [body for body, count in degree.items() if count > 1]:
-        parts = groups([body for body in degree if body != gone], every)
+        parts = group_connected([body for body in degree if body != gone], every)
         own = next(part for part in parts if {base, platform} - {gone} <= set(part))
         found = {name: pair for name, pair in found.items() if set(pair) - {gone} <= set(own)}
     return found
@@ -58,7 +58,9 @@ def cut_out(tree: LoopTree, base: str, platform: str, *, carry: bool = False) ->
     """
     fixed = [joint for joint in tree.joints.values() if joint.kind == "fixed"]
     bodies = {
-        link: part[0] for part in groups(tree.links, [(joint.inner, joint.outer) for joint in fixed]) for link in part
+        link: part[0]
+        for part in group_connected(tree.links, [(joint.inner, joint.outer) for joint in fixed])
+        for link in part
     }
     ground, tool = bodies[base], bodies[platform]
     if ground == tool:
@@ -66,7 +68,7 @@ def cut_out(tree: LoopTree, base: str, platform: str, *, carry: bool = False) ->
     joints = [joint for joint in tree.joints.values() if joint.kind != "free"]
     pairs = {j.name: (bodies[j.inner], bodies[j.outer]) for j in (*joints, *tree.closures)}
     pairs = {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
-    part = next(part for part in groups(dict.fromkeys(bodies.values()), pairs.values()) if tool in part)
+    part = next(part for part in group_connected(dict.fromkeys(bodies.values()), pairs.values()) if tool in part)
     if ground not in part:
         near = [link for link in tree.links if bodies[link] in part and link != platform]
         raise ParameterError(
@@ -85,7 +87,7 @@ def cut_out(tree: LoopTree, base: str, platform: str, *, carry: bool = False) ->
     for host in kept:
         # Links that hang on a body are connected to it by joints outside the linkage.
         away = [body for body in dict.fromkeys(bodies.values()) if body not in kept or body == host]
-        hanging = next(group for group in groups(away, bridges) if host in group)
+        hanging = next(group for group in group_connected(away, bridges) if host in group)
         own = [link for name, link in tree.links.items() if bodies[name] in hanging and bodies[name] != host]
         if not own:
             continue

@@ -10,7 +10,7 @@ import numpy as np
 
 from pkm_twin.codegen.expressions import norm, plain
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.graph import BASE, Graph, limb_numbers
+from pkm_twin.machine.graph import BASE, Graph, number_limbs
 from pkm_twin.machine.joints import unit
 from pkm_twin.machine.members import Beam, Parts
 from pkm_twin.machine.reach import PassiveLimit
@@ -26,7 +26,7 @@ RIGID: Final = (
 
 def find_parts(graph: Graph, specs: Specs) -> Parts:
     """Return bodies with a member, rods with a section or radius, and the compliance of joints."""
-    limb = limb_numbers(graph)
+    limb = number_limbs(graph)
     beams = []
     for name, body in specs["bodies"].items():
         m = body.member

@@ -13,7 +13,7 @@ from typing import Final
 
 from pkm_twin.errors import ParameterError, warn
 from pkm_twin.machine import urdf_xml
-from pkm_twin.machine.graph import groups
+from pkm_twin.machine.graph import group_connected
 from pkm_twin.machine.loop_tree import Fault, Joint, Link
 
 IGNORED: Final = {
@@ -108,7 +108,7 @@ def gravity_of(
     :raises ParameterError: gravity is switched off on only some of these links.
     """
     bolts = [(joint.inner, joint.outer) for joint in joints if joint.kind == "fixed"]
-    held = groups(dict.fromkeys([root, *weight]), bolts)[0]
+    held = group_connected(dict.fromkeys([root, *weight]), bolts)[0]
     moving = [name for name in weight if name not in held and links[name].mass > 0.0]
     off = [name for name in moving if not weight[name]]
     if off and len(off) < len(moving):
@@ -123,4 +123,4 @@ def flag(element: ET.Element, tag: str, default: bool) -> bool:
     """Read a truth value in an element of its own."""
     text = element.findtext(tag)
     where = element.get("name") or element.get("reference")
-    return default if text is None else urdf_xml.boolean(text, f"{where}.{tag}")
+    return default if text is None else urdf_xml.parse_boolean(text, f"{where}.{tag}")

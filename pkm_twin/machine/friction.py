@@ -90,7 +90,7 @@ class FrictionLaw:
     @classmethod
     def along(cls, values: Values, q: Array, rates: Array) -> Array:
         """Return the effort without load along a motion in time, shape (k, n) as q and rates."""
-        return np.asarray(taken([cls.name], values, q, rates, 0.0 * q), np.float64)
+        return np.asarray(evaluate_laws([cls.name], values, q, rates, 0.0 * q), np.float64)
 
 
 class ViscousCoulomb(FrictionLaw):
@@ -281,25 +281,25 @@ def law_names(friction: Any, opened: Sequence[str] = ()) -> tuple[str, ...]:
     )
 
 
-def compiled(names: Sequence[str]) -> tuple[str, ...]:
+def select_compiled_laws(names: Sequence[str]) -> tuple[str, ...]:
     """Select the laws that are part of compiled programs: those without memory."""
     return tuple(name for name in names if not LAWS[name].memory)
 
 
-def not_shared(names: Sequence[str]) -> list[str]:
+def list_unshareable_laws(names: Sequence[str]) -> list[str]:
     """Select the laws that depend on load or past motion, which redundant drives cannot have."""
     laws = {name: LAWS[name] for name in names}
     return [n for n, law in laws.items() if law.memory or law.share is not FrictionLaw.share]
 
 
-def keys_of(names: Sequence[str]) -> dict[str, Parameter]:
+def list_parameters(names: Sequence[str]) -> dict[str, Parameter]:
     """Return the parameters of laws by key, in order."""
     return {key: one for name in names for key, one in LAWS[name].parameters.items()}
 
 
 def linear_keys(names: Sequence[str]) -> tuple[str, ...]:
     """Return the keys of the linear parameters of the basic law and of the named laws."""
-    every = {**BASIC.parameters, **keys_of(names)}
+    every = {**BASIC.parameters, **list_parameters(names)}
     return tuple(key for key, one in every.items() if one.linear)
 
 
@@ -311,7 +311,7 @@ def turning_keys() -> frozenset[str]:
 
 def all_keys() -> dict[str, Parameter]:
     """Return all parameters of a drive's friction, those of the basic law first."""
-    return {**BASIC.parameters, **keys_of(tuple(LAWS))}
+    return {**BASIC.parameters, **list_parameters(tuple(LAWS))}
 
 
 def check_laws(friction: Any, path: str) -> None:
@@ -319,7 +319,7 @@ def check_laws(friction: Any, path: str) -> None:
 
     :raises ParameterError: a parameter is missing; the error names its field.
     """
-    for law in (LAWS[name] for name in compiled(tuple(LAWS))):
+    for law in (LAWS[name] for name in select_compiled_laws(tuple(LAWS))):
         linear = [key for key, one in law.parameters.items() if one.linear]
         used = np.any([references(getattr(friction, key)) != 0.0 for key in linear], axis=0)
         for key, one in law.parameters.items():
@@ -328,17 +328,17 @@ def check_laws(friction: Any, path: str) -> None:
                 raise ParameterError(f"{path}.{key}", 0.0, f"above zero where {' or '.join(linear)} is given")
 
 
-def taken(names: Sequence[str], values: Values, q: Any, rate: Any, load: Any) -> Any:
+def evaluate_laws(names: Sequence[str], values: Values, q: Any, rate: Any, load: Any) -> Any:
     """Return the friction of a drive by the named laws, without the basic law.
 
     :param names: names of the laws; other arguments as for :class:`FrictionLaw`.
     """
     speed, way = absolute(rate), sign(rate)
-    at_place, dry, share = parts(names, values, q, speed)
+    at_place, dry, share = sum_laws(names, values, q, speed)
     return at_place + (dry + share * absolute(load)) * way
 
 
-def parts(names: Sequence[str], values: Values, q: Any, speed: Any) -> tuple[Any, Any, Any]:
+def sum_laws(names: Sequence[str], values: Values, q: Any, speed: Any) -> tuple[Any, Any, Any]:
     """Sum the laws' efforts by position, dry efforts, and fractions of the load's magnitude."""
     laws = [LAWS[name] for name in names]
     at_place: Any = sum((law.by_position(values, q) for law in laws), 0.0)
@@ -354,18 +354,18 @@ def potential(names: Sequence[str], values: Values, q: Any) -> Any:
 
 def friction_values(names: Sequence[str], friction: Any) -> dict[str, Array]:
     """Return the parameters of laws, by key, from a friction section."""
-    return {key: np.asarray(getattr(friction, key), np.float64) for key in keys_of(names)}
+    return {key: np.asarray(getattr(friction, key), np.float64) for key in list_parameters(names)}
 
 
-def load_of(driving: Any, share: Any, way: Any) -> Any:
+def solve_load(driving: Any, share: Any, way: Any) -> Any:
     """Solve L + share |L| way = driving for the load L, with a share below one."""
     return driving / (1.0 + share * way * sign(driving))
 
 
-def bounds(held: Any, dry: Any, share: Any) -> tuple[Any, Any]:
+def bound_static_friction(held: Any, dry: Any, share: Any) -> tuple[Any, Any]:
     """Return the smallest and largest friction f of a joint at rest: |f| <= dry + share |held - f|.
 
     :param held: effort of the drive minus the efforts that depend on position and velocity.
     """
-    low, high = (held - load_of(held - way * dry, share, way) for way in (-1.0, 1.0))
+    low, high = (held - solve_load(held - way * dry, share, way) for way in (-1.0, 1.0))
     return low, high

@@ -229,7 +229,7 @@ class Graph:
 
         Virtual joints hold nothing.
         """
-        whole, own = self._welded, merged(self)[body]
+        whole, own = self._welded, map_welded_bodies(self)[body]
         true = {name: joint for name, joint in whole.joints.items() if not joint.virtual}
         return replace(whole, joints=true).joint_points(own) or whole.joint_points(own)
 
@@ -314,7 +314,7 @@ class Graph:
             raise ParameterError("joints", list(self.joints), "at least one with actuated: true")
         pairs = [(joint.inner, joint.outer) for joint in self.joints.values()]
         pairs += [(rod.inner, rod.outer) for rod in self.rods.values()]
-        reached = groups([BASE, *self.bodies], pairs)[0]
+        reached = group_connected([BASE, *self.bodies], pairs)[0]
         for name in self.bodies:
             if name not in reached:
                 raise ParameterError(f"bodies.{name}", name, "a body that joints or rods connect to the base")
@@ -340,7 +340,7 @@ def rotation_about_z(angle: Any) -> Array:
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def groups(things: Iterable[T], pairs: Iterable[tuple[T, T]]) -> list[list[T]]:
+def group_connected(things: Iterable[T], pairs: Iterable[tuple[T, T]]) -> list[list[T]]:
     """Group the things that pairs connect, in the order of the things; ignore other pairs."""
     own = {thing: [thing] for thing in things}
     place = {thing: k for k, thing in enumerate(own)}
@@ -350,17 +350,17 @@ def groups(things: Iterable[T], pairs: Iterable[tuple[T, T]]) -> list[list[T]]:
     return [sorted(group, key=place.__getitem__) for group in found.values()]
 
 
-def merged(graph: Graph) -> dict[str, str]:
+def map_welded_bodies(graph: Graph) -> dict[str, str]:
     """Return for each body, the ground too, the first of those that fixed joints unite with it."""
     fixed = [(j.inner, j.outer) for j in graph.joints.values() if j.kind == "fixed"]
     if not fixed:
         return {name: name for name in (BASE, *graph.bodies)}
-    return {name: one[0] for one in groups([BASE, *graph.bodies], fixed) for name in one}
+    return {name: one[0] for one in group_connected([BASE, *graph.bodies], fixed) for name in one}
 
 
 def weld(graph: Graph) -> Graph:
     """Return the graph with the bodies that fixed joints unite as one body, by the first one's name."""
-    own = merged(graph)
+    own = map_welded_bodies(graph)
     if all(name == first for name, first in own.items()):
         return graph
     joints = {n: replace(j, inner=own[j.inner], outer=own[j.outer]) for n, j in graph.joints.items()}
@@ -373,7 +373,7 @@ def weld(graph: Graph) -> Graph:
     )
 
 
-def spanning(things: Iterable[T], pairs: Mapping[K, tuple[T, T]]) -> list[K]:
+def choose_spanning_pairs(things: Iterable[T], pairs: Mapping[K, tuple[T, T]]) -> list[K]:
     """Choose the pairs of a spanning forest: each joins what no earlier pair does."""
     own = {thing: [thing] for thing in things}
     return [key for key, pair in pairs.items() if _join(own, *pair)]
@@ -389,13 +389,13 @@ def _join(own: dict[T, list[T]], a: T, b: T) -> bool:
     return True
 
 
-def limbs(graph: Graph) -> list[list[str]]:
+def list_limbs(graph: Graph) -> list[list[str]]:
     """Return the bodies and rods of each limb: those connected without the base and the platform."""
     parts = [name for name in (*graph.bodies, *graph.rods) if name not in (BASE, graph.platform)]
-    return groups(parts, graph.links)
+    return group_connected(parts, graph.links)
 
 
-def limb_numbers(graph: Graph) -> dict[str, int]:
+def number_limbs(graph: Graph) -> dict[str, int]:
     """Return the number of the limb of each body and rod; -1 for the platform."""
-    number = {name: k for k, limb in enumerate(limbs(graph)) for name in limb}
+    number = {name: k for k, limb in enumerate(list_limbs(graph)) for name in limb}
     return number | {graph.platform: -1}

@@ -22,7 +22,7 @@ from pkm_twin.machine.friction import all_keys, check_laws
 from pkm_twin.machine.graph import Body, Graph, Joint, Rod, array, rotation_about_z
 from pkm_twin.machine.joints import TURN, TYPES, Freedom, unit
 from pkm_twin.machine.members import Tube, compliances
-from pkm_twin.machine.places import Keys, number_in, path_of, placed
+from pkm_twin.machine.places import Keys, join_path, number_in, replace_numbers
 from pkm_twin.machine.sections import (
     MAX_PLACE,
     DriveSpec,
@@ -315,7 +315,7 @@ def read_limbs(field: str, value: Any) -> list[Limb]:
     limbs = []
     for k, section in enumerate(value if listed else [value] if value else []):
         place = (field, k) if listed else (field,)
-        path = path_of(place)
+        path = join_path(place)
         limb = schema.build(LimbFile, section, path)
         entries: dict[str, Any] = {
             kind: {
@@ -331,7 +331,7 @@ def read_limbs(field: str, value: Any) -> list[Limb]:
     return limbs
 
 
-def written_out(
+def expand_limbs(
     kinds: Mapping[str, Mapping[str, Any]], limbs: Sequence[Limb]
 ) -> tuple[dict[str, dict[str, Any]], dict[tuple[str, str], Source]]:
     """Return all entries by kind and name, with the rotated copies of limbs, and the source of each."""
@@ -348,9 +348,9 @@ def written_out(
         for number, azimuth, kind, name, entry in rows:
             full, place = f"{name}_{number + 1}", (*limb.place, kind, name)
             if full in result[kind]:
-                where = path_of(sources[kind, full].path)
+                where = join_path(sources[kind, full].path)
                 raise ParameterError(
-                    path_of(place),
+                    join_path(place),
                     full,
                     f"a name of its own for each copy: {full} stands for "
                     f"{where} already, so rename one of the two, for example {name}_b",
@@ -412,13 +412,13 @@ def numbered_entry(entry: T, values: Mapping[Keys, Any], azimuth: float, path: s
         return turned
     entry = _spelled(entry, values)
     if azimuth:
-        made = placed(_turned(entry, -azimuth, set(), 0), values, path)
+        made = replace_numbers(_turned(entry, -azimuth, set(), 0), values, path)
         back, whole = _turned(made, azimuth, set(), 0), copy.copy(entry)
         for key in {str(key) for key, *_ in values}:
             vars(whole)[key] = getattr(back, key)
         made = whole
     else:
-        made = placed(entry, values, path)
+        made = replace_numbers(entry, values, path)
     if ("rotor_inertia",) in values:
         vars(made)["drive"] = None
     return made
@@ -448,7 +448,7 @@ def _spelled(entry: T, places: Iterable[Keys]) -> T:
 
 
 def graph_of_entries(platform: str, specs: Mapping[str, Mapping[str, Any]], origin: Array | None = None) -> Graph:
-    """Return the graph of a file's entries, as :func:`written_out` gives them.
+    """Return the graph of a file's entries, as :func:`expand_limbs` gives them.
 
     :param origin: the platform's reference point, default its centre of mass.
     :raises ParameterError: no bodies, or a platform that is none of them.
@@ -467,7 +467,7 @@ def graph_of_entries(platform: str, specs: Mapping[str, Mapping[str, Any]], orig
     return Graph(bodies, joints, rods, platform, place)
 
 
-def shared_by(graph: Graph, leads: Sequence[str], how: Redundancy, effort: Any) -> Graph:
+def share_efforts(graph: Graph, leads: Sequence[str], how: Redundancy, effort: Any) -> Graph:
     """Return the graph in which redundant actuated joints follow the leading ones, and share efforts.
 
     :param effort: limits of all actuated joints, shape (n,); None, or all infinite, for no limits.
@@ -503,7 +503,7 @@ def shared_by(graph: Graph, leads: Sequence[str], how: Redundancy, effort: Any) 
     return dataclasses.replace(graph, joints=joints, sharing=sharing)
 
 
-def drives_of(graph: Graph, joints: Mapping[str, JointSpec]) -> dict[str, Any]:
+def collect_drives(graph: Graph, joints: Mapping[str, JointSpec]) -> dict[str, Any]:
     """Return the friction and limits of the actuated joints."""
     drives = graph.actuated
     limits = [joints[j].limits or LimitSpec() for j in drives]
@@ -520,7 +520,7 @@ def drives_of(graph: Graph, joints: Mapping[str, JointSpec]) -> dict[str, Any]:
 
 
 def drive_numbers(friction: Any, limits: Any, k: int) -> tuple[dict[str, float], dict[str, Any]]:
-    """Return friction and limits of the actuated joint k by key, from those of :func:`drives_of`.
+    """Return friction and limits of the actuated joint k by key, from those of :func:`collect_drives`.
 
     Infinite limits are left out.
     """
@@ -534,7 +534,7 @@ def drive_numbers(friction: Any, limits: Any, k: int) -> tuple[dict[str, float],
     return {key: float(getattr(friction, key)[k]) for key in all_keys()}, found
 
 
-def driven(joint: JointSpec, friction: Any, limits: Any, k: int) -> JointSpec:
+def set_drive(joint: JointSpec, friction: Any, limits: Any, k: int) -> JointSpec:
     """Return the entry of the actuated joint k with other friction and limits."""
     rub, bounds = drive_numbers(friction, limits, k)
     if "position" in bounds:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array, Indices
 from pkm_twin.codegen.expressions import plain
-from pkm_twin.machine.friction import all_keys, keys_of
+from pkm_twin.machine.friction import all_keys, list_parameters
 from pkm_twin.machine.graph import Graph, Joint
 from pkm_twin.machine.tree import Tree
 
@@ -116,7 +116,7 @@ class Layout:
             n,
             n,
             n,
-            n * len(keys_of(graph.laws)),
+            n * len(list_parameters(graph.laws)),
             n,
             3 * len(loaded_joints(graph)),
         ]
@@ -135,7 +135,7 @@ class Layout:
     @property
     def friction(self) -> Indices:
         """Indices of all friction parameters that efforts are linear in, also of passive joints."""
-        starts, keys = self.starts, keys_of(self.tree.graph.laws).values()
+        starts, keys = self.starts, list_parameters(self.tree.graph.laws).values()
         passive = np.arange(starts[8], starts[9])
         rubs = passive[np.arange(len(passive)) % 3 < 2]
         linear = np.repeat([one.linear for one in keys], len(self.tree.graph.actuated))
@@ -144,7 +144,7 @@ class Layout:
 
     def laws(self, part: Objects) -> dict[str, Objects]:
         """Split part ``laws`` into the friction laws' parameters by key, shape (n,) each."""
-        keys = keys_of(self.tree.graph.laws)
+        keys = list_parameters(self.tree.graph.laws)
         return dict(zip(keys, part.reshape(len(keys), -1) if keys else [], strict=True))
 
     def body(self, name: str) -> slice:
@@ -183,7 +183,7 @@ class Layout:
                     friction.viscous,
                     friction.coulomb,
                     friction.offset,
-                    *(getattr(friction, key) for key in keys_of(self.tree.graph.laws)),
+                    *(getattr(friction, key) for key in list_parameters(self.tree.graph.laws)),
                     [j.rotor_inertia for j in drives],
                     [value for j in loaded_joints(graph) for value in (j.viscous, j.coulomb, j.rotor_inertia)],
                 ]

@@ -27,7 +27,7 @@ def unit(vector: ArrayLike) -> Array:
     return np.asarray(values / norm(values))
 
 
-def across(axis: Array) -> tuple[Array, Array]:
+def perpendicular_axes(axis: Array) -> tuple[Array, Array]:
     """Return two unit vectors that form a right-handed orthogonal triple with an axis."""
     first = np.zeros(3)
     # Rounding keeps the choice the same where two components differ by the last bit only.
@@ -122,7 +122,7 @@ class JointType:
             return UNITS
         first, other = axes[0], axes[-1]
         if cls.count == 1:
-            return np.array([first, *across(first)])
+            return np.array([first, *perpendicular_axes(first)])
         second = unit(other - (other @ first) * first)
         return np.array([first, second, np.cross(first, second)])
 
@@ -135,11 +135,11 @@ class JointType:
 HELD: Final[dict[str, Callable[[Array, float], Sequence[Constraint]]]] = {
     "point": lambda _, __: [Constraint("point")],
     "turns": lambda _, __: [Constraint("angle", UNITS[i], UNITS[(i + 1) % 3]) for i in range(3)],
-    "line": lambda axes, _: [Constraint("plane", e) for e in across(axes[0])],
+    "line": lambda axes, _: [Constraint("plane", e) for e in perpendicular_axes(axes[0])],
     "flat": lambda axes, _: [Constraint("plane", axes[0])],
-    "direction": lambda axes, _: [Constraint("angle", e, axes[0]) for e in across(axes[0])],
+    "direction": lambda axes, _: [Constraint("angle", e, axes[0]) for e in perpendicular_axes(axes[0])],
     "crossing": lambda axes, _: [Constraint("angle", axes[0], axes[1], axes=(0, 1))],
-    "thread": lambda axes, pitch: [Constraint("screw", axes[0], across(axes[0])[0], slide=pitch)],
+    "thread": lambda axes, pitch: [Constraint("screw", axes[0], perpendicular_axes(axes[0])[0], slide=pitch)],
 }
 """Constraints as functions of a joint's axes and pitch, by name."""
 
@@ -208,7 +208,7 @@ class Planar(JointType):
     @classmethod
     def freedoms(cls, axes: Array, pitch: float) -> tuple[Freedom, ...]:
         """Return two slides, then the rotation."""
-        slides = (Freedom(axis, turns=False, slide=1.0) for axis in across(axes[0]))
+        slides = (Freedom(axis, turns=False, slide=1.0) for axis in perpendicular_axes(axes[0]))
         return (*slides, Freedom(axes[0]))
 
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, warn
-from pkm_twin.machine.graph import spanning
+from pkm_twin.machine.graph import choose_spanning_pairs
 from pkm_twin.machine.joints import TYPES, Free, Freedom, JointType, single_names
 from pkm_twin.machine.names import plain_name
 from pkm_twin.machine.rotations import Pose
@@ -233,7 +233,7 @@ def order_from_root(root: str, joints: Iterable[Joint]) -> list[TreeJoint]:
     return order
 
 
-def singles(joint: Joint, parent: str, child: str, taken: set[str]) -> list[Single]:
+def split_freedoms(joint: Joint, parent: str, child: str, taken: set[str]) -> list[Single]:
     """Replace a joint by joints of one freedom in series, with named links between them.
 
     :param taken: names of links, to which those of the links between are added.
@@ -254,7 +254,7 @@ def singles(joint: Joint, parent: str, child: str, taken: set[str]) -> list[Sing
     ]
 
 
-def screws(parts: Sequence[Single]) -> list[tuple[str, str, float, float]]:
+def list_screws(parts: Sequence[Single]) -> list[tuple[str, str, float, float]]:
     """Return slide, turn, factor and offset of each screw: slide = offset + factor turn."""
     return [
         (slide.name, turn.name, turn.joint.pitch, -turn.joint.pitch * turn.home)
@@ -287,7 +287,7 @@ def span_tree(
         return joint.name in excluded, joint.kind != "fixed", joint.name not in actuated, joint.type.cost
 
     pairs = {joint.name: (joint.inner, joint.outer) for joint in sorted(joints.values(), key=rank)}
-    chosen = set(spanning(links, pairs))
+    chosen = set(choose_spanning_pairs(links, pairs))
     tree = {name: joint for name, joint in joints.items() if name in chosen}
     reached = {WORLD, *(one.child for one in order_from_root(WORLD, tree.values()))}
     for name in links:

@@ -109,7 +109,7 @@ def _require_bounded(path: Path, top: ET.Element, folder: Path, depth: int = 0) 
                 if not included.resolve().is_relative_to(folder.resolve()):
                     raise ParameterError("include.file", text, f"a file below {folder}")
                 if included.exists():
-                    inner = urdf_xml.elements(included)
+                    inner = urdf_xml.parse_xml(included)
                     words += _require_bounded(included, inner, folder, depth + 1)
         repeated = key in ("count", "nrow", "ncol", "width", "height")
         if repeated and math.prod(map(_read_count, text.split())) > MAX_PARTS:

@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.machine.loop_tree import Link, LoopTree, Single, TreeJoint, screws, singles
+from pkm_twin.machine.loop_tree import Link, LoopTree, Single, TreeJoint, list_screws, split_freedoms
 from pkm_twin.machine.urdf_write import GROUND, PLATFORM, number_text
 
 
@@ -41,7 +41,7 @@ def write_mjcf(tree: LoopTree, gravity: Array, efforts: Sequence[float] | None =
     places = {GROUND: np.zeros(3)}
     home: list[float] = []
     parts: list[Single] = []
-    for parent, child, row in rows(tree):
+    for parent, child, row in list_bodies(tree):
         link = tree.links[child]
         place = row[0].joint.at if row else link.frame.position
         elements[child] = _body(elements[parent], link, place, places[parent])
@@ -71,7 +71,7 @@ def write_mjcf(tree: LoopTree, gravity: Array, efforts: Sequence[float] | None =
             ET.SubElement(loops, "connect", {"name": closure.name, **ends, "anchor": at})
     for body, split in welds:
         ET.SubElement(loops, "weld", name=f"{split}_weld", body1=body, body2=split)
-    for slide, turn, factor, offset in screws(parts):
+    for slide, turn, factor, offset in list_screws(parts):
         fit = number_text([offset, factor, 0.0, 0.0, 0.0])
         ET.SubElement(loops, "joint", name=slide, joint1=slide, joint2=turn, polycoef=fit)
     motors = ET.SubElement(top, "actuator")
@@ -84,7 +84,7 @@ def write_mjcf(tree: LoopTree, gravity: Array, efforts: Sequence[float] | None =
     return ET.tostring(top, encoding="unicode") + "\n"
 
 
-def rows(tree: LoopTree) -> list[tuple[str, str, list[Single]]]:
+def list_bodies(tree: LoopTree) -> list[tuple[str, str, list[Single]]]:
     """List bodies depth first, as MuJoCo numbers joints: parent, child, single joints between.
 
     A link without mass is left out where one joint alone goes on from it: its joints then belong to
@@ -98,7 +98,7 @@ def rows(tree: LoopTree) -> list[tuple[str, str, list[Single]]]:
     todo = [(GROUND, one, list[Single]()) for one in after.get(GROUND, [])[::-1]]
     while todo:
         start, (joint, parent, child), row = todo.pop()
-        row = row + [one for one in singles(joint, parent, child, set()) if one.kind != "fixed"]
+        row = row + [one for one in split_freedoms(joint, parent, child, set()) if one.kind != "fixed"]
         link, beyond = tree.links[child], after.get(child, [])
         empty = not link.mass and not link.inertia.any()
         if empty and len(beyond) == 1 and child not in held:

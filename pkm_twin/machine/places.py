@@ -22,7 +22,7 @@ Keys = tuple[Key, ...]
 """Location of a number in a file: keys of mappings and indices of lists."""
 
 
-def keys_of(path: str) -> list[Key]:
+def split_path(path: str) -> list[Key]:
     """Split a dotted path into keys and indices: ``joints.arm.at[2]`` has four.
 
     :raises ParameterError: the path is not a text or has no key.
@@ -34,7 +34,7 @@ def keys_of(path: str) -> list[Key]:
     return keys
 
 
-def path_of(keys: Iterable[Key]) -> str:
+def join_path(keys: Iterable[Key]) -> str:
     """Join keys and indices to a dotted path."""
     parts = (f"[{key}]" if isinstance(key, int) else f".{key}" for key in keys)
     return "".join(parts).removeprefix(".")
@@ -42,14 +42,14 @@ def path_of(keys: Iterable[Key]) -> str:
 
 def full_keys(path: str) -> list[Key]:
     """Split a path; a principal moment ``inertia[0]`` becomes ``inertia[0][0]``."""
-    keys = keys_of(path)
+    keys = split_path(path)
     moment = keys[-2:-1] == ["inertia"] and isinstance(keys[-1], int)
     return [*keys, keys[-1]] if moment else keys
 
 
 def list_file_numbers(sections: Mapping[str, Any], units: Mapping[str, Any]) -> dict[str, tuple[float, str]]:
     """Return every number in sections of a file, by dotted path, with its unit."""
-    data = {k: v for k, v in given(sections).items() if k not in ("uncertainty", "tolerances")}
+    data = {k: v for k, v in drop_missing(sections).items() if k not in ("uncertainty", "tolerances")}
     return dict(_iterate_numbers(data, units, ""))
 
 
@@ -65,14 +65,14 @@ def _iterate_numbers(data: Any, units: Any, path: str) -> Iterator[tuple[str, tu
         yield path, (float(data), units if isinstance(units, str) else "")
 
 
-def given(data: Any) -> Any:
+def drop_missing(data: Any) -> Any:
     """Drop entries without a value, which a file leaves out and which are derived."""
     if not isinstance(data, Mapping):
         return data
-    return {key: given(value) for key, value in data.items() if value is not None}
+    return {key: drop_missing(value) for key, value in data.items() if value is not None}
 
 
-def placed(section: T, changes: Mapping[tuple[Key, ...], Any], path: str = "") -> T:
+def replace_numbers(section: T, changes: Mapping[tuple[Key, ...], Any], path: str = "") -> T:
     """Return a section with other numbers or expressions at some locations, without any check.
 
     :param section: a dataclass, mapping, sequence or array.
@@ -102,7 +102,7 @@ def placed(section: T, changes: Mapping[tuple[Key, ...], Any], path: str = "") -
         single = np.isscalar(old) or isinstance(old, Expression)
         if isinstance(old, bool | str | None) or leaf != single:
             raise unknown_number(here, [])
-        result[name] = deeper[()] if leaf else placed(old, deeper, here)
+        result[name] = deeper[()] if leaf else replace_numbers(old, deeper, here)
     if whole:
         made = object.__new__(type(section))
         vars(made).update(result)
@@ -135,13 +135,13 @@ def check_number(section: Any, keys: Sequence[Key], path: str) -> None:
         left.pop(0)
 
 
-def merged(data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+def merge_data(data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     """Merge changes into plain data, recursively for mappings."""
     result = dict(data)
     for key, value in changes.items():
         old = result.get(key)
         both = isinstance(value, Mapping) and isinstance(old, Mapping)
-        result[key] = merged(dict(old or {}), value) if both else schema.plain(value)
+        result[key] = merge_data(dict(old or {}), value) if both else schema.plain(value)
     return result
 
 
@@ -155,11 +155,11 @@ def number_in(data: Any, keys: Iterable[Key], path: str) -> float:
         try:
             there = there[key]
         except (KeyError, IndexError, TypeError):
-            whole = keys_of(path)
+            whole = split_path(path)
             before = whole[: len(whole) - len(keys) + i]
             names: list[Key] = list(there) if isinstance(there, Mapping) else []
             names += range(len(there)) if isinstance(there, list | tuple) else ()
-            near = [path_of([*before, name, *keys[i + 1 :]]) for name in names]
+            near = [join_path([*before, name, *keys[i + 1 :]]) for name in names]
             raise unknown_number(path, near) from None
     if isinstance(there, bool) or not isinstance(there, int | float):
         raise unknown_number(path, [])
@@ -168,7 +168,7 @@ def number_in(data: Any, keys: Iterable[Key], path: str) -> float:
 
 def has_entry(data: Any, path: str) -> bool:
     """Return whether plain data has a value at a path."""
-    for key in keys_of(path):
+    for key in split_path(path):
         if isinstance(data, Mapping):
             data = data.get(key)
         elif isinstance(data, list) and isinstance(key, int) and key < len(data):

@@ -26,7 +26,7 @@ from pkm_twin.machine.joints import TURN, TYPES
 from pkm_twin.machine.loop_tree import WORLD, Joint, Link, LoopTree, hold_in_world, link_of, span_tree
 from pkm_twin.machine.precision import rounding_error
 from pkm_twin.machine.rotations import Pose, from_rpy
-from pkm_twin.machine.urdf_control import actuated_joints, find_marked, read_beside
+from pkm_twin.machine.urdf_control import actuated_joints, find_marked, read_companion_yaml
 
 MODEL: Final = "__model__"
 """Name of a model's own frame."""
@@ -59,7 +59,7 @@ def read(path: Path, top: ET.Element, actuated: Sequence[str] | None = None) -> 
     if not version or int(version[1]) not in VERSIONS:
         raise ParameterError("sdf.version", text or None, "1.4 to 1.12")
     outside, element, gravity = _model(path, top)
-    title, world = urdf_xml.name(element, ()), Model(outside, int(version[1]))
+    title, world = urdf_xml.read_name(element, ()), Model(outside, int(version[1]))
     model = world.models[title]
     links = {WORLD: Link(WORLD)}
     moments = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
@@ -80,7 +80,7 @@ def read(path: Path, top: ET.Element, actuated: Sequence[str] | None = None) -> 
         joint = _joint(path, part, world)
         own = urdf_xml.free_name(joint.name, taken, "_of_world")
         joints[own] = replace(joint, name=own)
-    joints |= {joint.name: joint for joint in welds(path, top, title, places, taken)}
+    joints |= {joint.name: joint for joint in read_welds(path, top, title, places, taken)}
     for name, _ in model.all("frame"):
         owner = model.link(name)
         if owner in links and name not in links:
@@ -92,7 +92,7 @@ def read(path: Path, top: ET.Element, actuated: Sequence[str] | None = None) -> 
     # Where only some joints have an effort limit, these are motors.
     limited = [name for name, joint in joints.items() if "effort" in joint.limits]
     motors, marked = actuated_joints(
-        path, types, faults, actuated, lambda: find_marked(top, read_beside(path), limited)
+        path, types, faults, actuated, lambda: find_marked(top, read_companion_yaml(path), limited)
     )
     tree, closures = span_tree(links, joints, motors)
     positions = [part for part in element.iter() if part.tag in ("pose", "xyz")]
@@ -115,11 +115,11 @@ def _model(path: Path, top: ET.Element) -> tuple[ET.Element, ET.Element, list[fl
     worlds = top.findall("world")
     gravity = None
     for world in worlds:
-        stated = urdf_xml.single(world, "gravity", "world")
+        stated = urdf_xml.find_single_child(world, "gravity", "world")
         if stated is None:
             stated = world.find("physics/gravity")  # Where SDF had it until 1.5.
         if stated is not None:
-            gravity = urdf_xml.vector(stated.text, "world.gravity", 3).tolist()
+            gravity = urdf_xml.parse_vector(stated.text, "world.gravity", 3).tolist()
     models = [(root, one) for root in (top, *worlds) for one in root.findall("model")]
     moving = [(root, one) for root, one in models if not foreign.flag(one, "static", False)]
     if not moving:
@@ -154,11 +154,11 @@ class Model:
         for part in sorted(element, key=lambda part: part.tag == "joint"):
             if part.tag in ("link", "joint", "frame", "model"):
                 # Until 1.6 a joint and a link could have one name; it meant the link.
-                name = urdf_xml.name(part, self.parts if version >= 7 else ())
+                name = urdf_xml.read_name(part, self.parts if version >= 7 else ())
                 self.parts.setdefault(name, part)
         self.models: dict[str, Model] = {}
         for one in element.findall("model"):
-            self.models[urdf_xml.name(one, self.models)] = Model(one, version, self)
+            self.models[urdf_xml.read_name(one, self.models)] = Model(one, version, self)
         if outer and not self.static:
             _reject_includes(element.findall("include"))
         self._known: dict[str, Pose | None] = {}
@@ -232,7 +232,7 @@ class Model:
 
     def _posed(self, part: ET.Element, default: str, scope: Model | None) -> Pose:
         where = f"{part.tag}.{part.get('name')}.pose"
-        stated = urdf_xml.single(part, "pose", where)
+        stated = urdf_xml.find_single_child(part, "pose", where)
         # ``frame`` is what ``relative_to`` was called until 1.6.
         name = default
         if stated is not None:
@@ -279,35 +279,35 @@ def pose(element: ET.Element | None, where: str) -> Pose:
     turn = element.get("rotation_format", "euler_rpy")
     if turn not in ("euler_rpy", "quat_xyzw"):
         raise UnknownNameError(f"{where}.rotation_format", turn, ["euler_rpy", "quat_xyzw"])
-    values = urdf_xml.vector(text, where, 7 if turn == "quat_xyzw" else 6)
+    values = urdf_xml.parse_vector(text, where, 7 if turn == "quat_xyzw" else 6)
     if turn == "quat_xyzw":
-        return Pose(urdf_xml.quaternion(values[3:], where), values[:3])
-    degrees = urdf_xml.boolean(element.get("degrees", "false"), f"{where}.degrees")
+        return Pose(urdf_xml.rotation_of_quaternion(values[3:], where), values[:3])
+    degrees = urdf_xml.parse_boolean(element.get("degrees", "false"), f"{where}.degrees")
     return Pose(from_rpy(np.radians(values[3:]) if degrees else values[3:]), values[:3])
 
 
 def _number(element: ET.Element | None, tag: str, where: str, default: float, low: float = -math.inf) -> float:
     """Read a number that stands in an element of its own."""
-    stated = urdf_xml.single(element, tag, where)
-    return default if stated is None else urdf_xml.number((stated.text or "").strip(), f"{where}.{tag}", low)
+    stated = urdf_xml.find_single_child(element, tag, where)
+    return default if stated is None else urdf_xml.parse_number((stated.text or "").strip(), f"{where}.{tag}", low)
 
 
 def _link(path: Path, element: ET.Element, name: str, rounding: float) -> Link:
     """Read mass and inertia; SDF has 1 kg and 1 kg m2 where the file leaves them out."""
     where = f"link.{name}.inertial"
-    inertial = urdf_xml.single(element, "inertial", f"link.{name}")
-    if inertial is not None and urdf_xml.boolean(inertial.get("auto", "false"), f"{where}.auto"):
+    inertial = urdf_xml.find_single_child(element, "inertial", f"link.{name}")
+    if inertial is not None and urdf_xml.parse_boolean(inertial.get("auto", "false"), f"{where}.auto"):
         raise ParameterError(f"{where}.auto", "true", "a mass and an inertia as numbers")
     if inertial is not None and inertial.find("fluid_added_mass") is not None:
         raise ParameterError(f"{where}.fluid_added_mass", "given", "a machine in air")
     stated = set() if inertial is None else {part.tag for part in inertial.iter()}
     if missing := [key for key in ("mass", "ixx", "iyy", "izz") if key not in stated]:
         warn(path, f"link {name} has no {', '.join(missing)}: SDF then has 1 kg and 1 kg m2")
-    inertia = urdf_xml.single(inertial, "inertia", where)
+    inertia = urdf_xml.find_single_child(inertial, "inertia", where)
     return link_of(
         name,
         _number(inertial, "mass", where, 1.0),
-        pose(urdf_xml.single(inertial, "pose", where), where),
+        pose(urdf_xml.find_single_child(inertial, "pose", where), where),
         lambda key: _number(inertia, key, f"{where}.inertia", float(key[1] == key[2])),
         rounding,
     )
@@ -315,14 +315,14 @@ def _link(path: Path, element: ET.Element, name: str, rounding: float) -> Link:
 
 def _joint(path: Path, part: ET.Element, model: Model) -> Joint:
     """Read a joint with its frame in the world."""
-    name = model.prefix + urdf_xml.name(part, ())
+    name = model.prefix + urdf_xml.read_name(part, ())
     where = f"joint.{name}"
     place = partial(model.place, where=where)
     ends = [_end(part, tag) for tag in ("parent", "child")]
     links = model.link(ends[0], f"{where}.parent"), model.link(ends[1], f"{where}.child")
     if links[0] == links[1]:
         raise ParameterError(where, links[0], "a joint between two links")
-    stated = urdf_xml.single(part, "pose", where)
+    stated = urdf_xml.find_single_child(part, "pose", where)
     named = None if stated is None else stated.get("relative_to") or stated.get("frame")
     at = place(named or ends[1]) @ pose(stated, f"{where}.pose")
     frame = model.parts.get(ends[0])
@@ -359,25 +359,25 @@ def joint_of(
     axes, limits = list[Array](), dict[str, Any]()
     viscous = coulomb = pitch = 0.0
     for k, tag in enumerate(("axis", "axis2")):
-        own, element = f"{where}.{tag}", urdf_xml.single(part, tag, where)
+        own, element = f"{where}.{tag}", urdf_xml.find_single_child(part, tag, where)
         if k < count:
-            stated = urdf_xml.single(element, "xyz", own)
-            local = urdf_xml.direction("0 0 1" if stated is None else stated.text, f"{own}.xyz")
+            stated = urdf_xml.find_single_child(element, "xyz", own)
+            local = urdf_xml.parse_direction("0 0 1" if stated is None else stated.text, f"{own}.xyz")
             frame = "" if stated is None else stated.get("expressed_in", "")
             old = None if element is None else element.findtext("use_parent_model_frame")
-            if version == VERSIONS[0] or (old and urdf_xml.boolean(old, f"{own}.use_parent_model_frame")):
+            if version == VERSIONS[0] or (old and urdf_xml.parse_boolean(old, f"{own}.use_parent_model_frame")):
                 frame = frame or MODEL
             axes.append((turn(frame) if frame else place.rotation) @ local)
-        dynamics = urdf_xml.single(element, "dynamics", own)
+        dynamics = urdf_xml.find_single_child(element, "dynamics", own)
         viscous = max(viscous, _number(dynamics, "damping", f"{own}.dynamics", 0.0, 0.0))
         coulomb = max(coulomb, _number(dynamics, "friction", f"{own}.dynamics", 0.0, 0.0))
-        limit = urdf_xml.single(element, "limit", where)
+        limit = urdf_xml.find_single_child(element, "limit", where)
         if limit is not None and tag == "axis" and kind in ("revolute", "prismatic", "helical"):
             given = {child.tag: (child.text or "").strip() for child in limit}
             # -1 is no limit, and one end of a range may stand alone.
             given = {k: v for k, v in given.items() if k in ("lower", "upper") or v[:1] != "-"}
             given = {"lower": "-inf", "upper": "inf", **given}
-            limits = urdf_xml.limits(given, where, "revolute" if kind == "helical" else kind)
+            limits = urdf_xml.read_limits(given, where, "revolute" if kind == "helical" else kind)
     if kind == "helical" and part.find("screw_thread_pitch") is None and part.find("thread_pitch") is not None:
         # ``thread_pitch`` is in rad/m, positive for a left-handed thread; its successor is in m per turn.
         thread = _number(part, "thread_pitch", where, 1.0)
@@ -390,7 +390,7 @@ def joint_of(
     return Joint(name, kind, *links, (place, place), rows, 0.0, limits, viscous, coulomb, pitch=pitch)
 
 
-def welds(path: Path, top: ET.Element, model: str, places: Mapping[str, Pose], taken: set[str]) -> Iterator[Joint]:
+def read_welds(path: Path, top: ET.Element, model: str, places: Mapping[str, Pose], taken: set[str]) -> Iterator[Joint]:
     """Read the pairs of links that Gazebo's plugins hold together, as they are drawn.
 
     :param taken: names of joints and closures; the welds' own are added.

@@ -15,7 +15,7 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine import urdf_xml
-from pkm_twin.machine.loop_tree import Capsule, Link, LoopTree, Single, singles
+from pkm_twin.machine.loop_tree import Capsule, Link, LoopTree, Single, split_freedoms
 from pkm_twin.machine.rotations import Pose
 from pkm_twin.machine.urdf_write import GROUND, PLATFORM, number_text, rpy_along
 
@@ -45,7 +45,7 @@ def write_sdf(tree: LoopTree) -> str:
     rows: list[tuple[str, str, str, str, Array, Sequence[Single]]] = []
     for joint in joints:
         parent, child = ends.get(joint.name, (joint.inner, joint.outer))
-        row = singles(joint, parent, child, {PLATFORM, *links})
+        row = split_freedoms(joint, parent, child, {PLATFORM, *links})
         if joint.kind in KINDS:
             rows.append((joint.name, KINDS[joint.kind], parent, child, joint.at, row))
             continue

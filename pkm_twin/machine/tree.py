@@ -22,8 +22,8 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import norm, plain, reference, snapped, snapped_all
 from pkm_twin.codegen.operations import atan2
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.graph import BASE, Graph, rotation_about_z, spanning
-from pkm_twin.machine.joints import Freedom, across, unit
+from pkm_twin.machine.graph import BASE, Graph, choose_spanning_pairs, rotation_about_z
+from pkm_twin.machine.joints import Freedom, perpendicular_axes, unit
 
 BALL: Final = (1.0, 0.0, 0.0, 0.0)
 FREE: Final = (*BALL, 0.0, 0.0, 0.0)
@@ -36,7 +36,7 @@ def axes_with_z(z: Array, hint: Array) -> Array:
     """Return axes, as columns, with the given z; x points towards the hint."""
     x = hint - (hint @ z) * z
     size = norm(x)
-    x = x / size if reference(size) > PARALLEL_TOLERANCE else across(z)[0]
+    x = x / size if reference(size) > PARALLEL_TOLERANCE else perpendicular_axes(z)[0]
     return np.array([x, np.cross(z, x), z]).T
 
 
@@ -176,7 +176,7 @@ class Tree:
         pairs |= {joint.name: (joint.inner, joint.outer) for joint in order}
         pairs |= {(body,): (BASE, body) for body in graph.bodies}
         neighbours: dict[str, list[tuple[str, str | None]]] = {n: [] for n in (BASE, *graph.bodies)}
-        spanned = spanning(neighbours, pairs)
+        spanned = choose_spanning_pairs(neighbours, pairs)
         for key in spanned:
             a, b = pairs[key]
             name = key if isinstance(key, str) else None

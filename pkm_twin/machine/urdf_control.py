@@ -33,7 +33,7 @@ UNCOUPLED: Final = "joints without coupling; a base and a platform (--base) can 
 """What is expected in place of joints that follow others."""
 
 
-def read_beside(path: Path) -> dict[str, Any]:
+def read_companion_yaml(path: Path) -> dict[str, Any]:
     """Read the YAML file of the same name if it has closures or motors; else return nothing."""
     keys = ("closed_loop", "type", "name_mot", "joint_name", "joint_type")
     for suffix in (".yaml", ".yml"):
@@ -51,7 +51,7 @@ def read_beside(path: Path) -> dict[str, Any]:
     return {}
 
 
-def marked_joints(top: ET.Element, mark: str) -> list[str]:
+def list_marked_joints(top: ET.Element, mark: str) -> list[str]:
     """List the joints that are actuated by one of :data:`MARKS`, in the order of the file."""
     if mark == "plugin":
         moving = re.compile(r"(ApplyJointForce|Joint(Position|Trajectory|Force)?Controller)$")
@@ -62,13 +62,13 @@ def marked_joints(top: ET.Element, mark: str) -> list[str]:
         joints = [
             joint
             for joint in top.findall("joint")
-            if urdf_xml.boolean(joint.get("independent", "false"), f"joint.{joint.get('name')}.independent")
+            if urdf_xml.parse_boolean(joint.get("independent", "false"), f"joint.{joint.get('name')}.independent")
         ]
     else:
         joints = [joint for owner in top.iter(mark) for joint in owner.findall("joint")]
     if mark == "ros2_control":
         joints = [joint for joint in joints if joint.find("command_interface") is not None]
-    names = [urdf_xml.name(joint, ()) for joint in joints]
+    names = [urdf_xml.read_name(joint, ()) for joint in joints]
     # A joint may have several transmissions.
     return list(dict.fromkeys(names)) if mark == "transmission" else names
 
@@ -89,7 +89,7 @@ def find_marked(
     if names := [str(name) for name in beside.get("name_mot", [])]:
         return names, "name_mot", ways
     for mark in MARKS:
-        if names := marked_joints(top, mark):
+        if names := list_marked_joints(top, mark):
             return names, mark, ways
     return others or (), "limit.effort", ways
 
@@ -164,13 +164,13 @@ def tree_names(joints: Iterable[str], controls: Iterable[Control]) -> dict[str, 
     return {name: urdf_xml.free_name(name + MODEL, taken, MODEL) if name in drives else name for name in names}
 
 
-def take_drives(robot: ET.Element) -> dict[str, dict[str, Any]]:
+def convert_drives(robot: ET.Element) -> dict[str, dict[str, Any]]:
     """Convert a controller's URDF to the model's numbers, in place; return entries of a joint map.
 
     Other ``<mimic>`` elements stay.
     """
     joints = {joint.get("name", ""): joint for joint in robot.findall("joint")}
-    commanded = marked_joints(robot, "ros2_control")
+    commanded = list_marked_joints(robot, "ros2_control")
     parents = {_end(joint, "parent") for joint in joints.values()}
     links = {link.get("name", ""): link for link in robot.findall("link")}
     followers: dict[str, list[ET.Element]] = {}
@@ -189,8 +189,8 @@ def take_drives(robot: ET.Element) -> dict[str, dict[str, Any]]:
         back = Control(
             joint.get("name", ""),
             name,
-            urdf_xml.number(mimic.get("multiplier", "1"), f"{where}.multiplier"),
-            urdf_xml.number(mimic.get("offset", "0"), f"{where}.offset"),
+            urdf_xml.parse_number(mimic.get("multiplier", "1"), f"{where}.multiplier"),
+            urdf_xml.parse_number(mimic.get("offset", "0"), f"{where}.offset"),
         )
         if not back.factor:
             continue
@@ -208,7 +208,7 @@ def take_drives(robot: ET.Element) -> dict[str, dict[str, Any]]:
         for parameter in joint.iter("param") if name in found else ():
             key = parameter.get("name", "")
             if key in ("initial_value", "rotor_inertia", "friction_offset"):
-                value = urdf_xml.number((parameter.text or "").strip(), f"ros2_control.{name}.{key}")
+                value = urdf_xml.parse_number((parameter.text or "").strip(), f"ros2_control.{name}.{key}")
                 parameter.text = f"{found[name].value(key, value):.14g}"
         joint.set("name", own.get(name, name))
     entries = {}

@@ -25,7 +25,7 @@ from pkm_twin.machine.joints import TYPES
 from pkm_twin.machine.loop_tree import Fault, Joint, Link, LoopTree, link_of, order_from_root
 from pkm_twin.machine.precision import rounding_error
 from pkm_twin.machine.rotations import Pose
-from pkm_twin.machine.urdf_control import UNCOUPLED, actuated_joints, find_marked, read_beside
+from pkm_twin.machine.urdf_control import UNCOUPLED, actuated_joints, find_marked, read_companion_yaml
 
 _LOOPS: Final = {name: name for name in ("revolute", "prismatic", "fixed", "spherical")} | {"continuous": "revolute"}
 """Types of ``<loop>`` and ``<loop_joint>`` elements."""
@@ -79,13 +79,13 @@ def read(path: Path, robot: ET.Element, actuated: Sequence[str] | None = None) -
     links: dict[str, Link] = {}
     rounding = rounding_error(word for e in robot.iter("inertia") for word in e.attrib.values())
     for element in robot.findall("link"):
-        name = urdf_xml.name(element, links)
+        name = urdf_xml.read_name(element, links)
         links[name] = _link(element, name, rounding)
     if not links:
         raise ParameterError(str(path), "no <link>", "a robot with links")
     joints: dict[str, Joint] = {}
     for element in robot.findall("joint"):
-        name = urdf_xml.name(element, joints)
+        name = urdf_xml.read_name(element, joints)
         joints[name] = _joint(element, name, links)
     faults: list[Fault] = []
     for element in robot.findall("joint[mimic]"):
@@ -106,7 +106,7 @@ def read(path: Path, robot: ET.Element, actuated: Sequence[str] | None = None) -
             unknown.add("gazebo.gravity")
     if unknown:
         warn(path, f"elements that are not read: {', '.join(sorted(unknown))}")
-    beside = read_beside(path)
+    beside = read_companion_yaml(path)
     closures = _closures(robot, beside, links, joints)
     _warn_of_units(path, robot, joints, closures)
     frames = {root: Pose()}
@@ -158,18 +158,18 @@ def _of_gazebo(path: Path, robot: ET.Element, frames: Mapping[str, Pose], taken:
 
     found: list[Joint] = []
     for element in robot.findall("gazebo/joint"):
-        taken.add(name := urdf_xml.name(element, taken))
+        taken.add(name := urdf_xml.read_name(element, taken))
         where = f"gazebo.joint.{name}"
         first, second = (
-            urdf_xml.known_link(f"{where}.{end}", (element.findtext(end) or "").strip(), frames)
+            urdf_xml.find_link(f"{where}.{end}", (element.findtext(end) or "").strip(), frames)
             for end in ("parent", "child")
         )
-        stated = urdf_xml.single(element, "pose", where)
+        stated = urdf_xml.find_single_child(element, "pose", where)
         start = second if stated is None else stated.get("relative_to") or second
-        start = urdf_xml.known_link(f"{where}.pose", start, frames)
+        start = urdf_xml.find_link(f"{where}.pose", start, frames)
         place = frames[start] @ sdf_file.pose(stated, f"{where}.pose")
         found.append(sdf_file.joint_of(path, element, name, (first, second), place, turn))
-    found += sdf_file.welds(path, robot, robot.get("name", ""), frames, taken)
+    found += sdf_file.read_welds(path, robot, robot.get("name", ""), frames, taken)
     return {joint.name: joint.closing() for joint in found}
 
 
@@ -184,20 +184,20 @@ def _find_unread(element: ET.Element) -> Iterator[str]:
 
 
 def _link(element: ET.Element, name: str, rounding: float) -> Link:
-    inertial = urdf_xml.single(element, "inertial", f"link.{name}")
+    inertial = urdf_xml.find_single_child(element, "inertial", f"link.{name}")
     if inertial is None:
         return Link(name)
     where = f"link.{name}.inertial"
-    mass = urdf_xml.single(inertial, "mass", where)
-    value = urdf_xml.number(None if mass is None else mass.get("value"), f"{where}.mass")
-    inertia = urdf_xml.single(inertial, "inertia", where)
+    mass = urdf_xml.find_single_child(inertial, "mass", where)
+    value = urdf_xml.parse_number(None if mass is None else mass.get("value"), f"{where}.mass")
+    inertia = urdf_xml.find_single_child(inertial, "inertia", where)
     if inertia is None:
         raise ParameterError(f"{where}.inertia", None, "an <inertia> for the mass, kg m2")
-    pose = urdf_xml.origin(urdf_xml.single(inertial, "origin", where), where)
+    pose = urdf_xml.read_origin(urdf_xml.find_single_child(inertial, "origin", where), where)
 
     def moment(key: str) -> float:
         stated = inertia.get(key, None if key[1] == key[2] else "0")
-        return urdf_xml.number(stated, f"{where}.inertia.{key}")
+        return urdf_xml.parse_number(stated, f"{where}.inertia.{key}")
 
     return link_of(name, value, pose, moment, rounding)
 
@@ -209,15 +209,16 @@ def _joint(element: ET.Element, name: str, links: dict[str, Link]) -> Joint:
     if kind not in _LOOPS:
         raise UnknownNameError(f"{where}.type", kind, _LOOPS)
     parent, child = (
-        urdf_xml.reference(urdf_xml.single(element, end, where), f"{where}.{end}", links) for end in ("parent", "child")
+        urdf_xml.read_link_reference(urdf_xml.find_single_child(element, end, where), f"{where}.{end}", links)
+        for end in ("parent", "child")
     )
-    origin = urdf_xml.origin(urdf_xml.single(element, "origin", where), where)
+    origin = urdf_xml.read_origin(urdf_xml.find_single_child(element, "origin", where), where)
     bare = kind in ("fixed", "spherical")
-    axes = [] if bare else [urdf_xml.axis(element, "axis", where)]
-    limit = urdf_xml.single(element, "limit", where)
-    limits = {} if limit is None or bare else urdf_xml.limits(limit.attrib, where, kind)
+    axes = [] if bare else [urdf_xml.read_axis(element, "axis", where)]
+    limit = urdf_xml.find_single_child(element, "limit", where)
+    limits = {} if limit is None or bare else urdf_xml.read_limits(limit.attrib, where, kind)
     frames, rows = (origin, Pose()), np.reshape(axes, (-1, 3))
-    viscous, coulomb = urdf_xml.friction(element, where)
+    viscous, coulomb = urdf_xml.read_friction(element, where)
     return Joint(name, _LOOPS[kind], parent, child, frames, rows, 0.0, limits, viscous, coulomb)
 
 
@@ -231,7 +232,7 @@ def _take_screw(element: ET.Element, joints: dict[str, Joint], links: dict[str, 
     assert mimic is not None  # noqa: S101
     turn = joints.get(mimic.get("joint", ""), slide)
     numbers = (mimic.get("multiplier", "1"), mimic.get("offset", "0"))
-    pitch, offset = (urdf_xml.number(number, where) for number in numbers)
+    pitch, offset = (urdf_xml.parse_number(number, where) for number in numbers)
     between = [one.name for one in joints.values() if slide.inner in (one.inner, one.outer)]
     # The axes of a screw's rotation and slide agree but for rounding.
     pose, same = slide.frames[0], partial(np.allclose, atol=1e-9)
@@ -293,7 +294,7 @@ def _closures(
     found, taken = dict[str, Joint](), {*joints}
     for tag, read_one in (("constraint", _constraint), ("loop", _loop), ("loop_joint", _loop)):
         for element in robot.findall(tag):
-            taken.add(name := urdf_xml.name(element, taken))
+            taken.add(name := urdf_xml.read_name(element, taken))
             found[name] = read_one(element, name, links)
     pairs = beside.get("closed_loop", [])
     kinds = beside.get("type", ["6d"] * len(pairs))
@@ -306,7 +307,7 @@ def _closures(
         meeting = {"6d": "fixed", "3d": "spherical"}
         if str(kind).lower() not in meeting:
             raise UnknownNameError(f"type[{i}]", kind, meeting)
-        known = [urdf_xml.known_link(f"closed_loop[{i}]", name, [*links, *joints]) for name in pair]
+        known = [urdf_xml.find_link(f"closed_loop[{i}]", name, [*links, *joints]) for name in pair]
         # A joint's frame is its child link's frame.
         ends = [joints[name].outer if name in joints else name for name in known]
         name = "_".join(pair)
@@ -323,19 +324,23 @@ def _constraint(element: ET.Element, name: str, links: Collection[str]) -> Joint
     if kind not in _CONSTRAINTS:
         raise UnknownNameError(f"{where}.type", element.get("type"), _CONSTRAINTS)
     tags = ("parent", "child")
-    urdf_xml.only(element, where, ["dynamics", *(f"{tag}{part}" for tag in tags for part in ("", "_origin", "_axis"))])
+    urdf_xml.reject_other_children(
+        element, where, ["dynamics", *(f"{tag}{part}" for tag in tags for part in ("", "_origin", "_axis"))]
+    )
     for tag in tags:
-        urdf_xml.only(urdf_xml.single(element, tag, where), f"{where}.{tag}", ())
-    ends = [urdf_xml.reference(element.find(tag), f"{where}.{tag}", links) for tag in tags]
+        urdf_xml.reject_other_children(urdf_xml.find_single_child(element, tag, where), f"{where}.{tag}", ())
+    ends = [urdf_xml.read_link_reference(element.find(tag), f"{where}.{tag}", links) for tag in tags]
     origins = [f"{tag}_origin" for tag in tags]
-    frames = [urdf_xml.origin(urdf_xml.single(element, tag, where), f"{where}.{tag}") for tag in origins]
-    parent = urdf_xml.axis(element, "parent_axis", where)
+    frames = [
+        urdf_xml.read_origin(urdf_xml.find_single_child(element, tag, where), f"{where}.{tag}") for tag in origins
+    ]
+    parent = urdf_xml.read_axis(element, "parent_axis", where)
     # The child's axis is the parent's where the two frames meet, unless it is given.
     alone = kind != "universal" and element.find("child_axis") is None
-    child = parent if alone else urdf_xml.axis(element, "child_axis", where)
-    viscous, coulomb = urdf_xml.friction(element, where)
+    child = parent if alone else urdf_xml.read_axis(element, "child_axis", where)
+    viscous, coulomb = urdf_xml.read_friction(element, where)
     closure = _closure(name, _CONSTRAINTS[kind], ends, frames, (parent, child))
-    angle = urdf_xml.number(element.get("angle", repr(math.pi / 2)), f"{where}.angle")
+    angle = urdf_xml.parse_number(element.get("angle", repr(math.pi / 2)), f"{where}.angle")
     cosine = math.cos(angle) if "angle" in element.attrib and kind == "universal" else 0.0
     return replace(closure, viscous=viscous, coulomb=coulomb, cosine=cosine)
 
@@ -348,20 +353,20 @@ def _loop(element: ET.Element, name: str, links: Collection[str]) -> Joint:
     # URDF+ has the spelling sucessor too.
     nested = element.tag == "loop"
     tags = (("predecessor",), ("successor", "sucessor")) if nested else (("link1",), ("link2",))
-    urdf_xml.only(element, where, ("axis", *tags[0], *tags[1]))
+    urdf_xml.reject_other_children(element, where, ("axis", *tags[0], *tags[1]))
     ends, frames = [], []
     for spellings in tags:
         own = f"{where}.{spellings[0]}"
-        stated = [e for tag in spellings if (e := urdf_xml.single(element, tag, where)) is not None]
+        stated = [e for tag in spellings if (e := urdf_xml.find_single_child(element, tag, where)) is not None]
         if len(stated) > 1:
             raise ParameterError(own, f"{len(stated)} elements", "one")
         end = stated[0] if stated else None
-        ends.append(urdf_xml.reference(end, own, links))
+        ends.append(urdf_xml.read_link_reference(end, own, links))
         if nested:
-            urdf_xml.only(end, own, ("origin",))
-            end = urdf_xml.single(end, "origin", own)
-        frames.append(urdf_xml.origin(end, own))
-    axis = urdf_xml.axis(element, "axis", where)
+            urdf_xml.reject_other_children(end, own, ("origin",))
+            end = urdf_xml.find_single_child(end, "origin", own)
+        frames.append(urdf_xml.read_origin(end, own))
+    axis = urdf_xml.read_axis(element, "axis", where)
     return _closure(name, _LOOPS[kind], ends, frames, (axis, axis))
 
 
@@ -380,7 +385,7 @@ def _parameters(robot: ET.Element, actuated: tuple[str, ...], key: str, low: flo
         states = [s for s in joint.findall("state_interface") if s.get("name") == "position"]
         for param in [one for part in (joint, *states) for one in part.findall("param")]:
             if param.get("name") == key and name in actuated:
-                found[name] = urdf_xml.number((param.text or "").strip(), f"ros2_control.{name}.{key}", low)
+                found[name] = urdf_xml.parse_number((param.text or "").strip(), f"ros2_control.{name}.{key}", low)
     return found
 
 
@@ -394,13 +399,15 @@ def _warn_of_units(path: Path, robot: ET.Element, joints: dict[str, Joint], clos
         warn(path, f"{where}: an offset of {sizes[where]:g} m; a URDF uses metres; are these millimetres?")
     for top in robot:
         angles = [word for e in top.iter() for word in e.get("rpy", "").split()]
-        largest = max((abs(urdf_xml.number(word, "rpy")) for word in angles), default=0.0)
+        largest = max((abs(urdf_xml.parse_number(word, "rpy")) for word in angles), default=0.0)
         if largest > 2.0 * math.pi + 1e-6:
             name = f"{top.tag}.{top.get('name')}.rpy"
             warn(path, f"{name}: {largest:g} rad; a URDF uses radians; are these degrees?")
 
 
-def visuals(path: Path, robot: ET.Element, places: Mapping[str, Pose], bodies: Mapping[str, str]) -> Iterator[Visual]:
+def read_visuals(
+    path: Path, robot: ET.Element, places: Mapping[str, Pose], bodies: Mapping[str, str]
+) -> Iterator[Visual]:
     """Read the meshes of a machine's links; leave out invalid ones with a warning.
 
     :param places: frames of the links at home, base axes. ``bodies``: the body of each link.
@@ -415,8 +422,8 @@ def visuals(path: Path, robot: ET.Element, places: Mapping[str, Pose], bodies: M
                 continue
             where = f"link.{name}.visual.{number}"
             try:
-                pose = urdf_xml.origin(urdf_xml.single(visual, "origin", where), where)
-                scale = urdf_xml.vector(mesh.get("scale", "1 1 1"), f"{where}.scale", 3)
+                pose = urdf_xml.read_origin(urdf_xml.find_single_child(visual, "origin", where), where)
+                scale = urdf_xml.parse_vector(mesh.get("scale", "1 1 1"), f"{where}.scale", 3)
                 if not mesh.get("filename"):
                     raise ParameterError(f"{where}.filename", None, "the file of the mesh")
             except ParameterError as error:

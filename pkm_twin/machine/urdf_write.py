@@ -20,7 +20,7 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine import rotations, urdf_xml
-from pkm_twin.machine.loop_tree import Joint, Link, LoopTree, Single, screws, singles
+from pkm_twin.machine.loop_tree import Joint, Link, LoopTree, Single, list_screws, split_freedoms
 from pkm_twin.machine.rotations import Pose
 from pkm_twin.machine.urdf_control import Control, tree_names
 from pkm_twin.machine.urdf_xml import UNLIMITED
@@ -59,7 +59,7 @@ def write_urdf(tree: LoopTree, hardware: str = MOCK, prefix: str = "", controls:
     elements = {part.name: _joint(robot, part, places) for part in parts}
     for name, element in elements.items():
         element.set("name", names[name])
-    for slide, turn, *line in screws(parts):
+    for slide, turn, *line in list_screws(parts):
         _follow(elements[slide], names[turn], *line)
     for closure in tree.closures:
         _closure(robot, closure, places)
@@ -97,7 +97,7 @@ def parts_of(tree: LoopTree) -> list[Single]:
     place, taken = Pose(position=tree.origin), {PLATFORM, *tree.links}
     tool = Joint(f"{PLATFORM}_frame", "fixed", tree.platform, PLATFORM, (place, place))
     hung = (*tree.tree_joints, (tool, tree.platform, PLATFORM))
-    return [part for one in hung for part in singles(*one, taken)]
+    return [part for one in hung for part in split_freedoms(*one, taken)]
 
 
 def _inertial(link: ET.Element, body: Link, place: Array) -> None:

@@ -27,7 +27,7 @@ UNLIMITED: Final = {"revolute": 2.0 * math.pi - 1e-6, "prismatic": 10.0, "veloci
 """Limits of this size count as none, because a URDF needs numbers: rad, m, per second, N m or N."""
 
 
-def elements(path: Path) -> ET.Element:
+def parse_xml(path: Path) -> ET.Element:
     """Parse an XML file without a document type, thus without entities; return its top element.
 
     :raises ParameterError: not readable, too large, too deep, or not well-formed.
@@ -65,7 +65,7 @@ def elements(path: Path) -> ET.Element:
     return builder.close()
 
 
-def name(element: ET.Element, taken: Container[str]) -> str:
+def read_name(element: ET.Element, taken: Container[str]) -> str:
     """Read an element's name, which has to be unique."""
     own = element.get("name")
     kind = element.tag
@@ -84,7 +84,7 @@ def free_name(name: str, taken: set[str], more: str = "_") -> str:
     return name
 
 
-def only(element: ET.Element | None, where: str, tags: Collection[str]) -> None:
+def reject_other_children(element: ET.Element | None, where: str, tags: Collection[str]) -> None:
     """Reject child elements with other tags: a misspelt element would be taken for a missing one.
 
     :raises UnknownNameError: another child; the error names the closest valid tag.
@@ -94,7 +94,7 @@ def only(element: ET.Element | None, where: str, tags: Collection[str]) -> None:
             raise UnknownNameError(where, child.tag, tags)
 
 
-def single(element: ET.Element | None, tag: str, where: str) -> ET.Element | None:
+def find_single_child(element: ET.Element | None, tag: str, where: str) -> ET.Element | None:
     """Find the only child element of a tag; None if there is none, or no element.
 
     :raises ParameterError: there are several, of which a parser may take any.
@@ -105,7 +105,7 @@ def single(element: ET.Element | None, tag: str, where: str) -> ET.Element | Non
     return found[0] if found else None
 
 
-def known_link(where: str, name: str, links: Collection[str]) -> str:
+def find_link(where: str, name: str, links: Collection[str]) -> str:
     """Find a link by its name, or by the name of the part of a robot file that it was written for.
 
     :raises UnknownNameError: there is none.
@@ -116,7 +116,7 @@ def known_link(where: str, name: str, links: Collection[str]) -> str:
     raise UnknownNameError(where, name, links)
 
 
-def reference(element: ET.Element | None, where: str, links: Collection[str]) -> str:
+def read_link_reference(element: ET.Element | None, where: str, links: Collection[str]) -> str:
     """Find the link that an element names."""
     link = None if element is None else element.get("link", element.get("name"))
     if link is None:
@@ -126,34 +126,34 @@ def reference(element: ET.Element | None, where: str, links: Collection[str]) ->
     return link
 
 
-def axis(element: ET.Element, tag: str, where: str) -> Array:
+def read_axis(element: ET.Element, tag: str, where: str) -> Array:
     """Read a unit vector; a missing one is x, as in every URDF."""
-    stated = single(element, tag, where)
-    return direction("1 0 0" if stated is None else stated.get("xyz"), f"{where}.{tag}")
+    stated = find_single_child(element, tag, where)
+    return parse_direction("1 0 0" if stated is None else stated.get("xyz"), f"{where}.{tag}")
 
 
-def direction(text: str | None, where: str) -> Array:
+def parse_direction(text: str | None, where: str) -> Array:
     """Parse a vector that is not zero, and scale it to length 1; shape (3,)."""
-    value = vector(text, where, 3)
+    value = parse_vector(text, where, 3)
     size = float(np.linalg.norm(value))
     if not size > 1e-9:
         raise ParameterError(where, value.tolist(), "a vector that is not zero")
     return value / size
 
 
-def origin(element: ET.Element | None, where: str) -> Pose:
+def read_origin(element: ET.Element | None, where: str) -> Pose:
     """Read the frame of an ``<origin>`` or a similar element; the identity without one."""
     if element is None:
         return Pose()
-    position = vector(element.get("xyz", "0 0 0"), f"{where}.xyz", 3)
+    position = parse_vector(element.get("xyz", "0 0 0"), f"{where}.xyz", 3)
     turned = element.get("quat_xyzw")
     if turned is not None:
-        return Pose(quaternion(vector(turned, f"{where}.quat_xyzw", 4), where), position)
-    angles = vector(element.get("rpy", "0 0 0"), f"{where}.rpy", 3)
+        return Pose(rotation_of_quaternion(parse_vector(turned, f"{where}.quat_xyzw", 4), where), position)
+    angles = parse_vector(element.get("rpy", "0 0 0"), f"{where}.rpy", 3)
     return Pose(from_rpy(angles), position)
 
 
-def quaternion(values: Array, where: str) -> Array:
+def rotation_of_quaternion(values: Array, where: str) -> Array:
     """Return the rotation of a quaternion x, y, z, w of any length but zero, shape (3, 3)."""
     size = float(np.linalg.norm(values))
     if not size > 1e-9:
@@ -161,15 +161,15 @@ def quaternion(values: Array, where: str) -> Array:
     return from_quaternion(*(values / size).tolist())
 
 
-def vector(text: str | None, where: str, size: int) -> Array:
+def parse_vector(text: str | None, where: str, size: int) -> Array:
     """Parse ``size`` finite numbers, shape (size,)."""
     items = (text or "").split()
     if len(items) != size:
         raise ParameterError(where, text, f"{size} numbers")
-    return np.array([number(item, where) for item in items])
+    return np.array([parse_number(item, where) for item in items])
 
 
-def number(text: str | None, where: str, low: float = -math.inf) -> float:
+def parse_number(text: str | None, where: str, low: float = -math.inf) -> float:
     """Parse a finite number; ``low``: zero if it may not be negative."""
     try:
         value = decimal(text or "")
@@ -182,18 +182,18 @@ def number(text: str | None, where: str, low: float = -math.inf) -> float:
     return value
 
 
-def friction(element: ET.Element, where: str) -> tuple[float, float]:
+def read_friction(element: ET.Element, where: str) -> tuple[float, float]:
     """Read the viscous and Coulomb friction of a joint or closure; zero if not stated."""
     for tag in ("dynamics", "joint_properties"):
-        dynamics = single(element, tag, where)
+        dynamics = find_single_child(element, tag, where)
         if dynamics is not None:
             keys = ("damping", "friction")
-            viscous, coulomb = (number(dynamics.get(key, "0"), f"{where}.{tag}.{key}", 0.0) for key in keys)
+            viscous, coulomb = (parse_number(dynamics.get(key, "0"), f"{where}.{tag}.{key}", 0.0) for key in keys)
             return viscous, coulomb
     return 0.0, 0.0
 
 
-def boolean(text: str, where: str) -> bool:
+def parse_boolean(text: str, where: str) -> bool:
     """Parse a truth value, in the spellings of XML schemas and of Python."""
     value = {"true": True, "1": True, "false": False, "0": False}.get(text.strip().lower())
     if value is None:
@@ -201,7 +201,7 @@ def boolean(text: str, where: str) -> bool:
     return value
 
 
-def limits(limit: Mapping[str, str], where: str, kind: str) -> dict[str, Any]:
+def read_limits(limit: Mapping[str, str], where: str, kind: str) -> dict[str, Any]:
     """Read stated limits; zero, an empty range and :data:`UNLIMITED` sizes mean no limit."""
     found: dict[str, Any] = {}
     if kind in UNLIMITED and (limit.get("lower") or limit.get("upper")):
@@ -223,4 +223,4 @@ def limits(limit: Mapping[str, str], where: str, kind: str) -> dict[str, Any]:
 def _bound(text: str, where: str) -> float:
     """Parse a limit, which alone of all numbers may be infinite."""
     endless = text.strip().lower().lstrip("+-") in ("inf", "infinity")
-    return float(text) if endless else number(text, where)
+    return float(text) if endless else parse_number(text, where)

@@ -19,7 +19,7 @@ from pkm_twin.maps.kind import Case, Found, Kind, concatenate_found, evaluate_ki
 from pkm_twin.maps.sweep import check
 from pkm_twin.report import plots
 from pkm_twin.robot.robot import Robot
-from pkm_twin.robot.workspace import counts
+from pkm_twin.robot.workspace import belong_to_workspace
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +150,7 @@ def along(
     pose = robot.forward(q)
     known = np.ones(len(pose), bool)
     least = kind.least if least is None else least
-    counted = counts(robot, q, pose, known, least, least_clearance)
+    counted = belong_to_workspace(robot, q, pose, known, least, least_clearance)
     changes: list[int] = []
     if wrench is not None:
         changes = (1 + np.flatnonzero((wrench[1:] != wrench[:-1]).any(1))).tolist()

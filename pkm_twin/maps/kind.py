@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.robot.robot import Robot
-from pkm_twin.robot.workspace import counts
+from pkm_twin.robot.workspace import belong_to_workspace
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -273,7 +273,7 @@ class Space:
     def counts(self, q: Array, pose: Array, known: Mask, case: Case) -> Mask:
         """Return which joint positions (k, n) and poses (k, m) count, of those known."""
         bound = -math.inf if case.interfering else self.least_clearance
-        return counts(self.robot, q, pose, known & self.encircled(pose), self.least, bound)
+        return belong_to_workspace(self.robot, q, pose, known & self.encircled(pose), self.least, bound)
 
     def encircled(self, pose: Array) -> Mask:
         """Return which poses (k, m) are inside the circles, linear between their heights."""

@@ -15,7 +15,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.maps.kind import Case, Kind, Space, Worst, evaluate_kind
 from pkm_twin.robot.robot import Robot
-from pkm_twin.robot.workspace import causes, passing_singularity, reachable, try_forward
+from pkm_twin.robot.workspace import describe_causes, passing_singularity, reachable, try_forward
 
 GRID_SIDE: Final = 33
 """Poses along each coordinate of the grid that bounds a workspace, or a plane's visible part."""
@@ -84,7 +84,11 @@ def find_worst(space: Space, case: Case, starts: Array, tell: Callable[[float], 
                 f"{passing_singularity(best, '')} or less: "
                 f"no pose has a singularity index of {space.least:g} or more (best: {best:.3g})",
             )
-        why = "" if inside(tried).any() else causes(robot, *space.state(tried), space.least, space.least_clearance)
+        why = (
+            ""
+            if inside(tried).any()
+            else describe_causes(robot, *space.state(tried), space.least, space.least_clearance)
+        )
         bound = "a workspace in which some pose counts"
         raise ParameterError("robot", robot.name, f"{bound}: {why}" if why else bound)
     q, pose, _ = space.state(x[None])

@@ -15,7 +15,7 @@ from pkm_twin.errors import ParameterError, PkmTwinError, one_line
 from pkm_twin.files import replace_file
 from pkm_twin.machine.formulas import PARAMETERS
 from pkm_twin.machine.machine_yaml import describe_machine_yaml, edit_yaml
-from pkm_twin.machine.places import given, has_entry, keys_of
+from pkm_twin.machine.places import drop_missing, has_entry, split_path
 from pkm_twin.machine.strict_yaml import parse_yaml
 from pkm_twin.mechanisms.catalogue import TREES, load, robot_of_data, robot_path
 from pkm_twin.robot.robot import Robot
@@ -66,10 +66,10 @@ def edited_yaml(robot: Robot, source: str, values: Mapping[str, Fitted | Chosen]
     if not all(has_entry(data, name) for name in plain):
         moved = {name: values[name].value for name in plain if name.startswith(f"{PARAMETERS}.")}
         values = {name: fit for name, fit in values.items() if name not in moved}
-        sections = given((robot.numbered(moved) if moved else robot).parameter_sections())
+        sections = drop_missing((robot.numbered(moved) if moved else robot).parameter_sections())
         told = {k: v for k, v in sections.items() if v or not isinstance(v, Mapping)}
         text = describe_machine_yaml({"mechanism": robot.mechanism, **told})
-    keys = {name: tuple(keys_of(name)) for name in values}
+    keys = {name: tuple(split_path(name)) for name in values}
     return edit_yaml(
         text,
         {keys[name]: fit.value for name, fit in values.items()},

@@ -27,7 +27,7 @@ from pkm_twin.kinematics.scheme import check_masses, choose_coordinates, choose_
 from pkm_twin.machine import schema
 from pkm_twin.machine.file_parts import find_parts, find_passive_limits
 from pkm_twin.machine.formulas import PARAMETERS, Book
-from pkm_twin.machine.friction import not_shared
+from pkm_twin.machine.friction import list_unshareable_laws
 from pkm_twin.machine.graph import Graph
 from pkm_twin.machine.graph_file import (
     KINDS,
@@ -37,26 +37,26 @@ from pkm_twin.machine.graph_file import (
     Limb,
     RodSpec,
     Source,
-    driven,
-    drives_of,
+    collect_drives,
+    expand_limbs,
     graph_of_entries,
     number_of_entry,
     numbered_entry,
     read_limbs,
-    shared_by,
-    written_out,
+    set_drive,
+    share_efforts,
 )
 from pkm_twin.machine.members import Parts
 from pkm_twin.machine.places import (
     Keys,
     check_number,
+    drop_missing,
     full_keys,
-    given,
     has_entry,
-    keys_of,
+    join_path,
     number_in,
-    path_of,
-    placed,
+    replace_numbers,
+    split_path,
 )
 from pkm_twin.machine.precision import rounding_error
 from pkm_twin.machine.reach import PassiveLimit
@@ -130,7 +130,7 @@ class Machine(TwinRobot):
         book = Book.of(data)
         file = schema.build(MachineFile, book.marked(data))
         specs: Mapping[str, Mapping[str, Any]]
-        specs, sources = written_out({kind: getattr(file, kind) for kind in KINDS}, file.limbs)
+        specs, sources = expand_limbs({kind: getattr(file, kind) for kind in KINDS}, file.limbs)
         graph = graph_of_entries(file.platform, specs, file.origin)
         graph.check()
         # Numbers that follow from expressions are exact.
@@ -139,9 +139,9 @@ class Machine(TwinRobot):
             graph = graph_of_entries(file.platform, specs, file.origin)
         if len(graph.actuated) > MAX_JOINTS:
             raise ParameterError("joints", len(graph.actuated), f"at most {MAX_JOINTS} actuated joints")
-        own = drives_of(graph, specs["joints"])
+        own = collect_drives(graph, specs["joints"])
         leads = choose_leads(graph, file.redundancy.leads or (), len(file.pose or ()))
-        graph = shared_by(graph, leads, file.redundancy, own["limits"].effort)
+        graph = share_efforts(graph, leads, file.redundancy, own["limits"].effort)
         known = dict(COORDINATES)
         if file.angles:
             known = {name: known[name] for name in "xyz"}
@@ -191,11 +191,11 @@ class Machine(TwinRobot):
             return made
         joints = dict(made.specs["joints"])
         for k, name in enumerate(made.joint_names):
-            joints[name] = driven(joints[name], made.friction, made.limits, k)
+            joints[name] = set_drive(joints[name], made.friction, made.limits, k)
         specs = {**made.specs, "joints": joints}
         described = graph_of_entries(made.described.platform, specs, made.described.origin)
         leads = choose_leads(described, made.redundancy.leads or made.described.leads)
-        described = shared_by(described, leads, made.redundancy, made.limits.effort)
+        described = share_efforts(described, leads, made.redundancy, made.limits.effort)
         made = dataclasses.replace(made, specs=specs, described=described)
         made.check_laws()
         return made
@@ -205,7 +205,7 @@ class Machine(TwinRobot):
 
         :raises ParameterError: by the law.
         """
-        if self.redundant and (bad := not_shared(self.laws)):
+        if self.redundant and (bad := list_unshareable_laws(self.laws)):
             raise ParameterError(
                 "friction",
                 bad[0],
@@ -230,10 +230,10 @@ class Machine(TwinRobot):
             found = list(self.named(keys))
             for kind, name, where, azimuth in found:
                 order = 2 if keys[0] == kind else 1 if where == ("azimuth",) else 0
-                place = path_of(keys[: len(keys) - len(where)])
+                place = join_path(keys[: len(keys) - len(where)])
                 changes.setdefault((kind, name, order, place, azimuth), {})[where] = value
             if not found and keys[0] == "origin":
-                origin = placed({"origin": origin}, {tuple(keys): value})["origin"]
+                origin = replace_numbers({"origin": origin}, {tuple(keys): value})["origin"]
             elif not found:
                 rest[path] = value
         for (kind, name, _, place, azimuth), new in sorted(changes.items(), key=lambda c: c[0][2]):
@@ -243,9 +243,9 @@ class Machine(TwinRobot):
                 sources[kind, name] = dataclasses.replace(sources[kind, name], azimuth=turned)
         described = graph_of_entries(self.described.platform, specs, origin)
         made = super().numbered(rest)
-        own = drives_of(described, specs["joints"])
+        own = collect_drives(described, specs["joints"])
         leads, sharing = self.described.leads, made.redundancy
-        described = shared_by(described, leads, sharing, own["limits"].effort)
+        described = share_efforts(described, leads, sharing, own["limits"].effort)
         return dataclasses.replace(made, described=described, specs=specs, sources=sources, book=book, **own)
 
     def with_file_values(self, values: Mapping[str, Any]) -> Any:
@@ -256,7 +256,7 @@ class Machine(TwinRobot):
         if not kept or not all(has_entry(data, path) for path in values):
             return super().with_file_values(values)
         for path, value in values.items():
-            *keys, last = keys_of(path)
+            *keys, last = split_path(path)
             reduce(getitem, keys, data)[last] = value
         return type(self).from_data(data, self.name)
 
@@ -287,11 +287,11 @@ class Machine(TwinRobot):
 
     def own_path(self, path: str) -> str:
         """Return the path at the joint's entry of a drive's friction or limit: friction.viscous[0]."""
-        section, key, k, *rest = [*keys_of(path), "", ""]
+        section, key, k, *rest = [*split_path(path), "", ""]
         drive = section in ("friction", "limits") and isinstance(k, int)
         if not drive or int(k) >= self.joints_count:
             return path
-        return path_of(["joints", self.joint_names[int(k)], section, key, *rest[:-2]])
+        return join_path(["joints", self.joint_names[int(k)], section, key, *rest[:-2]])
 
     def named(self, keys: Sequence[str | int]) -> Iterator[tuple[str, str, Keys, float]]:
         """Yield the entries that keys name: all copies of a limb's entry, with its azimuth."""
@@ -423,7 +423,7 @@ class Machine(TwinRobot):
         told: dict[str, dict[str, dict[str, Any]]] = {kind: {} for kind in KINDS}
         for kind, word in _ELASTIC:
             for name, spec in self.specs[kind].items():
-                value = given(schema.plain(getattr(spec, word)))
+                value = drop_missing(schema.plain(getattr(spec, word)))
                 if value is not None:
                     told[kind].setdefault(name, {})[word] = value
         return {kind: entries for kind, entries in told.items() if entries}

@@ -16,7 +16,7 @@ from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
 from pkm_twin.paths.carrying import PayloadChange, compute_efforts
 from pkm_twin.paths.geometry import Path, Stretch
 from pkm_twin.robot.derivatives import joint_rates
-from pkm_twin.robot.limits import first_beyond
+from pkm_twin.robot.limits import find_first_beyond
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import passing_singularity
 
@@ -250,7 +250,7 @@ def check_positions(robot: Robot, s: Array, q: Array, begin: float) -> None:
 
     :raises ParameterError: names the first joint and position.
     """
-    if (beyond := first_beyond(robot, q)) is not None:
+    if (beyond := find_first_beyond(robot, q)) is not None:
         row = beyond.index or 0
         where = describe_place(robot, q[row], begin + float(s[row]))
         raise ParameterError(

@@ -15,7 +15,7 @@ from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import ParameterError
 from pkm_twin.paths.joint_path import Index, only_turns
 from pkm_twin.robot.robot import Robot
-from pkm_twin.robot.workspace import causes, counts, try_inverse
+from pkm_twin.robot.workspace import belong_to_workspace, describe_causes, try_inverse
 
 DEFAULT_RAYS: Final = 1000
 """Rays from home on which poses of the workspace are taken."""
@@ -102,7 +102,7 @@ def _poses_on_rays(robot: Robot, rays: int, singularity: float, least: Array) ->
     span = np.where(ways > 0.0, box[:, 1] - home, home - box[:, 0]) * ways
     if not _are_in_workspace(robot, home[None], singularity, least)[0]:
         q, known = try_inverse(robot, home[None])
-        why = causes(robot, q, home[None], known, singularity, -math.inf)
+        why = describe_causes(robot, q, home[None], known, singularity, -math.inf)
         raise ParameterError("workspace", f"home ({_named(robot, home)})", f"a home inside: {why}")
     low, high = np.zeros(len(span)), np.ones(len(span))
     for _ in range(14):
@@ -117,7 +117,7 @@ def _poses_on_rays(robot: Robot, rays: int, singularity: float, least: Array) ->
 def _are_in_workspace(robot: Robot, poses: Array, singularity: float, least: Array) -> Mask:
     """Return which poses (k, m) are in the workspace."""
     q, known = try_inverse(robot, poses)
-    inside = counts(robot, q, poses, known, singularity, -np.inf)
+    inside = belong_to_workspace(robot, q, poses, known, singularity, -np.inf)
     if least.any():
         inside[inside] = (levers(robot, q[inside]) >= least).all(-1)
     return inside

@@ -150,7 +150,7 @@ def read_bag(
     return replace(r, wrench=wrench)
 
 
-def bags_of(folder: Path) -> list[Path]:
+def list_bags(folder: Path) -> list[Path]:
     """List the recordings in a folder and below: MCAP files and rosbag2 folders, by name."""
     whole = {path.parent for path in folder.rglob(METADATA_FILE)}
     files = [p for p in folder.rglob("*.mcap") if not whole & set(p.parents)]
@@ -162,7 +162,7 @@ def is_collection(path: Path) -> bool:
     if not path.is_dir() or (path / METADATA_FILE).exists():
         return False
     # A bag whose metadata is lost has its files side by side.
-    return bool(bags_of(path)) and not any(path.glob("*.db3"))
+    return bool(list_bags(path)) and not any(path.glob("*.db3"))
 
 
 class _Found(NamedTuple):

@@ -130,7 +130,7 @@ def payload_columns(robot: Robot, carried: Load | None, time: Array) -> dict[str
     return dict(zip(PAYLOAD, columns, strict=False))
 
 
-def load_of_table(robot: Robot, table: Table, time: Array) -> Load | None:
+def read_table_load(robot: Robot, table: Table, time: Array) -> Load | None:
     """Read the payload from a table's columns; None if it is the robot's own.
 
     :raises ParameterError: a negative mass, several centres, or a part of a centre.

@@ -19,7 +19,7 @@ from pkm_twin.mechanisms.catalogue import load
 from pkm_twin.messages.reading import MAX_EFFORT, MAX_LOAD, MAX_SHIFT, MAX_TURN, TINY
 from pkm_twin.recordings.bags import read_bag
 from pkm_twin.recordings.origin import Origin, states_origin
-from pkm_twin.recordings.payload import load_of_table
+from pkm_twin.recordings.payload import read_table_load
 from pkm_twin.recordings.recording import MODEL_VALUES_NOTE, ReadOptions, Recording
 from pkm_twin.recordings.tables import (
     DEFLECTION,
@@ -206,7 +206,7 @@ def _read_table_recording(path: Path, name: str | Robot | None, how: ReadOptions
             raise ParameterError(
                 f"{table.line(bad[0])}: {name}", float(table[name][bad[0]]), f"0, or {TINY:g} to {bound:g} in size"
             )
-    held = how.load or load_of_table(robot, table, time)
+    held = how.load or read_table_load(robot, table, time)
     return Recording(
         robot,
         time,

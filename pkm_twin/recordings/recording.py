@@ -297,7 +297,7 @@ class Recording:
         if self.qd is not None and self.qdd is not None:
             return self
         if self.bag is not None:
-            qd, qdd, used = differentiated(self)
+            qd, qdd, used = differentiate_motion(self)
             if not used.any():
                 raise PkmTwinError(f"{self.source}: too few joint states in a row to differentiate: {len(self.time)}")
             return self._project_motion(qd, qdd, at_rest(self, qd), used)
@@ -338,7 +338,7 @@ def at_rest(r: Recording, qd: Array) -> Mask:
     return np.asarray(np.abs(qd) <= velocity_error_bound(r.time, r.q, gain, _WINDOW // 2))
 
 
-def differentiated(r: Recording) -> tuple[Array, Array, Mask]:
+def differentiate_motion(r: Recording) -> tuple[Array, Array, Mask]:
     """Return rates and accelerations (samples, n) by the differentiator, and where they are known."""
     late = _WINDOW // 2
     differentiator = Differentiator(order=_ORDER, window=_WINDOW, middle=True)

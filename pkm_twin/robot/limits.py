@@ -83,7 +83,7 @@ def beyond_limits(
     return outside, found
 
 
-def first_beyond(robot: Robot, q: Array, *, actuated: bool = True) -> Beyond | None:
+def find_first_beyond(robot: Robot, q: Array, *, actuated: bool = True) -> Beyond | None:
     """Find the first of positions (p, n) where a joint, passive or not, is beyond its limit.
 
     Errors as ``robot.forward``.
@@ -115,7 +115,7 @@ def _bounded(robot: Robot, q: Array, actuated: bool) -> Iterator[tuple[Sequence[
         yield [one.joint for one in passive], passive_values(robot, q), bounds, units
 
 
-def refuse_beyond(found: list[Beyond], where: str = "") -> None:
+def reject_beyond_limits(found: list[Beyond], where: str = "") -> None:
     """Reject a motion if :func:`beyond_limits` found a joint outside its limits.
 
     :param where: name of the recording, if there are several.

@@ -22,8 +22,8 @@ from pkm_twin.kinematics.pose import Coordinate
 from pkm_twin.kinematics.scheme import Start
 from pkm_twin.machine import schema
 from pkm_twin.machine.formulas import Book
-from pkm_twin.machine.friction import compiled, law_names
-from pkm_twin.machine.graph import Graph, limb_numbers
+from pkm_twin.machine.friction import law_names, select_compiled_laws
+from pkm_twin.machine.graph import Graph, number_limbs
 from pkm_twin.machine.inertia import Coefficients
 from pkm_twin.machine.joint_map import JointMap, JointMapEntry
 from pkm_twin.machine.members import Beam, Parts, Structure
@@ -31,12 +31,12 @@ from pkm_twin.machine.places import (
     Key,
     Keys,
     check_number,
+    drop_missing,
     full_keys,
-    given,
     list_file_numbers,
-    merged,
+    merge_data,
     number_in,
-    placed,
+    replace_numbers,
 )
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.reach import PassiveLimit, position_box
@@ -162,7 +162,7 @@ class Mechanism(Common):
             return part
         ends = self.graph.rods.get(part) or self.graph.joints.get(part)
         bodies = (part,) if ends is None else (ends.inner, ends.outer)
-        numbers = limb_numbers(self.graph)
+        numbers = number_limbs(self.graph)
         found = (numbers[body] for body in bodies if numbers.get(body, -1) >= 0)
         limb = next(found, None)
         return part if limb is None else self.limb_names[limb]
@@ -302,7 +302,7 @@ class Mechanism(Common):
 
     def with_laws(self, graph: Graph) -> Graph:
         """Add the robot's friction laws to a graph, from which programs of efforts are made."""
-        laws = compiled(self.laws)
+        laws = select_compiled_laws(self.laws)
         return dataclasses.replace(graph, laws=laws) if laws else graph
 
     @cached_property
@@ -446,7 +446,7 @@ class Mechanism(Common):
         :raises ParameterError: an unknown path.
         """
         values = self.resolved(values)
-        made = placed(self, {tuple(full_keys(path)): value for path, value in values.items()})
+        made = replace_numbers(self, {tuple(full_keys(path)): value for path, value in values.items()})
         return self._with(**{f.name: getattr(made, f.name) for f in dataclasses.fields(self)})
 
     def own_path(self, path: str) -> str:
@@ -483,7 +483,7 @@ class Mechanism(Common):
 
         :raises ParameterError: an unknown path, or a value that the file may not have.
         """
-        data = given(self.numbered(values).parameter_sections())
+        data = drop_missing(self.numbered(values).parameter_sections())
         return type(self).from_data(data, self.name)
 
     def check_number(self, path: str) -> None:
@@ -536,12 +536,12 @@ class Mechanism(Common):
             for key in sections:
                 if key not in known and key not in settings_of(Common):
                     raise UnknownNameError(key, key, known)
-            return type(self).from_data(merged(given(known), sections), self.name)
+            return type(self).from_data(merge_data(drop_missing(known), sections), self.name)
         new: dict[str, Any] = {}
         for key, value in sections.items():
             old = getattr(self, key)
             if isinstance(value, Mapping) and not isinstance(old, Mapping):
-                new[key] = schema.build(type(old), {**given(schema.plain(old)), **value}, key)
+                new[key] = schema.build(type(old), {**drop_missing(schema.plain(old)), **value}, key)
             else:
                 new[key] = settings_of(type(self))[key][1].check(key, value)
         made = dataclasses.replace(self, **new)

@@ -61,7 +61,7 @@ class Posture:
         return np.asarray(self.rotations[body] @ vector, np.float64)
 
 
-def telescope(joint: Joint) -> bool:
+def is_telescope(joint: Joint) -> bool:
     """Return whether a joint slides a ram in a tube that also moves: their lengths are unknown."""
     return joint.kind == "prismatic" and joint.inner != BASE and joint.home != 0.0
 
@@ -86,7 +86,7 @@ def body_points(graph: Graph) -> dict[str, list[Array]]:
         if joint.kind == "translation":  # it has no point
             continue
         inner = outer = joint.at
-        if telescope(joint):
+        if is_telescope(joint):
             # A tube of half the length at home; the ram starts in its middle.
             foot = tube_start(graph, joint)
             inner = foot + joint.home * joint.axes[0] / 2
@@ -100,7 +100,7 @@ def body_points(graph: Graph) -> dict[str, list[Array]]:
     return points
 
 
-def bars(graph: Graph) -> tuple[Bar, ...]:
+def list_bars(graph: Graph) -> tuple[Bar, ...]:
     """Return rods, both of a pair with their crosspieces, and bodies as bars from one point to the others."""
     radius = BAR_RADIUS_RATIO * graph.size
     result = []
@@ -122,7 +122,7 @@ def robot_bars(robot: Robot) -> tuple[Bar, ...]:
     """Return the bars of a robot, with the members' diameters, and the rails of slides on the base."""
     known = {part for beam in robot.beams for part in (*beam.parts, *beam.carries)}
     members = [Bar(beam.parts[0], beam.inner, beam.outer, beam.radius, beam.element) for beam in robot.beams]
-    rest = [bar for bar in bars(robot.graph) if bar.part not in known]
+    rest = [bar for bar in list_bars(robot.graph) if bar.part not in known]
     hidden = [bar for bar in crosspieces(robot.graph) if bar.part in known]
     graph, limits, rails = robot.graph, robot.limits.position, list[Bar]()
     for k, name in enumerate(() if limits is None else graph.actuated):
@@ -133,7 +133,7 @@ def robot_bars(robot: Robot) -> tuple[Bar, ...]:
     return (*members, *rest, *hidden, *rails)
 
 
-def face(points: Sequence[Array]) -> Array:
+def find_plate_corners(points: Sequence[Array]) -> Array:
     """Return the corners of the convex plate that covers points, in their order around it, shape (k, 3).
 
     Empty for fewer than three points, or points on one line.
@@ -166,7 +166,7 @@ def _half_hull(flat: Array, order: NDArray[np.int64]) -> list[int]:
 
 def base_face(graph: Graph) -> Array:
     """Return the corners of the plate under the base's joints, without slides, which have rails."""
-    return face(list(_fixed(graph, BASE)))
+    return find_plate_corners(list(_fixed(graph, BASE)))
 
 
 def base_line(graph: Graph) -> Array:
@@ -183,7 +183,7 @@ def base_line(graph: Graph) -> Array:
 
 def platform_face(graph: Graph) -> Array:
     """Return the corners of the platform: its joints and ends of rods, without slides."""
-    return face(list(_fixed(graph, graph.platform)))
+    return find_plate_corners(list(_fixed(graph, graph.platform)))
 
 
 def _fixed(graph: Graph, body: str) -> Iterable[Array]:

@@ -16,7 +16,7 @@ import numpy as np
 
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.kinematics.singularity import singularity_at_home
-from pkm_twin.machine.graph import BASE, Graph, Joint, merged
+from pkm_twin.machine.graph import BASE, Graph, Joint, map_welded_bodies
 from pkm_twin.machine.members import RigidError
 from pkm_twin.robot.robot import Robot
 
@@ -114,7 +114,7 @@ def _check_masses(robot: Robot, graph: Graph) -> Iterator[Finding]:
         "kg/m3",
         (f"{whole} tonnes?", f"{whole} grams?"),
     )
-    lead = merged(graph)
+    lead = map_welded_bodies(graph)
     with_platform = [b for b in graph.bodies if lead[b] == lead[graph.platform]]
     if not any(graph.bodies[b].mass for b in with_platform) and not robot.payload.mass:
         yield Finding(

@@ -83,7 +83,7 @@ class Printer:
         return "\n".join([",".join(head), *(",".join(row) for row in rows), ""])
 
 
-def printer_of(robot: Robot) -> Printer:
+def convert_to_printer(robot: Robot) -> Printer:
     """Return the printer of a robot file, rotated so that its third tower is at 90 degrees.
 
     :raises ParameterError: not a linear Delta, leaning towers, or joints with a ratio.
@@ -104,7 +104,7 @@ def printer_of(robot: Robot) -> Printer:
     return Printer(1e3 * g.radius, angles, 1e3 * g.arm_lengths, -1e3 * own.offsets, none, none)
 
 
-def written(printer: Printer, firmware: Firmware) -> str:
+def write_configuration(printer: Printer, firmware: Firmware) -> str:
     """Write the lines of a firmware's configuration."""
     radius, arms = printer.radius, printer.arms
     above = printer.ends - _find_carriage_heights(arms, radius, "geometry.arm_lengths")

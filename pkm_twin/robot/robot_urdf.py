@@ -19,13 +19,13 @@ from pkm_twin.machine.graph_file import drive_numbers
 from pkm_twin.machine.loop_tree import Capsule, Joint, Link, LoopTree
 from pkm_twin.machine.mjcf_write import write_mjcf
 from pkm_twin.machine.names import joint_labels, plain_name
-from pkm_twin.machine.places import has_entry, path_of
+from pkm_twin.machine.places import has_entry, join_path
 from pkm_twin.machine.rotations import Pose
 from pkm_twin.machine.sdf_write import write_sdf
 from pkm_twin.machine.urdf_control import Control, tree_names
 from pkm_twin.machine.urdf_write import GROUND, MOCK, PLATFORM, write_urdf
 from pkm_twin.robot.mechanism import FREE_FALL
-from pkm_twin.robot.outline import bars
+from pkm_twin.robot.outline import list_bars
 from pkm_twin.robot.robot import Robot
 
 PAYLOAD: Final = "payload"
@@ -159,7 +159,7 @@ def robot_tree(robot: Robot) -> LoopTree:
         links[PAYLOAD] = Link(PAYLOAD, at, load.mass, at.position, load.inertia)
         label = f"{PAYLOAD}_frame"
         joints[label] = Joint(label, "fixed", platform, PAYLOAD, (at, at))
-    capsules = (Capsule(names[bar.part], bar.start[1], bar.end[1], bar.radius) for bar in bars(graph))
+    capsules = (Capsule(names[bar.part], bar.start[1], bar.end[1], bar.radius) for bar in list_bars(graph))
     return LoopTree(
         robot.name or robot.mechanism,
         GROUND,
@@ -253,7 +253,7 @@ def copied_tolerances(robot: Robot) -> dict[str, list[str]]:
         drive = kind == "joints" and robot.graph.joints[name].actuated
         for end in ("offset", "backlash") if drive else ("length",) if kind != "joints" else ():
             if source.path[0] == "limbs":
-                copies.setdefault(path_of([*source.path, end]), []).append(f"{kind}.{name}.{end}")
+                copies.setdefault(join_path([*source.path, end]), []).append(f"{kind}.{name}.{end}")
     found: dict[str, list[str]] = {}
     for name in robot.tolerances:
         fits = re.compile(".*".join(map(re.escape, name.split("*")))).fullmatch

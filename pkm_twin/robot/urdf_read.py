@@ -21,8 +21,8 @@ from pkm_twin.machine.graph import BASE, Graph
 from pkm_twin.machine.graph_description import graph_description
 from pkm_twin.machine.loop_tree import SINGLE, Joint, Link, LoopTree
 from pkm_twin.machine.rotations import Pose
-from pkm_twin.machine.urdf_control import take_drives
-from pkm_twin.machine.urdf_file import Visual, visuals
+from pkm_twin.machine.urdf_control import convert_drives
+from pkm_twin.machine.urdf_file import Visual, read_visuals
 from pkm_twin.robot.urdf_home import LEAST_ROUNDING, MAX_LOOP_GAP, Assembly, HomeSearch
 
 PLATFORMS: Final = (
@@ -132,13 +132,13 @@ def read_tree(path: str | Path, part: Part = Part()) -> UrdfReading:
     if path.suffix in usd_file.SUFFIXES:
         tree = usd_file.read(path, part.actuated)
     else:
-        top = urdf_xml.elements(path)
-        controller = take_drives(top)
+        top = urdf_xml.parse_xml(path)
+        controller = convert_drives(top)
         readers = {"mujoco": mjcf_file.read, "sdf": sdf_file.read}
         tree = readers.get(top.tag, urdf_file.read)(path, top, part.actuated)
     tool = _platform(tree, part.platform)
     ground = tree.root if part.base is None else part.base
-    ground = urdf_xml.known_link("base", ground, tree.links)
+    ground = urdf_xml.find_link("base", ground, tree.links)
     notes, carried = list[str](), tuple[Link, ...]()
     if part.cuts:
         cut = cut_out(tree, ground, tool, carry=part.carry)
@@ -192,7 +192,7 @@ def read_tree(path: str | Path, part: Part = Part()) -> UrdfReading:
     frames = {name: move @ tree.links[name].frame for name, move in _find_placed_links(assembly, ground).items()}
     shown = list[Visual]()
     if top is not None and top.tag == "robot":
-        shown += visuals(path, top, frames, bodies)
+        shown += read_visuals(path, top, frames, bodies)
     return UrdfReading(data, home.text, tuple(notes), tree.marked, tuple(shown))
 
 
@@ -206,7 +206,7 @@ def _require_closed(path: Path, tree: LoopTree) -> None:
     if len(moving) > 1000:
         raise ParameterError(str(path), f"{len(moving)} joints that move", "at most 1000")
     ends = [(one.inner, one.outer) for one in (*tree.joints.values(), *tree.closures) if one.kind != "free"]
-    for part in graphs.groups(tree.links, ends):
+    for part in graphs.group_connected(tree.links, ends):
         if tree.root not in part:
             bound = "a joint or closure that connects it; a base and a platform (--base) can leave it out"
             raise ParameterError(f"link.{part[0]}", "not connected", bound)
@@ -341,7 +341,7 @@ def _graph(assembly: Assembly, bodies: dict[str, str], tool: str, ground: str) -
 
 def _platform(tree: LoopTree, asked: str | None) -> str:
     if asked is not None:
-        return urdf_xml.known_link("platform", asked, tree.links)
+        return urdf_xml.find_link("platform", asked, tree.links)
     lower = {name.lower(): name for name in tree.links}
     for name in PLATFORMS:
         if name in lower:

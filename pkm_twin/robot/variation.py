@@ -13,7 +13,7 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.places import given
+from pkm_twin.machine.places import drop_missing
 from pkm_twin.robot.robot import Robot
 
 Distribution = Literal["normal", "uniform"]
@@ -43,7 +43,9 @@ class _Number:
     value: Any
 
 
-def varied(robot: Robot, spread: Mapping[str, float], seed: int, distribution: Distribution = "normal") -> Variation:
+def vary_robot(
+    robot: Robot, spread: Mapping[str, float], seed: int, distribution: Distribution = "normal"
+) -> Variation:
     """Draw a robot with other masses, inertias, friction and lengths.
 
     Every number gets its own factor 1 + s d, an inertia one factor for all entries; d is standard
@@ -60,7 +62,7 @@ def varied(robot: Robot, spread: Mapping[str, float], seed: int, distribution: D
         if kind not in KINDS or not 0.0 <= size <= MAX_SPREAD:
             raise ParameterError(f"spread.{kind}", size, f"0 to {MAX_SPREAD:g} for {KINDS}")
     rng = np.random.default_rng(seed)
-    data = given(robot.parameter_sections())
+    data = drop_missing(robot.parameter_sections())
     drawn: dict[str, float] = {}
     for number in _numbers(data, robot.parameter_units(), ()):
         # Draw for every number, so that a kind's deviation does not change the draws of other kinds.

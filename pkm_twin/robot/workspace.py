@@ -150,7 +150,7 @@ def keeps_limits(robot: Robot, q: Array, pose: Array, least_clearance: float = 0
     return inside
 
 
-def counts(robot: Robot, q: Array, pose: Array, known: Mask, least: float, least_clearance: float) -> Mask:
+def belong_to_workspace(robot: Robot, q: Array, pose: Array, known: Mask, least: float, least_clearance: float) -> Mask:
     """Return which joint positions (k, n) and poses (k, m) belong to a workspace, shape (k,).
 
     :param known: where there is an assembly.
@@ -280,7 +280,7 @@ def passing_singularity(index: float, bound: str = "--singularity ") -> str:
     return f"{bound}{math.floor(index * 10**digits) / 10**digits:g}"
 
 
-def causes(robot: Robot, q: Array, pose: Array, known: Mask, least: float, least_clearance: float) -> str:
+def describe_causes(robot: Robot, q: Array, pose: Array, known: Mask, least: float, least_clearance: float) -> str:
     """Describe why joint positions (k, n) are outside a workspace, the most frequent first.
 
     Each is counted for the first of these that it fails: assembly, actuator limits, limits of

@@ -11,7 +11,7 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine import rotations
-from pkm_twin.machine.joints import across
+from pkm_twin.machine.joints import perpendicular_axes
 from pkm_twin.machine.members import Place
 from pkm_twin.robot.outline import Posture, robot_bars
 from pkm_twin.robot.robot import Robot
@@ -161,7 +161,7 @@ class Scene:
             quaternion = (0.0, 0.0, 0.0, 1.0)
             if length > 0.0:
                 z = span / length
-                x = across(z)[0]
+                x = perpendicular_axes(z)[0]
                 quaternion = _to_quaternion(np.column_stack((x, np.cross(z, x), z)))
             size, middle = (width, width, length), (start + end) / 2.0
             shapes.append(Shape("cylinder", "bars", k, colour, size, middle, quaternion, text=bar.part, lasting=True))

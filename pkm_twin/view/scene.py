@@ -19,9 +19,9 @@ from pkm_twin.robot.outline import (
     Bar,
     Posture,
     base_face,
+    is_telescope,
     platform_face,
     robot_bars,
-    telescope,
     tube_start,
 )
 from pkm_twin.robot.robot import Robot
@@ -279,7 +279,7 @@ class Scene:
         """Return the cylinder that stands for a drive, along its axis."""
         axis, body, middle = joint.axes[0], joint.inner, joint.at
         radius = self._find_radius((joint.outer, joint.at))
-        if telescope(joint):
+        if is_telescope(joint):
             parts = {joint.inner, joint.outer}
             radius = max((bar.radius for bar in self.bars if bar.part in parts), default=radius)
             middle = tube_start(self.robot.graph, joint) + joint.home * axis / 2

@@ -19,8 +19,8 @@ import pinocchio
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load
 from pkm_twin.export.c_package import c_package
-from pkm_twin.machine.joints import across
-from pkm_twin.machine.mjcf_write import rows
+from pkm_twin.machine.joints import perpendicular_axes
+from pkm_twin.machine.mjcf_write import list_bodies
 from pkm_twin.machine.tree import axes_with_z
 from pkm_twin.machine.urdf_write import GROUND
 from pkm_twin.mechanisms.catalogue import robot_of_data
@@ -58,10 +58,10 @@ def description(robot):
     tree = robot_tree(robot)
     places = {GROUND: (0, np.eye(4))}
     joints, inertias, numbers, home = [], [], {}, []
-    for parent, child, row in rows(tree):
+    for parent, child, row in list_bodies(tree):
         index, above = places[parent]
         for part in row:
-            here = frame(axes_with_z(part.axis, across(part.axis)[0]), part.joint.at)
+            here = frame(axes_with_z(part.axis, perpendicular_axes(part.axis)[0]), part.joint.at)
             zero = here.copy()
             c, s = np.cos(part.home), np.sin(part.home)
             if part.kind == "revolute":
@@ -90,7 +90,7 @@ def description(robot):
         if closure.kind == "universal":
             pairs = [closure.axes]
         elif closure.kind == "revolute":
-            pairs = [(e, closure.axes[0]) for e in across(closure.axes[0])]
+            pairs = [(e, closure.axes[0]) for e in perpendicular_axes(closure.axes[0])]
         elif closure.kind != "spherical":
             raise ValueError(closure.kind)
         for first, second in pairs:

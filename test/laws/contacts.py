@@ -9,7 +9,7 @@ from functools import lru_cache
 import numpy as np
 
 from delta_dynamics import ContactMonitor, inverse_dynamics
-from delta_dynamics.estimates.isolation import CLAMPING, PLATFORM, limbs_of, list_joined_bodies
+from delta_dynamics.estimates.isolation import CLAMPING, PLATFORM, list_joined_bodies, map_limbs
 from delta_dynamics.torques.regressor import PAYLOAD, parameter_names, parameter_values, regressor
 from pkm_twin import Robot
 from pkm_twin.codegen.arrays import Array
@@ -227,7 +227,7 @@ def strike(robot: Robot, rng: np.random.Generator, motion: tuple[Array, ...], ki
     """
     time, q, qd, _ = motion
     moving = time[np.abs(qd).max(1) > 0.0][0]
-    limbs = limbs_of(robot)
+    limbs = map_limbs(robot)
     platform, names = robot.graph.platform, sorted({*limbs.values()} - {PLATFORM})
     limb = names[int(rng.integers(len(names)))]
     own = [platform] if kind == PLATFORM else [p for p, name in limbs.items() if name == limb]

@@ -13,7 +13,7 @@ from pkm_twin import Robot
 from pkm_twin.bags.reader import open_bag
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.recordings import Recording, read
-from pkm_twin.recordings.recording import differentiated
+from pkm_twin.recordings.recording import differentiate_motion
 from test.laws.contacts import OFF, RATE, REST, Stream, measured, moves, pushed, seen_after
 from test.support.robots import load, massive, partly_long, unsure
 
@@ -25,7 +25,7 @@ PICKS = BAGS / "delta_cu_pick_and_place.mcap"
 def watched(r: Recording, robot: Robot, begin: float, end: float) -> tuple[Array, list[Contact]]:
     """What the monitor says from one time to another."""
     assert r.effort is not None
-    qd, qdd, used = differentiated(r)
+    qd, qdd, used = differentiate_motion(r)
     monitor, times, found = ContactMonitor(robot), [], []
     for k in np.flatnonzero(used & (r.time > begin) & (r.time < end)):
         contact = monitor.push(float(r.time[k]), (r.q[k], qd[k], qdd[k]), r.effort[k])

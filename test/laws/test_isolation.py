@@ -15,7 +15,7 @@ from delta_dynamics.estimates.isolation import (
     UNKNOWN,
     ContactLocator,
     Places,
-    limbs_of,
+    map_limbs,
 )
 from test.laws.contacts import place_and_jacobian, spot
 from test.support.robots import load, often, partly_long, random_joints
@@ -37,10 +37,10 @@ def test_jacobians_are_derivatives_of_the_places(name: str, rng: np.random.Gener
 
 
 def test_limbs_are_what_hangs_together_without_base_and_platform() -> None:
-    limbs = limbs_of(load("linear_delta"))
+    limbs = map_limbs(load("linear_delta"))
     assert limbs["carriage_1"] == limbs["left_1"] == limbs["right_1"] == "rail_1"
     assert limbs["platform"] == PLATFORM
-    five = limbs_of(load("five_bar"))
+    five = map_limbs(load("five_bar"))
     assert set(five.values()) == {"left", "right", PLATFORM}
 
 
@@ -70,7 +70,7 @@ def test_a_place_is_finite_or_none_and_usual_samples_bring_one(name: str, rng: n
 def drawn(name: str, rng: np.random.Generator, count: int) -> list[tuple[str, ContactLocator]]:
     """Forces on platform and limbs, as often as expected before, with 2 % of noise."""
     robot = load(name)
-    locator, limbs = ContactLocator(robot), limbs_of(robot)
+    locator, limbs = ContactLocator(robot), map_limbs(robot)
     owners = sorted({*limbs.values()} - {PLATFORM})
     found = []
     for q in random_joints(robot, rng, count):

@@ -19,7 +19,7 @@ from delta_dynamics import (
     sphere_directions,
     tilted_pose,
 )
-from delta_dynamics.torques.isotropy import largest, minimax_direction
+from delta_dynamics.torques.isotropy import evaluate_largest, minimax_direction
 from pkm_twin.errors import ParameterError
 from test.support import robots
 from test.support.robots import load, loaded, partly_long, random_joints
@@ -134,7 +134,7 @@ def test_max_driving_force_range_holds_all_samples_and_is_attained(name, robot, 
 def descended(forms, start):
     """What a search downhill from a direction finds, no matter how far it comes."""
     return minimize(
-        lambda x: largest(forms, x / np.linalg.norm(x)),
+        lambda x: evaluate_largest(forms, x / np.linalg.norm(x)),
         start,
         method="Nelder-Mead",
         options={"xatol": 1e-10, "fatol": 0.0, "maxfev": 400},
@@ -157,9 +157,9 @@ def test_the_least_direction_is_global(shift, scales):
         forms = forms + forms.swapaxes(-1, -2) + shift * np.eye(3)
         forms = forms * np.array(scales)[:, None, None]
         y = minimax_direction(forms)
-        value = largest(forms, y)
+        value = evaluate_largest(forms, y)
         assert np.linalg.norm(y) == pytest.approx(1, abs=1e-14)
-        sampled = largest(forms, dense)
+        sampled = evaluate_largest(forms, dense)
         found = [descended(forms, x) for x in dense[np.argsort(sampled)[:6]]]
         # Forms that cancel leave the rounding of the largest one.
         rounding = 16 * np.finfo(float).eps * np.abs(forms).max()
@@ -177,8 +177,8 @@ def test_the_least_direction_of_mirrored_limbs():
         a, b = np.random.default_rng(seed).normal(size=(2, 3, 3))
         a, b = a + a.T, b + b.T
         forms = np.array([a, mirror @ a @ mirror, b + mirror @ b @ mirror])
-        value = largest(forms, minimax_direction(forms))
-        sampled = largest(forms, dense)
+        value = evaluate_largest(forms, minimax_direction(forms))
+        sampled = evaluate_largest(forms, dense)
         best = dense[np.argsort(sampled)[:4]]
         assert value <= min(descended(forms, x) for x in best) + 1e-9 * value
 
@@ -193,7 +193,7 @@ def test_the_least_direction_of_any_number_of_forms_and_coordinates(count, size)
     assert np.linalg.norm(y) == pytest.approx(1, abs=1e-14)
     dense = rng.normal(size=(6_000, size))
     dense /= np.linalg.norm(dense, axis=-1, keepdims=True)
-    assert largest(forms, y) <= largest(forms, dense).min() * (1 + 1e-12)
+    assert evaluate_largest(forms, y) <= evaluate_largest(forms, dense).min() * (1 + 1e-12)
 
 
 @pytest.mark.parametrize("name", ["five_bar", "stewart"])

@@ -9,7 +9,7 @@ import pytest
 
 from pkm_twin.errors import ParameterError
 from pkm_twin.recordings import Load, Recording, by_load
-from pkm_twin.recordings.payload import load_of_table, payload_columns
+from pkm_twin.recordings.payload import payload_columns, read_table_load
 from pkm_twin.recordings.tables import Table
 from test.support.robots import load as robot_of
 
@@ -54,5 +54,5 @@ def test_several_payloads_follow_each_other_without_a_sample_of_both():
     loaded = {machine.payload.mass for machine, _ in by_load(robot, load, TIME, 8)}
     assert loaded == {0.0, 0.1, 0.2, 0.5}
     table = Table(Path("x.csv"), payload_columns(robot, load, TIME))
-    again = load_of_table(robot, table, TIME)
+    again = read_table_load(robot, table, TIME)
     np.testing.assert_array_equal(again.carried(TIME), expected)

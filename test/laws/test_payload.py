@@ -12,7 +12,7 @@ from delta_dynamics import PayloadEstimator, inverse_dynamics
 from pkm_twin import Robot
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.recordings import read
-from pkm_twin.recordings.recording import differentiated
+from pkm_twin.recordings.recording import differentiate_motion
 from test.support.robots import joint_range, load
 
 BAGS = Path(__file__).resolve().parents[2] / "bags"
@@ -69,7 +69,7 @@ def test_a_pick_is_seen_and_weighed_within_a_second() -> None:
     """The recorded load of 0.15 kg comes at 8.275 s and goes at 14.875 s."""
     r = read(BAGS / "delta_cu_pick_and_place.mcap")
     assert r.effort is not None
-    qd, qdd, used = differentiated(r)
+    qd, qdd, used = differentiate_motion(r)
     near = used & (r.time > 6.5) & (r.time < 9.3)
     estimator = PayloadEstimator(r.robot)
     told = []

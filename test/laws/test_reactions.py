@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from delta_dynamics import inverse_dynamics, least_norm_reactions, reactions
-from delta_dynamics.torques.reactions import loads_kernel, transmitters
+from delta_dynamics.torques.reactions import list_transmitters, loads_kernel
 from pkm_twin.errors import SingularityError
 from test.support.bodies import bodies, rubs
 from test.support.robots import FREE, MASSIVE, load, loaded, massive, random_motion
@@ -146,7 +146,7 @@ def balance(robot, motion):
     """What every component does to every body: shape (n, 6 bodies, components), base's origin."""
     (_, rods, places), status = loads_kernel(robot)(robot.inertial, *motion)
     assert status is None
-    joints = transmitters(robot.graph, rods, places)
+    joints = list_transmitters(robot.graph, rods, places)
     names = list(dict.fromkeys(c for joint in joints for c in joint.components))
     rows = [n for n in robot.body_names if n != "payload"]
     matrix = np.zeros((len(rods), len(rows), 6, len(names)))

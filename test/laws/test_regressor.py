@@ -18,7 +18,7 @@ from delta_dynamics.torques.regressor import random_states
 from pkm_twin import Robot
 from pkm_twin.identification.estimation import possible
 from pkm_twin.identification.parameters import file_parameters
-from pkm_twin.machine.places import path_of
+from pkm_twin.machine.places import join_path
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from test.machine.random_machines import NAMES, variant
 from test.support.robots import load, loaded, massive, random_motion
@@ -61,9 +61,9 @@ def test_numbers_of_a_file_are_linear_parameters(name):
         if group.kind in ("payload", "inertia"):
             values[where] = new
             for key, value in group.keys(new).items():
-                numbers[path_of(key)] = value
+                numbers[join_path(key)] = value
                 if isinstance(key[-2], int):
-                    numbers[path_of((*key[:-2], key[-1], key[-2]))] = value
+                    numbers[join_path((*key[:-2], key[-1], key[-2]))] = value
     q, qd, qdd, _ = random_motion(robot, rng, 10)
     table = regressor(robot, q, qd, qdd) @ parameters.mixing
     for other, own in ((robot, parameters.values), (robot.spelled.numbered(numbers), values)):

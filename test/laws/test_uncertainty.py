@@ -16,7 +16,7 @@ from pkm_twin import Robot, variants
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.design.variants import Variants
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.places import given
+from pkm_twin.machine.places import drop_missing
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.robot.derivatives import position_effects
 from stiffness_monitor import compliance, compliance_deviation, strain_energy
@@ -148,7 +148,7 @@ def test_what_is_no_number_of_the_file_is_refused(entry: dict[str, Any], text: s
 def test_a_machine_keeps_what_its_file_says_beside_its_graph() -> None:
     robot = unsure(load("five_bar"), {"gravity": {"relative": 0.02}})
     joint = robot.joint_names[0]
-    data = {**given(robot.parameter_sections()), "mechanism": "machine"}
+    data = {**drop_missing(robot.parameter_sections()), "mechanism": "machine"}
     mapped = robot_of_data({**data, "joint_map": {joint: {"offset": 0.1}}}, "mine")
     again = mapped.with_file_values({"origin[2]": mapped.file_numbers()["origin[2]"][0]})
     assert again.controller.offsets[0] == 0.1

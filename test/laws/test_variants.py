@@ -17,7 +17,7 @@ from pkm_twin.codegen.lu import pivot_order
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.kinematics.motion import Motion
 from pkm_twin.machine import places, schema
-from pkm_twin.machine.places import keys_of
+from pkm_twin.machine.places import split_path
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.robot.numbers import geometry_and_masses
 from stiffness_monitor import compliance, derivatives
@@ -227,7 +227,7 @@ def test_numbers_of_one_limb_s_entry_vary_together(rng):
     for k, pose in enumerate(many.forward(q)):
         made = plain("stewart")
         for path, value in values.items():
-            *way, last = keys_of(path)
+            *way, last = split_path(path)
             holder = made
             for key in way:
                 holder = holder[key]

@@ -86,7 +86,7 @@ def test_the_platform_stands_where_the_robot_says_and_all_loops_are_closed(robot
     model = pin.buildModelFromUrdf(str(path))
     assert model.nq == model.nv == len(robot.joint_names) + len(robot.passive_joints)
     ends = []
-    tree = urdf_file.read(path, urdf_xml.elements(path))
+    tree = urdf_file.read(path, urdf_xml.parse_xml(path))
     for closure in tree.closures:
         pair = []
         for link, drawn in zip((closure.inner, closure.outer), closure.frames, strict=True):

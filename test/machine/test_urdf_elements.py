@@ -178,7 +178,7 @@ def test_gazebo_s_ways_to_close_a_loop(kind, tmp_path):
     )
     closure = CLOSURES[kind].replace("ROBOT", re.search(r'<robot name="([^"]*)"', text)[1])
     path.write_text(f"{tree}{pin}<gazebo>{closure}</gazebo>{rest}")
-    tree = urdf_file.read(path, urdf_xml.elements(path))
+    tree = urdf_file.read(path, urdf_xml.parse_xml(path))
     (weld,) = tree.closures
     assert weld.kind == "fixed"
     first, second = weld.frames

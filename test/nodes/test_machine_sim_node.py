@@ -19,7 +19,7 @@ from trajectory_msgs.msg import JointTrajectory
 from delta_dynamics import inverse_dynamics
 from delta_dynamics.nodes.simulation import CHECK_PERIOD
 from delta_dynamics.simulation.machine import MachineSettings, Simulation, WrenchSignal, tune_position_control
-from pkm_twin.robot.variation import varied
+from pkm_twin.robot.variation import vary_robot
 from test.nodes.harness import SECOND, counts_of, stamp_of
 from test.support.robots import load
 
@@ -78,7 +78,7 @@ def answer(peer, data):
 
 
 def test_lockstep_gives_the_core_s_numbers(peer, machine):
-    robot = varied(ROBOT, dict.fromkeys(KINDS, 0.02), 7, "uniform").robot
+    robot = vary_robot(ROBOT, dict.fromkeys(KINDS, 0.02), 7, "uniform").robot
     core = Simulation(
         robot,
         MachineSettings(
@@ -159,7 +159,7 @@ def test_who_comes_late_gets_what_was_drawn(peer, machine):
     kept = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     peer.node.create_subscription(DiagnosticArray, "/machine_sim/drawn", received.append, kept)
     peer.until(lambda: received)
-    drawn = varied(ROBOT, dict.fromkeys(KINDS, 0.02), 7, "uniform").drawn
+    drawn = vary_robot(ROBOT, dict.fromkeys(KINDS, 0.02), 7, "uniform").drawn
     (status,) = received[0].status
     assert {pair.key: float(pair.value) for pair in status.values} == drawn
     assert all(f"drawn: {name} " in machine.output for name in drawn)

@@ -17,7 +17,7 @@ from delta_dynamics.simulation.machine import (
     tune_position_control,
 )
 from pkm_twin.errors import MessageError, ParameterError
-from pkm_twin.robot.variation import varied
+from pkm_twin.robot.variation import vary_robot
 from test.nodes.harness import SECOND, reject
 from test.support.robots import load
 
@@ -173,7 +173,7 @@ def test_feedforward_follows_where_feedback_lags(make):
     exact = follow(ROBOT, ahead)
     assert exact[1] < 2e-5
     kinds = ("masses", "inertias", "friction", "lengths")
-    other = varied(ROBOT, dict.fromkeys(kinds, 0.01), 1).robot
+    other = vary_robot(ROBOT, dict.fromkeys(kinds, 0.01), 1).robot
     lags, follows = follow(other, plain), follow(other, ahead)
     print(f"PD {lags[0]:.3e}, with feedforward {follows[0]:.3e} rad rms at 1 %")
     assert lags[0] > 5.0 * follows[0]

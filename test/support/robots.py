@@ -24,7 +24,7 @@ import pkm_twin
 from pkm_twin import Robot, robot_names
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.places import given
+from pkm_twin.machine.places import drop_missing
 from pkm_twin.mechanisms.catalogue import config_folder
 
 LIMITED = 0.7
@@ -43,7 +43,7 @@ def partly_long(names: Iterable[Any], *kept: Any) -> list[Any]:
 
 def data_of(robot: Robot) -> dict[str, Any]:
     """What the robot's file gives, as plain data, written out."""
-    data: dict[str, Any] = copy.deepcopy(given(robot.parameter_sections()))
+    data: dict[str, Any] = copy.deepcopy(drop_missing(robot.parameter_sections()))
     return data
 
 

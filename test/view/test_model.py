@@ -12,7 +12,7 @@ from delta_dynamics import inverse_dynamics
 from pkm_twin import robot_names
 from pkm_twin.report.plots import pyplot
 from pkm_twin.robot.clearance import clearance, has_clearance
-from pkm_twin.robot.outline import Posture, telescope
+from pkm_twin.robot.outline import Posture, is_telescope
 from pkm_twin.view import texts
 from pkm_twin.view.drawing import draw
 from pkm_twin.view.model import Model, _round, _step
@@ -333,7 +333,7 @@ def test_a_deflected_machine_stays_together_and_moves_as_its_members(name):
             k = next(k for k, spot in enumerate(spots) if spot is place)
             own = np.linalg.norm(points - before[k], axis=-1).argmin()
             np.testing.assert_allclose(ways[k], factor * shifts[own], atol=1e-9 * scene.size)
-    for name in filter(lambda name: telescope(graph.joints[name]), after.drives):
+    for name in filter(lambda name: is_telescope(graph.joints[name]), after.drives):
         at = after.drives[name]
         bars = [k for k, b in enumerate(scene.bars) if graph.joints[name].inner == b.part]
         assert bars

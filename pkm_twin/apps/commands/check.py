@@ -135,9 +135,9 @@ def _check_safely(given: Check, path: Path) -> dict[str, Any]:
 
 def _check_folder(given: Check) -> Report:
     """Judge all recordings of a folder."""
-    from pkm_twin.recordings.bags import bags_of
+    from pkm_twin.recordings.bags import list_bags
 
-    paths, results = bags_of(given.bag), list[dict[str, Any]]()
+    paths, results = list_bags(given.bag), list[dict[str, Any]]()
     each, jobs = partial(_check_safely, given), min(given.jobs, len(paths))
     with progress("checking", len(paths)) as update, ExitStack() as stack:
         run: Callable[..., Iterable[dict[str, Any]]] = map

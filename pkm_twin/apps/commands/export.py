@@ -18,7 +18,7 @@ from pkm_twin.errors import ParameterError
 from pkm_twin.extensions import Extensible
 from pkm_twin.files import replace_file, replace_files
 from pkm_twin.report import Fact, Report
-from pkm_twin.robot.printers import Firmware, printer_of, written
+from pkm_twin.robot.printers import Firmware, convert_to_printer, write_configuration
 from pkm_twin.settings import setting
 
 
@@ -261,7 +261,7 @@ class ToPrinter(TextOutput):
 @command()
 def printer(given: ToPrinter) -> Report:
     """Write a printer's configuration."""
-    return given.write(written(printer_of(given.machine()), given.firmware))
+    return given.write(write_configuration(convert_to_printer(given.machine()), given.firmware))
 
 
 OWN: Final = {

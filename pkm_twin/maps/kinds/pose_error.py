@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.places import keys_of
+from pkm_twin.machine.places import split_path
 from pkm_twin.maps.kind import Case, Found, Kind, largest_axis
 from pkm_twin.robot.derivatives import position_effects
 from pkm_twin.robot.robot import Robot
@@ -52,7 +52,7 @@ def _moving_causes(robot: Robot) -> NDArray[np.intp]:
     """
     for name, steps in robot.causes.items() if robot.mechanism == "machine" else ():
         places = {"at", "axis", "axes", "ends"}
-        shared = [path for path, step in steps.items() if step and places & {*keys_of(path)[2:3]}]
+        shared = [path for path, step in steps.items() if step and places & {*split_path(path)[2:3]}]
         if shared:
             raise ParameterError(
                 f"uncertainty.{name}",
