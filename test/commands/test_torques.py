@@ -110,7 +110,9 @@ def test_its_own_table_is_a_motion_again(twin, tmp_path, name):
         twin.good(command, name, tmp_path / "b.csv")
 
 
-@pytest.mark.parametrize(("word", "factor"), [("effort", 1.2), ("measured", 1.2), ("effort", 1.0)])
+@pytest.mark.parametrize(
+    ("word", "factor"), [("effort", 1.2), pytest.param("measured", 1.2, marks=pytest.mark.long), ("effort", 1.0)]
+)
 def test_measured_efforts_stay_and_the_models_are_not_judged(twin, tmp_path, word, factor):
     """The model against itself is no evidence; efforts of a table may be a plan's."""
     robot, columns = load("linear_delta"), motion("linear_delta", 200)

@@ -99,7 +99,7 @@ def test_a_hexapod_on_a_shaking_base(name):
     check(robot, plain("stewart"), engine(name), rng)
 
 
-@pytest.mark.parametrize("name", partly_long(MACHINES, "rps3", "platform_motor"))
+@pytest.mark.parametrize("name", partly_long(MACHINES, "rps3"))
 def test_random_machines_on_a_moving_base(name):
     rng = np.random.default_rng([20261128, MACHINES.index(name)])
     description = variant(name, rng)

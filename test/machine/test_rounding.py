@@ -128,7 +128,7 @@ def check_rejection(error):
 
 
 CASES = [(name, ending) for name in MACHINES for ending in WRITERS]
-SAMPLE = [("agile_eye", "yaml"), ("wrist", "urdf"), ("wrist", "xml")]
+SAMPLE = [("agile_eye", "yaml"), ("wrist", "urdf")]
 DIGITS = partly_long((5, 6, 7, 8), 6)
 
 
