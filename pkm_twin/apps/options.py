@@ -195,10 +195,10 @@ class MotionOptions(RecordingOptions):
         :raises ParameterError: its efforts were computed with what the file lacks, unless another
             payload is asked for.
         """
-        from pkm_twin.paths.along import check_computed, settle_rests
+        from pkm_twin.paths.along import check_efforts, settle_rests
 
         motion = settle_rests(self.read(path, robot, planned=True).with_rates())
-        return motion if getattr(self, "payload", None) is not None else check_computed(motion)
+        return motion if getattr(self, "payload", None) is not None else check_efforts(motion)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -59,8 +59,8 @@ class EffortComparison:
             return ""
         return (
             f"the file's efforts of {self.motion.robot.joint_names[worst]} differ from the model's "
-            f"by {100 * self.difference[worst]:.3g} % RMS: the file may be of another robot, "
-            "payload or rotor, or under a wrench that it does not contain"
+            f"by {100 * self.difference[worst]:.3g} % RMS: another robot, payload or rotor, or a wrench "
+            "that the file lacks"
         )
 
 
@@ -70,22 +70,26 @@ def relative_difference(efforts: Array, model: Array) -> Array:
     return np.asarray(np.sqrt(squares / np.maximum((model**2).mean(0), 1e-24)))
 
 
-def check_computed(motion: Recording) -> Recording:
-    """Check that the model computes the efforts that the motion's file says were computed.
+def check_efforts(motion: Recording) -> Recording:
+    """Compare the efforts of a motion's file with the model's, and reject wrong computed ones.
 
-    :returns: the motion, with a note where another robot computed them.
+    :returns: the motion; its ``doubt`` says that measured efforts are not this robot's, or that
+        another robot computed them.
     :raises ParameterError: this robot computed them, or the file does not name its robot, and the
         model computes others: the file lacks a wrench, payload or number that they rest on.
     """
-    if motion.computed is None or not motion.robot.has_masses:
+    if not motion.robot.has_masses:
         return motion
+    doubt = "" if motion.effort is None else compare_efforts(motion).unlike
+    if motion.computed is None:
+        return replace(motion, doubt=doubt)
     origin, away = motion.origin, relative_difference(motion.computed, model_efforts(motion))
     other = "" if origin is None else origin.differs_from(motion.robot)
     worst = int(away.argmax())
     if away[worst] <= (MAX_EFFORT_DIFFERENCE if origin is None or other else 1e-3):
-        return motion
+        return replace(motion, doubt=doubt)
     if other:
-        return replace(motion, notes=(*motion.notes, other))
+        return replace(motion, doubt=other)
     raise ParameterError(
         f"{motion.source}: efforts of {motion.robot.joint_names[worst]}",
         f"{100 * away[worst]:.3g} % RMS from those that {motion.robot.name} computes",

@@ -101,6 +101,8 @@ class Recording:
     """Efforts that the file says a model computed, shape (samples, n), beside what they rest on."""
     origin: Origin | None = None
     """The robot that computed them, where the file names it."""
+    doubt: str = ""
+    """How the file's efforts contradict the robot's model; empty if they do not, or none are known."""
     late: float = 0.0
     """How late the efforts were against the positions, s: they are put on time."""
     source: str = ""
@@ -131,6 +133,10 @@ class Recording:
     def name(self) -> str:
         """The file's name, in one line."""
         return one_line(Path(self.source).name, 100)
+
+    def qualify(self, answer: str) -> str:
+        """Return an answer for this motion, with what makes it doubtful."""
+        return f"{answer}; {self.doubt}" if self.doubt else answer
 
     @property
     def stamps(self) -> np.ndarray[Any, np.dtype[np.int64]]:

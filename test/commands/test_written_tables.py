@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import yaml
 
+from delta_dynamics import inverse_dynamics
 from pkm_twin.recordings import ReadOptions, read
 from pkm_twin.recordings.origin import COMPUTED_WITH, GRAVITY
 from pkm_twin.recordings.tables import PAYLOAD, WRENCH
@@ -106,6 +107,53 @@ def test_a_planned_cycle_gives_the_same_answers_in_every_format(name, ending, tw
     assert ending == "mcap" or same == table
     judged = twin.told("check", out, "--robot", name)
     assert judged["good"] and "none is measured" in twin.good("check", out, "--robot", name).out
+
+
+@pytest.mark.parametrize("name", partly_long(["delta", "upr_rpu"], "upr_rpu"))
+def test_an_exciting_motion_is_the_same_in_its_bag_its_table_and_a_recovered_bag(name, twin, tmp_path):
+    bag, again = tmp_path / "motion.mcap", tmp_path / "again.mcap"
+    twin.good("excite", name, "--out", bag, "--duration", "2", "--harmonics", "3", "--trials", "10", "--rate", "50")
+    twin.good("recover", bag, again)
+    first, *others = (bag.with_suffix(".csv"), bag, again)
+    *expected, _ = answers(twin, name, first)
+    verdict = twin("check", first, "--robot", name, "--json")
+    for path in others:
+        *found, _ = answers(twin, name, path)
+        alike(found, expected)
+        judged = twin("check", path, "--robot", name, "--json")
+        assert judged.code == verdict.code
+        assert json.loads(judged.out)["good"] == json.loads(verdict.out)["good"]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("loads",),
+        ("size",),
+        ("size", "--efforts", "model"),
+        ("torques",),
+        ("map", "acceleration", "--along"),
+        ("design", "--minimise", "peak-effort", "--vary", "geometry.arm_length=0.14:0.3", "--starts", "2", "--path"),
+    ],
+    ids=" ".join,
+)
+def test_efforts_that_the_machine_cannot_explain_are_said_in_the_first_line(words, twin, tmp_path, rng):
+    """Of a table of another program, computed under a wrench that the table does not have."""
+    robot, path, (command, *options) = load("delta"), tmp_path / "foreign.csv", words
+    time, q = swings(robot, rng)
+    qd = np.gradient(q, time, axis=0)
+    qdd = np.gradient(qd, time, axis=0)
+    wrench = np.outer(1.0 + time, [0.0, 0.0, -200.0, 0.0, 0.0, 0.0])
+    for load_there in (0.0, 1.0):
+        effort = inverse_dynamics(robot, q, qd, qdd, load_there * wrench)
+        columns = {"time": time}
+        for word, values in (("position", q), ("velocity", qd), ("acceleration", qdd), ("effort", effort)):
+            columns |= of_joints(robot, word, values)
+        write_columns(path, columns)
+        more = ["--out", tmp_path / "out.csv", "--overwrite"] if command == "torques" else []
+        out = twin.good(command, "delta", *options, path, *more)
+        first = out.err if command == "design" else out.out.splitlines()[0]
+        assert ("differ from the model's" in first) == bool(load_there)
 
 
 def spoilt(path, leave_out=(), change=()):

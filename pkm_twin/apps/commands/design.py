@@ -111,7 +111,6 @@ def read_path(given: Design, path: Path, *, efforts: bool = True) -> tuple[Robot
     :raises BagError: a bag without a motion.
     """
     from pkm_twin.design import PosePath
-    from pkm_twin.paths.along import compare_efforts
 
     robot = given.machine()
     motion = given.read_motion(path, robot)
@@ -120,8 +119,8 @@ def read_path(given: Design, path: Path, *, efforts: bool = True) -> tuple[Robot
             bound = "one that is held throughout; --payload gives one"
             raise ParameterError(f"{path}: payload", str(motion.load), bound)
         robot = motion.load.on(robot)
-    if efforts and robot.has_masses and (unlike := compare_efforts(motion, "file").unlike):
-        warn(path, unlike)
+    if efforts and motion.doubt:
+        warn(path, motion.doubt)
     q, qd, qdd, load = motion.motion
     load = load + np.asarray(given.wrench or np.zeros(6))
     return robot, PosePath.of_joints(robot, motion.time, q, qd, qdd, load)

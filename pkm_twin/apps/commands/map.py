@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, get_type_hints
 
@@ -138,15 +138,16 @@ def compute(given: MapOptions) -> Report:
         # Evaluate the kind along a path; report the worst of each case.
         path = given.along
         from pkm_twin.maps.along import along
-        from pkm_twin.paths.along import check_computed, settle_rests
+        from pkm_twin.paths.along import check_efforts, settle_rests
         from pkm_twin.recordings import ReadOptions, read
         from pkm_twin.recordings.payload import by_load
 
         if given.out is not None and given.out.suffix != ".csv":
             raise ParameterError("out", str(given.out), "a name that ends in .csv")
         motion = read(path, machine, ReadOptions(planned=True, load=given.load))
-        if motion.computed is not None and given.payload is None:
-            check_computed(settle_rests(motion.with_rates()))
+        if given.payload is None and (motion.computed is not None or (motion.effort is not None and len(motion.q) > 2)):
+            doubt = check_efforts(settle_rests(motion.with_rates())).doubt
+            motion = replace(motion, doubt=doubt)
         found = along(
             kind,
             machine,
@@ -170,7 +171,7 @@ def compute(given: MapOptions) -> Report:
             reason = alone if low == beyond else f"{alone}; others are beyond limits or limbs interfere"
             notes.append(f"{beyond} of {len(found.time)} samples would not count, but are included: {reason}")
         return Report(
-            first,
+            motion.qualify(first),
             [
                 Fact("robot", machine.name),
                 Fact("kind", kind.name),

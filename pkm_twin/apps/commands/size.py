@@ -135,8 +135,9 @@ def size(given: Size) -> Report:
         Fact("mean_power_W", net / duration, "W", "mean power"),
     ]
     title = answer
-    if taken.unlike:
-        notes.append(f"{taken.unlike}; --efforts model uses the model's")
+    if doubt := motion.doubt or taken.unlike:
+        answer += f"; {doubt}"
+        answer += "; --efforts model uses the model's" if taken.unlike else ""
     if motors:
         none = f"none of {len(duties[0].fits)}"
         alike = find_smallest([duty.alike for duty in duties])
