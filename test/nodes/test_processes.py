@@ -247,6 +247,34 @@ def test_all_threads_are_real_time_and_memory_stays_or_the_node_warns(peer, laun
         assert locked(process.process.pid) > 10_000
 
 
+HIDING = """
+import sys
+class Hidden:
+    def find_spec(self, name, *_):
+        if name.partition(".")[0] == "llvmlite":
+            raise ModuleNotFoundError("hidden", name=name)
+sys.meta_path.insert(0, Hidden())
+"""
+INSTALLING = ("sudo apt install python3-llvmlite", "pip install llvmlite")
+
+
+def test_a_missing_compiler_is_warned_of_once_at_a_nodes_start_and_in_info(domain, peer, launch_alone):
+    """With the line that installs it."""
+    begin = "from delta_dynamics.nodes import gate\nraise SystemExit(gate.run(gate.NODE))"
+    node = launch_alone(None, code=HIDING + begin, fresh=True, arguments=renamed("slow"))
+    peer.hear(DiagnosticArray, "/diagnostics")
+    array = peer.diagnostics("/slow")
+    assert "llvmlite is not installed" in text_of(array) and array.status[0].level >= DiagnosticStatus.WARN
+    command = "from pkm_twin.apps import cli\ncli.main(['info', 'delta'])"
+    info = Command(domain, [sys.executable, "-c", HIDING + command])
+    assert info.wait() == 0, info.output
+    for output in (node.output, info.output):
+        (line,) = (line for line in output.splitlines() if "llvmlite" in line)
+        assert all(words in line for words in INSTALLING)
+    assert "[WARN]" in next(line for line in node.output.splitlines() if "llvmlite" in line)
+    info.close()
+
+
 def test_a_refusal_of_the_system_is_told(monkeypatch):
     def refuse(*_):
         raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
