@@ -127,6 +127,29 @@ static void @_turn(const double *x, double *s, double *c, int count)
 """
 
 
+ARCTANGENT_C: Final = f"""\
+/* Arctangent of y over x in all quadrants: a quotient of polynomials up to 0.66, beyond it of the
+   angle from an eighth turn. */
+static double @_atan2(double y, double x)
+{{
+    const double small = (fabs(y) > fabs(x)) ? fabs(x) : fabs(y);
+    const double large = (fabs(y) > fabs(x)) ? fabs(y) : fabs(x);
+    const int high = (small * {1 / 0.66!r}) > large;
+    const double over = high ? (small - large) : small;
+    const double below = high ? (small + large) : large;
+    const double u = over / ((below <= 0.0) ? 1.0 : below);
+    const double z = u * u;
+    const double ratio = {_write_horner_c(ATAN_P)}
+        / {_write_horner_c(ATAN_Q)};
+    double angle = PKM_FMA(u * z, ratio, u);
+    angle = high ? ((angle + {HALF_PI_REMAINDER / 2!r}) + {math.pi / 4!r}) : angle;
+    angle = (fabs(y) > fabs(x)) ? (({math.pi / 2!r} - angle) + {HALF_PI_REMAINDER!r}) : angle;
+    angle = (copysign(1.0, x) < 0.0) ? (({math.pi!r} - angle) + {2 * HALF_PI_REMAINDER!r}) : angle;
+    return copysign(angle, y);
+}}
+"""
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Operation:
     """An operation on one to three arguments.
@@ -462,6 +485,8 @@ atan2: Final = Operation(
     _write_atan2,
     lambda e, y, x: (x / (y * y + x * x), -y / (y * y + x * x)),
     math.atan2,
+    c="@_atan2",
+    helper=ARCTANGENT_C,
 )
 minimum: Final = Operation(
     "min",

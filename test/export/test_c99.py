@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import re
 import shutil
@@ -13,8 +14,9 @@ import pytest
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import robot_names
+from pkm_twin.codegen.operations import ARCTANGENT_C
 from pkm_twin.codegen.program import MAX_ITERATIONS
-from pkm_twin.export.c99 import CORRECTIONS
+from pkm_twin.export.c99 import CORRECTIONS, HEAD
 from pkm_twin.export.c_package import c_package
 from test.machine.random_machines import FILES
 from test.support.robots import (
@@ -452,6 +454,25 @@ LANGUAGES = (
     "-std=c99 -O1",
     "-std=c99 -O2 -mfma",
 )
+
+
+@pytest.mark.parametrize("compiler", COMPILERS)
+def test_arctangents_are_those_of_numpy(compiler, tmp_path, rng):
+    """Within two units of rounding in all quadrants, on the axes, and on both sides of a zero."""
+    pairs = 10.0 ** rng.uniform(-150, 150, (4000, 2)) * rng.choice([-1.0, 1.0], (4000, 2))
+    pairs[:2000] = rng.normal(size=(2000, 2))
+    special = [-1e300, -1.0, -0.0, 0.0, 5e-324, 1.0]
+    pairs = np.concatenate([pairs, [[y, x] for y in special for x in special]])
+    call = "double at(double y, double x) { return pkm_atan2(y, x); }\n"
+    (tmp_path / "at.c").write_text(HEAD + ARCTANGENT_C.replace("@", "pkm") + call)
+    command = [compiler, "-O3", *STRICT, "-shared", "-fPIC", "at.c", "-o", "at.so", "-lm"]
+    subprocess.run(command, cwd=tmp_path, check=True)
+    at = ctypes.CDLL(str(tmp_path / "at.so")).at
+    at.restype, at.argtypes = ctypes.c_double, [ctypes.c_double] * 2
+    found, expected = np.array([at(*pair) for pair in pairs]), np.arctan2(*pairs.T)
+    np.testing.assert_allclose(found, expected, rtol=5e-16, atol=0.0)
+    assert (np.signbit(found) == np.signbit(expected)).all()
+    assert np.isnan([at(np.nan, 1.0), at(1.0, np.nan)]).all()
 
 
 @pytest.mark.parametrize("compiler", COMPILERS)
