@@ -197,13 +197,13 @@ class _PoseDrivenMachine:
     def program(self, outputs: dict[str, Numbers], **inputs: int) -> Program:
         """Return the program; ``inputs``: sizes of those besides the pose."""
         t, posed = self.t, self.posed
-        branch: list[Any] = t.limit_growth(self.lead, t.drive_scales, t.pose_scales)
-        branch += certify_assembly(t, self.scheme, posed, self.q) if self.certified else []
+        branch = t.limit_growth(self.lead, t.drive_scales, t.pose_scales)
+        certain = certify_assembly(t, self.scheme, posed, self.q) if self.certified else []
         return Program(
             {"pose": len(posed.q)} | inputs,
             self.layout.size,
             {name: t.lift(values) for name, values in outputs.items()},
-            posed.equations(branch=t.lift(branch)),
+            posed.equations(branch=branch, certain=t.lift(certain)),
             single=self.certified,
         )
 

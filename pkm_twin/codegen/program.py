@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import Any, Final, NamedTuple
 
 from pkm_twin.codegen.expressions import (
@@ -141,6 +141,8 @@ class Equations:
     near: Expression | None = None
     """1 where a single step starts from ``foreseen``, unknowns predicted from another sample."""
     foreseen: Sequence[Expression] = ()
+    certain: Sequence[Expression] = ()
+    """Expressions that are positive where nothing else has to confirm the assembly."""
 
     lone: bool = False
     """Whether samples are solved one by one, so that ``moving`` and ``alive`` need no selects."""
@@ -224,19 +226,27 @@ class Equations:
 
     @cached_property
     def held(self) -> Expression:
-        """1 where all equations hold in the mechanism's own assembly, else 0."""
+        """1 where all equations hold and ``branch`` is positive, else 0."""
         held = less(self.residual, RESIDUAL**2)
         for value in self.branch:
             held = both(held, less(0.0, value))
         return self._lift(held)[0]
 
 
-def holding(equations: Iterable[Equations]) -> list[Expression]:
-    """Return one expression in a list, 1 where all equations hold; nothing without equations."""
-    result: list[Expression] = []
-    for q in equations:
-        result = [both(result[0], q.held) if result else q.held]
-    return result
+def holding(equations: Iterable[Equations], *, certain: bool = True) -> list[Expression]:
+    """Return one expression in a list, 1 where all equations hold; nothing without equations.
+
+    :param certain: whether it has to be :func:`certainty` too.
+    """
+    equations = list(equations)
+    flags = [q.held for q in equations] + (certainty(equations) if certain else [])
+    return [reduce(both, flags)] if flags else []
+
+
+def certainty(equations: Iterable[Equations]) -> list[Expression]:
+    """Return one expression in a list, 1 where the assembly is certain; nothing where it always is."""
+    flags = [q.size.tape.lift(less(0.0, value)) for q in equations for value in q.certain]
+    return [reduce(both, flags)] if flags else []
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,6 +35,7 @@ from pkm_twin.codegen.program import (
     STATE,
     UNKNOWNS,
     Equations,
+    certainty,
     holding,
     previous,
 )
@@ -155,7 +156,7 @@ def _angles(results: Sequence[Expression], known: Mapping[int, str]) -> list[dic
     return [groups[k] for k in sorted(groups)]
 
 
-ROWS: Final = ("home", "origin", "start", "onward", "corrected", "branch", "goal", "foreseen")
+ROWS: Final = ("home", "origin", "start", "onward", "corrected", "branch", "certain", "goal", "foreseen")
 NUMBERS: Final = ("size", "determinant", "residual", "near")
 """What equations have as expressions, in a row and alone."""
 
@@ -196,8 +197,8 @@ class Routine:
 
     ``outputs``: expressions by argument. ``equations``: are solved one after the other.
     ``state``: what it leaves to its next call, by the input ``last``. ``upon``: a function whose
-    body it calls and goes on from. ``single``: whether it makes one attempt. ``otherwise``: where
-    that fails, these are called in turn, on arguments of the same names, as long as they succeed.
+    body it calls and goes on from. ``judge``: a function of inputs of the same names, by whose status
+    results are accepted whose assembly is not certain.
     """
 
     name: str
@@ -207,8 +208,7 @@ class Routine:
     summary: str
     state: Sequence[Expression] = ()
     upon: Routine | None = None
-    single: bool = False
-    otherwise: tuple[Routine, ...] = ()
+    judge: Routine | None = None
 
     @property
     def given(self) -> dict[str, Sequence[Expression]]:
@@ -222,8 +222,8 @@ class Routine:
 
     @property
     def body(self) -> list[Expression]:
-        """Results, then whether the closures hold: 1 or 0."""
-        return [*self.results, *holding(self.equations)]
+        """Results, then whether the closures hold, 1 or 0, and whether no judge is needed."""
+        return [*self.results, *holding(self.equations, certain=False), *certainty(self.equations)]
 
     @property
     def worst(self) -> tuple[int, int]:
@@ -233,11 +233,10 @@ class Routine:
         """
         solved = [q for q in self.equations if q.home]
         step = sum(MAX_ITERATIONS * count(q.correct) + count([*q.begin, *q.onward, *q.aim]) for q in solved)
-        rest = count([*self.results, *(e for q in self.equations for e in (*q.goal, q.held))])
+        rest = count([*self.body, *(e for q in self.equations for e in q.goal)])
         more = len(self.state) > 1
-        tried = solved and not self.single
-        steps, attempts = (sum(LADDER), len(LADDER)) if tried else (1, 1)
-        further = sum(routine.worst[0] for routine in self.otherwise)
+        steps, attempts = (sum(LADDER), len(LADDER)) if solved else (1, 1)
+        further = 0 if self.judge is None else self.judge.worst[0]
         first = (1 + more) * (step + rest)
         return (steps + more) * step + (attempts + more) * rest + further, first
 
@@ -504,30 +503,26 @@ static int @_{name}({more}const double *{q.target}, int steps, double *h, double
         self._bodies[routine.name] = call, body
         rooms["r"] = len(body)
         work = "\n".join([*solving, f"{call % 'r'};", f"status = @_judged(r, {len(routine.results)});"])
-        # Results of functions in its place that it does not give.
-        left = {name: len(row) for o in routine.otherwise for name, row in o.outputs.items()}
-        left = {name: size for name, size in left.items() if name not in routine.outputs}
         lines = [f"    double {name}[{size}] = {{0.0}};" for name, size in rooms.items()]
         if any(q.home for q in routine.equations):
-            lines.append("    int rung;")
+            lines.append("    int rung = 0;")
             first = "(state[0] > 0.0) ? -1 : 0" if "none" in rooms else "0"
-            last = "1" if routine.single else "PKM_ATTEMPTS"
-            loop = f"for (rung = {first}; (rung < {last}) && (status == 1); rung++) {{"
+            loop = f"for (rung = {first}; (rung < PKM_ATTEMPTS) && (status == 1); rung++) {{"
             work = f"status = 1;\n{loop}\n{indent(work, '    ')}\n}}"
         finite = [f"(@_finite({name}, {size}) != 0)" for name, size in routine.inputs.items()]
         lines.append("    int status = 2;")
         if "parameters" not in call:
             lines.append("    (void)parameters;")
         lines += [f"    if ({' && '.join(finite)}) {{", indent(work, "        "), "    }"]
-        if routine.otherwise:
-            lines.append("    if (status == 1) {")
-            for name, size in left.items():
-                lines.append(f"        double {name}[{size}];")
-            for k, other in enumerate(routine.otherwise):
-                names = ", ".join(["parameters", *other.inputs, *other.outputs])
-                call = f"status = @_{other.name}_with({names});"
-                lines.append(f"        if (status == 0) {{ {call} }}" if k else f"        {call}")
-            lines += ["        if (status == 0) { return 0; }", "    }"]
+        if routine.judge is not None:
+            certain = f"(r[{len(body) - 1}] > 0.0)"
+            if any(q.home for q in routine.equations):
+                # It is judged of the first attempt alone.
+                certain = f"((rung == 1) && {certain})"
+            (size,) = map(len, routine.judge.outputs.values())
+            names = ", ".join(["parameters", *routine.judge.inputs, "other"])
+            lines += [f"    if ((status == 0) && !{certain}) {{", f"        double other[{size}];"]
+            lines += [f"        status = @_{routine.judge.name}_with({names});", "    }"]
         at = 0
         for name, row in routine.given.items():
             source = f"&r[{at}]" if at else "r"

@@ -7,6 +7,7 @@ import re
 import textwrap
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -134,7 +135,7 @@ class Package:
             kernels: Callable[[], Kernel] | Sequence[Callable[[], Kernel]],
             own: Sequence[Any] | Array = (),
             upon: str = "",
-            otherwise: tuple[Routine, ...] = (),
+            judge: Routine | None = None,
             **outputs: str,
         ) -> None:
             if self._wants(name):
@@ -154,8 +155,7 @@ class Package:
                         summary,
                         last,
                         base,
-                        bool(otherwise),
-                        otherwise,
+                        judge,
                     )
                 )
 
@@ -208,15 +208,12 @@ class Package:
             )
         add("forward", "Pose of joint positions.", q, lambda: engine.forward, pose="pose")
         if self._wants("inverse"):
-            whole: tuple[Routine, ...] = ()
-            if engine.posed is not None:
-                whole = (self._hidden("inverse_confirmed", {"pose": self.m}, engine.inverse, q="q"),)
             add(
                 "inverse",
                 "Joint positions of a pose, accepted only if _forward of them is the pose.",
                 {"pose": self.m},
                 lambda: engine.quick_inverse,
-                otherwise=whole,
+                judge=self._confirmed,
                 q="q",
             )
             if self.massive:
@@ -329,42 +326,21 @@ class Package:
                 {"acceleration": "acceleration", "qdd": "qdd"},
             ),
         )
-        inverse = result[-1]
         for name, summary, inputs, kernel, outputs in programs:
             if not self._wants(f"{name}_at_pose"):
                 continue
-            otherwise: tuple[Routine, ...] = ()
-            if inverse.otherwise:
-                accepted = kernel(self.robot, certified=False)
-                otherwise = inverse, self._hidden(f"{name}_at_accepted_pose", inputs, accepted, own, **outputs)
             rows, equations = self._read(kernel(self.robot, certified=True), own)
             made = {key: rows[row] for key, row in outputs.items()}
-            result.append(
-                Routine(
-                    f"{name}_at_pose",
-                    inputs,
-                    made,
-                    equations,
-                    summary,
-                    single=bool(otherwise),
-                    otherwise=otherwise,
-                )
-            )
+            result.append(Routine(f"{name}_at_pose", inputs, made, equations, summary, judge=self._confirmed))
 
-    def _hidden(
-        self,
-        name: str,
-        inputs: Mapping[str, int],
-        kernel: Kernel,
-        own: Sequence[Any] | Array = (),
-        **outputs: str,
-    ) -> Routine:
-        """Return a function that others call, which is not declared."""
-        rows, equations = self._read(kernel, own)
-        made = {key: rows[row] for key, row in outputs.items()}
-        routine = Routine(name, inputs, made, equations, "")
-        self.hidden.append(routine)
-        return routine
+    @cached_property
+    def _confirmed(self) -> Routine | None:
+        """The function that judges poses whose assembly is not certain, which is not declared."""
+        if self.robot.engine.posed is None:
+            return None
+        rows, equations = self._read(self.robot.engine.inverse)
+        self.hidden.append(Routine("inverse_confirmed", {"pose": self.m}, rows, equations, ""))
+        return self.hidden[-1]
 
     def _wants(self, name: str) -> bool:
         return not self._names or name in self._names
@@ -372,7 +348,6 @@ class Package:
     def _add_transmission(self, result: list[Routine]) -> None:
         """Add the functions of the robot as a transmission between its pose and its joints."""
         robot, n, m = self.robot, self.n, self.m
-        inverse = next((r for r in result if r.name == "inverse"), None)
         for curved, name, summary, inputs in (
             (
                 False,
@@ -392,34 +367,16 @@ class Package:
         ):
             if not self._wants(name):
                 continue
-            made: list[Routine] = []
-            for certified in (False, True) if robot.engine.posed is not None else (True,):
-                kernel = transmission_kernel(robot, certified=certified, curved=curved)
-                ways = directions(m) if curved else [[]]
-                found = [self._read(kernel, rate=way) for way in ways]
-                rows, equations = found[0]
-                terms = TransmissionTerms(robot, self.fold, rows["ratio"])
-                equations = terms.limit_growth(equations)
-                if curved:
-                    changes = [rows["change"] for rows, _ in found]
-                    outputs = terms.gains(changes)
-                else:
-                    outputs = {"q": rows["q"], **terms.actuator_side()}
-                full = name if certified else f"{name}_accepted"
-                otherwise = (inverse, made[0]) if made and inverse is not None else ()
-                made.append(
-                    Routine(
-                        full,
-                        inputs,
-                        outputs,
-                        equations,
-                        summary,
-                        single=bool(otherwise),
-                        otherwise=otherwise,
-                    )
-                )
-            self.hidden += made[:-1]
-            result.append(made[-1])
+            kernel = transmission_kernel(robot, certified=True, curved=curved)
+            found = [self._read(kernel, rate=way) for way in (directions(m) if curved else [[]])]
+            rows, equations = found[0]
+            terms = TransmissionTerms(robot, self.fold, rows["ratio"])
+            equations = terms.limit_growth(equations)
+            if curved:
+                outputs = terms.gains([rows["change"] for rows, _ in found])
+            else:
+                outputs = {"q": rows["q"], **terms.actuator_side()}
+            result.append(Routine(name, inputs, outputs, equations, summary, judge=self._confirmed))
         if self._wants("actuator_to_joint"):
             kernel = robot.engine.kernel("actuator to joint", actuator_program)
             rows, equations = self._read(kernel)

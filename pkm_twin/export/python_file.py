@@ -15,7 +15,19 @@ from typing import Any, Final
 from pkm_twin.codegen.expressions import PARAMETERS, Expression
 from pkm_twin.codegen.operations import OPERATIONS
 from pkm_twin.codegen.plain import source
-from pkm_twin.codegen.program import AHEAD, AT, CLOSED, CONTRACTION, FIRST, LEAST, MARGIN, RESIDUAL, STATE, previous
+from pkm_twin.codegen.program import (
+    AHEAD,
+    AT,
+    CLOSED,
+    CONTRACTION,
+    FIRST,
+    LEAST,
+    MARGIN,
+    RESIDUAL,
+    STATE,
+    certainty,
+    previous,
+)
 from pkm_twin.export.c99 import Folding, Routine
 from pkm_twin.export.c_package import Package
 from pkm_twin.kinematics.programs import SAME_POSE
@@ -195,15 +207,13 @@ def _call(inputs, equations, results, sizes):
     return (*rows, valid)
 
 
-def _choose(results, further, checked):
-    # Other results where the first are not valid.
-    *rows, valid = results
-    if _is_done(valid):
-        return results
-    *others, good = further()
-    good = valid | (good & checked())
-    rows = [xp.where(valid[..., None], a, b) for a, b in zip(rows, others)]
-    return (*[xp.where(good[..., None], row, float("nan")) for row in rows], good)
+def _judge(results, judge):
+    # Results whose assembly is not certain are valid where the judge's are.
+    *rows, certain, valid = results
+    certain = certain[..., 0] > 0.0
+    if not _is_done(certain | ~valid):
+        valid = valid & (certain | judge()[-1])
+    return (*[xp.where(valid[..., None], row, float("nan")) for row in rows], valid)
 """
 
 
@@ -271,18 +281,16 @@ def _write_function(routine: Routine, payload: Mapping[str, Sequence[Any]], pref
         )
         judged.append(q.residual)
         branches += q.branch
-    outputs = [e for row in routine.outputs.values() for e in fold(row, payload)]
+    own = list(routine.outputs.values()) + ([] if routine.judge is None else [certainty(routine.equations)])
+    outputs = [e for row in own for e in fold(row, payload)]
     results = write("results", [*outputs, *judged, *branches])
-    sizes = [len(row) for row in routine.outputs.values()]
+    sizes = [len(row) for row in own]
     shapes = [f"{key} (..., {size})" for key, size in routine.inputs.items()]
     gives = [f"{key} (..., {len(row)})" for key, row in routine.outputs.items()]
     inputs = ", ".join(f"{key!r}: {key}" for key in routine.inputs)
     call = f"_call({{{inputs}}}, equations, {results}, {tuple(sizes)})"
-    if routine.otherwise:
-        # Where this fails, the last of these gives the results, if all succeed.
-        *checks, last = routine.otherwise
-        further = " & ".join(f"{one.name}({', '.join(one.inputs)})[-1]" for one in checks) or "True"
-        call = f"_choose({call}, lambda: _{last.name}({', '.join(last.inputs)}), lambda: {further})"
+    if routine.judge is not None:
+        call = f"_judge({call}, lambda: _{routine.judge.name}({', '.join(routine.judge.inputs)}))"
     parts.append(
         f"\n\ndef {prefix}{name}({', '.join(routine.inputs)}):\n"
         f'    """{routine.summary}\n\n    {", ".join(shapes)} -> {", ".join(gives)}, mask (...).\n'

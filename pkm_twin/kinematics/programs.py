@@ -192,7 +192,7 @@ def quick_inverse_program(t: Traced, scheme: CarriedScheme) -> Program:
     ``forward``, to second order about home, is near the pose; others are left to that program.
     """
     posed, q = solve_pose(t, scheme)
-    equations = posed.equations(branch=t.lift(certify_assembly(t, scheme, posed, q)))
+    equations = posed.equations(certain=t.lift(certify_assembly(t, scheme, posed, q)))
     return Program({"pose": len(posed.q)}, 0, {"q": t.lift(q)}, equations, single=True)
 
 
@@ -227,8 +227,8 @@ def transmission_program(t: Traced, scheme: CarriedScheme | None, *, certified: 
             changes = t.tree.drive_rates(change, t.du)
     else:
         posed, q = solve_pose(t, scheme)
-        branch = certify_assembly(t, scheme, posed, q) if certified else []
-        equations = posed.equations(branch=t.lift(branch))
+        certain = certify_assembly(t, scheme, posed, q) if certified else []
+        equations = posed.equations(certain=t.lift(certain))
         by_pose = posed.rates_of_joints(t.graph.actuated)
         if rate is not None:
             posed.set_rates(rate)
