@@ -118,6 +118,7 @@ def test_a_file_has_tolerances_of_its_parts(twin, tmp_path, name):
     assert "tolerances.joints.*.offset" in twin.refused("design", path, "--tolerance", "file")
 
 
+@pytest.mark.long
 def test_copies_that_are_off_alike_stay_so_without_limbs(twin, tmp_path):
     path, out = tmp_path / "delta.yaml", tmp_path / "graph.yaml"
     data = yaml.safe_load(Path("examples/machines/delta_graph.yaml").read_text())

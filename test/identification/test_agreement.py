@@ -325,6 +325,7 @@ def test_a_fit_is_compared_with_the_file_wherever_it_starts() -> None:
     np.testing.assert_allclose(sizes, np.broadcast_to(sizes[1], np.shape(sizes)), rtol=0.02)
 
 
+@pytest.mark.long
 def test_a_payload_is_looked_for_with_the_memory_of_friction() -> None:
     """It is held throughout, though no effort tells at first what friction does."""
     robot, rng = load("five_bar"), np.random.default_rng(5)

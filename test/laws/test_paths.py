@@ -253,6 +253,7 @@ def missed_by_the_rates(motion):
     return np.abs(np.diff(q, axis=0) - np.einsum("kg,kgn->kn", half * weight, qd)).sum(0).max()
 
 
+@pytest.mark.long
 def test_rates_with_limits_of_jerk_are_those_of_the_positions():
     """Two of the points are 10 micrometres apart; there the machine nearly stops."""
     robot = load("delta_cu").changed(payload={"mass": 0.3})

@@ -14,7 +14,7 @@ from pkm_twin.kinematics.singularity import singularity_at_home
 from pkm_twin.mechanisms.machine import Machine
 from pkm_twin.robot.urdf_home import Assembly
 from pkm_twin.robot.urdf_read import read_tree
-from test.support.robots import often, partly_long, random_joints
+from test.support.robots import partly_long, random_joints
 
 pytest.importorskip("pinocchio")
 
@@ -126,15 +126,15 @@ def test_the_index_is_that_of_the_machine_however_its_closures_are_written(tmp_p
     assert found[0] == pytest.approx(found[1], rel=1e-9)
 
 
-@pytest.mark.parametrize("tries", often(1, 12))
-def test_of_several_assemblies_the_best_conditioned_is_home(tries, tmp_path):
+@pytest.mark.long
+def test_of_several_assemblies_the_best_conditioned_is_home(tmp_path):
     """Those that Pinocchio's tree has with the motors at zero, each made a drawing of its own."""
     path = spheres(palletizer(), tmp_path)
     _, robot = read(path)
     best = float(robot.singularity(robot.inverse(robot.home())))
     tree = spheres_of(path)
     rng, found = np.random.default_rng(2), []
-    for _ in range(tries):
+    for _ in range(12):
         q = np.zeros(tree.model.nv)
         q[tree.loose] = rng.uniform(-np.pi, np.pi, len(tree.loose))
         if np.abs(tree.rows(settled(tree, q, tree.loose))[0]).max() < 1e-9:
