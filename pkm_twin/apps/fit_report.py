@@ -14,6 +14,7 @@ from pkm_twin.identification.compare import lateness
 from pkm_twin.identification.deflections import ElasticFit
 from pkm_twin.identification.drives import DriveFriction, Law
 from pkm_twin.identification.fit import Fit, Judged, Result
+from pkm_twin.identification.hypotheses import Explanation
 from pkm_twin.identification.parameters import Group, Number
 from pkm_twin.report import Column, Fact, Report, Table, plots
 
@@ -109,6 +110,7 @@ def report_fit(result: Result, marks: Sequence[str] = ()) -> tuple[Report, list[
         c.name: (c.residual, c.noise, unit, 100.0 * c.left, c.held_out)
         for c, unit in zip(result.verdict.channels, own, strict=True)
     }
+    explained = result.explained if isinstance(result, Fit) else ()
     return Report(
         _answer(result, held),
         [
@@ -125,12 +127,24 @@ def report_fit(result: Result, marks: Sequence[str] = ()) -> tuple[Report, list[
         ],
         [
             Table("", number_columns, number_rows, "parameters", "parameter"),
+            *tabulate_causes(explained, [judged.name for judged in result.judged]),
             Table("", columns, held, "residual of the last third, which was held out", "recording"),
         ],
         {"": partial(_draw_changes, {label(n): n for n in shown})}
         | {f"_{k}": partial(_draw_residuals, one, units) for k, one in enumerate(result.judged)},
         notes,
     ), [Table("", channel_columns, channel_rows, "verdict", "channel")]
+
+
+def tabulate_causes(explained: Sequence[Explanation], names: Sequence[str]) -> list[Table]:
+    """Return a table of what was considered as the cause of each recording's deviations."""
+    rows = {
+        f"{name}: {text}" if len(explained) > 1 else text: (100.0 * part,)
+        for name, one in zip(names, explained, strict=False)
+        for text, part in one.considered
+    }
+    column = Column("probability_percent", text="probability (%)", form=".3g")
+    return [Table("considered", [column], rows, "considered as the cause of deviations", "cause")] * bool(rows)
 
 
 def _name(number: Number) -> str:

@@ -31,10 +31,8 @@ from pkm_twin.identification.compare import (
 )
 from pkm_twin.identification.fit import Fit, fit
 from pkm_twin.identification.friction_laws import fit_recordings
-from pkm_twin.identification.hypotheses import NO_MACHINE, Explanation, explain
+from pkm_twin.identification.hypotheses import NO_MACHINE, Explanation, describe_steps, explain_recording
 from pkm_twin.identification.judge import LOUD
-from pkm_twin.identification.parameters import file_parameters
-from pkm_twin.identification.rows import rows_of
 from pkm_twin.identification.words import LATEST, listed, position_text, scale_text
 from pkm_twin.recordings import Recording
 from pkm_twin.report import Fact, Verdict, judged
@@ -43,7 +41,6 @@ from pkm_twin.robot.plausibility import why_no_torques
 from pkm_twin.streams.drives import CONSTANT_SAMPLES, MAX_RELATIVE_CHANGE
 from pkm_twin.streams.noise import estimate_deviation
 from pkm_twin.streams.rates import MAX_RATE, STANDSTILL_FRACTION, rate_faults, rms
-from pkm_twin.streams.steps import find_play
 
 REJECTED: Final = "messages that a node rejects"
 POSITION_STEPS: Final = "position steps"
@@ -81,6 +78,8 @@ class Checked:
     compared, why they are not one machine's."""
     findings: tuple[str, ...] = ()
     """What `fit` says of them, where nothing explains them."""
+    explanation: Explanation | None = None
+    """What explains the efforts most probably, as `fit` has it; None where it was not asked."""
     hint: str = ""
     """The payload that explains most of a good residual; empty: none does."""
 
@@ -142,8 +141,9 @@ def checked(r: Recording, residual: float) -> Checked:
         reason = "joint states without efforts: the bag has none, or NaN, in some or all of them"
         reason = "the table has no columns JOINT.effort" if r.bag is None else reason
         reason = COMPUTED if r.efforts == "model" else reason
-    fault = r.step_fault if r.steps.publishers else _play_of(r)
-    if fault or reason:
+    fault = describe_steps(r)
+    # Single jumps are left out of what is compared.
+    if reason or r.steps.publishers or (fault and fault != r.step_fault):
         items.append(judged(RESIDUAL, fault or reason, bound, None))
         return Checked(r, items, unjudged=reason, causes=(fault,) if fault else ())
     try:
@@ -167,17 +167,6 @@ def checked(r: Recording, residual: float) -> Checked:
             items.append(judged(MEASURED, stuck, "change as the model's", False))
         items += _residuals(r, compared, bands, bound)
     return Checked(r, items, bands, unjudged, compared, left_out)
-
-
-def _play_of(r: Recording) -> str:
-    """Say which joints cross play in their positions, and how far; empty where none does."""
-    names, units = r.robot.joint_names, r.robot.joint_units
-    found = [
-        f"the position of {name} steps by {size:.3g} {unit} {count} times, up and down in turn"
-        for name, unit, size, count in zip(names, units, *find_play(r.q), strict=True)
-        if count
-    ]
-    return f"{'; '.join(found)}: play between the joint and its encoder?" if found else ""
 
 
 def _file(r: Recording) -> list[Fact]:
@@ -204,7 +193,7 @@ def _motion(r: Recording) -> list[Fact]:
     median, longest = float(np.median(periods)), float(periods.max())
     gap = f"{1e3 * longest:.3f} ms at {r.time[int(periods.argmax())]:.3f} s"
     within, rate = 5.0 * median, f"{1 / median:.1f} Hz over {r.time[-1]:.3f} s"
-    fault = r.step_fault or _play_of(r)
+    fault = describe_steps(r)
     items = [
         judged("rate", rate, "", True, number=1 / median, unit="Hz"),
         missing_samples(r.time),
@@ -426,58 +415,50 @@ def check(r: Recording, residual: float = MAX_RESIDUAL, thorough: bool = True) -
     :param thorough: also ask what `fit` finds, which takes some seconds.
     """
     found = checked(r, residual)
-    if found.causes:
+    c, bad, played = found.compared, found.named(Verdict.BAD), POSITION_STEPS in found.named(Verdict.BAD)
+    if r.step_fault or (found.causes and (found.unjudged or not played)):
+        return replace(found, causes=found.causes or (r.step_fault,))
+    # Of positions that are none the efforts say nothing; noise needs no explanation.
+    unlike = c is not None and (not c.good.all() or (thorough and (c.rms > LOUD * c.noise).any()))
+    one = _explain(found) if played or (unlike and VELOCITIES not in bad) else None
+    found = replace(found, explanation=one)
+    if played:
+        return replace(found, causes=(one.cause,) if one else found.causes)
+    if c is None or VELOCITIES in bad:
         return found
-    c = found.compared
-    if thorough and found.answer == "good" and c is not None:
-        # Of a residual that is noise nothing is to be explained.
-        one = _explain(found) if (c.rms > LOUD * c.noise).any() else None
-        text = one.text.partition(" explains the efforts: use ") if one and one.load else ("",) * 3
-        hint = f"{text[0]} explains most of the residual: {text[2]}" if text[2] else ""
-        return replace(found, hint=hint)
-    causes, findings = _causes_of(found, thorough)
-    return replace(found, causes=causes, findings=findings)
-
-
-Explained = tuple[tuple[str, ...], tuple[str, ...]]
-"""Causes that make the efforts agree, and what `fit` finds where there is none."""
-
-
-def _causes_of(found: Checked, thorough: bool) -> Explained:
-    """Find the first cause that makes the efforts agree."""
-    c, r, bad = found.compared, found.recording, found.named(Verdict.BAD)
-    # Of positions that are none the efforts say nothing.
-    if {POSITION_STEPS, VELOCITIES, MEASURED} & set(bad) or c is None:
-        return (), ()
     if c.good.all():
-        return (c.delayed,) if c.delayed else (), ()
-    cause = _explain(found)
-    if cause is not None and cause.text and not cause.text.startswith(NO_MACHINE):
-        return (cause.text,), ()
+        text = one.text.partition(" explains the efforts: use ") if one and one.load else ("",) * 3
+        hint = f"{text[0]} explains most of the residual: {text[2]}" if text[2] and found.answer == "good" else ""
+        return replace(found, hint=hint, causes=(c.delayed,) if c.delayed else ())
+    if one is not None and one.text and not one.text.startswith(NO_MACHINE):
+        return replace(found, causes=(one.text,))
+    if MEASURED in bad:
+        return found
     causes = _saturated(r, c) or tuple(
         text for text, after in _contact(r, c) if _agrees(r, found.left_out | after, c.bound)
     )
-    if causes or not thorough:
-        return causes, ()
-    return _of_fit(found, c.bound)
+    findings: tuple[str, ...] = ()
+    if thorough and not causes:
+        causes, findings = _of_fit(found, c.bound)
+    return replace(found, causes=causes, findings=findings)
 
 
 def _explain(found: Checked) -> Explanation | None:
     """Return what explains a recording, as `fit` has it; None where it cannot be fitted."""
-    r, c = recorded_of(found.recording, found.left_out), found.compared
+    r, c = found.recording, found.compared
     if r.robot.redundant and c is not None:
         # Of drives that share: the signs of some, or the scale of all.
-        whole, opposed = found.recording, ~c.good & (np.sum(c.measured * c.expected, 0) < 0.0)
+        opposed = ~c.good & (np.sum(c.measured * c.expected, 0) < 0.0)
         scale = float(np.sum(c.measured * c.expected) / max(float(np.sum(c.expected**2)), 1e-300))
         names = listed(np.array(r.robot.joint_names)[opposed].tolist(), len(opposed))
         tried = [(f"efforts of {names} have the wrong sign", np.where(opposed, -1.0, 1.0))] * bool(opposed.any())
         for text, factors in (*tried, (scale_text("all joints", scale), np.full(len(opposed), 1.0 / scale))):
-            if _agrees(replace(whole, effort=factors * whole.measured), found.left_out, c.bound):
+            if _agrees(replace(r, effort=factors * r.measured), found.left_out, c.bound):
                 return Explanation(text, fault=True)
     if r.robot.redundant:
         return None
     try:
-        return explain(rows_of(r.robot, file_parameters(r.robot), r))
+        return explain_recording(r.robot, r)
     except (PkmTwinError, ValueError, np.linalg.LinAlgError):
         return None
 
@@ -536,7 +517,7 @@ def _saturated(r: Recording, c: Compared) -> tuple[str, ...]:
     return tuple(texts)
 
 
-def _of_fit(found: Checked, bound: float) -> Explained:
+def _of_fit(found: Checked, bound: float) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Whether other friction, or all that a fit varies, explains the efforts; else its findings."""
     r = found.recording
     try:

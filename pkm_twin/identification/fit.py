@@ -93,9 +93,13 @@ class Result:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Fit(Result):
-    """A fit of efforts."""
+    """A fit of efforts.
+
+    ``explained``: what explains each recording most probably, as `check` has it; empty for currents.
+    """
 
     problem: Problem
+    explained: tuple[Explanation, ...] = ()
 
     @property
     def filtering(self) -> tuple[Filtering, ...]:
@@ -120,7 +124,7 @@ def fit(
     *,
     accept: bool = False,
     progress: Callable[[int], None] | None = None,
-    explained: Sequence[Explanation | None] | None = None,
+    explained: Sequence[Explanation] = (),
     known: Sequence[Rows] = (),
 ) -> Fit:
     """Fit some kinds of numbers of a robot's file.
@@ -129,21 +133,23 @@ def fit(
     :param accept: fit recordings that this machine cannot have made, too.
     :param progress: called with the number of recordings that are read.
     :param explained: of each recording, where it is known, what
-        :func:`~pkm_twin.identification.hypotheses.explain` returns; ``known``: rows that are read.
+        :func:`~pkm_twin.identification.hypotheses.explain_recording` returns; ``known``: rows that are read.
     :raises PkmTwinError: recordings that are too short, that show nothing, or that this machine
         cannot have made.
     """
     problem = Problem.of(robot, recordings, what, progress=progress, known=known)
-    told = explained or [None] * len(recordings)
-    moved = on_time(problem)
-    why = [one or explain(made) for one, made in zip(told, moved.whole, strict=True)]
-    if moved is not problem and any(one.fault for one in why):
-        # Of another machine's recording the delay says nothing.
-        why = [one or explain(made) for one, made in zip(told, problem.whole, strict=True)]
+    why = explained or [explain(made) for made in problem.whole]
     names = [made.recording.name for made in problem.whole]
-    faults = [f"{name}: {one.text}" for name, one in zip(names, why, strict=True) if one.fault]
-    problem = moved if not faults else problem
-    faults = faults or _late(problem)
+    faults = [f"{name}: {one.cause}" for name, one in zip(names, why, strict=True) if one.fault]
+    if not faults:
+        # Of another machine's recording the delay says nothing.
+        problem = on_time(problem)
+        faults = [
+            f"{made.recording.name}: {late_text('all joints', late)}"
+            for made, late in zip(problem.whole, delays(problem), strict=True)
+            # What was not put on time has no delay that the efforts show.
+            if abs(late) > LATEST and made.recording.late
+        ]
     refuse_faults(faults, accept)
     problem.check_count()
     faults = faults or _worse(problem)
@@ -241,18 +247,6 @@ def fitted(problem: Problem, accepted: tuple[str, ...] = ()) -> Fit:
     )
 
 
-def _late(problem: Problem) -> list[str]:
-    """Return recordings whose efforts are too late.
-
-    What was not put on time has no delay that the efforts show.
-    """
-    return [
-        f"{made.recording.name}: {late_text('all joints', late)}"
-        for made, late in zip(problem.whole, delays(problem), strict=True)
-        if abs(late) > LATEST and made.recording.late
-    ]
-
-
 def _worse(problem: Problem) -> list[str]:
     """List recordings whose held-out part the fitted values predict worse than the file's.
 
@@ -289,10 +283,12 @@ def find_worse(result: Result) -> str:
         parts = one.measured - one.before, one.measured - one.after, 1e-6 * one.measured
         sums += [np.nansum(part**2, 0) for part in parts]
     before, after, floor = sums
-    some = before + after > 2.0 * floor
-    if not some.any() or np.mean((after / np.maximum(before, floor))[some]) <= 1.0:
+    # A channel that no recording measures has neither residual.
+    seen = np.flatnonzero(before + after > 2.0 * floor)
+    ratios = after[seen] / np.maximum(before, np.maximum(floor, 1e-300))[seen]
+    if not len(seen) or np.mean(ratios) <= 1.0:
         return ""
-    worst = int(np.argmax(np.where(some, after / np.maximum(before, floor), 0.0)))
+    worst = int(seen[np.argmax(ratios)])
     count = sum(np.isfinite(one.measured[:, worst]).sum() for one in result.judged)
     new, old = (float(np.sqrt(part[worst] / count)) for part in (after, before))
     return (

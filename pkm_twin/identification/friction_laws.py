@@ -21,11 +21,11 @@ from pkm_twin.errors import BagError, ParameterError, PkmTwinError, UnknownNameE
 from pkm_twin.identification.compare import missing_samples, recorded_of
 from pkm_twin.identification.drives import FIT, fitted_constants, given_constants
 from pkm_twin.identification.fit import Fit, fit, fitted, on_time, refuse_faults
-from pkm_twin.identification.hypotheses import Explanation, explain
+from pkm_twin.identification.hypotheses import Explanation, describe_positions, explain_recording
 from pkm_twin.identification.identifiable import KINDS, LOAD, Kind, of_drives
 from pkm_twin.identification.judge import SIGMAS, Verdict, basis_of
 from pkm_twin.identification.parameters import Number, file_parameters
-from pkm_twin.identification.rows import Problem, Rows, rows_of
+from pkm_twin.identification.rows import Problem
 from pkm_twin.identification.samples import EXACT, filtered
 from pkm_twin.identification.suspects import LINE
 from pkm_twin.machine.friction import BASIC, KNOWN_FRACTION, LAWS, Dahl, select_compiled_laws
@@ -190,27 +190,28 @@ def fit_recordings(
                 path=Path(r.source),
                 reason="frames",
             )
-    file, found = robot, ((r.name, r.step_fault) for r in recordings)
-    faults = [f"{name}: position steps that are no motion: {fault}" for name, fault in found if fault]
+    file = robot
+    faults = [f"{r.name}: {describe_positions(r)}" for r in recordings if r.step_fault]
     refuse_faults(faults, accept)
     notes = [f"accepted by --accept: {fault}" for fault in faults]
     for r in recordings:
         if sampling_of(r.time).missing:
             gaps = missing_samples(r.time)
             notes.append(f"{r.name}: {gaps.text} {gaps.value}, {gaps.bound}: {gaps.verdict}")
-    made = [recorded_of(r) for r in recordings]
-    explained: list[Explanation | None] = [None] * len(made)
-    rows = list[Rows]()
+    found: list[Explanation] = []
     if constant is None:
         seen = robot
         if "friction" in what and Dahl.name in (laws or ()):
             # What a memory does at reversals is no payload.
-            seen = _remembering(robot, made, what)
-        parameters = file_parameters(seen)
-        rows = [rows_of(seen, parameters, r) for r in made]
-        explained = [explain(one) for one in rows]
-    for k, one in enumerate(explained):
-        if one is None or not one.text or (one.fault and one.load is None):
+            seen = _remembering(robot, [recorded_of(r) for r in recordings], what)
+        found = [explain_recording(seen, r) for r in recordings]
+    rows = [one.rows for one in found if one.rows is not None]
+    made = [one.recording for one in rows] or [recorded_of(r) for r in recordings]
+    explained = list(found)
+    for k, one in enumerate(found):
+        if one.steps and not one.fault:
+            notes.append(f"{made[k].name}: {one.steps}")
+        if not one.text or (one.fault and one.load is None):
             continue
         note, load = one.text, one.load
         # Of several recordings each has another estimate.
@@ -218,7 +219,7 @@ def fit_recordings(
             made[k] = replace(made[k], load=load)
             spans = ", ".join(f"from {a:.2f} to {b:.2f} s" for a, b in load.times)
             note = f"the payload is held {spans or 'throughout'}"
-            explained[k] = None
+            explained[k] = Explanation("")
         notes.append(f"{made[k].name}: {note}")
     if "payload" in what:
         loads = [r.load for r in made if r.load is not None]
@@ -242,6 +243,7 @@ def fit_recordings(
         made, notes = [constants.applied(r) for r in made], constants.lines(robot) + notes
     options = {"accept": accept, "progress": progress, "explained": explained, "known": rows}
     result, choices = fit_with_laws(robot, made, what, laws, **options)
+    result = replace(result, explained=tuple(found))
     return result if robot is file else _beside(file, result), choices, notes
 
 

@@ -11,7 +11,7 @@ wide enough for a heavy payload would prefer a wrong scale to a sound recording 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import combinations
 from typing import Any, Final
@@ -20,15 +20,19 @@ import numpy as np
 import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.errors import PkmTwinError
+from pkm_twin.errors import PkmTwinError, SingularityError, UnreachableError
 from pkm_twin.identification.columns import OFFSET_SHARE, Columns
+from pkm_twin.identification.compare import idle_of, recorded_of
 from pkm_twin.identification.evidence import Model, Spectra
 from pkm_twin.identification.judge import ALTERNATIVE, SIGMAS
+from pkm_twin.identification.parameters import file_parameters
 from pkm_twin.identification.rows import LARGEST, Rows, rows_of
 from pkm_twin.identification.samples import Motion, held_payload
-from pkm_twin.identification.words import LATEST, UNITS, late_text, listed, scale_text, usual_scale
+from pkm_twin.identification.words import LATEST, UNITS, late_text, listed, position_text, scale_text, usual_scale
 from pkm_twin.messages.reading import in_base_axes
 from pkm_twin.recordings import Load, Recording
+from pkm_twin.robot.robot import Robot
+from pkm_twin.streams.steps import find_play
 
 HEAVY: Final = 30.0
 """Deviation of a heavy payload over that of a usual one."""
@@ -41,6 +45,8 @@ CLASSES: Final = {
     "friction heavy payload": 5.0,
 }
 """Kinds of numbers that differ from the file, and the log prior odds against it."""
+LISTED: Final = 6
+"""Causes that are listed with their probabilities, at most."""
 SHARES: Final = np.geomspace(0.01, 1.0, 7)
 """Shares of the discrepancy: no model of a machine is better than 1 % of its efforts."""
 UNIT: Final = 5.0
@@ -85,12 +91,22 @@ class Explanation:
     """Name the cause of a recording's deviations; empty if the file or several numbers explain them.
 
     ``fault``: this machine cannot have made the recording, or not with the payload that is given.
-    ``load``: the payload that explains the efforts.
+    ``load``: the payload that explains the efforts. ``steps``: positions that step without a motion.
+    ``considered``: the most probable causes with their probabilities. ``rows``: those that were
+    explained.
     """
 
     text: str
     fault: bool = False
     load: Load | None = None
+    steps: str = ""
+    considered: tuple[tuple[str, float], ...] = ()
+    rows: Rows | None = field(default=None, compare=False, repr=False)
+
+    @property
+    def cause(self) -> str:
+        """What the positions and the efforts show, in words."""
+        return "; ".join(text for text in (self.steps, self.text) if text)
 
 
 class Search:
@@ -403,6 +419,16 @@ class Search:
             return Explanation(held.text, load=held.load)
         return Explanation("")
 
+    def list_causes(self) -> tuple[tuple[str, float], ...]:
+        """Return the most probable causes with their probabilities; other numbers by their kinds."""
+        found = [(one.text, one.log) for one in self.all if one.text]
+        for kinds, part in zip(CLASSES, self.sound.classes, strict=True):
+            text = f"other numbers in the file: {kinds}" if kinds else "the file as it is"
+            found.append((text, self.sound.log + float(np.log(max(part, 1e-300)))))
+        parts = scipy.special.softmax([log for _, log in found])
+        order = np.argsort(-parts)[:LISTED].tolist()
+        return tuple((found[k][0], float(parts[k])) for k in order if parts[k] > 1e-6)
+
     def _tell_scale(self, scale: float, kinds: str = "") -> Explanation | None:
         """Return that all efforts are scaled; None where heavier masses explain them better.
 
@@ -487,7 +513,50 @@ def explain(rows: Rows) -> Explanation:
     if period > 1.0:
         text = f"samples {period:.3g} s apart show no motion (is the time in ms?)"
         return Explanation(text, fault=True)
-    return Search(rows).explain()
+    search = Search(rows)
+    found = search.explain()
+    return found if found.considered else replace(found, considered=search.list_causes())
+
+
+def explain_recording(robot: Robot, r: Recording) -> Explanation:
+    """Return what explains a recording most probably: the cause that `check` names, and `fit` notes or rejects.
+
+    A payload is the cause if nothing contradicts it.
+
+    :raises PkmTwinError: a recording whose efforts cannot be compared with the robot's.
+    """
+    rows = rows_of(robot, file_parameters(robot), recorded_of(r))
+    found = explain(rows)
+    if found.load is not None:
+        loaded = explain(rows_of(robot, rows.model.parameters, replace(rows.recording, load=found.load)))
+        found = loaded if loaded.fault else found
+    return replace(found, steps="" if r.step_fault else describe_steps(r), rows=rows)
+
+
+def describe_steps(r: Recording) -> str:
+    """Say which positions step without a motion: by several publishers, by play, or by a fault of the encoder."""
+    names, units = r.robot.joint_names, r.robot.joint_units
+    found = (
+        []
+        if r.steps.publishers
+        else [
+            f"the position of {name} steps by {size:.3g} {unit} {count} times, up and down in turn"
+            for name, unit, size, count in zip(names, units, *find_play(r.q), strict=True)
+            if count
+        ]
+    )
+    return f"{'; '.join(found)}: play between the joint and its encoder?" if found else r.step_fault
+
+
+def describe_positions(r: Recording) -> str:
+    """Say why positions that step are no motion of the machine: it cannot take them, or they jump."""
+    steps = describe_steps(r)
+    if steps == r.step_fault and not r.steps.publishers and r.effort is not None:
+        try:
+            idle_of(r)
+        except (UnreachableError, SingularityError) as error:
+            return position_text(error)
+    return f"position steps that are no motion: {steps}"
 
 
 def wrenches(r: Recording, motion: Motion) -> Iterator[tuple[str, Array]]:

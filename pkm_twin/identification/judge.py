@@ -370,8 +370,8 @@ class Fitted:
         """Return the numbers' mean, and their covariance about it over all sets of kinds of errors.
 
         The mean is that of the found errors: numbers that are used without the others predict best.
-        Errors that are known to be there, such as those of lengths, are in all sets.
-
+        Errors that are known to be there, such as those of lengths, are in all sets. The sets are
+        weighed by all rows, as errors are selected; each set's numbers are those of the fitted rows.
 
         :param used: columns of the found errors: their shares of the discrepancy are taken.
         """
@@ -387,13 +387,13 @@ class Fitted:
         kinds += rare[:3]
         for places in rare[3:]:
             always[places] = True
-        shares = self.model.logs(used)
+        shares, all_shares = self.model.logs(used), self.whole.logs(used)
         logs, masks = [], []
         for which in product((False, True), repeat=len(kinds)):
             inside = [k for own, on in zip(kinds, which, strict=True) if on for k in own]
             masks.append(self.with_columns(always, inside))
             prior = [PRESENT if on else 1.0 - PRESENT for on in which]
-            logs.append(self.model.log_evidence(masks[-1], shares) + float(np.log(prior).sum()))
+            logs.append(self.whole.log_evidence(masks[-1], all_shares) + float(np.log(prior).sum()))
         weights = np.exp(np.array(logs) - max(logs))
         weights[weights < 1e-3] = 0.0
         weights /= weights.sum()

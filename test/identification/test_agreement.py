@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import re
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +15,7 @@ from pkm_twin import Robot
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.check import check, recorded_of
 from pkm_twin.identification.compare import compare
-from pkm_twin.identification.fit import Fit, fit
+from pkm_twin.identification.fit import Fit, find_worse, fit
 from pkm_twin.identification.friction_laws import fit_recordings
 from pkm_twin.machine.friction import Dahl
 from pkm_twin.recordings import Load, Recording
@@ -277,6 +278,37 @@ def test_fit_and_check_agree(name: str) -> None:
         agree(bare, made)
 
 
+@pytest.mark.parametrize(
+    ("name", "what"),
+    [
+        pytest.param(name, what, marks=() if name == "five_bar" and what == "play" else pytest.mark.long)
+        for name in ("five_bar", "linear_delta", "prru")
+        for what in (*IMPOSSIBLE, *WRONG, "sound", "play")
+    ],
+)
+def test_fit_and_check_read_one_explanation(name: str, what: str) -> None:
+    """A cause that `fit` rejects is bad in `check`; both have it from one value."""
+    rng = np.random.default_rng([8, *name.encode()])
+    m = machine(load(name), rng, 6.0)
+    made = WRONG[what](m, rng) if what in WRONG else m.recorded()
+    if what == "play":
+        made = replace(made, q=m.q + 1e-3 * m.robot.size * np.sign(m.qd))
+    made = noisy(made, rng)
+    made = IMPOSSIBLE[what](made, rng) if what in IMPOSSIBLE else made
+    found = check(made)
+    try:
+        result, *_ = fit_recordings(m.robot, [made], ("friction", "payload"), (), accept=True)
+    except PkmTwinError:
+        assert found.answer == "bad"
+        return
+    (one,) = result.explained
+    assert found.explanation in (one, None)
+    if one.fault:
+        assert found.answer == "bad" and found.causes[:1] in ((one.cause,), ())
+        assert any(one.cause in text for text in result.accepted)
+    assert ("play" in one.steps) == (what == "play")
+
+
 @pytest.mark.parametrize("name", ["five_bar", "upr_rpu"])
 def test_fit_and_check_say_that_the_machine_cannot_take_the_positions(name: str) -> None:
     m = machine(load(name), np.random.default_rng([5, *name.encode()]), 3.0)
@@ -344,3 +376,14 @@ def test_a_payload_is_looked_for_with_the_memory_of_friction() -> None:
     assert start is not None and start.mass == pytest.approx(1.0, rel=0.02)
     (payload,) = (n for n in found.numbers if n.name == "payload.mass")
     assert abs(payload.after - 1.0) < 3.0 * payload.deviation < 0.5
+
+
+def test_a_channel_that_was_not_measured_is_not_compared() -> None:
+    m = machine(load("five_bar"), np.random.default_rng(5), 4.0)
+    result = fit(m.robot, [m.recorded()], ("friction", "payload"))
+    (one,) = result.judged
+    unseen = replace(one, measured=one.measured * [np.nan, 1.0])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert find_worse(replace(result, judged=(unseen,))) == ""
+        assert "worse" in find_worse(replace(result, judged=(replace(unseen, after=2.0 * one.after),)))

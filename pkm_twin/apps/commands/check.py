@@ -71,6 +71,7 @@ def check(given: Check) -> Report:
 def check_one(given: Check, path: Path, update: Any = None, thorough: bool = True) -> Report:
     """Judge a recording, and append it to the history; errors as of ``recordings.read``."""
     from pkm_twin import load
+    from pkm_twin.apps.fit_report import tabulate_causes
     from pkm_twin.identification.check import COMPARED, IDLE, RESIDUAL
     from pkm_twin.identification.check import check as checked
 
@@ -119,6 +120,7 @@ def check_one(given: Check, path: Path, update: Any = None, thorough: bool = Tru
             Fact("duration_s", float(r.time[-1]), "s"),
             Fact("delay_s", None if found.compared is None else found.compared.late, "s"),
         ],
+        tabulate_causes([found.explanation] if found.explanation else [], [r.name]),
         notes=[] if r.robot.uncertainty else [none],
         verdict=Verdict.GOOD if good else Verdict.BAD if bad else Verdict.UNKNOWN,
         code=0 if good else REFUSED if bad else NOT_JUDGED,
