@@ -16,7 +16,7 @@ from pkm_twin.errors import ParameterError
 from pkm_twin.machine.strict_yaml import read_yaml
 from pkm_twin.maps import figures
 from pkm_twin.maps.figures import shown
-from pkm_twin.maps.kind import counts, evaluate_kind
+from pkm_twin.maps.kind import evaluate_kind
 from pkm_twin.maps.kinds import KINDS
 from pkm_twin.maps.kinds.cutting_depth import CuttingDepth
 from pkm_twin.maps.kinds.frequency import Frequency
@@ -25,7 +25,7 @@ from pkm_twin.maps.search import badness, evolve, find_worst
 from pkm_twin.maps.store import open_map
 from pkm_twin.maps.sweep import map_of
 from pkm_twin.mechanisms.catalogue import robot_of_data
-from pkm_twin.robot.workspace import passive_values, reachable, try_forward
+from pkm_twin.robot.workspace import belong_to_workspace, passive_values, reachable, try_forward
 from stiffness_monitor import Milling, compliance, stable_depth, strain_energy
 from stiffness_monitor.modes import natural_frequencies
 from test.machine.random_machines import FILES, plain
@@ -48,7 +48,7 @@ def states(robot, rng, count, least=LEAST):
     low, high = robot.limits.position.T
     q = rng.uniform(low, high, (count, len(low)))
     pose, known = try_forward(robot, q)
-    return q[counts(robot, q, pose, known, least, 0.0)]
+    return q[belong_to_workspace(robot, q, pose, known, least, 0.0)]
 
 
 def found(robot, name, q, wrench=None):
