@@ -311,10 +311,10 @@ def stability_lobes(
         depth that is stable at every speed.
     :raises ParameterError: a speed with more than :data:`MAX_WAVES_PER_TOOTH` vibrations from tooth to tooth.
     """
-    return lobes_of(tool_modes(robot, pose, damping=damping, tool=tool), milling, speeds, deepest)
+    return lobes_from_modes(tool_modes(robot, pose, damping=damping, tool=tool), milling, speeds, deepest)
 
 
-def lobes_of(modes: ToolModes, milling: Milling, speeds: ArrayLike, deepest: float | None = None) -> Lobes:
+def lobes_from_modes(modes: ToolModes, milling: Milling, speeds: ArrayLike, deepest: float | None = None) -> Lobes:
     """Find limit depths as :func:`stability_lobes`, from the tool point's modes."""
     plane = _CuttingPlane.of(modes, milling)
     at = np.atleast_1d(np.asarray(speeds, np.float64))
@@ -322,7 +322,7 @@ def lobes_of(modes: ToolModes, milling: Milling, speeds: ArrayLike, deepest: flo
     return _find_limits(plane, milling, at, last, safe)
 
 
-def lobes_between(
+def refine_lobes(
     modes: ToolModes, milling: Milling, low: float, high: float, points: int, deepest: float | None = None
 ) -> Lobes:
     """Find limit depths over a speed range, dense enough for its smallest and best depth.
@@ -334,7 +334,7 @@ def lobes_between(
     0.1 % apart.
 
     :param low, high: rpm. ``points``: number of evenly spaced speeds. Others, and errors, as
-        :func:`lobes_of`.
+        :func:`lobes_from_modes`.
     """
     plane = _CuttingPlane.of(modes, milling)
     even = np.linspace(low, high, points)
@@ -357,7 +357,7 @@ def lobes_between(
 
 
 def _check_range(plane: _CuttingPlane, milling: Milling, at: Array, deepest: float | None) -> tuple[float, float]:
-    """Return the deepest depth to try and the zero-order depth, m; errors as :func:`lobes_of`."""
+    """Return the deepest depth to try and the zero-order depth, m; errors as :func:`lobes_from_modes`."""
     if at.ndim != 1:
         raise ParameterError("speeds", at.shape, "one speed after another")
     for speed in (at.min(), at.max()) if at.size else ():
@@ -391,13 +391,13 @@ def stable_depth(
 ) -> float:
     """Return the axial depth that is stable at every spindle speed in zero order, m.
 
-    An interrupted cut can chatter at a smaller depth at some speeds, see :func:`lobes_between`.
+    An interrupted cut can chatter at a smaller depth at some speeds, see :func:`refine_lobes`.
     Infinite where no depth is unstable. Parameters and errors as :func:`stability_lobes`.
     """
-    return stable_depth_of(tool_modes(robot, pose, damping=damping, tool=tool), milling)[0]
+    return stable_depth_from_modes(tool_modes(robot, pose, damping=damping, tool=tool), milling)[0]
 
 
-def stable_depth_of(modes: ToolModes, milling: Milling) -> tuple[float, int]:
+def stable_depth_from_modes(modes: ToolModes, milling: Milling) -> tuple[float, int]:
     """Return the modes' zero-order stable depth, m, and the index of the chattering mode."""
     depth, turn = _CuttingPlane.of(modes, milling).stable_depth(milling)
     return depth, int(np.abs(2.0 * np.pi * modes.frequencies - turn).argmin())

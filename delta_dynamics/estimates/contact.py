@@ -291,7 +291,7 @@ class ContactMonitor:
             if not was_idle and time - self._since < BRAKE_TIME:
                 # The brake has taken the weight; there was no contact.
                 self._touching = False
-            return self._verdict(q, external, idle)
+            return self._judge(q, external, idle)
         learnt = self._learner.learn(step, external, np.where(still, 0.0, qd), touching=self._touching)
         # The learnt friction is bounded: a larger opposing effort is a contact.
         friction = np.minimum(learnt, 0.2 * self._greatest) + np.where(still, self._reach + holds, 0.0)
@@ -307,7 +307,7 @@ class ContactMonitor:
         self._noise.advance(step)
         left = np.maximum(np.abs(external) - self._slack - self._impulse, 0.0)
         if self._noise.settled:
-            touching = bool((np.abs(external) > self._bound()).any())
+            touching = bool((np.abs(external) > self._effort_bound()).any())
             if touching:
                 begins, since = not self._touching, time - self._placed
                 if begins:
@@ -316,11 +316,11 @@ class ContactMonitor:
                 # A place is found every 4 ms at the beginning, later every 10 ms: errors of efforts last longer.
                 if begins or since >= (0.004 if time - self._since < 0.04 else 0.01) - 0.5 * step:
                     locator = self.prepare()
-                    unsure = np.hypot(self._spread(), 0.5 * (self._friction + self._impulse))
+                    unsure = np.hypot(self._standard_deviation(), 0.5 * (self._friction + self._impulse))
                     locator.push(step if begins else since, q, qd, external, unsure)
                     self._place, self._placed = locator.place(), time
             self._touching = touching
-            verdict = self._verdict(q, external, idle)
+            verdict = self._judge(q, external, idle)
         else:
             verdict = None
         if not self._touching:
@@ -338,13 +338,13 @@ class ContactMonitor:
             self._locator.place()
         return self._locator
 
-    def _spread(self) -> Array:
+    def _standard_deviation(self) -> Array:
         return np.asarray(np.sqrt(self._unsure**2 + self._noise.variance), np.float64)
 
-    def _bound(self) -> Array:
-        return np.asarray(self.sigmas * self._spread() + self._slack + self._impulse, np.float64)
+    def _effort_bound(self) -> Array:
+        return np.asarray(self.sigmas * self._standard_deviation() + self._slack + self._impulse, np.float64)
 
-    def _verdict(self, q: Array, external: Array, idle: bool) -> Contact:
+    def _judge(self, q: Array, external: Array, idle: bool) -> Contact:
         wrench = platform_wrench(self.robot, q, external)
         place = self._place if self._touching and not idle else None
-        return Contact(external, self._bound(), wrench, self._touching, idle, place)
+        return Contact(external, self._effort_bound(), wrench, self._touching, idle, place)

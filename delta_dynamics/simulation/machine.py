@@ -330,7 +330,7 @@ class Simulation(Core):
             try:
                 as_message_error(self._move)
             except MessageError as error:
-                self.plant.rest()
+                self.plant.stop_motion()
                 self.failure = f"{error.reason}: {error}"
                 self.stream.stop(error.reason, str(error))
                 self._end_period()

@@ -77,7 +77,7 @@ class Plant:
         q[self.others], qd[self.others] = (rows[self.others] for rows in found[:2])
         return q, qd
 
-    def rest(self) -> None:
+    def stop_motion(self) -> None:
         """Set all velocities to zero."""
         self.qd = np.zeros_like(self.q)
 

@@ -27,7 +27,7 @@ from delta_dynamics.torques.virtual_work import body_mass_matrix, mass_matrix
 from pkm_twin.codegen.arrays import Array, common_batch, doubles, finite, vectors
 from pkm_twin.errors import ParameterError, SingularityError
 from pkm_twin.machine.pose_grid import zero_torsion
-from pkm_twin.robot.derivatives import joint_changes
+from pkm_twin.robot.derivatives import joint_accelerations
 from pkm_twin.robot.robot import Robot
 
 
@@ -189,7 +189,7 @@ def joint_motion(robot: Robot, pose: ArrayLike, rates: ArrayLike, accelerations:
     change = vectors(np.broadcast_to(change, m) if change.ndim == 0 else change, m, "Xddot")
     common_batch(q.shape[:-1], rates.shape[:-1], change.shape[:-1])
     qd = np.einsum("...ij,...j->...i", inverse, rates)
-    qdd = joint_changes(robot, q, qd, inverse, change)
+    qdd = joint_accelerations(robot, q, qd, inverse, change)
     finite(qdd, "an acceleration")
     q, qd, qdd = np.broadcast_arrays(q, qd, qdd)
     return JointMotion(q.copy(), qd.copy(), qdd)

@@ -207,7 +207,7 @@ class BeyondLimitsOption:
 
     beyond_limits: bool = setting(False, "also compute outside the joint limits, marked")
 
-    def admitted(self, machine: Robot, q: Array, qd: Array | None = None, where: str = "") -> list[Beyond]:
+    def list_beyond_limits(self, machine: Robot, q: Array, qd: Array | None = None, where: str = "") -> list[Beyond]:
         """Return the joints that joint states (..., n) take beyond their limits.
 
         :param where: the recording, where there may be several.
@@ -236,7 +236,7 @@ class PoseOption(PayloadOption, BeyondLimitsOption):
         pose: list[float] = machine.home().tolist()
         if self.at is not None:
             pose = numbers(self.at, len(names), f"a pose {','.join(names)}")
-        for joint in self.admitted(machine, machine.inverse(pose)):
+        for joint in self.list_beyond_limits(machine, machine.inverse(pose)):
             click.echo(f"outside the limits: {joint}", err=True)
         return pose
 

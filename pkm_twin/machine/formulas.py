@@ -316,12 +316,12 @@ class Book:
         numbers = {name: given[name] for name in order if name not in own}
         return cls(dict.fromkeys(order, 0.0), own, {}, data)._replace_numbers(numbers)
 
-    def marked(self, data: Any) -> Any:
+    def mark_expressions(self, data: Any) -> Any:
         """Convert all texts of data to :class:`Written`, so that they may be expressions."""
         if isinstance(data, Mapping):
-            return {name: self.marked(value) for name, value in data.items()}
+            return {name: self.mark_expressions(value) for name, value in data.items()}
         if isinstance(data, list):
-            return [self.marked(value) for value in data]
+            return [self.mark_expressions(value) for value in data]
         return Written.of(data, self) if isinstance(data, str) else data
 
     def _replace_numbers(self, numbers: Mapping[str, Any]) -> Book:
@@ -335,7 +335,7 @@ class Book:
                 values[name] = float(values[name])
         return replace(self, values=values, own=own)
 
-    def moved(self, values: Mapping[str, Any]) -> tuple[Book, dict[str, Any]]:
+    def change_numbers(self, values: Mapping[str, Any]) -> tuple[Book, dict[str, Any]]:
         """Change numbers and parameters by path; return the book and all numbers that change.
 
         :raises ParameterError: a parameter does not exist, or a result is not finite.
@@ -349,7 +349,7 @@ class Book:
         if not values:
             return self, rest
         book = replace(self._replace_numbers(new), formulas=kept, data={})
-        return book, {**{one.path: one.value(book.values) for one in book.moving(new)}, **rest}
+        return book, {**{one.path: one.value(book.values) for one in book.list_dependent(new)}, **rest}
 
     def replace_sections(self, sections: Mapping[str, Any]) -> Book:
         """Return the book of the file with other sections, without their expressions."""
@@ -357,7 +357,7 @@ class Book:
         data = {**self.data, **sections} if sections and self.data else {}
         return replace(self, formulas=kept, data=data)
 
-    def moving(self, names: Iterable[str]) -> list[Formula]:
+    def list_dependent(self, names: Iterable[str]) -> list[Formula]:
         """List the numbers that depend, directly or not, on some parameters."""
         moving = set(names)
         for name in self.values:
@@ -372,7 +372,7 @@ class Book:
         found = self.own.get(path.partition(f"{PARAMETERS}.")[2]) or self.formulas.get(path)
         return found.text if found else ""
 
-    def lost(self, other: Book) -> list[str]:
+    def describe_lost(self, other: Book) -> list[str]:
         """Describe the expressions and dependences that are lost in another book, in up to two lines."""
         texts = [f"{path} was {formula.text}" for path, formula in self.formulas.items() if path not in other.formulas]
         kept = other.values.keys() - other.unused

@@ -139,8 +139,8 @@ class _Reader:
         self.joints: dict[str, Joint] = {}
         self.names: dict[tuple[str, int], str] = {}
         # The names of the file, and new names for parts without one.
-        self.link_names = self._named(SITE=model.nsite, BODY=model.nbody)
-        self.joint_names = self._named(JOINT=model.njnt, EQUALITY=model.neq)
+        self.link_names = self._name_parts(SITE=model.nsite, BODY=model.nbody)
+        self.joint_names = self._name_parts(JOINT=model.njnt, EQUALITY=model.neq)
         kinds = mujoco.mjtJoint
         types = {
             kinds.mjJNT_FREE: "free",
@@ -219,13 +219,13 @@ class _Reader:
             tuple(self.faults),
         )
 
-    def _named(self, **counts: int) -> set[str]:
+    def _name_parts(self, **counts: int) -> set[str]:
         """Name the parts of several kinds; MuJoCo's names are unique within one kind only.
 
         A name that parts share belongs to the first kind, and the world's name to the world.
         """
         parts = [(kind, i) for kind, count in counts.items() for i in range(count)]
-        given = {part: name for part in parts if (name := self._given(*part))}
+        given = {part: name for part in parts if (name := self._find_name(*part))}
         owners = {name: part for part, name in reversed(given.items())}
         if "BODY" in counts:
             owners[WORLD] = "BODY", 0
@@ -242,12 +242,12 @@ class _Reader:
                 warn(self.path, f"{kind.lower()} {name} is read as {other}: a {first} is {name}")
         return taken
 
-    def _given(self, kind: str, index: int) -> str | None:
+    def _find_name(self, kind: str, index: int) -> str | None:
         name = self.mj.mj_id2name(self.model, getattr(self.mj.mjtObj, f"mjOBJ_{kind}"), index)
         return str(name) if name else None
 
     def _name(self, kind: str, index: int) -> str:
-        own = self.names.get((kind, int(index))) or self._given(kind, index)
+        own = self.names.get((kind, int(index))) or self._find_name(kind, index)
         return own or f"{kind.lower()}_{index}"
 
     def _body(self, body: int) -> None:

@@ -191,9 +191,9 @@ class Model:
 
         :raises ParameterError: the frame is unknown, or depends on itself.
         """
-        return self._outwards(self.local(name, where), None)
+        return self._express_outside(self.local(name, where), None)
 
-    def _outwards(self, frame: Pose, end: Model | None) -> Pose:
+    def _express_outside(self, frame: Pose, end: Model | None) -> Pose:
         """Return a frame of this model in an outer model, by default in the world."""
         scope = self
         while scope is not end and scope.outer is not None:
@@ -202,7 +202,7 @@ class Model:
 
     def pose(self) -> Pose:
         """Return the model's frame in the outer model."""
-        found = self._posed(self.element, MODEL, self.outer)
+        found = self._read_frame(self.element, MODEL, self.outer)
         placed = self.element.get("placement_frame")
         return found @ self.local(placed, "placement_frame").inverse() if placed else found
 
@@ -217,7 +217,7 @@ class Model:
         model, own = self._in(name, where)
         part = None if own in (MODEL, WORLD) else model.parts[own]
         if model is not self:
-            found = model._outwards(model.local(own, where), self)
+            found = model._express_outside(model.local(own, where), self)
         elif part is None and name == WORLD and self.outer is not None:
             found = self.pose().inverse() @ self.outer.local(WORLD, where)
         elif part is None:
@@ -226,11 +226,11 @@ class Model:
             found = self.models[name].pose()
         else:
             default = _end(part, "child") if part.tag == "joint" else part.get("attached_to")
-            found = self._posed(part, MODEL if part.tag == "link" else default or MODEL, self)
+            found = self._read_frame(part, MODEL if part.tag == "link" else default or MODEL, self)
         self._known[name] = found
         return found
 
-    def _posed(self, part: ET.Element, default: str, scope: Model | None) -> Pose:
+    def _read_frame(self, part: ET.Element, default: str, scope: Model | None) -> Pose:
         where = f"{part.tag}.{part.get('name')}.pose"
         stated = urdf_xml.find_single_child(part, "pose", where)
         # ``frame`` is what ``relative_to`` was called until 1.6.

@@ -62,7 +62,7 @@ class _Reader:
         self.prims = list(Usd.PrimRange.Stage(stage, every))
         self.bodies = [p for p in self.prims if p.HasAPI(UsdPhysics.RigidBodyAPI)]
         self.bodies = [p for p in self.bodies if self._value(p, "physics:rigidBodyEnabled", True)]
-        self.names = self._named()
+        self.names = self._name_parts()
         self.links = {WORLD: Link(WORLD)}
         self.faults: list[Fault] = []
 
@@ -100,7 +100,7 @@ class _Reader:
         marked = driven, "a drive", "a drive with a stiffness or a damping"
         motors, source = actuated_joints(self.path, types, self.faults, chosen, lambda: marked)
         tree, left = span_tree(self.links, joints, motors, excluded)
-        placed = self._placed(tree)
+        placed = self._place_links(tree)
         closures = [self._closure(joint) for joint in left]
         size = max(1.0, *(float(np.abs(link.frame.position).max()) for link in self.links.values()))
         # Scene's gravity, by default 9.81 m/s2 downwards, as PhysX.
@@ -125,7 +125,7 @@ class _Reader:
             faults=tuple(self.faults),
         )
 
-    def _named(self) -> dict[Any, str]:
+    def _name_parts(self) -> dict[Any, str]:
         """Name bodies and joints by their prims: the prim's name, or its path if others have it."""
         named: dict[Any, str] = {}
         for prims in (self.bodies, [p for p in self.prims if p.IsA(self.physics.Joint)]):
@@ -139,7 +139,7 @@ class _Reader:
         value = prim.GetAttribute(name).Get() if prim.HasAttribute(name) else None
         return default if value is None else value
 
-    def _world(self, prim: Any) -> tuple[Pose, Array]:
+    def _find_world_frame(self, prim: Any) -> tuple[Pose, Array]:
         """Return a prim's frame, m, and the scales of its axes.
 
         :raises ParameterError: a frame that is mirrored or not orthogonal.
@@ -157,7 +157,7 @@ class _Reader:
 
         :raises ParameterError: a mass that would follow from shapes and densities.
         """
-        where, (frame, scales) = str(prim.GetPath()), self._world(prim)
+        where, (frame, scales) = str(prim.GetPath()), self._find_world_frame(prim)
         name = self.names[prim.GetPath()]
         if self._value(prim, "physics:kinematicEnabled", False):
             raise ParameterError(f"{where}.physics:kinematicEnabled", True, "a body that forces move")
@@ -192,7 +192,7 @@ class _Reader:
             owner = prim.GetStage().GetPrimAtPath(targets[0]) if targets else None
             if targets and not owner:
                 raise ParameterError(f"{where}.physics:body{k}", str(targets[0]), "a prim's path")
-            frame, scales = (Pose(), np.ones(3)) if owner is None else self._world(owner)
+            frame, scales = (Pose(), np.ones(3)) if owner is None else self._find_world_frame(owner)
             while owner and owner not in self.bodies:
                 owner = owner.GetParent()
             ends.append(self.names[owner.GetPath()] if owner else WORLD)
@@ -268,7 +268,7 @@ class _Reader:
             for name in ("angular", "linear")
         )
 
-    def _placed(self, joints: dict[str, Joint]) -> dict[str, Joint]:
+    def _place_links(self, joints: dict[str, Joint]) -> dict[str, Joint]:
         """Place all links from the world on, so that the joints of the tree meet exactly.
 
         :raises ParameterError: a joint that is drawn open.

@@ -89,7 +89,7 @@ def write_edited(path: Path, head: Sequence[str], text: str, before: Robot) -> l
     except ValueError as error:
         raise PkmTwinError(f"the values are not a valid robot, so {path} is not written: {error}") from None
     # Names are untrusted: they may contain line breaks.
-    lost = before.book.lost(after.book)
+    lost = before.book.describe_lost(after.book)
     whole = "".join(f"# {one_line(line, 2000)}\n" for line in (*head, *lost)) + text
     try:
         replace_file(path, whole.encode())

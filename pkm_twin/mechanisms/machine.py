@@ -128,7 +128,7 @@ class Machine(TwinRobot):
         :raises ParameterError: by the field.
         """
         book = Book.of(data)
-        file = schema.build(MachineFile, book.marked(data))
+        file = schema.build(MachineFile, book.mark_expressions(data))
         specs: Mapping[str, Mapping[str, Any]]
         specs, sources = expand_limbs({kind: getattr(file, kind) for kind in KINDS}, file.limbs)
         graph = graph_of_entries(file.platform, specs, file.origin)
@@ -219,7 +219,7 @@ class Machine(TwinRobot):
         A limb's number is that of all its copies, in the axes of azimuth zero; another azimuth
         turns its copy.
         """
-        book, values = self.book.moved(self.resolved(values))
+        book, values = self.book.change_numbers(self.resolved(values))
         sources = dict(self.sources)
         specs = {kind: dict(entries) for kind, entries in self.specs.items()}
         rest, origin = {}, self.described.origin
@@ -264,7 +264,7 @@ class Machine(TwinRobot):
         """Check a number in each of the entries that have it."""
         path = self.own_path(path)
         keys = full_keys(path)
-        for moved in self.book.moving([str(keys[-1])]) if keys[0] == PARAMETERS else ():
+        for moved in self.book.list_dependent([str(keys[-1])]) if keys[0] == PARAMETERS else ():
             self.check_number(moved.path)
         named = list(self.named(keys))
         for kind, name, where, _ in named:

@@ -38,13 +38,13 @@ from pkm_twin.robot.limits import beyond_limits
 from pkm_twin.robot.robot import Robot
 
 RECORDING: Final = "an MCAP file, a rosbag2 folder, or a table with columns time, JOINT.position ..."
-FOLLOWED: Final = ("joints", "pose")
+COORDINATES: Final = ("joints", "pose")
 SIDES: Final = ("joint", "controller", "motor")
-TERM: Final = "effort_gravity"
+GRAVITY_TERM: Final = "effort_gravity"
 """In every table that `torques` writes."""
-BLOCK: Final = 4096
+SAMPLES_PER_BLOCK: Final = 4096
 """Samples computed at a time, so that memory stays flat."""
-SIZES: Final = dict(
+MAX_SIZES: Final = dict(
     zip((*WRENCH, *DEFLECTION), np.repeat([MAX_LOAD, MAX_LOAD, MAX_SHIFT, MAX_TURN], 3).tolist(), strict=True)
 )
 """Greatest values of a table's columns, as of messages: N, N m, m, rad."""
@@ -76,8 +76,8 @@ def read(
         cannot have.
     """
     path = Path(path)
-    if how.follow not in (None, *FOLLOWED):
-        raise UnknownNameError("follow", str(how.follow), FOLLOWED)
+    if how.follow not in (None, *COORDINATES):
+        raise UnknownNameError("follow", str(how.follow), COORDINATES)
     try:
         bag = is_bag(path)
     except OSError as error:
@@ -149,7 +149,7 @@ def _read_table_recording(path: Path, name: str | Robot | None, how: ReadOptions
     time, notes, effort, word = read_times(path, times), [], None, how.efforts[0]
     origin = Origin.of_table(table)
     # In a table of a model's terms the efforts are their sum.
-    computed = any(f"{joint}.{TERM}" in table for joint in robot.joint_names)
+    computed = any(f"{joint}.{GRAVITY_TERM}" in table for joint in robot.joint_names)
     if computed:
         # Reject computed efforts without the wrench or payload that they were computed with.
         own = how.load is not None or robot.payload.mass > 0.0
@@ -199,7 +199,7 @@ def _read_table_recording(path: Path, name: str | Robot | None, how: ReadOptions
                 raise ParameterError(str(path), f"no {what}", f"a column {axes[0]} or more of {', '.join(axes)}")
     efforts = (f"{joint}.{what}" for joint in joints for what in EFFORTS)
     # As in messages, reject impossible numbers and numbers below every sensor's resolution.
-    for name, bound in (SIZES | dict.fromkeys(efforts, MAX_EFFORT)).items():
+    for name, bound in (MAX_SIZES | dict.fromkeys(efforts, MAX_EFFORT)).items():
         sizes = np.abs(table.get(name, np.zeros(1)))
         bad = np.flatnonzero((sizes > bound) | ((sizes < TINY) & (sizes > 0.0)))
         if len(bad):
@@ -268,7 +268,7 @@ def _reject_misspelt_columns(table: Table, robot: Robot, joints: Sequence[str], 
             if dot and joint in joints and not known:
                 raise UnknownNameError(f"{table.path}: column", name, inputs)
     if how.deflected:
-        known = ("time", *SIZES, *PAYLOAD, *robot.pose_names, *inputs)
+        known = ("time", *MAX_SIZES, *PAYLOAD, *robot.pose_names, *inputs)
         for name in table:
             _, dot, what = name.rpartition(".")
             if name not in known and (not dot or what == "position"):
@@ -301,8 +301,8 @@ def check_pose(path: Path, robot: Robot, q: Array, pose: Array, how: str = "") -
     :param how: what else the table may be read as.
     :raises ParameterError: by the sample that is farthest off.
     """
-    for begin in range(0, len(q), BLOCK):
-        rows = slice(begin, begin + BLOCK)
+    for begin in range(0, len(q), SAMPLES_PER_BLOCK):
+        rows = slice(begin, begin + SAMPLES_PER_BLOCK)
         found, good = robot.try_forward(q[rows])
         off = found - pose[rows]
         turns = [i for i, unit in enumerate(robot.pose_units) if unit != "m"]

@@ -33,10 +33,10 @@ def joint_rates(robot: Robot, q: Array, rate: Array, change: Array) -> tuple[Arr
     """Return first and second derivatives of joints (k, n) from those of the pose, shape (k, m) each."""
     back = robot.inverse_jacobian(q)
     first = (back @ rate[..., None])[..., 0]
-    return first, joint_changes(robot, q, first, back, change)
+    return first, joint_accelerations(robot, q, first, back, change)
 
 
-def joint_changes(robot: Robot, q: Array, qd: Array, back: Array, change: Array | float = 0.0) -> Array:
+def joint_accelerations(robot: Robot, q: Array, qd: Array, back: Array, change: Array | float = 0.0) -> Array:
     """Return second derivatives of joints (k, n) from those of the pose, at joint rates (k, n).
 
     :param back: of :meth:`Robot.inverse_jacobian`, shape (k, n, m).

@@ -181,7 +181,7 @@ class Assembly:
     def _close(self, values: Array, rank: float, held: Mask | bool) -> tuple[Array, float]:
         slow = 0
 
-        def look(values: Array) -> tuple[Array, Array]:
+        def evaluate(values: Array) -> tuple[Array, Array]:
             self.place(values)
             return self.residuals(rates=False)[0], values
 
@@ -196,22 +196,22 @@ class Assembly:
             step = np.where(held, 0.0, -np.linalg.lstsq(rates, residual, rcond=rank)[0])
             step *= min(1.0, 0.5 / max(float(np.abs(step).max(initial=0.0)), 1e-300))
             for _ in range(12):
-                less = float(np.linalg.norm(look(values + step)[0]))
+                less = float(np.linalg.norm(evaluate(values + step)[0]))
                 if less < miss:
                     slow = slow + 1 if less > 0.98 * miss else 0
                     return np.asarray(step, np.float64)
                 step /= 2
             return np.zeros(len(values))
 
-        values, _ = newton(values, look, np.add, solve, iterations=MAX_ITERATIONS, gain=math.inf, tolerance=1e-300)
+        values, _ = newton(values, evaluate, np.add, solve, iterations=MAX_ITERATIONS, gain=math.inf, tolerance=1e-300)
         self.place(values)
-        return values, self.miss()
+        return values, self.measure_gap()
 
-    def miss(self) -> float:
+    def measure_gap(self) -> float:
         """Return how far the loops are open at the placed values, m or rad."""
         return float(np.abs(self.residuals(rates=False)[0]).max(initial=0.0))
 
-    def anywhere(self) -> tuple[Array, float]:
+    def close_near_drawing(self) -> tuple[Array, float]:
         """Close the loops near the drawing; return the values and their miss.
 
         :raises ParameterError: a loop that does not close, by how much.
@@ -243,13 +243,13 @@ class Assembly:
             )
         return values, miss
 
-    def relaxed(self, values: Array, held: Mask | bool = False) -> Array:
+    def move_nearest_to_drawing(self, values: Array, held: Mask | bool = False) -> Array:
         """Return, and set, the values nearest to the drawing that the closed loops can reach.
 
         :param held: steps that keep their values, shape (count,); by default none does.
         """
         self.place(values)
-        miss = max(self.miss(), 1e-12)
+        miss = max(self.measure_gap(), 1e-12)
         for _ in range(MAX_ITERATIONS):
             rates, own = (np.where(held, 0.0, table) for table in (self.residuals()[1], values))
             slope = own - np.linalg.lstsq(rates, rates @ own, rcond=RANK_BOUNDS[0])[0]
@@ -363,10 +363,10 @@ class HomeSearch:
 
         :raises ParameterError: the loops close nowhere; the error states the gap.
         """
-        home = self._best()
+        home = self._find_best()
         if not home.held or home.graph is None:
             return home
-        values = self.assembly.relaxed(home.values, self.held)
+        values = self.assembly.move_nearest_to_drawing(home.values, self.held)
         steps = list(self.assembly.steps)
         zero = np.array([name in home.held and steps.count(name) == 1 for name in steps], bool)
         for left in range(8, 0, -1):
@@ -374,19 +374,19 @@ class HomeSearch:
             values, miss = self.assembly.close(values, self.held | zero)
         if miss > max(home.miss, MAX_LOOP_GAP):
             return home
-        turned = self._home(self._wrapped(values), miss, home.how)
+        turned = self._make_home(self._wrap_turns(values), miss, home.how)
         return turned if turned.index >= MIN_HOME_INDEX else home
 
-    def _best(self) -> Home:
+    def _find_best(self) -> Home:
         """Find the home, with parts that only spin at any angle."""
-        drawn = self._drawn()
+        drawn = self._close_drawing()
         if drawn is not None and drawn.how == "drawn" and drawn.index >= 0.01:
             return drawn
         if drawn is None:
             # Loops that close nowhere are rejected before the search.
-            closed = self.assembly.anywhere()[0]
-        found = [home for home in (drawn, *self._others()) if home is not None]
-        inside = [home for home in found if self._inside(home.values)] or found
+            closed = self.assembly.close_near_drawing()[0]
+        found = [home for home in (drawn, *self._find_others()) if home is not None]
+        inside = [home for home in found if self._is_inside_limits(home.values)] or found
         chosen = None
         if inside:
             # The best conditioned; of indices within 5 % the nearest to all joints' zeros.
@@ -403,9 +403,9 @@ class HomeSearch:
             for _ in range(6):
                 start = self.wanted + rng.uniform(-reach, reach, len(self.wanted)) * self.units
                 start = np.where(self.held, np.clip(start, self.low, self.high), start)
-                home = self._reached(start, "near")
+                home = self._close_from(start, "near")
                 tried += [] if home is None else [home]
-            good = [h for h in tried if self._inside(np.where(self.held, h.values, self.low))]
+            good = [h for h in tried if self._is_inside_limits(np.where(self.held, h.values, self.low))]
             candidates += [max(good, key=lambda home: home.index)] if good else []
             if tried and (not candidates or candidates[-1].index < MIN_HOME_INDEX):
                 # All closed assemblies are singular, wherever they are.
@@ -417,14 +417,14 @@ class HomeSearch:
         if chosen is not None:
             return chosen
         # No assembly is regular: creating the robot rejects it with the reason.
-        values = self.assembly.relaxed(closed)
-        return self._home(values, self.assembly.miss(), "near")
+        values = self.assembly.move_nearest_to_drawing(closed)
+        return self._make_home(values, self.assembly.measure_gap(), "near")
 
-    def _drawn(self) -> Home | None:
+    def _close_drawing(self) -> Home | None:
         """Close the drawing with the actuated joints where they should be."""
         values = self.wanted.copy()
         self.assembly.place(values)
-        miss = self.assembly.miss()
+        miss = self.assembly.measure_gap()
         if miss > max(MAX_LOOP_GAP, self.assembly.rounding):
             values, miss = self.assembly.close(values, self.held)
         if miss > self.assembly.closed:
@@ -432,9 +432,9 @@ class HomeSearch:
         self._known.append(self.assembly.places())
         far = float((np.abs(values) / self.units)[~self.held].max(initial=0.0))
         # As drawn if no passive joint moves by more than 0.1 rad or a tenth of the size.
-        return self._home(values, miss, "drawn" if far <= 0.1 else "wanted")
+        return self._make_home(values, miss, "drawn" if far <= 0.1 else "wanted")
 
-    def _reached(self, start: Array, how: str) -> Home | None:
+    def _close_from(self, start: Array, how: str) -> Home | None:
         """Close the loops from a start; None if they stay open or the assembly is known."""
         values, miss = self.assembly.close(start, self.held)
         if miss > self.assembly.closed and how == "near":
@@ -444,24 +444,24 @@ class HomeSearch:
         if miss > self.assembly.closed or known:
             return None
         self._known.append(places)
-        return self._home(self._wrapped(values), miss, how)
+        return self._make_home(self._wrap_turns(values), miss, how)
 
-    def _others(self) -> list[Home | None]:
+    def _find_others(self) -> list[Home | None]:
         """Find assemblies with the actuated joints at the same values, from random starts."""
         rng, reach = np.random.default_rng(0), np.where(self.turns, math.pi, self.units / 2)
         starts = rng.uniform(-reach, reach, (0 if self.held.all() else 12, len(reach)))
-        return [self._reached(np.where(self.held, self.wanted, s), "wanted") for s in starts]
+        return [self._close_from(np.where(self.held, self.wanted, s), "wanted") for s in starts]
 
-    def _wrapped(self, values: Array) -> Array:
+    def _wrap_turns(self, values: Array) -> Array:
         """Wrap passive turns to at most half a revolution."""
         turned = (values + math.pi) % (2 * math.pi) - math.pi
         return np.where(self.turns & ~self.held, turned, values)
 
-    def _inside(self, values: Array) -> bool:
+    def _is_inside_limits(self, values: Array) -> bool:
         """Return whether all joints, passive ones too, are inside the file's limits."""
         return bool(((values >= self.low - 1e-6) & (values <= self.high + 1e-6)).all())
 
-    def _home(self, values: Array, miss: float, how: str) -> Home:
+    def _make_home(self, values: Array, miss: float, how: str) -> Home:
         self.assembly.place(values)
         try:
             settled = self._settle(self.graph(), miss)

@@ -13,7 +13,7 @@ from scipy.linalg import expm
 
 from pkm_twin.errors import ParameterError
 from stiffness_monitor import compliance, frequency_response, stability_lobes, stable_depth
-from stiffness_monitor.chatter import Milling, lobes_between, lobes_of, stable_depth_of
+from stiffness_monitor.chatter import Milling, lobes_from_modes, refine_lobes, stable_depth_from_modes
 from stiffness_monitor.modes import natural_frequencies
 from stiffness_monitor.vibration import ToolModes, tool_modes
 from test.support.command import command
@@ -112,7 +112,7 @@ def test_a_published_machine_has_its_multipliers():
     slot = Milling(2, KT, 1.0 / 3.0)
     for depth, expected in published.items():
         assert multiplier(ONE, slot, 5000.0, depth, 120) == pytest.approx(expected, rel=1e-2)
-    limit = lobes_of(ONE, slot, [5000.0]).depths[0]
+    limit = lobes_from_modes(ONE, slot, [5000.0]).depths[0]
     # Between the first two.
     assert limit == pytest.approx(np.interp(1.0, [0.8192, 1.0726], [0.2e-3, 0.5e-3]), rel=0.05)
 
@@ -136,7 +136,7 @@ CASES = [
 @pytest.mark.parametrize("case", partly_long(range(len(CASES)), 0, 2))
 def test_limits_are_an_independent_semi_discretisation_s(case):
     modes, milling, speed = CASES[case]
-    depth = lobes_of(modes, milling, [speed]).depths[0]
+    depth = lobes_from_modes(modes, milling, [speed]).depths[0]
     c, s = np.cos(milling.feed), np.sin(milling.feed)
     turned = np.array([[c, -s], [s, c]])
     plain = modes_of(modes.frequencies, modes.damping, modes.shapes[:, :2] @ turned)
@@ -148,8 +148,8 @@ def test_lobes_follow_the_laws_of_scale():
     """Depth is as stiffness over coefficient; a slot's zero-order depth is stable at each speed."""
     slot = Milling(2, KT, 1.0 / 3.0)
     speeds = np.array([6000.0, 9000.0, 14000.0])
-    found = lobes_of(ONE, slot, speeds)
-    half = lobes_of(ONE, Milling(2, KT / 2.0, 1.0 / 3.0), speeds)
+    found = lobes_from_modes(ONE, slot, speeds)
+    half = lobes_from_modes(ONE, Milling(2, KT / 2.0, 1.0 / 3.0), speeds)
     np.testing.assert_allclose(half.depths, 2.0 * found.depths, rtol=5e-3)
     assert (found.depths > found.safe).all() and found.best == found.depths.argmax()
     # A single mode along x: the classical limit 2 k z (1 + z) over the mean coefficient.
@@ -157,11 +157,11 @@ def test_lobes_follow_the_laws_of_scale():
     mean = slot.mean()[0, 0]
     assert found.safe == pytest.approx(2.0 * stiffness * 0.011 * 1.011 / mean, rel=1e-3)
     both = modes_of([922.0, 3000.0], [0.011, 0.02], [[5.0, 0.0], [0.0, 1.0]])
-    assert stable_depth_of(both, slot)[1] == 0
-    capped = lobes_of(ONE, slot, speeds, deepest=1e-4)
+    assert stable_depth_from_modes(both, slot)[1] == 0
+    capped = lobes_from_modes(ONE, slot, speeds, deepest=1e-4)
     assert capped.open.all() and (capped.depths == 1e-4).all()
     with pytest.raises(ParameterError, match="speeds"):
-        lobes_of(ONE, slot, [50.0])
+        lobes_from_modes(ONE, slot, [50.0])
     with pytest.raises(ParameterError, match="immersion"):
         Milling(2, KT, 0.3, 1.2)
     for other_unit in (600.0, 0.6, 6e14):
@@ -182,14 +182,14 @@ def test_no_speed_of_a_range_is_worse_than_its_least_depth(seed):
     milling = Milling(int(rng.integers(1, 4)), KT, 0.3, rng.choice([0.1, 0.5, 1.0]))
     high = 60.0 * modes.frequencies.max() / milling.teeth * rng.uniform(0.5, 1.5)
     low = 0.6 * high
-    found = lobes_between(modes, milling, low, high, 8)
-    tried = lobes_of(modes, milling, rng.uniform(low, high, 15))
+    found = refine_lobes(modes, milling, low, high, 8)
+    tried = lobes_from_modes(modes, milling, rng.uniform(low, high, 15))
     assert tried.depths.min() > (1.0 - 2e-3) * found.depths.min()
     speed, depth, _ = found.steady()
-    near = lobes_of(modes, milling, speed * (1.0 + 0.01 * rng.uniform(-1.0, 1.0, 5)))
+    near = lobes_from_modes(modes, milling, speed * (1.0 + 0.01 * rng.uniform(-1.0, 1.0, 5)))
     assert near.depths.min() > (1.0 - 2e-3) * depth
     # A range without speeds between: cliffs and minima are found from its ends.
-    again = lobes_between(modes, milling, low, high, 5)
+    again = refine_lobes(modes, milling, low, high, 5)
     assert again.depths.min() == pytest.approx(found.depths.min(), rel=2e-3)
 
 
@@ -210,11 +210,11 @@ def test_the_ends_of_a_range_are_enough_to_find_what_holds_in_it(case):
     modes = modes_of(frequencies, damping, size * rng.normal(size=(count, 2)))
     milling = Milling(1, KT, 0.3, immersion, up)
     low, high = 60.0 * frequencies[-1] * np.array([0.62, 0.87] if up else [1.1, 1.3])
-    found = lobes_between(modes, milling, low, high, 2)
+    found = refine_lobes(modes, milling, low, high, 2)
     speed, depth, _ = found.steady()
-    near = lobes_of(modes, milling, speed * (1.0 + np.linspace(-0.01, 0.01, 9)))
+    near = lobes_from_modes(modes, milling, speed * (1.0 + np.linspace(-0.01, 0.01, 9)))
     assert near.depths.min() > (1.0 - 5e-3) * depth
-    tried = lobes_of(modes, milling, np.linspace(low, high, 17))
+    tried = lobes_from_modes(modes, milling, np.linspace(low, high, 17))
     assert tried.depths.min() > (1.0 - 5e-3) * found.depths.min()
 
 
@@ -226,8 +226,8 @@ def test_what_no_machine_has_is_rejected_by_name():
         "damping": lambda: tool_modes(robot, pose, damping=1e-9),
         "frequencies": lambda: frequency_response(robot, pose, [0.0, 1e300], damping=0.02),
         "immersion": lambda: Milling(2, KT, 0.3, 1e-12),
-        "speeds": lambda: lobes_between(ONE, milling, 3000.0, 1e300, 181),
-        "deepest": lambda: lobes_of(ONE, milling, [5000.0], deepest=1e-12),
+        "speeds": lambda: refine_lobes(ONE, milling, 3000.0, 1e300, 181),
+        "deepest": lambda: lobes_from_modes(ONE, milling, [5000.0], deepest=1e-12),
     }.items():
         with pytest.raises(ParameterError) as caught:
             call()

@@ -91,7 +91,7 @@ class Calibrate(RobotArgument, TableOptions, BeyondLimitsOption, AcceptOption, O
         read = self.plan is None and self.poses is not None
         return {"out": self.out or Path("calibrated.yaml")} if read else {}
 
-    def words(self) -> tuple[tuple[Kind, ...], dict[str, float], dict[str, tuple[float, float]]]:
+    def parse_options(self) -> tuple[tuple[Kind, ...], dict[str, float], dict[str, tuple[float, float]]]:
         """Return the kinds of measurements, their known noise, and the bounds of a plan's poses.
 
         :raises ParameterError: other words, or the noise of what is not measured.
@@ -123,7 +123,7 @@ def calibrate(given: Calibrate) -> Report:
     :raises ParameterError: poses of another machine, or too few; see
         :func:`pkm_twin.identification.calibration.calibrate`.
     """
-    kinds, known, within = given.words()
+    kinds, known, within = given.parse_options()
     machine, measured = given.machine(), None
     if given.poses is not None:
         read = partial(read_measured, kinds=kinds, noise=known) if kinds else read_poses
@@ -131,7 +131,7 @@ def calibrate(given: Calibrate) -> Report:
     notes = []
     if measured is not None:
         q = machine.controller.positions(measured.joints)
-        notes = [f"beyond limits: {item}" for item in given.admitted(machine, q)]
+        notes = [f"beyond limits: {item}" for item in given.list_beyond_limits(machine, q)]
     if given.plan is not None:
         some = measured if isinstance(measured, Measured) else None
         chosen = plan_of(

@@ -50,7 +50,7 @@ def compliance(given: Compliance) -> Report:
         shown = " ".join(f"{number:g}" for number in given.pose)
         raise click.UsageError(f"a pose of {machine.name} is {', '.join(units)}, not {shown}")
     try:
-        beyond = given.admitted(machine, machine.inverse(given.pose))
+        beyond = given.list_beyond_limits(machine, machine.inverse(given.pose))
         energy = strain_energy(machine, given.pose, given.wrench)
     except PkmTwinError:
         raise

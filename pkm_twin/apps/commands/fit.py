@@ -102,7 +102,7 @@ class Fit(TimedPayloadOptions, RecordingOptions, BeyondLimitsOption, AcceptOptio
         out = self.out or Path("fitted.yaml")
         return {"out": out, "report": None if self.no_report else out.with_suffix(".html")}
 
-    def words(self) -> tuple[tuple[Kind, ...] | None, tuple[str, ...] | None]:
+    def parse_options(self) -> tuple[tuple[Kind, ...] | None, tuple[str, ...] | None]:
         """Return the kinds of parameters (None: compliances) and the friction laws (None: automatic).
 
         :raises ParameterError: unknown words, or options that do not go together.
@@ -148,7 +148,7 @@ def fit(given: Fit) -> Report:
         return report_drive(drive_friction(*runs))
     if not given.robot or not given.recordings:
         raise click.UsageError("a robot and recordings are missing; give both, or --drive TABLE")
-    (kinds, laws), options = given.words(), {"accept": given.accept}
+    (kinds, laws), options = given.parse_options(), {"accept": given.accept}
     text, machine = robot_text(given.robot, per_copy=given.per_copy, **given.part)
     elastic, currents = kinds is None, given.torque_constant is not None
     if elastic:
@@ -156,7 +156,9 @@ def fit(given: Fit) -> Report:
     with progress("fit", len(given.recordings)) as update:
         read = [given.read(path, machine, deflected=elastic, currents=currents) for path in given.recordings]
         beyond = [
-            f"beyond limits: {r.name}: {item}" for r in read for item in given.admitted(machine, r.q, where=r.name)
+            f"beyond limits: {r.name}: {item}"
+            for r in read
+            for item in given.list_beyond_limits(machine, r.q, where=r.name)
         ]
         result: Result
         choices: Sequence[Choice] = ()

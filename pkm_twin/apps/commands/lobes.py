@@ -48,7 +48,7 @@ class Lobes(MillingOptions, PoseOption, ToolOptions, OutputOption, PictureOption
 @command("Stiffness, workspace and vibration")
 def lobes(given: Lobes) -> Report:
     """Compute the limits of stability over the spindle's speed."""
-    from stiffness_monitor.chatter import SPEED_MARGIN, lobes_between
+    from stiffness_monitor.chatter import SPEED_MARGIN, refine_lobes
     from stiffness_monitor.vibration import tool_modes
 
     low, high = given.speeds
@@ -58,7 +58,7 @@ def lobes(given: Lobes) -> Report:
     machine = given.machine()
     pose = given.pose(machine)
     modes = tool_modes(machine, pose, damping=given.damping, tool=given.tool)
-    found = lobes_between(modes, milling, low, high, given.points, given.deepest)
+    found = refine_lobes(modes, milling, low, high, given.points, given.deepest)
     best, least = found.steady(), int(found.depths.argmin())
     worst = found.speeds[least], found.depths[least], found.open[least]
     answer = (

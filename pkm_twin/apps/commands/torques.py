@@ -97,7 +97,7 @@ def torques(given: Torques) -> Report:
         if given.wrench is not None:
             raise click.UsageError("--wrench needs --at; a motion has it in columns fx ... mz")
         motion = given.read_motion(given.motion, given.machine())
-    beyond = given.admitted(motion.robot, motion.q, motion.qd)
+    beyond = given.list_beyond_limits(motion.robot, motion.q, motion.qd)
     with progress("torques", len(motion.time)) as update:
         columns = torque_table(motion, update)
     if given.out is not None:

@@ -11,7 +11,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.maps.kind import Found, size_and_direction
 from pkm_twin.maps.kinds.frequency import Frequency
 from pkm_twin.robot.robot import Robot
-from stiffness_monitor.chatter import Milling, stable_depth_of
+from stiffness_monitor.chatter import Milling, stable_depth_from_modes
 from stiffness_monitor.vibration import DYNAMIC_MODES, tool_modes
 
 
@@ -43,7 +43,7 @@ class CuttingDepth(Frequency):
         """Return the zero-order depth, and direction and index of the chattering mode."""
         poses = robot.forward(q)
         found = [tool_modes(robot, p, damping=self.damping, tool=self.tool) for p in poses]
-        depths = [stable_depth_of(modes, self.milling) for modes in found]
+        depths = [stable_depth_from_modes(modes, self.milling) for modes in found]
         moved = [modes.shapes[k, :3] for modes, (_, k) in zip(found, depths, strict=True)]
         value, mode = np.array(depths).reshape(-1, 2).T
         direction = size_and_direction(np.array(moved))[1]
