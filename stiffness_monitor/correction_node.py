@@ -20,7 +20,7 @@ from pkm_twin.robot.effort_limits import EffortLimits
 from pkm_twin.robot.robot import Robot
 from pkm_twin.ros.joints import JointPublisher
 from pkm_twin.ros.node import TwinNode
-from pkm_twin.ros.wrench import triple
+from pkm_twin.ros.wrench import declare_vector
 from pkm_twin.streams.monitor import Core, counting
 from stiffness_monitor.correction import SetpointStream, setpoint_correction
 from stiffness_monitor.monitor import Answer
@@ -54,7 +54,7 @@ class SetpointCorrection(Core):
             "correct_setpoint", False, "publish joint offsets that compensate the tool point's deflection"
         )
         text = "position of the tool point from the platform's reference point, platform axes"
-        self._tool = np.array(triple(node, "tool.xyz", text, "m"))
+        self._tool = np.array(declare_vector(node, "tool.xyz", text, "m"))
         self._bound = node.declare(
             "correction_bound",
             1e-3,

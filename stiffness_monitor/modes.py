@@ -202,7 +202,7 @@ def assemble(model: StructuralModel, elements: int, kept: int | None = None) -> 
         rigidity = np.array([[spring.rigidity]])
         whole.append(Part(spring.element, list(spring.row), row, rigidity, np.zeros((1, 1))))
     if frame.held:
-        # A basis of the closures' null space, (size, fewer); the first six rows are unit.
+        # Basis of the closures' null space, (size, fewer); the first six rows are unit.
         table = np.zeros((len(frame.held), size))
         table[:, : frame.size] = frame.table()
         dependent, chosen = frame.dependents(table[None, :, : frame.size])

@@ -197,7 +197,7 @@ class Places:
         way = ends[1::2] - ends[::2]
         length = np.sqrt((way * way).sum(1))[:, None]
         way = np.divide(way, length, out=np.zeros_like(way), where=length > 0.0)[self._bar]
-        # Places are last in memory: there are many more of them than of joints and axes.
+        # The axis of positions is last in memory, because it is the longest.
         return found[0].T, found[1:].transpose(2, 0, 1), way
 
 
@@ -243,7 +243,7 @@ class ContactLocator:
         if not y.any():
             return
         self._at, turned, along = self.places.at(q)
-        # Places are last: jacobian (n, 3, P), way (3, P).
+        # The axis of positions is last: jacobian (n, 3, P), way (3, P).
         jacobian, way = turned.transpose(1, 2, 0), along.T
         if self._sums is None:
             self._begin(jacobian, sure, qd)

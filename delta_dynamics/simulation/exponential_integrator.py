@@ -71,7 +71,7 @@ def make_damped_stepper(span: float, modes: Array, back: Array, decays: Array) -
     :param decays: of the modes, 1/s, shape (r,).
     """
     plain = np.array(_undamped_weights(span))
-    # Method's weights for each damped mode, shape (11, r).
+    # The method's weights for each damped mode, shape (11, r).
     z = -span * decays
     near, far = _phi(0.5 * z), _phi(z)
 

@@ -367,7 +367,7 @@ def balance(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: A
     found = solve_balances(robot, loads)
     if robot.redundant:
         efforts = robot.evaluate(body_efforts(robot), q, qd, qdd, load, p=robot.inertial)[0]
-        # Balances with given efforts, shape (..., n), of a redundant machine's drives.
+        # Balances with the given efforts (..., n) of a redundant machine's drives.
         names = [joint.actuated for joint in found.joints if joint.actuated is not None]
         rows = [found.components.index(name) for name in names]
         unit = found.unit[..., rows]

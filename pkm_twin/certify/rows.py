@@ -121,7 +121,7 @@ class Moving(ABC):
         value, spin = frame.rotation @ vector, frame.rate[3:]
         rate = cross(spin, value)
         bias = cross(frame.bias[3:], value) + cross(spin, rate)
-        # Matrix of the cross product v x, shape (3, 3).
+        # The cross product's matrix, shape (3, 3).
         x, y, z = value.tolist()
         return Jet(value, -np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ frame.columns[3:], rate, bias)
 

@@ -64,7 +64,7 @@ class TransmissionTerms:
         """
         m = self.m
         wanted, damping = (self.tape.inputs(name, m * m).reshape(m, m) for name in ("stiffness", "damping"))
-        # Sum_i w_i d2q_i/dx2, shape (m, m).
+        # The sum of w_i d2q_i/dx2, shape (m, m).
         weights = self.tape.inputs("tau", len(self.ratio))
         along = [np.array(change, dtype=object) @ weights for change in changes]
         result = np.empty((self.m, self.m), dtype=object)

@@ -15,7 +15,7 @@ from pkm_twin.codegen.arrays import Array, Indices
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.identification.calibration_state import Poses, State, derivatives, rotations
 from pkm_twin.identification.samples import CLEAR, FINEST, huber
-from pkm_twin.recordings.tables import PLAIN, Dialect, Table, read_table
+from pkm_twin.recordings.tables import DEFAULT_DIALECT, Dialect, Table, read_table
 from pkm_twin.robot.robot import Robot
 
 COORDINATES: Final = ("x", "y", "z", "roll", "pitch", "yaw")
@@ -443,7 +443,7 @@ _TURN: Final = re.compile(r"(?:\w*_)?(?:ori|orientation|quat|quaternion|rotation
 _MEASURED: Final = re.compile(r"meas\w*_|actual_|mocap_")
 
 
-def read_poses(path: Path, robot: Robot, dialect: Dialect = PLAIN) -> Poses:
+def read_poses(path: Path, robot: Robot, dialect: Dialect = DEFAULT_DIALECT) -> Poses:
     """Measured poses.
 
     Columns, in any order: ``JOINT.position`` of every joint, in the controller's names and numbers;
@@ -482,7 +482,7 @@ def read_measured(
     robot: Robot,
     kinds: Sequence[Kind],
     noise: Mapping[str, float],
-    dialect: Dialect = PLAIN,
+    dialect: Dialect = DEFAULT_DIALECT,
 ) -> Measured:
     """Measurements of some quantities; cells may be empty.
 

@@ -103,7 +103,7 @@ class _Reader:
         placed = self._place_links(tree)
         closures = [self._closure(joint) for joint in left]
         size = max(1.0, *(float(np.abs(link.frame.position).max()) for link in self.links.values()))
-        # Scene's gravity, by default 9.81 m/s2 downwards, as PhysX.
+        # The scene's gravity, by default 9.81 m/s2 downwards, as PhysX.
         down = -np.eye(3)["XYZ".index(self.up)]
         size = 9.81
         for prim in self.prims:

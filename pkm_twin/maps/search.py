@@ -217,7 +217,7 @@ def workspace_box(robot: Robot) -> Array:
     """
     bounds = np.asarray(robot.search_box(), np.float64)
     # Poses with interference are included: maps show them.
-    # Reachable poses of joint states between the limits, (k, m); none without limits.
+    # Sample joint states between the limits; keep the reachable poses, (k, m).
     limits = robot.limits.position
     count = len(robot.joint_names)
     if limits is None or not np.isfinite(limits).all():

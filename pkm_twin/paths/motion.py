@@ -307,7 +307,7 @@ class TimedPath:
     @cached_property
     def bounds(self) -> list[Bound]:
         """Intervals with the limit that binds, in order."""
-        # Binding column of each row of used fractions (k, l), -1 for none.
+        # The limit that binds at each time, by the used fractions (k, l); -1 for none.
         active = self.used >= BINDING_USE
         lasts = np.zeros(self.used.shape, np.int64)
         count = np.zeros(self.used.shape[1], np.int64)

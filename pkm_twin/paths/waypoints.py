@@ -16,9 +16,9 @@ from pkm_twin.paths.geometry import Path, Space, lines, through
 from pkm_twin.recordings.origin import states_origin
 from pkm_twin.recordings.payload import Load
 from pkm_twin.recordings.tables import (
+    DEFAULT_DIALECT,
     EFFORTS,
     PAYLOAD,
-    PLAIN,
     WRENCH,
     Dialect,
     kinds_of,
@@ -34,7 +34,7 @@ def read_waypoints(
     file: File,
     robot: Robot,
     blend: float | None,
-    dialect: Dialect = PLAIN,
+    dialect: Dialect = DEFAULT_DIALECT,
 ) -> tuple[Path, list[float] | None]:
     """Read the path of a table of waypoints: pose coordinates, or JOINT.position of every joint.
 

@@ -16,7 +16,7 @@ from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import BagError, MessageError, ParameterError, PkmTwinError, one_line
 from pkm_twin.recordings.origin import Origin
 from pkm_twin.recordings.payload import Load
-from pkm_twin.recordings.tables import PLAIN, Dialect
+from pkm_twin.recordings.tables import DEFAULT_DIALECT, Dialect
 from pkm_twin.recordings.topics import COLUMNS, Topics
 from pkm_twin.robot.derivatives import nearest_motion
 from pkm_twin.robot.robot import Robot
@@ -54,7 +54,7 @@ class ReadOptions:
     topics: tuple[str, ...] = ()
     load: Load | None = None
     follow: str | None = None
-    dialect: Dialect = PLAIN
+    dialect: Dialect = DEFAULT_DIALECT
     side: str = "joint"
     wrench_frame: str | None = None
     base_frame: str = WrenchSettings.base_frame
@@ -356,7 +356,7 @@ def differentiate_motion(r: Recording) -> tuple[Array, Array, Mask]:
             differentiator.reset()
         try:
             rates = differentiator.push(stamp, r.q[i], None if r.qd is None else r.qd[i])
-        except MessageError:  # stamps too uneven here
+        except MessageError:  # the stamps are too uneven here
             continue
         if rates is not None:
             used[i - late], qd[i - late], qdd[i - late] = True, *rates

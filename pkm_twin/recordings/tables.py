@@ -125,7 +125,7 @@ class Dialect:
         return UNITS[self.units[kind]][1] if kind in self.units else 1.0
 
 
-PLAIN: Final = Dialect()
+DEFAULT_DIALECT: Final = Dialect()
 
 
 class Table(dict[str, Array]):
@@ -203,7 +203,7 @@ def kinds_of(robot: Robot, side: str = "joint") -> dict[str, str]:
 
 
 def read_table(
-    path: Path, kinds: Mapping[str, str] | None = None, dialect: Dialect = PLAIN, *, blank: bool = False
+    path: Path, kinds: Mapping[str, str] | None = None, dialect: Dialect = DEFAULT_DIALECT, *, blank: bool = False
 ) -> Table:
     """Read the columns of a CSV or, by its ending, Parquet file with a header row, in SI units.
 

@@ -228,7 +228,7 @@ class Assembly:
                 values, miss = other, less
         self.place(values)
         if miss > self.closed:
-            # Error of loops that do not close, with the one that misses the most.
+            # Report the loop with the largest gap.
             closure = max(self.tree.closures, key=lambda one: max(abs(float(e.value)) for e in self._equations(one)))
             a, b = (self.frame(closure, end) for end in (0, 1))
             apart = 1e3 * float(np.linalg.norm(b.position - a.position))
@@ -395,7 +395,7 @@ class HomeSearch:
             chosen = min(good, key=lambda home: float(np.linalg.norm(home.values / self.units)))
         if chosen is not None and chosen.index >= MIN_HOME_INDEX:
             return chosen
-        # Best conditioned assembly of the smallest reach that has a good one.
+        # Try growing distances from the wanted values; take the best conditioned assembly of the first that has one.
         rng = np.random.default_rng(1)
         tried: list[Home] = []
         candidates: list[Home] = []

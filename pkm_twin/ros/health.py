@@ -119,7 +119,7 @@ class Health:
     def _find_incompatible_ends(self) -> None:
         """Find incompatible nodes in the graph; this costs less than the middleware's events."""
         for topic, tells in self._watched_topics.items():
-            # The name as it was given: both calls remap it.
+            # The name before remapping: both calls remap it.
             speakers = self._node.get_publishers_info_by_topic(topic)
             listeners = self._node.get_subscriptions_info_by_topic(topic)
             speaking, listening = ([*filter(self._is_own, ends)] for ends in (speakers, listeners))

@@ -109,7 +109,7 @@ class GuardedNode(ParameterNode):
             try:
                 take(answer)
             except (PkmTwinError, ValueError) as error:
-                # In a constraint singularity, for example, the answer itself is valid.
+                # The answer stays valid: a further output may fail alone, as near a constraint singularity.
                 self.log_throttled("beside", f"no {what}: {error}")
 
     def stream_broken(self, where: str) -> None:

@@ -41,7 +41,7 @@ def set_priority(priority: int) -> None:
         try:
             os.sched_setscheduler(int(thread.name), os.SCHED_FIFO, parameter)
         except ProcessLookupError:
-            continue  # It has ended meanwhile.
+            continue  # The thread has ended.
         except OSError as error:
             raise OSError(f"SCHED_FIFO: {error.strerror}") from None
     if ctypes.CDLL(None, use_errno=True).mlockall(1 | 4):  # MCL_CURRENT | MCL_ONFAULT

@@ -32,7 +32,7 @@ def declare_mounts(node: TwinNode, platform_frame: str = PLATFORM) -> Mounts | N
     return TransformMounts(node, platform_frame)
 
 
-def triple(node: TwinNode, name: str, text: str, unit: str) -> tuple[float, float, float]:
+def declare_vector(node: TwinNode, name: str, text: str, unit: str) -> tuple[float, float, float]:
     """Declare a parameter of three numbers, zeros by default.
 
     :raises ParameterError: another number of values.

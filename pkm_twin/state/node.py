@@ -34,7 +34,7 @@ from pkm_twin.robot.robot_urdf import joint_names, robot_urdf
 from pkm_twin.ros.joints import header, named, xyz
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.run import run
-from pkm_twin.ros.wrench import declare_mounts, triple
+from pkm_twin.ros.wrench import declare_mounts, declare_vector
 from pkm_twin.settings import changeable, with_parameters
 from pkm_twin.state.scene import Load, Scales, Scene, Shape
 from pkm_twin.state.state import STATE, MachineState, State, moving_state_kernel, state_kernel
@@ -120,8 +120,10 @@ class MachineStateNode(TwinNode):
             "tool": self._declare_frame("tool_frame", "tool0", "of the tool"),
         }
         self._tool = Mount.of(
-            triple(self, "tool.xyz", "position of the tool from the platform's reference point, platform axes", "m"),
-            triple(self, "tool.rpy", "roll, pitch and yaw of the tool relative to the platform", "rad"),
+            declare_vector(
+                self, "tool.xyz", "position of the tool from the platform's reference point, platform axes", "m"
+            ),
+            declare_vector(self, "tool.rpy", "roll, pitch and yaw of the tool relative to the platform", "rad"),
         )
         mounts = declare_mounts(self, self._frames["platform"])
         self.core = MachineState(robot, settings, mounts)
