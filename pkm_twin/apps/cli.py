@@ -9,7 +9,7 @@ from typing import Final, NoReturn
 import click
 
 from pkm_twin.apps.groups import Tasks, commands
-from pkm_twin.apps.options import REFUSED
+from pkm_twin.apps.options import REFUSED, SALVAGED
 from pkm_twin.console import flush_output, silence_output, system_error, tell
 from pkm_twin.errors import PkmTwinError, plain_warnings
 from pkm_twin.files import open_standard_streams
@@ -80,16 +80,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
         silence_output()
         sys.exit(REFUSED)
     except PkmTwinError as error:
-        _end(str(error))
+        # Of a damaged bag, as `recover` can save a part of it.
+        _end(str(error), SALVAGED if getattr(error, "salvageable", 0) else REFUSED)
     except OSError as error:
         flush_output()
         # An error without a file name is one of the output.
         _end(f"{'' if error.filename else 'cannot write the output: '}{system_error(error)}")
 
 
-def _end(text: str) -> NoReturn:
+def _end(text: str, code: int = REFUSED) -> NoReturn:
     tell(text)
-    sys.exit(REFUSED)
+    sys.exit(code)
 
 
 if __name__ == "__main__":

@@ -49,6 +49,7 @@ class TestRecover:
         cut.write_bytes(whole[: len(whole) * 3 // 4])
         refused = forked(tmp_path, "check", cut)
         assert refused.code == 3
+        assert twin("torques", "delta_cu", cut).code == 3
         promised = int(re.search(r"(\d+) intact messages", refused.one_line_error())[1])
         done = forked(tmp_path, "recover", cut, saved, "--json")
         assert (done.code, done.err) == (3, "")
@@ -96,7 +97,7 @@ class TestPlay:
     def test_a_damaged_bag_is_not_played(self, twin, tiny, tmp_path):
         cut = tmp_path / "cut.mcap"
         cut.write_bytes(tiny.read_bytes()[:-10])
-        assert "recovered" in twin.refused("play", cut)
+        assert "recovered" in twin.refused("play", cut, code=3)
 
 
 def test_only_regular_files(twin, tmp_path):

@@ -52,7 +52,6 @@ class Check(TimedPayloadOptions, RecordingOptions):
 @command("Recordings")
 def check(given: Check) -> Report:
     """Judge a recording, or all of a folder."""
-    from pkm_twin.bags.reader import DamagedBagError
     from pkm_twin.recordings.bags import is_collection
 
     if is_collection(given.bag):
@@ -63,7 +62,7 @@ def check(given: Check) -> Report:
     except PkmTwinError as error:
         if isinstance(error, ParameterError) and error.field.startswith("--") and error.value:
             raise  # the option's value is wrong, not the recording
-        saved = error.salvageable if isinstance(error, DamagedBagError) else 0
+        saved = getattr(error, "salvageable", 0)
         facts = [Fact("bag", str(given.bag)), Fact("good", False), Fact("salvageable", saved)]
         return Report(facts=facts, code=SALVAGED if saved else REFUSED, error=str(error))
 
