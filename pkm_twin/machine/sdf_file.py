@@ -334,11 +334,10 @@ def _joint(path: Path, part: ET.Element, model: Model) -> Joint:
                 f"{where}: the frame {ends[0]} is drawn {far:.3g} m from the joint; "
                 "a joint of SDF holds its links as they are drawn",
             )
-    return joint_of(path, part, name, links, at, lambda frame: place(frame).rotation, model.version)
+    return joint_of(part, name, links, at, lambda frame: place(frame).rotation, model.version)
 
 
 def joint_of(
-    path: Path,
     part: ET.Element,
     name: str,
     links: tuple[str, str],

@@ -168,7 +168,7 @@ def _of_gazebo(path: Path, robot: ET.Element, frames: Mapping[str, Pose], taken:
         start = second if stated is None else stated.get("relative_to") or second
         start = urdf_xml.find_link(f"{where}.pose", start, frames)
         place = frames[start] @ sdf_file.pose(stated, f"{where}.pose")
-        found.append(sdf_file.joint_of(path, element, name, (first, second), place, turn))
+        found.append(sdf_file.joint_of(element, name, (first, second), place, turn))
     found += sdf_file.read_welds(path, robot, robot.get("name", ""), frames, taken)
     return {joint.name: joint.closing() for joint in found}
 
