@@ -237,9 +237,9 @@ class StiffnessAlarm:
 
     def judge(self) -> tuple[Departure, ...] | None:
         """Return the elements with an alarm, the most certain first; None without enough load."""
-        return finished(self.judge_in_slices())
+        return finished(self.judging())
 
-    def judge_in_slices(self) -> Generator[None, None, tuple[Departure, ...] | None]:
+    def judging(self) -> Generator[None, None, tuple[Departure, ...] | None]:
         """Evaluate as :meth:`judge` in slices, with the samples of the first slice."""
         if not self._samples:
             return None
@@ -479,7 +479,7 @@ class StiffnessWatch(Core):
 
         def evaluate() -> Generator[None, None, bool]:
             try:
-                found = yield from self._alarm.judge_in_slices()
+                found = yield from self._alarm.judging()
                 if self._judging is not mine:
                     return False
                 self.departures = found
