@@ -17,6 +17,7 @@ from pkm_twin.maps.run import run
 from pkm_twin.maps.search import workspace_box
 from pkm_twin.maps.store import open_map
 from pkm_twin.maps.sweep import map_of
+from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.robot.workspace import reachable, singularity_at, try_forward
 from test.support.robots import SHIPPED, load, often, partly_long
 
@@ -63,6 +64,19 @@ def test_the_volume_is_that_of_random_poses(name, count, rng, tmp_path):
     with open_map(run(sweep, tmp_path / "a.nc", workers=1)) as data:
         expected = share * np.prod(high - low)
         assert float(data.volume) == pytest.approx(expected, rel=0.06)
+
+
+@pytest.mark.usefixtures("short")
+def test_of_one_coordinate_the_map_tells_its_range(tmp_path):
+    """Of an arm about one axis, which has no area."""
+    joint = {"type": "revolute", "between": ["base", "arm"], "at": [0, 0, 0], "axis": [0, 1, 0], "actuated": True}
+    arm = {"mass": 1.0, "com": [0.2, 0, 0], "inertia": [0.01, 0.01, 0.01]}
+    data = {"mechanism": "machine", "platform": "arm", "origin": [0.4, 0, 0], "pose": ["pitch"], "bodies": {"arm": arm}}
+    data["joints"] = {"hub": joint | {"limits": {"position": [-0.5, 0.7]}}}
+    sweep = map_of(robot_of_data(data, "arm"), Workspace(), 2000)
+    with open_map(run(sweep, tmp_path / "a.nc", workers=1)) as found:
+        assert float(found.volume) == pytest.approx(1.2, rel=0.01)
+        assert "range of the reachable pitch" in Workspace.facts(found)[0]
 
 
 @pytest.mark.parametrize("name", robot_names())

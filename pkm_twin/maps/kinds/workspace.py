@@ -82,7 +82,7 @@ class Workspace(Kind):
     def summaries(self, space: Space, counted: int, apart: int) -> dict[str, Variable]:
         """Return volume, interference, and circles and cylinder of a workspace with an axis."""
         robot, result = space.robot, {}
-        if 1 < len(space.ticks) == len(robot.pose_names):
+        if len(space.ticks) == len(robot.pose_names):
             cell = math.prod(float(ticks[1] - ticks[0]) for ticks in space.ticks)
             what = "volume of the reachable poses"
             counts = {unit: robot.pose_units.count(unit) for unit in sorted(set(robot.pose_units))}
@@ -111,7 +111,7 @@ class Workspace(Kind):
                 others = tuple(axis for axis in range(len(names)) if axis != k)
                 ends = data[name].values[counted.any(others)]
                 extents.append(f"{name} {ends.min():.3g} to {ends.max():.3g}")
-            what = {2: "area", 3: "volume"}.get(len(names), "measure")
+            what = {1: "range", 2: "area", 3: "volume"}.get(len(names), "measure")
             facts.append(
                 f"{what} of the reachable {', '.join(names)}: {float(data.volume):.4g} "
                 f"{data.volume.attrs['units']}; {', '.join(extents)}"
