@@ -9,7 +9,7 @@ as the other back ends.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from textwrap import indent
 from typing import Any, Final
@@ -39,6 +39,7 @@ from pkm_twin.codegen.program import (
     holding,
     previous,
 )
+from pkm_twin.export.schedule import LATENCIES, LATENCY, TURN_LATENCY, Work, order_work
 
 LADDER: Final = (1, *STEPS)
 """Steps of Newton's method, one attempt after the other."""
@@ -89,58 +90,74 @@ def bare(text: str) -> str:
 class Lines:
     """Straight-line C of some expressions, as the body of a function.
 
+    Lines are in the order in which a processor can begin them, so that it computes several chains of
+    operations side by side: it looks a few hundred instructions ahead, and no compiler moves more.
+
     :param known: texts of expressions that are given.
     """
 
     def __init__(self, results: Sequence[Expression], known: Mapping[int, str]) -> None:
-        self.lines: list[str] = []
         self.doubles = 0
         self.needed: set[Operation] = set()
         self._known, self._text, self._used = known, dict(known), uses(results)
-        self._turns = 0
-        for angles in _angles(results, known):
-            self._turn(angles)
+        self._work: dict[int, Work] = {}
+        """Of every expression that has a text: what has to be computed with it."""
+        self._statements: list[tuple[str, Work]] = []
+        for k, angles in enumerate(_angles(results, known)):
+            self._turn(k, angles)
         self._write(results)
         self.results = [self._text[e.number] for e in results]
+        self.lines = [self._statements[k][0] for k in order_work([work for _, work in self._statements])]
 
-    def _turn(self, angles: Mapping[int, Sequence[Expression]]) -> None:
+    def _turn(self, k: int, angles: Mapping[int, Sequence[Expression]]) -> None:
         """Write sines and cosines of several angles in one call, by the number of the angle."""
-        k, size = self._turns, len(angles)
-        self._turns += 1
+        size = len(angles)
         self._write([x for turn in angles.values() for x in turn[0].args])
         self.needed.add(sin)
-        self.lines.append(f"    double a{k}[{size}], s{k}[{size}], c{k}[{size}];")
+        lines = [f"    double a{k}[{size}], s{k}[{size}], c{k}[{size}];"]
         self.doubles += 3 * size
+        work = Work.join([self._work[angle] for angle in angles if angle in self._work], TURN_LATENCY)
         for i, (angle, turn) in enumerate(angles.items()):
-            self.lines.append(f"    a{k}[{i}] = {bare(self._text[angle])};")
+            lines.append(f"    a{k}[{i}] = {bare(self._text[angle])};")
             for e in turn:
                 self._text[e.number] = f"{'s' if e.op is sin else 'c'}{k}[{i}]"
-        self.lines.append(f"    @_turn(a{k}, s{k}, c{k}, {size});")
+                self._work[e.number] = Work(frozenset({len(self._statements)}))
+        lines.append(f"    @_turn(a{k}, s{k}, c{k}, {size});")
+        self._statements.append(("\n".join(lines), work))
 
     def _write(self, results: Sequence[Expression]) -> None:
         for e in ordered(results, self._text):
+            work = Work()
             if e.source is not None:
                 text = "{}[{}]".format(*e.source)
             elif e.op is None:
                 text = c_number(e.value)
             else:
-                parts = fused(e, self._used, self._known)
-                if parts is None:
-                    self.needed.add(e.op)
-                    text = e.op.text([self._text[x.number] for x in e.args], in_c=True)
-                else:
-                    first, product, rest = parts
-                    x, y, z = (self._text[v.number] for v in (*product.args, rest))
-                    if e.op is sub:
-                        x, z = (x, f"-{z}") if first else (f"-{x}", z)
-                    text = f"PKM_FMA({x}, {y}, {z})"
+                text, work = self._operation(e, e.op)
                 once = self._used.get(e.number, 2) == 1
                 # A product that is used once becomes part of a fused operation.
                 if not once or (e.op is not mul and len(text) > LONGEST):
-                    self.lines.append(f"    const double v{self.doubles} = {bare(text)};")
-                    text = f"v{self.doubles}"
+                    name = f"v{self.doubles}"
+                    self._statements.append((f"    const double {name} = {bare(text)};", work))
+                    text, work = name, Work(frozenset({len(self._statements) - 1}))
                     self.doubles += 1
-            self._text[e.number] = text
+            self._text[e.number], self._work[e.number] = text, work
+
+    def _operation(self, e: Expression, op: Operation) -> tuple[str, Work]:
+        parts = fused(e, self._used, self._known)
+        first, values = True, list(e.args)
+        if parts is not None:
+            first, product, rest = parts
+            values = [*product.args, rest]
+        work = Work.join([self._work.get(v.number, Work()) for v in values], LATENCIES.get(op, LATENCY))
+        x, *others = (self._text[v.number] for v in values)
+        if parts is None:
+            self.needed.add(op)
+            return op.text([x, *others], in_c=True), work
+        y, z = others
+        if op is sub:
+            x, z = (x, f"-{z}") if first else (f"-{x}", z)
+        return f"PKM_FMA({x}, {y}, {z})", work
 
 
 def _angles(results: Sequence[Expression], known: Mapping[int, str]) -> list[dict[int, list[Expression]]]:
@@ -384,16 +401,7 @@ static const int @_steps[{len(LADDER)}] = {{{steps}}};
             others = sum(known.startswith(name) for known, _ in self._solvers.values())
             name += str(others + 1) if others else ""
             # What does not change in a step is computed once, and the last serves the results.
-            # Find values that do not depend on the named inputs, but are read by values that do.
-            names = (q.unknowns, STATE)
-            moved: set[int] = set()
-            found: dict[int, Expression] = {}
-            for error in ordered(q.correct):
-                if (error.source or ("",))[0] in names or any(x.number in moved for x in error.args):
-                    moved.add(error.number)
-                    still = (x for x in error.args if x.number not in moved and x.op is not None)
-                    found |= {x.number: x for x in still}
-            ahead = list(found.values())
+            ahead = _without((q.unknowns, STATE), q.correct)
             self._solvers[key] = name, {e.number: k for k, e in enumerate(ahead)}
             self._write_solver(name, q, ahead)
         return self._solvers[key]
@@ -548,4 +556,16 @@ def _read_of(body: Sequence[Expression], above: Iterable[Sequence[Expression]]) 
         beyond = [e for e in ordered(results, known) if e.number not in inner]
         read = [*results, *(x for e in beyond for x in e.args)]
         found |= {e.number: e for e in read if e.number in inner - known}
+    return list(found.values())
+
+
+def _without(names: Container[str], results: Sequence[Expression]) -> list[Expression]:
+    """Find values that do not depend on the named inputs, but are read by values that do."""
+    moved: set[int] = set()
+    found: dict[int, Expression] = {}
+    for e in ordered(results):
+        if (e.source or ("",))[0] in names or any(x.number in moved for x in e.args):
+            moved.add(e.number)
+            still = (x for x in e.args if x.number not in moved and x.op is not None)
+            found |= {x.number: x for x in still}
     return list(found.values())
