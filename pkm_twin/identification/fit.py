@@ -20,7 +20,6 @@ from pkm_twin.identification.hypotheses import Explanation, explain
 from pkm_twin.identification.identifiable import KINDS, Kind
 from pkm_twin.identification.judge import Verdict, basis_of
 from pkm_twin.identification.parameters import (
-    FileParameters,
     Number,
     Status,
     numbers_of_group,
@@ -218,8 +217,17 @@ def fitted(problem: Problem, accepted: tuple[str, ...] = ()) -> Fit:
     parameters, verdict = problem.parameters, verdict_of(problem)
     if accepted:
         verdict = replace(verdict, answer="does not explain")
-    best = _possible(parameters, problem.estimate, verdict)
-    wide = best.covariance
+    # The posterior's numbers, or the nearest that a machine can have.
+    start, cones, first = parameters.values, parameters.cones, problem.estimate
+    aim, wide = start + verdict.change, verdict.covariance
+    bound, near = beyond(aim, cones), aim
+    if bound:
+        sizes, vectors = np.linalg.eigh(verdict.plain / np.outer(first.prior, first.prior))
+        factor = vectors * np.sqrt(np.maximum(sizes, 1e-12 * sizes.max()))
+        near = nearest((aim - start) / first.prior, factor, start, first.prior, cones)
+        # How far a bound moves the numbers next to it is an estimate.
+        wide = wide + np.outer(near - aim, near - aim)
+    best = replace(first, values=near, covariance=wide, bound=bound)
     told = np.full_like(wide, np.nan) if verdict.deviations == "withheld" else wide
     numbers: list[Number] = []
     for group, k in zip(parameters.groups, parameters.slices, strict=True):
@@ -305,18 +313,3 @@ def refuse_faults(faults: Sequence[str], accept: bool) -> None:
     """
     if faults and not accept:
         raise PkmTwinError(f"{faults[0]}; --accept fits it nevertheless")
-
-
-def _possible(parameters: FileParameters, first: Estimate, verdict: Verdict) -> Estimate:
-    """Return the posterior's numbers, or the nearest that a machine can have."""
-    start, cones = parameters.values, parameters.cones
-    aim = start + verdict.change
-    bound = beyond(aim, cones)
-    if not bound:
-        return replace(first, values=aim, covariance=verdict.covariance, bound=bound)
-    sizes, vectors = np.linalg.eigh(verdict.plain / np.outer(first.prior, first.prior))
-    factor = vectors * np.sqrt(np.maximum(sizes, 1e-12 * sizes.max()))
-    near = nearest((aim - start) / first.prior, factor, start, first.prior, cones)
-    # How far a bound moves the numbers next to it is an estimate.
-    covariance = verdict.covariance + np.outer(near - aim, near - aim)
-    return replace(first, values=near, covariance=covariance, bound=bound)

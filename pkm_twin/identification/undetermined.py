@@ -226,7 +226,13 @@ def undetermined(graph: Graph, names: Sequence[str], scales: Array, directions: 
         found.setdefault((change.kind, change.axis), []).append(change.item)
         # What is orthogonal to it, in the space that is left.
         left = left @ np.linalg.svd(inner[None])[2][1:].T
-    told = list(_joined(found))
+    # Those that differ by the axis alone are one sentence.
+    merged: dict[tuple[str, tuple[str, ...]], list[str]] = {}
+    for (kind, axis), items in found.items():
+        merged.setdefault((kind, tuple(dict.fromkeys(items))), []).append(axis)
+    told = [
+        kind.format(items=_listed(names_of), axes=_and(sorted(set(axes)))) for (kind, names_of), axes in merged.items()
+    ]
     rest = list(_combinations(names, left))
     if len(told) + len(rest) > LINES:
         shown = told[: LINES - 1]
@@ -237,15 +243,6 @@ def undetermined(graph: Graph, names: Sequence[str], scales: Array, directions: 
             f"{more} further combinations, mostly of {_listed(_greatest(names, weights))}",
         ]
     return [*told, *rest]
-
-
-def _joined(found: dict[tuple[str, str], list[str]]) -> Iterator[str]:
-    """Write a sentence for each kind; those that differ by the axis alone are one."""
-    merged: dict[tuple[str, tuple[str, ...]], list[str]] = {}
-    for (kind, axis), items in found.items():
-        merged.setdefault((kind, tuple(dict.fromkeys(items))), []).append(axis)
-    for (kind, names), axes in merged.items():
-        yield kind.format(items=_listed(names), axes=_and(sorted(set(axes))))
 
 
 def _combinations(names: Sequence[str], left: Array) -> Iterator[str]:
