@@ -8,7 +8,9 @@ from typing import Any, Final
 
 import numpy as np
 
+from pkm_twin.errors import warn
 from pkm_twin.machine.sections import MAX_MASS
+from pkm_twin.robot.plausibility import gravity_findings, payload_findings
 from pkm_twin.robot.robot import Robot
 from pkm_twin.ros.node import TwinNode
 
@@ -50,7 +52,7 @@ def declare_changes(node: TwinNode, robot: Robot, names: Collection[str] = CHANG
 
 
 def change_robot(robot: Robot, values: dict[str, Any]) -> Robot:
-    """Return the robot with new values of :data:`CHANGES`."""
+    """Return the robot with new values of :data:`CHANGES`; an implausible one gives a warning."""
     sections: dict[str, Any] = {}
     for name, value in values.items():
         section, key, *_ = CHANGES[name]
@@ -61,4 +63,7 @@ def change_robot(robot: Robot, values: dict[str, Any]) -> Robot:
             sections.setdefault(section, {})[key] = plain
         else:
             sections[section] = plain
-    return robot.changed(**sections)
+    made = robot.changed(**sections)
+    for finding in (*gravity_findings(made), *payload_findings(made)):
+        warn(f"parameters of {robot.name}", finding.text)
+    return made

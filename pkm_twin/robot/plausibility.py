@@ -55,7 +55,7 @@ def findings(robot: Robot) -> tuple[Finding, ...]:
         *_check_masses(robot, graph),
         *_check_bodies(robot, graph),
         *_check_drives(robot, graph),
-        *_check_gravity(robot),
+        *gravity_findings(robot),
         *_check_members(robot, graph),
         *_check_home(graph),
     ]
@@ -197,7 +197,8 @@ def _check_drives(robot: Robot, graph: Graph) -> Iterator[Finding]:
             yield from _above(f"{name}: rotor_inertia", what, weight, 100.0 * total, "kg", likely)
 
 
-def _check_gravity(robot: Robot) -> Iterator[Finding]:
+def gravity_findings(robot: Robot) -> Iterator[Finding]:
+    """Return an implausible gravity."""
     size = float(np.linalg.norm(robot.gravity))
     times = f"{size / 9.81:.4g} times the Earth's; in mm/s2 or cm/s2?"
     # Between the Moon and Jupiter.
