@@ -89,67 +89,6 @@ def c_number(value: float) -> str:
     return f"({text})" if text.startswith("-") else text
 
 
-def _write_horner_c(coefficients: Sequence[float]) -> str:
-    text = c_number(coefficients[0])
-    for c in coefficients[1:]:
-        text = f"PKM_FMA({text}, z,\n        {c_number(c)})"
-    return text
-
-
-SINE_COSINE_C: Final = f"""\
-/* Sines and cosines: polynomials after Cody and Waite's reduction by quarter turns. NaN where
-   the angle is so large that the reduction loses digits. */
-static void @_turn(const double *x, double *s, double *c, int count)
-{{
-    int i;
-    for (i = 0; i < count; i++) {{
-        const double angle = (fabs(x[i]) < {MAX_ANGLE!r}) ? x[i] : 0.0;
-        const int k = (int)((angle * {c_number(2.0 / math.pi)}) + {MAX_QUARTER}.5) - {MAX_QUARTER};
-        const double n = -(double)k;
-        const double y = PKM_FMA(n, {c_number(HALF_PI[2])},
-            PKM_FMA(n, {c_number(HALF_PI[1])}, PKM_FMA(n, {c_number(HALF_PI[0])}, angle)));
-        const double z = y * y;
-        const double sine = PKM_FMA(z * y, {_write_horner_c(SINE)}, y);
-        const double cosine = PKM_FMA(z, -0.5, 1.0) + (z * z) * {_write_horner_c(COSINE)};
-        const int even = 1 - (k & 1);
-        const int side = 1 - (k & 2);
-        const double u = (double)(even * side);
-        const double v = (double)((1 - even) * side);
-        s[i] = PKM_FMA(u, sine, v * cosine);
-        c[i] = PKM_FMA(u, cosine, -(v * sine));
-    }}
-    for (i = 0; i < count; i++) {{
-        if (!(fabs(x[i]) < {MAX_ANGLE!r})) {{
-            s[i] = c[i] = (double)NAN;
-        }}
-    }}
-}}
-"""
-
-
-ARCTANGENT_C: Final = f"""\
-/* Arctangent of y over x in all quadrants: a quotient of polynomials up to 0.66, beyond it of the
-   angle from an eighth turn. */
-static double @_atan2(double y, double x)
-{{
-    const double small = (fabs(y) > fabs(x)) ? fabs(x) : fabs(y);
-    const double large = (fabs(y) > fabs(x)) ? fabs(y) : fabs(x);
-    const int high = (small * {1 / 0.66!r}) > large;
-    const double over = high ? (small - large) : small;
-    const double below = high ? (small + large) : large;
-    const double u = over / ((below <= 0.0) ? 1.0 : below);
-    const double z = u * u;
-    const double ratio = {_write_horner_c(ATAN_P)}
-        / {_write_horner_c(ATAN_Q)};
-    double angle = PKM_FMA(u * z, ratio, u);
-    angle = high ? ((angle + {HALF_PI_REMAINDER / 2!r}) + {math.pi / 4!r}) : angle;
-    angle = (fabs(y) > fabs(x)) ? (({math.pi / 2!r} - angle) + {HALF_PI_REMAINDER!r}) : angle;
-    angle = (copysign(1.0, x) < 0.0) ? (({math.pi!r} - angle) + {2 * HALF_PI_REMAINDER!r}) : angle;
-    return copysign(angle, y);
-}}
-"""
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class Operation:
     """An operation on one to three arguments.
@@ -159,8 +98,8 @@ class Operation:
     default ``numbers``. ``slopes``: partial derivatives as a function of the result and the
     arguments. ``lanes``: LLVM instruction, or a function that writes several. ``infix``: format of
     the operation in Python and C; without it the operation is written as a function call: in C of
-    ``c``, of the function of x, y and z that returns ``body``, or of math.h. ``helper``: C function
-    that the call needs. ``folds``: simplification of the expression. ``commutes``: a op b = b op a.
+    ``c``, of the function of x, y and z that returns ``body``, or of math.h. ``folds``:
+    simplification of the expression. ``commutes``: a op b = b op a.
     """
 
     name: str
@@ -172,7 +111,6 @@ class Operation:
     infix: str = ""
     c: str = ""
     body: str = ""
-    helper: str = ""
     folds: Callable[..., Any] | None = None
     commutes: bool = False
 
@@ -200,11 +138,11 @@ class Operation:
         return f"{c if in_c else self.name}({', '.join(texts)})"
 
     @property
-    def helpers(self) -> str:
-        """C functions that the text of the operation calls."""
+    def helper(self) -> str:
+        """The C function that returns ``body``; empty without one."""
         names = ", ".join(f"double {x}" for x in "xyz" if re.search(rf"\b{x}\b", self.body))
         head = f"static double @_{self.name}({names})"
-        return f"{head}\n{{\n    return {self.body};\n}}\n" if self.body else self.helper
+        return f"{head}\n{{\n    return {self.body};\n}}\n" if self.body else ""
 
     def __repr__(self) -> str:
         return self.name
@@ -298,7 +236,6 @@ def _define_angle_function(name: str, index: int, slope: Callable[[Any], Any]) -
         lambda x: within(x) if abs(x) < MAX_ANGLE else math.nan,
         lambda x: numbers(np.where(np.abs(x) < MAX_ANGLE, x, np.nan)),
         folds=folds,
-        helper=SINE_COSINE_C,
     )
     return turn
 
@@ -486,7 +423,6 @@ atan2: Final = Operation(
     lambda e, y, x: (x / (y * y + x * x), -y / (y * y + x * x)),
     math.atan2,
     c="@_atan2",
-    helper=ARCTANGENT_C,
 )
 minimum: Final = Operation(
     "min",

@@ -39,6 +39,7 @@ from pkm_twin.codegen.program import (
     holding,
     previous,
 )
+from pkm_twin.export.c_functions import C_FUNCTIONS
 from pkm_twin.export.schedule import LATENCIES, LATENCY, TURN_LATENCY, Work, order_work
 
 LADDER: Final = (1, *STEPS)
@@ -340,7 +341,7 @@ class Unit:
 
     def text(self) -> str:
         """Return the source: helpers and all functions."""
-        needed = (op.helpers for op in OPERATIONS if op in self._needed)
+        needed = (C_FUNCTIONS.get(op, op.helper) for op in OPERATIONS if op in self._needed)
         steps = ", ".join(map(str, LADDER))
         ladder = f"""\
 /* Attempts of Newton's method; fewer shorten the worst case, and reject some valid states. */

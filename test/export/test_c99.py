@@ -14,9 +14,9 @@ import pytest
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import robot_names
-from pkm_twin.codegen.operations import ARCTANGENT_C
 from pkm_twin.codegen.program import MAX_ITERATIONS
 from pkm_twin.export.c99 import CORRECTIONS, HEAD
+from pkm_twin.export.c_functions import ARCTANGENT_C
 from pkm_twin.export.c_package import c_package
 from test.machine.random_machines import FILES
 from test.support.robots import (
