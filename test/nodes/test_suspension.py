@@ -287,30 +287,41 @@ def chain(peer, launch):
     return chain
 
 
+def stop(chain, way, on_stop, policy, heavy):
+    """Stop the running stream in this way; what left meanwhile is judged."""
+    if chain.place > len(PLACES) - 5000:
+        chain.place = 10
+        chain.wait(2.5 * STALE)
+    chain.on_stop = on_stop
+    chain.set(on_stop=on_stop, limit_policy=policy)
+    chain.set_payload(heavy)
+    chain.ask()
+    chain.ask(positions=np.full((3, 3), math.nan))
+    chain.twin.call(Trigger, "reset")
+    if heavy and policy == "reject":
+        # No answer leaves: the stream runs for an effort that is within the limits.
+        chain.set_payload(False)
+    chain.until_answered()
+    chain.set_payload(heavy)
+    WAYS[way](chain)
+    chain.judge_gates()
+
+
 def run(chain, cases):
-    """Stop the running chain in each way, with each on_stop, policy and payload; then it runs again."""
-    for way, on_stop, policy, heavy in cases:
-        if chain.place > len(PLACES) - 5000:
-            chain.place = 10
-            chain.wait(2.5 * STALE)
-        chain.on_stop = on_stop
-        chain.set(on_stop=on_stop, limit_policy=policy)
-        chain.set_payload(heavy)
-        chain.ask()
-        chain.ask(positions=np.full((3, 3), math.nan))
-        chain.twin.call(Trigger, "reset")
-        if heavy and policy == "reject":
-            # No answer leaves: the stream runs for an effort that is within the limits.
-            chain.set_payload(False)
-        chain.until_answered()
-        chain.set_payload(heavy)
-        WAYS[way](chain)
-        chain.judge_gates()
-    wanted = {way.split(",")[0] for way, *_ in cases} & {way.split(",")[0] for way in REASONS}
-    assert wanted - counts_of(chain.twin.diagnostics(), "stopped").keys() == set()
+    """Stop the chain in each way, with each on_stop, policy and payload."""
+    for case in cases:
+        stop(chain, *case)
+    missing = {way.split(",")[0] for way in REASONS}
+    # A loaded machine may stop the stream for want of states before it is stopped in its way.
+    for _ in range(4):
+        missing -= counts_of(chain.twin.diagnostics(), "stopped").keys()
+        for case in cases:
+            if case[0].split(",")[0] in missing:
+                stop(chain, *case)
+    assert not missing
     for process in (chain.twin.process, *chain.gates):
         assert process.alive(), process.output
-    # The answers of a light machine, and at least one of each other kind, were judged.
+    # At least one of each kind was judged, and answers that are not zero.
     assert min(chain.answers, chain.stops, chain.points, chain.forwarded) > 0
     assert chain.law.judged > 100
 
@@ -322,4 +333,5 @@ def test_no_effort_leaves_a_live_node_beyond_its_limits_or_of_an_old_state(chain
 
 @pytest.mark.long
 def test_no_effort_leaves_by_any_reason_any_on_stop_and_any_policy(chain):
-    run(chain, list(product(WAYS, ON_STOP, POLICIES, (False, True))))
+    cases = product(WAYS, ON_STOP, POLICIES)
+    run(chain, [(*case, heavy) for case, heavy in zip(cases, cycle((False, True)), strict=False)])
