@@ -22,7 +22,7 @@ from pkm_twin.robot.derivatives import nearest_motion
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.differentiator import Differentiator
 from pkm_twin.streams.noise import SIGMAS, estimate_noise
-from pkm_twin.streams.rates import MAX_ACCELERATION_ERROR, MAX_RATE, rate_faults
+from pkm_twin.streams.rates import MAX_ACCELERATION_ERROR, MAX_RATE, STANDSTILL_FRACTION, rate_faults
 from pkm_twin.streams.rest import gradient_gain, velocity_error_bound
 from pkm_twin.streams.steps import MAX_GAP_PERIODS, Steps, repeats_of, steps_of
 from pkm_twin.streams.wrench import WrenchSettings
@@ -300,6 +300,8 @@ class Recording:
                     )
             if self.step_fault:
                 self = replace(self, notes=(*self.notes, f"positions jump: {self.step_fault}"))
+        with np.errstate(all="ignore"):
+            self = self._with_gap_note()
         if self.qd is not None and self.qdd is not None:
             return self
         if self.bag is not None:
@@ -315,6 +317,23 @@ class Recording:
             rest = np.abs(qd) <= velocity_error_bound(self.time, self.q, gradient_gain(self.time))
         qdd = _differentiate(qd, self.time) if self.qdd is None else self.qdd
         return self._project_motion(qd, qdd, rest, slice(None))
+
+    def _with_gap_note(self) -> Recording:
+        """Return the recording with a note of its longest gap in which joints move, if there is one."""
+        span = np.diff(self.time)
+        if self.qd is None:
+            steps = np.pad(np.abs(np.diff(self.q, axis=0)) / span[:, None], ((1, 1), (0, 0)))
+            rates = steps[:-2] + steps[2:]
+        else:
+            rates = np.abs(self.qd[:-1]) + np.abs(self.qd[1:])
+        moving = (rates > STANDSTILL_FRACTION * rates.max(0, initial=0.0)).any(1)
+        gaps = np.flatnonzero(moving & (span > MAX_GAP_PERIODS * np.median(span))) if len(span) else span
+        if not len(gaps):
+            return self
+        k = int(gaps[span[gaps].argmax()])
+        others = f" and {len(gaps) - 1} more gaps" if len(gaps) > 1 else ""
+        text = f"no samples from {self.time[k]:.6g} to {self.time[k + 1]:.6g} s{others}, while joints move: "
+        return replace(self, notes=(*self.notes, f"{text}RMS and energy are interpolated there"))
 
     def _project_motion(self, qd: Array, qdd: Array, still: Mask | None, rows: Any) -> Recording:
         """Return some samples with these velocities and accelerations; measured ones are kept.

@@ -237,6 +237,17 @@ def test_velocities_that_contradict_the_positions_are_rejected():
             Recording(robot, time, q, qd, scale * qdd).with_rates()
 
 
+@pytest.mark.parametrize("rates", [True, False])
+def test_a_gap_while_joints_move_is_noted(rates):
+    robot = load("delta")
+    time, q, qd, qdd = smooth_motion(robot, np.random.default_rng(1), 4.0, 100.0)
+    known = (qd, qdd) if rates else (None, None)
+    assert not Recording(robot, time, q, *known).with_rates().notes
+    later = time + 10.0 * (np.arange(len(time)) >= 200)
+    (note,) = Recording(robot, later, q, *known).with_rates().notes
+    assert f"from {time[199]:.6g} to {later[200]:.6g} s" in note
+
+
 @pytest.mark.parametrize("turn", [0.1, 0.5, 1.0, 1.5, 2.0, 3.0])
 @pytest.mark.parametrize("count", [12, 30, 200])
 def test_what_few_samples_a_turn_explain_is_no_contradiction(turn, count):
