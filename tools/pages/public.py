@@ -51,7 +51,8 @@ def groups() -> Iterator[tuple[str, list[str]]]:
             yield f"command {words}", [one for one in options if one.startswith("-")]
     source = (ROOT / "pkm_twin/export/c_package.py").read_text(encoding="utf-8")
     calls = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Call)]
-    named = [c.args[0] for c in calls if ast.unparse(c.func) in ("add", "Routine")]
+    static = {arg for call in calls if ast.unparse(call.func) == "self.hidden.append" for arg in call.args}
+    named = [c.args[0] for c in calls if ast.unparse(c.func) in ("add", "Routine") and c not in static]
     functions = [n.value for n in named if isinstance(n, ast.Constant) and n.value != "terms"]
     yield "exported C pkm_ROBOT_", ["parameters", *functions]
     above = ""
