@@ -241,7 +241,7 @@ class Command(click.Command):
                 for path in value if isinstance(value, tuple) else (value,):
                     if isinstance(one, Argument) and isinstance(path, Path) and not path.exists():
                         raise FileError(path, FileNotFoundError(), "a file to read")
-            for check in ("words", "machine"):
+            for check in ("parse_options", "machine"):
                 getattr(given, check, lambda: None)()
         for target in dict.fromkeys(targets):
             refuse_existing(target, overwrite, source)
