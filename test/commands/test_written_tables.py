@@ -13,6 +13,7 @@ from delta_dynamics import inverse_dynamics
 from pkm_twin.recordings import ReadOptions, read
 from pkm_twin.recordings.origin import COMPUTED_WITH, GRAVITY
 from pkm_twin.recordings.tables import PAYLOAD, WRENCH
+from test.support.command import REPOSITORY
 from test.support.robots import load, parameters_of, partly_long
 from test.support.tables import of_joints, read_columns, write_columns
 
@@ -43,7 +44,7 @@ def alike(found, expected):
     """Compare what readers print; a table has the times of a payload as sampled."""
     if isinstance(expected, dict):
         assert found.keys() == expected.keys()
-        for key in expected.keys() - {"efforts", "notes", "held_s", "source"}:
+        for key in expected.keys() - {"efforts", "notes", "held_s", "source", "bag", "history"}:
             alike(found[key], expected[key])
     elif isinstance(expected, list):
         assert len(found) == len(expected)
@@ -115,14 +116,35 @@ def test_an_exciting_motion_is_the_same_in_its_bag_its_table_and_a_recovered_bag
     twin.good("excite", name, "--out", bag, "--duration", "2", "--harmonics", "3", "--trials", "10", "--rate", "50")
     twin.good("recover", bag, again)
     first, *others = (bag.with_suffix(".csv"), bag, again)
-    *expected, _ = answers(twin, name, first)
+    vary = {"delta": "geometry.arm_length=0.18:0.22", "upr_rpu": "geometry.platform_radius=0.25:0.27"}[name]
+    design = ("design", name, "--minimise", "peak-effort", "--vary", vary, "--starts", "1", "--path")
+
+    def told(path):
+        *found, _ = answers(twin, name, path)
+        return [*found, twin.told(*design, path)]
+
+    expected = told(first)
     verdict = twin("check", first, "--robot", name, "--json")
     for path in others:
-        *found, _ = answers(twin, name, path)
-        alike(found, expected)
+        alike(told(path), expected)
         judged = twin("check", path, "--robot", name, "--json")
         assert judged.code == verdict.code
         assert json.loads(judged.out)["good"] == json.loads(verdict.out)["good"]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("bag, robot", [("delta_cu_pick_and_place", "delta_cu"), ("prru_milling", "prru")])
+def test_a_recovered_recording_gives_the_verdicts_and_numbers_of_its_source(bag, robot, twin, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    source, again = REPOSITORY / "bags" / f"{bag}.mcap", tmp_path / f"{bag}.mcap"
+    twin.good("recover", source, again)
+    found = []
+    for number, path in enumerate((source, again)):
+        judged = twin("check", path, "--json", "--history", f"{number}.db", "--machine", robot)
+        fitted = twin("fit", robot, path, "--what", "friction,payload", "--json", "--overwrite", "--no-report")
+        drift = twin.told("trend", f"{number}.db")
+        found.append([judged.code, json.loads(judged.out), fitted.code, fitted.out and json.loads(fitted.out), drift])
+    alike(*found[::-1])
 
 
 @pytest.mark.parametrize(
