@@ -181,7 +181,7 @@ def test_what_nobody_commands_stays_so_and_a_velocity_is_at_the_measured_positio
 
 
 def test_out_of_reach_holds_the_last_result_for_one_call(compiled):
-    home, far = compiled.robot.home(), compiled.robot.home() + 50.0
+    home, far = compiled.robot.home(), compiled.robot.home() + 2.0  # rad and m
     still = np.zeros(compiled.m)
     at_home = compiled.rows(1.0, home, still, still, still)
     beyond = compiled.rows(1.0, far, still, still, still)
