@@ -350,16 +350,8 @@ EXPORT Status FMI(ActivateModelPartition)(void *instance, Reference clock, doubl
 }
 
 /* Getter and setter of a type that no variable of the model has. */
-#define NO_VARIABLES(kind, type)                                                                                 \
-EXPORT Status FMI(Get##kind)(void *instance, const Reference *vr, size_t count, type *values, size_t size)       \
-{                                                                                                                \
-    Instance *c = (Instance *)instance;                                                                          \
-    (void)vr;                                                                                                    \
-    (void)values;                                                                                                \
-    (void)size;                                                                                                  \
-    return unsupported(c, count);                                                                                \
-}                                                                                                                \
-EXPORT Status FMI(Set##kind)(void *instance, const Reference *vr, size_t count, const type *values, size_t size) \
+#define NO_ACCESS(name, type)                                                                                    \
+EXPORT Status FMI(name)(void *instance, const Reference *vr, size_t count, type *values, size_t size)            \
 {                                                                                                                \
     Instance *c = (Instance *)instance;                                                                          \
     (void)vr;                                                                                                    \
@@ -367,6 +359,7 @@ EXPORT Status FMI(Set##kind)(void *instance, const Reference *vr, size_t count, 
     (void)size;                                                                                                  \
     return unsupported(c, count);                                                                                \
 }
+#define NO_VARIABLES(kind, type) NO_ACCESS(Get##kind, type) NO_ACCESS(Set##kind, const type)
 
 NO_VARIABLES(Float32, float)
 NO_VARIABLES(Int8, int8_t)
