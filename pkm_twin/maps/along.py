@@ -168,5 +168,5 @@ def along(
             values = evaluate_kind(kind, loaded, q[begin:end], under)
             pieces.append([one if one.element is None else one._replace(element=index[one.element]) for one in values])
     found = [concatenate_found(each) for each in zip(*pieces, strict=True)]
-    low = int((robot.try_singularity(q)[0] < least).sum())
+    low = int((robot.try_singularity(q[~counted])[0] < least).sum())
     return Along(robot, kind, chosen, time, pose, least, counted, found, tuple(elements), low, wrench is not None)
