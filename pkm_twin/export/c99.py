@@ -102,7 +102,7 @@ class Lines:
         self.needed: set[Operation] = set()
         self._known, self._text, self._used = known, dict(known), uses(results)
         self._work: dict[int, Work] = {}
-        """Of every expression that has a text: what has to be computed with it."""
+        """Work to compute the text of an expression, by the expression's number."""
         self._statements: list[tuple[str, Work]] = []
         for k, angles in enumerate(_angles(results, known)):
             self._turn(k, angles)

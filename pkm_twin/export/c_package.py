@@ -213,7 +213,7 @@ class Package:
                 "Joint positions of a pose, accepted only if _forward of them is the pose.",
                 {"pose": self.m},
                 lambda: engine.quick_inverse,
-                judge=self._confirmed,
+                judge=self._confirmed_inverse,
                 q="q",
             )
             if self.massive:
@@ -331,11 +331,11 @@ class Package:
                 continue
             rows, equations = self._read(kernel(self.robot, certified=True), own)
             made = {key: rows[row] for key, row in outputs.items()}
-            result.append(Routine(f"{name}_at_pose", inputs, made, equations, summary, judge=self._confirmed))
+            result.append(Routine(f"{name}_at_pose", inputs, made, equations, summary, judge=self._confirmed_inverse))
 
     @cached_property
-    def _confirmed(self) -> Routine | None:
-        """The function that judges poses whose assembly is not certain, which is not declared."""
+    def _confirmed_inverse(self) -> Routine | None:
+        """Undeclared function that judges poses whose assembly is not certain; None on a machine's own tree."""
         if self.robot.engine.posed is None:
             return None
         rows, equations = self._read(self.robot.engine.inverse)
@@ -376,7 +376,7 @@ class Package:
                 outputs = terms.gains([rows["change"] for rows, _ in found])
             else:
                 outputs = {"q": rows["q"], **terms.actuator_side()}
-            result.append(Routine(name, inputs, outputs, equations, summary, judge=self._confirmed))
+            result.append(Routine(name, inputs, outputs, equations, summary, judge=self._confirmed_inverse))
         if self._wants("actuator_to_joint"):
             kernel = robot.engine.kernel("actuator to joint", actuator_program)
             rows, equations = self._read(kernel)

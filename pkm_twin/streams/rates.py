@@ -28,8 +28,8 @@ STANDSTILL_FRACTION: Final = 0.03
 MAX_RATE: Final = 0.15
 """Largest relative RMS difference of the moves of a whole recording."""
 MAX_ACCELERATION_ERROR: Final = 0.6
-"""The same of changes of the velocities: a step of the acceleration between two samples is up to 0.2 of a block
-of five steps, and filters delay accelerations; wrong signs, units and zeros leave 1 or more."""
+"""Largest relative RMS difference of changes of the velocities. A step of the acceleration between two samples
+is up to 0.2 of a block of five steps, and filters delay accelerations; wrong signs, units and zeros leave 1 or more."""
 SCALE_TOLERANCE: Final = 0.1
 """Largest relative difference that a factor between both may leave to be named as the cause."""
 
