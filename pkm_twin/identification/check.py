@@ -31,7 +31,7 @@ from pkm_twin.identification.compare import (
 )
 from pkm_twin.identification.fit import Fit, fit
 from pkm_twin.identification.friction_laws import fit_recordings
-from pkm_twin.identification.hypotheses import NO_MACHINE, Explanation, describe_steps, explain_recording
+from pkm_twin.identification.hypotheses import NO_MACHINE, Explanation, explain_recording
 from pkm_twin.identification.judge import LOUD
 from pkm_twin.identification.words import LATEST, listed, position_text, scale_text
 from pkm_twin.recordings import Recording
@@ -79,7 +79,7 @@ class Checked:
     findings: tuple[str, ...] = ()
     """What `fit` says of them, where nothing explains them."""
     explanation: Explanation | None = None
-    """What explains the efforts most probably, as `fit` has it; None where it was not asked."""
+    """Most probable explanation of the efforts, the same as that of `fit`; None if none was searched for."""
     hint: str = ""
     """The payload that explains most of a good residual; empty: none does."""
 
@@ -141,9 +141,9 @@ def checked(r: Recording, residual: float) -> Checked:
         reason = "joint states without efforts: the bag has none, or NaN, in some or all of them"
         reason = "the table has no columns JOINT.effort" if r.bag is None else reason
         reason = COMPUTED if r.efforts == "model" else reason
-    fault = describe_steps(r)
+    fault = r.play_fault or r.step_fault
     # Single jumps are left out of what is compared.
-    if reason or r.steps.publishers or (fault and fault != r.step_fault):
+    if reason or r.steps.publishers or r.play_fault:
         items.append(judged(RESIDUAL, fault or reason, bound, None))
         return Checked(r, items, unjudged=reason, causes=(fault,) if fault else ())
     try:
@@ -193,7 +193,7 @@ def _motion(r: Recording) -> list[Fact]:
     median, longest = float(np.median(periods)), float(periods.max())
     gap = f"{1e3 * longest:.3f} ms at {r.time[int(periods.argmax())]:.3f} s"
     within, rate = 5.0 * median, f"{1 / median:.1f} Hz over {r.time[-1]:.3f} s"
-    fault = describe_steps(r)
+    fault = r.play_fault or r.step_fault
     items = [
         judged("rate", rate, "", True, number=1 / median, unit="Hz"),
         missing_samples(r.time),

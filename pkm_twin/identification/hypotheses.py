@@ -32,7 +32,6 @@ from pkm_twin.identification.words import LATEST, UNITS, late_text, listed, posi
 from pkm_twin.messages.reading import in_base_axes
 from pkm_twin.recordings import Load, Recording
 from pkm_twin.robot.robot import Robot
-from pkm_twin.streams.steps import find_play
 
 HEAVY: Final = 30.0
 """Deviation of a heavy payload over that of a usual one."""
@@ -105,7 +104,7 @@ class Explanation:
 
     @property
     def cause(self) -> str:
-        """What the positions and the efforts show, in words."""
+        """Sentence with the steps of the positions and the cause of the efforts; empty without both."""
         return "; ".join(text for text in (self.steps, self.text) if text)
 
 
@@ -530,33 +529,17 @@ def explain_recording(robot: Robot, r: Recording) -> Explanation:
     if found.load is not None:
         loaded = explain(rows_of(robot, rows.model.parameters, replace(rows.recording, load=found.load)))
         found = loaded if loaded.fault else found
-    return replace(found, steps="" if r.step_fault else describe_steps(r), rows=rows)
-
-
-def describe_steps(r: Recording) -> str:
-    """Say which positions step without a motion: by several publishers, by play, or by a fault of the encoder."""
-    names, units = r.robot.joint_names, r.robot.joint_units
-    found = (
-        []
-        if r.steps.publishers
-        else [
-            f"the position of {name} steps by {size:.3g} {unit} {count} times, up and down in turn"
-            for name, unit, size, count in zip(names, units, *find_play(r.q), strict=True)
-            if count
-        ]
-    )
-    return f"{'; '.join(found)}: play between the joint and its encoder?" if found else r.step_fault
+    return replace(found, steps="" if r.step_fault else r.play_fault, rows=rows)
 
 
 def describe_positions(r: Recording) -> str:
     """Say why positions that step are no motion of the machine: it cannot take them, or they jump."""
-    steps = describe_steps(r)
-    if steps == r.step_fault and not r.steps.publishers and r.effort is not None:
+    if not r.play_fault and not r.steps.publishers and r.effort is not None:
         try:
             idle_of(r)
         except (UnreachableError, SingularityError) as error:
             return position_text(error)
-    return f"position steps that are no motion: {steps}"
+    return f"position steps that are no motion: {r.play_fault or r.step_fault}"
 
 
 def wrenches(r: Recording, motion: Motion) -> Iterator[tuple[str, Array]]:

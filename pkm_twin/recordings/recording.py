@@ -24,7 +24,7 @@ from pkm_twin.streams.differentiator import Differentiator
 from pkm_twin.streams.noise import SIGMAS, estimate_noise
 from pkm_twin.streams.rates import MAX_ACCELERATION_ERROR, MAX_RATE, STANDSTILL_FRACTION, rate_faults
 from pkm_twin.streams.rest import gradient_gain, velocity_error_bound
-from pkm_twin.streams.steps import MAX_GAP_PERIODS, Steps, repeats_of, steps_of
+from pkm_twin.streams.steps import MAX_GAP_PERIODS, Steps, find_play, repeats_of, steps_of
 from pkm_twin.streams.wrench import WrenchSettings
 
 MODEL_VALUES_NOTE: Final = "tables use the model's joint values; joint_map applies to messages and bags only"
@@ -102,7 +102,7 @@ class Recording:
     origin: Origin | None = None
     """The robot that computed them, where the file names it."""
     doubt: str = ""
-    """How the file's efforts contradict the robot's model; empty if they do not, or none are known."""
+    """Sentence on efforts of the file that the robot's model does not give; empty without such efforts."""
     late: float = 0.0
     """How late the efforts were against the positions, s: they are put on time."""
     source: str = ""
@@ -174,6 +174,19 @@ class Recording:
         ]
         more = f" and {len(found) - MAX_LISTED_JUMPS} more" if len(found) > MAX_LISTED_JUMPS else ""
         return f"{len(found)} jumps: {', '.join(texts)}{more}" if found else ""
+
+    @cached_property
+    def play_fault(self) -> str:
+        """Description of positions that cross a play; empty without any, or if publishers are interleaved."""
+        if self.steps.publishers:
+            return ""
+        names, units = self.robot.joint_names, self.robot.joint_units
+        texts = [
+            f"the position of {name} steps by {size:.3g} {unit} {count} times, up and down in turn"
+            for name, unit, size, count in zip(names, units, *find_play(self.q), strict=True)
+            if count
+        ]
+        return f"{'; '.join(texts)}: play between the joint and its encoder?" if texts else ""
 
     @property
     def message_count(self) -> int:
