@@ -17,32 +17,32 @@ from computed_torque import Controller, main
 from delta_dynamics import inverse_dynamics
 from pkm_twin import transmission
 
-REACH = np.array([0.2, -0.3])
-"""How far roll and pitch go, rad."""
+TRAVEL = np.array([0.2, -0.3])
+"""Amplitudes of roll and pitch, rad."""
 
 
 class AnkleController(Controller):
-    """Commands the motors' efforts for a motion of roll and pitch."""
+    """Command the motors' efforts for a motion of roll and pitch."""
 
     def __init__(self, options):
         super().__init__(options)
         self.ankle = transmission(self.robot)
-        self._reach = REACH
+        self._travel = TRAVEL
         # Compiled before the first joint state is due.
         home = self.robot.home()
         motors = self.ankle.joint_to_actuator(home, home, home)
         self.ankle.actuator_to_joint(motors.position, motors.velocity)
         self.ankle.inertia(home)
 
-    def effort(self, t, q, qd):
-        """Efforts at a time of the path and a state of the motors; None after its end."""
-        # The transmission has the controller's numbers.
+    def compute_effort(self, t, q, qd):
+        """Return the motors' efforts at time ``t`` of the path for their state; None after its end."""
+        # The transmission takes and returns the controller's values.
         numbers = self.controller
         positions, rates = numbers.controller_positions(q), numbers.controller_rates(qd)
         foot = self.ankle.actuator_to_joint(positions, rates)
         if t == 0.0:
             self._start = foot.position
-        wanted = self.wanted(t)
+        wanted = self.plan(t)
         if wanted is None:
             return None
         w = 2.0 * np.pi * self.options.bandwidth

@@ -21,17 +21,17 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
-from trajectory_client import reaches
+from trajectory_client import choose_travel
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load
 from pkm_twin.errors import PkmTwinError
 
-SECOND = 1e9
+NANOSECONDS = 1e9
 
 
 class Controller(Node):
-    """Commands a robot's efforts; the first fault stops it permanently."""
+    """Command a robot's efforts; stop permanently at the first fault."""
 
     def __init__(self, options):
         super().__init__("computed_torque")
@@ -41,32 +41,32 @@ class Controller(Node):
         self.options = options
         self.errors, self.stopped, self.done = [], "", False
         self._first = self._last = None
-        self._reach = reaches(self.robot, options.reach)
+        self._travel = choose_travel(self.robot, options.reach)
         # Compiled before the first joint state is due.
         rest = np.zeros(self.robot.joints_count)
         inverse_dynamics(self.robot, self.robot.inverse(self.robot.home()), rest, rest)
         self._publisher = self.create_publisher(Float64MultiArray, options.commands, 1)
         self.create_subscription(JointState, "joint_states", self._on_state, 10)
-        # By the steady clock: a clock that stands still stops nothing else.
-        self._heard = time.monotonic()
+        # The steady clock, so that the watch also works if the simulated clock stops.
+        self._last_arrival = time.monotonic()
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._watch = self.create_timer(0.05, self._on_silence, clock=steady)
+        self._silence_timer = self.create_timer(0.05, self._on_silence, clock=steady)
 
     def _on_silence(self):
-        silent = time.monotonic() - self._heard
+        silent = time.monotonic() - self._last_arrival
         if self._first is not None and silent > self.options.deadline:
             self.stop(f"no joint state for {silent:.3f} s")
 
     def _on_state(self, message):
-        self._heard = time.monotonic()
+        self._last_arrival = time.monotonic()
         if self.stopped or self.done:
             return
-        stamp = message.header.stamp.sec * SECOND + message.header.stamp.nanosec
+        stamp = message.header.stamp.sec * NANOSECONDS + message.header.stamp.nanosec
         if stamp == self._last:
             return
-        trouble = self._trouble(message, stamp)
-        if trouble:
-            self.stop(trouble)
+        fault = self._find_fault(message, stamp)
+        if fault:
+            self.stop(fault)
             return
         index = [message.name.index(name) for name in self.controller.names]
         q = self.controller.positions(np.array(message.position)[index])
@@ -75,17 +75,17 @@ class Controller(Node):
             self._first, self._start = stamp, q
         self._last = stamp
         try:
-            effort = self.effort((stamp - self._first) / SECOND, q, qd)
+            effort = self.compute_effort((stamp - self._first) / NANOSECONDS, q, qd)
             if effort is None:
                 self.done = True
                 return
-            self.send(effort)
+            self.command(effort)
         except ValueError as refusal:
             self.stop(str(refusal))
 
-    def effort(self, t, q, qd):
-        """Efforts at a time of the path and a joint state; None after its end."""
-        wanted = self.wanted(t)
+    def compute_effort(self, t, q, qd):
+        """Return the efforts at time ``t`` of the path for a joint state; None after its end."""
+        wanted = self.plan(t)
         if wanted is None:
             return None
         w = 2.0 * np.pi * self.options.bandwidth
@@ -93,8 +93,8 @@ class Controller(Node):
         self.errors.append(error)
         return inverse_dynamics(self.robot, q, qd, wanted[2] + 2.0 * w * error_rate + w**2 * error)
 
-    def _trouble(self, message, stamp):
-        """The fault of a joint state, or an empty text."""
+    def _find_fault(self, message, stamp):
+        """Describe what is wrong with a joint state; empty if nothing is."""
         missing = set(self.controller.names) - set(message.name)
         if missing:
             return f"no joint {', '.join(sorted(missing))}"
@@ -102,18 +102,18 @@ class Controller(Node):
             return "positions and velocities are not as many as names"
         if not np.isfinite([*message.position, *message.velocity]).all():
             return "a position or velocity is not finite"
-        age = (self.get_clock().now().nanoseconds - stamp) / SECOND
+        age = (self.get_clock().now().nanoseconds - stamp) / NANOSECONDS
         if age > self.options.age:
             return f"the joint state is {age:.3f} s old"
         if self._last is None:
             return ""
-        gap = (stamp - self._last) / SECOND
+        gap = (stamp - self._last) / NANOSECONDS
         if not 0.0 < gap <= self.options.gap:
             return f"{gap:.4f} s between two joint states, allowed {self.options.gap:g}"
         return ""
 
-    def wanted(self, t):
-        """Position, rate and acceleration of the path there and back; None after its end."""
+    def plan(self, t):
+        """Return position, velocity and acceleration of the path at time ``t``; None after its end."""
         x = t / self.options.seconds
         if x > 1.0:
             return None
@@ -121,10 +121,10 @@ class Controller(Node):
         blend = 64.0 * np.array([-1.0, 3.0, -3.0, 1.0, 0.0, 0.0, 0.0])
         scale = self.options.seconds
         p, v, a = (np.polyval(np.polyder(blend, k), x) / scale**k for k in range(3))
-        return self._start + p * self._reach, v * self._reach, a * self._reach
+        return self._start + p * self._travel, v * self._travel, a * self._travel
 
-    def send(self, effort):
-        """Command efforts, unless one is not finite or beyond the limits."""
+    def command(self, effort):
+        """Publish efforts; stop if one is not finite or beyond the limits."""
         limits = self.robot.limits.effort
         if not np.isfinite(effort).all() or (limits is not None and (abs(effort) > limits).any()):
             self.stop(f"effort {effort.round(3).tolist()} is beyond the limits")
@@ -133,13 +133,13 @@ class Controller(Node):
         self._publisher.publish(Float64MultiArray(data=command.tolist()))
 
     def stop(self, why):
-        """Send zeros, and nothing after them."""
+        """Stop permanently for a reason, with zero efforts."""
         if not self.stopped:
             self.stopped = why
             self.get_logger().error(f"stopped: {why}")
-            self.end()
+            self.send_zeros()
 
-    def end(self):
+    def send_zeros(self):
         """Send zeros, and wait until the controller has received them."""
         zeros = [0.0] * self.robot.joints_count
         self._publisher.publish(Float64MultiArray(data=zeros))
@@ -147,7 +147,7 @@ class Controller(Node):
 
 
 def main(kind=Controller, text=__doc__, robot="delta_cu"):
-    """0 after the whole path, 1 if a check stopped it."""
+    """Run the controller; return 0 after the whole path, 1 if a check stopped it."""
     parser = argparse.ArgumentParser(description=text)
     parser.add_argument("--robot", default=robot)
     parser.add_argument("--commands", default="machine_sim/commands")
@@ -172,7 +172,7 @@ def main(kind=Controller, text=__doc__, robot="delta_cu"):
     except (KeyboardInterrupt, ExternalShutdownException):
         controller.stop("interrupted")
     if controller.done:
-        controller.end()
+        controller.send_zeros()
         worst = abs(np.array(controller.errors)).max()
         print(f"{len(controller.errors)} samples, largest tracking error {worst:.3e}")
     controller.destroy_node()

@@ -17,7 +17,7 @@ ARM, FOREARM = "geometry.arm_length", "geometry.forearm_length"
 
 
 def main() -> None:
-    """Print what each step finds."""
+    """Run the steps and print their results."""
     robot = load("delta")
     motion = timed(robot, cycle(robot, 0.025, 0.2, 0.025), duration=0.5).uniform(100.0)
 
@@ -28,7 +28,7 @@ def main() -> None:
     for length, effort in zip(lengths, np.abs(efforts).max((1, 2)), strict=True):
         print(f"arm {length:.3f} m: peak effort {effort:.3f} N m on the same joint motion")
 
-    # How the efforts of one sample change with a number: exact, and by the variants.
+    # Derivatives of the efforts of one sample with respect to the arm length.
     k = int(np.abs(inverse_dynamics(robot, motion.q, motion.qd, motion.qdd)).max(1).argmax())
     slopes = torque_derivatives(robot, motion.q[k], motion.qd[k], motion.qdd[k], by=[ARM])
     print(f"efforts per metre of arm at {motion.time[k]:.3f} s: {slopes.by[ARM]} N m/m")
@@ -41,7 +41,7 @@ def main() -> None:
         print(f"{name}: {found.before.quantities[name]:.4g} before, {value:.4g} after")
     print({name: round(value, 4) for name, value in found.best.numbers.items()})
 
-    # What a tenth of a millimetre of one arm does to the platform.
+    # Position error of the platform for 0.1 mm of one arm.
     errors = tolerances(found.robot, {"bodies.arm I.length": 1e-4}, found.robot.inverse(path.pose))
     largest = np.linalg.norm(errors.deviation[:, :3], axis=-1).max()
     print(f"position error on the path: {1e3 * largest:.3f} mm at most (1 sigma)")

@@ -22,13 +22,13 @@ from pkm_twin import Robot, load
 from pkm_twin.identification.history import append, measure
 from pkm_twin.recordings import read
 
-NIGHTS, WORN = 24, 17
-DAY, FIRST = 86400.0, 1.7621e9
-"""Seconds, and the first night in seconds since 1970."""
+NIGHTS, HEALTHY_NIGHTS = 24, 17
+DAY, FIRST_NIGHT = 86400.0, 1.7621e9
+"""Length of a day, s, and time of the first night, s since 1970."""
 
 
-def motion() -> tuple[NDArray[np.float64], ...]:
-    """Times (k,) and q, qd, qdd (k, 3) of four seconds."""
+def make_motion() -> tuple[NDArray[np.float64], ...]:
+    """Return times (k,) and q, qd, qdd (k, 3) of a motion of four seconds."""
     time = np.arange(0.0, 4.0, 0.004)
     rate = 2 * np.pi * np.array([0.7, 1.1, 1.3])
     phase = np.outer(time, rate) + np.array([0.0, 1.0, 2.0])
@@ -36,7 +36,7 @@ def motion() -> tuple[NDArray[np.float64], ...]:
     return time, q, qd, rate**2 * (0.2 - q)
 
 
-def night(
+def write_night(
     path: Path,
     robot: Robot,
     rng: np.random.Generator,
@@ -48,7 +48,7 @@ def night(
 
     :param viscous: true friction of the drives, N m s/rad; ``coulomb``: N m; ``mass``: kg.
     """
-    time, q, qd, qdd = motion()
+    time, q, qd, qdd = make_motion()
     real = robot.changed(payload={"mass": mass}, friction={"viscous": viscous, "coulomb": coulomb})
     effort = inverse_dynamics(real, q, qd, qdd) + rng.normal(0.0, 0.02, q.shape)
     names = [f"{j}.{w}" for w in ("position", "velocity", "acceleration", "measured") for j in robot.joint_names]
@@ -57,18 +57,18 @@ def night(
     return path
 
 
-def record(history: Path) -> None:
-    """Write the nights into a history."""
+def write_history(history: Path) -> None:
+    """Simulate all nights and append their measurements to a history."""
     robot, rng = load("delta_cu"), np.random.default_rng(5)
     with tempfile.TemporaryDirectory() as folder:
         for k in range(NIGHTS):
-            dry = [0.16 if k >= WORN else 0.10, 0.10, 0.10]
-            # From night to night the friction of a healthy drive differs too.
+            dry = [0.16 if k >= HEALTHY_NIGHTS else 0.10, 0.10, 0.10]
+            # The friction of a healthy drive varies from night to night, too.
             coulomb = tuple(np.array(dry) + rng.normal(0.0, 0.003, 3))
-            path = night(Path(folder) / f"{k}.csv", robot, rng, (0.05, 0.05, 0.05), coulomb)
+            path = write_night(Path(folder) / f"{k}.csv", robot, rng, (0.05, 0.05, 0.05), coulomb)
             numbers = measure(read(path, robot))
-            append(history, "cell 3", robot.name, path, FIRST + DAY * k, True, numbers)
+            append(history, "cell 3", robot.name, path, FIRST_NIGHT + DAY * k, True, numbers)
 
 
 if __name__ == "__main__":
-    record(Path(sys.argv[1]))
+    write_history(Path(sys.argv[1]))

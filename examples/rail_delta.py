@@ -35,7 +35,7 @@ class Geometry:
     azimuths: np.ndarray = schema.vector(3, unit="rad")
 
     def verify(self, path):
-        """Limbs apart."""
+        """Check that no two limbs have one azimuth."""
         check_azimuths(self.azimuths, f"{path}.azimuths")
 
 
@@ -63,8 +63,8 @@ class RailDelta(Robot):
     coordinates: ClassVar = tuple(COORDINATES[name] for name in "xyz")
     limb_names: ClassVar = ("limb 1", "limb 2", "limb 3")
 
-    def limbs(self):
-        """For each limb: the outward direction, and that of the pair's width."""
+    def list_limb_directions(self):
+        """Yield for each limb the outward direction and the direction between the rods of its pair."""
         for azimuth in self.geometry.azimuths:
             out = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
             yield out, np.cross(UP, out)
@@ -76,7 +76,7 @@ class RailDelta(Robot):
         platform = -drop * UP
         bodies = {"platform": Body("platform", m.platform_mass, array(platform), m.platform_inertia)}
         joints, rods = {}, {}
-        for i, (out, along) in enumerate(self.limbs(), 1):
+        for i, (out, along) in enumerate(self.list_limb_directions(), 1):
             ball = g.carriage_radius * out
             carriage, rail = f"carriage_{i}", f"rail_{i}"
             bodies[carriage] = Body(carriage, m.carriage_mass, array(ball))
@@ -123,7 +123,7 @@ def main():
     pose = np.random.default_rng(1).uniform(-0.05, 0.05, (100, 3)) - [0, 0, 0.3]
     found, heights = own.inverse(pose), []
     g = own.geometry
-    for out, _ in own.limbs():
+    for out, _ in own.list_limb_directions():
         x, y, _ = (pose + (g.platform_radius - g.carriage_radius) * out).T
         heights.append(pose[:, 2] + np.sqrt(g.rod_length**2 - x * x - y * y))
     miss = np.abs(found - np.transpose(heights)).max()

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Sends a trajectory to delta_dynamics, forwards the answer with effort, and checks its end.
+"""Send a trajectory to delta_dynamics, forward the answer with effort, and check the final position.
 
     ros2 run pkm_twin machine_sim --ros-args -p mechanism:=delta_cu
     ros2 run pkm_twin delta_dynamics --ros-args -p mechanism:=delta_cu
@@ -25,15 +25,15 @@ from pkm_twin import load
 from pkm_twin.errors import PkmTwinError
 
 
-def blend(points=101, seconds=1.0):
-    """Times and a smooth way from 0 to 1 with two derivatives, at rest at both ends."""
+def make_rest_to_rest_law(points=101, seconds=1.0):
+    """Return times, and a polynomial from 0 to 1 with two derivatives, at rest at both ends."""
     x = np.linspace(0.0, 1.0, points)
-    way = np.array([6.0, -15.0, 10.0, 0.0, 0.0, 0.0])
-    return x * seconds, [np.polyval(np.polyder(way, k), x) / seconds**k for k in range(3)]
+    quintic = np.array([6.0, -15.0, 10.0, 0.0, 0.0, 0.0])
+    return x * seconds, [np.polyval(np.polyder(quintic, k), x) / seconds**k for k in range(3)]
 
 
-def trajectory(names, times, q, qd, qdd):
-    """A message with a zero stamp: it starts on receipt."""
+def make_trajectory(names, times, q, qd, qdd):
+    """Make a trajectory message; its zero stamp means a start on receipt."""
     rows = zip(times, q.tolist(), qd.tolist(), qdd.tolist(), strict=True)
     points = [
         JointTrajectoryPoint(positions=p, velocities=v, accelerations=a, time_from_start=Duration(seconds=t).to_msg())
@@ -43,7 +43,7 @@ def trajectory(names, times, q, qd, qdd):
 
 
 class Client(Node):
-    """Sends a trajectory to the twin and what comes back to the controller."""
+    """Send a trajectory to the twin, and the twin's answer to the controller."""
 
     def __init__(self, controller="machine_sim/joint_trajectory", twin="delta_dynamics"):
         super().__init__("trajectory_client")
@@ -54,18 +54,18 @@ class Client(Node):
         self.create_subscription(JointTrajectory, topic, self.answers.append, 1)
         self.create_subscription(JointState, "joint_states", self.states.append, 1000)
 
-    def go(self, message, patience=60.0):
-        """Joint states until the trajectory's end, and the efforts of its points.
+    def execute(self, message, patience=60.0):
+        """Execute a trajectory; return the joint states until its end, and the efforts of its points.
 
-        :raises TimeoutError: something that is awaited does not come.
+        :raises TimeoutError: a node, a joint state or the answer is missing, or the end is not reached.
         """
         ends = (self._to_twin, self._to_controller)
-        self.until(lambda: all(p.get_subscription_count() for p in ends), patience, "both nodes")
-        self.until(lambda: self.states, patience, "joint_states")
-        # Again until it is heard: a node may find a publisher later than that finds the node.
+        self.spin_until(lambda: all(p.get_subscription_count() for p in ends), patience, "both nodes")
+        self.spin_until(lambda: self.states, patience, "joint_states")
+        # Repeat until there is an answer: the node may discover this publisher later.
         ask = functools.partial(self._to_twin.publish, message)
-        self.until(lambda: self.filled(message), patience, "the efforts", again=ask)
-        filled = self.filled(message)[-1]
+        self.spin_until(lambda: self.find_answers(message), patience, "the efforts", again=ask)
+        filled = self.find_answers(message)[-1]
         efforts = np.array([point.effort for point in filled.points])
         if efforts.shape != (len(message.points), len(message.joint_names)):
             raise RuntimeError(f"the answer has efforts of shape {efforts.shape}")
@@ -74,25 +74,26 @@ class Client(Node):
         self.states.clear()
         self._to_controller.publish(filled)
         goal = np.array(filled.points[-1].positions)
-        self.until(lambda: self.at_rest(goal, filled.joint_names), patience, "the end")
+        self.spin_until(lambda: self.is_at_rest(goal, filled.joint_names), patience, "the end")
         return list(self.states), efforts
 
-    def filled(self, message):
-        """Answers to this trajectory, not to one before it."""
+    def find_answers(self, message):
+        """Return the answers to this trajectory, not to an earlier one."""
         wanted = [list(point.positions) for point in message.points]
         return [a for a in self.answers if [list(p.positions) for p in a.points] == wanted]
 
-    def at_rest(self, goal, names):
-        """Whether the newest joint state is at the goal, within a percent of the path."""
+    def is_at_rest(self, goal, names):
+        """Return whether the machine rests at the goal, within a percent of the path."""
         if not self.states:
             return False
-        q, first = (positions(self.states[i], names) for i in (-1, 0))
-        return abs(q - goal).max() < 0.01 * max(abs(goal - first).max(), 1e-6) and (
-            len(self.states) > 20 and abs(q - positions(self.states[-20], names)).max() < 1e-4 * abs(goal - first).max()
-        )
+        q, first = (read_positions(self.states[i], names) for i in (-1, 0))
+        path = abs(goal - first).max()
+        if len(self.states) <= 20 or abs(q - goal).max() >= 0.01 * max(path, 1e-6):
+            return False
+        return abs(q - read_positions(self.states[-20], names)).max() < 1e-4 * path
 
-    def until(self, condition, patience, what, again=None):
-        """Spin until it is so; ``again`` is called at once and every second."""
+    def spin_until(self, condition, patience, what, again=None):
+        """Spin until a condition holds; call ``again`` at once and every second."""
         end, due = time.monotonic() + patience, 0.0
         while not condition():
             if again is not None and time.monotonic() >= due:
@@ -103,13 +104,13 @@ class Client(Node):
                 raise TimeoutError(f"{what}: nothing within {patience:g} s")
 
 
-def positions(state, names):
-    """Joint positions of a state in the order of the names."""
+def read_positions(state, names):
+    """Return the joint positions of a state in the order of the names."""
     return np.array([state.position[state.name.index(name)] for name in names])
 
 
-def reaches(robot, share):
-    """A share of every joint's range; of one without limits, of 1 rad or of the platform's size."""
+def choose_travel(robot, share):
+    """Return a fraction of every joint's range; without limits of 1 rad or the platform's size."""
     whole = np.where([unit == "m" for unit in robot.joint_units], robot.size, 1.0)
     if robot.limits.position is not None:
         low, high = robot.limits.position.T
@@ -129,22 +130,22 @@ def main():
     client = Client(options.controller)
     try:
         robot = load(options.robot)
-        client.until(lambda: client.states, 60.0, "joint_states")
+        client.spin_until(lambda: client.states, 60.0, "joint_states")
         # Messages carry the controller's names and numbers of the joints.
         joints = robot.controller
-        start = positions(client.states[-1], joints.names)
-        times, ways = blend(seconds=options.seconds)
-        way = joints.controller_rates(reaches(robot, options.reach))
-        rows = [np.outer(share, way) for share in ways]
-        message = trajectory(joints.names, times, start + rows[0], *rows[1:])
-        states, efforts = client.go(message)
+        start = read_positions(client.states[-1], joints.names)
+        times, laws = make_rest_to_rest_law(seconds=options.seconds)
+        travel = joints.controller_rates(choose_travel(robot, options.reach))
+        rows = [np.outer(law, travel) for law in laws]
+        message = make_trajectory(joints.names, times, start + rows[0], *rows[1:])
+        states, efforts = client.execute(message)
     except (TimeoutError, RuntimeError, PkmTwinError) as error:
         print(f"failed: {error}", file=sys.stderr)
         return 1
     finally:
         client.destroy_node()
         rclpy.try_shutdown()
-    miss = abs(positions(states[-1], joints.names) - start - rows[0][-1]).max()
+    miss = abs(read_positions(states[-1], joints.names) - start - rows[0][-1]).max()
     peak = ", ".join(f"{value:.3g}" for value in abs(efforts).max(0))
     print(f"{len(efforts)} points, peak efforts {peak}, position error at the end {miss:.2e}")
     return 0

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""The machines of one cell, each with its own robot, namespace and topics."""
+"""Run the nodes of several machines, each with its own robot, namespace and topics."""
 
 from pathlib import Path
 
@@ -12,12 +12,12 @@ from pkm_twin.ros.arguments import check_launch_arguments
 from pkm_twin.ros.launching import load_launch_file
 from pkm_twin.ros.signals import leave_interrupts_to_launch
 
-TWIN = Path(__file__).with_name("twin.launch.py")
+TWIN_LAUNCH = Path(__file__).with_name("twin.launch.py")
 
-MACHINES = "picker=delta_cu,head=prru"
+DEFAULT_MACHINES = "picker=delta_cu,head=prru"
 
 ARGUMENTS = {
-    "machines": (MACHINES, "the machines: NAMESPACE=ROBOT,NAMESPACE=ROBOT,..."),
+    "machines": (DEFAULT_MACHINES, "the machines: NAMESPACE=ROBOT,NAMESPACE=ROBOT,..."),
     "params_file": ("", "YAML file of parameters, with a section /NAMESPACE/NODE for each node"),
     "command_gate": ("false", "run this node in every namespace"),
     "machine_state": ("false", "run this node in every namespace"),
@@ -35,13 +35,13 @@ def generate_launch_description() -> LaunchDescription:
                 DeclareLaunchArgument(name, default_value=default, description=text)
                 for name, (default, text) in ARGUMENTS.items()
             ),
-            OpaqueFunction(function=machines),
+            OpaqueFunction(function=launch_machines),
         ]
     )
 
 
-def machines(context: LaunchContext) -> list[Node]:
-    """The nodes of every machine, all checked before the first one starts."""
+def launch_machines(context: LaunchContext) -> list[Node]:
+    """Return the nodes of all machines, after all arguments are checked."""
     leave_interrupts_to_launch()
     check_launch_arguments(__file__, context.argv, ARGUMENTS)
     given = {name: context.launch_configurations[name] for name in ARGUMENTS}
@@ -52,10 +52,10 @@ def machines(context: LaunchContext) -> list[Node]:
     names = [namespace for namespace, _, _ in pairs]
     if len(set(names)) < len(names):
         raise RuntimeError(f"machines: {', '.join(names)}: two share a namespace")
-    twin = load_launch_file(TWIN)
+    twin = load_launch_file(TWIN_LAUNCH)
     defaults = {name: default for name, (default, _) in twin.ARGUMENTS.items()}
     return [
         node
         for namespace, _, robot in pairs
-        for node in twin.processes({**defaults, **given, "namespace": namespace, "robot": robot})
+        for node in twin.create_processes({**defaults, **given, "namespace": namespace, "robot": robot})
     ]

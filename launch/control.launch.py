@@ -1,10 +1,10 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""A robot under ros2_control: mock hardware, controllers, and the twin's efforts between.
+"""Run a robot under ros2_control: mock hardware, controllers, and the feedforward efforts.
 
 Trajectories go to ``delta_dynamics/joint_trajectory``, or as goals of the action
 ``delta_dynamics/follow_joint_trajectory``, and on to joint_trajectory_controller with effort. With
 ``command_gate:=true`` the stamped torques go through the gate to effort_controller instead. With
-``use:=plugin`` there is no node between: joint_trajectory_controller is chained to the controller
+``use:=plugin`` no node is involved: joint_trajectory_controller is chained to the controller
 that ``pkm-twin export ros2-control`` has written, and takes the trajectories itself.
 """
 
@@ -48,7 +48,7 @@ from pkm_twin.ros.launching import (
 from pkm_twin.ros.signals import leave_interrupts_to_launch
 
 HERE = Path(__file__).parent
-EFFORTS = "effort_controller"
+EFFORT_CONTROLLER = "effort_controller"
 
 ARGUMENTS = {
     "robot": ("delta_cu", "the robot, a name or path"),
@@ -67,7 +67,7 @@ ARGUMENTS = {
     ),
     "hardware_plugin": ("mock_components/GenericSystem", "plugin in the default description"),
     "bandwidth": ("", "Hz: gains by the machine's masses; default: the file's"),
-    "command_gate": ("false", f"true: torques through command_gate to {EFFORTS}"),
+    "command_gate": ("false", f"true: torques through command_gate to {EFFORT_CONTROLLER}"),
     "robot_state_publisher": ("true", "false if another node publishes robot_description"),
     "params_file": ("", "YAML file of parameters of delta_dynamics"),
     "use_sim_time": ("false", "use simulated time, of a simulator that publishes /clock"),
@@ -82,13 +82,13 @@ def generate_launch_description() -> LaunchDescription:
                 DeclareLaunchArgument(name, default_value=default, description=text)
                 for name, (default, text) in ARGUMENTS.items()
             ),
-            OpaqueFunction(function=control),
+            OpaqueFunction(function=launch_control),
         ]
     )
 
 
-def control(context: LaunchContext) -> list[LaunchDescriptionEntity]:
-    """Everything, once the arguments have their values."""
+def launch_control(context: LaunchContext) -> list[LaunchDescriptionEntity]:
+    """Return all nodes and controllers; called when the arguments have their values."""
     leave_interrupts_to_launch()
     check_launch_arguments(__file__, context.argv, ARGUMENTS)
     given = {name: context.launch_configurations[name] for name in ARGUMENTS}
@@ -98,40 +98,41 @@ def control(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     plugin = read_choice(given, "use", ("twin", "plugin")) == "plugin"
     if plugin and gate:
         raise RuntimeError("command_gate: with use:=plugin no torques pass through topics")
-    described = read_flag(given, "robot_state_publisher")
+    publishes_description = read_flag(given, "robot_state_publisher")
     check_executables(
         [
             ("controller_manager", "ros2_control_node"),
             ("controller_manager", "spawner"),
-            *([("robot_state_publisher", "robot_state_publisher")] if described else []),
+            *([("robot_state_publisher", "robot_state_publisher")] if publishes_description else []),
             ("pkm_twin", "pkm-twin"),
         ]
     )
-    controller = EFFORTS if gate else TRAJECTORIES
-    # Whose gains hold the machine.
+    controller = EFFORT_CONTROLLER if gate else TRAJECTORIES
+    # The controller whose gains hold the position.
     holding = FEEDFORWARD if plugin else controller
     space = f"/{namespace}".rstrip("/")
     folder = tempfile.TemporaryDirectory(prefix="pkm_twin_")
     file = Path(folder.name) / "controllers.yaml"
-    sections = _controllers(given, space)
+    sections = _read_controllers(given, space)
     file.write_text(yaml.safe_dump(sections), encoding="utf-8")
     publisher = Node(
         package="robot_state_publisher",
         executable="robot_state_publisher",
         namespace=namespace,
-        parameters=[{"robot_description": _description(given), **sim_time}],
+        parameters=[{"robot_description": _read_description(given), **sim_time}],
     )
     settings = sections.get(f"{space}/{holding}", {}).get("ros__parameters", {})
     gains = settings.get("gains", {})
-    loose = [joint for joint, gain in gains.items() if not gain.get("p")]
+    without_gain = [joint for joint, gain in gains.items() if not gain.get("p")]
     warning = (
-        f"{holding} has no gain for {', '.join(loose)}: the machine is carried and not held in place; see bandwidth:=HZ"
+        f"{holding} has no gain for {', '.join(without_gain)}: the machine is carried and not held in "
+        "place; see bandwidth:=HZ"
     )
-    known = sections.get(f"{space}/controller_manager", {}).get("ros__parameters", {})
-    # A controller is not activated before what it falls back to is configured.
+    manager_settings = sections.get(f"{space}/controller_manager", {}).get("ros__parameters", {})
+    # The fallback controller has to be configured before the controller that names it is activated.
     spawners = [
-        *([_spawner(space, file, GRAVITY, "--inactive")] if plugin and GRAVITY in known else []),
-        _spawner(
+        *([_create_spawner(space, file, GRAVITY, "--inactive")] if plugin and GRAVITY in manager_settings else []),
+        _create_spawner(
             space,
             file,
             "joint_state_broadcaster",
@@ -140,9 +141,9 @@ def control(context: LaunchContext) -> list[LaunchDescriptionEntity]:
         ),
     ]
     return [
-        *([LogInfo(msg=warning)] if loose and holding != EFFORTS else []),
+        *([LogInfo(msg=warning)] if without_gain and holding != EFFORT_CONTROLLER else []),
         RegisterEventHandler(OnShutdown(on_shutdown=lambda *_: folder.cleanup())),
-        *([publisher] if described else []),
+        *([publisher] if publishes_description else []),
         Node(
             package="controller_manager",
             executable="ros2_control_node",
@@ -153,21 +154,21 @@ def control(context: LaunchContext) -> list[LaunchDescriptionEntity]:
         ),
         *(RegisterEventHandler(OnProcessExit(target_action=one, on_exit=[after])) for one, after in pairwise(spawners)),
         spawners[0],
-        *([] if plugin else _twin(given, controller)),
+        *([] if plugin else _create_twin_nodes(given, controller)),
     ]
 
 
 def _end_launch(event: ProcessExited, context: LaunchContext) -> None:
-    """End the launch with exit code 1 when ros2_control_node ends before it.
+    """Stop the launch with exit code 1 if ros2_control_node ends on its own.
 
-    :raises RuntimeError: it has.
+    :raises RuntimeError: the launch is not being shut down.
     """
     if not context.is_shutdown:
         raise RuntimeError(f"ros2_control_node has ended with exit code {event.returncode}")
 
 
-def _spawner(space: str, file: Path, *arguments: str) -> Node:
-    """Loads, configures and activates controllers of the manager in a namespace."""
+def _create_spawner(space: str, file: Path, *arguments: str) -> Node:
+    """Create the process that loads, configures and activates controllers of a namespace's manager."""
     return Node(
         package="controller_manager",
         executable="spawner",
@@ -181,18 +182,18 @@ def _spawner(space: str, file: Path, *arguments: str) -> Node:
     )
 
 
-def _twin(given: dict[str, str], controller: str) -> list[Node]:
-    """delta_dynamics, and the gate where there is one."""
+def _create_twin_nodes(given: dict[str, str], controller: str) -> list[Node]:
+    """Create delta_dynamics, and command_gate if torques pass through it."""
     twin = load_launch_file(HERE / "twin.launch.py")
     names = ("robot", "namespace", "params_file", "use_sim_time", "log_level")
-    processes: list[Node] = twin.processes(
+    processes: list[Node] = twin.create_processes(
         {
             **{name: default for name, (default, _) in twin.ARGUMENTS.items()},
             **{name: given[name] for name in names},
             "stiffness_monitor": "false",
             **(
-                {"command_gate": "true", "commands": f"{EFFORTS}/commands"}
-                if controller == EFFORTS
+                {"command_gate": "true", "commands": f"{EFFORT_CONTROLLER}/commands"}
+                if controller == EFFORT_CONTROLLER
                 else {
                     "joint_trajectory_ff": f"{TRAJECTORIES}/joint_trajectory",
                     "controller_action": f"{TRAJECTORIES}/follow_joint_trajectory",
@@ -203,7 +204,7 @@ def _twin(given: dict[str, str], controller: str) -> list[Node]:
     return processes
 
 
-def _description(given: dict[str, str]) -> str:
+def _read_description(given: dict[str, str]) -> str:
     if given["description"]:
         return Path(given["description"]).read_text(encoding="utf-8")
     program = Path(get_package_prefix("pkm_twin"), "lib/pkm_twin/pkm-twin")
@@ -218,19 +219,19 @@ def _description(given: dict[str, str]) -> str:
     return written.stdout
 
 
-def _controllers(given: dict[str, str], space: str) -> dict[str, dict[str, dict[str, Any]]]:
-    """The settings with the robot's joints, each section under its node's full name."""
+def _read_controllers(given: dict[str, str], space: str) -> dict[str, dict[str, dict[str, Any]]]:
+    """Return the controllers' settings with the robot's joints, by full node name."""
     robot = load_robot(given["robot"])
     try:
         strong, damped = tune_position_control(robot, float(given["bandwidth"] or 0.0))
     except ValueError as error:
         raise RuntimeError(f"bandwidth {given['bandwidth']!r}: {error}") from None
-    path = Path(given["controllers"] or _settings_file(given, robot))
+    path = Path(given["controllers"] or _find_settings_file(given, robot))
     sections = {
         name.removeprefix("/**/"): section for name, section in yaml.safe_load(path.read_text(encoding="utf-8")).items()
     }
     joints = list(robot.controller.names)
-    # Efforts of the controller's numbers per the controller's numbers.
+    # Gains per controller position and velocity instead of the model's.
     scale = robot.controller.factors**2
     tuned_gains = {
         joint: {"p": float(p), "i": 0.0, "d": float(d), "i_clamp": 0.0}
@@ -243,7 +244,7 @@ def _controllers(given: dict[str, str], space: str) -> dict[str, dict[str, dict[
         gains = parameters.get("gains", {})
         if "each" in gains:
             each = gains.pop("each")
-            # Copies: the middleware's reader takes no YAML with references.
+            # Copies, as the middleware cannot read YAML with references.
             parameters["gains"] = {joint: dict(gains.get(joint, each)) for joint in joints}
         if given["bandwidth"] and name == FEEDFORWARD:
             parameters["gains"] = {joint: {key: gain[key] for key in ("p", "d")} for joint, gain in tuned_gains.items()}
@@ -252,7 +253,7 @@ def _controllers(given: dict[str, str], space: str) -> dict[str, dict[str, dict[
     return {f"{space}/{name}": section for name, section in sections.items()}
 
 
-def _settings_file(given: dict[str, str], robot: Robot) -> Path:
+def _find_settings_file(given: dict[str, str], robot: Robot) -> Path:
     if given["use"] == "twin":
         return HERE / "controllers.yaml"
     package = package_name(robot)

@@ -1,8 +1,8 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""The nodes of one robot, in one namespace. Every argument has a default.
+"""Run the nodes of one robot in one namespace. Every argument has a default.
 
-A node that ends is restarted. A node that rejects its configuration would reject it again, so it
-is restarted only a few times, with increasing pauses.
+A node that ends is restarted. A node that rejected its configuration is restarted only a few
+times, with increasing pauses.
 """
 
 import atexit
@@ -34,14 +34,15 @@ from pkm_twin.ros.signals import leave_interrupts_to_launch
 
 ROBOT = "delta_cu"
 GATE = "command_gate"
-"""Outlives the node whose torques it forwards: a process of its own."""
+"""Runs in a process of its own, so that it outlives the node whose torques it forwards."""
 RESPAWN_DELAY = 1.0
-REJECTED = 1
+"""Pause before a node is restarted, s."""
+REJECTED_EXIT_CODE = 1
 """Exit code of a node that rejects its configuration."""
-RETRIES = 3
-"""How often such a node is started again, after RESPAWN_DELAY, twice and four times as long."""
-SETTLED = 30.0
-"""A node that ran for so long had a good configuration, s."""
+MAX_RETRIES = 3
+"""Restarts of a node that rejects its configuration; each pause is twice the one before."""
+MIN_VALID_RUN = 30.0
+"""Running time that shows that a node accepted its configuration, s."""
 
 ARGUMENTS = {
     "robot": ("", f"the robot, a name or path; default: that of params_file, else {ROBOT}"),
@@ -76,7 +77,7 @@ PARAMETERS = {
     "command_gate": (),
     "machine_state": ("wrench_frame",),
 }
-"""Nodes, and the arguments that are parameters of each."""
+"""Arguments that are parameters, by node."""
 
 TOPICS = {
     "delta_dynamics": ("joint_states", "wrench", "~/joint_trajectory_ff"),
@@ -84,7 +85,7 @@ TOPICS = {
     "command_gate": ("joint_states", "~/commands"),
     "machine_state": ("joint_states", "wrench"),
 }
-"""Topics of each node that an argument of that name can move."""
+"""Topics of each node that the argument of the same name remaps."""
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -94,20 +95,20 @@ def generate_launch_description() -> LaunchDescription:
                 DeclareLaunchArgument(name, default_value=default, description=text)
                 for name, (default, text) in ARGUMENTS.items()
             ),
-            OpaqueFunction(function=nodes),
+            OpaqueFunction(function=launch_nodes),
         ]
     )
 
 
-def nodes(context: LaunchContext) -> list[Node]:
-    """The chosen nodes, once the arguments have their values."""
+def launch_nodes(context: LaunchContext) -> list[Node]:
+    """Return the chosen nodes; called when the arguments have their values."""
     leave_interrupts_to_launch()
     check_launch_arguments(__file__, context.argv, ARGUMENTS)
-    return processes({name: context.launch_configurations[name] for name in ARGUMENTS})
+    return create_processes({name: context.launch_configurations[name] for name in ARGUMENTS})
 
 
-def processes(given: dict[str, str]) -> list[Node]:
-    """The processes of one robot, all arguments checked; none runs yet.
+def create_processes(given: dict[str, str]) -> list[Node]:
+    """Check the arguments and create the processes of one robot, without starting them.
 
     :raises RuntimeError: an argument is wrong, or a program is missing.
     """
@@ -130,19 +131,21 @@ def processes(given: dict[str, str]) -> list[Node]:
         groups = [[name] for name in chosen if name == GATE] + [together]
     else:
         groups = [[name] for name in chosen]
-    check_executables(("pkm_twin", _executable(names)) for names in groups)
-    return [_process(names, given) for names in groups]
+    check_executables(("pkm_twin", _choose_executable(names)) for names in groups)
+    return [_create_process(names, given) for names in groups]
 
 
 def _check_deadline(given: dict[str, str], chosen: list[str]) -> None:
-    """Torques that may come later than the gate demands never reach it: the middleware stops them.
+    """Check that delta_dynamics publishes torques within the deadline of the gate.
 
-    :raises RuntimeError: they may.
+    The middleware does not connect a publisher with a longer deadline than its subscriber's.
+
+    :raises RuntimeError: ``stale_after`` exceeds the deadline.
     """
     if not {"delta_dynamics", GATE} <= set(chosen):
         return
-    stale_after = _parameter(given, "delta_dynamics", "stale_after", Settings().stale_after)
-    deadline = _parameter(given, GATE, "deadline", GateSettings().deadline)
+    stale_after = _read_parameter(given, "delta_dynamics", "stale_after", Settings().stale_after)
+    deadline = _read_parameter(given, GATE, "deadline", GateSettings().deadline)
     if stale_after > deadline:
         raise RuntimeError(
             f"params_file: delta_dynamics has stale_after {stale_after:g} s and command_gate has "
@@ -151,55 +154,55 @@ def _check_deadline(given: dict[str, str], chosen: list[str]) -> None:
         )
 
 
-def _parameter(given: dict[str, str], node: str, name: str, default: float) -> float:
-    """A parameter of a node by the file, whose later sections go before its earlier ones."""
+def _read_parameter(given: dict[str, str], node: str, name: str, default: float) -> float:
+    """Read a parameter of a node from the file; later sections override earlier ones."""
     file = given["params_file"]
     if not file:
         return default
-    full, found = _full(given, node), default
+    full, found = _qualify_name(given, node), default
 
-    def look(section: object, path: str) -> None:
+    def search_section(section: object, path: str) -> None:
         nonlocal found
         for key, value in section.items() if isinstance(section, dict) else ():
             if key != "ros__parameters":
-                look(value, f"{path}/{str(key).strip('/')}")
-            elif re.fullmatch(_pattern(path), full) and isinstance(value, dict):
+                search_section(value, f"{path}/{str(key).strip('/')}")
+            elif re.fullmatch(_compile_wildcards(path), full) and isinstance(value, dict):
                 found = value.get(name, found)
 
     try:
-        look(yaml.safe_load(Path(file).read_text(encoding="utf-8")), "")
+        search_section(yaml.safe_load(Path(file).read_text(encoding="utf-8")), "")
         return float(found)
     except (OSError, yaml.YAMLError, TypeError, ValueError) as error:
         raise RuntimeError(f"params_file: {file!r}: {' '.join(str(error).split())}") from None
 
 
-def _full(given: dict[str, str], node: str) -> str:
-    """A node's name with its namespace."""
+def _qualify_name(given: dict[str, str], node: str) -> str:
+    """Return a node's name with its namespace."""
     return f"/{given['namespace'].strip('/')}/{node}".replace("//", "/")
 
 
-def _pattern(path: str) -> str:
-    """The middleware's ** stands for any names, none included; its * for one."""
+def _compile_wildcards(path: str) -> str:
+    """Return the regular expression of a parameter file's node name: * is one name, ** any number."""
     return re.escape(path).replace(r"/\*\*", "(/.*)?").replace(r"\*", "[^/]*")
 
 
-def _executable(names: list[str]) -> str:
-    """The program that runs one node, or several in one process."""
+def _choose_executable(names: list[str]) -> str:
+    """Return the executable of one node, or that of several nodes in one process."""
     return names[0] if len(names) == 1 else "composed"
 
 
-def _process(names: list[str], given: dict[str, str], tries: int = 0) -> Node:
-    """One node, or several in one process: a file of parameters has a section for each."""
+def _create_process(names: list[str], given: dict[str, str], tries: int = 0) -> Node:
+    """Create the process of one or several nodes, with a parameter file with a section for each."""
     folder = tempfile.mkdtemp(prefix="pkm_twin_")
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     before, after = Path(folder, "before.yaml"), Path(folder, "after.yaml")
-    # A file may name the robot; an argument that is given goes before the file's.
+    # Later files win: the default robot, then params_file, then the given arguments.
     for file, section in (
         (before, lambda _: {"mechanism": ROBOT}),
-        (after, lambda name: _parameters(name, given)),
+        (after, lambda name: _collect_parameters(name, given)),
     ):
-        told = {_full(given, name): {"ros__parameters": section(name)} for name in names}
-        file.write_text(yaml.safe_dump(told), encoding="utf-8")
+        sections = {_qualify_name(given, name): {"ros__parameters": section(name)} for name in names}
+        file.write_text(yaml.safe_dump(sections), encoding="utf-8")
     files = [] if given["robot"] else [str(before)]
     files += [given["params_file"]] if given["params_file"] else []
     remappings = [
@@ -211,21 +214,21 @@ def _process(names: list[str], given: dict[str, str], tries: int = 0) -> Node:
     single = names[0] if len(names) == 1 else None
     return Node(
         package="pkm_twin",
-        executable=_executable(names),
+        executable=_choose_executable(names),
         name=single,
         namespace=given["namespace"],
         arguments=[] if single else names,
         parameters=[*files, str(after)],
         ros_arguments=[*remappings, "--log-level", given["log_level"]],
-        on_exit=_Again(names, given, tries),
-        # Matrices here are small: threads cost more than they bring.
+        on_exit=_Restart(names, given, tries),
+        # For such small matrices threads cost more time than they save.
         additional_env={"OMP_NUM_THREADS": "1"},
         output="screen",
     )
 
 
-def _parameters(name: str, given: dict[str, str]) -> dict[str, object]:
-    """What the arguments say of a node's parameters."""
+def _collect_parameters(name: str, given: dict[str, str]) -> dict[str, object]:
+    """Return the parameters of a node that the arguments give."""
     chosen: dict[str, object] = {key: given[key] for key in PARAMETERS[name] if given[key]}
     if given["robot"]:
         chosen["mechanism"] = given["robot"]
@@ -235,8 +238,8 @@ def _parameters(name: str, given: dict[str, str]) -> dict[str, object]:
     return {**chosen, "use_sim_time": read_flag(given, "use_sim_time")}
 
 
-class _Again:
-    """What follows the end of a node: its next start, or a line that says that there is none."""
+class _Restart:
+    """Restart processes that ended, or report that they are not restarted."""
 
     def __init__(self, names: list[str], given: dict[str, str], tries: int) -> None:
         self._names, self._given, self._tries = names, given, tries
@@ -247,16 +250,16 @@ class _Again:
         gate = names == [GATE]
         if context.is_shutdown or not (gate or read_flag(given, "respawn")):
             return []
-        if event.returncode != REJECTED or time.monotonic() - self._began > SETTLED:
-            again = _process(names, given)
-            # A gate that has failed is missing for as long as a controller holds the last torque.
-            # One that was ended has sent zeros; what ended it may be about to end the launch.
+        if event.returncode != REJECTED_EXIT_CODE or time.monotonic() - self._began > MIN_VALID_RUN:
+            restarted = _create_process(names, given)
+            # Restart a failed gate at once, as the controller holds the last torque until then. A gate
+            # that was stopped has sent zeros, and the whole launch may be stopping.
             if gate and event.returncode:
-                return [again]
-            return [TimerAction(period=RESPAWN_DELAY, actions=[again])]
-        if self._tries == RETRIES:
+                return [restarted]
+            return [TimerAction(period=RESPAWN_DELAY, actions=[restarted])]
+        if self._tries == MAX_RETRIES:
             text = f"{', '.join(names)}: the configuration is rejected; not started again"
             return [LogInfo(msg=text)]
         pause = RESPAWN_DELAY * 2**self._tries
-        again = _process(names, given, self._tries + 1)
-        return [TimerAction(period=pause, actions=[again])]
+        restarted = _create_process(names, given, self._tries + 1)
+        return [TimerAction(period=pause, actions=[restarted])]

@@ -2,7 +2,7 @@
 """View a robot: machine_state and, if they are installed, robot_state_publisher and rviz2.
 
 ``machine_state`` publishes every joint of the tree, also the passive ones; robot_state_publisher
-publishes the transforms of all links. Without it machine_state publishes that of the platform.
+publishes the transforms of all links. Without it machine_state publishes the transform of the platform.
 """
 
 import tempfile
@@ -27,7 +27,7 @@ from pkm_twin.ros.launching import (
 from pkm_twin.ros.signals import leave_interrupts_to_launch
 
 HERE = Path(__file__).parent
-LAYOUT = "view/machine.rviz"
+RVIZ_LAYOUT = "view/machine.rviz"
 
 ARGUMENTS = {
     "robot": ("delta_cu", "the robot, a name or path"),
@@ -49,21 +49,21 @@ def generate_launch_description() -> LaunchDescription:
                 DeclareLaunchArgument(name, default_value=default, description=text)
                 for name, (default, text) in ARGUMENTS.items()
             ),
-            OpaqueFunction(function=view),
+            OpaqueFunction(function=launch_view),
         ]
     )
 
 
-def view(context: LaunchContext) -> list[LaunchDescriptionEntity]:
-    """The nodes, once the arguments have their values."""
+def launch_view(context: LaunchContext) -> list[LaunchDescriptionEntity]:
+    """Return the nodes; called when the arguments have their values."""
     leave_interrupts_to_launch()
     check_launch_arguments(__file__, context.argv, ARGUMENTS)
     given = {name: context.launch_configurations[name] for name in ARGUMENTS}
     namespace = given["namespace"].strip("/")
     prefix = f"{namespace}/" if namespace else ""
-    sim_time = {"use_sim_time": _wanted(given, "use_sim_time")}
-    links = _wanted(given, "robot_state_publisher", "robot_state_publisher")
-    rviz = _wanted(given, "rviz", "rviz2")
+    sim_time = {"use_sim_time": _is_wanted(given, "use_sim_time")}
+    links = _is_wanted(given, "robot_state_publisher", "robot_state_publisher")
+    rviz = _is_wanted(given, "rviz", "rviz2")
     read_choice(given, "log_level", LOG_LEVELS)
     if given["params_file"] and not Path(given["params_file"]).is_file():
         raise RuntimeError(f"params_file: {given['params_file']!r} is no file")
@@ -85,7 +85,7 @@ def view(context: LaunchContext) -> list[LaunchDescriptionEntity]:
                 *([given["params_file"]] if given["params_file"] else []),
                 {
                     "mechanism": given["robot"],
-                    # A frame has one parent.
+                    # Two nodes must not publish the transform of one frame.
                     "publish_tf": "tool" if links else "all",
                     **sim_time,
                 },
@@ -114,13 +114,13 @@ def view(context: LaunchContext) -> list[LaunchDescriptionEntity]:
             )
         )
     if rviz:
-        actions += _rviz(prefix, sim_time)
+        actions += _create_rviz(prefix, sim_time)
     return actions
 
 
-def _rviz(prefix: str, sim_time: dict[str, bool]) -> list[LaunchDescriptionEntity]:
-    """RViz on the layout, its topics and frames those of the namespace."""
-    text = (_share() / LAYOUT).read_text(encoding="utf-8")
+def _create_rviz(prefix: str, sim_time: dict[str, bool]) -> list[LaunchDescriptionEntity]:
+    """Create RViz with the layout, its topics and frames moved into the namespace."""
+    text = (_find_layouts() / RVIZ_LAYOUT).read_text(encoding="utf-8")
     for old, new in (
         ("Value: /", f"Value: /{prefix}"),
         ("Fixed Frame: ", f"Fixed Frame: {prefix}"),
@@ -142,12 +142,12 @@ def _rviz(prefix: str, sim_time: dict[str, bool]) -> list[LaunchDescriptionEntit
     ]
 
 
-def _share() -> Path:
-    """Where the layouts are: beside this folder where installed, in it in a checkout."""
-    return HERE if (HERE / LAYOUT).is_file() else HERE.parent
+def _find_layouts() -> Path:
+    """Return the folder of the layouts: this one in a checkout, its parent if installed."""
+    return HERE if (HERE / RVIZ_LAYOUT).is_file() else HERE.parent
 
 
-def _wanted(given: dict[str, str], name: str, package: str = "") -> bool:
+def _is_wanted(given: dict[str, str], name: str, package: str = "") -> bool:
     value = given[name].lower()
     if value == "auto" and package:
         return is_installed(package)

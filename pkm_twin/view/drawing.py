@@ -12,47 +12,50 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.report.plots import pyplot
 from pkm_twin.robot.outline import base_line
 from pkm_twin.robot.robot import Robot
-from pkm_twin.view.scene import ANCHORS, GROUND, PLATFORM, Scene, anchors
-from pkm_twin.view.stage import LETTER, LOOK
+from pkm_twin.view.scene import ANCHORS, GROUND, PLATFORM, Scene, choose_anchors
+from pkm_twin.view.stage import MAX_LETTER_PIXELS, VIEW_DIRECTION
 
-PICTURES: Final = (".png", ".svg")
+PICTURE_SUFFIXES: Final = (".png", ".svg")
 """Name endings of pictures."""
 WIDTH, HEIGHT = 600, 480
 DPI: Final = 100
-FINE: Final = 2
-"""Samples per pixel and direction."""
+SAMPLES_PER_PIXEL: Final = 2
+"""Samples per pixel in each direction, which are averaged."""
 
 
 class Camera:
-    """Parallel projection from :data:`~pkm_twin.view.stage.LOOK` on a grid of samples.
+    """Parallel projection from :data:`~pkm_twin.view.stage.VIEW_DIRECTION` on a grid of samples.
 
-    Coordinates of the camera are right, up, and the distance from the eye, m. Each ``draw`` keeps
-    what is nearer than what was drawn before.
+    Camera coordinates are right, up, and the distance from the camera, m. Nearer shapes cover
+    farther ones in any order of drawing.
     """
 
     def __init__(self, low: Array, high: Array) -> None:
         """Set the corners of the box to show: ``low`` and ``high``, base axes, (3,) m."""
-        away = -LOOK / np.linalg.norm(LOOK)
+        away = -VIEW_DIRECTION / np.linalg.norm(VIEW_DIRECTION)
         right = np.cross(away, [0.0, 0.0, 1.0])
         right /= np.linalg.norm(right)
         self.turn = np.array([right, np.cross(right, away), away])
         corners = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
-        seen = self.see(corners)[:, :2]
+        seen = self.to_camera(corners)[:, :2]
         middle = (seen.min(0) + seen.max(0)) / 2
         size = np.array([WIDTH, HEIGHT])
         self.pixel = float((np.ptp(seen, axis=0) / (0.86 * size)).max())
         self.low, self.high = middle - self.pixel * size / 2, middle + self.pixel * size / 2
-        x, y = (np.linspace(a, b, FINE * n) for a, b, n in zip(self.low, self.high, (WIDTH, HEIGHT), strict=True))
+        x, y = (
+            np.linspace(a, b, SAMPLES_PER_PIXEL * n)
+            for a, b, n in zip(self.low, self.high, (WIDTH, HEIGHT), strict=True)
+        )
         self.x, self.y = x, y
         self.depth = np.full((len(y), len(x)), np.inf)
         self.image = np.ones((len(y), len(x), 3))
 
-    def see(self, points: Array) -> Array:
+    def to_camera(self, points: Array) -> Array:
         """Transform base coordinates, (..., 3), to those of the camera."""
         return np.asarray(points @ self.turn.T, np.float64)
 
     def _find_window(self, points: Array, radius: float) -> tuple[Any, Array, Array]:
-        """Return the pixels around some points, and their coordinates."""
+        """Return the samples within a radius around the bounding box of points, and their coordinates."""
         (left, low), (right, high) = points[:, :2].min(0) - radius, points[:, :2].max(0) + radius
         columns = slice(*np.searchsorted(self.x, [left, right]))
         rows = slice(*np.searchsorted(self.y, [low, high]))
@@ -60,7 +63,7 @@ class Camera:
         return (rows, columns), x, y
 
     def _paint(self, window: Any, depth: Array, normal: Array, colour: Any, opacity: float = 1.0) -> None:
-        # The light comes from the left above, behind the eye.
+        # The light comes from behind the camera, left and above.
         bright = 0.5 + 0.5 * np.clip(normal @ np.array([-0.45, 0.65, -0.61]), 0.0, 1.0)
         nearer = depth < self.depth[window]
         lit = bright[..., None] * np.asarray(colour) / 255.0
@@ -68,9 +71,9 @@ class Camera:
         under[nearer] += opacity * (lit - under)[nearer]
         self.depth[window][nearer] = depth[nearer]
 
-    def ball(self, at: Array, radius: float, colour: Any) -> None:
+    def draw_ball(self, at: Array, radius: float, colour: Any) -> None:
         """Draw a ball around a point (3,) in base coordinates."""
-        (middle,) = self.see(at[None])
+        (middle,) = self.to_camera(at[None])
         window, x, y = self._find_window(middle[None], radius)
         across = np.stack([x - middle[0], y - middle[1]], -1)
         with np.errstate(invalid="ignore"):
@@ -78,9 +81,9 @@ class Camera:
         normal = np.concatenate([across, -towards[..., None]], -1) / radius
         self._paint(window, np.nan_to_num(middle[2] - towards, nan=np.inf), normal, colour)
 
-    def cylinder(self, ends: Array, radius: float, colour: Any) -> None:
+    def draw_cylinder(self, ends: Array, radius: float, colour: Any) -> None:
         """Draw a cylinder between two points (2, 3) in base coordinates, with its lids."""
-        start, end = self.see(ends)
+        start, end = self.to_camera(ends)
         length = float(np.linalg.norm(end - start))
         if not length > 0.0:
             return
@@ -102,9 +105,9 @@ class Camera:
         facing = np.broadcast_to(-np.sign(axis[2]) * axis, ray.shape)
         self._paint(window, np.where(good, lid, np.inf), facing, colour)
 
-    def plate(self, corners: Array, colour: Any, opacity: float = 1.0) -> None:
+    def draw_plate(self, corners: Array, colour: Any, opacity: float = 1.0) -> None:
         """Draw a flat plate by its corners in base coordinates, shape (k, 3)."""
-        corners = self.see(corners)
+        corners = self.to_camera(corners)
         middle = corners.mean(0)
         normal = np.linalg.svd(corners - middle)[2][2]
         normal = normal * -np.sign(normal[2])
@@ -116,9 +119,9 @@ class Camera:
         depth = np.where(inside.reshape(x.shape), middle[2] - away, np.inf)
         self._paint(window, depth, np.broadcast_to(normal, (*x.shape, 3)), colour, opacity)
 
-    def pixels(self) -> Array:
+    def average_samples(self) -> Array:
         """Return the picture, shape (HEIGHT, WIDTH, 3), the first row at the bottom."""
-        fine = self.image.reshape(HEIGHT, FINE, WIDTH, FINE, 3)
+        fine = self.image.reshape(HEIGHT, SAMPLES_PER_PIXEL, WIDTH, SAMPLES_PER_PIXEL, 3)
         return np.asarray(fine.mean((1, 3)), np.float64)
 
 
@@ -134,40 +137,40 @@ def draw(robot: Robot, marked: bool = False) -> Any:
 
     scene, q = Scene(robot), robot.inverse(robot.home())
     shapes = scene.shapes(q)
-    camera = Camera(*scene.box())
+    camera = Camera(*scene.find_bounds())
     sizes = shapes.cylinder_sizes[:, 0]
     for pair, radius, colour in zip(shapes.ends, sizes, shapes.cylinder_colours, strict=True):
-        camera.cylinder(pair, float(radius), colour)
+        camera.draw_cylinder(pair, float(radius), colour)
     for at, radius, colour in zip(shapes.ball_at, shapes.ball_sizes[:, 0], shapes.ball_colours, strict=True):
-        camera.ball(at, float(radius), colour)
+        camera.draw_ball(at, float(radius), colour)
     if len(scene.platform):
-        camera.plate(scene.platform + shapes.platform_at, PLATFORM)
+        camera.draw_plate(scene.platform + shapes.platform_at, PLATFORM)
     if len(scene.base):
-        camera.plate(scene.base, GROUND, opacity=0.35)
+        camera.draw_plate(scene.base, GROUND, opacity=0.35)
     elif len(ground := base_line(robot.graph)):
-        camera.cylinder(ground, 0.015 * scene.size, GROUND)
+        camera.draw_cylinder(ground, 0.015 * scene.size, GROUND)
     figure = pyplot().figure(figsize=(WIDTH / DPI, HEIGHT / DPI), dpi=DPI)
     ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     extent = (camera.low[0], camera.high[0], camera.low[1], camera.high[1])
-    ax.imshow(camera.pixels(), origin="lower", extent=extent, interpolation="nearest")
+    ax.imshow(camera.average_samples(), origin="lower", extent=extent, interpolation="nearest")
     ax.axis("off")
     halo = patheffects.withStroke(linewidth=3, foreground="w")
     style: dict[str, Any] = {"fontsize": 9, "path_effects": [halo], "ha": "center"}
-    points = camera.see(np.array(list(shapes.drives.values())))[:, :2]
-    sizes = np.array([[LETTER[0] * len(name) + 8.0, LETTER[1]] for name in shapes.drives])
+    points = camera.to_camera(np.array(list(shapes.drives.values())))[:, :2]
+    sizes = np.array([[MAX_LETTER_PIXELS[0] * len(name) + 8.0, MAX_LETTER_PIXELS[1]] for name in shapes.drives])
     down = np.array([1.0, -1.0])
     spots = down * (points - [camera.low[0], camera.high[1]]) / camera.pixel
-    found = anchors(spots, sizes, (WIDTH, HEIGHT))
+    found = choose_anchors(spots, sizes, (WIDTH, HEIGHT))
     for name, point, size, anchor in zip(shapes.drives, points, sizes, found, strict=True):
         if anchor:
             at = point + camera.pixel * down * size / 2 * ANCHORS[anchor]
             ax.text(*at, name, va="center", **style)
-    # The directions of the base frame at the left, a length at the right.
+    # The axes of the base frame at the left, a scale at the right.
     start = camera.low + 45 * camera.pixel
     for name, colour, axis in zip("xyz", ((213, 60, 40), (40, 140, 60), (40, 80, 200)), np.eye(3), strict=True):
-        tip = start + 32 * camera.pixel * camera.see(axis)[:2]
+        tip = start + 32 * camera.pixel * camera.to_camera(axis)[:2]
         ax.annotate("", tip, start, arrowprops={"arrowstyle": "-|>", "color": np.array(colour) / 255, "linewidth": 1.5})
-        at = start + 42 * camera.pixel * camera.see(axis)[:2]
+        at = start + 42 * camera.pixel * camera.to_camera(axis)[:2]
         ax.text(*at, name, va="center", **style)
     reach = 0.25 * (camera.high[0] - camera.low[0])
     length = max(
@@ -184,7 +187,7 @@ def draw(robot: Robot, marked: bool = False) -> Any:
             (masses, "o", "centre of mass of a body"),
             ([robot.graph.origin], "X", "reference point"),
         ):
-            seen = camera.see(np.reshape(places, (-1, 3)))[:, :2]
+            seen = camera.to_camera(np.reshape(places, (-1, 3)))[:, :2]
             ax.plot(*seen.T, marker, label=name, color="w", markeredgecolor="k", markersize=8)
         ax.legend(loc="upper left", fontsize=9, frameon=False)
         ax.set(xlim=(camera.low[0], camera.high[0]), ylim=(camera.low[1], camera.high[1]))

@@ -1,7 +1,7 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The latest message of each running node, and traces of the torques.
 
-Messages are read by their attributes alone.
+Messages are read through their attributes, so that this module needs no ROS.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from pkm_twin.messages.reading import JointReader
 from pkm_twin.messages.stamps import SECOND, StampRules, stamp_of
 from pkm_twin.robot.robot import Robot
 
-SPAN: Final = 20.0
-"""How much of the past is drawn, s."""
+TRACE_SECONDS: Final = 20.0
+"""Length of the drawn traces, s."""
 TOPICS: Final = {
     "state": ("sensor_msgs/msg/JointState", "joint_states"),
     "torque": ("sensor_msgs/msg/JointState", "delta_dynamics/joint_torques"),
@@ -33,16 +33,17 @@ TOPICS: Final = {
 }
 """Subscriptions by name: type, and topic in the robot's namespace."""
 TRACES: Final = ("torque", "residual")
-_ANY: Final = StampRules(accept_zero=True, future_tolerance=2**62)
+_ANY_STAMP: Final = StampRules(accept_zero=True, future_tolerance=2**62)
 
 
 @dataclass(frozen=True, eq=False)
-class Heard:
+class LiveValues:
     """Hold the latest values that nodes published; ``None`` or empty without a message.
 
     ``q`` (n,); ``traces``: by name, times (k,) s before the latest, and values (k, n), N m or N;
     ``shares``: of the strain energy by element; ``deflection``: in platform axes, (6,), m and rad.
-    ``counts``: messages taken by name; ``refused``: how many were not, with the last reason.
+    ``counts``: accepted messages by name; ``refused``: number of rejected messages; ``reason``: of
+    the last rejection.
     """
 
     q: Array | None
@@ -56,10 +57,10 @@ class Heard:
 
 
 class Live:
-    """Takes messages from one thread and tells of them to others."""
+    """Store the latest messages of running nodes; a lock lets other threads read them."""
 
     def __init__(self, robot: Robot) -> None:
-        # Beyond a limit is to be seen, too.
+        # Joint states beyond the limits are shown, too.
         self._reader = JointReader(robot, limited=False)
         self._lock = threading.Lock()
         self._counts: Counter[str] = Counter()
@@ -69,15 +70,15 @@ class Live:
         self._dominant, self._shares = "", dict[str, float]()
         self._deflection: Array | None = None
         self._take: dict[str, Callable[[Any], None]] = {
-            "state": self._state,
-            "torque": lambda message: self._effort("torque", message),
-            "residual": lambda message: self._effort("residual", message),
-            "energy": self._energy,
-            "deflection": self._transform,
+            "state": self._take_joint_state,
+            "torque": lambda message: self._take_efforts("torque", message),
+            "residual": lambda message: self._take_efforts("residual", message),
+            "energy": self._take_strain_energy,
+            "deflection": self._take_deflection,
         }
 
     def take(self, name: str, message: Any) -> None:
-        """Take a message of a topic by its name in TOPICS; an invalid one is counted."""
+        """Store a message of the topic ``name`` in TOPICS; count it as refused if it is invalid."""
         with self._lock:
             try:
                 self._take[name](message)
@@ -86,31 +87,31 @@ class Live:
                 self._refused += 1
                 self._reason = one_line(f"{TOPICS[name][1]}: {error}")
 
-    def _state(self, message: Any) -> None:
-        self._q = self._reader.positions(message, 0, _ANY).q
+    def _take_joint_state(self, message: Any) -> None:
+        self._q = self._reader.positions(message, 0, _ANY_STAMP).q
 
-    def _effort(self, name: str, message: Any) -> None:
-        sample = self._reader.efforts(message, 0, _ANY)
+    def _take_efforts(self, name: str, message: Any) -> None:
+        sample = self._reader.efforts(message, 0, _ANY_STAMP)
         trace = self._traces[name]
         if trace and sample.stamp < trace[-1][0]:
-            trace.clear()  # the clock jumped back: a bag begins anew
+            trace.clear()  # the clock jumped back: a bag is played again
         # At most 50 points a second are kept.
         if trace and sample.stamp - trace[-1][0] < SECOND / 50.0:
             return
         trace.append((sample.stamp, sample.effort))
-        while sample.stamp - trace[0][0] > SPAN * SECOND:
+        while sample.stamp - trace[0][0] > TRACE_SECONDS * SECOND:
             trace.popleft()
 
-    def _energy(self, message: Any) -> None:
+    def _take_strain_energy(self, message: Any) -> None:
         status = next(iter(message.status), None)
         if status is None:
             raise MessageError("empty", "no status")
         stamp_of(message.header)
-        values = {pair.key: _number(pair.value) for pair in status.values}
+        values = {pair.key: _parse_finite(pair.value) for pair in status.values}
         total = values.pop("total_energy", None)
         if total is None:
             raise MessageError("empty", "no total_energy")
-        # The factors come first; what follows the energy is the pose.
+        # The keys are the factors of the elements, then total_energy, then the pose.
         keys = [pair.key for pair in status.values]
         factors = keys[: keys.index("total_energy")]
         shares = {key: values[key] for key in factors}
@@ -119,7 +120,7 @@ class Live:
         self._shares = {key: float(share) for key, share in shares.items() if share is not None}
         self._dominant = str(status.message)
 
-    def _transform(self, message: Any) -> None:
+    def _take_deflection(self, message: Any) -> None:
         move, turn = message.transform.translation, message.transform.rotation
         numbers = np.array([move.x, move.y, move.z, turn.x, turn.y, turn.z, turn.w])
         if not np.isfinite(numbers).all() or not np.any(numbers[3:]):
@@ -127,7 +128,7 @@ class Live:
         vector = Rotation.from_quat(numbers[3:]).as_rotvec()
         self._deflection = np.concatenate([numbers[:3], vector])
 
-    def heard(self) -> Heard:
+    def read_latest(self) -> LiveValues:
         """Return a copy of the latest values."""
         with self._lock:
             newest = max((t[-1][0] for t in self._traces.values() if t), default=0)
@@ -139,7 +140,7 @@ class Live:
                 for name, trace in self._traces.items()
                 if trace
             }
-            return Heard(
+            return LiveValues(
                 self._q,
                 traces,
                 self._dominant,
@@ -151,7 +152,7 @@ class Live:
             )
 
 
-def _number(text: Any) -> float | None:
+def _parse_finite(text: Any) -> float | None:
     try:
         value = float(text)
     except (TypeError, ValueError):

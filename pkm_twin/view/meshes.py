@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Meshes of a robot's URDF, read and placed: what its links look like on the page."""
+"""Read the meshes of a robot's URDF and place them at home."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from pkm_twin.errors import one_line, warn
 from pkm_twin.machine.urdf_file import Visual
 from pkm_twin.robot.robot import Robot
 
-LARGEST: Final = 64 * 1024 * 1024
-"""Largest file of a mesh that is read, bytes."""
+MAX_MESH_BYTES: Final = 64 * 1024 * 1024
+"""Largest mesh file."""
 
 
-def body_meshes(robot: Robot) -> dict[str, tuple[Array, NDArray[np.int64]]]:
+def read_body_meshes(robot: Robot) -> dict[str, tuple[Array, NDArray[np.int64]]]:
     """Read each body's meshes: corners (k, 3) at home, m, base axes, and triangles (j, 3).
 
     A mesh that cannot be read is left out with a warning.
@@ -28,9 +28,9 @@ def body_meshes(robot: Robot) -> dict[str, tuple[Array, NDArray[np.int64]]]:
     found: dict[str, list[tuple[Array, NDArray[np.int64]]]] = {}
     for visual in robot.visuals:
         try:
-            part = _read(visual)
+            part = _read_mesh(visual)
         except Exception as error:
-            # Readers of meshes raise anything.
+            # Mesh readers may raise any exception.
             why = one_line(str(error)) or type(error).__name__
             warn(visual.urdf, f"mesh {visual.mesh!r}: {why}; it is not shown")
         else:
@@ -44,7 +44,7 @@ def body_meshes(robot: Robot) -> dict[str, tuple[Array, NDArray[np.int64]]]:
     return result
 
 
-def _in_package(package: str, rest: str, folder: Path) -> Iterator[Path]:
+def _find_in_package(package: str, rest: str, folder: Path) -> Iterator[Path]:
     for above in (folder, *folder.parents):
         if above.name == package:
             yield above / rest
@@ -57,7 +57,7 @@ def _in_package(package: str, rest: str, folder: Path) -> Iterator[Path]:
         return
 
 
-def _read(visual: Visual) -> tuple[Array, NDArray[np.int64]]:
+def _read_mesh(visual: Visual) -> tuple[Array, NDArray[np.int64]]:
     import trimesh  # viser needs it as well
 
     # A mesh's file: a path from the URDF's folder, file:// or package://.
@@ -67,12 +67,12 @@ def _read(visual: Visual) -> tuple[Array, NDArray[np.int64]]:
     if separator and kind == "file":
         tried = iter((Path(unquote(rest)),))
     elif separator and kind == "package":
-        tried = _in_package(*rest.partition("/")[::2], folder)
+        tried = _find_in_package(*rest.partition("/")[::2], folder)
     path = next((path for path in tried if path.is_file()), None)
     if path is None:
         raise FileNotFoundError("no such file")
-    if path.stat().st_size > LARGEST:
-        raise ValueError(f"more than {LARGEST} bytes")
+    if path.stat().st_size > MAX_MESH_BYTES:
+        raise ValueError(f"more than {MAX_MESH_BYTES} bytes")
     mesh: Any = trimesh.load(path, force="mesh")
     corners = np.asarray(mesh.vertices, np.float64) * visual.scale
     faces = np.asarray(mesh.faces, np.int64)

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""A robot under sliders: a state in, numbers out; what cannot be is refused in words."""
+"""The model behind the page: states from slider positions, their quantities, and reasons for rejection."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from stiffness_monitor.compliance import member_deflections
 Grade = Literal["good", "warn", "bad"]
 
 MAX_SHOWN_DEFLECTION: Final = 0.3
-"""Size that the greatest deflection may be enlarged to, per size of the machine."""
+"""Largest drawn deflection, as a fraction of the machine's size."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Range:
 class State:
     """The shown state: q (n,), pose (m,), wrench (6,) on the platform, base axes, N and N m.
 
-    ``refusal``: why the last thing that was asked for is not shown; empty where it is.
+    ``refusal``: why the last request was rejected; empty if it was not.
     """
 
     q: Array
@@ -59,7 +59,7 @@ class State:
 
 @dataclass(frozen=True, eq=False)
 class Numbers:
-    """The quantities of a state; ``None`` is unknown, with the reason in ``why``, by name.
+    """The quantities of a state; ``None`` where unknown; ``why`` has the reason.
 
     ``singularity``: 1 best, 0 singular; ``clearance``: of limbs, m; ``effort``: to hold the weight
     and the wrench at rest, shape (n,), N m or N; ``energy``: of the wrench.
@@ -104,7 +104,7 @@ class Model:
     def joint_ranges(self) -> tuple[Range, ...]:
         """Ranges of q: the limits, or without limits a turn or the machine's size about home."""
         robot, graph = self.robot, self.robot.graph
-        free = {"rad": 3.15, "m": _round(graph.size) / 2}
+        free = {"rad": 3.15, "m": _round_up(graph.size) / 2}
         rows = []
         for k, (name, unit) in enumerate(zip(robot.joint_names, robot.joint_units, strict=True)):
             middle = round(float(graph.home[k]), 1)
@@ -115,12 +115,12 @@ class Model:
                     float(limit) if math.isfinite(limit) else other
                     for limit, other in zip(limits, (low, high), strict=True)
                 )
-            rows.append(Range(name, unit, float(low), float(high), _step(high - low)))
+            rows.append(Range(name, unit, float(low), float(high), _choose_step(high - low)))
         return tuple(rows)
 
     @cached_property
     def pose_ranges(self) -> tuple[Range, ...]:
-        """Ranges of the pose that joint states all over their ranges reach, rounded outwards."""
+        """Ranges of the poses of sampled joint positions within their ranges, rounded outwards."""
         robot = self.robot
         lows, highs = (np.array([getattr(r, end) for r in self.joint_ranges]) for end in ("low", "high"))
         random = np.random.default_rng(0).random((1000, robot.joints_count))
@@ -134,57 +134,56 @@ class Model:
         ranges = []
         for k, (name, unit) in enumerate(zip(robot.pose_names, robot.pose_units, strict=True)):
             least, most = float(found[:, k].min()), float(found[:, k].max())
-            step = _step(most - least)
+            step = _choose_step(most - least)
             low, high = (round(end * step, 12) for end in (least // step, -(-most // step)))
             ranges.append(Range(name, unit, low, high, step))
         return tuple(ranges)
 
     @cached_property
     def wrench_ranges(self) -> tuple[Range, ...]:
-        """Forces and moments that the drives hold at the start, rounded up; else 100 N."""
+        """Ranges of forces and moments: what the drives hold at the start, rounded up; else 100 N."""
         robot, force = self.robot, 100.0
         if robot.limits.effort is not None and np.isfinite(robot.limits.effort).any():
             speeds = np.linalg.norm(robot.platform_jacobian(self.start.q)[:3], axis=0)
             held = robot.limits.effort / np.maximum(speeds, 1e-9)
             force = float(np.median(held[np.isfinite(held)]))
-        force, moment = _round(force), _round(force * robot.size)
+        force, moment = _round_up(force), _round_up(force * robot.size)
         tops = [("N", force)] * 3 + [("N m", moment)] * 3
         return tuple(
-            Range(name, unit, -top, top, _step(2 * top))
+            Range(name, unit, -top, top, _choose_step(2 * top))
             for name, (unit, top) in zip(("fx", "fy", "fz", "mx", "my", "mz"), tops, strict=True)
         )
 
     @cached_property
     def enlargement(self) -> Range:
-        """By how much deflections are drawn enlarged: the greatest is plain to see."""
+        """Range of the factor on drawn deflections; the largest makes them MAX_SHOWN_DEFLECTION."""
         if "energy" in self._why:
             return Range("deflection enlarged", "times", 0.0, 1.0, 0.01)
         full = np.diag([r.high for r in self.wrench_ranges])[:3]
         moved = platform_response(self.robot, self.start.q, full).deflection
         scale = np.repeat([1.0, self.robot.size], 3)
         largest = float(np.abs(moved * scale).max())
-        top = _round(MAX_SHOWN_DEFLECTION * self.robot.graph.size / largest)
-        return Range("deflection enlarged", "times", 0.0, top, _step(top))
+        top = _round_up(MAX_SHOWN_DEFLECTION * self.robot.graph.size / largest)
+        return Range("deflection enlarged", "times", 0.0, top, _choose_step(top))
 
     def to_joints(self, state: State, q: ArrayLike) -> State:
-        """Return the state at joint positions, (n,), or the old one with the reason why not."""
-        asked = np.asarray(q, np.float64)
-        return self._moved(state, asked, None)
+        """Return the state at joint positions, (n,), or the old state with a refusal."""
+        return self._try_move(state, np.asarray(q, np.float64), None)
 
     def to_pose(self, state: State, pose: ArrayLike) -> State:
-        """Return the state at a pose, shape (m,), or the old one with the reason why not."""
+        """Return the state at a pose, shape (m,), or the old state with a refusal."""
         asked = np.asarray(pose, np.float64)
         try:
             q = self.robot.inverse(asked)
         except ValueError as error:
-            return _refuse(state, str(error))
-        return self._moved(state, q, asked)
+            return _reject(state, str(error))
+        return self._try_move(state, q, asked)
 
     def to_platform(self, state: State, position: Array, rotation: Array) -> State:
         """Return the state whose platform is nearest to a position (3,), m, and a rotation (3, 3).
 
-        What the machine cannot do is left out; angles count by the size of the platform. Errors as
-        :meth:`to_pose`.
+        Minimise the squared distance, angles times the platform's size, by Gauss-Newton steps; motions
+        that the machine does not have remain as distance. Refusals as in :meth:`to_pose`.
         """
         robot, q = self.robot, state.q
         weights = np.repeat([1.0, robot.size], 3)
@@ -196,29 +195,29 @@ class Model:
                 twists = weights[:, None] * robot.platform_jacobian(q)
                 q = robot.project_redundant(q + np.linalg.lstsq(twists, missing, rcond=1e-9)[0])[0]
         except ValueError as error:
-            return _refuse(state, str(error))
-        return self._moved(state, q, None)
+            return _reject(state, str(error))
+        return self._try_move(state, q, None)
 
-    def _moved(self, state: State, q: Array, asked: Array | None) -> State:
+    def _try_move(self, state: State, q: Array, asked: Array | None) -> State:
         try:
             q = self.robot.project_redundant(q)[0]
         except ValueError as error:
-            return _refuse(state, str(error))
+            return _reject(state, str(error))
         _, found = beyond_limits(self.robot, q)
         if found:
             more = f" ({len(found) - 1} more)" if len(found) > 1 else ""
-            return _refuse(state, f"{found[0]}{more}")
+            return _reject(state, f"{found[0]}{more}")
         try:
             pose = self.robot.forward(q)
         except ValueError as error:
-            return _refuse(state, str(error))
+            return _reject(state, str(error))
         if asked is not None:
-            # A pose there and back may miss itself by 1e-6 per 1 and its size; m and rad.
+            # Tolerance of inverse and forward kinematics, m and rad.
             if (np.abs(pose - asked) > 1e-6 * (1.0 + np.abs(asked))).any():
-                return _refuse(state, "the pose is in another assembly mode than home")
+                return _reject(state, "the pose is in another assembly mode than home")
             pose = asked
         beyond = self._describe_beyond_passive(q, pose)
-        return _refuse(state, beyond) if beyond else replace(state, q=q, pose=pose, refusal="")
+        return _reject(state, beyond) if beyond else replace(state, q=q, pose=pose, refusal="")
 
     def _describe_beyond_passive(self, q: Array, pose: Array) -> str:
         """Describe which passive joint is beyond its limits; empty if none is."""
@@ -226,7 +225,7 @@ class Model:
         bound = getattr(robot.limits, "joint_angle", None)
         angles = robot.limit_angles(pose) if self._angles else None
         if bound is not None and angles is not None and angles.max() > bound:
-            # The angles are those of the passive joints, in the order of the graph.
+            # limit_angles has the passive joints in the order of the graph.
             names = [joint.name for joint in graph.joints.values() if not joint.actuated]
             worst = int(angles.argmax())
             return f"{names[worst]} is at {angles[worst]:.6g} rad, limit {float(bound):g}"
@@ -238,25 +237,25 @@ class Model:
                     return f"{limit.joint} is at {value:.6g} {unit}, {limits}"
         return ""
 
-    def loaded(self, state: State, wrench: ArrayLike) -> State:
-        """Return the state under a wrench, (6,), N and N m; the old one if it is not finite."""
+    def apply_wrench(self, state: State, wrench: ArrayLike) -> State:
+        """Return the state under a wrench, (6,), N and N m; the old state with a refusal if it is not finite."""
         values = np.array(wrench, np.float64)
         if not np.isfinite(values).all():
-            return _refuse(state, "the wrench is not finite")
+            return _reject(state, "the wrench is not finite")
         return replace(state, wrench=values, refusal="")
 
-    def link(self, state: State) -> str:
-        """Return the query of an address that carries robot, pose and load."""
+    def write_link(self, state: State) -> str:
+        """Write robot, pose and wrench as the query of an address."""
         parts = {"robot": self.robot.name, "pose": _write_numbers(state.pose)}
         if state.wrench.any():
             parts["load"] = _write_numbers(state.wrench)
         return f"?{urlencode(parts, safe=',')}"
 
-    def linked(self, state: State, link: str) -> State:
-        """Return the state of such an address, or the old one with the reason why not."""
+    def open_link(self, state: State, link: str) -> State:
+        """Return the state in an address of :meth:`write_link`, or the old state with a refusal."""
         parts = {name: given[-1] for name, given in parse_qs(link.rpartition("?")[2]).items()}
         if parts.get("robot") != self.robot.name:
-            return _refuse(state, f"the link is not of the robot {self.robot.name}")
+            return _reject(state, f"the link is not of the robot {self.robot.name}")
         rows = []
         for name, count in (("pose", len(state.pose)), ("load", 6)):
             try:
@@ -264,16 +263,16 @@ class Model:
             except ValueError:
                 row = []
             if len(row) != count or not np.isfinite(row).all() or "pose" not in parts:
-                return _refuse(state, f"the link's {name} has not {count} numbers")
+                return _reject(state, f"the link's {name} has not {count} numbers")
             rows.append(row)
         moved = self.to_pose(state, rows[0])
-        return moved if moved.refusal else self.loaded(moved, rows[1])
+        return moved if moved.refusal else self.apply_wrench(moved, rows[1])
 
-    def softest(self, wrench: Array, tell: Callable[[float], object] = abs) -> tuple[Array, str]:
+    def find_softest_pose(self, wrench: Array, tell: Callable[[float], object] = abs) -> tuple[Array, str]:
         """Find the joint positions of the softest pose, or of the one that a wrench (6,) moves most.
 
-        The second part is the answer in words, with its units. The search is that of
-        ``pkm-twin map``; ``tell`` gets the part that is done, 0 to 1.
+        Return the positions and the answer in words, with its units. The search is that of
+        ``pkm-twin map``; ``tell`` is called with the progress, 0 to 1.
 
         :raises PkmTwinError: no elasticity in the robot's file, or no pose that counts.
         """
@@ -291,7 +290,7 @@ class Model:
         told = what.format(1e6 * worst.found.value.item())
         return worst.q, f"{told} along ({along})"
 
-    def numbers(self, state: State) -> Numbers:
+    def compute_numbers(self, state: State) -> Numbers:
         """Compute the quantities of a state; the reasons of failures are in ``why``."""
         robot, why = self.robot, dict(self._why)
         measure = float(robot.singularity(state.q))
@@ -313,7 +312,7 @@ class Model:
         over = np.zeros(robot.joints_count, np.bool_)
         if effort is not None and robot.limits.effort is not None:
             over = np.abs(effort) > robot.limits.effort
-        # Limbs nearer than 5 mm are shown as near each other.
+        # A clearance below 5 mm is marked as low.
         return Numbers(
             position,
             rotation,
@@ -327,7 +326,7 @@ class Model:
             why,
         )
 
-    def deflected(self, state: State, deflection: Array) -> Deflection:
+    def compute_deflection(self, state: State, deflection: Array) -> Deflection:
         """Return the members' displacements for the platform's, (6,), m and rad, base axes."""
         robot, q = self.robot, state.q
         wrench = np.linalg.solve(platform_response(robot, q, np.zeros(6)).compliance, deflection)
@@ -338,7 +337,7 @@ def _write_numbers(values: Array) -> str:
     return ",".join(f"{value:.9g}" for value in np.round(values, 12) + 0.0)
 
 
-def _refuse(state: State, reason: str) -> State:
+def _reject(state: State, reason: str) -> State:
     return replace(state, refusal=one_line(reason))
 
 
@@ -346,12 +345,12 @@ def _grade(value: float, bad: float, warn: float) -> Grade:
     return "bad" if value <= bad else "warn" if value < warn else "good"
 
 
-def _step(span: float) -> float:
-    """Return a power of ten of which 400 to 4000 are in the span."""
+def _choose_step(span: float) -> float:
+    """Return the power of ten that divides the span into 400 to 4000 steps."""
     return float(10.0 ** math.floor(math.log10(max(span, 1e-9) / 400)))
 
 
-def _round(value: float) -> float:
-    """Round up to the next of 1, 2, 5, 10, 20 ..."""
+def _round_up(value: float) -> float:
+    """Round up to 1, 2 or 5 times a power of ten."""
     decade = 10.0 ** math.floor(math.log10(max(value, 1e-9)))
     return float(next(k * decade for k in (1.0, 2.0, 5.0, 10.0) if k * decade >= 0.999 * value))

@@ -1,7 +1,7 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The page of ``pkm-twin view``: viser's sliders and numbers around the pure model.
 
-Callbacks only note what was asked for; one loop does it, the latest of each kind.
+Callbacks only store the latest request of each kind; one loop carries the requests out.
 """
 
 from __future__ import annotations
@@ -27,29 +27,29 @@ from pkm_twin.view.scene import DRIVE, Scene
 from pkm_twin.view.stage import Stage
 
 ADDRESS: Final = "127.0.0.1"
-"""The only address that is listened on."""
+"""The server listens on this address only."""
 
 
 @contextmanager
-def serving(port: int) -> Iterator[Any]:
-    """Run a viser server on this computer's own address; port 0 is any that is free.
+def run_server(port: int) -> Iterator[Any]:
+    """Run a viser server on the loopback address; port 0 chooses a free port.
 
-    :raises PkmTwinError: the port is another program's.
+    :raises PkmTwinError: another program uses the port.
     """
     import viser
 
     class Server(viser.ViserServer):
-        """Without the tunnel to a host outside that any visitor could ask for."""
+        """Serve without the public tunnel, which any visitor could request."""
 
         def request_share_url(self, verbose: bool = True) -> None:
-            """Refuse viser's public link: the page is for this computer alone."""
+            """Do nothing instead of opening viser's public link."""
 
-    # A visitor that breaks off is no error of this program's.
+    # websockets logs a closed browser as an error.
     logging.getLogger("websockets").setLevel(logging.CRITICAL)
     with contextlib.redirect_stdout(io.StringIO()):
         server = Server(host=ADDRESS, port=port, verbose=False)
     try:
-        # viser takes the next port where one is in use.
+        # viser takes the next port if the chosen one is in use.
         if port not in (0, server.get_port()):
             text = f"cannot listen on {ADDRESS} port {port}: it is in use; choose another --port"
             raise PkmTwinError(text)
@@ -59,27 +59,27 @@ def serving(port: int) -> Iterator[Any]:
             server.stop()
 
 
-class Moving(Protocol):
+class MovingPanel(Protocol):
     """A panel that moves the machine, in addition to the sliders."""
 
     @property
     def busy(self) -> bool:
-        """True if it moves now."""
+        """True while the panel moves the machine."""
 
     def step(self) -> None:
-        """Draw what moved since the last step."""
+        """Draw the motion since the last step."""
 
 
 class Page:
-    """A robot on a server; all connected browsers share it."""
+    """The page of a robot; all connected browsers share one state."""
 
     def __init__(self, server: Any, model: Model, first: str = "") -> None:
-        """Build the page; ``first`` names a tab before the others, ``self.first``, for a bag or nodes."""
+        """Build the page; ``first`` is the title of an additional first tab, ``self.first``."""
         self.server, self.model, self.state = server, model, model.start
         lowest = min((r.low for r in model.pose_ranges if r.name == "z"), default=0.0)
         self.stage = Stage(server, Scene(model.robot), model.start.q, lowest)
-        self.moving: list[Moving] = []
-        self._asked: dict[str, Callable[[], None]] = {}
+        self.moving: list[MovingPanel] = []
+        self._requests: dict[str, Callable[[], None]] = {}
         self._failures: set[str] = set()
         self._dragged = False
         self._wake = threading.Event()
@@ -89,7 +89,7 @@ class Page:
         server.gui.main_panel.dock_right()
         server.gui.set_panel_label(f"pkm-twin view {model.robot.name}")
         gui = server.gui
-        gui.add_html(texts.SHEET)
+        gui.add_html(texts.STYLE_AND_LINK_SCRIPT)
         self._status = gui.add_html("")
         tabs = gui.add_tab_group()
         if first:
@@ -99,43 +99,43 @@ class Page:
                 self._joints = self._add_sliders(model.joint_ranges, "joint", self._move_joint)
             with gui.add_folder("Pose of the platform"):
                 self._pose = self._add_sliders(model.pose_ranges, "pose", self._move_pose)
-            self.ask(gui.add_button("Home").on_click, "home", self._go_home)
-            self._check("names of drives", True, self.stage.name_drives)
-            self._check("drag platform", False, partial(setattr, self.stage.gizmo, "visible"))
-            self.ask(self.stage.gizmo.on_update, "drag", self._drag)
-            self._check("trail of the tool", False, self.stage.leave_trail)
+            self.call_on(gui.add_button("Home").on_click, "home", self._go_home)
+            self._add_checkbox("names of drives", True, self.stage.show_drive_names)
+            self._add_checkbox("drag platform", False, partial(setattr, self.stage.gizmo, "visible"))
+            self.call_on(self.stage.gizmo.on_update, "drag", self._move_platform)
+            self._add_checkbox("trail of the tool", False, self.stage.show_trail)
             if self.stage.meshes:
-                self._check("meshes of the URDF, which do not bend", True, self.stage.show_meshes)
+                self._add_checkbox("meshes of the URDF, which do not bend", True, self.stage.show_meshes)
         self.load_tab = tabs.add_tab("Load")
         with self.load_tab:
             with gui.add_folder("Wrench on the platform, base axes"):
-                self._wrench = self._add_sliders(model.wrench_ranges, "wrench", self._load)
-                self.ask(gui.add_button("No wrench").on_click, "unload", self._unload)
+                self._wrench = self._add_sliders(model.wrench_ranges, "wrench", self._change_wrench)
+                self.call_on(gui.add_button("No wrench").on_click, "unload", self._remove_wrench)
             r = model.enlargement
             self._enlarge = gui.add_slider("deflection magnified, times", r.low, r.high, r.step, r.high / 2)
-            self.ask(self._enlarge.on_update, "enlarge", self._show)
+            self.call_on(self._enlarge.on_update, "enlarge", self._update)
             self._loads = gui.add_html("")
-            if "energy" not in model.numbers(self.state).why:
-                self.moving.append(Search(self))
-        self._link = gui.add_text("link", model.link(self.state))
-        self.ask(self._link.on_update, "link", self._follow)
-        gui.add_html(texts.buttons(model.robot.name))
-        self._show()
+            if "energy" not in model.compute_numbers(self.state).why:
+                self.moving.append(SoftestPoseSearch(self))
+        self._link = gui.add_text("link", model.write_link(self.state))
+        self.call_on(self._link.on_update, "link", self._open_link)
+        gui.add_html(texts.write_buttons(model.robot.name))
+        self._update()
 
-    def ask(self, react: Any, what: str, call: Callable[[], None]) -> None:
-        """Make the call in the page's loop when a visitor triggers the event of ``react``.
+    def call_on(self, react: Any, what: str, call: Callable[[], None]) -> None:
+        """Call a function in the page's loop when a visitor triggers an event.
 
-        :param react: ``on_update`` or ``on_click`` of a handle; of many calls with one name,
-            ``what``, the last one is made.
+        :param react: ``on_update`` or ``on_click`` of a handle.
+        :param what: name of the request; only the latest request of a name is carried out.
         """
 
-        def noted(event: Any) -> None:
-            if event.client is not None:  # else the page itself moved it
+        def store_request(event: Any) -> None:
+            if event.client is not None:  # None if the page itself moved the handle
                 self._dragged = getattr(event, "phase", "end") != "end"
-                self._asked[what] = call
+                self._requests[what] = call
                 self._wake.set()
 
-        react(noted)
+        react(store_request)
 
     def run(self) -> None:
         """Serve until a signal ends the process."""
@@ -145,16 +145,16 @@ class Page:
             self.step()
 
     def step(self) -> None:
-        """Do what was asked for, and draw what moved by itself."""
-        while self._asked:
-            _, call = self._asked.popitem()
+        """Carry out the stored requests, then step the panels that move."""
+        while self._requests:
+            _, call = self._requests.popitem()
             self._attempt(call)
         for item in self.moving:
             if item.busy:
                 self._attempt(item.step)
 
     def _attempt(self, call: Callable[[], None]) -> None:
-        """Make a call; one that fails is logged, once a reason, and the page goes on for all."""
+        """Call a function; log an exception once per reason and keep serving."""
         try:
             call()
         except Exception as error:
@@ -163,63 +163,63 @@ class Page:
                 self._failures.add(reason)
                 logging.getLogger("pkm_twin").warning("view: a change was rejected: %s", reason)
 
-    def become(self, state: State) -> None:
-        """Show another state; one with a refusal leaves the sliders where they were put."""
+    def show_state(self, state: State) -> None:
+        """Show another state; with a refusal the sliders stay as the visitor set them."""
         self.state = state
-        self._show()
+        self._update()
 
-    def _check(self, label: str, value: bool, call: Callable[[bool], None]) -> None:
+    def _add_checkbox(self, label: str, value: bool, call: Callable[[bool], None]) -> None:
         box = self.server.gui.add_checkbox(label, value)
-        self.ask(box.on_update, label, lambda: call(box.value))
+        self.call_on(box.on_update, label, lambda: call(box.value))
 
     def _add_sliders(self, ranges: Sequence[Range], kind: str, move: Callable[[int], None]) -> list[Any]:
         handles = []
         for k, r in enumerate(ranges):
-            amid = min(max(0.0, r.low), r.high)
-            handle = self.server.gui.add_slider(f"{r.name}, {r.unit}", r.low, r.high, r.step, amid)
-            self.ask(handle.on_update, f"{kind} {k}", partial(move, k))
+            initial = min(max(0.0, r.low), r.high)
+            handle = self.server.gui.add_slider(f"{r.name}, {r.unit}", r.low, r.high, r.step, initial)
+            self.call_on(handle.on_update, f"{kind} {k}", partial(move, k))
             handles.append(handle)
         return handles
 
     def _move_joint(self, k: int) -> None:
         q = self.state.q.copy()
         q[k] = self._joints[k].value
-        self.become(self.model.to_joints(self.state, q))
+        self.show_state(self.model.to_joints(self.state, q))
 
     def _move_pose(self, k: int) -> None:
         pose = self.state.pose.copy()
         pose[k] = self._pose[k].value
-        self.become(self.model.to_pose(self.state, pose))
+        self.show_state(self.model.to_pose(self.state, pose))
 
-    def _load(self, _: int) -> None:
+    def _change_wrench(self, _: int) -> None:
         wrench = [handle.value for handle in self._wrench]
-        self.become(self.model.loaded(self.state, wrench))
+        self.show_state(self.model.apply_wrench(self.state, wrench))
 
-    def _unload(self) -> None:
-        self.become(self.model.loaded(self.state, np.zeros(6)))
+    def _remove_wrench(self) -> None:
+        self.show_state(self.model.apply_wrench(self.state, np.zeros(6)))
 
-    def _drag(self) -> None:
+    def _move_platform(self) -> None:
         gizmo = self.stage.gizmo
         rotation = Rotation.from_quat(np.roll(gizmo.wxyz, -1)).as_matrix()
-        self.become(self.model.to_platform(self.state, gizmo.position, rotation))
+        self.show_state(self.model.to_platform(self.state, gizmo.position, rotation))
 
-    def _follow(self) -> None:
-        self.become(self.model.linked(self.state, self._link.value))
+    def _open_link(self) -> None:
+        self.show_state(self.model.open_link(self.state, self._link.value))
 
     def _go_home(self) -> None:
-        self.become(self.model.to_joints(self.state, self.model.start.q))
+        self.show_state(self.model.to_joints(self.state, self.model.start.q))
 
-    def _show(self) -> None:
-        state, numbers = self.state, self.model.numbers(self.state)
+    def _update(self) -> None:
+        state, numbers = self.state, self.model.compute_numbers(self.state)
         energy = numbers.energy
         with self.server.atomic():
             if not state.refusal:
-                _put(self._joints, state.q)
-                _put(self._pose, state.pose)
-                _put(self._wrench, state.wrench)
-                self._link.value = self.model.link(state)
-            self._status.content = texts.status(self.model, state, numbers)
-            self._loads.content = texts.load(numbers)
+                _set_sliders(self._joints, state.q)
+                _set_sliders(self._pose, state.pose)
+                _set_sliders(self._wrench, state.wrench)
+                self._link.value = self.model.write_link(state)
+            self._status.content = texts.describe_state(self.model, state, numbers)
+            self._loads.content = texts.describe_load(numbers)
             if energy is None or energy.dominant == "none":
                 self.stage.draw(state.q)
             else:
@@ -235,62 +235,62 @@ class Page:
 
     def draw_deflected(self, deflection: Array, shares: dict[str, float], dominant: str) -> None:
         """Draw the state with a deflection (6,), m and rad, base axes, enlarged by the slider."""
-        moved = self.model.deflected(self.state, deflection).times(self._enlarge.value)
+        moved = self.model.compute_deflection(self.state, deflection).times(self._enlarge.value)
         self.stage.draw(self.state.q, moved, shares, dominant)
 
 
-class Search:
-    """The softest pose, looked for in a thread of its own."""
+class SoftestPoseSearch:
+    """Search for the softest pose in a thread of its own, then move there."""
 
     def __init__(self, page: Page) -> None:
-        self._page, self._done = page, 0.0
+        self._page, self._progress = page, 0.0
         self._found: Future[tuple[Array, str]] | None = None
         button = page.server.gui.add_button("Go to the softest pose")
         self._note = page.server.gui.add_html("")
-        page.ask(button.on_click, "soft", self._begin)
+        page.call_on(button.on_click, "soft", self._start_search)
 
     @property
     def busy(self) -> bool:
-        """True if it is under way, or found what is not shown yet."""
+        """True from the start of the search until its result is shown."""
         return self._found is not None
 
-    def _begin(self) -> None:
+    def _start_search(self) -> None:
         if self.busy:
             return
         self._found = found = Future[tuple[Array, str]]()
         wrench = self._page.state.wrench
 
-        def work() -> None:
+        def search() -> None:
             try:
-                found.set_result(self._page.model.softest(wrench, self._show_progress))
+                found.set_result(self._page.model.find_softest_pose(wrench, self._show_progress))
             except BaseException as error:
                 found.set_exception(error)
 
-        threading.Thread(target=work, name="softest", daemon=True).start()
+        threading.Thread(target=search, name="softest", daemon=True).start()
 
     def _show_progress(self, done: float) -> None:
-        self._done = done
+        self._progress = done
 
     def step(self) -> None:
-        """Say how far it is, then go there."""
+        """Show the progress, then the result."""
         found, page = self._found, self._page
         if found is None:
             return
         if not found.done():
-            self._note.content = texts.note(f"searching the workspace: {100 * self._done:.0f} %")
+            self._note.content = texts.write_note(f"searching the workspace: {100 * self._progress:.0f} %")
             return
-        self._found, self._done = None, 0.0
+        self._found, self._progress = None, 0.0
         try:
-            q, told = found.result()
+            q, answer = found.result()
         except PkmTwinError as error:
-            self._note.content = texts.note(str(error))
+            self._note.content = texts.write_note(str(error))
             return
-        page.become(page.model.to_joints(page.state, q))
-        self._note.content = texts.note(told)
+        page.show_state(page.model.to_joints(page.state, q))
+        self._note.content = texts.write_note(answer)
 
 
-def _put(handles: Sequence[Any], values: Array) -> None:
-    """Move sliders to values, or to the nearest end of their range."""
+def _set_sliders(handles: Sequence[Any], values: Array) -> None:
+    """Set sliders to values, clipped to their ranges."""
     for handle, value in zip(handles, values.tolist(), strict=True):
-        # What is zero but for rounding has no sign.
+        # Round away the sign of -0.
         handle.value = round(min(max(value, handle.min), handle.max), 12) + 0.0

@@ -12,7 +12,7 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError, one_line
 from pkm_twin.view import texts
-from pkm_twin.view.live import SPAN, TOPICS, TRACES, Live
+from pkm_twin.view.live import TOPICS, TRACE_SECONDS, TRACES, Live
 from pkm_twin.view.model import MAX_SHOWN_DEFLECTION, State
 from pkm_twin.view.page import Page
 from pkm_twin.view.scene import Deflection
@@ -21,14 +21,14 @@ from stiffness_monitor.modes import Modes, modes
 
 COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 """Colours of the joints' curves (Okabe and Ito 2008)."""
-MODES: Final = 6
-"""Natural modes to choose from."""
+MODE_COUNT: Final = 6
+"""Number of natural modes to choose from."""
 _MEASURED: Final = "measured"
-"""A wide curve, on which the model's is seen."""
+"""Name of the measured curve, drawn wide so that the model's curve on it is visible."""
 
 
 class BagPanel:
-    """A slider of time, a play button, numbers at that time and curves of all of it."""
+    """Replay a recording: a time slider, a play button, numbers at that time, and charts."""
 
     def __init__(self, page: Page, timeline: Timeline) -> None:
         self._page, self._timeline = page, timeline
@@ -41,28 +41,30 @@ class BagPanel:
             self._speed = gui.add_dropdown("speed factor", ("0.25", "0.5", "1", "2", "4"), initial_value="1")
             self._instant = gui.add_html("")
             names = page.model.robot.joint_names
-            self._times, self._twin, self._measured = timeline.curves()
+            self._times, self._twin, self._measured = timeline.sample_curves()
             self._charts: list[tuple[Any, Array]] = []
             if len(self._times) > 1:
                 self._joint = gui.add_dropdown("joint", names, initial_value=names[0])
-                page.ask(self._joint.on_update, "joint", self._draw_joint)
+                page.call_on(self._joint.on_update, "joint", self._draw_joint)
                 efforts = {_MEASURED: "#999999", "model": COLOURS[1]}
                 if self._measured is None:
                     del efforts[_MEASURED]
-                self._add_chart("effort of the joint", self._efforts(), efforts)
+                self._add_chart("effort of the joint", self._select_efforts(), efforts)
                 if self._measured is not None:
-                    self._add_chart("residual: measured minus model", self._measured - self._twin, _coloured(names))
-        page.ask(self._time.on_update, "time", self._go)
-        page.ask(self._play.on_click, "play", self._play_or_pause)
-        page.ask(self._speed.on_update, "speed", self._restart)
+                    self._add_chart(
+                        "residual: measured minus model", self._measured - self._twin, _assign_colours(names)
+                    )
+        page.call_on(self._time.on_update, "time", self._show_time)
+        page.call_on(self._play.on_click, "play", self._play_or_pause)
+        page.call_on(self._speed.on_update, "speed", self._restart_playing)
         page.moving.append(self)
-        self._go()
+        self._show_time()
 
     def _add_chart(self, title: str, values: Array, colours: dict[str, str]) -> None:
-        chart = _chart(self._page, title, self._times, values, colours, mark=True)
+        chart = _create_chart(self._page, title, self._times, values, colours, mark=True)
         self._charts.append((chart, values))
 
-    def _efforts(self) -> Array:
+    def _select_efforts(self) -> Array:
         """Return the chosen joint's measured efforts, if any, and the model's, (j, k)."""
         k = self._page.model.robot.joint_names.index(self._joint.value)
         both = (self._measured, self._twin)
@@ -70,36 +72,36 @@ class BagPanel:
 
     def _draw_joint(self) -> None:
         chart, _ = self._charts[0]
-        values = self._efforts()
+        values = self._select_efforts()
         self._charts[0] = chart, values
-        chart.data = (self._times, *map(np.ascontiguousarray, values.T), self._mark(values))
+        chart.data = (self._times, *map(np.ascontiguousarray, values.T), self._mark_time(values))
 
-    def _mark(self, values: Array) -> Array:
-        return _mark(self._times, values, self._time.value)
+    def _mark_time(self, values: Array) -> Array:
+        return _draw_time_mark(self._times, values, self._time.value)
 
     @property
     def busy(self) -> bool:
-        """True if it plays."""
+        """True while the recording plays."""
         return self._since is not None
 
-    def show(self, at: float) -> None:
-        """Go to a time, s."""
+    def show_time(self, at: float) -> None:
+        """Set the slider to a time, s, and show it."""
         self._time.value = min(max(at, 0.0), self._timeline.end)
-        self._go()
+        self._show_time()
 
-    def _go(self) -> None:
-        self._restart()
-        page, at = self._page, self._timeline.at(self._time.value)
+    def _show_time(self) -> None:
+        self._restart_playing()
+        page, at = self._page, self._timeline.sample_at(self._time.value)
         state = page.state
         if at.wrench is not None:
-            state = page.model.loaded(state, at.wrench)
+            state = page.model.apply_wrench(state, at.wrench)
         state = page.model.to_joints(state, at.q)
-        self._instant.content = texts.instant(page.model.robot, self._timeline, at)
-        page.become(state)
+        self._instant.content = texts.describe_instant(page.model.robot, self._timeline, at)
+        page.show_state(state)
         if not self.busy or time.monotonic() - self._marked > 0.25:
             self._marked = time.monotonic()
             for chart, values in self._charts:
-                chart.data = (*chart.data[:-1], self._mark(values))
+                chart.data = (*chart.data[:-1], self._mark_time(values))
 
     def _play_or_pause(self) -> None:
         if self.busy:
@@ -110,12 +112,12 @@ class BagPanel:
             self._since = time.monotonic(), self._time.value
         self._play.label = "Pause" if self.busy else "Play"
 
-    def _restart(self) -> None:
+    def _restart_playing(self) -> None:
         if self.busy:
             self._since = time.monotonic(), self._time.value
 
     def step(self) -> None:
-        """Go on to the time that it is by now."""
+        """Advance the slider to the present playing time."""
         if self._since is None:
             return
         began, start = self._since
@@ -124,11 +126,11 @@ class BagPanel:
         if now >= self._timeline.end:
             self._since = None
             self._play.label = "Play"
-        self._go()
+        self._show_time()
 
 
 class ModePanel:
-    """A natural mode of the present pose as a slow vibration of the platform and its legs."""
+    """Animate a natural mode of the present pose as a slow vibration."""
 
     def __init__(self, page: Page) -> None:
         self._page = page
@@ -136,10 +138,10 @@ class ModePanel:
         self._state: State | None = None
         gui = page.server.gui
         with page.load_tab:
-            still = ("none", *map(str, range(1, MODES + 1)))
-            self._choice = gui.add_dropdown("animated mode", still, initial_value=still[0])
+            choices = ("none", *map(str, range(1, MODE_COUNT + 1)))
+            self._choice = gui.add_dropdown("animated mode", choices, initial_value=choices[0])
             self._note = gui.add_html("")
-        page.ask(self._choice.on_update, "mode", self._choose)
+        page.call_on(self._choice.on_update, "mode", self._on_choice)
         page.moving.append(self)
 
     @property
@@ -147,28 +149,28 @@ class ModePanel:
         """True if a mode is chosen."""
         return bool(self._choice.value != "none")
 
-    def _choose(self) -> None:
+    def _on_choice(self) -> None:
         self._state = None
         if not self.busy:
             self._note.content = ""
-            self._page.become(self._page.state)
+            self._page.show_state(self._page.state)
 
-    def _solve(self, state: State) -> None:
+    def _compute_modes(self, state: State) -> None:
         self._state, self._modes = state, None
         k = int(self._choice.value) - 1
         try:
-            self._modes = modes(self._page.model.robot, state.pose, MODES)
+            self._modes = modes(self._page.model.robot, state.pose, MODE_COUNT)
         except (PkmTwinError, ValueError) as error:
-            self._note.content = texts.note(one_line(str(error)))
+            self._note.content = texts.write_note(one_line(str(error)))
             return
         shape, names = self._modes.shapes[k], self._modes.nodes
         sizes = np.linalg.norm(shape[:, :3], axis=1)
-        told = f"{texts.number(float(self._modes.frequencies[k]))} Hz, drives locked"
+        text = f"{texts.format_number(float(self._modes.frequencies[k]))} Hz, drives locked"
         if sizes[0] < 0.1 * sizes.max():
-            told += f"; {names[int(sizes.argmax())]} moves most, the platform hardly"
-        self._note.content = texts.note(told)
+            text += f"; {names[int(sizes.argmax())]} moves most, the platform hardly"
+        self._note.content = texts.write_note(text)
         part = MAX_SHOWN_DEFLECTION / 3 * self._page.model.robot.graph.size / sizes.max()
-        # A member's nodes have its name and their number.
+        # Node names are a member's name and a number.
         owners = [name.rpartition(" ")[0] for name in names[1:]]
         at, moved = self._modes.positions[1:], shape[1:, :3]
         rows = {name: np.array([owner == name for owner in owners]) for name in owners}
@@ -178,10 +180,10 @@ class ModePanel:
         self._shares = dict(zip(self._modes.energies.elements, strain, strict=True))
 
     def step(self) -> None:
-        """Draw the mode at this instant."""
+        """Draw the mode at the present phase of the vibration."""
         state = self._page.state
         if self._state is None or not np.array_equal(self._state.pose, state.pose):
-            self._solve(state)
+            self._compute_modes(state)
         if self._modes is not None:
             swing = float(np.sin(2 * np.pi * time.monotonic() / 1.5))
             most = max(self._shares, key=lambda name: self._shares[name])
@@ -189,7 +191,7 @@ class ModePanel:
 
 
 class LivePanel:
-    """The panel of running nodes: joint states that the machine follows, and torques."""
+    """Show running nodes: the machine follows their joint states; charts have the torques."""
 
     busy = True
 
@@ -199,44 +201,46 @@ class LivePanel:
         gui = page.server.gui
         with page.first:
             self._heard = gui.add_html("")
-            joints = _coloured(page.model.robot.joint_names)
+            joints = _assign_colours(page.model.robot.joint_names)
             nothing = np.zeros((2, len(joints)))
             self._charts = {
-                name: _chart(page, f"{name}, the last {SPAN:g} s", np.array([-SPAN, 0.0]), nothing, joints)
+                name: _create_chart(
+                    page, f"{name}, the last {TRACE_SECONDS:g} s", np.array([-TRACE_SECONDS, 0.0]), nothing, joints
+                )
                 for name in TRACES
             }
         page.moving.append(self)
 
     def step(self) -> None:
-        """Show what was heard last."""
-        page, heard = self._page, self._live.heard()
-        news = (heard.counts, heard.refused)
-        if news == self._seen:
+        """Show the latest messages."""
+        page, heard = self._page, self._live.read_latest()
+        counts = (heard.counts, heard.refused)
+        if counts == self._seen:
             return
-        self._seen = news
+        self._seen = counts
         waiting = ", ".join(TOPICS[name][1] for name in TOPICS if not heard.counts.get(name))
-        self._heard.content = texts.heard(page.model.robot, heard, waiting)
+        self._heard.content = texts.describe_live_values(page.model.robot, heard, waiting)
         for name, (times, values) in heard.traces.items():
             if len(times) > 1:
                 self._charts[name].data = (times, *map(np.ascontiguousarray, values.T))
         if heard.q is None:
             return
-        page.become(page.model.to_joints(page.state, heard.q))
-        # A wrench on the sliders is looked at instead of the measured one.
+        page.show_state(page.model.to_joints(page.state, heard.q))
+        # A wrench of the sliders has priority over the measured one.
         if heard.shares and heard.deflection is not None and not page.state.wrench.any():
             rotation = page.model.robot.platform(page.state.q)[1]
             moved = np.concatenate([rotation @ part for part in np.split(heard.deflection, 2)])
             page.draw_deflected(moved, heard.shares, heard.dominant)
 
 
-def _coloured(names: Sequence[str]) -> dict[str, str]:
+def _assign_colours(names: Sequence[str]) -> dict[str, str]:
     return {name: COLOURS[k % len(COLOURS)] for k, name in enumerate(names)}
 
 
-def _chart(
+def _create_chart(
     page: Page, title: str, times: Array, values: Array, colours: Mapping[str, str], *, mark: bool = False
 ) -> Any:
-    """Draw curves with names and colours, values (k, n), and if asked a mark of the present."""
+    """Create a chart of named curves, values (k, n); with ``mark`` also of the present time."""
     from viser import uplot
 
     points = uplot.Series_Points(show=False)
@@ -248,7 +252,7 @@ def _chart(
     curves = list(map(np.ascontiguousarray, values.T))
     if mark:
         series.append(uplot.Series(label="now", stroke="#555555", width=1, points=points))
-        curves.append(_mark(times, values, 0.0))
+        curves.append(_draw_time_mark(times, values, 0.0))
     return page.server.gui.add_uplot(
         (times, *curves),
         tuple(series),
@@ -258,8 +262,8 @@ def _chart(
     )
 
 
-def _mark(times: Array, values: Array, now: float) -> Array:
-    """Return a curve along the bottom with a peak at the present time: charts have no lines."""
+def _draw_time_mark(times: Array, values: Array, now: float) -> Array:
+    """Return a curve with a peak at the present time, as charts cannot draw vertical lines."""
     result = np.full(len(times), float(values.min()))
     result[int(np.argmin(np.abs(times - now)))] = float(values.max())
     return result

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""A state as shapes: cylinders, balls and plates with their places and colours, in numbers."""
+"""The shapes of a state: cylinders, balls and plates, with positions and colours as arrays."""
 
 from __future__ import annotations
 
@@ -35,23 +35,22 @@ PLATFORM: Final = (213, 94, 0)
 DRIVE: Final = (0, 114, 178)
 GROUND: Final = (70, 74, 80)
 JOINT: Final = (98, 104, 112)
-"""Rods, platform and drives: distinct with every kind of colour vision (Okabe and Ito 2008)."""
-SCALE: Final = np.array([[198, 206, 214], [240, 228, 66], [213, 94, 0]], np.float64)
-"""From no share of the energy to the greatest one: grey, yellow, vermilion (Okabe and Ito 2008)."""
+"""Colours of parts, 0 to 255; ROD, PLATFORM and DRIVE are distinct for colour-blind readers (Okabe and Ito 2008)."""
+ENERGY_COLOURS: Final = np.array([[198, 206, 214], [240, 228, 66], [213, 94, 0]], np.float64)
+"""Colours from no share of the strain energy to the greatest: grey, yellow, vermilion (Okabe and Ito 2008)."""
 
 
-def share_colours(shares: Mapping[str, float]) -> dict[str, Colour]:
-    """Return a colour for each element by its share of the strain energy.
-
-    Empty where there is no energy.
-    """
+def colour_by_share(shares: Mapping[str, float]) -> dict[str, Colour]:
+    """Return a colour for each element by its share of the strain energy; empty without energy."""
     most = max(shares.values(), default=0.0)
     if not most > 0.0:
         return {}
     result = {}
     for name, share in shares.items():
-        at = np.clip(share / most, 0.0, 1.0) * (len(SCALE) - 1)
-        red, green, blue = (round(float(np.interp(at, range(len(SCALE)), channel))) for channel in SCALE.T)
+        at = np.clip(share / most, 0.0, 1.0) * (len(ENERGY_COLOURS) - 1)
+        red, green, blue = (
+            round(float(np.interp(at, range(len(ENERGY_COLOURS)), channel))) for channel in ENERGY_COLOURS.T
+        )
         result[name] = (red, green, blue)
     return result
 
@@ -87,10 +86,10 @@ class Shapes:
 
 @dataclass(frozen=True, eq=False)
 class Deflection:
-    """How a machine is deflected, as it is to be drawn; base axes.
+    """The deflection to draw, base axes.
 
-    ``platform``: (6,), m and rad. ``members``: by name, points along it at rest, from one end to
-    the other, (k, 3) m, and their displacements of the same shape.
+    ``platform``: (6,), m and rad. ``members``: for each name points along the member at rest, from
+    end to end, (k, 3) m, and their displacements, (k, 3) m.
     """
 
     platform: Array
@@ -112,7 +111,7 @@ class Scene:
     def __init__(self, robot: Robot) -> None:
         self.robot, graph = robot, robot.graph
         self.size = graph.size
-        # What slides on an axis stays on a pin along it.
+        # A cylindrical joint slides on its pin.
         pins = [
             Bar(j.name, (j.inner, j.at), (j.outer, j.at), BAR_RADIUS_RATIO * graph.size / 2)
             for j in graph.joints.values()
@@ -121,14 +120,14 @@ class Scene:
         self.bars = (*robot_bars(robot), *pins)
         members = np.arange(len(self.bars)) < len(robot.beams)
         self.pieces = np.where(members, 4, 1)
-        """Straight pieces that each bar is drawn of: members bend."""
+        """Number of straight pieces per bar: members are drawn bent."""
         self.base = base_face(graph)
         self.platform = platform_face(graph) - graph.origin
         self._thin = BAR_RADIUS_RATIO * graph.size
         self._elements = {bar.element for bar in self.bars if bar.element}
         self._joints = [j for j in graph.joints.values() if j.kind not in ("translation", "fixed")]
         self._drives = {j.name: self._make_motor(j) for j in self._joints if j.actuated}
-        # Balls stand at joints that turn and at the ends of rods, by the joint's label.
+        # Balls mark joints that rotate and the ends of rods; each has the label of its joint.
         self._balls: list[tuple[str, Place]] = [
             (j.label or j.name, (j.outer, j.at)) for j in self._joints if j.kind != "prismatic"
         ]
@@ -159,7 +158,7 @@ class Scene:
         return self._members[key]
 
     def _on_platform(self, place: Place) -> bool:
-        """Return whether a point moves with the platform: on it, or of a joint with it."""
+        """Return whether a point is on the platform or at one of its joints."""
         graph, (body, point) = self.robot.graph, place
         if body == graph.platform:
             return True
@@ -170,7 +169,7 @@ class Scene:
         )
 
     def _find_radius(self, place: Place) -> float:
-        """Return the radius of the thickest bar at a point, else of a body's bar, m."""
+        """Return the radius of the thickest bar that ends at a point, m; without one the default."""
         near = 1e-6 * self.size
         at_end = [
             bar.radius
@@ -187,11 +186,11 @@ class Scene:
         :param shares: of the strain energy by element, which colour members and joints.
         """
         posture, graph = Posture(self.robot, q), self.robot.graph
-        colours = share_colours(shares or {})
+        colours = colour_by_share(shares or {})
         origin = posture.place(graph.platform, graph.origin)
         shift, turn = moved.platform[:3], Rotation.from_rotvec(moved.platform[3:])
 
-        def place(spot: Place) -> Array:
+        def move_point(spot: Place) -> Array:
             point = posture.place(*spot)
             if moved is RIGID:
                 return point
@@ -200,8 +199,8 @@ class Scene:
             member = moved.members.get(self._find_member(spot))
             return point if member is None else point + _interpolate_along(*member, point[None])[0]
 
-        def line(bar: Bar, pieces: int, name: str) -> Array:
-            first, last = place(bar.start), place(bar.end)
+        def draw_bar(bar: Bar, pieces: int, name: str) -> Array:
+            first, last = move_point(bar.start), move_point(bar.end)
             shares = np.linspace(0.0, 1.0, pieces + 1)[:, None]
             if (member := moved.members.get(name)) is None:
                 return np.asarray(first + shares * (last - first), np.float64)
@@ -212,8 +211,8 @@ class Scene:
 
         names = [beam.name for beam in self.robot.beams]
         names += [""] * (len(self.bars) - len(names))
-        lines = list(map(line, self.bars, self.pieces, names))
-        motors = [line(bar, 1, "") for bar in self._drives.values()]
+        lines = list(map(draw_bar, self.bars, self.pieces, names))
+        motors = [draw_bar(bar, 1, "") for bar in self._drives.values()]
         ends = np.concatenate([np.stack([a[:-1], a[1:]], axis=1) for a in (*lines, *motors)])
         thick = np.array([bar.radius for bar in self.bars])
         parts = dict.fromkeys(graph.rods, ROD) | {BASE: GROUND, graph.platform: PLATFORM}
@@ -223,15 +222,15 @@ class Scene:
         length = np.linalg.norm(along, axis=1)
         z = along / np.maximum(length, 1e-12)[:, None]
         z[length < 1e-12] = (0.0, 0.0, 1.0)
-        # Any direction across will do: a cylinder is round.
+        # Any x axis normal to z will do, as cylinders are round.
         least = np.eye(3)[np.argmin(np.abs(z), axis=1)]
         x = np.cross(least, z)
         x /= np.linalg.norm(x, axis=1, keepdims=True)
         turns = Rotation.from_matrix(np.stack([x, np.cross(z, x), z], axis=-1))
         at, turns, sizes = ends.mean(1), _convert_to_quaternions(turns), np.column_stack([radii, radii, length])
-        balls = [place(spot) for _, spot in self._balls]
+        balls = [move_point(spot) for _, spot in self._balls]
         ball_radii = np.array([1.25 * self._find_radius(spot) for _, spot in self._balls])
-        # Round ends, so that bars of one body meet without gaps.
+        # Balls at the ends close the gaps between bars of one body.
         tips = np.concatenate(lines)
         tip_radii = np.repeat(thick, self.pieces + 1)
         ball_colours = [colours.get(name, JOINT) for name, _ in self._balls]
@@ -259,9 +258,9 @@ class Scene:
         )
 
     def frames(self, q: Array, moved: Deflection) -> dict[str, tuple[Array, Array]]:
-        """Return the present places of each body's points, given at home in base axes.
+        """Return the displacement of each body from home: position (3,), m, and quaternion (4,), w first.
 
-        Position (3,), m, and quaternion (4,), w first; the platform's with its deflection.
+        The platform's includes its deflection.
         """
         posture, graph = Posture(self.robot, q), self.robot.graph
         result = {}
@@ -276,7 +275,7 @@ class Scene:
         return result
 
     def _make_motor(self, joint: Joint) -> Bar:
-        """Return the cylinder that stands for a drive, along its axis."""
+        """Return the cylinder that represents a drive, along the joint's axis."""
         axis, body, middle = joint.axes[0], joint.inner, joint.at
         radius = self._find_radius((joint.outer, joint.at))
         if is_telescope(joint):
@@ -290,8 +289,8 @@ class Scene:
             half, radius = 2.0 * radius, 1.6 * radius
         return Bar(joint.name, (body, middle - half * axis), (body, middle + half * axis), radius)
 
-    def box(self) -> tuple[Array, Array]:
-        """Least and greatest coordinates of the machine at home, (3,) m."""
+    def find_bounds(self) -> tuple[Array, Array]:
+        """Return the smallest and largest coordinates of the machine at home, (3,) m each."""
         points = np.array([spot[1] for bar in self.bars for spot in (bar.start, bar.end)])
         return points.min(0), points.max(0)
 
@@ -323,13 +322,13 @@ ANCHORS: Final = {
 """Offset of a label from its place, right and down, in halves of its size."""
 
 
-def anchors(spots: Array, sizes: Array, window: tuple[float, float]) -> list[str]:
-    """Return an anchor for each label, so that none covers another; empty if none is free.
+def choose_anchors(spots: Array, sizes: Array, window: tuple[float, float]) -> list[str]:
+    """Choose an anchor for each label so that no two labels overlap; empty if none is free.
 
-    What finds no place is placed first in another attempt.
+    Each attempt places first the labels that the previous attempt could not place.
 
-    :param spots: places named in the picture, (k, 2) pixels, right and down; ``sizes``: (k, 2).
-    :param window: width and height; a label outside of it is not placed.
+    :param spots: labelled points, (k, 2) pixels, right and down; ``sizes``: of labels, (k, 2).
+    :param window: width and height; labels have to be inside.
     """
     order, best = list(range(len(spots))), [""] * len(spots)
     for _ in spots:
@@ -352,7 +351,7 @@ def anchors(spots: Array, sizes: Array, window: tuple[float, float]) -> list[str
     return best
 
 
-def seen(points: Array, camera: Any) -> tuple[Array, Array]:
+def project_points(points: Array, camera: Any) -> tuple[Array, Array]:
     """Project points (k, 3) to pixels (k, 2), right and down, and distances (k,) along the view.
 
     :param camera: ``position``, ``wxyz`` (z ahead, y down), ``fov`` of the height in rad,
@@ -365,13 +364,13 @@ def seen(points: Array, camera: Any) -> tuple[Array, Array]:
     return pixels * size[1] / 2 / np.tan(camera.fov / 2) + size / 2, ahead
 
 
-def round_mesh(sides: int = 24, rings: int = 12) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+def make_round_meshes(sides: int = 24, rings: int = 12) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
     """Return vertices and triangles of a cylinder (radius and length 1, along z) and of a ball."""
     angle = np.arange(sides) * 2 * np.pi / sides
     ring = np.column_stack([np.cos(angle), np.sin(angle)])
     k, n = np.arange(sides), np.roll(np.arange(sides), -1)
     low, high = np.full((sides, 1), -0.5), np.full((sides, 1), 0.5)
-    # The lids have corners of their own, so that edges are sharp.
+    # The lids have their own vertices, so that the edges are shaded sharp.
     rims = [np.hstack([ring, z]) for z in (low, high, low, high)]
     tips = np.array([[0.0, 0.0, -0.5], [0.0, 0.0, 0.5]])
     wall = [np.column_stack([k, n, sides + n]), np.column_stack([k, sides + n, sides + k])]
@@ -389,8 +388,8 @@ def round_mesh(sides: int = 24, rings: int = 12) -> tuple[tuple[Array, Array], t
     return cylinder, (ball, np.concatenate(faces))
 
 
-def plate(corners: Array, thickness: float) -> tuple[Array, NDArray[np.int64]]:
-    """Return vertices and triangles of a plate of convex outline, both sides and the rim."""
+def make_plate(corners: Array, thickness: float) -> tuple[Array, NDArray[np.int64]]:
+    """Return vertices and triangles of a plate with a convex outline, both faces and the rim."""
     count = len(corners)
     normal = np.linalg.svd(corners - corners.mean(0))[2][2]
     aside = normal * thickness / 2
@@ -405,5 +404,5 @@ def plate(corners: Array, thickness: float) -> tuple[Array, NDArray[np.int64]]:
             np.column_stack([k, count + n, n]),
         ]
     )
-    # Seen from both sides: the order of the corners may go either way round.
+    # Triangles of both orientations, as the order of the corners is unknown.
     return vertices, np.concatenate([faces, faces[:, ::-1]])

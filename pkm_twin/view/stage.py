@@ -14,39 +14,50 @@ from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine.graph import BASE
-from pkm_twin.view.meshes import body_meshes
-from pkm_twin.view.scene import BODY, GROUND, PLATFORM, RIGID, Deflection, Scene, anchors, plate, round_mesh, seen
+from pkm_twin.view.meshes import read_body_meshes
+from pkm_twin.view.scene import (
+    BODY,
+    GROUND,
+    PLATFORM,
+    RIGID,
+    Deflection,
+    Scene,
+    choose_anchors,
+    make_plate,
+    make_round_meshes,
+    project_points,
+)
 
-FORCE: Final = (0, 158, 115)
-LETTER: Final = (7.4, 19.0)
-"""Width and height of a label's letter, at the most, pixels."""
-LOOK: Final = np.array([0.62, -0.95, 0.42])
-"""From where the machine is looked at, in its greatest extents from its middle."""
+ARROW_COLOUR: Final = (0, 158, 115)
+MAX_LETTER_PIXELS: Final = (7.4, 19.0)
+"""Largest width and height of a letter in a label, pixels."""
+VIEW_DIRECTION: Final = np.array([0.62, -0.95, 0.42])
+"""Direction from the machine's middle to the initial camera."""
 
 
-def farther(width: float, height: float) -> float:
-    """Return the factor on the camera's distance in a window that is narrower than high."""
+def fit_narrow_window(width: float, height: float) -> float:
+    """Return the factor on the camera's distance that fits the machine into a narrow window."""
     return max(1.0, height / width)
 
 
 class Stage:
-    """A machine on a server; all who look at it see the same."""
+    """Draw a machine on a viser server."""
 
     def __init__(self, server: Any, scene: Scene, q: Array, lowest: float) -> None:
         """Draw the ground below ``lowest``, the smallest z of the platform, m."""
         self._server, self._scene = server, scene
         draw, size, shapes = server.scene, scene.size, scene.shapes(q)
         draw.set_up_direction("+z")
-        # Lights of its own: a lit face has just the colour that it was given.
+        # Own lights, which show a lit face in its given colour.
         draw.configure_default_lights(False)
         draw.configure_environment_map(None)
         draw.add_light_ambient("/lights/all", intensity=1.5)
-        for name, place in (("key", LOOK * [-0.3, 0.5, 3.0]), ("back", -LOOK)):
+        for name, place in (("key", VIEW_DIRECTION * [-0.3, 0.5, 3.0]), ("back", -VIEW_DIRECTION)):
             bright = 1.7 if name == "key" else 0.4
             draw.add_light_directional(
                 f"/lights/{name}", intensity=bright, position=tuple(place.tolist()), cast_shadow=name == "key"
             )
-        low, high = scene.box()
+        low, high = scene.find_bounds()
         middle, reach = (low + high) / 2, float((high - low).max())
         cell = 10.0 ** np.floor(np.log10(reach))
         draw.add_grid(
@@ -63,25 +74,25 @@ class Stage:
             plane_opacity=1.0,
             shadow_opacity=0.35,
         )
-        self._server.on_client_connect(self._frame)
+        self._server.on_client_connect(self._fit_camera)
         camera = self._server.initial_camera
-        camera.position = tuple((middle + 1.15 * reach * LOOK).tolist())
+        camera.position = tuple((middle + 1.15 * reach * VIEW_DIRECTION).tolist())
         camera.look_at = tuple(middle.tolist())
         camera.up = (0.0, 0.0, 1.0)
-        draw.add_frame("/base", **_axes(0.12 * size, size))
+        draw.add_frame("/base", **_size_axes(0.12 * size, size))
         graph = scene.robot.graph
         feet = [j.at for j in graph.joints.values() if BASE in (j.inner, j.outer)]
         away = float(np.sign((graph.origin - np.mean(feet, axis=0))[2])) or 1.0
         if len(scene.base):
             draw.add_mesh_simple(
                 "/base_plate",
-                *plate(scene.base - [0.0, 0.0, 0.02 * away * size], 0.03 * size),
+                *make_plate(scene.base - [0.0, 0.0, 0.02 * away * size], 0.03 * size),
                 color=(150, 156, 164),
                 flat_shading=True,
             )
-        self._platform = draw.add_frame("/platform", **_axes(0.1 * size, size))
+        self._platform = draw.add_frame("/platform", **_size_axes(0.1 * size, size))
         # A flange and its axis on the platform.
-        (round_, faces), _ = round_mesh()
+        (round_, faces), _ = make_round_meshes()
         for name, radius, length in (("flange", 0.05, 0.03), ("tool", 0.012, 0.2)):
             shape = size * (round_ * [radius, radius, length] + [0.0, 0.0, away * length / 2])
             draw.add_mesh_simple(f"/platform/{name}", shape, faces, color=BODY)
@@ -90,11 +101,11 @@ class Stage:
             "/bars_at_rest", np.zeros((1, 2, 3)), colors=GROUND, thickness=1.5, thickness_units="screen", visible=False
         )
         if len(scene.platform):
-            moving = plate(scene.platform, 0.016 * size)
+            moving = make_plate(scene.platform, 0.016 * size)
             draw.add_mesh_simple("/platform/plate", *moving, color=PLATFORM, flat_shading=True)
-            still = plate(scene.platform, 0.01 * size)
+            still = make_plate(scene.platform, 0.01 * size)
             draw.add_mesh_simple("/at_rest/plate", *still, color=(110, 110, 110), opacity=0.35)
-        (cylinder, cylinder_faces), (ball, ball_faces) = round_mesh()
+        (cylinder, cylinder_faces), (ball, ball_faces) = make_round_meshes()
         self._cylinders = draw.add_batched_meshes_simple(
             "/machine/bars",
             cylinder,
@@ -116,9 +127,9 @@ class Stage:
             batched_colors=_to_linear(shapes.ball_colours),
             lod="off",
         )
-        # Frames of the bodies that have meshes; bars are seen through them.
+        # The meshes are transparent, so that bars are visible.
         self.meshes = {}
-        for k, (body, mesh) in enumerate(body_meshes(scene.robot).items()):
+        for k, (body, mesh) in enumerate(read_body_meshes(scene.robot).items()):
             self.meshes[body] = draw.add_frame(f"/meshes/{k}", show_axes=False)
             colour = {BASE: GROUND, scene.robot.graph.platform: PLATFORM}.get(body, BODY)
             draw.add_mesh_simple(f"/meshes/{k}/mesh", *mesh, color=colour, opacity=0.6)
@@ -128,7 +139,7 @@ class Stage:
             "/drag", 0.3 * size, disable_rotations=not rotates, depth_test=False, visible=False
         )
         self._trail = draw.add_line_segments(
-            "/trail", np.zeros((1, 2, 3)), colors=FORCE, thickness=0.006 * size, visible=False
+            "/trail", np.zeros((1, 2, 3)), colors=ARROW_COLOUR, thickness=0.006 * size, visible=False
         )
         self._named, self._element = True, ""
         self._places: dict[str, Array] = shapes.drives
@@ -138,14 +149,14 @@ class Stage:
         self._arrows = draw.add_arrows(
             "/wrench",
             np.zeros((2, 2, 3)),
-            _to_linear(np.array([FORCE, (204, 121, 167)])),
+            _to_linear(np.array([ARROW_COLOUR, (204, 121, 167)])),
             shaft_radius=0.008 * size,
             head_radius=0.02 * size,
             head_length=0.05 * size,
             visible=False,
         )
 
-    async def _frame(self, client: Any) -> None:
+    async def _fit_camera(self, client: Any) -> None:
         """Fit the camera to the whole machine, now and after each change of the window's size.
 
         A camera that the visitor has turned or moved stays where it is.
@@ -154,23 +165,22 @@ class Stage:
         middle = np.array(start.look_at)
         begin = np.array(start.position) - middle
         placed: deque[float] = deque(maxlen=16)
-        # One label a name, and one for the element: a browser may show the text and the place of a
-        # change one after the other.
+        # One label per name, since a browser may show a changed text before its changed position.
         labels = {
             name: client.scene.add_label(f"/names/{k}", name, visible=False)
             for k, name in enumerate(["", *self._drives])
         }
         self._labels[client.client_id] = client.camera, labels
 
-        async def fit(camera: Any) -> None:
-            # A browser may send any numbers: those of no window change nothing.
+        async def fit_to_window(camera: Any) -> None:
+            # Ignore invalid numbers from a browser.
             with contextlib.suppress(ArithmeticError, TypeError, ValueError):
-                self._arrange(camera, labels)
+                self._place_labels(camera, labels)
                 width, height = camera.image_width, camera.image_height
-                # Below this size the scene is being laid out.
+                # A smaller window is not laid out yet.
                 if not min(width, height) >= 100:
                     return
-                way, factor = camera.position - camera.look_at, farther(width, height)
+                way, factor = camera.position - camera.look_at, fit_narrow_window(width, height)
                 part = float(way @ begin / (begin @ begin))
                 ours = any(math.isclose(part, known, rel_tol=1e-3) for known in (1.0, *placed))
                 near = 1e-3 * float(np.linalg.norm(begin))
@@ -181,7 +191,7 @@ class Stage:
                     with client.atomic():
                         camera.position, camera.look_at = middle + factor * begin, middle
 
-        client.camera.on_update(fit)
+        client.camera.on_update(fit_to_window)
 
     def show_meshes(self, shown: bool) -> None:
         """Show or hide the meshes of the robot's file."""
@@ -193,8 +203,8 @@ class Stage:
     ) -> None:
         """Draw the machine at q (n,), with a deflection that is already enlarged.
 
-        At rest it is a shadow of the platform and lines along the bars. Elements have the colour of
-        their share, ``dominant`` has a label.
+        The undeflected platform and bars are drawn in grey. Elements are coloured by their share of
+        the strain energy; ``dominant`` gets a label.
         """
         shares = shares or {}
         shapes = self._scene.shapes(q, moved, shares)
@@ -219,23 +229,23 @@ class Stage:
         if dominant in shapes.places:
             self._element = f"{dominant}: {100 * shares[dominant]:.0f} % of the strain energy"
             self._places = {self._element: shapes.places[dominant]} | self._places
-        self._arrange_all()
+        self._place_all_labels()
 
-    def _arrange_all(self) -> None:
+    def _place_all_labels(self) -> None:
         for camera, labels in list(self._labels.values()):
             with contextlib.suppress(ArithmeticError, TypeError, ValueError):
-                self._arrange(camera, labels)
+                self._place_labels(camera, labels)
 
-    def _arrange(self, camera: Any, labels: Mapping[str, Any]) -> None:
-        """Put labels beside what they name, so that none covers another in this window."""
+    def _place_labels(self, camera: Any, labels: Mapping[str, Any]) -> None:
+        """Place the labels of one browser next to their points, without overlaps."""
         texts = [text for text in self._places if self._named or text == self._element]
         points = np.array([self._places[text] for text in texts]).reshape(-1, 3)
-        pixels, ahead = seen(points, camera)
-        # The element first, then what is nearest.
+        pixels, ahead = project_points(points, camera)
+        # The dominant element has priority, then the nearest points.
         order = sorted(range(len(texts)), key=lambda k: (texts[k] != self._element, ahead[k]))
-        sizes = np.array([[LETTER[0] * len(texts[k]) + 8.0, LETTER[1]] for k in order])
+        sizes = np.array([[MAX_LETTER_PIXELS[0] * len(texts[k]) + 8.0, MAX_LETTER_PIXELS[1]] for k in order])
         window = camera.image_width, camera.image_height
-        found = anchors(pixels[order], sizes.reshape(-1, 2), window)
+        found = choose_anchors(pixels[order], sizes.reshape(-1, 2), window)
         placed = {texts[k]: anchor for k, anchor in zip(order, found, strict=True) if anchor}
         for name, label in labels.items():
             text = name or self._element
@@ -246,14 +256,14 @@ class Stage:
     def draw_wrench(self, at: Array, part: Array) -> None:
         """Draw a wrench at the reference point: the force's arrow ends there, the moment's begins.
 
-        :param part: of the greatest wrench, (6,), base axes.
+        :param part: the wrench as a fraction of the largest wrench, (6,), base axes.
         """
         self._arrows.visible = bool(part.any())
         force, moment = 0.4 * self._scene.size * part.reshape(2, 3)
         self._arrows.points = np.array([[at - force, at], [at, at + moment]])
 
-    def leave_trail(self, shown: bool) -> None:
-        """Show or hide the line that the reference point draws; a new one begins now."""
+    def show_trail(self, shown: bool) -> None:
+        """Show or hide the path of the reference point; it begins at the present position."""
         self._trail.visible, self._passed = shown, []
 
     def extend_trail(self, at: Array) -> None:
@@ -266,13 +276,13 @@ class Stage:
         if len(passed) > 1:
             self._trail.points = np.stack([passed[:-1], passed[1:]], axis=1)
 
-    def name_drives(self, shown: bool) -> None:
+    def show_drive_names(self, shown: bool) -> None:
         """Show or hide the names of the drives."""
         self._named = shown
-        self._arrange_all()
+        self._place_all_labels()
 
 
-def _axes(length: float, size: float) -> dict[str, float]:
+def _size_axes(length: float, size: float) -> dict[str, float]:
     return {"axes_length": length, "axes_radius": 0.004 * size, "origin_radius": 0.008 * size}
 
 

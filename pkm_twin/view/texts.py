@@ -10,16 +10,16 @@ from typing import Final
 import numpy as np
 
 from pkm_twin.robot.robot import Robot
-from pkm_twin.view.live import Heard
+from pkm_twin.view.live import LiveValues
 from pkm_twin.view.model import Grade, Model, Numbers, State
-from pkm_twin.view.scene import share_colours
+from pkm_twin.view.scene import colour_by_share
 from pkm_twin.view.timeline import Instant, Timeline
 
 GRADES: Final[Mapping[Grade, str]] = {"good": "#009E73", "warn": "#B87800", "bad": "#D55E00"}
-"""Colours of Okabe and Ito; the middle one darker, so that text in it is read on white."""
+"""Colours of Okabe and Ito; the middle one is darkened for contrast on white."""
 MAX_LISTED_ELEMENTS: Final = 8
 """Largest number of listed elements; the shares of the others are summed."""
-SHEET: Final = """<style>
+STYLE_AND_LINK_SCRIPT: Final = """<style>
 .mantine-Slider-markLabel { font-size: 0.7rem !important; color: #343a40 !important; }
 .mantine-Flex-root > .mantine-NumberInput-root { width: 4.4rem !important; }
 @media (max-width: 36em) {
@@ -41,16 +41,16 @@ SHEET: Final = """<style>
     Object.getOwnPropertyDescriptor(HTMLInputElement.prototype, 'value').set.call(input, link);
     input.dispatchEvent(new Event('input', {bubbles: true}));
   }, 100)">"""
-"""An address with a link's query is handed to the text of the link, once.
+"""A query in the address is copied once into the field ``link``.
 
 In a narrow window the browser shows the sliders as a sheet at the bottom: it is as wide as the
 window, and the scene ends above it."""
 
-_BUTTON: Final = (
+_BUTTON_STYLE: Final = (
     "font:inherit;color:#fff;background:rgb(0,114,178);border:0;border-radius:4px;"
     "padding:0.3em 0.8em;margin-right:0.5em;cursor:pointer"
 )
-_COPY: Final = """
+_COPY_LINK_SCRIPT: Final = """
 const label = [...document.querySelectorAll('label')].find(l => l.innerText === 'link');
 const input = label.closest('.mantine-Flex-root').querySelector('input'), button = this;
 const whole = location.origin + location.pathname + input.value;
@@ -62,8 +62,8 @@ const plainly = () => {
   document.execCommand('copy'); text.remove(); done() };
 if (navigator.clipboard) navigator.clipboard.writeText(whole).then(done, plainly);
 else plainly()"""
-# A new size empties the scene until its next frame.
-_SAVE: Final = """
+# Setting the canvas size clears it until the next frame, so wait for a frame with content.
+_SAVE_PICTURE_SCRIPT: Final = """
 const scene = document.querySelector('canvas[data-engine]'), sheet = scene.cloneNode();
 const pen = sheet.getContext('2d'), link = document.createElement('a');
 const take = left => requestAnimationFrame(() => {
@@ -74,37 +74,37 @@ const take = left => requestAnimationFrame(() => {
   if (empty && left) return take(left - 1);
   link.href = sheet.toDataURL('image/png'); link.download = this.dataset.name; link.click() });
 take(200)"""
-_STYLE: Final = "font-size:0.82em;line-height:1.5;padding:0.15em 0.9em 0.4em"
+_BLOCK_STYLE: Final = "font-size:0.82em;line-height:1.5;padding:0.15em 0.9em 0.4em"
 
 
-def number(value: float) -> str:
+def format_number(value: float) -> str:
     """Format a number with four digits; rounding errors of zero are shown as 0."""
     return f"{value:.4g}" if abs(value) > 1e-12 else "0"
 
 
-def buttons(name: str) -> str:
+def write_buttons(name: str) -> str:
     """Write buttons that the browser handles itself: copy the link, save the scene as a PNG."""
     return (
-        f'<div style="{_STYLE}">'
-        f'<button id="copy" style="{_BUTTON}" onclick="{escape(_COPY)}">Copy link</button>'
-        f'<button id="save" style="{_BUTTON}" data-name="{escape(name)}.png" '
-        f'onclick="{escape(_SAVE)}">Save picture</button></div>'
+        f'<div style="{_BLOCK_STYLE}">'
+        f'<button id="copy" style="{_BUTTON_STYLE}" onclick="{escape(_COPY_LINK_SCRIPT)}">Copy link</button>'
+        f'<button id="save" style="{_BUTTON_STYLE}" data-name="{escape(name)}.png" '
+        f'onclick="{escape(_SAVE_PICTURE_SCRIPT)}">Save picture</button></div>'
     )
 
 
-def note(text: str) -> str:
+def write_note(text: str) -> str:
     """Return a line of plain text."""
-    return f'<div id="note" style="{_STYLE}">{escape(text)}</div>'
+    return f'<div id="note" style="{_BLOCK_STYLE}">{escape(text)}</div>'
 
 
-def status(model: Model, state: State, numbers: Numbers) -> str:
+def describe_state(model: Model, state: State, numbers: Numbers) -> str:
     """Describe singularity index, clearance, joints with their efforts at rest, and why a state is rejected."""
     gap = None if numbers.clearance is None else 1e3 * numbers.clearance
     rows = [
-        _judged(
+        _write_judged_row(
             "singularity", "singularity index", numbers.singularity, "", numbers.singularity_grade, "1 best, 0 singular"
         ),
-        _judged(
+        _write_judged_row(
             "clearance", "clearance between limbs", gap, "mm", numbers.clearance_grade, numbers.why.get("clearance", "")
         ),
     ]
@@ -114,10 +114,10 @@ def status(model: Model, state: State, numbers: Numbers) -> str:
         if state.refusal
         else '<div id="refusal"></div>'
     )
-    return f'<div style="{_STYLE}">{_write_table(rows)}{said}{_joints(model, state, numbers)}</div>'
+    return f'<div style="{_BLOCK_STYLE}">{_write_table(rows)}{said}{_write_joint_rows(model, state, numbers)}</div>'
 
 
-def _joints(model: Model, state: State, numbers: Numbers) -> str:
+def _write_joint_rows(model: Model, state: State, numbers: Numbers) -> str:
     robot = model.robot
     effort: Sequence[float | None] = [None] * len(state.q)
     if numbers.effort is not None:
@@ -137,12 +137,12 @@ def _joints(model: Model, state: State, numbers: Numbers) -> str:
     return _write_table(rows) + (f"<div>efforts: {escape(why)}</div>" if why else "")
 
 
-def load(numbers: Numbers) -> str:
-    """Deflection of the platform and the elements by their share of the strain energy."""
+def describe_load(numbers: Numbers) -> str:
+    """Describe the platform's deflection, and the elements by their share of the strain energy."""
     energy = numbers.energy
     if energy is None:
         why = numbers.why.get("energy", "")
-        return f'<div style="{_STYLE}">no elasticity: {escape(why)}</div>'
+        return f'<div style="{_BLOCK_STYLE}">no elasticity: {escape(why)}</div>'
     rows = [_write_head("deflection", "along", "about")]
     moved = 1e6 * np.asarray(energy.deflection)
     for k, axis in enumerate("xyz"):
@@ -157,15 +157,15 @@ def load(numbers: Numbers) -> str:
     shares = dict(zip(energy.elements, np.asarray(energy.factors).tolist(), strict=True))
     total = _write_row("strain energy", _write_value("energy", float(energy.total), "J"))
     return (
-        f'<div style="{_STYLE}">{_write_table(rows)}{_write_table([total])}'
+        f'<div style="{_BLOCK_STYLE}">{_write_table(rows)}{_write_table([total])}'
         f'<div>dominant element <b id="dominant">{escape(str(energy.dominant))}</b>{tie}</div>'
-        f"{bars(shares)}</div>"
+        f"{draw_share_bars(shares)}</div>"
     )
 
 
-def bars(shares: Mapping[str, float]) -> str:
+def draw_share_bars(shares: Mapping[str, float]) -> str:
     """Draw bars of the elements' shares, the largest first, in the colours of the scene."""
-    colours = share_colours(shares)
+    colours = colour_by_share(shares)
     order = sorted(colours, key=lambda name: -shares[name])
     rows = []
     for k, name in enumerate(order[:MAX_LISTED_ELEMENTS]):
@@ -184,7 +184,7 @@ def bars(shares: Mapping[str, float]) -> str:
     return _write_table(rows) + more
 
 
-def instant(robot: Robot, timeline: Timeline, at: Instant) -> str:
+def describe_instant(robot: Robot, timeline: Timeline, at: Instant) -> str:
     """Describe the bag at one time: each joint's measured effort, the twin's, and the residual."""
     rows = [_write_head("joint", "measured", "model", "residual")]
     columns = (("measured", at.measured), ("twin", at.twin), ("residual", at.residual))
@@ -194,10 +194,10 @@ def instant(robot: Robot, timeline: Timeline, at: Instant) -> str:
         rows.append(_write_row(escape(name), *cells))
     why = f"<div>no torques: {escape(timeline.why)}</div>" if timeline.why else ""
     time = _write_row("time", _write_value("bag_time", at.time, "s"))
-    return f'<div style="{_STYLE}">{_write_table([time])}{_write_table(rows)}{why}</div>'
+    return f'<div style="{_BLOCK_STYLE}">{_write_table([time])}{_write_table(rows)}{why}</div>'
 
 
-def heard(robot: Robot, live: Heard, waiting: str) -> str:
+def describe_live_values(robot: Robot, live: LiveValues, waiting: str) -> str:
     """Describe the messages of running nodes: efforts, residuals, dominant element, rejections."""
     rows = [_write_head("joint", "torque", "residual")]
     for k, name in enumerate(robot.joint_names):
@@ -217,11 +217,11 @@ def heard(robot: Robot, live: Heard, waiting: str) -> str:
         )
     if live.dominant:
         text += f'<div>dominant element <b id="live_dominant">{escape(live.dominant)}</b></div>'
-    return f'<div style="{_STYLE}">{_write_table(rows)}{text}{bars(live.shares)}</div>'
+    return f'<div style="{_BLOCK_STYLE}">{_write_table(rows)}{text}{draw_share_bars(live.shares)}</div>'
 
 
-def _judged(key: str, what: str, value: float | None, unit: str, grade: Grade, hint: str) -> str:
-    # Text and colour both say it: not everybody sees the colour.
+def _write_judged_row(key: str, what: str, value: float | None, unit: str, grade: Grade, hint: str) -> str:
+    # Words besides the colour, for colour-blind readers.
     words, colour = {"good": "", "warn": " low", "bad": " too low"}[grade], GRADES[grade]
     if value is None:
         words, colour = " unknown", "inherit"
@@ -234,7 +234,7 @@ def _write_value(key: str, value: float | None, unit: str, colour: str = "inheri
     if value is None:
         return f'<span id="{key}">{"&ndash;"}</span>'
     weight = ";font-weight:700" if bold else ""
-    shown = f'<span id="{key}" style="color:{colour}{weight}">{number(value)}</span>'
+    shown = f'<span id="{key}" style="color:{colour}{weight}">{format_number(value)}</span>'
     return f"{shown}&nbsp;{escape(unit)}" if unit else shown
 
 

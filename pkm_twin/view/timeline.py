@@ -14,15 +14,16 @@ from pkm_twin.paths.along import model_efforts
 from pkm_twin.recordings import Recording
 from pkm_twin.robot.plausibility import why_no_torques
 
-POINTS: Final = 800
-"""Points of a curve that are drawn."""
+MAX_CURVE_POINTS: Final = 800
+"""Largest number of drawn points per curve."""
 
 
 @dataclass(frozen=True, eq=False)
 class Instant:
-    """One sample: q (n,); twin and measured effort and their difference (n,), N m or N.
+    """One sample of a recording: q (n,); the model's (``twin``) and measured efforts (n,), N m or N.
 
-    ``None`` is not known: no masses, no efforts in the bag, or a window that is not full here.
+    An effort is None if unknown: no masses, no efforts in the bag, or an incomplete window of
+    differentiation.
     """
 
     index: int
@@ -34,7 +35,7 @@ class Instant:
 
     @property
     def residual(self) -> Array | None:
-        """Measured less the twin's, shape (n,)."""
+        """Measured minus model efforts, shape (n,)."""
         if self.twin is None or self.measured is None:
             return None
         return self.measured - self.twin
@@ -42,10 +43,11 @@ class Instant:
 
 @dataclass(frozen=True, eq=False)
 class Timeline:
-    """time (k,) s since the first sample; q (k, n); twin (k, n), NaN where it is not known.
+    """A recording with the model's efforts, ``twin``.
 
-    ``measured`` (k, n) and ``wrench`` (k, 6, base axes) where the bag has them. ``why``: why there
-    are no torques of the twin; empty where there are.
+    ``time`` (k,), s since the first sample; ``q`` (k, n); ``twin`` (k, n), NaN where unknown;
+    ``measured`` (k, n) and ``wrench`` (k, 6, base axes) if recorded. ``why``: why there are no
+    model efforts; empty if there are.
     """
 
     time: Array
@@ -56,11 +58,11 @@ class Timeline:
     why: str
 
     @classmethod
-    def of(cls, recording: Recording) -> Timeline:
-        """Return the time line of a recording.
+    def from_recording(cls, recording: Recording) -> Timeline:
+        """Compute the model's efforts along a recording.
 
-        :raises UnreachableError: a joint state that the machine cannot be assembled in.
-        :raises SingularityError: one in a singularity.
+        :raises UnreachableError: a joint state in which the machine cannot be assembled.
+        :raises SingularityError: a joint state at a singularity.
         """
         why = why_no_torques(recording.robot)
         twin: Array | None = None
@@ -78,7 +80,7 @@ class Timeline:
         """Time of the last sample, s."""
         return float(self.time[-1])
 
-    def at(self, time: float) -> Instant:
+    def sample_at(self, time: float) -> Instant:
         """Return the sample that is nearest to a time, s."""
         right = int(np.clip(np.searchsorted(self.time, time), 0, len(self.time) - 1))
         left = max(0, right - 1)
@@ -93,13 +95,13 @@ class Timeline:
             None if self.measured is None else self.measured[k],
         )
 
-    def curves(self) -> tuple[Array, Array, Array | None]:
-        """Return times (j,), the twin's and the measured efforts (j, n) where the twin has any.
+    def sample_curves(self) -> tuple[Array, Array, Array | None]:
+        """Return times (j,), model and measured efforts (j, n) of at most MAX_CURVE_POINTS samples.
 
-        No more than POINTS of them, evenly taken.
+        Samples without model efforts are left out.
         """
         if self.twin is None:
             return np.zeros(0), np.zeros((0, self.q.shape[1])), None
         known = np.flatnonzero(~np.isnan(self.twin).any(1))
-        rows = known[:: max(1, -(-len(known) // POINTS))]
+        rows = known[:: max(1, -(-len(known) // MAX_CURVE_POINTS))]
         return (self.time[rows], self.twin[rows], None if self.measured is None else self.measured[rows])

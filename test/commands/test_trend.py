@@ -17,7 +17,7 @@ from test.commands.conftest import REPOSITORY
 from test.support.robots import load, often
 
 DAY = 86400.0
-night = runpy.run_path(str(REPOSITORY / "examples/nights.py"))["night"]
+write_night = runpy.run_path(str(REPOSITORY / "examples/nights.py"))["write_night"]
 """A recording of one motion, as the example makes it."""
 
 
@@ -79,7 +79,7 @@ def test_many_write_at_once_and_none_is_lost(tmp_path):
 def test_a_recording_tells_friction_and_payload(tmp_path, rng):
     robot = load("delta")
     viscous, coulomb = (0.05, 0.1, 0.2), (0.1, 0.3, 0.2)
-    path = night(tmp_path / "night.csv", robot, rng, viscous, coulomb, 0.12)
+    path = write_night(tmp_path / "night.csv", robot, rng, viscous, coulomb, 0.12)
     found = {(m.quantity, m.part): m for m in measure(read(path, robot))}
     for k, name in enumerate(robot.joint_names):
         for what, true in (("viscous", viscous), ("coulomb", coulomb)):
@@ -97,7 +97,7 @@ def test_nights_to_a_verdict(twin, tmp_path, monkeypatch, rng):
     monkeypatch.chdir(tmp_path)
     robot = load("delta")
     sound, worn = (
-        measure(read(night(tmp_path / f"{c}.csv", robot, rng, coulomb=[c, 0.1, 0.1]), robot)) for c in (0.1, 0.5)
+        measure(read(write_night(tmp_path / f"{c}.csv", robot, rng, coulomb=[c, 0.1, 0.1]), robot)) for c in (0.1, 0.5)
     )
     for k in range(8):
         numbers = [

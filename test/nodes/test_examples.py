@@ -47,7 +47,7 @@ def test_a_robot_without_limits_has_a_way_to_go_too(tmp_path, monkeypatch):
     """Limits are optional in a file, joint by joint."""
     monkeypatch.syspath_prepend(EXAMPLES)
     client = importlib.import_module("trajectory_client")
-    np.testing.assert_allclose(client.reaches(ROBOT, 0.1), 0.22)
+    np.testing.assert_allclose(client.choose_travel(ROBOT, 0.1), 0.22)
     data = parameters_of("five_bar")
     _, (low, high) = load("five_bar").limits.position
     for expected in ([1.0, high - low], [1.0, 1.0]):
@@ -55,7 +55,7 @@ def test_a_robot_without_limits_has_a_way_to_go_too(tmp_path, monkeypatch):
         del joint["limits"]
         path = tmp_path / "free.yaml"
         path.write_text(yaml.safe_dump(data, sort_keys=False))
-        np.testing.assert_allclose(client.reaches(load(path), 0.1), 0.1 * np.array(expected))
+        np.testing.assert_allclose(client.choose_travel(load(path), 0.1), 0.1 * np.array(expected))
 
 
 @pytest.mark.parametrize("name", ["trajectory_client.py", "computed_torque.py"])

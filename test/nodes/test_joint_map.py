@@ -298,7 +298,7 @@ def test_the_page_that_listens(both):
     live.take("state", states(both, q)[1])
     live.take("torque", torques(both, effort))
     live.take("residual", torques(both, 0.1 * effort, NOW))
-    heard = live.heard()
+    heard = live.read_latest()
     assert heard.refused == 0
     close(heard.q, q)
     close(heard.traces["torque"][1][-1], effort)

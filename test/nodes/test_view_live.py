@@ -9,7 +9,7 @@ pytest.importorskip("rclpy", exc_type=ImportError)
 from sensor_msgs.msg import JointState
 
 from delta_dynamics import inverse_dynamics
-from pkm_twin.apps.commands.view import listening
+from pkm_twin.apps.commands.view import receive_messages
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.view.live import Live
 from test.nodes.harness import Maker, Ros
@@ -37,11 +37,11 @@ def test_a_running_nodes_torques_and_residuals_are_heard(domain, peer, launch, m
         message = make.joint_state(robot.joint_names, q, rest, measured, stamp=peer.now())
         peer.send("/cell/joint_states", message)
 
-    with listening(live, "cell"):
+    with receive_messages(live, "cell"):
         peer.until(peer.matched)
         # A residual goes with every torque from the first full window on.
-        peer.until(lambda: {"state", "torque", "residual"} <= set(live.heard().counts), repeat=send)
-        heard = live.heard()
+        peer.until(lambda: {"state", "torque", "residual"} <= set(live.read_latest().counts), repeat=send)
+        heard = live.read_latest()
     np.testing.assert_array_equal(heard.q, q)
     np.testing.assert_allclose(heard.traces["torque"][1][-1], expected, atol=1e-9)
     np.testing.assert_allclose(heard.traces["residual"][1][-1], 0.25, atol=1e-9)
@@ -52,5 +52,5 @@ def test_a_running_nodes_torques_and_residuals_are_heard(domain, peer, launch, m
 def test_a_namespace_that_is_none_is_refused(domain, monkeypatch):
     monkeypatch.setenv("ROS_DOMAIN_ID", str(domain.number))
     told = pytest.raises(PkmTwinError, match="--namespace 'a b'")
-    with told, listening(Live(load("delta_cu")), "a b"):
+    with told, receive_messages(Live(load("delta_cu")), "a b"):
         pass

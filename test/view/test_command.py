@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 
 from pkm_twin.robot.limits import beyond_limits
-from pkm_twin.view.scene import seen
-from pkm_twin.view.texts import number
+from pkm_twin.view.scene import project_points
+from pkm_twin.view.texts import format_number
 from stiffness_monitor import strain_energy
 from test.commands.conftest import DELTA, REPOSITORY
 from test.maps.browser import Browser, find_browser
@@ -74,7 +74,7 @@ def test_without_viser_the_line_says_what_brings_it(twin, monkeypatch):
 
 
 @contextlib.contextmanager
-def serving(*arguments):
+def run_server(*arguments):
     """A running command and the address that it prints."""
     running = subprocess.Popen(
         [sys.executable, "-m", "pkm_twin.apps.cli", "view", *map(str, arguments), "--port", "0"],
@@ -98,7 +98,7 @@ def serving(*arguments):
 @pytest.mark.parametrize("number", partly_long([signal.SIGINT, signal.SIGTERM], signal.SIGTERM))
 @needs_viser
 def test_a_signal_ends_it_quietly(number):
-    with serving("five_bar") as (running, _):
+    with run_server("five_bar") as (running, _):
         running.send_signal(number)
         out, err = running.communicate()
         assert (running.returncode, out, err) == (130, "", "")
@@ -149,28 +149,28 @@ def addresses(browser):
 @pytest.mark.timeout(1800)  # without a graphics card, on a machine that has much else to do
 def test_a_slider_moves_the_machine_and_the_numbers_are_the_cores(browser):
     robot = load("delta_cu")
-    with serving("delta_cu") as (_, address):
+    with run_server("delta_cu") as (_, address):
         browser.visit(address)
-        browser.until(f"{TEXT % 'q_0'} === '{number(0.2)}'")
+        browser.until(f"{TEXT % 'q_0'} === '{format_number(0.2)}'")
         assert float(browser.run(VALUE % 0)) == 0.2
         q = robot.inverse(robot.home())
         q[0] = moved(browser, 0, "ArrowRight")
-        browser.until(f"{TEXT % 'q_0'} === '{number(q[0])}'")
+        browser.until(f"{TEXT % 'q_0'} === '{format_number(q[0])}'")
         pose = robot.forward(q)
-        assert read(browser, "singularity") == number(float(robot.singularity(q)))
+        assert read(browser, "singularity") == format_number(float(robot.singularity(q)))
         # The pose's sliders have followed, to a slider's step.
         shown = [float(browser.run(VALUE % k)) for k in (3, 4, 5)]
         np.testing.assert_allclose(shown, pose, atol=1e-3)
         # And the other way round.
         pose[2] = moved(browser, 5, "ArrowLeft")
         q = robot.inverse(pose)
-        browser.until(f"{TEXT % 'q_1'} === '{number(q[1])}'")
-        assert read(browser, "q_0") == number(q[0])
+        browser.until(f"{TEXT % 'q_1'} === '{format_number(q[1])}'")
+        assert read(browser, "q_0") == format_number(q[0])
         # An end of the range that cannot be: words, and the machine stays.
         moved(browser, 5, "Home")
         browser.until(f"({TEXT % 'refusal'}).length > 10")
         assert "limits" in read(browser, "refusal") or "unreachable" in read(browser, "refusal")
-        assert read(browser, "q_0") == number(q[0])
+        assert read(browser, "q_0") == format_number(q[0])
         # A force of one step, and what it does.
         browser.run(TAB)
         browser.press("ArrowRight")
@@ -180,8 +180,8 @@ def test_a_slider_moves_the_machine_and_the_numbers_are_the_cores(browser):
         wrench[0] = moved(browser, 6, "ArrowRight")
         energy = strain_energy(robot, pose, wrench)
         browser.until(f"{TEXT % 'dominant'} === '{energy.dominant}'")
-        assert read(browser, "deflection_0") == number(1e6 * energy.deflection[0])
-        assert read(browser, "energy") == number(float(energy.total))
+        assert read(browser, "deflection_0") == format_number(1e6 * energy.deflection[0])
+        assert read(browser, "energy") == format_number(float(energy.total))
         assert addresses(browser) == {"127.0.0.1"}
         assert colours(browser.picture()) > 200
 
@@ -236,11 +236,11 @@ def test_every_control_does_what_it_says(browser, tmp_path):
     pose = robot.home() + np.array([0.02, -0.01])
     browser.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
     browser.call("Browser.grantPermissions", permissions=["clipboardReadWrite", "clipboardSanitizedWrite"])
-    with serving("five_bar") as (_, address):
+    with run_server("five_bar") as (_, address):
         link = f"?robot=five_bar&pose={pose[0]:.9g},{pose[1]:.9g}&load=0,5,0,0,0,0"
         browser.resize(500, 900)
         browser.visit(address + link)
-        browser.until(f"{TEXT % 'q_0'} === '{number(robot.inverse(pose)[0])}'")
+        browser.until(f"{TEXT % 'q_0'} === '{format_number(robot.inverse(pose)[0])}'")
         assert_fits(browser)
         energy = strain_energy(robot, pose, [0.0, 5.0, 0.0, 0.0, 0.0, 0.0])
         assert browser.until(f"{LINK}.value") == link
@@ -259,7 +259,7 @@ def test_every_control_does_what_it_says(browser, tmp_path):
         browser.run(TAB)
         browser.press("ArrowRight")
         browser.until(f"{TEXT % 'energy'} && {TEXT % 'energy'} !== '0'")
-        assert read(browser, "energy") != number(float(energy.total))
+        assert read(browser, "energy") != format_number(float(energy.total))
         clicked(browser, "Go to the softest pose")
         assert "µm" in browser.until(f"({TEXT % 'note'} || '').includes('along') && {TEXT % 'note'}")
         clicked(browser, "No wrench")
@@ -285,10 +285,10 @@ def pressed(browser, selector, test):
 def page():
     """A page of this process, its loop in a thread."""
     from pkm_twin.view.model import Model
-    from pkm_twin.view.page import Page, serving
+    from pkm_twin.view.page import Page, run_server
     from pkm_twin.view.panels import ModePanel
 
-    with serving(0) as server:
+    with run_server(0) as server:
         page = Page(server, Model(load("delta_cu")))
         page.mode = ModePanel(page)
         page.address = f"http://127.0.0.1:{server.get_port()}/"
@@ -318,7 +318,7 @@ def test_the_mouse_drags_the_platform_along_one_axis_within_limits_and_chooses_a
         ends = at + np.outer([0.24, 0.24 + way / 2, 0.24 + way], reach[axis])
 
         def drag(ends=ends):
-            browser.drag(*seen(ends, camera())[0].tolist(), pause=look)
+            browser.drag(*project_points(ends, camera())[0].tolist(), pause=look)
 
         wait_until(lambda p=pose: (page.state.pose != p).any() or page.state.refusal, drag, 60.0, "")
         wait_until(lambda: not page._dragged, look, 60.0, "")
@@ -357,7 +357,7 @@ def colours(png):
     ids=str,
 )
 def test_every_kind_of_machine_is_shown(browser, arguments, tmp_path):
-    with serving(*arguments) as (_, address):
+    with run_server(*arguments) as (_, address):
         browser.visit(address)
         assert float(browser.until(TEXT % "singularity")) > 0.0
         if "--bag" in arguments:

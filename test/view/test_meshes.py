@@ -13,7 +13,7 @@ if find_spec("trimesh") is None:
 from pkm_twin import load
 from pkm_twin.errors import RobotWarning
 from pkm_twin.robot.outline import Posture
-from pkm_twin.view.meshes import body_meshes
+from pkm_twin.view.meshes import read_body_meshes
 from pkm_twin.view.scene import RIGID, Scene
 from test.commands.conftest import REPOSITORY
 
@@ -41,7 +41,7 @@ def test_a_mesh_moves_with_its_link(tmp_path, filename, rng):
     folder = tmp_path / "cell"
     folder.mkdir()
     robot = load(written(folder, filename.format(folder), scale=0.001))
-    (found,) = body_meshes(robot).values()
+    (found,) = read_body_meshes(robot).values()
     corners = found[0][found[1]].reshape(-1, 3)
     graph, scene = robot.graph, Scene(robot)
     for _ in range(5):
@@ -59,7 +59,7 @@ def test_a_mesh_moves_with_its_link(tmp_path, filename, rng):
 def test_a_mesh_that_cannot_be_read_is_named_and_left_out(tmp_path, filename):
     robot = load(written(tmp_path, filename))
     with pytest.warns(RobotWarning, match=f"mesh '{filename}'.*it is not shown"):
-        assert body_meshes(robot).keys() <= {"upper_left"}
+        assert read_body_meshes(robot).keys() <= {"upper_left"}
 
 
 def test_an_invalid_place_of_a_mesh_does_not_stop_the_machine(tmp_path):

@@ -15,17 +15,17 @@ from pkm_twin.robot.clearance import clearance, has_clearance
 from pkm_twin.robot.outline import Posture, is_telescope
 from pkm_twin.view import texts
 from pkm_twin.view.drawing import draw
-from pkm_twin.view.model import Model, _round, _step
+from pkm_twin.view.model import Model, _choose_step, _round_up
 from pkm_twin.view.scene import (
     ANCHORS,
+    ENERGY_COLOURS,
     RIGID,
-    SCALE,
     Deflection,
     Scene,
-    anchors,
-    plate,
-    round_mesh,
-    share_colours,
+    choose_anchors,
+    colour_by_share,
+    make_plate,
+    make_round_meshes,
 )
 from stiffness_monitor import compliance
 from stiffness_monitor.compliance import member_deflections
@@ -104,11 +104,11 @@ def test_no_slider_leads_to_an_exception(name, rng):
             np.testing.assert_array_equal(state.pose, model.start.pose)
         else:
             np.testing.assert_allclose(model.robot.forward(state.q), pose, rtol=0, atol=1e-6)
-        assert np.isfinite(model.numbers(state).singularity)
+        assert np.isfinite(model.compute_numbers(state).singularity)
     far = model.to_pose(model.start, np.full(len(low), 50.0))
     assert far.refusal
     assert model.to_joints(model.start, np.full(len(model.start.q), np.nan)).refusal
-    assert model.loaded(model.start, np.full(6, np.inf)).refusal
+    assert model.apply_wrench(model.start, np.full(6, np.inf)).refusal
     assert 0 < refused <= 10
 
 
@@ -116,13 +116,13 @@ def test_no_slider_leads_to_an_exception(name, rng):
 def test_a_link_carries_pose_and_load(name, rng):
     model = model_of(name)
     wrench = np.array([3.0, -2.0, 5.0, 0.1, 0.0, -0.3])
-    state = model.loaded(model.to_pose(model.start, states(model, 8, rng)[0].pose), wrench)
-    for given in (state, model.loaded(state, np.zeros(6))):
-        opened = model.linked(model.start, f"http://127.0.0.1:8080/{model.link(given)}")
+    state = model.apply_wrench(model.to_pose(model.start, states(model, 8, rng)[0].pose), wrench)
+    for given in (state, model.apply_wrench(state, np.zeros(6))):
+        opened = model.open_link(model.start, f"http://127.0.0.1:8080/{model.write_link(given)}")
         assert opened.refusal == ""
         np.testing.assert_allclose(opened.pose, given.pose, rtol=1e-8, atol=1e-12)
         np.testing.assert_array_equal(opened.wrench, given.wrench)
-        assert model.link(opened) == model.link(given)
+        assert model.write_link(opened) == model.write_link(given)
 
 
 @every_model
@@ -143,18 +143,18 @@ def test_a_dragged_platform_goes_where_it_can(name, rng):
 
 def test_zero_but_for_rounding_has_no_sign():
     """Of a number on the page, of a link, of a slider."""
-    assert [texts.number(x) for x in (-0.0, -1e-13, 1e-13, -2.0)] == ["0", "0", "0", "-2"]
+    assert [texts.format_number(x) for x in (-0.0, -1e-13, 1e-13, -2.0)] == ["0", "0", "0", "-2"]
     model = model_of("five_bar")
-    pushed = model.loaded(model.start, np.array([-0.0, 5.0, -1e-13, 0.0, 0.0, 0.0]))
-    assert model.link(pushed).endswith("load=0,5,0,0,0,0")
+    pushed = model.apply_wrench(model.start, np.array([-0.0, 5.0, -1e-13, 0.0, 0.0, 0.0]))
+    assert model.write_link(pushed).endswith("load=0,5,0,0,0,0")
     slider = SimpleNamespace(value=1.0, min=-100.0, max=100.0)
-    pytest.importorskip("pkm_twin.view.page")._put([slider], np.array([-1e-14]))
+    pytest.importorskip("pkm_twin.view.page")._set_sliders([slider], np.array([-1e-14]))
     assert str(slider.value) == "0.0"
 
 
 def test_a_link_that_says_something_else_changes_nothing():
     model = model_of("five_bar")
-    good = model.link(model.start)
+    good = model.write_link(model.start)
     for link in (
         "",
         "?",
@@ -167,7 +167,7 @@ def test_a_link_that_says_something_else_changes_nothing():
         "?robot=five_bar&pose=0,x",
         "?robot=five_bar&pose=9,9",
     ):
-        state = model.linked(model.start, link)
+        state = model.open_link(model.start, link)
         assert state.refusal, link
         assert state.q is model.start.q
         assert not state.wrench.any()
@@ -186,7 +186,7 @@ def test_the_softest_pose_is_softer_than_all_others(rng):
             return np.linalg.eigvalsh(block[:3, :3])[-1]
 
         parts = []
-        q, told = model.softest(wrench, parts.append)
+        q, told = model.find_softest_pose(wrench, parts.append)
         assert parts == sorted(parts)
         found = model.to_joints(model.start, q)
         assert found.refusal == ""
@@ -234,7 +234,7 @@ def test_numbers_are_the_cores(name, rng):
     known = {"clearance": has_clearance(robot), "energy": has(robot, "structure")}
     known["effort"] = has(robot, "massive")
     for state in states(model, 5, rng)[:2]:
-        got = model.numbers(model.loaded(state, wrench))
+        got = model.compute_numbers(model.apply_wrench(state, wrench))
         assert {what: what not in got.why for what in known} == known
         assert got.singularity == pytest.approx(float(robot.singularity(state.q)), rel=1e-12)
         assert got.singularity_grade == ("good" if got.singularity >= 0.05 else "warn")
@@ -252,30 +252,30 @@ def test_numbers_are_the_cores(name, rng):
         if "energy" not in got.why:
             moved = compliance(robot, state.pose) @ wrench
             np.testing.assert_allclose(got.energy.deflection, moved, rtol=1e-7)
-        html = texts.status(model, state, got) + texts.load(got)
+        html = texts.describe_state(model, state, got) + texts.describe_load(got)
         for key in ("singularity", "clearance", "q_0", "refusal"):
             assert html.count(f'id="{key}"') == 1
 
 
 def test_what_is_not_known_is_said(tmp_path):
     model = model_of(rigid("stewart", tmp_path / "rigid.yaml"))
-    numbers = model.numbers(model.start)
+    numbers = model.compute_numbers(model.start)
     assert numbers.energy is None
     assert "member" in numbers.why["energy"]
     assert "diameters" in numbers.why["clearance"]
-    assert "member" in texts.load(numbers)
+    assert "member" in texts.describe_load(numbers)
 
 
 def test_names_cannot_write_into_the_page():
     model = model_of("five_bar")
     state = model.to_joints(model.start, model.start.q)
     bad = type(state)(state.q, state.pose, state.wrench, "<script>alert(1)</script>")
-    assert "<script>" not in texts.status(model, bad, model.numbers(bad))
+    assert "<script>" not in texts.describe_state(model, bad, model.compute_numbers(bad))
 
 
 def test_steps_and_rounding():
-    assert [_step(span) for span in (2.2, 0.42, 200.0)] == [0.001, 0.001, 0.1]
-    assert [_round(value) for value in (0.7, 1.0, 1.3, 34.0, 61.0)] == [1.0, 1.0, 2.0, 50.0, 100.0]
+    assert [_choose_step(span) for span in (2.2, 0.42, 200.0)] == [0.001, 0.001, 0.1]
+    assert [_round_up(value) for value in (0.7, 1.0, 1.3, 34.0, 61.0)] == [1.0, 1.0, 2.0, 50.0, 100.0]
 
 
 @every_model
@@ -308,11 +308,11 @@ def test_bars_keep_their_lengths_and_the_platform_carries_what_is_on_it(name, rn
 def test_a_deflected_machine_stays_together_and_moves_as_its_members(name):
     """What joints without a slide join stays joined, drives stay on their legs."""
     model = model_of(name)
-    scene, state = Scene(model.robot), model.loaded(model.start, [10.0, 5, -20, 0, 0, 0])
-    deflection = model.numbers(state).energy.deflection
+    scene, state = Scene(model.robot), model.apply_wrench(model.start, [10.0, 5, -20, 0, 0, 0])
+    deflection = model.compute_numbers(state).energy.deflection
     # So small that turns are linear.
     factor = 1e-4 * scene.size / np.abs(deflection).max()
-    moved = model.deflected(state, deflection).times(factor)
+    moved = model.compute_deflection(state, deflection).times(factor)
     rest, after = scene.shapes(state.q), scene.shapes(state.q, moved)
     last = np.cumsum(scene.pieces) - 1
     tips = np.column_stack([last - scene.pieces + 1, last]), [0, 1]
@@ -345,14 +345,14 @@ def test_a_deflected_machine_stays_together_and_moves_as_its_members(name):
 def test_every_element_has_a_place_and_its_colour():
     for name in ("delta_cu", "prru", "upr_rpu", "stewart", "linear_delta"):
         model = model_of(name)
-        energy = model.numbers(model.loaded(model.start, [10.0, 5, -20, 0, 0, 0])).energy
+        energy = model.compute_numbers(model.apply_wrench(model.start, [10.0, 5, -20, 0, 0, 0])).energy
         shares = dict(zip(energy.elements, energy.factors.tolist(), strict=True))
         shapes = Scene(model.robot).shapes(model.start.q, RIGID, shares)
         assert set(energy.elements) <= set(shapes.places)
-        last = tuple(SCALE[-1].astype(int))
+        last = tuple(ENERGY_COLOURS[-1].astype(int))
         assert last in {tuple(c) for c in [*shapes.cylinder_colours, *shapes.ball_colours]}
-        assert share_colours(shares)[energy.dominant] == last
-    assert share_colours({"a": 0.0}) == {}
+        assert colour_by_share(shares)[energy.dominant] == last
+    assert colour_by_share({"a": 0.0}) == {}
 
 
 def test_labels_do_not_cover_each_other(rng):
@@ -361,7 +361,7 @@ def test_labels_do_not_cover_each_other(rng):
     for window in (300, 300), (500, 400), (1400, 900):
         spots = rng.random((12, 2)) * window
         sizes = np.column_stack([rng.uniform(30, 240, 12), np.full(12, 19.0)])
-        found = anchors(spots, sizes, window)
+        found = choose_anchors(spots, sizes, window)
         shown = [(s + h * offsets[a], h) for s, h, a in zip(spots, sizes / 2, found, strict=True) if a]
         assert len(shown) >= (3 if window[0] < 1000 else 10)
         for k, (middle, half) in enumerate(shown):
@@ -373,8 +373,8 @@ def test_labels_do_not_cover_each_other(rng):
 def test_meshes_are_closed():
     """Every edge is of two triangles, once in each direction."""
     square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
-    ball = round_mesh()[1]
-    vertices, faces = plate(square, 0.1)
+    ball = make_round_meshes()[1]
+    vertices, faces = make_plate(square, 0.1)
     half = faces[: len(faces) // 2]
     for points, triangles in (ball, (vertices, half)):
         _, place = np.unique(np.round(points, 9), axis=0, return_inverse=True)

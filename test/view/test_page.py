@@ -16,10 +16,10 @@ import msgspec
 from websockets.asyncio.client import connect
 
 from pkm_twin.view.model import MAX_SHOWN_DEFLECTION, Model
-from pkm_twin.view.page import Page, serving
+from pkm_twin.view.page import Page, run_server
 from pkm_twin.view.panels import BagPanel, ModePanel
-from pkm_twin.view.stage import farther
-from pkm_twin.view.texts import number
+from pkm_twin.view.stage import fit_narrow_window
+from pkm_twin.view.texts import format_number
 from pkm_twin.view.timeline import Timeline
 from stiffness_monitor.modes import modes
 from test.support.robots import load
@@ -45,7 +45,7 @@ def page():
     q = robot.inverse(robot.home())
     rows = q + np.linspace(0.0, 0.1, 11)[:, None]
     line = Timeline(np.linspace(0.0, 1.0, 11), rows, None, None, None, "no masses")
-    with serving(0) as server:
+    with run_server(0) as server:
         page = Page(server, Model(robot), "Bag")
         page.bag = BagPanel(page, line)
         page.port = server.get_port()
@@ -139,7 +139,7 @@ def test_a_mode_is_animated_at_the_pose_that_is_shown(page, monkeypatch):
     for _ in range(3):
         panel.step()
     found = modes(page.model.robot, page.state.pose, 6)
-    assert number(float(found.frequencies[1])) in panel._note.content
+    assert format_number(float(found.frequencies[1])) in panel._note.content
     shape = found.shapes[1, 0]
     for _, moved, shares, most in drawn:
         np.testing.assert_allclose(np.outer(moved.platform, shape), np.outer(shape, moved.platform))
@@ -159,9 +159,9 @@ def test_a_change_that_fails_is_logged_once_and_the_page_goes_on(page, caplog, m
         raise ZeroDivisionError("nobody\nexpected this")
 
     with monkeypatch.context() as patch:
-        patch.setattr(page.model, "loaded", fail)
+        patch.setattr(page.model, "apply_wrench", fail)
         for _ in range(3):
-            page._asked["load"] = page._unload
+            page._requests["load"] = page._remove_wrench
             page.step()
     assert len(caplog.records) == 1
 
@@ -175,9 +175,9 @@ def test_a_change_that_fails_is_logged_once_and_the_page_goes_on(page, caplog, m
 
 def test_the_machine_fits_into_narrow_windows():
     """As wide as in a square window."""
-    assert farther(1400, 757) == 1.0
+    assert fit_narrow_window(1400, 757) == 1.0
     sizes = np.linspace(0.3, 2.0, 200)
-    assert all(farther(aspect, 1.0) * aspect >= 1.0 - 1e-12 for aspect in sizes)
+    assert all(fit_narrow_window(aspect, 1.0) * aspect >= 1.0 - 1e-12 for aspect in sizes)
 
 
 def placed(page, states):
@@ -190,7 +190,7 @@ def placed(page, states):
     calls = []
     camera = SimpleNamespace(on_update=calls.append, wxyz=np.eye(4)[0], fov=1.0)
     client = SimpleNamespace(camera=camera, atomic=contextlib.nullcontext, client_id=-1, scene=page.server.scene)
-    asyncio.run(page.stage._frame(client))
+    asyncio.run(page.stage._fit_camera(client))
     for width, height, distance in states:
         camera.image_width, camera.image_height = width, height
         camera.position, camera.look_at = middle + distance * begin, middle
@@ -201,7 +201,7 @@ def placed(page, states):
 @pytest.mark.parametrize("late", [0.0, 1.0])
 def test_reports_that_come_late_do_not_move_the_camera_away(page, late):
     """A page that is laid out slowly: thin first, then wide, while the browser lags behind."""
-    thin, wide = farther(150, 600), farther(1200, 700)
+    thin, wide = fit_narrow_window(150, 600), fit_narrow_window(1200, 700)
     assert (thin, wide) == (4.0, 1.0)
     behind = thin + late * (wide - thin)
     states = [(3, 700, 1.0), (150, 600, 1.0), (1200, 700, behind), (1200, 700, thin)]

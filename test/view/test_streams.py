@@ -7,8 +7,8 @@ import pytest
 from pkm_twin.paths.along import model_efforts
 from pkm_twin.recordings import read
 from pkm_twin.view import texts
-from pkm_twin.view.live import SPAN, Live
-from pkm_twin.view.timeline import POINTS, Timeline
+from pkm_twin.view.live import TRACE_SECONDS, Live
+from pkm_twin.view.timeline import MAX_CURVE_POINTS, Timeline
 from stiffness_monitor import strain_energy
 from test.commands.conftest import DELTA, MILLING, rewrite
 from test.nodes.harness import SECOND, Maker, Plain
@@ -31,37 +31,37 @@ def milling(tmp_path_factory):
 
 
 def test_the_time_line_has_a_node_s_residual(recording):
-    line = Timeline.of(recording)
+    line = Timeline.from_recording(recording)
     motion = recording.with_rates()
     used = np.isin(recording.time, motion.time)
     residual = np.full_like(recording.q, np.nan)
     residual[used] = motion.effort - model_efforts(motion)
     assert line.end == recording.time[-1]
     for k in np.flatnonzero(used)[:: len(used) // 7]:
-        at = line.at(line.time[k] + 1e-5)
+        at = line.sample_at(line.time[k] + 1e-5)
         assert at.index == k
         np.testing.assert_array_equal(at.q, recording.q[k])
         np.testing.assert_array_equal(at.residual, residual[k])
         np.testing.assert_allclose(at.measured - at.twin, at.residual, rtol=0, atol=1e-15)
-    assert line.at(-5.0).index == 0
-    assert line.at(1e9).index == len(line.time) - 1
-    assert line.at(0.0).twin is None  # the window is not full there
-    assert "&ndash;" in texts.instant(recording.robot, line, line.at(0.0))
+    assert line.sample_at(-5.0).index == 0
+    assert line.sample_at(1e9).index == len(line.time) - 1
+    assert line.sample_at(0.0).twin is None  # the window is not full there
+    assert "&ndash;" in texts.describe_instant(recording.robot, line, line.sample_at(0.0))
 
 
 def test_curves_are_finite_and_few(recording):
-    line = Timeline.of(recording)
-    time, twin, measured = line.curves()
-    assert len(time) == len(twin) == len(measured) <= POINTS
+    line = Timeline.from_recording(recording)
+    time, twin, measured = line.sample_curves()
+    assert len(time) == len(twin) == len(measured) <= MAX_CURVE_POINTS
     assert np.isfinite(twin).all()
     assert np.isfinite(measured).all()
     assert (np.diff(time) > 0).all()
 
 
 def test_a_recorded_wrench_comes_in_base_axes(milling):
-    line = Timeline.of(milling)
-    assert line.at(0.2).wrench is not None
-    np.testing.assert_array_equal(line.at(0.2).wrench, milling.wrench[line.at(0.2).index])
+    line = Timeline.from_recording(milling)
+    assert line.sample_at(0.2).wrench is not None
+    np.testing.assert_array_equal(line.sample_at(0.2).wrench, milling.wrench[line.sample_at(0.2).index])
 
 
 def status_message(names, shares, dominant, total=1.0, pose=(0.1, 0.2, 0.3)):
@@ -92,17 +92,17 @@ def test_messages_become_numbers():
     angle = 1e-3
     turned = (np.sin(angle / 2), 0.0, 0.0, np.cos(angle / 2))
     live.take("deflection", transform((1e-4, 0, 0), turned))
-    heard = live.heard()
+    heard = live.read_latest()
     np.testing.assert_array_equal(heard.q, (0.1, 0.2, 0.3))
     times, values = heard.traces["torque"]
     assert times[-1] == 0.0
-    assert times[0] == -SPAN
+    assert times[0] == -TRACE_SECONDS
     np.testing.assert_array_equal(values[-1], (40.0, 2.0, 3.0))
     assert heard.shares == {"arm I": 0.75, "forearm I": 0.25}
     assert heard.dominant == "arm I"
     np.testing.assert_allclose(heard.deflection, (1e-4, 0, 0, angle, 0, 0), atol=1e-12)
     assert heard.counts == {"state": 1, "torque": 40, "energy": 1, "deflection": 1}
-    html = texts.heard(robot, heard, "delta_dynamics/torque_residual")
+    html = texts.describe_live_values(robot, heard, "delta_dynamics/torque_residual")
     assert 'id="live_torque_0"' in html
     assert "waiting for delta_dynamics/torque_residual" in html
 
@@ -111,7 +111,7 @@ def test_a_message_that_makes_no_sense_leaves_nothing_behind():
     robot = load("delta_cu")
     live = Live(robot)
     live.take("state", MAKE.joint_state(robot.joint_names, (0.1, 0.2, 0.3), stamp=SECOND))
-    before = live.heard()
+    before = live.read_latest()
     nan = float("nan")
     for name, message in (
         ("state", MAKE.joint_state(robot.joint_names, (0.1, nan, 0.3), stamp=SECOND)),
@@ -123,7 +123,7 @@ def test_a_message_that_makes_no_sense_leaves_nothing_behind():
         ("deflection", transform((0, 0, 0), (0, 0, 0, 0))),
     ):
         live.take(name, message)
-    after = live.heard()
+    after = live.read_latest()
     assert after.refused == 7
     assert after.reason.startswith("stiffness_monitor/deflection: ")
     np.testing.assert_array_equal(after.q, before.q)
@@ -141,7 +141,7 @@ def test_a_bag_that_begins_anew_begins_a_new_trace():
             "torque",
             MAKE.joint_state(robot.joint_names, (), effort=effort, stamp=stamp * SECOND),
         )
-    assert live.heard().traces["torque"][1].tolist() == [[1.0, 0.0, 0.0]]
+    assert live.read_latest().traces["torque"][1].tolist() == [[1.0, 0.0, 0.0]]
 
 
 def test_the_monitors_own_status_is_understood():
@@ -150,4 +150,4 @@ def test_the_monitors_own_status_is_understood():
     energy = strain_energy(robot, robot.home(), [30, -50, -40, 10, -20, 50])
     live = Live(robot)
     live.take("energy", status_message(energy.elements, energy.factors, energy.dominant))
-    assert live.heard().shares == pytest.approx(dict(zip(energy.elements, energy.factors.tolist(), strict=True)))
+    assert live.read_latest().shares == pytest.approx(dict(zip(energy.elements, energy.factors.tolist(), strict=True)))

@@ -11,7 +11,7 @@ import tempfile
 from pathlib import Path
 from typing import Final
 
-from examples.nights import record
+from examples.nights import write_history
 from pkm_twin.apps import cli
 
 SHOWN: Final = 2
@@ -34,7 +34,7 @@ def rewritten(text, picture):
     """Return the page with today's output, and draw the picture."""
     with tempfile.TemporaryDirectory() as folder:
         history = Path(folder) / "nights.db"
-        record(history)
+        write_history(history)
         lines = printed(history, picture)
     block = "\n".join(["```text", *lines[: SHOWN + 1], "...", "```"])
     before, trend, after = text.partition("## Find a trend over nights")

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -17,6 +17,9 @@ from pkm_twin.apps.options import RecordingOptions, TimedPayloadOptions
 from pkm_twin.console import progress
 from pkm_twin.report import Report
 from pkm_twin.settings import setting
+
+if TYPE_CHECKING:
+    from pkm_twin.view.live import Live
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +58,7 @@ def view(given: View) -> Report:
     from pkm_twin import load
     from pkm_twin.view.live import Live
     from pkm_twin.view.model import Model
-    from pkm_twin.view.page import ADDRESS, Page, serving
+    from pkm_twin.view.page import ADDRESS, Page, run_server
     from pkm_twin.view.panels import BagPanel, LivePanel, ModePanel
     from pkm_twin.view.timeline import Timeline
     from stiffness_monitor.modes import has_modes
@@ -65,25 +68,25 @@ def view(given: View) -> Report:
         timeline = None
         if bag is not None:
             with progress("reading", None) as update:
-                timeline = Timeline.of(given.read(bag, given.robot, update, limited=True))
+                timeline = Timeline.from_recording(given.read(bag, given.robot, update, limited=True))
         model = Model(machine)
-        server = stack.enter_context(serving(given.port))
+        server = stack.enter_context(run_server(given.port))
         page = Page(server, model, "Bag" if timeline is not None else "Live" if given.live else "")
         if has_modes(machine):
             ModePanel(page)
         if timeline is not None:
             BagPanel(page, timeline)
         if given.live:
-            heard = Live(machine)
-            stack.enter_context(listening(heard, given.namespace))
-            LivePanel(page, heard)
+            live = Live(machine)
+            stack.enter_context(receive_messages(live, given.namespace))
+            LivePanel(page, live)
         click.echo(f"{machine.name}: http://{ADDRESS}:{server.get_port()}/  (Ctrl-C ends)")
         page.run()
     return Report()
 
 
 @contextmanager
-def listening(live: Any, namespace: str) -> Iterator[None]:
+def receive_messages(live: Live, namespace: str) -> Iterator[None]:
     """Pass messages of the nodes in a namespace to ``live`` while the block lasts."""
     from pkm_twin.ros.context import listening_node, subscribe_best_effort
     from pkm_twin.view.live import TOPICS
@@ -93,11 +96,11 @@ def listening(live: Any, namespace: str) -> Iterator[None]:
         for name, (kind, topic) in TOPICS.items():
             subscribe_best_effort(node, kind, topic, lambda m, name=name: live.take(name, m))  # type: ignore[misc]
 
-        def work() -> None:
+        def receive() -> None:
             while not ended.is_set():
                 spin(0.1)
 
-        thread = threading.Thread(target=work, name="view listens")
+        thread = threading.Thread(target=receive, name="view listens")
         thread.start()
         try:
             yield
