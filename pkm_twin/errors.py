@@ -16,6 +16,9 @@ from typing import Any, Final, TextIO
 class PkmTwinError(Exception):
     """Base of all errors that pkm_twin raises for invalid input."""
 
+    salvageable: int = 0
+    """Number of intact messages that ``pkm-twin recover`` can save from a damaged bag."""
+
 
 class ParameterError(PkmTwinError, ValueError):
     """An invalid file, key or value.

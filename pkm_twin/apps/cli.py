@@ -80,8 +80,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         silence_output()
         sys.exit(REFUSED)
     except PkmTwinError as error:
-        # Of a damaged bag, as `recover` can save a part of it.
-        _end(str(error), SALVAGED if getattr(error, "salvageable", 0) else REFUSED)
+        _end(str(error), SALVAGED if error.salvageable else REFUSED)
     except OSError as error:
         flush_output()
         # An error without a file name is one of the output.

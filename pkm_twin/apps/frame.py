@@ -20,6 +20,7 @@ import click
 from click.core import ParameterSource
 from click.shell_completion import CompletionItem
 
+from pkm_twin.apps.options import CheckedOptions, DrawingOptions
 from pkm_twin.console import numbers, refuse_existing
 from pkm_twin.errors import FileError, ParameterError, PkmTwinError, UnknownNameError
 from pkm_twin.files import STANDARD, decimal
@@ -189,7 +190,7 @@ class Command(click.Command):
         # The first file that the command reads, which it never replaces.
         source = next((value for value in read if isinstance(value, Path)), None)
         self._check_targets(given, overwrite, source)
-        drawing = given.drawing(self.name) if hasattr(given, "drawing") else None
+        drawing = given.drawing(str(self.name)) if isinstance(given, DrawingOptions) else None
         piped = any(str(path) == STANDARD for path in (getattr(given, "out", None), drawing))
         if drawing is not None:
             refuse_existing(drawing, overwrite, source)
@@ -209,7 +210,7 @@ class Command(click.Command):
             if not word or f"--{word.split()[0].removeprefix('--')}" not in texts:
                 raise
             raise click.UsageError(f"--{str(error).removeprefix('--')}") from None
-        if hasattr(given, "drawing"):
+        if isinstance(given, DrawingOptions):
             report = _draw(report, drawing, overwrite)
         present(report, as_json, piped=piped)
         if report.exit_code:
@@ -241,8 +242,8 @@ class Command(click.Command):
                 for path in value if isinstance(value, tuple) else (value,):
                     if isinstance(one, Argument) and isinstance(path, Path) and not path.exists():
                         raise FileError(path, FileNotFoundError(), "a file to read")
-            for check in ("parse_options", "machine"):
-                getattr(given, check, lambda: None)()
+            if isinstance(given, CheckedOptions):
+                given.check_options()
         for target in dict.fromkeys(targets):
             refuse_existing(target, overwrite, source)
 

@@ -19,6 +19,7 @@ from pkm_twin.settings import setting
 
 if TYPE_CHECKING:
     from pkm_twin.codegen.arrays import Array
+    from pkm_twin.paths.along import EffortComparison
     from pkm_twin.recordings import Dialect, Load, ReadOptions, Recording
     from pkm_twin.robot.limits import Beyond
     from pkm_twin.robot.robot import Robot
@@ -32,6 +33,13 @@ PICTURES = (".png", ".svg", ".pdf")
 BESIDE = "auto"
 """Value of --picture without a name: next to --out."""
 ROBOT_HELP = "a robot's name (see `pkm-twin robots`), or its YAML, URDF, MJCF, SDF, USD"
+
+
+class CheckedOptions:
+    """Options that can be wrong in themselves, or name a robot that cannot be read."""
+
+    def check_options(self) -> None:
+        """Raise the error of wrong options before an existing target is rejected."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +68,7 @@ class CutOutOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RobotArgument(CutOutOptions):
+class RobotArgument(CutOutOptions, CheckedOptions):
     """Argument of a command on a robot."""
 
     robot: str = setting(..., ROBOT_HELP, argument=True)
@@ -73,6 +81,10 @@ class RobotArgument(CutOutOptions):
         from pkm_twin import load
 
         return load(self.robot, **self.part)
+
+    def check_options(self) -> None:
+        """Raise the error of a robot or payload that cannot be read."""
+        self.machine()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -200,6 +212,16 @@ class MotionOptions(RecordingOptions):
         motion = settle_rests(self.read(path, robot, planned=True).with_rates())
         return motion if getattr(self, "payload", None) is not None else check_efforts(motion)
 
+    def read_efforts(self, path: Path, robot: Robot) -> EffortComparison:
+        """Return a recorded or planned motion with its efforts and the model's.
+
+        :raises ParameterError: as :meth:`read_motion`, or a robot without masses.
+        """
+        from pkm_twin.paths.along import compare_efforts, settle_rests
+
+        compared = compare_efforts(settle_rests(self.read(path, robot, planned=True).with_rates()))
+        return compared if getattr(self, "payload", None) is not None else compared.checked()
+
 
 @dataclass(frozen=True, kw_only=True)
 class BeyondLimitsOption:
@@ -298,8 +320,16 @@ class OutputOption(OverwriteOption):
     out: Path | None = setting(None, "file to write", writes=True)
 
 
+class DrawingOptions:
+    """Options of a command that draws its result."""
+
+    def drawing(self, command: str) -> Path | None:
+        """Return the picture's file, None for none."""
+        raise NotImplementedError
+
+
 @dataclass(frozen=True, kw_only=True)
-class PictureOptions(OverwriteOption):
+class PictureOptions(OverwriteOption, DrawingOptions):
     """Options of a picture of the result: named, or next to ``--out``."""
 
     picture: str | None = setting(

@@ -123,6 +123,17 @@ class Checked:
             for j, (joint, unit) in enumerate(zip(robot.joint_names, robot.effort_units, strict=True))
         }
 
+    @property
+    def summary(self) -> str:
+        """The answer with what it rests on, and the items that are not judged."""
+        what, why = ", ".join(self.named(Verdict.BAD)) or self.unjudged or self.agreement, "; ".join(self.causes)
+        if why and self.compared is None:
+            what = f"{why} ({what})"
+        # The answer "not judged" already says why efforts are not judged.
+        said = (COMPARED, IDLE, RESIDUAL) if self.answer == "not judged" else ()
+        unknown = [item for item in self.named(Verdict.UNKNOWN) if item not in said]
+        return f"{self.answer}: {what}" + (f"; not judged: {', '.join(unknown)}" if unknown else "")
+
     def named(self, verdict: Verdict) -> list[str]:
         """List what got this verdict."""
         return [str(item.text) for item in self.items if item.verdict is verdict]

@@ -238,6 +238,15 @@ def append(
         base.execute("COMMIT")
 
 
+def append_recording(path: Path, recording: Recording, file: Path, good: bool, machine: str | None = None) -> None:
+    """Measure a recording and add it to a history; errors as of :func:`append`.
+
+    :param machine: its name in the history; default: the robot's.
+    """
+    robot, began = recording.robot.name, recorded_at(recording, file)
+    append(path, machine or robot, robot, file, began, good, measure(recording))
+
+
 def read_history(path: Path, machine: str | None = None) -> list[Series]:
     """All series of a history, by machine, quantity and part, in the order of recording.
 

@@ -36,7 +36,7 @@ reported."""
 
 @dataclass(frozen=True)
 class EffortComparison:
-    """Hold a motion, the efforts to size for, shape (k, n), and where these are from.
+    """Hold a motion, its efforts, shape (k, n), and their source in words.
 
     ``model``: efforts of the robot's model along the motion, shape (k, n).
     """
@@ -50,6 +50,34 @@ class EffortComparison:
     def difference(self) -> Array:
         """RMS difference between efforts and model over the model's RMS, shape (n,)."""
         return relative_difference(self.effort, self.model)
+
+    def with_model(self) -> EffortComparison:
+        """Return the motion with the model's efforts."""
+        return replace(self, effort=self.model, source="the model's")
+
+    def checked(self) -> EffortComparison:
+        """Reject computed efforts of the file that are not the model's.
+
+        :returns: the comparison; the ``doubt`` of its motion says that measured efforts are not
+            this robot's, or that another robot computed them.
+        :raises ParameterError: this robot computed them, or the file does not name its robot, and
+            the model computes others: the file lacks a wrench, payload or number.
+        """
+        motion, doubt = self.motion, self.unlike
+        if motion.computed is not None:
+            origin, away = motion.origin, relative_difference(motion.computed, self.model)
+            other = "" if origin is None else origin.differs_from(motion.robot)
+            worst = int(away.argmax())
+            if away[worst] > (MAX_EFFORT_DIFFERENCE if origin is None or other else 1e-3):
+                if not other:
+                    raise ParameterError(
+                        f"{motion.source}: efforts of {motion.robot.joint_names[worst]}",
+                        f"{100 * away[worst]:.3g} % RMS from those that {motion.robot.name} computes",
+                        "a file with the wrench (fx ... mz) and payload that its efforts were computed with, "
+                        "or without efforts",
+                    )
+                doubt = other
+        return replace(self, motion=replace(motion, doubt=doubt))
 
     @property
     def unlike(self) -> str:
@@ -71,41 +99,21 @@ def relative_difference(efforts: Array, model: Array) -> Array:
 
 
 def check_efforts(motion: Recording) -> Recording:
-    """Compare the efforts of a motion's file with the model's, and reject wrong computed ones.
-
-    :returns: the motion; its ``doubt`` says that measured efforts are not this robot's, or that
-        another robot computed them.
-    :raises ParameterError: this robot computed them, or the file does not name its robot, and the
-        model computes others: the file lacks a wrench, payload or number that they rest on.
-    """
-    if not motion.robot.has_masses:
+    """Compare the efforts of a motion's file, if any, with the model's; errors of ``checked``."""
+    if not motion.robot.has_masses or (motion.effort is None and motion.computed is None):
         return motion
-    doubt = "" if motion.effort is None else compare_efforts(motion).unlike
-    if motion.computed is None:
-        return replace(motion, doubt=doubt)
-    origin, away = motion.origin, relative_difference(motion.computed, model_efforts(motion))
-    other = "" if origin is None else origin.differs_from(motion.robot)
-    worst = int(away.argmax())
-    if away[worst] <= (MAX_EFFORT_DIFFERENCE if origin is None or other else 1e-3):
-        return replace(motion, doubt=doubt)
-    if other:
-        return replace(motion, doubt=other)
-    raise ParameterError(
-        f"{motion.source}: efforts of {motion.robot.joint_names[worst]}",
-        f"{100 * away[worst]:.3g} % RMS from those that {motion.robot.name} computes",
-        "a file with the wrench (fx ... mz) and payload that its efforts were computed with, or without efforts",
-    )
+    return compare_efforts(motion).checked().motion
 
 
-def compare_efforts(motion: Recording, efforts: str = "file") -> EffortComparison:
-    """Return a motion with the file's efforts if it has them and they are wanted, or the model's.
+def compare_efforts(motion: Recording) -> EffortComparison:
+    """Return a motion with the file's efforts, or the model's if the file has none.
 
     :raises ParameterError: a robot without masses.
     """
     model = model_efforts(motion)
-    if motion.effort is not None and efforts == "file":
-        return EffortComparison(motion, motion.effort, "the file's", model)
-    return EffortComparison(motion, model, "the model's", model)
+    if motion.effort is None:
+        return EffortComparison(motion, model, "the model's", model)
+    return EffortComparison(motion, motion.effort, "the file's", model)
 
 
 def model_efforts(m: Recording) -> Array:

@@ -103,6 +103,11 @@ class Calibrate(RobotArgument, TableOptions, BeyondLimitsOption, AcceptOption, O
             raise ParameterError("--noise", name, f"a kind that --measure names ({measured})")
         return kinds, noise, parse_within(self.within)
 
+    def check_options(self) -> None:
+        """Raise the error of wrong options, then that of the robot."""
+        self.parse_options()
+        super().check_options()
+
     @property
     def free(self) -> dict[str, Any]:
         """Options of the fit: what is fitted in addition to the file's numbers, and the prior."""

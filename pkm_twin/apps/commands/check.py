@@ -10,7 +10,7 @@ from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pkm_twin.apps.frame import command
 from pkm_twin.apps.options import NOT_JUDGED, REFUSED, SALVAGED, RecordingOptions, TimedPayloadOptions, payload_fact
@@ -18,6 +18,9 @@ from pkm_twin.console import progress
 from pkm_twin.errors import ParameterError, PkmTwinError, one_line
 from pkm_twin.report import Fact, Report, Verdict
 from pkm_twin.settings import setting
+
+if TYPE_CHECKING:
+    from pkm_twin.robot.robot import Robot
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,45 +65,35 @@ def check(given: Check) -> Report:
     except PkmTwinError as error:
         if isinstance(error, ParameterError) and error.field.startswith("--") and error.value:
             raise  # the option's value is wrong, not the recording
-        saved = getattr(error, "salvageable", 0)
-        facts = [Fact("bag", str(given.bag)), Fact("good", False), Fact("salvageable", saved)]
-        return Report(facts=facts, code=SALVAGED if saved else REFUSED, error=str(error))
+        facts = [Fact("bag", str(given.bag)), Fact("good", False), Fact("salvageable", error.salvageable)]
+        return Report(facts=facts, code=SALVAGED if error.salvageable else REFUSED, error=str(error))
 
 
-def check_one(given: Check, path: Path, update: Any = None, thorough: bool = True) -> Report:
+def check_one(given: Check, path: Path, update: Callable[[int], None] | None = None, thorough: bool = True) -> Report:
     """Judge a recording, and append it to the history; errors as of ``recordings.read``."""
     from pkm_twin import load
     from pkm_twin.apps.fit_report import tabulate_causes
-    from pkm_twin.identification.check import COMPARED, IDLE, RESIDUAL
-    from pkm_twin.identification.check import check as checked
+    from pkm_twin.identification.check import check as judge_recording
 
     if given.history is not None:
-        from pkm_twin.identification.history import append, check_file, measure, recorded_at
+        from pkm_twin.identification.history import append_recording, check_file
 
         check_file(given.history)
-    robot: Any = given.robot
+    robot: str | Robot | None = given.robot
     if any(given.part.values()):
-        if robot is None:
+        if given.robot is None:
             raise ParameterError("--robot", None, "a file, for --platform, --base and the like")
-        robot = load(robot, **given.part)
+        robot = load(given.robot, **given.part)
     r = given.read(path, robot, update, limited=True, trajectory=True)
-    found = checked(r, given.residual, thorough)
+    found = judge_recording(r, given.residual, thorough)
     good = found.answer == "good"
     if given.history is not None:
-        name = given.machine_name or r.robot.name
-        append(given.history, name, r.robot.name, path, recorded_at(r, path), good, measure(r))
-    bad, unknown = found.named(Verdict.BAD), found.named(Verdict.UNKNOWN)
-    if found.answer == "not judged":
-        # The answer already says why the efforts are not judged.
-        unknown = [what for what in unknown if what not in (COMPARED, IDLE, RESIDUAL)]
+        append_recording(given.history, r, path, good, given.machine_name)
     why, findings = "; ".join(found.causes), "; ".join(found.findings)
-    what = ", ".join(bad) or found.unjudged or found.agreement
-    if why and found.compared is None:
-        what = f"{why} ({what})"
-    answer = f"{found.answer}: {what}"
+    verdict = {"good": Verdict.GOOD, "bad": Verdict.BAD}.get(found.answer, Verdict.UNKNOWN)
     none = "uncertainty: none in the robot file, so the model has no uncertainty band"
     return Report(
-        answer + (f"; not judged: {', '.join(unknown)}" if unknown else ""),
+        found.summary,
         [
             Fact("causes", found.causes, text="explanation" if why else None, shown=why),
             Fact("findings", found.findings, shown=findings, text="`fit` finds" if findings else None),
@@ -121,8 +114,8 @@ def check_one(given: Check, path: Path, update: Any = None, thorough: bool = Tru
         ],
         tabulate_causes([found.explanation] if found.explanation else [], [r.name]),
         notes=[] if r.robot.uncertainty else [none],
-        verdict=Verdict.GOOD if good else Verdict.BAD if bad else Verdict.UNKNOWN,
-        code=0 if good else REFUSED if bad else NOT_JUDGED,
+        verdict=verdict,
+        code={Verdict.GOOD: 0, Verdict.BAD: REFUSED}.get(verdict, NOT_JUDGED),
     )
 
 

@@ -121,6 +121,11 @@ class Fit(TimedPayloadOptions, RecordingOptions, BeyondLimitsOption, AcceptOptio
             raise ParameterError("--what", self.what, rest)
         return None, laws
 
+    def check_options(self) -> None:
+        """Raise the error of wrong options, then that of the robot."""
+        self.parse_options()
+        super().check_options()
+
 
 @command("Identification and calibration")
 def fit(given: Fit) -> Report:

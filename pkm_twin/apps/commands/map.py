@@ -13,6 +13,7 @@ import click
 
 from pkm_twin.apps.frame import Command, Group, command
 from pkm_twin.apps.options import (
+    DrawingOptions,
     MillingOptions,
     OutputOption,
     OverwriteOption,
@@ -106,13 +107,13 @@ class Loads:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Show(PageOption, OverwriteOption):
+class Show(PageOption, OverwriteOption, DrawingOptions):
     """Plot a stored map: PNGs, and with --html an offline interactive HTML page."""
 
     file: Path = setting(..., "a file that `pkm-twin map` wrote", argument=True)
     out: Path | None = setting(None, "stem of the PNGs; default: that of the file", writes=True)
 
-    def drawing(self, _command: str) -> Path:
+    def drawing(self, command: str) -> Path:
         """Return the pictures' common name."""
         return (self.out or self.file).with_suffix(".png")
 

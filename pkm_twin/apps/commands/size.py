@@ -80,7 +80,7 @@ class Size(TimedPayloadOptions, MotionOptions, SingularityOption, PictureOptions
 @command("Torques, paths and drives")
 def size(given: Size) -> Report:
     """Compute what each drive must give, and which motors can."""
-    from pkm_twin.paths.along import EFFORT_TOLERANCE, compare_efforts
+    from pkm_twin.paths.along import EFFORT_TOLERANCE
     from pkm_twin.paths.sizing import find_smallest, net_energy, read_motors, size_drives
 
     if (given.motion is None) == (given.over_workspace is None):
@@ -96,16 +96,18 @@ def size(given: Size) -> Report:
     if given.motion is None:
         return report_workspace(given)
     motors = {} if given.drives is None else read_motors(given.drives, given.motor)
-    motion = given.read_motion(given.motion, given.machine())
-    taken, notes = compare_efforts(motion, given.efforts or "file"), list(motion.notes)
+    taken = given.read_efforts(given.motion, given.machine())
+    motion, notes = taken.motion, list(taken.motion.notes)
     doubted = taken.unlike or motion.efforts != "measured"
-    if given.payload is not None and given.efforts is None and doubted:
+    if given.efforts == "model":
+        taken = taken.with_model()
+    elif given.payload is not None and given.efforts is None and doubted:
         if taken.difference.max() > EFFORT_TOLERANCE:
             notes.append(
                 f"the file's efforts are not those of {motion.load}: the model's are used; "
                 "--efforts file uses the file's"
             )
-        taken = compare_efforts(motion, "model")
+        taken = taken.with_model()
     duties = size_drives(motion, taken.effort, motors, *read_gear_options(given, motion.robot))
     duration = float(motion.time[-1] - motion.time[0])
     energy = sum(d.at_joint.energy for d in duties)
