@@ -342,15 +342,20 @@ def adjoints(sums: Iterable[tuple[Any, Any]], by: Sequence[Expression]) -> list[
     return [bars.get(e.number, 0.0) for e in by]
 
 
-def tangents(results: Sequence[Expression], by: Sequence[Expression]) -> list[list[Any]]:
-    """Differentiate expressions by forward mode; return one row per result, one entry per input."""
+def tangents(results: Sequence[Expression], by: Sequence[Expression], *, at_reference: bool = False) -> list[list[Any]]:
+    """Differentiate expressions by forward mode; return one row per result, one entry per input.
+
+    :param at_reference: return the derivatives' values at the tape's reference geometry, which takes
+        a tenth of the time of their expressions.
+    """
     rows: dict[int, dict[int, Any]] = {e.number: {k: 1.0} for k, e in enumerate(by)}
     for e in ordered(results):
         if e.op is None or e.number in rows or not any(rows[x.number] for x in e.args):
             rows.setdefault(e.number, {})
             continue
         total: dict[int, Any] = {}
-        for x, slope in zip(e.args, e.op.slopes(e, *e.args), strict=True):
+        slopes: Iterable[Any] = e.op.slopes(e, *e.args)
+        for x, slope in zip(e.args, map(reference, slopes) if at_reference else slopes, strict=True):
             for k, value in rows[x.number].items():
                 total[k] = total.get(k, 0.0) + slope * value
         rows[e.number] = total

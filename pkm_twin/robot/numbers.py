@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.expressions import GEOMETRY, Expression, Tape, references, tangents
+from pkm_twin.codegen.expressions import GEOMETRY, Expression, Tape, tangents
 from pkm_twin.codegen.plain import functions
 from pkm_twin.machine.geometry import geometry_of
 from pkm_twin.machine.inertia import Layout
@@ -39,13 +39,10 @@ class FileNumbers:
         _, self._run = functions(self._results, {GEOMETRY: len(paths)})
 
     @cached_property
-    def _tangents(self) -> list[list[Any]]:
-        return tangents(self._results, self._given)
-
-    @cached_property
     def slopes(self) -> Array:
         """Derivatives of the results by the numbers, at the file's values, shape (results, paths)."""
-        return references(self._tangents).reshape(len(self._results), len(self._given))
+        table = tangents(self._results, self._given, at_reference=True)
+        return np.array(table, np.float64).reshape(len(self._results), len(self._given))
 
     @cached_property
     def _slopes_run(self) -> tuple[list[tuple[int, int]], Callable[..., tuple[Any, ...]]]:
@@ -53,7 +50,7 @@ class FileNumbers:
         tape = Tape() if not self._results else self._results[0].tape
         found = [
             (i, k, tape.lift(value))
-            for i, row in enumerate(self._tangents)
+            for i, row in enumerate(tangents(self._results, self._given))
             for k, value in enumerate(row)
             if isinstance(value, Expression) or value
         ]

@@ -166,6 +166,7 @@ def test_slopes_of_operations_are_those_of_their_values(rng, name):
     tape = ex.Tape(values.tolist())
     given = list(tape.inputs(ex.GEOMETRY, 3))[:arguments]
     (found,) = tangents([one(*given)], given)
+    assert tangents([one(*given)], given, at_reference=True) == [[ex.reference(slope) for slope in found]]
     for k, slope in enumerate(found):
         step = 1e-6 * np.eye(3)[k]
         high, low = (one.numbers(*(values + s)[:arguments]) for s in (step, -step))
