@@ -22,7 +22,7 @@ from pkm_twin.robot.derivatives import nearest_motion
 from pkm_twin.robot.effort_limits import NON_FINITE, EffortLimits, LimitedEfforts, LimitPolicy
 from pkm_twin.robot.limits import find_first_beyond
 from pkm_twin.robot.robot import Robot
-from pkm_twin.robot.workspace import passing_singularity
+from pkm_twin.robot.workspace import describe_singularity_bound
 from pkm_twin.settings import AGE_BOUNDS, COUNT_BOUNDS, FRACTION_BOUNDS, FUTURE, SECONDS, ZERO_STAMP, setting
 from pkm_twin.streams.base_motion import BaseImu
 from pkm_twin.streams.continuity import Continuity
@@ -302,7 +302,7 @@ class Feedforward(Core):
                         "singular",
                         f"point {first + worst}: close to a singularity or the edge of the workspace: "
                         f"index {measures[worst]:.3g}, allowed {stop:g} or more; "
-                        f"{passing_singularity(float(measures[worst]), 'singularity_stop ')} passes",
+                        f"{describe_singularity_bound(float(measures[worst]), 'singularity_stop ')} passes",
                     )
                 self.near_singularities += int((measures < self.settings.singularity_warn).sum())
                 solved = _evaluate_points(first, inverse_dynamics, robot, q, qd[part], qdd[part])

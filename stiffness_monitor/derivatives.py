@@ -14,7 +14,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics.gradients import gradient_program
-from pkm_twin.robot.derivatives import Derivatives, geometry_numbers, pose_by_geometry
+from pkm_twin.robot.derivatives import Derivatives, differentiate_pose, list_geometry_numbers
 from pkm_twin.robot.numbers import CauseSlopes, FileNumbers
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor.compliance import compliance
@@ -81,7 +81,7 @@ def _evaluate_gradients(
     weights = np.eye(kernel.sizes[0][-1])
     (by_q, by_numbers), _ = kernel(NO_PARAMETERS, q[..., None, :], *loads, weights)
     if by_q.shape[-1]:
-        moved = pose_by_geometry(robot, q)
+        moved = differentiate_pose(robot, q)
         geometry = np.arange(moved.shape[-1])
         if chosen is not None:
             geometry = np.array([k for k in chosen if k < len(geometry)], int)
@@ -97,7 +97,7 @@ def _unravel_square(table: Array) -> Array:
 
 def elastic_numbers(robot: Robot) -> list[Any]:
     """Return the geometry, then the further inputs of elasticity: numbers or expressions."""
-    return [*geometry_numbers(robot), *list_numbers(robot.elastic)]
+    return [*list_geometry_numbers(robot), *list_numbers(robot.elastic)]
 
 
 def compliance_gradient(elastic: Elastic) -> Kernel:

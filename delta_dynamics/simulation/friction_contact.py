@@ -18,8 +18,8 @@ from scipy.linalg.lapack import dposv  # type: ignore[import-untyped]
 from delta_dynamics.simulation.exponential_integrator import Stepper, make_damped_stepper, make_undamped_stepper
 from delta_dynamics.torques.equations import Equations, Terms
 from pkm_twin.codegen.arrays import Array, Indices, Mask
-from pkm_twin.machine.friction import Memory, bound_static_friction, friction_values, potential, sum_laws
-from pkm_twin.machine.inertia import loaded_joints
+from pkm_twin.machine.friction import Memory, bound_static_friction, potential, read_friction_values, sum_laws
+from pkm_twin.machine.inertia import list_loaded_joints
 from pkm_twin.robot.robot import Robot
 
 States = NDArray[np.int8]
@@ -147,14 +147,14 @@ class Resistance:
     def __init__(self, robot: Robot, pushed: Sequence[int] = (), memory: Memory | None = None) -> None:
         self._pushed = list(pushed)
         n = robot.joints_count
-        friction, passive = robot.friction, loaded_joints(robot.graph)
+        friction, passive = robot.friction, list_loaded_joints(robot.graph)
         self._offset = np.array(friction.offset, np.float64)
         self._viscous = np.array(friction.viscous, np.float64)
         self._inner = np.array([joint.viscous for joint in passive])
         self._damped = bool(self._viscous.any() or self._inner.any())
         self._passive = bool(passive)
         self._dry = np.array([*friction.coulomb, *(joint.coulomb for joint in passive)])
-        self._laws, self._numbers = robot.laws, friction_values(robot.laws, robot.friction)
+        self._laws, self._numbers = robot.laws, read_friction_values(robot.laws, robot.friction)
         # Friction with memory acts like a spring at rest, so no joint sticks by it.
         self._distance = np.array(friction.presliding)
         self._level = np.where(self._distance > 0.0, friction.coulomb, 0.0)

@@ -18,7 +18,7 @@ from delta_dynamics.simulation.friction_contact import Law, Resistance
 from delta_dynamics.torques.equations import Terms
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError
-from pkm_twin.machine.inertia import loaded_joints
+from pkm_twin.machine.inertia import list_loaded_joints
 from pkm_twin.robot.robot import Robot
 
 MAX_EXPLICIT_PARTS: Final = 100
@@ -61,7 +61,7 @@ class Plant:
         """
         self.robot, self._leading = robot, robot.graph.leading
         self.others = [k for k in range(robot.joints_count) if k not in self._leading]
-        names = [joint.name for joint in loaded_joints(robot.leading_machine.graph)] if self.others else []
+        names = [joint.name for joint in list_loaded_joints(robot.leading_machine.graph)] if self.others else []
         pushed = [names.index(robot.joint_names[k]) for k in self.others]
         before: Resistance | None = vars(self).get("_resistance")
         memory = None if before is None else before.memory

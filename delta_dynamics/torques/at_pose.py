@@ -31,7 +31,7 @@ from pkm_twin.kinematics.motion import BaseMotion
 from pkm_twin.kinematics.posed import CarriedScheme
 from pkm_twin.kinematics.programs import certify_assembly, follow_pose, pose_factors, solve_pose
 from pkm_twin.kinematics.traced import Traced
-from pkm_twin.machine.inertia import ROTORS, Layout, change_of_frame, loaded_joints
+from pkm_twin.machine.inertia import ROTORS_PART, Layout, list_loaded_joints, make_frame_change
 from pkm_twin.robot.rejection import report_lost_digits
 from pkm_twin.robot.robot import Robot
 
@@ -218,7 +218,7 @@ class _PoseDrivenMachine:
                 rows.append(np.zeros(10))
                 continue
             lever = snapped_all(t.tree.at[name] - link.at)
-            rows.append(change_of_frame(link.axes, lever) @ p[layout.body(name)])
+            rows.append(make_frame_change(link.axes, lever) @ p[layout.body(name)])
         return np.array(rows, dtype=object)
 
     def joint(self, values: Objects) -> list[Any]:
@@ -237,7 +237,7 @@ class _PoseDrivenMachine:
         posed.set_rates(rate)
         posed.set_accelerations(acceleration, BaseMotion.at_rest(self.parts[2]))
         forces = self.add_inertia(Forces.inertia)
-        for k, joint in enumerate(loaded_joints(t.graph)):
+        for k, joint in enumerate(list_loaded_joints(t.graph)):
             forces.joint(joint, passive[3 * k : 3 * k + 3])
         forces.wrench(t.tape.inputs("wrench", 6))
         unknown, on_pose = forces.generalised()
@@ -257,7 +257,7 @@ class _PoseDrivenMachine:
         for k, unit in enumerate(np.eye(m + free)):
             posed.motion.set_rates(unit[m:], unit[:m])
             forces = self.add_inertia(Forces.momenta)
-            for j, joint in enumerate(loaded_joints(t.graph)):
+            for j, joint in enumerate(list_loaded_joints(t.graph)):
                 forces.pair(joint, passive[3 * j + 2] * forces.relative(joint, accelerated=False)[0])
             unknown, driven = forces.generalised()
             # The column of the rate that is farther from the base moves fewer bodies.
@@ -269,7 +269,7 @@ class _PoseDrivenMachine:
         coupled = np.array([lu.solve_transposed(table[kept, k]) for k in range(m)], dtype=object) @ jq
         by_rates = _complete_symmetric(both) @ jq
         mass = table[:m, :m] - coupled - coupled.T + jq.T @ by_rates
-        for rotor, row in zip(self.parts[ROTORS], self.drives, strict=True):
+        for rotor, row in zip(self.parts[ROTORS_PART], self.drives, strict=True):
             mass = mass + rotor * row[:, None] * row
         return _complete_symmetric(mass)
 

@@ -17,7 +17,7 @@ from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics.motion import BaseMotion
 from pkm_twin.kinematics.traced import Traced
-from pkm_twin.machine.inertia import loaded_joints
+from pkm_twin.machine.inertia import list_loaded_joints
 from pkm_twin.robot.robot import Robot
 
 
@@ -46,7 +46,7 @@ class Equations:
     """The terms of a robot's equations of motion, by state."""
 
     def __init__(self, robot: Robot) -> None:
-        n, k = robot.joints_count, len(loaded_joints(robot.graph))
+        n, k = robot.joints_count, len(list_loaded_joints(robot.graph))
         self.robot = robot
         self._shapes = ((n, n), (n,), (2,), (6, n), (k, n), (k,))
         ends = np.cumsum([0, *(int(np.prod(shape)) for shape in self._shapes)]).tolist()
@@ -92,7 +92,7 @@ def _motion(t: Traced) -> Program:
     forces = Forces(motion)
     forces.inertia(bodies, rods)
     drift = []
-    for k, joint in enumerate(loaded_joints(graph)):
+    for k, joint in enumerate(list_loaded_joints(graph)):
         _, second = forces.relative(joint, accelerated=True)
         forces.pair(joint, passive[3 * k + 2] * second)
         drift.append(second)
@@ -104,7 +104,7 @@ def _motion(t: Traced) -> Program:
 
     def visit(forces: Forces) -> None:
         twists.append([*motion.velocity(graph.platform, graph.origin), *motion.omega[graph.platform]])
-        rows.append([forces.relative(j, accelerated=False)[0] for j in loaded_joints(graph)])
+        rows.append([forces.relative(j, accelerated=False)[0] for j in list_loaded_joints(graph)])
 
     mass = mass_entries(t, parts, visit)
     # By columns, as the joints were visited: turned round, rows of joints.

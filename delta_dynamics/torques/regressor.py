@@ -21,8 +21,15 @@ from pkm_twin.codegen.expressions import PARAMETERS
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics.motion import BaseMotion
 from pkm_twin.kinematics.traced import Traced
-from pkm_twin.machine.friction import evaluate_laws, friction_values, linear_keys
-from pkm_twin.machine.inertia import TEN, TEN_UNITS, change_of_frame, drive_units, loaded_joints, standard_parameters
+from pkm_twin.machine.friction import evaluate_laws, list_linear_keys, read_friction_values
+from pkm_twin.machine.inertia import (
+    STANDARD_PARAMETERS,
+    STANDARD_UNITS,
+    drive_units,
+    list_loaded_joints,
+    make_frame_change,
+    standard_parameters,
+)
 from pkm_twin.machine.schema import frozen
 from pkm_twin.robot.mechanism import SHARED
 from pkm_twin.robot.robot import Robot
@@ -70,7 +77,7 @@ def parameter_values(robot: Robot) -> Array:
         values += [*rub, graph.joints[name].rotor_inertia]
     for key in law_keys(robot):
         values += [*getattr(friction, key)]
-    for joint in loaded_joints(graph):
+    for joint in list_loaded_joints(graph):
         values += [joint.viscous, joint.coulomb, joint.rotor_inertia]
     return np.array([*values, 1.0])
 
@@ -106,7 +113,7 @@ def regressor(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench:
     parts = [
         np.moveaxis(ten, -3, -2).reshape(*batch, n, len(links) * ten.shape[-1]),
         other[..., :rods],
-        platform @ change_of_frame(np.eye(3), lever),
+        platform @ make_frame_change(np.eye(3), lever),
         drives.reshape(*batch, n, n * len(DRIVE)),
     ]
     if not robot.laws:
@@ -124,7 +131,7 @@ def regressor(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench:
 
 def law_keys(robot: Robot) -> tuple[str, ...]:
     """List the parameters that efforts are linear in, of the drives' laws beyond the basic one."""
-    return tuple(key for key in linear_keys(robot.laws) if key not in DRIVE)
+    return tuple(key for key in list_linear_keys(robot.laws) if key not in DRIVE)
 
 
 def law_columns(robot: Robot, q: Array, qd: Array, load: Array) -> Array:
@@ -133,7 +140,7 @@ def law_columns(robot: Robot, q: Array, qd: Array, load: Array) -> Array:
     :param load: efforts of the drives without friction, shape (..., n). All shape (..., n).
     """
     n, keys = robot.joints_count, law_keys(robot)
-    values = friction_values(robot.laws, robot.friction)
+    values = read_friction_values(robot.laws, robot.friction)
     columns = np.zeros((*qd.shape, len(keys), n))
     for i, key in enumerate(keys):
         unit = values | {other: np.full(n, float(other == key)) for other in keys}
@@ -176,7 +183,7 @@ def _columns(robot: Robot) -> list[tuple[str, str]]:
     graph, tree = robot.graph, robot.massive().tree
 
     def ten(owner: str) -> list[tuple[str, str]]:
-        return [(f"{owner}.{what}", unit) for what, unit in zip(TEN, TEN_UNITS, strict=True)]
+        return [(f"{owner}.{what}", unit) for what, unit in zip(STANDARD_PARAMETERS, STANDARD_UNITS, strict=True)]
 
     def joint(name: str, whats: Sequence[str]) -> list[tuple[str, str]]:
         units = drive_units(graph, name)
@@ -188,7 +195,7 @@ def _columns(robot: Robot) -> list[tuple[str, str]]:
     result += [column for name in graph.actuated for column in joint(name, DRIVE)]
     result += [column for key in law_keys(robot) for name in graph.actuated for column in joint(name, [key])]
     passive = tuple(what for what in DRIVE if what != "offset")
-    result += [column for j in loaded_joints(graph) for column in joint(j.name, passive)]
+    result += [column for j in list_loaded_joints(graph) for column in joint(j.name, passive)]
     return [*result, (WRENCH, "1")]
 
 
@@ -222,7 +229,7 @@ def _regressor(t: Traced) -> Program:
         forces = Forces(motion)
         forces.rod(rod, 1.0)
         add_powers(forces, rod.inner, rod.outer)
-    for joint in loaded_joints(graph):
+    for joint in list_loaded_joints(graph):
         for three in np.eye(3):
             forces = Forces(motion)
             forces.joint(joint, three)
@@ -276,12 +283,12 @@ def base_parameters(robot: Robot, *, seed: int = 0) -> BaseParameters:
     table = regressor(robot, *states).reshape(-1, len(names))
     # Units of kg by the machine's size: moments have a length in them, inertias its square. Drives lead
     # combinations before bodies, bodies before the payload, masses and moments before products of inertia.
-    powers = dict(zip(TEN, (0, 1, 1, 1, 2, 2, 2, 2, 2, 2), strict=True))
+    powers = dict(zip(STANDARD_PARAMETERS, (0, 1, 1, 1, 2, 2, 2, 2, 2, 2), strict=True))
     units, preference = np.ones(len(names)), np.ones(len(names))
     for k, name in enumerate(names[:-1]):
         owner, _, what = name.rpartition(".")
         units[k] = robot.engine.tree.size ** -powers.get(what, 0)
-        preference[k] = (0.1 if owner == PAYLOAD else 1.0) * (0.3 if what in TEN[7:] else 1.0)
+        preference[k] = (0.1 if owner == PAYLOAD else 1.0) * (0.3 if what in STANDARD_PARAMETERS[7:] else 1.0)
         if what in DRIVE:
             preference[k] = 10.0
     columns, matrix = choose_independent_columns(table / units, preference)

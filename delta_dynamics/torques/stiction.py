@@ -13,7 +13,7 @@ import numpy as np
 
 from delta_dynamics.torques.virtual_work import inverse_dynamics
 from pkm_twin.codegen.arrays import Array, Mask
-from pkm_twin.machine.friction import LoadDependent, friction_values, solve_load, sum_laws
+from pkm_twin.machine.friction import LoadDependent, read_friction_values, solve_load, sum_laws
 from pkm_twin.robot.robot import Robot
 
 SMALL_RATE: Final = 1e-6
@@ -58,7 +58,7 @@ class LoadShare:
         self._given = self.robot = robot
         self.share = np.zeros(robot.joints_count)
         if LoadDependent.name in robot.laws:
-            self.share = friction_values(robot.laws, robot.friction)["load_dependent"]
+            self.share = read_friction_values(robot.laws, robot.friction)["load_dependent"]
             self.robot = robot.changed(friction={"load_dependent": (0.0 * self.share).tolist()})
 
     def remove(self, q: Array, rates: Array, effort: Array) -> tuple[Array, Array]:
@@ -70,7 +70,7 @@ class LoadShare:
             return effort, self.share
         laws, own = self._given.laws, self._given.friction
         way = np.sign(rates)
-        at_place, dry, share = sum_laws(laws, friction_values(laws, own), q, np.abs(rates))
+        at_place, dry, share = sum_laws(laws, read_friction_values(laws, own), q, np.abs(rates))
         held = effort - own.viscous * rates - own.offset - at_place
         load = solve_load(held - (own.coulomb + dry) * way, share, way)
         holds = np.where(way == 0.0, share / (1.0 - share) * np.abs(held), 0.0)

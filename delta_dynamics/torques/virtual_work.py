@@ -23,7 +23,7 @@ from pkm_twin.kinematics.stream import start_from_last
 from pkm_twin.kinematics.traced import Traced
 from pkm_twin.machine import friction
 from pkm_twin.machine.graph import BASE, Joint, Rod
-from pkm_twin.machine.inertia import LAW_VALUES, ROTORS, Layout, loaded_joints
+from pkm_twin.machine.inertia import LAWS_PART, ROTORS_PART, Layout, list_loaded_joints
 from pkm_twin.robot.robot import Robot
 
 _NO_WRENCH: Final = np.zeros(6)
@@ -242,7 +242,7 @@ class Forces:
 
     def passive(self, values: Objects) -> None:
         """Add friction and rotor inertia of passive joints, three numbers per joint."""
-        for k, joint in enumerate(loaded_joints(self.motion.graph)):
+        for k, joint in enumerate(list_loaded_joints(self.motion.graph)):
             self.joint(joint, values[3 * k : 3 * k + 3])
 
     def joint(self, joint: Joint, three: Numbers) -> None:
@@ -253,7 +253,7 @@ class Forces:
 
     def passive_momenta(self, values: Objects) -> None:
         """Add the momenta of the passive joints' rotors."""
-        for k, joint in enumerate(loaded_joints(self.motion.graph)):
+        for k, joint in enumerate(list_loaded_joints(self.motion.graph)):
             self.pair(joint, values[3 * k + 2] * self.relative(joint, accelerated=False)[0])
 
     def relative(self, joint: Joint, *, accelerated: bool) -> tuple[Any, Any]:
@@ -358,7 +358,7 @@ def add_friction_and_rotors(
     :param q: positions of all drives, shape (n,), with ``rates`` and ``changes`` (accelerations).
     :returns: efforts of the leading drives, and the part of friction and rotor of all, shape (n,).
     """
-    rotors = [rotor * change for rotor, change in zip(parts[ROTORS], changes, strict=True)]
+    rotors = [rotor * change for rotor, change in zip(parts[ROTORS_PART], changes, strict=True)]
     basic = _basic_friction(parts, rates)
     for k, values in enumerate(_law_values(t, parts)):
         # No drive of several that share the effort has a law by load.
@@ -377,7 +377,7 @@ def _basic_friction(parts: list[Objects], qd: Numbers) -> list[Any]:
 
 def _law_values(t: Traced, parts: list[Objects]) -> list[dict[str, Any]]:
     """Return the parameters of each drive's other friction laws; an empty list without laws."""
-    laws = Layout(t.tree).laws(parts[LAW_VALUES])
+    laws = Layout(t.tree).laws(parts[LAWS_PART])
     return [{key: v[k] for key, v in laws.items()} for k in range(t.drives.count if laws else 0)]
 
 
@@ -460,7 +460,7 @@ def efforts_left(
             at_place, dry, share = friction.sum_laws(t.graph.laws, values, q[k], absolute(rates[k]))
             way = sign(rates[k])
             free = driving[k] - basic[k] - at_place - dry * way
-            rest[k] = friction.solve_load(free, share, way) - (loads[k] + parts[ROTORS][k] * changes[k])
+            rest[k] = friction.solve_load(free, share, way) - (loads[k] + parts[ROTORS_PART][k] * changes[k])
     return rest
 
 

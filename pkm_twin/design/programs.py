@@ -15,7 +15,7 @@ from delta_dynamics.torques.virtual_work import torques as torques_kernel
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.kinematics.gradients import free_forward, platform_gradient, pose_motion_gradient
 from pkm_twin.kinematics.singularity import singularity_gradient
-from pkm_twin.robot.derivatives import geometry_numbers
+from pkm_twin.robot.derivatives import list_geometry_numbers
 from pkm_twin.robot.numbers import FileNumbers, geometry_and_masses
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor.derivatives import compliance_gradient
@@ -30,7 +30,7 @@ class NumberFunctions:
         self.robot, self.paths = robot, paths
         self.others: list[Robot] = []
         """Robots with these numbers changed, one per further structure that occurred."""
-        self.geometry = FileNumbers(robot, paths, geometry_numbers)
+        self.geometry = FileNumbers(robot, paths, list_geometry_numbers)
 
     @cached_property
     def rigid(self) -> FileNumbers:

@@ -26,10 +26,10 @@ from pkm_twin.codegen.kernels import MAX_GEOMETRY_MISMATCH
 from pkm_twin.design import programs
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.machine.formulas import PARAMETERS
-from pkm_twin.machine.geometry import pattern_of
+from pkm_twin.machine.geometry import describe_pattern
 from pkm_twin.machine.places import split_path
 from pkm_twin.machine.tree import Tree
-from pkm_twin.robot.derivatives import twist_rows
+from pkm_twin.robot.derivatives import make_twist_rows
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor.compliance import MIN_PIVOT_RATIO
 from stiffness_monitor.programs import Elastic
@@ -188,7 +188,7 @@ class Variants:
         :param q: joint positions, shape (samples, n).
         """
         states = np.asarray(q, np.float64)[None]
-        rows = twist_rows(len(self.robot.pose_names), self.platform(states)[1])
+        rows = make_twist_rows(len(self.robot.pose_names), self.platform(states)[1])
         (found,), _ = self.run(programs.platform_slopes, states[..., None, :], rows)
         return np.asarray(found[0] @ self.geometry_slopes, np.float64)
 
@@ -394,7 +394,7 @@ class Variants:
         if k not in self._patterns:
             given = dict(zip(self.paths, self.values[k].tolist(), strict=True))
             try:
-                self._patterns[k] = pattern_of(Tree(self.robot.numbered(given).graph))
+                self._patterns[k] = describe_pattern(Tree(self.robot.numbered(given).graph))
             except PkmTwinError:
                 self._patterns[k] = "none"
         return self._patterns[k]

@@ -495,8 +495,8 @@ int @_parameters(double mass, const double *com, const double *inertia, double *
         if self.elastic is not None:
             sizes.append(("ELEMENTS", len(self.elastic.names)))
         # In capitals as macros are, and with the robot's own spelling as the functions have it.
-        spelled = dict.fromkeys([self.macro, f"PKM_{self.prefix.removeprefix('pkm_')}"])
-        lines = [f"#define {m}_{name} {count}" for m in spelled for name, count in sizes]
+        with_default_inertia = dict.fromkeys([self.macro, f"PKM_{self.prefix.removeprefix('pkm_')}"])
+        lines = [f"#define {m}_{name} {count}" for m in with_default_inertia for name, count in sizes]
         parts = []
         for routine in self.routines:
             most = WORST.format(*routine.worst)

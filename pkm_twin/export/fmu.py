@@ -21,7 +21,7 @@ from pkm_twin.errors import ParameterError
 from pkm_twin.export.c99 import table
 from pkm_twin.export.c_package import Package
 from pkm_twin.export.fmu_xml import Description, Variable, build_of, quoted, text_of
-from pkm_twin.machine.inertia import loaded_joints
+from pkm_twin.machine.inertia import list_loaded_joints
 from pkm_twin.robot.robot import Robot
 
 VERSIONS: Final = (2, 3)
@@ -66,7 +66,7 @@ class Fmu:
         names = ("terms" if self.dynamic else "torques_and_singularity", "forward")
         self._package = Package(robot, names)
         self.identifier = self._package.prefix
-        passive = loaded_joints(robot.graph)
+        passive = list_loaded_joints(robot.graph)
         dry = [*robot.friction.coulomb, *(joint.coulomb for joint in passive)]
         self._rows = [k for k, force in enumerate(dry) if force > 0.0] if self.dynamic else []
         self._dry = [float(dry[k]) for k in self._rows]

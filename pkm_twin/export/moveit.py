@@ -26,7 +26,7 @@ from pkm_twin.export.c_package import c_package, identifier
 from pkm_twin.export.ros2_control import fill_templates, literal, number, package_name, printable
 from pkm_twin.kinematics.pose import Coordinate, Entry
 from pkm_twin.machine.loop_tree import LoopTree, Single
-from pkm_twin.machine.urdf_write import GROUND, PLATFORM, parts_of
+from pkm_twin.machine.urdf_write import GROUND, PLATFORM, list_single_joints
 from pkm_twin.robot.clearance import distance
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.robot_urdf import robot_tree, robot_urdf
@@ -57,7 +57,7 @@ def moveit_package(robot: Robot, kinematics: str = "") -> dict[str, str]:
     name = re.sub(r"\W", "_", robot.name or robot.mechanism)
     # Write the SRDF: groups, passive joints, home state, and links that always touch.
     tree = robot_tree(robot)
-    parts = parts_of(tree)
+    parts = list_single_joints(tree)
     root = ET.Element("robot", name=tree.name)
     joints = list(robot.joint_names)
     group = ET.SubElement(root, "group", name=GROUP)

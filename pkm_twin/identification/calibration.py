@@ -60,7 +60,7 @@ from pkm_twin.identification.undetermined import Pair, find_determined_pairs, un
 from pkm_twin.machine.formulas import PARAMETERS
 from pkm_twin.machine.joint_map import JointMap
 from pkm_twin.mechanisms.entries import Fitted as FittedNumber
-from pkm_twin.robot.derivatives import geometry_numbers
+from pkm_twin.robot.derivatives import list_geometry_numbers
 from pkm_twin.robot.numbers import FileNumbers
 from pkm_twin.robot.robot import Robot
 
@@ -240,7 +240,7 @@ def geometric(robot: Robot, q: Array, only: Sequence[str] = ()) -> tuple[str, ..
         if not path.startswith(NOT_GEOMETRY if only else (*NOT_GEOMETRY, f"{PARAMETERS}."))
         and (not only or path.startswith(tuple(only)))
     ]
-    slopes = robot.cached(FileNumbers, tuple(paths), geometry_numbers).slopes
+    slopes = robot.cached(FileNumbers, tuple(paths), list_geometry_numbers).slopes
     paths = [path for path, moves in zip(paths, np.abs(slopes).max(0) > 1e-9, strict=True) if moves]
     found: list[str] = []
     if paths:

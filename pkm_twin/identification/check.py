@@ -36,7 +36,7 @@ from pkm_twin.identification.judge import LOUD
 from pkm_twin.identification.words import LATEST, listed, position_text, scale_text
 from pkm_twin.recordings import Recording
 from pkm_twin.report import Fact, Verdict, judged
-from pkm_twin.robot.limits import ranges
+from pkm_twin.robot.limits import list_limits
 from pkm_twin.robot.plausibility import why_no_torques
 from pkm_twin.streams.drives import CONSTANT_SAMPLES, MAX_RELATIVE_CHANGE
 from pkm_twin.streams.noise import estimate_deviation
@@ -274,7 +274,7 @@ def _limits(r: Recording) -> list[Fact]:
     """Effort limits; position and velocity limits are already a node's reason to reject."""
     recorded = {"position": r.q, "velocity": r.qd, "effort": r.effort}
     items = []
-    for what, low, high, units in ranges(r.robot):
+    for what, low, high, units in list_limits(r.robot):
         values = recorded[what]
         if values is None:
             continue

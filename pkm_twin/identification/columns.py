@@ -15,7 +15,7 @@ from pkm_twin.identification.judge import ALL
 from pkm_twin.identification.rows import Rows
 from pkm_twin.identification.samples import Motion
 from pkm_twin.identification.suspects import DELAY, GAIN, OFF, Lengths, errors_of
-from pkm_twin.machine.friction import turning_keys
+from pkm_twin.machine.friction import list_reversal_keys
 
 MASS_ERROR: Final = 0.3
 """Prior deviation of a mass or a rotor, as a part of it."""
@@ -173,7 +173,7 @@ def _differentiate(rows: Rows, table: Array, rest: Array, motion: Motion) -> Col
         deviation += spread.tolist()
         low += least.tolist()
         kinds += [kind] * count
-        turning += [kind == "friction" and word in {*turning_keys(), "viscous"}] * count
+        turning += [kind == "friction" and word in {*list_reversal_keys(), "viscous"}] * count
     quick_rest = (rest - rest_standing) + quick @ p.values
     return Columns(
         rows,

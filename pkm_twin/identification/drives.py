@@ -27,7 +27,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.identification.compare import by_held
 from pkm_twin.identification.samples import WINDOWS, low_pass, tracks
-from pkm_twin.machine.friction import all_keys
+from pkm_twin.machine.friction import list_friction_keys
 from pkm_twin.recordings import Recording, Table
 from pkm_twin.robot.robot import Robot
 
@@ -96,7 +96,7 @@ def _constants(
         window = None if windows is None else windows[i]
         pieces, how = tracks(r.time, r.q, r.measured, r.wrench, window=window)
         used.append(how.window)
-        smooth = replace(r, robot=robot.changed(friction=dict.fromkeys(all_keys(), 0.0)))
+        smooth = replace(r, robot=robot.changed(friction=dict.fromkeys(list_friction_keys(), 0.0)))
         for track in pieces:
             motion = track.q, track.qd, track.qdd, track.wrench
             load = by_held(smooth, inverse_dynamics, track.time, *motion)

@@ -26,7 +26,7 @@ from pkm_twin.errors import PkmTwinError, check_limit
 from pkm_twin.identification.parameters import FileParameters
 from pkm_twin.identification.samples import tracks
 from pkm_twin.robot.robot import Robot
-from pkm_twin.robot.workspace import passing_singularity, position_range, reachable
+from pkm_twin.robot.workspace import describe_singularity_bound, position_range, reachable
 
 SHRINK: Final = 0.85
 SLOWEST: Final = 20.0
@@ -320,7 +320,7 @@ def _remedy(robot: Robot, keep: Bounds, centre: Array) -> str:
         return "try wider limits.position"
     return (
         f"the singularity index is {index:.3g} in the middle of the travel, allowed "
-        f"{keep.singularity:g} or more; {passing_singularity(index)} passes there, half of it "
+        f"{keep.singularity:g} or more; {describe_singularity_bound(index)} passes there, half of it "
         "leaves room to move"
     )
 

@@ -17,8 +17,8 @@ from typing import Any, Final, Literal
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array, Indices
-from pkm_twin.machine.friction import LAWS, all_keys, linear_keys
-from pkm_twin.machine.inertia import change_of_frame, drive_units, matrix_of, standard_parameters
+from pkm_twin.machine.friction import LAWS, list_friction_keys, list_linear_keys
+from pkm_twin.machine.inertia import drive_units, inertia_matrix, make_frame_change, standard_parameters
 from pkm_twin.machine.places import Keys, join_path
 from pkm_twin.robot.numbers import FileNumbers
 from pkm_twin.robot.robot import Robot
@@ -64,7 +64,7 @@ def pseudo_inertia() -> Array:
     """
     parts = []
     for ten in np.eye(10):
-        about = matrix_of(ten)
+        about = inertia_matrix(ten)
         block = np.zeros((4, 4))
         block[:3, :3] = 0.5 * np.trace(about) * np.eye(3) - about
         block[:3, 3] = block[3, :3] = ten[1:4]
@@ -80,7 +80,7 @@ def identifiable(robot: Robot) -> tuple[Identifiable, ...]:
     """
     # The engine's own graph may be that of a machine with other masses.
     robot.massive()
-    return (*of_drives(robot), *of_masses(robot.spelled))
+    return (*of_drives(robot), *of_masses(robot.with_default_inertia))
 
 
 def of_drives(robot: Robot) -> tuple[Identifiable, ...]:
@@ -89,11 +89,11 @@ def of_drives(robot: Robot) -> tuple[Identifiable, ...]:
     found, rotors = [], dict[Keys, list[str]]()
     # A memory that is open to a fit has columns along a motion, which a regressor has not.
     open_keys = [key for name in robot.open_laws if LAWS[name].memory for key in LAWS[name].parameters]
-    words = dict.fromkeys((*linear_keys(robot.laws), *open_keys))
+    words = dict.fromkeys((*list_linear_keys(robot.laws), *open_keys))
 
     def number(kind: Kind, name: str, value: float, key: Keys, joints: Sequence[str]) -> None:
         word = name.rpartition(".")[2]
-        rub = all_keys().get(word)
+        rub = list_friction_keys().get(word)
         linear, signed = rub is None or rub.linear, rub is not None and rub.low is None
         # Of a rotor behind a gear the file has the inertia at the motor.
         drive = dict(zip(robot.joint_names, robot.drives, strict=True)).get(joints[0])
@@ -164,7 +164,7 @@ def of_masses(robot: Robot) -> Iterator[Identifiable]:
     rods = dict(zip(graph.rods, slopes[10 * len(names) :], strict=True))
     coms = [*(body.com for body in graph.bodies.values()), graph.origin + load.com]
     moved = zip(coms, tens, strict=True)
-    own = np.array([change_of_frame(np.eye(3), -com) @ ten for com, ten in moved])
+    own = np.array([make_frame_change(np.eye(3), -com) @ ten for com, ten in moved])
     own[np.abs(own) < 1e-12 * np.abs(own).max((1, 2), keepdims=True, initial=1e-300)] = 0.0
     touched = np.vstack([own.any(1), slopes[10 * len(names) :] != 0.0]).astype(float)
     linked = np.linalg.matrix_power(touched.T @ touched > 0.0, 4)

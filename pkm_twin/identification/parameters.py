@@ -23,7 +23,7 @@ from pkm_twin.identification.identifiable import (
     possible_inertia,
 )
 from pkm_twin.machine.graph import group_connected
-from pkm_twin.machine.inertia import TEN, change_of_frame
+from pkm_twin.machine.inertia import STANDARD_PARAMETERS, make_frame_change
 from pkm_twin.machine.machine_yaml import edit_yaml
 from pkm_twin.machine.places import Keys, join_path
 from pkm_twin.robot.robot import Robot
@@ -109,8 +109,8 @@ def file_parameters(robot: Robot, what: Sequence[Kind] = KINDS) -> FileParameter
     for group in kept:
         end = start + len(group.names)
         for body, ten in group.bodies.items():
-            rows = [place[f"{body}.{word}"] for word in TEN]
-            mixing[rows, start:end] += change_of_frame(np.eye(3), -tree.at[body]) @ ten
+            rows = [place[f"{body}.{word}"] for word in STANDARD_PARAMETERS]
+            mixing[rows, start:end] += make_frame_change(np.eye(3), -tree.at[body]) @ ten
         for name, row in group.others.items():
             mixing[place[name], start:end] += row
         start = end

@@ -42,7 +42,7 @@ from pkm_twin.machine.friction import (
     KNOWN_FRACTION,
     Dahl,
     Memory,
-    all_keys,
+    list_friction_keys,
     list_unshareable_laws,
     select_compiled_laws,
 )
@@ -72,7 +72,7 @@ class Model:
     @property
     def of_drives(self) -> Mask:
         """Which parameters are friction of the drives."""
-        keys, drives = all_keys(), set(self.robot.joint_names)
+        keys, drives = list_friction_keys(), set(self.robot.joint_names)
         pairs = [name.rpartition(".")[::2] for name in self.parameters.names]
         return np.array([joint in drives and key in keys for joint, key in pairs])
 

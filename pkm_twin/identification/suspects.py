@@ -36,9 +36,9 @@ from pkm_twin.identification.judge import (
 from pkm_twin.identification.parameters import FileParameters
 from pkm_twin.identification.rows import BLOCK, Problem, Rows
 from pkm_twin.identification.samples import EXACT, by_blocks
-from pkm_twin.machine.friction import turning_keys
+from pkm_twin.machine.friction import list_reversal_keys
 from pkm_twin.machine.places import join_path
-from pkm_twin.machine.uncertainty import numbers_below
+from pkm_twin.machine.uncertainty import match_numbers
 from pkm_twin.robot.robot import Robot
 
 GAIN: Final = "gain of the efforts"
@@ -80,7 +80,7 @@ def errors_of(rows: Rows, values: Array) -> tuple[Errors, Array]:
     # A radian for joints that turn, the machine's size for those that slide.
     eye, lengths = np.eye(len(names)), np.array([robot.size if u == "m" else 1.0 for u in robot.joint_units])
     # Without dry friction: its sign has no derivative, and turns where a rate is near zero.
-    dry = turning_keys()
+    dry = list_reversal_keys()
     own = [name.rpartition(".")[2] for name in rows.model.parameters.names]
     smooth = np.where([word in dry for word in own], 0.0, values)
 
@@ -142,7 +142,7 @@ class Lengths:
         causes: list[tuple[Suspect, Mapping[str, float]]] = []
         told = set()
         for name, entry in robot.uncertainty.items():
-            below = {p: v for p, v in numbers_below(name, entry, known).items() if p in paths}
+            below = {p: v for p, v in match_numbers(name, entry, known).items() if p in paths}
             told |= set(below)
             if not below:
                 continue

@@ -22,7 +22,7 @@ from pkm_twin.kinematics.constraints import cross
 from pkm_twin.kinematics.engine import Engine
 from pkm_twin.kinematics.traced import Traced
 from pkm_twin.machine.graph import Rod
-from pkm_twin.machine.joints import perpendicular_axes, single_names, unit
+from pkm_twin.machine.joints import name_single_freedoms, perpendicular_axes, unit
 from pkm_twin.machine.names import FREE_BODY, FREE_ROD, joint_labels
 from pkm_twin.machine.tree import Link
 
@@ -38,11 +38,11 @@ def passive_names(engine: Engine) -> tuple[str, ...]:
     labels = joint_labels(engine.tree)
     for link in engine.tree.links.values():
         if link.joint is None:
-            names += single_names(labels["bodies", link.body], FREE_BODY)
+            names += name_single_freedoms(labels["bodies", link.body], FREE_BODY)
         else:
             joint = engine.graph.joints[link.joint]
-            names += single_names(labels["joints", joint.name], joint.freedoms)[joint.actuated :]
-    rods = (single_names(labels["rods", rod], FREE_ROD) for rod in engine.graph.rods)
+            names += name_single_freedoms(labels["joints", joint.name], joint.freedoms)[joint.actuated :]
+    rods = (name_single_freedoms(labels["rods", rod], FREE_ROD) for rod in engine.graph.rods)
     return (*names, *chain.from_iterable(rods))
 
 

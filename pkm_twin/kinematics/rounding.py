@@ -32,7 +32,7 @@ from pkm_twin.kinematics.constraints import (
 )
 from pkm_twin.kinematics.iterations import newton
 from pkm_twin.machine.graph import Graph, Joint, array
-from pkm_twin.machine.joints import HELD
+from pkm_twin.machine.joints import CONSTRAINTS
 
 CHAIN: Final = 20.0
 """How far rounding may move a body or open a loop, rounding errors: a loop is a chain of places."""
@@ -355,7 +355,7 @@ class _Loops:
             points = placed.point(a, joint.at), placed.point(b, joint.at)
             turns = partial(rotate, placed.turn(a)), partial(rotate, placed.turn(b))
             for key in joint.type.holds:
-                for held in HELD[key](joint.axes, joint.pitch):
+                for held in CONSTRAINTS[key](joint.axes, joint.pitch):
                     frames = [_Frame(("at", name, 0), joint.at)] * 2
                     if key not in ("point", "turns"):
                         frames = [

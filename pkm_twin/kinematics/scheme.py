@@ -26,7 +26,7 @@ from pkm_twin.kinematics.motion import Motion, Row, matrices, numbers
 from pkm_twin.kinematics.pose import Coordinate
 from pkm_twin.kinematics.spins import null
 from pkm_twin.kinematics.three_rods import find_three_rods
-from pkm_twin.machine.geometry import geometry_of, pattern_of
+from pkm_twin.machine.geometry import describe_pattern, list_geometry
 from pkm_twin.machine.graph import BASE, Graph
 from pkm_twin.machine.tree import Step, Tree
 
@@ -66,7 +66,7 @@ class Scheme(Linkage):
     @cached_property
     def geometry(self) -> Array:
         """The geometry's numbers that programs take as inputs, shape (k,)."""
-        return np.array(geometry_of(self.graph), np.float64)
+        return np.array(list_geometry(self.graph), np.float64)
 
     @cached_property
     def structure(self) -> ProgramKey:
@@ -75,7 +75,7 @@ class Scheme(Linkage):
             repr(
                 (
                     self.graph.topology,
-                    pattern_of(self.tree),
+                    describe_pattern(self.tree),
                     self.coordinates,
                     self.start,
                     self.independent,

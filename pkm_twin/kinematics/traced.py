@@ -27,7 +27,7 @@ from pkm_twin.kinematics.drives import LEADS, TIME, Drives
 from pkm_twin.kinematics.limb_pose import LimbPose
 from pkm_twin.kinematics.motion import FIXED, BaseMotion, Columns, Motion, Row, matrices
 from pkm_twin.kinematics.scheme import Scheme
-from pkm_twin.machine.geometry import graph_on
+from pkm_twin.machine.geometry import build_sized_graph
 from pkm_twin.machine.graph import Graph
 from pkm_twin.machine.tree import Tree
 
@@ -64,7 +64,7 @@ class Traced:
         given = self.tape.inputs(GEOMETRY, len(self.tape.reference))
         end = len(scheme.geometry)
         self.geometry = given[:end]
-        self.graph: Graph = graph_on(scheme.graph, self.geometry)
+        self.graph: Graph = build_sized_graph(scheme.graph, self.geometry)
         self.more = given[end:]
         """Numbers beside the geometry's, see :meth:`.engine.Engine.kernel_with`."""
         self._span()

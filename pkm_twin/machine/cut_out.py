@@ -26,7 +26,7 @@ MAX_NAMES: Final = 6
 class CutOut:
     """A linkage with its base as the root, notes on what is left out, and what it carries.
 
-    ``carried``: links that hang on the platform, as drawn.
+    ``carried``: links beyond the platform, kept as its payload.
     """
 
     tree: LoopTree

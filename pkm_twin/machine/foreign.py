@@ -57,9 +57,9 @@ def check_elements(
         if tag in ("visual", "collision"):
             continue
         where = ".".join(filter(None, (owner, tag, name)))
-        if tag in REJECTED and _acts(part):
+        if tag in REJECTED and _is_effective(part):
             raise ParameterError(where, f"<{tag}>", REJECTED[tag])
-        if tag in IGNORED and _acts(part):
+        if tag in IGNORED and _is_effective(part):
             warn(path, f"{where}: {IGNORED[tag]} is ignored")
         elif tag.partition(":")[0] in ("drake", "isaac") and owner:
             warn(path, f"{where} is not read")
@@ -80,7 +80,7 @@ def check_elements(
     return faults
 
 
-def _acts(part: ET.Element) -> bool:
+def _is_effective(part: ET.Element) -> bool:
     """Return whether an element states anything but zero or false."""
     stated = [part.text, *part.attrib.values(), *(e.text for e in part.iter() if e is not part)]
     words = [word for text in stated for word in (text or "").split()]
@@ -94,7 +94,7 @@ def _acts(part: ET.Element) -> bool:
     return not words
 
 
-def gravity_of(
+def read_gravity(
     path: Path,
     weight: Mapping[str, bool],
     links: Mapping[str, Link],

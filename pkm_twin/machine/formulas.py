@@ -32,8 +32,8 @@ MAX_DEPTH: Final = 40
 """Deepest nesting of an expression."""
 MAX_SIZE: Final = 1e18
 """Largest number: beyond every quantity of a machine in SI units; products stay finite."""
-_NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
-_NUMBER: Final = re.compile(r"(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+_NAME_PATTERN: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+_NUMBER_PATTERN: Final = re.compile(r"(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 
 
 def _dispatch(numbers: Callable[..., float], expressions: Callable[..., Any]) -> Callable[..., Any]:
@@ -138,25 +138,25 @@ class Formula:
         """
         for name in sorted(self.names - given.keys()):
             if name.lower() in ("nan", "inf"):
-                raise self._error("a finite number")
+                raise self._make_error("a finite number")
             close = difflib.get_close_matches(name, [*given, *FUNCTIONS, "pi"], 1)
             hint = f"; did you mean {close[0]!r}?" if close else ""
-            raise self._error(f"names under `{PARAMETERS}`; {name!r} is none{hint}")
+            raise self._make_error(f"names under `{PARAMETERS}`; {name!r} is none{hint}")
         try:
             found = _evaluate(self.tree, given)
         except ZeroDivisionError:
-            raise self._error("a finite number, not a division by zero") from None
+            raise self._make_error("a finite number, not a division by zero") from None
         except FloatingPointError:
-            raise self._error(f"0, or at least {sys.float_info.min:.1e} in size") from None
+            raise self._make_error(f"0, or at least {sys.float_info.min:.1e} in size") from None
         except (ValueError, OverflowError, TypeError):
-            raise self._error("a finite real number") from None
+            raise self._make_error("a finite real number") from None
         if hasattr(found, "tape"):
             return found
         if isinstance(found, complex) or not abs(found) <= MAX_SIZE:
-            raise self._error("a finite real number")
+            raise self._make_error("a finite real number")
         return float(found)
 
-    def _error(self, reason: str) -> ParameterError:
+    def _make_error(self, reason: str) -> ParameterError:
         return ParameterError(self.path, self.text, reason)
 
     def units(self, unit: str) -> Iterator[tuple[str, str]]:
@@ -179,7 +179,7 @@ def _find_invalid_reason(node: ast.expr, text: str) -> str:
     if isinstance(node, ast.Name):
         return f"{own}( )" if own in FUNCTIONS else ""
     if isinstance(node, ast.Constant):
-        if not _NUMBER.fullmatch(own):
+        if not _NUMBER_PATTERN.fullmatch(own):
             return f"decimal numbers; {own!r} is none"
         lost = not float(own) and re.match(r"[0.]*[1-9]", own)
         return f"0, or at least {sys.float_info.min:.1e} in size" if lost else ""
@@ -245,7 +245,7 @@ def _has_no_unit(node: ast.expr) -> bool:
 
 
 class Written(str):
-    """A text of a machine file that may be an expression for a number."""
+    """A text in a machine file that may be an expression in place of a number."""
 
     book: Book
     place: str
@@ -297,7 +297,7 @@ class Book:
         for name, value in given.items():
             path = f"{PARAMETERS}.{name}"
             taken = name in FUNCTIONS or name == "pi" or keyword.iskeyword(str(name))
-            if taken or not isinstance(name, str) or not _NAME.fullmatch(name):
+            if taken or not isinstance(name, str) or not _NAME_PATTERN.fullmatch(name):
                 raise ParameterError(path, name, "a name of letters, digits and _, not in use")
             if isinstance(value, str):
                 own[name] = Formula.of(path, value)

@@ -161,7 +161,7 @@ class Periodic(FrictionLaw):
 
 
 BASIC: Final = ViscousCoulomb
-"""The law that every drive has."""
+"""Law that every drive has."""
 
 
 class Memory(NamedTuple):
@@ -267,7 +267,7 @@ LAWS: Final[Mapping[str, type[FrictionLaw]]] = {
 """All laws but the basic one, by name."""
 
 
-def law_names(friction: Any, opened: Sequence[str] = ()) -> tuple[str, ...]:
+def find_law_names(friction: Any, opened: Sequence[str] = ()) -> tuple[str, ...]:
     """Name the laws besides the basic one that ``friction`` or ``opened`` has."""
 
     def given(law: type[FrictionLaw], *, linear: bool) -> list[bool]:
@@ -297,19 +297,19 @@ def list_parameters(names: Sequence[str]) -> dict[str, Parameter]:
     return {key: one for name in names for key, one in LAWS[name].parameters.items()}
 
 
-def linear_keys(names: Sequence[str]) -> tuple[str, ...]:
+def list_linear_keys(names: Sequence[str]) -> tuple[str, ...]:
     """Return the keys of the linear parameters of the basic law and of the named laws."""
     every = {**BASIC.parameters, **list_parameters(names)}
     return tuple(key for key, one in every.items() if one.linear)
 
 
-def turning_keys() -> frozenset[str]:
+def list_reversal_keys() -> frozenset[str]:
     """Return the keys of the parameters whose efforts jump at a reversal of the joint."""
     own = (key for law in LAWS.values() if law.turns for key in law.parameters)
     return frozenset({"coulomb", *own})
 
 
-def all_keys() -> dict[str, Parameter]:
+def list_friction_keys() -> dict[str, Parameter]:
     """Return all parameters of a drive's friction, those of the basic law first."""
     return {**BASIC.parameters, **list_parameters(tuple(LAWS))}
 
@@ -352,7 +352,7 @@ def potential(names: Sequence[str], values: Values, q: Any) -> Any:
     return sum((LAWS[name].potential(values, q) for name in names), 0.0)
 
 
-def friction_values(names: Sequence[str], friction: Any) -> dict[str, Array]:
+def read_friction_values(names: Sequence[str], friction: Any) -> dict[str, Array]:
     """Return the parameters of laws, by key, from a friction section."""
     return {key: np.asarray(getattr(friction, key), np.float64) for key in list_parameters(names)}
 

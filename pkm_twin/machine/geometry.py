@@ -42,19 +42,19 @@ class SizedGraph(Graph):
         return plain(self.given[k : k + 3]), self.given[k + 3]
 
 
-def scales_of(graph: Graph) -> list[float]:
+def list_scale_lengths(graph: Graph) -> list[float]:
     """List the lengths that only scale equations: size, rim, and every body's frame."""
     frames = [graph.frame(body) for body in graph.bodies]
     return [graph.size, graph.rim, *(v for middle, reach in frames for v in (*middle, reach))]
 
 
-def geometry_of(graph: Graph) -> Array:
+def list_geometry(graph: Graph) -> Array:
     """Return all numbers of a graph's geometry, shape (k,), the scale lengths last."""
-    return array([*graph.numbers, *scales_of(graph)])
+    return array([*graph.numbers, *list_scale_lengths(graph)])
 
 
-def graph_on(graph: Graph, numbers: Numbers) -> SizedGraph:
-    """Build the graph with other numbers or expressions, in the order of :func:`geometry_of`.
+def build_sized_graph(graph: Graph, numbers: Numbers) -> SizedGraph:
+    """Build the graph with other numbers or expressions, in the order of :func:`list_geometry`.
 
     Expressions that are 0, 1 or -1 at the reference geometry become constants, see
     :func:`pkm_twin.codegen.expressions.snapped`, except for scale lengths.
@@ -83,7 +83,7 @@ def graph_on(graph: Graph, numbers: Numbers) -> SizedGraph:
     )
 
 
-def pattern_of(tree: Tree) -> str:
+def describe_pattern(tree: Tree) -> str:
     """Describe the constants that programs assume, and the choice of the tree's frames.
 
     Two graphs with equal topology and pattern have the same programs, with their own numbers.

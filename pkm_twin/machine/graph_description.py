@@ -21,14 +21,18 @@ def graph_description(graph: Graph) -> dict[str, Any]:
     bodies: dict[str, Any] = {}
     for name, body in graph.bodies.items():
         diagonal = np.diag(body.inertia)
-        inertia: list[Any] = [_numbers(row) for row in body.inertia]
+        inertia: list[Any] = [_round_numbers(row) for row in body.inertia]
         if not np.any(body.inertia - np.diag(diagonal)):
-            inertia = _numbers(diagonal)
-        bodies[name] = {"mass": body.mass, "com": _numbers(body.com), "inertia": inertia}
+            inertia = _round_numbers(diagonal)
+        bodies[name] = {"mass": body.mass, "com": _round_numbers(body.com), "inertia": inertia}
     joints = {}
     for name, joint in graph.joints.items():
-        entry: dict[str, Any] = {"type": joint.kind, "between": [joint.inner, joint.outer], "at": _numbers(joint.at)}
-        axes = [_numbers(axis) for axis in joint.axes]
+        entry: dict[str, Any] = {
+            "type": joint.kind,
+            "between": [joint.inner, joint.outer],
+            "at": _round_numbers(joint.at),
+        }
+        axes = [_round_numbers(axis) for axis in joint.axes]
         if axes:
             entry |= {"axis": axes[0]} if len(axes) == 1 else {"axes": axes}
         if joint.pitch:
@@ -44,14 +48,14 @@ def graph_description(graph: Graph) -> dict[str, Any]:
             entry["friction"] = {"viscous": joint.viscous, "coulomb": joint.coulomb}
         joints[name] = entry
     rods = {
-        name: {"between": [rod.inner, rod.outer], "ends": [_numbers(end) for end in rod.ends], "mass": rod.mass}
+        name: {"between": [rod.inner, rod.outer], "ends": [_round_numbers(end) for end in rod.ends], "mass": rod.mass}
         for name, rod in graph.rods.items()
     }
-    data = {"mechanism": "machine", "platform": graph.platform, "origin": _numbers(graph.origin)}
+    data = {"mechanism": "machine", "platform": graph.platform, "origin": _round_numbers(graph.origin)}
     return data | {"bodies": bodies, "joints": joints} | ({"rods": rods} if rods else {})
 
 
-def _numbers(values: Array) -> list[float]:
+def _round_numbers(values: Array) -> list[float]:
     """List numbers without the rounding that rotations leave in their sixteenth digit."""
     least = 1e-15 * max(1.0, float(np.abs(values).max(initial=0.0)))
     return [0.0 if abs(x) < least else float(x) for x in values]

@@ -18,7 +18,7 @@ from pkm_twin.codegen.expressions import references
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.machine import schema
 from pkm_twin.machine.formulas import Written
-from pkm_twin.machine.friction import all_keys, check_laws
+from pkm_twin.machine.friction import check_laws, list_friction_keys
 from pkm_twin.machine.graph import Body, Graph, Joint, Rod, array, rotation_about_z
 from pkm_twin.machine.joints import TURN, TYPES, Freedom, unit
 from pkm_twin.machine.members import Tube, compliances
@@ -174,7 +174,7 @@ class JointSpec:
         freedoms = self._freedoms()
         if self.actuated and len(freedoms) != 1:
             raise ParameterError(f"{path}.actuated", self.type, "a joint of one freedom")
-        for key in all_keys():
+        for key in list_friction_keys():
             value = getattr(self.friction, key, 0.0)
             if value and not self.actuated and key not in ("viscous", "coulomb"):
                 raise ParameterError(f"{path}.friction.{key}", value, "0 at a joint that is not actuated")
@@ -273,11 +273,11 @@ class Source:
 
 KINDS: Final[Mapping[str, type]] = {"bodies": BodySpec, "joints": JointSpec, "rods": RodSpec}
 """The three mappings of a graph, and the schemas of their entries."""
-PER_COPY: Final = (["rotor_inertia"], *(["friction", key] for key in all_keys()))
+PER_COPY: Final = (["rotor_inertia"], *(["friction", key] for key in list_friction_keys()))
 """Keys of a limb's numbers that may be lists, one number per copy."""
 
 
-def _raw() -> Any:
+def _raw_field() -> Any:
     return schema.mapping(schema.key(lambda _, value: value, ""), default={})
 
 
@@ -290,9 +290,9 @@ class LimbFile:
     """
 
     azimuths: Array = schema.vector(0, unit="rad")
-    bodies: Mapping[str, Any] = _raw()
-    joints: Mapping[str, Any] = _raw()
-    rods: Mapping[str, Any] = _raw()
+    bodies: Mapping[str, Any] = _raw_field()
+    joints: Mapping[str, Any] = _raw_field()
+    rods: Mapping[str, Any] = _raw_field()
 
     def verify(self, path: str) -> None:
         """Check that azimuths are in rad."""
@@ -302,7 +302,7 @@ class LimbFile:
 
 @dataclass(frozen=True, eq=False)
 class Limb:
-    """A limb of a file: the keys of its section, its azimuths, and each entry's copies by kind."""
+    """A limb of a file: its azimuths, the keys of its section, and the names of each entry's copies."""
 
     place: Keys
     azimuths: Array
@@ -321,7 +321,7 @@ def read_limbs(field: str, value: Any) -> list[Limb]:
             kind: {
                 name: [
                     schema.build(spec, one, f"{path}.{kind}.{name}")
-                    for one in _copies(entry, len(limb.azimuths), f"{path}.{kind}.{name}")
+                    for one in _copy_entry(entry, len(limb.azimuths), f"{path}.{kind}.{name}")
                 ]
                 for name, entry in getattr(limb, kind).items()
             }
@@ -355,12 +355,12 @@ def expand_limbs(
                     f"a name of its own for each copy: {full} stands for "
                     f"{where} already, so rename one of the two, for example {name}_b",
                 )
-            result[kind][full] = _turned(entry, azimuth, own, number + 1)
+            result[kind][full] = _rotate_entry(entry, azimuth, own, number + 1)
             sources[kind, full] = Source(place, name, number, len(limb.azimuths), azimuth)
     return result, sources
 
 
-def _copies(entry: Any, count: int, path: str) -> list[Any]:
+def _copy_entry(entry: Any, count: int, path: str) -> list[Any]:
     """Return a limb's entry for each copy; numbers of drives may be lists, one number per copy."""
     result = [entry] * count
     if not isinstance(entry, Mapping):
@@ -382,7 +382,7 @@ def _copies(entry: Any, count: int, path: str) -> list[Any]:
     return result
 
 
-def _turned(entry: Any, azimuth: Any, own: set[str], number: int) -> Any:
+def _rotate_entry(entry: Any, azimuth: Any, own: set[str], number: int) -> Any:
     """Rotate a copy of a limb's entry about base z, and number the names of its own bodies."""
     rotation = rotation_about_z(azimuth)
     vectors = {key: getattr(entry, key, None) for key in ("com", "at", "axis", "axes", "ends")}
@@ -400,7 +400,7 @@ def _turned(entry: Any, azimuth: Any, own: set[str], number: int) -> Any:
     return dataclasses.replace(entry, **new)
 
 
-def numbered_entry(entry: T, values: Mapping[Keys, Any], azimuth: float, path: str) -> T:
+def replace_entry_numbers(entry: T, values: Mapping[Keys, Any], azimuth: float, path: str) -> T:
     """Return an entry with other numbers or expressions, without checks.
 
     :param values: new numbers by their keys in the entry; ``azimuth`` alone: a new azimuth of the limb.
@@ -408,12 +408,12 @@ def numbered_entry(entry: T, values: Mapping[Keys, Any], azimuth: float, path: s
     :param path: of the entry, for the error.
     """
     if ("azimuth",) in values:
-        turned: T = _turned(entry, values["azimuth",] - azimuth, set(), 0)
+        turned: T = _rotate_entry(entry, values["azimuth",] - azimuth, set(), 0)
         return turned
-    entry = _spelled(entry, values)
+    entry = _add_implied_zeros(entry, values)
     if azimuth:
-        made = replace_numbers(_turned(entry, -azimuth, set(), 0), values, path)
-        back, whole = _turned(made, azimuth, set(), 0), copy.copy(entry)
+        made = replace_numbers(_rotate_entry(entry, -azimuth, set(), 0), values, path)
+        back, whole = _rotate_entry(made, azimuth, set(), 0), copy.copy(entry)
         for key in {str(key) for key, *_ in values}:
             vars(whole)[key] = getattr(back, key)
         made = whole
@@ -424,19 +424,19 @@ def numbered_entry(entry: T, values: Mapping[Keys, Any], azimuth: float, path: s
     return made
 
 
-def number_of_entry(entry: Any, keys: tuple[str | int, ...], azimuth: float, path: str) -> float:
-    """Return the number that :func:`numbered_entry` replaces.
+def find_entry_number(entry: Any, keys: tuple[str | int, ...], azimuth: float, path: str) -> float:
+    """Return the number that :func:`replace_entry_numbers` replaces.
 
     :raises ParameterError: there is no number.
     """
     if keys == ("azimuth",):
         return azimuth
     if azimuth:
-        entry = _turned(entry, -azimuth, set(), 0)
-    return number_in(schema.plain(_spelled(entry, [keys])), keys, path)
+        entry = _rotate_entry(entry, -azimuth, set(), 0)
+    return number_in(schema.plain(_add_implied_zeros(entry, [keys])), keys, path)
 
 
-def _spelled(entry: T, places: Iterable[Keys]) -> T:
+def _add_implied_zeros(entry: T, places: Iterable[Keys]) -> T:
     """Return a joint's entry with the zeros at some keys that a file may leave out."""
     if not isinstance(entry, JointSpec):
         return entry
@@ -447,7 +447,7 @@ def _spelled(entry: T, places: Iterable[Keys]) -> T:
     return dataclasses.replace(entry, **zeros) if zeros else entry
 
 
-def graph_of_entries(platform: str, specs: Mapping[str, Mapping[str, Any]], origin: Array | None = None) -> Graph:
+def build_graph(platform: str, specs: Mapping[str, Mapping[str, Any]], origin: Array | None = None) -> Graph:
     """Return the graph of a file's entries, as :func:`expand_limbs` gives them.
 
     :param origin: the platform's reference point, default its centre of mass.
@@ -510,16 +510,16 @@ def collect_drives(graph: Graph, joints: Mapping[str, JointSpec]) -> dict[str, A
     rubs = [joints[j].friction or FrictionSpec() for j in drives]
     n = len(drives)
     return {
-        "friction": friction_of(n)(**{key: array([getattr(rub, key) for rub in rubs]) for key in all_keys()}),
+        "friction": friction_of(n)(**{key: array([getattr(rub, key) for rub in rubs]) for key in list_friction_keys()}),
         "limits": limits_of(n)(
-            position=_together([v.position for v in limits], [-math.inf, math.inf]),
-            velocity=_together([v.velocity for v in limits], math.inf),
-            effort=_together([v.effort for v in limits], math.inf),
+            position=_join_values([v.position for v in limits], [-math.inf, math.inf]),
+            velocity=_join_values([v.velocity for v in limits], math.inf),
+            effort=_join_values([v.effort for v in limits], math.inf),
         ),
     }
 
 
-def drive_numbers(friction: Any, limits: Any, k: int) -> tuple[dict[str, float], dict[str, Any]]:
+def list_drive_numbers(friction: Any, limits: Any, k: int) -> tuple[dict[str, float], dict[str, Any]]:
     """Return friction and limits of the actuated joint k by key, from those of :func:`collect_drives`.
 
     Infinite limits are left out.
@@ -531,18 +531,18 @@ def drive_numbers(friction: Any, limits: Any, k: int) -> tuple[dict[str, float],
         if values is not None:
             own = np.broadcast_to(values, shape)[k]
             found |= {key: own.tolist()} if np.isfinite(own).any() else {}
-    return {key: float(getattr(friction, key)[k]) for key in all_keys()}, found
+    return {key: float(getattr(friction, key)[k]) for key in list_friction_keys()}, found
 
 
 def set_drive(joint: JointSpec, friction: Any, limits: Any, k: int) -> JointSpec:
     """Return the entry of the actuated joint k with other friction and limits."""
-    rub, bounds = drive_numbers(friction, limits, k)
+    rub, bounds = list_drive_numbers(friction, limits, k)
     if "position" in bounds:
         bounds["position"] = array(bounds["position"])
     return dataclasses.replace(joint, friction=FrictionSpec(**rub), limits=LimitSpec(**bounds))
 
 
-def _together(values: list[Any], absent: Any) -> Array | None:
+def _join_values(values: list[Any], absent: Any) -> Array | None:
     """Return one array of the joints' values; None if no joint has one."""
     known = [absent if value is None else value for value in values]
     return None if all(value is None for value in values) else array(known)

@@ -14,22 +14,22 @@ from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array, Indices
 from pkm_twin.codegen.expressions import plain
-from pkm_twin.machine.friction import all_keys, list_parameters
+from pkm_twin.machine.friction import list_friction_keys, list_parameters
 from pkm_twin.machine.graph import Graph, Joint
 from pkm_twin.machine.tree import Tree
 
 Objects = NDArray[Any]
 
-TEN: Final = ("mass", "mx", "my", "mz", "ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+STANDARD_PARAMETERS: Final = ("mass", "mx", "my", "mz", "ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 """A body's ten standard inertial parameters: mass, kg; first moments, kg m; inertia, kg m2."""
-_ENTRIES: Final = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-"""Rows and columns of an inertia matrix in the order of :data:`TEN`."""
-TEN_UNITS: Final = ("kg", *["kg m"] * 3, *["kg m2"] * 6)
+_MATRIX_ENTRIES: Final = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+"""Rows and columns of an inertia matrix in the order of :data:`STANDARD_PARAMETERS`."""
+STANDARD_UNITS: Final = ("kg", *["kg m"] * 3, *["kg m2"] * 6)
 PARTS: Final = ("bodies", "rods", "gravity", "viscous", "coulomb", "offset", "laws", "rotors", "passive")
 """Parts of the parameter vector, in order."""
 GRAVITY: Final = 2
-LAW_VALUES: Final = 6
-ROTORS: Final = 7
+LAWS_PART: Final = 6
+ROTORS_PART: Final = 7
 """Indices of parts, see :meth:`Layout.part`."""
 
 
@@ -41,11 +41,11 @@ def standard_parameters(mass: float, com: Array, inertia: Array) -> Array:
     """
     # Symmetrise, so that a derivative by one off-diagonal entry is half of that by both.
     about = 0.5 * (inertia + inertia.T) + mass * (com @ com * np.eye(3) - np.outer(com, com))
-    upper = [about[i, k] for i, k in _ENTRIES]
+    upper = [about[i, k] for i, k in _MATRIX_ENTRIES]
     return plain([mass, *(mass * com), *upper])
 
 
-def change_of_frame(axes: Array, lever: Array) -> Array:
+def make_frame_change(axes: Array, lever: Array) -> Array:
     """Return the matrix (10, 10) that transforms standard inertial parameters to another frame.
 
     :param axes: the new axes as columns in the old ones, shape (3, 3).
@@ -54,22 +54,22 @@ def change_of_frame(axes: Array, lever: Array) -> Array:
     # One row per parameter: its mass, first moments and inertia.
     mass, first = np.eye(10)[:, :1], np.eye(10)[:, 1:4]
     crossed = lever[:, None] * first[:, None, :]
-    units = np.array([matrix_of(ten) for ten in np.eye(10)])
+    units = np.array([inertia_matrix(ten) for ten in np.eye(10)])
     about = units + 2.0 * (first @ lever)[:, None, None] * np.eye(3)
     about = about - crossed - crossed.swapaxes(-1, -2)
     about = about + mass[..., None] * (lever @ lever * np.eye(3) - np.outer(lever, lever))
     turned = axes.T @ about @ axes
-    moved = [mass, (first + mass * lever) @ axes, turned[:, *np.transpose(_ENTRIES)]]
+    moved = [mass, (first + mass * lever) @ axes, turned[:, *np.transpose(_MATRIX_ENTRIES)]]
     return plain(np.concatenate(moved, 1).T)
 
 
-def matrix_of(ten: Array) -> Array:
+def inertia_matrix(ten: Array) -> Array:
     """Return the inertia matrix of ten standard inertial parameters, shape (3, 3)."""
     xx, yy, zz, xy, xz, yz = ten[4:]
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
-def loaded_joints(graph: Graph) -> tuple[Joint, ...]:
+def list_loaded_joints(graph: Graph) -> tuple[Joint, ...]:
     """Return the passive joints with friction or a rotor."""
     return tuple(joint for joint in graph.joints.values() if joint.loaded)
 
@@ -77,7 +77,7 @@ def loaded_joints(graph: Graph) -> tuple[Joint, ...]:
 def drive_units(graph: Graph, joint: str) -> dict[str, str]:
     """Return the units of a joint's friction parameters and rotor inertia."""
     slides = graph.joints[joint].slides
-    units = {key: one.in_units(slides=slides) for key, one in all_keys().items()}
+    units = {key: one.in_units(slides=slides) for key, one in list_friction_keys().items()}
     return units | {"rotor_inertia": "kg" if slides else "kg m2"}
 
 
@@ -118,7 +118,7 @@ class Layout:
             n,
             n * len(list_parameters(graph.laws)),
             n,
-            3 * len(loaded_joints(graph)),
+            3 * len(list_loaded_joints(graph)),
         ]
         return np.cumsum([0, *sizes])
 
@@ -158,8 +158,8 @@ class Layout:
         bodies = zip(parts[0].reshape(-1, 10), self.tree.links.values(), strict=True)
         turned = []
         for ten, link in bodies:
-            about = link.axes.T @ matrix_of(ten) @ link.axes
-            turned.append([ten[0], *(link.axes.T @ ten[1:4]), *(about[i][k] for i, k in _ENTRIES)])
+            about = link.axes.T @ inertia_matrix(ten) @ link.axes
+            turned.append([ten[0], *(link.axes.T @ ten[1:4]), *(about[i][k] for i, k in _MATRIX_ENTRIES)])
         parts[0] = np.array(turned)
         return parts
 
@@ -185,7 +185,7 @@ class Layout:
                     friction.offset,
                     *(getattr(friction, key) for key in list_parameters(self.tree.graph.laws)),
                     [j.rotor_inertia for j in drives],
-                    [value for j in loaded_joints(graph) for value in (j.viscous, j.coulomb, j.rotor_inertia)],
+                    [value for j in list_loaded_joints(graph) for value in (j.viscous, j.coulomb, j.rotor_inertia)],
                 ]
             )
         )

@@ -82,7 +82,7 @@ class JointType:
     """The base class of joint types, each declared by its freedoms and constraints.
 
     ``steps``: freedoms from the inner to the outer body: "turn", "slide" or "screw". ``holds``:
-    constraints, keys of HELD. ``count``: number of axes: one for all freedoms; two, of which the
+    constraints, keys of CONSTRAINTS. ``count``: number of axes: one for all freedoms; two, of which the
     second is fixed in the outer body; or none, with freedoms along base axes. ``placed``: whether
     the joint's point matters. ``ball``: whether the tree describes it by a quaternion. ``cost``:
     unknowns that it adds to the tree, which takes joints of lower cost first.
@@ -129,10 +129,10 @@ class JointType:
     @classmethod
     def constraints(cls, axes: Array, pitch: float) -> tuple[Constraint, ...]:
         """Return the joint's constraints; arguments as for :meth:`freedoms`."""
-        return tuple(held for key in cls.holds for held in HELD[key](axes, pitch))
+        return tuple(held for key in cls.holds for held in CONSTRAINTS[key](axes, pitch))
 
 
-HELD: Final[dict[str, Callable[[Array, float], Sequence[Constraint]]]] = {
+CONSTRAINTS: Final[dict[str, Callable[[Array, float], Sequence[Constraint]]]] = {
     "point": lambda _, __: [Constraint("point")],
     "turns": lambda _, __: [Constraint("angle", UNITS[i], UNITS[(i + 1) % 3]) for i in range(3)],
     "line": lambda axes, _: [Constraint("plane", e) for e in perpendicular_axes(axes[0])],
@@ -235,7 +235,7 @@ TURN: Final = 2.0 * math.pi
 """One revolution, rad: a screw's lead is its pitch times this."""
 
 
-def single_names(name: str, freedoms: Sequence[Freedom]) -> list[str]:
+def name_single_freedoms(name: str, freedoms: Sequence[Freedom]) -> list[str]:
     """Name a joint's freedoms as single rotations and slides; a screw has one of each."""
     if len(freedoms) == 1:
         return [name, f"{name}_slide"] if freedoms[0].turns and freedoms[0].slide else [name]

@@ -19,13 +19,13 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, warn
 from pkm_twin.machine.graph import choose_spanning_pairs
-from pkm_twin.machine.joints import TYPES, Free, Freedom, JointType, single_names
+from pkm_twin.machine.joints import TYPES, Free, Freedom, JointType, name_single_freedoms
 from pkm_twin.machine.names import plain_name
 from pkm_twin.machine.rotations import Pose
 from pkm_twin.machine.urdf_xml import free_name
 
 KINDS: Final[Mapping[str, type[JointType]]] = {**TYPES, Free.name: Free}
-"""Types of joints, that of a body that closures alone hold among them."""
+"""Joint types of description files, with that of a body that only closures hold."""
 WORLD: Final = "world"
 """Name of the root of a tree read from MJCF, SDF or USD."""
 SINGLE: Final = tuple(name for name, kind in TYPES.items() if len(kind.steps) == 1)
@@ -52,7 +52,7 @@ class Link:
         return Link(self.name, pose @ self.frame, self.mass, pose.point(self.com), inertia)
 
 
-def link_of(name: str, mass: float, pose: Pose, moment: Callable[[str], float], rounding: float) -> Link:
+def make_link(name: str, mass: float, pose: Pose, moment: Callable[[str], float], rounding: float) -> Link:
     """Make a link from its mass, kg, and its inertia in the frame ``pose`` of its centre of mass.
 
     ``moment``: returns an entry of the inertia, ``ixx`` to ``izz``, kg m2. ``rounding``: the largest
@@ -245,7 +245,7 @@ def split_freedoms(joint: Joint, parent: str, child: str, taken: set[str]) -> li
     for one in freedoms:
         kinds = ["revolute"] * one.turns + ["prismatic"] * bool(one.slide)
         parts += [(kind, np.asarray(one.axis, np.float64)) for kind in kinds]
-    names = single_names(joint.name, freedoms)
+    names = name_single_freedoms(joint.name, freedoms)
     inside = [free_name(f"{plain_name(name)}_link", taken, "_body") for name in names[:-1]]
     ends = [parent, *inside, child]
     return [

@@ -13,7 +13,7 @@ from pkm_twin.errors import ParameterError, one_line
 
 Path = tuple[str | int, ...]
 WIDTH: Final = 100
-"""An entry that is longer than this takes a line for each of its keys."""
+"""Longest entry on one line, characters; a longer one has one line per key."""
 HEAD: Final = """\
 # A machine as bodies, joints and rods at its home pose: every vector in base axes at home.
 # Units: m, kg, kg m2, rad, s, N, N m. The ground is called base.
@@ -67,10 +67,10 @@ def describe_machine_yaml(data: Mapping[str, Any], parameters: Sequence[str] = (
             lines.append(f"\n{SECTIONS[key]}{key}:\n")
             listed = not isinstance(data[key], Mapping)
             for item in data[key] if listed else [data[key]]:
-                entries = [_entry(name, value, "    " if listed else "  ") for name, value in item.items()]
+                entries = [_write_entry(name, value, "    " if listed else "  ") for name, value in item.items()]
                 lines += ["  - ", "".join(entries)[4:]] if listed else entries
         else:
-            line, note = f"{key}: {_flow(data[key])}", NOTES.get(key, "")
+            line, note = f"{key}: {_write_flow(data[key])}", NOTES.get(key, "")
             if len(line) + len(note) > WIDTH and note:
                 line, note = f"# {note}\n{line}", ""
             lines.append(f"{line}  # {note}\n" if note else f"{line}\n")
@@ -80,31 +80,31 @@ def describe_machine_yaml(data: Mapping[str, Any], parameters: Sequence[str] = (
     return "".join(lines)
 
 
-def _entry(name: object, value: Any, indent: str) -> str:
+def _write_entry(name: object, value: Any, indent: str) -> str:
     """Write an entry in one line if it fits, else one line per key."""
-    line = f"{indent}{_flow(name)}: {_flow(value)}"
+    line = f"{indent}{_write_flow(name)}: {_write_flow(value)}"
     if not isinstance(value, Mapping) or len(line) <= WIDTH:
         return line + "\n"
-    inner = "".join(_entry(key, item, indent + "  ") for key, item in value.items())
-    return f"{indent}{_flow(name)}:\n{inner}"
+    inner = "".join(_write_entry(key, item, indent + "  ") for key, item in value.items())
+    return f"{indent}{_write_flow(name)}:\n{inner}"
 
 
-def _flow(value: Any) -> str:
+def _write_flow(value: Any) -> str:
     # In a list, because names between brackets may need quotes.
-    text = yaml.safe_dump([_plain(value)], default_flow_style=True, sort_keys=False, width=math.inf)
+    text = yaml.safe_dump([_to_plain(value)], default_flow_style=True, sort_keys=False, width=math.inf)
     return text.strip()[1:-1]
 
 
-def _plain(value: Any) -> Any:
+def _to_plain(value: Any) -> Any:
     """Convert to plain YAML data: no point in whole numbers, no minus before zero, no shared objects."""
     if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): _to_plain(item) for key, item in value.items()}
     if isinstance(value, str | bool) or value is None:
         return value
     if isinstance(value, int | float):
         whole = math.isfinite(value) and float(value).is_integer() and abs(value) < 1e15
         return int(value) if whole else float(value)
-    return [_plain(item) for item in value]
+    return [_to_plain(item) for item in value]
 
 
 def edit_yaml(text: str, values: Mapping[Path, Any], notes: Mapping[Path, str]) -> str:
@@ -114,11 +114,11 @@ def edit_yaml(text: str, values: Mapping[Path, Any], notes: Mapping[Path, str]) 
         the deepest section that exists.
     """
     for path, value in values.items():
-        text = _set(text, path, value)
+        text = _set_value(text, path, value)
     lines = text.splitlines(keepends=True)
     above: dict[int, list[str]] = {}
     for path, note in notes.items():
-        node = _find(_root(text), path)
+        node = _find_node(_parse_root(text), path)
         number = node.start_mark.line
         # Never inside the list that a number belongs to.
         while number and lines[number].lstrip().startswith(("[", "]", ",")):
@@ -131,11 +131,11 @@ def edit_yaml(text: str, values: Mapping[Path, Any], notes: Mapping[Path, str]) 
     return "".join(lines)
 
 
-def _root(text: str) -> Any:
+def _parse_root(text: str) -> Any:
     return yaml.compose(text, Loader=yaml.SafeLoader)
 
 
-def _child(node: Any, key: str | int) -> Any:
+def _find_child(node: Any, key: str | int) -> Any:
     """Return the value of a key or index; None if there is none."""
     if isinstance(key, int):
         inside = isinstance(node, yaml.SequenceNode) and key < len(node.value)
@@ -147,25 +147,25 @@ def _child(node: Any, key: str | int) -> Any:
     return None
 
 
-def _find(node: Any, path: Path) -> Any:
+def _find_node(node: Any, path: Path) -> Any:
     for key in path:
-        node = _child(node, key)
+        node = _find_child(node, key)
         if node is None:
             raise ParameterError(".".join(map(str, path)), None, "a key of the file")
     return node
 
 
-def _set(text: str, path: Path, value: Any) -> str:
-    node = _root(text)
+def _set_value(text: str, path: Path, value: Any) -> str:
+    node = _parse_root(text)
     for depth, key in enumerate(path):
-        below = _child(node, key)
+        below = _find_child(node, key)
         if below is None:
-            return _add(text, node, path[depth:], value)
+            return _add_key(text, node, path[depth:], value)
         node = below
     begin, end = int(node.start_mark.index), int(node.end_mark.index)
     block = isinstance(node, yaml.CollectionNode) and not node.flow_style
     if block:
-        # A list of lines, or an empty value: it ends where the next key begins.
+        # A list over several lines, or an empty value, ends where the next key begins.
         while end > begin and text[end - 1] in " \n":
             end -= 1
         return text[:begin].rstrip(" \n") + " " + flow(value) + text[end:]
@@ -173,7 +173,7 @@ def _set(text: str, path: Path, value: Any) -> str:
     return text[:begin] + space + flow(value) + text[end:]
 
 
-def _add(text: str, node: Any, rest: Path, value: Any) -> str:
+def _add_key(text: str, node: Any, rest: Path, value: Any) -> str:
     """Add a key that the mapping ``node`` does not have."""
     for key in reversed(rest[1:]):
         value = {str(key): value}
@@ -188,7 +188,7 @@ def _add(text: str, node: Any, rest: Path, value: Any) -> str:
     first = node.value[0][0]
     if first.start_mark.column == 0:
         return text + ("" if text.endswith("\n") else "\n") + entry + "\n"
-    # Before the second key, which has a line of its own even in a list; a lone one makes room.
+    # Insert before the second key, which has its own line even in a list, or after a single key.
     marks = [name.start_mark for name, _ in node.value]
     if len(marks) > 1:
         at = marks[1].index - marks[1].column

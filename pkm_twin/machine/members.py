@@ -63,7 +63,7 @@ class Section:
         return self.mass_per_length * self.second_moment / self.area
 
 
-def cowper(ratio: float) -> float:
+def shear_area_ratio(ratio: float) -> float:
     """Return A / A_shear of a tube by its inner over outer diameter: 7/6 solid, 2 thin.
 
     Cowper 1966, table 1, hollow circle, for a Poisson's ratio of 0: a laminate's moduli are
@@ -131,7 +131,7 @@ class Tube:
                     f"mass in a solid bar of that diameter",
                 )
             inner = number(sqrt(maximum(0.0, square)) * sqrt(sign(spare)))
-        factor = cowper(inner / outer) if self.shear_factor is None else self.shear_factor
+        factor = shear_area_ratio(inner / outer) if self.shear_factor is None else self.shear_factor
         # The factor is 1, or NaN without mass.
         young = number(self.youngs_modulus * sqrt(2.0 * sign(mass_per_length) - 1.0))
         return Section(young, self.shear_modulus, outer, inner, mass_per_length, factor)

@@ -23,7 +23,7 @@ from pkm_twin.machine import urdf_xml
 from pkm_twin.machine.loop_tree import WORLD, Fault, Joint, Link, LoopTree
 from pkm_twin.machine.precision import rounding_error
 from pkm_twin.machine.rotations import Pose, from_quaternion
-from pkm_twin.machine.urdf_control import CHOOSE, UNCOUPLED, actuated_joints
+from pkm_twin.machine.urdf_control import ACTUATED_OPTION, UNCOUPLED_JOINTS, list_actuated_joints
 
 IGNORED: Final = (
     ("the spring (stiffness, springref)", "JOINT", ("jnt_stiffness", "jnt_stiffnesspoly")),
@@ -36,7 +36,7 @@ IGNORED: Final = (
     ("the limit", "TENDON", ("tendon_limited",)),
     ("damping that is not linear", "ACTUATOR", ("actuator_dampingpoly",)),
 )
-"""What acts in MuJoCo and is not read: in words, its kind of object, and the model's arrays."""
+"""Effects in MuJoCo that are not read: description, kind of object, and the model's arrays."""
 MAX_PARTS: Final = 100_000
 """Most elements, copies or pixels along a side that a file may ask for by a number."""
 
@@ -114,7 +114,7 @@ def _require_bounded(path: Path, top: ET.Element, folder: Path, depth: int = 0) 
         repeated = key in ("count", "nrow", "ncol", "width", "height")
         if repeated and math.prod(map(_read_count, text.split())) > MAX_PARTS:
             raise ParameterError(f"{element.tag}.{key}", text, f"at most {MAX_PARTS}")
-    if _copies(top) > MAX_PARTS:
+    if _count_copies(top) > MAX_PARTS:
         raise ParameterError("replicate", "nested copies", f"at most {MAX_PARTS} bodies")
     return words
 
@@ -126,10 +126,10 @@ def _read_count(text: str) -> int:
         return 1  # MuJoCo rejects the text with its own error.
 
 
-def _copies(element: ET.Element) -> int:
-    """Count the parts that an element stands for, with everything replicated in it."""
+def _count_copies(element: ET.Element) -> int:
+    """Count the parts that an element makes, including replicated ones."""
     count = _read_count(element.get("count", "1")) if element.tag == "replicate" else 1
-    return count * (1 + sum(map(_copies, element)))
+    return count * (1 + sum(map(_count_copies, element)))
 
 
 class _Reader:
@@ -151,12 +151,12 @@ class _Reader:
         self.types = [types[kinds(int(kind))] for kind in model.jnt_type]
         self.faults: list[Fault] = []
         self.locks: dict[int, float] = {}
-        for name, kind, data, (joint, other), _ in self._equalities():
+        for name, kind, data, (joint, other), _ in self._list_equalities():
             if kind != mujoco.mjtEq.mjEQ_JOINT:
                 continue
             if other >= 0 or self.types[joint] in ("free", "spherical"):
-                pair = [self._name("JOINT", k) for k in (joint, other) if k >= 0]
-                error = ParameterError(f"equality.{name}", pair[0], UNCOUPLED)
+                pair = [self._get_name("JOINT", k) for k in (joint, other) if k >= 0]
+                error = ParameterError(f"equality.{name}", pair[0], UNCOUPLED_JOINTS)
                 self.faults.append((tuple(pair), error))
             else:
                 self.locks[joint] = float(model.qpos0[model.jnt_qposadr[joint]]) + float(data[0])
@@ -172,47 +172,47 @@ class _Reader:
         :raises ParameterError: loop closures that are switched off, or deformable bodies.
         """
         m = self.model
-        if self._disables("CONSTRAINT", "EQUALITY") and m.neq:
+        if self._is_switched_off("CONSTRAINT", "EQUALITY") and m.neq:
             raise ParameterError("option.flag", "equality disabled", "closures that are enabled")
-        if self._disables("GRAVITY"):
+        if self._is_switched_off("GRAVITY"):
             warn(self.path, "gravity is switched off by <flag>")
         if getattr(m, "nflex", 0):
-            raise ParameterError("flex", self._name("FLEX", 0), "a machine of rigid bodies")
+            raise ParameterError("flex", self._get_name("FLEX", 0), "a machine of rigid bodies")
         if getattr(m, "nplugin", 0):
             warn(self.path, "forces of plugins are ignored")
         for what, kind, arrays in IGNORED:
             values = [np.abs(array) for name in arrays if (array := getattr(m, name, None)) is not None]
             names = [
-                self._name(kind, i)
+                self._get_name(kind, i)
                 for i in range(len(values[0]) if values else 0)
                 if any(np.any(array[i]) for array in values) and not (kind == "JOINT" and i in self.locks)
             ]
             if names:
                 warn(self.path, f"{what} of {kind.lower()} {', '.join(names)} is ignored")
-        gears = {self._name("ACTUATOR", i): float(m.actuator_gear[i][0]) for i in range(m.nu)}
+        gears = {self._get_name("ACTUATOR", i): float(m.actuator_gear[i][0]) for i in range(m.nu)}
         if geared := [f"{name} ({gear:g})" for name, gear in gears.items() if gear != 1.0]:
             warn(self.path, f"efforts are at the joints, not before the gear of {', '.join(geared)}")
         if m.opt.density or m.opt.viscosity:
             warn(self.path, "the fluid of density and viscosity is ignored")
         for body in range(1, m.nbody):
-            self._body(body)
+            self._add_body(body)
         for site in range(m.nsite):
-            name = self._name("SITE", site)
-            place = _pose(self.data.site_xmat[site], self.data.site_xpos[site])
+            name = self._get_name("SITE", site)
+            place = _make_pose(self.data.site_xmat[site], self.data.site_xpos[site])
             self.links[name] = Link(name).moved(place)
             label = urdf_xml.free_name(f"{name}_frame", self.joint_names)
-            owner = self._name("BODY", m.site_bodyid[site])
+            owner = self._get_name("BODY", m.site_bodyid[site])
             self.joints[label] = Joint.fixed(label, owner, name, place)
         types = {name: joint.kind for name, joint in self.joints.items()}
-        actuated, marked = actuated_joints(self.path, types, self.faults, chosen, self._find_driven)
+        actuated, marked = list_actuated_joints(self.path, types, self.faults, chosen, self._find_driven)
         return LoopTree(
             self.path.stem,
             WORLD,
             self.links,
             self.joints,
-            tuple(self._closures()),
+            tuple(self._read_closures()),
             actuated,
-            [0.0, 0.0, 0.0] if self._disables("GRAVITY") else m.opt.gravity.tolist(),
+            [0.0, 0.0, 0.0] if self._is_switched_off("GRAVITY") else m.opt.gravity.tolist(),
             {name: self.joints[name].drawn for name in actuated},
             rounding,
             marked,
@@ -246,40 +246,40 @@ class _Reader:
         name = self.mj.mj_id2name(self.model, getattr(self.mj.mjtObj, f"mjOBJ_{kind}"), index)
         return str(name) if name else None
 
-    def _name(self, kind: str, index: int) -> str:
+    def _get_name(self, kind: str, index: int) -> str:
         own = self.names.get((kind, int(index))) or self._find_name(kind, index)
         return own or f"{kind.lower()}_{index}"
 
-    def _body(self, body: int) -> None:
+    def _add_body(self, body: int) -> None:
         """Add a body on its joints, one after another, each in the body's frame."""
-        m, name = self.model, self._name("BODY", body)
-        place = _pose(self.data.xmat[body], self.data.xpos[body])
+        m, name = self.model, self._get_name("BODY", body)
+        place = _make_pose(self.data.xmat[body], self.data.xpos[body])
         turn = self.data.ximat[body].reshape(3, 3)
         inertia = turn @ np.diag(m.body_inertia[body]) @ turn.T
-        parent = self._name("BODY", m.body_parentid[body])
+        parent = self._get_name("BODY", m.body_parentid[body])
         count = int(m.body_jntnum[body])
         if not count:
             label = urdf_xml.free_name(f"{name}_body", self.joint_names)
             self.joints[label] = Joint.fixed(label, parent, name, place)
         for k in range(count):
             joint = int(m.body_jntadr[body]) + k
-            label, link = self._name("JOINT", joint), name
+            label, link = self._get_name("JOINT", joint), name
             if k < count - 1:
                 link = urdf_xml.free_name(f"{label}_link", self.link_names)
                 self.links[link] = Link(link).moved(place)
             at = Pose(place.rotation, self.data.xanchor[joint].copy())
-            kind, more = self.types[joint], self._resistance(joint)
+            kind, more = self.types[joint], self._read_resistance(joint)
             if joint in self.locks:
                 kind, more = "fixed", {}
             elif kind in ("revolute", "prismatic"):
                 axes, drawn = self.data.xaxis[joint][None].copy(), float(m.qpos0[m.jnt_qposadr[joint]])
-                more |= {"axes": axes, "drawn": drawn, "limits": self._limits(joint)}
+                more |= {"axes": axes, "drawn": drawn, "limits": self._read_limits(joint)}
             self.joints[label] = Joint(label, kind, parent, link, (at, at), **more)
             parent = link
         mass, com = float(m.body_mass[body]), self.data.xipos[body].copy()
         self.links[name] = Link(name, place, mass, com, inertia)
 
-    def _limits(self, joint: int) -> dict[str, Any]:
+    def _read_limits(self, joint: int) -> dict[str, Any]:
         """Return the range of a hinge or a slide, and the effort that its actuators can apply."""
         m, mj = self.model, self.mj
         limits: dict[str, Any] = {}
@@ -289,7 +289,7 @@ class _Reader:
         if m.jnt_actfrclimited[joint]:
             most = float(np.abs(m.jnt_actfrcrange[joint]).max())
         efforts = []
-        for i in self._drives(joint):
+        for i in self._find_drives(joint):
             force = float(np.abs(m.actuator_forcerange[i]).max()) if m.actuator_forcelimited[i] else math.inf
             motor = (
                 int(m.actuator_gaintype[i]) == mj.mjtGain.mjGAIN_FIXED
@@ -305,7 +305,7 @@ class _Reader:
             limits["effort"] = most
         return limits
 
-    def _drives(self, joint: int) -> list[int]:
+    def _find_drives(self, joint: int) -> list[int]:
         """Find the actuators of a joint.
 
         :raises ParameterError: an actuator with a gear of zero, which moves nothing.
@@ -315,15 +315,15 @@ class _Reader:
         found = [i for i in range(m.nu) if int(m.actuator_trntype[i]) in own and m.actuator_trnid[i][0] == joint]
         for i in found:
             if m.actuator_gear[i][0] == 0.0:
-                raise ParameterError(f"actuator.{self._name('ACTUATOR', i)}.gear", 0, "a gear that is not zero")
+                raise ParameterError(f"actuator.{self._get_name('ACTUATOR', i)}.gear", 0, "a gear that is not zero")
         return found
 
-    def _resistance(self, joint: int) -> dict[str, Any]:
+    def _read_resistance(self, joint: int) -> dict[str, Any]:
         """Return the friction and rotor inertia of a joint, with those of its actuators at the joint."""
         m = self.model
         dofs = np.flatnonzero(m.dof_jntid == joint)
-        damps_not = self._disables("DAMPER", "PASSIVE")
-        rubs_not = self._disables("FRICTIONLOSS", "CONSTRAINT")
+        damps_not = self._is_switched_off("DAMPER", "PASSIVE")
+        rubs_not = self._is_switched_off("FRICTIONLOSS", "CONSTRAINT")
         found = {
             "viscous": 0.0 if damps_not else float(m.dof_damping[dofs].max()),
             "coulomb": 0.0 if rubs_not else float(m.dof_frictionloss[dofs].max()),
@@ -332,20 +332,22 @@ class _Reader:
         for key, own in (("viscous", "actuator_damping"), ("rotor_inertia", "actuator_armature")):
             values = getattr(m, own, None)
             if values is not None and not (key == "viscous" and damps_not):
-                found[key] += sum(float(values[i]) * float(m.actuator_gear[i][0]) ** 2 for i in self._drives(joint))
+                found[key] += sum(
+                    float(values[i]) * float(m.actuator_gear[i][0]) ** 2 for i in self._find_drives(joint)
+                )
         return found
 
-    def _disables(self, *flags: str) -> bool:
+    def _is_switched_off(self, *flags: str) -> bool:
         """Return whether the file's ``<flag>`` switches off any of these features."""
         bits = sum(int(getattr(self.mj.mjtDisableBit, f"mjDSBL_{flag}", 0)) for flag in flags)
         return bool(int(self.model.opt.disableflags) & bits)
 
-    def _equalities(self) -> list[tuple[str, int, Array, tuple[int, int], bool]]:
+    def _list_equalities(self) -> list[tuple[str, int, Array, tuple[int, int], bool]]:
         """Return name, type, data, objects and whether these are sites of each active constraint."""
         m = self.model
         return [
             (
-                self._name("EQUALITY", i),
+                self._get_name("EQUALITY", i),
                 int(m.eq_type[i]),
                 m.eq_data[i],
                 (int(m.eq_obj1id[i]), int(m.eq_obj2id[i])),
@@ -355,10 +357,10 @@ class _Reader:
             if m.eq_active0[i]
         ]
 
-    def _closures(self) -> list[Joint]:
+    def _read_closures(self) -> list[Joint]:
         kinds = self.mj.mjtEq
         closures = []
-        for name, kind, data, ids, sites in self._equalities():
+        for name, kind, data, ids, sites in self._list_equalities():
             if kind == kinds.mjEQ_JOINT:
                 continue
             if kind not in (kinds.mjEQ_CONNECT, kinds.mjEQ_WELD):
@@ -375,7 +377,7 @@ class _Reader:
                 frames = first, Pose(position=data[:3].copy())
             else:
                 frames = Pose(position=data[:3].copy()), Pose(position=data[3:6].copy())
-            ends = [self._name("SITE" if sites else "BODY", i) for i in ids]
+            ends = [self._get_name("SITE" if sites else "BODY", i) for i in ids]
             joint = Joint(name, "fixed" if weld else "spherical", ends[0], ends[1], frames)
             closures.append(joint.placed(*(self.links[end].frame for end in ends)))
         return closures
@@ -385,9 +387,9 @@ class _Reader:
         m, mj = self.model, self.mj
         names: list[str] = []
         for i in range(m.nu):
-            name, index = self._name("ACTUATOR", i), int(m.actuator_trnid[i][0])
-            if i in self._drives(index):
-                own = self._name("JOINT", index)
+            name, index = self._get_name("ACTUATOR", i), int(m.actuator_trnid[i][0])
+            if i in self._find_drives(index):
+                own = self._get_name("JOINT", index)
                 if index in self.locks or self.joints[own].kind not in ("revolute", "prismatic"):
                     bound = "an actuator of a hinge or slide that can move"
                     self.faults.append(((own,), ParameterError(f"actuator.{name}", own, bound)))
@@ -411,10 +413,10 @@ class _Reader:
                     moved.add(body)
                     body = int(m.body_parentid[body])
             joints = joints or [k for k in range(m.njnt) if int(m.jnt_bodyid[k]) in moved]
-            error = ParameterError(f"actuator.{name}", name, f"an actuator of a joint, or names with {CHOOSE}")
-            self.faults.append((tuple(self._name("JOINT", joint) for joint in joints), error))
+            error = ParameterError(f"actuator.{name}", name, f"an actuator of a joint, or names with {ACTUATED_OPTION}")
+            self.faults.append((tuple(self._get_name("JOINT", joint) for joint in joints), error))
         return names, "an actuator", "an <actuator> of each driven joint"
 
 
-def _pose(rotation: Array, position: Array) -> Pose:
+def _make_pose(rotation: Array, position: Array) -> Pose:
     return Pose(rotation.reshape(3, 3).copy(), position.copy())

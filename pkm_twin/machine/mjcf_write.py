@@ -28,7 +28,7 @@ def write_mjcf(tree: LoopTree, gravity: Array, efforts: Sequence[float] | None =
     :param efforts: of the actuators at the keyframe ``home``, shape (n,), N m or N.
     """
     timestep = 1e-3  # s
-    tree, welds = _split(tree)
+    tree, welds = _split_bodies(tree)
     top = ET.Element("mujoco", model=tree.name)
     ET.SubElement(top, "compiler", angle="radian", autolimits="true", inertiafromgeom="false")
     ET.SubElement(top, "option", gravity=number_text(gravity), timestep=number_text([timestep]), integrator="RK4")
@@ -44,10 +44,10 @@ def write_mjcf(tree: LoopTree, gravity: Array, efforts: Sequence[float] | None =
     for parent, child, row in list_bodies(tree):
         link = tree.links[child]
         place = row[0].joint.at if row else link.frame.position
-        elements[child] = _body(elements[parent], link, place, places[parent])
+        elements[child] = _write_body(elements[parent], link, place, places[parent])
         places[child] = place
         for part in row:
-            ET.SubElement(elements[child], "joint", _joint(part, place))
+            ET.SubElement(elements[child], "joint", _write_joint(part, place))
             home.append(part.home)
         parts += row
     for capsule in tree.capsules:
@@ -109,7 +109,7 @@ def list_bodies(tree: LoopTree) -> list[tuple[str, str, list[Single]]]:
     return found
 
 
-def _split(tree: LoopTree) -> tuple[LoopTree, list[tuple[str, str]]]:
+def _split_bodies(tree: LoopTree) -> tuple[LoopTree, list[tuple[str, str]]]:
     """Cut a body at each closure that is neither a ball nor fixed; return the tree and the welds.
 
     The joint then leads to a part of the outer body, or of the inner one if only that has mass, and
@@ -137,7 +137,7 @@ def _split(tree: LoopTree) -> tuple[LoopTree, list[tuple[str, str]]]:
     return replace(tree, links=links, joints=joints, closures=tuple(kept)), welds
 
 
-def _body(parent: ET.Element, link: Link, place: Array, before: Array) -> ET.Element:
+def _write_body(parent: ET.Element, link: Link, place: Array, before: Array) -> ET.Element:
     """Write a body; MuJoCo rejects a body without mass, or without inertia about an axis.
 
     What is added is below the twelfth digit. MuJoCo takes an inertia of 1e-14 kg m2 for none.
@@ -155,7 +155,7 @@ def _body(parent: ET.Element, link: Link, place: Array, before: Array) -> ET.Ele
     return element
 
 
-def _joint(part: Single, place: Array) -> dict[str, str]:
+def _write_joint(part: Single, place: Array) -> dict[str, str]:
     joint, limits = part.joint, part.joint.limits if part.whole else {}
     found = {
         "name": part.name,

@@ -1,12 +1,12 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Names of joints in ROS messages and description files: each once, passive ones without spaces."""
+"""Names of joints in ROS messages and description files: unique, passive ones without spaces."""
 
 from __future__ import annotations
 
 import re
 from typing import Final
 
-from pkm_twin.machine.joints import UNITS, Free, Freedom, single_names
+from pkm_twin.machine.joints import UNITS, Free, Freedom, name_single_freedoms
 from pkm_twin.machine.tree import Tree
 
 FREE_BODY: Final = Free.freedoms(UNITS, 0.0)
@@ -37,14 +37,14 @@ def joint_labels(tree: Tree) -> dict[tuple[str, str], str]:
         if link.joint is None:
             wanted["bodies", link.body] = f"{link.body}_free", FREE_BODY
     labels = {("joints", name): name for name in graph.actuated}
-    taken = {single for name in graph.actuated for single in single_names(name, graph.joints[name].freedoms)}
+    taken = {single for name in graph.actuated for single in name_single_freedoms(name, graph.joints[name].freedoms)}
     # Names that need no change come first and stay.
     changes = {key: plain_name(name) != name for key, (name, _) in wanted.items()}
     for key in sorted(wanted.keys() - labels.keys(), key=lambda key: (changes[key], key)):
         name, freedoms = wanted[key]
         label = plain_name(name)
-        while taken.intersection([label, f"{label}_end", *single_names(label, freedoms)]):
+        while taken.intersection([label, f"{label}_end", *name_single_freedoms(label, freedoms)]):
             label += "_"
-        taken.update([label, f"{label}_end", *single_names(label, freedoms)])
+        taken.update([label, f"{label}_end", *name_single_freedoms(label, freedoms)])
         labels[key] = label
     return labels

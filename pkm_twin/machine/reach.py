@@ -85,7 +85,7 @@ def position_box(
             box[:, 1] = np.minimum(box[:, 1], point + radius)
     if not np.isfinite(box).all():
         free = [graph.joints[name] for name, way in travel.items() if math.isinf(way)]
-        # A screw goes as far as its slide.
+        # The travel of a screw is that of its slide.
         first = min(free, key=lambda joint: (len(joint.freedoms), joint.freedoms[0].turns))
         path = dict(zip(graph.actuated, paths, strict=False)).get(first.name, f"joints.{first.name}.limits.position")
         raise ParameterError(path, None, "limits of the slides; without them the workspace is unbounded")

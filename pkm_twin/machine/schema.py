@@ -58,7 +58,7 @@ def key(check: Check, bound: str, default: Any = MISSING, **more: Any) -> Any:
 
 def number(*, default: Any = MISSING, **more: Any) -> Any:
     """Make a field of one finite number within bounds; ``more``: attributes of :class:`Key`."""
-    return _numbers_field((), "number", default, more)
+    return _make_numbers_field((), "number", default, more)
 
 
 def vector(size: int, *, spread: bool = False, default: Any = MISSING, **more: Any) -> Any:
@@ -67,15 +67,15 @@ def vector(size: int, *, spread: bool = False, default: Any = MISSING, **more: A
     Size 0 means any number of entries, but none only if there is a default.
     """
     words = f"{size} numbers" if size else "one number or more"
-    return _numbers_field((size,), words, default, more, spread)
+    return _make_numbers_field((size,), words, default, more, spread)
 
 
 def matrix(rows: int, columns: int, *, default: Any = MISSING, **more: Any) -> Any:
     """Make a field of ``rows`` lists of ``columns`` numbers, a read-only array."""
-    return _numbers_field((rows, columns), f"{rows} lists of {columns} numbers", default, more)
+    return _make_numbers_field((rows, columns), f"{rows} lists of {columns} numbers", default, more)
 
 
-def _numbers_field(
+def _make_numbers_field(
     shape: tuple[int, ...], words: str, default: Any, more: Mapping[str, Any], spread: bool = False
 ) -> Any:
     bounds = Key(**more)

@@ -23,10 +23,10 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, UnknownNameError, warn
 from pkm_twin.machine import foreign, urdf_xml
 from pkm_twin.machine.joints import TURN, TYPES
-from pkm_twin.machine.loop_tree import WORLD, Joint, Link, LoopTree, hold_in_world, link_of, span_tree
+from pkm_twin.machine.loop_tree import WORLD, Joint, Link, LoopTree, hold_in_world, make_link, span_tree
 from pkm_twin.machine.precision import rounding_error
 from pkm_twin.machine.rotations import Pose, from_rpy
-from pkm_twin.machine.urdf_control import actuated_joints, find_marked, read_companion_yaml
+from pkm_twin.machine.urdf_control import find_marked, list_actuated_joints, read_companion_yaml
 
 MODEL: Final = "__model__"
 """Name of a model's own frame."""
@@ -58,7 +58,7 @@ def read(path: Path, top: ET.Element, actuated: Sequence[str] | None = None) -> 
     version = re.fullmatch(r"1\.(\d+)", text)
     if not version or int(version[1]) not in VERSIONS:
         raise ParameterError("sdf.version", text or None, "1.4 to 1.12")
-    outside, element, gravity = _model(path, top)
+    outside, element, gravity = _find_model(path, top)
     title, world = urdf_xml.read_name(element, ()), Model(outside, int(version[1]))
     model = world.models[title]
     links = {WORLD: Link(WORLD)}
@@ -67,7 +67,7 @@ def read(path: Path, top: ET.Element, actuated: Sequence[str] | None = None) -> 
     faults = foreign.check_elements(path, [element], joints={part: name for name, part in model.all("joint")})
     weight = {name: foreign.flag(part, "gravity", True) for name, part in model.all("link")}
     for name, part in model.all("link"):
-        links[name] = _link(path, part, name, rounding).moved(model.place(name))
+        links[name] = _read_link(path, part, name, rounding).moved(model.place(name))
     places = {name: link.frame for name, link in links.items()}
     joints: dict[str, Joint] = {}
     for joint in model.joints(path):
@@ -77,7 +77,7 @@ def read(path: Path, top: ET.Element, actuated: Sequence[str] | None = None) -> 
     taken = set(joints)
     for part in world.element.findall("joint"):
         # Names are unique within the world only.
-        joint = _joint(path, part, world)
+        joint = _read_joint(path, part, world)
         own = urdf_xml.free_name(joint.name, taken, "_of_world")
         joints[own] = replace(joint, name=own)
     joints |= {joint.name: joint for joint in read_welds(path, top, title, places, taken)}
@@ -91,7 +91,7 @@ def read(path: Path, top: ET.Element, actuated: Sequence[str] | None = None) -> 
     types = {name: joint.kind for name, joint in joints.items()}
     # Where only some joints have an effort limit, these are motors.
     limited = [name for name, joint in joints.items() if "effort" in joint.limits]
-    motors, marked = actuated_joints(
+    motors, marked = list_actuated_joints(
         path, types, faults, actuated, lambda: find_marked(top, read_companion_yaml(path), limited)
     )
     tree, closures = span_tree(links, joints, motors)
@@ -103,14 +103,14 @@ def read(path: Path, top: ET.Element, actuated: Sequence[str] | None = None) -> 
         tree,
         tuple(joint.closing() for joint in closures),
         motors,
-        foreign.gravity_of(path, weight, links, WORLD, joints.values(), gravity),
+        foreign.read_gravity(path, weight, links, WORLD, joints.values(), gravity),
         rounding=rounding_error(word for part in positions for word in (part.text or "").split()),
         marked=marked,
         faults=tuple(faults),
     )
 
 
-def _model(path: Path, top: ET.Element) -> tuple[ET.Element, ET.Element, list[float] | None]:
+def _find_model(path: Path, top: ET.Element) -> tuple[ET.Element, ET.Element, list[float] | None]:
     """Find the only model that can move, its parent, and the gravity of a world if it is stated."""
     worlds = top.findall("world")
     gravity = None
@@ -173,15 +173,15 @@ class Model:
     def joints(self, path: Path) -> Iterator[Joint]:
         """Read the joints, also of nested models; the path is for warnings."""
         for part in self.element.findall("joint"):
-            yield _joint(path, part, self)
+            yield _read_joint(path, part, self)
         for one in self.models.values():
             yield from () if one.static else one.joints(path)
 
-    def _in(self, name: str, where: str) -> tuple[Model, str]:
+    def _find_nested(self, name: str, where: str) -> tuple[Model, str]:
         """Find the nested model that a scoped name leads to, and the rest of the name."""
         first, _, rest = name.partition("::")
         if rest and first in self.models:
-            return self.models[first]._in(rest, where)
+            return self.models[first]._find_nested(rest, where)
         if name not in (MODEL, WORLD) and name not in self.parts:
             raise UnknownNameError(where, name, [MODEL, WORLD, *self.parts])
         return self, name
@@ -214,7 +214,7 @@ class Model:
                 raise ParameterError(f"{self.prefix}{name}.pose", where, "frames that do not lead back to themselves")
             return found
         self._known[name] = None
-        model, own = self._in(name, where)
+        model, own = self._find_nested(name, where)
         part = None if own in (MODEL, WORLD) else model.parts[own]
         if model is not self:
             found = model._express_outside(model.local(own, where), self)
@@ -225,7 +225,7 @@ class Model:
         elif part.tag == "model":
             found = self.models[name].pose()
         else:
-            default = _end(part, "child") if part.tag == "joint" else part.get("attached_to")
+            default = _read_end(part, "child") if part.tag == "joint" else part.get("attached_to")
             found = self._read_frame(part, MODEL if part.tag == "link" else default or MODEL, self)
         self._known[name] = found
         return found
@@ -246,7 +246,7 @@ class Model:
         """
         model, own = self, name
         for _ in range(urdf_xml.MAX_DEPTH):
-            model, own = model._in(own, where)
+            model, own = model._find_nested(own, where)
             held = model.models.get(own, model)
             if own == WORLD or held.static or (held.outer is None and own == MODEL):
                 return WORLD
@@ -259,12 +259,12 @@ class Model:
                 if named is None and first is None:
                     raise ParameterError(f"model.{part.get('name')}", "no link", "a model of links")
                 return str(first) if named is None else held.link(named, "canonical_link")
-            end = _end(part, "child") if part.tag == "joint" else part.get("attached_to")
+            end = _read_end(part, "child") if part.tag == "joint" else part.get("attached_to")
             own = end or MODEL
         raise ParameterError(where, name, "frames that do not lead back to themselves")
 
 
-def _end(joint: ET.Element, tag: str) -> str:
+def _read_end(joint: ET.Element, tag: str) -> str:
     text = (joint.findtext(tag) or "").strip()
     if not text:
         raise ParameterError(f"joint.{joint.get('name')}.{tag}", None, "the name of a link")
@@ -286,13 +286,13 @@ def pose(element: ET.Element | None, where: str) -> Pose:
     return Pose(from_rpy(np.radians(values[3:]) if degrees else values[3:]), values[:3])
 
 
-def _number(element: ET.Element | None, tag: str, where: str, default: float, low: float = -math.inf) -> float:
+def _read_number(element: ET.Element | None, tag: str, where: str, default: float, low: float = -math.inf) -> float:
     """Read a number that stands in an element of its own."""
     stated = urdf_xml.find_single_child(element, tag, where)
     return default if stated is None else urdf_xml.parse_number((stated.text or "").strip(), f"{where}.{tag}", low)
 
 
-def _link(path: Path, element: ET.Element, name: str, rounding: float) -> Link:
+def _read_link(path: Path, element: ET.Element, name: str, rounding: float) -> Link:
     """Read mass and inertia; SDF has 1 kg and 1 kg m2 where the file leaves them out."""
     where = f"link.{name}.inertial"
     inertial = urdf_xml.find_single_child(element, "inertial", f"link.{name}")
@@ -304,21 +304,21 @@ def _link(path: Path, element: ET.Element, name: str, rounding: float) -> Link:
     if missing := [key for key in ("mass", "ixx", "iyy", "izz") if key not in stated]:
         warn(path, f"link {name} has no {', '.join(missing)}: SDF then has 1 kg and 1 kg m2")
     inertia = urdf_xml.find_single_child(inertial, "inertia", where)
-    return link_of(
+    return make_link(
         name,
-        _number(inertial, "mass", where, 1.0),
+        _read_number(inertial, "mass", where, 1.0),
         pose(urdf_xml.find_single_child(inertial, "pose", where), where),
-        lambda key: _number(inertia, key, f"{where}.inertia", float(key[1] == key[2])),
+        lambda key: _read_number(inertia, key, f"{where}.inertia", float(key[1] == key[2])),
         rounding,
     )
 
 
-def _joint(path: Path, part: ET.Element, model: Model) -> Joint:
+def _read_joint(path: Path, part: ET.Element, model: Model) -> Joint:
     """Read a joint with its frame in the world."""
     name = model.prefix + urdf_xml.read_name(part, ())
     where = f"joint.{name}"
     place = partial(model.place, where=where)
-    ends = [_end(part, tag) for tag in ("parent", "child")]
+    ends = [_read_end(part, tag) for tag in ("parent", "child")]
     links = model.link(ends[0], f"{where}.parent"), model.link(ends[1], f"{where}.child")
     if links[0] == links[1]:
         raise ParameterError(where, links[0], "a joint between two links")
@@ -334,10 +334,10 @@ def _joint(path: Path, part: ET.Element, model: Model) -> Joint:
                 f"{where}: the frame {ends[0]} is drawn {far:.3g} m from the joint; "
                 "a joint of SDF holds its links as they are drawn",
             )
-    return joint_of(part, name, links, at, lambda frame: place(frame).rotation, model.version)
+    return read_joint_element(part, name, links, at, lambda frame: place(frame).rotation, model.version)
 
 
-def joint_of(
+def read_joint_element(
     part: ET.Element,
     name: str,
     links: tuple[str, str],
@@ -368,8 +368,8 @@ def joint_of(
                 frame = frame or MODEL
             axes.append((turn(frame) if frame else place.rotation) @ local)
         dynamics = urdf_xml.find_single_child(element, "dynamics", own)
-        viscous = max(viscous, _number(dynamics, "damping", f"{own}.dynamics", 0.0, 0.0))
-        coulomb = max(coulomb, _number(dynamics, "friction", f"{own}.dynamics", 0.0, 0.0))
+        viscous = max(viscous, _read_number(dynamics, "damping", f"{own}.dynamics", 0.0, 0.0))
+        coulomb = max(coulomb, _read_number(dynamics, "friction", f"{own}.dynamics", 0.0, 0.0))
         limit = urdf_xml.find_single_child(element, "limit", where)
         if limit is not None and tag == "axis" and kind in ("revolute", "prismatic", "helical"):
             given = {child.tag: (child.text or "").strip() for child in limit}
@@ -379,12 +379,12 @@ def joint_of(
             limits = urdf_xml.read_limits(given, where, "revolute" if kind == "helical" else kind)
     if kind == "helical" and part.find("screw_thread_pitch") is None and part.find("thread_pitch") is not None:
         # ``thread_pitch`` is in rad/m, positive for a left-handed thread; its successor is in m per turn.
-        thread = _number(part, "thread_pitch", where, 1.0)
+        thread = _read_number(part, "thread_pitch", where, 1.0)
         if thread == 0.0:
             raise ParameterError(f"{where}.thread_pitch", thread, "rad/m, not zero")
         pitch = -1.0 / thread
     elif kind == "helical":
-        pitch = _number(part, "screw_thread_pitch", where, 1.0) / TURN
+        pitch = _read_number(part, "screw_thread_pitch", where, 1.0) / TURN
     rows = np.reshape(axes, (-1, 3))
     return Joint(name, kind, *links, (place, place), rows, 0.0, limits, viscous, coulomb, pitch=pitch)
 

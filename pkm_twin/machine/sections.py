@@ -14,7 +14,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.operations import absolute
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine import schema
-from pkm_twin.machine.friction import BASIC, all_keys, check_laws
+from pkm_twin.machine.friction import BASIC, check_laws, list_friction_keys
 from pkm_twin.machine.graph import MIN_LENGTH
 
 MAX_LENGTH: Final = 100.0
@@ -154,7 +154,7 @@ def friction_fields(kind: Any, *size: int, **options: Any) -> list[tuple[str, An
     """Return names, types and fields of friction; only the basic law's zeros are written out."""
     return [
         (key, Any, kind(*size, unit=one.unit, low=one.low, high=one.high, rare=key not in BASIC.parameters, **options))
-        for key, one in all_keys().items()
+        for key, one in list_friction_keys().items()
     ]
 
 

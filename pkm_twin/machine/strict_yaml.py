@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Plain YAML and nothing else: no tags, aliases, merges or duplicate keys."""
+"""Read plain YAML: tags, aliases, merges and duplicate keys are rejected."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class _StrictLoader(yaml.SafeLoader):
 
 _StrictLoader.add_constructor("tag:yaml.org,2002:int", _StrictLoader.construct_yaml_int)
 _StrictLoader.add_constructor("tag:yaml.org,2002:float", _StrictLoader.construct_yaml_float)
-# YAML 1.1 reads 1e-10 and 5.0e6 as strings; everybody means the numbers.
+# YAML 1.1 reads 1e-10 and 5.0e6 as strings; here they are numbers.
 _StrictLoader.add_implicit_resolver(
     "tag:yaml.org,2002:float", re.compile(r"^[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789")
 )

@@ -111,7 +111,7 @@ class Tree:
         graph = self.graph
         self.axes: dict[str, Array] = {BASE: np.eye(3)}
         self.at: dict[str, Array] = {BASE: np.zeros(3)}
-        neighbours = self._span()
+        neighbours = self._span_tree()
         todo = [BASE]
         parents: dict[str, str] = {}
         while todo:  # breadth first, so that it stays shallow
@@ -140,13 +140,13 @@ class Tree:
 
     def drive_positions(self, leads: Any, x: Any) -> list[Any]:
         """Return positions of all drives from the leading ones; rotations within half a turn of home."""
-        return [leads[step.position] if step.actuated else self._value(step, x) for step in self.drives]
+        return [leads[step.position] if step.actuated else self._joint_value(step, x) for step in self.drives]
 
     def joint_positions(self, names: Sequence[str], x: Any) -> list[Any]:
         """Return positions of passive joints of one freedom; rotations within half a turn of home."""
-        return [self._value(self.steps[name], x) for name in names]
+        return [self._joint_value(self.steps[name], x) for name in names]
 
-    def _value(self, step: Step, x: Any) -> Any:
+    def _joint_value(self, step: Step, x: Any) -> Any:
         k = step.position
         value = atan2(x[k + 1], x[k]) if step.circle else x[k]
         return value + self.graph.joints[step.joint].home
@@ -164,7 +164,7 @@ class Tree:
             body = self.links[body].parent
         return chain
 
-    def _span(self) -> dict[str, list[tuple[str, str | None]]]:
+    def _span_tree(self) -> dict[str, list[tuple[str, str | None]]]:
         graph = self.graph
         able = self.carriers
         order = sorted(
@@ -243,7 +243,7 @@ class Tree:
                         hint = None
                 turned = axes_with_z(axis, frame[:, 0] if hint is None else hint)
                 if actuated and hint is None:
-                    offset = self._tilt(body, turned, at)
+                    offset = self._find_tilt(body, turned, at)
                 before, frame = snapped_all(frame.T @ turned), turned @ rotation_about_z(offset)
             circle = freedom.turns and not freedom.slide and not actuated
             if actuated:
@@ -279,7 +279,7 @@ class Tree:
         self.owners += [owner] * rates
         return position, rate
 
-    def _tilt(self, body: str, frame: Array, at: Array) -> Any:
+    def _find_tilt(self, body: str, frame: Array, at: Array) -> Any:
         """Return the rotation about z, rad, that puts x or y of a frame along the body's first lever.
 
         As part of the joint's angle it reduces the lever to one number and keeps the frame before simple.

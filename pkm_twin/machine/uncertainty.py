@@ -61,7 +61,7 @@ class Tolerance:
         return 3.0 * self.size if self.bound is None else self.size
 
 
-def causes_of(
+def list_causes(
     entries: Mapping[str, UncertaintyEntry], numbers: Mapping[str, tuple[float, str]]
 ) -> dict[str, dict[str, float]]:
     """Return for each entry the changes of numbers, by path, for one standard deviation.
@@ -74,14 +74,14 @@ def causes_of(
         deviation, relative = entry.deviation, float(entry.relative or 0.0)
         found[name] = {
             path: value * relative if deviation is None else deviation
-            for path, value in numbers_below(name, entry, numbers).items()
+            for path, value in match_numbers(name, entry, numbers).items()
             if math.isfinite(value)
         }
     return found
 
 
-def numbers_below(name: str, entry: UncertaintyEntry, numbers: Mapping[str, tuple[float, str]]) -> dict[str, float]:
-    """Return the numbers that an entry's path covers; errors as of :func:`causes_of`."""
+def match_numbers(name: str, entry: UncertaintyEntry, numbers: Mapping[str, tuple[float, str]]) -> dict[str, float]:
+    """Return the numbers that an entry's path covers; errors as of :func:`list_causes`."""
     parts = (f"{name}.", f"{name}[")
     below = {path: v for path, (v, _) in numbers.items() if path == name or path.startswith(parts)}
     field = f"uncertainty.{name}"

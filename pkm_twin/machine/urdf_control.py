@@ -27,9 +27,9 @@ MODEL: Final = "_model"
 """Suffix of a joint of the tree whose own name is the controller's name of a drive."""
 MARKS: Final = ("ros2_control", "transmission", "independent", "plugin")
 """What marks actuated joints after a YAML file's name_mot: the first that names any counts."""
-CHOOSE: Final = "`actuated=[...]` or --actuated"
-"""How a user names the actuated joints of a file that marks none."""
-UNCOUPLED: Final = "joints without coupling; a base and a platform (--base) can leave them out"
+ACTUATED_OPTION: Final = "`actuated=[...]` or --actuated"
+"""How a user names the actuated joints, for errors."""
+UNCOUPLED_JOINTS: Final = "joints without coupling; a base and a platform (--base) can leave them out"
 """What is expected in place of joints that follow others."""
 
 
@@ -38,7 +38,7 @@ def read_companion_yaml(path: Path) -> dict[str, Any]:
     keys = ("closed_loop", "type", "name_mot", "joint_name", "joint_type")
     for suffix in (".yaml", ".yml"):
         other = path.with_suffix(suffix)
-        # An empty one is the target of a conversion that reads this very URDF.
+        # An empty file is the target of a conversion that reads this URDF.
         if not other.is_file() or other.stat().st_size == 0:
             continue
         data = read_yaml(other)
@@ -94,7 +94,7 @@ def find_marked(
     return others or (), "limit.effort", ways
 
 
-def actuated_joints(
+def list_actuated_joints(
     path: Path,
     types: Mapping[str, str],
     faults: list[Fault],
@@ -110,7 +110,7 @@ def actuated_joints(
     """
     names, source, ways = find() if chosen is None else (chosen, "actuated", "")
     if chosen is None and not names:
-        bound = f"{ways}; or joints that {CHOOSE} names"
+        bound = f"{ways}; or joints that {ACTUATED_OPTION} names"
         faults.append(((), ParameterError(str(path), "no joint is marked as actuated", bound)))
         return (), ""
     if len(set(names)) != len(names) or not names:
@@ -171,7 +171,7 @@ def convert_drives(robot: ET.Element) -> dict[str, dict[str, Any]]:
     """
     joints = {joint.get("name", ""): joint for joint in robot.findall("joint")}
     commanded = list_marked_joints(robot, "ros2_control")
-    parents = {_end(joint, "parent") for joint in joints.values()}
+    parents = {_read_end(joint, "parent") for joint in joints.values()}
     links = {link.get("name", ""): link for link in robot.findall("link")}
     followers: dict[str, list[ET.Element]] = {}
     for joint in joints.values():
@@ -179,7 +179,7 @@ def convert_drives(robot: ET.Element) -> dict[str, dict[str, Any]]:
             followers.setdefault(mimic.get("joint", ""), []).append(joint)
     found: dict[str, Control] = {}
     for name, drive in joints.items():
-        link, (joint, *others) = _end(drive, "child"), followers.get(name, [drive])
+        link, (joint, *others) = _read_end(drive, "child"), followers.get(name, [drive])
         alone = link in links and not len(links[link]) and link not in parents
         if joint is drive or others or not alone or name not in commanded:
             continue
@@ -220,6 +220,6 @@ def convert_drives(robot: ET.Element) -> dict[str, dict[str, Any]]:
     return entries
 
 
-def _end(joint: ET.Element, tag: str) -> str:
+def _read_end(joint: ET.Element, tag: str) -> str:
     end = joint.find(tag)
     return "" if end is None else end.get("link", "")

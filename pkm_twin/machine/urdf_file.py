@@ -22,10 +22,10 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, UnknownNameError, warn
 from pkm_twin.machine import foreign, sdf_file, urdf_xml
 from pkm_twin.machine.joints import TYPES
-from pkm_twin.machine.loop_tree import Fault, Joint, Link, LoopTree, link_of, order_from_root
+from pkm_twin.machine.loop_tree import Fault, Joint, Link, LoopTree, make_link, order_from_root
 from pkm_twin.machine.precision import rounding_error
 from pkm_twin.machine.rotations import Pose
-from pkm_twin.machine.urdf_control import UNCOUPLED, actuated_joints, find_marked, read_companion_yaml
+from pkm_twin.machine.urdf_control import UNCOUPLED_JOINTS, find_marked, list_actuated_joints, read_companion_yaml
 
 _LOOPS: Final = {name: name for name in ("revolute", "prismatic", "fixed", "spherical")} | {"continuous": "revolute"}
 """Types of ``<loop>`` and ``<loop_joint>`` elements."""
@@ -34,7 +34,7 @@ _CONSTRAINTS: Final = {
     "continuous": "revolute",
     "link": "fixed",  # a link that was cut in two
 }
-"""Types of ``<constraint>`` elements, without ``_joint``."""
+"""Types of ``<constraint>`` elements, without ``_read_joint``."""
 _KNOWN: Final = {
     "link": "name type inertial visual collision contact self_collision_checking material",
     "inertial": "origin mass inertia",
@@ -80,13 +80,13 @@ def read(path: Path, robot: ET.Element, actuated: Sequence[str] | None = None) -
     rounding = rounding_error(word for e in robot.iter("inertia") for word in e.attrib.values())
     for element in robot.findall("link"):
         name = urdf_xml.read_name(element, links)
-        links[name] = _link(element, name, rounding)
+        links[name] = _read_link(element, name, rounding)
     if not links:
         raise ParameterError(str(path), "no <link>", "a robot with links")
     joints: dict[str, Joint] = {}
     for element in robot.findall("joint"):
         name = urdf_xml.read_name(element, joints)
-        joints[name] = _joint(element, name, links)
+        joints[name] = _read_joint(element, name, links)
     faults: list[Fault] = []
     for element in robot.findall("joint[mimic]"):
         try:
@@ -94,7 +94,7 @@ def read(path: Path, robot: ET.Element, actuated: Sequence[str] | None = None) -
         except ParameterError as error:
             leader = str(element.find("mimic").get("joint"))  # type: ignore[union-attr]
             faults.append(((element.get("name", ""), leader), error))
-    root = _root(links, joints)
+    root = _find_root(links, joints)
     others = [element for element in robot if element.tag not in ("link", "joint")]
     inside = [part for element in robot if element.tag in ("link", "joint") for part in element if part.tag != "mimic"]
     foreign.check_elements(path, [*others, *inside])
@@ -107,7 +107,7 @@ def read(path: Path, robot: ET.Element, actuated: Sequence[str] | None = None) -
     if unknown:
         warn(path, f"elements that are not read: {', '.join(sorted(unknown))}")
     beside = read_companion_yaml(path)
-    closures = _closures(robot, beside, links, joints)
+    closures = _read_closures(robot, beside, links, joints)
     _warn_of_units(path, robot, joints, closures)
     frames = {root: Pose()}
     for joint, parent, child in order_from_root(root, joints.values()):
@@ -116,12 +116,12 @@ def read(path: Path, robot: ET.Element, actuated: Sequence[str] | None = None) -
     joints, closures = (
         {n: one.placed(frames[one.inner], frames[one.outer]) for n, one in some.items()} for some in (joints, closures)
     )
-    closures |= _of_gazebo(path, robot, frames, {*joints, *closures})
+    closures |= _read_gazebo(path, robot, frames, {*joints, *closures})
     types = {n: joint.kind for n, joint in joints.items()}
-    motors, marked = actuated_joints(path, types, faults, actuated, lambda: find_marked(robot, beside))
-    initial = _parameters(robot, motors, "initial_value")
-    rotors = _parameters(robot, motors, "rotor_inertia", 0.0)
-    offsets = _parameters(robot, motors, "friction_offset")
+    motors, marked = list_actuated_joints(path, types, faults, actuated, lambda: find_marked(robot, beside))
+    initial = _read_parameter(robot, motors, "initial_value")
+    rotors = _read_parameter(robot, motors, "rotor_inertia", 0.0)
+    offsets = _read_parameter(robot, motors, "friction_offset")
     for name in {**rotors, **offsets}:
         rotor, offset = rotors.get(name, 0.0), offsets.get(name, 0.0)
         joints[name] = replace(joints[name], rotor_inertia=rotor, offset=offset)
@@ -139,7 +139,7 @@ def read(path: Path, robot: ET.Element, actuated: Sequence[str] | None = None) -
         joints,
         tuple(closures.values()),
         motors,
-        foreign.gravity_of(path, weight, links, root, joints.values(), None),
+        foreign.read_gravity(path, weight, links, root, joints.values(), None),
         initial=initial,
         rounding=rounding_error(word for e in places for key in ("xyz", "rpy") for word in e.get(key, "").split()),
         marked=marked,
@@ -147,7 +147,7 @@ def read(path: Path, robot: ET.Element, actuated: Sequence[str] | None = None) -
     )
 
 
-def _of_gazebo(path: Path, robot: ET.Element, frames: Mapping[str, Pose], taken: set[str]) -> dict[str, Joint]:
+def _read_gazebo(path: Path, robot: ET.Element, frames: Mapping[str, Pose], taken: set[str]) -> dict[str, Joint]:
     """Read joints of SDF inside ``<gazebo>``, and links that Gazebo's plugins hold together.
 
     :param frames: of the links. ``taken``: names of joints and closures, to which these are added.
@@ -168,7 +168,7 @@ def _of_gazebo(path: Path, robot: ET.Element, frames: Mapping[str, Pose], taken:
         start = second if stated is None else stated.get("relative_to") or second
         start = urdf_xml.find_link(f"{where}.pose", start, frames)
         place = frames[start] @ sdf_file.pose(stated, f"{where}.pose")
-        found.append(sdf_file.joint_of(element, name, (first, second), place, turn))
+        found.append(sdf_file.read_joint_element(element, name, (first, second), place, turn))
     found += sdf_file.read_welds(path, robot, robot.get("name", ""), frames, taken)
     return {joint.name: joint.closing() for joint in found}
 
@@ -183,7 +183,7 @@ def _find_unread(element: ET.Element) -> Iterator[str]:
         yield from (f"{tag}.{key}" for key in _find_unread(part))
 
 
-def _link(element: ET.Element, name: str, rounding: float) -> Link:
+def _read_link(element: ET.Element, name: str, rounding: float) -> Link:
     inertial = urdf_xml.find_single_child(element, "inertial", f"link.{name}")
     if inertial is None:
         return Link(name)
@@ -199,10 +199,10 @@ def _link(element: ET.Element, name: str, rounding: float) -> Link:
         stated = inertia.get(key, None if key[1] == key[2] else "0")
         return urdf_xml.parse_number(stated, f"{where}.inertia.{key}")
 
-    return link_of(name, value, pose, moment, rounding)
+    return make_link(name, value, pose, moment, rounding)
 
 
-def _joint(element: ET.Element, name: str, links: dict[str, Link]) -> Joint:
+def _read_joint(element: ET.Element, name: str, links: dict[str, Link]) -> Joint:
     where, kind = f"joint.{name}", element.get("type")
     if kind in ("floating", "planar"):
         raise ParameterError(f"{where}.type", kind, "revolute and prismatic joints in its place")
@@ -243,13 +243,13 @@ def _take_screw(element: ET.Element, joints: dict[str, Joint], links: dict[str, 
         or not (same(turn.axes, slide.axes) and same(pose.rotation, np.eye(3)))
         or not same(np.cross(pose.position, slide.axes[0]), 0.0)
     ):
-        raise ParameterError(where, "<mimic>", UNCOUPLED)
+        raise ParameterError(where, "<mimic>", UNCOUPLED_JOINTS)
     frame = turn.frames[0] @ Pose(position=pose.position + offset * slide.axes[0])
     joints[turn.name] = replace(turn, kind="helical", outer=slide.outer, frames=(frame, Pose()), pitch=pitch)
     del joints[slide.name], links[slide.inner]
 
 
-def _root(links: dict[str, Link], joints: dict[str, Joint]) -> str:
+def _find_root(links: dict[str, Link], joints: dict[str, Joint]) -> str:
     parents: dict[str, Joint] = {}
     for joint in joints.values():
         if joint.outer in parents:
@@ -270,7 +270,7 @@ def _root(links: dict[str, Link], joints: dict[str, Joint]) -> str:
     return roots[0]
 
 
-def _closures(
+def _read_closures(
     robot: ET.Element, beside: Mapping[str, Any], links: Collection[str], joints: dict[str, Joint]
 ) -> dict[str, Joint]:
     """Read all closures of a robot by name, and the types of joints that only a YAML file can state.
@@ -292,7 +292,7 @@ def _closures(
         own, axes = types[kind]
         joints[name] = replace(joints[name], kind=own, axes=np.reshape(axes, (-1, 3)), limits={})
     found, taken = dict[str, Joint](), {*joints}
-    for tag, read_one in (("constraint", _constraint), ("loop", _loop), ("loop_joint", _loop)):
+    for tag, read_one in (("constraint", _read_constraint), ("loop", _read_loop), ("loop_joint", _read_loop)):
         for element in robot.findall(tag):
             taken.add(name := urdf_xml.read_name(element, taken))
             found[name] = read_one(element, name, links)
@@ -314,11 +314,11 @@ def _closures(
         if name in taken:
             raise ParameterError("closed_loop", name, "each pair once")
         taken.add(name)
-        found[name] = _closure(name, meeting[str(kind).lower()], ends, (Pose(), Pose()), ())
+        found[name] = _make_closure(name, meeting[str(kind).lower()], ends, (Pose(), Pose()), ())
     return found
 
 
-def _constraint(element: ET.Element, name: str, links: Collection[str]) -> Joint:
+def _read_constraint(element: ET.Element, name: str, links: Collection[str]) -> Joint:
     where = f"constraint.{name}"
     kind = (element.get("type") or "").removesuffix("_joint")
     if kind not in _CONSTRAINTS:
@@ -339,13 +339,13 @@ def _constraint(element: ET.Element, name: str, links: Collection[str]) -> Joint
     alone = kind != "universal" and element.find("child_axis") is None
     child = parent if alone else urdf_xml.read_axis(element, "child_axis", where)
     viscous, coulomb = urdf_xml.read_friction(element, where)
-    closure = _closure(name, _CONSTRAINTS[kind], ends, frames, (parent, child))
+    closure = _make_closure(name, _CONSTRAINTS[kind], ends, frames, (parent, child))
     angle = urdf_xml.parse_number(element.get("angle", repr(math.pi / 2)), f"{where}.angle")
     cosine = math.cos(angle) if "angle" in element.attrib and kind == "universal" else 0.0
     return replace(closure, viscous=viscous, coulomb=coulomb, cosine=cosine)
 
 
-def _loop(element: ET.Element, name: str, links: Collection[str]) -> Joint:
+def _read_loop(element: ET.Element, name: str, links: Collection[str]) -> Joint:
     """Read a ``<loop>``, or a ``<loop_joint>`` between two frames, as Isaac Sim and Drake write it."""
     where, kind = f"{element.tag}.{name}", element.get("type")
     if kind not in _LOOPS:
@@ -367,17 +367,17 @@ def _loop(element: ET.Element, name: str, links: Collection[str]) -> Joint:
             end = urdf_xml.find_single_child(end, "origin", own)
         frames.append(urdf_xml.read_origin(end, own))
     axis = urdf_xml.read_axis(element, "axis", where)
-    return _closure(name, _LOOPS[kind], ends, frames, (axis, axis))
+    return _make_closure(name, _LOOPS[kind], ends, frames, (axis, axis))
 
 
-def _closure(name: str, kind: str, links: Sequence[str], frames: Sequence[Pose], axes: Sequence[Array]) -> Joint:
+def _make_closure(name: str, kind: str, links: Sequence[str], frames: Sequence[Pose], axes: Sequence[Array]) -> Joint:
     if links[0] == links[1]:
         raise ParameterError(name, links[0], "a closure between two links")
     rows = np.reshape(axes if TYPES[kind].count else (), (-1, 3))
     return Joint(name, kind, links[0], links[1], (frames[0], frames[1]), rows)
 
 
-def _parameters(robot: ET.Element, actuated: tuple[str, ...], key: str, low: float = -math.inf) -> dict[str, float]:
+def _read_parameter(robot: ET.Element, actuated: tuple[str, ...], key: str, low: float = -math.inf) -> dict[str, float]:
     """Read a parameter of the actuated joints, or of their position, in ``<ros2_control>``."""
     found: dict[str, float] = {}
     for joint in robot.findall("ros2_control/joint"):

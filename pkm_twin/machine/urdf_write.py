@@ -45,24 +45,24 @@ def write_urdf(tree: LoopTree, hardware: str = MOCK, prefix: str = "", controls:
     :param prefix: of the names of all links, joints and closures, for several machines in one file.
     """
     robot = ET.Element("robot", name=tree.name)
-    parts = parts_of(tree)
+    parts = list_single_joints(tree)
     places = {name: link.frame.position for name, link in tree.links.items()}
-    _shapes(ET.SubElement(robot, "link", name=GROUND), tree, GROUND)
+    _write_shapes(ET.SubElement(robot, "link", name=GROUND), tree, GROUND)
     for part in parts:
         at = places.setdefault(part.child, part.joint.at)
         link = ET.SubElement(robot, "link", name=part.child)
         if part.child != PLATFORM:
-            _inertial(link, tree.links.get(part.child, Link(part.child, com=at)), at)
-            _shapes(link, tree, part.child)
+            _write_inertial(link, tree.links.get(part.child, Link(part.child, com=at)), at)
+            _write_shapes(link, tree, part.child)
     drives = {c.joint: c for c in controls} if hardware else {}
     names = tree_names((part.name for part in parts), drives.values())
-    elements = {part.name: _joint(robot, part, places) for part in parts}
+    elements = {part.name: _write_joint(robot, part, places) for part in parts}
     for name, element in elements.items():
         element.set("name", names[name])
     for slide, turn, *line in list_screws(parts):
-        _follow(elements[slide], names[turn], *line)
+        _write_mimic(elements[slide], names[turn], *line)
     for closure in tree.closures:
-        _closure(robot, closure, places)
+        _write_closure(robot, closure, places)
     for part in parts:
         if part.name not in drives or drives[part.name].same:
             continue
@@ -75,12 +75,12 @@ def write_urdf(tree: LoopTree, hardware: str = MOCK, prefix: str = "", controls:
         # A motor rotates; only a controller that counts the metres of a slide has a slide.
         slides = part.kind == "prismatic" and abs(control.factor) == 1.0
         kind = "prismatic" if slides else "revolute"
-        _joint(robot, Single(control.name, kind, part.axis, part.parent, name, joint), places)
+        _write_joint(robot, Single(control.name, kind, part.axis, part.parent, name, joint), places)
         ET.SubElement(robot, "link", name=name)
         back = control.inverse()
-        _follow(elements[part.name], control.name, back.factor, back.offset)
+        _write_mimic(elements[part.name], control.name, back.factor, back.offset)
     if hardware:
-        _control(robot, tree, hardware, drives)
+        _write_control(robot, tree, hardware, drives)
     if prefix:
         # Names of interfaces and parameters are the same in all machines.
         named = ("link", "joint", "constraint", "ros2_control")
@@ -92,7 +92,7 @@ def write_urdf(tree: LoopTree, hardware: str = MOCK, prefix: str = "", controls:
     return '<?xml version="1.0"?>\n' + ET.tostring(robot, encoding="unicode") + "\n"
 
 
-def parts_of(tree: LoopTree) -> list[Single]:
+def list_single_joints(tree: LoopTree) -> list[Single]:
     """List the joints of the URDF, from the ground outwards; the last leads to ``platform``."""
     place, taken = Pose(position=tree.origin), {PLATFORM, *tree.links}
     tool = Joint(f"{PLATFORM}_frame", "fixed", tree.platform, PLATFORM, (place, place))
@@ -100,7 +100,7 @@ def parts_of(tree: LoopTree) -> list[Single]:
     return [part for one in hung for part in split_freedoms(*one, taken)]
 
 
-def _inertial(link: ET.Element, body: Link, place: Array) -> None:
+def _write_inertial(link: ET.Element, body: Link, place: Array) -> None:
     # Written for massless links too: some simulators assume 1 kg for a missing inertia.
     inertial = ET.SubElement(link, "inertial")
     ET.SubElement(inertial, "origin", xyz=number_text(body.com - place), rpy="0 0 0")
@@ -113,7 +113,7 @@ def _inertial(link: ET.Element, body: Link, place: Array) -> None:
     ET.SubElement(inertial, "inertia", values)
 
 
-def _shapes(link: ET.Element, tree: LoopTree, name: str) -> None:
+def _write_shapes(link: ET.Element, tree: LoopTree, name: str) -> None:
     """Write bars, which are both the picture and the collision geometry."""
     round_ends: list[Array] = []
     for capsule in [one for one in tree.capsules if one.link == name]:
@@ -146,7 +146,7 @@ def rpy_along(direction: Array) -> str:
     return number_text([0.0, math.atan2(math.hypot(x, y), z), math.atan2(y, x)])
 
 
-def _joint(robot: ET.Element, part: Single, places: Mapping[str, Array]) -> ET.Element:
+def _write_joint(robot: ET.Element, part: Single, places: Mapping[str, Array]) -> ET.Element:
     element = ET.SubElement(robot, "joint", name=part.name, type=part.kind)
     xyz, rpy = part.joint.at - places[part.parent], np.zeros(3)
     # The joint's frame is where the child stands at the value zero.
@@ -167,22 +167,22 @@ def _joint(robot: ET.Element, part: Single, places: Mapping[str, Array]) -> ET.E
     bounds |= {key: limits.get(key, UNLIMITED[key]) for key in ("velocity", "effort")}
     ET.SubElement(element, "limit", {key: number_text([v]) for key, v in bounds.items()})
     if part.whole:
-        _dynamics(element, part.joint)
+        _write_dynamics(element, part.joint)
     return element
 
 
-def _follow(follower: ET.Element, joint: str, factor: float, offset: float) -> None:
+def _write_mimic(follower: ET.Element, joint: str, factor: float, offset: float) -> None:
     numbers = {"multiplier": repr(factor), "offset": repr(offset + 0.0)}
     ET.SubElement(follower, "mimic", {"joint": joint, **numbers})
 
 
-def _dynamics(element: ET.Element, joint: Joint) -> None:
+def _write_dynamics(element: ET.Element, joint: Joint) -> None:
     if joint.viscous or joint.coulomb:
         damping, friction = number_text([joint.viscous]), number_text([joint.coulomb])
         ET.SubElement(element, "dynamics", damping=damping, friction=friction)
 
 
-def _closure(robot: ET.Element, closure: Joint, places: Mapping[str, Array]) -> None:
+def _write_closure(robot: ET.Element, closure: Joint, places: Mapping[str, Array]) -> None:
     kind = "link" if closure.kind == "fixed" else f"{closure.kind}_joint"
     element = ET.SubElement(robot, "constraint", name=closure.name, type=kind)
     for i, (end, link) in enumerate((("parent", closure.inner), ("child", closure.outer))):
@@ -192,14 +192,14 @@ def _closure(robot: ET.Element, closure: Joint, places: Mapping[str, Array]) -> 
         if len(closure.axes):
             axis = closure.axes[min(i, len(closure.axes) - 1)]
             ET.SubElement(element, f"{end}_axis", xyz=number_text(axis))
-    _dynamics(element, closure)
+    _write_dynamics(element, closure)
     if len(closure.axes) == 2:
         cosine = float(np.clip(closure.axes[0] @ closure.axes[1], -1.0, 1.0))
         if abs(cosine) > 1e-12:
             element.set("angle", number_text([math.acos(cosine)]))
 
 
-def _control(robot: ET.Element, tree: LoopTree, plugin: str, drives: Mapping[str, Control]) -> None:
+def _write_control(robot: ET.Element, tree: LoopTree, plugin: str, drives: Mapping[str, Control]) -> None:
     system = ET.SubElement(robot, "ros2_control", name=tree.name, type="system")
     hardware = ET.SubElement(system, "hardware")
     ET.SubElement(hardware, "plugin").text = plugin

@@ -21,7 +21,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, install, warn
 from pkm_twin.machine.loop_tree import WORLD, Fault, Joint, Link, LoopTree, hold_in_world, order_from_root, span_tree
 from pkm_twin.machine.rotations import Pose, about, from_quaternion
-from pkm_twin.machine.urdf_control import UNCOUPLED, actuated_joints
+from pkm_twin.machine.urdf_control import UNCOUPLED_JOINTS, list_actuated_joints
 
 SUFFIXES: Final = (".usd", ".usda", ".usdc")
 FRAME_ROUNDING: Final = 1e-3
@@ -61,7 +61,7 @@ class _Reader:
         every = Usd.TraverseInstanceProxies(Usd.PrimDefaultPredicate)
         self.prims = list(Usd.PrimRange.Stage(stage, every))
         self.bodies = [p for p in self.prims if p.HasAPI(UsdPhysics.RigidBodyAPI)]
-        self.bodies = [p for p in self.bodies if self._value(p, "physics:rigidBodyEnabled", True)]
+        self.bodies = [p for p in self.bodies if self._read_value(p, "physics:rigidBodyEnabled", True)]
         self.names = self._name_parts()
         self.links = {WORLD: Link(WORLD)}
         self.faults: list[Fault] = []
@@ -69,7 +69,7 @@ class _Reader:
     def tree(self, chosen: Sequence[str] | None) -> LoopTree:
         """Return the machine; ``chosen``: actuated joints in place of those with a drive."""
         for prim in self.bodies:
-            self.links[self.names[prim.GetPath()]] = self._link(prim)
+            self.links[self.names[prim.GetPath()]] = self._read_link(prim)
         if len(self.links) == 1:
             raise ParameterError(str(self.path), "no rigid body", "prims with PhysicsRigidBodyAPI")
         joints: dict[str, Joint] = {}
@@ -77,40 +77,40 @@ class _Reader:
         for prim in self.prims:
             if not prim.IsA(self.physics.Joint):
                 continue
-            if not self._value(prim, "physics:jointEnabled", True):
+            if not self._read_value(prim, "physics:jointEnabled", True):
                 warn(self.path, f"{prim.GetPath()} is switched off and left out")
                 continue
-            joint = self._joint(prim)
+            joint = self._read_joint(prim)
             if joint.inner == joint.outer:
                 continue
             joints[joint.name] = joint
-            if self._value(prim, "physics:excludeFromArticulation", False):
+            if self._read_value(prim, "physics:excludeFromArticulation", False):
                 excluded.add(joint.name)
-            if self._value(prim, "physxJoint:jointFriction", 0.0):
+            if self._read_value(prim, "physxJoint:jointFriction", 0.0):
                 rubbing.append(joint.name)
-            if self._drives(prim):
+            if self._list_drives(prim):
                 driven.append(joint.name)
             if any(str(s).startswith(("PhysxMimicJointAPI", "NewtonMimicAPI")) for s in prim.GetAppliedSchemas()):
-                error = ParameterError(str(prim.GetPath()), "a mimic joint", UNCOUPLED)
+                error = ParameterError(str(prim.GetPath()), "a mimic joint", UNCOUPLED_JOINTS)
                 self.faults.append(((joint.name,), error))
         if rubbing:
             warn(self.path, f"jointFriction of PhysX is ignored, of {', '.join(rubbing)}")
         hold_in_world(self.path, joints, lambda: self.links[self.names[self.bodies[0].GetPath()]])
         types = {name: joint.kind for name, joint in joints.items()}
         marked = driven, "a drive", "a drive with a stiffness or a damping"
-        motors, source = actuated_joints(self.path, types, self.faults, chosen, lambda: marked)
+        motors, source = list_actuated_joints(self.path, types, self.faults, chosen, lambda: marked)
         tree, left = span_tree(self.links, joints, motors, excluded)
         placed = self._place_links(tree)
-        closures = [self._closure(joint) for joint in left]
+        closures = [self._make_closure(joint) for joint in left]
         size = max(1.0, *(float(np.abs(link.frame.position).max()) for link in self.links.values()))
         # The scene's gravity, by default 9.81 m/s2 downwards, as PhysX.
         down = -np.eye(3)["XYZ".index(self.up)]
         size = 9.81
         for prim in self.prims:
             if prim.IsA(self.physics.Scene):
-                way = np.array(self._value(prim, "physics:gravityDirection", (0.0,) * 3), float)
+                way = np.array(self._read_value(prim, "physics:gravityDirection", (0.0,) * 3), float)
                 down = way / np.linalg.norm(way) if way.any() else down
-                stated = float(self._value(prim, "physics:gravityMagnitude", -math.inf))
+                stated = float(self._read_value(prim, "physics:gravityMagnitude", -math.inf))
                 size = stated * self.length if stated >= 0.0 else size
         return LoopTree(
             self.path.stem,
@@ -135,7 +135,7 @@ class _Reader:
                 named[prim.GetPath()] = path if own.count(name) > 1 or name == WORLD else name
         return named
 
-    def _value(self, prim: Any, name: str, default: Any) -> Any:
+    def _read_value(self, prim: Any, name: str, default: Any) -> Any:
         value = prim.GetAttribute(name).Get() if prim.HasAttribute(name) else None
         return default if value is None else value
 
@@ -152,38 +152,38 @@ class _Reader:
         u, _, vt = np.linalg.svd(axes)
         return Pose(u @ vt, self.length * table[3, :3]), scales
 
-    def _link(self, prim: Any) -> Link:
+    def _read_link(self, prim: Any) -> Link:
         """Return a body with its mass.
 
         :raises ParameterError: a mass that would follow from shapes and densities.
         """
         where, (frame, scales) = str(prim.GetPath()), self._find_world_frame(prim)
         name = self.names[prim.GetPath()]
-        if self._value(prim, "physics:kinematicEnabled", False):
+        if self._read_value(prim, "physics:kinematicEnabled", False):
             raise ParameterError(f"{where}.physics:kinematicEnabled", True, "a body that forces move")
         below = [p for p in self.prims if p.GetPath().HasPrefix(prim.GetPath()) and p != prim]
         shapes = [p for p in below if p.HasAPI(self.physics.CollisionAPI)]
-        mass = self.kilogram * float(self._value(prim, "physics:mass", 0.0))
+        mass = self.kilogram * float(self._read_value(prim, "physics:mass", 0.0))
         for part in below:
-            if part not in self.bodies and float(self._value(part, "physics:mass", 0.0)) > 0.0:
+            if part not in self.bodies and float(self._read_value(part, "physics:mass", 0.0)) > 0.0:
                 raise ParameterError(f"{part.GetPath()}.physics:mass", "a shape's", f"one of {where}")
         if mass <= 0.0:
             if shapes:
                 raise ParameterError(f"{where}.physics:mass", None, "kg, not only shapes")
             return Link(name, frame)
-        moments = np.array(self._value(prim, "physics:diagonalInertia", (0.0, 0.0, 0.0)), float)
-        center = np.array(self._value(prim, "physics:centerOfMass", (-math.inf,) * 3), float)
+        moments = np.array(self._read_value(prim, "physics:diagonalInertia", (0.0, 0.0, 0.0)), float)
+        center = np.array(self._read_value(prim, "physics:centerOfMass", (-math.inf,) * 3), float)
         if not moments.all() or (shapes and not np.isfinite(center).all()):
             missing = "diagonalInertia" if not moments.all() else "centerOfMass"
             raise ParameterError(f"{where}.physics:{missing}", None, "a value, not only shapes")
         center = np.where(np.isfinite(center), center, 0.0)
-        turn = self._value(prim, "physics:principalAxes", None)
-        axes = np.eye(3) if turn is None or not turn.GetReal() else _rotation(turn)
+        turn = self._read_value(prim, "physics:principalAxes", None)
+        axes = np.eye(3) if turn is None or not turn.GetReal() else _to_rotation(turn)
         inertia = axes @ np.diag(moments) @ axes.T * self.kilogram * self.length**2
         own = Link(name, Pose(), mass, self.length * scales * center, inertia)
         return own.moved(frame)
 
-    def _joint(self, prim: Any) -> Joint:
+    def _read_joint(self, prim: Any) -> Joint:
         """Return a joint with its frames on both bodies, as drawn, its first axis in each."""
         where, name = str(prim.GetPath()), self.names[prim.GetPath()]
         ends, frames = [], []
@@ -196,20 +196,20 @@ class _Reader:
             while owner and owner not in self.bodies:
                 owner = owner.GetParent()
             ends.append(self.names[owner.GetPath()] if owner else WORLD)
-            at = np.array(self._value(prim, f"physics:localPos{k}", (0.0, 0.0, 0.0)), float)
-            turn = self._value(prim, f"physics:localRot{k}", None)
-            local = np.eye(3) if turn is None else _rotation(turn)
+            at = np.array(self._read_value(prim, f"physics:localPos{k}", (0.0, 0.0, 0.0)), float)
+            turn = self._read_value(prim, f"physics:localRot{k}", None)
+            local = np.eye(3) if turn is None else _to_rotation(turn)
             frames.append(frame @ Pose(local, self.length * scales * at))
-        kind, axis = self._kind(prim, where)
+        kind, axis = self._read_kind(prim, where)
         more: dict[str, Any] = {}
         if kind in ("revolute", "prismatic"):
             local = np.eye(3)["XYZ".index(axis)]
             first, second = (frame.rotation @ local for frame in frames)
-            more = {"axes": np.array([first, second]), **self._numbers(prim, kind)}
+            more = {"axes": np.array([first, second]), **self._read_numbers(prim, kind)}
             more["drawn"] = _value_between(kind, local, *frames)
         return Joint(name, kind, ends[0], ends[1], (frames[0], frames[1]), **more)
 
-    def _kind(self, prim: Any, where: str) -> tuple[str, str]:
+    def _read_kind(self, prim: Any, where: str) -> tuple[str, str]:
         """Return a joint's type, and its axis if it has one.
 
         :raises ParameterError: a type that is not read.
@@ -222,12 +222,12 @@ class _Reader:
         }
         kind = str(prim.GetTypeName())
         if kind in types:
-            return types[kind], str(self._value(prim, "physics:axis", "X"))
+            return types[kind], str(self._read_value(prim, "physics:axis", "X"))
         free = [
             freedom
             for freedom in ("transX", "transY", "transZ", "rotX", "rotY", "rotZ")
-            if self._value(prim, f"limit:{freedom}:physics:low", -math.inf)
-            <= self._value(prim, f"limit:{freedom}:physics:high", math.inf)
+            if self._read_value(prim, f"limit:{freedom}:physics:low", -math.inf)
+            <= self._read_value(prim, f"limit:{freedom}:physics:high", math.inf)
         ]
         if kind == "PhysicsJoint":
             if not free or free == ["rotX", "rotY", "rotZ"]:
@@ -237,14 +237,14 @@ class _Reader:
             kind += f" free in {', '.join(free)}"
         raise ParameterError(where, kind, "a revolute, prismatic, spherical or fixed joint, or one that is free alike")
 
-    def _numbers(self, prim: Any, kind: str) -> dict[str, Any]:
+    def _read_numbers(self, prim: Any, kind: str) -> dict[str, Any]:
         """Return limits and the rotor of a joint of one axis."""
         turns = kind == "revolute"
         unit = math.radians(1.0) if turns else self.length
         force = self.kilogram * self.length ** (2 if turns else 1)
         limits: dict[str, Any] = {}
         ends = [
-            float(self._value(prim, f"physics:{end}Limit", sign * math.inf)) * unit
+            float(self._read_value(prim, f"physics:{end}Limit", sign * math.inf)) * unit
             for end, sign in (("lower", -1), ("upper", 1))
         ]
         if np.isfinite(ends).any():
@@ -254,17 +254,19 @@ class _Reader:
             ("effort", f"{drive}:maxForce", force),
             ("velocity", "physxJoint:maxJointVelocity", unit),
         ):
-            most = float(self._value(prim, name, math.inf)) * scale
+            most = float(self._read_value(prim, name, math.inf)) * scale
             if 0.0 < most < 1e30:
                 limits[key] = most
-        rotor = float(self._value(prim, "physxJoint:armature", 0.0))
+        rotor = float(self._read_value(prim, "physxJoint:armature", 0.0))
         scale = self.kilogram * (self.length**2 if turns else 1.0)
         return {"limits": limits, "rotor_inertia": rotor * scale}
 
-    def _drives(self, prim: Any) -> bool:
+    def _list_drives(self, prim: Any) -> bool:
         return any(
             prim.HasAPI(self.physics.DriveAPI, name)
-            and any(self._value(prim, f"drive:{name}:physics:{gain}", 0.0) > 0.0 for gain in ("stiffness", "damping"))
+            and any(
+                self._read_value(prim, f"drive:{name}:physics:{gain}", 0.0) > 0.0 for gain in ("stiffness", "damping")
+            )
             for name in ("angular", "linear")
         )
 
@@ -303,7 +305,7 @@ class _Reader:
         self.links = {name: link.moved(moves[name]) for name, link in self.links.items()}
         return {name: placed[name] for name in joints}
 
-    def _closure(self, joint: Joint) -> Joint:
+    def _make_closure(self, joint: Joint) -> Joint:
         """Return a joint that closes a loop, on the placed links."""
         first, second = (self.moves[end] for end in (joint.inner, joint.outer))
         axes = [m.rotation @ a for m, a in zip((first, second), joint.axes, strict=False)]
@@ -311,7 +313,7 @@ class _Reader:
         return replace(joint, frames=frames, axes=np.reshape(axes, (-1, 3))).closing()
 
 
-def _rotation(quaternion: Any) -> Array:
+def _to_rotation(quaternion: Any) -> Array:
     x, y, z = quaternion.GetImaginary()
     return from_quaternion(x, y, z, quaternion.GetReal())
 

@@ -15,7 +15,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.maps.kind import Case, Kind, Space, Worst, evaluate_kind
 from pkm_twin.robot.robot import Robot
-from pkm_twin.robot.workspace import describe_causes, passing_singularity, reachable, try_forward
+from pkm_twin.robot.workspace import describe_causes, describe_singularity_bound, reachable, try_forward
 
 GRID_SIDE: Final = 33
 """Poses along each coordinate of the grid that bounds a workspace, or a plane's visible part."""
@@ -81,7 +81,7 @@ def find_worst(space: Space, case: Case, starts: Array, tell: Callable[[float], 
             raise ParameterError(
                 "singularity",
                 space.least,
-                f"{passing_singularity(best, '')} or less: "
+                f"{describe_singularity_bound(best, '')} or less: "
                 f"no pose has a singularity index of {space.least:g} or more (best: {best:.3g})",
             )
         why = (

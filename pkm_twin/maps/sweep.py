@@ -46,7 +46,7 @@ from pkm_twin.maps.kinds.workspace import LAYERS, circle_variables, circles
 from pkm_twin.maps.search import GRID_SIDE, MAX_GRID_DIMENSIONS, badness, find_worst, workspace_box
 from pkm_twin.robot.clearance import has_clearance, joint_clearance
 from pkm_twin.robot.robot import Robot
-from pkm_twin.robot.workspace import LEAST_TILT, distance_unit, keeps_limits
+from pkm_twin.robot.workspace import MIN_TILT_RADIUS, distance_unit, satisfies_limits
 
 STARTS_PER_CHUNK: Final = 16
 """Worst poses of a chunk that the search may start from."""
@@ -254,7 +254,7 @@ class Map(Space):
             ticks = [_make_ticks(ends, pose[k], GRID_SIDE) for k, ends in zip(shown, box, strict=True)]
             poses = self._plane_poses(plane, case, ticks)
             q, _, known = self.of_poses(poses)
-            reach = keeps_limits(self.robot, q, poses, -math.inf, known)
+            reach = satisfies_limits(self.robot, q, poses, -math.inf, known)
             seen = np.concatenate([poses[reach], pose[None]])[:, shown]
             # More than a step, so that a tip between the poses appears on the next grid.
             margin = 1.5 * np.array([np.diff(side).max() for side in ticks])
@@ -317,7 +317,7 @@ class Map(Space):
 
     def _evaluate_batch(self, q: Array, pose: Array, known: Mask, cases: Sequence[Case]) -> Values:
         robot, count = self.robot, len(q)
-        reach = keeps_limits(robot, q, pose, -math.inf, known)
+        reach = satisfies_limits(robot, q, pose, -math.inf, known)
         inside = reach & self.encircled(pose)
         inside[inside] = robot.try_singularity(q[inside])[0] >= self.least
         apart = inside.copy()
@@ -457,7 +457,7 @@ def map_of(
     :param least_singularity: singularity index below which a pose does not count; default by kind.
     :param least_clearance: distance between limbs, m, below which a pose does not count.
     :param regular: count only poses inside the largest circles about the axis, of
-        ``LEAST_TILT`` or more where they are tilts (2UPR-RPU paper, figure 5).
+        ``MIN_TILT_RADIUS`` or more where they are tilts (2UPR-RPU paper, figure 5).
     :raises ParameterError: the robot's file lacks what the kind needs, or limits that bound the
         workspace; a bound on an unknown clearance; no circle.
     :raises UnreachableError: ``at`` is out of reach.
@@ -518,7 +518,7 @@ def map_of(
 def find_circles(robot: Robot, bounds: Array, least: float, least_clearance: float) -> Array:
     """Return heights and radii, (2, k), of the largest circles about the axis that count.
 
-    Circles of tilts below ``LEAST_TILT`` are NaN.
+    Circles of tilts below ``MIN_TILT_RADIUS`` are NaN.
 
     :param bounds: of the pose coordinates, shape (m, 2).
     :raises ParameterError: a machine whose workspace has no axis, or without a circle.
@@ -530,7 +530,7 @@ def find_circles(robot: Robot, bounds: Array, least: float, least_clearance: flo
     low, high = bounds[robot.pose_names.index(grid.height)].tolist()
     heights = np.linspace(low, high, LAYERS)
     radius = circles(robot, heights, least=least, least_clearance=least_clearance)
-    smallest = LEAST_TILT if distance_unit(robot) == "rad" else 0.0
+    smallest = MIN_TILT_RADIUS if distance_unit(robot) == "rad" else 0.0
     kept = (radius >= smallest) & (radius > 0.0)
     if not kept.any():
         raise ParameterError("regular", float(radius.max()), f"a circle of {smallest:.4g} or more")

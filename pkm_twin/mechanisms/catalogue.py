@@ -23,9 +23,9 @@ CATALOGUE: Final = {
     "prru": "pkm_twin.mechanisms.prru:Prru",
     "upr_rpu": "pkm_twin.mechanisms.upr_rpu:UprRpu",
 }
-"""Mechanism name to class: one line a mechanism."""
-TREES: Final = (".urdf", ".xml", ".mjcf", ".sdf", ".world", *usd_file.SUFFIXES)
-"""Endings of files that give a tree of links and its loop closures."""
+"""Class of each mechanism, by name."""
+TREE_SUFFIXES: Final = (".urdf", ".xml", ".mjcf", ".sdf", ".world", *usd_file.SUFFIXES)
+"""Suffixes of files with links, joints and loop closures."""
 
 
 def config_folder() -> Path:
@@ -53,11 +53,11 @@ def robot_path(robot: str | Path) -> Path:
             "a xacro file",
             f"a URDF: run `xacro {Path(text).name} > {written}` and use that file",
         )
-    if isinstance(robot, Path) or text.endswith((".yaml", ".yml", *TREES)) or "/" in text:
+    if isinstance(robot, Path) or text.endswith((".yaml", ".yml", *TREE_SUFFIXES)) or "/" in text:
         return Path(robot)
     if text in robot_names():
         return config_folder() / f"{text}.yaml"
-    near = [f"{text}{ending}" for ending in (".yaml", ".yml", *TREES)]
+    near = [f"{text}{ending}" for ending in (".yaml", ".yml", *TREE_SUFFIXES)]
     files = [name for name in near if Path(name).is_file()]
     raise UnknownNameError("robot", text, [*robot_names(), *files])
 
@@ -89,7 +89,7 @@ def load(
     :raises ParameterError: an invalid file, key, type or value, with its dotted name.
     """
     path, part = robot_path(robot), Part(platform, base, actuated, pose, carry)
-    if path.suffix in TREES:
+    if path.suffix in TREE_SUFFIXES:
         reading = read_tree(path, part)
         robot_read = robot_of_data(reading.description, path.stem)
         graph = robot_read.graph
@@ -103,17 +103,17 @@ def load(
             )
         for note in reading.notes:
             warn(path, note)
-        return _with_warnings(path, replace(robot_read, home_choice=reading.home, visuals=reading.visuals))
+        return _warn_of_implausible(path, replace(robot_read, home_choice=reading.home, visuals=reading.visuals))
     for key in ("platform", "base", "actuated", "carry"):
         if getattr(part, key):
             raise ParameterError(key, getattr(part, key), f"none, because the file has its {key}")
     data = read_yaml(path)
     if pose is not None:
         data = {**data, "pose": list(pose)}
-    return _with_warnings(path, robot_of_data(data, path.stem))
+    return _warn_of_implausible(path, robot_of_data(data, path.stem))
 
 
-def _with_warnings(path: Path, robot: Robot) -> Robot:
+def _warn_of_implausible(path: Path, robot: Robot) -> Robot:
     """Return the robot, after a warning of each implausible number in a user's file."""
     if path.parent != config_folder():
         for finding in findings(robot):

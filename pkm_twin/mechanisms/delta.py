@@ -43,7 +43,7 @@ from pkm_twin.mechanisms import TwinRobot
 LIMBS: Final = ("I", "II", "III")
 MAX_ITERATIONS: Final = 12
 MIN_REGULARITY: Final = 0.02
-"""Least regularity of the middle of the limits, of 1, with which it is taken for home."""
+"""Smallest regularity, 0 to 1, with which the middle of the limits is the home."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,17 +126,17 @@ class Delta(TwinRobot):
 
     @cached_property
     def _directions(self) -> list[tuple[Array, Array]]:
-        """Outwards, and along the arm's axis, of every limb."""
+        """Unit vectors of each limb: outwards, and along the axis of the arm."""
         outwards = [np.array([np.cos(a), np.sin(a), 0.0]) for a in self.geometry.azimuths]
         return [(out, np.cross(UP, out)) for out in outwards]
 
     def _elbow(self, i: int, q: Any) -> Any:
-        """Return the elbow of limb i; of an rcu, where its axis meets the plane of the arm."""
+        """Return the elbow of limb i; for an rcu limb the point of its axis in the plane of the arm."""
         g, (out, _) = self.geometry, self._directions[i]
         return g.base_radius * out + g.arm_length * (cos(q) * out - sin(q) * UP)
 
     def _forearm(self, i: int, q: Any, platform: Any) -> Any:
-        """Return the forearm of limb i from elbow to platform joint; of an rcu, without its slide.
+        """Return the vector of forearm i from elbow to platform joint, for an rcu limb normal to its slide.
 
         Delta-CU paper, equation 9.
         """
@@ -162,7 +162,7 @@ class Delta(TwinRobot):
                 return None
             step = sum(v * pair for v, pair in zip(value, pairs, strict=True)) / determinant
             x = x - step
-            # An expression's other values may need all steps.
+            # Expressions are evaluated for other values, which may need all steps.
             if x.dtype != object or not any(isinstance(v, Expression) for v in x):
                 x = np.asarray(x, np.float64)
                 if np.abs(np.asarray(step, float)).max() < 1e-13 * length:
@@ -172,7 +172,7 @@ class Delta(TwinRobot):
     def chosen_home(self) -> float:
         """Angle of the arms at home, rad: the middle of their limits, if it is regular.
 
-        Else the one that is farthest from singularities.
+        Else the angle farthest from singularities.
         """
 
         def regularity(angle: float) -> float:
@@ -204,7 +204,7 @@ class Delta(TwinRobot):
         their locked drives.
         """
         g, members = self.geometry, self.members
-        m: Any = self.spelled.inertia
+        m: Any = self.with_default_inertia.inertia
         q = array(np.full(3, self.home_joint))
         platform = self._assemble(q)
         if platform is None:
@@ -227,7 +227,7 @@ class Delta(TwinRobot):
             foot = array(corner - span)
             fixed = tuple(Direction(name, BASE, array(v)) for name, v in (("r", out), ("t", along), ("z", UP)))
             bodies[arm] = Body(
-                arm, m.arm_mass, array(pivot + m.arm_com * (tip - pivot)), _thin(m.arm_inertia, tip - pivot)
+                arm, m.arm_mass, array(pivot + m.arm_com * (tip - pivot)), _bar_inertia(m.arm_inertia, tip - pivot)
             )
             joints[self.joints[i]] = Joint(
                 self.joints[i],
@@ -238,12 +238,12 @@ class Delta(TwinRobot):
                 array([along]),
                 actuated=True,
                 home=q[i],
-                rotor_inertia=self.reflected_rotor(m.rotor_inertia, slides=False),
+                rotor_inertia=self.reflect_rotor(m.rotor_inertia, slides=False),
                 directions=fixed,
                 label=base,
             )
             if rcu:
-                inertia = _thin(m.forearm_mass * g.forearm_length**2 / 12, span)
+                inertia = _bar_inertia(m.forearm_mass * g.forearm_length**2 / 12, span)
                 bodies[forearm] = Body(forearm, m.forearm_mass, array((foot + corner) / 2), inertia)
                 sliding[elbow] = Joint(elbow, "cylindrical", arm, forearm, foot, array([along]), directions=fixed)
                 axes = array([along, out])
@@ -280,13 +280,13 @@ class Delta(TwinRobot):
         if turning is None:
             turning = disc(m.platform_mass, g.platform_radius)
         bodies[PLATFORM] = Body(PLATFORM, m.platform_mass, array(platform), array(turning))
-        # The parallelograms keep the platform from turning, so three slides carry it.
+        # Parallelograms prevent rotation, so the platform has three translations.
         joints["translation"] = Joint("translation", "translation", BASE, PLATFORM, array(platform), virtual=True)
         graph = Graph(bodies, {**joints, **sliding}, rods, PLATFORM, array(platform))
         if members is None:
             return Parts(graph)
         if members.rcu_forearm is None and "rcu" in g.closures:
-            # Distances from a forearm without a diameter are not known, so no limb's are.
+            # Without the diameter of one forearm no clearance is computed.
             return Parts(graph, (), compliances, missing="members.rcu_forearm")
         beams = []
         for i, part, end, start, stop, key, line in bars:
@@ -309,6 +309,6 @@ class Delta(TwinRobot):
         return box
 
 
-def _thin(across: float, along: Array) -> Array:
-    """Return the inertia of a thin bar, ``across`` about every axis across it."""
+def _bar_inertia(across: float, along: Array) -> Array:
+    """Return the inertia of a thin bar along a vector, ``across`` about every normal axis."""
     return array(axial(across, 0.0, unit(along)))

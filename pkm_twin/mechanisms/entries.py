@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""The numbers of a robot's file, and the same robot or the same file with some of them changed."""
+"""Write a robot's file with some of its numbers changed."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pkm_twin.machine.formulas import PARAMETERS
 from pkm_twin.machine.machine_yaml import describe_machine_yaml, edit_yaml
 from pkm_twin.machine.places import drop_missing, has_entry, split_path
 from pkm_twin.machine.strict_yaml import parse_yaml
-from pkm_twin.mechanisms.catalogue import TREES, load, robot_of_data, robot_path
+from pkm_twin.mechanisms.catalogue import TREE_SUFFIXES, load, robot_of_data, robot_path
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.robot_urdf import robot_description
 from pkm_twin.robot.urdf_read import read_urdf
@@ -47,7 +47,7 @@ class Fitted:
         return f"+- {self.deviation:.2g}{unit} (standard deviation), {self.source}"
 
 
-def edited_yaml(robot: Robot, source: str, values: Mapping[str, Fitted | Chosen]) -> str:
+def edit_robot_text(robot: Robot, source: str, values: Mapping[str, Fitted | Chosen]) -> str:
     """Write the text of a robot's file with other numbers, each with its comment.
 
     Where the file writes a number once for several limbs, or is no YAML, the text is a new one with
@@ -59,7 +59,7 @@ def edited_yaml(robot: Robot, source: str, values: Mapping[str, Fitted | Chosen]
     :raises ParameterError: a path that no such file can have.
     """
     path = robot_path(source)
-    text = "" if path.suffix in TREES else path.read_text(encoding="utf-8")
+    text = "" if path.suffix in TREE_SUFFIXES else path.read_text(encoding="utf-8")
     data: Any = yaml.safe_load(text)
     values = robot.resolved(values)
     plain = [name for name in values if not name.startswith("joint_map.")]
@@ -98,10 +98,10 @@ def write_edited(path: Path, head: Sequence[str], text: str, before: Robot) -> l
     return lost
 
 
-def robot_text(name: str, *, per_copy: bool = False, **part: Any) -> tuple[str, Robot]:
+def load_with_text(name: str, *, per_copy: bool = False, **part: Any) -> tuple[str, Robot]:
     """Load a robot and the text of its file; a URDF, or with ``per_copy``, as a machine's YAML.
 
-    :param part: what of a file is the robot, as :func:`load` takes it.
+    :param part: options of :func:`load` that cut the robot out of its file.
     :raises ParameterError: the file is refused; or it is to be written out, and would lose what it
         says of elasticity.
     """
@@ -117,7 +117,7 @@ def robot_text(name: str, *, per_copy: bool = False, **part: Any) -> tuple[str, 
             "a file without them, or fit without --per-copy",
         )
     path = robot_path(name)
-    if path.suffix in TREES:
+    if path.suffix in TREE_SUFFIXES:
         data = read_urdf(path, **part)
     elif per_copy:
         data = robot_description(robot)

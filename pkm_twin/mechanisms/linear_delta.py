@@ -35,7 +35,8 @@ LIMBS: Final = ("a", "b", "c")
 class Geometry:
     """Lengths (m), tower angles about z from x, and the towers' leans (rad).
 
-    ``leans``: of each tower outwards, then sideways (counter-clockwise), at its height of home.
+    ``leans``: angles of each tower from the vertical at home, outwards and sideways
+    (counter-clockwise).
     """
 
     radius: float = length()
@@ -53,7 +54,7 @@ class Geometry:
 
 @dataclass(frozen=True, eq=False)
 class Inertia:
-    """Masses, kg: of the platform, a carriage, a rod pair; the rotors' reflected to a carriage."""
+    """Masses, kg, of platform, carriage and rod pair, and the rotor inertia reflected to a carriage."""
 
     platform_mass: float = mass()
     carriage_mass: float = mass()
@@ -84,7 +85,7 @@ class LinearDelta(TwinRobot):
     def make_parts(self) -> Parts:
         """Make carriages on their towers, rods to the nozzle, a platform that does not turn."""
         g, m = self.geometry, self.inertia
-        rotor = self.reflected_rotor(m.rotor_inertia, slides=True)
+        rotor = self.reflect_rotor(m.rotor_inertia, slides=True)
         bodies: dict[str, Body] = {}
         joints: dict[str, Joint] = {}
         rods: dict[str, Rod] = {}
@@ -121,6 +122,6 @@ class LinearDelta(TwinRobot):
             )
         turning = disc(m.platform_mass, 0.3 * g.radius)
         bodies[PLATFORM] = Body(PLATFORM, m.platform_mass, array(np.zeros(3)), array(turning))
-        # The rod pairs keep the platform from turning, so three slides carry it.
+        # Rod pairs prevent rotation, so the platform has three translations.
         joints["translation"] = Joint("translation", "translation", BASE, PLATFORM, array(np.zeros(3)), virtual=True)
         return Parts(Graph(bodies, joints, rods, PLATFORM, array(np.zeros(3))))

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Any parallel machine: its parameter file is the graph of bodies, joints and rods at home.
+"""The mechanism ``machine``: a parameter file with the graph of bodies, joints and rods at home.
 
 Every vector stands in base axes at the home pose. ``forward`` gives the assembly that is connected
 to home along the straight line in joint space; a singularity on the way is an error that says
@@ -37,12 +37,12 @@ from pkm_twin.machine.graph_file import (
     Limb,
     RodSpec,
     Source,
+    build_graph,
     collect_drives,
     expand_limbs,
-    graph_of_entries,
-    number_of_entry,
-    numbered_entry,
+    find_entry_number,
     read_limbs,
+    replace_entry_numbers,
     set_drive,
     share_efforts,
 )
@@ -131,12 +131,12 @@ class Machine(TwinRobot):
         file = schema.build(MachineFile, book.mark_expressions(data))
         specs: Mapping[str, Mapping[str, Any]]
         specs, sources = expand_limbs({kind: getattr(file, kind) for kind in KINDS}, file.limbs)
-        graph = graph_of_entries(file.platform, specs, file.origin)
+        graph = build_graph(file.platform, specs, file.origin)
         graph.check()
-        # Numbers that follow from expressions are exact.
+        # Numbers computed from expressions have no rounding to remove.
         if not book.formulas:
-            specs = _without_rounding(data, graph, specs, name)
-            graph = graph_of_entries(file.platform, specs, file.origin)
+            specs = _remove_rounding(data, graph, specs, name)
+            graph = build_graph(file.platform, specs, file.origin)
         if len(graph.actuated) > MAX_JOINTS:
             raise ParameterError("joints", len(graph.actuated), f"at most {MAX_JOINTS} actuated joints")
         own = collect_drives(graph, specs["joints"])
@@ -193,7 +193,7 @@ class Machine(TwinRobot):
         for k, name in enumerate(made.joint_names):
             joints[name] = set_drive(joints[name], made.friction, made.limits, k)
         specs = {**made.specs, "joints": joints}
-        described = graph_of_entries(made.described.platform, specs, made.described.origin)
+        described = build_graph(made.described.platform, specs, made.described.origin)
         leads = choose_leads(described, made.redundancy.leads or made.described.leads)
         described = share_efforts(described, leads, made.redundancy, made.limits.effort)
         made = dataclasses.replace(made, specs=specs, described=described)
@@ -237,11 +237,11 @@ class Machine(TwinRobot):
             elif not found:
                 rest[path] = value
         for (kind, name, _, place, azimuth), new in sorted(changes.items(), key=lambda c: c[0][2]):
-            specs[kind][name] = numbered_entry(specs[kind][name], new, azimuth, place)
+            specs[kind][name] = replace_entry_numbers(specs[kind][name], new, azimuth, place)
             if ("azimuth",) in new:
                 turned = reference(new["azimuth",])
                 sources[kind, name] = dataclasses.replace(sources[kind, name], azimuth=turned)
-        described = graph_of_entries(self.described.platform, specs, origin)
+        described = build_graph(self.described.platform, specs, origin)
         made = super().numbered(rest)
         own = collect_drives(described, specs["joints"])
         leads, sharing = self.described.leads, made.redundancy
@@ -274,7 +274,7 @@ class Machine(TwinRobot):
             super().check_number(path)
 
     def number(self, path: str) -> float:
-        """Return the number at a path; of a limb that of its first copy."""
+        """Return the number at a path; in a limb the number of its first copy."""
         path = self.own_path(path)
         keys = full_keys(path)
         if keys[0] == PARAMETERS:
@@ -282,7 +282,7 @@ class Machine(TwinRobot):
         if keys[0] == "origin":
             return number_in(self.described.origin.tolist(), keys[1:], path)
         for kind, name, where, azimuth in self.named(keys):
-            return number_of_entry(self.specs[kind][name], where, azimuth, path)
+            return find_entry_number(self.specs[kind][name], where, azimuth, path)
         return super().number(path)
 
     def own_path(self, path: str) -> str:
@@ -357,7 +357,7 @@ class Machine(TwinRobot):
         return robot_description(self)
 
     def parameter_units(self) -> dict[str, Any]:
-        """Return units of the sections' numbers; of a joint by its own type."""
+        """Return the units of the sections' numbers; those of joints depend on their types."""
         sections = self.parameter_sections()
         plain = {key: value for key, value in sections.items() if key not in KINDS}
         result = schema.units(MachineFile, plain, {"effort": self.effort_unit})
@@ -396,12 +396,12 @@ class Machine(TwinRobot):
         return (*source.path, "friction", what, *tail)
 
     def rotor_key(self, joint: str) -> Keys:
-        """Return the keys of a joint's rotor, a limb's once for all copies."""
+        """Return the keys of a joint's rotor; copies of a limb share them."""
         tail = ["rotor_inertia"] if self.specs["joints"][joint].drive is None else ["drive", "inertia"]
         return (*self.sources["joints", joint].path, *tail)
 
     def mass_keys(self) -> Iterator[Keys]:
-        """Yield the keys of masses, centres and inertias, a limb's once for all copies."""
+        """Yield the keys of masses, centres and inertias; copies of a limb share them."""
         found: dict[Keys, None] = {}
         for kind, entries in (("bodies", self.graph.bodies), ("rods", self.graph.rods)):
             for name, entry in entries.items():
@@ -430,7 +430,7 @@ class Machine(TwinRobot):
 
     @cached_property
     def leading_machine(self) -> Machine:
-        """The machine whose leading drives alone are actuated; the others keep friction and rotor.
+        """The machine with only the leading drives actuated; the others keep friction and rotor.
 
         :raises ParameterError: a friction law that passive joints do not have.
         """
@@ -452,7 +452,7 @@ class Machine(TwinRobot):
             if spec.drive is not None:
                 slides = self.graph.joints[name].slides
                 joint["rotor_inertia"] = spec.drive.reflected(slides, f"joints.{name}.drive")
-            # A joint with friction, however small, is one whose rate is computed.
+            # A nonzero friction, since rates are computed only for joints with friction.
             viscous = max(float(self.friction.viscous[k]), 1e-12)
             joint["friction"] = {"viscous": viscous, "coulomb": float(self.friction.coulomb[k])}
             data["joints"][name] = joint
@@ -479,7 +479,7 @@ class Machine(TwinRobot):
         return told
 
 
-def _without_rounding(
+def _remove_rounding(
     data: Any, graph: Graph, specs: Mapping[str, Mapping[str, Any]], name: str
 ) -> Mapping[str, Mapping[str, Any]]:
     """Return the file's entries with vectors corrected for the rounding of their digits.

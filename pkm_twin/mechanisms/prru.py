@@ -137,10 +137,10 @@ class Prru(TwinRobot):
         of its universal joint asks for (equations 13 to 17): the graph's closures find the angle.
         """
         g, members = self.geometry, self.members
-        m: Any = self.spelled.inertia
+        m: Any = self.with_default_inertia.inertia
         height, l = self.home_joint, g.limb_length  # noqa: E741
         lower, upper = m.lower_link_inertia, m.upper_link_inertia
-        rotor = self.reflected_rotor(m.rotor_inertia, slides=True)
+        rotor = self.reflect_rotor(m.rotor_inertia, slides=True)
         aside = g.base_radius - g.platform_radius
         # The level platform's height over the sliders.
         rise = (1.0 if g.branch == "below" else -1.0) * sqrt(g.limb_length**2 - aside**2)

@@ -194,7 +194,7 @@ class LargestRoot:
         beta = atan2(-rho, a) - atan2(sqrt((1.0 - g) * (1.0 + g)), g)
 
         def direct(i: int, rho: Any, beta: Any, gamma: Any) -> tuple[Any, Any]:
-            """Limb 0 or 1 from B to A along X and tau; limb 2 from A to B along y and tau."""
+            """Return components of a limb: 0 and 1 from B to A along X and tau; 2 from A to B along y and tau."""
             if i == 2:
                 return b * cos(beta) - a, -b * sin(beta) - rho
             side = -1.0 if i == 0 else 1.0
@@ -217,7 +217,7 @@ class LargestRoot:
         return result
 
     def find_miss(self, tree: Tree, q: Numbers) -> None:
-        """Return None: a drive's way back tells the miss."""
+        """Return None: the gap is found from the nearest possible drive position."""
         del tree, q
 
 
@@ -320,7 +320,7 @@ class UprRpu(TwinRobot):
         return np.stack(limbs, -3)
 
     def search_box(self) -> Array:
-        """Return bounds of the pose: limbs 1 and 2 end above and below o alike, so z is at most their length."""
+        """Return bounds of the pose; z is at most the length of limbs 1 and 2, which are symmetric about o."""
         box, lengths = super().search_box(), self.limits.limb_length
         return box if lengths is None else np.array([(-float(lengths[:2].max()), 0.0), *box[1:]])
 
@@ -338,10 +338,10 @@ class UprRpu(TwinRobot):
         overlap are not told apart. Without inertia bars have no mass.
         """
         a, b = self._radii
-        inertia: Any = self.spelled.inertia
+        inertia: Any = self.with_default_inertia.inertia
         limb_length, aside = self.home_joint, absolute(b - a)
         origin = array([0.0, 0.0, -sqrt((limb_length - aside) * (limb_length + aside))])
-        rotor = self.reflected_rotor(0.0 if inertia is None else inertia.rotor_inertia, slides=True)
+        rotor = self.reflect_rotor(0.0 if inertia is None else inertia.rotor_inertia, slides=True)
         members, soft = self.members, self.joints_compliance
         density = 0.0 if inertia is None else inertia.density
         bodies: dict[str, Body] = {}
@@ -381,7 +381,7 @@ class UprRpu(TwinRobot):
                 *pair,
                 at,
                 array([_X, _Y]),
-                directions=_directions(((inner, _X), (outer, _Y), (inner, w))),
+                directions=_make_directions(((inner, _X), (outer, _Y), (inner, w))),
                 label=f"{limb}U",
             )
             axis, turning = (_Y, high) if i < 2 else (_X, low)
@@ -392,7 +392,7 @@ class UprRpu(TwinRobot):
                 *other_pair,
                 other_at,
                 array([axis]),
-                directions=_directions(((turning, u), (turning, v), (turning, -d))),
+                directions=_make_directions(((turning, u), (turning, v), (turning, -d))),
                 label=f"{limb}R",
             )
             drive = Joint(
@@ -417,6 +417,6 @@ class UprRpu(TwinRobot):
         return Parts(Graph(bodies, joints, {}, PLATFORM, origin), tuple(beams), compliances, order)
 
 
-def _directions(axes: Sequence[tuple[str, Array]]) -> tuple[Direction, ...]:
-    """Return directions u, v and w, each fixed in a body."""
+def _make_directions(axes: Sequence[tuple[str, Array]]) -> tuple[Direction, ...]:
+    """Return the named directions u, v and w; each axis comes with the body in which it is fixed."""
     return tuple(Direction(name, body, array(v)) for name, (body, v) in zip("uvw", axes, strict=True))

@@ -3,7 +3,7 @@
 
 A path is a chain of stretches, each from rest to rest; a stretch is a chain of pieces that meet
 with the same direction. The coordinate s of a piece is a length: angles count by the platform's
-radius, see :func:`scales_of`.
+radius, see :func:`coordinate_scales`.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class Path:
         return sum(stretch.length for stretch in self.stretches)
 
 
-def scales_of(robot: Robot, space: Space) -> Array:
+def coordinate_scales(robot: Robot, space: Space) -> Array:
     """Return lengths per coordinate: 1 for a length, the platform's radius for an angle."""
     if space == "pose":
         return robot.pose_scales
@@ -95,7 +95,7 @@ def _check_waypoints(robot: Robot, points: ArrayLike, space: Space) -> tuple[Arr
     if bad.any():
         row = int(bad.argmax())
         raise ParameterError(f"waypoint {row}", values[row].tolist(), f"numbers up to {MAX_LENGTH:g}")
-    steps = np.linalg.norm(np.diff(values, axis=0) * scales_of(robot, space), axis=1)
+    steps = np.linalg.norm(np.diff(values, axis=0) * coordinate_scales(robot, space), axis=1)
     if not (steps > MIN_DISTANCE).any():
         raise ParameterError("waypoints", "all equal", "two or more different waypoints")
     return values, np.concatenate([[True], steps > MIN_DISTANCE])
@@ -109,7 +109,7 @@ def through(robot: Robot, points: ArrayLike, *, space: Space = "pose") -> Path:
     """
     values, new = _check_waypoints(robot, points, space)
     values = values[new]
-    steps = np.linalg.norm(np.diff(values, axis=0) * scales_of(robot, space), axis=1)
+    steps = np.linalg.norm(np.diff(values, axis=0) * coordinate_scales(robot, space), axis=1)
     knots = np.concatenate([[0.0], np.cumsum(steps)])
     if len(values) == 2:
         piece: Piece = Line(values[0], (values[1] - values[0]) / knots[1], float(knots[1]))
@@ -163,7 +163,7 @@ def lines(
 
 def _join_waypoints(robot: Robot, space: Space, points: Array, blends: Array, dwells: Array, arcs: Mask) -> Path:
     """Build the pieces between waypoints that differ."""
-    scales, last = scales_of(robot, space), len(points) - 1
+    scales, last = coordinate_scales(robot, space), len(points) - 1
     if arcs[0] or arcs[last]:
         raise ParameterError("waypoints: arc", "the first or last", "waypoints between two others")
     places = [i for i, name in enumerate(robot.pose_names if space == "pose" else ()) if name in ("x", "y", "z")]
@@ -243,7 +243,7 @@ def circle(robot: Robot, centre: ArrayLike, radius: float, *, turns: float = 1.0
             "circle", [radius, turns], f"a radius above 0 and turns other than 0, up to {MAX_LENGTH:g}"
         )
     across, along = np.zeros(len(middle)), np.zeros(len(middle))
-    scale = float(scales_of(robot, "pose")[places[0]])
+    scale = float(coordinate_scales(robot, "pose")[places[0]])
     across[places[0]], along[places[1]] = 1.0 / scale, float(np.sign(turns)) / scale
     angle = 2 * np.pi * abs(turns)
     piece = Arc(middle, across, along, np.zeros(len(middle)), scale * float(radius), angle)

@@ -18,7 +18,7 @@ from pkm_twin.paths.geometry import Path, Stretch
 from pkm_twin.robot.derivatives import joint_rates
 from pkm_twin.robot.limits import find_first_beyond
 from pkm_twin.robot.robot import Robot
-from pkm_twin.robot.workspace import passing_singularity
+from pkm_twin.robot.workspace import describe_singularity_bound
 
 Index = NDArray[np.int64]
 
@@ -276,7 +276,7 @@ def check_singularity(robot: Robot, way: Array, q: Array, singularity: float) ->
         raise ParameterError(
             f"path: singularity index {describe_place(robot, q[row], float(way[row]))}",
             round(least, 6),
-            f"{singularity:g} or more; {passing_singularity(least)} passes",
+            f"{singularity:g} or more; {describe_singularity_bound(least)} passes",
         )
 
 

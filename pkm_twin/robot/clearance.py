@@ -37,14 +37,14 @@ def distance(start: Any, span: Any, other: Any, other_span: Any) -> Any:
     w, tiny = other - start, 1e-300
     uu, vv = span @ span, other_span @ other_span
     n = cross(span, other_span)
-    s = _clamped((cross(w, other_span) @ n) / maximum(n @ n, tiny))
-    t = _clamped(((s * span - w) @ other_span) / maximum(vv, tiny))
-    s = _clamped(((t * other_span + w) @ span) / maximum(uu, tiny))
+    s = _clamp((cross(w, other_span) @ n) / maximum(n @ n, tiny))
+    t = _clamp(((s * span - w) @ other_span) / maximum(vv, tiny))
+    s = _clamp(((t * other_span + w) @ span) / maximum(uu, tiny))
     gap = w + t * other_span - s * span
     return sqrt(gap @ gap)
 
 
-def _clamped(value: Any) -> Any:
+def _clamp(value: Any) -> Any:
     return minimum(1.0, maximum(0.0, value))
 
 
@@ -80,7 +80,7 @@ def joint_clearance(robot: Robot, q: ArrayLike, refuse: bool = True) -> Array:
 
 def member_gaps(robot: Robot, q: ArrayLike, refuse: bool = True) -> Array:
     """Return the distances of all :func:`member_pairs`, shape (..., pairs), m."""
-    (gaps,), status = _kernel(robot)(_radii(robot), q)
+    (gaps,), status = _make_kernel(robot)(_find_radii(robot), q)
     if status is not None and refuse:
         reject_joints(robot, robot.engine, status, q)
     return gaps
@@ -91,11 +91,11 @@ def member_pairs(robot: Robot) -> list[tuple[Beam, Beam]]:
     return [pair for pair in combinations(robot.beams, 2) if pair[0].limb != pair[1].limb]
 
 
-def _radii(robot: Robot) -> Array:
+def _find_radii(robot: Robot) -> Array:
     return np.array([beam.radius for beam in robot.beams])
 
 
-def _kernel(robot: Robot) -> Kernel:
+def _make_kernel(robot: Robot) -> Kernel:
     if not has_clearance(robot):
         raise ParameterError("members", None, "a section that gives the members' outer diameters")
     ends = [(beam.limb, *((body, point.tolist()) for body, point in (beam.inner, beam.outer))) for beam in robot.beams]

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from pkm_twin.codegen.arrays import Array, vectors
 from pkm_twin.kinematics.gradients import platform_gradient
-from pkm_twin.machine.geometry import geometry_of
+from pkm_twin.machine.geometry import list_geometry
 from pkm_twin.robot.numbers import CauseSlopes, FileNumbers
 from pkm_twin.robot.robot import Robot
 
@@ -98,11 +98,11 @@ def platform_derivatives(robot: Robot, q: ArrayLike, by: Sequence[str] = ()) -> 
     Translation of the reference point and rotation vector, base axes, per unit change. Arguments and
     errors as in :func:`forward_derivatives`.
     """
-    rows = twist_rows(len(robot.pose_names), robot.platform(q)[1])
+    rows = make_twist_rows(len(robot.pose_names), robot.platform(q)[1])
     return Derivatives(robot.platform_jacobian(q), _differentiate_by_numbers(robot, q, rows, by))
 
 
-def twist_rows(m: int, rotation: Array) -> Array:
+def make_twist_rows(m: int, rotation: Array) -> Array:
     """Return the weights of pose, position and rotation that give the six components of a twist.
 
     :param rotation: of the platform now, shape (..., 3, 3).
@@ -122,31 +122,31 @@ def _differentiate_by_numbers(robot: Robot, q: ArrayLike, rows: Array, by: Seque
     """Differentiate weighted sums of pose, position and rotation by numbers of the file."""
     if not by:
         return {}
-    slopes = robot.cached(FileNumbers, tuple(by), geometry_numbers).slopes
-    table = _by_geometry(robot, q, rows) @ slopes
+    slopes = robot.cached(FileNumbers, tuple(by), list_geometry_numbers).slopes
+    table = _differentiate_by_geometry(robot, q, rows) @ slopes
     return {path: np.ascontiguousarray(table[..., k]) for k, path in enumerate(by)}
 
 
-def pose_by_geometry(robot: Robot, q: ArrayLike) -> Array:
+def differentiate_pose(robot: Robot, q: ArrayLike) -> Array:
     """Differentiate the pose by the engine's geometry, joints held, shape (..., m, k)."""
-    return _by_geometry(robot, q, np.eye(len(robot.pose_names), len(robot.pose_names) + 12))
+    return _differentiate_by_geometry(robot, q, np.eye(len(robot.pose_names), len(robot.pose_names) + 12))
 
 
-def position_effects(robot: Robot, q: ArrayLike) -> Array:
+def list_position_effects(robot: Robot, q: ArrayLike) -> Array:
     """Return the platform's motion by one standard deviation of each cause, joints held.
 
     :returns: translations of the reference point, shape (..., 3, causes), m.
     """
-    causes, m = robot.cached(CauseSlopes, geometry_numbers), len(robot.pose_names)
-    table = _by_geometry(robot, q, np.eye(3, m + 12, m))[..., list(causes.chosen)]
+    causes, m = robot.cached(CauseSlopes, list_geometry_numbers), len(robot.pose_names)
+    table = _differentiate_by_geometry(robot, q, np.eye(3, m + 12, m))[..., list(causes.chosen)]
     return np.asarray(table @ causes.slopes, np.float64)
 
 
-def _by_geometry(robot: Robot, q: ArrayLike, rows: Array) -> Array:
+def _differentiate_by_geometry(robot: Robot, q: ArrayLike, rows: Array) -> Array:
     states = vectors(q, robot.joints_count, "q")[..., None, :]
     return robot.evaluate(platform_gradient(robot.engine), states, rows)[0]
 
 
-def geometry_numbers(robot: Robot) -> list[Any]:
+def list_geometry_numbers(robot: Robot) -> list[Any]:
     """Return the numbers or expressions of ``Engine.geometry``."""
-    return list(geometry_of(robot.graph))
+    return list(list_geometry(robot.graph))

@@ -16,7 +16,7 @@ from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import passive_values
 
 ROUNDING: Final = 1e-9
-"""Relative rounding error within which a position is on its limit."""
+"""Relative distance beyond a limit that counts as rounding."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Beyond:
         )
 
 
-def ranges(robot: Robot) -> Iterator[tuple[str, Array, Array, list[str]]]:
+def list_limits(robot: Robot) -> Iterator[tuple[str, Array, Array, list[str]]]:
     """Yield quantity, lowest and highest values (n,) and units of each limit in a robot's file."""
     limits = robot.limits
     units = list(robot.joint_units)
@@ -65,7 +65,7 @@ def beyond_limits(
     single = values["position"].ndim == 1
     outside = np.zeros(values["position"].shape[:-1], np.bool_)
     found = []
-    for quantity, low, high, units in ranges(robot):
+    for quantity, low, high, units in list_limits(robot):
         if quantity not in values:
             continue
         # A pose on the limit is within it despite rounding.
@@ -90,7 +90,7 @@ def find_first_beyond(robot: Robot, q: Array, *, actuated: bool = True) -> Beyon
 
     :param actuated: also judge the actuated joints.
     """
-    for names, values, bounds, units in _bounded(robot, q, actuated):
+    for names, values, bounds, units in _list_bounded(robot, q, actuated):
         excess = np.maximum(values - bounds[:, 1], bounds[:, 0] - values)
         bad = excess > ROUNDING * np.maximum(1.0, np.abs(values))
         if bad.any():
@@ -101,7 +101,9 @@ def find_first_beyond(robot: Robot, q: Array, *, actuated: bool = True) -> Beyon
     return None
 
 
-def _bounded(robot: Robot, q: Array, actuated: bool) -> Iterator[tuple[Sequence[str], Array, Array, Sequence[str]]]:
+def _list_bounded(
+    robot: Robot, q: Array, actuated: bool
+) -> Iterator[tuple[Sequence[str], Array, Array, Sequence[str]]]:
     """Yield names, values (p, k), bounds (k, 2) and units of all bounded quantities at q (p, n)."""
     if actuated and robot.limits.position is not None:
         yield robot.joint_names, q, robot.limits.position, robot.joint_units

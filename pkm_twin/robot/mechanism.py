@@ -22,7 +22,7 @@ from pkm_twin.kinematics.pose import Coordinate
 from pkm_twin.kinematics.scheme import Start
 from pkm_twin.machine import schema
 from pkm_twin.machine.formulas import Book
-from pkm_twin.machine.friction import law_names, select_compiled_laws
+from pkm_twin.machine.friction import find_law_names, select_compiled_laws
 from pkm_twin.machine.graph import Graph, number_limbs
 from pkm_twin.machine.inertia import Coefficients
 from pkm_twin.machine.joint_map import JointMap, JointMapEntry
@@ -41,7 +41,7 @@ from pkm_twin.machine.places import (
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.reach import PassiveLimit, position_box
 from pkm_twin.machine.sections import DriveSpec, JointLimits, Payload, friction_of, limits_of
-from pkm_twin.machine.uncertainty import Tolerance, UncertaintyEntry, causes_of
+from pkm_twin.machine.uncertainty import Tolerance, UncertaintyEntry, list_causes
 from pkm_twin.machine.urdf_file import Visual
 from pkm_twin.settings import settings_of
 
@@ -147,7 +147,7 @@ class Mechanism(Common):
     def size(self) -> float:
         """Greatest distance of a joint on the platform from its reference point, m.
 
-        With it an angle becomes a length.
+        It converts angles to lengths.
         """
         return float(self.graph.rim)
 
@@ -262,15 +262,15 @@ class Mechanism(Common):
         return {}
 
     @property
-    def spelled(self: R) -> R:
+    def with_default_inertia(self: R) -> R:
         """The robot with every inertia that its file may leave out."""
         own: Any = getattr(self, "inertia", None)
         usual = {} if own is None else self.default_inertia()
         left = {key: value for key, value in usual.items() if getattr(own, key) is None}
-        return self._with(inertia=dataclasses.replace(own, **left)) if left else self
+        return self._replace_fields(inertia=dataclasses.replace(own, **left)) if left else self
 
     def mass_keys(self) -> Iterator[Keys]:
-        """Yield the keys of masses, centres and inertias in the file of a :attr:`spelled` robot."""
+        """Yield the keys of masses, centres and inertias in the file of a :attr:`with_default_inertia` robot."""
         for name, value in self.parameter_sections()["inertia"].items():
             if name != "rotor_inertia":
                 yield from (("inertia", name, *index) for index in np.ndindex(np.shape(value)))
@@ -283,7 +283,7 @@ class Mechanism(Common):
         """Return the keys of a joint's rotor in the file."""
         return ("inertia", "rotor_inertia") if self.drive is None else ("drive", "inertia")
 
-    def reflected_rotor(self, given: float, slides: bool) -> float:
+    def reflect_rotor(self, given: float, slides: bool) -> float:
         """Return the rotor inertia at the joints, kg m2 or kg: of the file's ``drive``, or as given.
 
         :raises ParameterError: both are given, or a gear for another type of joint.
@@ -298,7 +298,7 @@ class Mechanism(Common):
     @cached_property
     def laws(self) -> tuple[str, ...]:
         """Friction laws of the drives in addition to the basic one, see ``machine.friction``."""
-        return law_names(self.friction, self.open_laws)
+        return find_law_names(self.friction, self.open_laws)
 
     def with_laws(self, graph: Graph) -> Graph:
         """Add the robot's friction laws to a graph, from which programs of efforts are made."""
@@ -308,7 +308,7 @@ class Mechanism(Common):
     @cached_property
     def causes(self) -> Mapping[str, Mapping[str, float]]:
         """The changes of numbers, by path, for one standard deviation of each uncertainty."""
-        return causes_of(self.uncertainty, self.file_numbers())
+        return list_causes(self.uncertainty, self.file_numbers())
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state for a copy in another process, without derived values."""
@@ -339,12 +339,12 @@ class Mechanism(Common):
     @property
     def joint_unit(self) -> str:
         """Unit of q if all joints have the same, else ``rad or m``."""
-        return _common(self.joint_units)
+        return _find_common_unit(self.joint_units)
 
     @property
     def effort_unit(self) -> str:
         """Unit of the efforts if all joints have the same, else ``N m or N``."""
-        return _common(self.effort_units)
+        return _find_common_unit(self.effort_units)
 
     def parameter_sections(self) -> dict[str, Any]:
         """Return the parameters by section, as plain data."""
@@ -447,7 +447,7 @@ class Mechanism(Common):
         """
         values = self.resolved(values)
         made = replace_numbers(self, {tuple(full_keys(path)): value for path, value in values.items()})
-        return self._with(**{f.name: getattr(made, f.name) for f in dataclasses.fields(self)})
+        return self._replace_fields(**{f.name: getattr(made, f.name) for f in dataclasses.fields(self)})
 
     def own_path(self, path: str) -> str:
         """Return the path in the robot's file of a number that several paths name."""
@@ -493,7 +493,7 @@ class Mechanism(Common):
         """
         check_number(self, full_keys(path), path)
 
-    def _with(self: R, **values: Any) -> R:
+    def _replace_fields(self: R, **values: Any) -> R:
         """Copy the robot with other fields or derived values, without checks."""
         made = object.__new__(type(self))
         vars(made).update(self.__getstate__() | values)
@@ -549,5 +549,5 @@ class Mechanism(Common):
         return made
 
 
-def _common(units: Sequence[str]) -> str:
+def _find_common_unit(units: Sequence[str]) -> str:
     return " or ".join(sorted(set(units), reverse=True))

@@ -16,7 +16,7 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import GEOMETRY, Expression, Tape, tangents
 from pkm_twin.codegen.plain import functions
-from pkm_twin.machine.geometry import geometry_of
+from pkm_twin.machine.geometry import list_geometry
 from pkm_twin.machine.inertia import Layout
 from pkm_twin.machine.tree import Tree
 from pkm_twin.robot.robot import Robot
@@ -45,7 +45,7 @@ class FileNumbers:
         return np.array(table, np.float64).reshape(len(self._results), len(self._given))
 
     @cached_property
-    def _slopes_run(self) -> tuple[list[tuple[int, int]], Callable[..., tuple[Any, ...]]]:
+    def _slopes_function(self) -> tuple[list[tuple[int, int]], Callable[..., tuple[Any, ...]]]:
         """Indices of the nonzero derivatives, and the function that computes them."""
         tape = Tape() if not self._results else self._results[0].tape
         found = [
@@ -59,7 +59,7 @@ class FileNumbers:
 
     def slopes_at(self, values: Array) -> Array:
         """Compute the derivatives at values, shape (k, paths); shape (k, results, paths)."""
-        places, run = self._slopes_run
+        places, run = self._slopes_function
         table = np.zeros((len(values), len(self._results), len(self._given)))
         with np.errstate(all="ignore"):
             for (i, k), value in zip(places, run(**{GEOMETRY: list(values.T)}), strict=True):
@@ -100,4 +100,4 @@ def geometry_and_masses(robot: Robot) -> list[Any]:
     layout = Layout(Tree(graph))
     inertial = layout.pack(graph, robot.gravity, robot.friction)
     inertial = inertial + layout.payload(load.mass, load.com, load.inertia)
-    return [*geometry_of(graph), *inertial]
+    return [*list_geometry(graph), *inertial]

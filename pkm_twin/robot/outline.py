@@ -108,9 +108,9 @@ def list_bars(graph: Graph) -> tuple[Bar, ...]:
         if body == BASE:
             continue
         # A body with one joint is drawn from there to its centre of mass.
-        if not _others(found, radius) and graph.bodies[body].mass > 0.0:
+        if not _drop_coincident(found, radius) and graph.bodies[body].mass > 0.0:
             found = [*found[:1], graph.bodies[body].com]
-        result += [Bar(body, (body, found[0]), (body, point), radius) for point in _others(found, radius)]
+        result += [Bar(body, (body, found[0]), (body, point), radius) for point in _drop_coincident(found, radius)]
     for rod in graph.rods.values():
         for shift in (0.0,) if rod.pair is None else (-rod.width / 2, rod.width / 2):
             ends = rod.ends if rod.pair is None else rod.ends + shift * rod.pair
@@ -166,7 +166,7 @@ def _half_hull(flat: Array, order: NDArray[np.int64]) -> list[int]:
 
 def base_face(graph: Graph) -> Array:
     """Return the corners of the plate under the base's joints, without slides, which have rails."""
-    return find_plate_corners(list(_fixed(graph, BASE)))
+    return find_plate_corners(list(_iterate_fixed_points(graph, BASE)))
 
 
 def base_line(graph: Graph) -> Array:
@@ -174,7 +174,7 @@ def base_line(graph: Graph) -> Array:
 
     They are the ground of a planar linkage, whose base has no face.
     """
-    points = np.array(list(_fixed(graph, BASE))).reshape(-1, 3)
+    points = np.array(list(_iterate_fixed_points(graph, BASE))).reshape(-1, 3)
     far = np.linalg.norm(points[:, None] - points, axis=-1)
     if not far.any():
         return np.zeros((0, 3))
@@ -183,10 +183,10 @@ def base_line(graph: Graph) -> Array:
 
 def platform_face(graph: Graph) -> Array:
     """Return the corners of the platform: its joints and ends of rods, without slides."""
-    return find_plate_corners(list(_fixed(graph, graph.platform)))
+    return find_plate_corners(list(_iterate_fixed_points(graph, graph.platform)))
 
 
-def _fixed(graph: Graph, body: str) -> Iterable[Array]:
+def _iterate_fixed_points(graph: Graph, body: str) -> Iterable[Array]:
     """Yield the points of a body that its joints do not move along it."""
     standing = ("revolute", "universal", "spherical", "cylindrical", "fixed")
     for joint in graph.joints.values():
@@ -198,7 +198,7 @@ def _fixed(graph: Graph, body: str) -> Iterable[Array]:
                 yield end
 
 
-def _others(points: Sequence[Array], radius: float) -> list[Array]:
+def _drop_coincident(points: Sequence[Array], radius: float) -> list[Array]:
     return [p for p in points[1:] if float(np.linalg.norm(p - points[0])) > radius]
 
 

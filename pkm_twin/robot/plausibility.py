@@ -21,7 +21,7 @@ from pkm_twin.machine.members import RigidError
 from pkm_twin.robot.robot import Robot
 
 EXTENTS: Final = (2e-3, 20.0)
-"""Extents of a machine, m; beyond them its lengths look like another unit."""
+"""Bounds of a machine's extent, m; outside them its lengths were probably meant in another unit."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ def findings(robot: Robot) -> tuple[Finding, ...]:
     )
 
 
-def _outside(
+def _check_bounds(
     field: str, quantity: str, value: float, bounds: tuple[float, float], unit: str, likely: tuple[str, str]
 ) -> Iterator[Finding]:
     """Yield a finding if a quantity is out of its bounds; zero counts as absent.
@@ -82,12 +82,12 @@ def _outside(
         yield Finding(field, quantity, value, bounds[0], unit, likely[0])
 
 
-def _above(field: str, quantity: str, value: float, most: float, unit: str, likely: str) -> Iterator[Finding]:
-    yield from _outside(field, quantity, value, (0.0, most), unit, ("", likely))
+def _check_maximum(field: str, quantity: str, value: float, most: float, unit: str, likely: str) -> Iterator[Finding]:
+    yield from _check_bounds(field, quantity, value, (0.0, most), unit, ("", likely))
 
 
 def _check_size(graph: Graph) -> Iterator[Finding]:
-    yield from _outside(
+    yield from _check_bounds(
         "geometry",
         "extent of the machine",
         _extent(graph),
@@ -98,7 +98,7 @@ def _check_size(graph: Graph) -> Iterator[Finding]:
 
 
 def _check_masses(robot: Robot, graph: Graph) -> Iterator[Finding]:
-    total = _total(graph)
+    total = _sum_mass(graph)
     if not total > 0.0:
         return
     # All masses over the cube of the extent: at most between solid aluminium and steel. Grams or tonnes
@@ -106,7 +106,7 @@ def _check_masses(robot: Robot, graph: Graph) -> Iterator[Finding]:
     extent = _extent(graph)
     density = total / extent**3 if EXTENTS[0] <= extent <= EXTENTS[1] else 0.0
     whole = f"{total:.4g} kg in all; masses in"
-    yield from _outside(
+    yield from _check_bounds(
         "masses",
         "all that moves over the cube of the extent",
         density,
@@ -130,10 +130,10 @@ def _check_masses(robot: Robot, graph: Graph) -> Iterator[Finding]:
 
 def payload_findings(robot: Robot) -> Iterator[Finding]:
     """Yield a finding if the payload is too heavy for the machine."""
-    total, mass = _total(robot.graph), robot.payload.mass
+    total, mass = _sum_mass(robot.graph), robot.payload.mass
     if total > 0.0:
         likely = f"{total:.4g} kg move it; a mass in grams?"
-        yield from _above("payload.mass", "payload", mass, 50.0 * total, "kg", likely)
+        yield from _check_maximum("payload.mass", "payload", mass, 50.0 * total, "kg", likely)
 
 
 def _check_bodies(robot: Robot, graph: Graph) -> Iterator[Finding]:
@@ -149,15 +149,15 @@ def _check_bodies(robot: Robot, graph: Graph) -> Iterator[Finding]:
             continue
         radius = math.sqrt(max(float(np.linalg.eigvalsh(inertia)[-1]), 0.0) / mass)
         likely = f"inertia in {'g mm2' if radius > 3e3 * extent else 'kg mm2'}?"
-        yield from _above(f"{name}: inertia", "radius of gyration", radius, 2.0 * extent, "m", likely)
+        yield from _check_maximum(f"{name}: inertia", "radius of gyration", radius, 2.0 * extent, "m", likely)
         what = "its joints" if name != "payload" else "the reference point"
         what = f"distance of the centre of mass from {what}"
         likely = "a place in millimetres, or in other axes?"
-        yield from _above(f"{name}: com", what, far, 2.0 * extent, "m", likely)
+        yield from _check_maximum(f"{name}: com", what, far, 2.0 * extent, "m", likely)
 
 
 def _check_drives(robot: Robot, graph: Graph) -> Iterator[Finding]:
-    total = _total(graph) + robot.payload.mass
+    total = _sum_mass(graph) + robot.payload.mass
     positions, home = robot.limits.position, graph.home.tolist()
     for k, name in enumerate(graph.actuated):
         joint = graph.joints[name]
@@ -194,7 +194,7 @@ def _check_drives(robot: Robot, graph: Graph) -> Iterator[Finding]:
         weight = joint.rotor_inertia / (graph.size**2 if turns else 1.0)
         if total > 0.0:
             what, likely = ("rotor as a mass at the machine's extent", "an inertia in kg mm2 or g cm2?")
-            yield from _above(f"{name}: rotor_inertia", what, weight, 100.0 * total, "kg", likely)
+            yield from _check_maximum(f"{name}: rotor_inertia", what, weight, 100.0 * total, "kg", likely)
 
 
 def gravity_findings(robot: Robot) -> Iterator[Finding]:
@@ -202,7 +202,7 @@ def gravity_findings(robot: Robot) -> Iterator[Finding]:
     size = float(np.linalg.norm(robot.gravity))
     times = f"{size / 9.81:.4g} times the Earth's; in mm/s2 or cm/s2?"
     # Between the Moon and Jupiter.
-    yield from _outside("gravity", "gravity", size, (1.0, 25.0), "m/s2", ("in km/s2?", times))
+    yield from _check_bounds("gravity", "gravity", size, (1.0, 25.0), "m/s2", ("in km/s2?", times))
     if size == 1.0:
         yield Finding("gravity", "gravity", size, 1.62, "m/s2", "in units of the Earth's?")
 
@@ -225,7 +225,7 @@ def _check_members(robot: Robot, graph: Graph) -> Iterator[Finding]:
             if outside and joint.type.placed and not joint.virtual:
                 far = min(float(np.linalg.norm(joint.at - end)) for end in ends)
                 what, likely = f"distance of its ends from joint {joint.name}", "a mistyped place?"
-                yield from _above(f"{name}: member", what, far, most, "m", likely)
+                yield from _check_maximum(f"{name}: member", what, far, most, "m", likely)
 
 
 def _check_home(graph: Graph) -> Iterator[Finding]:
@@ -251,7 +251,7 @@ def _extent(graph: Graph) -> float:
     return extent if extent > 1e-9 else 0.0
 
 
-def _total(graph: Graph) -> float:
+def _sum_mass(graph: Graph) -> float:
     return sum(b.mass for b in graph.bodies.values()) + sum(r.mass for r in graph.rods.values())
 
 

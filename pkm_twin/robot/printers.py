@@ -151,8 +151,8 @@ def read_printer(text: str, firmware: Firmware | None, probe_radius: float | Non
         smooth = not table and ("G29.1" in text or "G32" in text)
         firmware = Firmware.SMOOTHIEWARE if smooth else Firmware.MARLIN
     if firmware is Firmware.KLIPPER:
-        return _klipper(text)
-    m665, m666 = _words(text, "M665"), _words(text, "M666")
+        return _read_klipper(text)
+    m665, m666 = _read_words(text, "M665"), _read_words(text, "M666")
     for word, what in (("L", "rod length"), ("R", "radius")):
         if word not in m665:
             raise ParameterError(f"M665 {word}", None, f"M665 with {word}, the {what}, in the log")
@@ -167,7 +167,7 @@ def read_printer(text: str, firmware: Firmware | None, probe_radius: float | Non
         arms = arms + [m665.get(axis, [0.0])[0] for axis in "ABC"]
     sign = 1.0 if firmware is Firmware.REPRAPFIRMWARE else -1.0
     ends = height + _find_carriage_heights(arms, radius, "M665 L") + sign * trims
-    points = _points(text, firmware, probe_radius or m665.get("B", [0.0])[0])
+    points = _read_points(text, firmware, probe_radius or m665.get("B", [0.0])[0])
     turned = np.radians(angles)
     towers = radius * np.stack([np.cos(turned), np.sin(turned)], -1)
     away = np.sum((points[:, None, :2] - towers) ** 2, -1)
@@ -188,7 +188,7 @@ def _find_carriage_heights(arms: Array, radius: float, where: str) -> Array:
     return np.sqrt(arms**2 - radius**2)
 
 
-def _words(text: str, code: str) -> dict[str, list[float]]:
+def _read_words(text: str, code: str) -> dict[str, list[float]]:
     """Read the numbers by letter in all lines of a G-code; later lines replace earlier numbers."""
     found: dict[str, list[float]] = {}
     for line in re.findall(rf"\b{code}\b([^;\n]*)", text):
@@ -197,14 +197,14 @@ def _words(text: str, code: str) -> dict[str, list[float]]:
     return found
 
 
-def _points(text: str, firmware: Firmware, radius: float) -> Array:
+def _read_points(text: str, firmware: Firmware, radius: float) -> Array:
     """Read the probed points and their heights, mm, (k, 3).
 
     :raises ParameterError: there are none, or their positions are unknown.
     """
     found: list[tuple[float, float, float]] = []
     heights = re.findall(r"bed probe heights:((?:\s+" + _NUMBER + r")+)", text, re.I)
-    rows = list(_height_map(text))
+    rows = list(_read_height_map(text))
     if firmware is Firmware.MARLIN and re.search(r"\bc\s*:", text):
         seen: set[str] = set()
         for name, value in _G33.findall(text[re.search(r"\bc\s*:", text).start() :]):  # type: ignore[union-attr]
@@ -220,7 +220,7 @@ def _points(text: str, firmware: Firmware, radius: float) -> Array:
     elif firmware is Firmware.MARLIN and "G33" in text:
         raise ParameterError("G33", "no table of points", "a log of `G33 V3`, which prints one")
     elif heights:
-        # Not across lines: the search from each of many lines would read all lines that follow.
+        # Within one line, since a search across lines would take quadratic time.
         point = rf"^[ \t]*G30\s+P\d+\s+X({_NUMBER})\s*Y({_NUMBER})"
         places, values = re.findall(point, text, re.M), heights[0].split()
         if len(places) < len(values):
@@ -239,7 +239,7 @@ def _points(text: str, firmware: Firmware, radius: float) -> Array:
     return np.array(found)
 
 
-def _height_map(text: str) -> Iterator[tuple[float, float, float]]:
+def _read_height_map(text: str) -> Iterator[tuple[float, float, float]]:
     """Read the probed points of RepRapFirmware's heightmap.csv."""
     lines = text.splitlines()
     heads = (k for k, line in enumerate(lines) if line.startswith(("xmin,", "axis0,")))
@@ -258,7 +258,7 @@ def _height_map(text: str) -> Iterator[tuple[float, float, float]]:
                 yield x0 + column * dx, y0 + row * dy, float(cell)
 
 
-def _klipper(text: str) -> Printer:
+def _read_klipper(text: str) -> Printer:
     """Read a printer.cfg, with the block that SAVE_CONFIG appends.
 
     :raises ParameterError: an entry is missing.
@@ -280,36 +280,36 @@ def _klipper(text: str) -> Printer:
         value = steppers[stepper].get(key, steppers[0].get(key))
         if value is None and default is None:
             raise ParameterError(f"[stepper_{'abc'[stepper]}] {key}", None, "a value")
-        return default if value is None else _number(value, key)  # type: ignore[return-value]
+        return default if value is None else _read_number(value, key)  # type: ignore[return-value]
 
     kind = sections.get("printer", {}).get("kinematics", "delta")
     if kind != "delta":
         raise ParameterError("[printer] kinematics", kind, "delta, a linear Delta printer")
     if "delta_radius" not in sections.get("printer", {}):
         raise ParameterError("[printer] delta_radius", None, "a linear Delta's radius, mm")
-    radius = _number(sections["printer"]["delta_radius"], "delta_radius")
+    radius = _read_number(sections["printer"]["delta_radius"], "delta_radius")
     arms = np.array([number(k, "arm_length") for k in range(3)])
     angles = np.array(
-        [_number(s["angle"], "angle") if "angle" in s else a for s, a in zip(steppers, ANGLES, strict=True)]
+        [_read_number(s["angle"], "angle") if "angle" in s else a for s, a in zip(steppers, ANGLES, strict=True)]
     )
     ends = np.array([number(k, "position_endstop") for k in range(3)])
     ends = ends + _find_carriage_heights(arms, radius, "arm_length")
-    steps = np.array([_step(number, steppers, k) for k in range(3)])
+    steps = np.array([_find_step_length(number, steppers, k) for k in range(3)])
     stored = sections.get("delta_calibrate", {})
 
     def carriages(key: str) -> list[float]:
-        values = [_number(value, key) for value in stored[key].split(",")]
+        values = [_read_number(value, key) for value in stored[key].split(",")]
         if len(values) != 3:
             raise ParameterError(f"[delta_calibrate] {key}", len(values), "3 step counts")
         return [float(v) for v in -np.array(values) * steps]
 
     heights = [
-        [*carriages(f"{key}_pos"), _number(stored[key], key)]
+        [*carriages(f"{key}_pos"), _read_number(stored[key], key)]
         for key in stored
         if re.fullmatch(r"(manual_)?height\d+", key) and f"{key}_pos" in stored
     ]
     distances = [
-        [*carriages(f"{key}_pos1"), *carriages(f"{key}_pos2"), _number(stored[key], key)]
+        [*carriages(f"{key}_pos1"), *carriages(f"{key}_pos2"), _read_number(stored[key], key)]
         for key in stored
         if re.fullmatch(r"distance\d+", key) and f"{key}_pos1" in stored
     ]
@@ -319,7 +319,7 @@ def _klipper(text: str) -> Printer:
     return Printer(radius, angles, arms, ends, *shapes)
 
 
-def _step(number: Callable[..., float], steppers: list[dict[str, str]], k: int) -> float:
+def _find_step_length(number: Callable[..., float], steppers: list[dict[str, str]], k: int) -> float:
     """Return the carriage's travel per step, mm."""
     if "step_distance" in {**steppers[0], **steppers[k]}:
         return float(number(k, "step_distance"))
@@ -327,12 +327,12 @@ def _step(number: Callable[..., float], steppers: list[dict[str, str]], k: int) 
     turns = 1.0
     for pair in gear.split(","):
         driven, _, driving = pair.partition(":")
-        turns *= _number(driven, "gear_ratio") / _number(driving or "1", "gear_ratio")
+        turns *= _read_number(driven, "gear_ratio") / _read_number(driving or "1", "gear_ratio")
     full = number(k, "full_steps_per_rotation", 200.0)
     return float(number(k, "rotation_distance") / (full * number(k, "microsteps") * turns))
 
 
-def _number(text: str, key: str) -> float:
+def _read_number(text: str, key: str) -> float:
     try:
         return decimal(text)
     except ValueError:

@@ -44,7 +44,7 @@ def reject_poses(
     poses = np.asarray(pose, float)
     one = np.broadcast_to(poses, (*status.shape[:-1], poses.shape[-1]))[index]
     if code == NOT_FINITE or not np.isfinite(one).all():
-        raise _not_finite("pose", index)
+        raise _make_finite_error("pose", index)
     part, miss, met = engine.shortest_pose(one)
     question = _ask_for_unit(robot, one, engine.home_pose)
     if met and reached < 1.0:
@@ -93,11 +93,11 @@ def reject_joints(
         given[name] = np.broadcast_to(array, (*batch, array.shape[-1]))[index]
         if not np.isfinite(given[name]).all():
             if name in ("q", "qd", "qdd"):
-                raise _not_finite("joint state", index)
-            raise ParameterError(f"{name}{_at_sample(index)}", given[name].tolist(), "finite numbers")
+                raise _make_finite_error("joint state", index)
+            raise ParameterError(f"{name}{_write_sample(index)}", given[name].tolist(), "finite numbers")
     code, reached = status[index].tolist()
     if code == NOT_FINITE:
-        raise _not_finite("joint state", index)
+        raise _make_finite_error("joint state", index)
     sample, question = given["q"], ""
     if robot.redundant:
         _reject_contradiction(robot, engine, given, index)
@@ -181,9 +181,9 @@ def _find_first(codes: Array) -> tuple[int, ...] | None:
     return tuple(int(i) for i in bad[0]) if len(bad) else None
 
 
-def _not_finite(what: str, index: tuple[int, ...]) -> ValueError:
-    return ValueError(f"{what}{_at_sample(index)} is not finite, or leads to a result that is not")
+def _make_finite_error(what: str, index: tuple[int, ...]) -> ValueError:
+    return ValueError(f"{what}{_write_sample(index)} is not finite, or leads to a result that is not")
 
 
-def _at_sample(index: tuple[int, ...]) -> str:
+def _write_sample(index: tuple[int, ...]) -> str:
     return f" at sample {index}" if index else ""

@@ -54,14 +54,14 @@ class Robot(Mechanism):
     @cached_property
     def engine(self) -> Engine:
         """The engine of the robot's geometry, shared by all robots that have the same."""
-        return self._engine_on(self.graph)
+        return self._make_engine(self.graph)
 
-    def _engine_on(self, graph: Graph) -> Engine:
+    def _make_engine(self, graph: Graph) -> Engine:
         return engine_of(graph, self.coordinates, self.start)
 
     @cached_property
-    def _massive(self) -> Engine:
-        return self._engine_on(self.with_laws(self.graph)) if self.laws else self.engine
+    def _massive_engine(self) -> Engine:
+        return self._make_engine(self.with_laws(self.graph)) if self.laws else self.engine
 
     @cached_property
     def _cached(self) -> dict[object, Any]:
@@ -119,7 +119,7 @@ class Robot(Mechanism):
 
     @property
     def _layout(self) -> Layout:
-        return Layout(self._massive.tree)
+        return Layout(self._massive_engine.tree)
 
     def massive(self) -> Engine:
         """Return the engine of a robot with masses, whose programs include the friction laws.
@@ -128,7 +128,7 @@ class Robot(Mechanism):
         """
         if getattr(self, "inertia", True) is None:
             raise ParameterError("inertia", None, "a section with the masses and inertias")
-        return self._massive
+        return self._massive_engine
 
     @property
     def has_masses(self) -> bool:
@@ -190,7 +190,7 @@ class Robot(Mechanism):
         return self.placed(q)[1:]
 
     def placed(self, q: ArrayLike) -> tuple[Array, Array, Array]:
-        """Compute the pose of :meth:`forward` and position and rotation of :meth:`platform` together."""
+        """Return the results of :meth:`forward` and :meth:`platform`, computed together."""
         pose, position, rotation = self.evaluate(self.engine.forward, q)
         return pose, position, rotation.reshape(*rotation.shape[:-1], 3, 3)
 

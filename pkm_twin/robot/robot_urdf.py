@@ -15,7 +15,7 @@ from pkm_twin.kinematics.pose import describe_angles
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import BASE, POSE
 from pkm_twin.machine.graph_description import graph_description
-from pkm_twin.machine.graph_file import drive_numbers
+from pkm_twin.machine.graph_file import list_drive_numbers
 from pkm_twin.machine.loop_tree import Capsule, Joint, Link, LoopTree
 from pkm_twin.machine.mjcf_write import write_mjcf
 from pkm_twin.machine.names import joint_labels, plain_name
@@ -50,16 +50,16 @@ def robot_urdf(robot: Robot, hardware: str = MOCK, prefix: str = "") -> str:
     _warn_of_losses(robot, "URDF")
     if hardware:
         robot.controller.check_even()
-    return write_urdf(robot_tree(robot), hardware, prefix, _controls(robot))
+    return write_urdf(robot_tree(robot), hardware, prefix, _list_controls(robot))
 
 
 def joint_names(robot: Robot, hardware: str) -> tuple[str, ...]:
     """Return the names that :func:`robot_urdf` gives actuated and passive joints of the tree."""
     names = (*robot.joint_names, *robot.passive_joints)
-    return tuple(tree_names(names, _controls(robot) if hardware else ()).values())
+    return tuple(tree_names(names, _list_controls(robot) if hardware else ()).values())
 
 
-def _controls(robot: Robot) -> list[Control]:
+def _list_controls(robot: Robot) -> list[Control]:
     controller = robot.controller
     factors, offsets = controller.factors.tolist(), controller.offsets.tolist()
     return list(map(Control, controller.names, robot.joint_names, factors, offsets))
@@ -105,17 +105,17 @@ def _warn_of_losses(robot: Robot, where: str) -> None:
 def robot_tree(robot: Robot) -> LoopTree:
     """Return the robot in the form of description files, drawn at home, with bars for pictures."""
     graph, tree, load = robot.graph, robot.engine.tree, robot.payload
-    names = _link_names([*graph.bodies, *graph.rods])
+    names = _choose_link_names([*graph.bodies, *graph.rods])
     labels = joint_labels(tree)
     links, joints = {GROUND: Link(GROUND)}, dict[str, Joint]()
 
-    def joint_of(source: str) -> Joint:
+    def make_joint(source: str) -> Joint:
         one, at = graph.joints[source], Pose(position=graph.joints[source].at)
         rub = {"viscous": one.viscous, "coulomb": one.coulomb, "offset": 0.0}
         limits: dict[str, Any] = {}
         if one.actuated:
             k = graph.actuated.index(source)
-            rub, limits = drive_numbers(robot.friction, robot.limits, k)
+            rub, limits = list_drive_numbers(robot.friction, robot.limits, k)
         return Joint(
             labels["joints", source],
             one.kind,
@@ -140,9 +140,9 @@ def robot_tree(robot: Robot) -> LoopTree:
             label = labels["bodies", link.body]
             joints[label] = Joint(label, "free", names[link.parent], own, (at, at))
         else:
-            joint = joint_of(link.joint)
+            joint = make_joint(link.joint)
             joints[joint.name] = joint
-    closures = [joint_of(source) for source in tree.cut]
+    closures = [make_joint(source) for source in tree.cut]
     for rod in graph.rods.values():
         start, end = (Pose(position=place) for place in rod.ends)
         along = end.position - start.position
@@ -173,7 +173,7 @@ def robot_tree(robot: Robot) -> LoopTree:
     )
 
 
-def _link_names(names: Sequence[str]) -> dict[str, str]:
+def _choose_link_names(names: Sequence[str]) -> dict[str, str]:
     """Return a link's name for each body and rod, and the ground; none is a link of the file itself."""
     links = {BASE: GROUND}
     # Names that need no change come first and stay.
@@ -216,7 +216,7 @@ def robot_description(robot: Robot) -> dict[str, Any]:
             data["joints"][name].pop("rotor_inertia", None)
             data["joints"][name]["drive"] = own
     for k, name in enumerate(robot.graph.actuated):
-        rub, limits = drive_numbers(robot.friction, robot.limits, k)
+        rub, limits = list_drive_numbers(robot.friction, robot.limits, k)
         if limits:
             data["joints"][name]["limits"] = limits
         if any(rub.values()):
@@ -236,14 +236,14 @@ def robot_description(robot: Robot) -> dict[str, Any]:
             data[key] = told
     told = {
         path: {field: value for field, value in entry.items() if value is not None}
-        for name, paths in copied_tolerances(robot).items()
+        for name, paths in expand_tolerances(robot).items()
         for entry in [schema.plain(robot.tolerances[name])]
         for path in paths
     }
     return data | ({"tolerances": data.get("tolerances", {}) | told} if told else {})
 
 
-def copied_tolerances(robot: Robot) -> dict[str, list[str]]:
+def expand_tolerances(robot: Robot) -> dict[str, list[str]]:
     """Return the paths in all copies of a limb's parts, by names of ``tolerances``: they share one error.
 
     Errors along axes are left out, because the copies are rotated.

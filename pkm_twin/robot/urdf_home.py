@@ -30,7 +30,7 @@ from pkm_twin.kinematics.singularity import singularity_at_home
 from pkm_twin.kinematics.spins import RANK, hold, null, without_spins
 from pkm_twin.machine import graph as graphs
 from pkm_twin.machine.graph import BASE, Graph
-from pkm_twin.machine.joints import HELD, Constraint
+from pkm_twin.machine.joints import CONSTRAINTS, Constraint
 from pkm_twin.machine.loop_tree import Joint, LoopTree
 from pkm_twin.machine.rotations import Pose, rotation_about, rotation_vector
 from pkm_twin.machine.tree import Tree
@@ -40,11 +40,11 @@ MAX_ITERATIONS: Final = 100
 RANK_BOUNDS: Final = (1e-4, 1e-6, 1e-8)
 """Singular values below this part of the largest count as zero; the next one if loops stay open."""
 MAX_LOOP_GAP: Final = 1e-9
-"""Loops that miss by less are closed for all purposes, m or rad."""
+"""Largest gap of a closed loop, m or rad."""
 MIN_HOME_INDEX: Final = 1e-4
-"""Smallest singularity index of a home: below it the machine can hardly move from there."""
-LEAST_ROUNDING: Final = 1e-6
-"""Deviation of axes and points that is rounding in any file, rad or relative to the size."""
+"""Smallest singularity index of a home."""
+MIN_ROUNDING: Final = 1e-6
+"""Deviation of axes and points that counts as rounding in every file, rad or relative to the size."""
 
 
 class Assembly:
@@ -100,7 +100,7 @@ class Assembly:
         return self._moves[link]
 
     def places(self) -> Array:
-        """Return where the links are, shape (links, 3), m."""
+        """Return the positions of the links, shape (links, 3), m."""
         at, links = self._motion.point, self.tree.links
         return numbers([at(body, links[n].frame.position) for n, body in self._bodies.items()])
 
@@ -118,7 +118,7 @@ class Assembly:
             angular[:, k] = column
         return linear, angular
 
-    def _equations(self, closure: Joint) -> list[Equation]:
+    def _write_equations(self, closure: Joint) -> list[Equation]:
         """Return the equations of a closure at the placed values."""
         name, bodies = closure.name, (closure.inner, closure.outer)
         inner, outer = (self.move(link).rotation for link in bodies)
@@ -138,7 +138,7 @@ class Assembly:
 
         :param rates: without them their shape is (rows, 0), else (rows, count).
         """
-        closures = [self._equations(one) for one in self.tree.closures]
+        closures = [self._write_equations(one) for one in self.tree.closures]
         values = np.array([float(one.value) for found in closures for one in found])
         if not rates:
             return values, np.zeros((len(values), 0))
@@ -167,7 +167,7 @@ class Assembly:
         """
         best, miss = values, math.inf
         for rank in RANK_BOUNDS:
-            new, left = self._close(best, rank, held)
+            new, left = self._solve_closures(best, rank, held)
             gone = float(np.abs(new - best).max(initial=0.0))
             # A loop that is closed but for rounding moves no joint by 0.01 rad or m.
             if left < 0.5 * miss and (miss > self.closed or gone < 1e-2):
@@ -178,7 +178,7 @@ class Assembly:
         self.place(best)
         return best, miss
 
-    def _close(self, values: Array, rank: float, held: Mask | bool) -> tuple[Array, float]:
+    def _solve_closures(self, values: Array, rank: float, held: Mask | bool) -> tuple[Array, float]:
         slow = 0
 
         def evaluate(values: Array) -> tuple[Array, Array]:
@@ -229,7 +229,9 @@ class Assembly:
         self.place(values)
         if miss > self.closed:
             # Report the loop with the largest gap.
-            closure = max(self.tree.closures, key=lambda one: max(abs(float(e.value)) for e in self._equations(one)))
+            closure = max(
+                self.tree.closures, key=lambda one: max(abs(float(e.value)) for e in self._write_equations(one))
+            )
             a, b = (self.frame(closure, end) for end in (0, 1))
             apart = 1e3 * float(np.linalg.norm(b.position - a.position))
             turned = float(np.linalg.norm(rotation_vector(b.rotation @ a.rotation.T)))
@@ -282,7 +284,7 @@ def _list_constraints(closure: Joint) -> Iterator[tuple[Constraint, Array]]:
             yield from ((Constraint("angle", one, one), apart) for one in np.eye(3))
         elif closure.type.count == 1:
             apart = _align(closure.axes[0], closure.axes[-1])
-        yield from ((held, apart) for held in HELD[key](closure.axes, closure.pitch))
+        yield from ((held, apart) for held in CONSTRAINTS[key](closure.axes, closure.pitch))
 
 
 def _align(first: Array, second: Array) -> Array:
@@ -378,7 +380,7 @@ class HomeSearch:
         return turned if turned.index >= MIN_HOME_INDEX else home
 
     def _find_best(self) -> Home:
-        """Find the home, with parts that only spin at any angle."""
+        """Find the home; parts that can spin about their own axis have arbitrary angles."""
         drawn = self._close_drawing()
         if drawn is not None and drawn.how == "drawn" and drawn.index >= 0.01:
             return drawn
@@ -408,7 +410,7 @@ class HomeSearch:
             good = [h for h in tried if self._is_inside_limits(np.where(self.held, h.values, self.low))]
             candidates += [max(good, key=lambda home: home.index)] if good else []
             if tried and (not candidates or candidates[-1].index < MIN_HOME_INDEX):
-                # All closed assemblies are singular, wherever they are.
+                # Every assembly is singular, so more starts do not help.
                 break
         most = candidates[-1].index if candidates else 0.0
         near = next((home for home in candidates if home.index >= max(0.5 * most, MIN_HOME_INDEX)), None)
@@ -484,7 +486,7 @@ class HomeSearch:
             do not determine the machine.
         """
         rounding = max(self.assembly.tree.rounding, miss)
-        repaired = repair_rounded(graph, rounding, LEAST_ROUNDING)
+        repaired = repair_rounded(graph, rounding, MIN_ROUNDING)
         if repaired is None:
             return None
         if self._hinges is not None:

@@ -23,7 +23,7 @@ from pkm_twin.machine.loop_tree import SINGLE, Joint, Link, LoopTree
 from pkm_twin.machine.rotations import Pose
 from pkm_twin.machine.urdf_control import convert_drives
 from pkm_twin.machine.urdf_file import Visual, read_visuals
-from pkm_twin.robot.urdf_home import LEAST_ROUNDING, MAX_LOOP_GAP, Assembly, HomeSearch
+from pkm_twin.robot.urdf_home import MAX_LOOP_GAP, MIN_ROUNDING, Assembly, HomeSearch
 
 PLATFORMS: Final = (
     "platform",
@@ -136,7 +136,7 @@ def read_tree(path: str | Path, part: Part = Part()) -> UrdfReading:
         controller = convert_drives(top)
         readers = {"mujoco": mjcf_file.read, "sdf": sdf_file.read}
         tree = readers.get(top.tag, urdf_file.read)(path, top, part.actuated)
-    tool = _platform(tree, part.platform)
+    tool = _find_platform(tree, part.platform)
     ground = tree.root if part.base is None else part.base
     ground = urdf_xml.find_link("base", ground, tree.links)
     notes, carried = list[str](), tuple[Link, ...]()
@@ -151,18 +151,18 @@ def read_tree(path: str | Path, part: Part = Part()) -> UrdfReading:
         if own.intersection(names) or not (names or tree.actuated):
             raise error
     _require_closed(path, tree)
-    bodies = _bodies(tree, tool, ground)
+    bodies = _map_bodies(tree, tool, ground)
     _require_open(tree, bodies, tool, ground)
     assembly = Assembly(tree)
     _require_moving(tree, bodies, tool)
-    home = HomeSearch(assembly, lambda: _graph(assembly, bodies, tool, ground)).home()
+    home = HomeSearch(assembly, lambda: _build_graph(assembly, bodies, tool, ground)).home()
     assembly.place(home.values)
-    graph = home.graph or _graph(assembly, bodies, tool, ground)
-    data = _description(assembly, graph, ground)
+    graph = home.graph or _build_graph(assembly, bodies, tool, ground)
+    data = _describe_graph(assembly, graph, ground)
     if carried:
         move = _find_placed_links(assembly, ground)[tool]
         mass, com, inertia = _sum_masses([link.moved(move) for link in carried])
-        com = _snapped(com - graph.origin).tolist()
+        com = _round_vector(com - graph.origin).tolist()
         data["payload"] = {"mass": mass, "com": com, "inertia": inertia.tolist()}
     if part.pose is not None:
         data["pose"] = list(part.pose)
@@ -240,8 +240,8 @@ def _require_open(tree: LoopTree, bodies: dict[str, str], tool: str, ground: str
     """
     if all(joint.name not in tree.actuated for joint in tree.closures):
         return
-    graph = _graph(Assembly(replace(tree, actuated=())), bodies, tool, ground)
-    repaired = repair_rounded(graph, tree.rounding, LEAST_ROUNDING)
+    graph = _build_graph(Assembly(replace(tree, actuated=())), bodies, tool, ground)
+    repaired = repair_rounded(graph, tree.rounding, MIN_ROUNDING)
     freedoms = Linkage(graph if repaired is None else repaired.graph).mobility.freedoms
     raise ParameterError(
         tree.marked,
@@ -281,13 +281,13 @@ def _find_placed_links(assembly: Assembly, ground: str) -> dict[str, Pose]:
     return {name: view @ assembly.move(name) for name in assembly.tree.links}
 
 
-def _description(assembly: Assembly, graph: Graph, ground: str) -> dict[str, Any]:
+def _describe_graph(assembly: Assembly, graph: Graph, ground: str) -> dict[str, Any]:
     """Describe the placed machine's graph, with the file's gravity, limits and friction."""
     tree = assembly.tree
     data = graph_description(graph)
     if tree.gravity is not None:
         gravity = _find_placed_links(assembly, ground)[tree.root].rotation @ tree.gravity
-        data["gravity"] = _snapped(gravity).tolist()
+        data["gravity"] = _round_vector(gravity).tolist()
     for name, entry in data["joints"].items():
         ends = tree.joints[name].limits.get("position") if name in tree.joints else None
         if ends is not None and np.isfinite(ends).any() and entry["type"] in SINGLE:
@@ -302,7 +302,7 @@ def _description(assembly: Assembly, graph: Graph, ground: str) -> dict[str, Any
     return data
 
 
-def _graph(assembly: Assembly, bodies: dict[str, str], tool: str, ground: str) -> Graph:
+def _build_graph(assembly: Assembly, bodies: dict[str, str], tool: str, ground: str) -> Graph:
     """Return the graph of the machine at the placed values."""
     tree, moves = assembly.tree, _find_placed_links(assembly, ground)
     home = dict(zip(assembly.steps, assembly.values.tolist(), strict=True))
@@ -310,7 +310,7 @@ def _graph(assembly: Assembly, bodies: dict[str, str], tool: str, ground: str) -
     joints = [tree.joints[name] for name in (*tree.actuated, *passive)]
     joints += [one for one in tree.closures if bodies[one.inner] != bodies[one.outer]]
 
-    def joint_of(joint: Joint) -> graphs.Joint:
+    def make_joint(joint: Joint) -> graphs.Joint:
         ends = moves[joint.inner], moves[joint.outer]
         axes = [e.rotation @ axis for e, axis in zip(ends, joint.axes, strict=False)]
         axes = axes[: joint.type.count]
@@ -324,22 +324,22 @@ def _graph(assembly: Assembly, bodies: dict[str, str], tool: str, ground: str) -
             joint.kind,
             bodies[joint.inner],
             bodies[joint.outer],
-            _snapped(ends[0].point(joint.at)),
-            np.reshape([_snapped(a) for a in axes], (-1, 3)),
+            _round_vector(ends[0].point(joint.at)),
+            np.reshape([_round_vector(a) for a in axes], (-1, 3)),
             joint.name in tree.actuated,
             **own,
         )
 
     return Graph(
-        _masses(tree, bodies, moves),
-        {joint.name: joint_of(joint) for joint in joints if joint.kind != "free"},
+        _list_masses(tree, bodies, moves),
+        {joint.name: make_joint(joint) for joint in joints if joint.kind != "free"},
         {},
         bodies[tool],
-        _snapped(moves[tool].point(tree.links[tool].frame.position)),
+        _round_vector(moves[tool].point(tree.links[tool].frame.position)),
     )
 
 
-def _platform(tree: LoopTree, asked: str | None) -> str:
+def _find_platform(tree: LoopTree, asked: str | None) -> str:
     if asked is not None:
         return urdf_xml.find_link("platform", asked, tree.links)
     lower = {name.lower(): name for name in tree.links}
@@ -349,7 +349,7 @@ def _platform(tree: LoopTree, asked: str | None) -> str:
     raise ParameterError("platform", None, f"the link that carries the tool, one of {', '.join(sorted(tree.links))}")
 
 
-def _bodies(tree: LoopTree, tool: str, ground: str) -> dict[str, str]:
+def _map_bodies(tree: LoopTree, tool: str, ground: str) -> dict[str, str]:
     """Return the body of each link, named by its link nearest to the root; the tool's by the tool.
 
     :raises ParameterError: the tool is fixed to the ground.
@@ -368,13 +368,13 @@ def _bodies(tree: LoopTree, tool: str, ground: str) -> dict[str, str]:
     return {link: names[first] for link, first in group.items()}
 
 
-def _masses(tree: LoopTree, bodies: dict[str, str], moves: dict[str, Pose]) -> dict[str, graphs.Body]:
+def _list_masses(tree: LoopTree, bodies: dict[str, str], moves: dict[str, Pose]) -> dict[str, graphs.Body]:
     """Return all bodies except the ground, in base axes."""
     result: dict[str, graphs.Body] = {}
     for body in dict.fromkeys(body for body in bodies.values() if body != BASE):
         links = [link.moved(moves[name]) for name, link in tree.links.items() if bodies[name] == body]
         mass, com, inertia = _sum_masses(links)
-        result[body] = graphs.Body(body, mass, _snapped(com), inertia)
+        result[body] = graphs.Body(body, mass, _round_vector(com), inertia)
     return result
 
 
@@ -395,6 +395,6 @@ def _sum_masses(links: Sequence[Link]) -> tuple[float, Array, Array]:
     return mass, com, np.array([[float(f"{x:.15g}") for x in row] for row in clean.tolist()])
 
 
-def _snapped(vector: Array) -> Array:
+def _round_vector(vector: Array) -> Array:
     """Round a vector to 14 decimals, which removes the rounding of rotations."""
     return np.array([round(float(x), 14) + 0.0 for x in vector])

@@ -19,7 +19,7 @@ from pkm_twin.robot.robot import Robot
 Distribution = Literal["normal", "uniform"]
 
 MAX_SPREAD: Final = 0.3
-"""Largest relative standard deviation: three of them leave a mass above zero."""
+"""Largest relative standard deviation; three of them leave masses above zero."""
 KINDS: Final = ("masses", "inertias", "friction", "lengths")
 POINTS: Final = ("at", "ends")
 """Keys of the points of a machine's joints and rods."""
@@ -64,7 +64,7 @@ def vary_robot(
     rng = np.random.default_rng(seed)
     data = drop_missing(robot.parameter_sections())
     drawn: dict[str, float] = {}
-    for number in _numbers(data, robot.parameter_units(), ()):
+    for number in _iterate_numbers(data, robot.parameter_units(), ()):
         # Draw for every number, so that a kind's deviation does not change the draws of other kinds.
         size, path = spread.get(number.kind, 0.0), ".".join(number.path)
         if number.path[-1] in POINTS:
@@ -98,7 +98,7 @@ def vary_robot(
     return Variation(made, drawn)
 
 
-def _numbers(data: Any, units: Any, path: tuple[str, ...]) -> Iterator[_Number]:
+def _iterate_numbers(data: Any, units: Any, path: tuple[str, ...]) -> Iterator[_Number]:
     """Yield the numbers that are varied, in the order of the file."""
     for key, value in data.items():
         here = (*path, key)
@@ -107,14 +107,14 @@ def _numbers(data: Any, units: Any, path: tuple[str, ...]) -> Iterator[_Number]:
         if key in ("limits", "payload", "joint_map", "members", "member", "section", "uncertainty", "tolerances"):
             continue
         if isinstance(value, Mapping):
-            yield from _numbers(value, unit, here)
+            yield from _iterate_numbers(value, unit, here)
             continue
-        kind = _kind(here, unit)
+        kind = _find_kind(here, unit)
         if kind is not None:
             yield _Number(here, kind, value)
 
 
-def _kind(path: tuple[str, ...], unit: str) -> str | None:
+def _find_kind(path: tuple[str, ...], unit: str) -> str | None:
     if "friction" in path:
         return "friction"
     if unit in ("kg", "kg/m3"):

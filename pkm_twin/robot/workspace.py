@@ -52,7 +52,7 @@ STEPS_PER_BLOCK: Final = 16
 """Steps along a ray that are tried at a time."""
 MIN_WORKSPACE_INDEX: Final = 0.01
 """Singularity index (0 singular, 1 best) above which regular workspaces stay."""
-LEAST_TILT: Final = math.radians(10.0)
+MIN_TILT_RADIUS: Final = math.radians(10.0)
 """Radius, rad, below which a circle of tilts is left out (2UPR-RPU paper, section 4)."""
 MIN_SAMPLED_INDEX: Final = 0.05
 """Singularity index above which random joint positions stay."""
@@ -73,7 +73,7 @@ def try_forward(robot: Robot, q: ArrayLike) -> tuple[Array, Mask]:
     return np.where(good[..., None], pose, 0.0), good
 
 
-def singularity_at(robot: Robot, pose: ArrayLike) -> Array:
+def singularity_of_pose(robot: Robot, pose: ArrayLike) -> Array:
     """Return ``Robot.singularity`` at poses, shape (...): 0 in a singularity or out of reach.
 
     :param pose: shape (..., m), m and rad.
@@ -125,13 +125,15 @@ def reachable(robot: Robot, pose: ArrayLike, least_clearance: float = 0.0) -> Ma
     """
     poses = vectors(pose, len(robot.pose_names), "the pose")
     q, inside = try_inverse(robot, poses)
-    return inside & keeps_limits(robot, q, poses, least_clearance, inside)
+    return inside & satisfies_limits(robot, q, poses, least_clearance, inside)
 
 
-def keeps_limits(robot: Robot, q: Array, pose: Array, least_clearance: float = 0.0, known: Mask | bool = True) -> Mask:
+def satisfies_limits(
+    robot: Robot, q: Array, pose: Array, least_clearance: float = 0.0, known: Mask | bool = True
+) -> Mask:
     """Return whether joint positions are within all limits without limb interference, shape (...).
 
-    :param q: shape (..., n); ``pose``: theirs, shape (..., m).
+    :param q: shape (..., n); ``pose``: the poses of q, shape (..., m).
     :param least_clearance: as in :func:`reachable`.
     :param known: where there is an assembly; elsewhere the result is False.
     """
@@ -156,7 +158,7 @@ def belong_to_workspace(robot: Robot, q: Array, pose: Array, known: Mask, least:
     :param known: where there is an assembly.
     :param least: singularity index, and ``least_clearance``: clearance (m), that are too little.
     """
-    inside = keeps_limits(robot, q, pose, least_clearance, known)
+    inside = satisfies_limits(robot, q, pose, least_clearance, known)
     inside[inside] = robot.try_singularity(q[inside])[0] >= least
     return inside
 
@@ -177,7 +179,7 @@ class RegularWorkspace:
 def regular_workspace(
     robot: Robot,
     z: ArrayLike,
-    least_radius: float = LEAST_TILT,
+    least_radius: float = MIN_TILT_RADIUS,
     directions: int = 360,
     step: float = math.radians(0.25),
 ) -> RegularWorkspace:
@@ -226,7 +228,7 @@ def circle_radii(
     def outside(height: Array, distance: Array, azimuth: Array) -> Mask:
         poses = grid.polar_pose(height, distance, azimuth)
         kept = reachable(robot, poses, least_clearance)
-        kept[kept] = singularity_at(robot, poses[kept]) >= least
+        kept[kept] = singularity_of_pose(robot, poses[kept]) >= least
         return ~kept
 
     rung, left = np.zeros(len(heights), np.int64), np.zeros((len(heights), rays), bool)
@@ -236,7 +238,7 @@ def circle_radii(
         part = slice(start, start + at_once)
         rung[part], left[part] = _first_rungs(outside, heights[part], turn, step, steps)
     low, high = step * np.maximum(rung - 1, 0), step * rung
-    # The nearest end of all rays of a height: a ray that goes on beyond another's end is dropped.
+    # Only the shortest rays of a height matter, so drop longer ones.
     row, ray = np.nonzero(left & (rung > 0)[:, None])
     ends = np.isin(np.arange(len(heights)), row)
     for _ in range(32):
@@ -272,7 +274,7 @@ def _first_rungs(
     return rung, left
 
 
-def passing_singularity(index: float, bound: str = "--singularity ") -> str:
+def describe_singularity_bound(index: float, bound: str = "--singularity ") -> str:
     """Return a bound's name with a value that a singularity index passes: the index, rounded down."""
     if not index > 0.0:
         return f"{bound}0"
@@ -297,10 +299,10 @@ def describe_causes(robot: Robot, q: Array, pose: Array, known: Mask, least: flo
         left = left & kept
 
     judged("an actuator beyond its limits", within_limits(robot, q))
-    judged("a passive joint beyond its limits", keeps_limits(robot, q, pose, -math.inf, left))
+    judged("a passive joint beyond its limits", satisfies_limits(robot, q, pose, -math.inf, left))
     index = robot.try_singularity(q)[0]
     best = float(index[left].max(initial=0.0))
-    hint = f" (best: {best:.3g}; {passing_singularity(best)} passes)" if best < least else ""
+    hint = f" (best: {best:.3g}; {describe_singularity_bound(best)} passes)" if best < least else ""
     judged(f"a singularity index below {least:g}{hint}", index >= least)
     if has_clearance(robot):
         gap = joint_clearance(robot, q, refuse=False)

@@ -14,7 +14,7 @@ from pkm_twin.errors import MessageError
 from pkm_twin.kinematics.stream import stream_kernel
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
-from pkm_twin.robot.workspace import passing_singularity
+from pkm_twin.robot.workspace import describe_singularity_bound
 from pkm_twin.streams.steps import farthest
 
 
@@ -94,7 +94,7 @@ class Continuity:
                 "singular",
                 f"too close to a singularity or the edge of the workspace: index {measure:.3g}, "
                 f"allowed {self.stop:g} or more; "
-                f"{passing_singularity(measure, 'singularity_stop ')} passes",
+                f"{describe_singularity_bound(measure, 'singularity_stop ')} passes",
             )
         self._before, self._last = last, state
         return bool(measure < self.warn)

@@ -13,7 +13,7 @@ from pkm_twin.apps.commands.excite import MAX_CONDITION, Excite, excite
 from pkm_twin.bags.reader import open_bag
 from pkm_twin.identification.identifiable import identifiable
 from pkm_twin.identification.samples import Filtering, find_lines
-from pkm_twin.mechanisms.entries import robot_text
+from pkm_twin.mechanisms.entries import load_with_text
 from stiffness_monitor import compliance
 from test.commands.conftest import DELTA, MILLING, STIFFNESS, rewrite
 from test.laws.recordings import smooth_motion
@@ -156,7 +156,7 @@ def elastic_machine(path):
 def test_copies_of_a_limb_keep_elastic_parts_and_the_joint_map(tmp_path):
     source = tmp_path / "elastic.yaml"
     robot = elastic_machine(source)
-    text, written = robot_text(str(source), per_copy=True)
+    text, written = load_with_text(str(source), per_copy=True)
     out = tmp_path / "written.yaml"
     out.write_text(text)
     for other in (written, load(str(out))):
@@ -176,7 +176,7 @@ def test_copies_that_would_lose_elastic_members_are_refused_by_name(twin, tmp_pa
     data["joint_map"] = {load("delta").joint_names[0]: {"offset": 0.1}}
     rigid = tmp_path / "rigid.yaml"
     rigid.write_text(yaml.safe_dump(data))
-    assert robot_text(str(rigid), per_copy=True)[1].controller.offsets[0] == pytest.approx(0.1)
+    assert load_with_text(str(rigid), per_copy=True)[1].controller.offsets[0] == pytest.approx(0.1)
     out = tmp_path / "fitted.yaml"
     assert "members" in twin.refused("fit", "delta_cu", DELTA, "--per-copy", "--out", out)
     assert not out.exists()

@@ -18,7 +18,7 @@ from test.machine.random_machines import FILES, MACHINES
 from test.support.robots import load, partly_long
 
 pytestmark = pytest.mark.skipif(not COMPILERS or not shutil.which("g++"), reason="there is no C and C++ compiler")
-GOOD, HELD, OUT_OF_REACH, NOT_FINITE = range(4)
+GOOD, CONSTRAINTS, OUT_OF_REACH, NOT_FINITE = range(4)
 REDUNDANT = MACHINES.parents[2] / "examples/machines/rrr4_planar.yaml"
 HEADERS = (
     "transmission_interface/transmission",
@@ -177,7 +177,7 @@ def test_what_nobody_commands_stays_so_and_a_velocity_is_at_the_measured_positio
     assert first[0] == GOOD and np.isnan(first[1][2]).all()
     assert velocity[0] == GOOD and np.isnan(velocity[1][[0, 2]]).all()
     np.testing.assert_allclose(velocity[1][1], there.velocity, atol=1e-11)
-    assert nothing[0] == HELD
+    assert nothing[0] == CONSTRAINTS
 
 
 def test_out_of_reach_holds_the_last_result_for_one_call(compiled):
@@ -187,7 +187,7 @@ def test_out_of_reach_holds_the_last_result_for_one_call(compiled):
     beyond = compiled.rows(1.0, far, still, still, still)
     broken = compiled.rows(1.0, np.append(home[:-1], np.inf), still, still, still)
     good, held, lost, bad, again = compiled.run(at_home, beyond, beyond, broken, at_home)
-    assert [row[0] for row in (good, held, lost, bad, again)] == [GOOD, HELD, OUT_OF_REACH, NOT_FINITE, GOOD]
+    assert [row[0] for row in (good, held, lost, bad, again)] == [GOOD, CONSTRAINTS, OUT_OF_REACH, NOT_FINITE, GOOD]
     np.testing.assert_array_equal(held[1][:3], good[1][:3])
     assert np.isnan(lost[1][:3]).all() and np.isnan(bad[1][:3]).all()
     np.testing.assert_array_equal(again[1], good[1])

@@ -14,7 +14,7 @@ from delta_dynamics.torques.regressor import PAYLOAD, parameter_names, parameter
 from pkm_twin import Robot
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine.graph import BASE
-from pkm_twin.machine.inertia import TEN
+from pkm_twin.machine.inertia import STANDARD_PARAMETERS
 from pkm_twin.machine.members import Place
 from pkm_twin.robot.outline import Bar, body_points, robot_bars
 from test.support.robots import joint_range
@@ -112,7 +112,7 @@ def measured(
         shares: dict[str, float] = {}
         for k, name in enumerate(names):
             owner, _, what = name.rpartition(".")
-            if what in TEN and owner != PAYLOAD:
+            if what in STANDARD_PARAMETERS and owner != PAYLOAD:
                 share = shares.setdefault(owner, masses + each * rng.uniform(-1.0, 1.0))
                 change[k] = share * values[k]
         effort = effort + regressor(robot, q, qd, qdd) @ change

@@ -12,7 +12,7 @@ from scipy.linalg import eigh
 from scipy.optimize import brentq
 
 from pkm_twin.machine.graph import BASE
-from pkm_twin.machine.members import Section, cowper
+from pkm_twin.machine.members import Section, shear_area_ratio
 from stiffness_monitor.frame import Frame, rigid_offset
 from stiffness_monitor.modes import assemble, body_mass, element_matrices, member_matrices
 from stiffness_monitor.structure import (
@@ -133,8 +133,8 @@ def test_rigid_motion_has_the_mass_of_the_bar_and_no_strain(section, elements):
 
 
 def test_shear_factors_of_a_tube():
-    assert cowper(0.0) == pytest.approx(7 / 6)
-    assert cowper(1.0) == pytest.approx(2.0)
+    assert shear_area_ratio(0.0) == pytest.approx(7 / 6)
+    assert shear_area_ratio(1.0) == pytest.approx(2.0)
 
 
 # ------------------------------------------------------------------ frequencies in closed form

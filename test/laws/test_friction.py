@@ -16,7 +16,7 @@ from delta_dynamics.simulation.plant import Plant
 from pkm_twin.certify.maximal import Maximal
 from pkm_twin.errors import ParameterError
 from pkm_twin.export.fmu import Fmu
-from pkm_twin.machine.friction import BASIC, LAWS, all_keys
+from pkm_twin.machine.friction import BASIC, LAWS, list_friction_keys
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.robot.robot_urdf import robot_description
 from test.machine.random_machines import variant
@@ -44,7 +44,7 @@ def rubbing(name, rng, *keys):
     """The robot with friction of random size in the laws of some keys, by default of all."""
     robot = robot_of(name)
     n = robot.joints_count
-    none = {key: [0.0] * n for key in all_keys()}
+    none = {key: [0.0] * n for key in list_friction_keys()}
     q = robot.inverse(robot.home())
     plain = robot.changed(friction=none)
     size = np.abs(inverse_dynamics(plain, q, 0.0 * q, 0.0 * q)).max() + 0.5
@@ -81,7 +81,7 @@ def by_hand(robot, q, qd, load):
 def test_efforts_and_all_that_follows_from_them_have_the_laws(name, rng):
     robot = rubbing(name, rng)
     assert robot.laws == tuple(LAWS)
-    plain = robot.changed(friction=dict.fromkeys(all_keys(), 0.0))
+    plain = robot.changed(friction=dict.fromkeys(list_friction_keys(), 0.0))
     q, qd, qdd, wrench = random_motion(robot, rng, 20)
     load_of = inverse_dynamics(plain, q, qd, qdd, wrench)
     tau = inverse_dynamics(robot, q, qd, qdd, wrench)
@@ -123,7 +123,7 @@ def test_a_drive_breaks_away_at_static_friction_and_its_share_of_the_load(way, r
 def test_files_state_the_laws_and_keep_them():
     robot = rubbing("five_bar", np.random.default_rng(1))
     again = robot_of_data(robot_description(robot), "again")
-    for key in all_keys():
+    for key in list_friction_keys():
         assert (getattr(again.friction, key) == getattr(robot.friction, key)).all()
     plain = load("delta_cu").parameter_sections()["friction"]
     assert set(plain) == set(BASIC.parameters)

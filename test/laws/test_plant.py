@@ -12,7 +12,7 @@ from delta_dynamics.simulation.friction_contact import solve_resisting_forces
 from delta_dynamics.simulation.plant import Plant
 from delta_dynamics.torques.equations import Equations
 from pkm_twin.errors import PkmTwinError
-from pkm_twin.machine.inertia import loaded_joints
+from pkm_twin.machine.inertia import list_loaded_joints
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from test.machine.random_machines import FILES, variant
 from test.support.robots import (
@@ -44,7 +44,7 @@ def rubs_inside(robot):
 
 def inner_friction(robot):
     """Dry friction of all passive joints, N m or N."""
-    return sum(joint.coulomb for joint in loaded_joints(robot.graph))
+    return sum(joint.coulomb for joint in list_loaded_joints(robot.graph))
 
 
 def beside_rest(robot):
@@ -394,7 +394,7 @@ def test_viscous_friction_is_exact_however_stiff(decay):
 def test_all_terms_are_those_of_inverse_dynamics(name, machine, rng):
     robot = machine(name)
     n, equations = robot.joints_count, Equations(robot)
-    friction, passive = robot.friction, loaded_joints(robot.graph)
+    friction, passive = robot.friction, list_loaded_joints(robot.graph)
     for q in random_joints(robot, rng, 3):
         qd, qdd = rng.normal(size=(2, n)) * joint_units_of_size(robot)
         wrench = rng.normal(size=6)

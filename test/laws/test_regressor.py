@@ -66,7 +66,7 @@ def test_numbers_of_a_file_are_linear_parameters(name):
                     numbers[join_path((*key[:-2], key[-1], key[-2]))] = value
     q, qd, qdd, _ = random_motion(robot, rng, 10)
     table = regressor(robot, q, qd, qdd) @ parameters.mixing
-    for other, own in ((robot, parameters.values), (robot.spelled.numbered(numbers), values)):
+    for other, own in ((robot, parameters.values), (robot.with_default_inertia.numbered(numbers), values)):
         efforts = inverse_dynamics(other, q, qd, qdd)
         assert np.abs(table @ own - efforts).max() < 1e-12 * np.abs(efforts).max()
 

@@ -12,7 +12,7 @@ from pkm_twin.kinematics.diagnosis import is_right, near_conditions
 from pkm_twin.kinematics.rounding import repair
 from pkm_twin.kinematics.spins import without_spins
 from pkm_twin.machine import schema
-from pkm_twin.machine.graph_file import KINDS, expand_limbs, graph_of_entries
+from pkm_twin.machine.graph_file import KINDS, build_graph, expand_limbs
 from pkm_twin.mechanisms.machine import Machine, MachineFile
 from test.support.robots import partly_long
 
@@ -25,7 +25,7 @@ DEVIATIONS = partly_long((1e-7, 1e-5, 1e-3), 1e-5)
 def graph_of(data):
     file = schema.build(MachineFile, data)
     kinds = {kind: getattr(file, kind) for kind in KINDS}
-    return graph_of_entries(file.platform, expand_limbs(kinds, file.limbs)[0], file.origin)
+    return build_graph(file.platform, expand_limbs(kinds, file.limbs)[0], file.origin)
 
 
 def tilted(axis, angle, rng):

@@ -17,7 +17,7 @@ from pkm_twin.design.variables import Variables, parse_vary
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.machine.strict_yaml import parse_yaml
 from pkm_twin.mechanisms.catalogue import config_folder, robot_of_data
-from pkm_twin.mechanisms.entries import Chosen, edited_yaml, write_edited
+from pkm_twin.mechanisms.entries import Chosen, edit_robot_text, write_edited
 from pkm_twin.paths.sizing import read_motors
 
 from .random_machines import written_out
@@ -143,14 +143,14 @@ def test_a_new_value_is_written_where_the_parameter_stands(tmp_path):
     path = tmp_path / "own.yaml"
     path.write_text(SOURCE)
     robot, new = load(path), {"parameters.arm": Chosen(0.21, "longer")}
-    text = edited_yaml(robot, str(path), new)
+    text = edit_robot_text(robot, str(path), new)
     old = SOURCE.splitlines()
     assert [line for line in text.splitlines() if line not in old] == [
         "  # parameters.arm: longer",
         "  arm: 0.21  # pivot to elbow",
     ]
     # A copy's own number needs the file written out, with the parameter's new value.
-    text = edited_yaml(robot, str(path), new | {"joints.motor_1.at[0]": Chosen(0.1, "moved")})
+    text = edit_robot_text(robot, str(path), new | {"joints.motor_1.at[0]": Chosen(0.1, "moved")})
     path.write_text(text)
     numbers = {"parameters.arm": 0.21, "joints.motor_1.at[0]": 0.1}
     assert torques(load(path)) == pytest.approx(torques(robot.numbered(numbers)), abs=1e-12)
@@ -160,16 +160,16 @@ def test_what_an_edited_file_loses_of_its_expressions_is_told(tmp_path):
     path, out = tmp_path / "own.yaml", tmp_path / "out.yaml"
     path.write_text(SOURCE)
     robot, new = load(path), {"bodies.platform.mass": Chosen(0.4, "fitted")}
-    (told,) = write_edited(out, [], edited_yaml(robot, str(path), new), robot)
+    (told,) = write_edited(out, [], edit_robot_text(robot, str(path), new), robot)
     assert told.endswith("expressions: bodies.platform.mass was m + 0.05")
     assert f"# {told}\n" in out.read_text() and load(out).book.values == robot.book.values
     new = {f"limbs.bodies.arm.{end}": Chosen(0.4, "") for end in ("mass", "inertia[1]")}
     new |= {"limbs.bodies.arm.inertia[2]": Chosen(0.4, ""), "bodies.platform.mass": Chosen(1.0, "")}
-    _, dead = write_edited(out, [], edited_yaml(robot, str(path), new), robot)
+    _, dead = write_edited(out, [], edit_robot_text(robot, str(path), new), robot)
     assert dead == "nothing depends on m any more"
     # Written out, the file has none of them.
     new = {"joints.motor_1.at[0]": Chosen(0.1, "moved")}
-    texts, dead = write_edited(out, [], edited_yaml(robot, str(path), new), robot)
+    texts, dead = write_edited(out, [], edit_robot_text(robot, str(path), new), robot)
     assert texts.count(" was ") == len(robot.book.formulas)
     assert all(name in dead for name in robot.book.values)
     poses, rng = tmp_path / "poses.csv", np.random.default_rng(3)

@@ -257,7 +257,7 @@ def test_links_need_no_quoting_and_their_old_names_are_found(robot, tmp_path):
     ],
 )
 def test_a_link_s_name_is_plain_and_its_own(names, links):
-    found = writing._link_names(names)
+    found = writing._choose_link_names(names)
     assert tuple(found[name] for name in names) == links
 
 

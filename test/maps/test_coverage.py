@@ -18,7 +18,7 @@ from pkm_twin.maps.search import workspace_box
 from pkm_twin.maps.store import open_map
 from pkm_twin.maps.sweep import map_of
 from pkm_twin.mechanisms.catalogue import robot_of_data
-from pkm_twin.robot.workspace import reachable, singularity_at, try_forward
+from pkm_twin.robot.workspace import reachable, singularity_of_pose, try_forward
 from test.support.robots import SHIPPED, load, often, partly_long
 
 
@@ -113,7 +113,7 @@ def test_planes_of_every_number_of_coordinates(name, tmp_path, monkeypatch):
         assert "Plotly.newPlot" in write_page(data, tmp_path / "a.html").read_text()
     names = list(robot.pose_names)
     through = data.through.values[0]
-    index = singularity_at(robot, through)
+    index = singularity_of_pose(robot, through)
     assert index == pytest.approx(float(data.worst_value[0]), rel=1e-6)
     assert index == pytest.approx(float(data.plane_value[0, ..., 0].min()), rel=1e-6)
     for k in range(data.sizes["plane"]):
@@ -125,11 +125,11 @@ def test_planes_of_every_number_of_coordinates(name, tmp_path, monkeypatch):
         inside = reachable(robot, grid)
         assert inside.any()
         assert (np.isfinite(part.plane_value.values) == inside).all()
-        expected = singularity_at(robot, grid[inside])
+        expected = singularity_of_pose(robot, grid[inside])
         assert part.plane_value.values[inside] == pytest.approx(expected, abs=1e-9)
     if size > 3:
         kept = np.isfinite(data.value.values[:, 0])
-        at = singularity_at(robot, data.pose.values[kept])
+        at = singularity_of_pose(robot, data.pose.values[kept])
         assert data.value.values[kept, 0] == pytest.approx(at, abs=1e-9)
 
 

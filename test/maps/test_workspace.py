@@ -14,7 +14,7 @@ from pkm_twin.maps.search import workspace_box
 from pkm_twin.maps.store import open_map
 from pkm_twin.maps.sweep import map_of
 from pkm_twin.robot.clearance import clearance
-from pkm_twin.robot.workspace import MIN_WORKSPACE_INDEX, RAYS_PER_CIRCLE, singularity_at
+from pkm_twin.robot.workspace import MIN_WORKSPACE_INDEX, RAYS_PER_CIRCLE, singularity_of_pose
 from stiffness_monitor import reachable
 from test.support.robots import load, parameters_of, partly_long
 
@@ -96,7 +96,7 @@ def test_circles_end_where_the_first_ray_does(name):
 
     def clear(z, distance):
         poses = robot.grid().polar_pose(z, distance, turn)
-        return ((singularity_at(robot, poses) >= MIN_WORKSPACE_INDEX) & reachable(robot, poses)).all()
+        return ((singularity_of_pose(robot, poses) >= MIN_WORKSPACE_INDEX) & reachable(robot, poses)).all()
 
     for z, radius in zip(heights.tolist(), found.tolist(), strict=True):
         if radius == 0.0:
@@ -120,7 +120,7 @@ def test_no_cylinder_where_nothing_is_reachable():
     far = circles(load("delta"), [-5.0, -4.0])
     assert (far == 0.0).all()
     assert largest_cylinder(np.array([-5.0, -4.0]), far).radius == 0.0
-    assert singularity_at(load("delta"), [[0.0, 0.0, -5.0]]) == [0.0]
+    assert singularity_of_pose(load("delta"), [[0.0, 0.0, -5.0]]) == [0.0]
 
 
 @pytest.mark.long
@@ -133,7 +133,7 @@ def test_a_bound_on_singularity_takes_away(small_maps, tmp_path):
         assert np.nanmin(values(narrow, "singularity")) >= 0.28
         answer = figures.answers(narrow)[0]
         assert answer["value"] == pytest.approx(0.28, rel=1e-3)
-        at = singularity_at(sweep.robot, list(answer["pose"].values()))
+        at = singularity_of_pose(sweep.robot, list(answer["pose"].values()))
         assert at == pytest.approx(answer["value"]) and answer["singularity_bound"] == 0.28
         assert (narrow.through.values[0] == list(answer["pose"].values())).all()
 
@@ -216,10 +216,10 @@ def test_circles_stay_clear_of_a_constraint_singularity():
     grid = robot.grid()
     for z, radius in zip(heights, found, strict=True):
         inside = grid.polar_pose(z, radius * np.linspace(0.0, 0.999, 100)[:, None], turn)
-        assert singularity_at(robot, inside).min() > 0.99 * least
+        assert singularity_of_pose(robot, inside).min() > 0.99 * least
         # All are reachable a little beyond, so it is the measure that bounds the circle.
         beyond = grid.polar_pose(z, np.full(361, 1.01 * radius), turn)
         assert reachable(robot, beyond).all()
-        assert singularity_at(robot, beyond).min() < least
+        assert singularity_of_pose(robot, beyond).min() < least
         jacobian = robot.jacobian(robot.inverse(beyond))
         assert (1.0 / np.linalg.cond(jacobian)).min() > 2 * least

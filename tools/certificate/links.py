@@ -90,7 +90,7 @@ class Links:
 
     shipped: Difference
     """With the shipped shear factor."""
-    cowper: Difference
+    shear_area_ratio: Difference
     """With a round bar's shear factor."""
     refinement: Difference
     """The coarser mesh from the finer one."""

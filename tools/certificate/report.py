@@ -202,7 +202,7 @@ def _compliance(links: dict[str, Links], judge: Judge) -> str:
         bent = judge(_worst(found.shipped.deflection), BOUND, f"{what}, deflection")
         rows.append(
             f"| {name} | {z:g}, {np.degrees(beta):.0f}, {np.degrees(gamma):.0f} "
-            f"| {entries} | {diagonal} | {bent} | {found.cowper.worst:.1e} |"
+            f"| {entries} | {diagonal} | {bent} | {found.shear_area_ratio.worst:.1e} |"
         )
     table = "\n".join(rows)
     robot = with_rigid_joints()

@@ -22,7 +22,7 @@ from pkm_twin.identification.calibration_state import Transmission
 from pkm_twin.identification.measurements import KINDS, Kind, Measured, kinds_of, parse_noise, read_measured, read_poses
 from pkm_twin.identification.plan import MAX_MEASUREMENTS, Plan, parse_within
 from pkm_twin.identification.plan import plan as plan_of
-from pkm_twin.mechanisms.entries import edited_yaml, write_edited
+from pkm_twin.mechanisms.entries import edit_robot_text, write_edited
 from pkm_twin.report import Column, Fact, Report, Table
 from pkm_twin.settings import setting
 
@@ -170,7 +170,7 @@ def calibrate(given: Calibrate) -> Report:
     head += [f"{result.scale}."] if result.scale is not None else []
     head += [f"Outlier, with a small weight: {one}." for one in result.outliers]
     out = given.files["out"]
-    text = edited_yaml(machine, given.robot, result.fitted(machine, source))
+    text = edit_robot_text(machine, given.robot, result.fitted(machine, source))
     marks += write_edited(out, [*head, *marks], text, machine)
     return report_calibration(machine, source, result, notes, marks, out)
 

@@ -11,7 +11,7 @@ from pkm_twin.apps.options import ROBOT_HELP, CutOutOptions, OutputOption
 from pkm_twin.console import refuse_existing
 from pkm_twin.errors import FileError, UnknownNameError, one_line
 from pkm_twin.files import open_regular, replace_file
-from pkm_twin.mechanisms.catalogue import TREES, load, robot_names
+from pkm_twin.mechanisms.catalogue import TREE_SUFFIXES, load, robot_names
 from pkm_twin.report import Fact, Report
 from pkm_twin.robot.printers import Firmware, read_printer
 from pkm_twin.settings import setting
@@ -53,7 +53,7 @@ def convert(given: Convert) -> Report:
     first = given.source[0]
     ending = Path(first).suffix
     if len(given.source) > 1 or (
-        ending not in (".yaml", ".yml", ".xacro", *TREES) if ending else Path(first).is_file()
+        ending not in (".yaml", ".yml", ".xacro", *TREE_SUFFIXES) if ending else Path(first).is_file()
     ):
         # Write a printer's geometry and probings.
         out, data = given.out or Path("printer.yaml"), given.data or Path("probes.csv")
@@ -81,16 +81,16 @@ def convert(given: Convert) -> Report:
     if not ending and first not in robot_names():
         raise UnknownNameError("SOURCE", first, [*robot_names(), "a robot's or a printer's file"])
     from pkm_twin.machine.machine_yaml import describe_machine_yaml
-    from pkm_twin.robot.robot_urdf import copied_tolerances, robot_description
+    from pkm_twin.robot.robot_urdf import expand_tolerances, robot_description
     from pkm_twin.robot.urdf_read import read_urdf
 
     told, notes = list[str](), list[str]()
-    if ending in TREES:
+    if ending in TREE_SUFFIXES:
         described = read_urdf(Path(first), **given.part)
     else:
         robot = load(first, **given.part)
         described, told = robot_description(robot), robot.book.describe()
-        carried = {*described.get("tolerances", ())} | {*copied_tolerances(robot)}
+        carried = {*described.get("tolerances", ())} | {*expand_tolerances(robot)}
         lost = sorted({*robot.tolerances} - carried)
         if lost:
             notes = [f"left out, not numbers of these parts: tolerances of {', '.join(lost)}"]

@@ -252,7 +252,7 @@ def write_robot(robot: Robot, source: str, found: Found, path: Path, out: Path) 
 
     :raises PkmTwinError: not writable.
     """
-    from pkm_twin.mechanisms.entries import Chosen, edited_yaml, write_edited
+    from pkm_twin.mechanisms.entries import Chosen, edit_robot_text, write_edited
 
     kept = "".join(f", {bound}" for bound in found.constraints)
     values = {
@@ -264,7 +264,7 @@ def write_robot(robot: Robot, source: str, found: Found, path: Path, out: Path) 
     }
     aim = " and ".join(found.minimise)
     head = [f"{robot.name}, designed for {path}: least {aim}{kept}."]
-    return write_edited(out, head, edited_yaml(robot, source, values), robot)
+    return write_edited(out, head, edit_robot_text(robot, source, values), robot)
 
 
 def draw_design(robot: Robot, found: Found, path: PosePath, answer: str) -> Any:

@@ -139,7 +139,7 @@ def fit(given: Fit) -> Report:
     from pkm_twin.identification.fit import find_worse, refuse_faults
     from pkm_twin.identification.friction_laws import fit_recordings
     from pkm_twin.identification.parameters import fitted_yaml
-    from pkm_twin.mechanisms.entries import robot_text, write_edited
+    from pkm_twin.mechanisms.entries import load_with_text, write_edited
     from pkm_twin.report.page import page
     from pkm_twin.streams.steps import sampling_of
 
@@ -154,7 +154,7 @@ def fit(given: Fit) -> Report:
     if not given.robot or not given.recordings:
         raise click.UsageError("a robot and recordings are missing; give both, or --drive TABLE")
     (kinds, laws), options = given.parse_options(), {"accept": given.accept}
-    text, machine = robot_text(given.robot, per_copy=given.per_copy, **given.part)
+    text, machine = load_with_text(given.robot, per_copy=given.per_copy, **given.part)
     elastic, currents = kinds is None, given.torque_constant is not None
     if elastic:
         _ = machine.elastic
