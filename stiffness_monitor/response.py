@@ -119,8 +119,11 @@ def elastic_columns(robot: Robot, q: Array) -> tuple[Array, Indices]:
     :returns: columns, shape (..., size, r), the platform's six displacements first; and the element
         of each column by index, shape (r,).
     """
-    (entries, *places), _ = robot.cached(Elastic).columns(NO_PARAMETERS, q)
-    rows, columns, owner = (np.atleast_2d(p)[0].astype(int) for p in places)
+    program = robot.cached(Elastic).columns
+    (entries, *_), _ = program(NO_PARAMETERS, q)
+    # The places are those of every pose; an empty batch has none.
+    (_, *places), _ = program(NO_PARAMETERS, robot.graph.home)
+    rows, columns, owner = (p.astype(int) for p in places)
     own = np.zeros((*q.shape[:-1], rows.max() + 1, len(owner)))
     own[..., rows, columns] = entries
     return own, owner

@@ -45,6 +45,8 @@ class CommandGate(TwinNode):
         self._closed = True
         # With names and a stamp for recordings and plots.
         self._commands = EffortPublisher(self, robot, "~/commands_stamped", "~/commands")
+        # An inertia has no effort at rest, and a payload that is set to 0 kg may have none.
+        robot = robot.changed(payload={"inertia": [0.0, 0.0, 0.0]})
         robot = change_robot(robot, declare_changes(self, robot, CHANGEABLE))
         if settings.on_stop == "gravity":
             # Compile before the first use; a robot without masses is rejected here.

@@ -30,7 +30,7 @@ The parameters, out[{size}], for another payload: mass (kg), com[3] (m) from the
 reference point and inertia[9] (kg m2) about the com, in axes fixed to the platform that are the
 base's at home. Status 2, too, for a payload that a robot file may not have: a mass below zero or
 above {mass:g} kg, a com beyond {reach:g} m, an inertia that is not symmetric, has a negative
-principal moment, or one above the sum of the others.
+principal moment, one above the sum of the others, or more than the mass can have.
 """
 MASSLESS: Final = """
 The robot's file gives no masses, so there are no functions of dynamics.

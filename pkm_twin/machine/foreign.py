@@ -28,6 +28,8 @@ IGNORED: Final = {
 """Elements that are ignored with a warning unless they are zero or false, and their meaning."""
 REJECTED: Final = {
     "kinematic": "links that forces move",
+    "robot": "one <robot>",
+    "world": "one <world> around the <model>",
     "coupling": "a machine without coupled joints",
     "force_element": "a machine without springs and dampers beside its joints",
     "gearbox_ratio": "joints without coupling",

@@ -26,7 +26,7 @@ from pkm_twin.machine.joints import TURN, TYPES
 from pkm_twin.machine.loop_tree import WORLD, Joint, Link, LoopTree, hold_in_world, make_link, span_tree
 from pkm_twin.machine.precision import rounding_error
 from pkm_twin.machine.rotations import Pose, from_rpy
-from pkm_twin.machine.urdf_control import find_marked, list_actuated_joints, read_companion_yaml
+from pkm_twin.machine.urdf_control import find_marked, limit_commands, list_actuated_joints, read_companion_yaml
 
 MODEL: Final = "__model__"
 """Name of a model's own frame."""
@@ -94,6 +94,7 @@ def read(path: Path, top: ET.Element, actuated: Sequence[str] | None = None) -> 
     motors, marked = list_actuated_joints(
         path, types, faults, actuated, lambda: find_marked(top, read_companion_yaml(path), limited)
     )
+    limit_commands(path, top, joints)
     tree, closures = span_tree(links, joints, motors)
     positions = [part for part in element.iter() if part.tag in ("pose", "xyz")]
     return LoopTree(
@@ -112,8 +113,10 @@ def read(path: Path, top: ET.Element, actuated: Sequence[str] | None = None) -> 
 
 def _find_model(path: Path, top: ET.Element) -> tuple[ET.Element, ET.Element, list[float] | None]:
     """Find the only model that can move, its parent, and the gravity of a world if it is stated."""
-    worlds = top.findall("world")
-    gravity = None
+    worlds, gravity = top.findall("world"), None
+    if worlds and len(top.findall("model")) + len(worlds) > 1:
+        found = [f"{part.tag} {part.get('name')}" for part in top if part.tag in ("world", "model")]
+        raise ParameterError(str(path), ", ".join(found), "one <world>, or a <model> without a world")
     for world in worlds:
         stated = urdf_xml.find_single_child(world, "gravity", "world")
         if stated is None:

@@ -70,13 +70,44 @@ class Payload:
     com: Array = schema.vector(3, low=-MAX_LENGTH, high=MAX_LENGTH, unit="m", default=[0, 0, 0])
     inertia: Array = schema.inertia(positive=False, default=[0, 0, 0])
 
+    def verify(self, path: str) -> None:
+        """Check that the mass can have the inertia, within :data:`MAX_LENGTH` of its centre."""
+        if not spread_margin(self.mass, self.inertia) >= 0.0:
+            most = self.mass * MAX_LENGTH**2
+            raise ParameterError(
+                f"{path}.inertia",
+                self.inertia.tolist(),
+                f"0 for a payload of mass 0, or half the trace at most {most:g} kg m2: {self.mass:g} kg within "
+                f"{MAX_LENGTH:g} m of its centre",
+            )
+
+
+def of_mass(mass: float, com: Any = None) -> dict[str, Any]:
+    """Return the entries of a payload of another mass (kg) and centre (m); without mass it has no inertia."""
+    entries: dict[str, Any] = {"mass": mass} if com is None else {"mass": mass, "com": list(com)}
+    return entries if mass else entries | {"inertia": [0.0, 0.0, 0.0]}
+
+
+def spread_margin(mass: Any, inertia: Any) -> Any:
+    """Return how much of a payload's inertia is left to that of its mass at :data:`MAX_LENGTH`, kg m2.
+
+    Half the trace is the integral of the squared distance from the centre over the mass.
+    """
+    return MAX_LENGTH**2 * mass - 0.5 * (inertia[0][0] + inertia[1][1] + inertia[2][2])
+
 
 def payload_margins(mass: Any, com: Any, inertia: Any) -> list[Any]:
     """Return the margins of a payload's numbers to the bounds of :class:`Payload`; >= 0 if valid.
 
     :param com: shape (3,), m; ``inertia``: shape (3, 3), kg m2. Numbers or expressions.
     """
-    return [mass, MAX_MASS - mass, *(MAX_LENGTH - absolute(value) for value in com), *schema.inertia_margins(inertia)]
+    return [
+        mass,
+        MAX_MASS - mass,
+        *(MAX_LENGTH - absolute(value) for value in com),
+        *schema.inertia_margins(inertia),
+        spread_margin(mass, inertia),
+    ]
 
 
 def check_angles(angle: float, path: str) -> None:

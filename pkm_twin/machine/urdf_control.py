@@ -12,14 +12,14 @@ from __future__ import annotations
 
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
-from pkm_twin.errors import ParameterError, UnknownNameError
+from pkm_twin.errors import ParameterError, UnknownNameError, warn
 from pkm_twin.machine import urdf_xml
-from pkm_twin.machine.loop_tree import Fault
+from pkm_twin.machine.loop_tree import Fault, Joint
 from pkm_twin.machine.strict_yaml import read_yaml
 from pkm_twin.machine.urdf_xml import UNLIMITED
 
@@ -123,6 +123,57 @@ def list_actuated_joints(
     return tuple(names), source
 
 
+def _command_bounds(joint: ET.Element) -> Iterator[tuple[str, ET.Element]]:
+    """Iterate over the bounds that a joint of ``<ros2_control>`` has for commands, and their interfaces' names."""
+    for interface in joint.findall("command_interface"):
+        # As ros2_control: limits may be switched off, of all interfaces or of one.
+        off = [part.get("enable", "true") for part in (*joint.findall("limits"), *interface.findall("limits"))]
+        if not all(urdf_xml.parse_boolean(text, f"ros2_control.{joint.get('name')}.limits.enable") for text in off):
+            continue
+        for parameter in interface.findall("param"):
+            if parameter.get("name") in ("min", "max"):
+                yield interface.get("name", ""), parameter
+
+
+def limit_commands(path: Path, top: ET.Element, joints: dict[str, Joint]) -> None:
+    """Narrow the limits of joints, in place, to the bounds of their command interfaces in ``<ros2_control>``.
+
+    As ros2_control does: the narrower of both counts, and of a velocity or an effort the smaller size.
+
+    :raises ParameterError: a bound that is no number, or bounds that leave no position.
+    """
+    for element in top.findall(".//ros2_control/joint"):
+        name = element.get("name", "")
+        stated: dict[str, dict[str, str]] = {}
+        for kind, parameter in _command_bounds(element):
+            stated.setdefault(kind, {})[parameter.get("name", "")] = (parameter.text or "").strip()
+        for kind, bounds in stated.items():
+            if kind not in ("position", "velocity", "effort"):
+                warn(path, f"ros2_control.{name}: {', '.join(bounds)} of the command interface {kind} is not read")
+                continue
+            where = f"ros2_control.{name}.{kind}"
+            if name not in joints:
+                raise UnknownNameError(f"ros2_control.{name}", name, joints)
+            low, high = (
+                urdf_xml.parse_limit(bounds.get(key, default), f"{where}.{key}")
+                for key, default in (("min", "-inf"), ("max", "inf"))
+            )
+            limits = dict(joints[name].limits)
+            if kind == "position":
+                far = UNLIMITED["prismatic" if joints[name].kind == "prismatic" else "revolute"]
+                first, last = limits.get(kind, (-far, far))
+                first, last = max(first, low), min(last, high)
+                if -far < first or last < far:
+                    limits[kind] = [first, last]
+            else:
+                first, last = 0.0, min(abs(low), abs(high), limits.get(kind, UNLIMITED[kind]))
+                if last < UNLIMITED[kind]:
+                    limits[kind] = last
+            if not (low < high and first < last):
+                raise ParameterError(where, [low, high], f"a range that leaves some of the joint's {kind}")
+            joints[name] = replace(joints[name], limits=limits)
+
+
 @dataclass(frozen=True)
 class Control:
     """A drive: the controller's position is offset + factor times the position of ``joint``."""
@@ -205,6 +256,13 @@ def convert_drives(robot: ET.Element) -> dict[str, dict[str, Any]]:
         joints[back.name].set("name", own[name])
     for joint in robot.findall("ros2_control/joint"):
         name = joint.get("name", "")
+        for kind, parameter in _command_bounds(joint) if name in found else ():
+            back, key = found[name], parameter.get("name", "")
+            value = urdf_xml.parse_limit((parameter.text or "").strip(), f"ros2_control.{name}.{kind}.{key}")
+            made = {"effort": value / back.factor, "velocity": back.factor * value}
+            parameter.text = f"{made.get(kind, back.value('', value)):.14g}"
+            if back.factor < 0.0:
+                parameter.set("name", "min" if key == "max" else "max")
         for parameter in joint.iter("param") if name in found else ():
             key = parameter.get("name", "")
             if key in ("initial_value", "rotor_inertia", "friction_offset"):

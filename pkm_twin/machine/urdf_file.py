@@ -25,7 +25,13 @@ from pkm_twin.machine.joints import TYPES
 from pkm_twin.machine.loop_tree import Fault, Joint, Link, LoopTree, make_link, order_from_root
 from pkm_twin.machine.precision import rounding_error
 from pkm_twin.machine.rotations import Pose
-from pkm_twin.machine.urdf_control import UNCOUPLED_JOINTS, find_marked, list_actuated_joints, read_companion_yaml
+from pkm_twin.machine.urdf_control import (
+    UNCOUPLED_JOINTS,
+    find_marked,
+    limit_commands,
+    list_actuated_joints,
+    read_companion_yaml,
+)
 
 _LOOPS: Final = {name: name for name in ("revolute", "prismatic", "fixed", "spherical")} | {"continuous": "revolute"}
 """Types of ``<loop>`` and ``<loop_joint>`` elements."""
@@ -119,6 +125,7 @@ def read(path: Path, robot: ET.Element, actuated: Sequence[str] | None = None) -
     closures |= _read_gazebo(path, robot, frames, {*joints, *closures})
     types = {n: joint.kind for n, joint in joints.items()}
     motors, marked = list_actuated_joints(path, types, faults, actuated, lambda: find_marked(robot, beside))
+    limit_commands(path, robot, joints)
     initial = _read_parameter(robot, motors, "initial_value")
     rotors = _read_parameter(robot, motors, "rotor_inertia", 0.0)
     offsets = _read_parameter(robot, motors, "friction_offset")

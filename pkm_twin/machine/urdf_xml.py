@@ -205,14 +205,14 @@ def read_limits(limit: Mapping[str, str], where: str, kind: str) -> dict[str, An
     """Read stated limits; zero, an empty range and :data:`UNLIMITED` sizes mean no limit."""
     found: dict[str, Any] = {}
     if kind in UNLIMITED and (limit.get("lower") or limit.get("upper")):
-        low, high = (_parse_limit(limit.get(end, "0"), f"{where}.limit.{end}") for end in ("lower", "upper"))
+        low, high = (parse_limit(limit.get(end, "0"), f"{where}.limit.{end}") for end in ("lower", "upper"))
         if low > high:
             raise ParameterError(f"{where}.limit", [low, high], "lower below upper")
         far = UNLIMITED[kind]
         if low < high and (low > -far or high < far):
             found["position"] = [max(low, -far), min(high, far)]
     for key in ("velocity", "effort"):
-        value = _parse_limit(limit.get(key, "0"), f"{where}.limit.{key}")
+        value = parse_limit(limit.get(key, "0"), f"{where}.limit.{key}")
         if value < 0.0:
             raise ParameterError(f"{where}.limit.{key}", value, "zero or more")
         if 0.0 < value < UNLIMITED[key]:
@@ -220,7 +220,7 @@ def read_limits(limit: Mapping[str, str], where: str, kind: str) -> dict[str, An
     return found
 
 
-def _parse_limit(text: str, where: str) -> float:
+def parse_limit(text: str, where: str) -> float:
     """Parse a limit, the only number that may be infinite."""
     endless = text.strip().lower().lstrip("+-") in ("inf", "infinity")
     return float(text) if endless else parse_number(text, where)

@@ -104,14 +104,15 @@ class _Reader:
         closures = [self._make_closure(joint) for joint in left]
         size = max(1.0, *(float(np.abs(link.frame.position).max()) for link in self.links.values()))
         # The scene's gravity, by default 9.81 m/s2 downwards, as PhysX.
-        down = -np.eye(3)["XYZ".index(self.up)]
-        size = 9.81
+        gravities = []
         for prim in self.prims:
             if prim.IsA(self.physics.Scene):
                 way = np.array(self._read_value(prim, "physics:gravityDirection", (0.0,) * 3), float)
-                down = way / np.linalg.norm(way) if way.any() else down
+                way = way / np.linalg.norm(way) if way.any() else -np.eye(3)["XYZ".index(self.up)]
                 stated = float(self._read_value(prim, "physics:gravityMagnitude", -math.inf))
-                size = stated * self.length if stated >= 0.0 else size
+                gravities.append(((stated * self.length if stated >= 0.0 else 9.81) * way).tolist())
+        if any(gravity != gravities[0] for gravity in gravities):
+            raise ParameterError(f"{self.path}: PhysicsScene", gravities, "scenes of one gravity")
         return LoopTree(
             self.path.stem,
             WORLD,
@@ -119,7 +120,7 @@ class _Reader:
             placed,
             tuple(closures),
             motors,
-            [float(x) for x in size * down],
+            gravities[0] if gravities else (-9.81 * np.eye(3)["XYZ".index(self.up)]).tolist(),
             rounding=float(np.finfo(np.float32).eps) / 2.0 * size,
             marked=source,
             faults=tuple(self.faults),

@@ -81,8 +81,6 @@ def read_waypoints(
             )
         masses = kilograms.tolist()
     given = {name: table[name] for name in PATH_COLUMNS if name in table}
-    if blend is None and not given:
-        return through(robot, points, space=space), masses
     if "arc" in given and not np.isin(given["arc"], (0.0, 1.0)).all():
         raise ParameterError(f"{file}: arc", given["arc"].tolist(), "0 or 1")
     arc = given.get("arc", np.zeros(len(points))) == 1.0
@@ -92,6 +90,8 @@ def read_waypoints(
         near = arc | np.roll(arc, 1) | np.roll(arc, -1)
         rounded = np.where(near, 0.0, rounded)
     try:
+        if blend is None and not given:
+            return through(robot, points, space=space), masses
         made = lines(robot, points, blend=rounded, dwell=given.get("dwell", 0.0), arc=arc, space=space)
     except ParameterError as error:
         raise ParameterError(f"{file}: {error.field}", error.value, error.bound) from None

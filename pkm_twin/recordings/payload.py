@@ -15,6 +15,7 @@ from pkm_twin.bags.reader import Bag
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import BagError, ParameterError
 from pkm_twin.files import parse_numbers
+from pkm_twin.machine.sections import of_mass
 from pkm_twin.recordings.tables import PAYLOAD, Table
 from pkm_twin.robot.plausibility import payload_findings
 from pkm_twin.robot.robot import Robot
@@ -91,10 +92,7 @@ class Load:
         :raises ParameterError: the robot takes none, or not such a one; a mass that is many times
             that of all that moves.
         """
-        changes: dict[str, Any] = {"mass": self.mass if mass is None else mass}
-        if self.com is not None:
-            changes["com"] = list(self.com)
-        loaded = robot.changed(payload=changes)
+        loaded = robot.changed(payload=of_mass(self.mass if mass is None else mass, self.com))
         for finding in payload_findings(loaded):
             raise ParameterError(finding.field, finding.value, f"{finding.bound:.4g} kg or less: {finding.likely}")
         return loaded

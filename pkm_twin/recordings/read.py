@@ -290,7 +290,11 @@ def read_times(path: Path, values: Array) -> Array:
             f"{path}: time",
             found or f"{values[0]:g} to {values[-1]:g}",
             f"rising times, {MIN_STEP:g} s or more apart, up to {MAX_DURATION:g} s in all"
-            + ("; are these nanoseconds? --units ns" if values[0] > 1e17 else ""),
+            + (
+                ""
+                if found and values[0] < 1e17
+                else "; are these microseconds (--units us) or nanoseconds (--units ns)?"
+            ),
         )
     return time
 
@@ -321,30 +325,17 @@ def check_pose(path: Path, robot: Robot, q: Array, pose: Array, how: str = "") -
 
 
 def check_units(path: Path, robot: Robot, time: Array, q: Array, qd: Array | None, dialect: Dialect) -> None:
-    """Reject times and velocities that are probably in other units than the positions.
-
-    Positions that may be in degrees give a warning.
+    """Warn of positions, and of times without velocities to compare them with, that are probably in other units.
 
     :param time: shape (samples,); q and qd, shape (samples, n), qd where the file tells it.
-    :raises ParameterError: velocities are a thousand times those of the positions.
     """
     if "angle" not in dialect.units and _is_in_degrees(robot, q):
         most = float(np.abs(q).max())
         warn(path, f"positions up to {most:.4g}; expected rad; are these degrees? --units deg")
     step = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
-    if qd is not None and len(time) > 2:
-        with np.errstate(all="ignore"):
-            moved = float(np.sqrt(np.mean(np.gradient(q, time, axis=0) ** 2)))
-            told = float(np.sqrt(np.mean(qd**2)))
-        if moved > 0.0 and 300.0 < told / moved < 3000.0:
-            raise ParameterError(
-                f"{path}: time",
-                f"steps of {step:g} s",
-                f"seconds: velocities are {told / moved:.4g} times those of the positions, as with "
-                "times in milliseconds",
-            )
-    if step > 0.2:
-        warn(path, f"time: steps of {step:g} s; expected seconds; are these milliseconds?")
+    if qd is None and step > 0.2:
+        unit = "milliseconds? --units ms" if step < 200.0 else "microseconds? --units us"
+        warn(path, f"time: steps of {step:g} s; expected seconds; are these {unit}")
 
 
 def _is_in_degrees(robot: Robot, q: Array) -> bool:

@@ -281,38 +281,39 @@ class Recording:
         effort = np.stack([np.interp(there, self.time, one) for one in self.measured.T], -1)
         return replace(self, effort=effort, late=self.late + late).part(known)
 
+    def check_rates(self) -> None:
+        """Reject velocities that contradict the positions, and accelerations that contradict the velocities.
+
+        :raises PkmTwinError: by more than `check` allows, with the factor between both if there is one.
+        """
+        judged = (
+            ("velocities", self.q, self.qd, MAX_RATE, ("position", "velocity")),
+            ("accelerations", self.qd, self.qdd, MAX_ACCELERATION_ERROR, ("velocity", "acceleration")),
+        )
+        for what, values, rates, most, names in judged:
+            if values is None or rates is None or len(self.time) < 3:
+                return
+            # An overflow gives numbers that are not finite, which the model rejects.
+            with np.errstate(all="ignore"):
+                _, faults = rate_faults(self.robot, self.stamps, values, rates, self.steps.jumps, most, names)
+            if faults:
+                plural = "positions" if values is self.q else "velocities"
+                raise PkmTwinError(
+                    f"{self.source}: {what} differ from the rate of the {plural} by {', '.join(faults)}; "
+                    f"expected at most {100 * most:g} %, or no {what}"
+                )
+
     def with_rates(self) -> Recording:
         """Return the samples whose velocities and accelerations are known, with these.
 
         If the recording has both, they stay. In a table the missing ones are second-order
         differences; in a bag, a node's differentiator gives them in the middle of its window.
 
-        :raises PkmTwinError: too few samples in a row, velocities that differ from the rate of the
-            positions by more than `check` allows, or accelerations that contradict the velocities.
+        :raises PkmTwinError: too few samples in a row, or as :meth:`check_rates`.
         """
-        if self.qd is not None and len(self.time) > 2:
-            # An overflow gives numbers that are not finite, which the model rejects.
-            with np.errstate(all="ignore"):
-                jumps = self.steps.jumps
-                _, faults = rate_faults(self.robot, self.stamps, self.q, self.qd, jumps)
-            if faults:
-                raise PkmTwinError(
-                    f"{self.source}: velocities differ from the rate of the positions by "
-                    f"{', '.join(faults)}; expected at most {100 * MAX_RATE:g} %, or no velocities"
-                )
-            if self.qdd is not None:
-                names = ("velocity", "acceleration")
-                with np.errstate(all="ignore"):
-                    _, faults = rate_faults(
-                        self.robot, self.stamps, self.qd, self.qdd, jumps, MAX_ACCELERATION_ERROR, names
-                    )
-                if faults:
-                    raise PkmTwinError(
-                        f"{self.source}: accelerations differ from the rate of the velocities by "
-                        f"{', '.join(faults)}; expected at most {100 * MAX_ACCELERATION_ERROR:g} %, or no accelerations"
-                    )
-            if self.step_fault:
-                self = replace(self, notes=(*self.notes, f"positions jump: {self.step_fault}"))
+        self.check_rates()
+        if self.qd is not None and len(self.time) > 2 and self.step_fault:
+            self = replace(self, notes=(*self.notes, f"positions jump: {self.step_fault}"))
         with np.errstate(all="ignore"):
             self = self._with_gap_note()
         if self.qd is not None and self.qdd is not None:

@@ -32,6 +32,9 @@ MAX_ACCELERATION_ERROR: Final = 0.6
 is up to 0.2 of a block of five steps, and filters delay accelerations; wrong signs, units and zeros leave 1 or more."""
 SCALE_TOLERANCE: Final = 0.1
 """Largest relative difference that a factor between both may leave to be named as the cause."""
+MAX_SHORT_SCALE: Final = 2.0
+"""Largest factor between both, up or down, of a recording without two blocks. Sampling alone explains a factor of
+x / tan(x), x half the phase between two samples: 0.6 to 1 where a move over two steps is not below that over one."""
 
 
 def rms(values: Array) -> Array:
@@ -46,12 +49,12 @@ def find_likely_cause(moved: Array, told: Array, names: tuple[str, str] = ("posi
     """
     by_q, by_qd = float(rms(moved)), float(rms(told))
     scale = float(np.sum(told * moved) / max(np.sum(moved**2), 1e-300))
-    if by_qd < STANDSTILL_FRACTION * by_q:
-        return f" (the {names[1]} is zero)"
     if abs(scale + 1.0) < SCALE_TOLERANCE:
         return " (wrong sign?)"
     if rms(told - scale * moved) < SCALE_TOLERANCE * by_qd:
         return f" ({scale:.3g} times the rate of the {names[0]}: time stamps, ratio or unit?)"
+    if by_qd < STANDSTILL_FRACTION * by_q:
+        return f" (the {names[1]} is zero)"
     if by_q < STANDSTILL_FRACTION * by_qd:
         return f" (the {names[0]} stands still: encoder?)"
     return ""
@@ -65,10 +68,10 @@ class RateAgreement:
     Joints are judged if the root of the sum of their squared moves is at least 0.01 rad, or 0.01 of
     the machine's size; delayed velocities may cause an RMS difference of 0.4 of the moves.
 
-    :param blocks: number of blocks that are kept and judged; None keeps all and judges none.
+    :param blocks: number of blocks that are kept and judged.
     """
 
-    def __init__(self, robot: Robot, blocks: int | None = 20) -> None:
+    def __init__(self, robot: Robot, blocks: int = 20) -> None:
         self._names, self._count = robot.joint_names, blocks
         sizes = [robot.size if unit == "m" else 1.0 for unit in robot.joint_units]
         self._least = 0.01 * np.array(sizes)
@@ -86,12 +89,6 @@ class RateAgreement:
     def skip(self) -> None:
         """Begin a new block at the next sample, as the motion until then is unknown."""
         self._begin: tuple[int, list[float]] | None = None
-
-    @property
-    def moves(self) -> tuple[Array, Array]:
-        """Moves of the blocks by positions and by velocities, shape (blocks, n) each."""
-        both = np.reshape(list(self._blocks), (-1, 2, len(self._names)))
-        return both[:, 0], both[:, 1]
 
     def push(self, stamp: int, q: Array, qd: Array) -> None:
         """Take a sample, shape (n,) each; its stamp, ns, is later than that of the last sample."""
@@ -117,7 +114,7 @@ class RateAgreement:
         self._sums, self._steps = [0.0] * len(q), 0
 
     def _judge(self) -> None:
-        moved, told = self.moves
+        moved, told = np.moveaxis(np.array(self._blocks), 1, 0)
         size = np.maximum(rms(moved), rms(told))
         moves = size * np.sqrt(len(moved)) >= self._least
         if not moves.any():
@@ -147,25 +144,35 @@ def rate_faults(
     :param jumps: steps that are not motions of the machine, (k - 1, n).
     :param most: largest relative RMS difference. ``names``: of ``q`` and ``qd``, for the descriptions.
     :returns: relative RMS difference of the moves, (n,), empty if the recording is too short; and
-        descriptions of the joints that disagree.
+        descriptions of the joints that disagree. A recording without two blocks disagrees only by a factor.
     """
     time = 1e-9 * (stamps - stamps[0])
     span = np.diff(time)
-    period = float(np.median(span))
-    apart = span > MAX_GAP_PERIODS * period
-    agreement = RateAgreement(robot, blocks=None)
-    skipped = [False, *(apart if jumps is None else apart | jumps.any(1)).tolist()]
-    for stamp, place, rate, other in zip(stamps.tolist(), q, qd, skipped, strict=True):
-        if other:
-            agreement.skip()
-        agreement.push(stamp, place, rate)
-    moved, told = agreement.moves
-    if len(moved) < 2:
-        return np.zeros(0), []
+    period = float(np.median(span)) if len(span) else 0.0
+    gaps, units, step = span > MAX_GAP_PERIODS * period, np.array(robot.joint_units), MIN_STEPS
+    apart = gaps if jumps is None else gaps | jumps.any(1)
+    moved, told = _block_moves(stamps, q, qd, apart, step, round(SECOND * MIN_BLOCK_TIME))
+    short = len(moved) < 2
+    if short:
+        # All steps jump where the times are far too short.
+        step = min(MIN_STEPS, max(1, len(span) // 4))
+        moved, told = _block_moves(stamps, q, qd, gaps, step, 0)
+        if len(moved) < 2 or moved.size < 3:
+            return np.zeros(0), []
+        weights = np.where(units == "m", 1.0 / robot.size, 1.0)
+        ours, theirs = moved * weights, told * weights
+        scale = float(np.sum(theirs * ours) / max(np.sum(ours**2), 1e-300))
+        twice = ours[1:] + ours[:-1]
+        if (
+            not (scale > MAX_SHORT_SCALE or 0.0 < scale < 1.0 / MAX_SHORT_SCALE)
+            or np.sum((theirs - scale * ours) ** 2) > SCALE_TOLERANCE**2 * np.sum(theirs**2)
+            or np.mean(twice**2) < np.mean(ours**2)
+        ):
+            return np.zeros(0), []
     # The moves of a joint that hardly moves are noise.
-    units, sizes = np.array(robot.joint_units), np.maximum(rms(moved), rms(told))
+    sizes = np.maximum(rms(moved), rms(told))
     floor = np.array([STANDSTILL_FRACTION * sizes[units == unit].max() for unit in units])
-    size, width = rms(told - moved), max(MIN_STEPS, MIN_BLOCK_TIME / period)
+    size, width = rms(told - moved), step if short else max(MIN_STEPS, MIN_BLOCK_TIME / period)
     noisy = 2.0 * estimate_noise(time, q) + np.sqrt(width) * period * estimate_noise(time, qd)
     part = size / np.maximum(np.maximum(sizes, floor), 1e-300)
     bad = (part > most) & (size > SIGMAS * noisy)
@@ -173,3 +180,24 @@ def rate_faults(
         f"{robot.joint_names[j]} {100 * part[j]:.3g} %{find_likely_cause(moved[:, j], told[:, j], names)}"
         for j in np.flatnonzero(bad)
     ]
+
+
+def _block_moves(
+    stamps: np.ndarray[Any, np.dtype[np.int64]], q: Array, qd: Array, apart: Mask, steps: int, duration: int
+) -> tuple[Array, Array]:
+    """Return the moves of consecutive blocks by positions and by integrated velocities, (blocks, n) each.
+
+    :param apart: steps over which no block extends, shape (k - 1,).
+    :param steps: fewest steps of a block; ``duration``: shortest duration, ns.
+    """
+    last = np.append(np.flatnonzero(apart), len(stamps) - 1)
+    blocks, begin, after = list[tuple[int, int]](), 0, np.searchsorted(stamps, stamps + duration)
+    for end in last.tolist():
+        while (stop := max(begin + steps, int(after[begin]))) <= end:
+            blocks.append((begin, stop))
+            begin = stop
+        begin = end + 1
+    edges = np.array(blocks, np.int64).reshape(-1, 2)
+    half = 0.5 * (qd[1:] + qd[:-1]) * (np.diff(stamps) / SECOND)[:, None]
+    sums = np.add.reduceat(np.concatenate([half, 0.0 * q[:1]]), edges.ravel())[::2] if blocks else q[:0]
+    return q[edges[:, 1]] - q[edges[:, 0]], sums

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import json
 from decimal import Decimal
 
@@ -161,8 +162,9 @@ def wrong_ones(array):
 
 
 ANSWERED = ("reachable", "try_forward", "try_inverse", "try_jacobian", "try_singularity")
-ONE_SAMPLE = ("spread", "tilted_pose", "element_response", "bound", "deflection", "compliance_at")
+ONE_SAMPLE = ("spread", "tilted_pose", "bound", "deflection", "compliance_at")
 """Without batches of samples, or with arguments of any shape."""
+OF_ONE_POSE = ("frequency_response", "stability_lobes", "stable_depth", "tool_modes")
 READ_ONLY = ("reactions", "least_norm_reactions", "modes", "strain_energy", "platform_response")
 EVERYWHERE = ("an object that is None", "text", "masked")
 """Kinds that every argument of every function is given."""
@@ -269,6 +271,38 @@ def test_batches_are_their_samples_and_results_are_read_only(name, rng):
         none = leaves(ask(*(array[:0] for array in batch)))
         for empty, many in zip(none, leaves(whole), strict=True):
             assert empty.shape in ((0, *many.shape[1:]), many.shape), function
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+@pytest.mark.parametrize("module", [dynamics, elasticity], ids=lambda module: module.__name__)
+def test_every_public_function_answers_an_empty_batch_by_an_empty_batch(module, name):
+    """All functions of the module's names that take numbers of samples, by their parameters' names."""
+    robot = load(name)
+    q, pose = robot.graph.home, robot.home()
+    joints = dict.fromkeys(("qd", "qdd", "tau", "external", "weights"), np.ones(len(q)))
+    poses = dict.fromkeys(("rate", "rates", "acceleration", "direction"), np.ones(len(pose)))
+    given = joints | poses | {"q": q, "pose": pose, "wrench": WRENCH, "deflection": 1e-5 * WRENCH}
+    asked = []
+    for function in module.__all__:
+        ask = getattr(module, function)
+        names = inspect.signature(ask).parameters if inspect.isfunction(ask) else {}
+        arrays = {name: given[name] for name in names if name in given}
+        if "robot" not in names or not arrays or function in OF_ONE_POSE:
+            continue
+        asked.append(function)
+
+        def shapes(*batch, ask=ask, arrays=arrays):
+            found = ask(robot, **{name: np.tile(array, (*batch, 1)) for name, array in arrays.items()})
+            return [leaf.shape for leaf in leaves(found)]
+
+        try:
+            right = shapes(2, 3)
+        except ParameterError as error:
+            assert error.field in ("mechanism", "pose"), function  # a mechanism of other limbs or more coordinates
+            continue
+        for batch in ((0,), (2, 0), (0, 3)):
+            assert shapes(*batch) == [(*batch, *s[2:]) if s[:2] == (2, 3) else s for s in right], function
+    assert len(asked) > 9
 
 
 @pytest.mark.parametrize("name", ROBOTS)

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 import yaml
 
+from delta_dynamics.simulation.machine import PayloadEvent
 from pkm_twin import load, robot_names
 from pkm_twin.errors import ParameterError, UnknownNameError
+from pkm_twin.recordings.payload import Load
 from test.laws.conftest import MISSING, changed, refusal
 from test.support.robots import parameters_of
 
@@ -224,19 +226,34 @@ class TestInertia:
         ],
     )
     def test_only_a_real_bodys_matrix_is_taken(self, load_data, value, bound):
-        data = changed(DELTA, "payload.inertia", value)
+        data = changed(changed(DELTA, "payload.mass", 1.0), "payload.inertia", value)
         if bound is None:
             assert load_data(data).payload.inertia.tolist() == value
         else:
             error = refusal(load_data, data)
             assert error.field.startswith("payload.inertia") and bound in str(error)
 
+    @pytest.mark.parametrize("mass", [0.0, 1e-9])
+    def test_a_payload_s_inertia_needs_its_mass(self, load_data, mass):
+        """Half the trace is at most the mass times the square of the greatest length, 100 m."""
+        for moment in (1e-12, 1e-3) if mass == 0.0 else (1e-3,):
+            data = changed(changed(DELTA, "payload.mass", mass), "payload.inertia", [moment, moment, 0.0])
+            assert refusal(load_data, data).field == "payload.inertia"
+            with pytest.raises(ParameterError, match=r"payload\.inertia"):
+                load_data(DELTA).changed(payload={"mass": mass, "inertia": [moment] * 3})
+        robot = load_data(changed(changed(DELTA, "payload.mass", 2.0), "payload.inertia", [0.1] * 3))
+        with pytest.raises(ParameterError, match=r"payload\.inertia"):
+            robot.changed(payload={"mass": 0.0})
+        # A payload that is put down takes its inertia along.
+        for none in (Load(0.0).on(robot), robot.changed(payload=PayloadEvent(0.0, 0.0).load)):
+            assert none.payload.mass == 0.0 and not none.payload.inertia.any()
+
     def test_any_turned_body_is_taken(self, load_data, rng):
         for _ in range(20):
             points = rng.normal(size=(5, 3))
             points -= points.mean(0)
             matrix = np.sum([(p @ p) * np.eye(3) - np.outer(p, p) for p in points], 0)
-            robot = load_data(changed(DELTA, "payload.inertia", matrix.tolist()))
+            robot = load_data(changed(changed(DELTA, "payload.mass", 1.0), "payload.inertia", matrix.tolist()))
             assert np.allclose(robot.payload.inertia, matrix, atol=1e-12)
             assert (robot.payload.inertia == robot.payload.inertia.T).all()
 

@@ -45,7 +45,7 @@ def fed(robot: Robot, *rows: Array, known: Array | None = None) -> PayloadEstima
 @pytest.mark.parametrize(("name", "feels"), [("stewart", True), ("rps3", True), ("delta_cu", False)])
 def test_a_load_is_found_with_what_the_machine_feels_of_it(name: str, feels: bool) -> None:
     """A platform that tilts feels the centre too, three translations the mass alone."""
-    robot = load(name).changed(payload={"mass": 0.0})
+    robot = load(name).changed(payload={"mass": 0.0, "inertia": [0.0] * 3})
     mass, com = 1.3, np.array([0.03, -0.02, 0.05])
     laden = robot.changed(payload={"mass": mass, "com": com.tolist()})
     time, q, qd, qdd = moved(robot, 3.0)
@@ -101,7 +101,7 @@ def test_a_reset_forgets_the_load_alone() -> None:
 
 def test_a_stream_four_times_as_fast_is_not_surer() -> None:
     """Errors last for a while: samples closer together than that share one and the same."""
-    robot = load("stewart").changed(payload={"mass": 0.0})
+    robot = load("stewart").changed(payload={"mass": 0.0, "inertia": [0.0] * 3})
     laden = robot.changed(payload={"mass": 1.3, "com": [0.03, -0.02, 0.05]})
     time, q, qd, qdd = moved(robot, 2.0)
     effort = inverse_dynamics(laden, q, qd, qdd)
@@ -113,7 +113,7 @@ def test_a_stream_four_times_as_fast_is_not_surer() -> None:
 
 
 def test_what_is_known_of_a_wrench_is_not_taken_for_a_load() -> None:
-    robot = load("stewart").changed(payload={"mass": 0.0})
+    robot = load("stewart").changed(payload={"mass": 0.0, "inertia": [0.0] * 3})
     laden = robot.changed(payload={"mass": 1.3})
     time, q, qd, qdd = moved(robot, 1.0)
     wrench = np.array([20.0, -10.0, 30.0, 1.0, 2.0, -1.0])
@@ -126,7 +126,7 @@ def test_what_is_known_of_a_wrench_is_not_taken_for_a_load() -> None:
 
 def test_after_a_long_pause_a_load_is_as_unknown_as_any() -> None:
     """What fades away gives place to what is known of any load: it never is less than that."""
-    robot = load("stewart").changed(payload={"mass": 0.0})
+    robot = load("stewart").changed(payload={"mass": 0.0, "inertia": [0.0] * 3})
     time, q, qd, qdd = moved(robot, 0.5)
     effort = inverse_dynamics(robot, q, qd, qdd)
     estimator = PayloadEstimator(robot, mass_range=5.0, reach=0.2)
@@ -217,7 +217,7 @@ def test_at_rest_dry_friction_may_bear_a_part_of_the_load() -> None:
 def test_friction_that_grows_with_the_load_is_no_load() -> None:
     """An unknown load adds to the friction of the gears, too."""
     laws = {"coulomb": 0.05, "load_dependent": 0.2}
-    robot = load("delta_cu").changed(payload={"mass": 0.0}, friction=laws)
+    robot = load("delta_cu").changed(payload={"mass": 0.0, "inertia": [0.0] * 3}, friction=laws)
     time, q, qd, qdd = moved(robot, 1.5)
     effort = inverse_dynamics(robot.changed(payload={"mass": 1.3}), q, qd, qdd)
     found = fed(robot, time, q, qd, qdd, effort).estimate()

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from pathlib import Path
 
 import numpy as np
@@ -235,6 +236,20 @@ def test_velocities_that_contradict_the_positions_are_rejected():
     for scale in (-1.0, 0.0, 57.3, 1e3, 1e-3):
         with pytest.raises(PkmTwinError, match=r"accelerations .*\d %"):
             Recording(robot, time, q, qd, scale * qdd).with_rates()
+
+
+@pytest.mark.parametrize("factor", [1e-6, 1e-3, 1 / 60, 60.0, 1e3, 1e6])
+@pytest.mark.parametrize("count", [4, 5, 9, 12, 100])
+@pytest.mark.parametrize("rate", [20.0, 1000.0])
+def test_times_in_another_unit_than_the_velocities_are_rejected_with_the_factor(factor, count, rate):
+    robot = load("delta")
+    time, q, qd, qdd = (values[:count] for values in smooth_motion(robot, np.random.default_rng(1), 6.0, rate))
+    Recording(robot, time, q, qd, qdd).check_rates()
+    for change in (None, qdd):
+        with pytest.raises(PkmTwinError) as error:
+            Recording(robot, factor * time, q, qd, change).with_rates()
+        found = re.search(r"\(([\d.e+-]+) times the rate of the position", str(error.value))
+        assert found is not None and abs(float(found[1]) / factor - 1.0) < 0.05
 
 
 @pytest.mark.parametrize("rates", [True, False])

@@ -226,6 +226,30 @@ def test_a_cell_s_description_is_read_back_with_its_joint_map(cell, tmp_path):
     assert [ET.tostring(e) for e in model] == [ET.tostring(e) for e in plain]
 
 
+def test_a_cell_s_command_bounds_are_limits_by_its_joint_map(cell, tmp_path):
+    path = tmp_path / "cell.urdf"
+    path.write_text(robot_urdf(cell.mapped))
+    own = Machine.from_data(read_urdf(path), "own").limits
+    root = ET.fromstring(path.read_text())
+    narrow = own.position @ np.array([[0.75, 0.25], [0.25, 0.75]])
+    for k, joint in enumerate(root.findall("ros2_control/joint")):
+        size, effort, speed = abs(cell.factors[k]), 0.5 * own.effort[k], 0.5 * own.velocity[k]
+        bounds = {
+            "position": sorted((cell.offsets[k] + cell.factors[k] * narrow[k]).tolist()),
+            "effort": (-effort / size, effort / size),
+            "velocity": (-speed * size, 9.0 * speed * size),
+        }
+        for kind, ends in bounds.items():
+            interface = ET.SubElement(joint, "command_interface", name=kind)
+            for key, value in zip(("min", "max"), ends, strict=True):
+                ET.SubElement(interface, "param", name=key).text = repr(float(value))
+    path.write_text(ET.tostring(root, "unicode"))
+    limits = Machine.from_data(read_urdf(path), "bounded").limits
+    np.testing.assert_allclose(limits.effort, 0.5 * own.effort, 1e-12)
+    np.testing.assert_allclose(limits.velocity, 0.5 * own.velocity, 1e-12)
+    np.testing.assert_allclose(limits.position, narrow, 1e-9, 1e-12)
+
+
 def test_a_ratio_that_changes_with_travel_has_no_description_for_a_controller():
     robot = robot_of_data(
         sides("linear_delta").data | {"joint_map": {"rail_1": {"ratio": 40.0, "ratio_change": 0.1}}},

@@ -440,6 +440,9 @@ REJECTED = {
     "joint of the world": (MODEL, M1.replace("m1", "j").replace("arm_1", "five_bar::none") + MODEL, "joint.j.child"),
     "no model": (MODEL, f"{MODEL}<static>1</static>", "five_bar.sdf"),
     "xacro": ("<static>1</static>", "<xacro:include/>", "five_bar.sdf"),
+    "two worlds": ("</sdf>", '<world name="moon"><gravity>0 0 -1.62</gravity></world></sdf>', "five_bar.sdf"),
+    "world and model": ("</sdf>", '<model name="free"><static>1</static></model></sdf>', "five_bar.sdf"),
+    "world in a model": (MODEL, f'{MODEL}<world name="moon"/>', "model.five_bar.world.moon"),
 }
 
 

@@ -8,7 +8,7 @@ import re
 import numpy as np
 import pytest
 
-from pkm_twin.errors import ParameterError
+from pkm_twin.errors import ParameterError, RobotWarning
 from pkm_twin.machine import urdf_file, urdf_xml
 from pkm_twin.robot.urdf_read import read_urdf
 
@@ -141,6 +141,43 @@ def test_what_marks_a_motor(mark, tmp_path):
         old = '<joint name="motor" type="revolute"'
         path.write_text(path.read_text().replace(old, f'{old} independent="{mark}"'))
     assert read_urdf(path)["joints"]["motor"]["actuated"]
+
+
+def bounded(kind, **bounds):
+    """A joint of ros2_control with bounds of one command interface."""
+    params = "".join(f'<param name="{key}">{value}</param>' for key, value in bounds.items())
+    return f'<joint name="motor"><command_interface name="{kind}">{params}</command_interface>'
+
+
+@pytest.mark.parametrize(
+    ("kind", "bounds", "limits"),
+    [
+        ("position", {"min": -0.5, "max": 9.0}, {"position": [-0.5, 1.0]}),
+        ("position", {"max": 0.25}, {"position": [-1.0, 0.25]}),
+        ("velocity", {"min": -2.5, "max": 3.5}, {"velocity": 2.5}),
+        ("effort", {"max": 2.0}, {"effort": 2.0}),
+        ("effort", {"min": -9.0, "max": 9.0}, {}),
+        ("position", {"min": "inf"}, "ros2_control.motor.position"),
+        ("position", {"min": 1.5}, "ros2_control.motor.position"),
+        ("velocity", {"max": "fast"}, "ros2_control.motor.velocity"),
+    ],
+)
+def test_the_bounds_of_a_command_interface_are_limits(kind, bounds, limits, tmp_path):
+    path = small(tmp_path, '<joint name="motor">\n  <command_interface name="effort"/>', bounded(kind, **bounds))
+    if isinstance(limits, str):
+        with pytest.raises(ParameterError, match=limits):
+            read_urdf(path)
+        return
+    stated = {"position": [-1.0, 1.0], "velocity": 4.0, "effort": 3.0}
+    assert read_urdf(path)["joints"]["motor"]["limits"] == stated | limits
+    path.write_text(path.read_text().replace("</command_interface>", '<limits enable="false"/></command_interface>'))
+    assert read_urdf(path)["joints"]["motor"]["limits"] == stated
+
+
+def test_bounds_that_are_not_limits_are_said(tmp_path):
+    path = small(tmp_path, '<joint name="motor">\n  <command_interface name="effort"/>', bounded("jerk", max=3.0))
+    with pytest.warns(RobotWarning, match=r"ros2_control\.motor.*jerk"):
+        read_urdf(path)
 
 
 @pytest.mark.parametrize("value", ["yes", "", "2", "truee"])

@@ -84,6 +84,7 @@ MORE = {
         "joint.l.child.*'tool' already .* 'tip'"
     ),
     '<coupling name="g"/>': "coupling.g",
+    '<robot name="second"/>': "robot.second: .*one <robot>",
     '<constraint name="k" type="sphercal"/>': "constraint.k.type.*did you mean 'spherical'",
     '<constraint name="k" type="link"><parent_orgin xyz="0 0 1"/></constraint>': (
         "constraint.k: .*'parent_orgin'.*did you mean 'parent_origin'"

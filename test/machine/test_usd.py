@@ -160,7 +160,12 @@ def _mirror(stage):
     UsdGeom.Xformable(stage.GetPrimAtPath("/robot/foot")).AddScaleOp().Set(Gf.Vec3f(1, 1, -1))
 
 
+def _second_scene(stage):
+    UsdPhysics.Scene.Define(stage, "/moon").CreateGravityMagnitudeAttr(1.62)
+
+
 WRONG = {
+    "two gravities": (_second_scene, "PhysicsScene.*one gravity"),
     "no inertia": (
         _set("/robot/foot", "physics:diagonalInertia", Gf.Vec3f(0)),
         "/robot/foot.*diagonalInertia",

@@ -29,7 +29,7 @@ that turn, m for joints that slide. Bold keys are required, defaults are in brac
 ROBOT` prints all values. Where no values are stated, lengths are 1e-06 to 100 m, masses 0 to
 100000 kg, moduli 1000 to 1e+14 Pa, coordinates -1e+06 to 1e+06 m.
 An inertia is three principal moments or a symmetric 3x3 matrix whose moments are not negative and
-keep the triangle rule.
+keep the triangle rule; a payload's needs its mass.
 """
 UNITS = {
     "{effort} per {joint}/s": "N m s/rad or N s/m",

@@ -146,6 +146,7 @@ def compute(given: MapOptions) -> Report:
         if given.out is not None and given.out.suffix != ".csv":
             raise ParameterError("out", str(given.out), "a name that ends in .csv")
         motion = read(path, machine, ReadOptions(planned=True, load=given.load))
+        motion.check_rates()
         if given.payload is None and (motion.computed is not None or (motion.effort is not None and len(motion.q) > 2)):
             doubt = check_efforts(settle_rests(motion.with_rates())).doubt
             motion = replace(motion, doubt=doubt)

@@ -164,7 +164,7 @@ inline Parameters read_payload(
   if (payload_parameters(mass, com, inertia, result) != 0) {
     throw std::invalid_argument(
             "payload.inertia: expected a symmetric matrix whose principal moments are at least "
-            "zero, each at most the sum of the others");
+            "zero, each at most the sum of the others, and zeros for a mass of 0");
   }
   return result;
 }
