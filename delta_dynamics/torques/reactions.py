@@ -329,15 +329,16 @@ class Balance:
 
     def reactions(self, value: Array, null: Array) -> Reactions:
         """Return the reactions of a solution and its null space."""
-        # Scale the null space's moments to forces, so that one bound applies to both.
-        reach = np.einsum("...jik,...kn->...jin", self.spread, null * self.unit[..., None])
-        reach[..., 3:, :] /= self.size[..., None, None, None]
-        joints = self.joints
+        joints, reach = self.joints, np.zeros((*self.spread.shape[:-1], 1))
+        if null.any():
+            # Scale the null space's moments to forces, so that one bound applies to both.
+            reach = self.spread @ (null * self.unit[..., None])[..., None, :, :]
+            reach[..., 3:, :] /= self.size[..., None, None, None]
         return Reactions(
             names=tuple(joint.name for joint in joints),
             bodies=tuple((joint.inner, joint.outer) for joint in joints),
             points=_read_only(self.points),
-            wrenches=_read_only(np.einsum("...jik,...k->...ji", self.spread, value)),
+            wrenches=_read_only((self.spread @ value[..., None, :, None])[..., 0]),
             determinate=_small(reach),
             components=self.components,
             values=_read_only(value),
@@ -500,7 +501,7 @@ def _solve(a: Array, b: Array, moment: Mask, size: Array, *, strict: bool) -> tu
     null = np.zeros((len(matrix), unknowns, unknowns))
     if not regular.all():
         value[~regular], null[~regular] = _deficient(matrix[~regular], right[~regular])
-    left = right - np.einsum("...rk,...k->...r", matrix, value)
+    left = right - (matrix @ value[..., None])[..., 0]
     scale = np.maximum(np.abs(right).max(-1), np.finfo(np.float64).tiny)
     residual = np.asarray(np.abs(left).max(-1) / scale, np.float64).reshape(batch)
     if strict and (residual > BALANCE_BOUND).any():
@@ -513,20 +514,29 @@ def _solve(a: Array, b: Array, moment: Mask, size: Array, *, strict: bool) -> tu
 
 
 def _regular(matrix: Array, right: Array) -> tuple[Array, Mask]:
-    """Solve by QR where the columns are clearly independent; return also where they are.
+    """Solve where the columns are clearly independent; return also where they are.
 
-    Ten times cheaper than the singular values that decide the other samples.
+    By QR, or at once where there are as many equations: ten times cheaper than the singular values
+    that decide the other samples.
     """
     equations, unknowns = matrix.shape[-2:]
     if unknowns > equations:
         return np.zeros((len(matrix), unknowns)), np.zeros(len(matrix), bool)
-    q, r = np.linalg.qr(matrix)
-    diagonal = np.abs(np.diagonal(r, axis1=-2, axis2=-1))
-    sound = diagonal.min(-1) > MIN_FULL_RANK_CONDITION * diagonal.max(-1)
-    inverse = np.linalg.inv(np.where(sound[:, None, None], r, np.eye(unknowns)))
+    sound = np.ones(len(matrix), bool)
+    if unknowns == equations:
+        r, along = matrix, right[..., None]
+        try:
+            inverse = np.linalg.inv(r)
+        except np.linalg.LinAlgError:
+            return _regular(np.pad(matrix, [(0, 0), (0, 1), (0, 0)]), np.pad(right, [(0, 0), (0, 1)]))
+    else:
+        q, r = np.linalg.qr(matrix)
+        along = q.swapaxes(-1, -2) @ right[..., None]
+        diagonal = np.abs(np.diagonal(r, axis1=-2, axis2=-1))
+        sound = diagonal.min(-1) > MIN_FULL_RANK_CONDITION * diagonal.max(-1)
+        inverse = np.linalg.inv(np.where(sound[:, None, None], r, np.eye(unknowns)))
     condition = np.linalg.norm(r, axis=(-2, -1)) * np.linalg.norm(inverse, axis=(-2, -1))
-    value = np.einsum("nij,nj->ni", inverse, np.einsum("nrk,nr->nk", q, right))
-    return value, sound & (condition * MIN_FULL_RANK_CONDITION < 1.0)
+    return (inverse @ along)[..., 0], sound & (condition * MIN_FULL_RANK_CONDITION < 1.0)
 
 
 def _deficient(matrix: Array, right: Array) -> tuple[Array, Array]:
@@ -538,9 +548,8 @@ def _deficient(matrix: Array, right: Array) -> tuple[Array, Array]:
     u, s, vt = np.linalg.svd(full, full_matrices=False)
     sound = s > RANK_BOUND * s[:, :1]
     inverse = np.where(sound, 1.0 / np.where(sound, s, 1.0), 0.0)
-    along = inverse * np.einsum("nrk,nr->nk", u, np.pad(right, [(0, 0), (0, missing)]))
-    value = np.einsum("nks,nk->ns", vt, along)
-    return value, np.where(sound[..., None], 0.0, vt).swapaxes(-1, -2)
+    along = inverse * (np.pad(right, [(0, 0), (0, missing)])[:, None] @ u)[:, 0]
+    return (along[:, None] @ vt)[:, 0], np.where(sound[..., None], 0.0, vt).swapaxes(-1, -2)
 
 
 def _small(reach: Array) -> Mask:

@@ -33,6 +33,8 @@ MAX_BYTES: Final = 1024**3
 """Largest table that is read: some millions of samples."""
 MAX_LINE: Final = 1024**2
 """Longest line of it, characters."""
+ROWS_PER_BLOCK: Final = 4096
+"""Rows written at a time, so that memory stays flat."""
 ENDINGS: Final = (".csv", ".parquet", ".mat")
 """Name endings of tables that can be written."""
 NOT_READ: Final = {
@@ -439,8 +441,14 @@ def write_table(columns: Mapping[str, Array], path: Path) -> None:
                 savemat(file, named, oned_as="column")
         else:
             with hidden.open("w", newline="", encoding="utf-8") as text:
-                writer = csv.writer(text)
-                writer.writerow(columns)
-                for row in zip(*(values.tolist() for values in columns.values()), strict=True):
-                    # An undetermined reaction is an empty cell; repr keeps every digit.
-                    writer.writerow(["" if value != value else repr(value) for value in row])
+                csv.writer(text).writerow(columns)
+                size = len(next(iter(columns.values())))
+                for begin in range(0, size, ROWS_PER_BLOCK):
+                    cells = []
+                    for values in columns.values():
+                        numbers = np.asarray(values[begin : begin + ROWS_PER_BLOCK], np.float64)
+                        # An undetermined reaction is an empty cell; repr keeps every digit.
+                        known = "" if np.isnan(numbers).any() else "nan"
+                        written = map(repr, numbers.tolist())
+                        cells.append([known if cell == "nan" else cell for cell in written] if not known else written)
+                    text.writelines([f"{','.join(row)}\r\n" for row in zip(*cells, strict=True)])
