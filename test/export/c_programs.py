@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import operator
 import os
 import platform
@@ -26,6 +27,7 @@ from delta_dynamics import (
     mass_matrix_at_pose,
 )
 from pkm_twin import Robot, transmission
+from pkm_twin.codegen import cache
 from pkm_twin.codegen.arrays import Array
 from stiffness_monitor import platform_response
 from test.support.robots import has
@@ -53,7 +55,37 @@ blocking = pytest.mark.parametrize(
     ],
 )
 """What watches calls: a hook of our own, or the compiler with RealtimeSanitizer."""
+SOURCES = (".c", ".cpp", ".h", ".hpp", ".o")
+"""Files that a compiler reads."""
 SANITIZED = ("-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+
+
+def compile_in(folder: Path, *words: str | Path) -> None:
+    """Run a compiler in a folder, or take the file that it made of the same sources before.
+
+    The file is kept beside the package's own compiled programs. It is that of the same words, compiler
+    and sources: all in the folder, in folders named by ``-I``, and the stand-ins of this folder.
+
+    :raises AssertionError: with what the compiler says.
+    """
+    said = [str(word) for word in words]
+    compiler = Path(shutil.which(said[0]) or said[0]).resolve()
+    found = sorted(Path(__file__).parent.glob("*.hpp"))
+    for place in (folder, *(Path(word[2:]) for word in said if word.startswith("-I/"))):
+        found += sorted(file for file in place.rglob("*") if file.suffix in SOURCES)
+    found += [Path(word) for word in said if word.startswith("/") and Path(word).suffix in SOURCES]
+    out = folder / said[said.index("-o") + 1] if "-o" in said else None
+    contents = [f"{file.name} {hashlib.sha256(file.read_bytes()).hexdigest()}" for file in found if file != out]
+    plain = [re.sub(r"^(-I)?/.*/", "", word) for word in said]
+    name = cache.digest(str(compiler), str(compiler.stat().st_mtime_ns), *platform.libc_ver(), *plain, *contents)
+    kept = cache.read(name)
+    if kept is None:
+        done = subprocess.run(said, cwd=folder, capture_output=True, text=True, check=False)
+        assert not done.returncode, done.stderr
+        cache.write(name, {}, out.read_bytes() if out and out.is_file() else b"")
+    elif out and out != Path(os.devnull):
+        out.write_bytes(kept[1])
+        out.chmod(0o755)
 
 
 def functions(robot: Robot) -> dict[str, Callable[..., Any]]:
@@ -194,12 +226,11 @@ def hooked(folder: Path, call: str, program: str, *sources: str | Path, watcher:
     (folder / changed).write_text(f"extern {linkage}void watch(int);\n{watched}")
     (folder / "hook.c").write_text(SANITIZER if watcher else HOOK)
     c, cpp = (watcher, watcher.replace("clang", "clang++")) if watcher else (COMPILERS[0], "g++")
-    subprocess.run([c, "-c", "hook.c", "-o", "hook.o"], cwd=folder, check=True)
+    compile_in(folder, c, "-c", "hook.c", "-o", "hook.o")
     compiler = [cpp, "-std=c++17"] if linkage else [c, "-std=c99"]
     compiler += ["-fsanitize=realtime"] * bool(watcher)
     made = folder / "hooked"
-    words = [*compiler, "-O0", changed, *map(str, sources), "hook.o", "-o", str(made), "-lm"]
-    subprocess.run([*words, "-ldl"], cwd=folder, check=True)
+    compile_in(folder, *compiler, "-O0", changed, *sources, "hook.o", "-o", "hooked", "-lm", "-ldl")
     return made
 
 
@@ -287,8 +318,7 @@ class Package:
         program = self.folder / f"driver{name}"
         if not program.exists():
             sources = [f"{self.prefix}.c", "driver.c"]
-            command = [compiler, "-std=c99", *flags, *sources, "-o", program.name, "-lm"]
-            subprocess.run(command, cwd=self.folder, check=True)
+            compile_in(self.folder, compiler, "-std=c99", *flags, *sources, "-o", program.name, "-lm")
         return program
 
     def run(self, program: Path, name: str, *inputs: Array) -> tuple[Array, Array]:

@@ -28,6 +28,7 @@ from .c_programs import (
     COMPILERS,
     PLAIN,
     Package,
+    compile_in,
     functions,
     inputs_of,
 )
@@ -42,12 +43,7 @@ def test_only_constants_and_functions_of_the_robot_s_name(small):
     for line in text.splitlines():
         if line.startswith("static") and not line.rstrip().endswith(")"):
             assert line.startswith("static const "), line
-    package.build("-O0")
-    subprocess.run(
-        [COMPILERS[0], "-std=c99", "-c", f"{package.prefix}.c", "-o", "o.o"],
-        cwd=package.folder,
-        check=True,
-    )
+    compile_in(package.folder, COMPILERS[0], "-std=c99", "-c", f"{package.prefix}.c", "-o", "o.o")
     symbols = subprocess.run(["nm", "o.o"], cwd=package.folder, capture_output=True, text=True, check=True).stdout
     kinds = dict(re.findall(r"(\w) (\w+)$", symbols, re.MULTILINE)[::-1])
     assert not set(kinds) & set("dDbBcC"), symbols
@@ -129,18 +125,8 @@ int main(void)
     return 0;
 }}
 """)
-    command = [
-        COMPILERS[0],
-        "-std=c99",
-        *PLAIN,
-        f"-I{package.folder}",
-        "judge.c",
-        package.folder / f"{package.prefix}.c",
-        "-o",
-        "judge",
-        "-lm",
-    ]
-    subprocess.run(command, cwd=tmp_path, check=True)
+    sources = "judge.c", package.folder / f"{package.prefix}.c"
+    compile_in(tmp_path, COMPILERS[0], "-std=c99", f"-I{package.folder}", *sources, "-o", "judge", "-lm")
     rows = drawn_payloads(rng, count)
     done = subprocess.run([tmp_path / "judge"], input=rows.tobytes(), capture_output=True, check=True)
     right = []
@@ -156,8 +142,8 @@ int main(void)
 
 def test_the_command_s_example_agrees_with_python(twin, tmp_path, small):
     assert twin("export", "c", "five_bar", "--out", tmp_path / "out").code == 0
-    command = [COMPILERS[0], "-std=c99", "example.c", "pkm_five_bar.c", "-o", "example", "-lm"]
-    subprocess.run(command, cwd=tmp_path / "out", check=True)
+    sources = "example.c", "pkm_five_bar.c"
+    compile_in(tmp_path / "out", COMPILERS[0], "-std=c99", *sources, "-o", "example", "-lm")
     done = subprocess.run(["./example"], cwd=tmp_path / "out", check=False, capture_output=True)
     assert not done.returncode
 

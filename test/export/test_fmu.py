@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import functools
 import shutil
-import subprocess
 import xml.etree.ElementTree as ET
 import zipfile
 
@@ -16,6 +15,7 @@ from delta_dynamics import inverse_dynamics
 from delta_dynamics.simulation.plant import Plant
 from pkm_twin.export.fmu import KINDS, VERSIONS, Fmu, find_compiler
 from pkm_twin.mechanisms.machine import Machine
+from test.export.c_programs import compile_in
 from test.machine.random_machines import variant
 from test.support.robots import loaded, partly_long, random_motion
 
@@ -99,9 +99,7 @@ def test_fmpy_finds_nothing_wrong_and_every_run_writes_the_same(unit, tmp_path):
     with zipfile.ZipFile(path) as archive:
         archive.extractall(tmp_path)
     for compiler in filter(shutil.which, ("gcc", "clang")):
-        command = [compiler, "-std=c99", *STRICT, "-fsyntax-only", "fmu.c"]
-        done = subprocess.run(command, cwd=tmp_path / "sources", capture_output=True, text=True, check=False)
-        assert not done.returncode, done.stderr
+        compile_in(tmp_path / "sources", compiler, "-std=c99", *STRICT, "-fsyntax-only", "fmu.c")
 
 
 @pytest.mark.parametrize("kind", TYPES)

@@ -18,7 +18,7 @@ from pkm_twin.export.moveit import ORIENTATION, POSITION, moveit_package
 from pkm_twin.kinematics.pose import values
 from test.support.robots import load, partly_long, random_joints
 
-from .c_programs import COMPILERS, STRICT
+from .c_programs import COMPILERS, STRICT, compile_in
 
 pytestmark = pytest.mark.skipif(not COMPILERS or not shutil.which("g++"), reason="there is no C and C++ compiler")
 SUCCESS, IN_COLLISION, NO_SOLUTION = 1.0, -12.0, -31.0
@@ -120,12 +120,8 @@ class Plugin:
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).write_text(text)
         source = f"c/pkm_{robot.name}.c"
-        for command in (
-            [COMPILERS[0], "-std=c99", "-O0", "-c", source, "-o", "robot.o"],
-            ["g++", *STRICT, "-I.", "-Ic", "driver.cpp", "robot.o", "-o", self.program, "-lm"],
-        ):
-            done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
-            assert not done.returncode, done.stderr
+        compile_in(folder, COMPILERS[0], "-std=c99", "-O0", "-c", source, "-o", "robot.o")
+        compile_in(folder, "g++", *STRICT, "-I.", "-Ic", "driver.cpp", "robot.o", "-o", "driver", "-lm")
 
     def run(self, word, stop=0.0, data=b""):
         command = [self.program, word, str(stop)]

@@ -35,7 +35,7 @@ from test.support.robots import (
     random_motion,
 )
 
-from .c_programs import COMPILERS, STRICT, blocking, hooked, watched
+from .c_programs import COMPILERS, STRICT, blocking, compile_in, hooked, watched
 
 ROS = [p for p in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if p]
 needs_ros2_control = pytest.mark.skipif(
@@ -98,23 +98,9 @@ class Core:
         (folder / "driver.cpp").write_text(DRIVER.replace("@", self.package))
         self.program = folder / "driver"
         (c_file,) = folder.glob("c/pkm_*.c")
-        for command in (
-            [COMPILERS[0], "-std=c99", "-O0", "-c", c_file, "-o", "robot.o"],
-            [
-                "g++",
-                *STRICT,
-                "-Iinclude",
-                "-Ic",
-                "driver.cpp",
-                "src/feedforward.cpp",
-                "robot.o",
-                "-o",
-                self.program,
-                "-lm",
-            ],
-        ):
-            done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
-            assert not done.returncode, done.stderr
+        compile_in(folder, COMPILERS[0], "-std=c99", "-O0", "-c", c_file, "-o", "robot.o")
+        sources = "driver.cpp", "src/feedforward.cpp", "robot.o"
+        compile_in(folder, "g++", *STRICT, "-Iinclude", "-Ic", *sources, "-o", "driver", "-lm")
 
     def run(self, rows, start, p=0.0, d=0.0, stop=0.0, hold=0.5, *, bounded=True):
         """Sound, verdict, effort and feedforward of updates: rows of 5 n numbers."""
@@ -340,9 +326,8 @@ def test_payload_and_effort_limits_are_one_set_for_all_controllers(mapped):
         (folder / name).parent.mkdir(exist_ok=True)
         (folder / name).write_text(stand_in)
     (folder / "common.cpp").write_text(COMMON.replace("@", core.package))
-    build = ["g++", "-std=c++17", "-O0", "-Wall", "-Wextra", "-Werror", "-I.", "-Iinclude", "-Ic"]
-    build += ["common.cpp", "robot.o", "-o", "common", "-lm"]
-    subprocess.run(build, cwd=folder, check=True)
+    flags = "-std=c++17", "-O0", "-Wall", "-Wextra", "-Werror", "-I.", "-Iinclude", "-Ic"
+    compile_in(folder, "g++", *flags, "common.cpp", "robot.o", "-o", "common", "-lm")
     done = subprocess.run([folder / "common"], capture_output=True, check=False)
     assert not done.returncode, done.returncode
     first, second, third = np.frombuffer(done.stdout).reshape(3, -1)
@@ -401,8 +386,7 @@ def test_drives_share_the_effort_in_the_controller_s_numbers(tmp_path):
     torn[1, 3] += factors[3] * 2e-3
     assert core.run(torn, place[0])[1] == ["NONE", "NO_ASSEMBLY"]
     (tmp_path / "shared.cpp").write_text(SHARED.replace("@", core.package))
-    build = ["g++", *STRICT, "-Iinclude", "-Ic", "shared.cpp", "robot.o", "-o", "shared", "-lm"]
-    subprocess.run(build, cwd=tmp_path, check=True)
+    compile_in(tmp_path, "g++", *STRICT, "-Iinclude", "-Ic", "shared.cpp", "robot.o", "-o", "shared", "-lm")
     given = np.hstack(motion[:2]).tobytes()
     done = subprocess.run([tmp_path / "shared"], input=given, capture_output=True, check=True)
     idle, change, twist = np.split(np.frombuffer(done.stdout).reshape(40, 32), [4, 8], 1)

@@ -13,7 +13,7 @@ import pytest
 from pkm_twin import transmission
 from pkm_twin.errors import ParameterError
 from pkm_twin.export.transmission import transmission_package
-from test.export.c_programs import COMPILERS, STRICT, hooked, watched
+from test.export.c_programs import COMPILERS, STRICT, compile_in, hooked, watched
 from test.machine.random_machines import FILES, MACHINES
 from test.support.robots import load, partly_long
 
@@ -108,17 +108,13 @@ class Compiled:
         (package,) = (folder / "include").iterdir()
         (folder / "driver.cpp").write_text(DRIVER.replace("@", package.name))
         (c_file,) = folder.glob("c/pkm_*.c")
-        self._do(COMPILERS[0], "-std=c99", "-O0", "-c", c_file, "-o", "robot.o")
+        compile_in(folder, COMPILERS[0], "-std=c99", "-O0", "-c", c_file, "-o", "robot.o")
         self.flags = ("-Iinclude", "-Ic", "-I.")
         parts = ("src/transmission.cpp", "-c", "-o", "transmission.o")
-        self._do("g++", *STRICT, *self.flags, *parts)
+        compile_in(folder, "g++", *STRICT, *self.flags, *parts)
         self.program = folder / "driver"
         objects = ("transmission.o", "robot.o")
-        self._do("g++", *STRICT, *self.flags, "driver.cpp", *objects, "-o", self.program, "-lm")
-
-    def _do(self, *words):
-        done = subprocess.run(words, cwd=self.folder, capture_output=True, text=True, check=False)
-        assert not done.returncode, done.stderr
+        compile_in(folder, "g++", *STRICT, *self.flags, "driver.cpp", *objects, "-o", "driver", "-lm")
 
     def rows(self, way, *parts):
         """Calls in one direction: position, velocity, effort, absolute position; None is NaN."""
