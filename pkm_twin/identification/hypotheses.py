@@ -165,9 +165,9 @@ class Search:
             logs.append(own.max() + np.log(np.mean(np.exp(own - own.max()))) - CLASSES[name])
             found.append(float(shares[int(own.argmax())]))
         best = int(np.argmax(logs))
-        log = float(scipy.special.logsumexp(logs)) - price
-        odds = tuple(scipy.special.softmax(logs).tolist())
-        return Hypothesis(text, log, found[best], classes[best], classes=odds)
+        log = float(np.logaddexp.reduce(logs))
+        odds = tuple(np.exp(np.array(logs) - log).tolist())
+        return Hypothesis(text, log - price, found[best], classes[best], classes=odds)
 
     def _find_logs(self, model: Model, name: str, bounded: bool) -> Array:
         """Return a class's log evidence at each share, less what possible numbers cost."""
@@ -184,10 +184,11 @@ class Search:
         if not bounded or not bound.any():
             return logs
         for k in np.flatnonzero(logs > logs.max() - 2.0 * ODDS):
-            one = model.posterior(used, np.where(np.arange(len(logs)) == k, 0.0, -np.inf))
-            mean, inner = one.mean[bound], one.covariance[np.ix_(bound, bound)]
+            mean, inner = model.posterior_at(int(k), used)
+            mean = mean[bound] * model.deviation[bound]
             if (mean >= low[bound]).all():
                 continue
+            inner = inner[np.ix_(bound, bound)] * np.outer(model.deviation[bound], model.deviation[bound])
             size = np.maximum(np.sqrt(np.diag(inner)), 1e-150)
             root = np.linalg.cholesky(inner / np.outer(size, size) + 1e-9 * np.eye(len(size)))
             back = scipy.linalg.solve_triangular(root, np.eye(len(size)), lower=True) / size
@@ -484,6 +485,9 @@ class Search:
         self, text: str, motion: Motion, turned: Array, both: str = "", order: Any = None
     ) -> Iterator[Hypothesis]:
         """Weigh another motion; and with the efforts turned or exchanged alike, ``both``."""
+        # The error of a motion that the machine cannot make takes as long as weighing it.
+        if not self.rows.model.robot.try_forward(motion.q)[1].all():
+            return
         try:
             made = self.columns.with_motion(motion, turned, order)
         except (PkmTwinError, ValueError, np.linalg.LinAlgError):

@@ -9,6 +9,7 @@ import importlib.util
 import numpy as np
 import pytest
 
+from pkm_twin.codegen import cache
 from pkm_twin.export.python_file import FUNCTIONS, python_file
 from test.export.c_programs import functions, inputs_of
 from test.machine.random_machines import FILES
@@ -32,6 +33,10 @@ class Made:
             import jax
 
             jax.config.update("jax_enable_x64", True)
+            # What is compiled stays from run to run: each operation is a program of a moment.
+            if (kept := cache.folder()) is not None:
+                jax.config.update("jax_compilation_cache_dir", str(kept / "jax"))
+                jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
             self.uncompiled = jax.disable_jit
         path = folder / "machine.py"
         path.write_text(python_file(robot, library))
