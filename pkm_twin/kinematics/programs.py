@@ -33,7 +33,7 @@ CERTAIN_MARGIN: Final = 1.0
 """Smallest ratio of the closures' determinant to that distance, from far poses of many machines: it
 is less than 0.5 where ``forward`` of the joints is not the pose."""
 CERTAIN_REGULAR: Final = 1e-5
-"""Smallest closures' determinant where a closed start is the pose: ``forward`` computes its own from
+"""Smallest closures' determinant of the assembly of a closed start: ``forward`` computes its own from
 other pivots, and refuses it below 1e-8. The two agree to fewer digits the nearer a singularity is."""
 SAME_POSE: Final = 1e-7
 """Largest difference of two poses that are one: rounding of the two solutions, of unit one. Another
@@ -287,8 +287,8 @@ def certify_assembly(t: Traced, scheme: CarriedScheme, posed: Traced, q: Sequenc
     """Return numbers that are above zero if ``forward`` of q is certainly the pose.
 
     With x the pose, A = dq/dx and home 0, the way from home is read from both ends: A0^-1 (q - q0)
-    and A^-1 (q - q0) lie near x - x0 where it is nearly straight. A closed start of ``forward`` is
-    compared with x itself.
+    and A^-1 (q - q0) lie near x - x0 where it is nearly straight. Of a closed start of ``forward``
+    the sides of its singularities tell its assembly.
     """
     names, order = t.graph.leads, scheme.drive_pivots
     rates, rates_home = (posed.rates_of_reaches(names, home=home) for home in (False, True))
@@ -297,13 +297,7 @@ def certify_assembly(t: Traced, scheme: CarriedScheme, posed: Traced, q: Sequenc
     drives = at_home.inverse_determinant / here.inverse_determinant
     closures = drives * posed.determinant
     if t.scheme.start is not None:
-        t.q = lead
-        position, rotation = t.place_start().platform()
-        goal, turned = posed.motion.platform()
-        apart = (position - goal) / t.tree.size
-        turns = np.ravel(rotation - turned)
-        # Of two rotations by an angle apart, these squares sum to 4 - 4 cos(angle).
-        return [closures - CERTAIN_REGULAR, SAME_POSE * SAME_POSE - (apart @ apart + 0.5 * (turns @ turns))]
+        return [closures - CERTAIN_REGULAR, *t.scheme.start.find_sides(posed.motion)]
     move, way = posed.q - posed.graph.lead_home, lead - t.graph.lead_home
     ends = ((lu.solve(way) - move) * np.array(t.pose_scales, dtype=object) for lu in (at_home, here))
     distance = 0.5 * sum(apart @ apart for apart in ends)

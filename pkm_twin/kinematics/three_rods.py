@@ -14,13 +14,14 @@ from typing import Any
 
 import numpy as np
 
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import Numbers, Objects, snapped, snapped_all
 from pkm_twin.codegen.operations import absolute, maximum, sqrt
 from pkm_twin.kinematics.constraints import cross
 from pkm_twin.kinematics.limb_pose import sign_of, square_of
 from pkm_twin.kinematics.limbs import Closures
 from pkm_twin.kinematics.motion import Motion
-from pkm_twin.machine.graph import UP
+from pkm_twin.machine.graph import UP, Graph
 from pkm_twin.machine.tree import Tree
 
 
@@ -53,32 +54,40 @@ class ThreeRods:
     rods: tuple[str, ...]
     body: str
 
+    def _list_ends(self, graph: Graph) -> list[tuple[str, Array, Array]]:
+        """Return each rod's driven body, its end there and its end on the body, at home."""
+        rods = [(rod, *rod.ends) for rod in map(graph.rods.__getitem__, self.rods)]
+        return [(r.outer, b, a) if r.inner == self.body else (r.inner, a, b) for r, a, b in rods]
+
     def _spheres(self, tree: Tree, q: Numbers) -> tuple[list[Any], list[Any]]:
         """Return centres and squared radii of the spheres of the body's displacement from home."""
         others = [name for name in tree.links if name != self.body]
         motion = Motion(tree, np.array(tree.home, dtype=object), q, others)
-        centres, squares = [], []
-        for name in self.rods:
-            rod = tree.graph.rods[name]
-            near, (end, own) = rod.inner, rod.ends
-            if near == self.body:
-                near, end, own = rod.outer, own, end
-            centres.append(motion.point(near, end) - own)
-            squares.append(square_of(end - own))
-        return centres, squares
+        ends = self._list_ends(tree.graph)
+        return [motion.point(near, end) - own for near, end, own in ends], [square_of(b - a) for _, a, b in ends]
+
+    def _find_up(self, graph: Graph) -> Objects:
+        """Return a normal of the centres' plane at home, on the body's side."""
+        c1, c2, c3 = (end - own for _, end, own in self._list_ends(graph))
+        n = cross(c2 - c1, c3 - c1)
+        return snapped_all(n * sign_of(-(c1 @ n)))
 
     def place(self, tree: Tree, q: Numbers) -> list[Any]:
         """Return the unknowns of the joint that carries the body, in closed form."""
-        c1, c2, c3 = self._spheres(tree, tree.graph.lead_home)[0]
-        n = cross(c2 - c1, c3 - c1)
-        up = snapped_all(n * sign_of(-(c1 @ n)))
-        point, _, _ = meet_spheres(*self._spheres(tree, q), up)
+        point, _, _ = meet_spheres(*self._spheres(tree, q), self._find_up(tree.graph))
         # Steps of the joint are along the base axes.
         steps = tree.links[self.body].steps
         x: list[Any] = [0.0] * len(steps)
         for step in steps:
             x[step.position] = (step.local @ point) * step.sign / step.slide
         return x
+
+    def find_sides(self, motion: Motion) -> list[Any]:
+        """Return a number above zero where the body is on the side of the centres' plane as at home."""
+        ends = self._list_ends(motion.graph)
+        c1, c2, c3 = (motion.point(near, end) - motion.point(self.body, own) for near, end, own in ends)
+        n = cross(c2 - c1, c3 - c1)
+        return [-(c1 @ n) * (n @ self._find_up(motion.graph))]
 
     def find_miss(self, tree: Tree, q: Numbers) -> tuple[str, float] | None:
         """Return the rod farthest from the two nearest ones, and by how much (m) the spheres miss.

@@ -262,10 +262,6 @@ class Traced:
         closed = self.scheme.start
         return self._guess() if closed is None else closed.place(self.tree, self.q)
 
-    def place_start(self) -> Motion:
-        """Place all bodies by the unknowns that Newton's method starts with."""
-        return self._placed(np.array(self._start(), dtype=object))[0]
-
     def rates_of_joints(self, names: Sequence[str]) -> Objects:
         """Return rates of passive joints per rate of each drive, shape (names, n)."""
         return np.array([self._rates_by_closures(name, self._here) for name in names], object)

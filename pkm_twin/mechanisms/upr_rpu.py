@@ -35,6 +35,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import Numbers, norm
 from pkm_twin.codegen.operations import absolute, atan2, cos, maximum, minimum, sin, sqrt
 from pkm_twin.errors import ParameterError
+from pkm_twin.kinematics.motion import Motion
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate, name_angles
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import BASE, MIN_LENGTH, PLATFORM, Body, Direction, Graph, Joint, array
@@ -46,6 +47,8 @@ from pkm_twin.mechanisms import TwinRobot
 
 MIN_HEIGHT_RATIO: Final = 1e-2
 """Smallest height of a limb at home relative to its width: below it the limbs lie in the base."""
+MAX_ROOT: Final = 1e4
+"""Largest root over a b: two roots that are 4 a b apart have errors of about 1e-16 (root / a b)^2."""
 _LIMB_DIRECTIONS: Final = array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 _X: Final = array([1.0, 0.0, 0.0])
 _Y: Final = array([0.0, 1.0, 0.0])
@@ -215,6 +218,19 @@ class LargestRoot:
             for step, angle in zip(passive, turns.get(str(link.joint), ()), strict=False):
                 result[step.position : step.position + 2] = [cos(angle), sin(angle)]
         return result
+
+    def find_sides(self, motion: Motion) -> list[Any]:
+        """Return numbers above zero between the singularities of the home assembly.
+
+        The cubic has at most two positive roots, as its value at 0 is not negative: the largest is
+        the one with a positive slope. Limb 3 keeps beta below atan2(-rho, a). Far away, 4 a b apart,
+        both roots lose digits.
+        """
+        joints, (position, turned) = motion.graph.joints, motion.platform()
+        a, b, z = joints["R joint 2"].at[0], joints["U joint 2"].at[0], position[2]
+        square, ab = z * z, a * b * turned[1][1] * turned[1][1]
+        slope = square * turned[0][0] - ab * turned[0][2] * turned[0][2]
+        return [-z * turned[1][1], slope, -(z + a * turned[2][1]), MAX_ROOT * ab - square]
 
     def find_miss(self, tree: Tree, q: Numbers) -> None:
         """Return None: the gap is found from the nearest possible drive position."""

@@ -69,6 +69,16 @@ def test_no_pose_is_answered_with_joints_of_another(name, count, rng):
         assert getattr(caught.value, "miss", 1.0) > 1e-9 * robot.graph.size
 
 
+def test_limbs_far_longer_than_the_machine(rng):
+    """A head tilted to a quarter turn has limbs as long as its height divided by the cosine."""
+    robot = load("upr_rpu")
+    tilt = (np.pi / 2 - 10.0 ** rng.uniform(-5.0, -1.0, 400)) * rng.choice([-1.0, 1.0], 400)
+    poses = np.stack([rng.uniform(-1.0, -0.5, 400), tilt, rng.uniform(-1.0, 1.0, 400)], axis=1)
+    q, good = robot.try_inverse(poses)
+    assert 40 < good.sum() < 400
+    assert np.abs(robot.forward(q[good]) - poses[good]).max() < 1e-6
+
+
 def test_a_hexapod_tilted_beyond_its_singularity():
     pose = np.array([-0.159, 0.2993, 0.5007, 0.8745, 0.5927, 0.3741])
     robot = load("stewart")
