@@ -280,15 +280,17 @@ typedef union {{
 /* Whether all magnitudes are below {LARGE!r}: magnitudes are in the order of their bits. */
 static int @_finite(const double *values, int count)
 {{
-    volatile @_double one;
-    int i, result = 1;
+    @_double one;
+    volatile unsigned long long largest;
+    unsigned long long most = 0;
+    int i;
     for (i = 0; i < count; i++) {{
         one.value = values[i];
-        if ((one.bits & 0x7fffffffffffffffULL) >= {_LARGE_BITS}ULL) {{
-            result = 0;
-        }}
+        one.bits &= 0x7fffffffffffffffULL;
+        most = (one.bits > most) ? one.bits : most;
     }}
-    return result;
+    largest = most;
+    return (largest < {_LARGE_BITS}ULL) ? 1 : 0;
 }}
 
 /* Status of results r, behind which stands whether the closures hold. */

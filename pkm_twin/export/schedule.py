@@ -6,7 +6,6 @@ Gibbons and Muchnick, Efficient instruction scheduling for a pipelined architect
 
 from __future__ import annotations
 
-import heapq
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -18,12 +17,14 @@ LATENCIES: Final[Mapping[Operation, int]] = {inv: 13, sqrt: 18, atan2: 75}
 TURN_LATENCY: Final = 60
 """Cycles until a result is there: of a product or sum, of some operations, and of sines and cosines.
 Of x86-64 processors of 2017 to 2023 (Fog, Instruction tables), of functions as measured."""
-PER_CYCLE: Final = 3.0
-"""Operations that begin in a cycle, with loads and stores beside them: the fastest of 1.5, 3 and 6."""
+PER_CYCLE: Final = 2.0
+"""Operations that begin in a cycle, with loads and stores beside them: as measured."""
 
 WINDOW: Final = 120
 """Statements among which the next one is chosen: with more, intermediate results no longer fit into
 registers, and programs of a thousand statements take longer than unordered ones."""
+PATIENCE: Final = 16
+"""Cycles before its arguments are there that a statement may begin: processors look ahead so far."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,9 @@ class Work:
 def order_work(statements: Sequence[Work]) -> list[int]:
     """Return the order in which statements begin on a processor that sees ``WINDOW`` of them.
 
-    Of those whose arguments are there, the one begins that the longest chain follows.
+    The one begins after which the fewest results are kept, so that they stay in registers; or, while
+    the longest chain takes longer than all operations that are left, the one of that chain (Goodman
+    and Hsu, Code scheduling and register allocation in large basic blocks, 1988).
     """
     count = len(statements)
     users: list[list[int]] = [[] for _ in range(count)]
@@ -60,32 +63,38 @@ def order_work(statements: Sequence[Work]) -> list[int]:
     chain = [0] * count
     for k in reversed(range(count)):
         chain[k] = statements[k].latency + max((chain[user] for user in users[k]), default=0)
-    missing = [len(work.reads) for work in statements]
+    missing, unread = [len(work.reads) for work in statements], [len(own) for own in users]
     since, done = [0.0] * count, [False] * count
     order: list[int] = []
-    waiting: list[tuple[float, int]] = []
-    ready: list[tuple[int, int]] = []
+    ready: set[int] = set()
     now, first, seen = 0.0, 0, 0
+    left = sum(work.operations for work in statements)
+
+    def count_freed(k: int) -> int:
+        """Return how many results are no longer kept after a statement, less its own."""
+        return sum(unread[read] == 1 for read in statements[k].reads) - bool(users[k])
+
     while len(order) < count:
         while first < count and done[first]:
             first += 1
-        for k in range(seen, min(first + WINDOW, count)):
-            if not missing[k]:
-                heapq.heappush(waiting, (since[k], k))
+        ready.update(k for k in range(seen, min(first + WINDOW, count)) if not missing[k])
         seen = max(seen, min(first + WINDOW, count))
-        while waiting and waiting[0][0] <= now:
-            _, k = heapq.heappop(waiting)
-            heapq.heappush(ready, (-chain[k], k))
-        if not ready:
-            now = waiting[0][0]
-            continue
-        _, k = heapq.heappop(ready)
-        order.append(k)
-        done[k] = True
-        now += statements[k].operations / PER_CYCLE
-        for user in users[k]:
+        hurry = max(chain[k] for k in ready) * PER_CYCLE > left
+        now = max(now, min(since[k] for k in ready) - (0 if hurry else PATIENCE))
+        able = [k for k in ready if since[k] <= now + (0 if hurry else PATIENCE)]
+        best = max(able, key=lambda k: (0 if hurry else count_freed(k), chain[k], -k))
+        order.append(best)
+        ready.remove(best)
+        done[best] = True
+        work = statements[best]
+        begun, busy = max(now, since[best]), work.operations / PER_CYCLE
+        now += busy
+        left -= work.operations
+        for read in work.reads:
+            unread[read] -= 1
+        for user in users[best]:
             missing[user] -= 1
-            since[user] = max(since[user], now + statements[k].latency)
+            since[user] = max(since[user], begun + busy + work.latency)
             if not missing[user] and user < seen:
-                heapq.heappush(waiting, (since[user], user))
+                ready.add(user)
     return order
