@@ -24,7 +24,7 @@ from pkm_twin.kinematics.constraints import Equation, constraint_equations, keep
 from pkm_twin.kinematics.iterations import newton
 from pkm_twin.kinematics.linkage import Linkage
 from pkm_twin.kinematics.motion import Motion, numbers
-from pkm_twin.kinematics.rounding import CHAIN, MAX_ROUNDING, Repair, repair_rounded
+from pkm_twin.kinematics.rounding import CHAIN, EXACT, MAX_ROUNDING, Repair, repair_rounded
 from pkm_twin.kinematics.scheme import choose_leads
 from pkm_twin.kinematics.singularity import singularity_at_home
 from pkm_twin.kinematics.spins import RANK, hold, null, without_spins
@@ -41,6 +41,8 @@ RANK_BOUNDS: Final = (1e-4, 1e-6, 1e-8)
 """Singular values below this part of the largest count as zero; the next one if loops stay open."""
 MAX_LOOP_GAP: Final = 1e-9
 """Largest gap of a closed loop, m or rad."""
+MAX_DRAWN_GAP: Final = 1e-3
+"""Largest gap of loops that are drawn closed but for the rounding of some numbers, of three digits: m or rad."""
 MIN_HOME_INDEX: Final = 1e-4
 """Smallest singularity index of a home."""
 MIN_ROUNDING: Final = 1e-6
@@ -228,22 +230,23 @@ class Assembly:
                 values, miss = other, less
         self.place(values)
         if miss > self.closed:
-            # Report the loop with the largest gap.
-            closure = max(
-                self.tree.closures, key=lambda one: max(abs(float(e.value)) for e in self._write_equations(one))
-            )
-            a, b = (self.frame(closure, end) for end in (0, 1))
-            apart = 1e3 * float(np.linalg.norm(b.position - a.position))
-            turned = float(np.linalg.norm(rotation_vector(b.rotation @ a.rotation.T)))
-            what = f"{apart:.3g} mm"
-            if closure.kind == "fixed":
-                what += f" and {turned:.3g} rad"
-            raise ParameterError(
-                closure.name,
-                f"open by {what} between {closure.inner} and {closure.outer}",
-                f"loops that close within {self.closed:g} (m or rad)",
-            )
+            raise self.open_loop()
         return values, miss
+
+    def open_loop(self) -> ParameterError:
+        """Return the error of the loop that is open farthest at the placed values."""
+        closure = max(self.tree.closures, key=lambda one: max(abs(float(e.value)) for e in self._write_equations(one)))
+        a, b = (self.frame(closure, end) for end in (0, 1))
+        apart = 1e3 * float(np.linalg.norm(b.position - a.position))
+        turned = float(np.linalg.norm(rotation_vector(b.rotation @ a.rotation.T)))
+        what = f"{apart:.3g} mm"
+        if closure.kind == "fixed":
+            what += f" and {turned:.3g} rad"
+        return ParameterError(
+            closure.name,
+            f"open by {what} between {closure.inner} and {closure.outer}",
+            f"loops that close within {self.closed:g} (m or rad)",
+        )
 
     def move_nearest_to_drawing(self, values: Array, held: Mask | bool = False) -> Array:
         """Return, and set, the values nearest to the drawing that the closed loops can reach.
@@ -396,6 +399,10 @@ class HomeSearch:
             good = [home for home in inside if home.index * 1.05 >= best]
             chosen = min(good, key=lambda home: float(np.linalg.norm(home.values / self.units)))
         if chosen is not None and chosen.index >= MIN_HOME_INDEX:
+            # A drawing that is open by the rounding of some numbers is not meant to be another assembly.
+            if drawn is None and self._drawn_gap <= MAX_DRAWN_GAP:
+                self.assembly.place(self.wanted)
+                raise self.assembly.open_loop()
             return chosen
         # Try growing distances from the wanted values; take the best conditioned assembly of the first that has one.
         rng = np.random.default_rng(1)
@@ -429,11 +436,12 @@ class HomeSearch:
         miss = self.assembly.measure_gap()
         if miss > max(MAX_LOOP_GAP, self.assembly.rounding):
             values, miss = self.assembly.close(values, self.held)
+        # As drawn if no passive joint moves by more than 0.1 rad or a tenth of the size.
+        far = float((np.abs(values) / self.units)[~self.held].max(initial=0.0))
+        self._drawn_gap = miss if far <= 0.1 else math.inf
         if miss > self.assembly.closed:
             return None
         self._known.append(self.assembly.places())
-        far = float((np.abs(values) / self.units)[~self.held].max(initial=0.0))
-        # As drawn if no passive joint moves by more than 0.1 rad or a tenth of the size.
         return self._make_home(values, miss, "drawn" if far <= 0.1 else "wanted")
 
     def _close_from(self, start: Array, how: str) -> Home | None:
@@ -485,24 +493,30 @@ class HomeSearch:
         :returns: the graph, the joints that hold spins, and the repair; None if the actuated joints
             do not determine the machine.
         """
-        rounding = max(self.assembly.tree.rounding, miss)
-        repaired = repair_rounded(graph, rounding, MIN_ROUNDING)
-        if repaired is None:
-            return None
-        if self._hinges is not None:
-            sound = hold(repaired.graph, list(self._hinges))
-            if _is_driven(sound):
-                return sound, self._hinges, repaired
-        sound, held = without_spins(repaired.graph)
-        if not _is_driven(sound):
-            return None
-        if all(sound.joints[name].kind == "fixed" for name in held):
-            self._hinges = held
-        return sound, held, repaired
+        # Numbers with fewer digits than most take freedoms, so that motors seem redundant.
+        own, found = self.assembly.tree.rounding, None
+        for rounding in (max(own, miss), *([MAX_ROUNDING] if own > EXACT else [])):
+            repaired = repair_rounded(graph, rounding, MIN_ROUNDING)
+            if repaired is None:
+                continue
+            held = self._hinges or {}
+            sound = hold(repaired.graph, list(held))
+            driven = self._hinges is not None and _count_driven(sound)
+            if not driven:
+                sound, held = without_spins(repaired.graph)
+                driven = _count_driven(sound)
+                if driven and all(sound.joints[name].kind == "fixed" for name in held):
+                    self._hinges = held
+            if driven and (found is None or driven == len(self.assembly.tree.actuated)):
+                found = sound, held, repaired
+                if driven == len(self.assembly.tree.actuated):
+                    break
+        return found
 
 
-def _is_driven(graph: Graph) -> bool:
-    """Return whether the actuated joints determine the machine at home, perhaps redundantly."""
+def _count_driven(graph: Graph) -> int:
+    """Count the freedoms at home if the actuated joints determine the machine, perhaps redundantly; else zero."""
     linkage = Linkage(graph)
     locked = null(linkage.scaled_at_home()[0], RANK, absolute=True)
-    return not locked.shape[1] and 0 < linkage.mobility.freedoms <= linkage.joints
+    freedoms = linkage.mobility.freedoms
+    return freedoms if not locked.shape[1] and 0 < freedoms <= linkage.joints else 0

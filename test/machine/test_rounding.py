@@ -18,7 +18,7 @@ from test.support.robots import load, partly_long
 from tools.pages.robots import GALLERY
 
 from .random_machines import MACHINES as OWN_MACHINES
-from .random_machines import plain
+from .random_machines import plain, variant
 
 pytestmark = [
     pytest.mark.usefixtures("quickly_compiled"),
@@ -162,6 +162,23 @@ def test_a_rounded_file_needs_the_efforts_of_the_exact_one(case, digits, how, tm
     for joint, wanted in expected.items():
         bound = AMPLIFIED * 10.0**-digits * largest
         np.testing.assert_allclose(found[joint], wanted, 0.0, bound)
+
+
+@pytest.mark.parametrize("seed", partly_long(range(6), 0))
+@pytest.mark.parametrize("case", partly_long([("five_bar", "xml"), ("hinged_platform", "sdf")], ("five_bar", "xml")))
+def test_a_file_of_which_some_lines_have_fewer_digits_stands_as_drawn(case, seed, tmp_path):
+    """A machine of other dimensions: each tenth line has four digits, the others eight."""
+    name, ending = case
+    text = WRITERS[ending](robot_of_data(variant(name, np.random.default_rng(seed)), name))
+    mixed = "\n".join(rounded(line, 8 if k % 10 else 4) for k, line in enumerate(text.split("\n")))
+    exact = read(tmp_path, text, ending)
+    try:
+        other = read(tmp_path, mixed, ending)
+    except ParameterError as error:
+        check_rejection(error)
+        assert case != ("five_bar", "xml"), error
+        return
+    np.testing.assert_allclose(other.graph.origin, exact.graph.origin, 0.0, 2e-4)
 
 
 @pytest.mark.parametrize("ending", partly_long(("urdf", "xml", "sdf"), "xml"))
