@@ -23,7 +23,7 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array, Indices, one_vector
 from pkm_twin.errors import MessageError, PkmTwinError, SingularityError, UnreachableError
-from pkm_twin.messages.reading import DeflectionSample, in_base_axes, read_deflection, shown
+from pkm_twin.messages.reading import DeflectionSample, quote_name, read_deflection, rotate_to_base
 from pkm_twin.messages.stamps import SECOND, StampRules
 from pkm_twin.robot.robot import Robot
 from pkm_twin.settings import setting
@@ -458,7 +458,7 @@ class StiffnessWatch(Core):
             sample = read_deflection(message, now, self.rules)
             if sample.frame not in self.frames:
                 told = " or ".join(map(repr, dict.fromkeys(self.frames)))
-                raise MessageError("frame", f"frame is {shown(sample.frame)}, expected {told}")
+                raise MessageError("frame", f"frame is {quote_name(sample.frame)}, expected {told}")
             check_order(sample.stamp, self._last)
         insort(self._waiting, sample, key=lambda waiting: waiting.stamp)
         self._pair_waiting()
@@ -520,7 +520,7 @@ class StiffnessWatch(Core):
         near = before if part < 0.5 else after
         values = sample.values
         if sample.frame != self.frames[0]:
-            values = in_base_axes(values, near.rotation)
+            values = rotate_to_base(values, near.rotation)
         try:
             self._alarm.push(sample.stamp / SECOND, near.pose, wrench, values)
         except (UnreachableError, SingularityError, ValueError) as error:

@@ -39,7 +39,7 @@ from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.drives import idle_samples
 from pkm_twin.streams.noise import estimate_deviation
 from pkm_twin.streams.rates import rms
-from pkm_twin.streams.steps import Steps, sampling_of
+from pkm_twin.streams.steps import Steps, find_sampling
 
 MAX_MISSING: Final = 0.01
 """Samples that may be missing, part of those that there should be."""
@@ -307,7 +307,7 @@ def missing_samples(time: Array) -> Fact:
 
     :param time: rising, shape (k,), k 2 or more, s.
     """
-    sampling, good, numbers = sampling_of(time), None, dict[str, Any]()
+    sampling, good, numbers = find_sampling(time), None, dict[str, Any]()
     text = "the samples have no common period"
     if sampling.missing is not None:
         share = sampling.missing / sampling.expected

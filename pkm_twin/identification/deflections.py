@@ -26,7 +26,7 @@ from pkm_twin.identification.identifiable import above_zero
 from pkm_twin.identification.judge import Case, Suspect, Verdict, judge
 from pkm_twin.identification.parameters import FITTED_RATIO, Group, Number, groups_of, number_of
 from pkm_twin.identification.rows import HELD_OUT
-from pkm_twin.messages.reading import in_base_axes
+from pkm_twin.messages.reading import rotate_to_base
 from pkm_twin.recordings import Recording
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor.response import ElementResponse, element_response
@@ -495,10 +495,10 @@ def _repairs(robot: Robot, r: _Part) -> Iterator[tuple[str, _Part]]:
     def moved(deflection: Array) -> _Part:
         return replace(r, deflection=deflection)
 
-    own, other = (in_base_axes(r.wrench, one) for one in (rotation, back))
+    own, other = (rotate_to_base(r.wrench, one) for one in (rotation, back))
     yield f"the wrench is in {platform} axes, not in {base}", loaded(own)
     yield f"the wrench is in {base}, not in {platform}", loaded(other)
-    own = in_base_axes(r.deflection, rotation)
+    own = rotate_to_base(r.deflection, rotation)
     yield f"the deflection is in {platform} axes, not in {base}", moved(own)
     for first, load, move in ((0, "forces", "shifts"), (3, "moments", "turns")):
         for i, j in combinations(range(3), 2):

@@ -31,7 +31,7 @@ from pkm_twin.identification.suspects import LINE
 from pkm_twin.machine.friction import BASIC, KNOWN_FRACTION, LAWS, Dahl, select_compiled_laws
 from pkm_twin.recordings import Recording
 from pkm_twin.robot.robot import Robot
-from pkm_twin.streams.steps import sampling_of
+from pkm_twin.streams.steps import find_sampling
 
 AUTO: Final = "auto"
 SPEEDS: Final = np.geomspace(0.01, 1.0, 17)
@@ -195,7 +195,7 @@ def fit_recordings(
     refuse_faults(faults, accept)
     notes = [f"accepted by --accept: {fault}" for fault in faults]
     for r in recordings:
-        if sampling_of(r.time).missing:
+        if find_sampling(r.time).missing:
             gaps = missing_samples(r.time)
             notes.append(f"{r.name}: {gaps.text} {gaps.value}, {gaps.bound}: {gaps.verdict}")
     found: list[Explanation] = []

@@ -29,7 +29,7 @@ from pkm_twin.identification.parameters import file_parameters
 from pkm_twin.identification.rows import LARGEST, Rows, rows_of
 from pkm_twin.identification.samples import Motion, held_payload
 from pkm_twin.identification.words import LATEST, UNITS, late_text, listed, position_text, scale_text, usual_scale
-from pkm_twin.messages.reading import in_base_axes
+from pkm_twin.messages.reading import rotate_to_base
 from pkm_twin.recordings import Load, Recording
 from pkm_twin.robot.robot import Robot
 
@@ -553,7 +553,7 @@ def wrenches(r: Recording, motion: Motion) -> Iterator[tuple[str, Array]]:
     rotation, axes = r.robot.rotation(r.robot.forward(motion.q)), "platform"
     if r.topics.turns:
         rotation, axes = rotation.swapaxes(-1, -2), "base"
-    yield f"the wrench has {axes} axes", in_base_axes(motion.wrench, rotation)
+    yield f"the wrench has {axes} axes", rotate_to_base(motion.wrench, rotation)
     text = "the wrench has the opposite sign: it is what the platform applies to its surroundings"
     yield text, -motion.wrench
     text = "without the wrench the efforts agree: it does not act on the platform"

@@ -75,7 +75,8 @@ class Along:
     def sentences(self) -> list[str]:
         """Worst sample of each case in words."""
         return [
-            ("" if len(self.cases) == 1 else f"{one['case']}: ") + f"{figures.sentence(one)}; at {one['time_s']:.4g} s"
+            ("" if len(self.cases) == 1 else f"{one['case']}: ")
+            + f"{figures.write_sentence(one)}; at {one['time_s']:.4g} s"
             for one in self.worst
         ]
 
@@ -104,7 +105,7 @@ class Along:
         blamed = np.unique(np.concatenate(indices)).tolist() if indices else []
         figure, ((*axes,),) = plots.columns(1, len(self.found))
         for ax, case, one, text in zip(axes, self.cases, self.found, self.sentences, strict=True):
-            scale, unit = figures.scale_of(float(np.nanmax(np.abs(one.value))), case.unit)
+            scale, unit = figures.choose_prefix(float(np.nanmax(np.abs(one.value))), case.unit)
             values = scale * one.value
             ax.plot(self.time, values, color="0.7", lw=1)
             for n, element in enumerate(blamed):

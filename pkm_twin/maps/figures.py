@@ -33,7 +33,7 @@ SCALE_QUANTILE: Final = 0.95
 """Quantile of the values that ends the colour scale if there are outliers."""
 
 
-def scale_of(greatest: float, unit: str) -> tuple[float, str]:
+def choose_prefix(greatest: float, unit: str) -> tuple[float, str]:
     """Return factor and prefixed unit that leave values up to ``greatest`` below 1000.
 
     Prefixes are used where they exist: kg has g and t; units that start with a power or an angle
@@ -49,13 +49,13 @@ def scale_of(greatest: float, unit: str) -> tuple[float, str]:
     return 10.0**-power, PREFIXES[power] + unit
 
 
-def shown(value: float, unit: str, digits: int = 4) -> str:
+def format_value(value: float, unit: str, digits: int = 4) -> str:
     """Format a value with its unit."""
-    scale, prefixed = scale_of(value, unit)
+    scale, prefixed = choose_prefix(value, unit)
     return f"{scale * value + 0.0:.{digits}g} {prefixed}".strip()
 
 
-def kind_of(data: Dataset) -> type[Kind]:
+def find_kind(data: Dataset) -> type[Kind]:
     """Return the kind of a stored map.
 
     :raises UnknownNameError: a kind that this version does not know.
@@ -66,7 +66,7 @@ def kind_of(data: Dataset) -> type[Kind]:
     return KINDS[name]
 
 
-def answers(data: Dataset) -> list[dict[str, Any]]:
+def list_answers(data: Dataset) -> list[dict[str, Any]]:
     """Return the worst of each case as plain data: case, value, unit, pose, direction, element."""
     names = [str(name) for name in data.coordinate.values]
     found = []
@@ -81,7 +81,7 @@ def answers(data: Dataset) -> list[dict[str, Any]]:
             "value": float(part.worst_value),
             "unit": str(part.case_unit.values),
             "pose": dict(zip(names, part.worst_pose.values.tolist(), strict=True)),
-            "pose_units": units_of(data),
+            "pose_units": list_units(data),
         }
         if "worst_bound" in data:
             answer["singularity"] = float(part.worst_singularity)
@@ -96,13 +96,13 @@ def answers(data: Dataset) -> list[dict[str, Any]]:
     return found
 
 
-def sentence(answer: dict[str, Any]) -> str:
+def write_sentence(answer: dict[str, Any]) -> str:
     """State the worst of a case: "softest: 32.8 µm/N along y at (0, -0.16, -0.35) m, arm III".
 
     The pose can be given to commands; it has enough digits to keep its singularity index.
     """
     pose = ", ".join(f"{_drop_noise(v, 5e-6):.6g}" for v in answer["pose"].values())
-    text = f"{answer['answer']}: {shown(answer['value'], answer['unit'])}"
+    text = f"{answer['answer']}: {format_value(answer['value'], answer['unit'])}"
     way = np.array(answer.get("direction", []))
     if len(way) and np.isfinite(way).all() and way.any():
         axis = int(np.abs(way).argmax())
@@ -123,17 +123,17 @@ def _drop_noise(value: float, least: float = MIN_SHOWN) -> float:
     return value if abs(value) >= least else 0.0
 
 
-def units_of(data: Dataset) -> dict[str, str]:
+def list_units(data: Dataset) -> dict[str, str]:
     """Return the units of the pose coordinates, by name."""
     return {str(k): str(u) for k, u in zip(data.coordinate.values, data.unit.values, strict=True)}
 
 
-def lines(data: Dataset) -> list[str]:
+def write_lines(data: Dataset) -> list[str]:
     """Return the answers of a map: a line per case, and the kind's facts on the workspace."""
-    found = answers(data)
+    found = list_answers(data)
     alone = len(found) == 1
-    texts = [("" if alone else f"{a['case']}: ") + sentence(a) for a in found]
-    kind = kind_of(data)
+    texts = [("" if alone else f"{a['case']}: ") + write_sentence(a) for a in found]
+    kind = find_kind(data)
     facts = kind.facts(data)
     return [*facts, *texts] if kind.facts_first else [*texts, *facts]
 
@@ -141,10 +141,10 @@ def lines(data: Dataset) -> list[str]:
 def title(data: Dataset, case: int) -> list[str]:
     """Return the lines of a case's title: question and answer."""
     name = str(data.case.values[case])
-    own = [sentence(a) for a in answers(data) if a["case"] == name]
+    own = [write_sentence(a) for a in list_answers(data) if a["case"] == name]
     label = "" if len(data.case) == 1 else f", {name.replace('-', ' ')}"
     head = f"{data.attrs['robot']}{label}: {data.attrs['question']}"
-    kind = kind_of(data)
+    kind = find_kind(data)
     facts = ["; ".join(kind.facts(data))] if kind.facts_first and case == 0 else []
     return [head, *facts, *own]
 
@@ -153,11 +153,11 @@ def draw(data: Dataset) -> dict[str, Figure]:
     """Draw all pictures of a stored map, by name: one per case, and those of its kind."""
     names = [str(name) for name in data.case.values]
     pictures = {n if len(names) > 1 else "": planes(data, k) for k, n in enumerate(names)}
-    return pictures | kind_of(data).figures(data)
+    return pictures | find_kind(data).figures(data)
 
 
-def limits(values: Array, worst: float) -> tuple[float, float]:
-    """Return the ends of a colour scale: from 0, or from least to most if these are close.
+def choose_colour_limits(values: Array, worst: float) -> tuple[float, float]:
+    """Choose the ends of a colour scale: 0 and the largest value, or both extremes if these are close.
 
     A few outliers above the others share the last colour.
     """
@@ -171,13 +171,13 @@ def limits(values: Array, worst: float) -> tuple[float, float]:
     return low, high if high > low else low + (abs(low) or 1.0)
 
 
-def plane_of(data: Dataset, case: int, plane: int) -> dict[str, Any]:
+def extract_plane(data: Dataset, case: int, plane: int) -> dict[str, Any]:
     """Return a plane for drawing: names, units and ticks of its sides, and values.
 
     ``star``: position of the worst pose; None if it is not in the plane. ``held``: the other
     coordinates.
     """
-    part, units = data.isel(case=case, plane=plane), units_of(data)
+    part, units = data.isel(case=case, plane=plane), list_units(data)
     names = tuple(n for n in (str(part.row_name.values), str(part.column_name.values)) if n)
     sides = [part.row_value.values, part.column_value.values]
     pose, through = part.worst_pose.values, part.through.values
@@ -208,14 +208,14 @@ def full_planes(data: Dataset, case: int) -> list[int]:
 
 def planes(data: Dataset, case: int) -> Figure:
     """Draw up to three planes of a case through its worst pose, with one colour scale."""
-    kind, part = kind_of(data), data.isel(case=case)
-    drawn = [plane_of(data, case, k) for k in sorted(full_planes(data, case)[:PANELS])]
+    kind, part = find_kind(data), data.isel(case=case)
+    drawn = [extract_plane(data, case, k) for k in sorted(full_planes(data, case)[:PANELS])]
     count, flat = len(drawn), len(drawn[0]["names"]) > 1
     worst = float(part.worst_value)
     values = np.concatenate([one["values"].ravel() for one in drawn])
-    low, high = limits(values, worst)
+    low, high = choose_colour_limits(values, worst)
     beyond = bool((np.append(values, worst) > high).any())
-    scale, unit = scale_of(max(abs(low), abs(high)), str(part.case_unit.values))
+    scale, unit = choose_prefix(max(abs(low), abs(high)), str(part.case_unit.values))
     label = textwrap.fill(f"{part.case_what.values} ({unit or 'dimensionless'})", 48)
     # Equal scales where all coordinates have one unit; a single panel fills the width.
     height, widths = 0.5 * plots.WIDTH, [1.0] * count
@@ -256,7 +256,7 @@ def planes(data: Dataset, case: int) -> Figure:
 
 
 def draw_panel(one: dict[str, Any], ax: Axes, scale: float, low: float, high: float, shares: Sequence[float]) -> Any:
-    """Draw a plane of :func:`plane_of`, with contours at quantiles of its values."""
+    """Draw a plane of :func:`extract_plane`, with contours at quantiles of its values."""
     x, y = one["ticks"]
     values = scale * one["values"].T
     mesh = ax.pcolormesh(

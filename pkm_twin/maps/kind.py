@@ -258,24 +258,24 @@ class Space:
         limits = self.robot.limits.position
         return limits if self.by_joints and limits is not None else self.bounds
 
-    def state(self, x: Array) -> tuple[Array, Array, Mask]:
+    def evaluate_point(self, x: Array) -> tuple[Array, Array, Mask]:
         """Return joint positions, poses, and which are known, for points (k, n) of the box."""
         if not self.by_joints:
-            return self.of_poses(x)
+            return self.evaluate_poses(x)
         pose, known = self.robot.try_forward(x)
         return x, np.where(known[:, None], pose, self.robot.home()), known
 
-    def of_poses(self, poses: Array) -> tuple[Array, Array, Mask]:
+    def evaluate_poses(self, poses: Array) -> tuple[Array, Array, Mask]:
         """Return joint positions, the poses (k, m), and which of them are known."""
         q, known = self.robot.try_inverse(poses)
         return np.where(known[:, None], q, self.robot.graph.home), poses, known
 
     def counts(self, q: Array, pose: Array, known: Mask, case: Case) -> Mask:
-        """Return which joint positions (k, n) and poses (k, m) count, of those known."""
+        """Return which known joint positions (k, n) and poses (k, m) belong to the workspace."""
         bound = -math.inf if case.interfering else self.least_clearance
-        return belong_to_workspace(self.robot, q, pose, known & self.encircled(pose), self.least, bound)
+        return belong_to_workspace(self.robot, q, pose, known & self.is_encircled(pose), self.least, bound)
 
-    def encircled(self, pose: Array) -> Mask:
+    def is_encircled(self, pose: Array) -> Mask:
         """Return which poses (k, m) are inside the circles, linear between their heights."""
         if self.circles is None:
             return np.ones(len(pose), bool)
@@ -286,8 +286,8 @@ class Space:
         # Comparisons with NaN, for a circle that is too small, are false.
         return np.asarray(radius >= grid.distance(pose))
 
-    def through(self, case: int) -> Array:
-        """Return the pose (m,) that the planes of a case go through."""
+    def planes_pose(self, case: int) -> Array:
+        """Return the pose (m,) in which the planes of a case intersect."""
         return self.worst[case].pose if self.at is None else self.at
 
 
@@ -295,19 +295,19 @@ def evaluate_kind(kind: Kind, robot: Robot, q: Array, cases: Sequence[Case]) -> 
     """Evaluate a kind's cases at joint positions (k, n); NaN in poses without a value."""
     ways = len(kind.axes(robot))
 
-    def without(k: int) -> Found:
+    def fill_absent(k: int) -> Found:
         shares = np.full((k, len(kind.elements(robot))), np.nan) if kind.has_shares else None
         return Found(np.full(k, np.nan), np.full((k, ways), np.nan), np.full(k, -1), shares)
 
     if not len(q):
-        return [without(0) for _ in cases]
+        return [fill_absent(0) for _ in cases]
     try:
         return kind.each(robot, q, cases)
     except ParameterError:
         raise
     except PkmTwinError:
         if len(q) == 1:
-            return [without(1) for _ in cases]
+            return [fill_absent(1) for _ in cases]
         halves = [evaluate_kind(kind, robot, part, cases) for part in np.array_split(q, 2)]
         return [concatenate_found(pair) for pair in zip(*halves, strict=True)]
 

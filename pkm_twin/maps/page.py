@@ -42,9 +42,9 @@ def write_page(data: Dataset, path: Path) -> Path:
     :raises MissingExtraError: plotly is not installed.
     """
     require("plotly", "maps")
-    kind = figures.kind_of(data)
+    kind = figures.find_kind(data)
     with reading(source(data)):
-        first, *rest = figures.lines(data)
+        first, *rest = figures.write_lines(data)
         drawn, more = page(data), kind.page(data)
     parts = [drawn, *([] if more is None else [more])]
     shown = [
@@ -68,7 +68,7 @@ def write_page(data: Dataset, path: Path) -> Path:
 
 def page(data: Dataset) -> Any:
     """Return a figure of all cases: layers for three coordinates, else planes."""
-    figure, buttons = _layers(data) if len(data.coordinate) == 3 else _planes(data)
+    figure, buttons = _draw_layers(data) if len(data.coordinate) == 3 else _draw_planes(data)
     figure.update_layout(
         coloraxis={"colorscale": "Viridis", "colorbar": BAR},
         updatemenus=[{"buttons": buttons, **MENU}],
@@ -86,8 +86,8 @@ def page(data: Dataset) -> Any:
 def _case_layout(data: Dataset, case: int, values: Array) -> tuple[float, str, dict[str, Any]]:
     """Return scale, unit, and layout of a case, with one colour scale that includes the worst."""
     part = data.isel(case=case)
-    low, high = figures.limits(values, float(part.worst_value))
-    scale, unit = figures.scale_of(max(abs(low), abs(high)), str(part.case_unit.values))
+    low, high = figures.choose_colour_limits(values, float(part.worst_value))
+    scale, unit = figures.choose_prefix(max(abs(low), abs(high)), str(part.case_unit.values))
     label = f"{part.case_what.values} ({unit})" if unit else str(part.case_what.values)
     label += ", brightest: or more" if (values > high).any() else ""
     layout = {
@@ -98,9 +98,9 @@ def _case_layout(data: Dataset, case: int, values: Array) -> tuple[float, str, d
     return scale, unit, layout
 
 
-def _layers(data: Dataset) -> tuple[Any, list[dict[str, Any]]]:
+def _draw_layers(data: Dataset) -> tuple[Any, list[dict[str, Any]]]:
     graph = require("plotly.graph_objects", "maps")
-    units = figures.units_of(data)
+    units = figures.list_units(data)
     dims = list(units)
     upwards = data.attrs["height"] or dims[2]
     flat = [name for name in dims if name != upwards]
@@ -132,7 +132,7 @@ def _layers(data: Dataset) -> tuple[Any, list[dict[str, Any]]]:
         pose = dict(zip(units, data.worst_pose.values[k].tolist(), strict=True))
         known = math.isfinite(float(data.worst_value[k]))
         star = [round_digits(np.array([pose[n]] * known)).tolist() for n in (*flat, upwards)]
-        worst = figures.shown(float(data.worst_value[k]), str(data.case_unit.values[k]))
+        worst = figures.format_value(float(data.worst_value[k]), str(data.case_unit.values[k]))
         change = {
             "intensity": [
                 *(round_digits(scale * v[s]) for v, s in zip(values[k], kept, strict=True)),
@@ -141,7 +141,7 @@ def _layers(data: Dataset) -> tuple[Any, list[dict[str, Any]]]:
             "hovertemplate": [*[said] * len(kept), f"{where}worst {worst}<extra></extra>"],
             **{axis: [*(t[axis] for t in figure.data[:-1]), place] for axis, place in zip("xyz", star, strict=True)},
         }
-        buttons.append(button(str(case), change, layout))
+        buttons.append(make_button(str(case), change, layout))
     # Ranges with a margin stay constant when traces are hidden.
     ends = [(float(np.nanmin(values)), float(np.nanmax(values))) for values in (x, y, heights)]
     ranges = [[low - 0.05 * (high - low), high + 0.05 * (high - low)] for low, high in ends]
@@ -174,13 +174,13 @@ def _layers(data: Dataset) -> tuple[Any, list[dict[str, Any]]]:
     return figure, buttons
 
 
-def _planes(data: Dataset) -> tuple[Any, list[dict[str, Any]]]:
+def _draw_planes(data: Dataset) -> tuple[Any, list[dict[str, Any]]]:
     graph = require("plotly.graph_objects", "maps")
     figure, buttons = graph.Figure(), []
     every = [(k, p) for k in range(len(data.case)) for p in figures.full_planes(data, k)]
     for k, p in every:
         scale, unit, layout = _case_layout(data, k, data.plane_value.isel(case=k).values)
-        one = figures.plane_of(data, k, p)
+        one = figures.extract_plane(data, k, p)
         what, (x, *y) = str(data.case_what.values[k]), one["names"]
         values, axes = scale * one["values"], [round_digits(ticks) for ticks in one["ticks"]]
         named = [f"{n} ({u})" for n, u in zip(one["names"], one["units"], strict=True)]
@@ -198,7 +198,7 @@ def _planes(data: Dataset) -> tuple[Any, list[dict[str, Any]]]:
         else:
             figure.add_scatter(x=axes[0], y=round_digits(values[:, 0]), hovertemplate=said)
         star = one["star"] if one["star"] and y else [None, None]
-        worst = figures.shown(float(data.worst_value[k]), str(data.case_unit.values[k]))
+        worst = figures.format_value(float(data.worst_value[k]), str(data.case_unit.values[k]))
         figure.add_scatter(
             x=star[:1],
             y=star[1:2],
@@ -215,10 +215,12 @@ def _planes(data: Dataset) -> tuple[Any, list[dict[str, Any]]]:
         trace.visible = seen
     figure.update_layout(margin={**MARGIN, "l": 70, "b": 60})
     shown = zip(buttons, visible, strict=True)
-    return figure, [button(text, {"visible": seen}, layout) for (text, layout), seen in shown]
+    return figure, [make_button(text, {"visible": seen}, layout) for (text, layout), seen in shown]
 
 
-def button(label: str, data: dict[str, Any], layout: dict[str, Any], traces: list[int] | None = None) -> dict[str, Any]:
+def make_button(
+    label: str, data: dict[str, Any], layout: dict[str, Any], traces: list[int] | None = None
+) -> dict[str, Any]:
     """Return a menu entry that changes data and layout."""
     args: list[Any] = [data, layout]
     return {"label": label, "method": "update", "args": args if traces is None else [*args, traces]}

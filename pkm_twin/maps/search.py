@@ -47,15 +47,15 @@ def find_worst(space: Space, case: Case, starts: Array, tell: Callable[[float], 
         low, high = low + 1e-9 * (high - low), high - 1e-9 * (high - low)
 
     def inside(x: Array) -> NDArray[np.bool_]:
-        return space.counts(*space.state(x), case)
+        return space.counts(*space.evaluate_point(x), case)
 
     def score(x: Array, what: Kind = kind) -> Array:
-        q = space.state(x)[0]
+        q = space.evaluate_point(x)[0]
         counted = inside(x)
         one = case if what is kind else what.cases(robot)[0]
         result = np.full(len(x), -np.inf)
         (found,) = evaluate_kind(what, robot, q[counted], [one])
-        result[counted] = badness(found.value, one.largest)
+        result[counted] = score_values(found.value, one.largest)
         return result
 
     def drawn(count: int) -> Array:
@@ -75,9 +75,9 @@ def find_worst(space: Space, case: Case, starts: Array, tell: Callable[[float], 
         more, other = evolve(score, edge, low, high, kind, rng, inside)
         x, best = (more, other) if other > best else (x, best)
     if not np.isfinite(best):
-        without = replace(space, least=0.0).counts(*space.state(tried), case)
+        without = replace(space, least=0.0).counts(*space.evaluate_point(tried), case)
         if without.any() and not inside(tried).any():
-            best = float(robot.try_singularity(space.state(tried)[0][without])[0].max())
+            best = float(robot.try_singularity(space.evaluate_point(tried)[0][without])[0].max())
             raise ParameterError(
                 "singularity",
                 space.least,
@@ -87,18 +87,18 @@ def find_worst(space: Space, case: Case, starts: Array, tell: Callable[[float], 
         why = (
             ""
             if inside(tried).any()
-            else describe_causes(robot, *space.state(tried), space.least, space.least_clearance)
+            else describe_causes(robot, *space.evaluate_point(tried), space.least, space.least_clearance)
         )
         bound = "a workspace in which some pose counts"
         raise ParameterError("robot", robot.name, f"{bound}: {why}" if why else bound)
-    q, pose, _ = space.state(x[None])
+    q, pose, _ = space.evaluate_point(x[None])
     found = evaluate_kind(kind, robot, q, [case])[0]
     # Poses near the worst show whether the bound on the singularity index excludes worse ones.
     near = rng.normal(size=(64, len(x))) * 10.0 ** rng.uniform(-4.0, -2.0, (64, 1))
-    state = space.state(np.clip(x + near * (high - low), low, high))
+    state = space.evaluate_point(np.clip(x + near * (high - low), low, high))
     below = replace(space, least=0.0).counts(*state, case) & ~space.counts(*state, case)
     (beyond,) = evaluate_kind(kind, robot, state[0][below], [case])
-    worse = badness(beyond.value, case.largest) > badness(found.value, case.largest)
+    worse = score_values(beyond.value, case.largest) > score_values(found.value, case.largest)
     index = float(robot.try_singularity(q)[0][0])
     return Worst(pose[0], q[0], found, index, bool(worse.any()))
 
@@ -121,7 +121,7 @@ def _edge_states(
     """
 
     def index_at(x: Array) -> Array:
-        return space.robot.try_singularity(space.state(x)[0])[0]
+        return space.robot.try_singularity(space.evaluate_point(x)[0])[0]
 
     x = tried[inside(tried)]
     index = index_at(x)
@@ -145,7 +145,7 @@ def _edge_states(
     return x[chosen]
 
 
-def badness(value: Array, largest: bool) -> Array:
+def score_values(value: Array, largest: bool) -> Array:
     """Return values whose largest is the worst; minus infinity where there is no value."""
     return np.where(np.isfinite(value), value if largest else -value, -np.inf)
 
@@ -207,7 +207,7 @@ def _pull_inside(x: Array, moved: Array, inside: Callable[[Array], NDArray[np.bo
     return np.asarray(x + share[:, None] * (moved - x))
 
 
-def workspace_box(robot: Robot) -> Array:
+def find_workspace_box(robot: Robot) -> Array:
     """Return bounds of all reachable poses, interference ignored, slightly wider; (m, 2).
 
     From poses of joint states all over the limits and, for few coordinates, from a grid of poses.

@@ -70,7 +70,7 @@ def find_spheres(space: Space, energy: float) -> dict[str, Variable]:
     lean = robot.platform(q[known])[1][:, 2, 2]
     if not np.allclose(lean, np.cos(tilt[known]), rtol=0.0, atol=1e-9):
         raise ParameterError("spheres", ",".join(robot.pose_names), "tilts about x and y (as prru)")
-    # Below, efforts grow without bound.
+    # Nearer to a singularity efforts grow without bound.
     known[known] = robot.try_singularity(q[known])[0] >= 1e-3
     # About 6 degrees apart.
     directions = sphere_directions(1000)
@@ -99,7 +99,7 @@ def find_spheres(space: Space, energy: float) -> dict[str, Variable]:
     }
 
 
-def questions(data: Dataset) -> dict[str, tuple[str, str]]:
+def list_questions(data: Dataset) -> dict[str, tuple[str, str]]:
     """Return the question and the scale's label of each index."""
     energy = json.loads(data.attrs["settings"])["options"]["energy"]
     unit = str(data.sphere_force.attrs["units"])
@@ -119,7 +119,7 @@ def questions(data: Dataset) -> dict[str, tuple[str, str]]:
 def state_ranges(data: Dataset) -> list[str]:
     """Return each index's smallest and largest value at the smallest and largest tilt."""
     lines = []
-    for index, (_, label) in questions(data).items():
+    for index, (_, label) in list_questions(data).items():
         values = data[f"sphere_{index}"].values
         drawn = [k for k in range(len(TILTS)) if np.isfinite(values[:, k]).any()]
         ranges = [
@@ -127,11 +127,11 @@ def state_ranges(data: Dataset) -> list[str]:
             f"{math.degrees(TILTS[k]):.0f} degrees"
             for k in (drawn[0], drawn[-1])
         ]
-        lines.append(f"spheres at {_height(data)}, {label}, {', '.join(ranges)}")
+        lines.append(f"spheres at {_read_height(data)}, {label}, {', '.join(ranges)}")
     return lines
 
 
-def _height(data: Dataset) -> str:
+def _read_height(data: Dataset) -> str:
     return f"{data.coordinate.values[0]} = {float(data.sphere_height):.4g} m"
 
 
@@ -160,7 +160,7 @@ def _triangles(ways: Array) -> NDArray[np.int64]:
     return corners
 
 
-def _axes() -> tuple[Array, Array]:
+def _picture_axes() -> tuple[Array, Array]:
     """Return the picture's right and up in pose rates."""
     right = np.cross([1.0, 0.0, 0.0], VIEW_DIRECTION)
     right /= np.linalg.norm(right)
@@ -169,19 +169,19 @@ def _axes() -> tuple[Array, Array]:
 
 def draw_spheres(data: Dataset) -> dict[str, Figure]:
     """Draw both indices on spheres at azimuth and tilt, each on one scale of colours."""
-    return {f"spheres_{index}": _draw(data, index) for index in questions(data)}
+    return {f"spheres_{index}": _draw_index(data, index) for index in list_questions(data)}
 
 
-def _draw(data: Dataset, index: str) -> Figure:
+def _draw_index(data: Dataset, index: str) -> Figure:
     from matplotlib.patches import Circle
 
     from pkm_twin.maps.figures import COLOUR_MAP
 
-    question, label = questions(data)[index]
+    question, label = list_questions(data)[index]
     values, inside = data[f"sphere_{index}"].values, data.sphere_inside.values
     low, high = float(np.nanmin(values)), float(np.nanquantile(values, 0.995))
     ways = data.way.values
-    right, up = _axes()
+    right, up = _picture_axes()
     flat = np.stack([ways @ right, ways @ up], -1)
     corners = _triangles(ways)
     front = corners[(ways @ VIEW_DIRECTION)[corners].max(-1) > 0.0]
@@ -240,7 +240,7 @@ def _draw(data: Dataset, index: str) -> Figure:
     # Draw in the lower left corner where the spheres' axes point.
     inset = ax.inset_axes((0.0, 0.0, 0.17, 0.17))
     for k, name in enumerate(data.axis.values):
-        tip = np.array([side[k] for side in _axes()])
+        tip = np.array([side[k] for side in _picture_axes()])
         arrow = {"arrowstyle": "->", "color": "black", "lw": 1.0}
         inset.annotate("", tuple(tip.tolist()), (0.0, 0.0), arrowprops=arrow)
         side = "center" if abs(tip[0]) < 0.3 else "left" if tip[0] > 0.0 else "right"
@@ -250,7 +250,7 @@ def _draw(data: Dataset, index: str) -> Figure:
     inset.set_axis_off()
     bar = figure.colorbar(mesh, ax=ax, aspect=32, pad=0.01, fraction=0.04, extend="max")
     bar.set_label(label)
-    plots.head(figure, f"{data.attrs['robot']}, {_height(data)}: {question}", 10)
+    plots.head(figure, f"{data.attrs['robot']}, {_read_height(data)}: {question}", 10)
     dashed = "; dashed rim: beyond the limits" if not inside.all() else ""
     figure.supxlabel(
         "a sphere is a pose: azimuth of the tilt around, tilt outwards; a point of it is a "
@@ -264,12 +264,12 @@ def _draw(data: Dataset, index: str) -> Figure:
 def make_page(data: Dataset) -> Any:
     """Return the spheres as a plotly figure to turn; a menu chooses the index."""
     graph = require("plotly.graph_objects", "maps")
-    from pkm_twin.maps.page import BAR, FLAT_LIGHT, MARGIN, MENU, button, round_digits
+    from pkm_twin.maps.page import BAR, FLAT_LIGHT, MARGIN, MENU, make_button, round_digits
 
     ways, places = data.way.values, _sphere_centres(data)
     corners = _triangles(ways)
     # In the scene's axes the viewer of the picture looks down.
-    scene = RADIUS * ways @ np.stack([*_axes(), VIEW_DIRECTION], -1)
+    scene = RADIUS * ways @ np.stack([*_picture_axes(), VIEW_DIRECTION], -1)
     vertices = np.concatenate([np.append(c, 0.0) + scene for _, _, c in places])
     every = np.concatenate([corners + k * len(ways) for k in range(len(places))])
     poses = np.degrees([(data.azimuth.values[a], data.tilt.values[t]) for a, t, _ in places])
@@ -286,14 +286,14 @@ def make_page(data: Dataset) -> Any:
         lighting=FLAT_LIGHT,
     )
     buttons = []
-    for index, (_, label) in questions(data).items():
+    for index, (_, label) in list_questions(data).items():
         values = data[f"sphere_{index}"].values
         low, high = float(np.nanmin(values)), float(np.nanquantile(values, 0.995))
         shown = np.concatenate([round_digits(values[a, t]) for a, t, _ in places])
         said = f"{where}{label.partition(':')[0]} %{{intensity:.4~g}}<extra></extra>"
         layout = {"coloraxis.cmin": low, "coloraxis.cmax": high, "coloraxis.colorbar.title.text": label}
         change = {"intensity": [shown.tolist()], "hovertemplate": [said]}
-        buttons.append(button(label.partition(":")[0], change, layout, [0]))
+        buttons.append(make_button(label.partition(":")[0], change, layout, [0]))
     first, layout = buttons[0]["args"][:2]
     figure.data[0].update({name: values[0] for name, values in first.items()})
     edge = float(data.tilt.values[-1]) + 2.0 * RADIUS

@@ -54,7 +54,7 @@ _OWN_NAMES: Final = re.compile(r"sweep\.json|lock|\d{8}\.npz|[\w.]+\.tmp")
 CHECKSUM_ATTRIBUTE: Final = {"checksum": "SHA-256 of all before, in the last 32 bytes"}
 """Attribute of a file that has its checksum at the end."""
 _SEAL_MARK: Final = b"\npkm_twin atlas SHA-256\n"
-_SEAL: Final = len(_SEAL_MARK) + hashlib.sha256().digest_size
+_SEAL_SIZE: Final = len(_SEAL_MARK) + hashlib.sha256().digest_size
 _SLAB_SIZE: Final = 1 << 22
 """Approximate number of values of a variable that are checked at once."""
 
@@ -351,7 +351,7 @@ def _convert_bounds(attrs: Mapping[str, Any], dtype: Any) -> dict[str, Any]:
 def _open_dataset(xarray: Any, path: Path) -> Dataset:
     """Open the data set of a file.
 
-    Objects that the library leaves after an error complain when they are deleted: here, silently.
+    After an error the library's objects raise when they are deleted, which is silenced here.
     """
     hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
     try:
@@ -388,7 +388,7 @@ def open_map(path: Path) -> Dataset:
             raise MapError(path, "no regular file")
         # Checked before HDF5 opens the file, because damage may crash the process there.
         with path.open("rb") as file:
-            size = max(0, file.seek(0, 2) - _SEAL)
+            size = max(0, file.seek(0, 2) - _SEAL_SIZE)
             file.seek(size)
             sealed, digest = file.read(len(_SEAL_MARK)) == _SEAL_MARK, file.read()
             if sealed and digest != _digest(file, size):
@@ -444,7 +444,7 @@ def find_invalid_number(data: Dataset) -> str:
         low, high = (
             float(variable.attrs.get(f"valid_{end}", bound)) for end, bound in (("min", -math.inf), ("max", math.inf))
         )
-        for values in _slabs(variable):
+        for values in _iterate_slabs(variable):
             if name in data.coords and np.isnan(values).any():
                 return f"{name} has the value nan"
             # The smallest and the largest number; NaN if there is none.
@@ -457,7 +457,7 @@ def find_invalid_number(data: Dataset) -> str:
     return ""
 
 
-def _slabs(variable: Any) -> Iterator[NDArray[Any]]:
+def _iterate_slabs(variable: Any) -> Iterator[NDArray[Any]]:
     """Yield all numbers of a variable, large ones in parts along the first two axes."""
     if variable.size <= _SLAB_SIZE or variable.ndim < 2:
         yield np.asarray(variable.values)

@@ -42,14 +42,14 @@ from pkm_twin.maps.kind import (
     name_labels,
     scalar,
 )
-from pkm_twin.maps.kinds.workspace import LAYERS, circle_variables, circles
-from pkm_twin.maps.search import GRID_SIDE, MAX_GRID_DIMENSIONS, badness, find_worst, workspace_box
+from pkm_twin.maps.kinds.workspace import LAYERS, find_circle_radii, make_circle_variables
+from pkm_twin.maps.search import GRID_SIDE, MAX_GRID_DIMENSIONS, find_workspace_box, find_worst, score_values
 from pkm_twin.robot.clearance import has_clearance, joint_clearance
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import MIN_TILT_RADIUS, distance_unit, satisfies_limits
 
 STARTS_PER_CHUNK: Final = 16
-"""Worst poses of a chunk that the search may start from."""
+"""Number of the worst poses of a chunk that the search may start from."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Chunk:
         return "" if self.plane is None else "plane_"
 
     def place(self, dims: Sequence[str]) -> tuple[Any, ...]:
-        """Return the index of its values in a field."""
+        """Return the index of the chunk's values in a field with dimensions ``dims``."""
         rows = slice(self.start, self.stop)
         if self.plane is None:
             return (rows,)
@@ -242,18 +242,18 @@ class Map(Space):
     def plane_ticks(self, plane: int, case: int) -> list[Array]:
         """Return the coordinates along a plane's sides, which include its pose."""
         sides = zip(self.planes[plane], self.extents[case][plane], strict=False)
-        return [_make_ticks(ends, self.through(case)[k], self.side) for k, ends in sides]
+        return [_make_ticks(ends, self.planes_pose(case)[k], self.side) for k, ends in sides]
 
     def _find_extent(self, plane: int, case: int) -> Array:
         """Return the ends of a plane's sides (2, 2), around its reachable part and its pose."""
-        shown, pose = list(self.planes[plane]), self.through(case)
+        shown, pose = list(self.planes[plane]), self.planes_pose(case)
         box = bounds = self.bounds[shown]
         least, most = np.minimum(bounds[:, 0], pose[shown]), np.maximum(bounds[:, 1], pose[shown])
         # Each time on a finer grid.
         for _ in range(3):
             ticks = [_make_ticks(ends, pose[k], GRID_SIDE) for k, ends in zip(shown, box, strict=True)]
             poses = self._plane_poses(plane, case, ticks)
-            q, _, known = self.of_poses(poses)
+            q, _, known = self.evaluate_poses(poses)
             reach = satisfies_limits(self.robot, q, poses, -math.inf, known)
             seen = np.concatenate([poses[reach], pose[None]])[:, shown]
             # More than a step, so that a tip between the poses appears on the next grid.
@@ -267,28 +267,28 @@ class Map(Space):
     def _plane_poses(self, plane: int, case: int, ticks: Sequence[Array]) -> Array:
         """Return the poses of a plane, shape (k, m)."""
         grid = np.meshgrid(*ticks, indexing="ij")
-        poses = np.broadcast_to(self.through(case), (*grid[0].shape, len(self.bounds))).copy()
+        poses = np.broadcast_to(self.planes_pose(case), (*grid[0].shape, len(self.bounds))).copy()
         for k, values in zip(self.planes[plane], grid, strict=True):
             poses[..., k] = values
         return poses.reshape(-1, len(self.bounds))
 
-    def _states(self, chunk: Chunk) -> tuple[Array, Array, Mask]:
+    def _evaluate_states(self, chunk: Chunk) -> tuple[Array, Array, Mask]:
         """Return joint positions, poses, and which are known, of a chunk."""
         rows = slice(chunk.start, chunk.stop)
         if chunk.plane is not None:
             case = chunk.case or 0
             first, *rest = self.plane_ticks(chunk.plane, case)
-            return self.of_poses(self._plane_poses(chunk.plane, case, [first[rows], *rest]))
+            return self.evaluate_poses(self._plane_poses(chunk.plane, case, [first[rows], *rest]))
         if self.ticks:
             grid = np.meshgrid(self.ticks[0][rows], *self.ticks[1:], indexing="ij")
-            return self.of_poses(np.stack(grid, -1).reshape(-1, len(self.bounds)))
+            return self.evaluate_poses(np.stack(grid, -1).reshape(-1, len(self.bounds)))
         rng = np.random.default_rng(chunk.start)
         low, high = self.box.T
-        return self.state(rng.uniform(low, high, (chunk.stop - chunk.start, len(low))))
+        return self.evaluate_point(rng.uniform(low, high, (chunk.stop - chunk.start, len(low))))
 
     def evaluate(self, chunk: Chunk) -> Values:
         """Evaluate the cases on a chunk; for the grid also worst poses and counts."""
-        states = self._states(chunk)
+        states = self._evaluate_states(chunk)
         parts = 1 + len(states[0]) // self.kind.chunk
         cases = self.cases if chunk.case is None else (self.cases[chunk.case],)
         batches = zip(*(np.array_split(array, parts) for array in states), strict=True)
@@ -305,7 +305,7 @@ class Map(Space):
             for column, number in enumerate(numbers):
                 worst = self.worst[number]
                 kept = (states[1] == worst.pose).all(-1)
-                _store(joined, column, kept, worst.found)
+                _store_values(joined, column, kept, worst.found)
                 joined["reach"][kept, column] = 1
             values = {chunk.before + name: array for name, array in joined.items()}
         fields = self.fields
@@ -318,7 +318,7 @@ class Map(Space):
     def _evaluate_batch(self, q: Array, pose: Array, known: Mask, cases: Sequence[Case]) -> Values:
         robot, count = self.robot, len(q)
         reach = satisfies_limits(robot, q, pose, -math.inf, known)
-        inside = reach & self.encircled(pose)
+        inside = reach & self.is_encircled(pose)
         inside[inside] = robot.try_singularity(q[inside])[0] >= self.least
         apart = inside.copy()
         if has_clearance(robot):
@@ -341,8 +341,8 @@ class Map(Space):
                 continue
             each = evaluate_kind(self.kind, robot, q[kept], [cases[k] for k in own])
             for k, found in zip(own, each, strict=True):
-                _store(values, k, kept, found)
-                best = np.argsort(-badness(found.value, cases[k].largest))[:STARTS_PER_CHUNK]
+                _store_values(values, k, kept, found)
+                best = np.argsort(-score_values(found.value, cases[k].largest))[:STARTS_PER_CHUNK]
                 values["starts"][0, k, : len(best)] = pose[kept][best]
         return values
 
@@ -387,7 +387,7 @@ class Map(Space):
         result |= {
             "through": Variable(
                 pose,
-                np.array([self.through(k) for k in range(len(self.cases))]),
+                np.array([self.planes_pose(k) for k in range(len(self.cases))]),
                 describe("pose that the planes go through, m and rad"),
             ),
             "worst_value": Variable(
@@ -415,11 +415,11 @@ class Map(Space):
             blame = np.array([-1 if (e := one.found.element) is None else e[0] for one in worst])
             result["worst_element"] = Variable(cases, blame, names)
         if self.circles is not None:
-            result |= circle_variables(self.robot, *self.circles)
+            result |= make_circle_variables(self.robot, *self.circles)
         return result | self.kind.summaries(self, counted, apart)
 
 
-def _store(values: Values, case: int, kept: Mask, found: Found) -> None:
+def _store_values(values: Values, case: int, kept: Mask, found: Found) -> None:
     """Store the values of the kept poses."""
     finite = np.isfinite(found.value)
     values["value"][kept, case] = np.where(finite, found.value, np.nan)
@@ -438,7 +438,7 @@ def _make_ticks(ends: Array, value: float, count: int) -> Array:
     return np.asarray(ticks, np.float64)
 
 
-def map_of(
+def plan_map(
     robot: Robot,
     kind: Kind,
     points: int | None = None,
@@ -477,7 +477,7 @@ def map_of(
         raise ParameterError("least_clearance", least_clearance, what)
     if at is not None:
         robot.inverse(at)
-    bounds = robot.cached(workspace_box)
+    bounds = robot.cached(find_workspace_box)
     count = len(bounds)
     stack = None
     if regular:
@@ -529,7 +529,7 @@ def find_circles(robot: Robot, bounds: Array, least: float, least_clearance: flo
         raise ParameterError("regular", robot.name, what)
     low, high = bounds[robot.pose_names.index(grid.height)].tolist()
     heights = np.linspace(low, high, LAYERS)
-    radius = circles(robot, heights, least=least, least_clearance=least_clearance)
+    radius = find_circle_radii(robot, heights, least=least, least_clearance=least_clearance)
     smallest = MIN_TILT_RADIUS if distance_unit(robot) == "rad" else 0.0
     kept = (radius >= smallest) & (radius > 0.0)
     if not kept.any():

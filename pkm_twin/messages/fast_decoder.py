@@ -27,8 +27,8 @@ ENCAPSULATION_BYTES: Final = 4
 STAMP_BYTES: Final = slice(4, 12)
 """Byte range of the stamp in a message that begins with a header."""
 LITTLE_ENDIAN: Final = b"\x00\x01"
-MAX_JOINT_STATE: Final = 2**18
-"""Most bytes of a joint state: far beyond all robots, and quickly decoded."""
+MAX_JOINT_STATE_BYTES: Final = 2**18
+"""Largest joint state, bytes: larger than that of every robot, and still quick to decode."""
 POINT_ARRAYS: Final = tuple(COLUMNS)
 TIME_INDEX: Final = len(POINT_ARRAYS)
 """Index of a point's time, which follows its arrays."""
@@ -105,8 +105,8 @@ class JointStateDecoder:
         return self._decode(data)
 
     def _decode(self, data: bytes) -> JointStateView:
-        if len(data) > MAX_JOINT_STATE:
-            raise MessageError("bounds", f"{len(data)} bytes, at most {MAX_JOINT_STATE}")
+        if len(data) > MAX_JOINT_STATE_BYTES:
+            raise MessageError("bounds", f"{len(data)} bytes, at most {MAX_JOINT_STATE_BYTES}")
         try:
             message = self._codec.decode(data)
         except BagError as error:
@@ -311,16 +311,16 @@ class _Points:
     def read(self, data: Any, array: int, kind: str, columns: int, *, of_length: bool = False) -> NDArray[Any]:
         """Read an array (or :data:`TIME_INDEX`) of all points, shape (points, columns)."""
         values = np.empty((self.points, columns), np.dtype(kind).newbyteorder("="))
-        for which, view in self._views(data, array, kind, columns, of_length):
+        for which, view in self._iterate_views(data, array, kind, columns, of_length):
             values[which] = view
         return values
 
     def write(self, data: bytearray, array: int, values: NDArray[Any], kind: str, *, of_length: bool = False) -> None:
         """Write an array of all points."""
-        for which, view in self._views(data, array, kind, values.shape[1], of_length):
+        for which, view in self._iterate_views(data, array, kind, values.shape[1], of_length):
             view[...] = values[which]
 
-    def _views(
+    def _iterate_views(
         self, data: Any, array: int, kind: str, columns: int, of_length: bool
     ) -> Iterator[tuple[slice, NDArray[Any]]]:
         for which, start, stride in self._groups:

@@ -27,7 +27,7 @@ from pkm_twin.robot.robot import Robot
 P = ParamSpec("P")
 R = TypeVar("R")
 
-TINY: Final = sys.float_info.min
+MIN_NORMAL: Final = sys.float_info.min
 """Smallest normal number: a smaller value that is not zero comes from damaged data."""
 
 MAX_RATE: Final = 1e4
@@ -48,7 +48,7 @@ COLUMNS: Final = {
     "accelerations": "acceleration",
     "effort": "effort",
 }
-"""Fields of a trajectory's points that are read, and the name of one of their values."""
+"""Fields of a trajectory's points that are read, and the singular of each name."""
 
 
 ExtraJoints = Literal["refuse", "zero"]
@@ -86,7 +86,7 @@ class EffortSample:
 
 @dataclass(frozen=True)
 class Ragged:
-    """The first point whose array has a wrong length, and this length."""
+    """The first point whose array has a wrong length, and that length."""
 
     point: int
     length: int
@@ -190,22 +190,22 @@ class JointReader:
 
         :raises MessageError: a joint is missing, or a value or the stamp is invalid.
         """
-        stamp, index, q = self._positions(message, now, rules)
+        stamp, index, q = self._read_positions(message, now, rules)
         count = len(message.name)
-        qd = self._take("velocity", message.velocity, count, index, self._velocity)
-        effort = self._take("effort", message.effort, count, index, self._effort)
+        qd = self._read_values("velocity", message.velocity, count, index, self._velocity)
+        effort = self._read_values("effort", message.effort, count, index, self._effort)
         return JointSample(stamp, q, qd, effort)
 
     def positions(self, message: Any, now: int, rules: StampRules) -> JointSample:
         """Read only the positions of a sensor_msgs/JointState; errors as of :meth:`joint_state`."""
-        stamp, _, q = self._positions(message, now, rules)
+        stamp, _, q = self._read_positions(message, now, rules)
         return JointSample(stamp, q, None, None)
 
-    def _positions(self, message: Any, now: int, rules: StampRules) -> tuple[int, list[int], Array]:
-        index = self._match(message.name)
+    def _read_positions(self, message: Any, now: int, rules: StampRules) -> tuple[int, list[int], Array]:
+        index = self._find_joints(message.name)
         count = len(message.name)
         stamp = rules.check(stamp_of(message.header), now)
-        q = self._take("position", message.position, count, index, self._position)
+        q = self._read_values("position", message.position, count, index, self._position)
         if q is None:
             what = "all positions are nan" if len(message.position) else "no positions"
             raise MessageError("empty", f"{what} for {count} names")
@@ -213,10 +213,10 @@ class JointReader:
 
     def efforts(self, message: Any, now: int, rules: StampRules) -> EffortSample:
         """Read only names and efforts of a sensor_msgs/JointState, a source of torques."""
-        index = self._match(message.name)
+        index = self._find_joints(message.name)
         stamp = rules.check(stamp_of(message.header), now)
         count = len(message.name)
-        effort = self._take("effort", message.effort, count, index, self._effort)
+        effort = self._read_values("effort", message.effort, count, index, self._effort)
         if effort is None:
             raise MessageError("empty", f"no efforts for {count} names")
         given = np.array([message.effort[i] for i in index], np.float64)
@@ -227,7 +227,7 @@ class JointReader:
         count = len(self._names)
         if len(values) != count:
             raise MessageError("length", f"{len(values)} efforts for {count} joints")
-        effort = self._take("effort", values, count, list(range(count)), self._effort)
+        effort = self._read_values("effort", values, count, list(range(count)), self._effort)
         if effort is None:
             raise MessageError("not finite", "all efforts are nan")
         return effort
@@ -272,17 +272,17 @@ class JointReader:
                 f"the trajectory ended {(now - end) / SECOND:.3f} s ago; a "
                 "replayed bag needs use_sim_time and a /clock",
             )
-        q = self._columns("positions", fields, index, self._position)
+        q = self._read_columns("positions", fields, index, self._position)
         if q is None:
             raise MessageError("empty", "the points carry no positions")
         return Trajectory(
             stamp,
             nanoseconds / SECOND,
             q,
-            self._columns("velocities", fields, index, self._velocity),
-            self._columns("accelerations", fields, index, self._acceleration),
+            self._read_columns("velocities", fields, index, self._velocity),
+            self._read_columns("accelerations", fields, index, self._acceleration),
             tuple(self._names.index(n) if n in self._names else -1 for n in names),
-            self._columns("effort", fields, index, self._effort) if self.with_effort else None,
+            self._read_columns("effort", fields, index, self._effort) if self.with_effort else None,
         )
 
     def check_shape(self, message: Any) -> None:
@@ -300,7 +300,7 @@ class JointReader:
                     raise MessageError("length" if count else "empty", text)
 
     def _match_points(self, names: tuple[str, ...], points: int) -> list[int]:
-        """Return where each of the robot's joints stands among a trajectory's names."""
+        """Return the index of each of the robot's joints among a trajectory's names."""
         if not names or not points:
             raise MessageError("empty", f"{len(names)} joint names and {points} points")
         if points > MAX_POINTS:
@@ -309,10 +309,10 @@ class JointReader:
         if unknown and self.extra_joints == "refuse":
             raise MessageError(
                 "unknown joint",
-                f"joint {shown(unknown[0])} is not one of {', '.join(self._names)}; "
+                f"joint {quote_name(unknown[0])} is not one of {', '.join(self._names)}; "
                 "set extra_joints to zero for joints that the model lacks",
             )
-        return self._match(names)
+        return self._find_joints(names)
 
     def check_derived(self, qd: Array, qdd: Array) -> None:
         """Check differentiated velocities and accelerations (..., n) as if measured."""
@@ -329,9 +329,9 @@ class JointReader:
                 worst = tuple(np.argwhere(~good)[0])
                 joint = int(worst[-1])
                 bounds = self._velocity if what == "velocity" else self._acceleration
-                raise self._refusal(f"differentiated {what}", joint, float(values[worst]), *bounds[joint])
+                raise self._make_bound_error(f"differentiated {what}", joint, float(values[worst]), *bounds[joint])
 
-    def _match(self, names: Sequence[str]) -> list[int]:
+    def _find_joints(self, names: Sequence[str]) -> list[int]:
         """Return the index of each of the robot's joints among the names."""
         # tuple() of a tuple makes no copy.
         key = tuple(names)
@@ -343,7 +343,7 @@ class JointReader:
         for joint in self._names:
             count = key.count(joint)
             if count == 0:
-                given = ", ".join(map(shown, key[:8])) + (", ..." if len(key) > 8 else "")
+                given = ", ".join(map(quote_name, key[:8])) + (", ..." if len(key) > 8 else "")
                 raise MessageError("missing joint", f"joint {joint!r} is missing; given: {given}")
             if count > 1:
                 raise MessageError("duplicated joint", f"joint {joint!r} occurs {count} times")
@@ -353,7 +353,7 @@ class JointReader:
             self._known[key] = index
         return index
 
-    def _take(
+    def _read_values(
         self, what: str, values: Sequence[float], count: int, index: list[int], bounds: Sequence[tuple[float, ...]]
     ) -> Array | None:
         if len(values) == 0:
@@ -364,13 +364,13 @@ class JointReader:
         if self._map is not None:
             picked = _TO_MODEL[what](self._map, np.array(picked)).tolist()
         for i, (value, (low, high)) in enumerate(zip(picked, bounds, strict=True)):
-            if not low <= value <= high or (-TINY < value < TINY and value != 0.0):
+            if not low <= value <= high or (-MIN_NORMAL < value < MIN_NORMAL and value != 0.0):
                 if all(map(math.isnan, picked)):
                     return None
-                raise self._refusal(what, i, value, low, high)
+                raise self._make_bound_error(what, i, value, low, high)
         return np.array(picked, np.float64)
 
-    def _columns(
+    def _read_columns(
         self, what: str, fields: TrajectoryFields, index: list[int], bounds: Sequence[tuple[float, ...]]
     ) -> Array | None:
         given = fields.columns[what]
@@ -384,16 +384,16 @@ class JointReader:
             values = _TO_MODEL[COLUMNS[what]](self._map, values)
         box = np.array(bounds)
         size = np.abs(values)
-        good = (values >= box[:, 0]) & (values <= box[:, 1]) & ((size >= TINY) | (size == 0.0))
+        good = (values >= box[:, 0]) & (values <= box[:, 1]) & ((size >= MIN_NORMAL) | (size == 0.0))
         if not good.all():
             row, column = np.argwhere(~good)[0]
             low, high = bounds[column]
             value = float(values[row, column])
-            error = self._refusal(COLUMNS[what], int(column), value, low, high)
+            error = self._make_bound_error(COLUMNS[what], int(column), value, low, high)
             raise MessageError(error.reason, f"point {row}: {error}")
         return np.ascontiguousarray(values)
 
-    def _refusal(self, what: str, joint: int, value: float, low: float, high: float) -> MessageError:
+    def _make_bound_error(self, what: str, joint: int, value: float, low: float, high: float) -> MessageError:
         # The sender knows the controller's names and units.
         name, quantity = self._names[joint], what.split()[-1]
         value, low, high = self.robot.controller.shown(joint, quantity, value, low, high)
@@ -405,7 +405,7 @@ class JointReader:
         return MessageError(reason, f"{what} of {name} is {value:g}, allowed {low:g} to {high:g}")
 
 
-def shown(name: str) -> str:
+def quote_name(name: str) -> str:
     """Quote a name from a message; cut it after MAX_SHOWN characters."""
     return repr(name if len(name) <= MAX_SHOWN else name[:MAX_SHOWN] + "...")
 
@@ -425,7 +425,7 @@ def as_message_error(call: Callable[P, R], *arguments: P.args, **options: P.kwar
         raise MessageError("non-finite result", str(error)) from error
 
 
-MAX_LOAD: Final = 1e7
+MAX_FORCE: Final = 1e7
 """Largest component of a force, N, or moment, N m: beyond all sensors."""
 
 
@@ -445,7 +445,7 @@ def _check_numbers(labels: Sequence[str], values: Sequence[float], bound: float)
             raise MessageError("not finite", f"{label} is {value}")
         if abs(value) > bound:
             raise MessageError("bounds", f"{label} is {value:g}, allowed up to {bound:g}")
-        if 0.0 < abs(value) < TINY:
+        if 0.0 < abs(value) < MIN_NORMAL:
             raise MessageError("bounds", f"{label} is {value:g}, a denormal number")
 
 
@@ -454,12 +454,12 @@ def read_wrench(message: Any, now: int, rules: StampRules, frame: str, accept_em
     given = message.header.frame_id
     if given != frame and not (given == "" and accept_empty):
         hint = "; set accept_empty_frame to allow it" if given == "" else ""
-        raise MessageError("frame", f"frame is {shown(given)}, expected {frame!r}{hint}")
+        raise MessageError("frame", f"frame is {quote_name(given)}, expected {frame!r}{hint}")
     stamp = rules.check(stamp_of(message.header), now)
     force, torque = message.wrench.force, message.wrench.torque
     values = [force.x, force.y, force.z, torque.x, torque.y, torque.z]
     labels = ("force.x", "force.y", "force.z", "torque.x", "torque.y", "torque.z")
-    _check_numbers(labels, values, MAX_LOAD)
+    _check_numbers(labels, values, MAX_FORCE)
     return WrenchSample(stamp, given or frame, np.array(values, np.float64))
 
 
@@ -481,7 +481,7 @@ def read_imu(message: Any, now: int, rules: StampRules, frame: str) -> ImuSample
     """
     given = message.header.frame_id
     if given != frame:
-        raise MessageError("frame", f"frame is {shown(given)}, expected {frame!r}")
+        raise MessageError("frame", f"frame is {quote_name(given)}, expected {frame!r}")
     stamp = rules.check(stamp_of(message.header), now)
     parts = []
     # Largest components, rad/s and m/s2: beyond all sensors.
@@ -495,9 +495,9 @@ def read_imu(message: Any, now: int, rules: StampRules, frame: str) -> ImuSample
     return ImuSample(stamp, *parts)
 
 
-MAX_SHIFT: Final = 0.1
-MAX_TURN: Final = 0.1
-"""Largest deflection, m and rad: larger ones are not small, or belong to another pose."""
+MAX_DEFLECTION_M: Final = 0.1
+MAX_DEFLECTION_RAD: Final = 0.1
+"""Largest deflection, m and rad; formulas for small deflections do not hold beyond."""
 
 
 class DeflectionSample(NamedTuple):
@@ -523,8 +523,8 @@ def read_deflection(message: Any, now: int, rules: StampRules) -> DeflectionSamp
     values = (move.x, move.y, move.z, turn.x, turn.y, turn.z, turn.w)
     _check_numbers(labels, values, math.inf)
     far = max(abs(value) for value in values[:3])
-    if far > MAX_SHIFT:
-        raise MessageError("bounds", f"translation is {far:g} m, allowed up to {MAX_SHIFT:g}")
+    if far > MAX_DEFLECTION_M:
+        raise MessageError("bounds", f"translation is {far:g} m, allowed up to {MAX_DEFLECTION_M:g}")
     length = math.hypot(*values[3:])
     if abs(length - 1.0) > 1e-3:
         raise MessageError("bounds", f"the rotation's length is {length:g}, not 1")
@@ -532,14 +532,14 @@ def read_deflection(message: Any, now: int, rules: StampRules) -> DeflectionSamp
     sign = math.copysign(1.0, turn.w)
     size = math.hypot(turn.x, turn.y, turn.z)
     angle = 2.0 * math.atan2(size, abs(turn.w))
-    if angle > MAX_TURN:
-        raise MessageError("bounds", f"rotation is {angle:g} rad, allowed up to {MAX_TURN:g}")
+    if angle > MAX_DEFLECTION_RAD:
+        raise MessageError("bounds", f"rotation is {angle:g} rad, allowed up to {MAX_DEFLECTION_RAD:g}")
     scale = sign * (2.0 if size < 1e-9 else angle / size)
     rotation = (scale * turn.x, scale * turn.y, scale * turn.z)
     return DeflectionSample(stamp, frame, np.array((*values[:3], *rotation), np.float64))
 
 
-def in_base_axes(values: Array, rotation: Array) -> Array:
+def rotate_to_base(values: Array, rotation: Array) -> Array:
     """Rotate deflections (..., 6) from platform axes to base axes by rotations (..., 3, 3)."""
     shift, turn = (rotation @ values[..., k : k + 3, None] for k in (0, 3))
     return np.asarray(np.concatenate([shift[..., 0], turn[..., 0]], -1), np.float64)

@@ -41,7 +41,7 @@ class StampRules:
             )
         if self.max_age is not None and stamp < now - self.max_age:
             age = now - stamp
-            # No queue holds a message for a minute.
+            # A message waits in a queue for much less than a minute.
             cause = (
                 "a replayed bag needs use_sim_time and a /clock"
                 if age > (60 * SECOND)

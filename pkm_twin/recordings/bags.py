@@ -23,9 +23,9 @@ from pkm_twin.messages.reading import (
     JointReader,
     JointSample,
     WrenchSample,
-    in_base_axes,
     read_deflection,
     read_wrench,
+    rotate_to_base,
 )
 from pkm_twin.messages.stamps import SECOND, StampRules
 from pkm_twin.recordings.origin import Origin, origin_columns, origin_facts
@@ -131,8 +131,8 @@ def read_bag(
             r.robot,
             (near - near[0]) / SECOND,
             q,
-            wrench=in_base_axes(wrench, rotation) if r.topics.turns else wrench,
-            deflection=np.where(fixed[:, None], values, in_base_axes(values, rotation)),
+            wrench=rotate_to_base(wrench, rotation) if r.topics.turns else wrench,
+            deflection=np.where(fixed[:, None], values, rotate_to_base(values, rotation)),
             source=r.source,
             notes=r.notes,
             start=int(near[0]),
@@ -146,7 +146,7 @@ def read_bag(
     at, wrench = _sort_wrenches(found.wrenches)
     wrench = wrench[_find_nearest(at, stamps)]
     if topics.turns:
-        wrench = in_base_axes(wrench, machine.rotation(machine.forward(r.q)))
+        wrench = rotate_to_base(wrench, machine.rotation(machine.forward(r.q)))
     return replace(r, wrench=wrench)
 
 

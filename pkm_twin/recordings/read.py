@@ -16,7 +16,7 @@ from pkm_twin.errors import FileError, ParameterError, UnknownNameError, one_lin
 from pkm_twin.machine.joint_map import JointMap
 from pkm_twin.machine.sections import DriveSpec
 from pkm_twin.mechanisms.catalogue import load
-from pkm_twin.messages.reading import MAX_EFFORT, MAX_LOAD, MAX_SHIFT, MAX_TURN, TINY
+from pkm_twin.messages.reading import MAX_DEFLECTION_M, MAX_DEFLECTION_RAD, MAX_EFFORT, MAX_FORCE, MIN_NORMAL
 from pkm_twin.recordings.bags import read_bag
 from pkm_twin.recordings.origin import Origin, states_origin
 from pkm_twin.recordings.payload import read_table_load
@@ -45,7 +45,11 @@ GRAVITY_TERM: Final = "effort_gravity"
 SAMPLES_PER_BLOCK: Final = 4096
 """Samples computed at a time, so that memory stays flat."""
 MAX_SIZES: Final = dict(
-    zip((*WRENCH, *DEFLECTION), np.repeat([MAX_LOAD, MAX_LOAD, MAX_SHIFT, MAX_TURN], 3).tolist(), strict=True)
+    zip(
+        (*WRENCH, *DEFLECTION),
+        np.repeat([MAX_FORCE, MAX_FORCE, MAX_DEFLECTION_M, MAX_DEFLECTION_RAD], 3).tolist(),
+        strict=True,
+    )
 )
 """Greatest values of a table's columns, as of messages: N, N m, m, rad."""
 MIN_STEP: Final = 1e-9
@@ -201,10 +205,12 @@ def _read_table_recording(path: Path, name: str | Robot | None, how: ReadOptions
     # As in messages, reject impossible numbers and numbers below every sensor's resolution.
     for name, bound in (MAX_SIZES | dict.fromkeys(efforts, MAX_EFFORT)).items():
         sizes = np.abs(table.get(name, np.zeros(1)))
-        bad = np.flatnonzero((sizes > bound) | ((sizes < TINY) & (sizes > 0.0)))
+        bad = np.flatnonzero((sizes > bound) | ((sizes < MIN_NORMAL) & (sizes > 0.0)))
         if len(bad):
             raise ParameterError(
-                f"{table.line(bad[0])}: {name}", float(table[name][bad[0]]), f"0, or {TINY:g} to {bound:g} in size"
+                f"{table.line(bad[0])}: {name}",
+                float(table[name][bad[0]]),
+                f"0, or {MIN_NORMAL:g} to {bound:g} in size",
             )
     held = how.load or read_table_load(robot, table, time)
     return Recording(

@@ -24,7 +24,7 @@ from pkm_twin.streams.differentiator import Differentiator
 from pkm_twin.streams.noise import SIGMAS, estimate_noise
 from pkm_twin.streams.rates import MAX_ACCELERATION_ERROR, MAX_RATE, STANDSTILL_FRACTION, rate_faults
 from pkm_twin.streams.rest import gradient_gain, velocity_error_bound
-from pkm_twin.streams.steps import MAX_GAP_PERIODS, Steps, find_play, repeats_of, steps_of
+from pkm_twin.streams.steps import MAX_GAP_PERIODS, Steps, find_play, find_repeats, steps_of
 from pkm_twin.streams.wrench import WrenchSettings
 
 MODEL_VALUES_NOTE: Final = "tables use the model's joint values; joint_map applies to messages and bags only"
@@ -260,7 +260,7 @@ class Recording:
     @property
     def without_repeats(self) -> Recording:
         """Without the samples that repeat the one before while a joint moves: they are missing."""
-        again = repeats_of(self.time, self.q)
+        again = find_repeats(self.time, self.q)
         if not again.any():
             return self
         text = f"{again.sum()} of {len(again)} samples repeat the one before: left out"

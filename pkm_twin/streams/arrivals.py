@@ -54,7 +54,7 @@ class Arrivals:
         :param number: sequence number, and ``sent``: time of sending, ns, by the middleware.
         """
         if self.count:
-            self._silence(steady - self.last)
+            self._count_silence(steady - self.last)
         else:
             self.first = steady
         self.count += 1
@@ -86,9 +86,9 @@ class Arrivals:
     def ended(self, steady: int) -> None:
         """End the count; the silence until ``steady``, ns, counts, too."""
         if self.count:
-            self._silence(steady - self.last)
+            self._count_silence(steady - self.last)
             self.last = steady
 
-    def _silence(self, silent: int) -> None:
+    def _count_silence(self, silent: int) -> None:
         self.longest_silence = max(self.longest_silence, silent)
         self.silences += silent > self.deadline * SECOND

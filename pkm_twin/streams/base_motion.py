@@ -19,7 +19,7 @@ from pkm_twin.streams.monitor import Core, StreamMonitor, counting
 from pkm_twin.streams.wrench import ZERO, Mount, TimeCache, Triple, check_mount, check_order
 
 AVERAGING_TIME: Final = 1.0
-"""Time constant of the mean acceleration, s: a base that stays in place has gravity alone in it."""
+"""Time constant of the mean acceleration, s; the mean of a base that stays in place is gravity."""
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,7 @@ class Continuity:
         n, m = len(robot.joint_names), len(self._scales)
         self._state_size = n + m + m * m
         self._nothing = np.zeros(self._state_size + m + 1)
-        self._call = robot.function(_stream, self._scales)
+        self._call = robot.function(_make_stream_program, self._scales)
         self.reset()
 
     def reset(self) -> None:
@@ -100,5 +100,5 @@ class Continuity:
         return bool(measure < self.warn)
 
 
-def _stream(robot: Robot) -> Kernel:
+def _make_stream_program(robot: Robot) -> Kernel:
     return stream_kernel(robot.engine)

@@ -119,7 +119,7 @@ class Differentiator:
         :param frequency: of the sine, Hz.
         """
         turns = 2.0 * np.pi * frequency * self.period
-        derivative, back, weights = self._weights()
+        derivative, back, weights = self._fit_weights()
         return float(abs(weights @ np.exp(1j * turns * back) / (1j * turns) ** derivative - 1.0))
 
     def noise_gain(self) -> float:
@@ -127,21 +127,21 @@ class Differentiator:
 
         In 1/s^2 for positions, in 1/s for velocities, at the stream's period.
         """
-        derivative, _, weights = self._weights()
+        derivative, _, weights = self._fit_weights()
         return float(np.linalg.norm(weights)) / self.period**derivative
 
     def slope_gain(self) -> float:
-        """Return the noise of velocities from positions, relative to theirs, times the period."""
+        """Return the noise of velocities over that of the positions, times the period."""
         at = self.window // 2 if self.middle else self.window - 1
         return float(np.linalg.norm(fit_weights(np.arange(float(self.window)), self.order + 1, 1, at)))
 
-    def _weights(self) -> tuple[int, Array, Array]:
+    def _fit_weights(self) -> tuple[int, Array, Array]:
         """Return the order of derivative, the samples' times in periods, and their weights."""
         back: Array = np.arange(1.0 - self.window, 1.0)
         derivative = 1 if self._carries_velocity else 2
         return derivative, back, fit_weights(back, self.degree, derivative, 0.0)
 
-    def _apart(self, stamp: int) -> bool:
+    def _is_gap(self, stamp: int) -> bool:
         """Return whether the stream was silent for too long to fit one polynomial."""
         if self._count < MIN_SAMPLES:
             return False
@@ -168,7 +168,7 @@ class Differentiator:
         carries = qd is not None
         values = q if qd is None else qd
         n = len(values)
-        if self._apart(stamp):
+        if self._is_gap(stamp):
             self.reset()
         if self._fit is None or carries is not self._carries_velocity or n != self._fit.joints:
             self.reset()
@@ -241,7 +241,7 @@ class _Fit:
         first = end - BLOCK_SAMPLES
         inputs = sums, stamps[first:end], values[first * n : end * n], weights, place
         result: Array = self._call(*inputs)
-        # Even stamps give pivots of 1e-4 or more.
+        # The pivots are 1e-4 or more for evenly spaced stamps.
         if not min(result[2 * n :].tolist()) > 1e-8:
             raise MessageError("uneven stamps", "the stamps of the window are too uneven to differentiate")
         return result[:n], result[n : 2 * n]

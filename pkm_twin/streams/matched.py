@@ -54,7 +54,7 @@ def window_weights(stamps: Array, order: int, carries_velocity: bool) -> Array:
 
 @dataclass(slots=True)
 class _Row:
-    """One joint state of the window; ``since``: stamp of its wrench, ns, -1 without one."""
+    """One joint state of the window; ``since``: stamp of the assigned wrench, ns, -1 without one."""
 
     stamp: int
     rotation: Array
@@ -130,7 +130,7 @@ class WrenchWindow(Core):
 
         :raises MessageError: there is no recent wrench, and the policy is to stop.
         """
-        found = self._recent.held(stamp)
+        found = self._recent.find_before(stamp)
         age = None if found is None else abs(stamp - found[0])
         if found is not None and age is not None and age <= self.max_age:
             return found[1]

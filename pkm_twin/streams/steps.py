@@ -32,7 +32,7 @@ MIN_JUMPING_FRACTION: Final = 0.02
 MIN_PUBLISHER_FRACTION: Final = 0.05
 """Smallest fraction of the samples that a publisher sends."""
 LOOKBACK_SAMPLES: Final = 10
-"""One of this number of samples before is from the same publisher."""
+"""Among this number of earlier samples one is from the same publisher."""
 MOTION_QUANTILE: Final = 0.85
 """The velocity of the motion is this quantile over the samples; higher ones may be jumps."""
 ALTERNATING_BLOCK: Final = 16
@@ -127,7 +127,7 @@ def steps_of(time: Array, q: Array, qd: Array | None, limit: Sequence[float] | A
     return Steps(jumps, sizes, publishers)
 
 
-def repeats_of(time: Array, q: Array) -> Mask:
+def find_repeats(time: Array, q: Array) -> Mask:
     """Find samples that repeat the sample before although a joint is moving, shape (k,).
 
     Such samples differ from the cubic through two samples on each side, as the encoder was not read
@@ -258,7 +258,7 @@ def _count_publisher_samples(q: Array, slack: Array) -> tuple[int, ...]:
         counts[nearest] += 1
     if len(counts) < 2 or min(counts) < MIN_PUBLISHER_FRACTION * len(rows) or jumps > MIN_JUMPING_FRACTION * len(rows):
         return ()
-    # Few changes between the tracks mean a single publisher with an offset for some time.
+    # A single publisher with a temporary offset changes rarely between the tracks.
     if turns < min(counts) / LOOKBACK_SAMPLES:
         return ()
     return tuple(counts)
@@ -276,7 +276,7 @@ class Sampling:
     missing: int | None
 
 
-def sampling_of(time: Array) -> Sampling:
+def find_sampling(time: Array) -> Sampling:
     """Find the period of the samples and count missing samples.
 
     :param time: rising, shape (k,), s.

@@ -199,7 +199,7 @@ class TimeCache(Generic[V]):
             best = item
         return best
 
-    def held(self, stamp: int) -> tuple[int, V] | None:
+    def find_before(self, stamp: int) -> tuple[int, V] | None:
         """Return the newest value that is not later, else the oldest; None if there is none."""
         for item in reversed(self.items):
             if item[0] <= stamp:

@@ -278,11 +278,11 @@ class Model:
         """
         from pkm_twin.maps.kinds.compliance import Compliance
         from pkm_twin.maps.search import find_worst
-        from pkm_twin.maps.sweep import map_of
+        from pkm_twin.maps.sweep import plan_map
 
         robot, kind = self.robot, Compliance()
         cases = [kind.loaded(robot, "load", wrench.tolist())] if wrench.any() else ()
-        space = map_of(robot, kind, cases=cases)
+        space = plan_map(robot, kind, cases=cases)
         worst = find_worst(space, space.cases[0], self.start.pose[None], tell)
         what = "largest deflection {:.4g} µm" if cases else "softest: {:.4g} µm/N"
         direction = np.zeros(3) if worst.found.direction is None else worst.found.direction

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.optimize import lsq_linear
 
-from pkm_twin.maps.search import workspace_box
+from pkm_twin.maps.search import find_workspace_box
 from pkm_twin.robot.clearance import (
     clearance,
     distance,
@@ -141,7 +141,7 @@ def test_members_are_those_of_the_frame(name, sections, variant, rng):
 
 def box(robot, count=25):
     """Poses around all that a robot reaches, shape (..., m)."""
-    ticks = [np.linspace(low, high, count) for low, high in robot.cached(workspace_box)]
+    ticks = [np.linspace(low, high, count) for low, high in robot.cached(find_workspace_box)]
     return np.stack(np.meshgrid(*ticks, indexing="ij"), -1)
 
 

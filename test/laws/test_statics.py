@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pkm_twin.errors import ParameterError, SingularityError
-from pkm_twin.maps.search import workspace_box
+from pkm_twin.maps.search import find_workspace_box
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.robot.clearance import clearance, has_clearance
 from pkm_twin.robot.workspace import reachable
@@ -140,7 +140,7 @@ def test_without_members_nothing_is_known_of_them_and_all_else_holds(name, rng):
             ask()
         assert caught.value.field == "members"
     assert robot.beams == () and not has_clearance(robot)
-    low, high = np.transpose(workspace_box(robot))
+    low, high = np.transpose(find_workspace_box(robot))
     poses = rng.uniform(low, high, (1000, len(low)))
     expected = reachable(load(name), poses, -math.inf)
     assert 0 < expected.sum() < 1000

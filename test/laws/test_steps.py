@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from pkm_twin.streams.steps import repeats_of, sampling_of, steps_of
+from pkm_twin.streams.steps import find_repeats, find_sampling, steps_of
 
 LIMIT = (20.0, 20.0, 20.0)
 
@@ -43,7 +43,7 @@ def test_no_motion_jumps(rng, rate, measured):
         for case, (t, x, v) in enumerate(cases):
             found = steps_of(t, x, v if measured else None, LIMIT)
             assert not found.jumps.any() and found.publishers == (), case
-            assert not repeats_of(t, x).any(), case
+            assert not find_repeats(t, x).any(), case
 
 
 @pytest.mark.parametrize("part", [0.005, 0.1, 0.5])
@@ -57,7 +57,7 @@ def test_samples_that_repeat_the_one_before_are_found(rng, part, noise):
         stale[2:-2] = rng.random(len(time) - 4) < part
         stale &= ~(np.roll(stale, 1) & np.roll(stale, 2) & np.roll(stale, 3))
         source = np.maximum.accumulate(np.where(stale, 0, np.arange(len(time))))
-        found = repeats_of(time, q[source])
+        found = find_repeats(time, q[source])
         assert not found[~stale].any()
         fast = np.abs(qd).max(1) > 1.0
         assert found[stale & fast].mean() > 0.98
@@ -132,11 +132,11 @@ def test_missing_samples_are_counted(rng, lost):
     for rate in (50.0, 333.3, 1000.0):
         time = np.arange(3000) / rate + rng.normal(0.0, 0.02 / rate, 3000)
         kept = time[(rng.random(3000) >= lost) | (np.arange(3000) % 2999 == 0)]
-        found = sampling_of(kept)
+        found = find_sampling(kept)
         assert found.expected == pytest.approx(3000, abs=3 + 0.002 * 3000 * (lost > 0.0))
         assert found.missing == found.expected - len(kept)
         assert found.period == pytest.approx(1.0 / rate, rel=2e-3)
 
 
 def test_samples_without_a_period_are_not_counted(rng):
-    assert sampling_of(np.cumsum(rng.exponential(0.01, 500))).missing is None
+    assert find_sampling(np.cumsum(rng.exponential(0.01, 500))).missing is None

@@ -16,7 +16,7 @@ from pkm_twin.maps.kinds.frequency import Frequency
 from pkm_twin.maps.kinds.strain_energy import StrainEnergy
 from pkm_twin.maps.run import run
 from pkm_twin.maps.store import open_map
-from pkm_twin.maps.sweep import map_of
+from pkm_twin.maps.sweep import plan_map
 from test.support.robots import load
 
 
@@ -67,7 +67,7 @@ def chunks(monkeypatch):
 
 def few(points=2000):
     """A map under a force upwards."""
-    return map_of(load("five_bar"), StrainEnergy(), points)
+    return plan_map(load("five_bar"), StrainEnergy(), points)
 
 
 class Maps:
@@ -93,7 +93,7 @@ class Maps:
             kind, robot = name.split()
             with pytest.MonkeyPatch.context() as patch:
                 shorten(patch)
-                sweep = map_of(load(robot), KINDS[kind](), POINTS.get(kind, 3000))
+                sweep = plan_map(load(robot), KINDS[kind](), POINTS.get(kind, 3000))
                 kept.write_bytes(pickle.dumps(sweep))
                 return sweep, run(sweep, path, workers=1)
 

@@ -15,7 +15,7 @@ import psutil
 
 from pkm_twin import load
 from pkm_twin.maps.kinds import KINDS
-from pkm_twin.maps.sweep import map_of
+from pkm_twin.maps.sweep import plan_map
 from test.support.pages import write_section
 
 MEASURED = (
@@ -33,7 +33,7 @@ SECONDS = 4.0
 
 def rate(kind: str, robot: str, points: int) -> float:
     """Samples a second of processor time, of chunks alone, kernels compiled before."""
-    sweep = map_of(load(robot), KINDS[kind](), points)
+    sweep = plan_map(load(robot), KINDS[kind](), points)
     chunks = [chunk for chunk in sweep.chunks() if chunk.plane is None]
     sweep.evaluate(chunks[0])
     done, begin = 0, time.process_time()

@@ -14,9 +14,9 @@ from pkm_twin.maps import figures
 from pkm_twin.maps.kinds.workspace import Workspace
 from pkm_twin.maps.page import write_page
 from pkm_twin.maps.run import run
-from pkm_twin.maps.search import workspace_box
+from pkm_twin.maps.search import find_workspace_box
 from pkm_twin.maps.store import open_map
-from pkm_twin.maps.sweep import map_of
+from pkm_twin.maps.sweep import plan_map
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.robot.workspace import reachable, singularity_of_pose, try_forward
 from test.support.robots import SHIPPED, load, often, partly_long
@@ -37,7 +37,7 @@ def reached(robot, rng, count):
 def test_the_default_map_holds_all_that_is_reachable(name, count, rng):
     robot = load(name)
     poses = reached(robot, rng, count)
-    bounds = workspace_box(robot)
+    bounds = find_workspace_box(robot)
     assert len(bounds) == len(robot.pose_names)
     for k, (low, high) in enumerate(bounds):
         assert low <= poses[:, k].min()
@@ -60,7 +60,7 @@ def test_the_volume_is_that_of_random_poses(name, count, rng, tmp_path):
     robot = load(name)
     low, high = robot.search_box().T
     share = reachable(robot, rng.uniform(low, high, (count, len(low)))).mean()
-    sweep = map_of(robot, Workspace(), 14_000)
+    sweep = plan_map(robot, Workspace(), 14_000)
     with open_map(run(sweep, tmp_path / "a.nc", workers=1)) as data:
         expected = share * np.prod(high - low)
         assert float(data.volume) == pytest.approx(expected, rel=0.06)
@@ -73,7 +73,7 @@ def test_of_one_coordinate_the_map_tells_its_range(tmp_path):
     arm = {"mass": 1.0, "com": [0.2, 0, 0], "inertia": [0.01, 0.01, 0.01]}
     data = {"mechanism": "machine", "platform": "arm", "origin": [0.4, 0, 0], "pose": ["pitch"], "bodies": {"arm": arm}}
     data["joints"] = {"hub": joint | {"limits": {"position": [-0.5, 0.7]}}}
-    sweep = map_of(robot_of_data(data, "arm"), Workspace(), 2000)
+    sweep = plan_map(robot_of_data(data, "arm"), Workspace(), 2000)
     with open_map(run(sweep, tmp_path / "a.nc", workers=1)) as found:
         assert float(found.volume) == pytest.approx(1.2, rel=0.01)
         assert "range of the reachable pitch" in Workspace.facts(found)[0]
@@ -102,7 +102,7 @@ def test_planes_of_every_number_of_coordinates(name, tmp_path, monkeypatch):
     monkeypatch.setattr("pkm_twin.maps.sweep.GRID_SIDE", 21)
     robot = load(name)
     size = len(robot.pose_names)
-    with open_map(run(map_of(robot, Workspace(), 3000), tmp_path / "a.nc", workers=1)) as data:
+    with open_map(run(plan_map(robot, Workspace(), 3000), tmp_path / "a.nc", workers=1)) as data:
         data.load()
         assert "circle" not in data
         assert data.sizes["plane"] == max(1, size * (size - 1) // 2)
@@ -138,4 +138,4 @@ def test_a_workspace_without_end_is_refused(name, key):
     robot = load(name)
     endless = replace(robot, limits=replace(robot.limits, **{key: None}))
     with pytest.raises(ParameterError, match=rf"limits\.{key}"):
-        map_of(endless, Workspace())
+        plan_map(endless, Workspace())

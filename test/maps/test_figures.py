@@ -14,7 +14,7 @@ import pytest
 from pkm_twin.errors import UnknownNameError
 from pkm_twin.maps import figures
 from pkm_twin.maps.kinds import KINDS, modes
-from pkm_twin.maps.kinds.modes import deformed, grounded, structure_edges
+from pkm_twin.maps.kinds.modes import deform_nodes, find_ground_nodes, structure_edges
 from pkm_twin.maps.page import write_page
 from pkm_twin.maps.store import open_map
 from pkm_twin.report import plots
@@ -49,7 +49,7 @@ def stored(request, small_maps):
 def test_a_picture_answers_and_the_star_has_its_cells_colour(stored):
     from matplotlib import pyplot
 
-    told = {one["case"]: one for one in figures.answers(stored)}
+    told = {one["case"]: one for one in figures.list_answers(stored)}
     drawn = figures.draw(stored)
     for name in map(str, stored.case.values):
         figure = drawn[name if len(stored.case) > 1 else ""]
@@ -62,7 +62,7 @@ def test_a_picture_answers_and_the_star_has_its_cells_colour(stored):
         assert min(sizes) * 900 / plots.WIDTH / 72 >= 10.6
         if name not in told:
             continue
-        assert figures.sentence(told[name]).split(",")[0] in figure.get_suptitle()
+        assert figures.write_sentence(told[name]).split(",")[0] in figure.get_suptitle()
         value = told[name]["value"]
         limits = set()
         for ax in panels:
@@ -133,7 +133,7 @@ def test_efforts_have_their_residual_and_a_long_motion_the_seconds_of_its_peak(s
     ],
 )
 def test_a_scale_begins_at_zero_or_at_the_least_with_the_worst_inside(values, worst, ends):
-    assert figures.limits(np.array(values), worst) == ends
+    assert figures.choose_colour_limits(np.array(values), worst) == ends
 
 
 def test_shapes_are_those_of_the_pose_that_rings_lowest(small_maps):
@@ -147,7 +147,7 @@ def test_shapes_are_those_of_the_pose_that_rings_lowest(small_maps):
         rest = data.position.values
         size = np.linalg.norm(np.ptp(rest, axis=0))
         for mode in range(modes.MODE_COUNT):
-            moved, far = deformed(data, mode)
+            moved, far = deform_nodes(data, mode)
             steps = np.linalg.norm(moved - rest, axis=1)
             assert steps.max() == pytest.approx(modes.MAX_DRAWN_DISPLACEMENT * size)
             assert far == pytest.approx(steps / steps.max())
@@ -163,7 +163,7 @@ def test_shapes_are_those_of_the_pose_that_rings_lowest(small_maps):
         assert one + other == pytest.approx(2 * still, abs=2e-5)
         assert np.abs(one - still).max() > 1e-3
         assert list(page.layout.updatemenus[0].buttons[3].args[0]["x"][0]) == list(frames["3/0"].x)
-        ground = grounded(data)
+        ground = find_ground_nodes(data)
         assert [str(n).rpartition(" ")[2] for n in data.node.values[ground]] == ["0/8"] * 3
 
 
@@ -215,5 +215,5 @@ def test_pages_hold_all_they_need(stored, tmp_path):
     assert links.found == []
     assert '"showSendToCloud": false' in text
     assert 1_000_000 < len(text) < 9_000_000
-    for answer in figures.answers(stored):
-        assert html.escape(figures.sentence(answer)) in text
+    for answer in figures.list_answers(stored):
+        assert html.escape(figures.write_sentence(answer)) in text

@@ -15,15 +15,15 @@ from delta_dynamics import energy_transfer, inverse_dynamics, max_driving_force
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.strict_yaml import read_yaml
 from pkm_twin.maps import figures
-from pkm_twin.maps.figures import shown
+from pkm_twin.maps.figures import format_value
 from pkm_twin.maps.kind import evaluate_kind
 from pkm_twin.maps.kinds import KINDS
 from pkm_twin.maps.kinds.cutting_depth import CuttingDepth
 from pkm_twin.maps.kinds.frequency import Frequency
 from pkm_twin.maps.run import run
-from pkm_twin.maps.search import badness, evolve, find_worst
+from pkm_twin.maps.search import evolve, find_worst, score_values
 from pkm_twin.maps.store import open_map
-from pkm_twin.maps.sweep import map_of
+from pkm_twin.maps.sweep import plan_map
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.robot.workspace import belong_to_workspace, passive_values, reachable, try_forward
 from stiffness_monitor import Milling, compliance, stable_depth, strain_energy
@@ -157,7 +157,7 @@ def test_errors_of_places_that_parts_share_are_no_errors_of_the_pose(cause, rng)
     np.testing.assert_allclose(found(sure, "pose-error", states(sure, rng, 5)).value, 1e-4)
     unsure = robot_of_data(data | {"uncertainty": {**origin, cause: {"relative": 1e-3}}}, "places")
     with pytest.raises(ParameterError) as caught:
-        map_of(unsure, KINDS["pose-error"]())
+        plan_map(unsure, KINDS["pose-error"]())
     assert caught.value.field == f"uncertainty.{cause}"
 
 
@@ -171,7 +171,7 @@ WORST = ("delta compliance", "five_bar acceleration")
 def test_no_pose_is_worse_than_the_worst(what, count, rng, tmp_path):
     name, kind = what.split()
     robot = load(name)
-    sweep = map_of(robot, KINDS[kind](), 200)
+    sweep = plan_map(robot, KINDS[kind](), 200)
     with open_map(run(sweep, tmp_path / "a.nc", workers=1)) as data:
         worst, pose = float(data.worst_value[0]), data.worst_pose.values[0]
         stored = np.concatenate([data.value.values.ravel(), data.plane_value.values.ravel()])
@@ -195,7 +195,7 @@ def test_a_stored_map_has_all_cases_and_is_nan_where_no_pose_counts(tmp_path):
     kind = KINDS["strain-energy"]()
     loads = {"push": (50.0, 0.0, 0.0, 0.0, 0.0, 0.0), "lift": (0.0, 0.0, 50.0, 0.0, 0.0, 0.0)}
     cases = [kind.loaded(robot, name, wrench) for name, wrench in loads.items()]
-    sweep = map_of(robot, kind, 400, cases=cases)
+    sweep = plan_map(robot, kind, 400, cases=cases)
     with open_map(run(sweep, tmp_path / "a.nc", workers=1)) as data:
         grid = np.stack(np.meshgrid(data.x, data.z, indexing="ij"), -1)
         inside = reachable(robot, grid)
@@ -205,7 +205,7 @@ def test_a_stored_map_has_all_cases_and_is_nan_where_no_pose_counts(tmp_path):
         assert float(data.valid) == pytest.approx(inside.mean())
         mean = np.nanmean(data.factor.values[..., 0, :], (0, 1))
         most = data.element.values[mean.argmax()]
-        assert f"workspace: {most} {100 * mean.max():.1f} %" in "\n".join(figures.lines(data))
+        assert f"workspace: {most} {100 * mean.max():.1f} %" in "\n".join(figures.write_lines(data))
         for k, case in enumerate(cases):
             expected = strain_energy(robot, grid[inside], case.wrench)
             np.testing.assert_allclose(data.value.values[inside, k], expected.total, rtol=1e-9)
@@ -215,7 +215,7 @@ def test_a_stored_map_has_all_cases_and_is_nan_where_no_pose_counts(tmp_path):
 def test_documented_worst_values():
     page, robot, kind = "docs/maps.md", load("delta"), KINDS["compliance"]()
     (softest,) = numbers(page, r"softest: (\S+) µm/N along")
-    sweep = map_of(robot, kind)
+    sweep = plan_map(robot, kind)
     worst = find_worst(sweep, sweep.cases[0], np.empty((0, 3)))
     assert 1e6 * worst.found.value[0] == pytest.approx(softest, rel=0.01)
     assert worst.bounded and worst.index == pytest.approx(LEAST, rel=1e-3)
@@ -233,10 +233,10 @@ def test_documented_worst_values():
 @pytest.mark.parametrize(("least", "bound"), [(0.05, None), (0.3, 0.3)])
 def test_an_answer_on_the_bound_of_the_singularity_index_has_it(least, bound, tmp_path):
     """The five-bar is softest at its nearest pose to a singularity, of index 0.243."""
-    sweep = map_of(load("five_bar"), KINDS["compliance"](), 400, least_singularity=least)
+    sweep = plan_map(load("five_bar"), KINDS["compliance"](), 400, least_singularity=least)
     with open_map(run(sweep, tmp_path / "a.nc", workers=1)) as data:
-        (answer,) = figures.answers(data)
-        (text,) = figures.lines(data)
+        (answer,) = figures.list_answers(data)
+        (text,) = figures.write_lines(data)
     assert answer["singularity_bound"] == bound
     assert answer["singularity"] == pytest.approx(bound or 0.24345, rel=1e-4)
     assert ("worse poses lie below" in text) == (bound is not None)
@@ -312,7 +312,7 @@ def test_a_pose_in_a_sentence_is_as_commands_read_it():
     answer = {"answer": "softest", "value": 1e-5, "unit": "m/N", "pose": {"x": 0.7235, "b": 0.4552}}
     for units, text in (("mm", "m"), (("m", "rad"), "[m, rad]")):
         answer["pose_units"] = dict(zip("xb", units, strict=True))
-        assert figures.sentence(answer).endswith(f"(0.7235, 0.4552) {text}")
+        assert figures.write_sentence(answer).endswith(f"(0.7235, 0.4552) {text}")
 
 
 def test_milling_depths_are_those_of_each_pose(capsys, tmp_path, monkeypatch):
@@ -355,7 +355,7 @@ def test_milling_depths_are_those_of_each_pose(capsys, tmp_path, monkeypatch):
     assert told["value"] == pytest.approx(min(each)) and told["unit"] == "m"
     assert told["element"].startswith("mode ")
     # A process goes with its map, so that another does not continue it.
-    maps = [map_of(robot, CuttingDepth(each, damping, tool), 60) for each in (milling, Milling(3, 600e6, 0.3, 0.5))]
+    maps = [plan_map(robot, CuttingDepth(each, damping, tool), 60) for each in (milling, Milling(3, 600e6, 0.3, 0.5))]
     assert maps[0].fingerprint != maps[1].fingerprint
 
 
@@ -396,14 +396,14 @@ def test_kinds_of_one_machine_agree(rng):
     q = q[(index > LEAST) & (index < 2.0 * LEAST)]
     found = {}
     for kind in (KINDS[name]() for name in ("payload", "acceleration", "speeds")):
-        sweep = map_of(robot, kind)
+        sweep = plan_map(robot, kind)
         found[kind] = sweep.cases[0], find_worst(sweep, sweep.cases[0], np.empty((0, 3)))
     tried = np.vstack([q, *(worst.q for _, worst in found.values())])
     assert len(q) > 20
     for kind, (case, worst) in found.items():
         (other,) = evaluate_kind(kind, robot, tried, [case])
-        least = badness(worst.found.value, case.largest)[0]
-        assert (badness(other.value, case.largest) <= least + 0.01 * abs(least)).all(), kind.name
+        least = score_values(worst.found.value, case.largest)[0]
+        assert (score_values(other.value, case.largest) <= least + 0.01 * abs(least)).all(), kind.name
     payload, acceleration = (found[kind][1].found.value[0] for kind in list(found)[:2])
     assert (payload == 0.0) == (acceleration == 0.0)
 
@@ -412,7 +412,7 @@ def test_kinds_of_one_machine_agree(rng):
 def test_the_lowest_frequency_is_found():
     """The Delta rings lowest where the singularity index is as low as it may be."""
     robot = load("delta")
-    sweep = map_of(robot, Frequency())
+    sweep = plan_map(robot, Frequency())
     worst = find_worst(sweep, sweep.cases[0], np.empty((0, 3)))
     assert robot.singularity(worst.q) == pytest.approx(LEAST, abs=2e-3)
     # 44.03 Hz by five times the rounds.
@@ -483,7 +483,7 @@ def test_ranges_of_passive_hinges_slides_and_rods(tmp_path):
 def test_what_a_file_lacks_is_named(kind, changes, field):
     data = {k: v for k, v in (parameters_of("delta") | changes).items() if v is not None}
     with pytest.raises(ParameterError) as caught:
-        map_of(robot_of_data(data, "delta"), KINDS[kind]())
+        plan_map(robot_of_data(data, "delta"), KINDS[kind]())
     assert caught.value.field == field
 
 
@@ -491,7 +491,7 @@ def test_tolerances_without_an_uncertainty_are_another_command_s():
     tolerances = {"bodies.arm.length": {"deviation": 1e-4}}
     robot = robot_of_data(parameters_of("delta") | {"tolerances": tolerances}, "delta")
     with pytest.raises(ParameterError, match="design --tolerance file"):
-        map_of(robot, KINDS["pose-error"]())
+        plan_map(robot, KINDS["pose-error"]())
 
 
 def test_angular_acceleration_of_a_wrist(rng):
@@ -545,7 +545,7 @@ def test_isotropy_is_that_of_directions(name, rng):
 @pytest.mark.parametrize("name", partly_long(["stewart", "five_bar", "delta"], "stewart"))
 def test_a_workspace_in_which_nothing_counts_names_the_cause(name):
     robot = load(name)
-    sweep = map_of(robot, KINDS["compliance"](), 60, least_singularity=0.999)
+    sweep = plan_map(robot, KINDS["compliance"](), 60, least_singularity=0.999)
     with pytest.raises(ParameterError, match=r"no pose has a singularity index of 0\.999 or more"):
         find_worst(sweep, sweep.cases[0], np.empty((0, len(robot.pose_names))))
 
@@ -568,4 +568,4 @@ def test_a_workspace_in_which_nothing_counts_names_the_cause(name):
     ],
 )
 def test_units_have_prefixes_that_exist(value, unit, text):
-    assert shown(value, unit) == text
+    assert format_value(value, unit) == text

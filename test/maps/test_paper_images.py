@@ -15,7 +15,7 @@ from pkm_twin.maps.kinds.strain_energy import StrainEnergy
 from pkm_twin.maps.page import write_page
 from pkm_twin.maps.run import run
 from pkm_twin.maps.store import open_map
-from pkm_twin.maps.sweep import map_of
+from pkm_twin.maps.sweep import plan_map
 from pkm_twin.robot.workspace import reachable
 from stiffness_monitor import regular_workspace, strain_energy
 from test.maps.conftest import shorten
@@ -26,7 +26,7 @@ def stored(folder, robot, kind, **options):
     """A short map in a file."""
     with pytest.MonkeyPatch.context() as patch:
         shorten(patch)
-        return run(map_of(load(robot), kind, 3000, **options), folder / "map.nc", workers=1)
+        return run(plan_map(load(robot), kind, 3000, **options), folder / "map.nc", workers=1)
 
 
 def lean(azimuth, tilt):
@@ -120,7 +120,7 @@ def test_the_page_turns_the_spheres(balls, tmp_path):
 @pytest.mark.parametrize("name", ["delta", "examples/machines/agile_eye.yaml", "five_bar"])
 def test_spheres_need_two_tilts(name):
     with pytest.raises(ParameterError, match="two tilts"):
-        map_of(load(name), Isotropy(spheres=True), 3000)
+        plan_map(load(name), Isotropy(spheres=True), 3000)
 
 
 LOADS = {"P1": [0, 0, 1, 0, 0, 0], "P2": [0.8, 0.3, 0.52, 0, 0, 0]}
@@ -159,7 +159,7 @@ def test_poses_count_inside_the_largest_circles_alone(shares):
 def test_circles_of_other_machines(name, unit):
     """Tilts without torsion count by the tilt itself, places by their distance from the axis."""
     robot = load(name)
-    space = map_of(robot, Payload(), 500, regular=True)
+    space = plan_map(robot, Payload(), 500, regular=True)
     grid = robot.grid()
     heights, radii = space.circles
     k = int(np.nanargmax(radii))
@@ -167,10 +167,10 @@ def test_circles_of_other_machines(name, unit):
     turn = np.linspace(0, 2 * np.pi, 37)
     for factor, whole in ((0.999, True), (1.001, False)):
         poses = grid.polar_pose(heights[k], factor * radii[k], turn)
-        assert space.encircled(poses).all() == whole
+        assert space.is_encircled(poses).all() == whole
         np.testing.assert_allclose(grid.distance(poses), factor * radii[k], rtol=1e-12)
     with pytest.raises(ParameterError, match="about an axis"):
-        map_of(load("stewart"), Payload(), 500, regular=True)
+        plan_map(load("stewart"), Payload(), 500, regular=True)
 
 
 def test_shares_are_drawn_by_rank_in_slices_and_in_the_plane(shares):

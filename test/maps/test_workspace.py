@@ -8,11 +8,11 @@ import pytest
 
 from pkm_twin.errors import ParameterError
 from pkm_twin.maps import figures
-from pkm_twin.maps.kinds.workspace import Workspace, circles, largest_cylinder
+from pkm_twin.maps.kinds.workspace import Workspace, find_circle_radii, largest_cylinder
 from pkm_twin.maps.run import run
-from pkm_twin.maps.search import workspace_box
+from pkm_twin.maps.search import find_workspace_box
 from pkm_twin.maps.store import open_map
-from pkm_twin.maps.sweep import map_of
+from pkm_twin.maps.sweep import plan_map
 from pkm_twin.robot.clearance import clearance
 from pkm_twin.robot.workspace import MIN_WORKSPACE_INDEX, RAYS_PER_CIRCLE, singularity_of_pose
 from stiffness_monitor import reachable
@@ -88,7 +88,7 @@ def test_circles_end_where_the_first_ray_does(name):
     """Each height alone, its rays one test at a time: whole inside, not whole a hair beyond."""
     robot = load(name)
     heights = np.linspace(*heights_of(robot), 31)
-    found = circles(robot, heights)
+    found = find_circle_radii(robot, heights)
     assert (found > 0.0).sum() > 4
     turn = np.arange(RAYS_PER_CIRCLE) * (2 * np.pi / RAYS_PER_CIRCLE)
     lateral = [robot.pose_names.index(name) for name in robot.grid().lateral]
@@ -117,7 +117,7 @@ def test_the_largest_cylinder_is_better_than_all_others(reach_map):
 
 
 def test_no_cylinder_where_nothing_is_reachable():
-    far = circles(load("delta"), [-5.0, -4.0])
+    far = find_circle_radii(load("delta"), [-5.0, -4.0])
     assert (far == 0.0).all()
     assert largest_cylinder(np.array([-5.0, -4.0]), far).radius == 0.0
     assert singularity_of_pose(load("delta"), [[0.0, 0.0, -5.0]]) == [0.0]
@@ -125,13 +125,13 @@ def test_no_cylinder_where_nothing_is_reachable():
 
 @pytest.mark.long
 def test_a_bound_on_singularity_takes_away(small_maps, tmp_path):
-    sweep = map_of(load("upr_rpu"), Workspace(), 4000, least_singularity=0.28)
+    sweep = plan_map(load("upr_rpu"), Workspace(), 4000, least_singularity=0.28)
     file = run(sweep, tmp_path / "a.nc", workers=1)
     with open_map(small_maps["workspace upr_rpu"]) as wide, open_map(file) as narrow:
         assert 0 < float(narrow.volume) < float(wide.volume)
         assert float(narrow.cylinder_radius) < float(wide.cylinder_radius)
         assert np.nanmin(values(narrow, "singularity")) >= 0.28
-        answer = figures.answers(narrow)[0]
+        answer = figures.list_answers(narrow)[0]
         assert answer["value"] == pytest.approx(0.28, rel=1e-3)
         at = singularity_of_pose(sweep.robot, list(answer["pose"].values()))
         assert at == pytest.approx(answer["value"]) and answer["singularity_bound"] == 0.28
@@ -147,7 +147,7 @@ def test_a_bound_on_clearance_takes_away(name, small_maps, tmp_path):
         data.load()
     gaps = values(data, "clearance")
     bound = float(np.nanquantile(gaps, 0.1))
-    sweep = map_of(robot, Workspace(), 4000, least_clearance=bound)
+    sweep = plan_map(robot, Workspace(), 4000, least_clearance=bound)
     with open_map(run(sweep, tmp_path / "narrow.nc", workers=1)) as left:
         left.load()
     np.testing.assert_array_equal(values(left, "clearance"), gaps)
@@ -155,11 +155,11 @@ def test_a_bound_on_clearance_takes_away(name, small_maps, tmp_path):
     assert (np.isfinite(values(left, "singularity")) == kept).all()
     lost = float(left.interference)
     assert 0 < lost < 0.2
-    assert f"interfere in {100 * lost:.3g} %" in "\n".join(figures.lines(left))
-    assert "interfere in" not in "\n".join(figures.lines(data))
+    assert f"interfere in {100 * lost:.3g} %" in "\n".join(figures.write_lines(left))
+    assert "interfere in" not in "\n".join(figures.write_lines(data))
     assert float(left.volume) == pytest.approx((1 - lost) * float(data.volume))
     assert (left.circle.values <= data.circle.values).all()
-    assert left.circle.values == pytest.approx(circles(robot, left.height.values, least_clearance=bound))
+    assert left.circle.values == pytest.approx(find_circle_radii(robot, left.height.values, least_clearance=bound))
 
 
 @pytest.mark.long
@@ -168,16 +168,16 @@ def test_the_box_holds_what_interference_takes_away(variant):
     thin = load("prru")
     limb = parameters_of("prru")["members"]["limb"] | {"outer_diameter": 0.40}
     thick, _ = variant("prru", members={"limb": limb})
-    box = workspace_box(thin)
+    box = find_workspace_box(thin)
     ticks = [np.linspace(low, high, 16) for low, high in box]
     poses = np.stack(np.meshgrid(*ticks, indexing="ij"), -1)
     tilt = np.abs(poses[..., 1:]).max((0, 1, 2))
     assert (np.abs(poses[reachable(thick, poses)])[:, 1:].max(0) < 0.9 * tilt).all()
-    assert (workspace_box(thick) == box).all()
+    assert (find_workspace_box(thick) == box).all()
 
 
 def test_all_taken_away_is_no_map(tmp_path):
-    sweep = map_of(load("delta"), Workspace(), 4000, least_clearance=0.05)
+    sweep = plan_map(load("delta"), Workspace(), 4000, least_clearance=0.05)
     with pytest.raises(ParameterError):
         run(sweep, tmp_path / "none.nc", workers=1)
     assert not list(tmp_path.glob("*.nc"))
@@ -188,9 +188,9 @@ def test_without_members_there_is_no_clearance(monkeypatch):
 
     monkeypatch.setattr(type(load("delta")), "beams", ())
     bare = pkm_twin.load("delta")
-    assert [case.name for case in map_of(bare, Workspace(), 4000).cases] == ["singularity"]
+    assert [case.name for case in plan_map(bare, Workspace(), 4000).cases] == ["singularity"]
     with pytest.raises(ParameterError) as caught:
-        map_of(bare, Workspace(), 4000, least_clearance=0.01)
+        plan_map(bare, Workspace(), 4000, least_clearance=0.01)
     assert caught.value.field == "least_clearance"
 
 
@@ -203,14 +203,14 @@ def test_bounds_are_checked():
         {"least_clearance": np.nan},
     ):
         with pytest.raises(ParameterError):
-            map_of(load("delta"), Workspace(), **bad)
+            plan_map(load("delta"), Workspace(), **bad)
 
 
 def test_circles_stay_clear_of_a_constraint_singularity():
     """The Delta-CU's surface, where its Jacobian is sound."""
     robot, least = load("delta_cu"), 0.1
     heights = np.array([-0.28, -0.25])
-    found = circles(robot, heights, steps=60, least=least)
+    found = find_circle_radii(robot, heights, steps=60, least=least)
     assert (found > 0.1).all()
     turn = np.linspace(0, 2 * np.pi, 361)
     grid = robot.grid()

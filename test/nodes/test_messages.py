@@ -11,7 +11,7 @@ import pytest
 from pkm_twin.messages.reading import (
     MAX_ACCELERATION,
     MAX_EFFORT,
-    MAX_LOAD,
+    MAX_FORCE,
     MAX_POINTS,
     JointReader,
     TrajectoryFields,
@@ -173,7 +173,7 @@ def test_a_wrong_length_names_both_lengths(make):
                 *((other, "") for other in ("tool0", "Platform", "/platform")),
             )
         ),
-        *(("wrench", {"values": at(WRENCH, k, 1.01 * MAX_LOAD)}, "bounds", []) for k in range(6)),
+        *(("wrench", {"values": at(WRENCH, k, 1.01 * MAX_FORCE)}, "bounds", []) for k in range(6)),
         ("wrench", {"stamp": 0}, "zero stamp", []),
         ("wrench", {"stamp": NOW + SECOND}, "future stamp", []),
         ("wrench", {"stamp": NOW - SECOND}, "stale stamp", []),

@@ -8,7 +8,7 @@ import pytest
 
 from pkm_twin.bags.reader import open_bag
 from pkm_twin.errors import MessageError
-from pkm_twin.messages.reading import in_base_axes, read_deflection
+from pkm_twin.messages.reading import read_deflection, rotate_to_base
 from pkm_twin.messages.stamps import SECOND, StampRules
 from stiffness_monitor.alarm import MAX_WAITING, AlarmSettings, StiffnessAlarm, StiffnessWatch
 from stiffness_monitor.monitor import Monitor
@@ -242,6 +242,6 @@ def test_axes_and_rotations_of_a_deflection():
     other = read_deflection(deflection(turn=[-v for v in turn]), SECOND, RULES)
     np.testing.assert_allclose(other.values, sample.values, atol=1e-15)
     rotation = ROBOT.platform([0.62, 0.6, 0.65])[1]
-    moved = in_base_axes(sample.values, rotation)
+    moved = rotate_to_base(sample.values, rotation)
     np.testing.assert_allclose(moved[:3], rotation @ sample.values[:3])
     np.testing.assert_allclose(moved[3:], rotation @ sample.values[3:])

@@ -95,7 +95,7 @@ class TestMounts:
 def test_the_nearest_of_recent_values_is_that_of_all():
     rng = np.random.default_rng(4)
     recent = TimeCache(16)
-    assert recent.nearest(5) is None and recent.held(5) is None and recent.latest is None
+    assert recent.nearest(5) is None and recent.find_before(5) is None and recent.latest is None
     stamps = np.sort(rng.integers(0, 1000, 40)).tolist()
     for k, stamp in enumerate(stamps):
         recent.push(stamp, k)
@@ -104,7 +104,7 @@ def test_the_nearest_of_recent_values_is_that_of_all():
             found = recent.nearest(asked)[0]
             assert abs(found - asked) == min(abs(s - asked) for s in kept)
             before = [s for s in kept if s <= asked]
-            assert recent.held(asked)[0] == (max(before) if before else kept[0])
+            assert recent.find_before(asked)[0] == (max(before) if before else kept[0])
     with pytest.raises(MessageError):
         recent.push(stamps[-1] - 1, 0)
 

@@ -141,7 +141,7 @@ def fit(given: Fit) -> Report:
     from pkm_twin.identification.parameters import fitted_yaml
     from pkm_twin.mechanisms.entries import load_with_text, write_edited
     from pkm_twin.report.page import page
-    from pkm_twin.streams.steps import sampling_of
+    from pkm_twin.streams.steps import find_sampling
 
     if given.drive is not None:
         # Fit a drive's torque constant and friction to weights that it lifts.
@@ -183,7 +183,7 @@ def fit(given: Fit) -> Report:
     facts = [
         Fact("beyond_limits", beyond),
         Fact("friction_laws", [dataclasses.asdict(choice) for choice in choices]),
-        Fact("missing_samples", [sampling_of(r.time).missing for r in read]),
+        Fact("missing_samples", [find_sampling(r.time).missing for r in read]),
         Fact("topics", [dataclasses.asdict(r.topics) for r in read]),
     ]
     names, (out, html) = [r.name for r in read], given.files.values()

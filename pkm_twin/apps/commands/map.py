@@ -131,7 +131,7 @@ def compute(given: MapOptions) -> Report:
     """
     from pkm_twin.maps.run import run
     from pkm_twin.maps.store import write_arrays
-    from pkm_twin.maps.sweep import map_of
+    from pkm_twin.maps.sweep import plan_map
 
     kind, machine = make_kind(given), given.machine()
     cases = given.cases(kind, machine)
@@ -189,7 +189,7 @@ def compute(given: MapOptions) -> Report:
             files={"out": given.out},
         )
     names = machine.pose_names
-    sweep = map_of(
+    sweep = plan_map(
         machine,
         kind,
         given.points,
@@ -230,12 +230,12 @@ def report_stored_map(file: Path, drawing: Path | None, html: bool, overwrite: b
 
     with open_map(file) as data:
         with reading(file):
-            first, *rest = figures.lines(data)
+            first, *rest = figures.write_lines(data)
             facts = [
                 Fact("robot", data.attrs["robot"]),
                 Fact("kind", data.attrs["kind"]),
                 Fact("sizes", {str(name): size for name, size in data.sizes.items()}),
-                Fact("worst", figures.answers(data)),
+                Fact("worst", figures.list_answers(data)),
                 Fact(
                     "facts",
                     (

@@ -58,7 +58,7 @@ class Modes(Frequency):
 
     def summaries(self, space: Space, counted: int, apart: int) -> dict[str, Variable]:
         """Return the mode shapes at the planes' pose, their energy shares, and lines to draw."""
-        pose, node, part = space.through(0), ("mode", "node", "space"), ("mode", "element")
+        pose, node, part = space.planes_pose(0), ("mode", "node", "space"), ("mode", "element")
         found = modes(space.robot, pose, len(space.cases))
         edges = structure_edges(structural_model(space.robot, space.robot.inverse(pose)), found.nodes)
         ends = {"valid_min": 0, "valid_max": len(found.nodes) - 1}
@@ -86,13 +86,13 @@ class Modes(Frequency):
         rest, edges = data.position.values, data.line.values
         low, high = _scene_bounds(rest)
         for mode, ax in enumerate(axes):
-            moved, far = deformed(data, mode)
+            moved, far = deform_nodes(data, mode)
             ax.add_collection3d(Line3DCollection(rest[edges], colors="0.7", linewidths=1.0))
             drawn = Line3DCollection(moved[edges], cmap="viridis", linewidths=2.2)
             drawn.set_array(far[edges].mean(1))
             drawn.set_clim(0.0, 1.0)
             ax.add_collection3d(drawn)
-            ax.scatter(*rest[grounded(data)].T, marker="s", s=14, color="0.3", depthshade=False)
+            ax.scatter(*rest[find_ground_nodes(data)].T, marker="s", s=14, color="0.3", depthshade=False)
             ax.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
             ax.set_box_aspect(high - low, zoom=0.95)
             ax.view_init(elev=18, azim=-58)
@@ -113,7 +113,7 @@ class Modes(Frequency):
     def page(cls, data: Dataset) -> Any:
         """Return a figure of the frame at rest and in a mode, with menu and animation."""
         graph = require("plotly.graph_objects", "maps")
-        from pkm_twin.maps.page import BAR, CAMERA, MARGIN, MENU, button
+        from pkm_twin.maps.page import BAR, CAMERA, MARGIN, MENU, make_button
 
         # All lines as one path, with -1 between lines that do not meet.
         rest, nodes = data.position.values, list[int]()
@@ -126,14 +126,14 @@ class Modes(Frequency):
         still: dict[str, Any] = {"hoverinfo": "skip", "showlegend": False}
         figure = graph.Figure()
         grey, square = {"color": "#b0b0b0"}, {"symbol": "square", "size": 4, "color": "#444"}
-        ground = _path_coordinates(rest, grounded(data))
+        ground = _path_coordinates(rest, find_ground_nodes(data))
         figure.add_scatter3d(**_path_coordinates(rest, path), mode="lines", line=grey, **still)
         figure.add_scatter3d(**ground, mode="markers", marker=square, **still)
         names = ["" if k < 0 else str(data.node.values[k]) for k in path.tolist()]
         figure.add_scatter3d(mode="lines", text=names, hovertemplate="%{text}<extra></extra>", showlegend=False)
         buttons, frames = [], []
         for mode in range(data.sizes["mode"]):
-            moved, far = deformed(data, mode)
+            moved, far = deform_nodes(data, mode)
             line = {
                 "color": _values_along_path(far, path, 0.0),
                 "coloraxis": "coloraxis",
@@ -147,7 +147,7 @@ class Modes(Frequency):
             change = {axis: [values] for axis, values in _path_coordinates(moved, path).items()}
             change["line"] = [line]
             buttons.append(
-                button(
+                make_button(
                     "; ".join(head),
                     change,
                     {"updatemenus[1].buttons": _animation_buttons(mode)},
@@ -187,7 +187,7 @@ class Modes(Frequency):
         return figure
 
 
-def deformed(data: Dataset, mode: int) -> tuple[Array, Array]:
+def deform_nodes(data: Dataset, mode: int) -> tuple[Array, Array]:
     """Return a mode's magnified nodes, (nodes, 3), m, and relative displacements, (nodes,).
 
     Displacements are relative to the largest of all nodes.
@@ -200,7 +200,7 @@ def deformed(data: Dataset, mode: int) -> tuple[Array, Array]:
     return rest + scale * moved, far / far.max()
 
 
-def grounded(data: Dataset) -> NDArray[np.int64]:
+def find_ground_nodes(data: Dataset) -> NDArray[np.int64]:
     """Return the nodes on the ground, by index: the ends that only one line meets."""
     nodes, count = np.unique(data.line.values, return_counts=True)
     return np.asarray(nodes[count == 1], np.int64)

@@ -117,9 +117,9 @@ def _draw_slices(data: Dataset, case: str, elements: list[int]) -> dict[str, Fig
 
     :returns: the picture by the end of its name; none where poses have no height.
     """
-    from pkm_twin.maps.figures import COLOUR_MAP, limits, scale_of, units_of
+    from pkm_twin.maps.figures import COLOUR_MAP, choose_colour_limits, choose_prefix, list_units
 
-    units = units_of(data)
+    units = list_units(data)
     upwards = data.attrs["height"]
     if upwards not in data.value.dims:
         return {}
@@ -128,8 +128,8 @@ def _draw_slices(data: Dataset, case: str, elements: list[int]) -> dict[str, Fig
     tables = [one.sel(case=case).transpose(upwards, *flat).values for one in fields]
     filled = np.flatnonzero(np.isfinite(tables[0]).sum((1, 2)) >= 4)
     chosen = filled[np.unique(np.linspace(0, len(filled) - 1, SLICES).round().astype(int))]
-    low, high = limits(np.concatenate([table.ravel() for table in tables]), np.nan)
-    scale, unit = (1.0, "") if elements else scale_of(high, str(data.case_unit.values[0]))
+    low, high = choose_colour_limits(np.concatenate([table.ravel() for table in tables]), np.nan)
+    scale, unit = (1.0, "") if elements else choose_prefix(high, str(data.case_unit.values[0]))
     levels = np.linspace(scale * low, scale * high, 22)
     beyond = any(np.nanmax(table) > high * (1.0 + 1e-12) for table in tables)
     extend = "max" if beyond else "neither"
@@ -177,14 +177,14 @@ def _draw_slices(data: Dataset, case: str, elements: list[int]) -> dict[str, Fig
 
 def _draw_planes(data: Dataset, case: str, elements: list[int]) -> dict[str, Figure]:
     """Draw elements' shares in the plane across the height, or in the fullest plane."""
-    from pkm_twin.maps.figures import draw_panel, full_planes, plane_of
+    from pkm_twin.maps.figures import draw_panel, extract_plane, full_planes
 
     k = [str(name) for name in data.case.values].index(case)
     upwards = data.attrs["height"]
     full = full_planes(data, k)
     across = [p for p in full if upwards not in (str(data.row_name.values[p]), str(data.column_name.values[p]))]
     plane = (across or full)[0]
-    one = plane_of(data, k, plane)
+    one = extract_plane(data, k, plane)
     if len(one["names"]) < 2:
         return {}
     table = data.plane_factor.isel(plane=plane, case=k).values[..., elements]

@@ -33,8 +33,8 @@ class Ratio(Kind):
 
     def found(self, robot: Robot, q: Array, case: Case) -> Found:
         """Return the least singular value of dq/dx; the element moves most in its direction."""
-        table = robot.inverse_jacobian(q) * _lengths(robot.joint_units, robot.size)[:, None]
-        table = table / _lengths(robot.pose_units, robot.size)
+        table = robot.inverse_jacobian(q) * _length_factors(robot.joint_units, robot.size)[:, None]
+        table = table / _length_factors(robot.pose_units, robot.size)
         _, values, ways = np.linalg.svd(table)
         direction = ways[..., -1, :]
         moved = np.abs((table @ direction[..., None])[..., 0])
@@ -55,7 +55,7 @@ class JointEffort(Ratio):
     def cases(self, robot: Robot) -> tuple[Case, ...]:
         """Return one case per pose coordinate."""
         units = ["N m" if unit == "rad" else "N" for unit in robot.pose_units]
-        return _per_joint(self, robot, units)
+        return _list_joint_cases(self, robot, units)
 
     def elements(self, robot: Robot) -> tuple[str, ...]:
         """Return no names: several actuators may be at their limits."""
@@ -71,7 +71,7 @@ class JointEffort(Ratio):
         return Found(limits[..., robot.pose_names.index(case.name), 1])
 
     def arrays(self, robot: Robot, poses: Array) -> dict[str, Array]:
-        """Return those of the ratio, and effort limits, shape (k, m, 2)."""
+        """Return the arrays of the ratio, and effort limits, shape (k, m, 2)."""
         own = {"effort_limits": transmission(robot).effort_limits(poses)}
         return super().arrays(robot, poses) | own
 
@@ -86,7 +86,7 @@ class JointInertia(JointEffort):
         """Return one case per pose coordinate."""
         robot.massive()
         units = ["kg m2" if unit == "rad" else "kg" for unit in robot.pose_units]
-        return _per_joint(self, robot, units)
+        return _list_joint_cases(self, robot, units)
 
     def found(self, robot: Robot, q: Array, case: Case) -> Found:
         """Return the diagonal entry of the case's joint."""
@@ -94,17 +94,17 @@ class JointInertia(JointEffort):
         return Found(transmission(robot).inertia(robot.forward(q))[..., k, k])
 
     def arrays(self, robot: Robot, poses: Array) -> dict[str, Array]:
-        """Return those of the ratio, and inertias, shape (k, m, m)."""
+        """Return the arrays of the ratio, and inertias, shape (k, m, m)."""
         return Ratio.arrays(self, robot, poses) | {"inertia": transmission(robot).inertia(poses)}
 
 
-def _per_joint(kind: Kind, robot: Robot, units: list[str]) -> tuple[Case, ...]:
+def _list_joint_cases(kind: Kind, robot: Robot, units: list[str]) -> tuple[Case, ...]:
     return tuple(
         Case(name, kind.what.format(name), unit, kind.answer, kind.largest)
         for name, unit in zip(robot.pose_names, units, strict=True)
     )
 
 
-def _lengths(units: tuple[str, ...], size: float) -> Array:
-    """Return what makes lengths of angles if there are lengths too; else one."""
+def _length_factors(units: tuple[str, ...], size: float) -> Array:
+    """Return factors that convert angles to lengths if there are lengths too; else one."""
     return np.array([1.0 if unit == "m" or "m" not in units else size for unit in units])

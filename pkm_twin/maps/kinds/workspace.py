@@ -96,7 +96,7 @@ class Workspace(Kind):
         if space.ticks and robot.grid().kind == "cylinder":
             low, high = space.ticks[robot.pose_names.index(robot.grid().height)][[0, -1]]
             heights = np.linspace(low, high, LAYERS)
-            result |= regular(robot, heights, space.least, space.least_clearance)
+            result |= make_regular_variables(robot, heights, space.least, space.least_clearance)
         return result
 
     @classmethod
@@ -153,18 +153,18 @@ class Workspace(Kind):
         return OVERLAY_CAPTION
 
 
-def regular(robot: Robot, heights: Array, least: float, least_clearance: float) -> dict[str, Variable]:
+def make_regular_variables(robot: Robot, heights: Array, least: float, least_clearance: float) -> dict[str, Variable]:
     """Return the largest circles about the axis at heights (n,), and the cylinder, for a file."""
-    radius = circles(robot, heights, least=least, least_clearance=least_clearance)
+    radius = find_circle_radii(robot, heights, least=least, least_clearance=least_clearance)
     best, unit = largest_cylinder(heights, radius), distance_unit(robot)
-    return circle_variables(robot, heights, radius) | {
+    return make_circle_variables(robot, heights, radius) | {
         "cylinder_low": scalar(best.low, "largest cylinder, low", "m"),
         "cylinder_high": scalar(best.high, "largest cylinder, high", "m"),
         "cylinder_radius": scalar(best.radius, "largest cylinder, radius", unit),
     }
 
 
-def circle_variables(robot: Robot, heights: Array, radius: Array) -> dict[str, Variable]:
+def make_circle_variables(robot: Robot, heights: Array, radius: Array) -> dict[str, Variable]:
     """Return circles about the axis at heights (n,), m, of radii (n,), for a file."""
     what = describe("largest circle, radius", distance_unit(robot), NON_NEGATIVE)
     return {
@@ -173,7 +173,7 @@ def circle_variables(robot: Robot, heights: Array, radius: Array) -> dict[str, V
     }
 
 
-def circles(
+def find_circle_radii(
     robot: Robot,
     heights: ArrayLike,
     steps: int = 340,
