@@ -257,7 +257,7 @@ def _draw_residuals(judged: Judged, units: Mapping[str, str]) -> Any:
         words = f"{name}: RMS {left:.3g} {units[name]} now, {was:.3g} {units[name]} before"
         plots.label(ax, "time (s)", f"residual ({units[name]})", words)
         plots.legend(ax)
-    plots.head(figure, f"{judged.name}: measured minus predicted, held out")
+    plots.write_title(figure, f"{judged.name}: measured minus predicted, held out")
     return figure
 
 
@@ -287,7 +287,7 @@ def _draw_changes(shown: Mapping[str, Number]) -> Any:
         ax.set_xscale("symlog", linthresh=2.0)
     over = "standard deviation" if known else "larger value"
     plots.label(ax, f"change over the {over}; orange: {COMBINED}", "")
-    plots.head(figure, title)
+    plots.write_title(figure, title)
     return figure
 
 

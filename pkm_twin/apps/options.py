@@ -207,9 +207,9 @@ class MotionOptions(RecordingOptions):
         :raises ParameterError: its efforts were computed with what the file lacks, unless another
             payload is asked for.
         """
-        from pkm_twin.paths.along import check_efforts, settle_rests
+        from pkm_twin.paths.along import check_efforts, zero_resting_motion
 
-        motion = settle_rests(self.read(path, robot, planned=True).with_rates())
+        motion = zero_resting_motion(self.read(path, robot, planned=True).with_rates())
         return motion if getattr(self, "payload", None) is not None else check_efforts(motion)
 
     def read_efforts(self, path: Path, robot: Robot) -> EffortComparison:
@@ -217,9 +217,9 @@ class MotionOptions(RecordingOptions):
 
         :raises ParameterError: as :meth:`read_motion`, or a robot without masses.
         """
-        from pkm_twin.paths.along import compare_efforts, settle_rests
+        from pkm_twin.paths.along import compare_efforts, zero_resting_motion
 
-        compared = compare_efforts(settle_rests(self.read(path, robot, planned=True).with_rates()))
+        compared = compare_efforts(zero_resting_motion(self.read(path, robot, planned=True).with_rates()))
         return compared if getattr(self, "payload", None) is not None else compared.checked()
 
 

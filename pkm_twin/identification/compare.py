@@ -33,7 +33,7 @@ from pkm_twin.identification.samples import (
 )
 from pkm_twin.identification.words import LATEST, late_text
 from pkm_twin.machine.friction import Dahl
-from pkm_twin.recordings import Load, Recording, at_rest, by_load
+from pkm_twin.recordings import Load, Recording, at_rest, split_by_load
 from pkm_twin.report import Fact, judged
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.drives import idle_samples
@@ -167,7 +167,7 @@ class Compared:
 
 def by_held(r: Recording, function: Callable[..., Array], time: Array, *motion: Array) -> Array:
     """Evaluate a function of the robot, loaded while it holds its payload, and a motion, (k, n)."""
-    parts = by_load(r.robot, r.load, time, BLOCK)
+    parts = split_by_load(r.robot, r.load, time, BLOCK)
     return np.concatenate([function(robot, *(v[rows] for v in motion)) for robot, rows in parts])
 
 

@@ -40,7 +40,7 @@ _CONSTRAINTS: Final = {
     "continuous": "revolute",
     "link": "fixed",  # a link that was cut in two
 }
-"""Types of ``<constraint>`` elements, without ``_read_joint``."""
+"""Types of ``<constraint>`` elements, without ``_joint``."""
 _KNOWN: Final = {
     "link": "name type inertial visual collision contact self_collision_checking material",
     "inertial": "origin mass inertia",

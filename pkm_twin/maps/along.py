@@ -117,7 +117,7 @@ class Along:
             plots.label(ax, "time (s)", f"{case.what} ({unit})", text, 9)
             if blamed:
                 plots.legend(ax)
-        plots.head(figure, f"{self.robot.name}: {self.kind.question}", 10)
+        plots.write_title(figure, f"{self.robot.name}: {self.kind.question}", 10)
         return figure
 
 

@@ -246,7 +246,7 @@ def planes(data: Dataset, case: int) -> Figure:
         if flat:
             bar = figure.colorbar(mesh, ax=axes, aspect=25, pad=0.01, extend="max" if beyond else "neither")
             bar.set_label(label)
-        rows = plots.head(figure, "\n".join(title(data, case)), 10)
+        rows = plots.write_title(figure, "\n".join(title(data, case)), 10)
         figure.set_figheight(height + 0.2 * rows)
         star = "star: worst pose; " if any(one["star"] for one in drawn) else ""
         more = "; brightest: this or more" if beyond else ""

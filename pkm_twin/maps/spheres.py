@@ -250,7 +250,7 @@ def _draw_index(data: Dataset, index: str) -> Figure:
     inset.set_axis_off()
     bar = figure.colorbar(mesh, ax=ax, aspect=32, pad=0.01, fraction=0.04, extend="max")
     bar.set_label(label)
-    plots.head(figure, f"{data.attrs['robot']}, {_read_height(data)}: {question}", 10)
+    plots.write_title(figure, f"{data.attrs['robot']}, {_read_height(data)}: {question}", 10)
     dashed = "; dashed rim: beyond the limits" if not inside.all() else ""
     figure.supxlabel(
         "a sphere is a pose: azimuth of the tilt around, tilt outwards; a point of it is a "

@@ -18,7 +18,7 @@ from pkm_twin.paths.joint_path import only_turns, reference_velocity
 from pkm_twin.paths.motion import Samples
 from pkm_twin.paths.sizing import rms
 from pkm_twin.recordings.origin import origin_columns
-from pkm_twin.recordings.payload import by_load
+from pkm_twin.recordings.payload import split_by_load
 from pkm_twin.recordings.recording import Recording
 from pkm_twin.recordings.tables import WRENCH
 from pkm_twin.robot.limits import beyond_limits
@@ -122,18 +122,18 @@ def model_efforts(m: Recording) -> Array:
 
     Dry friction has no direction at standstill, and the model adds none there.
     """
-    (q, _, qdd, wrench), rates, made = m.motion, _friction_rates(m), np.empty_like(m.q)
-    for robot, part in by_load(m.robot, m.load, m.time, SAMPLES_PER_BLOCK):
+    (q, _, qdd, wrench), rates, made = m.motion, _zero_resting_rates(m), np.empty_like(m.q)
+    for robot, part in split_by_load(m.robot, m.load, m.time, SAMPLES_PER_BLOCK):
         made[part] = inverse_dynamics(robot, q[part], rates[part], qdd[part], wrench[part])
     return made + Dahl.remembered(m.robot.friction, q, rates)[0]
 
 
-def settle_rests(m: Recording) -> Recording:
+def zero_resting_motion(m: Recording) -> Recording:
     """Return the motion with zero velocities where efforts are computed for a joint at rest."""
-    return replace(m, qd=_friction_rates(m), still=None)
+    return replace(m, qd=_zero_resting_rates(m), still=None)
 
 
-def _friction_rates(m: Recording) -> Array:
+def _zero_resting_rates(m: Recording) -> Array:
     """Return the velocities, with zero where friction may not count."""
     qd = m.motion[1]
     if m.still is None:
@@ -224,15 +224,15 @@ def torque_table(m: Recording, progress: Callable[[int], None] | None = None) ->
     """
     columns: dict[str, list[Array]] = {}
 
-    def put(name: str, values: Array) -> None:
+    def append_column(name: str, values: Array) -> None:
         columns.setdefault(name, []).append(values)
 
     q, qd, qdd, wrench = m.motion
     told = m.efforts == "measured" or (m.efforts == "effort" and m.bag is None)
     outside, _ = beyond_limits(m.robot, q, qd)
-    rates = _friction_rates(m)
+    rates = _zero_resting_rates(m)
     memory = Dahl.remembered(m.robot.friction, q, rates)[0]
-    for robot, part in by_load(m.robot, m.load, m.time, SAMPLES_PER_BLOCK):
+    for robot, part in split_by_load(m.robot, m.load, m.time, SAMPLES_PER_BLOCK):
         begin = part.start
         state = (robot, q[part], rates[part], qdd[part], wrench[part])
         try:
@@ -250,29 +250,29 @@ def torque_table(m: Recording, progress: Callable[[int], None] | None = None) ->
         except ValueError as e:
             seconds = f"{m.clock[part][0]:g} to {m.clock[part][-1]:g} s"
             raise PkmTwinError(f"between {seconds}: {e}") from None
-        put("time", m.clock[part])
+        append_column("time", m.clock[part])
         if outside.any():
-            put(BEYOND_LIMITS, outside[part].astype(np.float64))
+            append_column(BEYOND_LIMITS, outside[part].astype(np.float64))
         for i, joint in enumerate(m.robot.joint_names):
-            put(f"{joint}.position", q[part][:, i])
-            put(f"{joint}.velocity", rates[part][:, i])
-            put(f"{joint}.acceleration", qdd[part][:, i])
-            put(f"{joint}.effort", tau[:, i])
+            append_column(f"{joint}.position", q[part][:, i])
+            append_column(f"{joint}.velocity", rates[part][:, i])
+            append_column(f"{joint}.acceleration", qdd[part][:, i])
+            append_column(f"{joint}.effort", tau[:, i])
             if spread is not None:
-                put(f"{joint}.effort_deviation", spread[:, i])
+                append_column(f"{joint}.effort_deviation", spread[:, i])
             if m.effort is not None and told:
-                put(f"{joint}.measured", m.effort[part][:, i])
+                append_column(f"{joint}.measured", m.effort[part][:, i])
             for field in fields(terms):
-                put(f"{joint}.effort_{field.name}", getattr(terms, field.name)[:, i])
+                append_column(f"{joint}.effort_{field.name}", getattr(terms, field.name)[:, i])
         for k, name in enumerate(react.names):
             for i, axis in enumerate(WRENCH):
-                put(f"{name}.{axis}", react.wrenches[:, k, i])
+                append_column(f"{name}.{axis}", react.wrenches[:, k, i])
         if progress is not None:
             progress(part.stop)
-    whole = {name: np.concatenate(parts) for name, parts in columns.items()}
+    table = {name: np.concatenate(parts) for name, parts in columns.items()}
     if m.effort is not None and m.efforts == "effort" and told:
-        model = np.stack([whole[f"{joint}.effort"] for joint in m.robot.joint_names], -1)
+        model = np.stack([table[f"{joint}.effort"] for joint in m.robot.joint_names], -1)
         if np.abs(m.effort - model).max() <= EFFORT_TOLERANCE * np.abs(model).max():
             # The file is a plan of this machine, not a measurement.
-            whole = {name: v for name, v in whole.items() if not name.endswith(".measured")}
-    return whole | origin_columns(m.robot, m.load, m.wrench, m.time)
+            table = {name: v for name, v in table.items() if not name.endswith(".measured")}
+    return table | origin_columns(m.robot, m.load, m.wrench, m.time)

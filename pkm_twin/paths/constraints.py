@@ -85,7 +85,7 @@ class Limits:
         )
 
     def part(self, share: float) -> Limits:
-        """Return the limits times ``share``."""
+        """Return the limits scaled by ``share``."""
         return Limits(
             share * self.effort,
             share * self.velocity,
@@ -203,7 +203,7 @@ class Rows:
             fastest = np.where(rates > least, limits.velocity / np.maximum(rates, least), np.inf)
             tool = limits.speed / np.maximum(part.felt, 1e-300)
         most = np.minimum(fastest.min(1), tool) ** 2
-        # An x that no motion reaches: ten times that of constant full acceleration.
+        # An upper bound of x: ten times that of constant full acceleration.
         size = np.abs(a).max(1, initial=0.0)
         pushed = size > MIN_RATE_FRACTION * size.max()
         if pushed.any():

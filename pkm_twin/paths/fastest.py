@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Plan the fastest motion along a path within limits, or one by a law.
+"""Plan the fastest motion along a path within limits, or a motion by a law.
 
 Limits are those of drives, joints and tool. Laws are the quintic and S-curves of limited jerk.
 """
@@ -27,20 +27,20 @@ from pkm_twin.robot.robot import Robot
 
 @dataclass(frozen=True, eq=False)
 class Law:
-    """Describe a motion law from 0 to 1 in the time from 0 to 1, as :class:`Run` stores it."""
+    """A motion law: polynomials from 0 to 1 over the normalised time 0 to 1, as in :class:`Run`."""
 
     knots: Array
     way: Array
 
-    def on(self, part: JointPath, duration: float) -> Run:
-        """Return a stretch by this law, its duration in s."""
+    def make_run(self, part: JointPath, duration: float) -> Run:
+        """Return the run of a stretch by this law, duration in s."""
         return Run(part, self.knots, float(part.ends[-1]) * self.way).slower(duration)
 
 
 QUINTIC: Final = Law(np.array([0.0, 1.0]), np.array([[0.0, 0.0, 0.0, 10.0, -15.0, 6.0]]).T)
 
 
-def s_curve(cruise: float, smooth: float) -> Law:
+def make_s_curve(cruise: float, smooth: float) -> Law:
     """Return a law of seven parts with constant jerk.
 
     :param cruise: part of the duration at even speed, 0 to below 1.
@@ -64,7 +64,7 @@ def s_curve(cruise: float, smooth: float) -> Law:
 LAWS: Final[Mapping[str, Sequence[Law]]] = {
     "quintic": (QUINTIC,),
     "s-curve": tuple(
-        s_curve(cruise, smooth) for cruise in (0.0, 0.15, 0.3, 0.45, 0.6, 0.75) for smooth in (0.3, 0.5, 0.75, 1.0)
+        make_s_curve(cruise, smooth) for cruise in (0.0, 0.15, 0.3, 0.45, 0.6, 0.75) for smooth in (0.3, 0.5, 0.75, 1.0)
     ),
 }
 """Laws by name; the one that is fastest within the limits is used."""
@@ -72,7 +72,7 @@ LAWS: Final[Mapping[str, Sequence[Law]]] = {
 
 def run_by_law(part: JointPath, law: Law, limits: Limits, wrench: Array | None) -> Run:
     """Return the shortest run of a stretch by a law; limits hold at one time per point."""
-    run = law.on(part, 1.0)
+    run = law.make_run(part, 1.0)
     time = np.linspace(0.0, 1.0, len(part.ends))
     interval, share, v, u = run.at(time)
     _, qd, qdd = part.motion(interval, share, v, u)
@@ -249,7 +249,7 @@ def timed(
     result = replace(result, runs=tuple(run.slower(factor) for run in result.runs))
     over = max(result.worst.values(), default=0.0)
     if over > 1.0 + LIMIT_RESERVE:
-        # At lower speed the drives may lack the inertial forces that helped to hold the load.
+        # A slower motion has smaller inertial forces, which may have helped to hold the load.
         raise ParameterError("duration", duration, f"a motion within limits, not {over:.4g} of one")
     return result
 
@@ -325,7 +325,7 @@ def _solve_with_jerk(part: JointPath, limits: Limits, wrench: Array | None) -> R
         interval = run.at(0.5 * (run.times[1:] + run.times[:-1]))[0]
         np.maximum.at(over[0], interval, np.delete(used, np.s_[3 * n : 4 * n], 1).max(1))
         np.maximum.at(over[1], interval, used[:, 3 * n : 4 * n].max(1))
-        # The programs are inaccurate in intervals in which the speed changes by much.
+        # The linear programs are inaccurate where the speed changes much within an interval.
         parts = np.ones(len(share), np.int64)
         if count < MAX_JERK_REFINEMENTS:
             steep = np.maximum(x[1:], x[:-1]) > 2.0 * np.minimum(x[1:], x[:-1])

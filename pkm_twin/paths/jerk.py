@@ -84,7 +84,7 @@ def smooth_profile(
             method="highs",
         )
         if answer.status != 0 and count == 0 and slower < 6:
-            # A slower motion has smaller jerks, so that the bounds' tangents there are feasible.
+            # A slower profile has smaller jerks, so that its linearised bounds are feasible.
             x, slower = 0.25 * x, slower + 1
             continue
         if answer.status != 0 and count == 0:
@@ -157,7 +157,7 @@ def smooth_run(part: JointPath, x: Array) -> Run | None:
         rises = (u[:-1] < 0.0) & (u[1:] > 0.0)
         dip = np.where(rises, -0.5 * u[:-1] ** 2 * np.diff(knots) / np.where(rises, np.diff(u), 1.0), 0.0)
         below = -np.minimum(np.minimum(v[:-1], v[1:]), v[:-1] + dip)
-        # Between two middles of intervals lies the point of their common end.
+        # Two neighbouring intervals share the point between their middles.
         low = np.flatnonzero(below > 1e-12 * v.max())
         if not len(low):
             jerk = np.diff(u) / np.diff(knots)
@@ -185,12 +185,12 @@ def _integrate_profile(part: JointPath, x: Array) -> tuple[Array, Array, Array, 
     t = times / times[-1]
     step = np.diff(times)
 
-    def speeds(u: Array) -> Array:
+    def integrate_accelerations(u: Array) -> Array:
         return np.concatenate([[0.0], np.cumsum(0.5 * step * (u[1:] + u[:-1]))])
 
     bump = 6.0 * t * (1.0 - t)
-    u = u - bump * speeds(u)[-1] / speeds(bump)[-1]
-    v = speeds(u)
+    u = u - bump * integrate_accelerations(u)[-1] / integrate_accelerations(bump)[-1]
+    v = integrate_accelerations(u)
     jerk = np.diff(u) / step
     way = np.cumsum(step * (v[:-1] + step * (u[:-1] / 2 + step * jerk / 6)))
     scale = float(part.s[-1]) / way[-1]

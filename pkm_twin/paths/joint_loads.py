@@ -25,7 +25,7 @@ from pkm_twin.machine import schema
 from pkm_twin.machine.graph import BASE, Joint
 from pkm_twin.machine.rotations import skew
 from pkm_twin.paths.sizing import read_entries
-from pkm_twin.recordings import Recording, by_load
+from pkm_twin.recordings import Recording, split_by_load
 from pkm_twin.recordings.tables import WRENCH as AXES
 from pkm_twin.robot.robot import Robot
 
@@ -50,7 +50,7 @@ class Cycles:
         return ends, np.bincount(place, self.counts, classes).astype(np.float64)
 
 
-def turning_points(values: ArrayLike) -> Array:
+def find_reversals(values: ArrayLike) -> Array:
     """Return a load's reversals and its two ends, shape (k,)."""
     y = np.asarray(values, np.float64)
     y = y[np.concatenate([[True], np.diff(y) != 0.0])] if len(y) else y
@@ -67,7 +67,7 @@ class Reversals:
 
     def add(self, values: Array) -> None:
         """Add the next block, shape (samples,)."""
-        points = turning_points(np.concatenate([self._tail, values]))
+        points = find_reversals(np.concatenate([self._tail, values]))
         # The last point is a reversal only if the next block turns; it needs the one before.
         self._parts.append(points[:-2])
         self._tail = points[-2:]
@@ -89,7 +89,7 @@ def rainflow(values: ArrayLike) -> Cycles:
     def count(a: float, b: float, much: float) -> None:
         found.append((abs(b - a), (a + b) / 2.0, much))
 
-    for value in turning_points(values).tolist():
+    for value in find_reversals(values).tolist():
         stack.append(value)
         while len(stack) >= 3:
             newest, before = abs(stack[-1] - stack[-2]), abs(stack[-2] - stack[-3])
@@ -140,7 +140,7 @@ def bearing_life(
     """
     force, steps = np.asarray(load, np.float64), np.abs(np.asarray(moved, np.float64))
     whole = float(steps.sum())
-    # A smaller mean step, rad or m, is rounding.
+    # A mean step below 1e-12, rad or m, is rounding.
     still = whole <= 1e-12 * len(steps)
     mean = float(np.mean(force**exponent) if still else np.sum(force**exponent * steps) / whole)
     equivalent, amount = mean ** (1.0 / exponent), whole if slides else whole / math.tau
@@ -194,7 +194,7 @@ def joint_loads(motion: Recording) -> Iterator[list[JointLoad]]:
     """
     last: dict[str, tuple[Array, ...]] = {}
     slides = {name: joint for name, joint in joints_by_label(motion.robot).items() if joint.slides}
-    for robot, rows in by_load(motion.robot, motion.load, motion.time, SAMPLES_PER_BLOCK):
+    for robot, rows in split_by_load(motion.robot, motion.load, motion.time, SAMPLES_PER_BLOCK):
         q, *others = (values[rows] for values in motion.motion)
         found = elastic_reactions(robot, q, *others)
         rotations, origins = motion.robot.placements(q)
@@ -233,7 +233,7 @@ def joint_loads(motion: Recording) -> Iterator[list[JointLoad]]:
 
 
 class Summary:
-    """Accumulate one joint's loads: peaks, sums of squares, reversals, and its bearing's.
+    """Accumulate the loads of a joint and its bearing: peaks, sums of squares, reversals.
 
     ``peaks`` and ``squares``: of force and moment, then of both without the part that an actuated
     joint's drive carries (the moment about its axis, or the force along it). They, and ``sizes`` of
@@ -288,7 +288,7 @@ class Summary:
         return rainflow(self.reversals[axis].values)
 
     def life(self, duration: float) -> Life:
-        """Return the L10 of the joint's bearing, with linear load between samples."""
+        """Return the L10 life of the joint's bearing; the load is linear between samples."""
         assert self.spec is not None  # noqa: S101  asked for joints with a bearing
         load, moved = (np.concatenate(column) for column in zip(*self.bearing, strict=True))
         return bearing_life(load, moved, duration, self.spec.C, self.spec.p, self.slides)

@@ -50,12 +50,12 @@ class Curve:
         return 1e-5 * self.robot.size
 
     def grid(self, points: int) -> list[Array]:
-        """Return about so many points: half by the pieces' lengths, half equal for all pieces."""
+        """Distribute about ``points`` points: half by the pieces' lengths, half equally over the pieces."""
         pieces, result = self.stretch.pieces, []
         for k, piece in enumerate(pieces):
             share = piece.length / self.stretch.length + 1.0 / len(pieces)
             count = max(MIN_POINTS, len(piece.knots), round(0.5 * points * share))
-            # Closer near a stop: the speed grows with the root of the distance from it.
+            # Closer near a stop, where the speed grows with the root of the distance.
             t = np.linspace(0.0, 1.0, count + 1)
             begins, ends = k == 0, k == len(pieces) - 1
             if begins and ends:
@@ -189,7 +189,7 @@ class JointPath:
         return q, first / h, second / h**2
 
     def motion(self, interval: Index, part: Array, v: Array, u: Array) -> tuple[Array, ...]:
-        """Return positions, velocities and accelerations there, (k, n) each, for v and u."""
+        """Return positions, velocities and accelerations at fractions of intervals, (k, n) each."""
         q, first, second = self.between(interval, part)
         return q, first * v[:, None], first * u[:, None] + second * (v**2)[:, None]
 
@@ -199,7 +199,7 @@ class JointPath:
         return (1.0 - part) * self.slower[left] + part * self.slower[left + 1]
 
     def refined(self, parts: Index) -> JointPath:
-        """Return the path with each interval divided into so many parts.
+        """Return the path with each interval divided into ``parts`` parts.
 
         :param parts: shape (intervals,).
         :raises ParameterError: as of :meth:`Curve.at`.
@@ -237,7 +237,7 @@ def _format_place(robot: Robot, pose: Array, way: float) -> str:
     values = (np.round(pose, 12) + 0.0).tolist()
     entries = zip(robot.pose_names, values, robot.pose_units, strict=True)
     place = "at " + ", ".join(f"{name} {value:.4g} {unit}" for name, value, unit in entries)
-    # A path in angles alone has no length in metres.
+    # The length of a path in angles is not in metres.
     return f"{place}, {way:.4g} m after the start" if "m" in robot.pose_units else place
 
 

@@ -104,7 +104,7 @@ class Run:
         way, begins = self.part.ends[1:-1], self.way[0]
         k = np.clip(np.searchsorted(begins, way, side="right") - 1, 0, len(begins) - 1)
         low, high = self.knots[k], self.knots[k + 1]
-        # An interval shrinks to rounding.
+        # Bisect until the interval has the size of rounding errors.
         for _ in range(60):
             middle = 0.5 * (low + high)
             before = self.evaluate(k, middle)[0] < way
@@ -133,9 +133,9 @@ class Run:
 
 @dataclass(frozen=True)
 class TimedPath:
-    """Describe a motion along a path: runs from rest to rest, rests before and between (s).
+    """Describe a motion along a path: runs from rest to rest, and rests before and between, s.
 
-    ``robot``: with the payload that it begins with. ``limits``: those of the plan. ``law``: how its
+    ``robot``: with the first payload. ``limits``: those of the plan. ``law``: how its
     speed was chosen. ``carried``: payloads, the first from the beginning on.
     """
 
@@ -150,7 +150,7 @@ class TimedPath:
 
     @property
     def duration(self) -> float:
-        """From the first to the last moment, s."""
+        """Duration of the whole motion, s."""
         return self.begins[-1] + self.runs[-1].duration + self.rests[-1]
 
     @cached_property
@@ -213,12 +213,12 @@ class TimedPath:
         for k, (begin, run) in enumerate(zip(self.begins, self.runs, strict=True)):
             mine = np.flatnonzero(run_of == k)
             if len(mine):
-                # The end counts as rest; the beginning as motion, with its friction.
+                # The beginning of a run counts as motion, with friction; its end as rest.
                 moves = (t[mine] >= begin) & (t[mine] - begin < run.duration * (1.0 - 1e-12))
                 local = t[mine] - begin
                 for change, switch in zip(self.carried[1:], self.switches, strict=True):
                     if change.stretch == k and not change.rest:
-                        # Rounding leaves no time on the other side of a change of payload.
+                        # Keep times on their side of the payload change despite rounding.
                         end = float(run.ends[run.part.first_of(change.piece)])
                         before = np.minimum(local, np.nextafter(end, 0.0))
                         local = np.where(t[mine] >= switch, np.maximum(local, end), before)
@@ -354,7 +354,7 @@ class TimedPath:
 
     @property
     def worst(self) -> dict[str, float]:
-        """Largest used fraction of each limit, between points too; 1 is the limit."""
+        """Largest used fraction of each limit, also between points; 1 is the limit."""
         return {
             name: float(value)
             for name, value in zip(limit_names(self.robot), self._peak_usage, strict=True)
@@ -403,7 +403,7 @@ def sample_run(run: Run, time: Array, moves: Mask | bool = True, tool: bool = Tr
     :param tool: whether to compute the speeds; otherwise they are zero.
     """
     interval, part, v, u = run.at(time)
-    # A machine that moves is never at rest, where friction has no direction.
+    # A tiny minimum speed, so that friction has the direction of the motion also at its ends.
     creep = 1e-9 * run.part.ends[-1] / run.duration
     v, u = np.where(moves, np.maximum(v, creep), 0.0), np.where(moves, u, 0.0)
     q, qd, qdd = run.part.motion(interval, part, v, u)
@@ -475,7 +475,7 @@ def merge_bounds(time: Array, columns: list[int], names: list[str], used: Array)
     spans = [(b, e, columns[b]) for b, e in pairwise(edges) if e > b]
     result: list[tuple[int, int, int]] = []
     for b, e, column in spans:
-        # A brief contact with a limit after an interval without one stays separate.
+        # A brief interval after one without a binding limit stays separate.
         short = float(time[e] - time[b]) < brief and result and result[-1][2] >= 0
         if result and (short or result[-1][2] == column):
             result[-1] = (result[-1][0], e, result[-1][2])

@@ -41,7 +41,7 @@ class Line:
     knots = NO_KNOTS
 
     def at(self, s: Array) -> tuple[Array, Array, Array]:
-        """See :class:`Piece`."""
+        """Return coordinates and their first two derivatives by s, shape (k, m) each."""
         first = np.broadcast_to(self.slope, (len(s), len(self.slope)))
         return self.begin + s[:, None] * self.slope, first, np.zeros(first.shape)
 
@@ -67,7 +67,7 @@ class Corner:
         return 2.0 * self.radius
 
     def at(self, s: Array) -> tuple[Array, Array, Array]:
-        """See :class:`Piece`."""
+        """Return coordinates and their first two derivatives by s, shape (k, m) each."""
         t = (s / self.radius - 1.0)[:, None]
         f = 3 / 16 + t / 2 + 3 / 8 * t**2 - t**4 / 16
         slope = 1 / 2 + 3 / 4 * t - t**3 / 4
@@ -97,7 +97,7 @@ class SubPiece:
         return np.asarray(self.whole.knots[inner] - self.begin)
 
     def at(self, s: Array) -> tuple[Array, Array, Array]:
-        """See :class:`Piece`."""
+        """Return coordinates and their first two derivatives by s, shape (k, m) each."""
         return self.whole.at(self.begin + s)
 
 
@@ -128,7 +128,7 @@ class Arc:
         return self.radius * float(np.arctan2(way @ self.along, way @ self.across) % (2 * np.pi))
 
     def at(self, s: Array) -> tuple[Array, Array, Array]:
-        """See :class:`Piece`."""
+        """Return coordinates and their first two derivatives by s, shape (k, m) each."""
         angle = (s / self.radius)[:, None]
         c, si = np.cos(angle), np.sin(angle)
         place = self.centre + self.radius * (c * self.across + si * self.along)
@@ -154,7 +154,7 @@ class Smooth:
         return np.asarray(self.spline.x[1:-1], np.float64)
 
     def at(self, s: Array) -> tuple[Array, Array, Array]:
-        """See :class:`Piece`."""
+        """Return coordinates and their first two derivatives by s, shape (k, m) each."""
         return self.spline(s), self.spline(s, 1), self.spline(s, 2)
 
 
@@ -175,13 +175,13 @@ def arc_through(begin: Array, middle: Array, end: Array, *, places: Sequence[int
     normal = u - (u @ across) * across
     along = normal / np.linalg.norm(normal)
 
-    def angle(p: Array) -> float:
+    def find_angle(p: Array) -> float:
         d = p - a - offset
         return float(np.arctan2(d @ along, d @ across) % (2 * np.pi))
 
-    if angle(c) < angle(b):
+    if find_angle(c) < find_angle(b):
         along = -along
-    whole = angle(c)
+    whole = find_angle(c)
     size = len(np.asarray(begin))
     full = [np.zeros(size) for _ in range(3)]
     for row, part in zip(full, (a + offset, across, along), strict=True):

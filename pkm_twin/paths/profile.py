@@ -78,7 +78,7 @@ def _largest_start(low: Numbers, high: Numbers, slopes: Numbers, x: float, after
     The gap between the largest lower and the smallest upper line on x' is convex in x and open at
     0, so Newton's steps from the right converge to where it closes.
     """
-    # Two or three steps are usual.
+    # Newton's method usually converges in two or three steps.
     for _ in range(50):
         least, rise, most, fall = 0.0, 0.0, after, 0.0
         for c, e, d in zip(low, high, slopes, strict=True):

@@ -47,19 +47,19 @@ class Phase:
     rate: Array
 
     @cached_property
-    def _curve(self) -> Any:
+    def _phase_curve(self) -> Any:
         return scipy.interpolate.PchipInterpolator(self.times, self.rate)
 
     @cached_property
-    def _whole(self) -> Any:
-        return self._curve.antiderivative()
+    def _total_phase(self) -> Any:
+        return self._phase_curve.antiderivative()
 
     def at(self, time: Array) -> tuple[Array, Array, Array]:
         """Return phase (rad), its rate and the rate's derivative at times (k,)."""
         inside = np.clip(time, self.times[0], self.times[-1])
-        rate = self._curve(inside)
-        slope = np.where(inside == time, self._curve(inside, 1), 0.0)
-        return self._whole(inside) + rate * (time - inside), rate, slope
+        rate = self._phase_curve(inside)
+        slope = np.where(inside == time, self._phase_curve(inside, 1), 0.0)
+        return self._total_phase(inside) + rate * (time - inside), rate, slope
 
     def earlier(self, time: Array, phase: float) -> tuple[Array, Array, Array]:
         """Return times at which the phase was ``phase`` less, and their two derivatives."""
@@ -100,7 +100,7 @@ class ShapedPath(TimedPath):
     def _peak_usage(self) -> Array:
         assert self.phase is not None  # noqa: S101  shaped() gives it
         plain = np.concatenate([begin + run.times for begin, run in zip(self.begins, self.runs, strict=True)])
-        # Each delayed copy jumps where the unshaped motion does, later.
+        # The accelerations of each delayed copy jump at delayed times.
         late = [self.phase.earlier(plain, -k * np.pi)[0] for k in range(len(self.amplitudes))]
         even = np.linspace(0.0, self.duration, POSES_PER_STRETCH)
         times = np.unique(np.clip(np.concatenate([even, *late]), 0.0, self.duration))

@@ -30,7 +30,7 @@ from pkm_twin.machine import schema
 from pkm_twin.machine.sections import MAX_LEAD, DriveSpec
 from pkm_twin.machine.strict_yaml import read_yaml
 from pkm_twin.mechanisms.catalogue import config_folder
-from pkm_twin.recordings.payload import by_load
+from pkm_twin.recordings.payload import split_by_load
 from pkm_twin.recordings.recording import Recording
 
 SAMPLES_PER_BLOCK: Final = 4096
@@ -73,12 +73,12 @@ class Duty:
     def of(cls, time: Array, effort: Array, rate: Array, net: Array) -> Duty:
         """Integrate a motion's samples (k,) by the trapezoidal rule.
 
-        :param net: energy given in each interval less what comes back, shape (k - 1,), J. Where an
+        :param net: energy delivered minus regenerated in each interval, shape (k - 1,), J. Where an
             effort steps between two samples, trapezoids alone would not conserve energy.
         """
         power = effort * rate
         whole = float(time[-1] - time[0])
-        given, back = (_areas(time, np.maximum(side * power, 0.0)) for side in (1.0, -1.0))
+        given, back = (_integrate_intervals(time, np.maximum(side * power, 0.0)) for side in (1.0, -1.0))
         less = net < given - back
         given, back = (
             np.where(less, np.maximum(net + back, 0.0), np.maximum(given, net)),
@@ -88,7 +88,7 @@ class Duty:
             float(np.abs(effort).max()),
             rms(time, effort),
             float(np.abs(rate).max()),
-            float(_areas(time, np.abs(rate)).sum()) / whole,
+            float(_integrate_intervals(time, np.abs(rate)).sum()) / whole,
             max(0.0, float(power.max())),
             max(0.0, -float(power.min())),
             float(given.sum()),
@@ -117,7 +117,7 @@ def net_energy(duties: Sequence[Duty]) -> float:
     return net if abs(net) > CLOSED_CYCLE * sum(duty.returned for duty in duties) else 0.0
 
 
-def _areas(time: Array, values: Array) -> Array:
+def _integrate_intervals(time: Array, values: Array) -> Array:
     """Return the trapezoid under each interval of values (k,), shape (k - 1,)."""
     return np.asarray(0.5 * np.diff(time) * (values[:-1] + values[1:]), np.float64)
 
@@ -245,7 +245,7 @@ class Gear:
 
 @dataclass(frozen=True)
 class Gears:
-    """Hold gears to choose from; ``span``: also all between two neighbours."""
+    """Hold gears to choose from; ``span``: also all ratios between two neighbours."""
 
     gears: tuple[Gear, ...]
     span: bool = False
@@ -365,10 +365,10 @@ class Fit:
         """Return plain data; fractions are 1 at the bound."""
         return {
             "good": self.good,
-            "used_torque": _none_if_infinite(self.torque),
+            "used_torque": _finite_or_none(self.torque),
             "used_continuous_torque": self.thermal,
             "used_speed": self.speed,
-            "inertia_ratio": _none_if_infinite(self.inertia_ratio),
+            "inertia_ratio": _finite_or_none(self.inertia_ratio),
             "source": self.motor.source,
             **self.choice,
             "used_gear_torque": self.geared,
@@ -446,7 +446,7 @@ def size_drives(
     robot, time, (q, qd, qdd, _) = motion.robot, motion.time, motion.motion
     if len(time) < 2:
         raise ParameterError("motion", f"{len(time)} samples", "2 or more")
-    loaded = by_load(robot, motion.load, time, SAMPLES_PER_BLOCK)
+    loaded = split_by_load(robot, motion.load, time, SAMPLES_PER_BLOCK)
     inertias = np.concatenate([mass_matrix(one, q[rows]) for one, rows in loaded])
     masses = np.diagonal(inertias, axis1=-2, axis2=-1)
     # Positions and rates at an interval's ends give its exact mean rate and acceleration.
@@ -572,7 +572,7 @@ class _Axis:
 
 
 def _fit_best_gear(axes: Sequence[_Axis], name: str, motor: Motor, choice: Gears) -> list[Fit]:
-    """Fit joints with one gear: that with the smallest largest used fraction of all joints."""
+    """Choose one gear for several joints: it minimises the largest used fraction of all joints."""
     # Each round of a range is between the neighbours of the best gear. Beyond its curve a motor has
     # no torque; then the other fractions decide.
     for _ in range(4 if choice.span else 1):
@@ -591,8 +591,8 @@ def find_smallest(fits: Sequence[Sequence[Fit]]) -> int | None:
 
 def rms(time: Array, values: Array) -> float:
     """Return the root mean square over time of values (k,)."""
-    return math.sqrt(float(_areas(time, values**2).sum()) / float(time[-1] - time[0]))
+    return math.sqrt(float(_integrate_intervals(time, values**2).sum()) / float(time[-1] - time[0]))
 
 
-def _none_if_infinite(value: float) -> float | None:
+def _finite_or_none(value: float) -> float | None:
     return value if math.isfinite(value) else None

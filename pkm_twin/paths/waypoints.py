@@ -99,7 +99,7 @@ def read_waypoints(
 
 
 def parse_loads(texts: Sequence[str], waypoints: int) -> list[float | None]:
-    """Parse texts ``MASS@FROM:TO`` to the payload from each waypoint on, kg, None the robot's own.
+    """Parse texts ``MASS@FROM:TO``; return the payload from each waypoint on, kg, None: the file's.
 
     :raises ParameterError: another form, waypoints that do not exist, or two masses on one part.
     """

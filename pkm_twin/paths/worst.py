@@ -55,33 +55,33 @@ def workspace_poses(
 
     They lie on rays from home through the pose coordinates, up to the end of the workspace.
 
-    :param lever: least :func:`levers` of each drive, against its greatest in the workspace: near
+    :param lever: least :func:`compute_levers` of each drive, against its greatest in the workspace: near
         zero at a stretched limb, where the singularity index of the machine may still be high.
     :raises ParameterError: a workspace without bounds, or a home outside of it.
     """
     least = np.zeros(robot.joints_count)
     if lever > 0.0:
-        largest = levers(robot, robot.inverse(_poses_on_rays(robot, rays, singularity, least))).max(0)
+        largest = compute_levers(robot, robot.inverse(_poses_on_rays(robot, rays, singularity, least))).max(0)
         home = robot.home()
-        share = levers(robot, robot.inverse(home[None]))[0] / largest
+        share = compute_levers(robot, robot.inverse(home[None]))[0] / largest
         if share.min() < lever:
             joint = robot.joint_names[int(share.argmin())]
             raise ParameterError(
                 "lever",
                 lever,
                 f"{math.floor(100.0 * share.min()) / 100.0:g} or less: at home "
-                f"({_named(robot, home)}) the lever of {joint} is {share.min():.3g} of its largest "
+                f"({_name_coordinates(robot, home)}) the lever of {joint} is {share.min():.3g} of its largest "
                 "in the workspace",
             )
         least = lever * largest
     return _poses_on_rays(robot, rays, singularity, least)
 
 
-def _named(robot: Robot, pose: Array) -> str:
+def _name_coordinates(robot: Robot, pose: Array) -> str:
     return ", ".join(f"{n} {v + 0.0:.4g}" for n, v in zip(robot.pose_names, pose, strict=True))
 
 
-def levers(robot: Robot, q: Array) -> Array:
+def compute_levers(robot: Robot, q: Array) -> Array:
     """Return the tool point's speed per joint rate in its smallest direction, shape (k, n).
 
     In m per rad or m; for a machine that only rotates, the platform's rotation, rad per rad or m.
@@ -103,7 +103,7 @@ def _poses_on_rays(robot: Robot, rays: int, singularity: float, least: Array) ->
     if not _are_in_workspace(robot, home[None], singularity, least)[0]:
         q, known = try_inverse(robot, home[None])
         why = describe_causes(robot, q, home[None], known, singularity, -math.inf)
-        raise ParameterError("workspace", f"home ({_named(robot, home)})", f"a home inside: {why}")
+        raise ParameterError("workspace", f"home ({_name_coordinates(robot, home)})", f"a home inside: {why}")
     low, high = np.zeros(len(span)), np.ones(len(span))
     for _ in range(14):
         middle = 0.5 * (low + high)
@@ -119,14 +119,14 @@ def _are_in_workspace(robot: Robot, poses: Array, singularity: float, least: Arr
     q, known = try_inverse(robot, poses)
     inside = belong_to_workspace(robot, q, poses, known, singularity, -np.inf)
     if least.any():
-        inside[inside] = (levers(robot, q[inside]) >= least).all(-1)
+        inside[inside] = (compute_levers(robot, q[inside]) >= least).all(-1)
     return inside
 
 
 def _joint_rates(robot: Robot, q: Array) -> Array:
     """Return joint rates per velocity of the tool point at constant orientation, (k, n, size).
 
-    For a machine that only rotates, per angular velocity of the platform in axes of its own.
+    For a machine that only rotates, per angular velocity of the platform, in platform axes.
     """
     if only_turns(robot):
         robot.check_independent("worst directions of a rotation")
@@ -207,7 +207,7 @@ def _efforts_by_direction(
     if only_turns(robot):
         qd = np.einsum("knj,dj->kdn", back, ways)
         qs = np.broadcast_to(q[:, None], qd.shape)
-        # Accelerations at which the rotation is steady, from differences of its Jacobian.
+        # Joint accelerations without angular acceleration, from differences of the Jacobian.
         step = 1e-4 / np.maximum(np.abs(qd).max(-1, keepdims=True), 1e-4)
         ahead, behind = (_rotation_jacobian(robot, qs + way * step * qd) for way in (1.0, -1.0))
         own = (ahead - behind) @ qd[..., None] / (2.0 * step[..., None])

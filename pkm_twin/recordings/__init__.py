@@ -1,7 +1,7 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Recordings and planned motions: one type, one reader of bags and tables."""
 
-from pkm_twin.recordings.payload import Load, by_load
+from pkm_twin.recordings.payload import Load, split_by_load
 from pkm_twin.recordings.read import read
 from pkm_twin.recordings.recording import ReadOptions, Recording, at_rest
 from pkm_twin.recordings.tables import Dialect, Table, kinds_of, read_table, write_table
@@ -13,9 +13,9 @@ __all__ = [
     "Recording",
     "Table",
     "at_rest",
-    "by_load",
     "kinds_of",
     "read",
     "read_table",
+    "split_by_load",
     "write_table",
 ]

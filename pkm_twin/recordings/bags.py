@@ -65,7 +65,7 @@ def read_bag(
         recorded = bag.report.metadata.get("pkm_twin", {}).get("robot")
         if recorded is None:
             raise BagError("the bag names no robot; use --robot", path=bag.report.path, reason="no robot")
-        # Not a path: a bag does not choose which files are opened.
+        # A bag names a shipped robot only, so that it cannot choose which files are opened.
         if recorded not in robot_names():
             raise metadata_error(bag, "robot", recorded, f"one of {', '.join(robot_names())}; or give --robot")
         machine = load(recorded)
@@ -94,8 +94,8 @@ def read_bag(
         machine,
         (stamps - stamps[0]) / 1e9,
         np.array([s.q for s in found.samples]),
-        qd=_stack([s.qd for s in found.samples]),
-        effort=_stack([s.effort for s in found.samples]),
+        qd=_stack_values([s.qd for s in found.samples]),
+        effort=_stack_values([s.effort for s in found.samples]),
         load=held,
         source=str(path),
         notes=tuple(notes),
@@ -161,7 +161,7 @@ def is_collection(path: Path) -> bool:
     """Return whether a path is a folder of recordings, not a rosbag2 bag itself."""
     if not path.is_dir() or (path / METADATA_FILE).exists():
         return False
-    # A bag whose metadata is lost has its files side by side.
+    # A rosbag2 folder without metadata has .db3 files side by side.
     return bool(list_bags(path)) and not any(path.glob("*.db3"))
 
 
@@ -185,7 +185,7 @@ def _read_messages(
     # Wrenches of one frame: the first that is accepted, or the option's.
     accepted = how.wrench_frame
 
-    def wrench_of(message: Any, now: int) -> WrenchSample:
+    def accept_wrench(message: Any, now: int) -> WrenchSample:
         nonlocal accepted
         given = message.header.frame_id
         if accepted is None and given in (PLATFORM, how.base_frame):
@@ -217,7 +217,7 @@ def _read_messages(
                     raise MessageError("stamp order", f"stamp {sample.stamp} is not after the last")
                 found.samples.append(sample)
             elif message.topic == topics.wrench:
-                found.wrenches.append(wrench_of(message.message, message.log_time))
+                found.wrenches.append(accept_wrench(message.message, message.log_time))
             else:
                 moved = read_deflection(message.message, message.log_time, rules)
                 found.deflections.append(moved)
@@ -237,7 +237,7 @@ def _read_messages(
     return found._replace(first_reject=first, others=others)
 
 
-def _stack(values: list[Array | None]) -> Array | None:
+def _stack_values(values: list[Array | None]) -> Array | None:
     present = [v for v in values if v is not None]
     return np.array(present) if len(present) == len(values) else None
 
@@ -270,8 +270,8 @@ TOPIC: Final = "/delta_dynamics/joint_trajectory"
 def write_motion(path: Path, r: Recording, facts: Mapping[str, Any], overwrite: bool = False) -> None:
     """Write a planned motion: a bag with one JointTrajectory, FILE.mcap, or a table.
 
-    A table has time, the joints' motion and efforts, the pose with its rates, and what the efforts
-    rest on (``origin``). In a bag numbers are the controller's, and a zero stamp means a start on
+    A table has time, the joints' motion and efforts, the pose with its rates, and the origin of
+    the efforts (``origin``). In a bag numbers are the controller's, and a zero stamp means a start on
     receipt.
 
     :param r: with rates and accelerations.
@@ -279,7 +279,7 @@ def write_motion(path: Path, r: Recording, facts: Mapping[str, Any], overwrite: 
     :raises BagError: the bag exists or cannot be written.
     """
     if path.suffix != ".mcap":
-        write_table(_columns(r) | origin_columns(r.robot, r.load, r.wrench, r.time), path)
+        write_table(_make_columns(r) | origin_columns(r.robot, r.load, r.wrench, r.time), path)
         return
     if r.wrench is not None and r.wrench.any():
         raise ParameterError("out", str(path), "a table: a bag's trajectory has no wrench")
@@ -319,7 +319,7 @@ def write_motion(path: Path, r: Recording, facts: Mapping[str, Any], overwrite: 
         bag.write(TOPIC, message, 0)
 
 
-def _columns(r: Recording) -> dict[str, Array]:
+def _make_columns(r: Recording) -> dict[str, Array]:
     """Return a table's columns: time, the joints' motion and efforts, the pose and its rates."""
     q, qd, qdd, _ = r.motion
     words = {"position": q, "velocity": qd, "acceleration": qdd}

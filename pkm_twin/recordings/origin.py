@@ -42,7 +42,7 @@ class Origin:
 
     @classmethod
     def of(cls, robot: Robot) -> Origin:
-        """Return the origin of what a robot computes."""
+        """Return the origin of efforts that a robot computes."""
         numbers = json.dumps([robot.mechanism, robot.parameter_sections()], sort_keys=True)
         # A table's number, of 53 bits, holds six bytes exactly.
         digest = hashlib.sha256(numbers.encode()).digest()[:6]
@@ -97,7 +97,7 @@ def states_origin(name: str) -> bool:
 
 
 def origin_columns(robot: Robot, load: Load | None, wrench: Array | None, time: Array) -> dict[str, Array]:
-    """Return a table's columns of what efforts rest on, shape (samples,) each.
+    """Return a table's columns of robot, gravity, wrench and payload, shape (samples,) each.
 
     :param wrench: shape (samples, 6); ``time``: (samples,), s.
     """
@@ -109,11 +109,11 @@ def origin_columns(robot: Robot, load: Load | None, wrench: Array | None, time: 
 
 
 def origin_facts(robot: Robot, load: Load | None) -> dict[str, Any]:
-    """Return a bag's metadata of what efforts without a wrench rest on."""
+    """Return a bag's metadata of robot, gravity and payload."""
     own = Origin.of(robot)
     facts = {"robot": own.robot, COMPUTED_WITH: own.digest, "gravity": " ".join(map(repr, own.gravity))}
     if load is not None:
-        # Times are rounded as the bag's stamps are.
+        # Times have the resolution of the bag's stamps.
         *times, _ = zip(*load.spans, strict=True)
         stamped = [[round(1e9 * t) / 1e9 if math.isfinite(t) else t for t in row] for row in times]
         values = [*stamped, load.masses or [load.mass]]

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""The payload of a recording: as its bag or table tells it, or as it is asked for."""
+"""The payload of a recording: from its bag, its table, or an option."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SOURCES = {"bag": "recording", "table": "table, as sampled", "path": "path's way
 
 @dataclass(frozen=True)
 class Load:
-    """A payload that is no part of the robot's file, and when it is on the platform.
+    """A payload in addition to the robot's file, and the times at which the platform holds it.
 
     mass in kg, com in m from the platform's reference point; times in s since the first joint
     state, each from its begin until before its end, infinite where it never ends; empty where it is
@@ -38,7 +38,7 @@ class Load:
     times: tuple[tuple[float, float], ...] = ()
     source: str = "option"
     sought: bool = False
-    """True if it is fitted, and is the robot's own."""
+    """True if the payload is to be fitted; the robot then keeps the payload of its file."""
     masses: tuple[float, ...] = ()
 
     @classmethod
@@ -118,7 +118,7 @@ class Load:
 
 
 def payload_columns(robot: Robot, carried: Load | None, time: Array) -> dict[str, Array]:
-    """Return a table's payload columns, with the robot's own in between; empty without a load."""
+    """Return a table's payload columns; the robot file's payload applies outside the intervals."""
     if carried is None:
         return {}
     own, mass = robot.payload, carried.carried(time)
@@ -232,10 +232,10 @@ def parse_times(text: str) -> tuple[tuple[float, float], ...]:
     return tuple(zip(numbers[::2], numbers[1::2], strict=True))
 
 
-def by_load(robot: Robot, carried: Load | None, time: Array, longest: int) -> Iterator[tuple[Robot, slice]]:
+def split_by_load(robot: Robot, carried: Load | None, time: Array, longest: int) -> Iterator[tuple[Robot, slice]]:
     """Yield the loaded robot and the consecutive samples (at most ``longest``) that have its load.
 
-    A payload that is sought is the robot's own.
+    A payload to be fitted is the robot file's.
     """
     carried = None if carried is None or carried.sought else carried
     mass = np.full(len(time), np.nan) if carried is None else carried.carried(time)

@@ -41,7 +41,7 @@ RECORDING: Final = "an MCAP file, a rosbag2 folder, or a table with columns time
 COORDINATES: Final = ("joints", "pose")
 SIDES: Final = ("joint", "controller", "motor")
 GRAVITY_TERM: Final = "effort_gravity"
-"""In every table that `torques` writes."""
+"""Suffix of a column that is in every table of `torques`."""
 SAMPLES_PER_BLOCK: Final = 4096
 """Samples computed at a time, so that memory stays flat."""
 MAX_SIZES: Final = dict(
@@ -99,7 +99,7 @@ def read(
 
 def _read_table_recording(path: Path, name: str | Robot | None, how: ReadOptions) -> Recording:
     if name is None:
-        # A file that is no recording of any robot is rejected as such.
+        # Reject a file that cannot be a recording before the missing robot.
         try:
             columns = list(read_table(path))
         except ParameterError as error:
@@ -113,7 +113,7 @@ def _read_table_recording(path: Path, name: str | Robot | None, how: ReadOptions
     joints = robot.joint_names if side is None else side.names
     _reject_misspelt_columns(table, robot, joints, how)
 
-    def stack(word: str) -> Array | None:
+    def stack_columns(word: str) -> Array | None:
         values = table.stack_if([f"{joint}.{word}" for joint in joints])
         if values is not None and word in EFFORTS[:2] and "effort" in how.dialect.units:
             # In per cent of the motors' rated torques, N m.
@@ -132,7 +132,7 @@ def _read_table_recording(path: Path, name: str | Robot | None, how: ReadOptions
             return side.positions(values)
         return side.efforts(values) if word in EFFORTS else side.rates(values)
 
-    q = stack("position")
+    q = stack_columns("position")
     if q is None and any(f"{joint}.position" in table for joint in robot.joint_names):
         theirs = ", ".join(f"{joint}.position" for joint in joints)
         raise ParameterError("--side", how.side, f"columns {theirs}, or no --side")
@@ -152,7 +152,7 @@ def _read_table_recording(path: Path, name: str | Robot | None, how: ReadOptions
         )
     time, notes, effort, word = read_times(path, times), [], None, how.efforts[0]
     origin = Origin.of_table(table)
-    # In a table of a model's terms the efforts are their sum.
+    # A table with the terms of the model has computed efforts.
     computed = any(f"{joint}.{GRAVITY_TERM}" in table for joint in robot.joint_names)
     if computed:
         # Reject computed efforts without the wrench or payload that they were computed with.
@@ -173,9 +173,9 @@ def _read_table_recording(path: Path, name: str | Robot | None, how: ReadOptions
                     )
     if posed:
         assert pose is not None  # noqa: S101  one of the two is there
-        # Joint positions of a pose, and their rates where the table has those of the pose.
+        # Joint positions, and rates if given, from those of the pose.
         q = robot.inverse(pose)
-        # Velocities of joints belong to a table of joints, those of coordinates to one of poses.
+        # A table of poses has rates of coordinates, a table of joints those of joints.
         qd, qdd = (table.stack_if([f"{name}.{what}" for name in robot.pose_names]) for what in RATES[1:])
         if set(robot.joint_names) & set(robot.pose_names) or qd is None or qdd is None:
             q, qd, qdd = q, None, None
@@ -188,11 +188,11 @@ def _read_table_recording(path: Path, name: str | Robot | None, how: ReadOptions
         if pose is not None and how.follow is None:
             hint = "; --follow pose plans its pose again, --follow joints ignores it"
             check_pose(path, robot, q, pose, hint if how.planned else "")
-        qd, qdd = map(stack, RATES[1:])
+        qd, qdd = map(stack_columns, RATES[1:])
     if not (posed and how.planned):
         for word in how.efforts:
             if how.planned or not computed or word != "effort":
-                effort = stack(word)
+                effort = stack_columns(word)
             if effort is not None:
                 break
     check_units(path, robot, time, q, qd, how.dialect)
@@ -225,7 +225,7 @@ def _read_table_recording(path: Path, name: str | Robot | None, how: ReadOptions
         pose,
         held,
         efforts="model" if computed and word == "effort" else word,
-        computed=stack("effort") if (computed or origin is not None) and not posed else None,
+        computed=stack_columns("effort") if (computed or origin is not None) and not posed else None,
         origin=origin,
         source=str(path),
         notes=(
@@ -320,7 +320,7 @@ def check_pose(path: Path, robot: Robot, q: Array, pose: Array, how: str = "") -
         # Joint positions without a pose are rejected later, with their reason.
         size = np.where(good, np.linalg.norm(off * robot.pose_scales, axis=1), 0.0)
         worst = int(size.argmax())
-        # A pose may miss that of the joints by 1e-3 of the machine's size.
+        # Tolerance between pose and joint positions: 1e-3 of the machine's size.
         if size[worst] > 1e-3 * robot.size:
             names = ", ".join(robot.pose_names)
             raise ParameterError(

@@ -72,7 +72,7 @@ class ReadOptions:
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """Joint states of n joints on a common time axis, and what was measured beside them.
+    """Joint states of n joints on a common time axis, with other measurements.
 
     time (samples,) in s since the first sample; q, qd, qdd, effort (samples, n), rad or m, per s
     and s2, N m or N; wrench (samples, 6) in base axes at the platform's reference point, N and N m;
@@ -90,7 +90,7 @@ class Recording:
     pose: Array | None = None
     """Coordinates of the pose where they are known beside q, shape (samples, m)."""
     load: Load | None = None
-    """A payload beside the robot's own."""
+    """A payload in place of the robot file's."""
     still: Mask | None = None
     """Samples at which differentiation cannot distinguish a joint from rest, so that dry friction
     has no direction, shape (samples, n); None: no sample."""
@@ -98,21 +98,21 @@ class Recording:
     """Kind of the efforts: ``measured``, the ``effort`` of a plan or of a table that does not
     tell, the ``model``'s, which only a plan has, or a ``current``, A."""
     computed: Array | None = None
-    """Efforts that the file says a model computed, shape (samples, n), beside what they rest on."""
+    """Efforts that a model computed according to the file, shape (samples, n)."""
     origin: Origin | None = None
-    """The robot that computed them, where the file names it."""
+    """The robot that computed the efforts, if the file names it."""
     doubt: str = ""
     """Sentence on efforts of the file that the robot's model does not give; empty without such efforts."""
     late: float = 0.0
-    """How late the efforts were against the positions, s: they are put on time."""
+    """Delay of the efforts behind the positions, s, which was removed."""
     source: str = ""
-    """The file, as it was named."""
+    """Name of the file as the user gave it."""
     notes: tuple[str, ...] = ()
-    """For people: what was read and what was left out."""
+    """Notes for users on what was read and left out."""
     start: int = 0
     """Stamp of the first sample, ns."""
     bag: Bag | None = None
-    """None of a table."""
+    """The bag; None for a table."""
     topics: Topics = Topics(COLUMNS)
     rejected: Counter[str] = field(default_factory=Counter)
     """Refused messages by reason."""
@@ -135,7 +135,7 @@ class Recording:
         return one_line(Path(self.source).name, 100)
 
     def qualify(self, answer: str) -> str:
-        """Return an answer for this motion, with what makes it doubtful."""
+        """Return an answer for this motion, followed by the doubt about its efforts, if any."""
         return f"{answer}; {self.doubt}" if self.doubt else answer
 
     @property
@@ -145,7 +145,7 @@ class Recording:
 
     @property
     def clock(self) -> Array:
-        """Times as a table has them, s; of a bag since its first sample."""
+        """Times of the table, s; for a bag since its first sample."""
         return self.time if self.bag is not None else self.time + self.start / 1e9
 
     @cached_property
@@ -156,7 +156,7 @@ class Recording:
         if self.qd is None or not steps.jumps.any():
             return steps
         alone = steps_of(self.time, self.q, None, limit)
-        # Jumps that appear only with the measured velocities are the velocities' fault.
+        # Jumps found only with the measured velocities are faults of the velocities.
         return steps if alone.jumps.any() else alone
 
     @cached_property
@@ -190,7 +190,7 @@ class Recording:
 
     @property
     def message_count(self) -> int:
-        """How many messages the chosen topics have; of a table its rows."""
+        """Number of messages of the chosen topics, or of a table's rows."""
         if self.bag is None:
             return len(self.time)
         names = (self.topics.joint_states, self.topics.wrench)
@@ -211,7 +211,7 @@ class Recording:
 
     @property
     def carried(self) -> Robot | None:
-        """The robot with the payload that is known; of several the one farthest from its own."""
+        """The robot with its known payload; of several payloads the one that differs most from the file's."""
         load = self.load
         if load is None or load.sought:
             return None

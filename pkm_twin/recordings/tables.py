@@ -36,13 +36,13 @@ MAX_LINE: Final = 1024**2
 ROWS_PER_BLOCK: Final = 4096
 """Rows written at a time, so that memory stays flat."""
 ENDINGS: Final = (".csv", ".parquet", ".mat")
-"""Name endings of tables that can be written."""
+"""Suffixes of tables that can be written."""
 NOT_READ: Final = {
     ".mat": "CSV or Parquet; in MATLAB: writetable(T, 'FILE.csv')",
     ".gz": "the unpacked table; gunzip -k FILE.csv.gz",
     ".xlsx": "CSV, as the spreadsheet saves it",
 }
-"""Endings of tables that are rejected, and what is read in their place."""
+"""Suffixes of rejected tables, and what to use instead."""
 SEPARATORS: Final = {",": ",", ";": ";", "tab": "\t", "\t": "\t"}
 UNITS: Final = {
     "rad": ("angle", 1.0),
@@ -60,7 +60,7 @@ UNITS: Final = {
     "ns": ("time", 1e-9),
     "percent": ("effort", 1e-2),
 }
-"""Units of a table: what they are of, and their size in SI."""
+"""Units of a table: kind of quantity, and size in SI."""
 RATES: Final = ("position", "velocity", "acceleration")
 EFFORTS: Final = ("effort", "measured", "current")
 WRENCH: Final = ("fx", "fy", "fz", "mx", "my", "mz")
@@ -183,9 +183,9 @@ class Table(dict[str, Array]):
 
 
 def kinds_of(robot: Robot, side: str = "joint") -> dict[str, str]:
-    """Return what the columns of a robot's motion measure: angle, length, time, or another.
+    """Return the kind of quantity of each column of a robot's motion: angle, length, time, or other.
 
-    :param side: whose numbers the joints' are; a motor turns.
+    :param side: side of the joint values; those of the motor are angles.
     """
     kinds = {"time": "time"}
     names = robot.joint_names if side == "joint" else robot.controller.names
@@ -260,7 +260,7 @@ def _read_csv(
 ) -> tuple[list[str], Array, int]:
     """Return header cells, numbers (columns, rows), and how many lines are above the header.
 
-    NaN is an empty cell, and in columns beside ``kinds`` one that is no number.
+    Empty cells are NaN, and cells without a number in columns that are not in ``kinds``.
     """
     # Spreadsheets put a byte order mark before the header row.
     with io.TextIOWrapper(data, encoding="utf-8-sig", newline="") as text:
@@ -332,7 +332,7 @@ def _read_parquet(
 
 
 def _read_lines(text: TextIO, path: Path) -> Iterator[str]:
-    """Yield the lines of a file; a line that would take all memory is rejected."""
+    """Yield the lines of a file; reject a line longer than MAX_LINE."""
     while line := text.readline(MAX_LINE):
         if len(line) == MAX_LINE:
             raise ParameterError(f"{path}: a line", f"{line[:40]}...", f"at most {MAX_LINE} characters")

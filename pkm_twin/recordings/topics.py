@@ -102,11 +102,11 @@ def choose_topics(bag: Bag, robot: Robot, wanted: Sequence[str] = (), deflected:
         kinds[TRANSFORM] = []
     for name in wanted:
         info = bag.report.topics.get(name)
-        if info is None or type_of(info) not in kinds:
-            fit = [n for n, i in bag.report.topics.items() if type_of(i) in kinds]
+        if info is None or normalise_type(info) not in kinds:
+            fit = [n for n, i in bag.report.topics.items() if normalise_type(i) in kinds]
             is_a = "is not in the bag" if info is None else f"is a {info.type}"
             raise _make_choice_error(bag, f"topic {name} {is_a}; topics that fit: {', '.join(fit)}")
-        kinds[type_of(info)].append(name)
+        kinds[normalise_type(info)].append(name)
     for kind, names in kinds.items():
         if len(set(names)) > 1:
             raise _make_choice_error(bag, f"{' and '.join(names)} are both {kind}; choose one with --topic")
@@ -116,7 +116,7 @@ def choose_topics(bag: Bag, robot: Robot, wanted: Sequence[str] = (), deflected:
     if not filled:
         aside = "; ".join(f"{name} is there, but {why}" for name, why in left_out.items())
         text = f"no joint states that can be read: {aside}" if aside else "no joint states in the bag"
-        plans = [n for n, i in bag.report.topics.items() if type_of(i) == TRAJECTORY and i.count]
+        plans = [n for n, i in bag.report.topics.items() if normalise_type(i) == TRAJECTORY and i.count]
         if plans and not aside:
             text += (
                 f": {plans[0]} is a planned trajectory, which `pkm-twin torques` and `size` take; "
@@ -182,7 +182,7 @@ def is_output(topic: str) -> bool:
     )
 
 
-def type_of(info: TopicInfo) -> str:
+def normalise_type(info: TopicInfo) -> str:
     """Return a topic's type as ROS 2 writes it; some libraries leave the ``msg`` out."""
     package, _, name = info.type.partition("/")
     return info.type if "/" in name or not name else f"{package}/msg/{name}"
@@ -192,7 +192,7 @@ def _find_candidates(bag: Bag, kind: str, wanted: list[str], left_out: dict[str,
     """Find topics of a type: the wanted, else all but the twin's and a simulation's own."""
     fit = []
     for name, info in bag.report.topics.items():
-        if type_of(info) != kind:
+        if normalise_type(info) != kind:
             continue
         if info.encoding != "cdr":
             left_out[name] = f"its encoding is {info.encoding}; expected cdr"

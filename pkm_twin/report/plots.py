@@ -20,7 +20,7 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#F
 TERMS: Final = ("gravity", "inertia", "velocity", "payload", "friction", "external")
 """Terms of an effort, in the order of the plots."""
 MAX_SINGLE_COLUMN_TIME: Final = 5.0
-"""A motion that lasts longer, s, has a picture of its largest effort beside the whole."""
+"""Longest motion with one column of plots, s; a longer one has a second column at its largest effort."""
 DASHES: Final = ("-", "--", ":", "-.")
 """Styles of lines that can lie on one another."""
 WIDTH: Final = 9.0
@@ -75,7 +75,7 @@ def rendered(figure: Any, dpi: int, form: str = "png") -> bytes:
     return data.getvalue()
 
 
-def head(figure: Any, text: str, size: float = STYLE["figure.titlesize"]) -> int:
+def write_title(figure: Any, text: str, size: float = STYLE["figure.titlesize"]) -> int:
     """Write the figure's title, wrapped; return the number of lines."""
     # A no-break space keeps a value and its unit on one line.
     tied = re.sub(r"(?<=\d) (?=[^\W\d])|(?<=\bN) (?=m\b)", "\xa0", text)
@@ -124,7 +124,7 @@ def torques(motion: Any, table: Mapping[str, Any], title: str) -> Any:
         if not whole:
             axes[k].set_xlim(time[peak] - 1.0, time[peak] + 1.0)
         legend(axes[k])
-    head(figure, title)
+    write_title(figure, title)
     return figure
 
 

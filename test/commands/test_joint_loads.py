@@ -15,11 +15,11 @@ from pkm_twin.paths.joint_loads import (
     Reversals,
     Summary,
     bearing_life,
+    find_reversals,
     joint_loads,
     joints_by_label,
     rainflow,
     read_bearings,
-    turning_points,
 )
 from pkm_twin.recordings import ReadOptions, Recording, read
 from stiffness_monitor import platform_response
@@ -50,7 +50,7 @@ def test_rainflow_is_the_standards_example():
 def test_cycles_hold_all_reversals(rng):
     for _ in range(50):
         load_ = rng.normal(size=60)
-        points = turning_points(load_)
+        points = find_reversals(load_)
         found = rainflow(load_)
         # Each reversal to the next is half a cycle.
         assert found.counts.sum() == pytest.approx((len(points) - 1) / 2)
@@ -67,7 +67,7 @@ def test_reversals_of_blocks_are_those_of_the_whole(rng):
         found = Reversals()
         for part in np.split(values, np.sort(rng.integers(0, len(values), 12))):
             found.add(part)
-        np.testing.assert_array_equal(found.values, turning_points(values))
+        np.testing.assert_array_equal(found.values, find_reversals(values))
 
 
 def test_loads_in_blocks_are_those_of_the_whole(twin, tmp_path, monkeypatch):

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""The list_questions of the documentation, asked of machines of the templates: two commands each.
+"""The questions of the documentation, asked of machines of the templates: two commands each.
 
 An answer is judged by a number of its own: another engine, a difference, a machine built anew.
 """

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pkm_twin.errors import ParameterError
-from pkm_twin.recordings import Load, Recording, by_load
+from pkm_twin.recordings import Load, Recording, split_by_load
 from pkm_twin.recordings.payload import payload_columns, read_table_load
 from pkm_twin.recordings.tables import Table
 from test.support.robots import load as robot_of
@@ -51,7 +51,7 @@ def test_several_payloads_follow_each_other_without_a_sample_of_both():
     r = Recording(robot, TIME, np.zeros((8, 3)), load=load)
     masses = r.held * (r.carried.payload.mass - 0.1) + 0.1
     np.testing.assert_allclose(masses, np.where(np.isnan(expected), 0.1, expected), atol=1e-15)
-    loaded = {machine.payload.mass for machine, _ in by_load(robot, load, TIME, 8)}
+    loaded = {machine.payload.mass for machine, _ in split_by_load(robot, load, TIME, 8)}
     assert loaded == {0.0, 0.1, 0.2, 0.5}
     table = Table(Path("x.csv"), payload_columns(robot, load, TIME))
     again = read_table_load(robot, table, TIME)

@@ -316,7 +316,7 @@ def test_every_limit_is_plausible_or_rejected(name):
 def test_laws_go_from_rest_to_rest(law):
     t = np.linspace(0.0, 1.0, 20001)
     part = SimpleNamespace(ends=np.linspace(0.0, 1.0, 11))
-    run = law.on(part, 1.0)
+    run = law.make_run(part, 1.0)
     way, rate, change = run.evaluate(np.searchsorted(run.knots[1:-1], t, side="right"), t)
     np.testing.assert_allclose(np.interp(run.ends, t, way), part.ends, atol=1e-6)
     for values, ends in ((way, (0.0, 1.0)), (rate, (0.0, 0.0)), (change, (0.0, 0.0))):

@@ -93,7 +93,7 @@ def test_a_picture_answers_and_the_star_has_its_cells_colour(stored):
 def test_a_long_title_is_wrapped_and_keeps_values_with_their_units():
     figure, _ = plots.columns(1, 1)
     words = " ".join(f"part_{k} bears {k}.25 N m;" for k in range(9))
-    count = plots.head(figure, words)
+    count = plots.write_title(figure, words)
     rows = figure.get_suptitle().split("\n")
     assert count == len(rows) > 1 and max(map(len, rows)) < 90
     assert " ".join(rows) == words

@@ -251,7 +251,7 @@ def draw_modes(file: Path, first: int) -> None:
         ax.view_init(elev=12, azim=-60)
         ax.set_axis_off()
     question = "delta_cu: which parts move in each mode? Orange: R-C-U forearm; grey: at rest"
-    plots.head(figure, question, 10)
+    plots.write_title(figure, question, 10)
     plots.save(figure, file)
 
 

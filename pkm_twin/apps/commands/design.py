@@ -285,7 +285,7 @@ def draw_design(robot: Robot, found: Found, path: PosePath, answer: str) -> Any:
         x, y = (f"{aim} ({QUANTITIES[aim].unit(robot)})" for aim in found.minimise)
         plots.label(ax, x, y)
         plots.legend(ax)
-        plots.head(figure, answer)
+        plots.write_title(figure, answer)
         return figure
     numbers = found.best.numbers
     both = [{n: [robot.number(n)] for n in numbers}, {n: [v] for n, v in numbers.items()}]
@@ -301,7 +301,7 @@ def draw_design(robot: Robot, found: Found, path: PosePath, answer: str) -> Any:
         plots.label(ax, "time (s)", f"effort ({unit})", words)
         ax.set_ylim(-most, most)
     plots.legend(axes[0])
-    plots.head(figure, answer)
+    plots.write_title(figure, answer)
     return figure
 
 

@@ -107,7 +107,7 @@ def draw(found: ToolResponse, modes: ToolModes, title: str) -> Any:
         phase.plot(grid, np.degrees(np.angle(one)), **style)
     for frequency in modes.frequencies[modes.frequencies <= grid[-1]]:
         size.axvline(frequency, color="0.8", lw=0.8, zorder=0)
-    plots.head(figure, title)
+    plots.write_title(figure, title)
     plots.label(size, "frequency (Hz)", "displacement per force (µm/N)")
     plots.legend(size)
     plots.label(phase, "frequency (Hz)", "phase (deg)")

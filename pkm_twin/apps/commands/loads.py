@@ -183,5 +183,5 @@ def draw(motion: Recording, loads: Sequence[Summary], title: str) -> Any:
         if shown:
             # Below: beside curves that fill their axes there is no room.
             plots.legend(ax, below=True)
-    plots.head(figure, title)
+    plots.write_title(figure, title)
     return figure

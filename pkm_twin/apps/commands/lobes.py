@@ -104,7 +104,7 @@ def draw(found: Limits, milling: Milling, title: str) -> Any:
     way = "slot" if milling.immersion == 1.0 else "up-milling" if milling.up else "down-milling"
     words = f"{milling.teeth} teeth, {way}; chatter above the line; star: the best speed"
     plots.label(ax, "spindle speed (rpm)", "axial depth of cut (mm)", words)
-    plots.head(figure, title)
+    plots.write_title(figure, title)
     ax.set_ylim(0.0, 1.05 * depth.max())
     ax.margins(x=0.0)
     return figure

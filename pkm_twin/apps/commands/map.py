@@ -139,16 +139,16 @@ def compute(given: MapOptions) -> Report:
         # Evaluate the kind along a path; report the worst of each case.
         path = given.along
         from pkm_twin.maps.along import along
-        from pkm_twin.paths.along import check_efforts, settle_rests
+        from pkm_twin.paths.along import check_efforts, zero_resting_motion
         from pkm_twin.recordings import ReadOptions, read
-        from pkm_twin.recordings.payload import by_load
+        from pkm_twin.recordings.payload import split_by_load
 
         if given.out is not None and given.out.suffix != ".csv":
             raise ParameterError("out", str(given.out), "a name that ends in .csv")
         motion = read(path, machine, ReadOptions(planned=True, load=given.load))
         motion.check_rates()
         if given.payload is None and (motion.computed is not None or (motion.effort is not None and len(motion.q) > 2)):
-            doubt = check_efforts(settle_rests(motion.with_rates())).doubt
+            doubt = check_efforts(zero_resting_motion(motion.with_rates())).doubt
             motion = replace(motion, doubt=doubt)
         found = along(
             kind,
@@ -157,7 +157,7 @@ def compute(given: MapOptions) -> Report:
             motion.q,
             cases=cases,
             wrench=motion.wrench,
-            parts=by_load(machine, motion.load, motion.time, len(motion.q)),
+            parts=split_by_load(machine, motion.load, motion.time, len(motion.q)),
             least=given.singularity,
             least_clearance=given.least_clearance,
         )

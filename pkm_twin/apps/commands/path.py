@@ -296,7 +296,7 @@ def draw_limits(motion: TimedPath, title: str) -> Any:
         if colour is not None:
             for ax in (top, low):
                 ax.axvspan(bound.begin, bound.end, color=colour, alpha=0.15, lw=0)
-    plots.head(figure, title)
+    plots.write_title(figure, title)
     most = max(motion.worst.items(), key=lambda item: item[1], default=None)
     binds = any(bound.what in colours for bound in motion.bounds)
     words = ""
@@ -346,7 +346,7 @@ def _report_cut(cut: SoftCut, motion: TimedPath) -> tuple[list[Fact], Any]:
             words = f"{label}: up to {values.max():.4g}, limit {limit:.4g}"
             plots.label(ax, "time (s)", label, words)
             ax.set_ylim(0.0, 1.1 * limit)
-        plots.head(figure, title)
+        plots.write_title(figure, title)
         return figure
 
     return facts, draw

@@ -378,5 +378,5 @@ def draw(taken: EffortComparison, duties: Sequence[DriveDuty], answer: str) -> A
             ax.set(xlim=(-fastest, fastest), ylim=(-1.1 * most, 1.1 * most))
         plots.label(ax, *labels, f"{d.joint}: {words}")
         plots.legend(ax)
-    plots.head(figure, answer)
+    plots.write_title(figure, answer)
     return figure

@@ -93,5 +93,5 @@ def draw(results: Sequence[Judged], answer: str) -> Any:
         ax.tick_params(axis="x", labelrotation=30)
     shown = "" if len(order) == len(results) else f"; {len(order)} shown"
     marks = "band: control limits; ring: outside them; dashed: the mean changed"
-    plots.head(figure, f"Is it getting worse? {answer}{shown}\n{marks}")
+    plots.write_title(figure, f"Is it getting worse? {answer}{shown}\n{marks}")
     return figure

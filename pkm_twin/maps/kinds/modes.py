@@ -101,7 +101,7 @@ class Modes(Frequency):
         figure.colorbar(drawn, ax=axes, aspect=25, pad=0.01).set_label(
             "displacement over the mode's largest (dimensionless)", fontsize=9
         )
-        plots.head(
+        plots.write_title(
             figure,
             f"{data.attrs['robot']}: lowest modes at the map's worst pose, actuators locked\n"
             "grey: at rest; coloured: deformed, magnified; named: the parts with most energy",

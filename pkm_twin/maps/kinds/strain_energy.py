@@ -171,7 +171,7 @@ def _draw_slices(data: Dataset, case: str, elements: list[int]) -> dict[str, Fig
     bar.locator = plots.pyplot().MaxNLocator(6)
     bar.update_ticks()
     bar.set_label(label)
-    plots.head(figure, _title(data, case, elements, f"slices at heights {upwards} (m)"), 10)
+    plots.write_title(figure, _title(data, case, elements, f"slices at heights {upwards} (m)"), 10)
     return {"slices": figure}
 
 
@@ -198,5 +198,5 @@ def _draw_planes(data: Dataset, case: str, elements: list[int]) -> dict[str, Fig
         ax.set_title(str(data.element.values[n]), fontsize=10)
     bar = figure.colorbar(mesh, ax=figure.axes, aspect=25, pad=0.01)
     bar.set_label("share of the strain energy (dimensionless)")
-    plots.head(figure, _title(data, case, elements, f"{one['held']}"), 10)
+    plots.write_title(figure, _title(data, case, elements, f"{one['held']}"), 10)
     return {"plane": figure}
