@@ -25,7 +25,7 @@ __all__ = [
     "variants",
 ]
 
-_HOMES = {
+_MODULES = {
     "Robot": "pkm_twin.robot.robot",
     "forward_derivatives": "pkm_twin.robot.derivatives",
     "inverse_derivatives": "pkm_twin.robot.derivatives",
@@ -35,15 +35,15 @@ _HOMES = {
     "transmission": "delta_dynamics.torques.transmission",
     "variants": "pkm_twin.design.variants",
 }
-"""Loaded when they are asked for: a command or a node answers signals before it loads numpy."""
+"""Module of each public name, imported on first use: commands and nodes handle signals before numpy loads."""
 
 
 def __getattr__(name: str) -> Any:
     if name == "__version__":
         return import_module("importlib.metadata").version(__name__)
-    if name not in _HOMES:
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = globals()[name] = getattr(import_module(_HOMES[name]), name)
+    value = globals()[name] = getattr(import_module(_MODULES[name]), name)
     return value
 
 

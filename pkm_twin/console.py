@@ -21,7 +21,8 @@ from pkm_twin.files import STANDARD, parse_numbers, require_replaceable
 def progress(what: str, total: int | None) -> Iterator[Callable[[int], None]]:
     """Draw a progress bar on stderr, if that is a terminal; yield a function that takes the count.
 
-    The bar's length is what remains at the first count, so that it estimates resumed work correctly.
+    The bar's length is the work that remains at the first count, so that its estimate of the time is
+    also right for resumed work.
     """
     with ExitStack() as stack:
         bar, first = None, 0
@@ -29,7 +30,7 @@ def progress(what: str, total: int | None) -> Iterator[Callable[[int], None]]:
         def update(count: int) -> None:
             nonlocal bar, first
             if bar is None and sys.stderr.isatty():
-                # Without a length click needs something to iterate over.
+                # Without a length click needs an iterable.
                 endless = iter(int, 1) if total is None else None
                 length, first = None if total is None else total - count, count
                 shown = click.progressbar(endless, length, what, show_pos=True, file=sys.stderr)

@@ -113,11 +113,11 @@ _warned: dict[str, dict[Any, Any]] = {}
 """The warnings given for each file, so that a file that is loaded again does not repeat them."""
 
 
-LEAST_LIMIT: Final = 1e-9
+MIN_LIMIT: Final = 1e-9
 """Smallest limit that a machine can have, in any unit."""
 
 
-def check_limit(field: str, value: float, unit: str = "", least: float = LEAST_LIMIT, most: float = 1e12) -> None:
+def check_limit(field: str, value: float, unit: str = "", least: float = MIN_LIMIT, most: float = 1e12) -> None:
     """Reject NaN and values out of range; by default also zero and below.
 
     :raises ParameterError: the value is invalid; the error names the field.

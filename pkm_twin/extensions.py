@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Commands, kinds of maps and exports of this package and, as entry points, of other packages."""
+"""Look up commands, map kinds and exports of this package and, by entry points, of other packages."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Files that a user names: regular ones only, and written whole or not at all; numbers in them."""
+"""Open and atomically write files that a user names, and parse numbers."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from pkm_twin.errors import FileError, ParameterError
 
 STANDARD: Final = "-"
 """Name of standard input and output."""
-_KINDS: Final = (
+_FILE_KINDS: Final = (
     (stat.S_ISDIR, "a folder"),
     (stat.S_ISFIFO, "a FIFO"),
     (stat.S_ISCHR, "a character device"),
     (stat.S_ISBLK, "a block device"),
     (stat.S_ISSOCK, "a socket"),
 )
-_numbers: Final = count()
+_temporary_numbers: Final = count()
 
 
 def open_regular(path: Path) -> BinaryIO:
@@ -66,7 +66,7 @@ def read_bounded(path: Path, most: int, what: str) -> bytes:
 
 def _require_regular(mode: int, path: Path) -> None:
     if not stat.S_ISREG(mode):
-        kind = next((name for test, name in _KINDS if test(mode)), "something else")
+        kind = next((name for test, name in _FILE_KINDS if test(mode)), "something else")
         raise OSError(errno.EINVAL, f"it is {kind}, not a regular file", str(path))
 
 
@@ -118,7 +118,7 @@ def replacing(path: Path) -> Iterator[Path]:
             sys.stdout.buffer.flush()
         return
     require_replaceable(path)
-    hidden = path.with_name(f".{os.getpid()}.{next(_numbers)}.tmp")
+    hidden = path.with_name(f".{os.getpid()}.{next(_temporary_numbers)}.tmp")
     try:
         yield hidden
         os.replace(hidden, path)

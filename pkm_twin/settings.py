@@ -85,7 +85,7 @@ AGE_BOUNDS: Final[Mapping[str, Any]] = {**SECONDS, "low": 1e-3}
 COUNT_BOUNDS: Final[Mapping[str, Any]] = {"low": 1, "high": 10**6}
 FRACTION_BOUNDS: Final[Mapping[str, Any]] = {"low": 0.0, "high": 1.0}
 SCALE_BOUNDS: Final[Mapping[str, Any]] = {"low": 0.0, "high": 1e9}
-"""Bounds of settings of one kind."""
+"""Attributes of settings of the same kind."""
 FUTURE: Final = "how far time stamps may be ahead of the clock"
 ZERO_STAMP: Final = "accept a zero stamp, as the arrival time"
 

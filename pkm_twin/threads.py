@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""One thread for linear algebra: matrices here are small, and threads cost more than they bring."""
+"""Limit linear algebra to one thread: for small matrices threads cost more time than they save."""
 
 from __future__ import annotations
 

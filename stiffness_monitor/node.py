@@ -161,7 +161,7 @@ class StiffnessMonitor(TwinNode):
             # Most of the time goes into messages: only those that have a subscriber are made.
             if publisher.get_subscription_count():
                 publisher.publish(make(answer))
-        self.call_beside("correction or alarm", answer, self._correction.take, self._alarm.take)
+        self.call_further_outputs("correction or alarm", answer, self._correction.take, self._alarm.take)
 
     def _publish_frequencies(self) -> None:
         """Publish the frequencies of the latest joint state, at most at ``frequencies_rate``."""

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""A robot's elastic frame as an input deck of CalculiX's beams.
+"""Write a robot's elastic frame as an input deck of CalculiX's beams.
 
 Joints are equations between displacements. CalculiX drops equations between rotations of beams
 without a word, so nothing here equates rotations: beams hold points on short stiff levers.
@@ -21,7 +21,7 @@ from stiffness_monitor.structure import StructuralModel, local_axes
 CCX = shutil.which("ccx")
 ABSENT = "no CalculiX (ccx) on this machine"
 STIFF = Section(1e14, 5e13, 0.04, 0.03, 1e-6, 1.0)
-"""Levers: three orders stiffer than the members, and without weight."""
+"""Section of levers: three orders stiffer than the members, nearly massless."""
 
 
 def run(text: str, folder: Path) -> str:
@@ -42,7 +42,7 @@ def run(text: str, folder: Path) -> str:
 
 
 def calculix_version() -> str:
-    """Its number, such as 2.20."""
+    """Return CalculiX's version, such as 2.20."""
     done = subprocess.run([CCX, "-v"], capture_output=True, text=True, timeout=20)
     return re.search(r"[Vv]ersion\s+(\S+)", done.stdout).group(1)
 
@@ -79,7 +79,7 @@ class Deck:
         return len(self.nodes)
 
     def beam(self, chain, along, section):
-        """Elements along a chain of nodes, every second of them in the middle of one."""
+        """Add elements along a chain of nodes; every second node is in the middle of an element."""
         self.count += 1
         name = f"E{self.count}"
         self.elements.append(f"*ELEMENT, TYPE=B32R, ELSET={name}")
@@ -149,7 +149,7 @@ class Deck:
             raise AssertionError(f"{support.joint} holds {held}")
 
     def hold(self, axis, node, name, place):
-        """Axis . (displacement of the node - that of the body's point at place) = 0."""
+        """Add the equation axis . (displacement of the node - displacement of the body's point) = 0."""
         terms = [((node, k + 1), axis[k]) for k in range(3)]
         if name == self.moving:
             centre, turn = self.platform
@@ -195,7 +195,7 @@ class Deck:
 
 
 def frequencies(frame: StructuralModel, count: int, folder: Path, divisions: int = 8) -> np.ndarray:
-    """Lowest frequencies of a frame's beams by CalculiX, Hz."""
+    """Compute the lowest frequencies of a frame's beams by CalculiX, Hz."""
     deck = Deck(frame, divisions)
     output = run(deck.text(count + deck.idle), folder)
     rows = re.findall(r"^\s+\d+" + 4 * r"\s+([-+.E\d]+)" + r"\s*$", output, re.M)
@@ -208,7 +208,7 @@ def frequencies(frame: StructuralModel, count: int, folder: Path, divisions: int
 
 
 def harmonic(frame, damping, highest, folder, *, modes=30, divisions=8):
-    """CalculiX's natural frequencies, frequencies (k,) between them, Hz, and its responses there.
+    """Compute natural frequencies, frequencies (k,) between them, Hz, and responses there by CalculiX.
 
     :returns: the platform's complex displacements (k, 3) to a unit force along x.
     """

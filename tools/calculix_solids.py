@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""A robot's elastic frame as an input deck of CalculiX's solids, with round members.
+"""Write a robot's elastic frame as an input deck of CalculiX's solids, with round members.
 
 Joints are equations between weighted means of the displacements of the members' end sections.
 """
@@ -28,7 +28,7 @@ class Mesh:
 
     @property
     def section(self) -> int:
-        """Bricks in the section."""
+        """Number of bricks in the section."""
         return self.square**2 + 4 * self.square * self.rings
 
     def __str__(self) -> str:
@@ -100,7 +100,7 @@ def disc_mesh(square: int, rings: int) -> Disc:
     for row in quads:
         for r, one in zip(points, shares, strict=True):
             for s, other in zip(points, shares, strict=True):
-                value, slope = _shape(r, s)
+                value, slope = _evaluate_shape_functions(r, s)
                 jacobian = np.linalg.det(slope @ at[row])
                 assert jacobian > 0
                 y, z = value @ at[row]
@@ -110,8 +110,8 @@ def disc_mesh(square: int, rings: int) -> Disc:
     return Disc(at, np.array(quads), weights, float(weights[0].sum()), second)
 
 
-def _shape(r: float, s: float) -> tuple[np.ndarray, np.ndarray]:
-    """Values (8,) and slopes (2, 8) of a quadrilateral's shape functions."""
+def _evaluate_shape_functions(r: float, s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return values (8,) and slopes (2, 8) of a quadrilateral's shape functions."""
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
     value, slope = np.zeros(8), np.zeros((2, 8))
     for k, (a, b) in enumerate(corners):
@@ -143,7 +143,7 @@ class Solids:
         self.equations: list[str] = []
         self.rigid_ends = rigid_ends
         self.origin, self.moving = frame.origin, frame.platform
-        # As above: translations of one node, rotations as the translations of another.
+        # The platform: translations of one node, rotations as the translations of another.
         self.platform = self.node(frame.origin), self.node(frame.origin)
         self.mesh = mesh
         self.disc = disc_mesh(mesh.square, mesh.rings)
@@ -189,7 +189,7 @@ class Solids:
             self.joint(support, place, face, section, axes, s.outer_diameter / 2)
 
     def joint(self, support, place, face, section, axes, radius):
-        """Equations of one end, over the face's displacements, own ones, and the platform's."""
+        """Write the equations of an end between the face's, the joint's and the platform's displacements."""
         ids = [face[i] for i in range(len(section))]
         size = 3 * len(ids)
         dofs = [(i, k) for i in ids for k in (1, 2, 3)]
@@ -239,7 +239,7 @@ class Solids:
             self.equations.append("\n".join(["*EQUATION", str(len(lines)), *lines]))
 
     def text(self) -> str:
-        """Six steps, each with one unit force or moment on the platform."""
+        """Write the deck with six steps, each with a unit force or moment on the platform."""
         steps = []
         for node in self.platform:
             for k in (1, 2, 3):
@@ -261,7 +261,7 @@ class Solids:
 
 
 def section_motion(disc: Disc, axes: np.ndarray, radius: float) -> np.ndarray:
-    """Mean displacement and turn of a section by its nodes' displacements, shape (6, 3 nodes).
+    """Return the mean displacement and rotation of a section by its nodes' displacements, (6, 3 nodes).
 
     Exact for a section that moves as a rigid body. ``axes``: along the bar, y and z, as columns.
     """
@@ -284,7 +284,7 @@ def section_motion(disc: Disc, axes: np.ndarray, radius: float) -> np.ndarray:
 def solid_compliance(
     frame: StructuralModel, folder: Path, mesh: Mesh | None = None, *, rigid_ends: bool = False
 ) -> np.ndarray:
-    """Compliance of the platform at its origin, its bars as solids, shape (6, 6).
+    """Compute the compliance of the platform at its origin with bars as solids, shape (6, 6).
 
     Order x y z rx ry rz in fixed axes, m/N, rad/N, m/(N m), rad/(N m). Every joint is rigid or
     free in each direction.

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Branches and lines of the cores that tests reach, by folder, and what they do not reach."""
+"""Report line and branch coverage of the core folders, and what the tests do not reach."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ CORES = (
     "stiffness_monitor",
 )
 BOUND = 95.0
-"""Per cent of a folder."""
+"""Smallest coverage of a folder, per cent."""
 
 
 def measured() -> dict[str, Any]:
-    """Files and their figures, of the last run."""
+    """Return files and their coverage in the last run."""
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder) / "report.json"
         command = [sys.executable, "-m", "coverage", "json", "-q", "-o", str(report)]
@@ -36,7 +36,7 @@ def measured() -> dict[str, Any]:
 
 
 def main() -> int:
-    """Print the tables: 1 where a core is below its bound."""
+    """Print the tables; return 1 if a folder is below its bound."""
     folders = defaultdict(list)
     for name, file in measured().items():
         for core in CORES:

@@ -38,11 +38,11 @@ CLASSIFIED = {
 
 
 def build(target: Path) -> dict[str, str]:
-    """Build both archives into a folder: SHA-256 by file name."""
+    """Build both archives into a folder; return the SHA-256 by file name."""
     git = subprocess.run(["git", "log", "-1", "--format=%ct"], cwd=ROOT, capture_output=True, text=True)
     # Without git, the first time that a zip file can have.
     epoch = os.environ.get("SOURCE_DATE_EPOCH") or git.stdout.strip() or "315532800"
-    # Modes are in the archives.
+    # Archives contain file modes, so fix the mask.
     os.umask(0o022)
     target = target.resolve()
     target.mkdir(parents=True, exist_ok=True)
@@ -51,7 +51,7 @@ def build(target: Path) -> dict[str, str]:
         _python("-c", code, epoch=epoch)
         (made,) = Path(folder).glob("*.tar.gz")
         source = target / made.name
-        source.write_bytes(_settled(made, int(epoch)))
+        source.write_bytes(_normalise_archive(made, int(epoch)))
         with tarfile.open(source) as archive:
             archive.extractall(folder, filter="data")
         (tree,) = (path for path in Path(folder).iterdir() if path.is_dir())
@@ -69,7 +69,7 @@ def _python(*words: str, epoch: str, cwd: Path = ROOT) -> str:
     return done.stdout
 
 
-def _settled(path: Path, epoch: int) -> bytes:
+def _normalise_archive(path: Path, epoch: int) -> bytes:
     """Rewrite an archive in order, with one time and without accounts."""
     data = io.BytesIO()
     with tarfile.open(path) as source, tarfile.open(fileobj=data, mode="w") as target:
@@ -81,7 +81,7 @@ def _settled(path: Path, epoch: int) -> bytes:
     return gzip.compress(data.getvalue(), mtime=epoch)
 
 
-def needed(name: str = NAME) -> dict[str, metadata.Distribution]:
+def find_dependencies(name: str = NAME) -> dict[str, metadata.Distribution]:
     """Find a package's installed dependencies, and theirs, by normal name, without extras."""
     found: dict[str, metadata.Distribution] = {}
     todo = [name]
@@ -99,7 +99,7 @@ def needed(name: str = NAME) -> dict[str, metadata.Distribution]:
 
 
 def licence(package: metadata.Distribution) -> str:
-    """SPDX expression, or the package's own short words."""
+    """Return a package's SPDX expression, or its own short text."""
     about = package.metadata
     if "License-Expression" in about:
         return str(about["License-Expression"])
@@ -109,7 +109,7 @@ def licence(package: metadata.Distribution) -> str:
     return " AND ".join(sorted(names)) or text.strip()[:60] or "NOASSERTION"
 
 
-def bill() -> dict[str, Any]:
+def make_bill_of_materials() -> dict[str, Any]:
     """Write the bill of materials, CycloneDX 1.5."""
 
     def component(name: str, package: metadata.Distribution) -> dict[str, Any]:
@@ -123,7 +123,7 @@ def bill() -> dict[str, Any]:
             "licenses": [{"expression": licence(package)}],
         }
 
-    packages = needed()
+    packages = find_dependencies()
     own = component("pkm-twin", metadata.distribution(NAME)) | {"licenses": [{"expression": "Apache-2.0"}]}
     parts = [component(name, package) for name, package in packages.items()]
     return {
@@ -140,7 +140,7 @@ def main() -> None:
     """Build, or list."""
     target = Path(sys.argv[1])
     if target.suffix == ".json":
-        made = bill()
+        made = make_bill_of_materials()
         target.parent.mkdir(parents=True, exist_ok=True)
         target.write_text(json.dumps(made, indent=1) + "\n", encoding="utf-8")
         for part in made["components"]:

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Whether certain poses are right, of many machines: ``python -m tools.far_poses [SEED]``.
+"""Judge poses that kinematics accepts, of many machines: ``python -m tools.far_poses [SEED]``.
 
 Poses are drawn from the box of all poses in reach to five times this box, of shipped robots,
 examples and machines at random. Prints how many the quick inverse kinematics accepts, and of how
@@ -24,7 +24,7 @@ from test.support.robots import joint_range
 ROOT: Final = Path(__file__).resolve().parents[1]
 VARIANTS: Final = 220
 POSES: Final = 30_000, 8_000
-"""Poses of a file, and of a machine at random."""
+"""Numbers of poses for a file and for a random machine."""
 SAME_POSE: Final = 1e-6
 """Largest difference of two poses that are one, lengths over the size."""
 

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Measure what `fit` and `check` say of recordings whose truth is known.
+"""Measure the answers of `fit` and `check` for recordings with a known cause.
 
     python -m tools.fit_cases run OUT.jsonl [PART PARTS]    append what this tree says of each case
     python -m tools.fit_cases table OUT.jsonl [OUT.jsonl]   print confusion and coverage of each
@@ -49,8 +49,8 @@ from test.support.robots import load
 KINDS: Any = ("friction", "payload")
 SHIPPED: Final = ("delta", "delta_cu", "five_bar", "linear_delta", "prru", "rps3", "upr_rpu")
 MACHINES: Final = (*SHIPPED, "stewart", "machines/rsur", "machines/prru3", "machines/rcuu")
-FIVE: Final = ("delta", "five_bar", "linear_delta", "prru", "upr_rpu")
-POOR: Final = ("noise of 5 %", "coarse encoder", "repeated samples", "slow motion")
+SMALL_MACHINES: Final = ("delta", "five_bar", "linear_delta", "prru", "upr_rpu")
+POOR_CONDITIONS: Final = ("noise of 5 %", "coarse encoder", "repeated samples", "slow motion")
 ONE_CAUSE: Final = {
     "all negated": (-1.0, "all"),
     "one negated": (-1.0, "one"),
@@ -104,8 +104,8 @@ TRUTHS: Final = {
     "another machine": "unknown",
     "play": "play",
 }
-"""The cause that a case has; all others are sound."""
-SAID: Final = (
+"""True cause of each faulty case; all other cases are sound."""
+ANSWER_WORDS: Final = (
     ("play between the joint", "play"),
     ("positions of this machine", "positions"),
     ("positions and efforts of", "positions"),
@@ -131,7 +131,7 @@ SAID: Final = (
     ("too short", "too little"),
     ("no excitation", "too little"),
 )
-"""Words of an answer, and the cause that they name."""
+"""Phrases of an answer, and the cause that each names."""
 
 
 def find_robot(name: str) -> Robot:
@@ -150,7 +150,7 @@ def draw(name: str, seed: int, seconds: float = 12.0) -> Drawn:
 
 
 def slow_down(m: Drawn, factor: float) -> Drawn:
-    """Return the motion that takes so many times as long."""
+    """Return the motion with ``factor`` times the duration."""
     qd, qdd = m.qd / factor, m.qdd / factor**2
     return Drawn(m.robot, m.truth, factor * m.time, m.q, qd, qdd, inverse_dynamics(m.truth, m.q, qd, qdd))
 
@@ -276,7 +276,7 @@ MAKERS: Final[dict[str, Callable[[str, str], tuple[Robot, Recording, Robot]]]] =
 def list_cases() -> Iterator[Case]:
     """Yield the group, machine and condition of each case."""
     tests = [(n, w) for n in MACHINES for w in ("sound",)]
-    tests += [(n, w) for n in FIVE for w in (*WRONG, *IMPOSSIBLE)]
+    tests += [(n, w) for n in SMALL_MACHINES for w in (*WRONG, *IMPOSSIBLE)]
     single = [(n, w) for n in MACHINES for w in (*ONE_CAUSE, "payload 0.2", "payload 5")]
     event = [
         (n, w)
@@ -286,7 +286,7 @@ def list_cases() -> Iterator[Case]:
     poor = [
         (n, f"{q}: {w}")
         for n in ("delta", "five_bar", "linear_delta")
-        for q in POOR
+        for q in POOR_CONDITIONS
         for w in ("sound", "one_effort_negated", "half_speed", "three_times", "effort_columns_swapped", "gain")
     ]
     drawn = list[tuple[str, str]]()
@@ -320,7 +320,7 @@ def list_cases() -> Iterator[Case]:
 
 def say_cause(text: str) -> str:
     """Return the cause that an answer names."""
-    return next((cause for words, cause in SAID if words in text), "other")
+    return next((cause for words, cause in ANSWER_WORDS if words in text), "other")
 
 
 def answer_case(case: Case) -> dict[str, Any]:

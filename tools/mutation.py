@@ -55,7 +55,7 @@ PLAIN = (ast.Expr, ast.Assign, ast.AugAssign, ast.Raise)
 
 
 def mutants(node: ast.AST) -> Iterator[tuple[str, ast.AST]]:
-    """Yield what a node may be changed to, with names."""
+    """Yield changed versions of a syntax node, with names."""
 
     def changed(**fields: object) -> ast.AST:
         own = dict(ast.iter_fields(node))
@@ -80,14 +80,14 @@ def mutants(node: ast.AST) -> Iterator[tuple[str, ast.AST]]:
 
 
 class Walk(ast.NodeTransformer):
-    """Counts places of change in reach of tests, and changes one of them."""
+    """Count the places of change that tests reach, and change one of them."""
 
     def __init__(self, chosen: int | None = None) -> None:
         self.chosen, self.places = chosen, list[str]()
 
     def generic_visit(self, node: ast.AST) -> ast.AST:
         if isinstance(node, ast.FunctionDef):
-            node.returns = None  # Types are no rules.
+            node.returns = None  # Annotations do not change behaviour.
         if isinstance(node, ast.AnnAssign):
             node.value = node.value and self.visit(node.value)
             return node
@@ -98,7 +98,7 @@ class Walk(ast.NodeTransformer):
         return super().generic_visit(node)
 
     def visit_ClassDef(self, node: ast.ClassDef) -> ast.AST:
-        node.body = [self.visit(part) for part in node.body]  # That it is frozen is no rule.
+        node.body = [self.visit(part) for part in node.body]  # Decorators of classes (frozen) do not change behaviour.
         return node
 
     def visit_arguments(self, node: ast.arguments) -> ast.AST:
@@ -106,15 +106,15 @@ class Walk(ast.NodeTransformer):
         return node
 
     def visit_JoinedStr(self, node: ast.JoinedStr) -> ast.AST:
-        return node  # Words.
+        return node  # Texts of messages are not tested.
 
     def visit_Call(self, node: ast.Call) -> ast.AST:
-        # The tests of the pages hold the settings, in processes of their own.
+        # Settings are tested by the tests of the pages, in their own processes.
         return node if ast.unparse(node.func) in ("setting", "TypeVar") else self.generic_visit(node)
 
 
 def survives(path: str, chosen: int, tests: list[str]) -> bool:
-    """Whether all tests pass with a change; an endless one counts as found."""
+    """Return whether all tests pass with a change; a timeout counts as found."""
     child = os.fork()
     if not child:
         signal.alarm(900)
@@ -126,18 +126,18 @@ def survives(path: str, chosen: int, tests: list[str]) -> bool:
         for stream in (1, 2):
             os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
         with tempfile.TemporaryDirectory() as folder:
-            # Programs of a changed compiler are no one else's.
+            # Use another cache for programs of a changed compiler.
             if "codegen" in path:
                 os.environ["PKM_TWIN_CACHE"] = folder
             options = ["-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist"]
-            # The first file finds most: the others are not even read then.
+            # The first test file finds most mutants; the others are then skipped.
             failed = any(pytest.main([*options, test]) not in (0, 5) for test in tests)
         os._exit(failed)
     return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
 
 
 def main() -> int:
-    """Print each survivor, and the share that is found."""
+    """Print each survivor and the fraction of mutants that is found."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("paths", nargs="*", default=[*TARGETS])
     parser.add_argument("--most", type=int, default=60, help="mutants per module, drawn at random")

@@ -53,14 +53,14 @@ def fit_a_leg(robot: Robot, poses: Poses) -> Array:
 
 
 def leg_residual(p: Array, k: int, poses: Poses) -> Array:
-    """Distance of a leg's nodes less its length by the motor, (poses,), m."""
+    """Return the distance of a leg's nodes minus its length by the motor, (poses,), m."""
     assert poses.rotation is not None
     apart = poses.position + poses.rotation @ p[3:6] - p[:3]
     return np.asarray(np.linalg.norm(apart, axis=1) - p[6] - p[7] * poses.joints[:, k])
 
 
 def leg_poses(legs: Array, poses: Poses) -> Array:
-    """Distance of measured poses from those that legs give, (poses,), m."""
+    """Return the distance of measured poses from those of fitted legs, (poses,), m."""
     assert poses.rotation is not None
     away = []
     for row in range(len(poses.joints)):
@@ -77,7 +77,7 @@ def leg_poses(legs: Array, poses: Poses) -> Array:
 
 
 def lengths(robot: Robot, found: Calibration, poses: Poses) -> Array:
-    """Leg lengths by the motors less those of the calibrated machine at measured poses, m."""
+    """Return leg lengths by the motors minus those of the calibrated machine at measured poses, m."""
     assert poses.rotation is not None
     graph, q = found.robot.graph, found.joint_map.positions(poses.joints)
     out = np.empty_like(q)
@@ -104,7 +104,7 @@ def section() -> str:
     paths = geometric(robot, robot.controller.positions(poses.joints))
     rows: dict[str, list[list[Errors]]] = {"the file": [], "`calibrate`": [], ALONE: []}
     for k in range(HELD_OUT):
-        # `calibrate` holds the last of each four out.
+        # `calibrate` holds out the last of every four poses.
         part = _rolled(poses, HELD_OUT - 1 - k)
         last = np.arange(count) % HELD_OUT == HELD_OUT - 1
         away = leg_poses(fit_a_leg(robot, part.part(~last)), part.part(last))

@@ -19,7 +19,7 @@ from delta_dynamics.feedforward import Torques
 from delta_dynamics.torques.uncertainty import FRICTION, MASSES
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
-from pkm_twin.ros.joints import JointPublisher, header, wrench_stamped, xyz
+from pkm_twin.ros.joints import JointPublisher, header, make_wrench_message, xyz
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.streams.monitor import Pace
 
@@ -177,7 +177,7 @@ class Estimates:
         """Publish the external wrench and efforts; contact and place only when they change."""
         own = header(stamp, self._frames[0])
         if not found.idle:
-            self._wrench.publish(wrench_stamped(stamp, self._frames[0], found.wrench))
+            self._wrench.publish(make_wrench_message(stamp, self._frames[0], found.wrench))
             self._effort.publish(stamp, self._robot().controller.controller_efforts(found.external))
         if found.touching != self.touching:
             self.touching = found.touching

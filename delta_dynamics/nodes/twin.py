@@ -21,7 +21,7 @@ from pkm_twin.messages.fast_decoder import JointStateView, RawTrajectory
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
 from pkm_twin.ros import health
-from pkm_twin.ros.joints import EffortPublisher, JointPublisher, wrench_stamped
+from pkm_twin.ros.joints import EffortPublisher, JointPublisher, make_wrench_message
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.run import run
 from pkm_twin.ros.turns import Task
@@ -344,7 +344,7 @@ class DeltaDynamics(TwinNode):
         self._torques.publish(torques.stamp, torques.sent)
         if torques.residual is not None:
             self._residual.publish(torques.stamp, core.robot.controller.controller_efforts(torques.residual))
-        self.call_beside("reactions or estimates", torques, self._estimates.take, self._publish_reactions)
+        self.call_further_outputs("reactions or estimates", torques, self._estimates.take, self._publish_reactions)
 
     def _publish_reactions(self, torques: Torques) -> None:
         """Publish each joint's wrench that rigid bodies determine, world axes, at the joint's point.
@@ -357,7 +357,7 @@ class DeltaDynamics(TwinNode):
         result = reactions(self.core.robot, *torques.motion, torques.wrench)
         for k, name in enumerate(result.names):
             if result.determinate[k].all():
-                message = wrench_stamped(torques.stamp, self._base_frame, result.wrenches[k])
+                message = make_wrench_message(torques.stamp, self._base_frame, result.wrenches[k])
                 self._reactions[name].publish(message)
 
     def _watch_every(self, stale_after: float) -> None:

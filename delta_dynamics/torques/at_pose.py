@@ -362,10 +362,10 @@ def _pose_accelerations(t: Traced, scheme: CarriedScheme | None, *, certified: b
     on_pose = made.forces(rate, np.zeros(m))
     rates, drift = (made.joint(values) for values in (made.posed.u, made.posed.du))
     # Only friction that grows with the load needs the drives' loads.
-    split_by_load = bool(t.graph.laws) and not t.drives.others
-    loads = made.lead.solve_transposed(on_pose) if split_by_load else np.zeros(m)
+    by_load = bool(t.graph.laws) and not t.drives.others
+    loads = made.lead.solve_transposed(on_pose) if by_load else np.zeros(m)
     rest = efforts_left(t, made.parts, t.drives.on_leads([*tau]), loads, made.q, rates, drift)
-    forces = made.drives[t.drives.leading].T @ rest - (0.0 if split_by_load else on_pose)
+    forces = made.drives[t.drives.leading].T @ rest - (0.0 if by_load else on_pose)
     acceleration = np.array(solve_massive(made.masses(), forces), dtype=object)
     outputs = {"q": made.q, "qd": rates, "qdd": made.drives @ acceleration + drift, "acceleration": acceleration}
     return made.program(outputs, **sizes)

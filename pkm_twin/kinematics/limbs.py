@@ -113,7 +113,7 @@ def _is_regular(scheme: Closures, limb: Limb) -> bool:
     """Return whether home is far from where the limb is singular."""
     x, q = scheme.samples[0]
     pose = _solve_sample(scheme, limb, x, q)
-    sizes = [*pose.slopes, *pose.compute_levers]
+    sizes = [*pose.slopes, *pose.levers]
     return all(reference(size) > MIN_LEVER * reference(scale) for size, scale in sizes)
 
 

@@ -52,7 +52,7 @@ class _Repetition:
     due: float = -math.inf
     last: float = -math.inf
     held: int = 0
-    """Lines that were suppressed since the last logged one."""
+    """Number of lines suppressed since the last logged one."""
 
     def begin_line(self, now: float) -> int | None:
         """Return how many lines were held back before this one, or None to hold it back too."""
@@ -119,7 +119,7 @@ class Health:
     def _find_incompatible_ends(self) -> None:
         """Find incompatible nodes in the graph; this costs less than the middleware's events."""
         for topic, tells in self._watched_topics.items():
-            # The name before remapping: both calls remap it.
+            # Both calls expect the name before remapping.
             speakers = self._node.get_publishers_info_by_topic(topic)
             listeners = self._node.get_subscriptions_info_by_topic(topic)
             speaking, listening = ([*filter(self._is_own, ends)] for ends in (speakers, listeners))

@@ -45,7 +45,7 @@ def xyz(kind: Any, values: Iterable[float]) -> Any:
     return kind(**dict(zip("xyzw", map(float, values), strict=False)))
 
 
-def wrench_stamped(stamp: int, frame: str, wrench: Array) -> WrenchStamped:
+def make_wrench_message(stamp: int, frame: str, wrench: Array) -> WrenchStamped:
     """Return a wrench message, values (6,), N and N m, along the axes of a frame."""
     force, torque = xyz(Vector3, wrench[:3]), xyz(Vector3, wrench[3:])
     return WrenchStamped(header=header(stamp, frame), wrench=Wrench(force=force, torque=torque))

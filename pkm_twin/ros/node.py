@@ -103,17 +103,17 @@ class GuardedNode(ParameterNode):
         # The diagnostics run on the steady clock: they report a ROS clock that stands still.
         self.steady = Clock(clock_type=ClockType.STEADY_TIME)
 
-    def call_beside(self, what: str, answer: V, *takes: Callable[[V], object]) -> None:
-        """Pass an answer that is already published on to further outputs, whose errors are only logged."""
+    def call_further_outputs(self, what: str, answer: V, *takes: Callable[[V], object]) -> None:
+        """Pass a published answer to further outputs; their errors are only logged."""
         for take in takes:
             try:
                 take(answer)
             except (PkmTwinError, ValueError) as error:
-                # The answer stays valid: a further output may fail alone, as near a constraint singularity.
+                # Only the further output fails, for instance near a constraint singularity.
                 self.log_throttled("beside", f"no {what}: {error}")
 
     def stream_broken(self, where: str) -> None:
-        """React to an exception in a callback: its stream cannot be trusted any more."""
+        """React to an exception in a callback, for instance by stopping its stream."""
 
     def caught(self, where: str, error: Exception) -> None:
         """Report an exception in a callback; the node keeps running."""
@@ -121,7 +121,7 @@ class GuardedNode(ParameterNode):
         self.stream_broken(where)
 
     def failed(self, where: str, error: Exception) -> None:
-        """Report what a callback raised; a rejected message is not a fault of the node."""
+        """Report an exception of a callback; a rejected message is not a fault of the node."""
         if isinstance(error, MessageError):
             self.log_throttled(error.reason, f"{where}: rejected, {error.labelled}")
         else:
@@ -280,7 +280,7 @@ class GuardedSubscription:
             message, info = arguments if len(arguments) == 2 else arguments[0]
             # A replaced subscription may still deliver; its messages arrive twice.
             if relaxed == self._relaxed:
-                self._handle(message, info)
+                self._handle_message(message, info)
 
         # rclpy passes the message information if the signature has two parameters.
         heard.__signature__ = inspect.signature(  # type: ignore[attr-defined]
@@ -295,7 +295,7 @@ class GuardedSubscription:
             qos_overriding_options=QoSOverridingOptions(OVERRIDES[:-1] if relaxed else OVERRIDES),
         )
 
-    def _handle(self, message: Any, info: Any) -> None:
+    def _handle_message(self, message: Any, info: Any) -> None:
         node, statistics = self._node, self._statistics
         began = time.perf_counter()
         try:

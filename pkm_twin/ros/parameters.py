@@ -110,7 +110,7 @@ class ParameterNode(LifecycleNode):
             constraints = f"{low:g} to {high:g} {unit}".strip()
         given = self.given.get(name)
         if given is not None:
-            given = self.given[name] = _as_float(given, default)
+            given = self.given[name] = _convert_to_float(given, default)
         try:
             value = self.declare_parameter(name, default, descriptor).value
         except (InvalidParameterTypeException, InvalidParameterValueException) as error:
@@ -189,12 +189,14 @@ class ParameterNode(LifecycleNode):
         changeable = {name for name, (_, row) in self.rows.items() if not row.fixed}
         deaf = sorted(changeable - self.followed)
         if deaf:
-            # Setting it would be reported as successful.
+            # Without a callback a change would be reported as successful and ignored.
             raise NotImplementedError(f"nothing follows a change of {', '.join(deaf)}")
 
         def convert(changes: list[Parameter]) -> list[Parameter]:
             return [
-                _as_float(change, self.get_parameter(change.name).value) if self.has_parameter(change.name) else change
+                _convert_to_float(change, self.get_parameter(change.name).value)
+                if self.has_parameter(change.name)
+                else change
                 for change in changes
             ]
 
@@ -207,7 +209,7 @@ class ParameterNode(LifecycleNode):
         self.add_on_set_parameters_callback(reject_nameless)
 
 
-def _as_float(given: Parameter, like: Any) -> Parameter:
+def _convert_to_float(given: Parameter, like: Any) -> Parameter:
     if isinstance(like, float) and given.type_ == Parameter.Type.INTEGER:
         return Parameter(given.name, value=float(given.value))
     many = not isinstance(like, str) and hasattr(like, "__len__")

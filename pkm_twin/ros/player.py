@@ -30,7 +30,7 @@ _SLEEP_OVERSHOOT = 0.002
 
 
 @dataclass
-class _Stop:
+class _StopFlag:
     """Hold a flag that signals set.
 
     An event's lock would deadlock a handler that interrupts a handler.
@@ -93,7 +93,7 @@ def play(
     _check_number("wait_for_subscribers", wait_for_subscribers, wait_for_subscribers >= 0, "0 or more, s")
     bag = open_bag(path)
     targets = _find_targets(bag, topics, remap or {}, bool(clock))
-    stop = _Stop()
+    stop = _StopFlag()
     with (
         _stop_on_signals(stop) if pace is None else nullcontext(),
         _create_publishers(bag, targets, bool(clock)) as (publishers, clock_publisher),
@@ -150,7 +150,7 @@ def _find_targets(bag: Bag, topics: Iterable[str] | None, remap: Mapping[str, st
 
 
 @contextmanager
-def _stop_on_signals(stop: _Stop) -> Iterator[None]:
+def _stop_on_signals(stop: _StopFlag) -> Iterator[None]:
     """Let SIGINT and SIGTERM request a stop; works in the main thread only."""
     if threading.current_thread() is not threading.main_thread():
         yield
@@ -183,7 +183,7 @@ def _create_publishers(bag: Bag, targets: Mapping[str, str], with_clock: bool) -
             offer = parse_qos(name, bag.report.topics[name].offered_qos)
             latched = offer.transient_local
             qos = QoSProfile(
-                # A second at 1 kHz, so that a subscriber delayed so long loses nothing.
+                # One second at 1 kHz, the delay of a subscriber up to which nothing is lost.
                 depth=max(offer.depth, 1 if latched else 1000),
                 reliability=ReliabilityPolicy.RELIABLE if offer.reliable else ReliabilityPolicy.BEST_EFFORT,
                 durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
@@ -196,7 +196,7 @@ def _create_publishers(bag: Bag, targets: Mapping[str, str], with_clock: bool) -
         yield publishers, clock
 
 
-def _await_subscribers(publishers: Mapping[str, Any], seconds: float, stop: _Stop) -> None:
+def _await_subscribers(publishers: Mapping[str, Any], seconds: float, stop: _StopFlag) -> None:
     give_up = time.monotonic() + seconds
     missing = list(publishers) if seconds else []
     while missing and not stop.asked:
@@ -248,7 +248,7 @@ class _Replay:
         bag: Bag,
         publishers: Mapping[str, Any],
         rate: float,
-        stop: _Stop,
+        stop: _StopFlag,
         pace: Callable[[BagMessage], None] | None,
         clock: Any = None,
         clock_rate: float = 0.0,

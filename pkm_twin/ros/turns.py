@@ -20,7 +20,7 @@ Task = Generator[None, None, None]
 
 
 class LowRateGroup(MutuallyExclusiveCallbackGroup):
-    """Group the entities of requests, which are rare.
+    """Group the entities of rare requests.
 
     rclpy builds a wait set for every message, and each entity in it costs time; these are added
     only now and then. The events executor has no wait set and ignores the group.

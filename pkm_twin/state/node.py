@@ -51,13 +51,13 @@ KINDS: Final = {
 }
 
 
-def transform(stamp: int, frame: str, child: str, position: NDArray[Any], turn: NDArray[Any]) -> TransformStamped:
+def make_transform(stamp: int, frame: str, child: str, position: NDArray[Any], turn: NDArray[Any]) -> TransformStamped:
     """Make the message of a frame's transform to its child: position (3,), quaternion x y z w."""
     moved = Transform(translation=xyz(Vector3, position), rotation=xyz(Quaternion, turn))
     return TransformStamped(header=header(stamp, frame), child_frame_id=child, transform=moved)
 
 
-def markers(own: Header, shapes: Iterable[Shape], lifetime: DurationMessage) -> MarkerArray:
+def make_markers(own: Header, shapes: Iterable[Shape], lifetime: DurationMessage) -> MarkerArray:
     """Convert shapes to markers; those that are not lasting disappear after ``lifetime``."""
     array_of = MarkerArray()
     for shape in shapes:
@@ -96,13 +96,13 @@ class Transforms:
         """Publish the static transform from platform to tool; ``now`` in ns."""
         turn = rotations.to_quaternion(self._tool.rotation)
         names = self._frames["platform"], self._frames["tool"]
-        found = transform(now, *names, self._tool.position, turn)
+        found = make_transform(now, *names, self._tool.position, turn)
         self._static.publish(self._message(transforms=[found]))
 
     def send_platform(self, stamp: int, position: NDArray[Any], turn: NDArray[Any]) -> None:
         """Publish the transform from base to platform, if it is published here."""
         if self._moving is not None:
-            found = transform(stamp, self._base, self._frames["platform"], position, turn)
+            found = make_transform(stamp, self._base, self._frames["platform"], position, turn)
             self._moving.publish(self._message(transforms=[found]))
 
 
@@ -162,7 +162,7 @@ class MachineStateNode(TwinNode):
         self.create_guarded_subscription(
             "joint_states", self._on_joint_state, refuse=partial(self.core.refuse, self.core.states), expected=True
         )
-        self.create_guarded_subscription("wrench", lambda m: self.core.wrench(m, self.now()))
+        self.create_guarded_subscription("wrench", lambda m: self.core.store_wrench(m, self.now()))
         self.follow(
             changeable(WrenchSettings),
             lambda values: with_parameters(self.core.settings, values),
@@ -254,13 +254,13 @@ class MachineStateNode(TwinNode):
         if not self._markers.get_subscription_count():
             return
         self._drawn = state.stamp
-        shapes = self._scene.shapes(state, self._load(state))
+        shapes = self._scene.shapes(state, self._compute_load(state))
         own = header(state.stamp, self.core.settings.base_frame)
-        self._markers.publish(markers(own, shapes, Duration(seconds=1.0).to_msg()))
+        self._markers.publish(make_markers(own, shapes, Duration(seconds=1.0).to_msg()))
 
-    def _load(self, state: State) -> Load | None:
+    def _compute_load(self, state: State) -> Load | None:
         """Compute the effects of the wrench on the machine; None if the wrench is unknown."""
-        wrench = self.core.load(state) if self._elastic else None
+        wrench = self.core.find_wrench(state) if self._elastic else None
         if wrench is None:
             return None
         robot = self.core.robot

@@ -31,7 +31,7 @@ COLOURS: Final[Mapping[str, Colour]] = {
 }
 """Colours that can be distinguished with every kind of colour vision (Okabe and Ito 2008)."""
 SIZES: Final = {"line": 0.004, "arrow": 0.012, "joint": 0.02, "letter": 0.06}
-"""Widths and the height of letters as fractions of the machine's size."""
+"""Widths of lines, arrows and joints, and height of letters, as fractions of the machine's size."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +92,7 @@ class Shape:
     lasting: bool = False
 
 
-def heat(share: float) -> Colour:
+def choose_heat_colour(share: float) -> Colour:
     """Return the colour of a fraction from 0 to 1: blue, yellow, vermilion."""
     scale = (COLOURS["ellipsoid"], COLOURS["moment"], COLOURS["deflected"])
     r, g, b = (float(np.interp(2.0 * share, (0.0, 1.0, 2.0), values)) for values in list(zip(*scale, strict=True))[:3])
@@ -119,43 +119,43 @@ class Scene:
 
     def shapes(self, state: State, load: Load | None = None) -> list[Shape]:
         """Return the shapes of the machine in a state, and of the load's effects."""
-        places = self.placed(state.q)
+        places = self.place_bars(state.q)
         # Energies relative to the largest one; nothing without energy.
         factors = {} if load is None else load.factors
         greatest = max(factors.values(), default=0.0)
         shares = {name: value / greatest for name, value in factors.items()} if greatest > 0.0 else {}
-        shapes = self._bars(places, shares)
+        shapes = self._draw_bars(places, shares)
         if load is None:
             return shapes
-        shapes += self._joints(state.q, shares)
-        shapes += self._deflected(places, state, load)
+        shapes += self._draw_joints(state.q, shares)
+        shapes += self._draw_deflected(places, state, load)
         # The deflections under forces of one size: an ellipsoid with the axes of C.
         values, axes = np.linalg.eigh(load.compliance[:3, :3])
         axes = axes if np.linalg.det(axes) > 0.0 else -axes
         x, y, z = (2.0 * values * self.scales.ellipsoid_force * self.scales.deflection).tolist()
         turned = _to_quaternion(axes)
         shapes.append(Shape("sphere", "compliance", 0, COLOURS["ellipsoid"], (x, y, z), state.position, turned))
-        shapes += self._arrows(state, load)
+        shapes += self._draw_arrows(state, load)
         if load.dominant != "none":
             height = SIZES["letter"] * self._size
             at, size = state.position + np.array([0.0, 0.0, 2.0 * height]), (0.0, 0.0, height)
             shapes.append(Shape("text", "dominant", 0, COLOURS["text"], size, at, text=load.dominant))
         return shapes
 
-    def placed(self, q: Array) -> Array:
+    def place_bars(self, q: Array) -> Array:
         """Compute the ends of all bars at joint positions (n,), shape (bars, 2, 3), m."""
         ends = [end for bar in self.bars for end in (bar.start, bar.end)]
-        return self._points(q, ends).reshape(len(self.bars), 2, 3)
+        return self._find_points(q, ends).reshape(len(self.bars), 2, 3)
 
-    def _points(self, q: Array, places: Sequence[Place]) -> Array:
+    def _find_points(self, q: Array, places: Sequence[Place]) -> Array:
         posture = Posture(self.robot, q)
         return np.array([posture.place(*place) for place in places]).reshape(-1, 3)
 
-    def _bars(self, places: Array, shares: Mapping[str, float]) -> list[Shape]:
+    def _draw_bars(self, places: Array, shares: Mapping[str, float]) -> list[Shape]:
         shapes = []
         for k, (bar, (start, end)) in enumerate(zip(self.bars, places, strict=True)):
             share = shares.get(bar.element)
-            colour = COLOURS["neutral"] if share is None else heat(share)
+            colour = COLOURS["neutral"] if share is None else choose_heat_colour(share)
             span, width = end - start, 2.0 * bar.radius
             length = float(np.linalg.norm(span))
             quaternion = (0.0, 0.0, 0.0, 1.0)
@@ -167,17 +167,17 @@ class Scene:
             shapes.append(Shape("cylinder", "bars", k, colour, size, middle, quaternion, text=bar.part, lasting=True))
         return shapes
 
-    def _joints(self, q: Array, shares: Mapping[str, float]) -> list[Shape]:
+    def _draw_joints(self, q: Array, shares: Mapping[str, float]) -> list[Shape]:
         """Draw the elastic joints as spheres."""
         names = [name for name in self.joints if name in shares]
         width = SIZES["joint"] * self._size
-        points = self._points(q, [self.joints[name] for name in names])
+        points = self._find_points(q, [self.joints[name] for name in names])
         return [
-            Shape("sphere", "joints", k, heat(shares[name]), (1.5 * width,) * 3, point, text=name)
+            Shape("sphere", "joints", k, choose_heat_colour(shares[name]), (1.5 * width,) * 3, point, text=name)
             for k, (name, point) in enumerate(zip(names, points, strict=True))
         ]
 
-    def _deflected(self, places: Array, state: State, load: Load) -> list[Shape]:
+    def _draw_deflected(self, places: Array, state: State, load: Load) -> list[Shape]:
         """Draw deflected members and the displaced platform, both enlarged by the same factor."""
         scale, width = self.scales.deflection, (SIZES["line"] * self._size, 0.0, 0.0)
         lines = [(name, x + scale * u) for name, (x, u) in load.members.items()]
@@ -191,7 +191,7 @@ class Scene:
             for k, (name, points) in enumerate(lines)
         ]
 
-    def _arrows(self, state: State, load: Load) -> list[Shape]:
+    def _draw_arrows(self, state: State, load: Load) -> list[Shape]:
         """Draw force and moment as arrows from the reference point."""
         shaft = SIZES["arrow"] * self._size
         size = (shaft, 2.0 * shaft, 3.0 * shaft)

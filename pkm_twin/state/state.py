@@ -19,7 +19,7 @@ from pkm_twin.streams.monitor import Pace
 from pkm_twin.streams.topics import JOINTS, TEXT, WRENCH, Topic, table
 from pkm_twin.streams.wrench import Mount, TimeCache, TimeSynchronizer, check_order
 
-_TRANSFORMS: Final = "tf2_msgs/TFMessage"
+_TRANSFORM_TYPE: Final = "tf2_msgs/TFMessage"
 
 STATE: Final = table(
     Topic("in", "joint_states", JOINTS, "positions, and velocities where present"),
@@ -51,8 +51,10 @@ STATE: Final = table(
         "the output of `pkm-twin export urdf`, without a `ros2_control` element unless `hardware_plugin` is set",
         latched=True,
     ),
-    Topic("out", "/tf", _TRANSFORMS, "`base_frame` to `platform_frame`, if tf2_msgs is installed"),
-    Topic("out", "/tf_static", _TRANSFORMS, "`platform_frame` to `tool_frame`, if tf2_msgs is installed", latched=True),
+    Topic("out", "/tf", _TRANSFORM_TYPE, "`base_frame` to `platform_frame`, if tf2_msgs is installed"),
+    Topic(
+        "out", "/tf_static", _TRANSFORM_TYPE, "`platform_frame` to `tool_frame`, if tf2_msgs is installed", latched=True
+    ),
 )
 
 
@@ -88,7 +90,7 @@ def moving_state_kernel(robot: Robot) -> Kernel:
 
 @dataclass
 class MachineState(TimeSynchronizer):
-    """Computes the machine's state from joint states, and keeps wrenches to assign to it."""
+    """Compute the machine's state from joint states, with the wrench nearest in time."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -116,12 +118,12 @@ class MachineState(TimeSynchronizer):
             if not self.pace.due(sample.stamp):
                 self._last_stamp = sample.stamp
                 return None
-            state: State = as_message_error(self._state, sample)
+            state: State = as_message_error(self._compute_state, sample)
         self.latest, self._last_stamp = state, sample.stamp
         self.pace.answered(sample.stamp)
         return state
 
-    def wrench(self, message: Any, now: int) -> None:
+    def store_wrench(self, message: Any, now: int) -> None:
         """Store a geometry_msgs/WrenchStamped.
 
         :raises MessageError: the message is rejected, and counted.
@@ -130,7 +132,7 @@ class MachineState(TimeSynchronizer):
             sample, mount = self._wrench_reader.read(message, now)
             self._recent.push(sample.stamp, (sample, mount))
 
-    def load(self, state: State) -> Array | None:
+    def find_wrench(self, state: State) -> Array | None:
         """Return the wrench nearest in time to a state, base axes at the reference point, (6,).
 
         None if no wrench is within ``max_state_age``.
@@ -141,7 +143,7 @@ class MachineState(TimeSynchronizer):
         sample, mount = found[1]
         return self._wrench_reader.at_reference(sample, mount, state.rotation)
 
-    def _state(self, sample: JointSample) -> State:
+    def _compute_state(self, sample: JointSample) -> State:
         robot, q, qd = self.robot, sample.q, sample.qd
         rates = twist = None
         if qd is None:

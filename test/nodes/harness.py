@@ -46,7 +46,7 @@ class Plain:
 
     time = duration = header = __call__
     joint_state = point = trajectory = __call__
-    vector = wrench = wrench_stamped = __call__
+    vector = wrench = make_wrench_message = __call__
 
 
 class Ros:
@@ -62,7 +62,7 @@ class Ros:
         self.time, self.duration, self.header = Time, Duration, Header
         self.joint_state = JointState
         self.point, self.trajectory = JointTrajectoryPoint, JointTrajectory
-        self.vector, self.wrench, self.wrench_stamped = Vector3, Wrench, WrenchStamped
+        self.vector, self.wrench, self.make_wrench_message = Vector3, Wrench, WrenchStamped
 
 
 class Maker:
@@ -102,7 +102,7 @@ class Maker:
 
     def wrench(self, values, stamp=0, frame="platform"):
         fx, fy, fz, mx, my, mz = values
-        return self.kind.wrench_stamped(
+        return self.kind.make_wrench_message(
             header=self.header(stamp, frame),
             wrench=self.kind.wrench(
                 force=self.kind.vector(x=fx, y=fy, z=fz),

@@ -9,7 +9,7 @@ import pytest
 from pkm_twin import robot_names
 from pkm_twin.errors import MessageError
 from pkm_twin.machine import rotations
-from pkm_twin.state.scene import Load, Scales, Scene, heat
+from pkm_twin.state.scene import Load, Scales, Scene, choose_heat_colour
 from pkm_twin.state.state import MachineState
 from pkm_twin.streams.wrench import WrenchSettings
 from stiffness_monitor import compliance, strain_energy
@@ -145,7 +145,7 @@ class TestScene:
         lengths = []
         for q in poses(robot):
             state = told(robot, q)
-            places = scene.placed(q)
+            places = scene.place_bars(q)
             bars = by_group(scene.shapes(state))["bars"]
             assert len(bars) == len(scene.bars) and all(bar.lasting for bar in bars)
             for bar, ends in zip(bars, places, strict=True):
@@ -171,8 +171,8 @@ class TestScene:
         greatest = max(load.factors.values())
         assert set(load.factors) <= set(shown)
         for name, share in load.factors.items():
-            assert shown[name] == heat(share / greatest)
-        assert shown[load.dominant] == heat(1.0)
+            assert shown[name] == choose_heat_colour(share / greatest)
+        assert shown[load.dominant] == choose_heat_colour(1.0)
         assert [shape.text for shape in groups["dominant"]] == [load.dominant]
         # The deflected machine: members' ends on the undeflected ones, moved and enlarged.
         lines = {shape.text: shape.points for shape in groups["deflected"]}

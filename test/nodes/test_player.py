@@ -225,7 +225,7 @@ def test_in_lockstep_a_topics_first_message_is_acknowledged_before_the_next_goes
     opened = open_bag(bag)
     publishers = {name: Recorded(name) for name in opened.report.topics}
     pace = (lambda _: None) if lockstep else None
-    replay = player_module._Replay(opened, publishers, 1e3, player_module._Stop(), pace)
+    replay = player_module._Replay(opened, publishers, 1e3, player_module._StopFlag(), pace)
     replay.run(loop=False, update=lambda _seconds, _messages: None)
     sent = [name for what, name in events if what == "sent"]
     assert len(sent) == len(list(opened.messages(list(publishers))))

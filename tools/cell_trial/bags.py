@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Every shipped bag, played by `ros2 bag play --clock` into its nodes: the share that is answered.
+"""Play every shipped bag by `ros2 bag play --clock` into its nodes; print the answered fraction.
 
     python3 tools/cell_trial/bags.py [--rate 1.0] [-p NAME:=VALUE] [BAG ...]
 
@@ -30,7 +30,7 @@ ROBOTS = {
     "prru": ("delta_dynamics", "stiffness_monitor", "machine_state"),
     "upr_rpu": ("stiffness_monitor", "machine_state"),
 }
-"""Nodes that a robot's bags have all messages for."""
+"""Nodes whose input topics are all in a robot's bags."""
 
 
 def folder() -> Path:

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Shared parts of the trials: processes in own sessions, and a node that receives and sends."""
+"""Processes and a ROS node for all trials."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import rclpy
 from rclpy.executors import SingleThreadedExecutor
 
 DEADLINE = 120.0
-"""How long a condition is waited for, s."""
+"""Longest wait for a condition, s."""
 
 
 def find_executable(name: str) -> str:
@@ -31,7 +31,7 @@ def find_executable(name: str) -> str:
 
 
 class Process:
-    """A command in a session of its own, which takes signals whatever this one does about them."""
+    """A command in its own session, with default signal handlers."""
 
     def __init__(self, *command: str, environment: dict[str, str] | None = None) -> None:
         self._file = tempfile.TemporaryFile("w+")  # noqa: SIM115
@@ -51,16 +51,16 @@ class Process:
 
     @property
     def output(self) -> str:
-        """The process's output so far."""
+        """Output of the process so far."""
         self._file.seek(0)
         return self._file.read()
 
     def alive(self) -> bool:
-        """Whether it runs."""
+        """Return whether the process runs."""
         return self.process.poll() is None
 
     def signal(self, number: int, *, group: bool = False) -> None:
-        """Send a signal to the process, or as a terminal does to all of its group."""
+        """Send a signal to the process, or like a terminal to its whole group."""
         with contextlib.suppress(ProcessLookupError):
             if group:
                 os.killpg(self.process.pid, number)
@@ -76,12 +76,12 @@ class Process:
         self._file.close()
 
     def usage(self) -> float:
-        """Processor time so far, s, of the process and its threads."""
+        """Return the processor time of the process and its threads so far, s."""
         fields = Path(f"/proc/{self.process.pid}/stat").read_text().rsplit(")", 1)[1].split()
         return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
     def memory(self) -> float:
-        """Resident memory, MB."""
+        """Return the resident memory, MB."""
         pages = int(Path(f"/proc/{self.process.pid}/statm").read_text().split()[1])
         return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
@@ -101,7 +101,7 @@ def node(*names: str, parameters: Iterable[str] = (), remap: Iterable[str] = ())
 
 
 class Peer:
-    """The other side of the topics."""
+    """A node that subscribes to and publishes on the topics of the nodes under test."""
 
     def __init__(self, name: str = "trial") -> None:
         rclpy.init(args=[])
@@ -116,7 +116,7 @@ class Peer:
         return heard
 
     def spin(self, seconds: float) -> None:
-        """Take messages for so long."""
+        """Receive messages for a time, s."""
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0.0:
             self._executor.spin_once(timeout_sec=left)
@@ -129,10 +129,10 @@ class Peer:
         every: float = 0.005,
         needs: Iterable[Process] = (),
     ) -> Any:
-        """Take messages until the condition holds; its value.
+        """Receive messages until a condition holds; return the condition's value.
 
         :param needs: processes without which it cannot hold.
-        :raises TimeoutError: it never did.
+        :raises TimeoutError: the condition does not hold in time.
         :raises RuntimeError: one of the processes has ended.
         """
         end = time.monotonic() + timeout

@@ -53,7 +53,7 @@ class Cell:
         self.description = other.node.create_publisher(String, "/robot_description", latched)
         text = robot_urdf(self.robot)
         self.description.publish(String(data=text))
-        # Where mock hardware stands.
+        # The position of mock hardware.
         joints = ElementTree.fromstring(text).findall("ros2_control/joint")
         self.q = np.array([float(j.find("state_interface/param").text) for j in joints])
         self.states = other.hear(JointTrajectoryControllerState, f"/{CONTROLLER}/controller_state", 5000)
@@ -87,7 +87,7 @@ class Cell:
         )
 
     def start_controller(self) -> None:
-        """controller_manager with its two controllers, active."""
+        """Start controller_manager and wait until its two controllers are active."""
         self.manager = Process(
             "ros2",
             "run",
@@ -111,7 +111,7 @@ class Cell:
         self.other.until(lambda: self.states, lambda: f"the controller\n{self.manager.output}")
 
     def start_twin(self) -> None:
-        """delta_dynamics between the client and the controller."""
+        """Start delta_dynamics between the client and the controller."""
         self.twin = node(
             "delta_dynamics",
             parameters=(
@@ -122,14 +122,14 @@ class Cell:
         self.other.until(self.client.server_is_ready, lambda: f"the twin's action\n{self.twin.output}")
 
     def stop(self) -> None:
-        """All processes."""
+        """Stop all processes."""
         for process in (self.twin, self.spawner, self.manager):
             if process is not None:
                 process.close()
         self.twin = self.spawner = self.manager = None
 
     def goal(self, seconds: float = 3.0, *, braking: float = 0.0, tolerance: float = 0.0) -> Any:
-        """There and back by a twentieth of the range; braking: acceleration of the last point."""
+        """Make a goal there and back by a twentieth of the range; braking: the last point's acceleration."""
         steps = 200
         s = np.linspace(0.0, 1.0, steps + 1)
         limits = self.robot.limits.position
@@ -171,18 +171,18 @@ class Cell:
 
     def least_share(self, since: float) -> float:
         """Return the least share of the gravity effort since a stamp, moving or not."""
-        stamps, share = self._shares()
+        stamps, share = self._compute_shares()
         return float(share[stamps > since].min())
 
-    def _shares(self) -> tuple[Any, Any]:
-        """Stamps, s, and the effort of the joint that bears most, over the weight there."""
+    def _compute_shares(self) -> tuple[Any, Any]:
+        """Return stamps, s, and the ratio of effort to gravity effort of the joint with the largest one."""
         joint = int(np.abs(self.weight).argmax())
         efforts = np.array([m.output.effort[joint] for m in self.states])
         stamps = np.array([_seconds(m.header.stamp) for m in self.states])
         return stamps, efforts / self.weight[joint]
 
     def pass_by(self, seconds: float) -> None:
-        """Until the controller's states are of so long after now: on a busy machine they wait."""
+        """Wait until the controller's states are stamped ``seconds`` after now."""
         until = _now(self) + seconds
         self.other.until(
             lambda: self.states and _seconds(self.states[-1].header.stamp) > until,
@@ -190,7 +190,7 @@ class Cell:
         )
 
     def ended(self, result: Any, timeout: float = 60.0) -> tuple[str, str, float]:
-        """How a goal has ended, what was said of it, and after how long, s."""
+        """Return how a goal ended, its error text, and its duration, s."""
         began = time.monotonic()
         self.other.until(result.done, "the end of a goal", timeout)
         answer = result.result()
@@ -204,7 +204,7 @@ class Cell:
         """
         efforts = np.array([m.output.effort for m in self.states])
         moving = np.array([any(m.reference.velocities) for m in self.states])
-        stamps, share = self._shares()
+        stamps, share = self._compute_shares()
         after = (stamps > since) & ~moving
         if not after.any():
             return np.nan, np.nan, np.nan
@@ -221,7 +221,7 @@ def _now(cell: Cell) -> float:
     return _seconds(cell.other.node.get_clock().now().to_msg())
 
 
-def _say(cell: Cell, case: str, ended: tuple[str, str, float] | None, since: float | None) -> None:
+def _print_result(cell: Cell, case: str, ended: tuple[str, str, float] | None, since: float | None) -> None:
     words = [f"{case}:"]
     if ended is not None:
         words.append(f"{ended[0]} after {ended[2]:.2f} s, {ended[1]!r};")
@@ -234,11 +234,11 @@ def _say(cell: Cell, case: str, ended: tuple[str, str, float] | None, since: flo
     print(" ".join(words), flush=True)
 
 
-def cancelled(cell: Cell) -> None:
+def trial_cancel(cell: Cell) -> None:
     """Cancel a goal in the middle of the motion, the first goal and a later one."""
     for case in ("cancel of the first goal", "cancel after a goal that succeeded"):
         if case.startswith("cancel after"):
-            # Whose last effort is none that bears the weight.
+            # The last effort of this goal does not carry the weight.
             _, result = cell.send(cell.goal(0.5, braking=-20.0))
             cell.ended(result)
         handle, result = cell.send(cell.goal())
@@ -246,37 +246,37 @@ def cancelled(cell: Cell) -> None:
         cell.other.spin(0.8)
         since = _now(cell)
         handle.cancel_goal_async()
-        _say(cell, case, cell.ended(result), since)
+        _print_result(cell, case, cell.ended(result), since)
 
 
-def aborted(cell: Cell) -> None:
+def trial_abort(cell: Cell) -> None:
     """Let the controller abort: mock hardware does not follow, and the path has a tolerance."""
     _, result = cell.send(cell.goal(tolerance=0.005))
     since = _now(cell)
-    _say(cell, "abort by path tolerance", cell.ended(result), since)
+    _print_result(cell, "abort by path tolerance", cell.ended(result), since)
 
 
-def ended_in_acceleration(cell: Cell) -> None:
+def trial_end_in_acceleration(cell: Cell) -> None:
     """End a goal with a last point at rest that has an acceleration."""
     _, result = cell.send(cell.goal(0.5, braking=-20.0))
     ended = cell.ended(result)
-    _say(cell, "success whose last point accelerates", ended, _now(cell))
+    _print_result(cell, "success whose last point accelerates", ended, _now(cell))
 
 
-def replaced(cell: Cell) -> None:
+def trial_replacement(cell: Cell) -> None:
     """Replace a goal by a second one, which the first must not disturb."""
     _, first = cell.send(cell.goal())
     cell.until_moving()
     cell.other.spin(0.3)
     since = _now(cell)
     _, second = cell.send(cell.goal(1.0))
-    _say(cell, "replaced by another goal, the first", cell.ended(first), None)
-    _say(cell, "replaced by another goal, the second", cell.ended(second), _now(cell))
+    _print_result(cell, "replaced by another goal, the first", cell.ended(first), None)
+    _print_result(cell, "replaced by another goal, the second", cell.ended(second), _now(cell))
     print(f"  least effort since the second was sent: {cell.least_share(since):.2f} of the weight")
 
 
-def twin_ends(cell: Cell) -> None:
-    """SIGINT to the twin in the middle of the motion."""
+def trial_twin_end(cell: Cell) -> None:
+    """Send SIGINT to the twin in the middle of the motion."""
     _, result = cell.send(cell.goal())
     cell.until_moving()
     cell.other.spin(0.8)
@@ -286,7 +286,7 @@ def twin_ends(cell: Cell) -> None:
         ended = cell.ended(result, 30.0)
     except TimeoutError:
         ended = ("no end", "", 30.0)
-    _say(cell, "SIGINT of the twin", ended, since)
+    _print_result(cell, "SIGINT of the twin", ended, since)
     cell.other.until(lambda: not cell.twin.alive(), "the twin's end")
     print(f"  exit code {cell.twin.process.returncode}")
     cell.twin.close()
@@ -294,35 +294,35 @@ def twin_ends(cell: Cell) -> None:
     cell.other.spin(2.0)
 
 
-def controller_killed(cell: Cell) -> None:
+def trial_killed_controller(cell: Cell) -> None:
     """Kill the controller manager by SIGKILL."""
     _, result = cell.send(cell.goal())
     cell.until_moving()
     cell.other.spin(0.8)
     cell.manager.signal(signal.SIGKILL, group=True)
-    _say(cell, "kill -9 of the controller", cell.ended(result, 60.0), None)
+    _print_result(cell, "kill -9 of the controller", cell.ended(result, 60.0), None)
     cell.spawner.close()
     cell.manager.close()
     cell.start_controller()
 
 
-def first_goal(cell: Cell) -> None:
+def trial_first_goal(cell: Cell) -> None:
     """Send a goal immediately after the start of delta_dynamics."""
     for _ in range(5):
         cell.twin.close()
         cell.start_twin()
         _, result = cell.send(cell.goal(0.3))
-        _say(cell, "goal at once after the twin's start", cell.ended(result), None)
+        _print_result(cell, "goal at once after the twin's start", cell.ended(result), None)
 
 
 CASES: dict[str, Callable[[Cell], None]] = {
-    "cancelled": cancelled,
-    "aborted": aborted,
-    "accelerating": ended_in_acceleration,
-    "replaced": replaced,
-    "first": first_goal,
-    "twin": twin_ends,
-    "controller": controller_killed,
+    "cancelled": trial_cancel,
+    "aborted": trial_abort,
+    "accelerating": trial_end_in_acceleration,
+    "replaced": trial_replacement,
+    "first": trial_first_goal,
+    "twin": trial_twin_end,
+    "controller": trial_killed_controller,
 }
 
 

@@ -40,7 +40,7 @@ RATE = 250.0
 
 
 class Results:
-    """Lines, and whether all of them were good."""
+    """Print result lines, and record whether all were good."""
 
     def __init__(self) -> None:
         self.good = True
@@ -51,7 +51,7 @@ class Results:
 
 
 def output(*command: str, timeout: float = 2.0 * DEADLINE) -> tuple[int, str]:
-    """Exit code and what a command prints."""
+    """Run a command; return its exit code and output."""
     process = Process(*command)
     try:
         code = process.process.wait(timeout)
@@ -61,7 +61,7 @@ def output(*command: str, timeout: float = 2.0 * DEADLINE) -> tuple[int, str]:
 
 
 class States:
-    """A stream of joint states near home, and the weight's efforts."""
+    """A stream of joint states near home with gravity efforts."""
 
     def __init__(self, other: Peer) -> None:
         self.other, self.robot = other, load(ROBOT)
@@ -70,7 +70,7 @@ class States:
         self.rng = np.random.default_rng(1)
 
     def stream(self, seconds: float, *, late: float = 0.0, moving: bool = True, drives: str = "on") -> None:
-        """Send for so long.
+        """Publish for a time, s.
 
         :param late: age of the stamps, s; ``drives``: on, off, braked, or broken: NaN.
         """
@@ -113,7 +113,7 @@ def diagnosed(other: Peer) -> dict[str, Any]:
 
 
 def urdf(_: Peer, tell: Results) -> None:
-    """Options of pkm-twin export urdf."""
+    """Check the options of pkm-twin export urdf."""
     program = find_executable("pkm-twin")
     for words in (
         (),
@@ -136,7 +136,7 @@ def urdf(_: Peer, tell: Results) -> None:
 
 
 def description(other: Peer, tell: Results) -> None:
-    """machine_state's robot_description beside a controller_manager."""
+    """Check machine_state's robot_description with a controller_manager."""
     for plugin in ("", MOCK):
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         texts = other.hear(String, "/robot_description", latched)
@@ -190,7 +190,7 @@ def deadline(other: Peer, tell: Results) -> None:
 
 
 def resume(other: Peer, tell: Results) -> None:
-    """Torques after a gravity stop, stamped before the stop's torque."""
+    """Check torques after a gravity stop that are stamped before the stop's torque."""
     states = States(other)
     torques = other.hear(JointState, "/delta_dynamics/joint_torques", 1000)
     commands = other.hear(Float64MultiArray, "/command_gate/commands", 1000)
@@ -207,7 +207,7 @@ def resume(other: Peer, tell: Results) -> None:
         states.stream(2.0, late=0.5)
         other.spin(1.5)
         stamps = [m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec for m in torques]
-        # The stop's is the only one that a later one is stamped before.
+        # Only the stop's torque is followed by one with an earlier stamp.
         stop = int(np.argmax(np.diff(stamps) < 0.0))
         behind = stamps[stop] - stamps[stop + 1]
         resumed = torques[stop + 1 :]
@@ -223,7 +223,7 @@ def resume(other: Peer, tell: Results) -> None:
 
 
 def off(other: Peer, tell: Results) -> None:
-    """Efforts of drives that are off or braked, in the node and in a recording."""
+    """Check efforts of drives that are off or braked, in the node and in a recording."""
     states = States(other)
     loads = other.hear(InertiaStamped, "/delta_dynamics/payload", 1000)
     wrenches = other.hear(WrenchStamped, "/delta_dynamics/external_wrench", 1000)
@@ -243,7 +243,7 @@ def off(other: Peer, tell: Results) -> None:
                 states.stream(3.0, moving=False, drives=drives)
                 status = told["/delta_dynamics"]
                 values = {pair.key: pair.value for pair in status.values}
-                # What is on its way, and the time that it takes to know constant efforts.
+                # Messages in transit, and the time to detect constant efforts.
                 tell(
                     values["drives off or braked"] == "True" and values["contact"] == "False",
                     f"drives {drives} for 3 s: {status.message!r}; contact {values['contact']}, "
@@ -282,7 +282,7 @@ def launch(_: Peer, tell: Results) -> None:
 
 
 def control(other: Peer, tell: Results) -> None:
-    """control.launch.py with the gate."""
+    """Check control.launch.py with the gate."""
     commands = other.hear(Float64MultiArray, "/effort_controller/commands", 1000)
     robot = load(ROBOT)
     home = robot.inverse(robot.home())

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""The MoveIt configuration of every robot, loaded by the parsers that MoveIt uses.
+"""Load the MoveIt configuration of every robot by MoveIt's own parsers.
 
     python3 tools/cell_trial/moveit.py [ROBOT ...]
 

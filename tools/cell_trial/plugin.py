@@ -60,8 +60,8 @@ HARDWARE = {
     "killed": MOCK,
     "twin": MOCK,
 }
-MORE = 0.5
-"""Payload that is added at run time, kg."""
+ADDED_PAYLOAD = 0.5
+"""Payload added at run time, kg."""
 
 
 def to_duration(seconds: float) -> Duration:
@@ -71,7 +71,7 @@ def to_duration(seconds: float) -> Duration:
 
 
 def trajectory(names: list[str], times: Any, *columns: Any) -> JointTrajectory:
-    """Positions, velocities and accelerations (points, n) as a message."""
+    """Make a trajectory message of positions, velocities and accelerations (points, n)."""
     points = [
         JointTrajectoryPoint(
             positions=q.tolist(),
@@ -150,10 +150,10 @@ class Chain:
         return file
 
     def start(self) -> Any:
-        """Wait for both controllers; the model's joint positions."""
+        """Wait for both controllers; return the model's joint positions."""
         self.other.until(lambda: self.states, lambda: f"the controller\n{self.process.output}")
         self.other.until(self.send.get_subscription_count, "who takes trajectories")
-        # They become active one after the other.
+        # The controllers become active one after the other.
         self.other.spin(5.0)
         found, home = np.array(self.last.feedback.positions), self.robot.graph.home
         miss = np.abs(found - self.robot.controller.controller_positions(home)).max()
@@ -168,11 +168,11 @@ class Chain:
 
     @property
     def last(self) -> Any:
-        """The last state."""
+        """The last controller state."""
         return self.states[-1]
 
     def followed(self) -> list[Any]:
-        """States of a motion there and back."""
+        """Send a motion there and back; return the controller states."""
         self.go(there_and_back(self.robot, self.start(), 4.0))
         self.other.spin(5.0)
         self.other.until(lambda: not any(self.last.reference.velocities), "the motion's end")
@@ -263,10 +263,10 @@ class Chain:
     def beyond(self) -> None:
         """Send a trajectory through the position limit of the first joint, with another payload."""
         start, load = self.start(), self.robot.payload
-        self.set_parameter(CONTROLLER, "payload.mass", load.mass + MORE)
+        self.set_parameter(CONTROLLER, "payload.mass", load.mass + ADDED_PAYLOAD)
         self.robot = robot = self.robot.changed(
             payload={
-                "mass": load.mass + MORE,
+                "mass": load.mass + ADDED_PAYLOAD,
                 "com": load.com.tolist(),
                 "inertia": load.inertia.tolist(),
             }
@@ -288,7 +288,7 @@ class Chain:
         self.other.until(lambda: self.fallen, GRAVITY)
         self.other.spin(3.0)
         self.report()
-        self.compare_gravity(f"payload {MORE:g} kg more at {CONTROLLER} alone")
+        self.compare_gravity(f"payload {ADDED_PAYLOAD:g} kg more at {CONTROLLER} alone")
         idle = [m for m in self.hardware if not any(m.effort)]
         print(f"{self.part}: {len(idle)} of {len(self.hardware)} joint states have no effort")
         said = [line for line in self.process.output.splitlines() if "hold_time" in line]
@@ -349,12 +349,12 @@ def _output(*command: str) -> str:
 
 
 def twin_s_efforts(other: Peer, robot: Robot, given: str, states: list[Any]) -> Any:
-    """Efforts of a running delta_dynamics for the references of these states, (count, n)."""
+    """Return the efforts of a running delta_dynamics for the references of states, (count, n)."""
     answers = other.hear(JointTrajectory, "/delta_dynamics/joint_trajectory_ff", 10)
     send = other.node.create_publisher(JointTrajectory, "/delta_dynamics/joint_trajectory", QoSProfile(depth=10))
     references = [s.reference for s in states]
     columns = [np.array([getattr(r, name) for r in references]) for name in KINDS]
-    # Times only have to rise: efforts are those of each point.
+    # Only rising times are needed, as each point has its own efforts.
     message = trajectory(list(robot.controller.names), 1e-3 * np.arange(1, len(states) + 1), *columns)
     with closing(node("delta_dynamics", parameters=[f"mechanism:={given}"])):
         other.until(send.get_subscription_count, "delta_dynamics")

@@ -34,26 +34,26 @@ from pkm_twin.bags.reader import inspect
 from pkm_twin.mechanisms.catalogue import robot_path
 
 MACHINES = {"picker": ("delta_cu", 0.1, 0.5), "head": ("prru", 300.0, 80.0)}
-"""Namespace: robot, its viscous and its dry friction as the nodes know them."""
-SIMULATED = 4.0
-"""Friction of the simulated machines over that: they hold themselves without efforts, and come to
-rest. Efforts that compensate all friction would keep a machine moving that has begun to."""
-WARM = 15.0
+"""Robot of each namespace, with the viscous and dry friction of the nodes' model."""
+SIMULATED_FRICTION_RATIO = 4.0
+"""Ratio of simulated to modelled friction: the machines hold themselves and come to rest. With a
+ratio of 1, compensated friction would keep them moving."""
+WARM_UP_TIME = 15.0
 PARTS = ("cell", "kilohertz", "stops", "one")
 FAULTS = ("lost: ", " rejected: ", "stopped: ", "closed: ", "exceptions", "times behind")
 
 
 class Watch:
-    """Diagnostics and commands of every node."""
+    """Collect diagnostics and gate commands of all nodes."""
 
     def __init__(self, other: Peer) -> None:
         self.other = other
         self.values: dict[str, dict[str, str]] = {}
         self.messages: dict[str, str] = {}
         self.commands: dict[str, list[float]] = {}
-        other.node.create_subscription(DiagnosticArray, "/diagnostics", self._diagnosed, 1000)
+        other.node.create_subscription(DiagnosticArray, "/diagnostics", self._take_diagnostics, 1000)
 
-    def _diagnosed(self, array: DiagnosticArray) -> None:
+    def _take_diagnostics(self, array: DiagnosticArray) -> None:
         for status in array.status:
             self.values[status.name] = {pair.key: pair.value for pair in status.values}
             self.messages[status.name] = status.message
@@ -80,7 +80,7 @@ class Watch:
         return found
 
 
-def robots(folder: Path, factor: float = 1.0) -> dict[str, Path]:
+def write_robots(folder: Path, factor: float = 1.0) -> dict[str, Path]:
     """Write a robot file for each namespace, with friction multiplied by a factor."""
     files = {}
     for space, (robot, viscous, dry) in MACHINES.items():
@@ -90,9 +90,9 @@ def robots(folder: Path, factor: float = 1.0) -> dict[str, Path]:
     return files
 
 
-def simulators(spaces: Iterable[str], folder: Path, period: float, priority: int = 0) -> list[Process]:
+def start_simulators(spaces: Iterable[str], folder: Path, period: float, priority: int = 0) -> list[Process]:
     """Start a machine_sim for each namespace, driven by the efforts of its gate."""
-    files = robots(folder, SIMULATED)
+    files = write_robots(folder, SIMULATED_FRICTION_RATIO)
     return [
         node(
             "machine_sim",
@@ -107,8 +107,8 @@ def simulators(spaces: Iterable[str], folder: Path, period: float, priority: int
     ]
 
 
-def launched(files: dict[str, Path], *extra: str) -> Process:
-    """cell.launch.py with all nodes."""
+def launch_cell(files: dict[str, Path], *extra: str) -> Process:
+    """Launch cell.launch.py with all nodes."""
     machines = ",".join(f"{space}={robot}" for space, robot in files.items())
     return Process(
         "ros2",
@@ -122,8 +122,8 @@ def launched(files: dict[str, Path], *extra: str) -> Process:
     )
 
 
-def launched_alone(files: dict[str, Path], *extra: str) -> Process:
-    """twin.launch.py of the only machine, with all nodes."""
+def launch_machine(files: dict[str, Path], *extra: str) -> Process:
+    """Launch twin.launch.py of the only machine, with all nodes."""
     ((space, robot),) = files.items()
     return Process(
         "ros2",
@@ -138,14 +138,14 @@ def launched_alone(files: dict[str, Path], *extra: str) -> Process:
     )
 
 
-PATIENT: dict[str, dict[str, float]] = {
+RELAXED_PARAMETERS: dict[str, dict[str, float]] = {
     "delta_dynamics": {"stale_after": 1.0},
     "command_gate": {"deadline": 1.0},
 }
-"""Torques flow on a busy machine, too."""
+"""Parameters with which torques also flow on a busy machine."""
 
 
-def parameters(spaces: Iterable[str], folder: Path, given: dict[str, dict[str, Any]]) -> str:
+def write_parameters(spaces: Iterable[str], folder: Path, given: dict[str, dict[str, Any]]) -> str:
     """Write a parameter file for all namespaces, and return the launch argument."""
     file = folder / "parameters.yaml"
     file.write_text(
@@ -160,12 +160,12 @@ def parameters(spaces: Iterable[str], folder: Path, given: dict[str, dict[str, A
     return f"params_file:={file}"
 
 
-def watched(watch: Watch, processes: dict[str, int], seconds: float) -> bool:
-    """Look at faults and memory for so long after warming up; whether all is well."""
+def watch_faults(watch: Watch, processes: dict[str, int], seconds: float) -> bool:
+    """Watch faults and memory for a time after warming up; return whether all is well."""
     other = watch.other
-    other.spin(WARM)
-    before, memory = watch.faults(), {name: _memory(pid) for name, pid in processes.items()}
-    used = {name: _used(pid) for name, pid in processes.items()}
+    other.spin(WARM_UP_TIME)
+    before, memory = watch.faults(), {name: _resident_memory(pid) for name, pid in processes.items()}
+    used = {name: _processor_time(pid) for name, pid in processes.items()}
     began = time.monotonic()
     other.spin(seconds)
     took = time.monotonic() - began
@@ -175,23 +175,23 @@ def watched(watch: Watch, processes: dict[str, int], seconds: float) -> bool:
         print(f"  {name}: {'; '.join(f'{n} {key}' for key, n in new.items()) or 'nothing'}")
         good &= not new
     for name, pid in processes.items():
-        growth = _memory(pid) - memory[name]
-        share = 100 * (_used(pid) - used[name]) / took
-        print(f"  {name}: {share:.1f} % of a core, {_memory(pid):.0f} MB, {growth:+.2f} MB")
+        growth = _resident_memory(pid) - memory[name]
+        share = 100 * (_processor_time(pid) - used[name]) / took
+        print(f"  {name}: {share:.1f} % of a core, {_resident_memory(pid):.0f} MB, {growth:+.2f} MB")
     return good
 
 
-def _memory(pid: int) -> float:
+def _resident_memory(pid: int) -> float:
     return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * 4096 / 1e6
 
 
-def _used(pid: int) -> float:
+def _processor_time(pid: int) -> float:
     fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
     return (int(fields[11]) + int(fields[12])) / 100
 
 
-def _children(process: Process) -> dict[str, int]:
-    """Nodes that a launch has started, by executable and order."""
+def _find_nodes(process: Process) -> dict[str, int]:
+    """Return the nodes that a launch has started, by executable and order."""
     found = {}
     for line in process.output.splitlines():
         if "process started with pid [" in line:
@@ -200,16 +200,16 @@ def _children(process: Process) -> dict[str, int]:
     return found
 
 
-def cell(other: Peer, seconds: float, extra: tuple[str, ...], priority: int) -> bool:
-    """Two machines at 250 Hz and a recorder; what torques pass through has the priority."""
+def run_cell(other: Peer, seconds: float, extra: tuple[str, ...], priority: int) -> bool:
+    """Run two machines at 250 Hz and a recorder; nodes in the torque path have the priority."""
     watch = Watch(other)
     folder = Path(tempfile.mkdtemp())
     bag = folder / "bag"
-    files = robots(folder)
-    sims = simulators(files, folder, 0.004, priority)
+    files = write_robots(folder)
+    sims = start_simulators(files, folder, 0.004, priority)
     path = ("delta_dynamics", "command_gate")
     given = {name: {"thread_priority": priority} for name in path}
-    cell_ = launched(files, parameters(files, folder, given), *extra)
+    cell_ = launch_cell(files, write_parameters(files, folder, given), *extra)
     topics = [f"/{s}/{t}" for s in MACHINES for t in ("joint_states", "wrench")]
     recorder = Process("ros2", "bag", "record", "--storage", "mcap", "-o", str(bag), *topics)
     try:
@@ -219,12 +219,12 @@ def cell(other: Peer, seconds: float, extra: tuple[str, ...], priority: int) -> 
             lambda: f"nodes\n{cell_.output}",
             needs=(*sims, cell_),
         )
-        processes = _children(cell_) | {
+        processes = _find_nodes(cell_) | {
             f"machine_sim {space}": sim.process.pid for space, sim in zip(MACHINES, sims, strict=True)
         }
         processes["recorder"] = recorder.process.pid
         print(f"two machines, all nodes, recorder, {seconds:.0f} s:")
-        good = watched(watch, processes, seconds)
+        good = watch_faults(watch, processes, seconds)
         recorder.signal(signal.SIGINT, group=True)
         recorder.process.wait(60.0)
         report = inspect(bag)
@@ -237,36 +237,36 @@ def cell(other: Peer, seconds: float, extra: tuple[str, ...], priority: int) -> 
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def kilohertz(other: Peer, seconds: float, priority: int) -> bool:
-    """delta_dynamics, gate and machine_sim of one machine at 1 kHz."""
+def run_kilohertz(other: Peer, seconds: float, priority: int) -> bool:
+    """Run delta_dynamics, gate and machine_sim of one machine at 1 kHz."""
     watch = Watch(other)
     folder = Path(tempfile.mkdtemp())
-    space, file = next(iter(robots(folder).items()))
+    space, file = next(iter(write_robots(folder).items()))
     given = (f"mechanism:={file}", f"thread_priority:={priority}")
-    nodes = {"machine_sim": simulators([space], folder, 0.001, priority)[0]} | {
+    nodes = {"machine_sim": start_simulators([space], folder, 0.001, priority)[0]} | {
         name: node(name, parameters=given, remap=(f"__ns:=/{space}",)) for name in ("delta_dynamics", "command_gate")
     }
     try:
         other.until(lambda: len(watch.values) >= 3, "diagnostics of three nodes", needs=nodes.values())
         print(f"one machine at 1 kHz, {seconds:.0f} s:")
-        return watched(watch, {name: p.process.pid for name, p in nodes.items()}, seconds)
+        return watch_faults(watch, {name: p.process.pid for name, p in nodes.items()}, seconds)
     finally:
         for process in nodes.values():
             process.close()
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def stops(other: Peer, times: int, *, one: bool) -> bool:
-    """Ctrl-C, twice, in the terminal of a running cell or of one machine."""
+def run_stops(other: Peer, times: int, *, one: bool) -> bool:
+    """Send Ctrl-C twice to a running cell or machine, repeatedly."""
     watch = Watch(other)
     folder = Path(tempfile.mkdtemp())
-    files = dict(list(robots(folder).items())[: 1 if one else None])
+    files = dict(list(write_robots(folder).items())[: 1 if one else None])
     topics = {space: f"/{space}/command_gate/commands" for space in files}
     for topic in topics.values():
         watch.gate(topic)
-    extra = parameters(files, folder, PATIENT)
-    launch_of = launched_alone if one else launched
-    running = [*simulators(files, folder, 0.004)]
+    extra = write_parameters(files, folder, RELAXED_PARAMETERS)
+    launch_of = launch_machine if one else launch_cell
+    running = [*start_simulators(files, folder, 0.004)]
     ends: Counter[str] = Counter()
     try:
         for _ in range(times):
@@ -282,7 +282,7 @@ def stops(other: Peer, times: int, *, one: bool) -> bool:
                 needs=running,
             )
             other.spin(random.uniform(0.5, 1.5))
-            count = len(_children(launch))
+            count = len(_find_nodes(launch))
             # A terminal signals the whole group; launch then signals its processes once more.
             launch.signal(signal.SIGINT, group=True)
             time.sleep(10.0 ** random.uniform(-5, -0.7))
@@ -321,11 +321,11 @@ def main() -> int:
     for part in parts:
         with peer() as other:
             if part == "cell":
-                good &= cell(other, 60.0 * given.minutes, extra, given.priority)
+                good &= run_cell(other, 60.0 * given.minutes, extra, given.priority)
             elif part == "kilohertz":
-                good &= kilohertz(other, 60.0 * given.minutes, given.priority)
+                good &= run_kilohertz(other, 60.0 * given.minutes, given.priority)
             else:
-                good &= stops(other, given.stops, one=part == "one")
+                good &= run_stops(other, given.stops, one=part == "one")
     return 0 if good else 1
 
 

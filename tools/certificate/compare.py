@@ -26,7 +26,7 @@ BALANCE_BOUNDS = {"residual": 1e-10, "efforts": 1e-9, "power": 1e-9, "energy": 1
 
 @dataclass
 class Figures:
-    """The figures found; lists with one number per state."""
+    """The results; lists have one number per state."""
 
     machines: int = 0
     efforts: dict[str, list[float]] = field(default_factory=lambda: {r: [] for r in ROUTES})
@@ -34,7 +34,7 @@ class Figures:
     balances: dict[str, list[float]] = field(default_factory=lambda: {name: [] for name in BALANCE_BOUNDS})
 
     def add(self, other: Figures) -> None:
-        """Take in the figures of another machine."""
+        """Append the results of another machine."""
         self.machines += other.machines
         for mine, theirs in (
             (self.efforts, other.efforts),
@@ -46,12 +46,12 @@ class Figures:
 
 
 def difference(got: np.ndarray, expected: np.ndarray) -> float:
-    """Greatest difference over the greatest expected amount."""
+    """Return the greatest difference over the greatest expected magnitude."""
     return float(np.abs(got - expected).max() / np.abs(expected).max())
 
 
 def compare(name: str, seed: tuple[int, ...], states: int, exact: int) -> Figures:
-    """All routes over one random machine; the slow ones for the first ``exact`` states."""
+    """Compare one random machine by all engines; slow engines take the first ``exact`` states."""
     return compare_case(random_case(name, np.random.default_rng(seed), states), exact)
 
 

@@ -22,8 +22,8 @@ import numpy as np
 
 DIGITS = 50
 STEP = mpmath.mpf(10) ** -14
-WAY = 12
-"""Steps from the symmetric assembly to the wanted one."""
+HOMOTOPY_STEPS = 12
+"""Number of steps from the symmetric assembly to the wanted one."""
 
 Vector = list[Any]
 
@@ -46,10 +46,10 @@ class Result(NamedTuple):
 
 
 class Shape(NamedTuple):
-    """An assembled configuration, with what the energies need."""
+    """An assembled configuration with the points and axes of the energies."""
 
     points: list[Vector]
-    """Points and directions whose velocities the kinetic energy is made of."""
+    """Points and directions from whose velocities the kinetic energy follows."""
     centre: Vector
     axes: list[Vector]
     """The platform's axes x, y, z in the world."""
@@ -72,7 +72,7 @@ def plus(a: Sequence[Any], b: Sequence[Any], factor: Any = 1) -> Vector:
 
 
 def axes_of(alpha: Any, beta: Any, gamma: Any, m: Any) -> list[Vector]:
-    """Columns of Rx(alpha) Ry(beta) Rz(gamma)."""
+    """Return the columns of Rx(alpha) Ry(beta) Rz(gamma)."""
     ca, sa, cb, sb = m.cos(alpha), m.sin(alpha), m.cos(beta), m.sin(beta)
     cg, sg = m.cos(gamma), m.sin(gamma)
     return [
@@ -83,7 +83,7 @@ def axes_of(alpha: Any, beta: Any, gamma: Any, m: Any) -> list[Vector]:
 
 
 class Solid(NamedTuple):
-    """A body fixed to the platform: its kinetic energy needs its com and the turning axes."""
+    """A body fixed to the platform; its kinetic energy follows from the com and the rotating axes."""
 
     mass: Any
     com: Vector
@@ -106,7 +106,7 @@ class Solid(NamedTuple):
         return point
 
     def turning(self, rates: list[Vector]) -> Any:
-        """Kinetic energy of rotation from the velocities of the axes, half trace R' P R'T."""
+        """Return the kinetic energy of rotation from the axes' velocities, half trace R' P R'T."""
         total = mpmath.mpf(0)
         for i in range(3):
             for j in range(3):
@@ -116,7 +116,7 @@ class Solid(NamedTuple):
 
 
 class Energies:
-    """The common part: assembly, energies and their differences."""
+    """Assemble a machine and differentiate its energies; base class of the machines."""
 
     unknowns: int
 
@@ -138,14 +138,14 @@ class Energies:
         self._base: Vector = []
         self._slope: Any = None
 
-    # What a machine has to say
+    # Functions that a machine defines
 
     def gaps(self, q: Sequence[Any], u: Sequence[Any], m: Any) -> Vector:
-        """Errors of the closure, zero in an assembled configuration; m is math or mpmath."""
+        """Return the closure errors, zero in an assembled configuration; m is math or mpmath."""
         raise NotImplementedError
 
     def start(self, middle: float) -> list[float]:
-        """Unknowns of the symmetric assembly with all actuators at ``middle``."""
+        """Return the unknowns of the symmetric assembly with all actuators at ``middle``."""
         raise NotImplementedError
 
     def middles(self, q: np.ndarray) -> list[float]:
@@ -156,7 +156,7 @@ class Energies:
         raise NotImplementedError
 
     def kinetic_of(self, rates: list[Vector], axes: list[Vector]) -> Any:
-        """Kinetic energy from the velocities of the points and of the platform's axes."""
+        """Return the kinetic energy from the velocities of the points and of the platform's axes."""
         raise NotImplementedError
 
     def potential_of(self, shape: Shape) -> Any:
@@ -178,8 +178,8 @@ class Energies:
 
     def _walk(self, q: np.ndarray, middle: float) -> np.ndarray:
         u = np.array(self.start(middle))
-        for k in range(1, WAY + 1):
-            at = (middle + k / WAY * (q - middle)).tolist()
+        for k in range(1, HOMOTOPY_STEPS + 1):
+            at = (middle + k / HOMOTOPY_STEPS * (q - middle)).tolist()
             for _ in range(8):
                 error = np.array(self.gaps(at, u.tolist(), math), dtype=float)
                 slope = np.empty((self.unknowns, self.unknowns))
@@ -195,7 +195,7 @@ class Energies:
         return u
 
     def _settle(self, q: np.ndarray) -> None:
-        """Newton's method in all digits, and its matrix for the neighbours of ``q``."""
+        """Solve the closure by Newton's method in all digits; keep the matrix for neighbours of ``q``."""
         at = [mpmath.mpf(float(v)) for v in q]
         u = [mpmath.mpf(float(v)) for v in self._rough(q)]
         tiny = mpmath.mpf(10) ** -25
@@ -236,7 +236,7 @@ class Energies:
     # Energies
 
     def kinetic(self, q: Vector, qd: Vector) -> Any:
-        """Kinetic energy of a state."""
+        """Return the kinetic energy of a state."""
         high = self.assemble(plus(q, qd, STEP))
         low = self.assemble(plus(q, qd, -STEP))
         rates = [_rate(a, b) for a, b in zip(high.points, low.points, strict=True)]
@@ -244,7 +244,7 @@ class Energies:
         return self.kinetic_of(rates, axes)
 
     def total(self, q: Vector, qd: Vector) -> Any:
-        """Kinetic and potential energy of a state."""
+        """Return the kinetic and potential energy of a state."""
         return self.kinetic(q, qd) + self.potential_of(self.assemble(q))
 
     def _momentum(self, q: Vector, qd: Vector) -> Vector:
@@ -257,7 +257,7 @@ class Energies:
         return result
 
     def solve(self, q: Any, qd: Any, qdd: Any, wrench: Any) -> Result:
-        """Euler and Lagrange's equations for one state, all arguments floats."""
+        """Solve Lagrange's equations for one state; all arguments are floats."""
         with mpmath.workdps(DIGITS):
             self._settle(np.asarray(q, dtype=float))
             at = self._at
@@ -291,7 +291,7 @@ class Energies:
             )
 
     def state_energy(self, q: Any, qd: Any) -> float:
-        """Kinetic and potential energy of a state of floats, J."""
+        """Return the kinetic and potential energy of a state of floats, J."""
         with mpmath.workdps(DIGITS):
             self._settle(np.asarray(q, dtype=float))
             return float(self.total(self._at, [mpmath.mpf(float(v)) for v in qd]))

@@ -36,7 +36,7 @@ FINITE_ELEMENTS = np.array([row[2] for row in TABLE_1])
 RESOLVED = np.abs(FINITE_ELEMENTS) >= 0.1
 """Entries that are printed with three digits or more."""
 FACTORS = np.linspace(0.5, 2.0, 301)
-"""Tried on the compliance of all bars, and on that of all joints."""
+"""Factors tried on the compliance of all bars and on that of all joints."""
 
 
 def rigid_joints() -> dict[str, list[float]]:
@@ -86,7 +86,7 @@ def difference(ours: np.ndarray, theirs: np.ndarray) -> Difference:
 
 @dataclass(frozen=True, eq=False)
 class Links:
-    """A pose's differences from solid bars, of the mesh, and of the shear factor."""
+    """Differences at a pose from solid bars, by mesh and shear factor."""
 
     shipped: Difference
     """With the shipped shear factor."""
@@ -97,7 +97,7 @@ class Links:
 
 
 def compare_links(name: str) -> Links:
-    """All comparisons of one pose by its name."""
+    """Compare one pose, by its name, with solid bars in all variants."""
     robot = with_rigid_joints()
     pose = np.array(POSES[name])
     frame = structural_model(robot, robot.inverse(pose))
@@ -127,7 +127,7 @@ def deflections(bars: float = 1.0, joints: float = 1.0, base: Robot | None = Non
 
 @dataclass(frozen=True, eq=False)
 class PaperRows:
-    """The paper's finite elements beside the twin with the shipped joints.
+    """The paper's finite elements compared with the twin with the shipped joints.
 
     ``twin``: um and urad, shape (2, 6). ``rigid``: the same with rigid joints. ``excess``: finite
     elements over the twin, less 1. ``bars``, ``joints``: the one factor on all bars' or on all
@@ -156,5 +156,5 @@ def paper_rows(factors: np.ndarray = FACTORS) -> PaperRows:
 
 
 def error(rows: np.ndarray) -> float:
-    """Worst difference of the resolved entries over the finite elements."""
+    """Return the worst relative difference of the resolved entries from the finite elements."""
     return float(np.abs(rows / FINITE_ELEMENTS - 1)[RESOLVED].max())

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Random machines and states that the comparison is run over."""
+"""Draw random machines and states for the comparison."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ LEAST_MEASURE = 0.03
 routes lose digits alike."""
 
 AZIMUTH_ERROR = 0.1
-"""Limb azimuths are up to this far from even ones, rad."""
-THIN = 0.3
+"""Largest deviation of limb azimuths from even spacing, rad."""
+THIN_ROD_FRACTION = 0.3
 """Part of the PRRUs whose links are rods without inertia about themselves, the default."""
 
 ROBOTS = ("delta", "delta_cu", "prru")
@@ -29,7 +29,7 @@ ROBOTS = ("delta", "delta_cu", "prru")
 
 @dataclass(frozen=True)
 class Case:
-    """One machine with a handful of states; arrays of shape (states, 3), the wrench (states, 6)."""
+    """One machine with several states; arrays of shape (states, 3), the wrench (states, 6)."""
 
     data: dict[str, Any]
     robot: Robot
@@ -48,7 +48,7 @@ def build(data: dict[str, Any]) -> Robot:
 
 
 def friction(data: dict[str, Any], qd: np.ndarray) -> np.ndarray:
-    """Effort that friction costs, for the routes that know none."""
+    """Return the friction effort, for engines without friction."""
     values = data.get("friction", {})
     return np.multiply(values.get("viscous", 0.0), qd) + np.multiply(values.get("coulomb", 0.0), np.sign(qd))
 
@@ -56,9 +56,9 @@ def friction(data: dict[str, Any], qd: np.ndarray) -> np.ndarray:
 def random_case(name: str, rng: np.random.Generator, states: int) -> Case:
     """Draw a machine of the kind ``name``, and states in which it can be assembled."""
     for _ in range(100):
-        data = _prru(rng) if name == "prru" else _delta(rng, name == "delta_cu")
+        data = _draw_prru(rng) if name == "prru" else _draw_delta(rng, name == "delta_cu")
         robot = build(data)
-        q = _positions(name, robot, rng, states)
+        q = _draw_positions(name, robot, rng, states)
         if q is not None:
             break
     else:
@@ -72,7 +72,7 @@ def random_case(name: str, rng: np.random.Generator, states: int) -> Case:
     return Case(data, robot, q, qd, qdd, wrench)
 
 
-def _positions(name: str, robot: Robot, rng: np.random.Generator, states: int) -> np.ndarray | None:
+def _draw_positions(name: str, robot: Robot, rng: np.random.Generator, states: int) -> np.ndarray | None:
     found: list[np.ndarray] = []
     for _ in range(50 * states):
         try:
@@ -83,7 +83,7 @@ def _positions(name: str, robot: Robot, rng: np.random.Generator, states: int) -
                     continue
             else:
                 q = rng.uniform(-0.6, 1.0, 3)
-            if _regularity(robot, q) > LEAST_MEASURE:
+            if _compute_index(robot, q) > LEAST_MEASURE:
                 found.append(q)
         except (UnreachableError, SingularityError):
             continue
@@ -92,21 +92,21 @@ def _positions(name: str, robot: Robot, rng: np.random.Generator, states: int) -
     return None
 
 
-def _regularity(robot: Robot, q: np.ndarray) -> float:
-    """Reciprocal condition of the Jacobian, lengths at the platform's rim."""
+def _compute_index(robot: Robot, q: np.ndarray) -> float:
+    """Return the reciprocal condition of the Jacobian with angles times the platform's radius."""
     values = np.linalg.svd(robot.pose_scales[:, None] * robot.jacobian(q), compute_uv=False)
     return float(values[-1] / values[0])
 
 
-def _solid(rng: np.random.Generator, mass: float, size: float) -> list[list[float]]:
-    """Inertia of a random body: eight equal points about their centre, kg m2."""
+def _draw_inertia(rng: np.random.Generator, mass: float, size: float) -> list[list[float]]:
+    """Return the inertia of a random body of eight equal points, kg m2."""
     points = rng.uniform(-size, size, (8, 3))
     points -= points.mean(0)
     moments = np.einsum("ki,ki->", points, points) * np.eye(3) - points.T @ points
     return (mass / 8 * moments).tolist()
 
 
-def _shared(rng: np.random.Generator, payload: float, size: float, drag: float) -> dict[str, Any]:
+def _draw_common(rng: np.random.Generator, payload: float, size: float, drag: float) -> dict[str, Any]:
     mass = float(rng.uniform(0.0, payload))
     direction = rng.normal(size=3)
     gravity = rng.uniform(1.0, 15.0) * direction / np.linalg.norm(direction)
@@ -114,7 +114,7 @@ def _shared(rng: np.random.Generator, payload: float, size: float, drag: float) 
         "payload": {
             "mass": mass,
             "com": rng.uniform(-size, size, 3).tolist(),
-            "inertia": _solid(rng, mass, size),
+            "inertia": _draw_inertia(rng, mass, size),
         },
         "friction": {
             "viscous": rng.uniform(0.0, drag, 3).tolist(),
@@ -124,7 +124,7 @@ def _shared(rng: np.random.Generator, payload: float, size: float, drag: float) 
     }
 
 
-def _delta(rng: np.random.Generator, sliding: bool) -> dict[str, Any]:
+def _draw_delta(rng: np.random.Generator, sliding: bool) -> dict[str, Any]:
     arm = rng.uniform(0.12, 0.4)
     closures = ["rod", "rod", "rod"]
     if sliding:
@@ -149,17 +149,17 @@ def _delta(rng: np.random.Generator, sliding: bool) -> dict[str, Any]:
             "closures": closures,
         },
         "inertia": {key: float(value) for key, value in inertia.items()},
-        **_shared(rng, 1.0, 0.05, 0.2),
+        **_draw_common(rng, 1.0, 0.05, 0.2),
     }
 
 
-def _prru(rng: np.random.Generator) -> dict[str, Any]:
+def _draw_prru(rng: np.random.Generator) -> dict[str, Any]:
     base = rng.uniform(0.25, 0.5)
     limb = base * rng.uniform(1.4, 2.2)
     azimuths = np.array([3.0, 5.0, 1.0]) * math.pi / 3 + rng.uniform(-AZIMUTH_ERROR, AZIMUTH_ERROR, 3)
     platform = float(rng.uniform(10.0, 40.0))
     links: dict[str, Any] = {}
-    thin = rng.random() < THIN
+    thin = rng.random() < THIN_ROD_FRACTION
     for name in ("lower", "upper"):
         mass = float(rng.uniform(1.0, 5.0))
         across = mass * limb**2 * rng.uniform(0.05, 0.15)
@@ -182,7 +182,7 @@ def _prru(rng: np.random.Generator) -> dict[str, Any]:
             "link_com": float(rng.uniform(0.0, 1.0)),
             "platform_mass": platform,
             "platform_com": rng.uniform(-0.05, 0.05, 3).tolist(),
-            "platform_inertia": _solid(rng, platform, 0.2),
+            "platform_inertia": _draw_inertia(rng, platform, 0.2),
         },
-        **_shared(rng, 10.0, 0.15, 5.0),
+        **_draw_common(rng, 10.0, 0.15, 5.0),
     }

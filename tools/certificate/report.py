@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""The figures as a part of docs/validation.md."""
+"""Write the results as a part of docs/validation.md."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ PACKAGES = ("numpy", "llvmlite", "scipy", "pin", "mujoco", "mpmath")
 
 
 class Judge:
-    """Formats a figure with its verdict and counts what goes beyond its bound."""
+    """Format numbers with their verdicts and count those beyond their bounds."""
 
     def __init__(self) -> None:
         self.failures: list[str] = []
@@ -247,7 +247,7 @@ def _filled(text: str) -> str:
 
 
 def conclude(path: Path, text: str, failures: list[str], console: Console) -> int:
-    """Write the page's part, say what exceeds its bounds: the exit code."""
+    """Write the page's part, print what exceeds its bounds, and return the exit code."""
     write_section("cross-checks", text, path)
     console.print(f"{path} written")
     for line in failures:
@@ -264,7 +264,7 @@ def _worst(values: np.ndarray) -> float:
 
 
 def _span(values: np.ndarray) -> str:
-    """Least and greatest in per cent."""
+    """Format the smallest and largest value in per cent."""
     return f"{100 * values.min():+.2f} to {100 * values.max():+.2f} %"
 
 

@@ -28,7 +28,7 @@ from tools.certificate.machines import build
 
 DURATION = 10.0
 SAMPLES = 20
-"""Instants after the start at which energy and closure are looked at."""
+"""Number of instants at which energy and closure are checked."""
 TOLERANCE = 1e-13
 STEP = 1e-3
 """Step of Pinocchio's own integrator (RK4), s."""
@@ -36,11 +36,11 @@ STEP = 1e-3
 DELTA_REST = 0.8
 """All arms in the Deltas' equilibrium, rad."""
 DELTA_DEVIATION = (0.35, -0.25, 0.15)
-"""How far from there the arms are let go, rad."""
+"""Deviation of the arms from equilibrium at the start, rad."""
 PRRU_REST = 0.25
 """All sliders in the PRRU's equilibrium, m."""
 PRRU_RATES = (0.4, -0.1, -0.3)
-"""Slider rates that it begins with, m/s."""
+"""Rates of the PRRU's sliders at the start, m/s."""
 TOOL = {"mass": 10.0, "com": [0.02, 0.01, -0.4], "inertia": np.diag([0.2, 0.2, 0.05]).tolist()}
 """Tool on the PRRU's platform."""
 
@@ -87,12 +87,12 @@ def starts() -> list[Start]:
 
 
 def engine_of(data: dict[str, Any]) -> LoopEngine:
-    """Pinocchio's engine of a parameter mapping."""
+    """Return Pinocchio's engine of a parameter mapping."""
     return PrruEngine(data) if data["mechanism"] == "prru" else DeltaEngine(data)
 
 
 def closure_error(data: dict[str, Any], q: np.ndarray, centre: np.ndarray, axes: np.ndarray) -> float:
-    """How far the limbs are from fitting between actuators and platform, m."""
+    """Return the largest closure error of the limbs, m."""
     g = data["geometry"]
     worst = 0.0
     for i, azimuth in enumerate(g["azimuths"]):

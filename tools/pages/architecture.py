@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Which folder imports which, as a picture: ``python -m tools.pages.architecture OUT.png``."""
+"""Draw which folder imports which: ``python -m tools.pages.architecture OUT.png``."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pkm_twin.report import plots
 from test.support import sources
 
 CORE = "pkm_twin"
-"""Its own modules, errors and the like, are left out: all folders import them."""
+"""Its own modules, such as errors, are left out, as all folders import them."""
 
 
 def is_folder(room):
@@ -39,19 +39,19 @@ def reached(name):
 
 @cache
 def level(name):
-    """Longest chain of imports below a folder; one that goes round is an error."""
+    """Return the length of the longest import chain below a folder; reject a cycle."""
     return 1 + max(map(level, below()[name]), default=-1)
 
 
 @cache
 def row_of(name):
-    """Its row: close below all that import it; 0 is the lowest."""
+    """Return a folder's row, below all folders that import it; 0 is the lowest."""
     above = [row_of(n) for n, found in below().items() if name in found]
     return min(above) - 1 if above else level(name)
 
 
 def arrows():
-    """Pairs of folders, who imports and what, without those that a longer chain has."""
+    """Return pairs of importing and imported folder that no longer chain implies."""
     return [
         (here, there)
         for here, found in below().items()
@@ -76,7 +76,7 @@ def places():
 
 
 def draw(path):
-    """Folders as boxes, an arrow from who imports to what."""
+    """Draw folders as boxes with arrows from importing to imported folders."""
     figure, ((ax,),) = plots.columns(1, 1, 8)
     at = places()
     ends, boxes = np.array(list(at.values())), {}

@@ -14,7 +14,7 @@ from pkm_twin.apps.cli import app
 from pkm_twin.apps.groups import group_by_task
 
 SEVERAL = 2
-"""Commands that an option has to have with one meaning to be explained once for all."""
+"""Number of commands with the same option from which on it is explained once."""
 SHARED = "Options of several commands"
 GROUPS = {
     "--columns": "table",
@@ -22,9 +22,9 @@ GROUPS = {
     "--picture": "picture",
     "--teeth": "milling",
 }
-"""An option, and the name of those that the same commands have."""
+"""First option of a group of options that the same commands share, and the group's name."""
 PLAIN = ("", "TEXT", "NUMBER", "NUMBERS", "COUNT")
-"""Kinds of values that an option's explanation makes clear."""
+"""Metavariables that are left out, as the explanation is clear."""
 USUAL = ("--platform", "--base", "--actuated", "--pose", "--carry", "--overwrite")
 """Options of every command that takes a robot, and of every command that writes a file."""
 
@@ -46,7 +46,7 @@ class Word:
 
 
 def words_of(command: Any) -> list[Word]:
-    """Options and arguments of a command, but for ``--json``."""
+    """Return options and arguments of a command, except ``--json``."""
     found = []
     for one in command.params:
         argument = one.param_type_name == "argument"
@@ -90,7 +90,7 @@ def page() -> str:
         for word in often
         if len({words.split()[0] for words in users[word]}) > 1 or not any(word in words for words in common.values())
     ]
-    # One meaning a name.
+    # An option's name must have one meaning.
     names = [word.name for word in shared]
     groups = Groups([word for word in shared if names.count(word.name) == 1], users)
     lines = ["# Commands", "", every.help, ""]
@@ -124,7 +124,7 @@ class Groups:
         }
 
     def lines(self) -> list[str]:
-        """Explanations, the groups after the others."""
+        """Return the explanations, groups last."""
         alone = [w for w in self.shared if not any(w in words for words in self.groups.values())]
         lines = [*map(str, alone), ""]
         for name, words in self.groups.items():

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""A part of docs/errors.md from the classes: ``python -m tools.pages.errors docs/errors.md``."""
+"""Write a part of docs/errors.md from the classes: ``python -m tools.pages.errors docs/errors.md``."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ ERRORS = {
         "use `pkm-twin recover` ([recordings](recordings.md))",
     ),
 }
-"""An example of each class, and what a user can do."""
+"""An example of each error class, and its remedy."""
 REASONS = {
     "base motion": "only its present motion is known; send joint states",
     "bounds": "beyond any real machine; check the units",

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""How a limb is solved for a pose, as a picture: ``python -m tools.pages.limbs OUT.png``."""
+"""Draw how a limb is solved for a pose: ``python -m tools.pages.limbs OUT.png``."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pkm_twin import load
 from pkm_twin.report import plots
 
 POSE = (0.06, 0.33)
-"""Of a five-bar's tip, x and z, m: away from home, so that what moves is seen."""
+"""Pose of a five-bar's tip, x and z, m, away from home to show the motion."""
 GREY = "0.6"
 
 

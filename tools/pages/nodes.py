@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Tables of docs/nodes.md, and the topics of docs/security/policy.xml, by the nodes' own tables.
+"""Write tables of docs/nodes.md and topics of docs/security/policy.xml from the nodes' tables.
 
 ``python -m tools.pages.nodes docs/nodes.md docs/security/policy.xml``
 """
@@ -20,7 +20,7 @@ from pkm_twin.streams.topics import Topic
 from test.support.pages import write_section
 
 GIVEN: Final = {"command_gate": ("on_stop:=gravity",)}
-"""Without it the gate has no payload."""
+"""Parameters with which all parameters of a node are declared."""
 GROUPS: Final = {"in": "topics subscribe", "out": "topics publish", "service": "services reply"}
 
 
@@ -40,7 +40,7 @@ def class_of(node: str) -> Any:
 
 def rows_of(node: str) -> dict[str, tuple[Any, Setting]]:
     """Return a node's declared parameters with their defaults, from a node in this process."""
-    # Nobody else's node is meant.
+    # Discover no other nodes.
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "OFF")
     import rclpy
 

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""docs/parameters.md from the schemas: ``python -m tools.pages.parameters docs/parameters.md``."""
+"""Write docs/parameters.md from the schemas: ``python -m tools.pages.parameters docs/parameters.md``."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ TITLES = {
     JointMapEntry: "joint_map.JOINT",
     UncertaintyEntry: "uncertainty.PATH",
 }
-"""Headings of what has a table of its own."""
+"""Headings of the classes with their own table."""
 
 
 def default(field):

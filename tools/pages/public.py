@@ -26,12 +26,12 @@ PAGES = {
     "launch": ("launch", r"\.launch\.py$"),
     "parameters": ("file", ""),
 }
-"""Pages of names: what a line of theirs begins with here, and headings above names."""
+"""Pages with public names: prefix of a line of the file, and pattern of the headings above names."""
 ENTRY = re.compile(r"^\* (?:(?:in|out|service) |\*\*)?`([^`]+)`", re.MULTILINE)
 
 
 def groups() -> Iterator[tuple[str, list[str]]]:
-    """Each group of public names, and the names."""
+    """Return the public names by group."""
     for module in (pkm_twin, delta_dynamics, stiffness_monitor, paths, design):
         yield f"python {module.__name__}", module.__all__
         for name in module.__all__:

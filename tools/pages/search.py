@@ -28,12 +28,12 @@ OWN_SHIM = "assets/javascripts/iframe_worker.js"
 
 
 def brief(text: str) -> str:
-    """First paragraph, and the names in it and after it: what stands in backquotes."""
+    """Return the first paragraph and all names in backquotes."""
     return " ".join([paragraph(text), *dict.fromkeys(re.findall(r"<code>[^<]*</code>", text))])
 
 
 def paragraph(text: str) -> str:
-    """First paragraph."""
+    """Return the first paragraph."""
     first = re.search(r"<p>.*?</p>", text, re.DOTALL)
     return first[0] if first else ""
 

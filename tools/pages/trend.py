@@ -18,8 +18,8 @@ SHOWN: Final = 2
 """Lines of the output on the page, besides the first."""
 
 
-def printed(history, picture):
-    """Lines that the command prints for a history; it draws the picture."""
+def run_trend(history, picture):
+    """Run the command for a history; return its printed lines."""
     out = io.StringIO()
     try:
         with contextlib.redirect_stdout(out):
@@ -30,12 +30,12 @@ def printed(history, picture):
     return [line for line in out.getvalue().splitlines() if line != str(picture)]
 
 
-def rewritten(text, picture):
+def rewrite_page(text, picture):
     """Return the page with today's output, and draw the picture."""
     with tempfile.TemporaryDirectory() as folder:
         history = Path(folder) / "nights.db"
         write_history(history)
-        lines = printed(history, picture)
+        lines = run_trend(history, picture)
     block = "\n".join(["```text", *lines[: SHOWN + 1], "...", "```"])
     before, trend, after = text.partition("## Find a trend over nights")
     after = re.sub(r"```text\n.*?```", lambda _: block, after, count=1, flags=re.DOTALL)
@@ -44,5 +44,5 @@ def rewritten(text, picture):
 
 if __name__ == "__main__":
     page = Path(sys.argv[1])
-    text = rewritten(page.read_text(encoding="utf-8"), page.with_name("gallery") / "trend.png")
+    text = rewrite_page(page.read_text(encoding="utf-8"), page.with_name("gallery") / "trend.png")
     page.write_text(text, encoding="utf-8")

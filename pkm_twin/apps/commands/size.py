@@ -13,7 +13,7 @@ import numpy as np
 
 from pkm_twin.apps.frame import command
 from pkm_twin.apps.options import MotionOptions, PictureOptions, SingularityOption, TimedPayloadOptions, payload_fact
-from pkm_twin.errors import LEAST_LIMIT, ParameterError, check_limit
+from pkm_twin.errors import MIN_LIMIT, ParameterError, check_limit
 from pkm_twin.report import Column, Fact, Report, Table, plots
 from pkm_twin.settings import setting
 
@@ -267,7 +267,7 @@ def report_workspace(given: Size) -> Report:
     speed, change = given.over_workspace or (0.0, 0.0)
     for value in (speed, change):
         # 0 is allowed for one of the two: only the other is asked for.
-        check_limit("over-workspace", value or LEAST_LIMIT)
+        check_limit("over-workspace", value or MIN_LIMIT)
     robot, held = given.machine(), given.load
     robot = robot if held is None else held.on(robot)
     worst = worst_over_workspace(robot, speed, change, singularity=given.singularity, lever=given.lever)
