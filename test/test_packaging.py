@@ -21,7 +21,7 @@ from xml.etree import ElementTree
 import pytest
 
 import pkm_twin
-from tools.distribution import bill
+from tools.distribution import make_bill_of_materials
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 EXECUTABLES = {
@@ -213,7 +213,7 @@ def test_two_builds_have_equal_hashes(tmp_path):
 
 
 def test_the_bill_of_materials_has_each_dependency_with_its_licence():
-    parts = {part["name"]: part["licenses"][0]["expression"] for part in bill()["components"]}
+    parts = {part["name"]: part["licenses"][0]["expression"] for part in make_bill_of_materials()["components"]}
     own = {line for line in metadata.requires("pkm_twin") if "extra" not in line}
     assert own and {re.split(r"[^\w-]", line)[0].lower() for line in own} <= parts.keys()
     assert not [name for name, words in parts.items() if words == "NOASSERTION"]

@@ -247,7 +247,7 @@ class Dahl(FrictionLaw):
 
     @staticmethod
     def beyond(friction: Any, z: Array, rates: Array) -> Array:
-        """Return coulomb (z - sign(rate)), the effect of memory on efforts, as z, N m or N."""
+        """Return coulomb (z - sign(rate)), the effect of memory on efforts, N m or N, in z's shape."""
         change = friction.coulomb * (z - np.sign(rates))
         return np.where(friction.presliding > 0.0, change, 0.0)
 

@@ -37,7 +37,7 @@ class SizedGraph(Graph):
         return self.given[1]
 
     def frame(self, body: str) -> tuple[Array, Any]:
-        """Return the given frame of a body: its middle, shape (3,), and its reach, m."""
+        """Return the point, shape (3,), and the length, m, that scale a body; see :class:`Graph`."""
         k = 2 + 4 * self.names.index(body)
         return plain(self.given[k : k + 3]), self.given[k + 3]
 

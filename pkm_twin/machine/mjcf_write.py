@@ -140,7 +140,7 @@ def _split_bodies(tree: LoopTree) -> tuple[LoopTree, list[tuple[str, str]]]:
 def _write_body(parent: ET.Element, link: Link, place: Array, before: Array) -> ET.Element:
     """Write a body; MuJoCo rejects a body without mass, or without inertia about an axis.
 
-    What is added is below the twelfth digit. MuJoCo takes an inertia of 1e-14 kg m2 for none.
+    The mass and inertia added instead are below the twelfth digit. MuJoCo takes an inertia of 1e-14 kg m2 for none.
     """
     element = ET.SubElement(parent, "body", name=link.name, pos=number_text(place - before))
     inertia = link.inertia + np.eye(3) * max(1e-12 * float(np.trace(link.inertia)), 3e-14)

@@ -88,7 +88,12 @@ class _Reader:
                 excluded.add(joint.name)
             if self._read_value(prim, "physxJoint:jointFriction", 0.0):
                 rubbing.append(joint.name)
-            if self._list_drives(prim):
+            if any(
+                prim.HasAPI(self.physics.DriveAPI, axis)
+                and self._read_value(prim, f"drive:{axis}:physics:{gain}", 0.0) > 0.0
+                for axis in ("angular", "linear")
+                for gain in ("stiffness", "damping")
+            ):
                 driven.append(joint.name)
             if any(str(s).startswith(("PhysxMimicJointAPI", "NewtonMimicAPI")) for s in prim.GetAppliedSchemas()):
                 error = ParameterError(str(prim.GetPath()), "a mimic joint", UNCOUPLED_JOINTS)
@@ -261,15 +266,6 @@ class _Reader:
         rotor = float(self._read_value(prim, "physxJoint:armature", 0.0))
         scale = self.kilogram * (self.length**2 if turns else 1.0)
         return {"limits": limits, "rotor_inertia": rotor * scale}
-
-    def _list_drives(self, prim: Any) -> bool:
-        return any(
-            prim.HasAPI(self.physics.DriveAPI, name)
-            and any(
-                self._read_value(prim, f"drive:{name}:physics:{gain}", 0.0) > 0.0 for gain in ("stiffness", "damping")
-            )
-            for name in ("angular", "linear")
-        )
 
     def _place_links(self, joints: dict[str, Joint]) -> dict[str, Joint]:
         """Place all links from the world on, so that the joints of the tree meet exactly.

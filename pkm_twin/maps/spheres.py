@@ -268,7 +268,7 @@ def make_page(data: Dataset) -> Any:
 
     ways, places = data.way.values, _sphere_centres(data)
     corners = _triangles(ways)
-    # In the scene's axes the viewer of the picture looks down.
+    # The scene's z axis points to the viewer of the picture.
     scene = RADIUS * ways @ np.stack([*_picture_axes(), VIEW_DIRECTION], -1)
     vertices = np.concatenate([np.append(c, 0.0) + scene for _, _, c in places])
     every = np.concatenate([corners + k * len(ways) for k in range(len(places))])

@@ -63,13 +63,10 @@ class MapError(PkmTwinError):
     """Report a map, or its chunks, that cannot be read or written."""
 
     def __init__(self, path: Path, what: str) -> None:
-        super().__init__(f"{_shorten(path)}: {what}")
+        text = str(path)
+        text = text if len(text) <= 200 else f"{text[:120]}...{text[-60:]}"
+        super().__init__(f"{text}: {what}")
         self.path = path
-
-
-def _shorten(path: Path) -> str:
-    text = str(path)
-    return text if len(text) <= 200 else f"{text[:120]}...{text[-60:]}"
 
 
 def source(data: Dataset) -> Path:

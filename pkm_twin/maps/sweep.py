@@ -63,7 +63,7 @@ class Chunk:
 
     @property
     def before(self) -> str:
-        """Prefix of the names of its fields."""
+        """Prefix of the names of the chunk's fields."""
         return "" if self.plane is None else "plane_"
 
     def place(self, dims: Sequence[str]) -> tuple[Any, ...]:

@@ -226,7 +226,7 @@ def _read_messages(
             if error.reason == "zero stamp":
                 text = f"{message.topic}: the stamp is zero; {NO_STAMPS}"
             if how.deflected and error.reason == "frame" and message.topic == topics.wrench:
-                # Between wrenches of two frames there is no middle.
+                # Wrenches of different frames cannot be interpolated.
                 raise BagError(text, path=bag.report.path, reason="frames") from None
             found.rejected[error.reason] += 1
             first = first or one_line(text)

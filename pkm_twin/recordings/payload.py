@@ -89,8 +89,8 @@ class Load:
         """Return the robot with this payload.
 
         :param mass: one of ``masses``, by default the greatest.
-        :raises ParameterError: the robot takes none, or not such a one; a mass that is many times
-            that of all that moves.
+        :raises ParameterError: the robot cannot carry this payload, or its mass is many times that
+            of all moving parts.
         """
         loaded = robot.changed(payload=of_mass(self.mass if mass is None else mass, self.com))
         for finding in payload_findings(loaded):

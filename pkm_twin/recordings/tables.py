@@ -142,11 +142,11 @@ class Table(dict[str, Array]):
 
     @property
     def rows(self) -> int:
-        """How many rows it has."""
+        """Number of rows."""
         return len(next(iter(self.values()))) if self else 0
 
     def line(self, row: int) -> str:
-        """Return a row's place, as an error names it."""
+        """Return the file and line of a row, for errors."""
         return f"{self.path}: line {self._first + row}"
 
     def require(self, names: Iterable[str]) -> None:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
@@ -112,7 +112,11 @@ class Table:
         shown = [(k, column) for k, column in enumerate(self.columns) if column.text is not None]
         rows = self.rows.items()
         # Only numbers of the same unit can be compared with the largest.
-        least = [ROUNDING * _largest_size(values[k] for _, values in rows) * bool(column.unit) for k, column in shown]
+        least = []
+        for k, column in shown:
+            values = [row[k] for row in self.rows.values() if column.unit]
+            sizes = [abs(v) for v in values if isinstance(v, int | float) and math.isfinite(v)]
+            least.append(ROUNDING * float(max(sizes, default=0.0)))
         return [
             (self.head, *(column.heading for _, column in shown)),
             *(
@@ -179,11 +183,6 @@ class Report:
         found |= {"verdict": self.verdict} if self.verdict is not None else {}
         found |= {"error": self.error} if self.error else {}
         return dict(plain(found))
-
-
-def _largest_size(values: Iterable[Any]) -> float:
-    sizes = [abs(v) for v in values if isinstance(v, int | float) and math.isfinite(v)]
-    return float(max(sizes, default=0.0))
 
 
 def plain(value: Any) -> Any:

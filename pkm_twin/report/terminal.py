@@ -92,7 +92,10 @@ def aligned(rows: Sequence[Sequence[str]], sides: str) -> Iterator[str]:
     if not any(row[0] for row in rows):
         rows, sides = [row[1:] for row in rows], sides[1:]
     # Text in brackets (a unit) is not broken. A blank cell has no width to wrap to.
-    rows = [[re.sub(r"\([^)]*\)", _join_with_no_break_spaces, c) if c.strip() else "" for c in row] for row in rows]
+    rows = [
+        [re.sub(r"\([^)]*\)", lambda unit: unit[0].replace(" ", BLANK), c) if c.strip() else "" for c in row]
+        for row in rows
+    ]
     columns = list(zip(*rows, strict=True))
     widths = [max(map(len, column)) for column in columns]
     words = [[max(map(len, cell.split(" "))) for cell in column] for column in columns]
@@ -110,7 +113,3 @@ def aligned(rows: Sequence[Sequence[str]], sides: str) -> Iterator[str]:
         yield "\n".join(
             "  ".join(f"{c:{s}{w}}" for c, s, w in zip(line, sides, widths, strict=True)).rstrip() for line in lines
         ).replace(BLANK, " ")
-
-
-def _join_with_no_break_spaces(match: re.Match[str]) -> str:
-    return match[0].replace(" ", BLANK)

@@ -80,7 +80,7 @@ def joint_clearance(robot: Robot, q: ArrayLike, refuse: bool = True) -> Array:
 
 def member_gaps(robot: Robot, q: ArrayLike, refuse: bool = True) -> Array:
     """Return the distances of all :func:`member_pairs`, shape (..., pairs), m."""
-    (gaps,), status = _make_kernel(robot)(_find_radii(robot), q)
+    (gaps,), status = _make_kernel(robot)(np.array([beam.radius for beam in robot.beams]), q)
     if status is not None and refuse:
         reject_joints(robot, robot.engine, status, q)
     return gaps
@@ -89,10 +89,6 @@ def member_gaps(robot: Robot, q: ArrayLike, refuse: bool = True) -> Array:
 def member_pairs(robot: Robot) -> list[tuple[Beam, Beam]]:
     """Return all pairs of members of different limbs."""
     return [pair for pair in combinations(robot.beams, 2) if pair[0].limb != pair[1].limb]
-
-
-def _find_radii(robot: Robot) -> Array:
-    return np.array([beam.radius for beam in robot.beams])
 
 
 def _make_kernel(robot: Robot) -> Kernel:

@@ -390,7 +390,11 @@ class HomeSearch:
         if drawn is None:
             # Loops that close nowhere are rejected before the search.
             closed = self.assembly.close_near_drawing()[0]
-        found = [home for home in (drawn, *self._find_others()) if home is not None]
+        # Find other assemblies with the actuated joints at the same values, from random starts.
+        rng, reach = np.random.default_rng(0), np.where(self.turns, math.pi, self.units / 2)
+        starts = rng.uniform(-reach, reach, (0 if self.held.all() else 12, len(reach)))
+        others = [self._close_from(np.where(self.held, self.wanted, start), "wanted") for start in starts]
+        found = [home for home in (drawn, *others) if home is not None]
         inside = [home for home in found if self._is_inside_limits(home.values)] or found
         chosen = None
         if inside:
@@ -408,9 +412,9 @@ class HomeSearch:
         rng = np.random.default_rng(1)
         tried: list[Home] = []
         candidates: list[Home] = []
-        for reach in (0.05, 0.1, 0.2, 0.4, 0.8):
+        for distance in (0.05, 0.1, 0.2, 0.4, 0.8):
             for _ in range(6):
-                start = self.wanted + rng.uniform(-reach, reach, len(self.wanted)) * self.units
+                start = self.wanted + rng.uniform(-distance, distance, len(self.wanted)) * self.units
                 start = np.where(self.held, np.clip(start, self.low, self.high), start)
                 home = self._close_from(start, "near")
                 tried += [] if home is None else [home]
@@ -445,7 +449,7 @@ class HomeSearch:
         return self._make_home(values, miss, "drawn" if far <= 0.1 else "wanted")
 
     def _close_from(self, start: Array, how: str) -> Home | None:
-        """Close the loops from a start; None if they stay open or the assembly is known."""
+        """Close the loops from a start; None if they stay open or this assembly was found before."""
         values, miss = self.assembly.close(start, self.held)
         if miss > self.assembly.closed and how == "near":
             values, miss = self.assembly.close(values)
@@ -455,12 +459,6 @@ class HomeSearch:
             return None
         self._known.append(places)
         return self._make_home(self._wrap_turns(values), miss, how)
-
-    def _find_others(self) -> list[Home | None]:
-        """Find assemblies with the actuated joints at the same values, from random starts."""
-        rng, reach = np.random.default_rng(0), np.where(self.turns, math.pi, self.units / 2)
-        starts = rng.uniform(-reach, reach, (0 if self.held.all() else 12, len(reach)))
-        return [self._close_from(np.where(self.held, self.wanted, s), "wanted") for s in starts]
 
     def _wrap_turns(self, values: Array) -> Array:
         """Wrap passive turns to at most half a revolution."""

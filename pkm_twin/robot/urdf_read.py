@@ -330,8 +330,13 @@ def _build_graph(assembly: Assembly, bodies: dict[str, str], tool: str, ground: 
             **own,
         )
 
+    masses: dict[str, graphs.Body] = {}
+    for body in dict.fromkeys(body for body in bodies.values() if body != BASE):
+        links = [link.moved(moves[name]) for name, link in tree.links.items() if bodies[name] == body]
+        mass, com, inertia = _sum_masses(links)
+        masses[body] = graphs.Body(body, mass, _round_vector(com), inertia)
     return Graph(
-        _list_masses(tree, bodies, moves),
+        masses,
         {joint.name: make_joint(joint) for joint in joints if joint.kind != "free"},
         {},
         bodies[tool],
@@ -366,16 +371,6 @@ def _map_bodies(tree: LoopTree, tool: str, ground: str) -> dict[str, str]:
             continue
         names[first] = urdf_xml.free_name(wanted, taken)
     return {link: names[first] for link, first in group.items()}
-
-
-def _list_masses(tree: LoopTree, bodies: dict[str, str], moves: dict[str, Pose]) -> dict[str, graphs.Body]:
-    """Return all bodies except the ground, in base axes."""
-    result: dict[str, graphs.Body] = {}
-    for body in dict.fromkeys(body for body in bodies.values() if body != BASE):
-        links = [link.moved(moves[name]) for name, link in tree.links.items() if bodies[name] == body]
-        mass, com, inertia = _sum_masses(links)
-        result[body] = graphs.Body(body, mass, _round_vector(com), inertia)
-    return result
 
 
 def _sum_masses(links: Sequence[Link]) -> tuple[float, Array, Array]:

@@ -75,7 +75,7 @@ class Health:
     """
 
     def __init__(self, node: LifecycleNode, now: Callable[[], int]) -> None:
-        """Store the node; nothing of it is used before it is constructed."""
+        """Store the node, which is not constructed yet and must not be used here."""
         self._node, self._now = node, now
         self.seen = dict.fromkeys(("messages", "exceptions", "requests rejected", "clock messages rejected"), 0)
         self.statistics: dict[str, TopicStatistics] = {}

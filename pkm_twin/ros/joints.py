@@ -58,7 +58,7 @@ def named(
     rates: Sequence[float] = (),
     efforts: Sequence[float] = (),
 ) -> JointState:
-    """Return values by name as a joint state, which plotting tools can show."""
+    """Make a joint state of named values, for plotting tools."""
     position, velocity, effort = (array("d", row) for row in (values, rates, efforts))
     return JointState(header=header, name=list(names), position=position, velocity=velocity, effort=effort)
 

@@ -127,12 +127,25 @@ class Scene:
         shapes = self._draw_bars(places, shares)
         if load is None:
             return shapes
-        shapes += self._draw_joints(state.q, shares)
-        shapes += self._draw_deflected(places, state, load)
+        # Elastic joints as spheres.
+        names = [name for name in self.joints if name in shares]
+        points = self._find_points(state.q, [self.joints[name] for name in names])
+        sphere = (1.5 * SIZES["joint"] * self._size,) * 3
+        for k, (name, point) in enumerate(zip(names, points, strict=True)):
+            shapes.append(Shape("sphere", "joints", k, choose_heat_colour(shares[name]), sphere, point, text=name))
+        # Deflected members and the displaced platform, both enlarged by the same factor.
+        scale, width = self.scales.deflection, (SIZES["line"] * self._size, 0.0, 0.0)
+        lines = [(name, x + scale * u) for name, (x, u) in load.members.items()]
+        for bar, ends in zip(self.bars, places, strict=True):
+            if bar.part == self.robot.graph.platform:
+                moved = load.deflection[:3] + np.cross(load.deflection[3:], ends - state.position)
+                lines.append((bar.part, ends + scale * moved))
+        for k, (name, line) in enumerate(lines):
+            shapes.append(Shape("line", "deflected", k, COLOURS["deflected"], width, points=line, text=name))
         # The deflections under forces of one size: an ellipsoid with the axes of C.
         values, axes = np.linalg.eigh(load.compliance[:3, :3])
         axes = axes if np.linalg.det(axes) > 0.0 else -axes
-        x, y, z = (2.0 * values * self.scales.ellipsoid_force * self.scales.deflection).tolist()
+        x, y, z = (2.0 * values * self.scales.ellipsoid_force * scale).tolist()
         turned = _to_quaternion(axes)
         shapes.append(Shape("sphere", "compliance", 0, COLOURS["ellipsoid"], (x, y, z), state.position, turned))
         shapes += self._draw_arrows(state, load)
@@ -166,30 +179,6 @@ class Scene:
             size, middle = (width, width, length), (start + end) / 2.0
             shapes.append(Shape("cylinder", "bars", k, colour, size, middle, quaternion, text=bar.part, lasting=True))
         return shapes
-
-    def _draw_joints(self, q: Array, shares: Mapping[str, float]) -> list[Shape]:
-        """Draw the elastic joints as spheres."""
-        names = [name for name in self.joints if name in shares]
-        width = SIZES["joint"] * self._size
-        points = self._find_points(q, [self.joints[name] for name in names])
-        return [
-            Shape("sphere", "joints", k, choose_heat_colour(shares[name]), (1.5 * width,) * 3, point, text=name)
-            for k, (name, point) in enumerate(zip(names, points, strict=True))
-        ]
-
-    def _draw_deflected(self, places: Array, state: State, load: Load) -> list[Shape]:
-        """Draw deflected members and the displaced platform, both enlarged by the same factor."""
-        scale, width = self.scales.deflection, (SIZES["line"] * self._size, 0.0, 0.0)
-        lines = [(name, x + scale * u) for name, (x, u) in load.members.items()]
-        shift, turn = load.deflection[:3], load.deflection[3:]
-        for bar, ends in zip(self.bars, places, strict=True):
-            if bar.part == self.robot.graph.platform:
-                moved = shift + np.cross(turn, ends - state.position)
-                lines.append((bar.part, ends + scale * moved))
-        return [
-            Shape("line", "deflected", k, COLOURS["deflected"], width, points=points, text=name)
-            for k, (name, points) in enumerate(lines)
-        ]
 
     def _draw_arrows(self, state: State, load: Load) -> list[Shape]:
         """Draw force and moment as arrows from the reference point."""

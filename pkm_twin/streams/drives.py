@@ -60,7 +60,7 @@ class DriveWatch:
             self._moving = moves
         else:
             step = time - self._last[0]
-            # Averaged over 20 ms: noise appears as a motion now and then.
+            # Averaged over 20 ms, since noise occasionally looks like a motion.
             self._moving += min(1.0, step / 0.02) * (moves - self._moving)
             change = max(map(abs, map(sub, efforts, self._last[1])))
             same = change <= MAX_RELATIVE_CHANGE * greatest

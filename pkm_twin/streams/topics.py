@@ -56,7 +56,7 @@ def topic_tokens(names: Sequence[str]) -> dict[str, str]:
 
 
 def table(*rows: Topic) -> dict[str, Topic]:
-    """Return rows by name."""
+    """Return topics by name."""
     return {row.name: row for row in rows}
 
 

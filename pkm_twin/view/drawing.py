@@ -119,11 +119,6 @@ class Camera:
         depth = np.where(inside.reshape(x.shape), middle[2] - away, np.inf)
         self._paint(window, depth, np.broadcast_to(normal, (*x.shape, 3)), colour, opacity)
 
-    def average_samples(self) -> Array:
-        """Return the picture, shape (HEIGHT, WIDTH, 3), the first row at the bottom."""
-        fine = self.image.reshape(HEIGHT, SAMPLES_PER_PIXEL, WIDTH, SAMPLES_PER_PIXEL, 3)
-        return np.asarray(fine.mean((1, 3)), np.float64)
-
 
 def draw(robot: Robot, marked: bool = False) -> Any:
     """Draw the robot at home as a matplotlib figure.
@@ -152,7 +147,8 @@ def draw(robot: Robot, marked: bool = False) -> Any:
     figure = pyplot().figure(figsize=(WIDTH / DPI, HEIGHT / DPI), dpi=DPI)
     ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     extent = (camera.low[0], camera.high[0], camera.low[1], camera.high[1])
-    ax.imshow(camera.average_samples(), origin="lower", extent=extent, interpolation="nearest")
+    fine = camera.image.reshape(HEIGHT, SAMPLES_PER_PIXEL, WIDTH, SAMPLES_PER_PIXEL, 3)
+    ax.imshow(fine.mean((1, 3)), origin="lower", extent=extent, interpolation="nearest")
     ax.axis("off")
     halo = patheffects.withStroke(linewidth=3, foreground="w")
     style: dict[str, Any] = {"fontsize": 9, "path_effects": [halo], "ha": "center"}

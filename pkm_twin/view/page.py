@@ -118,7 +118,9 @@ class Page:
             if "energy" not in model.compute_numbers(self.state).why:
                 self.moving.append(SoftestPoseSearch(self))
         self._link = gui.add_text("link", model.write_link(self.state))
-        self.call_on(self._link.on_update, "link", self._open_link)
+        self.call_on(
+            self._link.on_update, "link", lambda: self.show_state(model.open_link(self.state, self._link.value))
+        )
         gui.add_html(texts.write_buttons(model.robot.name))
         self._update()
 
@@ -202,9 +204,6 @@ class Page:
         gizmo = self.stage.gizmo
         rotation = Rotation.from_quat(np.roll(gizmo.wxyz, -1)).as_matrix()
         self.show_state(self.model.to_platform(self.state, gizmo.position, rotation))
-
-    def _open_link(self) -> None:
-        self.show_state(self.model.open_link(self.state, self._link.value))
 
     def _go_home(self) -> None:
         self.show_state(self.model.to_joints(self.state, self.model.start.q))

@@ -167,7 +167,7 @@ def test_the_errors_page_has_every_error_and_reason():
 def test_the_output_of_the_trend_page_is_todays(tmp_path):
     """Else `make pages` writes it and draws its picture."""
     page = (DOCS / "recordings.md").read_text(encoding="utf-8")
-    assert trend.rewritten(page, tmp_path / "trend.png") == page
+    assert trend.rewrite_page(page, tmp_path / "trend.png") == page
     assert (tmp_path / "trend.png").stat().st_size
 
 

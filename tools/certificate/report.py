@@ -198,20 +198,20 @@ def _compliance(links: dict[str, Links], judge: Judge) -> str:
         z, beta, gamma = POSES[name]
         what = f"compliance, {name}"
         entries = judge(found.shipped.entries, BOUND, f"{what}, entries")
-        diagonal = judge(_worst(found.shipped.diagonal), BOUND, f"{what}, diagonal")
-        bent = judge(_worst(found.shipped.deflection), BOUND, f"{what}, deflection")
+        diagonal = judge(_find_worst(found.shipped.diagonal), BOUND, f"{what}, diagonal")
+        bent = judge(_find_worst(found.shipped.deflection), BOUND, f"{what}, deflection")
         rows.append(
             f"| {name} | {z:g}, {np.degrees(beta):.0f}, {np.degrees(gamma):.0f} "
             f"| {entries} | {diagonal} | {bent} | {found.shear_area_ratio.worst:.1e} |"
         )
     table = "\n".join(rows)
     robot = with_rigid_joints()
-    spans = _span(np.concatenate([found.shipped.diagonal for found in links.values()]))
+    spans = _write_span(np.concatenate([found.shipped.diagonal for found in links.values()]))
     return f"""{title}
 
 The shipped parameters with joints that are free or rigid, compared with CalculiX, where bars are
 solid bricks (C3D20R; {FINE} per bar). Differences of all entries are relative to
-sqrt(C_ii C_jj); those of the diagonal and of the deflections under {_wrench(LOAD)} N and N m, to
+sqrt(C_ii C_jj); those of the diagonal and of the deflections under {_write_wrench(LOAD)} N and N m, to
 their own values. Bound {BOUND:.0e}. {MESH} bricks per bar differ by at most {mesh}.
 
 | pose | z (m), beta, gamma (deg) | entries | diagonal | deflections | Cowper |
@@ -229,10 +229,10 @@ def _paper_rows(rows: PaperRows, judge: Judge) -> str:
     cause = _filled(f"""
         Compared with pkm_twin with the shipped joint compliances, the finite elements of table 1 in
         the 2UPR-RPU paper are softer in {int((known > 0).sum())} of {known.size} components, by
-        {_span(known)}. The worst difference relative to them is {worst}; the paper states
+        {_write_span(known)}. The worst difference relative to them is {worst}; the paper states
         {PAPER_BOUND:g}. If one factor multiplies all joints' compliances,
-        at least {_percent(rows.joints[1])} remains; with a factor of {rows.bars[0]:.2f} on all
-        bars' compliances, {_percent(rows.bars[1])}.
+        at least {_write_percent(rows.joints[1])} remains; with a factor of {rows.bars[0]:.2f} on all
+        bars' compliances, {_write_percent(rows.bars[1])}.
         The paper shows neither mesh nor contacts, so the cause cannot be determined.
     """)
     return f"""### The paper's finite elements
@@ -255,18 +255,18 @@ def conclude(path: Path, text: str, failures: list[str], console: Console) -> in
     return 1 if failures else 0
 
 
-def _percent(value: float) -> str:
+def _write_percent(value: float) -> str:
     return f"{100 * value:.2g} %"
 
 
-def _worst(values: np.ndarray) -> float:
+def _find_worst(values: np.ndarray) -> float:
     return float(np.abs(values).max())
 
 
-def _span(values: np.ndarray) -> str:
+def _write_span(values: np.ndarray) -> str:
     """Format the smallest and largest value in per cent."""
     return f"{100 * values.min():+.2f} to {100 * values.max():+.2f} %"
 
 
-def _wrench(values: list[float]) -> str:
+def _write_wrench(values: list[float]) -> str:
     return "(" + ", ".join(f"{v:g}" for v in values) + ")"

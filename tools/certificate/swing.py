@@ -124,7 +124,7 @@ def run(start: Start) -> list[Swing]:
     return result
 
 
-def _sampled(function: Any, first: np.ndarray) -> np.ndarray:
+def _integrate(function: Any, first: np.ndarray) -> np.ndarray:
     states = [first]
     for k in range(SAMPLES):
         span = DURATION * k / SAMPLES, DURATION * (k + 1) / SAMPLES
@@ -139,7 +139,7 @@ def _twin(
     def rates(_: float, y: np.ndarray) -> np.ndarray:
         return np.concatenate([y[3:], forward_dynamics(robot, y[:3], y[3:], effort)])
 
-    states = _sampled(rates, np.concatenate([start.q, start.qd]))
+    states = _integrate(rates, np.concatenate([start.q, start.qd]))
     places = list(zip(*robot.platform(states[:, :3]), strict=True))
     return states[:, :3], states[:, 3:], places
 
@@ -153,7 +153,7 @@ def _pinocchio(
         change = engine.forward_dynamics(y[:size], y[size:], effort)
         return np.concatenate([y[size:], change])
 
-    states = _sampled(rates, np.concatenate([q, v]))
+    states = _integrate(rates, np.concatenate([q, v]))
     return _read(engine, states[:, :size], states[:, size:])
 
 
