@@ -109,18 +109,18 @@ class TestState:
         settings = WrenchSettings("ft", max_state_age=0.01, sensor_xyz=(0.0, 0.0, 0.1))
         core = MachineState(robot, settings)
         state = told(robot, poses(robot, 1)[0])
-        assert core.load(state) is None
+        assert core.find_wrench(state) is None
         for i in (-30, -4, 3):
             stamp = NOW + i * STEP
-            core.wrench(MAKE.wrench(WRENCH + i, stamp, "ft"), stamp)
+            core.store_wrench(MAKE.wrench(WRENCH + i, stamp, "ft"), stamp)
         turn = state.rotation
         force = turn @ (WRENCH + 3)[:3]
         moment = turn @ (WRENCH + 3)[3:] + np.cross(turn @ [0.0, 0.0, 0.1], force)
-        assert np.allclose(core.load(state), [*force, *moment], rtol=1e-13)
+        assert np.allclose(core.find_wrench(state), [*force, *moment], rtol=1e-13)
         with pytest.raises(MessageError, match="frame"):
-            core.wrench(MAKE.wrench(WRENCH, NOW, "platform"), NOW)
+            core.store_wrench(MAKE.wrench(WRENCH, NOW, "platform"), NOW)
         late = told(robot, state.q, stamp=NOW + SECOND)
-        assert core.load(late) is None
+        assert core.find_wrench(late) is None
 
 
 def by_group(shapes):
