@@ -24,7 +24,7 @@ from pkm_twin.streams.differentiator import Differentiator
 from pkm_twin.streams.noise import SIGMAS, estimate_noise
 from pkm_twin.streams.rates import MAX_ACCELERATION_ERROR, MAX_RATE, STANDSTILL_FRACTION, rate_faults
 from pkm_twin.streams.rest import gradient_gain, velocity_error_bound
-from pkm_twin.streams.steps import MAX_GAP_PERIODS, Steps, find_play, find_repeats, steps_of
+from pkm_twin.streams.steps import MAX_GAP_PERIODS, Steps, find_play, find_repeats, find_steps
 from pkm_twin.streams.wrench import WrenchSettings
 
 MODEL_VALUES_NOTE: Final = "tables use the model's joint values; joint_map applies to messages and bags only"
@@ -152,10 +152,10 @@ class Recording:
     def steps(self) -> Steps:
         """The steps by the measured velocities, or by the positions alone if these do not jump."""
         limit = self.robot.limits.velocity
-        steps = steps_of(self.time, self.q, self.qd, limit)
+        steps = find_steps(self.time, self.q, self.qd, limit)
         if self.qd is None or not steps.jumps.any():
             return steps
-        alone = steps_of(self.time, self.q, None, limit)
+        alone = find_steps(self.time, self.q, None, limit)
         # Jumps found only with the measured velocities are faults of the velocities.
         return steps if alone.jumps.any() else alone
 

@@ -73,7 +73,7 @@ class Steps:
         return [(int(k), int(np.argmax(self.jumps[k] * self.sizes[k]))) for k in rows]
 
 
-def steps_of(time: Array, q: Array, qd: Array | None, limit: Sequence[float] | Array | None) -> Steps:
+def find_steps(time: Array, q: Array, qd: Array | None, limit: Sequence[float] | Array | None) -> Steps:
     """Find the steps of a recording that are not motions of the machine.
 
     :param time: rising, shape (k,), s; q and qd (None if not measured), shape (k, n).

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from pkm_twin.streams.steps import find_repeats, find_sampling, steps_of
+from pkm_twin.streams.steps import find_repeats, find_sampling, find_steps
 
 LIMIT = (20.0, 20.0, 20.0)
 
@@ -41,7 +41,7 @@ def test_no_motion_jumps(rng, rate, measured):
             (time, 0.0 * q, 0.0 * qd),
         ]
         for case, (t, x, v) in enumerate(cases):
-            found = steps_of(t, x, v if measured else None, LIMIT)
+            found = find_steps(t, x, v if measured else None, LIMIT)
             assert not found.jumps.any() and found.publishers == (), case
             assert not find_repeats(t, x).any(), case
 
@@ -71,7 +71,7 @@ def test_a_wrong_stretch_jumps_at_both_ends(rng, size, count, measured):
         q += 1e-5 * rng.normal(size=q.shape)
         at, joint = int(rng.integers(100, 5000)), int(rng.integers(3))
         q[at : at + count, joint] += size
-        found = steps_of(time, q, qd if measured else None, LIMIT)
+        found = find_steps(time, q, qd if measured else None, LIMIT)
         assert found.first == [(at - 1, joint), (at + count - 1, joint)]
         assert found.sizes[found.jumps] == pytest.approx(abs(size), rel=0.2)
 
@@ -79,8 +79,8 @@ def test_a_wrong_stretch_jumps_at_both_ends(rng, size, count, measured):
 def test_a_step_beyond_the_velocity_limit_jumps(rng):
     time, q, _ = drawn(rng, rate=20.0)
     q[60:] += 4.0
-    assert not steps_of(time[:60], q[:60], None, LIMIT).jumps.any()
-    assert steps_of(time, q, None, LIMIT).first[0][0] == 59
+    assert not find_steps(time[:60], q[:60], None, LIMIT).jumps.any()
+    assert find_steps(time, q, None, LIMIT).first[0][0] == 59
 
 
 @pytest.mark.parametrize("measured", [True, False])
@@ -96,7 +96,7 @@ def test_two_publishers_are_told_apart(rng, measured, share, regular, still):
     turn = np.floor(share * np.arange(len(time)))
     own = np.diff(turn, prepend=0.0) > 0.0 if regular else rng.random(len(time)) < share
     mixed, told = np.where(own[:, None], other, q), np.where(own[:, None], rates, qd)
-    found = steps_of(time, mixed, told if measured else None, LIMIT)
+    found = find_steps(time, mixed, told if measured else None, LIMIT)
     assert sum(found.publishers) == len(time)
     assert min(found.publishers) == pytest.approx(min(own.sum(), (~own).sum()), rel=0.02)
 
@@ -112,10 +112,10 @@ def test_two_publishers_of_one_motion_are_told_apart(rng, measured, late):
         lag = max(5, round(late * rate))
         for other in (np.roll(noisy, lag, 0), 1.01 * noisy + 20.0 / rate):
             mixed = np.where(odd, other, noisy)[lag:]
-            found = steps_of(time[lag:], mixed, qd[lag:] if measured else None, LIMIT)
+            found = find_steps(time[lag:], mixed, qd[lag:] if measured else None, LIMIT)
             assert sum(found.publishers) == len(mixed) and found.jumps.mean() > 0.1
         twice = np.repeat(q[::2], 2, 0)[: len(q)]
-        found = steps_of(time, twice, qd if measured else None, LIMIT)
+        found = find_steps(time, twice, qd if measured else None, LIMIT)
         assert found.publishers == ()
 
 
@@ -123,7 +123,7 @@ def test_wrong_bits_are_no_second_publisher(rng):
     time, q, qd = drawn(rng)
     bad = rng.random(q.shape) < 0.02
     q[bad] += rng.choice([-1.0, 1.0], bad.sum()) * 2.0 ** -rng.integers(1, 6, bad.sum())
-    found = steps_of(time, q, qd, LIMIT)
+    found = find_steps(time, q, qd, LIMIT)
     assert found.jumps.any() and found.publishers == ()
 
 
