@@ -194,20 +194,61 @@ def test_what_cannot_be_is_no_result(version, kind, unit):
         assert said
 
 
-@pytest.mark.parametrize("version", VERSIONS)
-def test_a_saved_state_goes_on_as_before(version, unit, tmp_path):
-    robot = loaded("five_bar")
-    path = unit(robot, version, "dynamics")
+def started(path, version, folder, name="one"):
+    """An instance of a unit for co-simulation, not yet initialised, and its description."""
     described = fmpy.read_model_description(path)
     slave = {2: fmpy.fmi2.FMU2Slave, 3: fmpy.fmi3.FMU3Slave}[version](
         guid=described.guid,
-        unzipDirectory=fmpy.extract(path, str(tmp_path / "out")),
+        unzipDirectory=fmpy.extract(path, str(folder / name)),
         modelIdentifier=described.coSimulation.modelIdentifier,
-        instanceName="one",
+        instanceName=name,
     )
-    slave.instantiate()
     if version == 2:
+        # The logger that fmpy shares may be that of a simulation that has ended.
+        callbacks = fmpy.fmi2.fmi2CallbackFunctions()
+        callbacks.logger = fmpy.fmi2.fmi2CallbackLoggerTYPE(lambda *_: None)
+        slave.instantiate(callbacks=callbacks)
         slave.setupExperiment(startTime=0.0)
+    else:
+        slave.instantiate()
+    return slave, described
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("version", VERSIONS)
+def test_calls_out_of_order_are_refused_and_change_nothing(version, kind, unit, tmp_path):
+    slave, _ = started(unit(loaded("five_bar"), version, kind), version, tmp_path)
+
+    def refused(call, *values):
+        with pytest.raises(fmpy.fmi1.FMICallException):
+            call(*values)
+
+    refused(slave.doStep, 0.0, 0.01)
+    refused(slave.exitInitializationMode)
+    refused(slave.terminate)
+    slave.enterInitializationMode()
+    refused(slave.enterInitializationMode)
+    refused(slave.doStep, 0.0, 0.01)
+    slave.exitInitializationMode()
+    for time, span in ((0.0, -0.01), (0.0, float("nan")), (0.01, 0.01), (float("nan"), 0.01)):
+        refused(slave.doStep, time, span)
+    slave.doStep(0.0, 0.01)
+    refused(slave.doStep, 0.0, 0.01)
+    slave.doStep(0.01, 0.0)
+    slave.doStep(0.01, 0.01)
+    slave.terminate()
+    refused(slave.doStep, 0.02, 0.01)
+    slave.reset()
+    slave.enterInitializationMode()
+    slave.exitInitializationMode()
+    slave.doStep(0.0, 0.01)
+    slave.terminate()
+    slave.freeInstance()
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_a_saved_state_goes_on_as_before(version, unit, tmp_path):
+    slave, described = started(unit(loaded("five_bar"), version, "dynamics"), version, tmp_path)
     slave.enterInitializationMode()
     slave.exitInitializationMode()
     at = [v.valueReference for v in described.modelVariables if v.name.startswith(("q.", "qd."))]
@@ -221,7 +262,12 @@ def test_a_saved_state_goes_on_as_before(version, unit, tmp_path):
     state = get()
     slave.doStep(0.01, 0.01)
     after = read(at)
-    restore(load(save(state)))
+    saved = save(state)
+    # A state that is damaged, or of another size, is none.
+    for other in (saved[:-8], bytes(len(saved)), saved[:8] + b"\xff" * 8 + saved[16:]):
+        with pytest.raises(fmpy.fmi1.FMICallException):
+            load(other)
+    restore(load(saved))
     assert read(at) != after
     slave.doStep(0.01, 0.01)
     assert read(at) == after

@@ -49,8 +49,7 @@ EXPORT Status FMI(SetupExperiment)(void *instance, int tolerant, double toleranc
 
 EXPORT Status FMI(EnterInitializationMode)(void *instance)
 {
-    (void)instance;
-    return STATUS_OK;
+    return enter((Instance *)instance, CREATED, INITIALISING);
 }
 
 EXPORT Status FMI(GetReal)(void *instance, const Reference *vr, size_t count, double *values)

@@ -70,7 +70,7 @@ EXPORT Status FMI(EnterInitializationMode)(void *instance, bool tolerant, double
     (void)stops;
     (void)stop;
     c->model.v[0] = start;
-    return STATUS_OK;
+    return enter(c, CREATED, INITIALISING);
 }
 
 EXPORT Status FMI(GetFloat64)(void *instance, const Reference *vr, size_t count, double *values, size_t size)

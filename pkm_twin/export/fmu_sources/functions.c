@@ -13,8 +13,7 @@ EXPORT Status FMI(EnterContinuousTimeMode)(void *instance)
 
 EXPORT Status FMI(Terminate)(void *instance)
 {
-    (void)instance;
-    return STATUS_OK;
+    return enter((Instance *)instance, RUNNING, ENDED);
 }
 
 EXPORT Status FMI(Reset)(void *instance)
@@ -28,6 +27,9 @@ EXPORT Status FMI(ExitInitializationMode)(void *instance)
 {
     Instance *c = (Instance *)instance;
     int changed;
+    if (enter(c, INITIALISING, RUNNING) != STATUS_OK) {
+        return STATUS_ERROR;
+    }
     return update(c, &changed);
 }
 
@@ -82,9 +84,9 @@ EXPORT Status FMI(FreeFMUSTATE)(void *instance, void **state)
 
 EXPORT Status FMI(SerializedFMUSTATESize)(void *instance, void *state, size_t *size)
 {
-    Instance *c = (Instance *)instance;
+    (void)instance;
     (void)state;
-    *size = sizeof c->model;
+    *size = SAVED;
     return STATUS_OK;
 }
 
@@ -97,14 +99,7 @@ EXPORT Status FMI(SerializeFMUSTATE)(void *instance, void *state, unsigned char 
 EXPORT Status FMI(DESERIALIZE)(void *instance, const unsigned char *bytes, size_t size, void **state)
 {
     Instance *c = (Instance *)instance;
-    if (size != sizeof c->model) {
-        return restore(c, NULL, 0);
-    }
-    if (copy_state(c, state) != STATUS_OK) {
-        return STATUS_ERROR;
-    }
-    memcpy(*state, bytes, size);
-    return STATUS_OK;
+    return load(c, bytes, size, state);
 }
 
 EXPORT Status FMI(GetDERIVATIVES)(void *instance, double *values, size_t count)

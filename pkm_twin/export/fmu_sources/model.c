@@ -1,6 +1,8 @@
 /* Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0 */
 /* Variables of an FMU and its payload; @ stands for the exported C's prefix. */
 /* What a state of the FMU is: all variables by value reference, and what follows from events. */
+typedef enum { CREATED, INITIALISING, RUNNING, ENDED } Phase;
+
 typedef struct {
     double v[COUNT];
     double parameters[PARAMETERS];
@@ -11,6 +13,7 @@ typedef struct {
     int prepared;
     int rates;    /* derivatives and event indicators are those of the state */
     int results;  /* so are the outputs */
+    Phase phase;
 } Model;
 
 static void begin(Model *m)

@@ -21,6 +21,9 @@ typedef struct {
     void *environment;
 } Instance;
 
+/* Size of a state that is written out, with its hash. */
+#define SAVED (sizeof(Model) + sizeof(unsigned int))
+
 static Status complain(const Instance *c, Status status, const char *what)
 {
     static const char *const category[] = {
@@ -176,6 +179,16 @@ static Status update(Instance *c, int *changed)
     return said(c, event(&c->model, changed));
 }
 
+/* A change of phase, which is possible from one phase alone. */
+static Status enter(Instance *c, Phase from, Phase to)
+{
+    if (c->model.phase != from) {
+        return complain(c, STATUS_ERROR, "a call out of order: instantiate, initialise, step, terminate");
+    }
+    c->model.phase = to;
+    return STATUS_OK;
+}
+
 /* A step that fails leaves the state as it was. */
 static Status do_step(Instance *c, double time, double span)
 {
@@ -183,6 +196,13 @@ static Status do_step(Instance *c, double time, double span)
     Status status;
     if (!((span >= 0.0) && (fabs(time) < HUGE_VAL) && (span < HUGE_VAL))) {
         return complain(c, STATUS_ERROR, "the step is negative, NaN or infinite");
+    }
+    if (enter(c, RUNNING, RUNNING) != STATUS_OK) {
+        return STATUS_ERROR;
+    }
+    /* Times that a program adds up differ by rounding. */
+    if (!(fabs(time - c->model.v[0]) <= 1e-9 * (1.0 + fabs(time)))) {
+        return complain(c, STATUS_ERROR, "the step does not begin where the last one ended");
     }
     status = said(c, (span > 0.0) ? advance(&c->model, span) : 0);
     if (status != STATUS_OK) {
@@ -205,6 +225,22 @@ static Status copy_state(const Instance *c, void **state)
     return STATUS_OK;
 }
 
+/* FNV-1a of a state, begun with the token: a state of another FMU, or a damaged one, has another. */
+static unsigned int hash_state(const void *state)
+{
+    const unsigned char *bytes = (const unsigned char *)state;
+    const char *token = TOKEN;
+    unsigned int hash = 2166136261U;
+    size_t i;
+    for (i = 0; token[i] != '\0'; i++) {
+        hash = (hash ^ (unsigned char)token[i]) * 16777619U;
+    }
+    for (i = 0; i < sizeof(Model); i++) {
+        hash = (hash ^ bytes[i]) * 16777619U;
+    }
+    return hash;
+}
+
 static Status restore(Instance *c, const void *state, size_t size)
 {
     if ((state == NULL) || (size != sizeof c->model)) {
@@ -223,10 +259,31 @@ static Status forget(void **state)
 
 static Status save(const Instance *c, const void *state, void *bytes, size_t size)
 {
-    if ((state == NULL) || (size != sizeof c->model)) {
+    const unsigned int hash = (state == NULL) ? 0U : hash_state(state);
+    if ((state == NULL) || (size != SAVED)) {
         return complain(c, STATUS_ERROR, "a wrong size of a state");
     }
-    memcpy(bytes, state, size);
+    memcpy(bytes, state, sizeof c->model);
+    memcpy((char *)bytes + sizeof c->model, &hash, sizeof hash);
+    return STATUS_OK;
+}
+
+static Status load(Instance *c, const void *bytes, size_t size, void **state)
+{
+    Model made;
+    unsigned int hash;
+    if ((bytes == NULL) || (size != SAVED)) {
+        return complain(c, STATUS_ERROR, "this is no state of this FMU");
+    }
+    memcpy(&made, bytes, sizeof made);
+    memcpy(&hash, (const char *)bytes + sizeof made, sizeof hash);
+    if (hash != hash_state(&made)) {
+        return complain(c, STATUS_ERROR, "this is no state of this FMU, or a damaged one");
+    }
+    if (copy_state(c, state) != STATUS_OK) {
+        return STATUS_ERROR;
+    }
+    memcpy(*state, &made, sizeof made);
     return STATUS_OK;
 }
 
