@@ -293,12 +293,12 @@ def certify_assembly(t: Traced, scheme: CarriedScheme, posed: Traced, q: Sequenc
     names, order = t.graph.leads, scheme.drive_pivots
     rates, rates_home = (posed.rates_of_reaches(names, home=home) for home in (False, True))
     here, at_home = SparseLU(rates, order), SparseLU(rates_home, order)
-    lead = np.array([q[k] for k in t.drives.leading], dtype=object)
     drives = at_home.inverse_determinant / here.inverse_determinant
     closures = drives * posed.determinant
     if t.scheme.start is not None:
         return [closures - CERTAIN_REGULAR, *t.scheme.start.find_sides(posed.motion)]
-    move, way = posed.q - posed.graph.lead_home, lead - t.graph.lead_home
+    move = posed.q - posed.graph.lead_home
+    way = np.array([q[k] for k in t.drives.leading], dtype=object) - t.graph.lead_home
     ends = ((lu.solve(way) - move) * np.array(t.pose_scales, dtype=object) for lu in (at_home, here))
     distance = 0.5 * sum(apart @ apart for apart in ends)
     return [

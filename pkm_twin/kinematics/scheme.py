@@ -50,6 +50,7 @@ class Start(Protocol):
 
     def find_miss(self, tree: Tree, q: Numbers) -> tuple[str, float] | None:
         """Return the joint or rod that falls short at q, and by how much (m); None: not known."""
+        return None
 
 
 class Scheme(Linkage):

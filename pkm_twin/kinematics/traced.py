@@ -170,11 +170,14 @@ class Traced:
             # Nothing is corrected: the result alone is judged.
             branch, determinant = [*branch, *self.lift([determinant - LEAST])], 1.0
         judged = [self.rows[k] for k in scheme.judged]
+        start: Sequence[Any] = []
+        if places:
+            start = self._guess() if scheme.start is None else scheme.start.place(tree, self.q)
         solved = Equations(
             self.target,
             self.lift([tree.home[k] for k in places]),
             self.lift(self.graph.lead_home),
-            self.lift(self._start() if places else []),
+            self.lift(start),
             self.retracted(onward) if places else [],
             self.lift([moved[k] for k in places]),
             self.square(step, [tree.scales[k] for k in rates]),
@@ -215,8 +218,8 @@ class Traced:
                 result = result * (slope / at_home)
         if self.scheme.held:
             holding = self._holding(self.ju, self.lu)
-            at_home = self._holding_at_home.inverse_determinant
-            result = result * (at_home / holding.inverse_determinant)
+            at_home = self._holding(snapped_all(matrices(self.tree, self.home.closures())[0]), home.lu)
+            result = result * (at_home.inverse_determinant / holding.inverse_determinant)
         return result
 
     def _holding(self, ju: Objects, lu: SparseLU) -> SparseLU:
@@ -246,21 +249,11 @@ class Traced:
             newton = SparseLU(snapped_all(self._table(solved)), scheme.solved_pivots)
         return Factors(limbs, jq, lu, solved, newton)
 
-    @cached_property
-    def _holding_at_home(self) -> SparseLU:
-        ju, _ = matrices(self.tree, self.home.closures())
-        return self._holding(snapped_all(ju), self._at_home.lu)
-
     @property
     def _here(self) -> Factors:
         """Limbs and factors in the state that is solved."""
         jq = self.jq[self.scheme.independent]
         return Factors(self.limbs, jq, self.lu, self.solved, self.newton)
-
-    def _start(self) -> Sequence[Any]:
-        """Return the unknowns that Newton's method starts with: in closed form, or a guess."""
-        closed = self.scheme.start
-        return self._guess() if closed is None else closed.place(self.tree, self.q)
 
     def rates_of_joints(self, names: Sequence[str]) -> Objects:
         """Return rates of passive joints per rate of each drive, shape (names, n)."""

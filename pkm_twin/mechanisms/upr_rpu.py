@@ -37,6 +37,7 @@ from pkm_twin.codegen.operations import absolute, atan2, cos, maximum, minimum, 
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.motion import Motion
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate, name_angles
+from pkm_twin.kinematics.scheme import Start
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import BASE, MIN_LENGTH, PLATFORM, Body, Direction, Graph, Joint, array
 from pkm_twin.machine.members import Beam, Parts, Section, axial, compliances, disc, modulus
@@ -145,25 +146,17 @@ class Limits:
 
     limb_length: Array | None = schema.interval(above=0.0, count=3, unit="m", default=None)
     joint_angle: float | None = schema.number(above=0.0, high=math.pi, unit="rad", default=None)
+    velocity: ClassVar[None] = None
+    effort: ClassVar[None] = None
 
     @property
     def position(self) -> Array | None:
         """Limits of the actuated joints, shape (3, 2), m."""
         return self.limb_length
 
-    @property
-    def velocity(self) -> Array | None:
-        """None: the machine's file has no such limit."""
-        return None
-
-    @property
-    def effort(self) -> Array | None:
-        """None: the machine's file has no such limit."""
-        return None
-
 
 @dataclass(frozen=True)
-class LargestRoot:
+class LargestRoot(Start):
     """The home assembly: rho, beta and gamma by the largest root of a cubic.
 
     The guess about home is too far from most states: limbs triple their length.
@@ -220,11 +213,9 @@ class LargestRoot:
         return result
 
     def find_sides(self, motion: Motion) -> list[Any]:
-        """Return numbers above zero between the singularities of the home assembly.
+        """Return numbers above zero between the singularities, where the roots keep their digits.
 
-        The cubic has at most two positive roots, as its value at 0 is not negative: the largest is
-        the one with a positive slope. Limb 3 keeps beta below atan2(-rho, a). Far away, 4 a b apart,
-        both roots lose digits.
+        As the cubic is not negative at 0, its largest root is the positive one of positive slope.
         """
         joints, (position, turned) = motion.graph.joints, motion.platform()
         a, b, z = joints["R joint 2"].at[0], joints["U joint 2"].at[0], position[2]
