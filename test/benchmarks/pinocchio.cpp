@@ -3,6 +3,7 @@
 //
 // The tree and its loops come as numbers from pinocchio_c.py. Inverse dynamics close the loops by
 // Newton's method from the sample before, and project rnea's torques on the actuated joints.
+// Accelerations of efforts are those of constraintDynamics, where all loops close in points.
 #include <algorithm>
 #include <ctime>
 #include <fstream>
@@ -12,6 +13,7 @@
 #include <pinocchio/fwd.hpp>
 #include <pinocchio/multibody.hpp>
 #include <pinocchio/spatial.hpp>
+#include <pinocchio/algorithm/constrained-dynamics.hpp>
 #include <pinocchio/algorithm/frames.hpp>
 #include <pinocchio/algorithm/jacobian.hpp>
 #include <pinocchio/algorithm/kinematics.hpp>
@@ -60,6 +62,9 @@ struct Loops
   MatrixXd all, jp, ja, left, right;
   VectorXd error, drift;
   Eigen::PartialPivLU<MatrixXd> lu;
+  std::vector<RigidConstraintModel> constraints;
+  std::vector<RigidConstraintData> held;
+  ProximalSettings settings{1e-12, 1e-10, 20};
   int named = 0;
 
   FrameIndex frame(std::istream & in, bool whole)
@@ -123,6 +128,13 @@ struct Loops
     drift.resize(rows);
     left.resize(6, model.nv);
     right.resize(6, model.nv);
+    for (const auto & p : points) {
+      const Frame & one = model.frames[p.a], & other = model.frames[p.b];
+      constraints.emplace_back(
+        CONTACT_3D, model, one.parentJoint, one.placement, other.parentJoint, other.placement, LOCAL);
+    }
+    for (const auto & c : constraints) held.emplace_back(c);
+    initConstraintDynamics(model, data, constraints, held);
     // Of dependent rows those that a pivoted factorisation chooses at home are left out.
     place();
     jacobian();
@@ -237,11 +249,25 @@ struct Loops
     const VectorXd forces = lu.transpose().solve(free);
     return driven - ja.transpose() * forces;
   }
+
+  // Of efforts without those of rotors, as this tree has no armature.
+  VectorXd accelerations(const VectorXd & at, const VectorXd & rate, const VectorXd & efforts)
+  {
+    close(at);
+    rates(rate);
+    a.setZero();
+    for (std::size_t k = 0; k < actuated.size(); k++) a[actuated[k]] = efforts[long(k)];
+    a = constraintDynamics(model, data, q, v, a, constraints, held, settings);
+    VectorXd driven(long(actuated.size()));
+    for (std::size_t k = 0; k < actuated.size(); k++) driven[long(k)] = a[actuated[k]];
+    return driven;
+  }
 };
 
 // Four inputs and an output: torques and accelerations of the exported C.
 using Exported = int (*)(const double *, const double *, const double *, const double *, double *);
 
+// Accelerations are timed where all loops close in points; elsewhere 0 is printed.
 // Words: the machine's numbers, the shared library of its exported C, the prefix of its names, and
 // how many rounds are timed.
 int main(int, char ** words)
@@ -257,7 +283,8 @@ int main(int, char ** words)
   int count;
   in >> count;
   const double wrench[6] = {0.0, 0.0, 0.0, 0.0, 0.0, 0.0};
-  double out[6], sum = 0.0, miss = 0.0, other = 0.0, size = 0.0;
+  const bool whole = loops.angles.empty();
+  double out[6], sum = 0.0, miss = 0.0, other = 0.0, size = 0.0, change = 0.0, most = 0.0;
   std::vector<VectorXd> q, qd, qdd, tau, load;
   for (int i = 0; i < count; i++) {
     q.push_back(numbers(in, n));
@@ -274,8 +301,12 @@ int main(int, char ** words)
     const double there = (Eigen::Map<VectorXd>(out, n) - load[k]).cwiseAbs().maxCoeff();
     if (failed || !(there <= other)) other = failed ? INFINITY : there;
     size = std::max(size, tau[k].cwiseAbs().maxCoeff());
+    most = std::max(most, qdd[k].cwiseAbs().maxCoeff());
+    if (!whole) continue;
+    const double apart = (loops.accelerations(q[k], qd[k], tau[k]) - qdd[k]).cwiseAbs().maxCoeff();
+    if (!(apart <= change)) change = apart;
   }
-  std::vector<std::vector<double>> times(4);
+  std::vector<std::vector<double>> times(5);
   for (int round = 0; round < rounds; round++) {
     double begun = now();
     for (std::size_t k = 0; k < q.size(); k++) sum += loops.torques(q[k], qd[k], qdd[k])[0];
@@ -296,8 +327,12 @@ int main(int, char ** words)
       sum += out[0];
     }
     times[3].push_back(now() - begun);
+    begun = now();
+    for (std::size_t k = 0; whole && k < q.size(); k++)
+      sum += loops.accelerations(q[k], qd[k], tau[k])[0];
+    times[4].push_back(now() - begun);
   }
-  std::cout << loops.model.nv << " " << miss / size << " " << other / size;
+  std::cout << loops.model.nv << " " << miss / size << " " << other / size << " " << change / most;
   for (auto & row : times) {
     std::sort(row.begin(), row.end());
     std::cout << " " << (row.empty() ? 0.0 : 1e9 * row[row.size() / 2] / double(count));
