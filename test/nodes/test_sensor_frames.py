@@ -21,7 +21,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import JointState
 from tf2_msgs.msg import TFMessage
 
-from pkm_twin.state.node import transform
+from pkm_twin.state.node import make_transform
 
 ROBOT = load("upr_rpu")
 Q = ROBOT.inverse([-0.7, 0.2, -0.15])
@@ -64,7 +64,7 @@ def test_the_transform_is_the_fixed_mount(peer, launch):
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     static = peer.node.create_publisher(TFMessage, "/tf_static", latched)
     turn = rotations.to_quaternion(rotations.from_rpy(np.array(RPY)))
-    mount = transform(peer.now(), "platform", "ft_sensor", np.array(XYZ), turn)
+    mount = make_transform(peer.now(), "platform", "ft_sensor", np.array(XYZ), turn)
     static.publish(TFMessage(transforms=[mount]))
     node.until(lambda: received, repeat=send)
     peer.node.destroy_publisher(static)
