@@ -41,7 +41,7 @@ def shorten(patch, chunk=Kind.chunk):
 
     In chunks of so many poses.
     """
-    for name, most in {"samples": 256, "population": 24, "rounds": 20}.items():
+    for name, most in {"samples": 256, "population": 16, "rounds": 8}.items():
         patch.setattr(Kind, name, most)
         patch.setattr(Frequency, name, most // 4)
     patch.setattr(Kind, "chunk", chunk)
