@@ -102,12 +102,12 @@ class Joint:
         """The joint's type, with its freedoms and constraints."""
         return TYPES[self.kind]
 
-    @property
+    @cached_property
     def freedoms(self) -> tuple[Freedom, ...]:
         """The elementary freedoms, from the inner body to the outer one."""
         return self.type.freedoms(self.axes, self.pitch)
 
-    @property
+    @cached_property
     def constraints(self) -> tuple[Constraint, ...]:
         """The constraints of the joint."""
         return self.type.constraints(self.axes, self.pitch)

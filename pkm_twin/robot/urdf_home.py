@@ -20,7 +20,7 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import ParameterError, SingularityError
-from pkm_twin.kinematics.constraints import Equation, constraint_equations, keep_angle
+from pkm_twin.kinematics.constraints import Equation, constraint_equations, cross, keep_angle
 from pkm_twin.kinematics.iterations import newton
 from pkm_twin.kinematics.linkage import Linkage
 from pkm_twin.kinematics.motion import Motion, numbers
@@ -153,7 +153,7 @@ class Assembly:
                 point = self.frame(closure, side).position
                 linear, angular = self.twist(link, point)
                 arm = np.array([one.points[side] for one in found]) - point
-                rows = force @ linear + (moment + np.cross(arm, force)) @ angular
+                rows = force @ linear + (moment + cross(arm, force)) @ angular
                 part = part + (rows if side else -rows)
             table.append(part)
         return values, np.vstack(table)
