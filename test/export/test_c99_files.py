@@ -34,6 +34,15 @@ from .c_programs import (
 )
 
 
+def test_a_program_is_compiled_anew_when_a_source_or_a_flag_changes(tmp_path):
+    """One that has been compiled is taken again by its content."""
+    (tmp_path / "main.c").write_text('#include "value.h"\nint main(void) { return VALUE + MORE; }\n')
+    for value, more in ((1, 0), (2, 0), (2, 3), (1, 0)):
+        (tmp_path / "value.h").write_text(f"#define VALUE {value}\n")
+        compile_in(tmp_path, COMPILERS[0], f"-DMORE={more}", "main.c", "-o", "main")
+        assert subprocess.run([tmp_path / "main"], check=False).returncode == value + more
+
+
 def test_only_constants_and_functions_of_the_robot_s_name(small):
     """No heap, no variable outside of functions, no name that another program may have."""
     _, package = small
