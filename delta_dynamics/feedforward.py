@@ -23,7 +23,15 @@ from pkm_twin.robot.effort_limits import NON_FINITE, EffortLimits, LimitedEffort
 from pkm_twin.robot.limits import find_first_beyond
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import describe_singularity_bound
-from pkm_twin.settings import AGE_BOUNDS, COUNT_BOUNDS, FRACTION_BOUNDS, FUTURE, SECONDS, ZERO_STAMP, setting
+from pkm_twin.settings import (
+    AGE_BOUNDS,
+    COUNT_BOUNDS,
+    DURATION_BOUNDS,
+    FRACTION_BOUNDS,
+    FUTURE_TOLERANCE_TEXT,
+    ZERO_STAMP_TEXT,
+    setting,
+)
 from pkm_twin.streams.base_motion import BaseImu
 from pkm_twin.streams.continuity import Continuity
 from pkm_twin.streams.differentiator import Differentiator
@@ -69,8 +77,8 @@ class Settings:
         "deadline of published torques, so at most command_gate's deadline",
         **AGE_BOUNDS,
     )
-    future_tolerance: float = setting(0.1, FUTURE, **SECONDS)
-    accept_zero_stamp: bool = setting(False, ZERO_STAMP)
+    future_tolerance: float = setting(0.1, FUTURE_TOLERANCE_TEXT, **DURATION_BOUNDS)
+    accept_zero_stamp: bool = setting(False, ZERO_STAMP_TEXT)
     trip_count: int = setting(5, "rejected joint states in a row that stop the stream", **COUNT_BOUNDS)
     recovery_count: int = setting(5, "accepted joint states in a row that restart it", **COUNT_BOUNDS)
     extra_joints: ExtraJoints = setting(
@@ -106,17 +114,18 @@ class Settings:
         )
 
 
-STOPPING: Final = (NON_FINITE, "singular", "jump", "no wrench", "no base motion")
+STOP_REASONS: Final = (NON_FINITE, "singular", "jump", "no wrench", "no base motion")
 """Reasons for which a single sample stops the stream, because the model cannot describe it."""
-SLICE: Final = 256
+POINTS_PER_SLICE: Final = 256
 """Points of a trajectory that are computed between two turns of the executor."""
 
 
 class Torques(NamedTuple):
-    """Efforts for one joint state; ``measured``: those of the sensors, None without.
+    """Efforts for one joint state.
 
-    ``wrench``: the external wrench in these efforts, base axes at the platform's reference point,
-    shape (6,). ``rate_error``: error bounds of the rates, shape (n,), None if they are not needed.
+    ``measured``: efforts that the drives report, None without. ``wrench``: the external wrench that
+    ``effort`` includes, base axes at the platform's reference point, shape (6,). ``rate_error``:
+    error bounds of the rates, shape (n,), None if they are not needed.
     ``memory``: the part of ``effort`` that friction with memory adds, shape (n,); 0 without.
     """
 
@@ -141,7 +150,7 @@ class Torques(NamedTuple):
 
 @dataclass
 class Feedforward(Core):
-    """Answers trajectories and a stream of joint states with feedforward efforts.
+    """Computes feedforward efforts for trajectories and for a stream of joint states.
 
     ``wrenches``: external wrenches for the stream's efforts; None: none. ``base``: measures the
     motion of the base; None: at rest. ``uncertain``: compute the rates' error bounds for every
@@ -168,16 +177,16 @@ class Feedforward(Core):
         self.limits = EffortLimits(self.robot)
         self.pose: MeasuredPose | None = None
         """Pose of the last accepted joint state."""
-        self._pull: Array | None = None
+        self._base_acceleration: Array | None = None
         """Mean acceleration of the base less gravity there, shape (3,); None: at rest."""
         self._memory: Memory | None = None
         """Memory of the drives' friction; None before the stream's first answer."""
-        self.differentiator = _differentiator(s, self.robot)
+        self.differentiator = _make_differentiator(s, self.robot)
         self._window = s.window
-        self._rest = VelocityErrorEstimator(self.differentiator.slope_gain())
+        self._velocity_error = VelocityErrorEstimator(self.differentiator.slope_gain())
         self.rates = RateAgreement(self.robot)
-        self._reach = friction_reach(self.robot)
-        self._take_rules(s)
+        self._friction_reach = friction_reach(self.robot)
+        self._apply_stamp_rules(s)
         self._reader = JointReader(self.robot, extra_joints=s.extra_joints)
         self._continuity = Continuity(self.robot, s.singularity_warn, s.singularity_stop, self._reader.highest_velocity)
 
@@ -185,7 +194,7 @@ class Feedforward(Core):
         """Take a robot with another payload, gravity, friction or limits, between two samples."""
         self.robot = robot
         self.limits = EffortLimits(robot)
-        self._reach = friction_reach(robot)
+        self._friction_reach = friction_reach(robot)
         self._reader = JointReader(robot, extra_joints=self.settings.extra_joints)
         self._continuity.robot = robot
 
@@ -194,7 +203,7 @@ class Feedforward(Core):
         before, self.settings = self.settings, settings
         self.stream.trip_count = settings.trip_count
         self.stream.recovery_count = settings.recovery_count
-        self._take_rules(settings)
+        self._apply_stamp_rules(settings)
         if settings.extra_joints != before.extra_joints:
             self._reader = JointReader(self.robot, extra_joints=settings.extra_joints)
         self._continuity.warn = settings.singularity_warn
@@ -202,13 +211,13 @@ class Feedforward(Core):
         if self.wrenches is not None:
             self.wrenches.change_stamps(settings.accept_zero_stamp, settings.future_tolerance)
         if (before.order, before.window) != (settings.order, settings.window):
-            self.differentiator = _differentiator(settings, self.robot)
+            self.differentiator = _make_differentiator(settings, self.robot)
             self._window = settings.window
-            self._rest = VelocityErrorEstimator(self.differentiator.slope_gain())
+            self._velocity_error = VelocityErrorEstimator(self.differentiator.slope_gain())
             if self.wrenches is not None:
                 self.wrenches.change_fit(settings.order, settings.window)
 
-    def _take_rules(self, settings: Settings) -> None:
+    def _apply_stamp_rules(self, settings: Settings) -> None:
         self._rules = settings.stamp_rules
         if self.base is not None:
             self.base.rules = self._rules
@@ -219,7 +228,7 @@ class Feedforward(Core):
         return self.stream.rejected[STAMP_ORDER]
 
     def reset(self) -> None:
-        """Forget the stream and the pose after a jump of the clock: no torque spans the jump."""
+        """Discard the stream and the pose after a jump of the clock."""
         self.pose = None
         if self.base is not None:
             self.base.clear()
@@ -281,14 +290,14 @@ class Feedforward(Core):
             qd = np.gradient(t.q, t.times, axis=0, edge_order=2) if t.qd is None else t.qd
             qdd = np.gradient(qd, t.times, axis=0, edge_order=2) if t.qdd is None else t.qdd
             reader.check_derived(qd, qdd)
-            if t.qd is None and self._reach.any():
+            if t.qd is None and self._friction_reach.any():
                 rate_error = velocity_error_bound(t.times, t.q, gradient_gain(t.times))
-                qd = zero_resting_rates(qd, np.abs(qd) <= rate_error, self._reach)
+                qd = zero_resting_rates(qd, np.abs(qd) <= rate_error, self._friction_reach)
             efforts = np.empty_like(t.q)
             saturated = False
-            for first in range(0, len(t.q), SLICE):
+            for first in range(0, len(t.q), POINTS_PER_SLICE):
                 yield
-                part = slice(first, first + SLICE)
+                part = slice(first, first + POINTS_PER_SLICE)
                 q = t.q[part]
                 beyond = _evaluate_points(first, find_first_beyond, robot, q, actuated=False)
                 if beyond is not None:
@@ -330,7 +339,7 @@ class Feedforward(Core):
         :raises MessageError: the message is rejected, and counted.
         """
         with self.refusing(self.stream):
-            torques = self._joint_state(message, now, now if steady is None else steady)
+            torques = self._compute_efforts(message, now, now if steady is None else steady)
         if torques is None or not self.stream.accept():
             return None
         self.saturations += torques.saturated
@@ -342,7 +351,7 @@ class Feedforward(Core):
         A trajectory stops it if the model gives no finite result for finite input.
         """
         super().refuse(counts, error)
-        if error.reason in (STOPPING if counts is self.stream else (NON_FINITE,)):
+        if error.reason in (STOP_REASONS if counts is self.stream else (NON_FINITE,)):
             self.stream.stop(error.reason, str(error))
 
     def check_age(self, torques: Torques, now: int) -> None:
@@ -360,35 +369,35 @@ class Feedforward(Core):
                 )
 
     def stop_effort(self, steady: int) -> LimitedEfforts | None:
-        """Return the efforts to send once when the stream stops, by ``on_stop``; None for nothing.
+        """Return the efforts to send once when the stream stops; None if ``on_stop`` is ``nothing``.
 
         :param steady: the steady clock, ns: gravity is that of a pose within ``stale_after``.
         """
         if self.settings.on_stop == "nothing":
             return None
         pose = self.pose if self.settings.on_stop == "gravity" else None
-        return find_holding_effort(self.limits, pose, steady, self.settings.stale_after, self._pull)
+        return find_holding_effort(self.limits, pose, steady, self.settings.stale_after, self._base_acceleration)
 
     def _forget_stream(self) -> None:
         self._last_stamp = 0
         if self.wrenches is not None:
             self.wrenches.clear()
-        self._begin_anew()
+        self._restart_stream()
 
-    def _begin_anew(self) -> None:
+    def _restart_stream(self) -> None:
         self.near_singular = False
         self._memory = None
-        self._restart_fit()
+        self._restart_differentiation()
         self._continuity.reset()
 
-    def _restart_fit(self) -> None:
+    def _restart_differentiation(self) -> None:
         self.differentiator.reset()
-        self._rest.reset()
+        self._velocity_error.reset()
         self.rates.reset()
         if self.wrenches is not None:
             self.wrenches.restart()
 
-    def _joint_state(self, message: Any, now: int, steady: int) -> Torques | None:
+    def _compute_efforts(self, message: Any, now: int, steady: int) -> Torques | None:
         """Compute the efforts of one sample; a rejected sample does not change the state."""
         # After a smaller step back the last stamp stays, and older samples are rejected.
         if now < self._last_now - self._rules.future_tolerance:
@@ -396,14 +405,14 @@ class Feedforward(Core):
         self._last_now = now
         sample = self._reader.joint_state(message, now, self._rules)
         check_order(sample.stamp, self._last_stamp + 1)
-        silence = sample.stamp - self._last_stamp
+        elapsed = sample.stamp - self._last_stamp
         if sample.qd is None and not self.settings.differentiate:
             raise MessageError("no velocities", "the joint state has no velocity; set acceleration to differentiate")
-        if silence > self.settings.stale_after * SECOND:
+        if elapsed > self.settings.stale_after * SECOND:
             if self._last_stamp:
-                text = f"no accepted joint state for {silence / SECOND:.3f} s, by the stamps"
+                text = f"no accepted joint state for {elapsed / SECOND:.3f} s, by the stamps"
                 self.stream.stop("stale input", text)
-            self._begin_anew()
+            self._restart_stream()
         wrench = None if self.wrenches is None else self.wrenches.require(sample.stamp)
         base = None
         if self.base is not None:
@@ -411,14 +420,16 @@ class Feedforward(Core):
         try:
             near_singular = as_message_error(self._continuity.step, sample.stamp, sample.q)
         except MessageError:
-            # No derivative spans a jump, or samples at which the machine cannot be assembled.
-            self._restart_fit()
+            # Do not differentiate across a jump, or across samples at which the machine cannot be assembled.
+            self._restart_differentiation()
             raise
         try:
             rates = self._differentiate(sample)
             rate_error = None
-            if self.uncertain or self._reach.any():
-                rate_error = self._rest.push(sample.stamp, sample.q, sample.qd, None if rates is None else rates[0])
+            if self.uncertain or self._friction_reach.any():
+                rate_error = self._velocity_error.push(
+                    sample.stamp, sample.q, sample.qd, None if rates is None else rates[0]
+                )
             measured, external = sample.effort, None
             if self.wrenches is not None:
                 self.wrenches.push(sample, self.robot.platform(sample.q)[1], wrench)
@@ -426,23 +437,27 @@ class Feedforward(Core):
                 self._reader.check_derived(*rates)
                 if self.wrenches is not None:
                     external, measured = self.wrenches.through()
-                motion, sure, change = as_message_error(self._resolve_motion, sample, rates, rate_error)
-                solved = as_message_error(inverse_dynamics, self.robot, sample.q, sure, change, external, base)
-                memory, added = self._add_friction_memory(sample.q, sure)
+                motion, rates_used, accelerations_used = as_message_error(
+                    self._resolve_motion, sample, rates, rate_error
+                )
+                solved = as_message_error(
+                    inverse_dynamics, self.robot, sample.q, rates_used, accelerations_used, external, base
+                )
+                memory, added = self._add_friction_memory(sample.q, rates_used)
                 controller, effort = self.robot.controller, solved + added
                 sent, saturated = self.limits.apply(controller.controller_efforts(effort), self.settings.limit_policy)
                 if saturated:
                     effort = controller.efforts(sent)
         except MessageError:
             self.differentiator.retract()
-            self._rest.retract()
+            self._velocity_error.retract()
             if self.wrenches is not None:
                 self.wrenches.retract()
             self._continuity.retract()
             raise
         self._last_stamp = sample.stamp
         self.pose = MeasuredPose.from_sample(sample.q, sample.stamp, now, steady)
-        self._pull = None if self.base is None else self.base.mean
+        self._base_acceleration = None if self.base is None else self.base.mean
         if sample.qd is not None:
             self.rates.push(sample.stamp, sample.q, sample.qd)
         self.near_singular = near_singular
@@ -453,7 +468,7 @@ class Feedforward(Core):
         return Torques(sample.stamp, motion, effort, sent, measured, saturated, external, rate_error, added)
 
     def _add_friction_memory(self, q: Array, rates: Array) -> tuple[Memory | None, Array | float]:
-        """Return friction's memory after a sample, and its part of the efforts, (n,)."""
+        """Return the presliding state after a sample, and the efforts (n,) that it adds."""
         friction = self.robot.friction
         if not friction.presliding.any():
             return None, 0.0
@@ -468,32 +483,32 @@ class Feedforward(Core):
 
         Rates below their noise count as zero.
         """
-        # Differentiated noise may contradict the closures: the nearest motion does not.
-        rate, change = nearest_motion(self.robot, sample.q, *rates)
-        motion = sample.q, rate, change
-        sure = rate if sample.qd is None else rates[0]
+        # Differentiated noise may contradict the loop constraints: take the nearest motion that fulfils them.
+        rate, acceleration = nearest_motion(self.robot, sample.q, *rates)
+        motion = sample.q, rate, acceleration
+        rates_used = rate if sample.qd is None else rates[0]
         if rate_error is not None:
-            sure = zero_resting_rates(sure, np.abs(sure) <= rate_error, self._reach)
+            rates_used = zero_resting_rates(rates_used, np.abs(rates_used) <= rate_error, self._friction_reach)
         if self.robot.redundant:
-            _, own, change = self.robot.project_redundant(sample.q, sure, change)
-            sure = own if sample.qd is None else sure
-        return motion, sure, change
+            _, own, acceleration = self.robot.project_redundant(sample.q, rates_used, acceleration)
+            rates_used = own if sample.qd is None else rates_used
+        return motion, rates_used, acceleration
 
     def _differentiate(self, sample: JointSample) -> tuple[Array, Array] | None:
-        """Return rates and accelerations; pass a new length of the window on to its other users."""
+        """Return rates and accelerations; tell the other estimators when the window's length changes."""
         rates = self.differentiator.push(sample.stamp, sample.q, sample.qd)
         if self.differentiator.window != self._window:
             self._window = self.differentiator.window
-            self._rest.gain = self.differentiator.slope_gain()
+            self._velocity_error.gain = self.differentiator.slope_gain()
             if self.wrenches is not None:
                 self.wrenches.window = self._window
         return rates
 
 
-def _differentiator(s: Settings, robot: Robot) -> Differentiator:
-    made = Differentiator(s.order, s.window, time=1e-3 * max(s.window - 1, 24))
-    made.prepare(robot.joints_count)
-    return made
+def _make_differentiator(s: Settings, robot: Robot) -> Differentiator:
+    differentiator = Differentiator(s.order, s.window, time=1e-3 * max(s.window - 1, 24))
+    differentiator.prepare(robot.joints_count)
+    return differentiator
 
 
 def warm_up(robot: Robot, *, base: bool = False) -> None:
@@ -514,7 +529,7 @@ def warm_up(robot: Robot, *, base: bool = False) -> None:
 def _evaluate_points(first: int, call: Callable[P, R], *arguments: P.args, **options: P.kwargs) -> R:
     """Evaluate the model at a trajectory's points from ``first`` on; errors name the point.
 
-    :raises MessageError: the model refuses.
+    :raises MessageError: the model rejects a point.
     """
     try:
         return as_message_error(call, *arguments, **options)

@@ -16,7 +16,7 @@ from pkm_twin.messages.reading import JointReader
 from pkm_twin.messages.stamps import SECOND, StampRules
 from pkm_twin.robot.effort_limits import EffortLimits, LimitedEfforts
 from pkm_twin.robot.robot import Robot
-from pkm_twin.settings import AGE_BOUNDS, COUNT_BOUNDS, FUTURE, SECONDS, setting
+from pkm_twin.settings import AGE_BOUNDS, COUNT_BOUNDS, DURATION_BOUNDS, FUTURE_TOLERANCE_TEXT, setting
 from pkm_twin.streams.monitor import Core, StreamMonitor, counting
 from pkm_twin.streams.wrench import check_order
 
@@ -40,17 +40,17 @@ class GateSettings:
         "deadline; stale_after of delta_dynamics must not exceed it",
         **AGE_BOUNDS,
     )
-    future_tolerance: float = setting(0.1, FUTURE, **SECONDS)
+    future_tolerance: float = setting(0.1, FUTURE_TOLERANCE_TEXT, **DURATION_BOUNDS)
     trip_count: int = setting(1, "rejected torques in a row that close the gate", **COUNT_BOUNDS)
     recovery_count: int = setting(5, "accepted torques in a row that open the gate", **COUNT_BOUNDS)
 
 
 @dataclass
 class Gate(Core):
-    """Forwards the torques of one robot; closed from the start, and whenever they stop.
+    """Forwards the torques of one robot; closed at the start, and whenever no torques arrive.
 
-    The controller may still hold the command of a gate before this one, so that a new gate is
-    closed and sends :meth:`stop_command` before the first torque.
+    The controller may still hold the command of an earlier gate. Therefore a new gate is closed and
+    sends :meth:`stop_command` before the first torque.
     """
 
     robot: Robot
@@ -87,12 +87,12 @@ class Gate(Core):
 
         The numbers are those of the message, bit by bit, in the robot's joint order.
 
-        :param message: sensor_msgs/JointState with an effort a joint, in any order of names.
+        :param message: sensor_msgs/JointState with one effort per joint, in any order of names.
         :param now: the ROS clock, ns; stamps are judged by it.
         :param steady: the steady clock, ns; silences are judged by it.
         :raises MessageError: the message is rejected, and counted.
         """
-        self.watch(steady)
+        self.close_if_silent(steady)
         with self.refusing(self.stream):
             sample = self._reader.efforts(message, now, self._rules)
             try:
@@ -116,7 +116,7 @@ class Gate(Core):
             sample = self._reader.joint_state(message, now, self._rules)
         self._pose = MeasuredPose.from_sample(sample.q, sample.stamp, now, steady)
 
-    def watch(self, steady: int) -> None:
+    def close_if_silent(self, steady: int) -> None:
         """Close the gate if no torque arrived within the deadline."""
         silent = (steady - self._last_arrival) / SECOND
         if not self.stream.stopped and silent > self.settings.deadline:

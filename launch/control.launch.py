@@ -36,7 +36,7 @@ from delta_dynamics.simulation.machine import tune_position_control
 from launch import LaunchDescription
 from pkm_twin import Robot
 from pkm_twin.export.ros2_control import CONTROLLER as FEEDFORWARD
-from pkm_twin.export.ros2_control import GRAVITY, TRAJECTORIES, package_name
+from pkm_twin.export.ros2_control import GRAVITY_CONTROLLER, TRAJECTORY_CONTROLLER, package_name
 from pkm_twin.ros.arguments import check_launch_arguments
 from pkm_twin.ros.launching import (
     check_executables,
@@ -107,7 +107,7 @@ def launch_control(context: LaunchContext) -> list[LaunchDescriptionEntity]:
             ("pkm_twin", "pkm-twin"),
         ]
     )
-    controller = EFFORT_CONTROLLER if gate else TRAJECTORIES
+    controller = EFFORT_CONTROLLER if gate else TRAJECTORY_CONTROLLER
     # The controller whose gains hold the position.
     holding = FEEDFORWARD if plugin else controller
     space = f"/{namespace}".rstrip("/")
@@ -131,7 +131,11 @@ def launch_control(context: LaunchContext) -> list[LaunchDescriptionEntity]:
     manager_settings = sections.get(f"{space}/controller_manager", {}).get("ros__parameters", {})
     # The fallback controller has to be configured before the controller that names it is activated.
     spawners = [
-        *([_create_spawner(space, file, GRAVITY, "--inactive")] if plugin and GRAVITY in manager_settings else []),
+        *(
+            [_create_spawner(space, file, GRAVITY_CONTROLLER, "--inactive")]
+            if plugin and GRAVITY_CONTROLLER in manager_settings
+            else []
+        ),
         _create_spawner(
             space,
             file,
@@ -195,8 +199,8 @@ def _create_twin_nodes(given: dict[str, str], controller: str) -> list[Node]:
                 {"command_gate": "true", "commands": f"{EFFORT_CONTROLLER}/commands"}
                 if controller == EFFORT_CONTROLLER
                 else {
-                    "joint_trajectory_ff": f"{TRAJECTORIES}/joint_trajectory",
-                    "controller_action": f"{TRAJECTORIES}/follow_joint_trajectory",
+                    "joint_trajectory_ff": f"{TRAJECTORY_CONTROLLER}/joint_trajectory",
+                    "controller_action": f"{TRAJECTORY_CONTROLLER}/follow_joint_trajectory",
                 }
             ),
         }
@@ -239,7 +243,7 @@ def _read_controllers(given: dict[str, str], space: str) -> dict[str, dict[str, 
     }
     for name, section in sections.items():
         parameters = section["ros__parameters"]
-        if name not in ("controller_manager", "joint_state_broadcaster", FEEDFORWARD, GRAVITY):
+        if name not in ("controller_manager", "joint_state_broadcaster", FEEDFORWARD, GRAVITY_CONTROLLER):
             parameters.setdefault("joints", list(joints))
         gains = parameters.get("gains", {})
         if "each" in gains:
@@ -248,7 +252,7 @@ def _read_controllers(given: dict[str, str], space: str) -> dict[str, dict[str, 
             parameters["gains"] = {joint: dict(gains.get(joint, each)) for joint in joints}
         if given["bandwidth"] and name == FEEDFORWARD:
             parameters["gains"] = {joint: {key: gain[key] for key in ("p", "d")} for joint, gain in tuned_gains.items()}
-        elif given["bandwidth"] and name == TRAJECTORIES and FEEDFORWARD not in sections:
+        elif given["bandwidth"] and name == TRAJECTORY_CONTROLLER and FEEDFORWARD not in sections:
             parameters["gains"] = tuned_gains
     return {f"{space}/{name}": section for name, section in sections.items()}
 

@@ -18,7 +18,7 @@ from pkm_twin.files import STANDARD, parse_numbers, require_replaceable
 
 
 @contextmanager
-def progress(what: str, total: int | None) -> Iterator[Callable[[int], None]]:
+def draw_progress(what: str, total: int | None) -> Iterator[Callable[[int], None]]:
     """Draw a progress bar on stderr, if that is a terminal; yield a function that takes the count.
 
     The bar's length is the work that remains at the first count, so that its estimate of the time is
@@ -27,21 +27,21 @@ def progress(what: str, total: int | None) -> Iterator[Callable[[int], None]]:
     with ExitStack() as stack:
         bar, first = None, 0
 
-        def update(count: int) -> None:
+        def update_bar(count: int) -> None:
             nonlocal bar, first
             if bar is None and sys.stderr.isatty():
                 # Without a length click needs an iterable.
                 endless = iter(int, 1) if total is None else None
                 length, first = None if total is None else total - count, count
-                shown = click.progressbar(endless, length, what, show_pos=True, file=sys.stderr)
-                bar = stack.enter_context(shown)
+                bar_context = click.progressbar(endless, length, what, show_pos=True, file=sys.stderr)
+                bar = stack.enter_context(bar_context)
             if bar is not None:
                 bar.update(count - first - bar.pos)
 
-        yield update
+        yield update_bar
 
 
-def numbers(text: str, count: int, expected: str = "") -> list[float]:
+def parse_count_of_numbers(text: str, count: int, expected: str = "") -> list[float]:
     """Parse ``count`` finite numbers separated by commas; any count for 0.
 
     :param expected: description of a valid text, for the error.
@@ -54,15 +54,18 @@ def numbers(text: str, count: int, expected: str = "") -> list[float]:
 
 
 def print_json(data: Any, *, err: bool = False) -> None:
-    """Print data as JSON; a number that is not finite is a programming error."""
+    """Print data as JSON.
+
+    :raises ValueError: a number is not finite.
+    """
     click.echo(json.dumps(data, indent=2, allow_nan=False), err=err)
 
 
-def refuse_existing(path: Path, overwrite: bool, source: Path | None = None) -> None:
+def reject_existing(path: Path, overwrite: bool, source: Path | None = None) -> None:
     """Reject an existing target, including a dangling link, unless it may be replaced.
 
-    The source, a FIFO, a device or a folder is never replaced. A missing folder is reported before the
-    work instead of after it.
+    The source, a FIFO, a device or a folder is never replaced. A missing folder is reported here, before the
+    computation.
 
     :raises PkmTwinError: the target cannot or may not be written.
     """
@@ -81,8 +84,8 @@ def refuse_existing(path: Path, overwrite: bool, source: Path | None = None) -> 
 
 
 @contextmanager
-def writing(path: Path | None) -> Iterator[None]:
-    """Convert errors of the operating system to one line with the file's name.
+def convert_write_errors(path: Path | None) -> Iterator[None]:
+    """Convert errors of the operating system in the block to one line with the file's name.
 
     :raises PkmTwinError: in place of any ``OSError``.
     """
@@ -92,29 +95,29 @@ def writing(path: Path | None) -> Iterator[None]:
         raise PkmTwinError(f"cannot write {error.filename or path}: {error.strerror}") from None
 
 
-def tell(text: str) -> None:
+def print_message(text: str) -> None:
     """Print a text as one line on stderr, with unprintable characters escaped."""
     print(f"pkm-twin: {one_line(text, 2000)}", file=sys.stderr)
 
 
-def system_error(error: OSError) -> str:
+def describe_system_error(error: OSError) -> str:
     """Describe an error of the operating system in one line."""
     what = error.strerror or str(error)
     return f"{error.filename}: {what}" if error.filename else what
 
 
 def flush_output() -> OSError | None:
-    """Flush stdout; return an error and discard the rest, so that it cannot fail again."""
+    """Flush stdout; in case of an error discard the rest and return the error."""
     try:
         sys.stdout.flush()
     except OSError as error:
-        silence_output()
+        discard_output()
         return error
     return None
 
 
-def silence_output() -> None:
-    """Discard the content of stdout's buffer, which the interpreter would flush again at its end."""
+def discard_output() -> None:
+    """Redirect stdout to the null device, because the interpreter flushes its buffer again at the end."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, sys.stdout.fileno())
     os.close(nowhere)

@@ -27,7 +27,7 @@ class ParameterError(PkmTwinError, ValueError):
     """
 
     def __init__(self, field: str, value: object, bound: str) -> None:
-        found = "missing" if value is None else short(value)
+        found = "missing" if value is None else shorten_value(value)
         super().__init__(one_line(f"{field}: {found}; expected {bound}", 2000))
         self.field = field
         self.value = value
@@ -50,8 +50,8 @@ class FileError(ParameterError):
         self.args = (one_line(f"{path}: {text}", 2000),)
 
 
-MAX_NAMES: Final = 60
-"""Most valid names that an error lists; of more names it lists the closest."""
+MAX_LISTED_NAMES: Final = 60
+"""Largest number of valid names that an error lists; with more names it lists the closest ones."""
 
 
 class UnknownNameError(ParameterError):
@@ -65,7 +65,7 @@ class UnknownNameError(ParameterError):
         match = difflib.get_close_matches(str(name), names, n=1, cutoff=0.5)
         self.closest: str | None = match[0] if match else None
         shown, more = names, ""
-        if len(names) > MAX_NAMES:
+        if len(names) > MAX_LISTED_NAMES:
             shown = difflib.get_close_matches(str(name), names, n=5, cutoff=0.0)
             more = f" or {len(names) - len(shown)} others"
         super().__init__(field, name, f"one of {', '.join(shown)}{more}")
@@ -73,17 +73,17 @@ class UnknownNameError(ParameterError):
         if field == str(name) or field.endswith(f".{name}"):
             what = f"unknown key {field!r}"
         elif field in ("robot", "mechanism", "map", "launch argument", "command"):
-            what = f"unknown {field} {short(name)}"
+            what = f"unknown {field} {shorten_value(name)}"
         else:
-            what = f"{field}: {short(name)}"
+            what = f"{field}: {shorten_value(name)}"
         hint = f"did you mean {self.closest!r}? " if self.closest else ""
         self.args = (one_line(f"{what}; {hint}expected {self.bound}", 2000),)
 
 
-def unknown_number(path: str, names: Iterable[str]) -> ParameterError:
-    """Return the error for a path without a number in the file; it names the closest paths."""
+def unknown_number_error(path: str, names: Iterable[str]) -> ParameterError:
+    """Return the error for a path that names no number of the file; it lists the closest paths."""
     known = list(names)
-    # Paths that contain the given one, those that end with it first; else similar spellings.
+    # Suggest paths that contain the given one, first those that end with it; otherwise similar spellings.
     close = [n for n in known if f".{path}.".replace("[", ".[") in f".{n}.".replace("[", ".[")]
     close = sorted(close, key=lambda name: not name.endswith(path))
     close = close[:3] or difflib.get_close_matches(path, known, 1)
@@ -126,7 +126,7 @@ def check_limit(field: str, value: float, unit: str = "", least: float = MIN_LIM
         raise ParameterError(field, value, f"{least:g} to {most:g} {unit}".strip())
 
 
-def warn(path: str | Path, text: str) -> None:
+def warn_of_file(path: str | Path, text: str) -> None:
     """Warn about a robot's file; the warning names the file, not a line of the program."""
     known = _warned.setdefault(str(path), {})
     warnings.warn_explicit(text, RobotWarning, str(path), 0, registry=known)
@@ -135,9 +135,9 @@ def warn(path: str | Path, text: str) -> None:
 @contextmanager
 def plain_warnings() -> Iterator[None]:
     """Print warnings about a robot's file as one line on stderr, without a line of the program."""
-    usual = warnings.showwarning
+    default_show = warnings.showwarning
 
-    def show(
+    def show_warning(
         message: Warning | str,
         category: type[Warning],
         filename: str,
@@ -148,13 +148,13 @@ def plain_warnings() -> Iterator[None]:
         if issubclass(category, RobotWarning):
             print(one_line(f"warning: {filename}: {message}", 2000), file=file or sys.stderr)
         else:
-            usual(message, category, filename, lineno, file, line)
+            default_show(message, category, filename, lineno, file, line)
 
-    warnings.showwarning = show
+    warnings.showwarning = show_warning
     try:
         yield
     finally:
-        warnings.showwarning = usual
+        warnings.showwarning = default_show
 
 
 class UnreachableError(PkmTwinError, ValueError):
@@ -163,8 +163,8 @@ class UnreachableError(PkmTwinError, ValueError):
     ``limb`` is the name of the limb or joint, ``index`` the sample's index in the batch (``()`` for
     one sample), ``miss`` the gap that remains (m), ``reached`` the fraction of the straight line
     from home up to which there is an assembly, None if no line was followed.
-    ``question``: the coordinate that is far outside the machine and the unit it may have, instead of
-    limb and gap. ``how``: why the limb cannot be placed, instead of the gap.
+    ``question``: text about a coordinate far outside the machine and the unit that it may have, shown
+    instead of limb and gap. ``how``: reason why the limb cannot be placed, shown instead of the gap.
     """
 
     def __init__(
@@ -237,12 +237,12 @@ class MessageError(PkmTwinError, ValueError):
 
     @property
     def labelled(self) -> str:
-        """The text with its reason in front, once."""
+        """The text with its reason in front, unless the text begins with it."""
         return label_reason(self.reason, str(self))
 
 
 def label_reason(reason: str, text: str) -> str:
-    """Return a text with its reason in front; a text that begins with it stays as it is."""
+    """Return a text with its reason in front, unless the text begins with it."""
     return text if text.startswith(f"{reason}: ") else f"{reason}: {text}"
 
 
@@ -268,7 +268,7 @@ def one_line(text: str, limit: int = 400) -> str:
 
     ``limit`` is the largest number of characters of the result.
     """
-    # Cut first: escaping may turn each character into ten.
+    # Cut before escaping, which may turn each character into ten.
     half = limit // 2
     if len(text) > 2 * limit:
         text = f"{text[:limit]}{text[-limit:]}"
@@ -276,43 +276,43 @@ def one_line(text: str, limit: int = 400) -> str:
     return shown if len(shown) <= limit else f"{shown[: half - 5]} ... {shown[5 - half :]}"
 
 
-def short(value: object, limit: int = 80) -> str:
+def shorten_value(value: object, limit: int = 80) -> str:
     """Write a value for an error message, without numpy's types and at most ``limit`` characters."""
     if isinstance(value, Exception):
         return str(value)
-    text = repr(_plain(value))
+    text = repr(_convert_from_numpy(value))
     return text if len(text) <= limit else text[: limit - 3] + "..."
 
 
-def _plain(value: Any) -> Any:
+def _convert_from_numpy(value: Any) -> Any:
     """Convert numpy's types, which ``repr`` would name, to Python's."""
     if type(value).__module__ == "numpy" and hasattr(value, "tolist"):
         return value.tolist()
     if type(value) in (list, tuple):
-        return type(value)(map(_plain, value))
+        return type(value)(map(_convert_from_numpy, value))
     if type(value) is dict:
-        return {_plain(key): _plain(one) for key, one in value.items()}
+        return {_convert_from_numpy(key): _convert_from_numpy(one) for key, one in value.items()}
     return value
 
 
-def install(extra: str) -> str:
+def write_install_command(extra: str) -> str:
     """Return the command that installs an extra from a clone; no package index has pkm_twin."""
     return f"pip install '.[{extra}]' in a clone of pkm_twin"
 
 
 class MissingExtraError(PkmTwinError, ImportError):
-    """A package that is not installed; ``extra`` is the extra of pkm_twin that brings it."""
+    """A package that is not installed; ``extra``: the extra of pkm_twin that installs it."""
 
     def __init__(self, package: str, extra: str) -> None:
-        super().__init__(f"{package} is not installed; {install(extra)} brings it")
+        super().__init__(f"{package} is not installed; {write_install_command(extra)} brings it")
         self.package = package
         self.extra = extra
 
 
-def require(module: str, extra: str) -> Any:
+def import_extra(module: str, extra: str) -> Any:
     """Import a module of an extra.
 
-    :raises MissingExtraError: naming the extra.
+    :raises MissingExtraError: the module is not installed; the error names the extra.
     """
     try:
         return importlib.import_module(module)

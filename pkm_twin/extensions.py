@@ -53,10 +53,10 @@ class Extensible(Mapping[str, T], Generic[T]):
         """
         if name not in self._loaded:
             own = name in self._own
-            self._loaded[name] = self._load(name) if own else self._load_point(self.points[name])
+            self._loaded[name] = self._load(name) if own else self._load_entry_point(self.points[name])
         return self._loaded[name]
 
-    def _load_point(self, point: EntryPoint) -> Any:
+    def _load_entry_point(self, point: EntryPoint) -> Any:
         try:
             found = point.load()
         except Exception as error:

@@ -35,10 +35,10 @@ def open_regular(path: Path) -> BinaryIO:
 
     A FIFO would wait for a writer and a device may never end, so neither is opened.
 
-    :raises OSError: it cannot be opened; or it is no regular file, ``strerror`` then says what.
+    :raises OSError: it cannot be opened or is not a regular file; ``strerror`` names its kind.
     """
     _require_regular(os.stat(path).st_mode, path)
-    # The file may have been replaced meanwhile: do not wait, and check the opened file again.
+    # The file may have been replaced since the check: open without waiting, and check again.
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC)
     try:
         _require_regular(os.fstat(descriptor).st_mode, path)
@@ -51,8 +51,8 @@ def open_regular(path: Path) -> BinaryIO:
 def read_bounded(path: Path, most: int, what: str) -> bytes:
     """Read a regular file of bounded size.
 
-    :param most: bytes. ``what``: such a file in words, for the error.
-    :raises ParameterError: not readable, or larger.
+    :param most: largest size, bytes. ``what``: description of the expected file, for errors.
+    :raises ParameterError: the file cannot be read, or is larger.
     """
     try:
         with open_regular(path) as file:
@@ -70,10 +70,10 @@ def _require_regular(mode: int, path: Path) -> None:
         raise OSError(errno.EINVAL, f"it is {kind}, not a regular file", str(path))
 
 
-def decimal(text: str) -> float:
-    """Parse a decimal number; reject Python's own forms, ``1_0`` and digits of other scripts.
+def parse_decimal(text: str) -> float:
+    """Parse a decimal number; reject forms that only Python has, ``1_0`` and digits of other scripts.
 
-    :raises ValueError: no number.
+    :raises ValueError: the text is not a number.
     """
     if "_" in text or not text.isascii():
         raise ValueError(f"{text!r} is not a number")
@@ -83,7 +83,7 @@ def decimal(text: str) -> float:
 def parse_numbers(text: str) -> list[float]:
     """Parse finite numbers separated by commas; return an empty list for any other text."""
     try:
-        numbers = [decimal(word) for word in text.split(",")]
+        numbers = [parse_decimal(word) for word in text.split(",")]
     except ValueError:
         return []
     return numbers if all(map(math.isfinite, numbers)) else []
@@ -101,14 +101,13 @@ def require_replaceable(path: Path) -> None:
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside ``path``, and move it to ``path`` if no error is raised.
+def write_atomically(path: Path) -> Iterator[Path]:
+    """Yield a temporary path next to ``path``; rename it to ``path`` if the block succeeds.
 
-    For :data:`STANDARD` the content is written to stdout instead.
+    With :data:`STANDARD` the content is written to stdout instead. The temporary name is short, so
+    that it is valid in the file system whenever the target's name is.
 
-    The temporary name is short, so that any target name that the file system takes works.
-
-    :raises OSError: the target is no regular file, or cannot be written.
+    :raises OSError: the target is not a regular file, or cannot be written.
     """
     if os.fspath(path) == STANDARD:
         with TemporaryDirectory() as folder:
@@ -123,7 +122,7 @@ def replacing(path: Path) -> Iterator[Path]:
         yield hidden
         os.replace(hidden, path)
     except OSError as error:
-        # A failed write names no file, and users do not know the temporary name.
+        # Name the target: a failed write has no name, and users do not know the temporary one.
         if error.filename is None or os.fspath(error.filename) == str(hidden):
             raise OSError(error.errno, error.strerror, str(path)) from None
         raise
@@ -133,29 +132,29 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def replace_file(path: Path, data: bytes) -> None:
-    """Write a small file whole or not at all.
+    """Write a small file atomically.
 
-    :raises OSError: the target is no regular file, or cannot be written.
+    :raises OSError: the target is not a regular file, or cannot be written.
     """
-    with replacing(path) as hidden:
+    with write_atomically(path) as hidden:
         hidden.write_bytes(data)
 
 
 def replace_files(files: Mapping[Path, bytes]) -> None:
-    """Write all small files or none: all are complete before the first replaces its target.
+    """Write several small files, replacing no target before all files are complete.
 
     :raises OSError: as :func:`replace_file`.
     """
     with ExitStack() as stack:
         for path, data in files.items():
-            stack.enter_context(replacing(path)).write_bytes(data)
+            stack.enter_context(write_atomically(path)).write_bytes(data)
 
 
 def open_standard_streams() -> None:
-    """Open stdin, stdout and stderr on the null device where the parent process closed them.
+    """Open those of stdin, stdout and stderr that the parent process closed on the null device.
 
     Otherwise the next file or socket would get one of their descriptors, and receive printed text.
-    Characters that the terminal's encoding does not have are escaped.
+    Also escapes characters that the terminal's encoding lacks.
     """
     nowhere = os.open(os.devnull, os.O_RDWR)
     while nowhere <= 2:

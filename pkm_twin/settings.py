@@ -20,14 +20,17 @@ S = TypeVar("S", bound="DataclassInstance")
 class Setting:
     """The parameter, option or key of a field.
 
-    ``name``: of the parameter, by default the field's. ``low``, ``high``: its bounds, and
-    ``above``: one that it is not equal to. ``choices``: the words that are allowed, or the field's
-    value for each. Of nodes alone: ``fixed``, not changeable while the node runs;
-    ``usual``, words for a default that depends on the robot. Of commands alone: ``argument``, given
-    by its place; ``count``, this many numbers with commas between, 0 for any count; ``writes``, a
-    file that the command writes, whose name ends in one of ``endings`` where there are any;
-    ``older``, spellings that help does not list; ``alone``, the value of an option without one;
-    ``metavar``, the value's name in help.
+    ``name``: the parameter's name, by default the field's. ``low``, ``high``: smallest and largest
+    value. ``above``: a bound that the value exceeds. ``choices``: the allowed words, or the field's
+    value for each word.
+
+    For nodes alone: ``fixed``: cannot change while the node runs. ``usual``: description of a default
+    that depends on the robot.
+
+    For commands alone: ``argument``: given by its position. ``count``: this many numbers separated
+    by commas, 0 for any count. ``writes``: a file that the command writes, whose name ends in one of
+    ``endings`` if there are any. ``older``: spellings that the help does not list. ``alone``: the
+    value of an option that is given without a value. ``metavar``: the value's name in the help.
     """
 
     text: str
@@ -48,52 +51,53 @@ class Setting:
     above: float | None = None
 
     @property
-    def span(self) -> str:
-        """Description of the bounds, to be appended to the name of the quantity."""
+    def bounds_text(self) -> str:
+        """Text of the bounds, such as ", 0 to 1", to append to the name of the quantity."""
         words = "" if self.above is None else f" above {self.above:g}"
         if self.high == math.inf:
-            return f"{words}{self._least}, or .inf"
+            return f"{words}{self._lower_bound_text}, or .inf"
         if self.low is not None and self.high is not None:
             return f", {self.low:g} to {self.high:g}"
-        return f"{words}{self._least}" + ("" if self.high is None else f", at most {self.high:g}")
+        return f"{words}{self._lower_bound_text}" + ("" if self.high is None else f", at most {self.high:g}")
 
     @property
-    def _least(self) -> str:
+    def _lower_bound_text(self) -> str:
         return "" if self.low is None else f", {self.low:g} or more"
 
-    def allows(self, number: float) -> bool:
+    def is_within_bounds(self, number: float) -> bool:
         """Return whether a number is within the bounds."""
         low = -math.inf if self.low is None else self.low
         high = math.inf if self.high is None else self.high
         return low <= number <= high and (self.above is None or number > self.above)
 
-    def value(self, given: Any) -> Any:
+    def to_field_value(self, given: Any) -> Any:
         """Convert a parameter's value to the field's."""
         if isinstance(self.choices, Mapping):
             return self.choices[given]
         return tuple(given) if hasattr(given, "__iter__") and not isinstance(given, str) else given
 
-    def parameter(self, value: Any) -> Any:
+    def to_parameter_value(self, value: Any) -> Any:
         """Convert a field's value to the parameter's."""
         if isinstance(self.choices, Mapping):
             return next(word for word, own in self.choices.items() if own == value)
         return list(value) if isinstance(value, tuple) else value
 
 
-SECONDS: Final[Mapping[str, Any]] = {"unit": "s", "low": 0.0, "high": 3600.0}
-AGE_BOUNDS: Final[Mapping[str, Any]] = {**SECONDS, "low": 1e-3}
+DURATION_BOUNDS: Final[Mapping[str, Any]] = {"unit": "s", "low": 0.0, "high": 3600.0}
+AGE_BOUNDS: Final[Mapping[str, Any]] = {**DURATION_BOUNDS, "low": 1e-3}
 COUNT_BOUNDS: Final[Mapping[str, Any]] = {"low": 1, "high": 10**6}
 FRACTION_BOUNDS: Final[Mapping[str, Any]] = {"low": 0.0, "high": 1.0}
 SCALE_BOUNDS: Final[Mapping[str, Any]] = {"low": 0.0, "high": 1e9}
-"""Attributes of settings of the same kind."""
-FUTURE: Final = "how far time stamps may be ahead of the clock"
-ZERO_STAMP: Final = "accept a zero stamp, as the arrival time"
+"""Bounds of settings of one kind."""
+FUTURE_TOLERANCE_TEXT: Final = "how far time stamps may be ahead of the clock"
+ZERO_STAMP_TEXT: Final = "accept a zero stamp, as the arrival time"
+"""Descriptions of parameters that several nodes have."""
 
 
 def setting(default: Any, text: str, **more: Any) -> Any:
     """Declare a field that is a node parameter or a command option.
 
-    :param default: ``...`` for none: it has to be given.
+    :param default: ``...`` if the user has to give a value.
     :param more: further attributes of :class:`Setting`.
     """
     if default is ...:
@@ -102,7 +106,7 @@ def setting(default: Any, text: str, **more: Any) -> Any:
 
 
 def settings_of(kind: Any) -> Mapping[str, tuple[str, Any]]:
-    """Return the field's name and its setting by parameter name."""
+    """Return the field's name and its setting, by the name of the parameter."""
     return _settings_of(kind)
 
 
@@ -112,16 +116,16 @@ def _settings_of(kind: Any) -> Mapping[str, tuple[str, Any]]:
     return {row.name or name: (name, row) for name, row in found.items()}
 
 
-def changeable(kind: type[DataclassInstance]) -> list[str]:
+def list_changeable(kind: type[DataclassInstance]) -> list[str]:
     """List the parameters that may change while the node runs."""
     return [name for name, (_, row) in settings_of(kind).items() if not row.fixed]
 
 
 def with_parameters(settings: S, values: Mapping[str, Any]) -> S:
-    """Return the settings with new parameter values; names that are no settings are ignored.
+    """Return the settings with new parameter values; other names in ``values`` are ignored.
 
-    :raises ParameterError: what the settings reject.
+    :raises ParameterError: the settings reject a value.
     """
     rows = settings_of(type(settings))
-    fields = {rows[name][0]: rows[name][1].value(values[name]) for name in rows.keys() & values}
+    fields = {rows[name][0]: rows[name][1].to_field_value(values[name]) for name in rows.keys() & values}
     return dataclasses.replace(settings, **fields)

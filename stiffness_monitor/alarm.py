@@ -100,10 +100,10 @@ class _Sample:
     """Hold a load in a pose and the model's quantities for it; shapes as in :class:`_Window`."""
 
     time: float
-    moved: Array
+    predicted: Array
     reach: Array
     rest: Array
-    carried: Array
+    loads: Array
     effects: Array
     measured: Array
 
@@ -116,16 +116,16 @@ class _Fit:
     variances: Array
     squares: float
 
-    def deviations(self, alike: float) -> Array:
-        """Return the factors' standard deviations; ``alike`` widens the variances."""
-        return np.asarray(np.sqrt(alike * self.variances), np.float64)
+    def deviations(self, variance_factor: float) -> Array:
+        """Return the factors' standard deviations, with variances times ``variance_factor``."""
+        return np.asarray(np.sqrt(variance_factor * self.variances), np.float64)
 
 
 @dataclass(frozen=True, eq=False)
 class _Window:
     """Hold k samples in d measured directions, each divided by its noise.
 
-    ``owner``: (r,). ``reach``: (k, d, r), ``rest``: (k, r, r), ``carried``: (k, r) as in
+    ``owner``: element of each column, (r,). ``reach``: (k, d, r), ``rest``: (k, r, r), ``loads``: (k, r) as in
     :mod:`stiffness_monitor.response`. ``common``: effects of the causes, then of the zeros,
     (k, d, c + d). ``residual``: measured less predicted, (k, d). ``prior``: (c + d,), of both.
     """
@@ -133,47 +133,47 @@ class _Window:
     owner: Indices
     reach: Array
     rest: Array
-    carried: Array
+    loads: Array
     common: Array
     residual: Array
     prior: Array
 
     def predict_change(self, chosen: Sequence[int], factors: Array) -> tuple[Array, Array]:
         """Return the deflection change by elements' factors, (k, d), and its derivatives."""
-        own = np.isin(self.owner, chosen)
-        mine = np.equal.outer(self.owner[own], np.asarray(chosen)).astype(float)
-        change = mine @ (factors - 1.0)
-        reach = self.reach[..., own]
-        matrix = np.eye(len(change)) + self.rest[:, own][..., own] * change
-        right = np.concatenate([np.swapaxes(reach, -1, -2), self.carried[:, own, None]], -1)
+        affected = np.isin(self.owner, chosen)
+        by_element = np.equal.outer(self.owner[affected], np.asarray(chosen)).astype(float)
+        change = by_element @ (factors - 1.0)
+        reach = self.reach[..., affected]
+        matrix = np.eye(len(change)) + self.rest[:, affected][..., affected] * change
+        right = np.concatenate([np.swapaxes(reach, -1, -2), self.loads[:, affected, None]], -1)
         solved = np.linalg.solve(matrix, right)
-        columns, amounts = np.swapaxes(solved[..., :-1], -1, -2), solved[..., -1]
-        added = reach @ (change * amounts)[..., None]
-        return added[..., 0], (columns * amounts[:, None]) @ mine
+        columns, column_forces = np.swapaxes(solved[..., :-1], -1, -2), solved[..., -1]
+        change_of_deflection = reach @ (change * column_forces)[..., None]
+        return change_of_deflection[..., 0], (columns * column_forces[:, None]) @ by_element
 
     def fit(self, chosen: Sequence[int], start: Array) -> _Fit:
         """Fit the factors of chosen elements to the window by Gauss-Newton, from ``start``."""
         factors, e = start, len(chosen)
-        held = np.concatenate([np.zeros(e), self.prior])
+        prior = np.concatenate([np.zeros(e), self.prior])
         for _ in range(20):
-            added, slopes = self.predict_change(chosen, factors)
-            table = np.concatenate([slopes, self.common], -1).reshape(-1, len(held))
-            target = (self.residual - added).ravel()
-            information = table.T @ table + np.diag(held)
+            change, slopes = self.predict_change(chosen, factors)
+            table = np.concatenate([slopes, self.common], -1).reshape(-1, len(prior))
+            target = (self.residual - change).ravel()
+            information = table.T @ table + np.diag(prior)
             # Scale the unknowns: zeros and factors differ by orders of magnitude.
             scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
             inverse = np.linalg.pinv(scale[:, None] * information * scale, 1e-12, hermitian=True)
-            found = scale * (inverse @ (scale * (table.T @ target)))
+            solution = scale * (inverse @ (scale * (table.T @ target)))
             bounds = (
                 np.maximum(factors / MAX_STEP_RATIO, FACTOR_RANGE[0]),
                 np.minimum(factors * MAX_STEP_RATIO, FACTOR_RANGE[1]),
             )
-            new = np.clip(factors + found[:e], *bounds)
+            new = np.clip(factors + solution[:e], *bounds)
             step, factors = np.abs(new - factors).max(initial=0.0), new
             if step < 1e-4:  # a relative change below any noise
                 break
-        left = target - table[:, e:] @ found[e:]
-        squares = float(left @ left + held[e:] @ found[e:] ** 2)
+        residual = target - table[:, e:] @ solution[e:]
+        squares = float(residual @ residual + prior[e:] @ solution[e:] ** 2)
         variances = (scale**2 * np.diag(inverse))[:e]
         return _Fit(factors, variances, squares)
 
@@ -193,9 +193,9 @@ class StiffnessAlarm:
         self.names: tuple[str, ...] = ()
         # A machine may be singular at home; then the first sample's pose is used.
         with suppress(PkmTwinError, ValueError):
-            self._prepare(self.robot.home())
+            self._read_elements(self.robot.home())
 
-    def _prepare(self, pose: Array) -> None:
+    def _read_elements(self, pose: Array) -> None:
         """Store the elements' names and the standard deviations that the file gives them."""
         response = element_response(self.robot, pose)
         self._file_deviations = _file_deviations(self.robot, pose, len(response.names))
@@ -213,12 +213,12 @@ class StiffnessAlarm:
     def push(self, time: float, pose: Array, wrench: Array, deflection: Array) -> None:
         """Add a sample: pose (m,), wrench and deflection (6,) in base axes.
 
-        :raises ValueError: a sample of another shape or that is not finite; it moves nothing.
+        :raises ValueError: a sample of another shape or that is not finite; it is not added.
         """
         wrench = one_vector(wrench, 6, "the wrench")
         deflection = one_vector(deflection, 6, "the deflection").copy()
         if not self.names:
-            self._prepare(pose)
+            self._read_elements(pose)
         response = element_response(self.robot, pose)
         effects = np.einsum("ijk,j->ik", compliance_effects(self.robot, pose), wrench)
         self._samples.append(
@@ -243,13 +243,13 @@ class StiffnessAlarm:
         """Evaluate as :meth:`judge` in slices, with the samples of the first slice."""
         if not self._samples:
             return None
-        sizes = np.array([np.linalg.norm(sample.moved[:3]) for sample in self._samples])
+        sizes = np.array([np.linalg.norm(sample.predicted[:3]) for sample in self._samples])
         # At least 20 samples must be loaded: predicted to deflect by a twentieth of the largest deflection.
         if int((sizes > 0.05 * sizes.max()).sum()) < 20 or not sizes.max() > 0.0:
             return None
-        window, alike, loudest = self._build_window()
-        if loudest < 10.0:
-            # The wrenches may be the sensor's noise.
+        window, variance_factor, signal_to_noise = self._build_window()
+        if signal_to_noise < 10.0:
+            # The loads are too small: the measured wrenches may be noise.
             return None
         yield
         # Each element's factor alone, to first order, and its standard error, without common causes.
@@ -262,79 +262,82 @@ class StiffnessAlarm:
         rows = rows - basis @ (basis.T @ rows)
         information = np.maximum(np.sum(rows**2, 0), 1e-300)
         values, deviations = 1.0 + rows.T @ window.residual.ravel() / information, 1.0 / np.sqrt(information)
-        bounds = self._departure_bounds(np.sqrt(alike) * deviations, range(len(self.names)))
+        bounds = self._departure_bounds(np.sqrt(variance_factor) * deviations, range(len(self.names)))
         if not (np.abs(values - 1.0) > 0.5 * bounds).any():
-            # To first order no factor comes near its bound: the full search would find none.
+            # To first order no factor exceeds half its bound, so a full search would find no departure.
             return ()
         yield
-        chosen = yield from self._select_elements(window, alike)
-        return (yield from self._describe_departures(window, alike, chosen))
+        chosen = yield from self._select_elements(window, variance_factor)
+        return (yield from self._describe_departures(window, variance_factor, chosen))
 
     def _departure_bounds(self, deviations: Array, elements: Sequence[int]) -> Array:
         """Return the differences from 1 of the factors that give no alarm."""
         s = self.settings
-        doubts = self._file_deviations[list(elements)]
-        return np.asarray(np.maximum(s.min_departure, s.sigmas * np.hypot(deviations, doubts)), np.float64)
+        file_deviations = self._file_deviations[list(elements)]
+        return np.asarray(np.maximum(s.min_departure, s.sigmas * np.hypot(deviations, file_deviations)), np.float64)
 
-    def _relative_departures(self, fit: _Fit, alike: float, elements: Sequence[int]) -> Array:
+    def _relative_departures(self, fit: _Fit, variance_factor: float, elements: Sequence[int]) -> Array:
         """Return the factors' differences from 1 over their bounds, (elements,)."""
-        bounds = self._departure_bounds(fit.deviations(alike), elements)
+        bounds = self._departure_bounds(fit.deviations(variance_factor), elements)
         return np.asarray(np.abs(fit.factors - 1.0) / bounds, np.float64)
 
-    def _select_elements(self, window: _Window, alike: float) -> Generator[None, None, list[int]]:
+    def _select_elements(self, window: _Window, variance_factor: float) -> Generator[None, None, list[int]]:
         """Find the fewest elements that explain the window: add one by one, then drop some."""
         chosen: list[int] = []
         factors = np.zeros(0)
         while len(chosen) < len(self.names):
-            left = [k for k in range(len(self.names)) if k not in chosen]
+            remaining = [k for k in range(len(self.names)) if k not in chosen]
             tried = {}
-            for k in left:
+            for k in remaining:
                 tried[k] = window.fit([*chosen, k], np.append(factors, 1.0))
                 yield
-            best = min(left, key=lambda k: tried[k].squares)
-            if not self._relative_departures(tried[best], alike, [*chosen, best])[-1] > 1.0:
+            best = min(remaining, key=lambda k: tried[k].squares)
+            if not self._relative_departures(tried[best], variance_factor, [*chosen, best])[-1] > 1.0:
                 break
             chosen.append(best)
             factors = tried[best].factors
         while chosen:
             fit = window.fit(chosen, factors)
             yield
-            beyond = self._relative_departures(fit, alike, chosen)
-            least = int(beyond.argmin())
-            if beyond[least] > 1.0:
+            departures = self._relative_departures(fit, variance_factor, chosen)
+            least = int(departures.argmin())
+            if departures[least] > 1.0:
                 break
             del chosen[least]
             factors = np.delete(fit.factors, least)
         return chosen
 
     def _describe_departures(
-        self, window: _Window, alike: float, chosen: Sequence[int]
+        self, window: _Window, variance_factor: float, chosen: Sequence[int]
     ) -> Generator[None, None, tuple[Departure, ...]]:
         """Return the departures of the chosen elements, the most certain first."""
         if not chosen:
             return ()
         fit = window.fit(chosen, np.ones(len(chosen)))
-        deviations, beyond = fit.deviations(alike), self._relative_departures(fit, alike, chosen)
+        deviations, departures = (
+            fit.deviations(variance_factor),
+            self._relative_departures(fit, variance_factor, chosen),
+        )
         bounds = self._departure_bounds(deviations, chosen)
         found = []
-        for at in np.argsort(-beyond).tolist():
+        for position in np.argsort(-departures).tolist():
             others = []
             for k in range(len(self.names)):
                 if k in chosen:
                     continue
                 swapped, start = list(chosen), fit.factors.copy()
-                swapped[at], start[at] = k, 1.0
+                swapped[position], start[position] = k, 1.0
                 other = window.fit(swapped, start)
                 yield
-                # Four standard deviations rule an element out.
-                if other.squares - fit.squares < 4.0**2 * alike:
-                    others.append((other.squares, self.names[k], float(other.factors[at])))
+                # Elements whose fit is worse by four standard deviations are excluded.
+                if other.squares - fit.squares < 4.0**2 * variance_factor:
+                    others.append((other.squares, self.names[k], float(other.factors[position])))
             found.append(
                 Departure(
-                    self.names[chosen[at]],
-                    float(fit.factors[at]),
-                    float(deviations[at]),
-                    float(bounds[at]),
+                    self.names[chosen[position]],
+                    float(fit.factors[position]),
+                    float(deviations[position]),
+                    float(bounds[position]),
                     tuple((name, value) for _, name, value in sorted(others)),
                 )
             )
@@ -346,41 +349,45 @@ class StiffnessAlarm:
         :returns: the window, the factor by which autocorrelation widens variances, and the
         deflections' standard deviation over their noise in the clearest direction.
         """
-        kept = np.flatnonzero(self.settings.directions)
-        moved, reach, rest, carried, effects, measured = (
+        directions = np.flatnonzero(self.settings.directions)
+        predicted, reach, rest, loads, effects, measured = (
             np.array([getattr(sample, name) for sample in self._samples])
-            for name in ("moved", "reach", "rest", "carried", "effects", "measured")
+            for name in ("predicted", "reach", "rest", "loads", "effects", "measured")
         )
-        residual, reach, effects = (a[:, kept] for a in (measured - moved, reach, effects))
-        zeros = np.broadcast_to(np.eye(len(kept)), (len(moved), len(kept), len(kept)))
+        residual, reach, effects = (a[:, directions] for a in (measured - predicted, reach, effects))
+        zeros = np.broadcast_to(np.eye(len(directions)), (len(predicted), len(directions), len(directions)))
         common = np.concatenate([effects, zeros], -1)
-        prior = np.repeat([1.0, 0.0], [effects.shape[-1], len(kept)])
-        plain = _Window(self._owner, reach, rest, carried, common, residual, prior)
+        prior = np.repeat([1.0, 0.0], [effects.shape[-1], len(directions)])
+        plain = _Window(self._owner, reach, rest, loads, common, residual, prior)
         _, slopes = plain.predict_change(range(len(self.names)), np.ones(len(self.names)))
-        size = np.std(measured[:, kept], 0)
-        # Noise is what no element, cause or zero explains; its correlation in time widens variances.
-        table, least = np.concatenate([slopes, common], -1), 1e-3 * size
-        noise, left = np.maximum(least, 1e-30), residual
+        size = np.std(measured[:, directions], 0)
+        # Estimate the noise from what elements, causes and zeros do not explain, and its correlation in time.
+        table, min_noise = np.concatenate([slopes, common], -1), 1e-3 * size
+        noise, unexplained = np.maximum(min_noise, 1e-30), residual
         for _ in range(2):
             rows = (table / noise[:, None]).reshape(-1, table.shape[-1])
             scale = 1.0 / np.maximum(np.linalg.norm(rows, axis=0), 1e-300)
             found = scale * np.linalg.lstsq(rows * scale, (residual / noise).ravel(), rcond=1e-12)[0]
-            left = residual - table @ found
-            noise = np.maximum(np.maximum(estimate_deviation(left - np.median(left, 0)), least), 1e-30)
-        scaled = left / noise
-        whole = float(np.sum(scaled**2))
-        correlation = float(np.sum(scaled[1:] * scaled[:-1])) / whole if whole > 0.0 else 0.0
+            unexplained = residual - table @ found
+            noise = np.maximum(
+                np.maximum(estimate_deviation(unexplained - np.median(unexplained, 0)), min_noise), 1e-30
+            )
+        scaled = unexplained / noise
+        square_sum = float(np.sum(scaled**2))
+        correlation = float(np.sum(scaled[1:] * scaled[:-1])) / square_sum if square_sum > 0.0 else 0.0
         # A correlation of 1 would make all variances infinite.
         correlation = min(max(correlation, 0.0), 0.95)
-        alike = (1.0 + correlation) / (1.0 - correlation)
-        loudest = float((size / noise).max())
-        over = noise[:, None]
-        window = _Window(self._owner, reach / over, rest, carried, common / over, residual / noise, prior)
-        return window, alike, loudest
+        variance_factor = (1.0 + correlation) / (1.0 - correlation)
+        signal_to_noise = float((size / noise).max())
+        scale_factors = noise[:, None]
+        window = _Window(
+            self._owner, reach / scale_factors, rest, loads, common / scale_factors, residual / noise, prior
+        )
+        return window, variance_factor, signal_to_noise
 
 
 def _file_deviations(robot: Robot, pose: Array, count: int) -> Array:
-    """Return the relative deviation of each element's compliance by the file, (elements,).
+    """Return the relative standard deviation of each element's compliance by ``uncertainty``, (elements,).
 
     The elements' energies under six unit loads are compared at one pose.
     """
@@ -393,12 +400,12 @@ def _file_deviations(robot: Robot, pose: Array, count: int) -> Array:
 
 
 MAX_WAITING: Final = 64
-"""Deflections that wait for the wrench after them; the latest stamps are dropped first."""
+"""Largest number of deflections that wait for a later wrench; the latest stamps are dropped first."""
 
 
 @dataclass
 class StiffnessWatch(Core):
-    """Pair measured deflections with the wrenches around them, and evaluate a window of pairs.
+    """Pair measured deflections with the wrenches before and after them, and evaluate a window of pairs.
 
     ``frames``: names of the base frame and of the platform frame; a deflection is in either one's
     axes. ``max_age``: largest time from a deflection to the wrench on either side, s. ``period``:
@@ -419,7 +426,7 @@ class StiffnessWatch(Core):
         self._alarm = StiffnessAlarm(self.robot, self.settings)
         self._answers: TimeCache[Answer] = TimeCache(1024)
         self._waiting: list[DeflectionSample] = []
-        """Sorted by stamp, so that a deflection without a pair does not block later ones."""
+        """Deflections that wait for a wrench, sorted by stamp, so that one without a pair does not block others."""
         self._last = self._due = self._judged = 0
         self._judging: object | None = None
 
@@ -447,7 +454,7 @@ class StiffnessWatch(Core):
         latest = self._answers.latest
         if latest is None or answer.stamp >= latest[0]:
             self._answers.push(answer.stamp, answer)
-        self._pair_waiting()
+        self._use_waiting_deflections()
 
     def deflection(self, message: Any, now: int) -> None:
         """Add a geometry_msgs/TransformStamped of the deflected platform.
@@ -457,20 +464,20 @@ class StiffnessWatch(Core):
         with self.refusing(self.taken):
             sample = read_deflection(message, now, self.rules)
             if sample.frame not in self.frames:
-                told = " or ".join(map(repr, dict.fromkeys(self.frames)))
-                raise MessageError("frame", f"frame is {quote_name(sample.frame)}, expected {told}")
+                expected = " or ".join(map(repr, dict.fromkeys(self.frames)))
+                raise MessageError("frame", f"frame is {quote_name(sample.frame)}, expected {expected}")
             check_order(sample.stamp, self._last)
         insort(self._waiting, sample, key=lambda waiting: waiting.stamp)
-        self._pair_waiting()
+        self._use_waiting_deflections()
         if len(self._waiting) > MAX_WAITING:
             self._waiting.pop()
             text = f"{MAX_WAITING} deflections are already waiting for the wrench after them"
             self.refuse(self.taken, MessageError("no wrench", text))
 
     def judgement(self) -> Generator[None, None, bool] | None:
-        """Start an evaluation in slices if none is running and 1 s of stamps has passed.
+        """Start an evaluation in slices; None if one is running or less than 1 s of stamps has passed.
 
-        The generator returns whether ``departures`` are new; they are not after a :meth:`reset`.
+        The generator returns True if it set ``departures``; after a :meth:`reset` it does not.
         """
         if self._judging is not None or self._due - self._judged < SECOND:
             return None
@@ -490,39 +497,39 @@ class StiffnessWatch(Core):
 
         return evaluate()
 
-    def _pair_waiting(self) -> None:
+    def _use_waiting_deflections(self) -> None:
         latest = self._answers.latest
         while self._waiting and latest is not None and self._waiting[0].stamp <= latest[0]:
             sample = self._waiting.pop(0)
             try:
-                self._use_pair(sample)
+                self._push_pair(sample)
             except MessageError as error:
                 self.refuse(self.taken, error)
                 continue
             self._last = sample.stamp
             self.taken.accept()
 
-    def _use_pair(self, sample: DeflectionSample) -> None:
+    def _push_pair(self, sample: DeflectionSample) -> None:
         """Push a deflection with the wrench interpolated at its stamp to the alarm."""
-        found = self._answers.around(sample.stamp)
-        if found is None:
+        neighbours = self._answers.around(sample.stamp)
+        if neighbours is None:
             raise MessageError("no wrench", "no wrenches before and after the deflection")
-        age = max(sample.stamp - found[0][0], found[1][0] - sample.stamp) / SECOND
+        age = max(sample.stamp - neighbours[0][0], neighbours[1][0] - sample.stamp) / SECOND
         if age > self.max_age:
             text = f"the wrench next to the deflection is {age:.3f} s away, allowed {self.max_age:g} s"
             raise MessageError("no wrench", text)
-        before, after = found[0][1], found[1][1]
+        before, after = neighbours[0][1], neighbours[1][1]
         if sample.stamp - self._due < self.period * SECOND:
             return
         span = after.stamp - before.stamp
-        part = (sample.stamp - before.stamp) / span if span else 0.0
-        wrench = before.wrench + part * (after.wrench - before.wrench)
-        near = before if part < 0.5 else after
+        fraction = (sample.stamp - before.stamp) / span if span else 0.0
+        wrench = before.wrench + fraction * (after.wrench - before.wrench)
+        nearest = before if fraction < 0.5 else after
         values = sample.values
         if sample.frame != self.frames[0]:
-            values = rotate_to_base(values, near.rotation)
+            values = rotate_to_base(values, nearest.rotation)
         try:
-            self._alarm.push(sample.stamp / SECOND, near.pose, wrench, values)
+            self._alarm.push(sample.stamp / SECOND, nearest.pose, wrench, values)
         except (UnreachableError, SingularityError, ValueError) as error:
             raise MessageError("pose", str(error)) from error
         self._due = sample.stamp

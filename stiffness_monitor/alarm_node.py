@@ -16,7 +16,7 @@ from pkm_twin.ros import health
 from pkm_twin.ros.joints import header
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.turns import Task
-from pkm_twin.settings import SECONDS
+from pkm_twin.settings import DURATION_BOUNDS
 from stiffness_monitor.alarm import AlarmSettings, Departure, StiffnessWatch
 from stiffness_monitor.frame import DIRECTIONS
 from stiffness_monitor.monitor import Answer
@@ -52,9 +52,11 @@ class StiffnessAlarmTopics:
             "alarm.wrench_age",
             0.02,
             "largest time between a deflection and the wrenches before and after it",
-            **SECONDS,
+            **DURATION_BOUNDS,
         )
-        period = node.declare("alarm.period", 0.1, "shortest time between two deflections that are used", **SECONDS)
+        period = node.declare(
+            "alarm.period", 0.1, "shortest time between two deflections that are used", **DURATION_BOUNDS
+        )
         if not wanted:
             return
         self._core = StiffnessWatch(robot, rules, frames, settings, age, period)
@@ -77,7 +79,7 @@ class StiffnessAlarmTopics:
         if self._core is not None:
             self._core.rules, self._core.frames = rules, frames
 
-    def take(self, answer: Answer) -> None:
+    def update(self, answer: Answer) -> None:
         """Use the model's answer to a wrench."""
         if self._core is not None:
             self._core.answer(answer)
@@ -104,7 +106,7 @@ class StiffnessAlarmTopics:
             self._start_evaluation(self._core)
 
     def _start_evaluation(self, core: StiffnessWatch) -> None:
-        """Start a due evaluation in slices: it takes tens of milliseconds, wrenches come sooner."""
+        """Start an evaluation if it is due, in slices, so that wrenches are answered meanwhile."""
         work = core.judgement()
 
         def evaluate() -> Task:
@@ -115,7 +117,7 @@ class StiffnessAlarmTopics:
             self._node.defer("measured_deflection", evaluate())
 
     def _publish(self, core: StiffnessWatch) -> None:
-        """Publish every evaluation with departures, one WARN status each, and the first without, OK."""
+        """Publish departures, one WARN status each; without any, publish OK once."""
         found = core.departures
         if found is None:
             return
@@ -134,7 +136,7 @@ class StiffnessAlarmTopics:
                 "deviation": repr(departure.deviation),
                 "bound": repr(departure.bound),
             }
-            # Elements that the loads do not distinguish from this one.
+            # Add the elements that the loads do not distinguish from this one.
             pairs |= {f"or {other}": repr(factor) for other, factor in departure.others}
             statuses.append(
                 DiagnosticStatus(

@@ -74,9 +74,12 @@ class Milling:
     def primitive(self, angle: Array) -> Array:
         """Integrate one tooth's W from 0 to angles (...), the cut alone, shape (..., 2, 2)."""
         a = np.clip(angle, *self.engaged)
-        one, two = 0.5 * a - 0.25 * np.sin(2.0 * a), 0.5 * np.sin(a) ** 2
-        rest, r = a - one, self.radial
-        rows = [[two + r * one, rest + r * two], [r * two - one, r * rest - two]]
+        sine_squared, sine_cosine = 0.5 * a - 0.25 * np.sin(2.0 * a), 0.5 * np.sin(a) ** 2
+        cosine_squared, r = a - sine_squared, self.radial
+        rows = [
+            [sine_cosine + r * sine_squared, cosine_squared + r * sine_cosine],
+            [r * sine_cosine - sine_squared, r * cosine_squared - sine_cosine],
+        ]
         return self.tangential * np.moveaxis(np.array(rows), (0, 1), (-2, -1))
 
     def mean(self) -> Array:
@@ -88,8 +91,8 @@ class Milling:
         """Return the mean of W in each of ``count`` steps of a tooth period, (count, 2, 2)."""
         pitch = 2.0 * np.pi / self.teeth
         edges = pitch / count * (np.arange(count + 1) - 0.5)
-        whole = edges + pitch * np.arange(self.teeth)[:, None]
-        total = self.primitive(whole).sum(0)
+        angles = edges + pitch * np.arange(self.teeth)[:, None]
+        total = self.primitive(angles).sum(0)
         return np.asarray(np.diff(total, axis=0) * (count / pitch))
 
 
@@ -98,7 +101,8 @@ class Lobes:
     """Hold limit depths over spindle speeds.
 
     ``speeds``: (k,), rpm. ``depths``: (k,), m, the depth at which the cut becomes unstable.
-    ``open``: (k,), where it is still stable at the deepest that was tried, which ``depths`` has.
+    ``open``: (k,), where the cut is stable at the deepest depth that was tried; ``depths`` then has
+    that depth.
     ``safe``: the zero-order depth that is stable at every speed, m.
     """
 
@@ -109,17 +113,16 @@ class Lobes:
 
     @property
     def best(self) -> int:
-        """Index of the speed with the greatest depth, of equal ones the fastest."""
+        """Index of the speed with the greatest depth; of several such speeds the fastest."""
         return int(np.flatnonzero(self.depths == self.depths.max())[-1])
 
     def steady(self, margin: float = SPEED_MARGIN) -> tuple[float, float, bool]:
-        """Return the speed (rpm) with the largest depth within a margin, that depth, its openness.
+        """Return the best speed (rpm) if the spindle's speed is uncertain, its depth, and whether that is open.
 
-        The depth (m) is stable at all speeds within the margin, and at the next ones on both sides;
-        openness is whether it is the deepest that was tried. If
+        The depth (m) is stable at all speeds within the margin, and at the next ones on both sides. If
         the range of speeds is narrower than the margin, its middle is taken. Speeds must rise.
 
-        :param margin: how far the speed may be off, as a part of it.
+        :param margin: relative error of the speed.
         """
         last = len(self.speeds) - 1
         low = np.searchsorted(self.speeds, self.speeds * (1.0 - margin), "right") - 1
@@ -128,14 +131,14 @@ class Lobes:
         if not len(inside):
             middle = 0.5 * float(self.speeds[0] + self.speeds[-1])
             return middle, float(self.depths.min()), bool(self.open.all())
-        least = np.array([self.depths[low[k] : high[k] + 1].min() for k in inside])
-        k = int(np.flatnonzero(least == least.max())[-1])
+        lowest_depths = np.array([self.depths[low[k] : high[k] + 1].min() for k in inside])
+        k = int(np.flatnonzero(lowest_depths == lowest_depths.max())[-1])
         at = int(inside[k])
-        whole = bool(self.open[low[at] : high[at] + 1].all())
-        return float(self.speeds[at]), float(least[k]), whole
+        all_open = bool(self.open[low[at] : high[at] + 1].all())
+        return float(self.speeds[at]), float(lowest_depths[k]), all_open
 
     def gaps(self, waves: Array) -> Mask:
-        """Return between which neighbouring speeds another one is needed, shape (k - 1,).
+        """Return a mask of the intervals between neighbouring speeds that need refinement, shape (k - 1,).
 
         :param waves: vibrations of the fastest mode from tooth to tooth, by speed, shape (k,).
         """
@@ -144,20 +147,20 @@ class Lobes:
         before, after = np.append(1.0, ratio), np.append(ratio, 1.0)
         falls = np.append(True, np.diff(depth) <= 0.0)
         lowest = falls & np.append(np.diff(depth) >= 0.0, True)
-        # Minima to 0.1 %, and steps of the depth by a quarter, up to 0.05 % of the speed, where depths may be
-        # discontinuous; ten speeds in a lobe, which is one vibration wide.
-        unsure = lowest & (np.maximum(before, after) > 1.001)
-        split = (ratio > 1.25) | unsure[1:] | unsure[:-1]
+        # Refine until minima are known to 0.1 %, steps of the depth by a quarter (where it may be
+        # discontinuous) to 0.05 % of the speed, and lobes, one vibration wide, have ten speeds.
+        near_minimum = lowest & (np.maximum(before, after) > 1.001)
+        split = (ratio > 1.25) | near_minimum[1:] | near_minimum[:-1]
         split = (split & (np.diff(n) > 5e-4 * n[1:])) | (waves[:-1] - waves[1:] > 0.1)
         if not split.any():
             best = self.steady()[0]
-            near = (n[1:] > (1.0 - SPEED_MARGIN) * best) & (n[:-1] < (1.0 + SPEED_MARGIN) * best)
-            split = near & (np.diff(n) > 1e-3 * n[1:])
+            inside_margin = (n[1:] > (1.0 - SPEED_MARGIN) * best) & (n[:-1] < (1.0 + SPEED_MARGIN) * best)
+            split = inside_margin & (np.diff(n) > 1e-3 * n[1:])
         return np.asarray(split)
 
 
 @dataclass(frozen=True, eq=False)
-class _CuttingPlane:
+class CuttingPlaneModes:
     """Hold modes in the cutting plane: rad/s, damping ratios (m,), shapes (m, 2) of unit mass."""
 
     turn: Array
@@ -165,7 +168,7 @@ class _CuttingPlane:
     shapes: Array
 
     @classmethod
-    def of(cls, modes: ToolModes, milling: Milling) -> _CuttingPlane:
+    def of(cls, modes: ToolModes, milling: Milling) -> CuttingPlaneModes:
         """Project tool-point modes onto the cutting plane; keep at most 8, and drop those below 1 %."""
         c, s = np.cos(milling.feed), np.sin(milling.feed)
         axes = modes.rotation @ np.array([[c, -s], [s, c], [0.0, 0.0]])
@@ -176,14 +179,14 @@ class _CuttingPlane:
         return cls(turn[kept], modes.damping[kept], shapes[kept])
 
     def stable_depth(self, milling: Milling) -> tuple[float, float]:
-        """Return the zero-order depth stable at every speed, m, and where it chatters, rad/s."""
-        far = np.geomspace(4.0, 100.0, 16)
-        near = np.concatenate([-far, np.linspace(-4.0, 4.0, 65), far])
-        at = (self.turn[:, None] * (1.0 + self.damping[:, None] * near)).ravel()
-        at = at[at > 0.0]
-        real = self._oriented_eigenvalues(milling, at).real.min(1)
+        """Return the zero-order depth that is stable at every speed, m, and its chatter frequency, rad/s."""
+        far_offsets = np.geomspace(4.0, 100.0, 16)
+        offsets = np.concatenate([-far_offsets, np.linspace(-4.0, 4.0, 65), far_offsets])
+        omega = (self.turn[:, None] * (1.0 + self.damping[:, None] * offsets)).ravel()
+        omega = omega[omega > 0.0]
+        real = self._oriented_eigenvalues(milling, omega).real.min(1)
         k = int(real.argmin())
-        return (-0.5 / float(real[k]) if real[k] < 0.0 else np.inf), float(at[k])
+        return (-0.5 / float(real[k]) if real[k] < 0.0 else np.inf), float(omega[k])
 
     def _oriented_eigenvalues(self, milling: Milling, at: Array) -> Complex:
         """Return the eigenvalues of mean W times the response at rad/s (k,), shape (k, 2)."""
@@ -191,7 +194,7 @@ class _CuttingPlane:
         return np.asarray(np.linalg.eigvals(milling.mean() @ response))
 
     def lobe_speeds(self, milling: Milling, low: float, high: float) -> Array:
-        """Return the speeds in a range at which zero-order lobes are lowest, rpm, (k,).
+        """Return the speeds in a range at which zero-order lobes are deepest, rpm, (k,).
 
         For each mode, a whole number of vibrations plus the lobe's phase fits into a tooth period
         at its worst frequency; for period doubling (every second tooth cuts deeper) half a
@@ -199,15 +202,15 @@ class _CuttingPlane:
         """
         found: list[float] = []
         for w, z in zip(self.turn, self.damping, strict=True):
-            at = w * (1.0 + z * np.linspace(-3.0, 3.0, 61))
-            values = self._oriented_eigenvalues(milling, at)
+            omega = w * (1.0 + z * np.linspace(-3.0, 3.0, 61))
+            values = self._oriented_eigenvalues(milling, omega)
             k, i = np.unravel_index(int(values.real.argmin()), values.shape)
             phase = np.pi - 2.0 * float(np.angle(-1.0 / values[k, i]))
-            flips = [(w * (1.0 + part * z), np.pi) for part in (-1.0, 0.0, 1.0)]
-            for turn, extra in ((float(at[k]), phase), *flips):
-                teeth = 60.0 * turn / (2.0 * np.pi * milling.teeth)
-                whole = np.arange(-1.0, np.ceil(teeth / low) + 1.0) + extra / (2.0 * np.pi)
-                found += [teeth / n for n in whole.tolist() if n > 0.0 and low < teeth / n < high]
+            period_doubling = [(w * (1.0 + part * z), np.pi) for part in (-1.0, 0.0, 1.0)]
+            for turn, extra in ((float(omega[k]), phase), *period_doubling):
+                tooth_rate = 60.0 * turn / (2.0 * np.pi * milling.teeth)
+                periods = np.arange(-1.0, np.ceil(tooth_rate / low) + 1.0) + extra / (2.0 * np.pi)
+                found += [tooth_rate / n for n in periods.tolist() if n > 0.0 and low < tooth_rate / n < high]
         return np.array(found)
 
     def waves(self, milling: Milling, speeds: Array) -> Array:
@@ -215,46 +218,46 @@ class _CuttingPlane:
         return np.asarray(60.0 * self.turn.max() / (2.0 * np.pi * milling.teeth) / speeds)
 
     def spectral_radius(self, milling: Milling, speed: float, depths: Array) -> Array:
-        """Return the largest eigenvalue size per tooth period, for depths (k,), m, at a speed."""
+        """Return the spectral radius of the motion over a tooth period, for depths (k,), m, at a speed."""
         period = 60.0 / (speed * milling.teeth)
         waves = float(self.waves(milling, np.array(speed)))
         count = max(2 * STEPS_PER_WAVE, int(np.ceil(STEPS_PER_WAVE * waves)))
         force, h = milling.steps(count), period / count
-        # A step's free motion of positions and rates, (m, 2, 2), and their gains by the force at its begin and
-        # end, (m, 2), from the motion under a constant and under a rising force.
+        # Matrices of a step: free motion, (m, 2, 2), and response to the forces at its begin and end, (m, 2),
+        # which follow from the responses to a constant and to a rising force.
         w, z = self.turn, self.damping
         root = w * np.sqrt(1.0 - z * z)
         decay, c, s = np.exp(-z * w * h), np.cos(root * h), np.sin(root * h) / root
         free = np.array([[c + z * w * s, s], [-w * w * s, c - z * w * s]]) * decay
-        one = np.array([(1.0 - free[0, 0]) / w**2, free[0, 1]])
-        ramp = np.array([h - 2.0 * z / w * (1.0 - free[0, 0]) - free[0, 1], 1.0 - free[0, 0]])
-        end = ramp / (w**2 * h)
-        free, begin, end = np.moveaxis(free, -1, 0), (one - end).T, end.T
-        # Only displacements at which a tooth cuts return. They are smooth: polynomials of time.
+        constant_gain = np.array([(1.0 - free[0, 0]) / w**2, free[0, 1]])
+        rising_gain = np.array([h - 2.0 * z / w * (1.0 - free[0, 0]) - free[0, 1], 1.0 - free[0, 0]])
+        end = rising_gain / (w**2 * h)
+        free, begin, end = np.moveaxis(free, -1, 0), (constant_gain - end).T, end.T
+        # Only displacements while a tooth cuts change later forces. They are smooth: fit polynomials of time.
         cut = np.flatnonzero(np.abs(force).max((1, 2)) > 1e-12 * milling.tangential)
         parts = np.split(cut, np.flatnonzero(np.diff(cut) > 1) + 1)
         basis = scipy.linalg.block_diag(*(_chebyshev_basis(len(part), waves / count) for part in parts))
-        own = 2 * len(self.turn)
-        n, b = own + 2 * basis.shape[1], depths[:, None, None]
+        states = 2 * len(self.turn)
+        n, b = states + 2 * basis.shape[1], depths[:, None, None]
         before = np.zeros((count, 2, n))
-        before[cut, 0, own::2] = before[cut, 1, own + 1 :: 2] = basis
+        before[cut, 0, states::2] = before[cut, 1, states + 1 :: 2] = basis
         begins, ends = (v[:, :, None] * self.shapes[:, None] for v in (begin, end))
-        gain, at = self.shapes.T @ ends[:, 0], self.shapes.T
-        state = np.broadcast_to(np.eye(own, n).reshape(-1, 2, n), (len(depths), own // 2, 2, n))
-        first = u = at @ state[:, :, 0]
+        gain, transposed_shapes = self.shapes.T @ ends[:, 0], self.shapes.T
+        state = np.broadcast_to(np.eye(states, n).reshape(-1, 2, n), (len(depths), states // 2, 2, n))
+        first = u = transposed_shapes @ state[:, :, 0]
         f = -b * (force[0] @ (u - before[0]))
         rows = []
         for k in range(count):
             rows.append(u)
             cutting = force[(k + 1) % count]
-            past = before[k + 1] if k + 1 < count else first
+            earlier = before[k + 1] if k + 1 < count else first
             state = free @ state + begins @ f[:, None]
-            u = at @ state[:, :, 0]
-            f = -b * np.linalg.solve(np.eye(2) + b * (cutting @ gain), cutting @ (u - past))
+            u = transposed_shapes @ state[:, :, 0]
+            f = -b * np.linalg.solve(np.eye(2) + b * (cutting @ gain), cutting @ (u - earlier))
             state, u = state + ends @ f[:, None], u + gain @ f
-        fitted = np.einsum("ck,kdin->dcin", np.linalg.pinv(basis), np.array(rows)[cut])
-        whole = np.concatenate([part.reshape(len(depths), -1, n) for part in (state, fitted)], 1)
-        return np.asarray(np.abs(np.linalg.eigvals(whole)).max(-1))
+        coefficients = np.einsum("ck,kdin->dcin", np.linalg.pinv(basis), np.array(rows)[cut])
+        transition = np.concatenate([part.reshape(len(depths), -1, n) for part in (state, coefficients)], 1)
+        return np.asarray(np.abs(np.linalg.eigvals(transition)).max(-1))
 
     def find_limit(self, milling: Milling, speed: float, low: float, deepest: float) -> float:
         """Find the smallest unstable depth at a speed, m; infinite if the deepest is stable.
@@ -262,19 +265,19 @@ class _CuttingPlane:
         :param low: depth to begin at.
         """
 
-        def margin(depth: float) -> float:
+        def log_radius(depth: float) -> float:
             return float(np.log(self.spectral_radius(milling, speed, np.array([depth]))[0]))
 
-        while margin(low) >= 0.0:
+        while log_radius(low) >= 0.0:
             low /= 4.0
-        # Depths grow by a quarter until one is unstable.
+        # Raise the depth by a quarter until the cut is unstable.
         count = max(2, int(np.ceil(np.log(deepest / low) / np.log(1.25))) + 1)
         tried = np.geomspace(low, deepest, count)
         for part in np.array_split(np.arange(1, count), max(1, count // 5)):
-            bad = self.spectral_radius(milling, speed, tried[part]) >= 1.0
-            if bad.any():
-                k = int(part[bad.argmax()])
-                return float(scipy.optimize.brentq(margin, tried[k - 1], tried[k], rtol=2e-4))
+            unstable = self.spectral_radius(milling, speed, tried[part]) >= 1.0
+            if unstable.any():
+                k = int(part[unstable.argmax()])
+                return float(scipy.optimize.brentq(log_radius, tried[k - 1], tried[k], rtol=2e-4))
         return np.inf
 
 
@@ -283,7 +286,7 @@ def _chebyshev_basis(count: int, waves: float) -> Array:
 
     :param waves: vibrations per step.
     """
-    # A degree of four per vibration resolves it to rounding, with a margin of ten.
+    # Four degrees per vibration, and ten more, resolve it to rounding.
     degree = 10 + int(np.ceil(4.0 * waves * count))
     if count < 2 * degree:
         return np.eye(count)
@@ -302,7 +305,7 @@ def stability_lobes(
 ) -> Lobes:
     """Find the axial depths at which milling begins to chatter, over spindle speeds.
 
-    The lowest modes that move the tool point in the cutting plane count, actuators locked.
+    Uses the lowest modes that move the tool point in the cutting plane, with locked actuators.
 
     :param pose: shape (m,), the mechanism's pose coordinates, m and rad.
     :param speeds: spindle speeds, shape (k,), rpm.
@@ -316,10 +319,10 @@ def stability_lobes(
 
 def lobes_from_modes(modes: ToolModes, milling: Milling, speeds: ArrayLike, deepest: float | None = None) -> Lobes:
     """Find limit depths as :func:`stability_lobes`, from the tool point's modes."""
-    plane = _CuttingPlane.of(modes, milling)
+    plane = CuttingPlaneModes.of(modes, milling)
     at = np.atleast_1d(np.asarray(speeds, np.float64))
     last, safe = _check_range(plane, milling, at, deepest)
-    return _find_limits(plane, milling, at, last, safe)
+    return _find_limit_depths(plane, milling, at, last, safe)
 
 
 def refine_lobes(
@@ -336,17 +339,17 @@ def refine_lobes(
     :param low, high: rpm. ``points``: number of evenly spaced speeds. Others, and errors, as
         :func:`lobes_from_modes`.
     """
-    plane = _CuttingPlane.of(modes, milling)
+    plane = CuttingPlaneModes.of(modes, milling)
     even = np.linspace(low, high, points)
     last, safe = _check_range(plane, milling, even, deepest)
     new = np.union1d(even, plane.lobe_speeds(milling, low, high))
-    found = _find_limits(plane, milling, new, last, safe)
+    found = _find_limit_depths(plane, milling, new, last, safe)
     while True:
         n, depth = found.speeds, found.depths
         split = found.gaps(plane.waves(milling, n))
         if not split.any():
             return found
-        more = _find_limits(plane, milling, 0.5 * (n[1:] + n[:-1])[split], last, safe)
+        more = _find_limit_depths(plane, milling, 0.5 * (n[1:] + n[:-1])[split], last, safe)
         order = np.argsort(np.concatenate([n, more.speeds]))
         found = Lobes(
             np.concatenate([n, more.speeds])[order],
@@ -356,7 +359,7 @@ def refine_lobes(
         )
 
 
-def _check_range(plane: _CuttingPlane, milling: Milling, at: Array, deepest: float | None) -> tuple[float, float]:
+def _check_range(plane: CuttingPlaneModes, milling: Milling, at: Array, deepest: float | None) -> tuple[float, float]:
     """Return the deepest depth to try and the zero-order depth, m; errors as :func:`lobes_from_modes`."""
     if at.ndim != 1:
         raise ParameterError("speeds", at.shape, "one speed after another")
@@ -375,7 +378,7 @@ def _check_range(plane: _CuttingPlane, milling: Milling, at: Array, deepest: flo
     return float(deepest), safe
 
 
-def _find_limits(plane: _CuttingPlane, milling: Milling, at: Array, last: float, safe: float) -> Lobes:
+def _find_limit_depths(plane: CuttingPlaneModes, milling: Milling, at: Array, last: float, safe: float) -> Lobes:
     low = min(0.4 * safe, 0.5 * last)
     found = np.array([plane.find_limit(milling, float(speed), low, last) for speed in at])
     return Lobes(at, np.minimum(found, last), found > last, safe)
@@ -399,5 +402,5 @@ def stable_depth(
 
 def stable_depth_from_modes(modes: ToolModes, milling: Milling) -> tuple[float, int]:
     """Return the modes' zero-order stable depth, m, and the index of the chattering mode."""
-    depth, turn = _CuttingPlane.of(modes, milling).stable_depth(milling)
+    depth, turn = CuttingPlaneModes.of(modes, milling).stable_depth(milling)
     return depth, int(np.abs(2.0 * np.pi * modes.frequencies - turn).argmin())

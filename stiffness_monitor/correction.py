@@ -122,13 +122,13 @@ class SetpointStream:
         return finite(corrected, "the corrected set point")
 
 
-def _solve_least_norm(matrix: Array, target: Array, best: Array) -> tuple[Array, Array]:
+def _solve_least_norm(matrix: Array, target: Array, target_change: Array) -> tuple[Array, Array]:
     """Return the least-norm solution within reach, and the projector on the other directions.
 
-    :param best: matrix whose largest singular value is the reference for reach.
+    :param target_change: matrix whose largest singular value is the reference for reach.
     """
     u, values, vt = np.linalg.svd(matrix, full_matrices=False)
-    greatest = np.linalg.svd(best, compute_uv=False)[..., :1]
+    greatest = np.linalg.svd(target_change, compute_uv=False)[..., :1]
     # Below a ratio of 0.02 a direction would need joint offsets of fifty times the deflection.
     held = values > 0.02 * greatest
     along = np.where(held, _multiply(u.swapaxes(-1, -2), target) / np.where(held, values, 1.0), 0.0)

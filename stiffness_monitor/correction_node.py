@@ -122,7 +122,7 @@ class SetpointCorrection(Core):
         """
         self._rules = replace(rules, max_age=round(self._age * SECOND))
 
-    def take(self, answer: Answer) -> None:
+    def update(self, answer: Answer) -> None:
         """Compute and publish the joint offsets that undo a wrench's deflection."""
         if not self.wanted:
             return
@@ -166,14 +166,14 @@ class SetpointCorrection(Core):
             corrected = self._robot.controller.controller_positions(position)
             self._corrected.publish(sample.stamp, corrected)
             if self._paired:
-                self._pair(sample.stamp, "position", corrected)
+                self._publish_pair(sample.stamp, "position", corrected)
 
     def _on_torques(self, message: JointStateView) -> None:
         sample = self._reader.efforts(message, self._node.now(), self._rules)
         efforts, _ = self._limits.apply(sample.given, "reject")
-        self._pair(sample.stamp, "effort", efforts)
+        self._publish_pair(sample.stamp, "effort", efforts)
 
-    def _pair(self, stamp: int, what: str, numbers: Any) -> None:
+    def _publish_pair(self, stamp: int, what: str, numbers: Any) -> None:
         """Publish set point and torques of one stamp, or keep the first until the other arrives."""
         other = self._waiting.pop(stamp, None)
         if other is not None and other[0] != what:

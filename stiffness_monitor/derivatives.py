@@ -72,7 +72,8 @@ def _evaluate_gradients(
 ) -> tuple[Array, Array]:
     """Return a program's derivatives by q, and by geometry and elasticity at constant pose.
 
-    :param chosen: places of the numbers that are needed; without geometry q is left out.
+    :param chosen: indices of the numbers to differentiate by; None for all. Derivatives by q are
+        computed only if a number of the geometry is among them.
     :returns: shape (..., outputs, k) each.
     """
     compliance(robot, pose)  # its errors

@@ -62,17 +62,17 @@ class Bar(NamedTuple):
 
 
 def rigid_offset(arm: Any) -> Any:
-    """Return the map of displacements between two points of a rigid body, shape (6, 6).
+    """Return the matrix (6, 6) from the displacement of a rigid body's point to that of another one.
 
     ``arm``: from the point whose displacement is known to the other one.
     """
     x, y, z = arm.tolist()
-    turned = [[1.0, 0, 0, 0, z, -y], [0, 1.0, 0, -z, 0, x], [0, 0, 1.0, y, -x, 0]]
-    return np.array([*turned, *np.eye(6)[3:].tolist()])
+    rows = [[1.0, 0, 0, 0, z, -y], [0, 1.0, 0, -z, 0, x], [0, 0, 1.0, y, -x, 0]]
+    return np.array([*rows, *np.eye(6)[3:].tolist()])
 
 
-def turned(axes: Any, displacements: Any) -> Any:
-    """Multiply both halves of displacements, shape (6, k), by a matrix (3, 3)."""
+def rotate_displacements(axes: Any, displacements: Any) -> Any:
+    """Rotate translations and rotations of displacements, shape (6, k), by a matrix (3, 3)."""
     return (axes @ displacements.reshape(2, 3, -1)).reshape(6, -1)
 
 
@@ -96,12 +96,12 @@ def deformations(length: Any, stretch: Any, twist: Any, bend: Any, shear: Any) -
 
     :param stretch: EA. ``twist``: GJ. ``bend``: EI. ``shear``: phi L^2.
     """
-    per = 1.0 / length
-    found = [({0: -1.0, 6: 1.0}, stretch * per), ({3: -1.0, 9: 1.0}, twist * per)]
-    bow = 3.0 * bend * per / (1.0 + shear * per * per)
+    inverse_length = 1.0 / length
+    found = [({0: -1.0, 6: 1.0}, stretch * inverse_length), ({3: -1.0, 9: 1.0}, twist * inverse_length)]
+    bending = 3.0 * bend * inverse_length / (1.0 + shear * inverse_length * inverse_length)
     for v, r, side in PLANES:
-        found.append(({r: -side, 6 + r: side}, bend * per))
-        found.append(({v: 2.0 * per, 6 + v: -2.0 * per, r: side, 6 + r: side}, bow))
+        found.append(({r: -side, 6 + r: side}, bend * inverse_length))
+        found.append(({v: 2.0 * inverse_length, 6 + v: -2.0 * inverse_length, r: side, 6 + r: side}, bending))
     return found
 
 
@@ -116,8 +116,8 @@ class Frame:
     """Set up the coordinates of a structural model in a pose.
 
     ``nodes``: points that other parts attach to, by name and end. ``bars``: members. ``springs``:
-    columns of joints. ``held``: linear forms that closures keep zero; coordinates from ``last`` on
-    belong to closures.
+    columns of joints. ``constraints``: linear forms that are zero in a closed loop; coordinates from
+    ``first_closure_coordinate`` on belong to closures.
 
     :param static: loads act on the platform alone, so that a strut only stretches.
     """
@@ -130,21 +130,23 @@ class Frame:
         }
         self.bars: list[Bar] = []
         self.springs: list[Column] = []
-        self.held: list[Row] = []
+        self.constraints: list[Row] = []
         for part in model.parts:
             if isinstance(part, Carried):
                 self.nodes[part.name, 0] = self._point_by_joint(part.support, part.at)
             else:
                 self._add_member(part)
-        self.last = self.size
+        self.first_closure_coordinate = self.size
         for closure in model.closures:
             # The joint's free directions become coordinates; the other directions are constrained.
             support = closure.support
             first = self._point_on_body(*closure.inner, closure.at)
             second = self._point_on_body(support.body, support.end, closure.at)
-            own, lets = self._add_joint(support)
-            minus, plus = (turned(support.axes.T, node.map) for node in (first, second))
-            self.held += [sum_forms((first.own, -minus[k]), (second.own, plus[k]), (own, -lets[k])) for k in range(6)]
+            own, free_directions = self._add_joint(support)
+            minus, plus = (rotate_displacements(support.axes.T, node.map) for node in (first, second))
+            self.constraints += [
+                sum_forms((first.own, -minus[k]), (second.own, plus[k]), (own, -free_directions[k])) for k in range(6)
+            ]
 
     def _add_coordinates(self, count: int) -> range:
         self.size += count
@@ -164,28 +166,28 @@ class Frame:
         24), are columns here.
         """
         kinds = [k for k, compliance in enumerate(support.compliance) if not is_zero(compliance)]
-        lets = [np.eye(6)[k] for k in kinds]
-        lets += [pitch * np.eye(6)[k] + np.eye(6)[3 + k] for k, pitch in support.screws]
-        own = self._add_coordinates(len(lets))
+        free_directions = [np.eye(6)[k] for k in kinds]
+        free_directions += [pitch * np.eye(6)[k] + np.eye(6)[3 + k] for k, pitch in support.screws]
+        own = self._add_coordinates(len(free_directions))
         self.springs += [
             Column(support.joint, {index: 1.0}, 1.0 / support.compliance[k])
             for index, k in zip(own, kinds, strict=False)
             if support.compliance[k] != FREE
         ]
-        return own, np.array(lets).reshape(-1, 6).T
+        return own, np.array(free_directions).reshape(-1, 6).T
 
     def _point_by_joint(self, support: Support, at: Any) -> Node:
         """Return a point that is attached to a body by a joint."""
         node = self._point_on_body(support.body, support.end, at)
-        own, lets = self._add_joint(support)
-        return Node((*node.own, *own), np.hstack((node.map, turned(support.axes, lets))), at)
+        own, free_directions = self._add_joint(support)
+        return Node((*node.own, *own), np.hstack((node.map, rotate_displacements(support.axes, free_directions))), at)
 
     def _add_member(self, member: Member) -> None:
         ends = []
         pairs = (member.inner, member.start), (member.outer, member.end)
         for k, (support, at) in enumerate(pairs):
             if support is None:
-                node = Node(self._add_coordinates(6), turned(member.axes, np.eye(6)), at)
+                node = Node(self._add_coordinates(6), rotate_displacements(member.axes, np.eye(6)), at)
                 ends.append(node._replace(map=np.eye(6)))
             else:
                 if self.static and member.strut:
@@ -193,31 +195,31 @@ class Frame:
                 node = self._point_by_joint(support, at if support.at is None else support.at)
                 if support.at is not None:
                     node = Node(node.own, rigid_offset(at - node.at) @ node.map, at)
-                ends.append(node._replace(map=turned(member.axes.T, node.map)))
+                ends.append(node._replace(map=rotate_displacements(member.axes.T, node.map)))
             self.nodes[member.name, k] = node
         self.bars.append(Bar(member, tuple(ends)))
 
     def columns(self, bar: Bar) -> list[Column]:
         """Return a member's stiffness columns, with rigidities of :func:`deformations`."""
         member, ends = bar
-        ways = deformations(member.length, *member.section)
+        modes = deformations(member.length, *member.section)
         return [
             Column(
                 member.body,
                 sum_forms(*((ends[k // 6].own, f * ends[k // 6].map[k % 6]) for k, f in form.items())),
                 rigidity,
             )
-            for form, rigidity in (ways[:1] if self.static and member.strut else ways)
+            for form, rigidity in (modes[:1] if self.static and member.strut else modes)
         ]
 
     def table(self) -> Any:
         """Return the closures' constraint matrix, shape (rows, size)."""
-        table = np.zeros((len(self.held), self.size), dtype=object)
-        for line, row in zip(table, self.held, strict=True):
+        table = np.zeros((len(self.constraints), self.size), dtype=object)
+        for line, row in zip(table, self.constraints, strict=True):
             line[list(row)] = list(row.values())
         return table
 
-    def dependents(self, tables: Array) -> tuple[list[int], list[int]]:
+    def choose_dependents(self, tables: Array) -> tuple[list[int], list[int]]:
         """Choose independent constraint rows, and as many coordinates that depend on the others.
 
         Redundant equations of an overconstrained machine are left out.
@@ -235,7 +237,7 @@ class Frame:
                 "hold the platform rigidly in some directions; in a direction that a joint holds, "
                 "for example 1e-9 m/N or 1e-7 rad/(N m)",
             )
-        # Prefer the closures' own coordinates: each is in one or two equations only.
-        weight = np.where(np.arange(PLATFORM, self.size) < self.last, 1.0, 10.0)
+        # Prefer the coordinates of closures, because each is in one or two equations only.
+        weight = np.where(np.arange(PLATFORM, self.size) < self.first_closure_coordinate, 1.0, 10.0)
         chosen = independent_rows((tables[:, rows, PLATFORM:] * weight).swapaxes(-1, -2))
         return rows, [PLATFORM + k for k in chosen]

@@ -49,7 +49,7 @@ def limb_stiffness(robot: Robot, pose: ArrayLike) -> LimbStiffness:
 
     :param pose: shape (..., 3), m and rad.
     :raises ParameterError: a mechanism other than ``upr_rpu``.
-    :raises UnreachableError: a pose that is none of the mechanism's.
+    :raises UnreachableError: a pose that the mechanism cannot reach.
     """
     q = robot.inverse(pose)
     wrenches = robot.limb_wrenches(pose)

@@ -60,13 +60,13 @@ def element_matrices(section: Section, length: float) -> tuple[Array, Array]:
 
 def member_matrices(section: Section, length: float, elements: int) -> tuple[Array, Array]:
     """Return stiffness and mass of a chain of equal elements, (6 (elements + 1),) * 2."""
-    one, weight = element_matrices(section, length / elements)
+    element_stiffness, element_mass = element_matrices(section, length / elements)
     size = 6 * (elements + 1)
     stiffness, mass = np.zeros((size, size)), np.zeros((size, size))
     for k in range(elements):
         at = slice(6 * k, 6 * k + 12)
-        stiffness[at, at] += one
-        mass[at, at] += weight
+        stiffness[at, at] += element_stiffness
+        mass[at, at] += element_mass
     return stiffness, mass
 
 
@@ -82,19 +82,19 @@ def _member_basis(section: Section, length: float, elements: int, kept: int | No
     ends, inside = np.r_[0:6, size - 6 : size], np.arange(6, size - 6)
     basis = np.zeros((size, 12))
     basis[ends] = np.eye(12)
-    own = np.eye(len(inside))
+    inner_modes = np.eye(len(inside))
     if kept is not None and kept < len(inside):
-        held = stiffness[np.ix_(inside, inside)]
-        # Static shapes decouple the ends from the modes in the stiffness matrix.
-        basis[inside] = -np.linalg.solve(held, stiffness[np.ix_(inside, ends)])
+        inner_stiffness = stiffness[np.ix_(inside, inside)]
+        # Static deformations by the ends' displacements are not coupled with fixed-end modes in the stiffness.
+        basis[inside] = -np.linalg.solve(inner_stiffness, stiffness[np.ix_(inside, ends)])
         root = np.linalg.inv(np.linalg.cholesky(mass[np.ix_(inside, inside)]))
-        values, vectors = np.linalg.eigh(root @ held @ root.T)
-        # Keep equal eigenvalues together: half a pair would make a round bar anisotropic.
+        values, vectors = np.linalg.eigh(root @ inner_stiffness @ root.T)
+        # Keep all modes of a repeated eigenvalue: one alone would make a round bar anisotropic.
         while kept < len(values) and values[kept] < values[kept - 1] * (1 + 1e-6):
             kept += 1
-        own = root.T @ vectors[:, :kept]
-    modal = np.zeros((size, own.shape[1]))
-    modal[inside] = own
+        inner_modes = root.T @ vectors[:, :kept]
+    modal = np.zeros((size, inner_modes.shape[1]))
+    modal[inside] = inner_modes
     basis = np.hstack((basis, modal))
     result = basis, basis.T @ stiffness @ basis, basis.T @ mass @ basis
     for array in result:
@@ -173,53 +173,53 @@ def assemble(model: StructuralModel, elements: int, kept: int | None = None) -> 
     """
     frame = Frame(model)
     names, positions = [model.platform], [model.origin[None]]
-    whole: list[Part] = []
+    parts: list[Part] = []
     for body in model.bodies:
         node = frame.nodes[body.body, 0]
-        weight = body_mass(body, node.at)
-        whole.append(Part(body.name, list(node.own), node.map, np.zeros((6, 6)), weight))
+        mass_matrix = body_mass(body, node.at)
+        parts.append(Part(body.name, list(node.own), node.map, np.zeros((6, 6)), mass_matrix))
     members: list[tuple[int, Array, Array]] = []
     size = frame.size
     for member, ends in frame.bars:
-        # Rounded, so that a member of constant length hits the cache in every pose.
+        # Round the length, so that a member of constant length is in the cache in every pose.
         length = round(float(member.length), 12)
         basis, stiffness, mass = _member_basis(member.section, length, elements, kept)
-        # Inner coordinates are along the member's own axes.
+        # The inner coordinates are displacements in the member's own axes.
         rows = len(mass)
         own = [*dict.fromkeys([*ends[0].own, *ends[1].own]), *range(size, size + rows - 12)]
         size += rows - 12
-        joined = np.zeros((rows, len(own)))
-        joined[12:, len(own) - rows + 12 :] = np.eye(rows - 12)
+        end_map = np.zeros((rows, len(own)))
+        end_map[12:, len(own) - rows + 12 :] = np.eye(rows - 12)
         for first, node in zip((0, 6), ends, strict=True):
-            joined[first : first + 6, [own.index(k) for k in node.own]] = node.map
-        members.append((len(whole), basis, member.axes))
-        whole.append(Part(member.body, own, joined, stiffness, mass))
+            end_map[first : first + 6, [own.index(k) for k in node.own]] = node.map
+        members.append((len(parts), basis, member.axes))
+        parts.append(Part(member.body, own, end_map, stiffness, mass))
         shares = np.arange(elements + 1)[:, None] / elements
         positions.append(member.start + shares * (member.end - member.start))
         names += [f"{member.name} {k}/{elements}" for k in range(elements + 1)]
     for spring in frame.springs:
         row = np.array([list(spring.row.values())], np.float64)
         rigidity = np.array([[spring.rigidity]])
-        whole.append(Part(spring.element, list(spring.row), row, rigidity, np.zeros((1, 1))))
-    if frame.held:
+        parts.append(Part(spring.element, list(spring.row), row, rigidity, np.zeros((1, 1))))
+    if frame.constraints:
         # Basis of the closures' null space, (size, fewer); the first six rows are unit.
-        table = np.zeros((len(frame.held), size))
+        table = np.zeros((len(frame.constraints), size))
         table[:, : frame.size] = frame.table()
-        dependent, chosen = frame.dependents(table[None, :, : frame.size])
+        dependent, chosen = frame.choose_dependents(table[None, :, : frame.size])
         free = [k for k in range(size) if k not in chosen]
         null = np.eye(size)[:, free]
         null[chosen] = -np.linalg.solve(table[np.ix_(dependent, chosen)], table[np.ix_(dependent, free)])
         basis = null
         size = basis.shape[1]
-        every = list(range(size))
-        whole = [Part(p.name, every, p.map @ basis[p.own], p.stiffness, p.mass) for p in whole]
+        all_coordinates = list(range(size))
+        parts = [Part(p.name, all_coordinates, p.map @ basis[p.own], p.stiffness, p.mass) for p in parts]
     stiffness, mass = np.zeros((size, size)), np.zeros((size, size))
-    for part in whole:
+    for part in parts:
         at = np.ix_(part.own, part.own)
         stiffness[at] += part.map.T @ part.stiffness @ part.map
         mass[at] += part.map.T @ part.mass @ part.map
-    where = np.concatenate(positions)
-    return System(stiffness, mass, tuple(whole), tuple(names), where, tuple(members))
+    node_positions = np.concatenate(positions)
+    return System(stiffness, mass, tuple(parts), tuple(names), node_positions, tuple(members))
 
 
 ELEMENTS: Final = 8
@@ -265,11 +265,11 @@ def natural_frequencies(robot: Robot, pose: ArrayLike, count: int = 6, *, elemen
     :param pose: shape (..., m), the mechanism's pose coordinates, m and rad.
     :param elements: beam elements a member.
     :raises ParameterError: a robot whose file has no data for modes, by the missing section.
-    :raises UnreachableError: a pose that is none of the mechanism's.
+    :raises UnreachableError: a pose that the mechanism cannot reach.
     :raises SingularityError: a pose in which the frame is a mechanism, with locked actuators.
     :raises ValueError: a wrong last axis, a value that is not finite, too many modes.
     """
-    q = _solve_joints(robot, pose)
+    q = _inverse_kinematics(robot, pose)
     result = np.empty((*q.shape[:-1], count))
     for index in np.ndindex(*q.shape[:-1]):
         system = frame_system(robot, q[index], elements)
@@ -285,7 +285,7 @@ def modes(robot: Robot, pose: ArrayLike, count: int = 6, *, elements: int = ELEM
     :param pose: shape (..., m), the mechanism's pose coordinates, m and rad.
     :param elements: beam elements a member.
     """
-    q = _solve_joints(robot, pose)
+    q = _inverse_kinematics(robot, pose)
     batch = q.shape[:-1]
     if not np.prod(batch, dtype=int):
         raise ValueError("modes: no poses given")
@@ -319,7 +319,7 @@ def has_modes(robot: Robot) -> bool:
     return True
 
 
-def _solve_joints(robot: Robot, pose: ArrayLike) -> Array:
+def _inverse_kinematics(robot: Robot, pose: ArrayLike) -> Array:
     """Return joint positions of poses, for a robot with masses and elastic members."""
     robot.massive()
     _ = robot.elastic
@@ -369,9 +369,9 @@ def solve_modes(system: System, count: int, index: tuple[int, ...], *, vectors: 
     if not vectors:
         values = scipy.linalg.eigh(matrix, eigvals_only=True, subset_by_index=chosen, check_finite=False, driver="evr")
         return _to_frequencies(values), np.empty((size, 0))
-    values, own = scipy.linalg.eigh(matrix, subset_by_index=chosen, check_finite=False, driver="evr")
-    found = scipy.linalg.solve_triangular(root, own, lower=True, trans=1, check_finite=False)
-    return _to_frequencies(values), (found / np.sqrt(np.maximum(values, 1e-300)))[:, ::-1]
+    values, eigenvectors = scipy.linalg.eigh(matrix, subset_by_index=chosen, check_finite=False, driver="evr")
+    vectors_found = scipy.linalg.solve_triangular(root, eigenvectors, lower=True, trans=1, check_finite=False)
+    return _to_frequencies(values), (vectors_found / np.sqrt(np.maximum(values, 1e-300)))[:, ::-1]
 
 
 def _to_frequencies(values: Array) -> Array:

@@ -24,8 +24,8 @@ Settings = WrenchSettings
 class Answer:
     """Hold the platform's response to one wrench.
 
-    ``energy`` and ``wrench`` (6,) in base axes at the platform's reference point; ``rotation`` (3,
-    3) turns platform axes into fixed ones.
+    ``wrench`` (6,) and the response ``energy`` are in base axes at the platform's reference point;
+    ``rotation`` (3, 3) is that of the platform relative to the base.
     """
 
     stamp: int

@@ -24,7 +24,7 @@ from pkm_twin.ros.joints import header, named, xyz
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.run import run
 from pkm_twin.ros.wrench import declare_mounts
-from pkm_twin.settings import changeable, with_parameters
+from pkm_twin.settings import list_changeable, with_parameters
 from pkm_twin.streams.monitor import Pace
 from pkm_twin.streams.wrench import PLATFORM
 from stiffness_monitor.alarm_node import StiffnessAlarmTopics
@@ -67,20 +67,20 @@ class StiffnessMonitor(TwinNode):
         self._alarm = StiffnessAlarmTopics(
             self, robot, settings.stamp_rules, (settings.base_frame, self._platform_frame or settings.platform_frame)
         )
-        # Messages without stamp or with text values have a second topic that plots can draw.
+        # Plots need stamps and numbers: messages without them have a second topic.
         self._outputs = [
             (self.create_guarded_publisher(topic), make)
             for topic, make in (
                 ("~/compliance", _compliance_message),
                 (
                     "~/compliance_stamped",
-                    lambda a: named(self._in_base(a), ENTRIES, a.compliance[UPPER_TRIANGLE].tolist()),
+                    lambda a: named(self._base_header(a), ENTRIES, a.compliance[UPPER_TRIANGLE].tolist()),
                 ),
                 ("~/strain_energy", self._energies_message),
                 (
                     "~/strain_energy_stamped",
                     lambda a: named(
-                        self._in_base(a),
+                        self._base_header(a),
                         a.energy.elements,
                         a.energy.factors.tolist(),
                         efforts=a.energy.energies.tolist(),
@@ -109,7 +109,7 @@ class StiffnessMonitor(TwinNode):
         )
         self.create_guarded_subscription("wrench", self._on_wrench)
         self.follow(
-            changeable(Settings), lambda values: with_parameters(self.core.settings, values), self._change_settings
+            list_changeable(Settings), lambda values: with_parameters(self.core.settings, values), self._change_settings
         )
         self.start()
 
@@ -158,10 +158,10 @@ class StiffnessMonitor(TwinNode):
         if answer is None:
             return
         for publisher, make in self._outputs:
-            # Most of the time goes into messages: only those that have a subscriber are made.
+            # Make only the messages that have a subscriber, because making them takes most of the time.
             if publisher.get_subscription_count():
                 publisher.publish(make(answer))
-        self.call_further_outputs("correction or alarm", answer, self._correction.take, self._alarm.take)
+        self.call_further_outputs("correction or alarm", answer, self._correction.update, self._alarm.update)
 
     def _publish_frequencies(self) -> None:
         """Publish the frequencies of the latest joint state, at most at ``frequencies_rate``."""
@@ -184,7 +184,7 @@ class StiffnessMonitor(TwinNode):
         names = [f"mode_{k + 1}" for k in range(len(values))]
         self._frequencies_stamped.publish(named(header(self._published_stamp, ""), names, values.tolist()))
 
-    def _in_base(self, answer: Answer) -> Header:
+    def _base_header(self, answer: Answer) -> Header:
         return header(answer.stamp, self.core.settings.base_frame)
 
     def _energies_message(self, answer: Answer) -> DiagnosticArray:
@@ -206,14 +206,14 @@ class StiffnessMonitor(TwinNode):
             hardware_id=robot.name,
             values=[KeyValue(key=key, value=value) for key, value in pairs.items()],
         )
-        return DiagnosticArray(header=self._in_base(answer), status=[status])
+        return DiagnosticArray(header=self._base_header(answer), status=[status])
 
     def _deflection_message(self, answer: Answer) -> TransformStamped:
         """Return the transform from platform to deflected platform, in platform axes."""
         shift = answer.rotation.T @ answer.energy.deflection[:3]
         turn = answer.rotation.T @ answer.energy.deflection[3:]
         angle = math.sqrt(float(turn @ turn))
-        # sin(x/2)/x goes to 1/2: deflections are so small that the quotient would lose digits.
+        # Near zero sin(x/2)/x is 1/2; the quotient of tiny numbers would lose digits.
         scale = 0.5 if angle < 1e-6 else math.sin(angle / 2) / angle
         frame = self._platform_frame or self.core.settings.platform_frame
         message = TransformStamped(header=header(answer.stamp, frame), child_frame_id=f"{frame}_deflected")

@@ -34,28 +34,28 @@ def list_numbers(structure: Structure) -> list[Any]:
 def substitute_numbers(structure: Structure, graph: Graph, numbers: Numbers) -> tuple[Structure, Rigidities]:
     """Return beams and compliances with other numbers, in the order of :func:`list_numbers`.
 
-    Properties of the known case are kept as assumptions: that a beam ends at a joint, and which
-    compliances are zero, finite or infinite.
+    The programs assume that the same beams end at joints, and that the same compliances are zero,
+    finite or infinite.
     """
-    left = iter(numbers)
-    places = list(_end_points(graph))
+    remaining = iter(numbers)
+    points = list(_end_points(graph))
 
-    def end(place: Place) -> Place:
+    def read_end(place: Place) -> Place:
         values = np.empty(3, dtype=object)
-        values[:] = [next(left) for _ in range(3)]
-        k = _find_point(places, values)
-        # A free tape has each end as an input of its own, so that derivatives by it exist.
+        values[:] = [next(remaining) for _ in range(3)]
+        k = _find_point(points, values)
+        # With a free tape each end is a separate input, so that derivatives by it exist.
         if k is not None and not values[0].tape.free:
-            for known, value in zip(places[k], values, strict=True):
+            for known, value in zip(points[k], values, strict=True):
                 snapped(value - known)
-            values = places[k]
+            values = points[k]
         return place[0], values
 
     beams, rigidities = [], {}
     for beam in structure.beams:
-        beams.append(replace(beam, inner=end(beam.inner), outer=end(beam.outer)))
-        rigidities[beam.name] = [next(left) for _ in range(4)]
-    compliances = {name: [next(left) for _ in values] for name, values in structure.compliances.items()}
+        beams.append(replace(beam, inner=read_end(beam.inner), outer=read_end(beam.outer)))
+        rigidities[beam.name] = [next(remaining) for _ in range(4)]
+    compliances = {name: [next(remaining) for _ in values] for name, values in structure.compliances.items()}
     for value in (v for values in compliances.values() for v in values):
         finite = _is_finite(value)
         value.tape.assumed.append((finite, finite.value))
@@ -81,11 +81,11 @@ def _end_points(graph: Graph) -> Iterator[Array]:
         yield from rod.ends
 
 
-def _find_point(places: Sequence[Array], at: Any) -> int | None:
+def _find_point(points: Sequence[Array], at: Any) -> int | None:
     """Return the index of the point that coincides with a position; None without one."""
     here = references(at)
-    near = (k for k, one in enumerate(places) if np.abs(references(one) - here).max() < SNAP)
-    return next(near, None)
+    coinciding = (k for k, one in enumerate(points) if np.abs(references(one) - here).max() < SNAP)
+    return next(coinciding, None)
 
 
 def _is_finite(compliance: Any) -> Any:

@@ -35,12 +35,13 @@ DEFLECTION_PARTS: Final = 4
 """Parts that a member is divided into to draw its deflection."""
 NO_PARAMETERS: Final = np.zeros(0)
 """Empty parameters of the programs: kernels hold all numbers."""
-_TINY: Final = 1e-200
+MIN_SCALE: Final = 1e-200
+"""Lower bound of divisors that are zero in a mechanism, far below every stiffness."""
 
 
 @dataclass(frozen=True)
 class DependentCoordinates:
-    """Hold which frame coordinates depend on others by closures: ``chosen``, by ``rows``.
+    """Hold the frame coordinates ``chosen`` that the constraint ``rows`` of closures determine.
 
     ``sample``: index of the engine state at which the closures' rank is largest; 0, home, if
     possible.
@@ -68,7 +69,7 @@ class Elastic:
         self._kernels: dict[str, Kernel] = {}
 
     @cached_property
-    def followers(self) -> DependentCoordinates | None:
+    def dependent_coordinates(self) -> DependentCoordinates | None:
         """Dependent coordinates, from the closures' ranks at and near home; None without closures.
 
         :raises ParameterError: the closures hold the platform itself.
@@ -76,26 +77,26 @@ class Elastic:
         if not self.plan.closures:
             return None
         engine = self.robot.engine
-        frames = [self._frame(Motion(engine.tree, x, q)) for x, q in engine.samples]
+        frames = [self._build_frame(Motion(engine.tree, x, q)) for x, q in engine.samples]
         tables = np.array([frame.table() for frame in frames], np.float64)
-        # Home can be a singularity of the frame.
+        # The frame may be singular at home: take the samples of the largest rank.
         ranks = np.array([len(independent_rows(table[None, :, PLATFORM:])) for table in tables])
         most = ranks == ranks.max()
-        rows, chosen = frames[0].dependents(tables[most])
+        rows, chosen = frames[0].choose_dependents(tables[most])
         pivots = pivot_order(tables[most][:, rows][:, :, chosen])
         return DependentCoordinates(tuple(rows), tuple(chosen), pivots, int(most.argmax()))
 
-    def _frame(self, motion: Motion) -> Frame:
+    def _build_frame(self, motion: Motion) -> Frame:
         """Return the frame in a numeric state, every rigidity and compliance one."""
         model = place_plan(self.plan, motion.point, motion.direction, lambda _: [1.0] * 4, lambda *_: 1.0)
         return Frame(model, static=True)
 
     @cached_property
     def _key(self) -> str:
-        tree, followers = self.robot.engine.tree, self.followers
+        tree, dependents = self.robot.engine.tree, self.dependent_coordinates
         pattern = constant_pattern(self.structure, tree)
-        own = self.robot.graph.key if followers is not None and followers.sample else ""
-        return repr((_plain_data(self.plan), pattern, self.names, followers, own))
+        own = self.robot.graph.key if dependents is not None and dependents.sample else ""
+        return repr((_plain_data(self.plan), pattern, self.names, dependents, own))
 
     def kernel(self, name: str, write: Callable[[SymbolicFrame], Program], *, free: bool = False) -> Kernel:
         """Return the compiled program of all numbers of the machine, as :meth:`Engine.kernel`."""
@@ -146,16 +147,16 @@ def _plain_data(value: Any) -> Any:
     return [_plain_data(one) for one in value] if isinstance(value, tuple) else value
 
 
-def _dot(a: Iterable[Any], b: Iterable[Any]) -> Any:
+def _sum_products(a: Iterable[Any], b: Iterable[Any]) -> Any:
     return sum((x * y for x, y in zip(a, b, strict=True)), 0.0)
 
 
 class SymbolicFrame:
     """Express the elastic frame of a solved motion.
 
-    ``follow``: rows of the coordinates that closures determine, by the others. ``place``: numbers
-    of the others. ``columns``: on the others, first those of the members in order, then those of
-    joints.
+    ``dependent_rows``: linear forms of the dependent coordinates in the independent ones. ``place``:
+    index of each independent coordinate. ``columns``: deformation modes by the independent
+    coordinates, first those of the members in order, then those of joints.
     """
 
     def __init__(self, t: Traced, elastic: Elastic) -> None:
@@ -163,19 +164,23 @@ class SymbolicFrame:
         self.t, self.elastic = t, elastic
         self.structure, self.rigidities = substitute_numbers(elastic.structure, t.graph, t.more)
         self.plan = plan_structure(t.graph, self.structure)
-        self.frame = frame = self._frame(t.motion)
+        self.frame = frame = self._build_frame(t.motion)
         self.measure: Any = 1.0
-        self.follow = {} if elastic.followers is None else self._solve_closures(elastic.followers)
-        left = (k for k in range(frame.size) if k not in self.follow)
+        self.dependent_rows = (
+            {} if elastic.dependent_coordinates is None else self._solve_closures(elastic.dependent_coordinates)
+        )
+        left = (k for k in range(frame.size) if k not in self.dependent_rows)
         self.place = {k: i for i, k in enumerate(left)}
         columns = [column for bar in frame.bars for column in frame.columns(bar)]
-        # By the coordinates that closures leave independent.
+        # Express the columns by the independent coordinates.
         self.columns = [
-            column._replace(row={self.place[k]: value for k, value in _substitute(column.row, self.follow).items()})
+            column._replace(
+                row={self.place[k]: value for k, value in _substitute(column.row, self.dependent_rows).items()}
+            )
             for column in (*columns, *frame.springs)
         ]
 
-    def _frame(self, motion: Motion) -> Frame:
+    def _build_frame(self, motion: Motion) -> Frame:
         compliances = self.structure.compliances
         model = place_plan(
             self.plan,
@@ -187,20 +192,21 @@ class SymbolicFrame:
         return Frame(model, static=True)
 
     def _solve_closures(self, chosen: DependentCoordinates) -> dict[int, Row]:
-        t, assumed, known = self.t, self.t.tape.assumed, self.t.home
+        t, assumed, reference_motion = self.t, self.t.tape.assumed, self.t.home
         if chosen.sample:
-            known = Motion(t.tree, *self.elastic.robot.engine.samples[chosen.sample])
-            # The sample state belongs to this geometry only.
+            reference_motion = Motion(t.tree, *self.elastic.robot.engine.samples[chosen.sample])
+            # The reference state is valid for this geometry only.
             assumed += [(e, e.value) for e in t.tape.inputs(GEOMETRY, len(t.tape.reference))]
-        follow, lu, _ = solve_dependents(self.frame, chosen)
-        _, there, left = solve_dependents(self._frame(known), chosen)
-        # With other numbers a redundant closure could become independent; numbers agree to 1e-9, residuals to 1e-6.
-        assumed += [(e * 1e-3, 0.0) for e in t.lift(left)]
-        # Zero where the closures no longer determine the chosen coordinates.
-        self.measure = 1.0 / maximum(absolute(lu.inverse_determinant / there.inverse_determinant), _TINY)
-        growth = lu.find_growth(there.inverse_pivots, np.ones(lu.size))
+        dependent_rows, lu, _ = solve_dependents(self.frame, chosen)
+        _, home_factors, residuals = solve_dependents(self._build_frame(reference_motion), chosen)
+        # A redundant closure must stay redundant with other numbers: assume that its residual is zero. Residuals
+        # may be 1e-6, a thousand times the tolerance of assumed numbers.
+        assumed += [(e * 1e-3, 0.0) for e in t.lift(residuals)]
+        # The measure is zero where the closures do not determine the dependent coordinates.
+        self.measure = 1.0 / maximum(absolute(lu.inverse_determinant / home_factors.inverse_determinant), MIN_SCALE)
+        growth = lu.find_growth(home_factors.inverse_pivots, np.ones(lu.size))
         self.measure = select(less(growth, MAX_GROWTH), self.measure, 0.0)
-        return follow
+        return dependent_rows
 
     def factorise(self) -> None:
         """Factorise the stiffness; set the platform's ``compliance`` and the frame's ``measure``.
@@ -216,7 +222,7 @@ class SymbolicFrame:
                 scaled = column.rigidity * x
                 for j, y in row[: at + 1]:
                     matrix[i, j] = matrix.get((i, j), 0.0) + scaled * y
-        scale = [maximum(matrix[i, i], _TINY) for i in range(n)]
+        scale = [maximum(matrix[i, i], MIN_SCALE) for i in range(n)]
         self.root = root = SparseCholesky(matrix, scale, PLATFORM)
         for index, pivot in zip(root.order, root.pivots, strict=True):
             self.measure = minimum(self.measure, pivot / scale[index])
@@ -225,12 +231,12 @@ class SymbolicFrame:
         for i in range(PLATFORM):
             for j in range(i):
                 lower = [root.factors.get((first + i, first + k), 0.0) for k in range(j, i)]
-                w[i][j] = -_dot(lower, [w[k][j] for k in range(j, i)])
+                w[i][j] = -_sum_products(lower, [w[k][j] for k in range(j, i)])
         inverse = [1.0 / pivot for pivot in root.pivots[first:]]
         self.compliance = np.zeros((PLATFORM, PLATFORM), dtype=object)
         for i in range(PLATFORM):
             for j in range(i + 1):
-                value = _dot(inverse[i:], [w[k][i] * w[k][j] for k in range(i, PLATFORM)])
+                value = _sum_products(inverse[i:], [w[k][i] * w[k][j] for k in range(i, PLATFORM)])
                 self.compliance[i, j] = self.compliance[j, i] = value
 
     def load(self, wrench: Any) -> None:
@@ -242,12 +248,12 @@ class SymbolicFrame:
         root, x = self.root, [0.0] * len(self.place)
         x[-PLATFORM:] = self.compliance @ wrench
         for j in reversed(range(len(x) - PLATFORM)):
-            x[j] = -_dot([root.factors[i, j] for i in root.below[j]], [x[i] for i in root.below[j]])
-        found = [x[root.place[i]] for i in range(len(x))]
-        self.amounts = [_dot(c.row.values(), [found[i] for i in c.row]) for c in self.columns]
-        self.x = {k: found[i] for k, i in self.place.items()}
-        for k, row in self.follow.items():
-            self.x[k] = _dot(row.values(), [self.x[c] for c in row])
+            x[j] = -_sum_products([root.factors[i, j] for i in root.below[j]], [x[i] for i in root.below[j]])
+        ordered = [x[root.place[i]] for i in range(len(x))]
+        self.amounts = [_sum_products(c.row.values(), [ordered[i] for i in c.row]) for c in self.columns]
+        self.x = {k: ordered[i] for k, i in self.place.items()}
+        for k, row in self.dependent_rows.items():
+            self.x[k] = _sum_products(row.values(), [self.x[c] for c in row])
 
     def energies(self) -> list[Any]:
         """Return the strain energies U_ij of the elements under the load, in their order.
@@ -255,10 +261,10 @@ class SymbolicFrame:
         Of bars and joints: W' C_ij W / 2 of the 2UPR-RPU paper (equations 4, 9, 14 and 26), here
         d (b . x)^2 / 2 summed over an element's columns.
         """
-        found: dict[str, Any] = dict.fromkeys(self.elastic.names, 0.0)
+        energies: dict[str, Any] = dict.fromkeys(self.elastic.names, 0.0)
         for column, amount in zip(self.columns, self.amounts, strict=True):
-            found[column.element] += 0.5 * column.rigidity * (amount * amount)
-        return list(found.values())
+            energies[column.element] += 0.5 * column.rigidity * (amount * amount)
+        return list(energies.values())
 
     def program(self, inputs: dict[str, int], outputs: dict[str, Any]) -> Program:
         """Return the program from q and further inputs to these outputs."""
@@ -276,17 +282,17 @@ def solve_dependents(frame: Frame, chosen: DependentCoordinates) -> tuple[dict[i
     """
     table = frame.table()[list(chosen.rows)]
     lu = SparseLU(table[:, list(chosen.chosen)], chosen.pivots)
-    rest = sorted({k for r in chosen.rows for k in frame.held[r]} - set(chosen.chosen))
-    solved = [lu.solve(-table[:, k]) for k in rest]
-    follow = {c: sum_forms((rest, [one[i] for one in solved])) for i, c in enumerate(chosen.chosen)}
-    others = (row for r, row in enumerate(frame.held) if r not in chosen.rows)
-    left = [value for row in others for value in _substitute(row, follow).values()]
-    return follow, lu, left
+    others = sorted({k for r in chosen.rows for k in frame.constraints[r]} - set(chosen.chosen))
+    solutions = [lu.solve(-table[:, k]) for k in others]
+    dependent_rows = {c: sum_forms((others, [one[i] for one in solutions])) for i, c in enumerate(chosen.chosen)}
+    redundant = (row for r, row in enumerate(frame.constraints) if r not in chosen.rows)
+    residuals = [value for row in redundant for value in _substitute(row, dependent_rows).values()]
+    return dependent_rows, lu, residuals
 
 
-def _substitute(row: Row, follow: dict[int, Row]) -> Row:
+def _substitute(row: Row, dependent_rows: dict[int, Row]) -> Row:
     """Eliminate dependent coordinates from a linear form."""
-    terms = [(follow.get(k, {k: 1.0}), value) for k, value in row.items()]
+    terms = [(dependent_rows.get(k, {k: 1.0}), value) for k, value in row.items()]
     return sum_forms(*((own, [value * f for f in own.values()]) for own, value in terms))
 
 
@@ -299,17 +305,17 @@ def write_response(s: SymbolicFrame) -> Program:
     """Write the program of factors, energies, deflection, energy, C and pivot ratio."""
     s.factorise()
     wrench = s.t.tape.inputs("wrench", 6)
-    size: Any = 0.0
+    scale: Any = 0.0
     for value in wrench:
-        size = maximum(size, absolute(value))
-    # Scaled to unit size, so that squares of tiny or huge loads do not under- or overflow.
-    s.load(wrench / maximum(size, 1e-300))
+        scale = maximum(scale, absolute(value))
+    # Scale the load to unit size, so that squares of tiny or huge loads neither underflow nor overflow.
+    s.load(wrench / maximum(scale, 1e-300))
     # U_ij, U = sum of U_ij = P' C P / 2 and mu_ij = U_ij / U (2UPR-RPU paper, equations 37 and 38).
-    energies, square = s.energies(), size * size
+    energies, square = s.energies(), scale * scale
     total = sum(energies, 0.0)
     factors = [energy / maximum(total, 1e-300) for energy in energies]
     row = [*factors, *(energy * square for energy in energies)]
-    row += [s.x[k] * size for k in range(PLATFORM)]
+    row += [s.x[k] * scale for k in range(PLATFORM)]
     return s.program({"wrench": 6}, {"row": [*row, total * square, *s.compliance.ravel(), s.measure]})
 
 
@@ -326,7 +332,7 @@ def _write_deflections(s: SymbolicFrame) -> Program:
         rows += [member.start + (member.end - member.start) * share for share in shares]
         for share in shares:
             across, _ = bending_shape(share, member.length, phi)
-            own = [_dot(across, bends[k : k + 2]) for k in (0, 2)] if bends else [0.0, 0.0]
+            own = [_sum_products(across, bends[k : k + 2]) for k in (0, 2)] if bends else [0.0, 0.0]
             rows.append(moved[0] + (moved[1] - moved[0]) * share + member.axes[:, 1:] @ own)
     return s.program({"wrench": 6}, {"rows": np.ravel(rows), "measure": [s.measure]})
 

@@ -121,7 +121,7 @@ def elastic_columns(robot: Robot, q: Array) -> tuple[Array, Indices]:
     """
     program = robot.cached(Elastic).columns
     (entries, *_), _ = program(NO_PARAMETERS, q)
-    # The places are those of every pose; an empty batch has none.
+    # Take the indices from the home pose: all poses have the same, but an empty batch has none.
     (_, *places), _ = program(NO_PARAMETERS, robot.graph.home)
     rows, columns, owner = (p.astype(int) for p in places)
     own = np.zeros((*q.shape[:-1], rows.max() + 1, len(owner)))

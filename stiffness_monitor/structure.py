@@ -67,7 +67,7 @@ class Support:
     ``axes``: the joint's axes as columns, shape (3, 3); None in a plan: the member's own.
     ``compliance``: along them three m/N, about them three rad/(N m); 0 rigid, infinite free.
     ``screws``: axes about which it turns freely while it goes so far along them, m a rad. ``at``:
-    the joint's place, a rigid lever away from the member's end; None where it is that end.
+    the joint's position, at a rigid lever from the member's end; None if the joint is at that end.
     """
 
     joint: str
@@ -163,7 +163,7 @@ class StructuralModel:
 
     @property
     def supports(self) -> tuple[Support, ...]:
-        """All joints: those of the parts in order, then those that close loops."""
+        """All joints: those of the parts in order, then those of the loop closures."""
         found: list[Support | None] = []
         for part in self.parts:
             found += [part.support] if isinstance(part, Carried) else [part.inner, part.outer]
@@ -219,13 +219,13 @@ def place_plan(
 ) -> StructuralModel:
     """Evaluate a plan in a pose, on numbers or on expressions.
 
-    :param place: where a point of a body is, given at home. ``turn``: where a direction points.
-    :param section: of a beam by its name. ``compliance``: of a joint by its name and entry.
+    :param place: returns the position of a body's point, given at home. ``turn``: rotates a direction of a body.
+    :param section: returns a beam's section. ``compliance``: returns an entry of a joint's compliance.
     """
 
     def place_support(support: Support, own: Any = None) -> Support:
         values = (v if isinstance(v, float) else compliance(*v) for v in support.compliance)
-        axes = own if support.axes is None else _joint_axes(support.axes, turn)
+        axes = own if support.axes is None else joint_axes_matrix(support.axes, turn)
         at = None if support.at is None else place(*support.at)
         return replace(support, axes=axes, compliance=tuple(values), at=at)
 
@@ -244,8 +244,8 @@ def place_plan(
     )
 
 
-def _joint_axes(given: Sequence[tuple[str, Array]], turn: Turn) -> Any:
-    """Return the columns of three directions.
+def joint_axes_matrix(given: Sequence[tuple[str, Array]], turn: Turn) -> Any:
+    """Return a joint's axes as columns, shape (3, 3).
 
     For two rotation axes, at any angle: the first axis, the one perpendicular to it in the plane of
     both, and that plane's normal.
@@ -260,10 +260,10 @@ def _joint_axes(given: Sequence[tuple[str, Array]], turn: Turn) -> Any:
 
 def plan_structure(graph: Graph, structure: Structure) -> StructuralModel:
     """Decide which part is attached to which, from the graph at home."""
-    return _Planner(graph, structure).plan()
+    return _StructurePlanner(graph, structure).plan()
 
 
-class _Planner:
+class _StructurePlanner:
     """Attach bodies, beams and rods to each other, beginning at base and platform."""
 
     def __init__(self, graph: Graph, structure: Structure) -> None:
@@ -275,15 +275,15 @@ class _Planner:
         self.parts: list[Member | Carried] = []
 
     def plan(self) -> StructuralModel:
-        left = [joint for joint in self.graph.joints.values() if not joint.virtual]
+        remaining = [joint for joint in self.graph.joints.values() if not joint.virtual]
         rods = [beam for beam in self.structure.beams if beam.parts[0] in self.graph.rods]
         while True:
             # Joints between an attached and an unattached body, in order.
-            ready = [j for j in left if self._is_attached(j.inner) != self._is_attached(j.outer)]
-            if not ready:
+            attachable = [j for j in remaining if self._is_attached(j.inner) != self._is_attached(j.outer)]
+            if not attachable:
                 break
-            left.remove(ready[0])
-            self._attach(ready[0], left)
+            remaining.remove(attachable[0])
+            self._attach(attachable[0], remaining)
             for beam in list(rods):
                 if self._is_attached(beam.inner[0]) and self._is_attached(beam.outer[0]):
                     rods.remove(beam)
@@ -294,7 +294,7 @@ class _Planner:
                 self._find_support(joint.inner, joint.at),
                 self._joint_support(joint, joint.outer, joint.at),
             )
-            for joint in left
+            for joint in remaining
             if not self._is_inside_beam(joint)
         )
         for beam in rods:
@@ -304,7 +304,7 @@ class _Planner:
         return StructuralModel(origin, graph.platform, tuple(self.parts), closures)
 
     def _is_inside_beam(self, joint: Joint) -> bool:
-        """Return whether a joint is within one beam: a telescope's."""
+        """Return whether a joint connects two bodies of one beam, as in a telescope."""
         a, b = self.beam_of.get(joint.inner), self.beam_of.get(joint.outer)
         return a is not None and a is b
 
@@ -320,8 +320,8 @@ class _Planner:
         part = self._part_name(body)
         if part not in self.points:
             raise ValueError(f"{part} is not connected to the base")
-        apart = [reference(size(point - at)) for point in self.points[part]]
-        return part, int(np.argmin(apart))
+        distances = [reference(size(point - at)) for point in self.points[part]]
+        return part, int(np.argmin(distances))
 
     def _joint_support(self, joint: Joint, body: str, at: Array) -> Support:
         part, end = self._find_support(body, at)
@@ -333,7 +333,7 @@ class _Planner:
         if joint.type.count == 2:
             axes = (joint.inner, joint.axes[0]), (joint.outer, joint.axes[1])
             # Match each axis with the given direction that is nearly parallel.
-            along = references(vectors @ _joint_axes(axes, lambda _, vector: vector))
+            along = references(vectors @ joint_axes_matrix(axes, lambda _, vector: vector))
             order = np.abs(along).argmax(0).tolist()
             values = [values[k] for k in order] + [values[3 + k] for k in order]
             values[3] = values[4] = FREE
@@ -349,9 +349,9 @@ class _Planner:
     def _member_support(self, joint: Joint, body: str, end: tuple[str, Array]) -> Support:
         """Return the support of a member's end by a joint, which may be away from that end."""
         lever = joint.at - end[1]
-        # A free tape has both positions as inputs, so that derivatives by either exist.
-        apart = getattr(getattr(lever[0], "tape", None), "free", False)
-        if not joint.type.placed or not (apart or np.abs(references(lever)).max() >= SNAP):
+        # With a free tape both positions are separate inputs, so keep the lever, even of length zero, for derivatives.
+        is_free_tape = getattr(getattr(lever[0], "tape", None), "free", False)
+        if not joint.type.placed or not (is_free_tape or np.abs(references(lever)).max() >= SNAP):
             return self._joint_support(joint, body, end[1])
         own = joint.outer if body == joint.inner else joint.inner
         return replace(self._joint_support(joint, body, joint.at), at=(own, joint.at))
@@ -361,7 +361,7 @@ class _Planner:
         values = enumerate(self.structure.compliances.get(name, RIGID))
         return [(name, k) if 0.0 < reference(value) < FREE else 0.0 for k, value in values]
 
-    def _attach(self, joint: Joint, left: list[Joint]) -> None:
+    def _attach(self, joint: Joint, remaining: list[Joint]) -> None:
         known, new = joint.inner, joint.outer
         if not self._is_attached(known):
             known, new = new, known
@@ -374,35 +374,45 @@ class _Planner:
         if _is_nearer(joint.at, ends[1][1], ends[0][1]):
             ends.reverse()
         support = self._member_support(joint, known, ends[0])
-        for part in [j for j in left if self._is_inside_beam(j)]:
+        for part in [j for j in remaining if self._is_inside_beam(j)]:
             if self.beam_of[part.inner] is beam:
-                left.remove(part)
+                remaining.remove(part)
         closing = None
-        for other in left:
-            for body, there in ((other.inner, other.outer), (other.outer, other.inner)):
-                if body in beam.parts and self._is_attached(there) and there not in beam.parts:
+        for other in remaining:
+            for body, other_body in ((other.inner, other.outer), (other.outer, other.inner)):
+                if body in beam.parts and self._is_attached(other_body) and other_body not in beam.parts:
                     near = _is_nearer(other.at, ends[1][1], ends[0][1])
                     if closing is None and near:
-                        closing = other, there
+                        closing = other, other_body
         outer = None
         if closing is not None:
-            left.remove(closing[0])
+            remaining.remove(closing[0])
             outer = self._member_support(*closing, ends[1])
         self._add_member(beam, ends, support, outer)
 
     def _add_member(self, beam: Beam, ends: list[Any], inner: Support, outer: Support | None) -> None:
-        strut = beam.parts[0] in self.graph.rods
+        is_rod = beam.parts[0] in self.graph.rods
         length = size(ends[1][1] - ends[0][1])
         if not reference(length) > 0.0:
             raise ValueError(f"{beam.name} has no length")
         self.points[beam.name] = [point for _, point in ends]
-        known = strut or ends[0][0] == ends[1][0]
+        constant_length = is_rod or ends[0][0] == ends[1][0]
         self.parts.append(
-            Member(beam.name, beam.element, beam.name, ends[0], ends[1], inner, outer, strut, length if known else None)
+            Member(
+                beam.name,
+                beam.element,
+                beam.name,
+                ends[0],
+                ends[1],
+                inner,
+                outer,
+                is_rod,
+                length if constant_length else None,
+            )
         )
 
     def _add_rod(self, beam: Beam) -> None:
-        """Add a rod with a ball joint at each end; the inner one holds the rod's idle spin."""
+        """Add a rod with a ball joint at each end; the inner joint blocks rotation about the rod's own axis."""
         rod = self.graph.rods[beam.parts[0]]
         supports = []
         for name, (body, at), spin in zip(rod.joint_names, (beam.inner, beam.outer), (0.0, FREE), strict=True):

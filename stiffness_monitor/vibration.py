@@ -26,7 +26,7 @@ DYNAMIC_MODES: Final = 24
 """Modes that respond dynamically; the others respond statically."""
 MAX_TOOL_DISTANCE: Final = 10.0
 """Largest distance of a tool point along an axis, over the machine's extent."""
-DAMPING: Final = (1e-5, 0.99)
+DAMPING_RANGE: Final = (1e-5, 0.99)
 """Valid range of modal damping ratios."""
 
 
@@ -139,7 +139,7 @@ def tool_modes(
     :param damping: ratio of all modes, or of each from the lowest on, the last one of all further
         modes; default the robot file's ``modal_damping``.
     :param tool: from the platform's reference point, platform axes, m.
-    :raises ParameterError: no damping is given, a ratio beyond :data:`DAMPING`, or a tool point
+    :raises ParameterError: no damping is given, a ratio beyond :data:`DAMPING_RANGE`, or a tool point
         farther off than :data:`MAX_TOOL_DISTANCE` times the machine's extent.
     """
     q = robot.inverse(one_vector(pose, len(robot.pose_names), "the pose"))
@@ -195,5 +195,5 @@ def damping_ratios(robot: Robot, given: ArrayLike | None, count: int) -> Array:
     if values.ndim != 1:
         raise ParameterError(field, values.shape, "one damping ratio after another")
     for value in values.tolist():
-        check_limit(field, value, "", *DAMPING)
+        check_limit(field, value, "", *DAMPING_RANGE)
     return values[np.minimum(np.arange(count), len(values) - 1)]

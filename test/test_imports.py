@@ -11,7 +11,7 @@ from xml.etree import ElementTree
 
 import pytest
 
-from pkm_twin.apps.groups import commands, module_of
+from pkm_twin.apps.groups import command_module, commands
 from test.support.sources import ROOT, arrows, imports, nodes, room, sources, within
 from tools.pages import architecture
 
@@ -164,7 +164,7 @@ def loaded_by(code):
 
 def test_a_command_and_a_node_start_without_what_they_may_never_need():
     """Parts of scipy take longer to load than all the rest of a command."""
-    modules = set(map(module_of, commands()))
+    modules = set(map(command_module, commands()))
     loaded = loaded_by(f"import {', '.join(modules)}, delta_dynamics, stiffness_monitor, pkm_twin.state")
     parts = ("linalg", "optimize", "signal", "special", "stats")
     assert not {f"scipy.{part}" for part in parts} & loaded

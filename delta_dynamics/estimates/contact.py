@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike
 
 from delta_dynamics.estimates.isolation import ContactLocator, ContactPlace
 from delta_dynamics.torques.stiction import LoadShare, friction_reach, zero_resting_rates
-from delta_dynamics.torques.uncertainty import AVERAGED, Noise, effort_parts, torque_deviation, usual_effort
+from delta_dynamics.torques.uncertainty import NOISE_AVERAGING_TIME, Noise, effort_parts, torque_deviation, usual_effort
 from delta_dynamics.torques.virtual_work import inverse_dynamics, mass_matrix
-from pkm_twin.codegen.arrays import Array, common_batch, finite, later, one_vector, vectors
+from pkm_twin.codegen.arrays import Array, check_later, common_batch, finite, one_vector, vectors
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.mechanism import SHARED
 from pkm_twin.robot.robot import Robot
@@ -31,13 +31,13 @@ class MomentumObserver:
 
         M qdd + b = tau + e,    and the estimate r obeys    r' = bandwidth (e - r)
 
-    Over a sample, M qdd becomes the mean of M times the change of qd, which is exactly the change
-    of the momentum less what the change of M itself brings: no acceleration and no derivative of M
-    is needed, and the error is of second order in the period. The step is implicit, so it is
+    Over a sample, the integral of M qdd is the mean of M times the change of qd: this equals the
+    change of the momentum less the part due to the change of M. Neither accelerations nor
+    derivatives of M are needed, and the error is of second order in the period. The step is implicit, so it is
     stable at every period (the observer of De Luca and Mattone, 2003, in its sampled form).
 
-    ``mass``: the mass matrix of the last sample, (n, n). ``jump``: half of what the efforts that
-    drive the motion changed by since the sample before, (n,): the greatest error of a step's mean.
+    ``mass``: the mass matrix of the last sample, (n, n). ``jump``: half the change of tau - b since
+    the sample before, (n,): the largest error of its mean over a step.
     """
 
     def __init__(self, robot: Robot, bandwidth: float = 60.0) -> None:
@@ -79,28 +79,28 @@ class MomentumObserver:
         :raises UnreachableError: a joint state without an assembly.
         :raises SingularityError: the Jacobian of the closure has no inverse.
         :raises ValueError: a sample that is not later than the last one, has another shape or is
-            not finite; it moves nothing.
+            not finite; it does not change the estimate.
         """
         n, last = self.robot.joints_count, self._last
-        time = later(time, None if last is None else last[0])
+        time = check_later(time, None if last is None else last[0])
         q, qd, effort = (
             one_vector(values, n, what)
             for values, what in ((q, "joint positions"), (qd, "joint rates"), (effort, "efforts"))
         )
         if known is None:
-            needed = inverse_dynamics(self.robot, q, qd, self._still, wrench)
-            known = mass_matrix(self.robot, q), needed
-        self.mass, needed = known
+            model_effort = inverse_dynamics(self.robot, q, qd, self._still, wrench)
+            known = mass_matrix(self.robot, q), model_effort
+        self.mass, model_effort = known
         mass = self.mass
-        driving = effort - needed
-        self._last = (time, qd.copy(), mass, driving)
+        net_effort = effort - model_effort
+        self._last = (time, qd.copy(), mass, net_effort)
         if last is None:
             return None
         before, qd_before, mass_before, driving_before = last
         step = time - before
-        self.jump = 0.5 * np.abs(driving - driving_before)
+        self.jump = 0.5 * np.abs(net_effort - driving_before)
         change = 0.5 * (mass + mass_before) @ (qd - qd_before)
-        change -= 0.5 * step * (driving + driving_before)
+        change -= 0.5 * step * (net_effort + driving_before)
         gain = self.bandwidth
         self._estimate = (self._estimate + gain * change) / (1.0 + gain * step)
         return self._estimate.copy()
@@ -120,7 +120,7 @@ def platform_wrench(robot: Robot, q: ArrayLike, external: ArrayLike) -> Array:
     robot.check_independent("wrenches of measured efforts", SHARED)
     lever = np.array([1.0, 1.0, 1.0, *(3 * [robot.size])])
     jacobian = robot.platform_jacobian(q) * lever[:, None]
-    # Directions below a part of 1e-9 of the best one are not measured by the joints.
+    # The joints do not measure directions whose singular value is below 1e-9 of the largest.
     inverse = np.linalg.pinv(np.swapaxes(jacobian, -1, -2), rcond=1e-9)
     efforts = vectors(external, robot.joints_count, "efforts")
     common_batch(jacobian.shape[:-2], efforts.shape[:-1])
@@ -157,18 +157,18 @@ class Contact:
 class FrictionLearner:
     """Estimate friction that the model lacks: effort that opposes a joint in both directions.
 
-    A contact opposes motion in one direction only, so that friction is learnt all the time, also
-    while the estimate looks like a contact.
+    A contact opposes motion in one direction only. Therefore friction is estimated at all times, also
+    while a contact is detected.
 
-    Before a joint has moved in both directions, friction is learnt from one of them while nothing
-    touches; of a joint that has just begun to move for the first time it is unknown.
+    Until a joint has moved in both directions, friction is estimated from one of them, without
+    contact; it is unknown for a joint that has just begun to move for the first time.
     """
 
     def __init__(self, joints: int) -> None:
-        # By joint and direction, [backwards, forwards]: the mean, and the time of the motion.
-        self._known = [[[0.0, 0.0], [0.0, 0.0]] for _ in range(joints)]
+        # By joint: the mean opposing effort and the time of motion, [backwards, forwards] each.
+        self._means = [[[0.0, 0.0], [0.0, 0.0]] for _ in range(joints)]
         # The same means at the last sample without contact.
-        self._alone = [[0.0, 0.0] for _ in range(joints)]
+        self._means_without_contact = [[0.0, 0.0] for _ in range(joints)]
 
     def learn(self, step: float, external: Array, qd: Array, *, touching: bool = False) -> Array:
         """Add external efforts and velocities, zero at rest, shape (n,).
@@ -177,13 +177,13 @@ class FrictionLearner:
         """
         known = []
         for (means, times), alone, effort, rate in zip(
-            self._known, self._alone, external.tolist(), qd.tolist(), strict=True
+            self._means, self._means_without_contact, external.tolist(), qd.tolist(), strict=True
         ):
             if rate != 0.0:
                 k = int(rate > 0.0)
                 times[k] += step
                 opposing = -effort if k else effort
-                means[k] += min(1.0, step / min(times[k], AVERAGED)) * (opposing - means[k])
+                means[k] += min(1.0, step / min(times[k], NOISE_AVERAGING_TIME)) * (opposing - means[k])
                 if not touching:
                     alone[k] = means[k]
             if min(times) > LEARNING_TIME:
@@ -223,10 +223,10 @@ class ContactMonitor:
         n = self.robot.joints_count
         self.observer.reset()
         self.drives = DriveWatch()
-        self._rest = VelocityErrorEstimator(0.0)
+        self._velocity_error = VelocityErrorEstimator(0.0)
         # Squares are clipped at 9 times the average, so that a contact is not learnt as noise.
-        self._noise = self._kept = Noise(np.zeros(n), LEARNING_TIME, 9.0)
-        self._unsure, self._slack, self._impulse, self._friction = np.zeros((4, n))
+        self._noise = self._saved_noise = Noise(np.zeros(n), LEARNING_TIME, 9.0)
+        self._filtered_deviation, self._filtered_slack, self._impulse, self._friction = np.zeros((4, n))
         self._greatest = usual_effort(self.robot)
         self._last: float | None = None
         self._touching, self._since = False, 0.0
@@ -241,7 +241,7 @@ class ContactMonitor:
         q, ones = robot.inverse(robot.home()), np.ones(robot.joints_count)
         self.stated = bool(robot.uncertainty) and bool(torque_deviation(robot, q, ones, ones).any())
         """True if the robot's file has uncertainties that efforts depend on."""
-        self._reach = friction_reach(robot)
+        self._friction_reach = friction_reach(robot)
 
     def push(
         self,
@@ -260,71 +260,73 @@ class ContactMonitor:
         :param wrench: on the platform, known otherwise, base axes at its reference point, (6,).
         :param rate_error: error bounds of the rates, (n,); by default from their own noise.
         :raises ValueError: a sample that is not later than the last one, has another shape or is
-            not finite; it moves nothing, nor does one without an assembly.
+            not finite; neither it nor a sample without an assembly changes the estimate.
         """
         n, last = self.robot.joints_count, self._last
-        time = later(time, last)
+        time = check_later(time, last)
         q, qd, qdd, effort = (one_vector(v, n, "a sample") for v in (*motion, effort))
         mass = mass_matrix(self.robot, q)
         if rate_error is None:
-            rate_error = self._rest.push(round(time * SECOND), q, qd, qd)
+            rate_error = self._velocity_error.push(round(time * SECOND), q, qd, qd)
         still = np.abs(qd) <= rate_error
-        sure = zero_resting_rates(qd, still, self._reach + self._share.share)
-        effort, holds = self._share.remove(q, sure, effort)
-        parts = effort_parts(self.robot, q, sure, qdd, wrench, mass)
+        rates_used = zero_resting_rates(qd, still, self._friction_reach + self._share.share)
+        effort, load_friction = self._share.remove(q, rates_used, effort)
+        parts = effort_parts(self.robot, q, rates_used, qdd, wrench, mass)
         self._last = time
         self._greatest = np.maximum(self._greatest, np.abs(parts.whole))
         was_idle = self.drives.idle
         idle = self.drives.push(time, still, effort, parts.rest)
         if idle and not was_idle:
-            self._noise = self._kept
+            self._noise = self._saved_noise
         elif was_idle and not idle:
             self.observer.reset()
         if not self.drives.repeated:
-            # From here on the efforts may be those of a brake.
-            self._kept = copy.copy(self._noise)
+            # Save the noise, because later efforts may be those of a brake.
+            self._saved_noise = copy.copy(self._noise)
         external = self.observer.push(time, q, qd, effort, wrench, (mass, parts.moving))
         if external is None or last is None:
             return None
         step = time - last
         if idle:
             if not was_idle and time - self._since < BRAKE_TIME:
-                # The brake has taken the weight; there was no contact.
+                # The brake took over the weight, which looked like a contact.
                 self._touching = False
-            return self._judge(q, external, idle)
-        learnt = self._learner.learn(step, external, np.where(still, 0.0, qd), touching=self._touching)
+            return self._make_contact(q, external, idle)
+        learned = self._learner.learn(step, external, np.where(still, 0.0, qd), touching=self._touching)
         # The learnt friction is bounded: a larger opposing effort is a contact.
-        friction = np.minimum(learnt, 0.2 * self._greatest) + np.where(still, self._reach + holds, 0.0)
-        # Uncertainties pass the observer's filter, as the estimate does.
+        friction = np.minimum(learned, 0.2 * self._greatest) + np.where(
+            still, self._friction_reach + load_friction, 0.0
+        )
+        # Filter the uncertainties as the observer filters the estimate.
         deviation = parts.default_deviation(self._greatest)
         if self.stated:
-            deviation = torque_deviation(self.robot, q, sure, qdd, wrench)
-        part, self._friction = self.observer.bandwidth * step, friction
+            deviation = torque_deviation(self.robot, q, rates_used, qdd, wrench)
+        gain, self._friction = self.observer.bandwidth * step, friction
         self._impulse = self.observer.bandwidth * np.abs(mass) @ rate_error
         slack = friction + self.observer.jump + self._impulse
-        self._unsure = (self._unsure + part * deviation) / (1.0 + part)
-        self._slack = (self._slack + part * slack) / (1.0 + part)
+        self._filtered_deviation = (self._filtered_deviation + gain * deviation) / (1.0 + gain)
+        self._filtered_slack = (self._filtered_slack + gain * slack) / (1.0 + gain)
         self._noise.advance(step)
-        left = np.maximum(np.abs(external) - self._slack - self._impulse, 0.0)
+        residual = np.maximum(np.abs(external) - self._filtered_slack - self._impulse, 0.0)
         if self._noise.settled:
             touching = bool((np.abs(external) > self._effort_bound()).any())
             if touching:
-                begins, since = not self._touching, time - self._placed
-                if begins:
+                starts, since = not self._touching, time - self._placed
+                if starts:
                     self._since = time
                     self.prepare().reset()
-                # A place is found every 4 ms at the beginning, later every 10 ms: errors of efforts last longer.
-                if begins or since >= (0.004 if time - self._since < 0.04 else 0.01) - 0.5 * step:
+                # Locate the contact every 4 ms for its first 40 ms, later every 10 ms: errors are correlated longer.
+                if starts or since >= (0.004 if time - self._since < 0.04 else 0.01) - 0.5 * step:
                     locator = self.prepare()
-                    unsure = np.hypot(self._standard_deviation(), 0.5 * (self._friction + self._impulse))
-                    locator.push(step if begins else since, q, qd, external, unsure)
+                    deviations = np.hypot(self._standard_deviation(), 0.5 * (self._friction + self._impulse))
+                    locator.push(step if starts else since, q, qd, external, deviations)
                     self._place, self._placed = locator.place(), time
             self._touching = touching
-            verdict = self._judge(q, external, idle)
+            verdict = self._make_contact(q, external, idle)
         else:
             verdict = None
         if not self._touching:
-            self._noise.learn(left, (MIN_NOISE_FRACTION * self._greatest) ** 2)
+            self._noise.learn(residual, (MIN_NOISE_FRACTION * self._greatest) ** 2)
         return verdict
 
     def prepare(self) -> ContactLocator:
@@ -339,12 +341,12 @@ class ContactMonitor:
         return self._locator
 
     def _standard_deviation(self) -> Array:
-        return np.asarray(np.sqrt(self._unsure**2 + self._noise.variance), np.float64)
+        return np.asarray(np.sqrt(self._filtered_deviation**2 + self._noise.variance), np.float64)
 
     def _effort_bound(self) -> Array:
-        return np.asarray(self.sigmas * self._standard_deviation() + self._slack + self._impulse, np.float64)
+        return np.asarray(self.sigmas * self._standard_deviation() + self._filtered_slack + self._impulse, np.float64)
 
-    def _judge(self, q: Array, external: Array, idle: bool) -> Contact:
+    def _make_contact(self, q: Array, external: Array, idle: bool) -> Contact:
         wrench = platform_wrench(self.robot, q, external)
         place = self._place if self._touching and not idle else None
         return Contact(external, self._effort_bound(), wrench, self._touching, idle, place)

@@ -2,7 +2,7 @@
 """Locate a contact: which body, and where along it, from the direction of external efforts.
 
 A force F at a point p of a body causes the joint efforts J(p)' F, with the Jacobian J of that
-point. Places on all bodies are compared by their marginal likelihood: F is unknown, its prior
+point. CandidatePositions on all bodies are compared by their marginal likelihood: F is unknown, its prior
 normal, of any size. A body that explains efforts of every direction thus has less evidence than
 one that explains these alone.
 """
@@ -106,7 +106,7 @@ def _twist_kernel(robot: Robot) -> Kernel:
     return robot.engine.kernel("twists of bodies", write)
 
 
-class Places:
+class CandidatePositions:
     """Hold candidate positions on all moving bodies: P of them, on bars between points of bodies.
 
     ``parts``: body or rod of each; ``limbs``: its limb, or ``platform``. ``thin``: whether it is
@@ -125,16 +125,16 @@ class Places:
         bodies = [*graph.bodies, BASE]
         at = robot.engine.tree.at
         limb_of = map_limbs(robot)
-        found = [(bar.part, bar.start, bar.end) for bar in robot_bars(robot) if bar.part in limb_of]
-        drawn = {part for part, _, _ in found}
+        bars = [(bar.part, bar.start, bar.end) for bar in robot_bars(robot) if bar.part in limb_of]
+        drawn = {part for part, _, _ in bars}
         for body, points in body_points(graph).items():
             if body in limb_of and body not in drawn:
-                only = (body, points[0] if points else graph.bodies[body].com)
-                found.append((body, only, only))
-        blocks = _blocks(graph)
+                end = (body, points[0] if points else graph.bodies[body].com)
+                bars.append((body, end, end))
+        blocks = _find_thick_bodies(graph)
         self.parts: list[str] = []
         ends, mix, lengths = [], [], []
-        for k, (part, start, end) in enumerate(found):
+        for k, (part, start, end) in enumerate(bars):
             length = float(np.linalg.norm(end[1] - start[1]))
             for body, point in (start, end):
                 ends.append((bodies.index(body), point - (at[body] if body != BASE else 0.0)))
@@ -158,10 +158,10 @@ class Places:
         owners = np.array(self.limbs)
         one, other = np.triu_indices(len(owners), 1)
         joined = {*list_joined_bodies(graph)}
-        # A force on the platform explains three efforts and fewer as well as any clamping.
-        apart = (owners[one] != owners[other]) & (robot.joints_count > 3)
-        apart &= [(self.parts[a], self.parts[b]) not in joined for a, b in zip(one, other, strict=True)]
-        self.pairs = one[apart], other[apart]
+        # With three drives or fewer, a force on the platform explains every effort, so clamping cannot be told.
+        eligible = (owners[one] != owners[other]) & (robot.joints_count > 3)
+        eligible &= [(self.parts[a], self.parts[b]) not in joined for a, b in zip(one, other, strict=True)]
+        self.pairs = one[eligible], other[eligible]
         self.classes = (PLATFORM, *self.names)
         self.of_class = np.array([owners == name for name in self.classes], float)
         self.bodies = tuple(dict.fromkeys(self.parts))
@@ -174,10 +174,10 @@ class Places:
         self.prior = np.empty(len(owners))
         for name in self.classes:
             own = owners == name
-            whole = PRIOR[PLATFORM] if name == PLATFORM else PRIOR["limbs"] / len(self.names)
-            self.prior[own] = whole * size[own] / max(size[own].sum(), 1e-300)
+            class_prior = PRIOR[PLATFORM] if name == PLATFORM else PRIOR["limbs"] / len(self.names)
+            self.prior[own] = class_prior * size[own] / max(size[own].sum(), 1e-300)
 
-    def at(self, q: Array) -> tuple[Array, Array, Array]:
+    def evaluate(self, q: Array) -> tuple[Array, Array, Array]:
         """Return positions (P, 3), Jacobians (P, n, 3) and bar directions (P, 3), base axes."""
         n, count = self.robot.joints_count, len(self.robot.graph.bodies)
         flat = self.robot.function(_twist_kernel)(q)
@@ -194,15 +194,15 @@ class Places:
             rows[1:, i] = rates[..., i] + rates[..., 3 + j] * lever[:, k]
             rows[1:, i] -= rates[..., 3 + k] * lever[:, j]
         found = (rows.reshape(-1, len(ends)) @ self._mix).reshape(n + 1, 3, -1)
-        way = ends[1::2] - ends[::2]
-        length = np.sqrt((way * way).sum(1))[:, None]
-        way = np.divide(way, length, out=np.zeros_like(way), where=length > 0.0)[self._bar]
+        direction = ends[1::2] - ends[::2]
+        length = np.sqrt((direction * direction).sum(1))[:, None]
+        direction = np.divide(direction, length, out=np.zeros_like(direction), where=length > 0.0)[self._bar]
         # The axis of positions is last in memory, because it is the longest.
-        return found[0].T, found[1:].transpose(2, 0, 1), way
+        return found[0].T, found[1:].transpose(2, 0, 1), direction
 
 
-def _blocks(graph: Graph) -> set[str]:
-    """Return the bodies that are not thin bars: the platform, and sliders on the base."""
+def _find_thick_bodies(graph: Graph) -> set[str]:
+    """Find the bodies that are not thin bars: the platform, and sliders on the base."""
     return {graph.platform} | {
         joint.outer for joint in graph.joints.values() if joint.kind == "prismatic" and joint.inner == BASE
     }
@@ -221,9 +221,9 @@ class ContactLocator:
     """
 
     def __init__(self, robot: Robot) -> None:
-        self.places = Places(robot)
+        self.places = CandidatePositions(robot)
         # A contact force on a thin bar is mostly across it: along it only friction acts.
-        self._slim = np.where(self.places.thin, 1.0 - CONTACT_FRICTION, 0.0)
+        self._along_reduction = np.where(self.places.thin, 1.0 - CONTACT_FRICTION, 0.0)
         self.reset()
 
     def reset(self) -> None:
@@ -238,82 +238,86 @@ class ContactLocator:
         :param q: joint positions (n,), with rates ``qd`` and external efforts (n,), N m or N.
         :param deviation: standard deviations of the efforts, (n,).
         """
-        sure = 1.0 / np.hypot(deviation, MODEL_DEVIATION * np.abs(external))
-        y = external * sure
+        weights = 1.0 / np.hypot(deviation, MODEL_DEVIATION * np.abs(external))
+        y = external * weights
         if not y.any():
             return
-        self._at, turned, along = self.places.at(q)
+        self._positions, jacobians, along = self.places.evaluate(q)
         # The axis of positions is last: jacobian (n, 3, P), way (3, P).
-        jacobian, way = turned.transpose(1, 2, 0), along.T
+        jacobian, direction = jacobians.transpose(1, 2, 0), along.T
         if self._sums is None:
-            self._begin(jacobian, sure, qd)
+            self._start_contact(jacobian, weights, qd)
         # The force is proportional to the efforts, in the units of the first sample.
-        sure = float(np.linalg.norm(external * self._unit)) * sure
-        fade = math.exp(-step / DECAY_TIME)
+        weights = float(np.linalg.norm(external * self._first_weights)) * weights
+        decay = math.exp(-step / DECAY_TIME)
         weight = min(1.0, step / CORRELATION_TIME)
-        one = jacobian * sure[:, None, None]
-        one -= (self._slim * np.einsum("nip,ip->np", one, way))[:, None] * way
+        force_columns = jacobian * weights[:, None, None]
+        force_columns -= (self._along_reduction * np.einsum("nip,ip->np", force_columns, direction))[
+            :, None
+        ] * direction
         # Derivatives of the pairs' distances by joint positions, (n, pairs).
         a, b = self._pairs
-        between = (self._at[a] - self._at[b]).T
-        between = between / np.sqrt((between * between).sum(0))
-        pair = sure[:, None] * np.einsum("nip,ip->np", jacobian.take(a, 2) - jacobian.take(b, 2), between)
-        free = sure * self._usual
+        pair_direction = (self._positions[a] - self._positions[b]).T
+        pair_direction = pair_direction / np.sqrt((pair_direction * pair_direction).sum(0))
+        pair_column = weights[:, None] * np.einsum(
+            "nip,ip->np", jacobian.take(a, 2) - jacobian.take(b, 2), pair_direction
+        )
+        unknown_column = weights * self._unknown_effort
         sums = (
             np.array([len(q), y @ y]),
-            np.einsum("nip,njp->ijp", one, one).ravel(),
-            np.einsum("n,nip->ip", y, one).ravel(),
-            np.einsum("np,np->p", pair, pair),
-            y @ pair,
-            free * free,
-            free * y,
+            np.einsum("nip,njp->ijp", force_columns, force_columns).ravel(),
+            np.einsum("n,nip->ip", y, force_columns).ravel(),
+            np.einsum("np,np->p", pair_column, pair_column),
+            y @ pair_column,
+            unknown_column * unknown_column,
+            unknown_column * y,
         )
         new = weight * np.concatenate(sums)
-        self._sums = new if self._sums is None else fade * self._sums + new
+        self._sums = new if self._sums is None else decay * self._sums + new
 
-    def _begin(self, jacobian: Array, sure: Array, qd: Array) -> None:
+    def _start_contact(self, jacobian: Array, weights: Array, qd: Array) -> None:
         """Set the typical force, and the pairs of approaching bodies that can clamp something."""
-        self._unit = sure
-        whole = np.sqrt(((jacobian * sure[:, None, None]) ** 2).sum((0, 1)))
-        felt = whole[whole > 0.0]
-        self._force = 1.0 / float(np.median(felt)) if len(felt) else math.inf
+        self._first_weights = weights
+        sensitivity = np.sqrt(((jacobian * weights[:, None, None]) ** 2).sum((0, 1)))
+        nonzero = sensitivity[sensitivity > 0.0]
+        self._typical_force = 1.0 / float(np.median(nonzero)) if len(nonzero) else math.inf
         # Unknown contacts: efforts of any size that known contacts can cause.
-        self._usual = self._force * np.sqrt(np.mean(jacobian**2, (1, 2)))
+        self._unknown_effort = self._typical_force * np.sqrt(np.mean(jacobian**2, (1, 2)))
         a, b = self.places.pairs
-        apart = self._at[a] - self._at[b]
-        far = np.sqrt((apart * apart).sum(1))
+        offset = self._positions[a] - self._positions[b]
+        distance = np.sqrt((offset * offset).sum(1))
         velocity = (qd @ jacobian.swapaxes(0, 1)).T
-        rate = ((velocity[a] - velocity[b]) * apart).sum(1) / far
-        # Bodies that clamp something are near each other, and approach clearly.
-        near = (far > 0.0) & (far < 0.4 * self.places.robot.graph.size)
+        rate = ((velocity[a] - velocity[b]) * offset).sum(1) / distance
+        # Bodies that clamp something are near each other and approach at 2 % of the fastest pair at least.
+        near = (distance > 0.0) & (distance < 0.4 * self.places.robot.graph.size)
         closing = near & (rate < -0.02 * np.abs(rate[near]).max(initial=0.0))
-        self._pairs, self._couple = (a[closing], b[closing]), self.places.couple_of[closing]
+        self._pairs, self._pair_couple = (a[closing], b[closing]), self.places.couple_of[closing]
 
     @np.errstate(all="ignore")
     def place(self) -> ContactPlace | None:
-        """Return the estimate; None before the first sample, or if it is not finite."""
+        """Return the most likely place; None before the first sample, or if it is not finite."""
         if self._sums is None:
             return None
-        if not np.isfinite(np.concatenate([self._sums, self._usual, self._at.ravel()])).all():
-            # Sums that are not finite cannot recover.
+        if not np.isfinite(np.concatenate([self._sums, self._unknown_effort, self._positions.ravel()])).all():
+            # A sum that is not finite stays so: start again.
             self.reset()
             return None
-        found = self._found(self._sums)
+        found = self._compute_estimate(self._sums)
         finite = np.isfinite([*found.point, found.deviation, *found.classes.values()]).all()
         return found if finite else None
 
-    def _found(self, sums: Array) -> ContactPlace:
-        """Return the estimate from finite sums; not finite only beyond the range of doubles."""
-        n, count, pairs = len(self._usual), len(self._at), len(self._couple)
+    def _compute_estimate(self, sums: Array) -> ContactPlace:
+        """Return the most likely place by the accumulated sums, which must be finite."""
+        n, count, pairs = len(self._unknown_effort), len(self._positions), len(self._pair_couple)
         # Model errors persist: more samples add directions, not accuracy in one direction.
         sums = sums / max(sums[0] / n, 1.0)
-        counted, square = sums[:2]
+        sample_weight, square = sums[:2]
         ends = 2 + 12 * count
         forces = sums[2:ends].reshape(4, 3, count)
         line, sides = sums[ends : ends + 2 * pairs].reshape(2, pairs)
         other, others = sums[-2 * n :].reshape(2, n)
         places = self.places
-        precision = ((self._force * FORCE_RATIOS) ** -2.0)[:, None]
+        precision = ((self._typical_force * FORCE_RATIOS) ** -2.0)[:, None]
         # Log marginal likelihoods, (sizes, hypotheses), up to a common constant.
         (a, b, c), (_, d, e), (_, _, f) = forces[:3]
         x, y, z = forces[3]
@@ -328,62 +332,68 @@ class ContactLocator:
         z = z - far * x - low * y
         norms = x * x / first + y * y / second + z * z / third
         size = (first / precision) * (second / precision) * (third / precision)
-        one = _mean(np.asarray(0.5 * (norms - np.log(size)), np.float64))
-        # Clamping efforts are off by the spacing of the positions: 0.15 of their size.
-        noise = 1.0 + 0.15**2 * square * n / counted
-        pair = _mean(_component_evidence(line / noise, sides / noise, precision, one_sided=True))
-        pair += 0.5 * (square * (1.0 - 1.0 / noise) - counted * math.log(noise))
-        nothing = float(_mean(_component_evidence(other, others, FORCE_RATIOS[:, None] ** -2.0).sum(-1)))
-        top = max(one.max(), pair.max(initial=-np.inf), nothing)
-        likely = places.prior * np.exp(one - top)
-        # Clamping is less likely if fewer places can clamp.
-        clamped = PRIOR[CLAMPING] * np.exp(pair - top) / max(len(pair), POSITIONS_PER_BAR**2)
-        odd = float(PRIOR[UNKNOWN] * np.exp(nothing - top))
+        force_evidence = _average_over_sizes(np.asarray(0.5 * (norms - np.log(size)), np.float64))
+        # The spacing of candidate positions gives clamping efforts an error of 0.15 of their size.
+        noise = 1.0 + 0.15**2 * square * n / sample_weight
+        clamping_evidence = _average_over_sizes(
+            _component_evidence(line / noise, sides / noise, precision, one_sided=True)
+        )
+        clamping_evidence += 0.5 * (square * (1.0 - 1.0 / noise) - sample_weight * math.log(noise))
+        unknown = float(_average_over_sizes(_component_evidence(other, others, FORCE_RATIOS[:, None] ** -2.0).sum(-1)))
+        top = max(force_evidence.max(), clamping_evidence.max(initial=-np.inf), unknown)
+        likely = places.prior * np.exp(force_evidence - top)
+        # The prior of clamping is spread over all pairs, over at least as many as two bars have.
+        clamped = PRIOR[CLAMPING] * np.exp(clamping_evidence - top) / max(len(clamping_evidence), POSITIONS_PER_BAR**2)
+        unknown_weight = float(PRIOR[UNKNOWN] * np.exp(unknown - top))
         by_class = places.of_class @ likely
-        shares = np.array([*by_class, clamped.sum(), odd])
-        shares /= shares.sum()
-        classes = dict(zip((*places.classes, CLAMPING, UNKNOWN), shares.tolist(), strict=True))
+        probabilities = np.array([*by_class, clamped.sum(), unknown_weight])
+        probabilities /= probabilities.sum()
+        classes = dict(zip((*places.classes, CLAMPING, UNKNOWN), probabilities.tolist(), strict=True))
         best = max(classes, key=lambda name: classes[name])
         if best == CLAMPING:
             a, b = self._pairs
-            couple = int(np.argmax(np.bincount(self._couple, clamped)))
-            weights, at = np.where(self._couple == couple, clamped, 0.0), 0.5 * (self._at[a] + self._at[b])
+            couple = int(np.argmax(np.bincount(self._pair_couple, clamped)))
+            weights, at = (
+                np.where(self._pair_couple == couple, clamped, 0.0),
+                0.5 * (self._positions[a] + self._positions[b]),
+            )
             body = " and ".join(places.couples[couple])
             where = f"{CLAMPING} {body}"
         else:
             if best != UNKNOWN:
                 likely = likely * places.of_class[places.classes.index(best)]
             number = int(np.argmax(places.of_body @ likely))
-            weights, at = likely * places.of_body[number], self._at
+            weights, at = likely * places.of_body[number], self._positions
             body, where = places.bodies[number], best
         # The weighted mean of the positions on the body, and their standard deviation.
-        share = weights / weights.sum()
-        point = share @ at
-        deviation = math.sqrt(float(share @ ((at - point) ** 2).sum(1)))
+        fractions = weights / weights.sum()
+        point = fractions @ at
+        deviation = math.sqrt(float(fractions @ ((at - point) ** 2).sum(1)))
         confidence = classes[best]
         return ContactPlace(
             where if confidence >= MIN_CONFIDENCE else UNKNOWN, confidence, classes, body, point, deviation
         )
 
 
-def _component_evidence(squares: Array, parts: Array, precision: Array, *, one_sided: bool = False) -> Array:
+def _component_evidence(squares: Array, products: Array, precision: Array, *, one_sided: bool = False) -> Array:
     """Return log marginal likelihoods of forces with one component, (sizes, hypotheses).
 
-    :param squares: B' B, (hypotheses,); ``parts``: B' y.
-    :param one_sided: f is positive.
+    :param squares: B' B of the efforts B by a unit force, (hypotheses,). ``products``: B' y.
+    :param precision: inverse variance of the force's prior, (sizes, 1).
+    :param one_sided: the force is positive.
     """
-    whole = squares + precision
-    logs = 0.5 * (parts / whole * parts - np.log(whole / precision))
+    total = squares + precision
+    logs = 0.5 * (products / total * products - np.log(total / precision))
     if one_sided:
-        at = parts / np.sqrt(whole)
+        deviations = products / np.sqrt(total)
         # The normal distribution's logarithm, log 2 more, without underflow.
-        tail = scipy.special.erfcx(np.abs(at) / math.sqrt(2.0))
-        density = np.exp(-0.5 * at * at)
-        logs += np.where(at > 0.0, np.log(2.0 - tail * density), np.log(tail) - 0.5 * at * at)
+        tail = scipy.special.erfcx(np.abs(deviations) / math.sqrt(2.0))
+        density = np.exp(-0.5 * deviations * deviations)
+        logs += np.where(deviations > 0.0, np.log(2.0 - tail * density), np.log(tail) - 0.5 * deviations * deviations)
     return np.asarray(logs, np.float64)
 
 
-def _mean(logs: Array) -> Array:
+def _average_over_sizes(logs: Array) -> Array:
     """Return the logarithm of the mean over the force's sizes, (hypotheses,)."""
     top = logs.max(0)
     return np.asarray(top + np.log(np.exp(logs - top).mean(0)), np.float64)

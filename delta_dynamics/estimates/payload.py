@@ -14,14 +14,14 @@ from delta_dynamics.torques.regressor import PAYLOAD, parameter_names, regressor
 from delta_dynamics.torques.stiction import LoadShare, beyond_friction, friction_reach, zero_resting_rates
 from delta_dynamics.torques.uncertainty import Noise
 from delta_dynamics.torques.virtual_work import inverse_dynamics
-from pkm_twin.codegen.arrays import Array, later, one_vector
+from pkm_twin.codegen.arrays import Array, check_later, one_vector
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.mechanism import SHARED
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.drives import DriveWatch
 from pkm_twin.streams.rest import VelocityErrorEstimator
 
-FOUND: Final = ("mass", "mx", "my", "mz")
+ESTIMATED_PARAMETERS: Final = ("mass", "mx", "my", "mz")
 """Estimated parameters: mass and first moments about the platform's reference point."""
 CORRELATION_TIME: Final = 0.02
 """Correlation time of the residual's errors, s."""
@@ -72,7 +72,7 @@ class PayloadEstimator:
         self._share = LoadShare(robot)
         self.robot = robot = self._share.robot
         names = parameter_names(robot)
-        self._columns = [names.index(f"{PAYLOAD}.{what}") for what in FOUND]
+        self._columns = [names.index(f"{PAYLOAD}.{what}") for what in ESTIMATED_PARAMETERS]
         load = robot.payload
         self._own = np.array([load.mass, *(load.mass * load.com)])
         self._prior = np.array([mass_range, *(3 * [mass_range * reach])])
@@ -82,9 +82,9 @@ class PayloadEstimator:
         limits = robot.limits.effort
         scale = 1.0 if limits is None else float(np.abs(limits).max())
         self._least = 0.01 * max(float(np.abs(rest).max()), 1e-3 * scale)
-        self._reach = friction_reach(robot)
+        self._friction_reach = friction_reach(robot)
         self.drives = DriveWatch()
-        self._rest = VelocityErrorEstimator(0.0)
+        self._velocity_error = VelocityErrorEstimator(0.0)
         self.resets = 0
         # Squares are clipped at 4 times the average, so that a jump is not learnt as noise.
         self._noise = Noise(np.full(robot.joints_count, 4.0 * self._least**2), SETTLING_TIME, 4.0)
@@ -98,19 +98,19 @@ class PayloadEstimator:
         self._weighted = self._information @ self._own
         self._average = np.zeros(self.robot.joints_count)
         self._since = 0.0
-        self._keep()
+        self._save_estimate()
         self.begin_anew()
 
-    def _keep(self) -> None:
-        """Store the estimate, because the next efforts may be those of a brake."""
+    def _save_estimate(self) -> None:
+        """Save the estimate, to restore it if the next efforts turn out to be those of a brake."""
         noise = copy.copy(self._noise)
-        self._kept = self._information, self._weighted, self._average, self._since, noise
+        self._saved = self._information, self._weighted, self._average, self._since, noise
 
     def begin_anew(self) -> None:
-        """Forget the time of the last sample, for a clock that jumps back; keep the estimate."""
+        """Forget the time of the last sample, after the clock jumped back; keep the estimate."""
         self._last: float | None = None
         self.drives.reset()
-        self._rest.reset()
+        self._velocity_error.reset()
 
     def push(
         self,
@@ -129,75 +129,75 @@ class PayloadEstimator:
         :param wrench: on the platform at its reference point, base axes, (6,), where it is known.
         :param rate_error: error bounds of the rates, (n,); by default from their own noise.
         :raises ValueError: a sample that is not later than the last one, has another shape or is
-            not finite; it moves nothing, nor does one without an assembly.
+            not finite; neither it nor a sample without an assembly changes the estimate.
         """
         n, last = self.robot.joints_count, self._last
-        time = later(time, last)
+        time = check_later(time, last)
         q, qd, qdd, effort = (one_vector(v, n, "a sample") for v in (q, qd, qdd, effort))
         held = inverse_dynamics(self.robot, q, 0.0 * q, 0.0 * q, wrench)
         self._last = time
         if rate_error is None:
-            rate_error = self._rest.push(round(time * SECOND), q, qd, qd)
+            rate_error = self._velocity_error.push(round(time * SECOND), q, qd, qd)
         still = np.abs(qd) <= rate_error
         was_idle = self.drives.idle
         idle = self.drives.push(time, still, effort, held)
         if idle and not was_idle:
-            self._information, self._weighted, self._average, self._since, self._noise = self._kept
+            self._information, self._weighted, self._average, self._since, self._noise = self._saved
         if idle or last is None:
             return None
         if not self.drives.repeated:
-            self._keep()
+            self._save_estimate()
         step = time - last
-        sure = zero_resting_rates(qd, still, self._reach + self._share.share)
-        effort, holds = self._share.remove(q, sure, effort)
-        reach = self._reach + holds
-        columns = regressor(self.robot, q, sure, qdd)[:, self._columns]
-        computed = inverse_dynamics(self.robot, q, sure, qdd, wrench)
+        rates_used = zero_resting_rates(qd, still, self._friction_reach + self._share.share)
+        effort, load_friction = self._share.remove(q, rates_used, effort)
+        reach = self._friction_reach + load_friction
+        columns = regressor(self.robot, q, rates_used, qdd)[:, self._columns]
+        computed = inverse_dynamics(self.robot, q, rates_used, qdd, wrench)
         target = effort - computed + columns @ self._own
-        left = beyond_friction(target - columns @ self._solution(), still, reach)
+        residual = beyond_friction(target - columns @ self._solve(), still, reach)
         self._since += step
-        self._average = self._average + min(1.0, step / JUMP_AVERAGING_TIME) * (left - self._average)
-        # Errors that last for their correlation time have this deviation in the average; 6 of it are a jump.
+        self._average = self._average + min(1.0, step / JUMP_AVERAGING_TIME) * (residual - self._average)
+        # Standard deviation of the average of errors with this correlation time; six of them are a jump.
         spread = np.sqrt(self._noise.variance * CORRELATION_TIME / (CORRELATION_TIME + JUMP_AVERAGING_TIME))
         if self._since >= SETTLING_TIME and (np.abs(self._average) > 6.0 * spread).any():
             self.reset()
             self._last = time
             return self.estimate()
-        fade = math.exp(-step / DECAY_TIME)
-        rubs = still & (reach > 0.0)
-        share = np.where(rubs, min(1.0, step / DECAY_TIME), min(1.0, step / CORRELATION_TIME))
-        variance = self._noise.variance + np.where(rubs, reach**2, 0.0)
-        rows = columns * (share / variance)[:, None]
+        decay = math.exp(-step / DECAY_TIME)
+        resting = still & (reach > 0.0)
+        weights = np.where(resting, min(1.0, step / DECAY_TIME), min(1.0, step / CORRELATION_TIME))
+        variance = self._noise.variance + np.where(resting, reach**2, 0.0)
+        rows = columns * (weights / variance)[:, None]
         prior = np.diag(self._prior**-2.0)
         # Faded information is replaced by the prior.
-        self._information = fade * self._information + (1 - fade) * prior + rows.T @ columns
-        self._weighted = fade * self._weighted + (1 - fade) * prior @ self._own + rows.T @ target
+        self._information = decay * self._information + (1 - decay) * prior + rows.T @ columns
+        self._weighted = decay * self._weighted + (1 - decay) * prior @ self._own + rows.T @ target
         self._noise.advance(step)
-        left = beyond_friction(target - columns @ self._solution(), still, reach)
-        self._noise.learn(left, self._least**2)
+        residual = beyond_friction(target - columns @ self._solve(), still, reach)
+        self._noise.learn(residual, self._least**2)
         return self.estimate()
 
-    def _solution(self) -> Array:
+    def _solve(self) -> Array:
         return np.asarray(np.linalg.solve(self._information, self._weighted), np.float64)
 
     def estimate(self) -> PayloadEstimate:
         """Return the present estimate."""
-        values = self._solution()
+        values = self._solve()
         covariance = np.linalg.inv(self._information)
         mass = float(values[0])
         deviation = math.sqrt(covariance[0, 0])
-        told = np.diag(covariance)[1:] < (0.5 * self._prior[1:]) ** 2
-        safe = mass if abs(mass) > 3.0 * deviation else math.nan
-        com = values[1:] / safe
+        determined = np.diag(covariance)[1:] < (0.5 * self._prior[1:]) ** 2
+        divisor = mass if abs(mass) > 3.0 * deviation else math.nan
+        com = values[1:] / divisor
         # Standard deviation of a quotient of two correlated numbers, to first order.
-        gradient = np.hstack([-com[:, None] / safe, np.eye(3) / safe])
-        spread = np.sqrt(np.einsum("ki,ij,kj->k", gradient, covariance, gradient))
-        known = told & np.isfinite(com)
+        gradient = np.hstack([-com[:, None] / divisor, np.eye(3) / divisor])
+        deviations = np.sqrt(np.einsum("ki,ij,kj->k", gradient, covariance, gradient))
+        known = determined & np.isfinite(com)
         own = self.robot.payload.com
         if mass < 0.0:
             # A negative mass means that no payload was found; its centre is undefined.
             nowhere = np.full(3, np.inf)
             return PayloadEstimate(0.0, own.copy(), math.hypot(deviation, mass), nowhere, self.resets, mass)
         return PayloadEstimate(
-            mass, np.where(known, com, own), deviation, np.where(known, spread, np.inf), self.resets, mass
+            mass, np.where(known, com, own), deviation, np.where(known, deviations, np.inf), self.resets, mass
         )

@@ -16,7 +16,7 @@ from delta_dynamics.estimates.contact import CONTACT_SIGMAS, Contact, ContactMon
 from delta_dynamics.estimates.isolation import ContactPlace
 from delta_dynamics.estimates.payload import PayloadEstimator
 from delta_dynamics.feedforward import Torques
-from delta_dynamics.torques.uncertainty import FRICTION, MASSES
+from delta_dynamics.torques.uncertainty import DEFAULT_FRICTION_ERROR, DEFAULT_MASS_ERROR
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
 from pkm_twin.ros.joints import JointPublisher, header, make_wrench_message, xyz
@@ -38,7 +38,7 @@ class Estimates:
         self.contacts = 0
         self._place: ContactPlace | None = None
         self._last = 0
-        # 250 samples a second: the errors of efforts last longer.
+        # 250 samples a second are enough, because errors of efforts are correlated over a longer time.
         self._pace = Pace(250.0)
         self._payload: PayloadEstimator | None = None
         self._contact: ContactMonitor | None = None
@@ -52,11 +52,11 @@ class Estimates:
             self._load_deviation = node.create_guarded_publisher("~/payload_deviation")
             node.create_trigger("~/reset_payload", self._reset_payload)
             self._payload = PayloadEstimator(known)
-            # Two samples compile the programs of a stream.
+            # Push two samples, which compile the programs of a stream.
             first = PayloadEstimator(known)
             for k in range(2):
                 first.push(float(k), *motion, still)
-        wanted = node.declare(
+        enabled = node.declare(
             "observe_wrench", False, "publish ~/external_wrench and ~/contact, estimated with a momentum observer"
         )
         bandwidth = node.declare(
@@ -74,7 +74,7 @@ class Estimates:
             low=1.0,
             high=1e3,
         )
-        if not wanted:
+        if not enabled:
             return
         self._wrench = node.create_guarded_publisher("~/external_wrench")
         self._effort = JointPublisher(node, known, "~/external_effort")
@@ -93,8 +93,8 @@ class Estimates:
             return ""
         return (
             "the robot's file has no section uncertainty; the default standard deviation of the "
-            f"model's efforts is {100 * MASSES:g} % of the efforts due to masses plus "
-            f"{100 * FRICTION:g} % of the largest effort"
+            f"model's efforts is {100 * DEFAULT_MASS_ERROR:g} % of the efforts due to masses plus "
+            f"{100 * DEFAULT_FRICTION_ERROR:g} % of the largest effort"
         )
 
     def reset(self) -> None:
@@ -113,7 +113,7 @@ class Estimates:
         if self._contact is not None:
             self._contact.change_robot(robot)
 
-    def take(self, torques: Torques) -> None:
+    def update(self, torques: Torques) -> None:
         """Update the estimates with a sample; without measured efforts nothing changes."""
         if torques.measured is None:
             return
@@ -143,7 +143,7 @@ class Estimates:
                     publisher.publish(InertiaStamped(header=own, inertia=Inertia(m=mass, com=xyz(Vector3, com))))
 
     @property
-    def wanted(self) -> bool:
+    def enabled(self) -> bool:
         """True if a payload or contacts are estimated."""
         return self._contact is not None or self._payload is not None
 
@@ -155,7 +155,7 @@ class Estimates:
     def diagnose(self) -> dict[str, object]:
         """Return values of the node's diagnostic status."""
         values: dict[str, object] = {}
-        if self.wanted:
+        if self.enabled:
             values["drives off or braked"] = self.idle
         if self._contact is not None:
             values |= {"contact": self.touching, "contacts": self.contacts}

@@ -30,7 +30,7 @@ MAX_DEADLINE = 3600.0
 
 
 class CommandGate(TwinNode):
-    """Forward live torques, and send zeros or gravity without them, also before the first.
+    """Forward current torques; without them send zeros or the effort against gravity.
 
     It has a process of its own, so that it outlives the node whose torques it forwards.
     """
@@ -56,7 +56,7 @@ class CommandGate(TwinNode):
         self.create_guarded_subscription(
             TORQUES,
             self._on_torques,
-            refuse=self._refuse_torques,
+            refuse=self._reject_torques,
             expected=True,
             expires=lambda: settings.deadline,
             expiry=settings.deadline,
@@ -69,7 +69,7 @@ class CommandGate(TwinNode):
                 expected=True,
             )
         self.follow(CHANGEABLE, lambda values: change_robot(self.core.robot, values), self.core.change_robot)
-        self.create_guarded_timer(min(0.25 * settings.deadline, 0.1), self._watch)
+        self.create_guarded_timer(min(0.25 * settings.deadline, 0.1), self._repeat_stop_command)
         self.start(leap=settings.deadline + settings.future_tolerance)
 
     def details(self) -> str:
@@ -86,7 +86,7 @@ class CommandGate(TwinNode):
         self.core.stream.stop("exception", f"{where} raised an exception")
 
     def activated(self) -> None:
-        """Send a command at once: the controller may still hold that of a gate before this one."""
+        """Send a command at once, because the controller may still hold one of an earlier gate."""
         self._send(self.core.stop_command(time.monotonic_ns()))
 
     def deactivated(self) -> None:
@@ -138,23 +138,23 @@ class CommandGate(TwinNode):
                 )
         return ""
 
-    def _refuse_torques(self, error: MessageError) -> None:
-        with self.core.stream.reacting(self._watch):
+    def _reject_torques(self, error: MessageError) -> None:
+        with self.core.stream.reacting(self._repeat_stop_command):
             self.core.refuse(self.core.stream, error)
 
     def _on_torques(self, message: JointStateView) -> None:
         # A closed gate sends its command at once.
-        with self.core.stream.reacting(self._watch):
+        with self.core.stream.reacting(self._repeat_stop_command):
             command = self.core.torques(message, self.now(), time.monotonic_ns())
         if command is not None:
             self._send(command)
 
-    def _watch(self) -> None:
-        """Repeat the command of a closed gate, as a controller may start late."""
+    def _repeat_stop_command(self) -> None:
+        """Send the closed gate's command repeatedly, because a controller may start later."""
         if not self.active:
             return
         steady = time.monotonic_ns()
-        self.core.watch(steady)
+        self.core.close_if_silent(steady)
         self._log_changes()
         if self.core.stream.stopped:
             self._send(self.core.stop_command(steady))

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from pkm_twin.errors import warn
+from pkm_twin.errors import warn_of_file
 from pkm_twin.machine.sections import MAX_MASS
 from pkm_twin.robot.plausibility import gravity_findings, payload_findings
 from pkm_twin.robot.robot import Robot
@@ -65,5 +65,5 @@ def change_robot(robot: Robot, values: dict[str, Any]) -> Robot:
             sections[section] = plain
     made = robot.changed(**sections)
     for finding in (*gravity_findings(made), *payload_findings(made)):
-        warn(f"parameters of {robot.name}", finding.text)
+        warn_of_file(f"parameters of {robot.name}", finding.text)
     return made

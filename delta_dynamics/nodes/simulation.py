@@ -27,7 +27,7 @@ from delta_dynamics.simulation.machine import (
 )
 from pkm_twin.bags.definitions import message_definition
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.errors import MessageError, ParameterError, short
+from pkm_twin.errors import MessageError, ParameterError, shorten_value
 from pkm_twin.messages.fast_decoder import DoublesTemplate, RawTrajectory
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.effort_limits import effort_limits
@@ -38,14 +38,14 @@ from pkm_twin.ros.joints import FIELDS, JointPublisher
 from pkm_twin.ros.node import TwinNode, latched_qos
 from pkm_twin.ros.run import run
 
-BEGIN: Final = SECOND
-"""Simulated time at the start, ns: a stamp of zero would be none."""
+START_TIME: Final = SECOND
+"""Simulated time at the start, ns; a stamp of zero would mean that there is none."""
 MAX_TICK_TIME: Final = 5e-3
 """Longest time that one tick of the clock may simulate, s: messages are taken between ticks."""
 CHECK_PERIOD: Final = 0.05
 """In lockstep: period of the checks for a silent commander, s."""
 WRENCH: Final = "geometry_msgs/msg/WrenchStamped"
-OWN_CLOCK: Final = "false, because machine_sim has its own clock"
+SIM_TIME_EXPECTED: Final = "false, because machine_sim has its own clock"
 
 
 class MachineSim(TwinNode):
@@ -83,12 +83,12 @@ class MachineSim(TwinNode):
         self._simulated = self._clock_kind != "wall"
         self._lockstep = self._clock_kind == "lockstep"
         if self.get_parameter("use_sim_time").value:
-            raise ParameterError("use_sim_time", True, OWN_CLOCK)
+            raise ParameterError("use_sim_time", True, SIM_TIME_EXPECTED)
         self.add_on_set_parameters_callback(_refuse_sim_time)
         if not self._simulated:
             self._factor = 1.0
         settings = self._declare_settings(robot)
-        begin = BEGIN if self._simulated else self.now()
+        begin = START_TIME if self._simulated else self.now()
         self.core = Simulation(self._variation.robot, settings, begin)
         self._check_control()
         self._skipped = 0
@@ -103,15 +103,15 @@ class MachineSim(TwinNode):
         self._heard = self._due
         self._flying = 0
         if self._lockstep:
-            self.create_guarded_timer(CHECK_PERIOD, self._go_alone)
+            self.create_guarded_timer(CHECK_PERIOD, self._advance_without_command)
         else:
             step = settings.period / self._factor if self._factor else 0.0
-            # At most 1 kHz: more turns of the executor would cost more than the simulation.
+            # At most 1 kHz: a faster timer would cost more time in the executor than the simulation takes.
             self.create_guarded_timer(max(1e-3, step), self._catch_up)
         self.start()
-        # A transient local topic and the log keep what was drawn.
+        # Publish the drawn parameters on a transient local topic, and log them.
         drawn = self._variation.drawn
-        values = [KeyValue(key=name, value=short(value)) for name, value in drawn.items()]
+        values = [KeyValue(key=name, value=shorten_value(value)) for name, value in drawn.items()]
         status = DiagnosticStatus(name=self.get_fully_qualified_name(), values=values)
         status.message = f"{len(drawn)} parameters drawn"
         status.hardware_id = self.core.robot.name
@@ -220,13 +220,13 @@ class MachineSim(TwinNode):
         :raises ParameterError: gains that were given are unstable at the period.
         """
         sim = self.core
-        if sim.stable_share == 1.0:
+        if sim.stable_fraction == 1.0:
             return
-        bandwidth = sim.stable_share * self.get_parameter("bandwidth").value
+        bandwidth = sim.stable_fraction * self.get_parameter("bandwidth").value
         for name, right in (
             ("bandwidth", f"at most {bandwidth:.2g} Hz"),
-            ("stiffness", f"at most {sim.stable_share**2:.2g} times this"),
-            ("damping", f"at most {sim.stable_share:.2g} times this"),
+            ("stiffness", f"at most {sim.stable_fraction**2:.2g} times this"),
+            ("damping", f"at most {sim.stable_fraction:.2g} times this"),
         ):
             if name in self.given:
                 value = self.get_parameter(name).value
@@ -268,7 +268,7 @@ class MachineSim(TwinNode):
         self.core.commands(message)
         self._heard = time.monotonic()
         if self._lockstep:
-            # Only the answer to the newest state is a step: some states were sent without a command.
+            # Advance only when the newest state is answered; states sent on a timeout may be answered later.
             self._flying = max(0, self._flying - 1)
             if self._flying == 0:
                 self._advance()
@@ -287,7 +287,7 @@ class MachineSim(TwinNode):
         if self._factor == 0.0:
             self._due = begun - MAX_TICK_TIME
         step = period / self._factor if self._factor else 0.0
-        # A timer that is up to a quarter period early does not wait for its next turn.
+        # Simulate a period up to a quarter period early, rather than wait for the next tick of the timer.
         while self._due + 0.75 * step <= (now := time.monotonic()):
             if now - begun > MAX_TICK_TIME:
                 break
@@ -301,7 +301,7 @@ class MachineSim(TwinNode):
             if not self._simulated:
                 self.core.skip(round(behind * SECOND))
 
-    def _go_alone(self) -> None:
+    def _advance_without_command(self) -> None:
         """Advance in lockstep before the first command, and without a command for 1 s."""
         if not self.active:
             return
@@ -319,7 +319,7 @@ class MachineSim(TwinNode):
         self._publish()
 
     def _publish(self) -> None:
-        measured = self.core.measured()
+        measured = self.core.read_sensors()
         if self._clock_topic is not None and measured.stamp >= self._clock_due:
             self._clock_due = measured.stamp + SECOND // 200
             self._clock_topic.publish(Clock(clock=Time(nanoseconds=measured.stamp).to_msg()))
@@ -327,7 +327,7 @@ class MachineSim(TwinNode):
         self._wrenches.publish(self._wrench.fill(measured.wrench, stamped))
         own = self.core.robot.controller
         self._flying += 1
-        # Published last: a node that answers it has received the others.
+        # Publish the joint states last, so that a node that answers them has received the other topics.
         self._states.publish(
             measured.stamp,
             own.controller_positions(measured.q),
@@ -339,7 +339,7 @@ class MachineSim(TwinNode):
 def _refuse_sim_time(changes: Sequence[Parameter]) -> SetParametersResult:
     """Reject use_sim_time while the node runs, as at its start."""
     good = not any(change.name == "use_sim_time" and change.value for change in changes)
-    reason = "" if good else str(ParameterError("use_sim_time", True, OWN_CLOCK))
+    reason = "" if good else str(ParameterError("use_sim_time", True, SIM_TIME_EXPECTED))
     return SetParametersResult(successful=good, reason=reason)
 
 

@@ -26,7 +26,7 @@ from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.run import run
 from pkm_twin.ros.turns import Task
 from pkm_twin.ros.wrench import declare_mounts
-from pkm_twin.settings import SECONDS, changeable, with_parameters
+from pkm_twin.settings import DURATION_BOUNDS, list_changeable, with_parameters
 from pkm_twin.streams.base_motion import BaseImu, ImuSettings
 from pkm_twin.streams.matched import WrenchWindow
 from pkm_twin.streams.monitor import Pace
@@ -51,14 +51,14 @@ class DeltaDynamics(TwinNode):
         warm_up(robot, base=base is not None)
         robot = change_robot(robot, declare_changes(self, robot))
         settings = self.declare_settings(Settings)
-        self.core = Feedforward(robot, settings, self._create_wrenches(settings), base)
+        self.core = Feedforward(robot, settings, self._create_wrench_window(settings), base)
         commands = self.declare("publish_commands", False, "publish ~/commands")
         if commands and "on_stop" not in self.given:
             # An effort controller holds the last plain command indefinitely.
             text = "nothing, zeros or gravity, explicitly set, because publish_commands is true"
             raise ParameterError("on_stop", None, text)
         self._trajectory = self.create_guarded_publisher("~/joint_trajectory_ff")
-        # A torque expires when the stream that it answers would be stale.
+        # A torque expires after the time after which its joint state counts as stale.
         stale_after = self.core.settings.stale_after
         self._torques = EffortPublisher(
             self, robot, "~/joint_torques", "~/commands", stale_after, with_plain=bool(commands)
@@ -66,14 +66,14 @@ class DeltaDynamics(TwinNode):
         self._residual = JointPublisher(self, robot, "~/torque_residual")
         self._reactions = self._create_reaction_publishers(robot)
         self._estimates = Estimates(self, lambda: self.core.robot, (self._base_frame, "platform"))
-        self.core.uncertain = self._estimates.wanted
+        self.core.uncertain = self._estimates.enabled
         if self._estimates.warning():
             self.get_logger().warning(self._estimates.warning())
         self.create_guarded_subscription("~/joint_trajectory", self._on_trajectory, raw=True)
         self.create_guarded_subscription(
             "joint_states",
             self._on_joint_state,
-            refuse=self._refuse_joint_state,
+            refuse=self._reject_joint_state,
             expected=True,
             expires=lambda: self.core.settings.stale_after,
             every=True,
@@ -90,12 +90,12 @@ class DeltaDynamics(TwinNode):
             self.create_guarded_subscription(
                 "base_imu", lambda message: base.take(message, self.now()), expected=True, every=True
             )
-        self.follow([*CHANGES, *changeable(Settings)], self._prepare, self._take)
+        self.follow([*CHANGES, *list_changeable(Settings)], self._prepare_changes, self._apply_changes)
         self._reported_window = 0
         self._accepted: tuple[int, Any] | None = None
         """Arrival of the last accepted joint state by the steady clock, ns, and the message."""
         self._watchdog: Any = None
-        self._watch_every(stale_after)
+        self._start_watchdog(stale_after)
         # A clock step that makes every accepted stamp too old.
         self.start(leap=stale_after + self.core.settings.future_tolerance)
 
@@ -113,7 +113,7 @@ class DeltaDynamics(TwinNode):
 
     def stream_broken(self, where: str) -> None:
         """Stop the stream after an exception."""
-        self._stop("exception", f"{where} raised an exception")
+        self._stop_stream("exception", f"{where} raised an exception")
 
     def activated(self) -> None:
         """Begin a new stream."""
@@ -125,7 +125,7 @@ class DeltaDynamics(TwinNode):
         if self._action is not None:
             self._action.deactivated()
         if self._accepted is not None:
-            self._stop("inactive", "the node was deactivated")
+            self._stop_stream("inactive", "the node was deactivated")
 
     def shutdown(self) -> None:
         """End the goals, hold the machine and send the stop's torque, before all else ends."""
@@ -136,7 +136,7 @@ class DeltaDynamics(TwinNode):
 
     @property
     def shutting_down(self) -> bool:
-        """True while the ends of goals wait for turns of the executor."""
+        """True while results of ended goals still have to be sent by the executor."""
         return self._action is not None and self._action.shutting_down
 
     def reset_stop(self) -> str:
@@ -181,7 +181,7 @@ class DeltaDynamics(TwinNode):
             "close to a singularity": core.near_singularities,
             "singularity index": "" if measure is None else f"{measure:.4f}",
             "acceleration delay (samples)": core.differentiator.delay,
-            "acceleration window": self._window_text(),
+            "acceleration window": self._describe_window(),
         }
         if core.robot.friction.presliding.any():
             values["friction unknown before motion"] = " ".join(core.unknown_friction())
@@ -196,7 +196,7 @@ class DeltaDynamics(TwinNode):
             values |= core.base.stream.counts("messages of base_imu")
         return values
 
-    def _window_text(self) -> str:
+    def _describe_window(self) -> str:
         """Describe the differentiator's window and its errors; log a new length."""
         fit = self.core.differentiator
         if fit.period == 0.0:
@@ -234,14 +234,14 @@ class DeltaDynamics(TwinNode):
             self,
             controller,
             lambda trajectory: self.core.trajectory_steps(trajectory, self.now()),
-            self._place,
+            self._read_positions,
             hold == "hold",
             hold_efforts=lambda trajectory: self.core.trajectory_steps(trajectory, self.now(), holding=True),
             max_age=lambda: self.core.settings.stale_after,
             check=self.core.check_shape,
         )
 
-    def _place(self) -> dict[str, float] | None:
+    def _read_positions(self) -> dict[str, float] | None:
         """Return the joint positions by the controller's names and values; None if not measured."""
         pose, stale_after = self.core.pose, self.core.settings.stale_after
         if self._accepted is None or pose is None or pose.age(time.monotonic_ns()) > stale_after:
@@ -249,11 +249,13 @@ class DeltaDynamics(TwinNode):
         state = self._accepted[1]
         return dict(zip(state.name, map(float, state.position), strict=True))
 
-    def _create_wrenches(self, settings: Settings) -> WrenchWindow | None:
+    def _create_wrench_window(self, settings: Settings) -> WrenchWindow | None:
         wanted = self.declare(
             "use_wrench", False, "include the measured wrench in torques and residual of joint states"
         )
-        age = self.declare("max_wrench_age", 0.1, "largest time between a joint state and its wrench", **SECONDS)
+        age = self.declare(
+            "max_wrench_age", 0.1, "largest time between a joint state and its wrench", **DURATION_BOUNDS
+        )
         policy = self.declare(
             "missing_wrench_policy",
             "ignore",
@@ -324,9 +326,9 @@ class DeltaDynamics(TwinNode):
         yield
         self._trajectory.publish(raw.with_effort(efforts))
         if self._action is not None:
-            self._action.other_motion()
+            self._action.cancel_hold_points()
 
-    def _refuse_joint_state(self, error: MessageError) -> None:
+    def _reject_joint_state(self, error: MessageError) -> None:
         with self._reacting_to_stop():
             self.core.refuse(self.core.stream, error)
 
@@ -337,19 +339,19 @@ class DeltaDynamics(TwinNode):
             if torques is not None:
                 # The process may have been suspended since.
                 core.check_age(torques, self.now())
-            # A rejected message, for example of another machine, is no sign of life of this one.
+            # Only accepted messages reset the watchdog: a rejected one may come from another machine.
             self._accepted = came, message
             if torques is None:
                 return
         self._torques.publish(torques.stamp, torques.sent)
         if torques.residual is not None:
             self._residual.publish(torques.stamp, core.robot.controller.controller_efforts(torques.residual))
-        self.call_further_outputs("reactions or estimates", torques, self._estimates.take, self._publish_reactions)
+        self.call_further_outputs("reactions or estimates", torques, self._estimates.update, self._publish_reactions)
 
     def _publish_reactions(self, torques: Torques) -> None:
-        """Publish each joint's wrench that rigid bodies determine, world axes, at the joint's point.
+        """Publish the wrenches of the joints that rigid-body statics determines, base axes, at the joint.
 
-        They have a rate of their own, as they need a dense solve per sample.
+        Their rate is limited, because each sample needs a dense linear solve.
         """
         if not (self._reactions and self._reactions_pace.due(torques.stamp)):
             return
@@ -360,28 +362,28 @@ class DeltaDynamics(TwinNode):
                 message = make_wrench_message(torques.stamp, self._base_frame, result.wrenches[k])
                 self._reactions[name].publish(message)
 
-    def _watch_every(self, stale_after: float) -> None:
+    def _start_watchdog(self, stale_after: float) -> None:
         if self._watchdog is not None:
             self.destroy_timer(self._watchdog)
-        self._watchdog = self.create_guarded_timer(min(0.25 * stale_after, 0.1), self._watch)
+        self._watchdog = self.create_guarded_timer(min(0.25 * stale_after, 0.1), self._stop_if_silent)
 
-    def _watch(self) -> None:
+    def _stop_if_silent(self) -> None:
         """Stop a silent stream; runs on the steady clock."""
         core = self.core
         silent = 0.0 if self._accepted is None else (time.monotonic_ns() - self._accepted[0]) / SECOND
         if not core.stream.stopped and silent > core.settings.stale_after:
-            self._stop("stale input", f"no accepted joint state for {silent:.3f} s")
+            self._stop_stream("stale input", f"no accepted joint state for {silent:.3f} s")
 
-    def _stop(self, reason: str, text: str) -> None:
+    def _stop_stream(self, reason: str, text: str) -> None:
         with self._reacting_to_stop():
             self.core.stop(reason, text)
 
-    def _prepare(self, values: dict[str, Any]) -> tuple[Robot, Settings]:
+    def _prepare_changes(self, values: dict[str, Any]) -> tuple[Robot, Settings]:
         core, own = self.core, {k: v for k, v in values.items() if k in CHANGES}
         robot = change_robot(core.robot, own) if own else core.robot
         return robot, with_parameters(core.settings, values)
 
-    def _take(self, prepared: tuple[Robot, Settings]) -> None:
+    def _apply_changes(self, prepared: tuple[Robot, Settings]) -> None:
         (robot, settings), core = prepared, self.core
         before = core.settings
         if robot is not core.robot:
@@ -389,7 +391,7 @@ class DeltaDynamics(TwinNode):
             self._estimates.change_robot(robot)
         core.change_settings(settings)
         if settings.stale_after != before.stale_after:
-            self._watch_every(settings.stale_after)
+            self._start_watchdog(settings.stale_after)
 
 
 NODE = DeltaDynamics

@@ -22,20 +22,20 @@ from pkm_twin.codegen.arrays import Array
 class Stepper:
     """Apply the method for one span of time.
 
-    :param weights: see :func:`_damped_weights`; matrices, shape (11, n, n), where something is damped.
-    :param damping: shape (n, n), 1/s; None: none.
+    :param weights: see :func:`_damped_weights`; matrices, shape (11, n, n), with damping.
+    :param damping: shape (n, n), 1/s; None without damping.
     """
 
     def __init__(self, weights: Any, damping: Array | None = None) -> None:
         self._weights, self._damping = weights, damping
-        self._on: Callable[..., Any] = np.multiply if damping is None else np.matmul
+        self._multiply: Callable[..., Any] = np.multiply if damping is None else np.matmul
 
     def run(self, q: Array, v: Array, accelerations: Callable[[Array, Array], Array]) -> tuple[Array, Array]:
         """Return positions and velocities at the end, shape (n,) each.
 
         :param accelerations: called four times with positions and velocities; includes damping.
         """
-        on, damping = self._on, self._damping
+        multiply, damping = self._multiply, self._damping
         half, drift, lift, whole, far, v0, v1, v2, q0, q1, q2 = self._weights
 
         def undamped_part(q: Array, v: Array) -> Array:
@@ -43,7 +43,7 @@ class Stepper:
             return a if damping is None else a + damping @ v
 
         def move_half(q: Array, v: Array, n: Array) -> tuple[Array, Array]:
-            return q + on(drift, v) + on(lift, n), on(half, v) + on(drift, n)
+            return q + multiply(drift, v) + multiply(lift, n), multiply(half, v) + multiply(drift, n)
 
         first = undamped_part(q, v)
         a = move_half(q, v, first)
@@ -52,8 +52,8 @@ class Stepper:
         fourth = undamped_part(*move_half(*a, 2.0 * third - first))
         inner = second + third
         return (
-            q + on(far, v) + on(q0, first) + on(q1, inner) + on(q2, fourth),
-            on(whole, v) + on(v0, first) + on(v1, inner) + on(v2, fourth),
+            q + multiply(far, v) + multiply(q0, first) + multiply(q1, inner) + multiply(q2, fourth),
+            multiply(whole, v) + multiply(v0, first) + multiply(v1, inner) + multiply(v2, fourth),
         )
 
 
@@ -63,28 +63,28 @@ def make_undamped_stepper(span: float) -> Stepper:
     return Stepper(_undamped_weights(span))
 
 
-def make_damped_stepper(span: float, modes: Array, back: Array, decays: Array) -> Stepper:
+def make_damped_stepper(span: float, modes: Array, to_modes: Array, decays: Array) -> Stepper:
     """Return the method of order four that integrates viscous damping exactly.
 
     :param modes: of the damping, columns, shape (n, r); other directions are undamped.
-    :param back: from rates to modes, shape (r, n).
+    :param to_modes: from rates to modes, shape (r, n).
     :param decays: of the modes, 1/s, shape (r,).
     """
     plain = np.array(_undamped_weights(span))
     # The method's weights for each damped mode, shape (11, r).
     z = -span * decays
-    near, far = _phi(0.5 * z), _phi(z)
+    near, far = evaluate_phi(0.5 * z), evaluate_phi(z)
 
-    def stages(k: int) -> list[Array]:
+    def stage_weights(k: int) -> list[Array]:
         a, b, c = far[k : k + 3]
         return [a - 3.0 * b + 4.0 * c, 2.0 * (b - 2.0 * c), 4.0 * c - b]
 
     rows = [near[0], 0.5 * span * near[1], 0.25 * span * span * near[2], far[0], span * far[1]]
-    rows += [span * row for row in stages(1)]
-    rows += [span * span * row for row in stages(2)]
+    rows += [span * row for row in stage_weights(1)]
+    rows += [span * span * row for row in stage_weights(2)]
     deltas = np.array(rows) - plain[:, None]
-    weights = plain[:, None, None] * np.eye(len(modes)) + (modes * deltas[:, None, :]) @ back
-    return Stepper(weights, (modes * decays) @ back)
+    weights = plain[:, None, None] * np.eye(len(modes)) + (modes * deltas[:, None, :]) @ to_modes
+    return Stepper(weights, (modes * decays) @ to_modes)
 
 
 def _undamped_weights(h: float) -> list[float]:
@@ -93,7 +93,7 @@ def _undamped_weights(h: float) -> list[float]:
     return [1.0, 0.5 * h, h * h / 8.0, 1.0, h, sixth, 2.0 * sixth, sixth, h * sixth, h * sixth, 0.0]
 
 
-def _phi(z: Array) -> list[Array]:
+def evaluate_phi(z: Array) -> list[Array]:
     """Return the functions phi_0 = exp to phi_4 of non-positive numbers, shape (r,) each.
 
     phi_k(z) = z phi_(k+1)(z) + 1 / k!, so k! phi_k is Kummer's function M(1, k + 1, z).

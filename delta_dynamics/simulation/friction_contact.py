@@ -96,14 +96,14 @@ def find_independent_rows(rows: Array, inverse: Array) -> list[int]:
 
 
 ZERO_VELOCITY: Final = 1e-12
-"""Velocity that counts as zero, relative to the joints' contributions to it."""
+"""Velocity of a row that counts as zero, relative to the largest contribution of a joint to it."""
 
 
 @dataclass(slots=True)
 class Law:
-    """The rows that slide (m), their directions, and the rows that are held (h), until a change."""
+    """The rows that slide (m), their directions, and the rows that are held (h), until one changes."""
 
-    pull: Array
+    dry_friction: Array
     """Constant dry friction of all rows, shape (n + k,)."""
     still: Mask
     """Rows that do not move, shape (n + k,)."""
@@ -131,21 +131,21 @@ class Law:
     """Holding forces at the start, shape (h,)."""
 
     @property
-    def stands(self) -> bool:
-        """True if all drives are held."""
+    def is_at_rest(self) -> bool:
+        """True if friction or stops hold all drives."""
         return len(self.held) == len(self.effort)
 
 
 class Resistance:
     """Model friction and stops of a robot, and track which of its rows move.
 
-    ``pushed``: passive joints that efforts act on, by their places among those with friction. These
+    ``forced_joints``: passive joints that efforts act on, by their places among those with friction. These
     efforts come after the wrench's six numbers, and their rates after the platform's twist.
-    ``memory``: of the drives' friction, at the start of the part of a step that goes on.
+    ``memory``: state of the drives' presliding friction at the start of the present part of a step.
     """
 
-    def __init__(self, robot: Robot, pushed: Sequence[int] = (), memory: Memory | None = None) -> None:
-        self._pushed = list(pushed)
+    def __init__(self, robot: Robot, forced_joints: Sequence[int] = (), memory: Memory | None = None) -> None:
+        self._pushed = list(forced_joints)
         n = robot.joints_count
         friction, passive = robot.friction, list_loaded_joints(robot.graph)
         self._offset = np.array(friction.offset, np.float64)
@@ -217,11 +217,11 @@ class Resistance:
             low[:n], high[:n] = bound_static_friction(held, self._dry[:n] + dry, share)
         return low, high
 
-    def rows(self, here: Terms) -> Array:
+    def row_velocities(self, here: Terms) -> Array:
         """Return the velocities of all rows by joint velocities, shape (n + k, n)."""
         return np.concatenate([self._drives, here.rows]) if self._passive else self._drives
 
-    def enter_state(self, q: Array, qd: Array) -> Terms:
+    def apply_state(self, q: Array, qd: Array) -> Terms:
         """Return the terms of a new state, after the impact of joints that reach their stops."""
         return self._apply_impact(self._classify_rows(self.at(q, qd)))
 
@@ -229,7 +229,7 @@ class Resistance:
         """Determine which rows move, and in which direction."""
         qd = here.qd
         rates = np.concatenate([qd, here.rows @ qd]) if self._passive else qd
-        self._still = np.abs(rates) <= ZERO_VELOCITY * np.abs(self.rows(here) * here.qd).max(1)
+        self._still = np.abs(rates) <= ZERO_VELOCITY * np.abs(self.row_velocities(here) * here.qd).max(1)
         self._states = np.where(self._still, 0.0, np.sign(rates)).astype(np.int8)
         self._law = None
         return here
@@ -243,7 +243,7 @@ class Resistance:
         j = np.flatnonzero(up | down)
         across = _inverse(here.mass)[:, j]
         low, high = np.where(down[j], -math.inf, 0.0), np.where(up[j], math.inf, 0.0)
-        # Friction, which is bounded, does not hold against an impact.
+        # An impact is unbounded, so bounded friction cannot resist it.
         impulse, states = solve_resisting_forces(across[j], qd[j], low, high, np.zeros(len(j), np.int8))
         qd = qd - across @ impulse
         qd[j[states == 0]] = 0.0
@@ -252,7 +252,10 @@ class Resistance:
         return self._classify_rows(self.at(q, qd))
 
     def find_law(self, here: Terms, effort: Array, wrench: Array | None) -> Law:
-        """Return which rows are held from now on, under efforts (n,) and a wrench (6,) and more."""
+        """Return which rows slide and which are held under efforts (n,) and a wrench.
+
+        :param wrench: shape (6,), followed by the efforts on ``forced_joints``.
+        """
         law = self._law
         if law is not None:
             self._set_load(law, here, effort, wrench)
@@ -274,21 +277,21 @@ class Resistance:
             low, high = self._bounds(here, law.given)
             high[:n][up] = math.inf
             low[:n][down] = -math.inf
-            # Forces that resist the motion of the still rows z, with friction of all others as it is.
+            # Solve for the forces that hold the resting rows z, while the others keep their friction.
             z, inverse, motion = np.flatnonzero(resists), _inverse(here.mass), law.first
-            rows = self.rows(here)[z]
+            rows = self.row_velocities(here)[z]
             if self._passive:
                 motion = np.concatenate([motion, here.rows @ motion + here.drift])
             force, states = solve_resisting_forces(rows @ inverse @ rows.T, motion[z], low[z], high[z], self._states[z])
             self._states[z] = states
             stays = np.flatnonzero(states == 0)
-            # A row that depends on others does not hold: its force is constant, and it is still.
+            # A row that depends on held rows is at rest by them: its own force is constant.
             own = stays[find_independent_rows(rows[stays], inverse)]
             law.still[z[stays]] = True
             for i in np.flatnonzero(states):
                 law.still[z[i]] = len(find_independent_rows(rows[[*own, i]], inverse)) == len(own)
             force[own] = 0.0
-            law.pull[z] = force
+            law.dry_friction[z] = force
             begins = z[~law.still[z] & self._rubs[z]]
             law.slides = np.concatenate([law.slides, begins])
             law.signs = np.concatenate([law.signs, self._states[begins]])
@@ -302,7 +305,7 @@ class Resistance:
 
     def _set_load(self, law: Law, here: Terms, effort: Array, wrench: Array | None) -> None:
         law.given, law.wrench = effort - self._offset, wrench
-        law.effort = law.given - law.pull[: len(effort)]
+        law.effort = law.given - law.dry_friction[: len(effort)]
         if self._laws and len(law.held):
             # The load that friction can hold grows with the load on the joint.
             low, high = (one[law.held] for one in self._bounds(here, law.given))
@@ -315,14 +318,14 @@ class Resistance:
         n, h, effort = len(law.effort), len(law.held), law.effort
         if self._laws:
             low, high = self._bounds(here, law.given)
-            pull = law.pull.copy()
+            pull = law.dry_friction.copy()
             pull[law.slides] = np.where(law.signs > 0.0, high[law.slides], low[law.slides])
             effort = law.given - pull[:n]
         rest = effort - here.bias
         if law.wrench is not None:
             rest = rest + law.wrench @ here.twists
         if self._passive:
-            rest = rest - (self._inner * (here.rows @ here.qd) + law.pull[n:]) @ here.rows
+            rest = rest - (self._inner * (here.rows @ here.qd) + law.dry_friction[n:]) @ here.rows
         if self._damped:
             rest = rest - self._viscous * here.qd
         if not h:
@@ -330,7 +333,7 @@ class Resistance:
             if bad:
                 raise ValueError("the mass matrix is not positive")
             return result, np.zeros(0)
-        rows = self.rows(here)[law.held]
+        rows = self.row_velocities(here)[law.held]
         matrix = np.zeros((n + h, n + h))
         matrix[:n, :n] = here.mass
         matrix[:n, n:] = rows.T
@@ -345,13 +348,13 @@ class Resistance:
         if not self._damped:
             return make_undamped_stepper(span)
         damping = self._damping(here)
-        # A decay below a tenth is no stiffness for the classical method.
+        # If velocities decay by less than a tenth in the span, the classical method is stable.
         if span * dposv(here.mass, damping)[1].trace() < 0.1:
             return make_undamped_stepper(span)
         free = self._drives
         if len(law.held):
-            # Joint velocities that the held rows allow.
-            free = np.linalg.svd(self.rows(here)[law.held])[2][len(law.held) :].T
+            # Basis of the joint velocities at which held rows rest.
+            free = np.linalg.svd(self.row_velocities(here)[law.held])[2][len(law.held) :].T
             free[law.held[law.held < len(free)]] = 0.0
         root = np.linalg.inv(np.linalg.cholesky(free.T @ here.mass @ free))
         decays, turned = np.linalg.eigh(root @ (free.T @ damping @ free) @ root.T)
@@ -366,8 +369,8 @@ class Resistance:
     def step_implicitly(self, here: Terms, law: Law, span: float) -> Terms:
         """Integrate a part of a step by Moreau's implicit time stepping, of order one.
 
-        For changes faster than can be resolved: friction so stiff that its transients have decayed.
-        It needs no constant law, always has a result, and removes energy.
+        For friction so stiff that its transients cannot be resolved. Rows may start or stop sliding in
+        the part; there is always a result, and energy never grows.
         """
         n = len(here.q)
         inverse = _inverse(here.mass + span * self._damping(here))
@@ -380,7 +383,7 @@ class Resistance:
         resists = self._rubs.copy()
         resists[:n] |= up | down
         z = np.flatnonzero(resists)
-        rows = self.rows(here)[z]
+        rows = self.row_velocities(here)[z]
         states = np.zeros(len(z), np.int8)
         if len(z):
             force, states = solve_resisting_forces(rows @ inverse @ rows.T, rows @ rates, low[z], high[z], states)
@@ -393,16 +396,16 @@ class Resistance:
         low, high = np.minimum(self._low, here.q), np.maximum(self._high, here.q)
         return self._apply_impact(self.at(np.clip(here.q + span * rates, low, high), rates))
 
-    def lasting_part(self, here: Terms, end: Terms, law: Law) -> float:
-        """Return the part of a span for which a law lasts, 1 for all of it.
+    def find_lasting_fraction(self, here: Terms, end: Terms, law: Law) -> float:
+        """Return the fraction of a span up to which the law holds, 1 for all of it.
 
-        Joints keep their stops, rows that slide their directions, and forces that hold their
-        bounds. Each of these margins is interpolated linearly between both ends of the span.
+        It holds while joints are within their stops, sliding rows keep their directions, and holding
+        forces are within their bounds. Each of these margins is interpolated linearly between both ends of the span.
         """
         before, after = here.q[law.moves], end.q[law.moves]
         begins, ends = [law.ceiling - before, before - law.floor], [law.ceiling - after, after - law.floor]
         if len(law.slides):
-            first, last = (self.rows(t)[law.slides] for t in (here, end))
+            first, last = (self.row_velocities(t)[law.slides] for t in (here, end))
             begins.append(law.signs * (first @ here.qd))
             ends.append(law.signs * (last @ end.qd) + ZERO_VELOCITY * (np.abs(last) @ np.abs(end.qd)))
         if len(law.held):
@@ -417,13 +420,13 @@ class Resistance:
         margin = np.maximum(margin[broken], 0.0)
         return float((margin / (margin - left[broken])).min())
 
-    def settle(self, end: Terms, law: Law) -> Terms:
-        """Return the state at the end of a part under a law; rows that are held stay still."""
+    def finish_part(self, end: Terms, law: Law) -> Terms:
+        """Return the state at the end of a part, with held rows at rest and impacts applied."""
         self._still = law.still
         self._states[law.still] = 0
         if self._passive and len(law.held):
-            # Rows of passive joints that are held would drift.
-            rows = self.rows(end)[law.held]
+            # Remove the velocity that integration errors give held rows of passive joints.
+            rows = self.row_velocities(end)[law.held]
             across = np.linalg.solve(end.mass, rows.T)
             drift = np.linalg.lstsq(rows @ across, rows @ end.qd, rcond=1e-12)[0]
             qd = end.qd - across @ drift

@@ -114,39 +114,40 @@ def tune_position_control(robot: Robot, bandwidth: float) -> tuple[Array, Array]
     return inertia * turn**2, 2.0 * inertia * turn
 
 
-def stable_share(robot: Robot, settings: MachineSettings) -> float:
-    """Return the stable fraction of the position control's bandwidth, at most 1.
+def stable_fraction(robot: Robot, settings: MachineSettings) -> float:
+    """Return the largest stable fraction of the position control's bandwidth, at most 1.
 
-    Stable: in the discrete loop of the sampled control and the machine's masses, linear about rest,
-    no error grows, at the start and in the pose where the loop is fastest, with every payload, and
-    with gains that are higher by :data:`GAIN_MARGIN`. The bandwidth is that of :func:`tune_position_control`:
-    stiffness goes by its square, damping by itself.
+    The control is stable if no error grows in the discrete loop of the sampled control and the
+    machine's masses, linearised about rest: at the start and in the pose where the loop is fastest,
+    with every payload, and with gains that are higher by :data:`GAIN_MARGIN`. As in
+    :func:`tune_position_control`, the stiffness is proportional to the square of the bandwidth, the
+    damping to the bandwidth.
     """
     q = np.vstack([settings.start, random_joints(robot, np.random.default_rng(0), 64)])
     inertias = []
-    follow = robot.drive_jacobian(q)
+    drive_rates = robot.drive_jacobian(q)
     for event in settings.payloads or (None,):
         loaded = robot if event is None else robot.changed(payload=event.load)
         inertia = mass_matrix(loaded.leading_machine, q[:, robot.graph.leading])
         gains = settings.damping + 0.5 * settings.period * settings.stiffness
-        gains = follow.swapaxes(-1, -2) @ (gains[:, None] * follow)
+        gains = drive_rates.swapaxes(-1, -2) @ (gains[:, None] * drive_rates)
         speeds = np.abs(np.linalg.eigvals(np.linalg.solve(inertia, gains))).max(-1)
         fastest = int(speeds.argmax())
-        inertias += [(inertia[0], follow[0]), (inertia[fastest], follow[fastest])]
+        inertias += [(inertia[0], drive_rates[0]), (inertia[fastest], drive_rates[fastest])]
 
-    def stable(share: float) -> bool:
+    def is_stable(fraction: float) -> bool:
         return all(
-            error_growth(inertia, settings, gain * share**2, gain * share, rates) <= 1.0 + 1e-6
+            error_growth(inertia, settings, gain * fraction**2, gain * fraction, rates) <= 1.0 + 1e-6
             for inertia, rates in inertias
             for gain in (1.0, GAIN_MARGIN)
         )
 
-    if stable(1.0):
+    if is_stable(1.0):
         return 1.0
     low, high = 0.0, 1.0
     for _ in range(12):
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if stable(middle) else (low, middle)
+        low, high = (middle, high) if is_stable(middle) else (low, middle)
     return low
 
 
@@ -164,22 +165,22 @@ def error_growth(
     :param stiffness: factor of the settings' stiffness, ``damping``: of their damping.
     """
     n, s = len(inertia), settings
-    turn = np.eye(n) if follow is None else follow
+    drive_rates = np.eye(n) if follow is None else follow
     delay = math.ceil(s.delay / s.period)
     period = s.period if delay <= MAX_MODELLED_DELAYS else s.delay / MAX_MODELLED_DELAYS
     # Every row block of the unit matrix is one quantity, in terms of the state.
     unit = np.eye(n * (3 + min(delay, MAX_MODELLED_DELAYS)))
     q, qd, before, *waiting = unit.reshape(-1, n, len(unit))
-    rates = np.where(s.resolution[:, None] > 0.0, turn @ (q - before) / period, turn @ qd)
-    effort = -stiffness * s.stiffness[:, None] * (turn @ q) - damping * s.damping[:, None] * rates
-    waiting.append(turn.T @ effort)
+    rates = np.where(s.resolution[:, None] > 0.0, drive_rates @ (q - before) / period, drive_rates @ qd)
+    effort = -stiffness * s.stiffness[:, None] * (drive_rates @ q) - damping * s.damping[:, None] * rates
+    waiting.append(drive_rates.T @ effort)
     qdd = np.linalg.solve(inertia, waiting.pop(0))
     after = [q + period * qd + 0.5 * period**2 * qdd, qd + period * qdd, q, *waiting]
     return float(np.abs(np.linalg.eigvals(np.concatenate(after))).max())
 
 
 @dataclass(frozen=True)
-class Measured:
+class SensorReadings:
     """Hold what the sensors measure, shape (n,) each: rad or m, their rates, N m or N."""
 
     stamp: int
@@ -214,9 +215,9 @@ class Simulation(Core):
         self.saturations = 0
         self.now = start
         self._reader = JointReader(robot, with_effort=True)
-        self._begin()
+        self._reset_state()
 
-    def _begin(self) -> None:
+    def _reset_state(self) -> None:
         s = self.settings
         self.braked, self.failure = True, ""
         self.plant = Plant(self.robot, s.start)
@@ -225,18 +226,18 @@ class Simulation(Core):
         )
         self._begun = self.now
         self._payloads = deque(sorted(s.payloads, key=lambda event: event.time))
-        self._coming: deque[tuple[int, Array]] = deque()
+        self._delayed_efforts: deque[tuple[int, Array]] = deque()
         self._effort = np.zeros(self.robot.joints_count)
         self._commanded: int | None = None
         self._path: tuple[int, JointPath] | None = None
-        self._pushed = np.zeros(6)
-        self._seen = self._read_encoders()
-        self._seen_rate = np.zeros_like(self._seen)
+        self._topic_wrench = np.zeros(6)
+        self._encoder_positions = self._read_encoders()
+        self._encoder_rates = np.zeros_like(self._encoder_positions)
 
     def restart(self) -> None:
         """Return to the start, braked; the clock continues."""
         self.stream.resume()
-        self._begin()
+        self._reset_state()
 
     @property
     def time(self) -> float:
@@ -244,12 +245,12 @@ class Simulation(Core):
         return (self.now - self._begun) / SECOND
 
     def skip(self, nanoseconds: int) -> None:
-        """Advance the clock without the machine, as after a suspension of the process."""
+        """Advance the clock but not the machine, as after a suspension of the process."""
         self.now += nanoseconds
         self._begun += nanoseconds
 
     def commands(self, message: Any) -> None:
-        """Take efforts as std_msgs/Float64MultiArray, the controller's, in the robot's order.
+        """Apply efforts of a std_msgs/Float64MultiArray, in the controller's units and the robot's order.
 
         :raises MessageError: rejected and counted; the previous command stays in effect.
         """
@@ -258,7 +259,7 @@ class Simulation(Core):
         self._path = None
         self._commanded = self.now
         self.braked = False
-        self._send(effort)
+        self._queue_effort(effort)
 
     def trajectory(self, message: Any) -> None:
         """Follow a trajectory_msgs/JointTrajectory by position control with its feedforward.
@@ -266,22 +267,22 @@ class Simulation(Core):
         A zero stamp starts it now. Before its first point the path leads there from here.
 
         :param message: the message or its TrajectoryFields.
-        :raises MessageError: rejected whole, and counted; what was commanded before stays.
+        :raises MessageError: rejected and counted; the previous command stays in effect.
         """
         with self.taking(self.trajectories):
             t = self._reader.trajectory(message, self.now)
-            if self.stable_share < 1.0:
+            if self.stable_fraction < 1.0:
                 raise MessageError("unstable control", self.control_fault())
-        self._path = (t.stamp or self.now, JointPath(t).from_here(self._seen))
+        self._path = (t.stamp or self.now, JointPath(t).from_here(self._encoder_positions))
 
     @cached_property
-    def stable_share(self) -> float:
-        """Stable fraction of this machine's bandwidth, as :func:`stable_share`."""
-        return stable_share(self.robot, self.settings)
+    def stable_fraction(self) -> float:
+        """Stable fraction of this machine's bandwidth, as :func:`stable_fraction`."""
+        return stable_fraction(self.robot, self.settings)
 
     def control_fault(self) -> str:
-        """Explain why no trajectory is followed if :attr:`stable_share` is below 1."""
-        s, share = self.settings, self.stable_share
+        """Explain why no trajectory is followed if :attr:`stable_fraction` is below 1."""
+        s, share = self.settings, self.stable_fraction
         # Critically damped: stiffness m w^2 and damping 2 m w.
         damped = s.damping > 0.0
         bandwidth = (s.stiffness[damped] / s.damping[damped] / np.pi).max(initial=0.0)
@@ -298,38 +299,38 @@ class Simulation(Core):
         """
         rules = StampRules(accept_zero=True, future_tolerance=SECOND)
         with self.taking(self.wrenches):
-            self._pushed = read_wrench(message, self.now, rules, frame, False).wrench
+            self._topic_wrench = read_wrench(message, self.now, rules, frame, False).wrench
 
-    def measured(self) -> Measured:
+    def read_sensors(self) -> SensorReadings:
         """Return the sensors' present measurements."""
         force = self._applied_wrench()
         rotation = self.robot.platform(self.plant.q)[1]
         turned = np.concatenate([force[:3] @ rotation, force[3:] @ rotation])
-        return Measured(self.now, self._seen, self._seen_rate, self._effort, turned)
+        return SensorReadings(self.now, self._encoder_positions, self._encoder_rates, self._effort, turned)
 
     def advance(self) -> None:
         """Simulate one period; a failed machine stays where it was.
 
-        :raises MessageError: it fails now: a singularity, the edge of reach, or no finite result.
+        :raises MessageError: it fails: a singularity, the edge of the workspace, or no finite result.
         """
         s = self.settings
         if self._path is not None and self.now >= self._path[0]:
             start, path = self._path
             self.braked, self._commanded = False, None
             wanted = path.at((self.now - start) / SECOND)
-            errors = wanted.q - self._seen, wanted.qd - self._seen_rate
-            self._send(np.asarray(s.stiffness * errors[0] + s.damping * errors[1] + wanted.effort))
-        while self._coming and self._coming[0][0] <= self.now:
-            self._apply(self._coming.popleft()[1])
+            errors = wanted.q - self._encoder_positions, wanted.qd - self._encoder_rates
+            self._queue_effort(np.asarray(s.stiffness * errors[0] + s.damping * errors[1] + wanted.effort))
+        while self._delayed_efforts and self._delayed_efforts[0][0] <= self.now:
+            self._apply_effort(self._delayed_efforts.popleft()[1])
         silent = self._commanded is not None and self.now - self._commanded > s.deadline * SECOND
         if silent and s.timeout_action == "zeros":
-            self._apply(np.zeros_like(self._effort))
+            self._apply_effort(np.zeros_like(self._effort))
         while self._payloads and self._payloads[0].time <= self.time:
             load = self._payloads.popleft().load
             self.plant.change_robot(self.robot.changed(payload=load))
         if not self.failure and not self.braked:
             try:
-                as_message_error(self._move)
+                as_message_error(self._integrate_period)
             except MessageError as error:
                 self.plant.stop_motion()
                 self.failure = f"{error.reason}: {error}"
@@ -338,7 +339,7 @@ class Simulation(Core):
                 raise
         self._end_period()
 
-    def _move(self) -> None:
+    def _integrate_period(self) -> None:
         s, wrench = self.settings, self._applied_wrench()
         q = self.plant.q
         for _ in range(s.substeps):
@@ -363,10 +364,12 @@ class Simulation(Core):
         """End the period: advance the clock, and sample the encoders."""
         s = self.settings
         self.now += round(s.period * SECOND)
-        before, self._seen = self._seen, self._read_encoders()
-        self._seen_rate = self.plant.qd
+        before, self._encoder_positions = self._encoder_positions, self._read_encoders()
+        self._encoder_rates = self.plant.qd
         if s.resolution.any():
-            self._seen_rate = np.where(s.resolution > 0.0, (self._seen - before) / s.period, self.plant.qd)
+            self._encoder_rates = np.where(
+                s.resolution > 0.0, (self._encoder_positions - before) / s.period, self.plant.qd
+            )
 
     def _read_encoders(self) -> Array:
         q, step = self.plant.q, self.settings.resolution
@@ -375,13 +378,13 @@ class Simulation(Core):
         steps = np.where(step > 0.0, step, 1.0)
         return np.where(step > 0.0, np.round(q / steps) * steps, q)
 
-    def _send(self, effort: Array) -> None:
-        self._coming.append((self.now + round(self.settings.delay * SECOND), effort))
+    def _queue_effort(self, effort: Array) -> None:
+        self._delayed_efforts.append((self.now + round(self.settings.delay * SECOND), effort))
 
-    def _apply(self, effort: Array) -> None:
+    def _apply_effort(self, effort: Array) -> None:
         limits = self.settings.effort_limits
         self.saturations += bool((np.abs(effort) > limits).any())
         self._effort = np.clip(effort, -limits, limits)
 
     def _applied_wrench(self) -> Array:
-        return self.settings.wrench.at(self.time) + self._pushed
+        return self.settings.wrench.at(self.time) + self._topic_wrench

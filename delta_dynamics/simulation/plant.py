@@ -22,7 +22,7 @@ from pkm_twin.machine.inertia import list_loaded_joints
 from pkm_twin.robot.robot import Robot
 
 MAX_EXPLICIT_PARTS: Final = 100
-"""Parts of a step from which on it is integrated implicitly, as changes accumulate."""
+"""Number of parts of a step after which implicit parts get longer, as changes accumulate."""
 MIN_RELATIVE_SPAN: Final = 0.5**12
 """Shortest part of a step, relative to it: the one in which what sticks or slides changes."""
 MAX_ENERGY_GROWTH: Final = 1e-9
@@ -41,8 +41,8 @@ class Plant:
     stops obey Coulomb's law: a joint sticks exactly and leaves only beyond its friction. A part
     ends just before what sticks or slides changes, by linear interpolation; the change itself is
     within 1/4096 of the step, which is integrated implicitly. Stops do not bounce: an impact
-    projects the rates, in the mass matrix, onto those that all stops allow. Energy grows by what
-    efforts and wrench do and by nothing else; a part that gains some is halved.
+    projects the rates, in the mass matrix, onto those that all stops allow. A part in which the
+    energy grows by more than the work of efforts and wrench is halved.
     """
 
     robot: Robot
@@ -89,8 +89,7 @@ class Plant:
             axes, shape (6,), N and N m.
         :raises UnreachableError: the machine has left where it can be assembled.
         :raises SingularityError: it has reached a singularity.
-        :raises ValueError: a result that is not finite, or a motion that no part of the step is
-            short enough for.
+        :raises ValueError: a result that is not finite, or a motion too fast for the shortest part.
         """
         effort = np.asarray(effort, np.float64)
         load = np.asarray(wrench, np.float64) if np.any(wrench) else None
@@ -101,16 +100,16 @@ class Plant:
         here, left = self._here, step
         q, qd = self.q[self._leading], self.qd[self._leading]
         if here is None or here.q.tobytes() + here.qd.tobytes() != q.tobytes() + qd.tobytes():
-            here = self._resistance.enter_state(q, qd)
+            here = self._resistance.apply_state(q, qd)
         least, span, changes = step * MIN_RELATIVE_SPAN, step, False
         for part in itertools.count():
-            # Where changes accumulate, implicit parts get longer.
+            # After many changes in one step, lengthen the implicit parts.
             least *= 4.0 if part > MAX_EXPLICIT_PARTS else 1.0
             law, taken = self._resistance.find_law(here, effort, load), left
-            if changes and not law.stands:
+            if changes and not law.is_at_rest:
                 here, taken = self._step_implicitly(here, law, min(left, least))
                 changes, span = False, step
-            elif not law.stands:
+            elif not law.is_at_rest:
                 here, taken, changes = self._integrate_law(here, law, min(left, span), least)
                 span = 2.0 * taken
             self._resistance.store_memory(here)
@@ -132,12 +131,12 @@ class Plant:
             part = 1.0
             with contextlib.suppress(PkmTwinError, ValueError):  # the law may change before
                 end, work = self._step_explicitly(here, law, span)
-                part = resistance.lasting_part(here, end, law)
+                part = resistance.find_lasting_fraction(here, end, law)
                 growth = _energy_growth(here, end, law, work)
                 if part == 1.0 and growth <= MAX_ENERGY_GROWTH * (here.kinetic + end.kinetic) + _energy_rounding(
                     here, end, law
                 ):
-                    settled = resistance.settle(end, law)
+                    settled = resistance.finish_part(end, law)
                     if settled is not end or growth > 0.0:
                         settled = _remove_growth(here, settled, law, work)
                     return settled, span, changes
@@ -193,6 +192,6 @@ def _remove_growth(here: Terms, end: Terms, law: Law, work: float = 0.0) -> Term
     growth = _energy_growth(here, end, law, work)
     if growth <= 0.0 or growth <= _energy_rounding(here, end, law):
         return end
-    # The change is so small that the other terms of the state are kept.
+    # The correction is so small that the other terms of the state need no update.
     left = max(0.0, 1.0 - growth / end.kinetic) if end.kinetic else 0.0
     return end._replace(qd=math.sqrt(left) * end.qd, kinetic=left * end.kinetic)

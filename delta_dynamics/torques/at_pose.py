@@ -14,14 +14,14 @@ from numpy.typing import ArrayLike
 from delta_dynamics.torques.virtual_work import (
     Forces,
     add_friction_and_rotors,
-    efforts_left,
     efforts_of_motion,
     leading_accelerations,
     mass_entries,
-    solve_massive,
+    remaining_efforts,
+    solve_accelerations,
 )
 from pkm_twin.codegen.arrays import Array, vectors
-from pkm_twin.codegen.code import GOOD, REFUSED
+from pkm_twin.codegen.code import REJECTED, VALID
 from pkm_twin.codegen.expressions import PARAMETERS, Numbers, Objects, snapped_all
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.lu import SparseLU
@@ -132,10 +132,10 @@ def evaluate_at_pose(robot: Robot, kernel: PoseKernel, p: Array, *given: ArrayLi
     if status is not None:
         rows = [np.broadcast_to(a, (*status.shape[:-1], np.shape(a)[-1])) for a in given]
         robot.inverse(rows[0])
-        left = status[..., 0] != GOOD
+        left = status[..., 0] != VALID
         again, status = kernel(robot, certified=False)(p, *(row[left] for row in rows))
         if status is not None:
-            lost = np.flatnonzero(status[:, 0] == REFUSED)
+            lost = np.flatnonzero(status[:, 0] == REJECTED)
             if not len(lost):
                 raise ValueError("an input in addition to the pose is not finite, or too large")
             index = tuple(int(k) for k in np.argwhere(left)[lost[0]])
@@ -146,7 +146,7 @@ def evaluate_at_pose(robot: Robot, kernel: PoseKernel, p: Array, *given: ArrayLi
     return found
 
 
-def _kernel(robot: Robot, name: str, write: Callable[..., Program], *, certified: bool) -> Kernel:
+def _compile_at_pose(robot: Robot, name: str, write: Callable[..., Program], *, certified: bool) -> Kernel:
     """Return the compiled program of a pose; without a closed form, one program for all poses.
 
     :raises ParameterError: a robot whose file gives no masses.
@@ -159,7 +159,7 @@ def _kernel(robot: Robot, name: str, write: Callable[..., Program], *, certified
 
 def pose_torques(robot: Robot, *, certified: bool) -> Kernel:
     """Return the program from pose, rate, acceleration and wrench to q, qd, qdd and efforts."""
-    return _kernel(robot, "torques", _pose_torques, certified=certified)
+    return _compile_at_pose(robot, "torques", _write_pose_torques, certified=certified)
 
 
 def iterated_pose_torques(robot: Robot) -> Kernel:
@@ -168,18 +168,18 @@ def iterated_pose_torques(robot: Robot) -> Kernel:
     Poses are accepted as by :attr:`.engine.Engine.followed_inverse`.
     """
     engine = robot.massive()
-    write = partial(_pose_torques, scheme=None, certified=True)
+    write = partial(_write_pose_torques, scheme=None, certified=True)
     return engine.kernel("followed torques at pose", write, repr(engine.inverse_pivots))
 
 
 def pose_masses(robot: Robot, *, certified: bool) -> Kernel:
     """Return the program from a pose to the mass matrices of joints and of pose coordinates."""
-    return _kernel(robot, "mass matrix", _pose_masses, certified=certified)
+    return _compile_at_pose(robot, "mass matrix", _write_pose_masses, certified=certified)
 
 
 def pose_accelerations(robot: Robot, *, certified: bool) -> Kernel:
     """Return the program from pose, rate, efforts and wrench to q, qd, qdd and x''."""
-    return _kernel(robot, "accelerations", _pose_accelerations, certified=certified)
+    return _compile_at_pose(robot, "accelerations", _write_pose_accelerations, certified=certified)
 
 
 class _PoseDrivenMachine:
@@ -311,7 +311,7 @@ class _IteratedMachine:
         }
 
 
-def _pose_torques(t: Traced, scheme: CarriedScheme | None, *, certified: bool) -> Program:
+def _write_pose_torques(t: Traced, scheme: CarriedScheme | None, *, certified: bool) -> Program:
     m = len(t.scheme.coordinates)
     sizes = {"rate": m, "acceleration": m, "wrench": 6}
     rate, acceleration = (t.tape.inputs(name, m) for name in ("rate", "acceleration"))
@@ -331,7 +331,7 @@ def _pose_torques(t: Traced, scheme: CarriedScheme | None, *, certified: bool) -
     return made.program({"q": made.q, "qd": rates, "qdd": changes, "tau": tau}, **sizes)
 
 
-def _pose_masses(t: Traced, scheme: CarriedScheme | None, *, certified: bool) -> Program:
+def _write_pose_masses(t: Traced, scheme: CarriedScheme | None, *, certified: bool) -> Program:
     m = len(t.scheme.coordinates)
     if scheme is None:
         own: _IteratedMachine | _PoseDrivenMachine = _IteratedMachine(t)
@@ -346,7 +346,7 @@ def _pose_masses(t: Traced, scheme: CarriedScheme | None, *, certified: bool) ->
     return own.program({"matrix": t.drives.shared_on_both(mass), "on pose": np.ravel(on_pose)})
 
 
-def _pose_accelerations(t: Traced, scheme: CarriedScheme | None, *, certified: bool) -> Program:
+def _write_pose_accelerations(t: Traced, scheme: CarriedScheme | None, *, certified: bool) -> Program:
     m = len(t.scheme.coordinates)
     sizes = {"rate": m, "tau": t.drives.count, "wrench": 6}
     rate, tau = t.tape.inputs("rate", m), t.tape.inputs("tau", t.drives.count)
@@ -364,8 +364,8 @@ def _pose_accelerations(t: Traced, scheme: CarriedScheme | None, *, certified: b
     # Only friction that grows with the load needs the drives' loads.
     by_load = bool(t.graph.laws) and not t.drives.others
     loads = made.lead.solve_transposed(on_pose) if by_load else np.zeros(m)
-    rest = efforts_left(t, made.parts, t.drives.on_leads([*tau]), loads, made.q, rates, drift)
+    rest = remaining_efforts(t, made.parts, t.drives.on_leads([*tau]), loads, made.q, rates, drift)
     forces = made.drives[t.drives.leading].T @ rest - (0.0 if by_load else on_pose)
-    acceleration = np.array(solve_massive(made.masses(), forces), dtype=object)
+    acceleration = np.array(solve_accelerations(made.masses(), forces), dtype=object)
     outputs = {"q": made.q, "qd": rates, "qdd": made.drives @ acceleration + drift, "acceleration": acceleration}
     return made.program(outputs, **sizes)

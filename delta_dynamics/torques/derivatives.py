@@ -78,7 +78,7 @@ def _derivatives(
     *,
     rows: bool,
 ) -> TorqueDerivatives:
-    inputs = _inputs(motion, wrench, weights, rows=rows)
+    inputs = _list_inputs(motion, wrench, weights, rows=rows)
     by_q, by_qd, by_qdd = robot.evaluate(motion_gradient(robot), *inputs, p=robot.inertial)
     found: dict[str, Array] = {}
     if by:
@@ -91,7 +91,7 @@ def torque_effects(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wr
     """Return the change of efforts per standard deviation of each cause, (..., n, causes)."""
     causes = robot.cached(CauseSlopes, geometry_and_masses)
     kernel = robot.cached(_effects_kernel)
-    inputs = _inputs((q, qd, qdd), wrench, np.eye(robot.joints_count), rows=True)
+    inputs = _list_inputs((q, qd, qdd), wrench, np.eye(robot.joints_count), rows=True)
     (table,) = robot.evaluate(kernel, *inputs, p=robot.inertial)
     return np.asarray(table @ causes.slopes, np.float64)
 
@@ -107,7 +107,7 @@ def _effects_kernel(robot: Robot) -> Kernel:
     return robot.massive().kernel(f"torque gradient by {chosen}", write, free=True)
 
 
-def _inputs(motion: Sequence[ArrayLike], wrench: ArrayLike | None, weights: Array, *, rows: bool) -> list[Array]:
+def _list_inputs(motion: Sequence[ArrayLike], wrench: ArrayLike | None, weights: Array, *, rows: bool) -> list[Array]:
     load = np.zeros(6) if wrench is None else wrench
     inputs = [doubles(value) for value in (*motion, load)]
     if rows:
@@ -129,7 +129,7 @@ def torques_by_numbers(
     :param robot: also one of :meth:`Robot.numbered`; with ``slopes`` of :func:`differentiate_numbers`.
         Others as of :func:`torque_derivatives`.
     """
-    inputs = _inputs((q, qd, qdd), wrench, np.eye(robot.joints_count), rows=True)
+    inputs = _list_inputs((q, qd, qdd), wrench, np.eye(robot.joints_count), rows=True)
     return _numbers_table(robot, inputs) @ slopes
 
 

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Joint reactions of overconstrained machines: what statics leaves open, elasticity decides.
+"""Joint reactions of overconstrained machines: elasticity determines what statics does not.
 
 Of all reactions that balance the bodies the true ones have the least complementary energy of
 members and elastic joints (Menabrea), actuators locked. Along a member the section's load is taken
@@ -39,16 +39,16 @@ def elastic_reactions(
         # Without elastic members no energy selects a solution.
         return hide_indeterminate(found.reactions(found.value, found.null))
     energy = np.asarray(sum(matrices, start=np.zeros_like(found.null)), np.float64)
-    own = found.null * found.unit[..., None]
-    stiff = own.swapaxes(-1, -2) @ energy @ own
-    values, ways = np.linalg.eigh(stiff)
+    null_forces = found.null * found.unit[..., None]
+    stiff = null_forces.swapaxes(-1, -2) @ energy @ null_forces
+    values, modes = np.linalg.eigh(stiff)
     # Energies below 1e-9 of the largest are rounding: such a self-stress is not determined.
     sound = values > 1e-9 * np.maximum(values[..., -1:], 1e-300)
     inverse = np.where(sound, 1.0 / np.where(sound, values, 1.0), 0.0)
-    pull = own.swapaxes(-1, -2) @ (energy @ found.value[..., None])
-    amounts = -ways @ (inverse[..., None] * (ways.swapaxes(-1, -2) @ pull))
-    left = found.null @ (ways * ~sound[..., None, :])
-    return hide_indeterminate(found.reactions(found.value + (own @ amounts)[..., 0], left))
+    gradient = null_forces.swapaxes(-1, -2) @ (energy @ found.value[..., None])
+    amounts = -modes @ (inverse[..., None] * (modes.swapaxes(-1, -2) @ gradient))
+    null = found.null @ (modes * ~sound[..., None, :])
+    return hide_indeterminate(found.reactions(found.value + (null_forces @ amounts)[..., 0], null))
 
 
 def energy_forms(robot: Robot, q: ArrayLike, found: Balance) -> dict[str, Array]:
@@ -63,7 +63,7 @@ def energy_forms(robot: Robot, q: ArrayLike, found: Balance) -> dict[str, Array]
         if beam.parts[0] in robot.graph.rods or beam.parts[0] == robot.graph.platform:
             continue
         ends = [posture.place(*place) for place in (beam.inner, beam.outer)]
-        matrix = _beam_form(robot, beam, structure.sections[beam.name], ends, found)
+        matrix = _beam_energy(robot, beam, structure.sections[beam.name], ends, found)
         result[beam.element] = result.get(beam.element, 0.0) + matrix
     for k, joint in enumerate(found.joints):
         known = [j for j in robot.graph.joints.values() if (j.label or j.name) == joint.name]
@@ -94,12 +94,12 @@ def energy_forms(robot: Robot, q: ArrayLike, found: Balance) -> dict[str, Array]
     return result
 
 
-def _beam_form(robot: Robot, beam: Beam, section: Section, ends: list[Array], found: Balance) -> Array:
+def _beam_energy(robot: Robot, beam: Beam, section: Section, ends: list[Array], found: Balance) -> Array:
     """Return twice a member's energy, (..., unknowns, unknowns)."""
     along = ends[1] - ends[0]
     length = np.linalg.norm(along, axis=-1)[..., None, None]
     first = along / length[..., 0]
-    # Two axes across; a round section has no others.
+    # Any two axes across the bar will do, because its section is round.
     seed = np.eye(3)[np.abs(first).argmin(-1)]
     second = np.cross(first, seed)
     second /= np.linalg.norm(second, axis=-1, keepdims=True)

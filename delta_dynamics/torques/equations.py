@@ -1,7 +1,8 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The equations of motion in the actuated joints, all terms of one state at once.
 
-What a simulation asks for several thousand times a second: one program, one solved closure.
+One program solves the closures once for all terms, because a simulation evaluates them several
+thousand times a second.
 """
 
 from __future__ import annotations
@@ -79,10 +80,10 @@ class Equations:
 
 def motion_kernel(robot: Robot) -> Kernel:
     """Return the program of :class:`Terms` from q and qd, row by row."""
-    return robot.massive().kernel("motion", _motion)
+    return robot.massive().kernel("motion", _write_motion)
 
 
-def _motion(t: Traced) -> Program:
+def _write_motion(t: Traced) -> Program:
     layout, parts = solve_and_split(t)
     bodies, rods, gravity, *_, passive = parts
     n, graph, motion = t.joints, t.scheme.graph, t.motion
@@ -102,12 +103,12 @@ def _motion(t: Traced) -> Program:
     twists: list[Any] = []
     rows: list[Any] = []
 
-    def visit(forces: Forces) -> None:
+    def add_motion(forces: Forces) -> None:
         twists.append([*motion.velocity(graph.platform, graph.origin), *motion.omega[graph.platform]])
         rows.append([forces.relative(j, accelerated=False)[0] for j in list_loaded_joints(graph)])
 
-    mass = mass_entries(t, parts, visit)
-    # By columns, as the joints were visited: turned round, rows of joints.
+    mass = mass_entries(t, parts, add_motion)
+    # twists and rows have one entry per joint: transpose them below.
     kinetic = 0.5 * (qd @ (np.reshape(mass, (n, n)) @ qd))
     flat = [*mass, *bias, kinetic, height]
     flat += [column[i] for i in range(6) for column in twists]

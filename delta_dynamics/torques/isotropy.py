@@ -43,8 +43,8 @@ def sphere_directions(count: int) -> Array:
     return np.stack([out * np.cos(turn), out * np.sin(turn), z], -1)
 
 
-MAX_SIZE: Final = 3
-"""Coordinates of which every minimum is known."""
+MAX_COORDINATES: Final = 3
+"""Largest number of pose coordinates for which all candidate minima are known."""
 
 
 def evaluate_largest(forms: Array, y: Array) -> Array:
@@ -74,21 +74,29 @@ def minimax_direction(forms: Array) -> Array:
             found.append(np.stack([x + z, x - z]))
     if size == 3:
         # At y = (1, u, v): rows G y as polynomials, and the polynomial y' G y of each form.
-        rows = {a: np.einsum("ij,juv->iuv", _scaled(_ROTATION.T @ forms[a] @ _ROTATION), _LINES) for a in range(count)}
+        rows = {
+            a: np.einsum("ij,juv->iuv", _normalise(_ROTATION.T @ forms[a] @ _ROTATION), _COORDINATE_POLYNOMIALS)
+            for a in range(count)
+        }
         curves = []
         for a, cone in cones:
-            g, h = rows[a], np.einsum("ij,juv->iuv", _scaled(_ROTATION.T @ cone @ _ROTATION), _LINES)
-            conic = np.sum([_product(_LINES[i], h[i]) for i in range(3)], axis=0)
+            g, h = (
+                rows[a],
+                np.einsum("ij,juv->iuv", _normalise(_ROTATION.T @ cone @ _ROTATION), _COORDINATE_POLYNOMIALS),
+            )
+            conic = np.sum([_multiply_polynomials(_COORDINATE_POLYNOMIALS[i], h[i]) for i in range(3)], axis=0)
             # det(y, G y, H y): zero where y' G y is stationary along y' H y = 0.
             stationary = np.zeros((4, 4))
             for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-                stationary += _product(_LINES[i], _product(g[j], h[k]) - _product(g[k], h[j]))
-            found.append(_common_points(conic, stationary) @ _ROTATION.T)
+                stationary += _multiply_polynomials(
+                    _COORDINATE_POLYNOMIALS[i], _multiply_polynomials(g[j], h[k]) - _multiply_polynomials(g[k], h[j])
+                )
+            found.append(_intersect_conic(conic, stationary) @ _ROTATION.T)
             curves.append(conic)
         for one, other in itertools.combinations(curves, 2):
-            found.append(_common_points(one, other) @ _ROTATION.T)
+            found.append(_intersect_conic(one, other) @ _ROTATION.T)
     points = np.concatenate(found)
-    # Points that are no minimum may be among them: the forms are evaluated at all points.
+    # Evaluate the forms at all points, because some may be no minimum.
     points = points[np.isfinite(points).all(-1) & points.any(-1)]
     points /= np.linalg.norm(points, axis=-1, keepdims=True)
     return np.asarray(points[evaluate_largest(forms, points).argmin()], np.float64)
@@ -97,12 +105,12 @@ def minimax_direction(forms: Array) -> Array:
 _ROTATION: Final = np.linalg.qr([[1.0, 0.3, -0.4], [0.2, 0.9, 0.7], [-0.5, 0.6, 1.1]])[0]
 """An arbitrary rotation, so that no plane of symmetry is a line u = constant and no minimum is at
 infinity."""
-_LINES: Final = np.zeros((3, 2, 2))
+_COORDINATE_POLYNOMIALS: Final = np.zeros((3, 2, 2))
 """y = (1, u, v) as polynomials: entry (i, j) of each is the coefficient of u^i v^j."""
-_LINES[0, 0, 0] = _LINES[1, 1, 0] = _LINES[2, 0, 1] = 1.0
+_COORDINATE_POLYNOMIALS[0, 0, 0] = _COORDINATE_POLYNOMIALS[1, 1, 0] = _COORDINATE_POLYNOMIALS[2, 0, 1] = 1.0
 
 
-def _product(p: Array, q: Array) -> Array:
+def _multiply_polynomials(p: Array, q: Array) -> Array:
     """Multiply two polynomials in u and v."""
     result = np.zeros((p.shape[0] + q.shape[0] - 1, p.shape[1] + q.shape[1] - 1))
     for i, j in np.ndindex(*p.shape):
@@ -110,12 +118,12 @@ def _product(p: Array, q: Array) -> Array:
     return result
 
 
-def _scaled(matrix: Array) -> Array:
+def _normalise(matrix: Array) -> Array:
     size = np.abs(matrix).max()
     return np.asarray(matrix / size if size > 0.0 else matrix, np.float64)
 
 
-def _common_points(conic: Array, curve: Array) -> Array:
+def _intersect_conic(conic: Array, curve: Array) -> Array:
     """Return points (1, u, v) of a conic, shape (k, 3), with all those of another curve.
 
     u are the eigenvalues of the polynomial Sylvester matrix of both in v; v follows from the
@@ -219,10 +227,10 @@ def energy_transfer(robot: Robot, pose: ArrayLike, direction: ArrayLike) -> Arra
     :param direction: pose rates of any length above zero, shape (..., m).
     :returns: shape (...), 0 to 1.
     """
-    x = _directions(direction, len(robot.pose_names))
+    x = _normalise_directions(direction, len(robot.pose_names))
     platform, everything = energy_matrices(robot, pose)
     common_batch(platform.shape[:-2], x.shape[:-1])
-    return _form(platform, x) / _form(everything, x)
+    return _evaluate_form(platform, x) / _evaluate_form(everything, x)
 
 
 def energy_transfer_range(robot: Robot, pose: ArrayLike) -> Extremes:
@@ -236,7 +244,7 @@ def energy_transfer_range(robot: Robot, pose: ArrayLike) -> Extremes:
     form = back.swapaxes(-1, -2) @ platform @ back
     values, vectors = np.linalg.eigh((form + form.swapaxes(-1, -2)) / 2)
     ends = vectors[..., [0, -1]]
-    directions = _directions((back @ ends).swapaxes(-1, -2))
+    directions = _normalise_directions((back @ ends).swapaxes(-1, -2))
     return Extremes(values[..., 0], values[..., -1], directions)
 
 
@@ -253,11 +261,11 @@ def max_driving_force(
     :param acceleration: Xddot, a number or shape (..., m).
     :returns: shape (...).
     """
-    x = _directions(direction, len(robot.pose_names))
+    x = _normalise_directions(direction, len(robot.pose_names))
     platform, _ = energy_matrices(robot, pose)
     common_batch(platform.shape[:-2], x.shape[:-1])
     _inverse_root(robot, platform)
-    rates = np.sqrt(2 * _energy(energy) / _form(platform, x))[..., None] * x
+    rates = np.sqrt(2 * _check_energy(energy) / _evaluate_form(platform, x))[..., None] * x
     motion = joint_motion(robot, pose, rates, acceleration)
     forces = efforts_without_friction(robot, *motion)
     return np.asarray(np.abs(forces).max(-1), np.float64)
@@ -276,15 +284,15 @@ def max_driving_force_range(
     :param acceleration: Xddot, a number or shape (..., m).
     :raises ParameterError: more than three pose coordinates.
     """
-    if len(robot.pose_names) > MAX_SIZE:
-        raise ParameterError("pose", len(robot.pose_names), f"at most {MAX_SIZE} pose coordinates")
+    if len(robot.pose_names) > MAX_COORDINATES:
+        raise ParameterError("pose", len(robot.pose_names), f"at most {MAX_COORDINATES} pose coordinates")
     back, forms = _driving_forms(robot, pose, energy, acceleration)
-    greatest, high, _ = _peak(forms)
+    greatest, high, _ = _find_largest_form(forms)
     flat = forms.reshape(-1, *forms.shape[-3:])
     low = np.array([minimax_direction(form) for form in flat]).reshape(high.shape)
     least = evaluate_largest(forms, low)
     y = np.stack([low, high], -2)
-    return Extremes(least, greatest, _directions(np.einsum("...ij,...kj->...ki", back, y)))
+    return Extremes(least, greatest, _normalise_directions(np.einsum("...ij,...kj->...ki", back, y)))
 
 
 def driving_force_peak(
@@ -295,15 +303,15 @@ def driving_force_peak(
     Arguments as of :func:`max_driving_force_range`; any number of pose coordinates.
     """
     back, forms = _driving_forms(robot, pose, energy, acceleration)
-    greatest, y, joint = _peak(forms)
-    return greatest, _directions(np.einsum("...ij,...j->...i", back, y)), joint
+    greatest, y, joint = _find_largest_form(forms)
+    return greatest, _normalise_directions(np.einsum("...ij,...j->...i", back, y)), joint
 
 
 def _driving_forms(robot: Robot, pose: ArrayLike, energy: float, acceleration: ArrayLike) -> tuple[Array, Array]:
     """Return pose rates of unit vectors y, (..., m, m), and F_d of y, (..., actuators, m, m)."""
     where = doubles(pose, "poses")
     platform, _ = energy_matrices(robot, where)
-    back = np.sqrt(2 * _energy(energy)) * _inverse_root(robot, platform)
+    back = np.sqrt(2 * _check_energy(energy)) * _inverse_root(robot, platform)
     size = where.shape[-1]
     start = joint_motion(robot, where, np.zeros(size), acceleration)
     constant = efforts_without_friction(robot, *start)
@@ -323,7 +331,7 @@ def _driving_forms(robot: Robot, pose: ArrayLike, energy: float, acceleration: A
     return back, forms
 
 
-def _peak(forms: Array) -> tuple[Array, Array, NDArray[np.int64]]:
+def _find_largest_form(forms: Array) -> tuple[Array, Array, NDArray[np.int64]]:
     """Return the largest absolute value of forms on the unit sphere, its direction and the form's index."""
     values, vectors = np.linalg.eigh(forms)
     ends = np.abs(values[..., [0, -1]])
@@ -354,7 +362,7 @@ def _inverse_jacobian(robot: Robot, pose: ArrayLike) -> tuple[Array, Array]:
     """Return joint positions, (..., n), and joint rates per pose rate, (..., n, m)."""
     q = robot.inverse(pose)
     s = np.linalg.svd(robot.jacobian(q), compute_uv=False)
-    # Against one m/rad at least: where all limbs are stretched the whole Jacobian vanishes.
+    # Compare with 1 m/rad at least: the whole Jacobian vanishes where all limbs are stretched.
     measure = s[..., -1] / np.maximum(s[..., 0], 1.0)
     bad = np.argwhere(~(measure > MIN_SINGULAR_VALUE_RATIO))
     if len(bad):
@@ -374,13 +382,13 @@ def _inverse_root(robot: Robot, form: Array) -> Array:
     return np.asarray(np.linalg.inv(root).swapaxes(-1, -2), np.float64)
 
 
-def _form(matrix: Array, x: Array) -> Array:
+def _evaluate_form(matrix: Array, x: Array) -> Array:
     """Return the quadratic form x' M x, shape (...)."""
     return np.asarray(np.einsum("...i,...ij,...j->...", x, matrix, x), np.float64)
 
 
-def _directions(directions: ArrayLike, size: int | None = None) -> Array:
-    """Return unit vectors: xdot of Xdot = X xdot (equation 45).
+def _normalise_directions(directions: ArrayLike, size: int | None = None) -> Array:
+    """Return directions at unit length: xdot of Xdot = X xdot (equation 45).
 
     :raises ValueError: a vector of length zero or not finite, or a wrong last axis.
     """
@@ -393,7 +401,7 @@ def _directions(directions: ArrayLike, size: int | None = None) -> Array:
     return np.asarray(x / norm, np.float64)
 
 
-def _energy(energy: float) -> float:
+def _check_energy(energy: float) -> float:
     if not 0.0 < energy < np.inf:
         raise ValueError(f"energy has to be above zero and finite, not {energy}")
     return energy

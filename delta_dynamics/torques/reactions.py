@@ -55,7 +55,7 @@ def list_transmitters(graph: Graph, rods: Array, places: Array) -> list[Transmit
     for k, joint in enumerate(graph.joints.values()):
         if not joint.virtual:
             here = places[..., 15 * k : 15 * k + 15]
-            result.append(_graph_joint(joint, here.reshape(*here.shape[:-1], 5, 3)))
+            result.append(_make_joint_transmitter(joint, here.reshape(*here.shape[:-1], 5, 3)))
     for k, rod in enumerate(graph.rods.values()):
         here = rods[..., 15 * k : 15 * k + 15]
         # Ball joints at both ends of a rod.
@@ -78,7 +78,7 @@ def list_transmitters(graph: Graph, rods: Array, places: Array) -> list[Transmit
     return result
 
 
-def _graph_joint(joint: Joint, vectors: Array) -> Transmitter:
+def _make_joint_transmitter(joint: Joint, vectors: Array) -> Transmitter:
     """Return a joint's wrenches: forces across its slides, moments across its rotations.
 
     A screw's force along its axis comes with the moment that its thread makes of it.
@@ -204,7 +204,7 @@ def assemble_transmission(
 
 POINT_FRACTION: Final = 1e-6
 """Extent of all joints, relative to the machine's size, below which they count as one point."""
-RANK_BOUND: Final = SINGULARITY_BOUND
+SINGULAR_VALUE_BOUND: Final = SINGULARITY_BOUND
 """Singular values of the balance below this part of the largest count as zero."""
 MIN_FULL_RANK_CONDITION: Final = 1e-6
 """Reciprocal condition above which the rank is full without singular values."""
@@ -309,7 +309,7 @@ def hide_indeterminate(full: Reactions) -> Reactions:
 
 @dataclass(frozen=True, eq=False)
 class Balance:
-    """Balances of all bodies in every sample, and all that solves them.
+    """Force and moment balances of all bodies in every sample, with their solutions.
 
     ``value``: the least-norm solution (..., unknowns). ``null``: columns that may be added to it,
     of no unit, shape (..., unknowns, unknowns), zero beyond their number; ``unit`` (..., unknowns)
@@ -339,10 +339,10 @@ class Balance:
             bodies=tuple((joint.inner, joint.outer) for joint in joints),
             points=_read_only(self.points),
             wrenches=_read_only((self.spread @ value[..., None, :, None])[..., 0]),
-            determinate=_small(reach),
+            determinate=_is_determinate(reach),
             components=self.components,
             values=_read_only(value),
-            determinate_components=_small(null),
+            determinate_components=_is_determinate(null),
             actuated=tuple(joint.actuated for joint in joints if joint.actuated is not None),
             residual=_read_only(self.residual),
         )
@@ -373,7 +373,7 @@ def balance(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: A
         rows = [found.components.index(name) for name in names]
         unit = found.unit[..., rows]
         u, s, vt = np.linalg.svd(found.null[..., rows, :])
-        used, turned = s > RANK_BOUND, found.null @ vt.swapaxes(-1, -2)
+        used, turned = s > SINGULAR_VALUE_BOUND, found.null @ vt.swapaxes(-1, -2)
         apart = np.einsum("...ij,...i->...j", u, (efforts - found.value[..., rows]) / unit)
         along = np.where(used, apart / np.where(used, s, 1.0), 0.0)
         n = len(rows)
@@ -387,7 +387,7 @@ def balance(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: A
 def solve_balances(robot: Robot, loads: Sequence[Array], *, strict: bool = True) -> Balance:
     """Solve the balances of the loads of :func:`loads_kernel`, also of variants of the robot.
 
-    :param strict: raise where there is no equilibrium; else ``residual`` is not below
+    :param strict: raise if a sample has no equilibrium; without it ``residual`` exceeds
         ``BALANCE_BOUND`` there.
     """
     engine = robot.massive()
@@ -397,7 +397,7 @@ def solve_balances(robot: Robot, loads: Sequence[Array], *, strict: bool = True)
     points = np.stack([joint.point for joint in joints], -2)
     centred = points - points.mean(-2, keepdims=True)
     size = np.sqrt(np.mean(np.sum(centred**2, -1), -1))
-    # Joints that are all in one point have no distance: use the machine's size.
+    # If all joints are in one point their extent is zero: use the machine's size.
     size = np.where(size > POINT_FRACTION * engine.graph.size, size, engine.graph.size)
 
     origin, needed = compute_needed_wrenches(engine.graph, list(engine.tree.links), bodies, rods)
@@ -406,7 +406,7 @@ def solve_balances(robot: Robot, loads: Sequence[Array], *, strict: bool = True)
     b = np.concatenate([needed[body] for body in origin], -1)
     moment = mark_moments(joints, names)
     with np.errstate(over="ignore", invalid="ignore"):
-        value, null, residual = _solve(a, b, moment, size, strict=strict)
+        value, null, residual = _solve_scaled(a, b, moment, size, strict=strict)
 
     spread = np.stack([_place_columns(joint, names, batch) for joint in joints], -3)
     return Balance(
@@ -427,10 +427,10 @@ def loads_kernel(robot: Robot) -> Kernel:
 
     :raises ParameterError: a robot without masses.
     """
-    return robot.massive().kernel("loads", _loads)
+    return robot.massive().kernel("loads", _write_loads)
 
 
-def _loads(t: Traced) -> Program:
+def _write_loads(t: Traced) -> Program:
     """Write the places of bodies, rods and joints, and the wrench that each body needs.
 
     A body: origin, force, moment about it. A rod: both ends, the forces they need, the direction of
@@ -444,7 +444,7 @@ def _loads(t: Traced) -> Program:
     t.set_accelerations(t.drives.given("qdd"), BaseMotion.at_rest(gravity))
     motion, graph = t.motion, t.graph
     forces = Forces(motion)
-    # Each rod is a body of its own here.
+    # Rods are separate bodies here, so add only the other bodies.
     for name, ten in zip(t.tree.links, bodies, strict=True):
         forces.body(name, ten)
     forces.passive(passive)
@@ -484,7 +484,7 @@ def _scale_unknowns(moment: Mask, size: Array) -> Array:
     return np.where(moment, size[..., None], 1.0)
 
 
-def _solve(a: Array, b: Array, moment: Mask, size: Array, *, strict: bool) -> tuple[Array, Array, Array]:
+def _solve_scaled(a: Array, b: Array, moment: Mask, size: Array, *, strict: bool) -> tuple[Array, Array, Array]:
     """Return the least-norm solution, an orthonormal null space and the relative imbalance.
 
     Moments and lengths are divided by the mechanism's size, so that all numbers are forces. The
@@ -497,10 +497,10 @@ def _solve(a: Array, b: Array, moment: Mask, size: Array, *, strict: bool) -> tu
     rows = np.where(turning, 1.0 / size[..., None], 1.0)
     matrix = (a * rows[..., None] * unit[..., None, :]).reshape(-1, equations, unknowns)
     right = (b * rows).reshape(-1, equations)
-    value, regular = _regular(matrix, right)
+    value, regular = _solve_full_rank(matrix, right)
     null = np.zeros((len(matrix), unknowns, unknowns))
     if not regular.all():
-        value[~regular], null[~regular] = _deficient(matrix[~regular], right[~regular])
+        value[~regular], null[~regular] = _solve_rank_deficient(matrix[~regular], right[~regular])
     left = right - (matrix @ value[..., None])[..., 0]
     scale = np.maximum(np.abs(right).max(-1), np.finfo(np.float64).tiny)
     residual = np.asarray(np.abs(left).max(-1) / scale, np.float64).reshape(batch)
@@ -508,16 +508,16 @@ def _solve(a: Array, b: Array, moment: Mask, size: Array, *, strict: bool) -> tu
         index = tuple(int(i) for i in np.argwhere(residual > BALANCE_BOUND)[0])
         s = np.linalg.svd(matrix.reshape(*batch, equations, unknowns)[index], compute_uv=False)
         measure = float(s[-1] / s[0])
-        raise SingularityError("constraint of the joint state", index, measure, RANK_BOUND)
+        raise SingularityError("constraint of the joint state", index, measure, SINGULAR_VALUE_BOUND)
     null = null.reshape(*batch, unknowns, unknowns)
     return value.reshape(*batch, unknowns) * unit, null, residual
 
 
-def _regular(matrix: Array, right: Array) -> tuple[Array, Mask]:
-    """Solve where the columns are clearly independent; return also where they are.
+def _solve_full_rank(matrix: Array, right: Array) -> tuple[Array, Mask]:
+    """Solve the samples with clearly independent columns; return also the mask of these.
 
-    By QR, or at once where there are as many equations: ten times cheaper than the singular values
-    that decide the other samples.
+    By QR, or directly if the system is square: this takes a tenth of the time of the singular value
+    decomposition that other samples need.
     """
     equations, unknowns = matrix.shape[-2:]
     if unknowns > equations:
@@ -528,7 +528,8 @@ def _regular(matrix: Array, right: Array) -> tuple[Array, Mask]:
         try:
             inverse = np.linalg.inv(r)
         except np.linalg.LinAlgError:
-            return _regular(np.pad(matrix, [(0, 0), (0, 1), (0, 0)]), np.pad(right, [(0, 0), (0, 1)]))
+            more = np.pad(matrix, [(0, 0), (0, 1), (0, 0)])
+            return _solve_full_rank(more, np.pad(right, [(0, 0), (0, 1)]))
     else:
         q, r = np.linalg.qr(matrix)
         along = q.swapaxes(-1, -2) @ right[..., None]
@@ -539,20 +540,20 @@ def _regular(matrix: Array, right: Array) -> tuple[Array, Mask]:
     return (inverse @ along)[..., 0], sound & (condition * MIN_FULL_RANK_CONDITION < 1.0)
 
 
-def _deficient(matrix: Array, right: Array) -> tuple[Array, Array]:
+def _solve_rank_deficient(matrix: Array, right: Array) -> tuple[Array, Array]:
     """Return the least-norm solution and the null space by singular values."""
     equations, unknowns = matrix.shape[-2:]
-    # Empty equations, so that there is a singular value for every unknown.
+    # Append empty equations, so that every unknown has a singular value.
     missing = max(0, unknowns - equations)
     full = np.pad(matrix, [(0, 0), (0, missing), (0, 0)])
     u, s, vt = np.linalg.svd(full, full_matrices=False)
-    sound = s > RANK_BOUND * s[:, :1]
+    sound = s > SINGULAR_VALUE_BOUND * s[:, :1]
     inverse = np.where(sound, 1.0 / np.where(sound, s, 1.0), 0.0)
     along = inverse * (np.pad(right, [(0, 0), (0, missing)])[:, None] @ u)[:, 0]
     return (along[:, None] @ vt)[:, 0], np.where(sound[..., None], 0.0, vt).swapaxes(-1, -2)
 
 
-def _small(reach: Array) -> Mask:
+def _is_determinate(reach: Array) -> Mask:
     """Return whether the null space leaves an entry unchanged, over the last axis."""
     result: Mask = np.linalg.norm(reach, axis=-1) < DETERMINATE_BOUND
     result.setflags(write=False)

@@ -35,10 +35,10 @@ from pkm_twin.robot.mechanism import SHARED
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import random_joints
 
-DRIVE: Final = ("viscous", "coulomb", "offset", "rotor_inertia")
-"""An actuated joint's parameters; a passive one that is loaded has no offset.
+DRIVE_PARAMETERS: Final = ("viscous", "coulomb", "offset", "rotor_inertia")
+"""Parameters of an actuated joint; a passive joint with friction or a rotor has no ``offset``.
 
-Then come those of its drive's other friction laws that efforts are linear in.
+The linear parameters of other friction laws follow after those of all drives.
 """
 PAYLOAD: Final = "payload"
 WRENCH: Final = "wrench"
@@ -54,12 +54,12 @@ def parameter_names(robot: Robot) -> tuple[str, ...]:
     ``mass``. An actuated joint has ``viscous``, ``coulomb``, ``offset`` and ``rotor_inertia``. A
     passive joint with friction or a rotor in the file has these without ``offset``.
     """
-    return tuple(name for name, _ in _columns(robot))
+    return tuple(name for name, _ in _list_columns(robot))
 
 
 def parameter_units(robot: Robot) -> tuple[str, ...]:
     """Return the units of the parameters, shape (p,)."""
-    return tuple(unit for _, unit in _columns(robot))
+    return tuple(unit for _, unit in _list_columns(robot))
 
 
 def parameter_values(robot: Robot) -> Array:
@@ -96,7 +96,7 @@ def regressor(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench:
     """
     robot.check_independent("parameters of efforts", SHARED)
     load = np.zeros(6) if wrench is None else wrench
-    kernel, gravity = robot.massive().kernel("regressor", _regressor), robot.gravity
+    kernel, gravity = robot.massive().kernel("regressor", _write_regressor), robot.gravity
     bodies, others = robot.evaluate(kernel, q, qd, qdd, load, p=np.ascontiguousarray(gravity))
     n, batch, graph = robot.joints_count, bodies.shape[:-1], robot.graph
     links = robot.engine.tree.links
@@ -106,7 +106,7 @@ def regressor(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench:
     platform = ten[..., list(links).index(graph.platform), :, :]
     lever = graph.origin - links[graph.platform].at
     rates, changes = (np.broadcast_to(np.asarray(v, np.float64), (*batch, n)) for v in (qd, qdd))
-    drives = np.zeros((*batch, n, n, len(DRIVE)))
+    drives = np.zeros((*batch, n, n, len(DRIVE_PARAMETERS)))
     for k in range(n):
         rate = rates[..., k]
         drives[..., k, k, :] = np.stack([rate, np.sign(rate), np.ones_like(rate), changes[..., k]], -1)
@@ -114,7 +114,7 @@ def regressor(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench:
         np.moveaxis(ten, -3, -2).reshape(*batch, n, len(links) * ten.shape[-1]),
         other[..., :rods],
         platform @ make_frame_change(np.eye(3), lever),
-        drives.reshape(*batch, n, n * len(DRIVE)),
+        drives.reshape(*batch, n, n * len(DRIVE_PARAMETERS)),
     ]
     if not robot.laws:
         return np.concatenate([*parts, other[..., rods:]], -1)
@@ -122,7 +122,7 @@ def regressor(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench:
     passive = other[..., rods:]
     free = values.copy()
     basic = sum(part.shape[-1] for part in parts)
-    free[basic - len(DRIVE) * n : basic].reshape(n, -1)[:, :3] = 0.0
+    free[basic - len(DRIVE_PARAMETERS) * n : basic].reshape(n, -1)[:, :3] = 0.0
     inner = passive @ free[-passive.shape[-1] :]
     load = np.concatenate(parts, -1) @ free[:basic] + inner
     laws = law_columns(robot, np.broadcast_to(np.asarray(q, np.float64), rates.shape), rates, load)
@@ -131,7 +131,7 @@ def regressor(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench:
 
 def law_keys(robot: Robot) -> tuple[str, ...]:
     """List the parameters that efforts are linear in, of the drives' laws beyond the basic one."""
-    return tuple(key for key in list_linear_keys(robot.laws) if key not in DRIVE)
+    return tuple(key for key in list_linear_keys(robot.laws) if key not in DRIVE_PARAMETERS)
 
 
 def law_columns(robot: Robot, q: Array, qd: Array, load: Array) -> Array:
@@ -150,7 +150,7 @@ def law_columns(robot: Robot, q: Array, qd: Array, load: Array) -> Array:
 
 
 def _body_columns(motion: Array, n: int) -> Array:
-    """Return Newton's and Euler's laws by a body's ten parameters, times its motion per joint.
+    """Return the joints' efforts per inertial parameter of a body, by Newton's and Euler's laws.
 
     :param motion: rows a (less gravity), omega, alpha of the body, then velocities v of its origin
         and angular velocities w per joint rate, in its own axes, shape (..., 3 + 2 n, 3).
@@ -166,7 +166,7 @@ def _body_columns(motion: Array, n: int) -> Array:
         - np.sum(omega * omega, -1, keepdims=True) * v
         + np.cross(a, w)
     )
-    # w (omega x J omega) is (w x omega) J omega.
+    # w . (omega x J omega) = (w x omega) . J omega.
     turning = np.cross(w, omega)
     diagonal = w * alpha + turning * omega
     pairs = [
@@ -179,27 +179,27 @@ def _body_columns(motion: Array, n: int) -> Array:
     return np.concatenate([mass, first, diagonal, np.stack(pairs, -1)], -1)
 
 
-def _columns(robot: Robot) -> list[tuple[str, str]]:
+def _list_columns(robot: Robot) -> list[tuple[str, str]]:
     graph, tree = robot.graph, robot.massive().tree
 
-    def ten(owner: str) -> list[tuple[str, str]]:
+    def body_columns(owner: str) -> list[tuple[str, str]]:
         return [(f"{owner}.{what}", unit) for what, unit in zip(STANDARD_PARAMETERS, STANDARD_UNITS, strict=True)]
 
-    def joint(name: str, whats: Sequence[str]) -> list[tuple[str, str]]:
+    def joint_columns(name: str, whats: Sequence[str]) -> list[tuple[str, str]]:
         units = drive_units(graph, name)
         return [(f"{name}.{what}", units[what]) for what in whats]
 
-    result = [column for body in tree.links for column in ten(body)]
+    result = [column for body in tree.links for column in body_columns(body)]
     result += [(f"{name}.mass", "kg") for name in graph.rods]
-    result += ten(PAYLOAD)
-    result += [column for name in graph.actuated for column in joint(name, DRIVE)]
-    result += [column for key in law_keys(robot) for name in graph.actuated for column in joint(name, [key])]
-    passive = tuple(what for what in DRIVE if what != "offset")
-    result += [column for j in list_loaded_joints(graph) for column in joint(j.name, passive)]
+    result += body_columns(PAYLOAD)
+    result += [column for name in graph.actuated for column in joint_columns(name, DRIVE_PARAMETERS)]
+    result += [column for key in law_keys(robot) for name in graph.actuated for column in joint_columns(name, [key])]
+    passive = tuple(what for what in DRIVE_PARAMETERS if what != "offset")
+    result += [column for j in list_loaded_joints(graph) for column in joint_columns(j.name, passive)]
     return [*result, (WRENCH, "1")]
 
 
-def _regressor(t: Traced) -> Program:
+def _write_regressor(t: Traced) -> Program:
     """Write the program of all bodies' motion, and of the columns of rods, joints and wrench."""
     t.solve()
     graph, motion, n = t.graph, t.motion, t.joints
@@ -242,8 +242,8 @@ def _regressor(t: Traced) -> Program:
     return Program(sizes, 3, {"bodies": t.lift(bodies), "others": t.lift(others)}, t.equations())
 
 
-RANK: Final = 1e-8
-"""Least pivot, of columns of norm one, that counts."""
+MIN_PIVOT: Final = 1e-8
+"""Smallest pivot of an independent column, for columns of unit norm."""
 ROUNDING_COEFFICIENT: Final = 1e-7
 """Coefficients below it are rounding errors and count as zero."""
 
@@ -289,7 +289,7 @@ def base_parameters(robot: Robot, *, seed: int = 0) -> BaseParameters:
         owner, _, what = name.rpartition(".")
         units[k] = robot.engine.tree.size ** -powers.get(what, 0)
         preference[k] = (0.1 if owner == PAYLOAD else 1.0) * (0.3 if what in STANDARD_PARAMETERS[7:] else 1.0)
-        if what in DRIVE:
+        if what in DRIVE_PARAMETERS:
             preference[k] = 10.0
     columns, matrix = choose_independent_columns(table / units, preference)
     matrix = matrix * units / units[list(columns)][:, None]
@@ -318,17 +318,17 @@ def choose_independent_columns(table: Array, preference: ArrayLike = 1.0) -> tup
     :param preference: shape (p,): greater ones are taken first.
     :returns: indices, rising, and the matrix B, shape (b, p), with table = table[:, indices] B.
     """
-    # Imported here, because a stream does not need it.
+    # Imported here to keep the start of nodes short, which do not need it.
     from scipy.linalg import qr  # type: ignore[import-untyped]
 
     norms = np.linalg.norm(table, axis=0)
-    # Smaller columns are zero but for rounding: all are of unit kg.
+    # Smaller columns are rounding errors of zero: all columns have the unit kg.
     seen = np.flatnonzero(norms > 1e-10 * norms.max())
     weights = np.broadcast_to(np.asarray(preference, np.float64), norms.shape)
     norms = norms / weights
     r, pivots = qr(table[:, seen] / norms[seen], mode="r", pivoting=True)
     diagonal = np.abs(np.diag(r))
-    rank = int((diagonal > RANK * weights.max()).sum())
+    rank = int((diagonal > MIN_PIVOT * weights.max()).sum())
     rest = np.linalg.solve(r[:rank, :rank], r[:rank])
     matrix = np.zeros((rank, table.shape[1]))
     matrix[:, seen[pivots]] = rest / norms[seen[pivots[:rank]]][:, None] * norms[seen[pivots]]

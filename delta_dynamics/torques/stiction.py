@@ -1,8 +1,8 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Dry friction of joints that stand still: its direction is not known, its size is a bound.
+"""Dry friction of joints at rest: its direction is unknown, its size bounded.
 
-At rest friction is whatever holds the joint, up to the joint's dry friction either way. The model
-gives none there, and what it is compared with may differ by the reach of friction.
+At rest, friction holds the joint with any effort up to the dry friction in both directions. The
+model has no friction there, so measured efforts may differ from it by up to the dry friction.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.machine.friction import LoadDependent, read_friction_values, solve_load, sum_laws
 from pkm_twin.robot.robot import Robot
 
-SMALL_RATE: Final = 1e-6
-"""A rate that only determines the sign of dry friction, rad/s or m/s."""
+SIGN_RATE: Final = 1e-6
+"""Joint rate that sets the sign of dry friction while viscous friction is negligible, rad/s or m/s."""
 
 
 def friction_reach(robot: Robot) -> Array:
@@ -29,7 +29,7 @@ def friction_reach(robot: Robot) -> Array:
     if not robot.has_masses:
         return np.zeros(n)
     if robot.redundant:
-        # A drive cannot move alone: its own friction.
+        # No drive of a redundant machine can move alone: take each drive's own friction.
         return np.array(robot.friction.coulomb)
     q, still = robot.inverse(robot.home()), np.zeros(n)
     size = np.abs(inverse_dynamics(robot, q, still, still)).max()
@@ -42,20 +42,20 @@ def friction_reach(robot: Robot) -> Array:
         return np.asarray(np.diag(ahead - back) / 2.0, np.float64)
 
     # Viscous friction doubles with the rates. Below a part of 1e-9 the rest is rounding.
-    reach = 2.0 * odd_part(SMALL_RATE) - odd_part(2.0 * SMALL_RATE)
+    reach = 2.0 * odd_part(SIGN_RATE) - odd_part(2.0 * SIGN_RATE)
     return np.where(reach > 1e-9 * (1.0 + size), reach, 0.0)
 
 
 class LoadShare:
     """Removes the friction that grows with the load from measured efforts.
 
-    What a payload or a contact adds to the load adds to this friction, too: by the known load alone
-    an estimate would be wrong by its share. ``robot``: without that law, which explains the efforts
-    that are left. ``share``: of the load, shape (n,).
+    An unknown payload or contact also increases this friction, so it cannot be computed from the
+    known load. ``robot``: the robot without that friction law, for the remaining efforts.
+    ``share``: friction as a fraction of the load, shape (n,).
     """
 
     def __init__(self, robot: Robot) -> None:
-        self._given = self.robot = robot
+        self._full = self.robot = robot
         self.share = np.zeros(robot.joints_count)
         if LoadDependent.name in robot.laws:
             self.share = read_friction_values(robot.laws, robot.friction)["load_dependent"]
@@ -66,15 +66,15 @@ class LoadShare:
 
         :param rates: zero at rest.
         """
-        if self.robot is self._given:
+        if self.robot is self._full:
             return effort, self.share
-        laws, own = self._given.laws, self._given.friction
-        way = np.sign(rates)
-        at_place, dry, share = sum_laws(laws, read_friction_values(laws, own), q, np.abs(rates))
-        held = effort - own.viscous * rates - own.offset - at_place
-        load = solve_load(held - (own.coulomb + dry) * way, share, way)
-        holds = np.where(way == 0.0, share / (1.0 - share) * np.abs(held), 0.0)
-        return effort - share * np.abs(load) * way, holds
+        laws, own = self._full.laws, self._full.friction
+        directions = np.sign(rates)
+        position_friction, dry, share = sum_laws(laws, read_friction_values(laws, own), q, np.abs(rates))
+        driving = effort - own.viscous * rates - own.offset - position_friction
+        load = solve_load(driving - (own.coulomb + dry) * directions, share, directions)
+        resting_bound = np.where(directions == 0.0, share / (1.0 - share) * np.abs(driving), 0.0)
+        return effort - share * np.abs(load) * directions, resting_bound
 
 
 def zero_resting_rates(qd: Array, still: Mask, reach: Array) -> Array:

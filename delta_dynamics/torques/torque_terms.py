@@ -35,7 +35,7 @@ class Terms:
 
     @property
     def total(self) -> Array:
-        """Sum of all, shape (..., n): what ``inverse_dynamics`` gives."""
+        """Sum of all terms, shape (..., n): the result of ``inverse_dynamics``."""
         own = self.gravity + self.inertia + self.velocity
         return own + self.payload + self.friction + self.external + self.preload
 
@@ -48,13 +48,13 @@ def efforts_without_friction(
     :param weight: False leaves gravity out, too.
     """
     layout = Layout(robot.massive().tree)
-    p = _zero_part(robot.inertial, layout.friction)
+    p = _zero_inputs(robot.inertial, layout.friction)
     if not weight:
-        p = _zero_part(p, layout.part(GRAVITY))
+        p = _zero_inputs(p, layout.part(GRAVITY))
     return robot.evaluate(torques(robot), q, qd, qdd, np.zeros(6), p=p)[0]
 
 
-def _zero_part(p: Array, part: slice | Indices) -> Array:
+def _zero_inputs(p: Array, part: slice | Indices) -> Array:
     result = p.copy()
     result[part] = 0.0
     return result
@@ -77,47 +77,48 @@ def dynamics_terms(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wr
     n = robot.joints_count
     given = (q, "joint positions"), (qd, "joint rates"), (qdd, "joint accelerations")
     arrays = [vectors(values, n, what) for values, what in given]
-    # The batch of all inputs together, so that every term has it.
+    # Broadcast all inputs, so that every term has the same batch shape.
     shape = common_batch(*(a.shape[:-1] for a in (*arrays, load)))
-    place, rate, change = (np.broadcast_to(a, (*shape, *a.shape[-1:])) for a in arrays)
+    position, rate, acceleration = (np.broadcast_to(a, (*shape, *a.shape[-1:])) for a in arrays)
     still = np.zeros(n)
     none = np.zeros(6)
 
-    def whole(p: Array, qd: Array, qdd: Array, wrench: Array) -> Array:
-        return robot.evaluate(kernel, place, qd, qdd, wrench, p=p)[0]
+    def evaluate(p: Array, qd: Array, qdd: Array, wrench: Array) -> Array:
+        return robot.evaluate(kernel, position, qd, qdd, wrench, p=p)[0]
 
     layout = Layout(robot.massive().tree)
-    held = _zero_part(robot.inertial, layout.friction)
-    empty = _zero_part(robot.own_inertial, layout.friction)
-    weightless = _zero_part(empty, layout.part(GRAVITY))
-    rubbing = _zero_part(robot.own_inertial, layout.part(GRAVITY))
+    without_friction = _zero_inputs(robot.inertial, layout.friction)
+    own_without_friction = _zero_inputs(robot.own_inertial, layout.friction)
+    weightless = _zero_inputs(own_without_friction, layout.part(GRAVITY))
+    own_without_gravity = _zero_inputs(robot.own_inertial, layout.part(GRAVITY))
     preload = np.zeros((*shape, n))
     if robot.redundant:
         # The effort that remains at rest without gravity, friction and wrench.
-        preload = whole(weightless, still, still, none)
+        preload = evaluate(weightless, still, still, none)
 
-    def efforts(p: Array, qd: Array, qdd: Array, wrench: Array) -> Array:
-        return whole(p, qd, qdd, wrench) - preload
+    def evaluate_less_preload(p: Array, qd: Array, qdd: Array, wrench: Array) -> Array:
+        return evaluate(p, qd, qdd, wrench) - preload
 
-    bent, linear = still, change
+    velocity_acceleration, inertia_acceleration = still, acceleration
     if robot.redundant:
         # Accelerations of dependent drives are counted in the mass matrix's term.
-        onto = robot.inverse_jacobian(place) @ robot.jacobian(place)
-        bent = robot.project_redundant(place, rate)[2]
-        bent = bent - np.einsum("...ij,...j->...i", onto, bent)
-        linear = np.einsum("...ij,...j->...i", onto, change)
-    velocity = efforts(weightless, rate, bent, none)
-    friction = efforts(rubbing, rate, bent, none) - velocity
+        projector = robot.inverse_jacobian(position) @ robot.jacobian(position)
+        velocity_acceleration = robot.project_redundant(position, rate)[2]
+        velocity_acceleration = velocity_acceleration - np.einsum("...ij,...j->...i", projector, velocity_acceleration)
+        inertia_acceleration = np.einsum("...ij,...j->...i", projector, acceleration)
+    velocity = evaluate_less_preload(weightless, rate, velocity_acceleration, none)
+    friction = evaluate_less_preload(own_without_gravity, rate, velocity_acceleration, none) - velocity
     if robot.laws:
         # Friction may grow with the load of the motion itself.
-        both = (efforts(p, rate, change, load) for p in (robot.inertial, held))
+        both = (evaluate_less_preload(p, rate, acceleration, load) for p in (robot.inertial, without_friction))
         friction = next(both) - next(both)
     return Terms(
-        gravity=efforts(empty, still, still, none),
-        inertia=efforts(weightless, still, linear, none),
+        gravity=evaluate_less_preload(own_without_friction, still, still, none),
+        inertia=evaluate_less_preload(weightless, still, inertia_acceleration, none),
         velocity=velocity,
-        payload=efforts(held, rate, change, none) - efforts(empty, rate, change, none),
+        payload=evaluate_less_preload(without_friction, rate, acceleration, none)
+        - evaluate_less_preload(own_without_friction, rate, acceleration, none),
         friction=friction,
-        external=efforts(weightless, still, still, load),
+        external=evaluate_less_preload(weightless, still, still, load),
         preload=preload,
     )

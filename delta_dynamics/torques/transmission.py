@@ -81,11 +81,13 @@ class Transmission:
         :returns: shape (..., n) each, in the controller's units.
         """
         q, ratio = self._solve(position)
-        moved = None if velocity is None else _apply(ratio, self._joint(velocity, "velocities"))
-        given = None
+        rate = None if velocity is None else _multiply(ratio, self._check_joint_values(velocity, "velocities"))
+        load = None
         if effort is not None:
-            given = _apply(self._joint_per_actuator(q, ratio).swapaxes(-1, -2), self._joint(effort, "efforts"))
-        return TransmissionState(self.robot.controller.controller_positions(q), moved, given)
+            load = _multiply(
+                self._joint_per_actuator(q, ratio).swapaxes(-1, -2), self._check_joint_values(effort, "efforts")
+            )
+        return TransmissionState(self.robot.controller.controller_positions(q), rate, load)
 
     def actuator_to_joint(
         self, position: ArrayLike, velocity: ArrayLike | None = None, effort: ArrayLike | None = None
@@ -129,43 +131,45 @@ class Transmission:
         :param effort: efforts that the actuators carry at the position, (..., n); default: none.
         :returns: Ka and Da, shape (..., n, n) each: their coupling is a part of the result.
         """
-        wanted = self._matrix(stiffness, "stiffness")
+        stiffness_sum = self._check_matrix(stiffness, "stiffness")
         if effort is None:
             q, ratio = self._solve(position)
         else:
-            q, ratio, bend = self._solve_twice(position)
+            q, ratio, curvature = self._solve_with_curvature(position)
             load = vectors(effort, self.robot.joints_count, "efforts")
-            wanted = wanted + np.einsum("...i,...ijk->...jk", load, bend)
-        back = self._joint_per_actuator(q, ratio)
-        forth = back.swapaxes(-1, -2)
-        return forth @ wanted @ back, forth @ self._matrix(damping, "damping") @ back
+            stiffness_sum = stiffness_sum + np.einsum("...i,...ijk->...jk", load, curvature)
+        joint_per_actuator = self._joint_per_actuator(q, ratio)
+        transposed = joint_per_actuator.swapaxes(-1, -2)
+        return transposed @ stiffness_sum @ joint_per_actuator, transposed @ self._check_matrix(
+            damping, "damping"
+        ) @ joint_per_actuator
 
     def curvature(self, position: ArrayLike) -> Array:
         """Return the second derivatives d2(actuator)/d(joint)2, shape (..., n, m, m)."""
-        return self._solve_twice(position)[2]
+        return self._solve_with_curvature(position)[2]
 
-    def _solve_twice(self, position: ArrayLike) -> tuple[Array, Array, Array]:
+    def _solve_with_curvature(self, position: ArrayLike) -> tuple[Array, Array, Array]:
         """Return the results of :meth:`_solve`, and the curvature."""
         m, controller = len(self.joints), self.robot.controller
-        place = self._joint(position, "positions")[..., None, :]
+        pose = self._check_joint_values(position, "positions")[..., None, :]
         # Polarisation: f''(a + b) - f''(a) - f''(b) is twice the mixed second derivative.
         pairs = [(j, k) for j in range(m) for k in range(j)]
-        ways = np.array([*np.eye(m), *(np.eye(m)[j] + np.eye(m)[k] for j, k in pairs)])
+        directions = np.array([*np.eye(m), *(np.eye(m)[j] + np.eye(m)[k] for j, k in pairs)])
         q, flat, change = evaluate_at_pose(
-            self.robot, partial(transmission_kernel, curved=True), _NO_PARAMETERS, place, ways
+            self.robot, partial(transmission_kernel, curved=True), _NO_PARAMETERS, pose, directions
         )
-        found = np.empty((*change.shape[:-2], change.shape[-1], m, m))
+        curvature = np.empty((*change.shape[:-2], change.shape[-1], m, m))
         for j in range(m):
-            found[..., j, j] = change[..., j, :]
+            curvature[..., j, j] = change[..., j, :]
         for row, (j, k) in enumerate(pairs, m):
             mixed = (change[..., row, :] - change[..., j, :] - change[..., k, :]) / 2.0
-            found[..., j, k] = found[..., k, j] = mixed
+            curvature[..., j, k] = curvature[..., k, j] = mixed
         by_pose = flat.reshape(*q.shape, m)[..., 0, :, :]
         q = q[..., 0, :]
         slopes = controller.slopes(q)[..., None]
-        bend = (controller.factors * controller.changes)[:, None, None]
-        found = found * slopes[..., None] + bend * by_pose[..., :, None] * by_pose[..., None, :]
-        return q, by_pose * slopes, found
+        controller_curvature = (controller.factors * controller.changes)[:, None, None]
+        curvature = curvature * slopes[..., None] + controller_curvature * by_pose[..., :, None] * by_pose[..., None, :]
+        return q, by_pose * slopes, curvature
 
     def effort_limits(self, position: ArrayLike) -> Array:
         """Return the least and largest effort of each joint alone, shape (..., m, 2), N m or N.
@@ -186,7 +190,7 @@ class Transmission:
             normals = np.linalg.svd(ratio[..., chosen, :])[2][..., -1, :]
         reach = np.abs(normals @ ratio.swapaxes(-1, -2))
         reach[reach < _ROUNDING * reach.max(-1, keepdims=True)] = 0.0
-        limits = self._limits("effort", q)[..., None, :]
+        limits = self._actuator_limits("effort", q)[..., None, :]
         with np.errstate(invalid="ignore", divide="ignore"):
             bound = np.where(reach > 0.0, limits * reach, 0.0).sum(-1)
             slope = np.abs(normals)
@@ -202,7 +206,7 @@ class Transmission:
         :raises ParameterError: the file has no velocity limits.
         """
         q, ratio = self._solve(position)
-        limits, rates = self._limits("velocity", q)[..., None], np.abs(ratio)
+        limits, rates = self._actuator_limits("velocity", q)[..., None], np.abs(ratio)
         rates = np.where(rates < _ROUNDING * rates.max(-2, keepdims=True), 0.0, rates)
         with np.errstate(divide="ignore"):
             most = np.where(rates > 0.0, limits / rates, np.inf).min(-2)
@@ -217,7 +221,7 @@ class Transmission:
         :raises ParameterError: an actuator without an effort limit.
         """
         q, ratio = self._solve(position)
-        limits = self._limits("effort", q)
+        limits = self._actuator_limits("effort", q)
         free = [n for n, own in zip(self.actuators, limits.T, strict=True) if np.isinf(own).any()]
         if free:
             raise ParameterError("limits.effort", np.inf, f"finite limits of {', '.join(free)}")
@@ -231,13 +235,13 @@ class Transmission:
 
         :raises ParameterError: the robot's file gives no masses.
         """
-        place, m = self._joint(position, "positions"), len(self.joints)
+        place, m = self._check_joint_values(position, "positions"), len(self.joints)
         found = evaluate_at_pose(self.robot, pose_masses, self.robot.inertial, place)[1]
         return found.reshape(*found.shape[:-1], m, m)
 
     def _solve(self, position: ArrayLike) -> tuple[Array, Array]:
         """Return the model's q, shape (..., n), and the ratio, shape (..., n, m)."""
-        place = self._joint(position, "positions")
+        place = self._check_joint_values(position, "positions")
         q, flat = evaluate_at_pose(self.robot, partial(transmission_kernel, curved=False), _NO_PARAMETERS, place)
         ratio = flat.reshape(*q.shape, len(self.joints))
         return q, ratio * self.robot.controller.slopes(q)[..., None]
@@ -250,7 +254,7 @@ class Transmission:
         weighted = (ratio * weights[..., None]).swapaxes(-1, -2)
         return np.asarray(np.linalg.inv(weighted @ ratio) @ weighted)
 
-    def _limits(self, name: str, q: Array) -> Array:
+    def _actuator_limits(self, name: str, q: Array) -> Array:
         """Return the actuators' limits in the controller's numbers at positions q, (..., n)."""
         limits = getattr(self.robot.limits, name)
         if limits is None:
@@ -258,10 +262,10 @@ class Transmission:
         slopes = np.abs(self.robot.controller.slopes(q))
         return np.asarray(limits / slopes if name == "effort" else limits * slopes)
 
-    def _joint(self, values: ArrayLike, name: str) -> Array:
+    def _check_joint_values(self, values: ArrayLike, name: str) -> Array:
         return vectors(values, len(self.joints), name)
 
-    def _matrix(self, values: ArrayLike, name: str) -> Array:
+    def _check_matrix(self, values: ArrayLike, name: str) -> Array:
         """Return matrices of the joint side, shape (..., m, m)."""
         m, given = len(self.joints), np.asarray(values, np.float64)
         if given.ndim < 2:
@@ -271,7 +275,7 @@ class Transmission:
         return np.asarray(given, np.float64)
 
 
-def _apply(matrix: Array, vector: Array) -> Array:
+def _multiply(matrix: Array, vector: Array) -> Array:
     return np.asarray((matrix @ vector[..., None])[..., 0])
 
 

@@ -13,10 +13,10 @@ from delta_dynamics.torques.virtual_work import inverse_dynamics, mass_matrix
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.robot.robot import Robot
 
-MASSES: Final = 0.015
+DEFAULT_MASS_ERROR: Final = 0.015
 """Default standard deviation of efforts due to masses, as a share of those of gravity, inertia and
 velocities each: parts from CAD or a scale, cables and screws left out, are within a few percent."""
-FRICTION: Final = 0.015
+DEFAULT_FRICTION_ERROR: Final = 0.015
 """Default standard deviation of efforts that are not modelled, such as friction and cables, as a
 share of the greatest effort."""
 
@@ -35,7 +35,7 @@ class EffortParts(NamedTuple):
         """
         sizes = np.abs(self.rest) + np.abs(self.moving - self.rest)
         sizes = sizes + np.abs(self.whole - self.moving)
-        return np.asarray(np.hypot(MASSES * sizes, FRICTION * greatest), np.float64)
+        return np.asarray(np.hypot(DEFAULT_MASS_ERROR * sizes, DEFAULT_FRICTION_ERROR * greatest), np.float64)
 
 
 def effort_parts(robot: Robot, q: Array, qd: Array, qdd: Array, wrench: Array | None, mass: Array) -> EffortParts:
@@ -51,14 +51,16 @@ def effort_parts(robot: Robot, q: Array, qd: Array, qdd: Array, wrench: Array | 
 
 
 def usual_effort(robot: Robot) -> Array:
-    """Return each joint's effort at home against the weight, or to accelerate the platform by g, (n,)."""
+    """Return each joint's effort at home, (n,): the larger one of holding the weight and accelerating by g."""
     q, still = robot.inverse(robot.home()), np.zeros(robot.joints_count)
     lever = np.array([1.0, 1.0, 1.0, *(3 * [robot.size])])
-    moves = np.linalg.norm(robot.platform_jacobian(q) * lever[:, None], axis=0)
+    platform_rate = np.linalg.norm(robot.platform_jacobian(q) * lever[:, None], axis=0)
     inertia = np.diag(mass_matrix(robot, q))
     held = np.abs(inverse_dynamics(robot, q, still, still))
-    felt = moves > 1e-6 * moves.max(initial=0.0)
-    return np.where(felt, np.maximum(held, 9.81 * inertia / np.where(felt, moves, 1.0)), held)
+    moves_platform = platform_rate > 1e-6 * platform_rate.max(initial=0.0)
+    return np.where(
+        moves_platform, np.maximum(held, 9.81 * inertia / np.where(moves_platform, platform_rate, 1.0)), held
+    )
 
 
 def torque_deviation(
@@ -78,19 +80,19 @@ def torque_deviation(
     return np.asarray(np.sqrt((effects * effects).sum(-1)), np.float64)
 
 
-AVERAGED: Final = 1.0
+NOISE_AVERAGING_TIME: Final = 1.0
 """Time over which the noise is averaged, s."""
 
 
 class Noise:
-    """Variance of errors of mean zero, shape (n,): an average of their squares.
+    """Estimate the variance of errors of mean zero, shape (n,), by the average of their squares.
 
-    Once it is settled a square counts up to ``clipped`` times the average: a lasting departure is
-    no noise.
+    After the learning time each square is clipped at ``clipped`` times the average, so that a lasting
+    error does not count as noise.
     """
 
     def __init__(self, variance: Array, learning: float, clipped: float) -> None:
-        """Begin with a variance, shape (n,); it is settled after the time ``learning``, s."""
+        """Start with a variance, shape (n,); ``learning``: time, s, in which squares are not clipped."""
         self.variance = variance
         self._learning, self._clipped = learning, clipped
         self._time = self._step = 0.0
@@ -110,5 +112,5 @@ class Noise:
         square = error**2
         if self.settled:
             square = np.minimum(square, self._clipped * self.variance)
-        part = min(1.0, self._step / min(self._time, AVERAGED))
+        part = min(1.0, self._step / min(self._time, NOISE_AVERAGING_TIME))
         self.variance = np.maximum(self.variance + part * (square - self.variance), least)

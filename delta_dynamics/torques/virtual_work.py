@@ -89,16 +89,16 @@ def stream_torques(robot: Robot) -> Kernel:
 
 def mass_matrix(robot: Robot, q: ArrayLike) -> Array:
     """Compute the mass matrix on the actuated joints, payload included, shape (..., n, n)."""
-    # A simulation asks for one sample, several thousand times a second.
-    return _square(robot, robot.function(masses_kernel, robot.inertial)(q))
+    # The cached function is fast for one sample: a simulation evaluates it several thousand times a second.
+    return _reshape_square(robot, robot.function(masses_kernel, robot.inertial)(q))
 
 
 def masses_kernel(robot: Robot) -> Kernel:
     """Return the program of :func:`mass_matrix`: q to its entries, row by row."""
-    return robot.massive().kernel("mass matrix", _masses)
+    return robot.massive().kernel("mass matrix", _write_mass_matrix)
 
 
-def _square(robot: Robot, flat: Array) -> Array:
+def _reshape_square(robot: Robot, flat: Array) -> Array:
     n = robot.joints_count
     return flat.reshape(*flat.shape[:-1], n, flat.shape[-1] // n)
 
@@ -107,7 +107,7 @@ def body_mass_matrix(robot: Robot, q: ArrayLike, body: str) -> Array:
     """Return one body's part of the mass matrix, (..., n, n); the platform's with payload."""
     p, where = np.zeros_like(robot.inertial), Layout(robot.massive().tree).body(body)
     p[where] = robot.inertial[where]
-    return _square(robot, robot.evaluate(masses_kernel(robot), q, p=p)[0])
+    return _reshape_square(robot, robot.evaluate(masses_kernel(robot), q, p=p)[0])
 
 
 def forward_dynamics(
@@ -120,16 +120,16 @@ def forward_dynamics(
     """
     load = _NO_WRENCH if wrench is None else wrench
 
-    def checked(q: ArrayLike, qd: ArrayLike, tau: ArrayLike, load: ArrayLike) -> Array:
+    def evaluate_checked(q: ArrayLike, qd: ArrayLike, tau: ArrayLike, load: ArrayLike) -> Array:
         efforts = vectors(tau, robot.joints_count, "efforts")
         return robot.evaluate(accelerations(robot), q, qd, efforts, load, p=robot.inertial)[0]
 
-    return robot.function(accelerations, robot.inertial, checked)(q, qd, tau, load)
+    return robot.function(accelerations, robot.inertial, evaluate_checked)(q, qd, tau, load)
 
 
 def accelerations(robot: Robot) -> Kernel:
     """Return the program of :func:`forward_dynamics`: q, qd, efforts and wrench to qdd."""
-    return robot.massive().kernel("accelerations", _accelerations)
+    return robot.massive().kernel("accelerations", _write_accelerations)
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,7 @@ class Energy:
 
 def energy(robot: Robot, q: ArrayLike, qd: ArrayLike) -> Energy:
     """Compute the mechanical energy of all bodies and rotors, payload included."""
-    kernel = robot.massive().kernel("energy", _energy)
+    kernel = robot.massive().kernel("energy", _write_energy)
     (both,) = robot.evaluate(kernel, q, qd, p=robot.inertial)
     return Energy(both[..., 0].copy(), both[..., 1].copy())
 
@@ -361,7 +361,7 @@ def add_friction_and_rotors(
     rotors = [rotor * change for rotor, change in zip(parts[ROTORS_PART], changes, strict=True)]
     basic = _basic_friction(parts, rates)
     for k, values in enumerate(_law_values(t, parts)):
-        # No drive of several that share the effort has a law by load.
+        # Drives of a redundant machine have no load-dependent friction law.
         load = 0.0 if t.drives.others else loads[k] + rotors[k]
         basic[k] = basic[k] + friction.evaluate_laws(t.graph.laws, values, q[k], rates[k], load)
     rows = loads, t.drives.on_leads(basic), t.drives.on_leads(rotors)
@@ -424,7 +424,7 @@ def torque_program(t: Traced, *, on_bodies: bool = False, base: int = 0) -> Prog
     return Program(sizes, layout.size, {"efforts": t.lift(efforts)}, t.equations())
 
 
-def _accelerations(t: Traced) -> Program:
+def _write_accelerations(t: Traced) -> Program:
     layout, parts = solve_and_split(t)
     leads = leading_accelerations(t, parts, t.drives.given("qd"), t.tape.inputs("tau", t.drives.count))
     outputs = {"accelerations": t.lift(t.drives.followed(leads, t.du))}
@@ -440,11 +440,11 @@ def leading_accelerations(t: Traced, parts: list[Objects], qd: Objects, tau: Obj
     driving, still = t.drives.on_leads([*tau]), np.zeros(t.joints)
     loads = driving_forces(t, parts, qd, still)
     q, rates, changes = t.drives.variables("q"), t.tree.drive_rates(qd, t.u), t.tree.drive_rates(still, t.du)
-    rest = efforts_left(t, parts, driving, loads, q, rates, changes)
-    return solve_massive(np.reshape(mass_entries(t, parts), (t.joints, t.joints)), rest)
+    rest = remaining_efforts(t, parts, driving, loads, q, rates, changes)
+    return solve_accelerations(np.reshape(mass_entries(t, parts), (t.joints, t.joints)), rest)
 
 
-def efforts_left(
+def remaining_efforts(
     t: Traced, parts: list[Objects], driving: Numbers, loads: Numbers, q: Numbers, rates: Numbers, changes: Numbers
 ) -> Objects:
     """Return the leading drives' efforts that remain for accelerations.
@@ -457,15 +457,15 @@ def efforts_left(
     if laws and not t.drives.others:
         basic = _basic_friction(parts, rates)
         for k, values in enumerate(laws):
-            at_place, dry, share = friction.sum_laws(t.graph.laws, values, q[k], absolute(rates[k]))
-            way = sign(rates[k])
-            free = driving[k] - basic[k] - at_place - dry * way
-            rest[k] = friction.solve_load(free, share, way) - (loads[k] + parts[ROTORS_PART][k] * changes[k])
+            position_friction, dry, share = friction.sum_laws(t.graph.laws, values, q[k], absolute(rates[k]))
+            direction = sign(rates[k])
+            free = driving[k] - basic[k] - position_friction - dry * direction
+            rest[k] = friction.solve_load(free, share, direction) - (loads[k] + parts[ROTORS_PART][k] * changes[k])
     return rest
 
 
-def solve_massive(mass: Objects, rest: Objects) -> list[Any]:
-    """Solve M a = rest; infinite where something would move without mass: the sample is rejected."""
+def solve_accelerations(mass: Objects, rest: Objects) -> list[Any]:
+    """Solve M a = rest; infinite if M is singular to rounding, so that the sample is rejected."""
     n = len(mass)
     root = SparseCholesky({(i, j): mass[i, j] for i in range(n) for j in range(i + 1)}, list(np.diag(mass)))
     least: Any = 1.0
@@ -503,7 +503,7 @@ def mass_entries(t: Traced, parts: list[Objects], visit: Callable[[Forces], None
     return [value for row in table for value in row]
 
 
-def _masses(t: Traced) -> Program:
+def _write_mass_matrix(t: Traced) -> Program:
     layout, parts = solve_and_split(t)
     mass = np.reshape(mass_entries(t, parts), (t.joints, t.joints))
     outputs = {"matrix": t.lift(t.drives.shared_on_both(mass))}
@@ -522,7 +522,7 @@ def potential(t: Traced, bodies: Objects, rods: Objects, gravity: Objects) -> An
     return -(weighted @ gravity)
 
 
-def _energy(t: Traced) -> Program:
+def _write_energy(t: Traced) -> Program:
     layout, (bodies, rods, gravity, *_, rotors, passive) = solve_and_split(t)
     qd = t.drives.given("qd")
     u = t.set_rates(qd)
@@ -538,9 +538,9 @@ def _energy(t: Traced) -> Program:
 
 
 def null_efforts(robot: Robot, q: ArrayLike) -> Array:
-    """Compute efforts that move nothing, (..., n - m, n), of n actuated joints and m freedoms.
+    """Compute efforts that cause no motion, (..., n - m, n), of n actuated joints and m freedoms.
 
-    The machine's inner forces: added to any efforts, they change the motion of no part. Rows are
+    They are the machine's internal forces: added to any efforts, they change no motion. Rows are
     of unit length and at right angles in efforts over their limits (``limits.effort``; without
     limits, in efforts). Errors as of :meth:`Robot.forward`.
     """

@@ -10,7 +10,7 @@ import click
 
 from pkm_twin.apps.groups import Tasks, commands
 from pkm_twin.apps.options import REFUSED, SALVAGED
-from pkm_twin.console import flush_output, silence_output, system_error, tell
+from pkm_twin.console import describe_system_error, discard_output, flush_output, print_message
 from pkm_twin.errors import PkmTwinError, plain_warnings
 from pkm_twin.files import open_standard_streams
 from pkm_twin.ros.signals import INTERRUPTED, first_signal
@@ -63,7 +63,7 @@ app = Tasks(
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line; report an error as one line with exit code 1, Ctrl-C with code 130."""
-    # Loaded modules are never garbage; collecting while they load takes a tenth of a short command's time.
+    # Disable garbage collection while modules load, which would take a tenth of a short command's time.
     gc.disable()
     open_standard_streams()
     one_blas_thread()
@@ -73,22 +73,22 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except SystemExit:
         failed = flush_output()
         if failed and not isinstance(failed, BrokenPipeError):
-            _end(f"cannot write the output: {system_error(failed)}")
+            _exit_with_message(f"cannot write the output: {describe_system_error(failed)}")
         raise
     except BrokenPipeError:
         # The reader of the pipe has closed it, as `head` does.
-        silence_output()
+        discard_output()
         sys.exit(REFUSED)
     except PkmTwinError as error:
-        _end(str(error), SALVAGED if error.salvageable else REFUSED)
+        _exit_with_message(str(error), SALVAGED if error.salvageable else REFUSED)
     except OSError as error:
         flush_output()
-        # An error without a file name is one of the output.
-        _end(f"{'' if error.filename else 'cannot write the output: '}{system_error(error)}")
+        # An error without a file name comes from writing to stdout.
+        _exit_with_message(f"{'' if error.filename else 'cannot write the output: '}{describe_system_error(error)}")
 
 
-def _end(text: str, code: int = REFUSED) -> NoReturn:
-    tell(text)
+def _exit_with_message(text: str, code: int = REFUSED) -> NoReturn:
+    print_message(text)
     sys.exit(code)
 
 

@@ -18,9 +18,9 @@ from pkm_twin.identification.hypotheses import Explanation
 from pkm_twin.identification.parameters import Group, Number
 from pkm_twin.report import Column, Fact, Report, Table, plots
 
-COMBINED: Final = "known only in combination with others"
-BY_AXIS: Final = "m_m_m_rad_rad_rad"
-"""Ending of keys in JSON: the units of a deflection's six components."""
+COMBINED_TEXT: Final = "known only in combination with others"
+DEFLECTION_UNITS: Final = "m_m_m_rad_rad_rad"
+"""Units of a deflection's six components, at the end of keys in JSON."""
 
 
 def report_fit(result: Result, marks: Sequence[str] = ()) -> tuple[Report, list[Table]]:
@@ -29,12 +29,12 @@ def report_fit(result: Result, marks: Sequence[str] = ()) -> tuple[Report, list[
     :param marks: notes that come first.
     """
     verdict, e, elastic = result.verdict, result.estimate, isinstance(result, ElasticFit)
-    label = _element if elastic else _name
+    label = _element_name if elastic else _parameter_name
     units = dict(zip(result.channels, result.units, strict=True))
     own = tuple(units[channel.name] for channel in verdict.channels)
     shown = [n for n in result.numbers if n.status != "not excited"]
     idle = [label(n) for n in result.of("not excited")]
-    # RMS residuals before and now, measured peak, unit: of the channels that were measured.
+    # RMS residuals before and after the fit, measured peak, and unit of each measured channel.
     held = {}
     for judged in result.judged:
         sizes = judged.rms(judged.before), judged.rms(judged.after), np.abs(judged.measured).max(0)
@@ -56,7 +56,7 @@ def report_fit(result: Result, marks: Sequence[str] = ()) -> tuple[Report, list[
             )
         more += [f"efforts replaced as outliers: {result.outliers}"] if result.outliers else []
     elif isinstance(result, ElasticFit):
-        names = tuple(map(_element, result.numbers))
+        names = tuple(map(_element_name, result.numbers))
         facts = _report_elastic(result)
         more = list(map(_describe_group, result.groups))
     notes = [*marks, *verdict.lines(own), *more]
@@ -64,13 +64,13 @@ def report_fit(result: Result, marks: Sequence[str] = ()) -> tuple[Report, list[
         notes.append(f"not excited, the file's value stays: {', '.join(idle)}")
     if e.bound:
         what = "a negative compliance" if elastic else "negative friction or an impossible body"
-        # A bound of a body concerns several of its numbers: name the body.
+        # A physical bound concerns several numbers of a body, so name the body.
         which = ", ".join(dict.fromkeys(names[k] if not more else names[k].rpartition(".")[0] for k, *more in e.bound))
         notes.append(f"at a physical bound, without which the fit would give {what}: {which}")
     parameters = [
         {
             "key": n.name,
-            **({"element": _element(n), "unit": "of the file's compliance"} if elastic else {"unit": n.unit}),
+            **({"element": _element_name(n), "unit": "of the file's compliance"} if elastic else {"unit": n.unit}),
             "before": n.before,
             "value": n.after,
             "standard_deviation": n.deviation,
@@ -93,7 +93,7 @@ def report_fit(result: Result, marks: Sequence[str] = ()) -> tuple[Report, list[
         Column("", text=" "),
     ]
     number_rows = {
-        name: (n.before, n.after, n.spread, n.unit, COMBINED if n.status == "combination" else "")
+        name: (n.before, n.after, n.spread, n.unit, COMBINED_TEXT if n.status == "combination" else "")
         for name, n in numbers.items()
     }
     channel_columns = [
@@ -112,7 +112,7 @@ def report_fit(result: Result, marks: Sequence[str] = ()) -> tuple[Report, list[
     }
     explained = result.explained if isinstance(result, Fit) else ()
     return Report(
-        _answer(result, held),
+        _write_answer(result, held),
         [
             Fact("robot", result.robot.name),
             Fact("verdict", verdict.as_json(own)),
@@ -137,7 +137,7 @@ def report_fit(result: Result, marks: Sequence[str] = ()) -> tuple[Report, list[
 
 
 def tabulate_causes(explained: Sequence[Explanation], names: Sequence[str]) -> list[Table]:
-    """Return a table of what was considered as the cause of each recording's deviations."""
+    """Return a table of the causes that were considered for each recording's deviations."""
     rows = {
         f"{name}: {text}" if len(explained) > 1 else text: (100.0 * part,)
         for name, one in zip(names, explained, strict=False)
@@ -147,15 +147,15 @@ def tabulate_causes(explained: Sequence[Explanation], names: Sequence[str]) -> l
     return [Table("considered", [column], rows, "considered as the cause of deviations", "cause")] * bool(rows)
 
 
-def _name(number: Number) -> str:
+def _parameter_name(number: Number) -> str:
     return number.name
 
 
-def _element(number: Number) -> str:
+def _element_name(number: Number) -> str:
     return str(number.key[-1])
 
 
-def _answer(result: Result, held: Mapping[str, tuple[float, float, float, str]]) -> str:
+def _write_answer(result: Result, held: Mapping[str, tuple[float, float, float, str]]) -> str:
     """Describe whether the model explains the recordings, and the worst held-out channel."""
     name, (before, after, peak, unit) = max(held.items(), key=lambda row: row[1][1] / max(row[1][2], 1e-300))
     return (
@@ -214,14 +214,14 @@ def _report_elastic(result: ElasticFit) -> list[Fact]:
             "recording": judged.name,
             "from_s": judged.time[0],
             "to_s": judged.time[-1],
-            f"zero_{BY_AXIS}": np.where(measured, zero, np.nan),
-            f"residual_rms_before_{BY_AXIS}": judged.rms(judged.before),
-            f"residual_rms_after_{BY_AXIS}": judged.rms(judged.after),
+            f"zero_{DEFLECTION_UNITS}": np.where(measured, zero, np.nan),
+            f"residual_rms_before_{DEFLECTION_UNITS}": judged.rms(judged.before),
+            f"residual_rms_after_{DEFLECTION_UNITS}": judged.rms(judged.after),
         }
         for judged, zero, measured in each
     ]
     noise = np.where(result.measured.any(0), result.estimate.noise, np.nan)
-    return [Fact("not_told_apart", groups), Fact(f"deflection_noise_{BY_AXIS}", noise), Fact("held_out", held)]
+    return [Fact("not_told_apart", groups), Fact(f"deflection_noise_{DEFLECTION_UNITS}", noise), Fact("held_out", held)]
 
 
 def _describe_group(group: Group) -> str:
@@ -229,12 +229,12 @@ def _describe_group(group: Group) -> str:
     for one in group.known:
         terms = " + ".join(f"{w:.2f} x {name}" for name, w in one.weights.items())
         sums.append(f"{terms.replace('+ -', '- ')} = {one.value:.4g} +- {one.deviation:.2g}")
-    told = "; ".join(sums) or "nothing"
-    return f"Loads do not distinguish {' and '.join(group.elements)}; they identify {told}"
+    combinations = "; ".join(sums) or "nothing"
+    return f"Loads do not distinguish {' and '.join(group.elements)}; they identify {combinations}"
 
 
 def _draw_residuals(judged: Judged, units: Mapping[str, str]) -> Any:
-    """Draw residuals of each channel before and now, with the model's standard deviation."""
+    """Draw residuals of each channel before and after the fit, with the model's standard deviation."""
     # At most 4,000 samples of a recording are drawn.
     step = max(1, len(judged.time) // 4000)
     rows: dict[str, list[Array]] = {}
@@ -243,7 +243,7 @@ def _draw_residuals(judged: Judged, units: Mapping[str, str]) -> Any:
         if np.isfinite(judged.measured[:, k]).any():
             rows[name] = [one[::step, k] for one in series]
     time = judged.time[::step]
-    # Lines are broken where samples were left out.
+    # Break lines where samples were left out.
     gaps = 1 + np.flatnonzero(np.diff(time) > 5.0 * np.median(np.diff(time)))
     figure, ((*axes,),) = plots.columns(1, len(rows))
     for ax, (name, (before, now, deviation)) in zip(axes, rows.items(), strict=True):
@@ -262,7 +262,7 @@ def _draw_residuals(judged: Judged, units: Mapping[str, str]) -> Any:
 
 
 def _draw_changes(shown: Mapping[str, Number]) -> Any:
-    """Draw how far numbers moved, in standard deviations where known."""
+    """Draw the changes of numbers, in standard deviations where these are known."""
     known = all(np.isfinite(n.deviation) and n.deviation > 0.0 for n in shown.values())
     moved = {
         name: (n.after - n.before) / (n.deviation if known else max(abs(n.before), abs(n.after), 1e-300))
@@ -286,12 +286,12 @@ def _draw_changes(shown: Mapping[str, Number]) -> Any:
     if max(map(abs, moved.values()), default=0.0) > 30.0:
         ax.set_xscale("symlog", linthresh=2.0)
     over = "standard deviation" if known else "larger value"
-    plots.label(ax, f"change over the {over}; orange: {COMBINED}", "")
+    plots.label(ax, f"change over the {over}; orange: {COMBINED_TEXT}", "")
     plots.write_title(figure, title)
     return figure
 
 
-def _write_terms(law: Law) -> str:
+def _write_law(law: Law) -> str:
     each = zip(law.terms, law.values, law.deviations, strict=True)
     return ", ".join(
         f"{term} {value:.3f} +- {deviation:.3f}" + (" A" if term != "load-dependent" else "")
@@ -308,7 +308,7 @@ def report_drive(found: DriveFriction) -> Report:
         rows[law.name] |= {"residual_a": law.residual, "held_out_a": law.held_out, "held_out_drive_a": law.other_drives}
     notes = []
     for law in found.laws:
-        line = f"{law.name}: {_write_terms(law)}; residual {law.residual:.3f} A"
+        line = f"{law.name}: {_write_law(law)}; residual {law.residual:.3f} A"
         line += f", held-out runs {law.held_out:.3f} A"
         if np.isfinite(law.other_drives):
             line += f", held-out drives {law.other_drives:.3f} A"
@@ -322,7 +322,7 @@ def report_drive(found: DriveFriction) -> Report:
         notes.append(f"{simpler} alone: {verdict} (p = {found.chance:.2g})")
     return Report(
         f"torque constant {found.torque_constant:.4f} +- {found.torque_constant_deviation:.4f} "
-        f"N m/A; friction {_write_terms(found.chosen)}; zero current {found.zero:.3f} A",
+        f"N m/A; friction {_write_law(found.chosen)}; zero current {found.zero:.3f} A",
         [
             Fact("torque_constant_nm_per_a", found.torque_constant),
             Fact("torque_constant_deviation_nm_per_a", found.torque_constant_deviation),

@@ -21,22 +21,22 @@ from click.core import ParameterSource
 from click.shell_completion import CompletionItem
 
 from pkm_twin.apps.options import CheckedOptions, DrawingOptions
-from pkm_twin.console import numbers, refuse_existing
+from pkm_twin.console import parse_count_of_numbers, reject_existing
 from pkm_twin.errors import FileError, ParameterError, PkmTwinError, UnknownNameError
-from pkm_twin.files import STANDARD, decimal
+from pkm_twin.files import STANDARD, parse_decimal
 from pkm_twin.report import Fact, Report
 from pkm_twin.report.terminal import present
 from pkm_twin.settings import Setting
 
-NEGATIVE: Final = re.compile(r"-\.?\d")
-"""Beginning of a negative number, which click takes for an option where an argument stands."""
-MARK: Final = " "
-"""Precedes a negative number until its value is read. click's own ``ignore_unknown_options`` would
-also take a misspelt option for an argument."""
+NEGATIVE_NUMBER: Final = re.compile(r"-\.?\d")
+"""Pattern of the beginning of a negative number, which click would read as an option."""
+NEGATIVE_MARK: Final = " "
+"""Put before a negative number until its value is read, so that click does not read it as an option.
+click's ``ignore_unknown_options`` would accept misspelt options as arguments."""
 
 
 class Value(click.ParamType):  # type: ignore[type-arg]
-    """Read the value of a setting from a word, and complete it."""
+    """Convert words of the command line to values of a setting, and complete them in the shell."""
 
     name = "value"
 
@@ -45,29 +45,29 @@ class Value(click.ParamType):  # type: ignore[type-arg]
         self.kind, self.row = kind, row
 
     def convert(self, value: Any, param: Any, ctx: click.Context | None) -> Any:
-        """Return the value that the field has for a word.
+        """Convert a word to the field's value.
 
-        :raises UsageError: the word is no choice, no number, or out of bounds.
+        :raises UsageError: the word is not one of the choices, not a number, or out of bounds.
         """
         row, name = self.row, spell(param)
-        word = value[1:] if value[:1] == MARK and NEGATIVE.match(value, 1) else value
+        word = value[1:] if value[:1] == NEGATIVE_MARK and NEGATIVE_NUMBER.match(value, 1) else value
         if row.choices:
             if word not in row.choices:
                 raise click.UsageError(f"{name}: {word!r}; expected {' or '.join(row.choices)}")
-            return row.value(word)
+            return row.to_field_value(word)
         if row.count is not None:
-            return tuple(numbers(word, row.count, row.metavar or ""))
+            return tuple(parse_count_of_numbers(word, row.count, row.metavar or ""))
         if self.kind not in (int, float):
             return self.kind(word)
         try:
-            number = decimal(word)
+            number = parse_decimal(word)
             number = int(word) if self.kind is int and math.isfinite(number) else number
         except ValueError:
             number = math.nan
-        if not (row.allows(number) and math.isfinite(number)):
-            whole = self.kind is int
-            what = "a whole number" if whole else "a number" + ", no commas" * ("," in word)
-            raise click.UsageError(f"{name}: {word.strip()!r}; expected {what}{row.span}")
+        if not (row.is_within_bounds(number) and math.isfinite(number)):
+            is_integer = self.kind is int
+            what = "a whole number" if is_integer else "a number" + ", no commas" * ("," in word)
+            raise click.UsageError(f"{name}: {word.strip()!r}; expected {what}{row.bounds_text}")
         return number
 
     def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
@@ -80,7 +80,7 @@ class Value(click.ParamType):  # type: ignore[type-arg]
 class Option(click.Option):
     """Option of a field: also accepts older spellings, and --X as the opposite of --no-X.
 
-    ``shown``: the default as help has it, empty for none.
+    ``shown``: the default's text in the help; empty if there is none.
     """
 
     def __init__(self, field: str, kind: Any, row: Setting, default: Any) -> None:
@@ -123,7 +123,7 @@ class Option(click.Option):
 
 
 class Argument(click.Argument):
-    """Argument of a field, explained in the help; ``shown``: its default there."""
+    """Argument of a field, with its text in the help; ``shown``: the default's text there."""
 
     def __init__(self, field: str, kind: Any, row: Setting, default: Any) -> None:
         """Read the field's type ``kind``, its setting and default."""
@@ -135,13 +135,13 @@ class Argument(click.Argument):
         self.row = row
 
     def get_help_record(self, ctx: click.Context) -> tuple[str, str]:
-        """Return name and text; click's own arguments have none."""
+        """Return name and text for the help, which click's own arguments lack."""
         default = f"  [default: {self.shown}]" if self.shown else ""
         return self.human_readable_name, self.row.text + ("  [required]" * self.required or default)
 
 
 class Command(click.Command):
-    """Command of a class of settings, whose docstring is the help, and of a function ``run``."""
+    """Command that calls ``run`` with an object of a class of settings, whose docstring is the help."""
 
     def __init__(self, given: type[Any], run: Callable[[Any], Report], task: str = "") -> None:
         """Declare the options of a class of settings.
@@ -149,7 +149,7 @@ class Command(click.Command):
         :param task: the heading in the list of commands; empty for a command of a group.
         """
         self.given, self.run, self.task = given, run, task
-        self.fields = list(_find_parameters(given))
+        self.fields = list(_list_parameters(given))
         as_json = click.Option(["--json", "as_json"], is_flag=True, help="print JSON")
         super().__init__(
             run.__name__.replace("_", "-"),
@@ -159,16 +159,16 @@ class Command(click.Command):
         )
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Read the words; a negative number is not an option."""
-        return super().parse_args(ctx, [MARK * bool(NEGATIVE.match(w)) + w for w in args])
+        """Parse the words of the command line, marking negative numbers, which are not options."""
+        return super().parse_args(ctx, [NEGATIVE_MARK * bool(NEGATIVE_NUMBER.match(w)) + w for w in args])
 
     def collect_usage_pieces(self, ctx: click.Context) -> list[str]:
-        """Return the words of the usage line, without arguments before the command's name."""
+        """Return the words of the usage line, without arguments that stand before the command's name."""
         before = str(ctx.info_name).split()[:-1]
         return [piece for piece in super().collect_usage_pieces(ctx) if piece not in before]
 
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Explain the arguments, then the options."""
+        """Write the arguments, then the options, with their texts."""
         records: dict[str, list[tuple[str, str]]] = {"argument": [], "option": []}
         for one in self.get_params(ctx):
             if record := one.get_help_record(ctx):
@@ -181,26 +181,26 @@ class Command(click.Command):
     def execute(self, as_json: bool, **values: Any) -> None:
         """Check the targets, run the command, present its report and write its pictures.
 
-        :raises UsageError: the value of an option is wrong in itself.
+        :raises UsageError: an option has a value that no machine allows.
         :raises PkmTwinError: what else the command raises, or a file that may not be replaced.
         """
         given = self.given(**values)
         overwrite = getattr(given, "overwrite", True)
         read = (getattr(given, str(one.name)) for one in self.fields if not one.row.writes)
-        # The first file that the command reads, which it never replaces.
+        # Never replace the first file that the command reads.
         source = next((value for value in read if isinstance(value, Path)), None)
         self._check_targets(given, overwrite, source)
         drawing = given.drawing(str(self.name)) if isinstance(given, DrawingOptions) else None
         piped = any(str(path) == STANDARD for path in (getattr(given, "out", None), drawing))
         if drawing is not None:
-            refuse_existing(drawing, overwrite, source)
+            reject_existing(drawing, overwrite, source)
         gc.freeze()
         gc.enable()
         try:
             report = self.run(given)
         except ParameterError as error:
-            # A text that the command cannot read is wrong usage; a number that only this machine
-            # cannot meet is not.
+            # Report an option's text that cannot be parsed as wrong usage, but not a number that this machine
+            # does not allow.
             find_source, word = click.get_current_context().get_parameter_source, error.field
             texts = [
                 spell(one)
@@ -211,7 +211,7 @@ class Command(click.Command):
                 raise
             raise click.UsageError(f"--{str(error).removeprefix('--')}") from None
         if isinstance(given, DrawingOptions):
-            report = _draw(report, drawing, overwrite)
+            report = _write_pictures(report, drawing, overwrite)
         present(report, as_json, piped=piped)
         if report.exit_code:
             raise click.exceptions.Exit(report.exit_code)
@@ -245,7 +245,7 @@ class Command(click.Command):
             if isinstance(given, CheckedOptions):
                 given.check_options()
         for target in dict.fromkeys(targets):
-            refuse_existing(target, overwrite, source)
+            reject_existing(target, overwrite, source)
 
 
 def command(task: str = "") -> Callable[[Callable[[Any], Report]], Command]:
@@ -262,7 +262,7 @@ def command(task: str = "") -> Callable[[Callable[[Any], Report]], Command]:
 
 
 class Group(click.Group):
-    """Group of commands under one name; the error of a wrong name has the closest one."""
+    """Group of commands under one name; the error for an unknown command names the closest one."""
 
     noun = ""
     """Word for a command of the group in errors; by default the group's name."""
@@ -292,7 +292,7 @@ class Group(click.Group):
         """Return the names of the commands in their order."""
         return list(self.commands)
 
-    def show(self, name: str) -> str:
+    def spell_command(self, name: str) -> str:
         """Return a command's name as typed, with the arguments before it."""
         return name
 
@@ -308,7 +308,7 @@ class Group(click.Group):
             noun = self.noun or str(ctx.info_name)
             raise click.UsageError(str(UnknownNameError(noun, name, tuple(self.commands))), ctx)
         _, found, rest = super().resolve_command(ctx, args)
-        return self.show(name), found, rest
+        return self.spell_command(name), found, rest
 
 
 def spell(one: click.Parameter) -> str:
@@ -316,7 +316,7 @@ def spell(one: click.Parameter) -> str:
     return one.human_readable_name if isinstance(one, click.Argument) else one.opts[0]
 
 
-def _draw(report: Report, drawing: Path | None, overwrite: bool) -> Report:
+def _write_pictures(report: Report, drawing: Path | None, overwrite: bool) -> Report:
     """Write the pictures of a report; the first is its ``picture``, ``pictures`` are all.
 
     :raises PkmTwinError: one of them exists and ``overwrite`` is false: none is written.
@@ -335,7 +335,7 @@ def _draw(report: Report, drawing: Path | None, overwrite: bool) -> Report:
     if len(there) > 1 and not overwrite:
         raise PkmTwinError(f"{', '.join(there)} exist; use --overwrite to replace them")
     for target in targets:
-        refuse_existing(target, overwrite)
+        reject_existing(target, overwrite)
     written = [plots.save(figure(), target) for target, figure in targets.items()]
     files = [*written, *(path for name, path in report.files.items() if name == "page" and path)]
     return dataclasses.replace(
@@ -349,7 +349,7 @@ def _draw(report: Report, drawing: Path | None, overwrite: bool) -> Report:
     )
 
 
-def _find_parameters(given: type[Any]) -> Iterator[Argument | Option]:
+def _list_parameters(given: type[Any]) -> Iterator[Argument | Option]:
     """Yield the arguments and options of a class of settings, in the order of the help.
 
     Arguments come first, those of the classes below before the class's own; of options, the
@@ -379,7 +379,7 @@ def _write_default(row: Setting, default: Any) -> tuple[str, dict[str, Any]]:
     if default in (MISSING, None, ()):
         return "", {}
     if row.choices:
-        default = row.parameter(default)
+        default = row.to_parameter_value(default)
     elif row.count is not None:
         default = ",".join(f"{value:g}" for value in default)
     elif isinstance(default, tuple):

@@ -14,12 +14,12 @@ import click
 
 from pkm_twin.apps.frame import Group
 from pkm_twin.apps.options import USAGE
-from pkm_twin.console import tell
+from pkm_twin.console import print_message
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.extensions import Extensible
 
-WIDE: Final = 200
-"""Characters allowed for a command's purpose: more than any has, so that none is cut."""
+MAX_HELP_WIDTH: Final = 200
+"""Characters allowed for a command's summary: more than any has, so that none is cut."""
 
 TASKS: Final = (
     "Robots",
@@ -30,7 +30,7 @@ TASKS: Final = (
     "Design and export",
 )
 """Headings of the list of commands: each command names one of them, or its own."""
-OLDER: Final[Mapping[str, tuple[str, ...]]] = {
+OLDER_NAMES: Final[Mapping[str, tuple[str, ...]]] = {
     "atlas": ("map",),
     "feed": ("path", "--slow-where-soft"),
     "guard-check": ("monitor-torques",),
@@ -52,18 +52,18 @@ pkm-twin --help lists all commands."""
 
 @cache
 def commands() -> Extensible[click.Command]:
-    """Return all commands of ``pkm-twin``, each loaded when it is first taken."""
+    """Return all commands of ``pkm-twin``, each loaded at its first use."""
     files = sorted((Path(__file__).parent / "commands").glob("[a-z]*.py"))
     names = [file.stem.replace("_", "-") for file in files]
-    return Extensible("pkm_twin.commands", click.Command, names, _load)
+    return Extensible("pkm_twin.commands", click.Command, names, _load_command)
 
 
-def _load(name: str) -> click.Command:
-    found = vars(import_module(module_of(name))).values()
+def _load_command(name: str) -> click.Command:
+    found = vars(import_module(command_module(name))).values()
     return next(one for one in found if isinstance(one, click.Command) and one.name == name)
 
 
-def module_of(name: str) -> str:
+def command_module(name: str) -> str:
     """Return the module of a command of this package."""
     return f"pkm_twin.apps.commands.{name.replace('-', '_')}"
 
@@ -75,7 +75,7 @@ def group_by_task() -> dict[str, list[str]]:
         try:
             task = getattr(commands()[name], "task", "Others")
         except PkmTwinError as error:
-            tell(f"warning: {error}")
+            print_message(f"warning: {error}")
         else:
             tasks.setdefault(task, []).append(name)
     return tasks
@@ -87,7 +87,7 @@ class Tasks(Group):
     noun = "command"
 
     def main(self, *args: Any, **extra: Any) -> Any:
-        """Run the program as click does, with one line for what is wrong."""
+        """Run the program as click does, but report wrong usage in one line."""
         try:
             code = super().main(*args, **{**extra, "standalone_mode": False})
         except click.UsageError as error:
@@ -100,22 +100,22 @@ class Tasks(Group):
             elif text == "Missing command" and isinstance(command, Group):
                 text = f"give one of {', '.join(command.commands)}"
             where = f"; see {context.command_path} --help" if context is not None else ""
-            tell(f"{text}{where}")
+            print_message(f"{text}{where}")
             sys.exit(USAGE)
         sys.exit(code if isinstance(code, int) else 0)
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Read a command's name, perhaps an older one; without a word, show what to try."""
+        """Parse a command's name, replacing an older name; without words, print the greeting."""
         if not args and not ctx.resilient_parsing:
             click.echo(GREETING)
             ctx.exit(USAGE)
-        return super().parse_args(ctx, [*OLDER.get(args[0], args[:1]), *args[1:]] if args else [])
+        return super().parse_args(ctx, [*OLDER_NAMES.get(args[0], args[:1]), *args[1:]] if args else [])
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write a section for each task."""
         longest = max(len(name) for name in self.commands)
         for task, names in group_by_task().items():
-            purposes = [self.commands[name].get_short_help_str(WIDE) for name in names]
+            purposes = [self.commands[name].get_short_help_str(MAX_HELP_WIDTH) for name in names]
             with formatter.section(task):
                 rows = zip((f"{name:{longest}}" for name in names), purposes, strict=True)
                 formatter.write_dl(list(rows))

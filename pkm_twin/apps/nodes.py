@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 from functools import partial
 
-from pkm_twin.errors import install
+from pkm_twin.errors import write_install_command
 from pkm_twin.files import open_standard_streams
 from pkm_twin.ros.arguments import answer
 from pkm_twin.ros.signals import leave_at_once
@@ -20,10 +20,10 @@ MODULES = {
     "machine_state": "pkm_twin.state.node",
     "machine_sim": "delta_dynamics.nodes.simulation",
 }
-TOGETHER = tuple(name for name in MODULES if name != "command_gate")
+COMPOSABLE = tuple(name for name in MODULES if name != "command_gate")
 
 
-def _run(name: str) -> None:
+def _run_node(name: str) -> None:
     leave_at_once()
     open_standard_streams()
     answer(
@@ -37,14 +37,14 @@ def _run(name: str) -> None:
         }[name],
         sys.argv[1:],
     )
-    _start(name, [name])
+    _start_nodes(name, [name])
 
 
-delta_dynamics = partial(_run, "delta_dynamics")
-command_gate = partial(_run, "command_gate")
-stiffness_monitor = partial(_run, "stiffness_monitor")
-machine_state = partial(_run, "machine_state")
-machine_sim = partial(_run, "machine_sim")
+delta_dynamics = partial(_run_node, "delta_dynamics")
+command_gate = partial(_run_node, "command_gate")
+stiffness_monitor = partial(_run_node, "stiffness_monitor")
+machine_state = partial(_run_node, "machine_state")
+machine_sim = partial(_run_node, "machine_sim")
 """Entry points of ``ros2 run pkm_twin NODE``."""
 
 
@@ -57,26 +57,26 @@ def composed() -> None:
     names = [word for word in words[:end] if not word.startswith("-")]
     answer(
         "composed",
-        f"Runs several nodes in one process and one executor: {', '.join(TOGETHER)}.",
+        f"Runs several nodes in one process and one executor: {', '.join(COMPOSABLE)}.",
         [word for word in words[:end] if word not in names],
         "NODE",
     )
-    if not names or set(names) - set(TOGETHER) or len(set(names)) < len(names):
+    if not names or set(names) - set(COMPOSABLE) or len(set(names)) < len(names):
         print(
             f"cannot start: composed {' '.join(names)}: expected one or more of "
-            f"{', '.join(TOGETHER)}, each once; command_gate must outlive the others, so it runs "
+            f"{', '.join(COMPOSABLE)}, each once; command_gate must outlive the others, so it runs "
             "in its own process",
             file=sys.stderr,
         )
         sys.exit(2)
-    _start("composed", names)
+    _start_nodes("composed", names)
 
 
-def _start(command: str, names: Sequence[str]) -> None:
+def _start_nodes(command: str, names: Sequence[str]) -> None:
     try:
         importlib.import_module("rclpy")
     except ImportError as error:
-        needed = f"source its setup, or {install('jazzy')} ({error})"
+        needed = f"source its setup, or {write_install_command('jazzy')} ({error})"
         print(f"cannot start: {command} needs ROS 2: {needed}", file=sys.stderr)
         sys.exit(1)
     nodes = [importlib.import_module(MODULES[name]).NODE for name in names]

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from pkm_twin.console import numbers
+from pkm_twin.console import parse_count_of_numbers
 from pkm_twin.errors import ParameterError
 from pkm_twin.files import STANDARD
 from pkm_twin.report import Fact
@@ -28,9 +28,9 @@ if TYPE_CHECKING:
 REFUSED, USAGE, SALVAGED, NOT_JUDGED = 1, 2, 3, 4
 """Exit codes: rejected; wrong usage; damaged, with messages that `recover` saves; no verdict."""
 
-PICTURES = (".png", ".svg", ".pdf")
+PICTURE_ENDINGS = (".png", ".svg", ".pdf")
 """Allowed endings of a picture's name."""
-BESIDE = "auto"
+NEXT_TO_OUTPUT = "auto"
 """Value of --picture without a name: next to --out."""
 ROBOT_HELP = "a robot's name (see `pkm-twin robots`), or its YAML, URDF, MJCF, SDF, USD"
 
@@ -99,7 +99,7 @@ class PayloadOption(RobotArgument):
 
     @property
     def load(self) -> Load | None:
-        """The payload, None if none is given."""
+        """The payload; None if the option is not given."""
         from pkm_twin.recordings.payload import Load, parse_payload, parse_times
 
         times = getattr(self, "load_times", None)
@@ -125,7 +125,7 @@ class TimedPayloadOptions(PayloadOption):
     load_times: str | None = setting(None, "times at which --payload is held: FROM,TO[,FROM,TO...], s; default: always")
 
     def machine(self) -> Robot:
-        """Load the robot alone: the recording knows what it carries and when."""
+        """Load the robot without the payload, which is added at the times at which it is held."""
         return RobotArgument.machine(self)
 
 
@@ -146,9 +146,9 @@ class TableOptions:
 
     @property
     def dialect(self) -> Dialect:
-        """Format of tables for the readers.
+        """Format of the tables that are read.
 
-        :raises ParameterError: an option that is none.
+        :raises ParameterError: an option has an invalid value.
         """
         from pkm_twin.recordings import Dialect
 
@@ -183,7 +183,7 @@ class RecordingOptions(TableOptions):
         return read(path, robot, self.reading(**more), progress)
 
     def reading(self, **more: Any) -> ReadOptions:
-        """Return the options of reading; ``more``: other fields of ``ReadOptions``."""
+        """Return the options for reading a recording; ``more``: other fields of ``ReadOptions``."""
         from pkm_twin.recordings import ReadOptions
 
         names = ("load", "follow", "dialect", "side", "wrench_frame", "base_frame")
@@ -232,8 +232,8 @@ class BeyondLimitsOption:
     def list_beyond_limits(self, machine: Robot, q: Array, qd: Array | None = None, where: str = "") -> list[Beyond]:
         """Return the joints that joint states (..., n) take beyond their limits.
 
-        :param where: the recording, where there may be several.
-        :raises ParameterError: something, and it is not allowed.
+        :param where: name of the recording, for the error, if there are several.
+        :raises ParameterError: a joint is beyond a limit and --beyond-limits is not given.
         """
         from pkm_twin.robot.limits import beyond_limits, reject_beyond_limits
 
@@ -252,12 +252,12 @@ class PoseOption(PayloadOption, BeyondLimitsOption):
     def pose(self, machine: Robot) -> list[float]:
         """Return the pose, shape (m,).
 
-        :raises ParameterError: beyond the joint limits, unless that is allowed.
+        :raises ParameterError: the pose is beyond the joint limits, and --beyond-limits is not given.
         """
         names = machine.pose_names
         pose: list[float] = machine.home().tolist()
         if self.at is not None:
-            pose = numbers(self.at, len(names), f"a pose {','.join(names)}")
+            pose = parse_count_of_numbers(self.at, len(names), f"a pose {','.join(names)}")
         for joint in self.list_beyond_limits(machine, machine.inverse(pose)):
             click.echo(f"outside the limits: {joint}", err=True)
         return pose
@@ -324,7 +324,7 @@ class DrawingOptions:
     """Options of a command that draws its result."""
 
     def drawing(self, command: str) -> Path | None:
-        """Return the picture's file, None for none."""
+        """Return the picture's file; None if none is drawn."""
         raise NotImplementedError
 
 
@@ -336,29 +336,29 @@ class PictureOptions(OverwriteOption, DrawingOptions):
         None,
         "picture to draw: .png, .svg or .pdf, - for stdout; default: next to --out",
         metavar="[FILE]",
-        alone=BESIDE,
+        alone=NEXT_TO_OUTPUT,
     )
     no_picture: bool = setting(False, "draw nothing next to --out")
 
     def drawing(self, command: str) -> Path | None:
-        """Return the picture's file, None for none.
+        """Return the picture's file; None if none is drawn.
 
-        :raises ParameterError: another ending.
+        :raises ParameterError: the name has an ending of no picture.
         """
         out = getattr(self, "out", None)
         if self.picture == STANDARD:
             if str(out) == STANDARD:
                 raise click.UsageError("--out - and --picture -: only one of them to stdout")
             return Path(STANDARD)
-        beside = None if out is None or str(out) == STANDARD else out.with_suffix(".png")
-        if self.no_picture or (self.picture is None and beside is None):
+        next_to_output = None if out is None or str(out) == STANDARD else out.with_suffix(".png")
+        if self.no_picture or (self.picture is None and next_to_output is None):
             return None
-        if self.picture in (None, BESIDE):
+        if self.picture in (None, NEXT_TO_OUTPUT):
             robot = getattr(self, "robot", None) or "recording"
-            return beside or Path(f"{command}_{Path(robot).stem}.png")
+            return next_to_output or Path(f"{command}_{Path(robot).stem}.png")
         picture = Path(str(self.picture))
-        if picture.suffix not in PICTURES:
-            bound = f"a name that ends in {', '.join(PICTURES)}"
+        if picture.suffix not in PICTURE_ENDINGS:
+            bound = f"a name that ends in {', '.join(PICTURE_ENDINGS)}"
             raise ParameterError("--picture", self.picture, bound)
         return picture
 

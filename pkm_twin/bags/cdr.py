@@ -57,47 +57,47 @@ class MessageCodec:
             expected = "plain CDR, 00 00 or 00 01 and two option bytes"
             text = f"{self.type_name} starts with [{head}]; expected {expected}"
             raise BagError(text, reason="cdr")
-        source = _Source(self.type_name, data, order)
-        # Bytes may be left: rclpy serializes into a buffer of estimated size and keeps it all.
+        source = _Cursor(self.type_name, data, order)
+        # Ignore further bytes: rclpy serializes into a buffer of estimated size and returns all of it.
         return self._decode(self._name, source)
 
-    def _decode(self, name: str, source: _Source) -> Any:
+    def _decode(self, name: str, source: _Cursor) -> Any:
         readers = self._readers[name]
         if not readers:
-            # IDL knows no empty structure: ROS 2 puts one byte into it.
-            source.number("B")
+            # IDL has no empty structures: ROS 2 writes one byte for them.
+            source.read_number("B")
         return self._classes[name](*[read(source) for read in readers])
 
-    def _choose_decoder(self, field: Field) -> Callable[[_Source], Any]:
+    def _choose_decoder(self, field: Field) -> Callable[[_Cursor], Any]:
         """Return the function that decodes a field; it is chosen once per type."""
         code, base = CODES.get(field.base), field.base
         if field.size is not None:
             return partial(self._read_items, field, code)
         if base == "byte":
-            return lambda source: bytes((source.number("B"),))
+            return lambda source: bytes((source.read_number("B"),))
         if code is not None:
-            return lambda source: source.number(code)
-        return _Source.text if base == "string" else partial(self._decode, base)
+            return lambda source: source.read_number(code)
+        return _Cursor.read_text if base == "string" else partial(self._decode, base)
 
-    def _read_items(self, field: Field, code: str | None, source: _Source) -> Any:
+    def _read_items(self, field: Field, code: str | None, source: _Cursor) -> Any:
         size = field.size or 0
-        count = size if field.fixed else source.number("I")
+        count = size if field.has_fixed_length else source.read_number("I")
         if field.upto and count > size:
-            raise source.error(f"field {field.name} has {count} items; at most {size}")
+            raise source.make_error(f"field {field.name} has {count} items; at most {size}")
         if code is not None:
-            # In a live message these two are lists, other numbers are arrays.
-            values = source.numbers(code, count)
+            # As in live messages, bool and byte are lists; other numbers are arrays.
+            values = source.read_numbers(code, count)
             if field.base == "bool":
                 return [value != 0 for value in values]
             return [bytes((value,)) for value in values] if field.base == "byte" else values
-        # Each item takes a byte at least: an absurd count ends here, not in memory.
-        source.require(count)
+        # Each item has at least one byte: reject a count that exceeds the data before allocating memory.
+        source.require_bytes(count)
         if field.base == "string":
-            return [source.text() for _ in range(count)]
+            return [source.read_text() for _ in range(count)]
         return [self._decode(field.base, source) for _ in range(count)]
 
     def encode(self, message: object) -> bytes:
-        """Encode a mapping, or any object with the fields as attributes (a live message too).
+        """Encode a mapping, or any object with the fields as attributes, such as a live message.
 
         A mapping may leave fields out, which are then zero or empty: a .msg file's default values
         are not known here, so the w of a quaternion must be given. Equal input gives equal
@@ -113,7 +113,7 @@ class MessageCodec:
         fields = self.definition[name]
         if not fields:
             out.append(0)
-        # A mapping may leave a field out, whose value is then None.
+        # A field that a mapping leaves out has the value None here.
         get: Callable[[str], Any]
         names = [field.name for field in fields]
         if isinstance(message, Mapping):
@@ -132,18 +132,18 @@ class MessageCodec:
             value = get(field.name)
             place = f"{where}.{field.name}"
             if field.size is None:
-                self._encode_items(field, [self._default(field) if value is None else value], out, place)
+                self._encode_items(field, [self._default_value(field) if value is None else value], out, place)
             else:
                 if value is None:
-                    value = [self._default(field)] * (field.size if field.fixed else 0)
+                    value = [self._default_value(field)] * (field.size if field.has_fixed_length else 0)
                 if isinstance(value, str | Mapping) or not hasattr(value, "__len__"):
                     raise BagError(f"{place} is {brief(value)}; expected a sequence", reason="message")
                 count = len(value)
-                if (field.fixed and count != field.size) or (field.upto and count > (field.size or 0)):
+                if (field.has_fixed_length and count != field.size) or (field.upto and count > (field.size or 0)):
                     expected = f"{'at most ' * field.upto}{field.size}"
                     raise BagError(f"{place} has {count} items; expected {expected}", reason="message")
-                if not field.fixed:
-                    _put(out, "I", [count], place)
+                if not field.has_fixed_length:
+                    _append_packed(out, "I", [count], place)
                 if count:
                     self._encode_items(field, value, out, place)
 
@@ -152,7 +152,7 @@ class MessageCodec:
         if field.base == "byte":
             values = [item[0] if isinstance(item, bytes) and len(item) == 1 else item for item in values]
         if code is not None:
-            _put(out, code, values, where)
+            _append_packed(out, code, values, where)
         elif field.base == "string":
             for text in values:
                 if not isinstance(text, str):
@@ -160,7 +160,7 @@ class MessageCodec:
                 if field.chars and len(text) > field.chars:
                     raise BagError(f"{where} has {len(text)} characters; at most {field.chars}", reason="message")
                 raw = text.encode()
-                _put(out, "I", [len(raw) + 1], where)
+                _append_packed(out, "I", [len(raw) + 1], where)
                 out.extend(raw)
                 out.append(0)
         else:
@@ -168,14 +168,14 @@ class MessageCodec:
                 self._encode(field.base, item, out, where)
 
     @staticmethod
-    def _default(field: Field) -> Any:
+    def _default_value(field: Field) -> Any:
         if field.base in CODES:
             return 0
         return "" if field.base == "string" else {}
 
 
-class _Source:
-    """A read position in one encoded message; nothing is read past its end."""
+class _Cursor:
+    """A read position in one encoded message; reading past its end raises an error."""
 
     def __init__(self, type_name: str, data: bytes, order: str) -> None:
         self._type_name = type_name
@@ -185,56 +185,56 @@ class _Source:
         self._end = len(data)
         self.position = len(_LITTLE_HEADER)
 
-    def error(self, text: str) -> BagError:
+    def make_error(self, text: str) -> BagError:
         return BagError(f"{self._type_name}: {text}", reason="cdr")
 
-    def require(self, count: int) -> None:
+    def require_bytes(self, count: int) -> None:
         """Raise an error unless ``count`` bytes are left."""
         left = self._end - self.position
         if count > left:
-            raise self.error(f"needs {count} bytes at {self.position}, {max(left, 0)} are left")
+            raise self.make_error(f"needs {count} bytes at {self.position}, {max(left, 0)} are left")
 
     def _align(self, size: int) -> None:
         # CDR aligns to the value's own size, counted from the end of the 4-byte header.
         self.position += -(self.position - len(_LITTLE_HEADER)) % size
 
-    def numbers(self, code: str, count: int) -> array.array[Any]:
-        # `array` has no bool: its bytes are taken.
+    def read_numbers(self, code: str, count: int) -> array.array[Any]:
+        # `array` has no bool: read bytes.
         values: array.array[Any] = array.array("B" if code == "?" else code)
         if count:
             self._align(values.itemsize)
             begin = self.position
-            self.require(count * values.itemsize)
+            self.require_bytes(count * values.itemsize)
             self.position += count * values.itemsize
             values.frombytes(self._data[begin : self.position])
             if self._swapped:
                 values.byteswap()
         return values
 
-    def number(self, code: str) -> Any:
+    def read_number(self, code: str) -> Any:
         size = _SIZES[code]
         self._align(size)
         begin = self.position
-        self.require(size)
+        self.require_bytes(size)
         self.position = begin + size
         return self._unpack[code](self._data, begin)[0]
 
-    def text(self) -> str:
-        count = self.number("I")
+    def read_text(self) -> str:
+        count = self.read_number("I")
         if count == 0:
             return ""
-        self.require(count)
+        self.require_bytes(count)
         raw = bytes(self._data[self.position : self.position + count])
         if raw[-1] != 0:
-            raise self.error(f"the string at {self.position} does not end with a zero")
+            raise self.make_error(f"the string at {self.position} does not end with a zero")
         self.position += count
         try:
             return raw[:-1].decode()
         except UnicodeDecodeError as error:
-            raise self.error(f"the string at {self.position - count} is not UTF-8") from error
+            raise self.make_error(f"the string at {self.position - count} is not UTF-8") from error
 
 
-def _put(out: bytearray, code: str, values: Sequence[Any], where: str) -> None:
+def _append_packed(out: bytearray, code: str, values: Sequence[Any], where: str) -> None:
     size = _SIZES[code]
     out.extend(bytes(-(len(out) - len(_LITTLE_HEADER)) % size))
     try:

@@ -10,7 +10,7 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from pkm_twin.errors import BagError, short
+from pkm_twin.errors import BagError, shorten_value
 
 SEPARATOR = "=" * 80
 """The line between the parts of a concatenated message definition."""
@@ -35,18 +35,18 @@ CODES = {
 MAX_DEFINITION_CHARACTERS = 1024**2
 """Longest definition text; the longest of the common interfaces has some 20,000 characters."""
 MAX_FIELDS = 5_000
-"""Most fields of a message and of all that it holds."""
+"""Largest number of fields of a message and of all messages that it contains."""
 MAX_NESTING = 50
-"""How deep a message may hold others."""
+"""Deepest nesting of messages in a message."""
 MAX_BOUND = 2**32 - 1
 """Largest array size and bound: lengths are 32-bit numbers in CDR."""
 
-_FIELD = re.compile(
+_FIELD_PATTERN = re.compile(
     r"(?P<base>[A-Za-z][\w/]*)(?:<=(?P<chars>\d+))?"
     r"(?P<array>\[(?:(?P<upto><=)?(?P<size>\d+))?\])?\s+(?P<name>[A-Za-z]\w*)\s*(?P<rest>.*)",
     re.ASCII,
 )
-_SPEC = re.compile(r"(?P<base>[A-Za-z][\w/]*)(?:<(?P<chars>\d+)>)?(?:\[(?P<size>\d+)\])?")
+_TYPE_PATTERN = re.compile(r"(?P<base>[A-Za-z][\w/]*)(?:<(?P<chars>\d+)>)?(?:\[(?P<size>\d+)\])?")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,13 +64,13 @@ class Field:
     chars: int = 0
 
     @property
-    def fixed(self) -> bool:
-        """True if the field is an array without a length in front."""
+    def has_fixed_length(self) -> bool:
+        """True if the field is an array of fixed length, which is encoded without its length."""
         return bool(self.size) and not self.upto
 
 
 Definition = dict[str, tuple[Field, ...]]
-"""Fields by ``package/Type``, the message itself and all that it holds."""
+"""Fields by ``package/Type``, of the message and of all types that it contains."""
 
 
 def message_class(type_name: str) -> Any:
@@ -82,7 +82,7 @@ def message_class(type_name: str) -> Any:
         text = f"{type_name!r} is not a type name; expected package/msg/Type"
         raise BagError(text, reason="type")
     package, _, name = type_name.split("/")
-    # A bag may name any package: only one of messages is imported.
+    # A bag may name any package: import it only if it is a package of messages.
     found = importlib.util.find_spec(package)
     places = (found and found.submodule_search_locations) or ()
     if not any(os.path.isdir(os.path.join(place, "msg")) for place in places):
@@ -96,10 +96,10 @@ def message_class(type_name: str) -> Any:
 
 
 def message_definition(type_name: str) -> str:
-    """Return the ``ros2msg`` text of a type: its fields, then those of every type it holds.
+    """Return the ``ros2msg`` text of a type: its fields, then those of every type that it contains.
 
-    Made from the message classes, since a pip installation of ROS 2 carries no .msg files.
-    Constants and default values are not part of the classes' field list, and not of the text.
+    It is written from the message classes, because a pip installation of ROS 2 has no .msg files.
+    These classes do not list constants and default values, so the text has none.
     """
     sections: dict[str, str] = {}
     waiting = [_short_name(type_name)]
@@ -109,8 +109,8 @@ def message_definition(type_name: str) -> str:
             continue
         package, short = name.split("/")
         cls = message_class(f"{package}/msg/{short}")
-        fields = [_class_field(*item) for item in cls.get_fields_and_field_types().items()]
-        sections[name] = "\n".join(_field_text(field) for field in fields)
+        fields = [_parse_class_field(*item) for item in cls.get_fields_and_field_types().items()]
+        sections[name] = "\n".join(_write_field(field) for field in fields)
         waiting += [field.base for field in fields if "/" in field.base]
     (main, *others) = sections.items()
     parts = [main[1], *(f"MSG: {name}\n{text}" for name, text in others)]
@@ -130,10 +130,10 @@ def _check_type_name(type_name: str) -> str:
     return _short_name(type_name)
 
 
-def _class_field(name: str, spec: str) -> Field:
-    """Turn ``sequence<double, 3>`` and its like, as the classes print them, into a field."""
+def _parse_class_field(name: str, spec: str) -> Field:
+    """Parse a field's type as message classes print it, such as ``sequence<double, 3>``."""
     sequence = re.fullmatch(r"sequence<(?P<item>.+?)(?:,\s*(?P<bound>\d+))?>", spec)
-    match = _SPEC.fullmatch(sequence["item"] if sequence else spec)
+    match = _TYPE_PATTERN.fullmatch(sequence["item"] if sequence else spec)
     if match is None:
         raise BagError(f"field {name} has the unknown type {spec!r}", reason="type")
     base = {"double": "float64", "float": "float32", "boolean": "bool", "octet": "byte"}.get(
@@ -145,7 +145,7 @@ def _class_field(name: str, spec: str) -> Field:
     return Field(name, base, size, bool(sequence and sequence["bound"]), int(match["chars"] or 0))
 
 
-def _field_text(field: Field) -> str:
+def _write_field(field: Field) -> str:
     chars = f"<={field.chars}" if field.chars else ""
     brackets = "" if field.size is None else f"[{'<=' * field.upto}{field.size or ''}]"
     return f"{field.base}{chars}{brackets} {field.name}"
@@ -161,7 +161,7 @@ def parse_definition(type_name: str, text: str) -> Definition:
         error = f"the definition of {type_name} has {len(text)} characters"
         raise BagError(f"{error}; at most {MAX_DEFINITION_CHARACTERS}", reason="schema")
     own = _check_type_name(type_name)
-    # Present in every ROS 2 system; some writers leave their text out of the definition.
+    # Some writers leave out these types, which are in every ROS 2 system.
     texts = {
         "builtin_interfaces/Time": "int32 sec\nuint32 nanosec",
         "builtin_interfaces/Duration": "int32 sec\nuint32 nanosec",
@@ -177,12 +177,12 @@ def parse_definition(type_name: str, text: str) -> Definition:
             name = _check_type_name(heading[4:].strip())
         texts[name] = fields
     definition: Definition = {}
-    _resolve(own, texts, definition, ())
+    _add_types(own, texts, definition, ())
     return {own: definition.pop(own), **definition}
 
 
-def _resolve(name: str, texts: Mapping[str, str], definition: Definition, holders: tuple[str, ...]) -> None:
-    """Add ``name`` and the types it holds to ``definition``; ``holders`` are those above it."""
+def _add_types(name: str, texts: Mapping[str, str], definition: Definition, holders: tuple[str, ...]) -> None:
+    """Add ``name`` and the types that it contains to ``definition``; ``holders`` are the types around it."""
     if name in holders:
         raise BagError(f"message type {name} contains itself", reason="schema")
     if name in definition:
@@ -194,13 +194,13 @@ def _resolve(name: str, texts: Mapping[str, str], definition: Definition, holder
         raise BagError(text, reason="schema")
     fields = []
     for line in texts[name].splitlines():
-        # A string constant may hold a '#', so constants are told apart before comments are cut.
-        match = _FIELD.fullmatch(line.strip())
+        # Match the line before cutting comments, because a string constant may contain a '#'.
+        match = _FIELD_PATTERN.fullmatch(line.strip())
         if match is None and line.split("#")[0].strip():
             raise BagError(f"definition of {name}: {brief(line)} is not a field", reason="schema")
         if match is None or match["rest"].startswith("="):
             continue
-        base = _base_type(match["base"], name.split("/", 1)[0], texts)
+        base = _resolve_base(match["base"], name.split("/", 1)[0], texts)
         where = f"definition of {name}: field {match['name']}"
         size = None if match["array"] is None else _read_bound(match["size"], where)
         chars = _read_bound(match["chars"], where)
@@ -210,19 +210,19 @@ def _resolve(name: str, texts: Mapping[str, str], definition: Definition, holder
         raise BagError(text, reason="schema")
     for field in fields:
         if "/" in field.base:
-            _resolve(field.base, texts, definition, (*holders, name))
+            _add_types(field.base, texts, definition, (*holders, name))
     definition[name] = tuple(fields)
 
 
 def _read_bound(digits: str | None, where: str) -> int:
-    # Python refuses to convert thousands of digits.
+    # Check the length first: Python raises an error for thousands of digits.
     if digits and (len(digits) > 20 or int(digits) > MAX_BOUND):
         text = f"{where} has the bound {brief(digits)}; at most {MAX_BOUND}"
         raise BagError(text, reason="schema")
     return int(digits or 0)
 
 
-def _base_type(base: str, package: str, texts: Mapping[str, str]) -> str:
+def _resolve_base(base: str, package: str, texts: Mapping[str, str]) -> str:
     if base in CODES or base == "string":
         return base
     if base == "wstring":
@@ -235,7 +235,7 @@ def _base_type(base: str, package: str, texts: Mapping[str, str]) -> str:
 
 
 def live_type_name(message: object) -> str | None:
-    """Return ``package/msg/Type`` of a live ROS message, None of any other object."""
+    """Return ``package/msg/Type`` of a live ROS message; None for any other object."""
     cls = type(message)
     if not hasattr(cls, "get_fields_and_field_types"):
         return None
@@ -244,4 +244,4 @@ def live_type_name(message: object) -> str | None:
 
 def brief(value: object) -> str:
     """Shorten a value of a file for an error."""
-    return short(value, 60)
+    return shorten_value(value, 60)

@@ -33,7 +33,7 @@ MAX_TOTAL_BYTES = 256 * 1024**3
 MAX_TOTAL_RATIO = 200
 """Largest ratio of all that is unpacked and read to the file's size, beyond FREE_TOTAL_BYTES."""
 FREE_TOTAL_BYTES = 128 * 1024**2
-"""Every file may unpack to so much."""
+"""Bytes that every file may unpack to, whatever its size."""
 MAX_CHUNK_BYTES = 64 * 1024**2
 """Largest unpacked chunk."""
 MAX_RATIO = 1000
@@ -42,19 +42,19 @@ FREE_BYTES = 8 * 1024**2
 """A chunk up to this size may have any ratio: a black image packs ten thousand to one."""
 ZSTD_MAGIC = zstandard.FRAME_HEADER
 METADATA_CRC = "crc32"
-TOTAL_CAP = "total_cap"
-"""Reason of a file that is refused whole for what it would cost."""
+EXCEEDS_BUDGET = "total_cap"
+"""Reason of a file that is rejected because reading it would exceed the budget."""
 FRAME = struct.Struct("<BQ")
 FOOTER_BYTES = FRAME.size + 20
 CRC_BYTES = 4
 _BLOCK_BYTES = 1024**2
 _MESSAGE = struct.Struct("<HIQQ")
 _INDEX, _INDEX_ENTRY = struct.Struct("<HI"), struct.Struct("<QQ")
-NAMES = {int(op): op.name.lower().replace("_", " ") for op in Op}
+OPCODE_NAMES = {int(op): op.name.lower().replace("_", " ") for op in Op}
 
 
 class FormatError(Exception):
-    """A fault with its place, before the path is known; never leaves this folder's modules."""
+    """A fault at a byte of a file; other modules of this folder add the path and raise BagError."""
 
     def __init__(self, text: str, offset: int | None, reason: str = "damaged") -> None:
         super().__init__(text)
@@ -64,9 +64,9 @@ class FormatError(Exception):
 
 
 class Budget:
-    """The bound on bytes read and unpacked of one file, whatever the file states.
+    """Bound the bytes that are read and unpacked of one file.
 
-    Without it a small file of many chunks, each within its own bounds, unpacks to gigabytes.
+    Otherwise a small file of many chunks, each within its own bounds, could unpack to gigabytes.
     """
 
     def __init__(self, packed: int) -> None:
@@ -75,16 +75,19 @@ class Budget:
         self._spent = 0
 
     def spend(self, count: int, offset: int | None) -> None:
-        """Take ``count`` bytes; once they are used up the file is rejected."""
+        """Count bytes that are read or unpacked.
+
+        :raises FormatError: the sum exceeds the limit.
+        """
         self._spent += count
         if self._spent > self.limit:
             text = f"the file of {self._packed} bytes unpacks to more than {self.limit}"
             most = f"at most {MAX_TOTAL_RATIO} to 1, and {MAX_TOTAL_BYTES} in all"
-            raise FormatError(f"{text}: {most}", offset, TOTAL_CAP)
+            raise FormatError(f"{text}: {most}", offset, EXCEEDS_BUDGET)
 
 
 class RecordReader:
-    """A file read forward, with its position and the CRC of all that was read."""
+    """A file that is read forward, with its position and the CRC of the bytes read."""
 
     def __init__(self, file: IO[bytes], budget: Budget | None = None) -> None:
         self._descriptor = file.fileno()
@@ -100,7 +103,7 @@ class RecordReader:
             text = f"the {what} needs {count} bytes, the file has {left} left: it is cut short"
             raise FormatError(text, position, "truncated")
         self.budget.spend(count, position)
-        # Others may read the same open file, each at a position of its own.
+        # Read by position, because several readers may use the same open file.
         data = os.pread(self._descriptor, count, position)
         if len(data) != count:
             raise FormatError("the file shrank while it was read", position, "truncated")
@@ -114,7 +117,7 @@ class RecordReader:
         return data
 
     def read_frame(self) -> tuple[int, int]:
-        """Read a record's opcode and length; the length is known to lie within the file."""
+        """Read a record's opcode and length, and check that the record ends within the file."""
         at = self.position
         opcode, length = FRAME.unpack(self.read(FRAME.size, "next record"))
         left = self.size - self.position
@@ -126,9 +129,9 @@ class RecordReader:
         return opcode, length
 
     def read_body(self, opcode: int, length: int) -> bytes:
-        """Read a record's content; of an unknown record nothing is kept."""
+        """Read a record's content; skip an unknown record and return no bytes."""
         what = f"{opcode_name(opcode)} record"
-        if opcode not in NAMES:
+        if opcode not in OPCODE_NAMES:
             self.skip(length, what)
             return b""
         if length > MAX_RECORD_BYTES:
@@ -137,7 +140,7 @@ class RecordReader:
         return self.read(length, what)
 
     def skip(self, length: int, what: str, crc: int = 0) -> int:
-        """Pass over ``length`` bytes in blocks; return ``crc`` continued over them."""
+        """Skip ``length`` bytes in blocks; return ``crc`` updated with them."""
         while length:
             block = self.read(min(length, _BLOCK_BYTES), what)
             crc = zlib.crc32(block, crc)
@@ -145,11 +148,11 @@ class RecordReader:
         return crc
 
     def read_attachment(self, at: int, length: int) -> mcap.AttachmentIndex:
-        """Check the attachment at ``at`` in blocks; return what its index must say."""
+        """Check the attachment at ``at`` in blocks; return the index that the summary must have for it."""
         what, end = "attachment record", self.position + length
         head = self.read(max(0, min(length - CRC_BYTES, _BLOCK_BYTES)), what)
-        stream = _Exact(io.BytesIO(head))
-        with _name_faults(Op.ATTACHMENT, at):
+        stream = _StrictStream(io.BytesIO(head))
+        with _name_record_in_errors(Op.ATTACHMENT, at):
             logged, created = stream.read8(), stream.read8()
             title, media = stream.read_prefixed_string(), stream.read_prefixed_string()
             size = stream.read8()
@@ -157,14 +160,17 @@ class RecordReader:
             raise FormatError(f"the attachment says {size} bytes of data; its record differs", at)
         crc = self.skip(end - CRC_BYTES - self.position, what, zlib.crc32(head))
         stated = int.from_bytes(self.read(CRC_BYTES, what), "little")
-        # Zero stands for no CRC.
+        # A CRC of zero means that there is none.
         if stated not in (0, crc):
             text = f"the attachment's CRC is {crc:08x}; the file says {stated:08x}"
             raise FormatError(text, at, "crc")
         return mcap.AttachmentIndex(at, FRAME.size + length, logged, created, size, title, media)
 
     def read_magic(self) -> None:
-        """Read the opening mark; say in plain words what a file without it is."""
+        """Read the MCAP signature.
+
+        :raises FormatError: the file has none; the error names its kind if it is a known one.
+        """
         head = self.read(min(self.size, 16), "opening mark")
         for magic, text in {
             b"#ROSBAG V2.0": "a ROS 1 bag, not MCAP",
@@ -186,12 +192,12 @@ class RecordReader:
 
 
 def opcode_name(opcode: int) -> str:
-    """Return the name of a kind of record, for error texts."""
-    return NAMES.get(opcode, f"unknown (0x{opcode:02x})")
+    """Return the name of an opcode, for errors."""
+    return OPCODE_NAMES.get(opcode, f"unknown (0x{opcode:02x})")
 
 
-class _Exact(ReadDataStream):
-    """Raises where a field reaches past its record's end; ``mcap`` takes what is there."""
+class _StrictStream(ReadDataStream):
+    """Raises an error if a field reaches past its record's end, where ``mcap`` would return fewer bytes."""
 
     def read(self, length: int) -> bytes:
         data = super().read(length)
@@ -201,8 +207,8 @@ class _Exact(ReadDataStream):
 
 
 @contextmanager
-def _name_faults(opcode: int, offset: int) -> Iterator[None]:
-    """Turn what ``mcap`` raises for a record's fields into an error with the record's place."""
+def _name_record_in_errors(opcode: int, offset: int) -> Iterator[None]:
+    """Convert errors of ``mcap`` in a record's fields to a FormatError with the record's position."""
     try:
         yield
     except (EndOfFile, OverflowError, struct.error):
@@ -214,18 +220,21 @@ def _name_faults(opcode: int, offset: int) -> Iterator[None]:
 
 
 def parse_record(opcode: int, body: bytes, offset: int) -> Any:
-    """Return a record of a known kind, which holds its fields and nothing else."""
+    """Parse a record of a known kind.
+
+    :raises FormatError: the record has missing, further or repeated content.
+    """
     if opcode == Op.MESSAGE_INDEX and len(body) >= _INDEX.size:
-        # Not by mcap.MessageIndex.read, which takes ten times as long; it says what is wrong.
+        # Unpack a sound index here, because mcap.MessageIndex.read takes ten times as long.
         number, size = _INDEX.unpack_from(body)
         if size == len(body) - _INDEX.size and size % _INDEX_ENTRY.size == 0:
             return mcap.MessageIndex(number, list(_INDEX_ENTRY.iter_unpack(body[_INDEX.size :])))
-    stream = _Exact(io.BytesIO(body))
-    with _name_faults(opcode, offset):
+    stream = _StrictStream(io.BytesIO(body))
+    with _name_record_in_errors(opcode, offset):
         record = getattr(mcap, Op(opcode).name.title().replace("_", "")).read(stream)
     if left := len(body) - stream.count:
         raise FormatError(f"the {opcode_name(opcode)} record has {left} bytes too many", offset)
-    # A chunk has no map, and may be large.
+    # Do not compare chunks, which may be large and have no map.
     if opcode != Op.CHUNK and pack_record(record)[FRAME.size :] != body:
         text = f"a map of the {opcode_name(opcode)} record has a key twice, or another length"
         raise FormatError(text, offset)
@@ -233,7 +242,7 @@ def parse_record(opcode: int, body: bytes, offset: int) -> Any:
 
 
 def pack_record(record: mcap.McapRecord) -> bytes:
-    """Return the record as a file has it."""
+    """Encode a record, with opcode and length."""
     builder = RecordBuilder()
     record.write(builder)
     return bytes(builder.end())
@@ -257,26 +266,26 @@ def iterate_records(data: bytes, offset: int, budget: Budget | None = None) -> I
 
 
 class Records:
-    """Schemas and channels seen so far; one number may not mean two things."""
+    """Schemas and channels that were read so far, by number; each number has one meaning."""
 
     def __init__(self) -> None:
         self.schemas: dict[int, mcap.Schema] = {}
         self.channels: dict[int, mcap.Channel] = {}
-        self.passed_over: Counter[int] = Counter()
+        self.unread: Counter[int] = Counter()
 
     def iterate_messages(
         self, data: bytes, offset: int, budget: Budget | None = None
     ) -> Iterator[tuple[int, mcap.Message]]:
-        """Walk the records in a chunk's data: yield each message with its position.
+        """Yield each message of a chunk's data with its position.
 
-        Schemas and channels are taken in; other records are counted in ``passed_over``.
+        Adds the chunk's schemas and channels; counts other records in ``unread``.
         """
         for opcode, start, end in iterate_records(data, offset, budget):
             if opcode == Op.MESSAGE:
                 if end - start < _MESSAGE.size:
                     text = f"a message record has {end - start} bytes; at least {_MESSAGE.size}"
                     raise FormatError(text, offset)
-                # Not by mcap.Message.read, which takes five times as long.
+                # Unpack here, because mcap.Message.read takes five times as long.
                 number, sequence, logged, published = _MESSAGE.unpack_from(data, start)
                 if number not in self.channels:
                     raise FormatError(f"a message has the unknown channel {number}", offset)
@@ -285,10 +294,13 @@ class Records:
             elif opcode in (Op.SCHEMA, Op.CHANNEL):
                 self.add(parse_record(opcode, data[start:end], offset), offset)
             else:
-                self.passed_over[opcode] += 1
+                self.unread[opcode] += 1
 
     def add(self, record: mcap.Schema | mcap.Channel, offset: int) -> None:
-        """Take in a schema or channel."""
+        """Add a schema or channel.
+
+        :raises FormatError: its number is invalid or has another meaning already.
+        """
         known: mcap.McapRecord
         if isinstance(record, mcap.Schema):
             what, known = "schema", self.schemas.setdefault(record.id, record)
@@ -314,10 +326,10 @@ class Records:
         return wrong
 
     def unpack_message(self, message: mcap.Message, offset: int, budget: Budget) -> bytes:
-        """Return a message's data, unpacked where rosbag2 has packed each message.
+        """Return a message's data, decompressed if rosbag2 compressed each message.
 
-        No plain CDR begins as a zstd frame does, so the bytes decide; rosbag2 says it only outside
-        them.
+        The first bytes show it, because no plain CDR begins like a zstd frame; rosbag2 states it in
+        the folder's metadata only.
         """
         packed = message.data
         cdr = self.channels[message.channel_id].message_encoding == "cdr"
@@ -331,7 +343,7 @@ class Records:
 
 
 def metadata_crc(title: str, entries: Mapping[str, str]) -> str:
-    """Return the CRC over a metadata record; MCAP has none there, and recovery needs one."""
+    """Return the CRC of a metadata record, which MCAP lacks and recovery needs."""
     texts = [text.encode() for text in (title, *chain(*sorted(entries.items())))]
     raw = b"".join(struct.pack("<I", len(text)) + text for text in texts)
     return f"{zlib.crc32(raw):08x}"
@@ -347,7 +359,7 @@ def check_metadata(record: mcap.Metadata, offset: int) -> tuple[dict[str, str], 
 
 
 def unpack_chunk(chunk: mcap.Chunk, offset: int, budget: Budget) -> bytes:
-    """Unpack a chunk, having checked its size first, and compare its CRC, if it has one."""
+    """Decompress a chunk after checking its size, and check its CRC if it has one."""
     compression, size, data = chunk.compression, chunk.uncompressed_size, chunk.data
     if compression not in ("", "zstd", "lz4"):
         text = f"unknown compression {compression!r}; known: zstd, lz4, none"
@@ -377,7 +389,7 @@ def _check_size(what: str, packed: int, size: int, offset: int) -> None:
 
 
 def _decompress(compression: str, data: bytes, limit: int, offset: int) -> bytes:
-    """Unpack at most ``limit`` bytes; the one-shot functions have no bound."""
+    """Decompress at most ``limit`` bytes, which the libraries' one-shot functions cannot bound."""
     try:
         if compression == "lz4":
             return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=limit))

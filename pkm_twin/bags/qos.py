@@ -30,17 +30,17 @@ class OfferedQos:
     reliable: bool = True
     transient_local: bool = False
     depth: int = 0
-    """Samples kept, 0 where the recording does not say."""
+    """Number of samples in the queue; 0 if the recording does not state it."""
 
 
 def load_plain(text: str) -> object:
-    """Read YAML that others wrote in bounded time: no tags, no aliases, not deep.
+    """Parse YAML of unknown origin in bounded time, without tags, aliases and deep nesting.
 
-    :raises ValueError: it is none, in one line why.
+    :raises ValueError: the text is not such YAML; the error says why in one line.
     """
     depth = 0
     try:
-        # Events come before anything is built: a few aliases may stand for gigabytes.
+        # Check the events before building objects, because a few aliases may stand for gigabytes.
         for event in yaml.parse(text, Loader=_LOADER):
             depth += isinstance(event, yaml.CollectionStartEvent)
             depth -= isinstance(event, yaml.CollectionEndEvent)

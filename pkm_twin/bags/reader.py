@@ -49,7 +49,7 @@ __all__ = [
 
 
 MAX_WAITING_BYTES = 256 * 1024**2
-"""Most that is held in memory to put messages into the order of their log times."""
+"""Largest memory for messages that wait to be sorted by log time, bytes."""
 # Memory of a message's Python objects in addition to its data, bytes.
 _MESSAGE_OVERHEAD_BYTES = 512
 
@@ -122,11 +122,11 @@ def open_bag(path: str | Path) -> Bag:
                 offset=check.fault.offset,
                 salvageable=sum(check.message_count for check in checks),
             )
-    return Bag(path, list(map(_Part, storage.files, checks)), make_report(path, storage, checks))
+    return Bag(path, list(map(CheckedFile, storage.files, checks)), make_report(path, storage, checks))
 
 
-class _Part:
-    """One file of a bag, checked."""
+class CheckedFile:
+    """A file of a bag after its check, which can be read any number of times."""
 
     def __init__(self, file: BagFile, check: Check) -> None:
         self.file = file
@@ -163,7 +163,7 @@ class _Part:
 class Bag:
     """A bag that has been checked; ``report`` is what the check found."""
 
-    def __init__(self, path: Path, parts: list[_Part], report: BagReport) -> None:
+    def __init__(self, path: Path, parts: list[CheckedFile], report: BagReport) -> None:
         self._path = path
         self._parts = parts
         self.report = report
@@ -207,8 +207,8 @@ class Bag:
                 if not sort:
                     yield from self._parts[number].parse(segment, reader, wanted)
                     continue
-                # Nothing from here on is earlier than this segment's start. A message of exactly
-                # that time stays, since the segment may stand before it in the file.
+                # No later message is earlier than this segment's start. A message of exactly that time has to
+                # wait, because the segment may precede it in the file.
                 while waiting and waiting[0][0] < segment.messages.start:
                     message = heapq.heappop(waiting)[-1]
                     held -= len(message.data) + _MESSAGE_OVERHEAD_BYTES

@@ -12,9 +12,9 @@ from pathlib import Path
 from pkm_twin.bags.format import FormatError
 from pkm_twin.bags.storage import BagFile, find_storage, list_files
 from pkm_twin.bags.strict import Check, check_files
-from pkm_twin.bags.writer import McapWriter, refuse_existing, write_error
+from pkm_twin.bags.writer import McapWriter, reject_existing, write_error
 from pkm_twin.errors import BagError
-from pkm_twin.files import replacing
+from pkm_twin.files import write_atomically
 
 
 @dataclass(frozen=True)
@@ -34,23 +34,22 @@ class RecoverResult:
 
     @property
     def lossless(self) -> bool:
-        """True where nothing of the source was lost."""
+        """True if nothing of the source was lost."""
         return not self.reason
 
 
 def recover(source: str | Path, target: str | Path, *, overwrite: bool = False) -> RecoverResult:
-    """Save what is whole in ``source``, a file or a rosbag2 folder, as a new, sound bag ``target``.
+    """Save the intact messages of ``source``, a file or a rosbag2 folder, as a new bag ``target``.
 
-    A message is saved when its chunk is complete and matches its CRC. Messages that no CRC covers
-    are saved too, and counted as unverified. The target appears only once it is complete, as one
-    file in which no message is packed by itself. Attachments, records of unknown kinds and what
-    rosbag2 says of its files are not carried over.
+    A message is saved if its chunk is complete and matches its CRC. Messages without a CRC are saved,
+    too, and counted as unverified. The target appears when it is complete, as one file without
+    compressed messages. Attachments, unknown records and rosbag2's metadata of files are left out.
 
-    :raises BagError: the source is not an MCAP bag or no message in it is whole, the target exists
+    :raises BagError: the source is not an MCAP bag or has no intact message, the target exists
         and ``overwrite`` is false, or it cannot be written.
     """
     source, target = Path(source), Path(target)
-    refuse_existing(target, overwrite)
+    reject_existing(target, overwrite)
     files, reason = _find_files(source)
     results = check_files(files)
     losses = (part.left_out if isinstance(part, Check) else str(part) for part in results.values())
@@ -61,15 +60,15 @@ def recover(source: str | Path, target: str | Path, *, overwrite: bool = False) 
         if target.exists() and file.path.exists() and target.samefile(file.path):
             raise BagError("target and source are the same file", path=target, reason="exists")
     try:
-        with replacing(target) as hidden:
+        with write_atomically(target) as hidden:
             with hidden.open("xb", buffering=0) as output:
-                # An OSError here concerns the target; those of the source are handled where it is read.
+                # An OSError here is one of the target, because errors of the source are converted where it is read.
                 profile = next((check.header.profile for check in found), "ros2")
                 writer = McapWriter(output, target, 256 * 1024, profile)
                 for file, check in checks.items():
                     for title, entries, verified in check.metadata:
-                        # Metadata without a CRC gets none, as a new CRC would certify what nobody checked.
-                        # rosbag2's record describes the old files, not this one.
+                        # Write no CRC for unverified metadata, which it would seem to confirm. Leave out rosbag2's
+                        # record, which describes the old files.
                         if title != "rosbag2":
                             writer.put_metadata(title, entries, verified)
                     if check.segments:
@@ -94,7 +93,7 @@ def recover(source: str | Path, target: str | Path, *, overwrite: bool = False) 
             if not any(check.message_count for check in found):
                 text = f"no message can be recovered: {reason or 'there are none in it'}"
                 raise BagError(text, path=source, reason="nothing")
-            refuse_existing(target, overwrite)
+            reject_existing(target, overwrite)
     except OSError as error:
         raise write_error(error, target) from error
     parts = [part for check in found for part in check.segments]

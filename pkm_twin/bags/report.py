@@ -145,7 +145,7 @@ def _find_warnings(check: Check) -> Iterator[str]:
     yield from check.notes
     if check.out_of_order:
         yield f"{check.out_of_order} messages are out of order by log time"
-    if unknown := check.records.passed_over.total():
+    if unknown := check.records.unread.total():
         yield f"{unknown} records of unknown kinds were passed over"
 
 

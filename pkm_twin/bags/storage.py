@@ -31,20 +31,23 @@ SQLITE_MAGIC: Final = b"SQLite format 3\x00"
 
 
 class BagFile:
-    """An MCAP file; if packed as a whole, its bytes are unpacked into a nameless file."""
+    """An MCAP file; one that is compressed as a whole is decompressed into a temporary file."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
 
     @contextmanager
     def open(self) -> Iterator[RecordReader]:
-        """Open it for reading; an error of the system becomes a BagError."""
+        """Open the file for reading.
+
+        :raises BagError: it cannot be opened or read, or is an SQLite bag.
+        """
         try:
             with open_regular(self.path) as file:
                 size = os.fstat(file.fileno()).st_size
                 head = os.pread(file.fileno(), len(SQLITE_MAGIC), 0)
                 if head == SQLITE_MAGIC:
-                    text = f"is an SQLite bag, not MCAP; {write_conversion(self.path)} converts it"
+                    text = f"is an SQLite bag, not MCAP; {conversion_command(self.path)} converts it"
                     raise BagError(text, path=self.path, reason="not_mcap")
                 if not head.startswith(ZSTD_MAGIC):
                     yield RecordReader(file)
@@ -60,8 +63,8 @@ class BagFile:
 
     @cached_property
     def _unpacked(self) -> IO[bytes]:
-        """Return the unpacked file; what does not unpack is found missing at its end."""
-        # The file is deleted when it is closed with its bag.
+        """The decompressed file, which ends where the data can no longer be decompressed."""
+        # The temporary file is deleted when it is closed with its bag.
         target = tempfile.TemporaryFile()  # noqa: SIM115
         with open_regular(self.path) as file:
             budget = Budget(os.fstat(file.fileno()).st_size)
@@ -83,7 +86,7 @@ class BagFile:
 class Storage:
     """The files of a bag in order, and the message counts that its folder states.
 
-    ``message_count``: of all, None where it is not stated; ``by_topic`` and ``by_file``: by name.
+    ``message_count``: of all files, None if it is not stated. ``by_topic``, ``by_file``: counts by name.
     """
 
     files: tuple[BagFile, ...]
@@ -93,9 +96,9 @@ class Storage:
 
 
 def is_bag(path: Path) -> bool:
-    """Return whether a path is meant as a bag: a folder, or by its name or first bytes one of its files.
+    """Return whether a path is a bag: a folder, or a file with the name or the first bytes of one.
 
-    :raises OSError: the file is there, but cannot be opened or is no regular one.
+    :raises OSError: the file exists, but cannot be opened or is not a regular file.
     """
     if str(path) == STANDARD:
         return False
@@ -111,9 +114,9 @@ def find_storage(path: Path) -> Storage:
     """Return the files of a bag: the file itself, or those that a folder's metadata name.
 
     :raises BagError: a folder without ``metadata.yaml``, or one that is not plain, names files
-        outside the folder, or is of another storage than MCAP.
+        outside the folder, or has another storage than MCAP.
     """
-    # Unlike Path.is_dir, these never raise: errors of the system are reported when the file is opened.
+    # Unlike Path.is_dir these never raise, so that errors are reported when the file is opened.
     if not os.path.isdir(path):
         return Storage((BagFile(path),))
     file = path / METADATA_FILE
@@ -121,12 +124,12 @@ def find_storage(path: Path) -> Storage:
         inside = ", ".join(p.name for p in list_files(path)) or "no .mcap file"
         text = f"is a folder without {METADATA_FILE}: no rosbag2 bag; name a file in it: {inside}"
         raise BagError(text, path=path, reason="folder")
-    facts = _Field(file, "", _load(file)).get("rosbag2_bagfile_information")
+    facts = _MetadataValue(file, "", _load_metadata(file)).get("rosbag2_bagfile_information")
     storage = facts.get("storage_identifier")
     if storage.text() == "sqlite3":
-        text = f"is an SQLite bag, not MCAP; {write_conversion(path)} converts it"
+        text = f"is an SQLite bag, not MCAP; {conversion_command(path)} converts it"
         raise BagError(text, path=path, reason="not_mcap")
-    # `ros2 bag reindex` leaves it empty; the files' kind is determined when they are opened.
+    # `ros2 bag reindex` leaves the identifier empty; opening the files then shows their kind.
     if storage.text() != "mcap" and storage.value != "":
         raise storage.error("'mcap'")
     packing = facts.get("compression_format")
@@ -135,7 +138,7 @@ def find_storage(path: Path) -> Storage:
     files = []
     for entry in facts.get("relative_file_paths").items():
         name = entry.text()
-        # rosbag2 puts its files beside the metadata; anything else could be any file.
+        # Accept only names of files in the folder, where rosbag2 writes them; other paths are not safe.
         if not name or name in (".", "..") or "/" in name or "\0" in name:
             raise entry.error("the name of a file in the folder")
         files.append(BagFile(path / name))
@@ -145,7 +148,7 @@ def find_storage(path: Path) -> Storage:
         entry.get("topic_metadata").get("name").text(): entry.get("message_count").count()
         for entry in facts.get("topics_with_message_count").items(optional=True)
     }
-    # For a compressed file rosbag2 states the name of the uncompressed one.
+    # rosbag2 lists a compressed file by the name of the uncompressed file.
     names = {file.path.name.removesuffix(".zstd"): file.path.name for file in files}
     parts = {
         names.get(name.removesuffix(".zstd"), name): entry.get("message_count").count()
@@ -163,15 +166,15 @@ def find_storage(path: Path) -> Storage:
 def list_files(folder: Path) -> list[Path]:
     """List the MCAP files of a folder in the order of their numbers."""
 
-    def order(path: Path) -> tuple[str, int, str]:
+    def sort_key(path: Path) -> tuple[str, int, str]:
         stem = path.name.split(".")[0]
         digits = stem[len(stem.rstrip("0123456789")) :]
         return stem[: len(stem) - len(digits)], int(digits[-18:] or 0), path.name
 
-    return sorted((*folder.glob("*.mcap"), *folder.glob("*.mcap.zstd")), key=order)
+    return sorted((*folder.glob("*.mcap"), *folder.glob("*.mcap.zstd")), key=sort_key)
 
 
-def write_conversion(path: Path) -> str:
+def conversion_command(path: Path) -> str:
     """Return the command line that converts an SQLite bag to MCAP."""
     target = path.with_name(f"{path.stem}_mcap")
     options = f"output_bags: [{{uri: {target}, storage_id: mcap, all_topics: true}}]"
@@ -181,8 +184,8 @@ def write_conversion(path: Path) -> str:
     )
 
 
-class _Field:
-    """A value of ``metadata.yaml`` with its name, for the error that refuses it."""
+class _MetadataValue:
+    """A value of ``metadata.yaml`` with its name, which errors state."""
 
     def __init__(self, path: Path, name: str, value: object) -> None:
         self._path = path
@@ -193,24 +196,24 @@ class _Field:
         text = f"{self.name or 'the file'} is {self.value!r}; expected {expected}"
         return BagError(text, path=self._path, reason="metadata")
 
-    def get(self, key: str) -> _Field:
-        """Return the entry ``key`` of a mapping, None where it is missing."""
+    def get(self, key: str) -> _MetadataValue:
+        """Return the entry ``key`` of a mapping; its value is None if it is missing."""
         if not isinstance(self.value, Mapping):
             raise self.error("a mapping")
         name = f"{self.name}.{key}" if self.name else key
-        return _Field(self._path, name, self.value.get(key))
+        return _MetadataValue(self._path, name, self.value.get(key))
 
     def text(self, default: str = "") -> str:
         if self.value is not None and not isinstance(self.value, str):
             raise self.error("a text")
         return default if self.value is None else self.value
 
-    def items(self, optional: bool = False) -> list[_Field]:
+    def items(self, optional: bool = False) -> list[_MetadataValue]:
         if optional and self.value is None:
             return []
         if not isinstance(self.value, list):
             raise self.error("a list")
-        return [_Field(self._path, f"{self.name}[{i}]", v) for i, v in enumerate(self.value)]
+        return [_MetadataValue(self._path, f"{self.name}[{i}]", v) for i, v in enumerate(self.value)]
 
     def count(self) -> int | None:
         if self.value is None:
@@ -220,7 +223,7 @@ class _Field:
         return self.value
 
 
-def _load(path: Path) -> object:
+def _load_metadata(path: Path) -> object:
     try:
         with open_regular(path) as file:
             size = os.fstat(file.fileno()).st_size

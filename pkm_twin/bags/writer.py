@@ -23,20 +23,23 @@ from pkm_twin.bags.cdr import MessageCodec
 from pkm_twin.bags.definitions import live_type_name, message_definition
 from pkm_twin.bags.format import FREE_BYTES, MAX_CHUNK_BYTES, METADATA_CRC, metadata_crc
 from pkm_twin.errors import BagError
-from pkm_twin.files import replacing, require_replaceable
+from pkm_twin.files import require_replaceable, write_atomically
 
 FLUSH_PERIOD = 0.05
-"""How often a live recording reaches the operating system, s; half of what a kill may cost."""
+"""Period at which a live recording is written to the file, s; a killed process loses up to two periods."""
 
 
-def refuse_existing(path: Path, overwrite: bool) -> None:
-    """Reject a target that is there, a dangling link too, unless it may be overwritten."""
+def reject_existing(path: Path, overwrite: bool) -> None:
+    """Reject an existing target, including a dangling link, unless it may be overwritten.
+
+    :raises BagError: the target exists.
+    """
     if not overwrite and os.path.lexists(path):
         raise BagError("exists already", path=path, reason="exists")
 
 
 def write_error(error: OSError, path: Path) -> BagError:
-    """Return the caller's error where the system cannot write ``path``."""
+    """Convert an error of the operating system in writing ``path`` to a BagError."""
     reason = {
         errno.ENOSPC: "disk_full",
         errno.EDQUOT: "disk_full",
@@ -67,36 +70,36 @@ def offered_qos(reliability: str, durability: str, depth: int) -> str:
 
 
 class McapWriter(Writer):
-    """Writes one MCAP file so that a CRC covers every byte, and one type or topic once."""
+    """Writes an MCAP file in which CRCs cover every byte, and each type and topic stands once."""
 
     def __init__(self, file: io.FileIO, path: Path, chunk_size: int, profile: str) -> None:
-        super().__init__(cast("IO[bytes]", _Target(file, path)), chunk_size, enable_data_crcs=True)
+        super().__init__(cast("IO[bytes]", _UnbufferedFile(file, path)), chunk_size, enable_data_crcs=True)
         self._numbers: dict[str, Any] = {}
         self.start(profile, "pkm_twin")
 
     def register(self, schema: Schema | None, channel: Channel) -> int:
-        """Return the number of a channel, whose own numbers do not count."""
+        """Write a schema and a channel unless they are in the file; return the channel's number in it."""
         number = 0
         if schema is not None:
-            number = self._register_once(self.register_schema, schema.name, schema.encoding, schema.data)
+            number = self._write_once(self.register_schema, schema.name, schema.encoding, schema.data)
         facts = (channel.topic, channel.message_encoding, number, channel.metadata)
-        number = self._register_once(self.register_channel, *facts)
+        number = self._write_once(self.register_channel, *facts)
         return int(number)
 
-    def _register_once(self, act: Callable[..., Any], *facts: Any) -> Any:
+    def _write_once(self, act: Callable[..., Any], *facts: Any) -> Any:
         key = repr(facts)
         if key not in self._numbers:
             self._numbers[key] = act(*facts)
         return self._numbers[key]
 
     def put_metadata(self, name: str, entries: Mapping[str, str], verified: bool = True) -> None:
-        """Write texts by name, with a CRC of their own where they are ``verified``."""
+        """Write a metadata record once; with a CRC if the entries are ``verified``."""
         crc = {METADATA_CRC: metadata_crc(name, entries)} if verified else {}
-        self._register_once(self.add_metadata, name, {**entries, **crc})
+        self._write_once(self.add_metadata, name, {**entries, **crc})
 
 
-class _Target:
-    """An unbuffered file: what has been written, the system has.
+class _UnbufferedFile:
+    """An unbuffered file, so that written bytes survive the end of the process.
 
     :raises BagError: the system cannot write it.
     """
@@ -117,20 +120,19 @@ class _Target:
 class BagWriter:
     """Records messages into a new bag that ``ros2 bag play`` takes as it is.
 
-    A thread of its own writes, so a caller is not held up by the disk, and a Ctrl-C in the caller
-    cannot strike in the middle of a record. Every ``flush_period`` seconds of wall time what has
-    come in goes to the operating system as a complete chunk: a killed process loses no more than
-    that, and :func:`recover` saves the rest. With ``flush_period=None`` chunks end by size alone,
-    and equal input gives equal bytes; that is for files that are made, not recorded.
+    A thread writes, so that the caller does not wait for the disk and Ctrl-C in the caller does not
+    interrupt a record. Every ``flush_period`` seconds of wall time the messages since the last flush
+    are written as a complete chunk: a killed process loses only later messages, and :func:`recover`
+    saves the others. With ``flush_period=None`` chunks end by size alone, and equal input gives equal
+    bytes, for files that are not recorded live.
 
-    Use it as a context manager, or call :meth:`close` in a ``finally``. A process that is to
-    survive SIGTERM with all its messages must turn the signal into an exception or a return, as
-    rclpy does.
+    Use it as a context manager, or call :meth:`close` in a ``finally``. To keep all messages after
+    SIGTERM, a process must convert the signal to an exception or a return, as rclpy does.
 
-    ``metadata`` holds records of texts by name, such as the robot's name.
+    ``metadata``: records of texts by name, such as the robot's name.
 
-    :raises BagError: the file exists and ``overwrite`` is false, or it cannot be written. A full
-        disk is told by the next call; what was flushed before stays recoverable.
+    :raises BagError: the file exists and ``overwrite`` is false, or it cannot be written. The call
+        after a full disk raises; messages flushed before can be recovered.
     """
 
     def __init__(
@@ -158,11 +160,10 @@ class BagWriter:
         self._error: BagError | None = None
         self._closed = False
         self._numbers: dict[str, int] = {}
-        refuse_existing(self._path, overwrite)
+        reject_existing(self._path, overwrite)
         try:
             if overwrite:
-                # Another process that writes there now keeps its own, nameless file: never two in
-                # one.
+                # Unlink instead of truncating: a process that still writes the old file keeps it, without a name.
                 require_replaceable(self._path)
                 self._path.unlink(missing_ok=True)
             self._file = self._path.open("xb", buffering=0)
@@ -191,7 +192,7 @@ class BagWriter:
         """Add a topic of a type such as ``sensor_msgs/msg/JointState``.
 
         ``definition`` is the type's ros2msg text; by default it is made from the installed message
-        classes. QoS is what a player shall offer.
+        classes. The QoS is stored for players.
         """
         self._require_open()
         if topic in self._codecs:
@@ -204,13 +205,13 @@ class BagWriter:
         qos = offered_qos(reliability, durability, depth)
         self._codecs[topic] = MessageCodec(type_name, text)
         self._sequences[topic] = 0
-        self._queue.put(lambda: self._register(topic, type_name, text, qos))
+        self._queue.put(lambda: self._write_channel(topic, type_name, text, qos))
 
     def write(self, topic: str, message: object, log_time_ns: int, publish_time_ns: int | None = None) -> None:
         """Record one message at its log time; its publish time is the same unless given.
 
-        ``message`` is CDR bytes, which are taken as they are, a live ROS message, a mapping, or an
-        object with the fields as attributes. It is encoded before this returns.
+        ``message``: CDR bytes, which are stored unchanged, a live ROS message, a mapping, or an object
+        with the fields as attributes. It is encoded before the call returns.
         """
         self._require_open()
         codec = self._codecs.get(topic)
@@ -236,13 +237,13 @@ class BagWriter:
             raise BagError(f"the message has {len(data)} bytes; at most {limit}", reason="size_cap")
         self._sequences[topic] += 1
         sequence = self._sequences[topic]
-        self._queue.put(lambda: self._add(topic, logged, data, published, sequence))
-        # Bytes that the writer may hold in memory before its caller waits.
+        self._queue.put(lambda: self._write_message(topic, logged, data, published, sequence))
+        # Bound the memory: wait while more than 20,000 messages are in the queue.
         while self._queue.qsize() > 20_000 and self._error is None:
             time.sleep(0.001)
 
     def close(self) -> None:
-        """Write what is left, the index and the summary. Further calls do nothing.
+        """Write the remaining messages, the index and the summary; further calls do nothing.
 
         :raises BagError: the bag could not be completed.
         """
@@ -254,7 +255,7 @@ class BagWriter:
             try:
                 self._thread.join()
             except KeyboardInterrupt as interrupt:
-                # Finishing takes milliseconds; leaving now would cost the summary.
+                # Finish first, which takes milliseconds: without it the file would have no summary.
                 interrupted = interrupt
         if interrupted:
             raise interrupted
@@ -268,7 +269,7 @@ class BagWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        # The first error is the one to tell.
+        # Do not replace the error of the block by one of closing.
         with suppress(*([BagError] if error else [])):
             self.close()
 
@@ -278,14 +279,14 @@ class BagWriter:
         if self._closed:
             raise BagError("is closed", path=self._path, reason="closed")
 
-    # From here on: the writer's thread.
+    # The following methods run in the writer's thread.
 
-    def _register(self, topic: str, type_name: str, text: str, qos: str) -> None:
+    def _write_channel(self, topic: str, type_name: str, text: str, qos: str) -> None:
         schema = Schema(0, text.encode(), "ros2msg", type_name)
         channel = Channel(0, topic, "cdr", {"offered_qos_profiles": qos}, 0)
         self._numbers[topic] = self._writer.register(schema, channel)
 
-    def _add(self, topic: str, log_time: int, data: bytes, published: int, sequence: int) -> None:
+    def _write_message(self, topic: str, log_time: int, data: bytes, published: int, sequence: int) -> None:
         number = self._numbers[topic]
         self._writer.add_message(number, log_time, data, published, sequence)
 
@@ -311,7 +312,7 @@ class BagWriter:
         except BagError as error:
             self._error = error
         except Exception as error:
-            # The caller is in another thread: without this it would record into nothing.
+            # Pass the error to the caller's thread, which would otherwise continue without a file.
             self._error = BagError(f"cannot be written: {error}", path=self._path, reason="io")
         finally:
             self._file.close()
@@ -323,9 +324,9 @@ def write_whole_bag(path: Path, overwrite: bool, metadata: Mapping[str, Mapping[
 
     :raises BagError: the file exists and ``overwrite`` is false, or it cannot be written.
     """
-    refuse_existing(path, overwrite)
+    reject_existing(path, overwrite)
     try:
-        with replacing(path) as hidden, BagWriter(hidden, metadata=metadata, flush_period=None) as writer:
+        with write_atomically(path) as hidden, BagWriter(hidden, metadata=metadata, flush_period=None) as writer:
             yield writer
     except OSError as error:
         raise write_error(error, path) from error

@@ -20,7 +20,7 @@ from delta_dynamics import inverse_dynamics, mass_matrix
 from pkm_twin.certify.description import UnfitError
 from pkm_twin.certify.maximal import Maximal, States, random_states
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.errors import ParameterError, PkmTwinError, SingularityError, UnreachableError, install
+from pkm_twin.errors import ParameterError, PkmTwinError, SingularityError, UnreachableError, write_install_command
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.robot_urdf import robot_description
 from pkm_twin.robot.variation import KINDS, vary_robot
@@ -46,7 +46,7 @@ VARIANT_DEVIATION: Final = 0.02
 
 
 class Judge(Protocol):
-    """The quantities that an engine computes for one state."""
+    """Quantities that an independent engine computes for one state."""
 
     def inverse_dynamics(self, q: Array, qd: Array, qdd: Array, wrench: Array) -> Array:
         """Compute the efforts, shape (n,)."""
@@ -169,10 +169,10 @@ def certify(
         except ImportError as error:
             if error.name is None or error.name.startswith("pkm_twin"):
                 raise
-            missing[name] = f"{ENGINES[name][1]} is not installed; {install('certificate')}"
+            missing[name] = f"{ENGINES[name][1]} is not installed; {write_install_command('certificate')}"
         except UnfitError as error:
             missing[name] = str(error)
-    # The inverse with the forward kinematics, and single samples with a batch.
+    # Compare the inverse with the forward kinematics, and single samples with a batch.
     motion = *_expand_to_all_joints(robot, drawn.q, drawn.qd, drawn.qdd), drawn.wrench
     trip = np.abs(robot.inverse(robot.forward(motion[0])) - motion[0]).max(-1)
     single = np.array([inverse_dynamics(robot, *state) for state in zip(*motion, strict=True)])
@@ -196,7 +196,7 @@ def certify(
     )
 
 
-def certificate_of(robot: Any, **options: Any) -> Certificate:
+def certify_robot(robot: Any, **options: Any) -> Certificate:
     """Run :func:`certify` with the robot's own description."""
     return certify(robot, robot_description(robot), **options)
 
@@ -212,9 +212,9 @@ def certify_variants(
     """
     found: list[Certificate] = []
     for k in range(count + 1):
-        machine = robot if k == 0 else drawn(robot, seed + k)
+        machine = robot if k == 0 else draw_variant(robot, seed + k)
         done = sum(one.states for one in found)
-        found.append(certificate_of(machine, seed=seed, progress=lambda n, done=done: progress(done + n), **options))
+        found.append(certify_robot(machine, seed=seed, progress=lambda n, done=done: progress(done + n), **options))
     by_name: dict[tuple[str, str], list[Item]] = {}
     for item in (item for one in found for item in one.items):
         by_name.setdefault((item.engine, item.what), []).append(item)
@@ -234,7 +234,7 @@ def certify_variants(
     )
 
 
-def drawn(robot: Robot, seed: int) -> Robot:
+def draw_variant(robot: Robot, seed: int) -> Robot:
     """Make a variant with perturbed parameters; perturb lengths only if the loops still close."""
     kinds = [kind for kind in KINDS if kind != "lengths"]
     try:
@@ -252,25 +252,25 @@ def _expand_to_all_joints(robot: Any, *motion: Array) -> tuple[Array, ...]:
     """Compute positions, velocities and accelerations of all joints from the independent ones."""
     if not _is_redundant(robot):
         return motion
-    whole = [np.zeros((*one.shape[:-1], robot.joints_count)) for one in motion]
-    for one, leads in zip(whole, motion, strict=True):
+    expanded = [np.zeros((*one.shape[:-1], robot.joints_count)) for one in motion]
+    for one, leads in zip(expanded, motion, strict=True):
         one[..., robot.graph.leading] = leads
-    return tuple(robot.project_redundant(*whole))
+    return tuple(robot.project_redundant(*expanded))
 
 
 def _compare_engines(
     robot: Any, judges: Mapping[str, Judge], states: States, progress: Callable[[int], None]
 ) -> list[Item]:
-    place, rates, changes = _expand_to_all_joints(robot, states.q, states.qd, states.qdd)
-    tau = inverse_dynamics(robot, place, rates, changes, states.wrench)
-    position, rotation = robot.platform(place)
-    twist, inertia = robot.platform_jacobian(place), mass_matrix(robot, place)
+    all_positions, rates, changes = _expand_to_all_joints(robot, states.q, states.qd, states.qdd)
+    tau = inverse_dynamics(robot, all_positions, rates, changes, states.wrench)
+    position, rotation = robot.platform(all_positions)
+    twist, inertia = robot.platform_jacobian(all_positions), mass_matrix(robot, all_positions)
     if _is_redundant(robot):
         # Velocities of all joints per velocity of the independent joints.
-        back = robot.inverse_jacobian(place)
-        by = back @ np.linalg.inv(back[:, robot.graph.leading])
-        tau = np.einsum("knm,kn->km", by, tau)
-        twist, inertia = twist @ by, by.swapaxes(-1, -2) @ inertia @ by
+        joint_rates = robot.inverse_jacobian(all_positions)
+        by_independent = joint_rates @ np.linalg.inv(joint_rates[:, robot.graph.leading])
+        tau = np.einsum("knm,kn->km", by_independent, tau)
+        twist, inertia = twist @ by_independent, by_independent.swapaxes(-1, -2) @ inertia @ by_independent
     efforts: dict[str, list[Array]] = {name: [] for name in judges}
     found: dict[tuple[str, str], list[float]] = {}
     for k in range(len(states.q)):
@@ -278,9 +278,9 @@ def _compare_engines(
         for name, judge in judges.items():
             effort = judge.inverse_dynamics(q, states.qd[k], states.qdd[k], states.wrench[k])
             efforts[name].append(effort)
-            place, turned = judge.platform(q)
-            apart = max(np.abs(position[k] - place).max(), np.abs(rotation[k] - turned).max())
-            found.setdefault((name, "platform"), []).append(float(apart))
+            all_positions, turned = judge.platform(q)
+            difference = max(np.abs(position[k] - all_positions).max(), np.abs(rotation[k] - turned).max())
+            found.setdefault((name, "platform"), []).append(float(difference))
             for what, got, expected in (
                 ("jacobian", twist[k], judge.jacobian(q)),
                 ("mass_matrix", inertia[k], judge.mass_matrix(q)),
@@ -315,6 +315,6 @@ def relative_difference(got: Array, expected: Array) -> float:
 
 def _make_item(engine: str, what: str, values: Any) -> Item:
     amounts = np.asarray(values, dtype=float)
-    # Infinity for NaN: np.max would depend on its position, and no bound must pass.
+    # Replace NaN by infinity, so that it exceeds every bound wherever it stands.
     worst = float(np.where(np.isfinite(amounts), amounts, np.inf).max())
     return Item(engine, what, worst, float(np.median(amounts)), BOUNDS[what])

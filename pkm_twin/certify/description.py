@@ -102,7 +102,7 @@ class Rod:
 
 @dataclass(frozen=True)
 class Machine:
-    """The machine as the engines read it."""
+    """A machine's geometry and masses, as read from its description for the engines."""
 
     gravity: Array
     platform: str
@@ -125,7 +125,7 @@ class Machine:
         """Values of the actuated joints at home, shape (n,), rad or m."""
         return np.array([joint.home for joint in self.actuated])
 
-    def of(self, rotation: Array, position: Array) -> Array:
+    def pose_coordinates(self, rotation: Array, position: Array) -> Array:
         """Return the pose coordinates of a rotation and a position, shape (m,), m and rad."""
         return self.select(position, Rotation.from_matrix(rotation).as_euler(self.sequence))
 
@@ -178,8 +178,8 @@ def expand(description: Description) -> dict[str, Any]:
     return result
 
 
-def _section_items(of: Description, kind: str) -> list[tuple[str, Any]]:
-    return list((of.get(kind) or {}).items())
+def _section_items(section: Description, kind: str) -> list[tuple[str, Any]]:
+    return list((section.get(kind) or {}).items())
 
 
 def _rotate_entry(entry: dict[str, Any], turn: Array, own: set[str], number: int) -> dict[str, Any]:
@@ -301,7 +301,7 @@ def _read_joint(name: str, entry: Mapping[str, Any], known: set[str]) -> Joint:
     )
 
 
-def with_laws(drives: Sequence[Joint], q: Array, qd: Array, tau: Array) -> Array:
+def add_friction_laws(drives: Sequence[Joint], q: Array, qd: Array, tau: Array) -> Array:
     """Add load-dependent friction, Stribeck friction and cogging to the efforts, shape (n,).
 
     :param tau: efforts that include viscous friction, Coulomb friction and offset, N m or N.
@@ -327,7 +327,7 @@ def cross(a: Array, b: Array) -> Array:
     return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
 
 
-def across(axis: Array) -> tuple[Array, Array]:
+def make_perpendicular_axes(axis: Array) -> tuple[Array, Array]:
     """Return two unit vectors that form a right-handed triple with ``axis``, shape (3,) each."""
     first = cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))])
     first = first / np.linalg.norm(first)

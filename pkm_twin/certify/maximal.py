@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
 
 from pkm_twin.certify.description import Array, Description, UnfitError, cross, read
-from pkm_twin.certify.rows import SINGULAR, Frame, Moving
+from pkm_twin.certify.rows import MIN_SINGULAR_VALUE_RATIO, Engine, Frame
 
 DEFAULT_HALF_RANGE: Final = 0.3
 """Half the range of a joint without limits, rad; for a prismatic joint half this times the size."""
@@ -59,7 +59,7 @@ def rotation_of(turn: Array) -> Array:
     return np.asarray(Rotation.from_rotvec(turn).as_matrix(), np.float64)
 
 
-class Maximal(Moving):
+class Maximal(Engine):
     """A machine in maximal coordinates.
 
     :raises UnfitError: the description cannot be read.
@@ -101,51 +101,51 @@ class Maximal(Moving):
         """
         q = np.asarray(q, dtype=float)
         if q.tobytes() not in self._assembled:
-            # The continuation takes far longer than the computations at a cached assembly.
+            # Cache assemblies, because the continuation takes far longer than computations in a state.
             if len(self._assembled) == 64:
                 self._assembled.clear()
-            self._assembled[q.tobytes()] = self._follow(q - self.machine.home)
+            self._assembled[q.tobytes()] = self._continue_to(q - self.machine.home)
         self._state = self._assembled[q.tobytes()]
         return self._state
 
-    def _follow(self, way: Array) -> State:
-        if self.home.condition < SINGULAR:
+    def _continue_to(self, goal_motion: Array) -> State:
+        if self.home.condition < MIN_SINGULAR_VALUE_RATIO:
             raise UnfitError("the actuated joints do not determine the machine at home")
         # Steps are fractions of the line from home to the goal.
-        state, gone, step, least = self._start, 0.0, 1.0 / 16.0, 1.0
+        state, done, step, least = self._start, 0.0, 1.0 / 16.0, 1.0
         folds = []
-        while gone < 1.0:
-            step = min(step, 1.0 - gone)
+        while done < 1.0:
+            step = min(step, 1.0 - done)
             self._state = state
             tangent = self.tangent()
-            folds.append(self._fold(tangent))
-            state = replace(state, velocity=(tangent @ way).reshape(-1, 6))
+            folds.append(self._pose_determinant(tangent))
+            state = replace(state, velocity=(tangent @ goal_motion).reshape(-1, 6))
             self._state = state
             change = self.solve(-self.closures().bias, -self.drives().bias)
             size = float(np.abs(state.velocity).max())
-            guess = self._moved(state, step * state.velocity.ravel() + step**2 / 2 * change)
-            goal = 1.0 if step >= 1.0 - gone else gone + step
-            # The first correction of an accepted step is at most a fiftieth of its motion.
-            trial, condition = self._close(guess, goal * way, 0.02 * max(size * step, 1e-9))
+            guess = self._move_bodies(state, step * state.velocity.ravel() + step**2 / 2 * change)
+            goal = 1.0 if step >= 1.0 - done else done + step
+            # Accept a step only if its first correction is at most a fiftieth of its motion.
+            trial, condition = self._close_loops(guess, goal * goal_motion, 0.02 * max(size * step, 1e-9))
             if trial is None:
                 step /= 2
                 if step < 1e-5:
-                    raise UnfitError(f"a singularity on the way from home, at {gone:.4g} of it")
+                    raise UnfitError(f"a singularity on the way from home, at {done:.4g} of it")
                 continue
-            state, gone, step = trial, goal, 1.5 * step
+            state, done, step = trial, goal, 1.5 * step
             least = min(least, condition / self.home.condition)
         self._state = state
-        folds.append(self._fold(self.tangent()))
+        folds.append(self._pose_determinant(self.tangent()))
         pose = min(fold / folds[0] for fold in folds) if folds[0] else 0.0
         return replace(state, velocity=np.zeros_like(state.velocity), least=least, pose=pose)
 
-    def _fold(self, tangent: Array) -> float:
+    def _pose_determinant(self, tangent: Array) -> float:
         """Return the determinant of d(pose)/dq; 1 if this matrix is not square."""
         machine = self.machine
         if len(machine.pose) != len(machine.actuated):
             return 1.0
         twist = self.twist_columns() @ tangent
-        _, rotation = self._placed()
+        _, rotation = self._platform_pose()
         sequence = machine.sequence
         turns = Rotation.from_matrix(rotation).as_euler(sequence)
         first = Rotation.from_euler(sequence[0], turns[0]).as_matrix()
@@ -155,28 +155,28 @@ class Maximal(Moving):
         spin = np.stack([a, first @ b, second @ c], -1)
         return float(np.linalg.det(machine.select(twist[:3], np.linalg.solve(spin, twist[3:]))))
 
-    def _moved(self, state: State, change: Array) -> State:
+    def _move_bodies(self, state: State, change: Array) -> State:
         each = change.reshape(-1, 6)
         turned = rotation_of(each[:, 3:]) @ state.rotation
-        # One Newton step of the polar decomposition restores orthogonality after rounding.
+        # Restore orthogonality after rounding by a Newton step of the polar decomposition.
         turned = turned @ (1.5 * np.eye(3) - 0.5 * turned.transpose(0, 2, 1) @ turned)
         return replace(state, rotation=turned, com=state.com + each[:, :3])
 
-    def _close(self, guess: State, way: Array, far: float) -> tuple[State | None, float]:
+    def _close_loops(self, guess: State, goal: Array, max_first_step: float) -> tuple[State | None, float]:
         state, last, condition = guess, math.inf, 0.0
         for _ in range(12):
             self._state = state
             closures, drives = self.closures(), self.drives()
             step, _, rank, sizes = np.linalg.lstsq(
                 np.vstack([closures.columns, drives.columns]),
-                np.concatenate([-closures.value, self.missing(way)]),
-                rcond=SINGULAR,
+                np.concatenate([-closures.value, self.remaining_motion(goal)]),
+                rcond=MIN_SINGULAR_VALUE_RATIO,
             )
             length = float(np.abs(step).max())
             condition = float(sizes[self.size - 1] / sizes[0])
-            if rank < self.size or length > (far if last == math.inf else last / 2):
+            if rank < self.size or length > (max_first_step if last == math.inf else last / 2):
                 return (state if last < 1e-13 else None), condition
-            state, last = self._moved(state, step), length
+            state, last = self._move_bodies(state, step), length
             if length < 1e-15:
                 break
         return (state if last < 1e-13 else None), condition
@@ -190,7 +190,7 @@ class Maximal(Moving):
     def pose(self, q: Array) -> Array:
         """Compute the pose coordinates, shape (m,), m and rad."""
         position, rotation = self.platform(q)
-        return self.machine.of(rotation, position)
+        return self.machine.pose_coordinates(rotation, position)
 
     def energy(self, q: Array, qd: Array) -> tuple[float, float]:
         """Compute kinetic and potential energy, J; the latter is zero at the base's origin."""
@@ -235,7 +235,7 @@ class States:
     drawn: int
     """Number of positions drawn, also out of reach, near a singularity or beyond a fold."""
     skipped: int
-    """Number of positions that only the package does not reach, for a singularity on its way."""
+    """Number of positions that the package alone does not reach, because of a singularity on its way."""
 
 
 def ranges(judge: Maximal) -> Array:
@@ -247,7 +247,7 @@ def ranges(judge: Maximal) -> Array:
         low, high = joint.position
         low = low if np.isfinite(low) else joint.home - reach
         high = high if np.isfinite(high) else joint.home + reach
-        # The outer tenths of the range are left out.
+        # Leave out the outer tenths of the range.
         middle, half = (low + high) / 2, 0.8 * (high - low) / 2
         result.append((middle - half, middle + half))
     return np.array(result)

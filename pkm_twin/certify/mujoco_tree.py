@@ -40,7 +40,7 @@ class MujocoTree(Tree):
         self._weights: list[tuple[str, float, Array]] = []
         super().__init__(description)
 
-    def hang(self, name: str, parent: str, at: Array, steps: Steps | None, body: Body) -> None:
+    def add_body(self, name: str, parent: str, at: Array, steps: Steps | None, body: Body) -> None:
         """Add a body to the tree; three rotations are a ball joint."""
         element = Xml.SubElement(self._elements[parent], "body", name=f"body {name}")
         self._elements[name] = element
@@ -91,7 +91,7 @@ class MujocoTree(Tree):
         mujoco.mj_comPos(self._model, self._data)
         mujoco.mj_comVel(self._model, self._data)
 
-    def stepped(self, full: Array, step: Array) -> Array:
+    def step_from(self, full: Array, step: Array) -> Array:
         """Return the configuration after a small motion, shape (size,)."""
         result = full.copy()
         mujoco.mj_integratePos(self._model, result, step, 1.0)

@@ -29,7 +29,7 @@ class PinocchioTree(Tree):
         """Joint that moves each body, and the position of its frame at home, m."""
         super().__init__(description)
 
-    def hang(self, name: str, parent: str, at: Array, steps: Steps | None, body: Body) -> None:
+    def add_body(self, name: str, parent: str, at: Array, steps: Steps | None, body: Body) -> None:
         """Add a body to the tree; three rotations are a ball joint."""
         carrier, origin = self._carriers[parent]
         if steps is None:
@@ -67,7 +67,7 @@ class PinocchioTree(Tree):
         pin.forwardKinematics(self.model, self.data, full, rates, np.zeros(self.size))
         pin.computeJointJacobians(self.model, self.data, full)
 
-    def stepped(self, full: Array, step: Array) -> Array:
+    def step_from(self, full: Array, step: Array) -> Array:
         """Return the configuration after a small motion, shape (size,)."""
         return np.asarray(pin.integrate(self.model, full, step))
 

@@ -20,9 +20,19 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from pkm_twin.certify.description import BASE, Array, Joint, Machine, Rod, UnfitError, across, cross, with_laws
+from pkm_twin.certify.description import (
+    BASE,
+    Array,
+    Joint,
+    Machine,
+    Rod,
+    UnfitError,
+    add_friction_laws,
+    cross,
+    make_perpendicular_axes,
+)
 
-SINGULAR: Final = 1e-9
+MIN_SINGULAR_VALUE_RATIO: Final = 1e-9
 """Smallest ratio of singular values: below it the rows do not determine the motion."""
 
 
@@ -41,8 +51,8 @@ class Frame(NamedTuple):
     """Accelerations of both at zero coordinate accelerations, shape (6,)."""
 
 
-class Jet(NamedTuple):
-    """A vector that moves with the bodies, with its derivatives."""
+class MovingVector(NamedTuple):
+    """A vector that moves with the bodies, with its derivatives by time and coordinates."""
 
     value: Array
     """Shape (3,)."""
@@ -53,13 +63,13 @@ class Jet(NamedTuple):
     bias: Array
     """Second derivative at zero coordinate accelerations, shape (3,)."""
 
-    def minus(self, other: Jet) -> Jet:
+    def minus(self, other: MovingVector) -> MovingVector:
         """Subtract another vector."""
-        return Jet(*(a - b for a, b in zip(self, other, strict=True)))
+        return MovingVector(*(a - b for a, b in zip(self, other, strict=True)))
 
-    def plus(self, other: Jet) -> Jet:
+    def plus(self, other: MovingVector) -> MovingVector:
         """Add another vector."""
-        return Jet(*(a + b for a, b in zip(self, other, strict=True)))
+        return MovingVector(*(a + b for a, b in zip(self, other, strict=True)))
 
 
 class Rows(NamedTuple):
@@ -70,8 +80,8 @@ class Rows(NamedTuple):
     bias: Array
 
 
-class Moving(ABC):
-    """The base class of engines, which computes everything from their frames and forces."""
+class Engine(ABC):
+    """Base class of engines: computes equations, Jacobians and dynamics from frames and forces of bodies."""
 
     machine: Machine
     size: int
@@ -98,35 +108,37 @@ class Moving(ABC):
 
     # Motion of points and directions
 
-    def point(self, body: str, at: Array) -> Jet:
+    def point(self, body: str, at: Array) -> MovingVector:
         """Return a point fixed in a body, given by its position at home, m."""
         if body == BASE:
-            return self._still(at)
+            return self._make_constant(at)
         frame = self.frame(body)
-        origin = Jet(frame.place, frame.columns[:3], frame.rate[:3], frame.bias[:3])
-        return origin.plus(self._swung(frame, at - frame.home))
+        origin = MovingVector(frame.place, frame.columns[:3], frame.rate[:3], frame.bias[:3])
+        return origin.plus(self._rotate_with(frame, at - frame.home))
 
-    def direction(self, body: str, axis: Array) -> Jet:
+    def direction(self, body: str, axis: Array) -> MovingVector:
         """Return a direction fixed in a body, given by its components at home."""
-        return self._still(axis) if body == BASE else self._swung(self.frame(body), axis)
+        return self._make_constant(axis) if body == BASE else self._rotate_with(self.frame(body), axis)
 
-    def spin(self, body: str) -> Jet:
-        """Return a body's angular velocity as a derivative; the value itself is zero."""
+    def spin(self, body: str) -> MovingVector:
+        """Return a body's angular velocity as the derivative of a vector whose value is zero."""
         if body == BASE:
-            return self._still(np.zeros(3))
+            return self._make_constant(np.zeros(3))
         frame = self.frame(body)
-        return Jet(np.zeros(3), frame.columns[3:], frame.rate[3:], frame.bias[3:])
+        return MovingVector(np.zeros(3), frame.columns[3:], frame.rate[3:], frame.bias[3:])
 
-    def _swung(self, frame: Frame, vector: Array) -> Jet:
+    def _rotate_with(self, frame: Frame, vector: Array) -> MovingVector:
         value, spin = frame.rotation @ vector, frame.rate[3:]
         rate = cross(spin, value)
         bias = cross(frame.bias[3:], value) + cross(spin, rate)
-        # The cross product's matrix, shape (3, 3).
+        # The derivative is -[value]x times the angular velocity, with the cross product's matrix.
         x, y, z = value.tolist()
-        return Jet(value, -np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ frame.columns[3:], rate, bias)
+        return MovingVector(
+            value, -np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ frame.columns[3:], rate, bias
+        )
 
-    def _still(self, value: Array) -> Jet:
-        return Jet(value, np.zeros((3, self.size)), np.zeros(3), np.zeros(3))
+    def _make_constant(self, value: Array) -> MovingVector:
+        return MovingVector(value, np.zeros((3, self.size)), np.zeros(3), np.zeros(3))
 
     # Joints
 
@@ -135,32 +147,32 @@ class Moving(ABC):
         inner, outer, axes = joint.inner, joint.outer, joint.axes
         gap = self.point(outer, joint.at).minus(self.point(inner, joint.at))
 
-        def angle(one: Array, other: Array) -> Rows:
+        def cosine_row(one: Array, other: Array) -> Rows:
             row = dot(self.direction(inner, one), self.direction(outer, other))
             return row._replace(value=row.value - one @ other)
 
         rows: list[Rows] = []
-        for held in joint.type.holds if holds is None else holds:
-            if held == "point":
+        for constraint in joint.type.holds if holds is None else holds:
+            if constraint == "point":
                 rows.append(Rows(gap.value, gap.columns, gap.bias))
-            elif held == "turns":
-                rows += [angle(np.eye(3)[k], np.eye(3)[(k + 1) % 3]) for k in range(3)]
-            elif held == "line":
-                rows += [dot(self.direction(inner, side), gap) for side in across(axes[0])]
-            elif held == "flat":
+            elif constraint == "turns":
+                rows += [cosine_row(np.eye(3)[k], np.eye(3)[(k + 1) % 3]) for k in range(3)]
+            elif constraint == "line":
+                rows += [dot(self.direction(inner, side), gap) for side in make_perpendicular_axes(axes[0])]
+            elif constraint == "flat":
                 rows.append(dot(self.direction(inner, axes[0]), gap))
-            elif held == "direction":
-                rows += [angle(side, axes[0]) for side in across(axes[0])]
-            elif held == "crossing":
-                rows.append(angle(axes[0], axes[1]))
-            elif held == "thread":
-                slide, turn, turned = self._slide(joint), self._turn(joint), joint.pitch
-                gone = slide.value - turned * turn.value
-                # The angle is known up to full revolutions.
-                gone = np.array([math.remainder(gone[0], 2.0 * math.pi * turned)])
-                rows.append(Rows(gone, *(a - turned * b for a, b in zip(slide[1:], turn[1:], strict=True))))
+            elif constraint == "direction":
+                rows += [cosine_row(side, axes[0]) for side in make_perpendicular_axes(axes[0])]
+            elif constraint == "crossing":
+                rows.append(cosine_row(axes[0], axes[1]))
+            elif constraint == "thread":
+                slide, turn, pitch = self._slide(joint), self._turn(joint), joint.pitch
+                residual = slide.value - pitch * turn.value
+                # The angle is known up to full turns only.
+                residual = np.array([math.remainder(residual[0], 2.0 * math.pi * pitch)])
+                rows.append(Rows(residual, *(a - pitch * b for a, b in zip(slide[1:], turn[1:], strict=True))))
             else:
-                raise UnfitError(f"joints.{joint.name}: no judge knows how to hold {held!r}")
+                raise UnfitError(f"joints.{joint.name}: no judge knows how to hold {constraint!r}")
         return rows
 
     def rates(self, joint: Joint) -> Rows:
@@ -176,7 +188,7 @@ class Moving(ABC):
     def _turn(self, joint: Joint) -> Rows:
         axis = self.direction(joint.inner, joint.axes[0])
         relative = self.spin(joint.outer).minus(self.spin(joint.inner))
-        side, other = across(joint.axes[0])
+        side, other = make_perpendicular_axes(joint.axes[0])
         moved = self.direction(joint.outer, side).value
         cosine = self.direction(joint.inner, side).value @ moved
         sine = self.direction(joint.inner, other).value @ moved
@@ -194,7 +206,7 @@ class Moving(ABC):
         """Return the equations of all joints and rods in the present state."""
         rows = [row for joint, holds in self.held() for row in self.joint_rows(joint, holds)]
         rows += [self.rod_rows(rod) for rod in self.machine.rods]
-        return stacked(rows, self.size)
+        return stack_rows(rows, self.size)
 
     def rod_rows(self, rod: Rod) -> Rows:
         """Return the equation of a rod's constant length."""
@@ -204,11 +216,11 @@ class Moving(ABC):
 
     def drives(self) -> Rows:
         """Return the rows of the actuated joints; values are relative to home, rad or m."""
-        return stacked([self.rates(joint) for joint in self.machine.actuated], self.size)
+        return stack_rows([self.rates(joint) for joint in self.machine.actuated], self.size)
 
-    def missing(self, way: Array) -> Array:
-        """Return ``way`` minus the actuated joints' motion from home, (n,), rad or m."""
-        result: Array = way - self.drives().value
+    def remaining_motion(self, goal: Array) -> Array:
+        """Return ``goal`` minus the actuated joints' motion from home, (n,), rad or m."""
+        result: Array = goal - self.drives().value
         for k, joint in enumerate(self.machine.actuated):
             if not joint.slides:
                 result[k] = math.remainder(result[k], 2 * math.pi)
@@ -218,7 +230,7 @@ class Moving(ABC):
         """Find coordinate velocities for given rates of the closures and of the actuated joints."""
         columns = np.vstack([self.closures().columns, self.drives().columns])
         right = np.concatenate([closed, driven])
-        return np.asarray(np.linalg.lstsq(columns, right, rcond=SINGULAR)[0], dtype=np.float64)
+        return np.asarray(np.linalg.lstsq(columns, right, rcond=MIN_SINGULAR_VALUE_RATIO)[0], dtype=np.float64)
 
     def tangent(self) -> Array:
         """Return coordinate velocities per velocity of the actuated joints, shape (size, n)."""
@@ -231,14 +243,14 @@ class Moving(ABC):
         point = self.point(machine.platform, machine.origin)
         return np.vstack([point.columns, self.spin(machine.platform).columns])
 
-    # What is asked for
+    # Quantities that are compared
 
     def platform(self, q: Array) -> tuple[Array, Array]:
         """Compute the reference point's position, (3,), m, and the rotation from home, (3, 3)."""
         self.assemble(q)
-        return self._placed()
+        return self._platform_pose()
 
-    def _placed(self) -> tuple[Array, Array]:
+    def _platform_pose(self) -> tuple[Array, Array]:
         platform = self.machine.platform
         rotation = self.frame(platform).rotation.copy()
         return self.point(platform, self.machine.origin).value, rotation
@@ -268,17 +280,17 @@ class Moving(ABC):
                 continue
             row = self.rates(joint)
             own = joint.rotor_inertia * (row.columns @ change + row.bias)
-            force = force + row.columns.T @ (own + drag(joint, row.columns @ rates))
+            force = force + row.columns.T @ (own + friction_efforts(joint, row.columns @ rates))
         tau: Array = tangent.T @ force
         for k, joint in enumerate(self.machine.actuated):
-            tau[k] += joint.rotor_inertia * qdd[k] + drag(joint, qd[k : k + 1])[0]
-        return with_laws(self.machine.actuated, q, qd, tau)
+            tau[k] += joint.rotor_inertia * qdd[k] + friction_efforts(joint, qd[k : k + 1])[0]
+        return add_friction_laws(self.machine.actuated, q, qd, tau)
 
     def mass_matrix(self, q: Array) -> Array:
         """Compute the mass matrix at the actuated joints, shape (n, n), kg m2, kg or kg m."""
         self.assemble(q)
         tangent = self.tangent()
-        # Without motion only the weight is left.
+        # Forces without accelerations are the weight.
         weight = self.forces(np.zeros(self.size))
         result: Array = np.array([self.forces(column) - weight for column in tangent.T]) @ tangent
         for joint in self.machine.joints:
@@ -288,7 +300,7 @@ class Moving(ABC):
         return result
 
 
-def dot(a: Jet, b: Jet) -> Rows:
+def dot(a: MovingVector, b: MovingVector) -> Rows:
     """Return the scalar product a . b as a row."""
     return Rows(
         np.array([a.value @ b.value]),
@@ -297,7 +309,7 @@ def dot(a: Jet, b: Jet) -> Rows:
     )
 
 
-def stacked(rows: list[Rows], size: int | None = None) -> Rows:
+def stack_rows(rows: list[Rows], size: int | None = None) -> Rows:
     """Stack rows; without rows return an empty one with ``size`` columns."""
     if not rows:
         return Rows(np.zeros(0), np.zeros((0, size or 0)), np.zeros(0))
@@ -308,6 +320,6 @@ def stacked(rows: list[Rows], size: int | None = None) -> Rows:
     )
 
 
-def drag(joint: Joint, rates: Array) -> Array:
+def friction_efforts(joint: Joint, rates: Array) -> Array:
     """Return viscous friction, Coulomb friction and offset at each velocity, N m or N."""
     return np.asarray(joint.viscous * rates + joint.coulomb * np.sign(rates) + joint.offset)

@@ -14,46 +14,56 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from pkm_twin.certify.description import BASE, Array, Body, Description, Joint, Rod, UnfitError, across, read
-from pkm_twin.certify.rows import Moving, Rows
+from pkm_twin.certify.description import (
+    BASE,
+    Array,
+    Body,
+    Description,
+    Joint,
+    Rod,
+    UnfitError,
+    make_perpendicular_axes,
+    read,
+)
+from pkm_twin.certify.rows import Engine, Rows
 
 Steps = Sequence[tuple[bool, Array]]
 """Freedoms of a joint from parent to child: true for a rotation, and the axis at home."""
 
 
-class Tree(Moving):
+class Tree(Engine):
     """The base class of machines as trees with loop constraints.
 
     :raises UnfitError: the description cannot be read.
     """
 
     widest: bool
-    """True if the tree prefers joints with many freedoms, else actuated ones and few freedoms."""
+    """True if the tree takes joints with many freedoms first, else actuated joints with few freedoms."""
 
     def __init__(self, description: Description) -> None:
         self.machine = read(description)
         self._held: list[tuple[Joint, Sequence[str]]] = []
         # Build a spanning tree from the base; the remaining joints become equations.
         joints, bodies = list(self.machine.joints), self.machine.bodies
-        hung = {BASE}
-        while len(hung) <= len(bodies):
-            edges = [j for j in joints if (j.inner in hung) != (j.outer in hung)]
+        attached = {BASE}
+        while len(attached) <= len(bodies):
+            edges = [j for j in joints if (j.inner in attached) != (j.outer in attached)]
             if not edges:
-                # A body held by rods alone gets six freedoms; joints continue the tree from it.
-                name = next(n for n in (self.machine.platform, *bodies) if n not in hung)
-                self.hang(name, BASE, bodies[name].com, None, bodies[name])
-                hung.add(name)
+                # A body that only rods hold gets six freedoms; the tree continues from it.
+                name = next(n for n in (self.machine.platform, *bodies) if n not in attached)
+                self.add_body(name, BASE, bodies[name].com, None, bodies[name])
+                attached.add(name)
                 continue
             if self.widest:
                 joint = max(edges, key=lambda j: (j.actuated, len(j.steps), joints.index(j)))
             else:
                 joint = min(edges, key=lambda j: (not j.actuated, len(j.steps)))
             joints.remove(joint)
-            back = joint.outer in hung
+            back = joint.outer in attached
             parent, child = (joint.outer, joint.inner) if back else (joint.inner, joint.outer)
             steps = [(turns, -axis) for turns, axis in joint.steps[::-1]] if back else joint.steps
-            self.hang(child, parent, joint.at, steps, bodies[child])
-            hung.add(child)
+            self.add_body(child, parent, joint.at, steps, bodies[child])
+            attached.add(child)
             if joint.type.threaded():
                 self._held.append((joint, ("thread",)))
         self._held += [(joint, joint.type.holds) for joint in joints]
@@ -61,13 +71,13 @@ class Tree(Moving):
             unit = (rod.ends[1] - rod.ends[0]) / rod.length
             turning = rod.mass * rod.length**2 / 12 * (np.eye(3) - np.outer(unit, unit))
             body = Body(rod.mass, rod.ends.mean(0), turning)
-            hinges = [(True, axis) for axis in across(unit)]
-            self.hang(_rod_body_name(rod), rod.inner, rod.ends[0], hinges, body)
+            hinges = [(True, axis) for axis in make_perpendicular_axes(unit)]
+            self.add_body(_rod_body_name(rod), rod.inner, rod.ends[0], hinges, body)
         self.size = self.finish()
         self._assembled: dict[bytes, Array] = {}
 
     @abstractmethod
-    def hang(self, name: str, parent: str, at: Array, steps: Steps | None, body: Body) -> None:
+    def add_body(self, name: str, parent: str, at: Array, steps: Steps | None, body: Body) -> None:
         """Add a body to its parent by joints through a point at home; None: six freedoms."""
 
     @abstractmethod
@@ -79,7 +89,7 @@ class Tree(Moving):
         """Set the tree's configuration and velocities, shape (size,)."""
 
     @abstractmethod
-    def stepped(self, full: Array, step: Array) -> Array:
+    def step_from(self, full: Array, step: Array) -> Array:
         """Return the configuration after a small motion, shape (size,)."""
 
     @abstractmethod
@@ -103,37 +113,37 @@ class Tree(Moving):
         """
         q = np.asarray(q, dtype=float)
         if q.tobytes() not in self._assembled:
-            # Caching one state is enough: all quantities are computed state by state.
-            self._assembled = {q.tobytes(): self._follow(q - self.machine.home)}
+            # One cached state is enough, because all quantities of a state are computed in a row.
+            self._assembled = {q.tobytes(): self._continue_to(q - self.machine.home)}
         full = self._assembled[q.tobytes()]
-        self._at(full)
+        self._set_at_rest(full)
         return full
 
     def move(self, rates: Array) -> None:
         """Set the velocities of the present assembly, shape (size,)."""
         self.place(self._full, rates)
 
-    def _at(self, full: Array) -> None:
+    def _set_at_rest(self, full: Array) -> None:
         self._full = full
         self.place(full, np.zeros(self.size))
 
-    def _follow(self, way: Array) -> Array:
+    def _continue_to(self, goal: Array) -> Array:
         full, steps = self.neutral(), 64
         for number in range(1, steps + 1):
-            self._at(full)
-            full = self.stepped(full, self.tangent() @ way / steps)
-            full = self._close(full, way * number / steps, f"{number} / {steps}")
+            self._set_at_rest(full)
+            full = self.step_from(full, self.tangent() @ goal / steps)
+            full = self._close_loops(full, goal * number / steps, f"{number} / {steps}")
         return full
 
-    def _close(self, full: Array, way: Array, fraction: str) -> Array:
+    def _close_loops(self, full: Array, goal: Array, fraction: str) -> Array:
         last = math.inf
         for _ in range(12):
-            self._at(full)
-            step = self.solve(-self.closures().value, self.missing(way))
+            self._set_at_rest(full)
+            step = self.solve(-self.closures().value, self.remaining_motion(goal))
             length = float(np.abs(step).max())
             if length > min(last / 2, 0.3):
                 break
-            full, last = self.stepped(full, step), length
+            full, last = self.step_from(full, step), length
             if length < 1e-15:
                 break
         if last > 1e-12:

@@ -43,7 +43,7 @@ def doubles(values: ArrayLike, what: str = "values") -> Array:
         raise ValueError(f"{what} are not an array: rows of different lengths") from None
     if array.dtype.kind == "O" and all(map(_is_real, array.flat)):
         # Fractions, decimals, integers beyond 64 bits; an overflow becomes infinity.
-        array = np.array([_double(value) for value in array.flat]).reshape(array.shape)
+        array = np.array([_convert_to_double(value) for value in array.flat]).reshape(array.shape)
     if array.dtype.kind not in "fiu":
         kind = type(values).__name__ if array.dtype.kind == "O" else array.dtype.name
         raise ValueError(f"{what} have to be real numbers, not {kind}")
@@ -55,7 +55,7 @@ def _is_real(value: Any) -> bool:
     return isinstance(value, (Real, Decimal)) and not isinstance(value, (bool, np.bool_))
 
 
-def _double(value: Any) -> float:
+def _convert_to_double(value: Any) -> float:
     try:
         return float(value)
     except OverflowError:
@@ -81,7 +81,7 @@ def vectors(values: ArrayLike, size: int, what: str) -> Array:
 def finite(result: NDArray[Any], cause: str) -> Array:
     """Check that a result is finite and return it as float64.
 
-    :param cause: the input that would be to blame, for the error.
+    :param cause: the input that the error names.
     :raises ValueError: an entry is not finite.
     """
     if not np.isfinite(result).all():
@@ -98,9 +98,9 @@ def one_vector(values: ArrayLike, size: int, what: str) -> Array:
 
 
 def common_batch(*batches: tuple[int, ...]) -> tuple[int, ...]:
-    """Return the batch axes of inputs together.
+    """Return the shape of the batch to which all inputs broadcast.
 
-    :raises ValueError: batches of different sizes, of which none is one sample.
+    :raises ValueError: batches of different sizes above one.
     """
     try:
         return np.broadcast_shapes(*batches)
@@ -109,7 +109,7 @@ def common_batch(*batches: tuple[int, ...]) -> tuple[int, ...]:
         raise ValueError(f"batches of {found} samples; expected the same of every input, or one sample") from None
 
 
-def later(time: float, last: float | None) -> float:
+def check_later(time: float, last: float | None) -> float:
     """Check that the time of a sample is later than that of the sample before; return it, s.
 
     :param last: time of the sample before, s; None for the first sample.

@@ -19,12 +19,12 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final
 
-VARIABLE: Final = "PKM_TWIN_CACHE"
+FOLDER_VARIABLE: Final = "PKM_TWIN_CACHE"
 """Environment variable with the cache folder; an empty value turns the cache off."""
-_MARK: Final = b"pkm_twin compiled program 2\n"
+MAGIC: Final = b"pkm_twin compiled program 2\n"
 _ELF: Final = struct.Struct("<4s36xQ10xHH2x")
 """ELF header: magic bytes, offset of the section table, size of an entry, number of entries."""
-_LARGEST: Final = 64 * 1024 * 1024
+MAX_PROGRAM_BYTES: Final = 64 * 1024 * 1024
 MAX_BYTES: Final = 512 * 1024 * 1024
 """Size of the cache, bytes, above which the least recently used programs are deleted."""
 LOCK_TIMEOUT: Final = 60.0
@@ -34,36 +34,36 @@ _NAME: Final = re.compile("[0-9a-f]{32,64}")
 _LOG: Final = logging.getLogger("pkm_twin")
 
 
-class _Said:
+class _WarnedOnce:
     once = False
 
 
-def folder() -> Path | None:
-    """Return the cache folder, made if needed; None if there can be none."""
-    named = os.environ.get(VARIABLE)
+def find_folder() -> Path | None:
+    """Return the cache folder, created if needed; None if there is none that is safe and writable."""
+    named = os.environ.get(FOLDER_VARIABLE)
     if named == "":
         return None
     try:
         base = os.environ.get("XDG_CACHE_HOME")
         place = Path(named or (Path(base) if base else Path.home() / ".cache") / "pkm_twin")
         place.mkdir(mode=0o700, parents=True, exist_ok=True)
-        # Code that another user could have placed there must not run.
+        # Do not run code that another user may have stored there.
         if place.stat().st_uid != os.geteuid() or place.stat().st_mode & 0o022:
             raise PermissionError(f"{place} can be written by others")
         if not os.access(place, os.W_OK):
             raise PermissionError(f"{place} is read-only")
     except (OSError, RuntimeError) as error:
-        say_once(error)
+        warn_once(error)
         return None
     return place
 
 
-def say_once(error: BaseException) -> None:
+def warn_once(error: BaseException) -> None:
     """Warn once per process that programs are not cached."""
-    if not _Said.once:
-        _Said.once = True
+    if not _WarnedOnce.once:
+        _WarnedOnce.once = True
         text = str(error) or type(error).__name__
-        _LOG.warning("compiled programs are not kept: %s; set %s to a folder", text, VARIABLE)
+        _LOG.warning("compiled programs are not kept: %s; set %s to a folder", text, FOLDER_VARIABLE)
 
 
 def digest(*parts: str) -> str:
@@ -76,22 +76,22 @@ def read(name: str) -> tuple[dict[str, Any], bytes] | None:
 
     The file must belong to this user, be complete, and carry the checksum of this name.
     """
-    place = folder()
+    place = find_folder()
     if place is None or not _NAME.fullmatch(name):
         return None
     try:
         # Without O_NONBLOCK a FIFO of this name would block until somebody writes to it.
         with open(os.open(place / name, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
-            if not _own(os.fstat(file.fileno())):
+            if not _is_owned_by_user(os.fstat(file.fileno())):
                 return None
-            data = file.read(_LARGEST)
-            # The modification time is the time of the last use; :func:`_shrink` sorts by it.
+            data = file.read(MAX_PROGRAM_BYTES)
+            # The modification time is the time of the last use; :func:`_delete_oldest` sorts by it.
             with suppress(OSError):
                 os.utime(file.fileno())
     except OSError:
         return None
-    seal = len(_MARK) + 32
-    if not data.startswith(_MARK) or hashlib.sha256(data[seal:]).digest() != data[len(_MARK) : seal]:
+    seal = len(MAGIC) + 32
+    if not data.startswith(MAGIC) or hashlib.sha256(data[seal:]).digest() != data[len(MAGIC) : seal]:
         return None
     head, _, code = data[seal:].partition(b"\n")
     try:
@@ -103,7 +103,7 @@ def read(name: str) -> tuple[dict[str, Any], bytes] | None:
     return header, code
 
 
-def _own(status: os.stat_result) -> bool:
+def _is_owned_by_user(status: os.stat_result) -> bool:
     """Return whether a file is a regular file that only this user can have written."""
     return stat.S_ISREG(status.st_mode) and status.st_uid == os.geteuid() and not status.st_mode & 0o022
 
@@ -123,7 +123,7 @@ def is_object(code: bytes, symbol: str) -> bool:
 
 def write(name: str, header: Mapping[str, Any], code: bytes) -> None:
     """Store a program atomically: temporary file, then rename."""
-    place = folder()
+    place = find_folder()
     if place is None:
         return
     body = json.dumps({**header, "name": name}).encode() + b"\n" + code
@@ -131,23 +131,23 @@ def write(name: str, header: Mapping[str, Any], code: bytes) -> None:
     try:
         handle, temporary = tempfile.mkstemp(dir=place)
         with os.fdopen(handle, "wb") as file:
-            file.write(_MARK + hashlib.sha256(body).digest() + body)
+            file.write(MAGIC + hashlib.sha256(body).digest() + body)
         os.replace(temporary, place / name)
-        _shrink(place, len(_MARK) + 32 + len(body))
+        _delete_oldest(place, len(MAGIC) + 32 + len(body))
     except OSError as error:
-        say_once(error)
+        warn_once(error)
         if temporary is not None:
             with suppress(OSError):
                 os.unlink(temporary)
 
 
 @contextmanager
-def alone(name: str) -> Iterator[None]:
-    """Hold a lock so that no other process compiles the same program meanwhile.
+def lock_program(name: str) -> Iterator[None]:
+    """Hold the lock of a program, so that no other process compiles it meanwhile.
 
-    Go on without the lock if it cannot be made or is not free within :data:`LOCK_TIMEOUT`.
+    Continue without the lock if it cannot be created or is not free within :data:`LOCK_TIMEOUT`.
     """
-    place = folder()
+    place = find_folder()
     handle = None
     if place is not None:
         with suppress(OSError):
@@ -163,24 +163,24 @@ def alone(name: str) -> Iterator[None]:
         yield
     finally:
         if handle is not None:
-            # A process that waits for the deleted file finds the stored program, as any later one.
+            # A process that waits for this lock, on the deleted file, then finds the stored program.
             with suppress(OSError):
                 os.unlink(path)
             os.close(handle)
 
 
-_sizes: Final[dict[Path, int]] = {}
-"""Size of each cache when this process listed it, and what it has written since, bytes."""
+_known_sizes: Final[dict[Path, int]] = {}
+"""Known size of each cache folder, bytes: when this process listed it, plus what it wrote since."""
 
 
-def _shrink(place: Path, written: int) -> None:
+def _delete_oldest(place: Path, written: int) -> None:
     """Delete the least recently used programs until half of :data:`MAX_BYTES` is left.
 
-    The folder, which may hold many thousands, is listed at a process's first write and when what
-    the process knows of is above the limit.
+    The folder may hold many thousands of files. It is listed at a process's first write, and when the
+    size that the process knows is above the limit.
     """
-    if place in _sizes and _sizes[place] + written <= MAX_BYTES:
-        _sizes[place] += written
+    if place in _known_sizes and _known_sizes[place] + written <= MAX_BYTES:
+        _known_sizes[place] += written
         return
     files = []
     with os.scandir(place) as entries:
@@ -188,7 +188,7 @@ def _shrink(place: Path, written: int) -> None:
             with suppress(OSError):
                 status = entry.stat(follow_symlinks=False)
                 files.append((status.st_mtime_ns, status.st_size, entry.path))
-    left = _sizes[place] = sum(size for _, size, _ in files)
+    left = _known_sizes[place] = sum(size for _, size, _ in files)
     if left <= MAX_BYTES:
         return
     for _, size, path in sorted(files):
@@ -197,4 +197,4 @@ def _shrink(place: Path, written: int) -> None:
         # Another process may have deleted the file already.
         with suppress(OSError):
             os.unlink(path)
-        left = _sizes[place] = left - size
+        left = _known_sizes[place] = left - size

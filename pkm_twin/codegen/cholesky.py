@@ -74,19 +74,19 @@ class SparseCholesky:
 
 def _minimum_degree_order(matrix: Mapping[tuple[int, int], Any], n: int, last: int) -> list[int]:
     """Return the elimination order: least degree first; the first ``last`` rows at the end."""
-    near: dict[int, set[int]] = {a: set() for a in range(n)}
+    neighbours: dict[int, set[int]] = {a: set() for a in range(n)}
     for a, b in matrix:
         if a != b:
-            near[a].add(b)
-            near[b].add(a)
+            neighbours[a].add(b)
+            neighbours[b].add(a)
     order = []
-    while len(near) > last:
-        best = min((a for a in near if a >= last), key=lambda a: (len(near[a]), a))
+    while len(neighbours) > last:
+        best = min((a for a in neighbours if a >= last), key=lambda a: (len(neighbours[a]), a))
         order.append(best)
-        around = near.pop(best)
-        for a in around:
-            near[a] = (near[a] | around) - {a, best}
-    return [*order, *near]
+        adjacent = neighbours.pop(best)
+        for a in adjacent:
+            neighbours[a] = (neighbours[a] | adjacent) - {a, best}
+    return [*order, *neighbours]
 
 
 def trace_over(numerator: Objects, matrix: Objects) -> Any:

@@ -30,16 +30,15 @@ STEPS: Final = (3, 9, 27, 81, 243, 1024)
 """Numbers of steps in which samples that a single step does not reach are tried again."""
 
 
-GOOD: Final = 0.0
-REFUSED: Final = 1.0
+VALID: Final = 0.0
+REJECTED: Final = 1.0
 NOT_FINITE: Final = 2.0
-
-
+"""Status of a sample: 1 if no assembly was found, 2 if an input or a result is not finite."""
 MAX_NUMBERS: Final = 1_000_000
 """Upper limit of the numbers in an input, an output or the parameters."""
-SMALL: Final = 4096
+MAX_BUFFERED_SAMPLES: Final = 4096
 """Largest batch, samples, that is copied into a preallocated buffer."""
-KEPT_ROOMS: Final = 16
+MAX_BUFFER_SIZES: Final = 16
 """Number of batch sizes whose buffers are kept."""
 
 
@@ -48,7 +47,7 @@ _NO_INPUT: Final = np.zeros(0)
 
 
 @remembered
-def _llvm() -> ModuleType | None:
+def _import_llvm() -> ModuleType | None:
     if os.environ.get(SWITCH, "0") not in ("", "0"):
         return None
     try:
@@ -60,11 +59,11 @@ def _llvm() -> ModuleType | None:
 
 def compiled() -> bool:
     """Return whether programs are compiled; otherwise they run as plain Python."""
-    return _llvm() is not None
+    return _import_llvm() is not None
 
 
 def slowness() -> str:
-    """Return why programs run as plain Python and what to do; empty where they are compiled."""
+    """Return why programs run as plain Python and what to do; empty if they are compiled."""
     if compiled():
         return ""
     if os.environ.get(SWITCH, "0") not in ("", "0"):
@@ -75,12 +74,12 @@ def slowness() -> str:
     )
 
 
-def _axes(array: Array) -> int:
+def _count_axes(array: Array) -> int:
     return array.ndim
 
 
-class Space:
-    """Preallocated inputs, outputs and status of a kernel, where compiled code expects them.
+class KernelBuffers:
+    """Preallocated inputs, outputs and status of a kernel, with their addresses for compiled code.
 
     Each has shape (size,), or (samples, size) for several samples. ``words``: the argument of the
     kernel, see :func:`.llvm.emit`.
@@ -106,47 +105,47 @@ class Space:
         self.prepared: Array | None = None
 
     def point_at(self, prepared: Array) -> None:
-        """Use prepared parameters; hold a reference, so that their memory stays allocated."""
+        """Use prepared parameters; keep a reference, so that their memory stays allocated."""
         self.prepared = prepared
         self.words[3] = prepared.ctypes.data
 
-    def takers(self) -> list[memoryview]:
+    def input_views(self) -> list[memoryview]:
         """Return views of one sample's inputs; they accept only doubles of the exact length."""
         return [memoryview(view.data) for view in self.inputs]
 
 
 @remembered
-def caller(inputs: int, outputs: int) -> Callable[..., Any]:
-    """Write a maker of fast calls with this number of inputs, without a loop over them.
+def make_fast_call(inputs: int, outputs: int) -> Callable[..., Any]:
+    """Return a maker of fast calls for this number of inputs, written without a loop over the inputs.
 
     A call returns the first output; with ``outputs`` above zero a list of all outputs, and None for
     the status. Each call takes a free buffer, so that threads do not share one.
     """
     names = [f"a{k}" for k in range(inputs)]
-    given, takers = ", ".join(names), ", ".join(f"t{k}" for k in range(inputs))
+    arguments, input_views = ", ".join(names), ", ".join(f"t{k}" for k in range(inputs))
     copies = [f"c{k}" for k in range(outputs or 1)]
     results = ", ".join(f"{copy}()" for copy in copies)
     lines = [
         "def make(code, room, array, otherwise):",
         "    free = []",
         "    take, give = free.pop, free.append",
-        f"    def call({given}):",
+        f"    def call({arguments}):",
         # Masked arrays are excluded: their buffer does not show the mask.
         f"        if not ({' is '.join(['array', *(f'type({name})' for name in names)])}) or a0.ndim != 1:",
-        f"            return otherwise({given})",
+        f"            return otherwise({arguments})",
         "        try:",
         "            place = take()",
         "        except IndexError:",
         "            place = room()",
-        f"        {takers}, {', '.join(copies)}, address, _ = place",
+        f"        {input_views}, {', '.join(copies)}, address, _ = place",
         "        try:",
         *(f"            t{k}[:] = a{k}" for k in range(inputs)),
         "        except (TypeError, ValueError):",
         "            give(place)",
-        f"            return otherwise({given})",
+        f"            return otherwise({arguments})",
         "        if code(address):",
         "            give(place)",
-        f"            return otherwise({given})",
+        f"            return otherwise({arguments})",
         f"        result = {f'[{results}], None' if outputs else results}",
         "        give(place)",
         "        return result",
@@ -160,15 +159,15 @@ def caller(inputs: int, outputs: int) -> Callable[..., Any]:
 
 def aligned(rows: int, size: int) -> Array:
     """Allocate an array aligned to 64 bytes, so that no vector straddles two cache lines."""
-    room = np.empty(rows * size + 8)
-    start = -room.ctypes.data % 64 // 8
-    return room[start : start + rows * size].reshape(rows, size)
+    memory = np.empty(rows * size + 8)
+    start = -memory.ctypes.data % 64 // 8
+    return memory[start : start + rows * size].reshape(rows, size)
 
 
 class Code:
     """A program that runs over batches of samples, for one machine or many.
 
-    Expressions of parameters alone are computed once per machine, see :meth:`prepare`.
+    Expressions of parameters are computed once per machine, see :meth:`prepare`.
 
     :param build: writes the program; called only if no compiled program is cached.
     :param key: the program's identity.
@@ -177,7 +176,7 @@ class Code:
     def __init__(self, build: Callable[[], Program], key: ProgramKey) -> None:
         self.build, self.key = build, key
         self._lock = threading.Lock()
-        self._spaces: dict[int, list[Space]] = {}
+        self._free_buffers: dict[int, list[KernelBuffers]] = {}
         """Free buffers by their number of samples."""
 
     @cached_property
@@ -188,19 +187,19 @@ class Code:
     @cached_property
     def _loaded(self) -> tuple[dict[str, Any], Any, Any, Any]:
         """Sizes, then the functions that prepare parameters, run batches and run one sample."""
-        llvm = _llvm()
+        llvm = _import_llvm()
         with self._lock:
             if llvm is None:
                 plain = PlainCode(self.program)
-                return _header(self.program, 1), plain.prepare, plain, None
+                return _make_header(self.program, 1), plain.prepare, plain, None
             from pkm_twin.codegen import native
 
-            header, code = self._compiled(llvm, native)
+            header, code = self._load_or_compile(llvm, native)
             prepare, address = native.load_object(code)
             prepare = native.LOCKED(prepare)
             return header, prepare, native.PROTOTYPE(address), native.LOCKED(address)
 
-    def _compiled(self, llvm: ModuleType, native: ModuleType) -> tuple[dict[str, Any], bytes]:
+    def _load_or_compile(self, llvm: ModuleType, native: ModuleType) -> tuple[dict[str, Any], bytes]:
         """Return sizes and object code from the cache, or compile them.
 
         The key's digest leads to the digest of the LLVM assembly, and that to the object code: a
@@ -209,15 +208,15 @@ class Code:
         source = self.key.digest(llvm.IDENTITY)
         match cache.read(source):
             case ({"program": str(name), **more}, b"") if not more:
-                stored = _stored(name, native.SYMBOL)
+                stored = _read_cached(name, native.SYMBOL)
                 if stored is not None:
                     return stored
-        header = _header(self.program, llvm.LANES)
+        header = _make_header(self.program, llvm.LANES)
         level = native.QUICK if self.program.quick else native.OPTIMISATION
         text = llvm.emit(self.program)
         name = cache.digest(text, repr(header), str(level), llvm.IDENTITY)
-        with cache.alone(name):
-            stored = _stored(name, native.SYMBOL)
+        with cache.lock_program(name):
+            stored = _read_cached(name, native.SYMBOL)
             if stored is None:
                 stored = header, native.compile_object(text, level)
                 cache.write(name, *stored)
@@ -231,7 +230,7 @@ class Code:
         return tuple(header["inputs"]), tuple(header["outputs"])
 
     def prepare(self, p: Array) -> Array:
-        """Compute the expressions of parameters alone.
+        """Compute the expressions of parameters for later samples.
 
         :param p: parameters of k machines, shape (k, parameters), contiguous, or of one machine,
             (parameters,).
@@ -269,7 +268,7 @@ class Code:
         :raises ValueError: an input is not real numbers, its last axis has another size, or batches differ.
         """
         arrays = self.checked(inputs)
-        shape = max(arrays, key=_axes, default=_NO_INPUT).shape[:-1]
+        shape = max(arrays, key=_count_axes, default=_NO_INPUT).shape[:-1]
         if shape and not all([a.ndim == 1 or a.shape[:-1] == shape for a in arrays]):
             shape = common_batch(*(a.shape[:-1] for a in arrays))
             arrays = [
@@ -279,46 +278,46 @@ class Code:
         if count == 0:
             return [np.empty((*shape, size)) for size in self.sizes[1]], None
         _, _, code, locked = self._loaded
-        if locked is not None and count <= SMALL:
-            # Copying into a buffer costs less than reading the arrays' addresses.
-            space = self._room(prepared, count)
+        if locked is not None and count <= MAX_BUFFERED_SAMPLES:
+            # For few samples, copying into a buffer takes less time than reading the arrays' addresses.
+            space = self._take_buffers(prepared, count)
             for view, a in zip(space.inputs, arrays, strict=True):
                 view[...] = a if a.ndim <= 2 else a.reshape(count, -1)
             bad = (locked if count == 1 else code)(space.address)
             outputs = [view.copy() for view in space.outputs]
             status = space.status.reshape(count, 2).copy() if bad else None
-            self._give(space, count)
+            self._release_buffers(space, count)
         else:
-            outputs, status = self._run(prepared[None], _rows(arrays, count), count, 1)
+            outputs, status = self._run(prepared[None], _make_rows(arrays, count), count, 1)
         if status is not None:
             flat = [output.reshape(count, -1) for output in outputs]
-            status = self._retried(prepared[None], _rows(arrays, count), flat, status, count)
+            status = self._retry_in_steps(prepared[None], _make_rows(arrays, count), flat, status, count)
         if locked is None or len(shape) != (count > 1):
             outputs = [output.reshape(*shape, -1) for output in outputs]
         return outputs, None if status is None else status.reshape(*shape, 2)
 
-    def _room(self, prepared: Array, count: int) -> Space:
-        """Take a buffer for ``count`` samples; :meth:`_give` returns it to the pool."""
-        free = self._spaces.get(count)
+    def _take_buffers(self, prepared: Array, count: int) -> KernelBuffers:
+        """Take a buffer for ``count`` samples; :meth:`_release_buffers` returns it to the pool."""
+        free = self._free_buffers.get(count)
         if free is None:
-            if len(self._spaces) >= KEPT_ROOMS:
-                self._spaces = {}
-            free = self._spaces[count] = []
+            if len(self._free_buffers) >= MAX_BUFFER_SIZES:
+                self._free_buffers = {}
+            free = self._free_buffers[count] = []
         try:
             space = free.pop()
         except IndexError:
-            space = Space(*self.sizes, count)
+            space = KernelBuffers(*self.sizes, count)
         if prepared is not space.prepared:
             space.point_at(prepared)
         return space
 
-    def _give(self, space: Space, count: int) -> None:
+    def _release_buffers(self, space: KernelBuffers, count: int) -> None:
         """Return a buffer to the pool; drop it if the pool no longer keeps this size."""
-        free = self._spaces.get(count)
+        free = self._free_buffers.get(count)
         if free is not None:
             free.append(space)
 
-    def run_each(self, prepared: Array, *inputs: Array) -> tuple[list[Array], Array | None]:
+    def run_machines(self, prepared: Array, *inputs: Array) -> tuple[list[Array], Array | None]:
         """Evaluate the program for k machines, each with its own parameters.
 
         :param prepared: shape (k, prepared).
@@ -334,7 +333,7 @@ class Code:
         prepared = np.ascontiguousarray(prepared)
         outputs, status = self._run(prepared, rows, count, 1)
         if status is not None:
-            status = self._retried(prepared, rows, outputs, status, count)
+            status = self._retry_in_steps(prepared, rows, outputs, status, count)
         shaped = [output.reshape(machines, count, -1) for output in outputs]
         return shaped, None if status is None else status.reshape(machines, count, 2)
 
@@ -360,17 +359,17 @@ class Code:
             return otherwise
         sizes = self.sizes
 
-        def room() -> tuple[Any, ...]:
-            space = Space(*sizes)
+        def make_buffers() -> tuple[Any, ...]:
+            space = KernelBuffers(*sizes)
             space.point_at(prepared)
             copies = (view.copy for view in space.outputs[: outputs or 1])
-            return (*space.takers(), *copies, space.address, space)
+            return (*space.input_views(), *copies, space.address, space)
 
-        make = caller(len(sizes[0]), outputs)
-        call: Callable[..., Any] = make(code, room, np.ndarray, otherwise)
+        make = make_fast_call(len(sizes[0]), outputs)
+        call: Callable[..., Any] = make(code, make_buffers, np.ndarray, otherwise)
         return call
 
-    def _retried(
+    def _retry_in_steps(
         self,
         prepared: Array,
         rows: Sequence[Array],
@@ -378,24 +377,24 @@ class Code:
         status: Array,
         count: int,
     ) -> Array | None:
-        """Solve refused samples again in more and more steps; return the status after it.
+        """Solve rejected samples again, each time in more steps; return the final status.
 
         Outputs are replaced in place; the status is None if all samples are good.
         """
         for steps in STEPS:
-            left = np.flatnonzero(status[:, 0] == REFUSED)
-            if not len(left) or not self._loaded[0]["stepped"]:
+            rejected = np.flatnonzero(status[:, 0] == REJECTED)
+            if not len(rejected) or not self._loaded[0]["stepped"]:
                 break
-            machines, samples = np.divmod(left, count)
+            machines, samples = np.divmod(rejected, count)
             for machine in np.unique(machines) if len(prepared) > 1 else [0]:
-                own = left[machines == machine] if len(prepared) > 1 else left
+                indices = rejected[machines == machine] if len(prepared) > 1 else rejected
                 at = samples[machines == machine] if len(prepared) > 1 else samples
-                picked = [row[machine if len(row) > 1 else 0][at if row.shape[1] > 1 else [0]][None] for row in rows]
-                alone = prepared[machine : machine + 1]
-                found, again = self._run(alone, picked, len(own), steps)
-                for output, values in zip(outputs, found, strict=True):
-                    output[own] = values
-                status[own] = np.array([GOOD, 1.0]) if again is None else again
+                inputs = [row[machine if len(row) > 1 else 0][at if row.shape[1] > 1 else [0]][None] for row in rows]
+                parameters = prepared[machine : machine + 1]
+                values_found, again = self._run(parameters, inputs, len(indices), steps)
+                for output, values in zip(outputs, values_found, strict=True):
+                    output[indices] = values
+                status[indices] = np.array([VALID, 1.0]) if again is None else again
         return status if status[:, 0].any() else None
 
     def _run(self, prepared: Array, rows: Sequence[Array], count: int, steps: int) -> tuple[list[Array], Array | None]:
@@ -406,40 +405,40 @@ class Code:
                 code.run(one, [row[k if len(row) > 1 else 0] for row in rows], count, steps)
                 for k, one in enumerate(prepared)
             ]
-            status = np.concatenate([part[1] for part in parts])
-            outputs = [np.concatenate([part[0][k] for part in parts]) for k in range(len(header["outputs"]))]
+            status = np.concatenate([run_part[1] for run_part in parts])
+            outputs = [np.concatenate([run_part[0][k] for run_part in parts]) for k in range(len(header["outputs"]))]
             return outputs, status if status[:, 0].any() else None
         outputs = [np.empty((machines * count, size)) for size in header["outputs"]]
         status = np.empty((machines * count, 2))
 
-        def part(begin: int, end: int) -> bool:
+        def run_part(begin: int, end: int) -> bool:
             """Compute some machines, or samples of a single one; return whether one failed."""
             many = machines > 1
             size = (end - begin, count) if many else (1, end - begin)
             own = prepared[begin:] if many else prepared
             words = [*size, steps, own.ctypes.data, prepared.shape[1]]
             for row in rows:
-                # Stride 0: one sample, or one machine, for all.
-                leap, every = (row.strides[k] // 8 if row.shape[k] > 1 else 0 for k in (0, 1))
-                at = begin * (leap if many else every)
-                words += [row.ctypes.data + 8 * at, every, leap]
+                # Stride 0: the same input for all samples, or for all machines.
+                machine_stride, sample_stride = (row.strides[k] // 8 if row.shape[k] > 1 else 0 for k in (0, 1))
+                at = begin * (machine_stride if many else sample_stride)
+                words += [row.ctypes.data + 8 * at, sample_stride, machine_stride]
             at = begin * count if many else begin
             words += [array[at:].ctypes.data for array in [*outputs, status]]
             # The name keeps the array alive while the compiled code reads it.
-            told = np.array(words, np.int64)
-            return bool(code(told.ctypes.data))
+            argument = np.array(words, np.int64)
+            return bool(code(argument.ctypes.data))
 
-        whole = machines if machines > 1 else count
-        bad = in_parts(part, whole, machines * count)
+        count_of_parts = machines if machines > 1 else count
+        bad = run_in_threads(run_part, count_of_parts, machines * count)
         return outputs, status if bad else None
 
 
-def _rows(arrays: Sequence[Array], count: int) -> list[Array]:
+def _make_rows(arrays: Sequence[Array], count: int) -> list[Array]:
     """Convert arrays to contiguous rows, shape (1, 1 or count, size)."""
     return [np.ascontiguousarray(a).reshape(1, 1 if a.ndim == 1 else count, a.shape[-1]) for a in arrays]
 
 
-def _header(program: Program, lanes: int) -> dict[str, Any]:
+def _make_header(program: Program, lanes: int) -> dict[str, Any]:
     return {
         "inputs": list(program.inputs.values()),
         "outputs": [len(row) for row in program.outputs.values()],
@@ -449,15 +448,15 @@ def _header(program: Program, lanes: int) -> dict[str, Any]:
     }
 
 
-def _stored(name: str, symbol: str) -> tuple[dict[str, Any], bytes] | None:
+def _read_cached(name: str, symbol: str) -> tuple[dict[str, Any], bytes] | None:
     """Read a cached program's sizes and object code; None if there is none that can run."""
     stored = cache.read(name)
-    good = stored is not None and _sound(stored[0]) and cache.is_object(stored[1], symbol)
+    good = stored is not None and _is_valid_header(stored[0]) and cache.is_object(stored[1], symbol)
     return stored if good else None
 
 
-def _sound(header: dict[str, Any]) -> bool:
-    """Return whether a cached header has the form that :func:`_header` writes."""
+def _is_valid_header(header: dict[str, Any]) -> bool:
+    """Return whether a cached header has the form that :func:`_make_header` writes."""
     match header:
         case {
             "inputs": [*taken],
@@ -473,8 +472,8 @@ def _sound(header: dict[str, Any]) -> bool:
 
 THREADS: Final = "PKM_TWIN_THREADS"
 """Environment variable: threads for a large batch; 1 unless set, 0 for all cores."""
-WORTH: Final = 4096
-"""Smallest number of samples for which starting a thread saves time."""
+MIN_SAMPLES_PER_THREAD: Final = 4096
+"""Smallest number of samples per thread for which starting it saves time."""
 
 
 def threads() -> int:
@@ -488,19 +487,19 @@ def threads() -> int:
     return int(text) or len(os.sched_getaffinity(0))
 
 
-def in_parts(part: Callable[[int, int], bool], whole: int, samples: int) -> bool:
-    """Compute ``part(begin, end)`` over range ``whole`` in threads; return whether any is True.
+def run_in_threads(part: Callable[[int, int], bool], size: int, samples: int) -> bool:
+    """Compute ``part(begin, end)`` over range ``size`` in threads; return whether any is True.
 
     :param samples: total number of samples, which decides the number of threads.
     """
-    count = min(whole, samples // WORTH)
+    count = min(size, samples // MIN_SAMPLES_PER_THREAD)
     if count > 1:
         count = min(count, threads())
     if count <= 1:
-        return part(0, whole)
-    ends = [whole * k // count for k in range(count + 1)]
-    # The threads belong to this call: a lasting pool would be missing in a forked process.
-    with ThreadPoolExecutor(count - 1) as others:
-        rest = [others.submit(part, *pair) for pair in pairwise(ends[1:])]
+        return part(0, size)
+    ends = [size * k // count for k in range(count + 1)]
+    # A lasting pool would not exist in a forked process, so each call starts its own threads.
+    with ThreadPoolExecutor(count - 1) as pool:
+        futures = [pool.submit(part, *pair) for pair in pairwise(ends[1:])]
         bad = part(0, ends[1])
-        return any([one.result() for one in rest]) or bad
+        return any([one.result() for one in futures]) or bad

@@ -52,7 +52,7 @@ class Tape:
 
     :param reference: reference values of the geometry. Expressions of the geometry alone have a
         value there, and :func:`snapped` may replace them by a constant.
-    :param free: replace nothing by constants, as for derivatives with respect to the geometry.
+    :param free: never replace expressions by constants, as derivatives by the geometry need.
     """
 
     def __init__(self, reference: Sequence[float] = (), *, free: bool = False) -> None:
@@ -200,7 +200,7 @@ class Expression:
 
 
 SNAP: Final = 1e-14
-"""Largest rounding error of numbers that should be 0, 1 or -1: some fifty units of 2.2e-16."""
+"""Largest difference from 0, 1 or -1 that counts as rounding: some fifty units of 2.2e-16."""
 
 
 def reference(value: Any) -> float:
@@ -264,7 +264,7 @@ def snapped(value: Any) -> Any:
     return value
 
 
-def ordered(results: Iterable[Expression], known: Iterable[int] = ()) -> list[Expression]:
+def list_dependencies(results: Iterable[Expression], known: Iterable[int] = ()) -> list[Expression]:
     """List all expressions that the results depend on, arguments first; stop at known numbers."""
     seen: set[int] = set(known)
     order: list[Expression] = []
@@ -288,10 +288,10 @@ def ordered(results: Iterable[Expression], known: Iterable[int] = ()) -> list[Ex
     return order
 
 
-def uses(results: Sequence[Expression]) -> dict[int, int]:
-    """Count the uses of each expression, by number; a result counts twice more."""
+def count_uses(results: Sequence[Expression]) -> dict[int, int]:
+    """Count the uses of each expression, by number; being a result counts as two uses."""
     counts: dict[int, int] = {}
-    for e in ordered(results):
+    for e in list_dependencies(results):
         for x in e.args:
             counts[x.number] = counts.get(x.number, 0) + 1
     for result in results:
@@ -300,15 +300,15 @@ def uses(results: Sequence[Expression]) -> dict[int, int]:
 
 
 def count(results: Iterable[Expression]) -> int:
-    """Count the operations per sample; expressions of parameters alone are not among them."""
-    return sum(e.level == SAMPLE and e.op is not None for e in ordered(results))
+    """Count the operations per sample, without those of expressions of parameters."""
+    return sum(e.level == SAMPLE and e.op is not None for e in list_dependencies(results))
 
 
-def edge(results: Iterable[Expression]) -> list[Expression]:
-    """List the expressions of parameters alone that are results or used by sample expressions."""
+def find_prepared(results: Iterable[Expression]) -> list[Expression]:
+    """Find the expressions that are computed once per machine: of parameters, used by samples or as results."""
     results = list(results)
     found = {e.number: e for e in results if e.level == PARAMETER}
-    for e in ordered(results):
+    for e in list_dependencies(results):
         if e.level == SAMPLE:
             found |= {x.number: x for x in e.args if x.level == PARAMETER}
     return list(found.values())
@@ -328,7 +328,7 @@ def adjoints(sums: Iterable[tuple[Any, Any]], by: Sequence[Expression]) -> list[
     for e, weight in pairs:
         bars[e.number] = bars.get(e.number, 0.0) + weight
     wanted = {e.number for e in by}
-    order = ordered([e for e, _ in pairs])
+    order = list_dependencies([e for e, _ in pairs])
     for e in order:
         if any(x.number in wanted for x in e.args):
             wanted.add(e.number)
@@ -349,7 +349,7 @@ def tangents(results: Sequence[Expression], by: Sequence[Expression], *, at_refe
         a tenth of the time of their expressions.
     """
     rows: dict[int, dict[int, Any]] = {e.number: {k: 1.0} for k, e in enumerate(by)}
-    for e in ordered(results):
+    for e in list_dependencies(results):
         if e.op is None or e.number in rows or not any(rows[x.number] for x in e.args):
             rows.setdefault(e.number, {})
             continue

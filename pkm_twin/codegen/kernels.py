@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.code import NOT_FINITE, Code, Space
+from pkm_twin.codegen.code import NOT_FINITE, Code, KernelBuffers
 from pkm_twin.codegen.program import Program
 
 MAX_GEOMETRY_MISMATCH: Final = 1e-24
@@ -21,7 +21,7 @@ _NO_GEOMETRY: Final = np.zeros(0)
 
 
 class Kernel:
-    """A program with one machine's geometry; expressions of parameters alone are computed once."""
+    """A program with one machine's geometry; expressions of parameters are computed once."""
 
     def __init__(self, code: Code, geometry: Array = _NO_GEOMETRY) -> None:
         self.code, self.geometry = code, geometry
@@ -39,7 +39,7 @@ class Kernel:
 
     @property
     def holds(self) -> bool:
-        """Whether the geometry agrees with the constants that the program assumes."""
+        """True if the geometry agrees with the constants that the program assumes."""
         p = np.zeros(self.code.parameters - len(self.geometry))
         return bool(self.code.prepare(np.concatenate([p, self.geometry]))[-1] <= MAX_GEOMETRY_MISMATCH)
 
@@ -84,10 +84,10 @@ class BoundCall:
 
     def __init__(self, kernel: Kernel, p: Array, samples: int = 1) -> None:
         self._kernel, self._p = kernel, p
-        self._space = space = Space(*kernel.sizes, samples)
+        self._space = space = KernelBuffers(*kernel.sizes, samples)
         space.point_at(kernel.prepared(p))
         self.inputs, self.outputs, self._address = space.inputs, space.outputs, space.address
-        # The interpreter lock is released for batches only: one sample is too short for it.
+        # Release the interpreter lock for batches only: for one sample that takes longer than the sample.
         code = kernel.code.functions
         self._code = None if code is None else code[samples == 1]
 

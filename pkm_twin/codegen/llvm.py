@@ -27,18 +27,18 @@ from pkm_twin.codegen.assembly import (
     Function,
     Lanes,
     Value,
+    integer_constant,
     module,
-    real,
-    undefined,
-    whole,
+    real_constant,
+    undefined_value,
 )
-from pkm_twin.codegen.expressions import GEOMETRY, PARAMETERS, Expression, ordered, uses
+from pkm_twin.codegen.expressions import GEOMETRY, PARAMETERS, Expression, count_uses, list_dependencies
 from pkm_twin.codegen.native import CPU, FEATURES, OPTIMISATION, PREPARE, QUICK, SYMBOL
 from pkm_twin.codegen.operations import fused, sub
 from pkm_twin.codegen.program import (
     AT,
-    LARGE,
     MAX_ITERATIONS,
+    MAX_SUM,
     STATE,
     Equations,
     Program,
@@ -50,18 +50,18 @@ STATUS: Final = " status"
 MAX_UNROLLED_STORES: Final = 100
 """Most entries of an output that are stored by straight-line code; more are stored in a loop."""
 
-ZERO: Final = whole(0)
-ONE: Final = whole(1)
+ZERO: Final = integer_constant(0)
+ONE: Final = integer_constant(1)
 IDENTITY: Final = f"{llvmlite.__version__} {CPU} {FEATURES} {LANES} {OPTIMISATION} {QUICK}"
-"""Everything besides the program that the machine code depends on."""
+"""Everything that the machine code depends on in addition to the program."""
 
 
 class Emitter(Lanes):
     """Writes the values of expressions at one point of the code, as scalars or in lanes.
 
-    :param used: number of uses of each expression, see :func:`uses`.
+    :param used: number of uses of each expression, see :func:`count_uses`.
     :param prepared: index in memory of each expression of parameters alone. It is loaded at every
-        use: kept in a register through the whole program it would only occupy that register.
+        use, because keeping it in a register through the whole program would occupy that register.
     :param base: address of the prepared values; None for scalar code.
     """
 
@@ -74,8 +74,8 @@ class Emitter(Lanes):
         """Return the value of an expression that was computed before."""
         if self._base is None or e.number not in self._prepared:
             return self._known[e.number]
-        place = self.b.gep(self._base, whole(self._prepared[e.number]))
-        return self.b.load(place, ALIGN)
+        place = self.function.gep(self._base, integer_constant(self._prepared[e.number]))
+        return self.function.load(place, ALIGN)
 
     def value(self, e: Expression, inputs: Mapping[str, Sequence[Value]]) -> Value:
         """Write the instructions of one expression whose arguments were computed before."""
@@ -90,27 +90,27 @@ class Emitter(Lanes):
         first, product, rest = parts
         x, y, z = [self.known(v) for v in (*product.args, rest)]
         if e.op is sub:
-            x, z = (x, self.b.fneg(z)) if first else (self.b.fneg(x), z)
+            x, z = (x, self.function.fneg(z)) if first else (self.function.fneg(x), z)
         return self.fused(x, y, z)
 
     def run(self, results: Sequence[Expression], inputs: Mapping[str, Sequence[Value]]) -> list[Value]:
         """Compute the results, every shared expression once."""
-        for e in ordered(results, {**self._known, **self._prepared}):
+        for e in list_dependencies(results, {**self._known, **self._prepared}):
             self._known[e.number] = self.value(e, inputs)
         return [self.known(e) for e in results]
 
 
-class _Counter:
+class _CountingLoop:
     """A loop whose index counts from zero to ``end``."""
 
     def __init__(self, b: Function, name: str, end: Value, step: int = 1) -> None:
-        self.b, self.end, self.step = b, end, step
+        self.function, self.end, self.step = b, end, step
         self._place = b.alloca(INT64)
         self.head, self.body, self.after = (b.block(name) for _ in range(3))
 
     def begin(self) -> Value:
         """Enter the loop; return its index."""
-        b = self.b
+        b = self.function
         b.store(ZERO, self._place)
         b.branch(self.head)
         b.go_to(self.head)
@@ -121,8 +121,8 @@ class _Counter:
 
     def close(self, more: Value | None = None) -> None:
         """End the body: repeat (only if ``more`` is true), then continue after the loop."""
-        b = self.b
-        b.store(b.add(b.load(self._place), whole(self.step)), self._place)
+        b = self.function
+        b.store(b.add(b.load(self._place), integer_constant(self.step)), self._place)
         if more is None:
             b.branch(self.head)
         else:
@@ -135,7 +135,7 @@ def _make_function(name: str) -> Function:
 
 
 def _load_word(b: Function, k: int) -> Value:
-    return b.load(b.gep(b.words, whole(k)))
+    return b.load(b.gep(b.words, integer_constant(k)))
 
 
 def _write_preparation(program: Program) -> Function:
@@ -148,21 +148,21 @@ def _write_preparation(program: Program) -> Function:
     count, stride = _load_word(b, 0), _load_word(b, 2)
     source, target = b.inttoptr(_load_word(b, 1), DOUBLE), b.inttoptr(_load_word(b, 3), DOUBLE)
     results = [*program.prepared, program.missed]
-    machines = _Counter(b, "machine", count)
+    machines = _CountingLoop(b, "machine", count)
     index = machines.begin()
     here = b.gep(source, b.mul(index, stride))
-    there = b.gep(target, b.mul(index, whole(LANES * len(results))))
-    # The geometry stands behind the program's own parameters.
+    there = b.gep(target, b.mul(index, integer_constant(LANES * len(results))))
+    # The geometry follows the program's own parameters.
     first = {PARAMETERS: 0, GEOMETRY: program.parameters}
     inputs: dict[str, dict[int, Value]] = {name: {} for name in first}
-    for e in ordered(results):
+    for e in list_dependencies(results):
         if e.source is not None:
             name, k = e.source
-            inputs[name][k] = b.load(b.gep(here, whole(first[name] + k)))
-    out = Emitter(b, uses(results), {}, None)
+            inputs[name][k] = b.load(b.gep(here, integer_constant(first[name] + k)))
+    out = Emitter(b, count_uses(results), {}, None)
     for k, value in enumerate(out.run(results, inputs)):  # type: ignore[arg-type]
         for lane in range(LANES):
-            b.store(value, b.gep(there, whole(LANES * k + lane)))
+            b.store(value, b.gep(there, integer_constant(LANES * k + lane)))
     machines.close()
     b.ret(ZERO)
     return b
@@ -173,8 +173,8 @@ class _Writer:
 
     def __init__(self, program: Program) -> None:
         self.program = program
-        b = self.b = _make_function(SYMBOL)
-        self.used = uses(program.results)
+        b = self.function = _make_function(SYMBOL)
+        self.used = count_uses(program.results)
         names = list(program.inputs)
         self.count, self.steps = _load_word(b, 1), _load_word(b, 2)
         self.flags = b.alloca(INT64)
@@ -186,82 +186,82 @@ class _Writer:
         leaps |= {name: (5 + 3 * k, _load_word(b, 7 + 3 * k)) for k, name in enumerate(names)}
         sizes = {**{name: len(row) for name, row in program.outputs.items()}, STATUS: 2}
         for k, (name, size) in enumerate(sizes.items()):
-            leaps[f"to {name}"] = at + k, b.mul(self.count, whole(size))
+            leaps[f"to {name}"] = at + k, b.mul(self.count, integer_constant(size))
         places = {name: b.alloca(INT64) for name in leaps}
         for name, (k, _) in leaps.items():
             b.store(_load_word(b, k), places[name])
-        machines = _Counter(b, "machine", _load_word(b, 0))
+        machines = _CountingLoop(b, "machine", _load_word(b, 0))
         machines.begin()
         self.pointers = {name: b.inttoptr(b.load(at), DOUBLE) for name, at in places.items()}
         self.base = b.inttoptr(b.load(places[""]), VECTOR)
         self.prepared = {e.number: k for k, e in enumerate(program.prepared)}
-        self._write()
+        self._write_samples()
         for name, (_, leap) in leaps.items():
             # Addresses count bytes, strides count doubles.
-            b.store(b.add(b.load(places[name]), b.mul(leap, whole(8))), places[name])
+            b.store(b.add(b.load(places[name]), b.mul(leap, integer_constant(8))), places[name])
         machines.close()
         b.ret(b.load(self.flags))
 
     def emitter(self) -> Emitter:
-        return Emitter(self.b, self.used, self.prepared, self.base)
+        return Emitter(self.function, self.used, self.prepared, self.base)
 
-    def _any(self, mask: Value) -> Value:
-        return self.b.call(f"llvm.vector.reduce.or.v{LANES}i1", BIT, [mask])
+    def _any_lane(self, mask: Value) -> Value:
+        return self.function.call(f"llvm.vector.reduce.or.v{LANES}i1", BIT, [mask])
 
-    def _above(self, value: Value) -> Value:
-        return self.b.fcmp("ogt", value, self.emitter().number(0.0))
+    def _is_positive(self, value: Value) -> Value:
+        return self.function.fcmp("ogt", value, self.emitter().number(0.0))
 
     def _load(self, name: str, size: int) -> list[Value]:
         """Load an input's entries, each as a vector over the samples."""
         base, stride = self.pointers[name], self.strides[name]
-        b = self.b
+        b = self.function
         rows = [b.mul(place, stride) for place in self.places]
         values = []
         for j in range(size):
-            vector = undefined(VECTOR)
+            vector = undefined_value(VECTOR)
             for lane, row in enumerate(rows):
-                at = b.gep(base, b.add(row, whole(j)))
+                at = b.gep(base, b.add(row, integer_constant(j)))
                 vector = b.insert_element(vector, b.load(at), lane)
             values.append(vector)
         return values
 
     def _save(self, base: Value, values: Sequence[Value]) -> None:
-        b = self.b
+        b = self.function
         if len(values) > MAX_UNROLLED_STORES:
-            self._save_long(base, values)
+            self._save_in_loop(base, values)
             return
-        size = whole(len(values))
+        size = integer_constant(len(values))
         rows = [b.mul(place, size) for place in self.places]
         for j, value in enumerate(values):
             for lane, row in enumerate(rows):
-                at = b.gep(base, b.add(row, whole(j)))
+                at = b.gep(base, b.add(row, integer_constant(j)))
                 b.store(b.extract_element(value, lane), at)
 
-    def _save_long(self, base: Value, values: Sequence[Value]) -> None:
+    def _save_in_loop(self, base: Value, values: Sequence[Value]) -> None:
         """Store an output in a loop: thousands of straight-line stores take minutes to compile."""
-        b = self.b
-        size = whole(len(values))
+        b = self.function
+        size = integer_constant(len(values))
         scratch = b.alloca(VECTOR, len(values))
         for j, value in enumerate(values):
-            b.store(value, b.gep(scratch, whole(j)))
+            b.store(value, b.gep(scratch, integer_constant(j)))
         rows = [b.mul(place, size) for place in self.places]
-        entries = _Counter(b, "save", size)
+        entries = _CountingLoop(b, "save", size)
         k = entries.begin()
         value = b.load(b.gep(scratch, k))
         for lane, row in enumerate(rows):
             b.store(b.extract_element(value, lane), b.gep(base, b.add(row, k)))
         entries.close()
 
-    def _write(self) -> None:
+    def _write_samples(self) -> None:
         """Write the loop over the samples of a machine."""
-        b, program = self.b, self.program
-        samples = _Counter(b, "samples", self.count, LANES)
+        b, program = self.function, self.program
+        samples = _CountingLoop(b, "samples", self.count, LANES)
         i = samples.begin()
-        # Lanes beyond the last sample repeat the last sample.
+        # Lanes beyond the last sample compute the last sample again.
         last = b.sub(self.count, ONE)
         self.places = []
         for lane in range(LANES):
-            place = b.add(i, whole(lane))
+            place = b.add(i, integer_constant(lane))
             self.places.append(b.select(b.icmp("slt", place, last), place, last))
         values = {name: self._load(name, size) for name, size in program.inputs.items()}
         good, reached = TRUE, self.emitter().number(1.0)
@@ -269,12 +269,12 @@ class _Writer:
         for q in program.equations:
             values[q.unknowns] = self._solve(q, values, state)
         if state:
-            good, reached = self._above(b.load(state[AT.alive])), b.load(state[AT.reached])
+            good, reached = self._is_positive(b.load(state[AT.alive])), b.load(state[AT.reached])
         out = self.emitter()
         names = list(program.outputs)
         rows = {name: out.run(list(program.outputs[name]), values) for name in names}
         for value in out.run(holding(program.equations), values):
-            good = b.and_(good, self._above(value))
+            good = b.and_(good, self._is_positive(value))
         total = out.number(0.0)
         for row in rows.values():
             for value in row:
@@ -283,7 +283,7 @@ class _Writer:
         for name in program.inputs:
             for value in values[name]:
                 total = b.fadd(total, out.call("fabs", value))
-        finite = b.fcmp("olt", total, out.number(LARGE))
+        finite = b.fcmp("olt", total, out.number(MAX_SUM))
         code = b.select(good, b.select(finite, out.number(0.0), out.number(2.0)), out.number(1.0))
         good = b.and_(good, finite)
         nothing = out.number(math.nan)
@@ -291,24 +291,24 @@ class _Writer:
             target = self.pointers[f"to {name}"]
             self._save(target, [b.select(good, v, nothing) for v in rows[name]])
         self._save(self.pointers[f"to {STATUS}"], [code, reached])
-        bad = b.zext(self._any(b.xor(good, TRUE)), INT64)
+        bad = b.zext(self._any_lane(b.xor(good, TRUE)), INT64)
         b.store(b.or_(b.load(self.flags), bad), self.flags)
         samples.close()
 
     def _store_progress(self, k: Value, n: Sequence[Value]) -> None:
         """Compute :func:`.program.progress` of step k + 1."""
-        b, parts = self.b, []
+        b, parts = self.function, []
         for more in (-1, 0, 1):
-            share = b.fdiv(b.sitofp(b.add(k, whole(more)), DOUBLE), b.sitofp(self.steps, DOUBLE))
-            left = b.fsub(real(1.0), share)
-            parts.append(b.fsub(real(1.0), b.fmul(b.fmul(left, left), left)))
+            share = b.fdiv(b.sitofp(b.add(k, integer_constant(more)), DOUBLE), b.sitofp(self.steps, DOUBLE))
+            left = b.fsub(real_constant(1.0), share)
+            parts.append(b.fsub(real_constant(1.0), b.fmul(b.fmul(left, left), left)))
         b.store(b.splat(parts[2], LANES), n[AT.part])
         onward = b.fdiv(b.fsub(parts[2], parts[1]), b.fsub(parts[1], parts[0]))
         b.store(b.splat(onward, LANES), n[AT.onward])
 
     def _solve(self, q: Equations, values: dict[str, list[Value]], n: list[Value]) -> list[Value]:
         """Write Newton's method in steps, with the state n; return the unknowns."""
-        b, number = self.b, self.emitter().number
+        b, number = self.function, self.emitter().number
         first = not n
         x, last, aim = ([b.alloca(VECTOR) for _ in row] for row in (q.home, q.home, q.origin))
         n += [b.alloca(VECTOR) for _ in (AT if first else ())]
@@ -316,20 +316,20 @@ class _Writer:
         if q.goal:
             values[q.target] = self.emitter().run(q.goal, values)
 
-        def run(
+        def compute(
             results: Sequence[Expression],
-            to: Sequence[Value],
-            moved: Mapping[str, Sequence[Value]] = MappingProxyType({}),
+            targets: Sequence[Value],
+            variables: Mapping[str, Sequence[Value]] = MappingProxyType({}),
             first: Sequence[Expression] = (),
         ) -> None:
-            """Compute results from the state and the inputs in ``moved``; store them in ``to``."""
-            here = {name: [b.load(place) for place in row] for name, row in moved.items()}
+            """Compute results from the state and the inputs in ``variables``; store them in ``targets``."""
+            here = {name: [b.load(place) for place in row] for name, row in variables.items()}
             here[STATE] = [b.load(place) for place in n]
             out, given = self.emitter(), {**values, **here}
-            out.masks |= uniform
-            # Compute the whole correction before its selects: fewer values occupy registers.
+            out.masks |= masks
+            # Compute the whole correction before its selects, so that fewer values occupy registers.
             out.run(first, given)
-            for place, e in zip(to, results, strict=True):
+            for place, e in zip(targets, results, strict=True):
                 b.store(out.run([e], given)[0], place)
 
         once = b.icmp("eq", self.steps, ONE)
@@ -337,35 +337,35 @@ class _Writer:
             b.store(b.select(once, number(1.0), number(0.0)), n[AT.once])
             b.store(number(1.0), n[AT.alive])
             b.store(number(0.0), n[AT.reached])
-        # The condition is equal in all lanes: a predictable branch instead of a select.
-        uniform = {q.state[AT.once].number: once}
-        run(q.home, last)
-        steps = _Counter(b, "step", self.steps)
+        # Use branches instead of selects for conditions that are equal in all lanes: they are predictable.
+        masks = {q.state[AT.once].number: once}
+        compute(q.home, last)
+        steps = _CountingLoop(b, "step", self.steps)
         k = steps.begin()
-        uniform[q.underway.number] = b.icmp("slt", b.add(k, ONE), self.steps)
+        masks[q.is_underway.number] = b.icmp("slt", b.add(k, ONE), self.steps)
         self._store_progress(k, n)
         b.store(b.load(n[AT.alive]), n[AT.moving])
-        run(q.aim, aim)
-        begin, onward, both = (b.block(name) for name in ("begin", "onward", "turns"))
+        compute(q.aim, aim)
+        begin, onward, joined = (b.block(name) for name in ("begin", "onward", "turns"))
         b.cbranch(b.icmp("eq", k, ZERO), begin, onward)
         b.go_to(begin)
-        run(q.begin, [*x, size], {q.target: aim})
-        b.branch(both)
+        compute(q.begin, [*x, size], {q.target: aim})
+        b.branch(joined)
         b.go_to(onward)
         here = [b.load(place) for place in x]
-        run(q.onward, x, {q.unknowns: x, previous(q.unknowns): last})
+        compute(q.onward, x, {q.unknowns: x, previous(q.unknowns): last})
         for value, place in zip(here, last, strict=True):
             b.store(value, place)
-        b.branch(both)
-        b.go_to(both)
+        b.branch(joined)
+        b.go_to(joined)
         b.store(b.load(size), n[AT.size])
-        turns = _Counter(b, "turn", whole(MAX_ITERATIONS))
-        turns.begin()
+        corrections = _CountingLoop(b, "turn", integer_constant(MAX_ITERATIONS))
+        corrections.begin()
         kept = [*x, *n[AT.size : AT.reached]]
-        run(q.correct, kept, {q.unknowns: x, q.target: aim}, q.results)
-        turns.close(self._any(self._above(b.load(n[AT.moving]))))
-        run(q.arrive, n[AT.alive : AT.reached + 1])
-        steps.close(self._any(self._above(b.load(n[AT.alive]))))
+        compute(q.correct, kept, {q.unknowns: x, q.target: aim}, q.results)
+        corrections.close(self._any_lane(self._is_positive(b.load(n[AT.moving]))))
+        compute(q.arrive, n[AT.alive : AT.reached + 1])
+        steps.close(self._any_lane(self._is_positive(b.load(n[AT.alive]))))
         return [b.load(place) for place in x]
 
 
@@ -382,4 +382,4 @@ def emit(program: Program) -> str:
     - the address of the status, two numbers per sample: 0 good, 1 refused, 2 not finite; and the
       fraction of the motion from home that was reached.
     """
-    return module(binding.get_default_triple(), [_write_preparation(program), _Writer(program).b])
+    return module(binding.get_default_triple(), [_write_preparation(program), _Writer(program).function])

@@ -67,20 +67,20 @@ def pivot_order(samples: Array, share: float = 0.1) -> Order:
     order: list[tuple[int, int]] = []
     while rows:
         block = np.abs(numbers[:, rows][:, :, columns])
-        there = (block > RELATIVE_ZERO * scale).any(0)
+        nonzero = (block > RELATIVE_ZERO * scale).any(0)
         large = np.maximum(block.max(2)[:, :, None], block.max(1)[:, None, :])
-        good = there & (block > np.maximum(share * large, 1e-12)).all(0)
-        if not good.any():
+        candidates = nonzero & (block > np.maximum(share * large, 1e-12)).all(0)
+        if not candidates.any():
             if len(samples) > 1:
                 return pivot_order(samples[: len(samples) // 2], share)
             raise SingularityError("the sample states", (), float(scale), share)
-        fill = np.multiply.outer(there.sum(1) - 1, there.sum(0) - 1)
-        # Ties take the first entry: a finer criterion would depend on the processor's rounding.
-        strong = ((block / np.maximum(large, 1e-300)).min(0) > STRONG_PIVOT_RATIO)[good]
-        # The reciprocal of a constant entry is computed once, not per sample.
-        steady = (np.ptp(numbers[:, rows][:, :, columns], axis=0) < 1e-12 * scale)[good]
-        best = int((fill[good] + 0.5 * ~strong + 0.6 * ~steady).argmin())
-        i, j = (int(index[best]) for index in np.nonzero(good))
+        fill = np.multiply.outer(nonzero.sum(1) - 1, nonzero.sum(0) - 1)
+        # Of equally good pivots take the first: a finer criterion would depend on rounding.
+        is_strong = ((block / np.maximum(large, 1e-300)).min(0) > STRONG_PIVOT_RATIO)[candidates]
+        # Prefer constant pivots, whose reciprocal is computed once and not per sample.
+        is_constant = (np.ptp(numbers[:, rows][:, :, columns], axis=0) < 1e-12 * scale)[candidates]
+        best = int((fill[candidates] + 0.5 * ~is_strong + 0.6 * ~is_constant).argmin())
+        i, j = (int(index[best]) for index in np.nonzero(candidates))
         row, column = rows.pop(i), columns.pop(j)
         order.append((row, column))
         ratio = numbers[:, rows, column] / numbers[:, row, column][:, None]
@@ -132,14 +132,14 @@ class SparseLU:
             self.inverse_determinant = inverse * self.inverse_determinant
 
     def find_growth(self, rows: Numbers | Mapping[int, Any], columns: Numbers, *, every: bool = False) -> Any:
-        """Return a bound of the square by which elimination magnifies rounding.
+        """Return a bound of the square of the factor by which elimination magnifies rounding.
 
-        Pivots are fixed, and one may vanish although the matrix is regular: what it eliminates then
-        has lost its digits (Higham, Accuracy and Stability of Numerical Algorithms, 2002, section
-        9.3). It is the sum of 1 / pivot^2, of unit one, of the pivots that eliminate others.
+        Pivots are fixed, and one may vanish although the matrix is regular: the entries that it
+        eliminates then lose their digits (Higham, Accuracy and Stability of Numerical Algorithms, 2002, section
+        9.3). The bound is the sum of 1 / pivot^2, dimensionless, of the pivots that eliminate others.
 
-        :param rows: factors that make rows of unit one, (n,). ``columns``: the same of unknowns.
-        :param every: whether pivots that eliminate nothing, small where the matrix is singular, count.
+        :param rows: factors that make rows dimensionless, (n,). ``columns``: factors for the unknowns.
+        :param every: also count pivots that eliminate nothing, which are small if the matrix is singular.
         """
         growth: Any = 0.0
         for (row, column, inverse), lower, upper in zip(self._pivots, self._lower, self._upper, strict=True):

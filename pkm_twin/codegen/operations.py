@@ -224,9 +224,9 @@ def _define_angle_function(name: str, index: int, slope: Callable[[Any], Any]) -
 
     def lanes(to: Lanes, e: Any, x: Value) -> Value:
         number = e.args[0].number
-        if number not in to.turned:
-            to.turned[number] = _write_cosine_sine(to, x)
-        return to.turned[number][index]
+        if number not in to.cosine_sine:
+            to.cosine_sine[number] = _write_cosine_sine(to, x)
+        return to.cosine_sine[number][index]
 
     turn = Operation(
         name,
@@ -242,7 +242,7 @@ def _define_angle_function(name: str, index: int, slope: Callable[[Any], Any]) -
 
 def _write_cosine_sine(to: Lanes, x: Value) -> tuple[Value, Value]:
     """Write cosine and sine in lanes."""
-    b, n = to.b, to.number
+    b, n = to.function, to.number
     quarters = to.call("rint", b.fmul(x, n(2 / math.pi)))
     y = b.select(b.fcmp("olt", to.call("fabs", x), n(MAX_ANGLE)), x, n(math.nan))
     for part in HALF_PI:
@@ -251,18 +251,18 @@ def _write_cosine_sine(to: Lanes, x: Value) -> tuple[Value, Value]:
     sine = to.fused(b.fmul(z, y), to.polynomial(z, SINE), y)
     cosine = b.fadd(to.fused(z, n(-0.5), n(1.0)), b.fmul(b.fmul(z, z), to.polynomial(z, COSINE)))
     k = b.fptosi(quarters, to.integer)
-    odd = b.icmp("ne", b.and_(k, to.whole(1)), to.whole(0))
+    odd = b.icmp("ne", b.and_(k, to.integer_constant(1)), to.integer_constant(0))
 
     def signed(value: Value, turns: Value) -> Value:
-        flip = b.shl(b.and_(turns, to.whole(2)), to.whole(62))
+        flip = b.shl(b.and_(turns, to.integer_constant(2)), to.integer_constant(62))
         return b.bitcast(b.xor(b.bitcast(value, to.integer), flip), to.type)
 
     turned = signed(b.select(odd, cosine, sine), k)
-    return signed(b.select(odd, sine, cosine), b.add(k, to.whole(1))), turned
+    return signed(b.select(odd, sine, cosine), b.add(k, to.integer_constant(1))), turned
 
 
 def _write_exponential(to: Lanes, x: Value) -> Value:
-    b, n = to.b, to.number
+    b, n = to.function, to.number
     for bound, condition in ((n(MAX_EXPONENT), "ogt"), (n(-MAX_EXPONENT), "olt")):
         x = b.select(b.fcmp(condition, x, bound), bound, x)
     twos = to.call("rint", b.fmul(x, n(1.0 / math.log(2.0))))
@@ -275,7 +275,7 @@ def _write_exponential(to: Lanes, x: Value) -> Value:
     # Scale in two steps: 2^k alone may overflow or underflow where the result does not.
     half = to.call("rint", b.fmul(twos, n(0.5)))
     for share in (half, b.fsub(twos, half)):
-        bits = b.shl(b.add(b.fptosi(share, to.integer), to.whole(1023)), to.whole(52))
+        bits = b.shl(b.add(b.fptosi(share, to.integer), to.integer_constant(1023)), to.integer_constant(52))
         result = b.fmul(result, b.bitcast(bits, to.type))
     return result
 
@@ -288,7 +288,7 @@ def _saturating_exponential(x: float) -> float:
 
 
 def _write_tanh(to: Lanes, e: Any, x: Value) -> Value:
-    b, n = to.b, to.number
+    b, n = to.function, to.number
     size, z = to.call("fabs", x), b.fmul(x, x)
     ratio = b.fdiv(to.polynomial(z, TANH_P), to.polynomial(z, TANH_Q))
     power = _write_exponential(to, b.fmul(size, n(2.0)))
@@ -298,7 +298,7 @@ def _write_tanh(to: Lanes, e: Any, x: Value) -> Value:
 
 
 def _write_atan2(to: Lanes, e: Any, y: Value, x: Value) -> Value:
-    b, n = to.b, to.number
+    b, n = to.function, to.number
     ay, ax = to.call("fabs", y), to.call("fabs", x)
     steep = b.fcmp("ogt", ay, ax)
     small, large = b.select(steep, ax, ay), b.select(steep, ay, ax)
@@ -311,14 +311,14 @@ def _write_atan2(to: Lanes, e: Any, y: Value, x: Value) -> Value:
     angle = to.fused(b.fmul(u, z), ratio, u)
     angle = b.select(high, b.fadd(b.fadd(angle, n(HALF_PI_REMAINDER / 2)), n(math.pi / 4)), angle)
     angle = b.select(steep, b.fadd(b.fsub(n(math.pi / 2), angle), n(HALF_PI_REMAINDER)), angle)
-    back = b.icmp("slt", b.bitcast(x, to.integer), to.whole(0))
+    back = b.icmp("slt", b.bitcast(x, to.integer), to.integer_constant(0))
     angle = b.select(back, b.fadd(b.fsub(n(math.pi), angle), n(2 * HALF_PI_REMAINDER)), angle)
-    signs = b.and_(b.bitcast(y, to.integer), to.whole(-(2**63)))
+    signs = b.and_(b.bitcast(y, to.integer), to.integer_constant(-(2**63)))
     return b.bitcast(b.or_(b.bitcast(angle, to.integer), signs), to.type)
 
 
 def _write_sign(to: Lanes, e: Any, x: Value) -> Value:
-    b, n = to.b, to.number
+    b, n = to.function, to.number
     down = b.select(b.fcmp("olt", x, n(0.0)), n(-1.0), b.fmul(x, n(0.0)))
     return b.select(b.fcmp("ogt", x, n(0.0)), n(1.0), down)
 
@@ -327,21 +327,21 @@ def _write_flag(to: Lanes, e: Any, mask: Value) -> Value:
     """Return 1.0 or 0.0; a following ``select`` uses the mask itself."""
     to.masks[e.number] = mask
     to.flags.add(e.number)
-    return to.b.select(mask, to.number(1.0), to.number(0.0))
+    return to.function.select(mask, to.number(1.0), to.number(0.0))
 
 
 def _write_less(to: Lanes, e: Any, x: Value, y: Value) -> Value:
-    return _write_flag(to, e, to.masks.get(e.number) or to.b.fcmp("olt", x, y))
+    return _write_flag(to, e, to.masks.get(e.number) or to.function.fcmp("olt", x, y))
 
 
 def _write_select(to: Lanes, e: Any, x: Value, y: Value, z: Value) -> Value:
     where, value, other = e.args
     if where.number not in to.masks:
-        to.masks[where.number] = to.b.fcmp("ogt", x, to.number(0.0))
+        to.masks[where.number] = to.function.fcmp("ogt", x, to.number(0.0))
     mask = to.masks[where.number]
     if value.number in to.flags and other.is_constant(0.0):
-        return _write_flag(to, e, to.b.and_(mask, to.masks[value.number]))
-    return to.b.select(mask, y, z)
+        return _write_flag(to, e, to.function.and_(mask, to.masks[value.number]))
+    return to.function.select(mask, y, z)
 
 
 def _fold_select(x: Any, y: Any, z: Any) -> Any:
@@ -389,7 +389,7 @@ neg: Final = Operation("neg", operator.neg, "fneg", lambda e, x: (-1.0,), infix=
 inv: Final[Operation] = Operation(
     "inv",
     lambda x: 1.0 / x,
-    lambda to, e, x: to.b.fdiv(to.number(1.0), x),
+    lambda to, e, x: to.function.fdiv(to.number(1.0), x),
     lambda e, x: (-(e * e),),
     lambda x: 1.0 / x if x else math.copysign(math.inf, x),
     c="(1.0 / {})",
@@ -427,7 +427,7 @@ atan2: Final = Operation(
 minimum: Final = Operation(
     "min",
     np.minimum,
-    lambda to, e, x, y: to.b.select(to.b.fcmp("olt", x, y), x, y),
+    lambda to, e, x, y: to.function.select(to.function.fcmp("olt", x, y), x, y),
     lambda e, x, y: (_step_weight(y, x), _step_weight(x, y)),
     lambda x, y: x if x < y else y,
     body="(x < y) ? x : y",
@@ -436,7 +436,7 @@ minimum: Final = Operation(
 maximum: Final = Operation(
     "max",
     np.maximum,
-    lambda to, e, x, y: to.b.select(to.b.fcmp("ogt", x, y), x, y),
+    lambda to, e, x, y: to.function.select(to.function.fcmp("ogt", x, y), x, y),
     lambda e, x, y: (_step_weight(x, y), _step_weight(y, x)),
     lambda x, y: x if x > y else y,
     body="(x > y) ? x : y",
@@ -489,7 +489,7 @@ def both(x: Any, y: Any) -> Any:
 def fused(e: Any, used: Mapping[int, int], known: Container[int]) -> tuple[bool, Any, Any] | None:
     """Find a product that only the sum or difference ``e`` uses, so that both are one instruction.
 
-    :param used: number of uses of each expression, see :func:`.expressions.uses`.
+    :param used: number of uses of each expression, see :func:`.expressions.count_uses`.
     :param known: numbers of the expressions that are computed elsewhere.
     :returns: whether the product is the first argument, the product, and the other argument; None
         if there is no such product.

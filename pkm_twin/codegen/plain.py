@@ -15,13 +15,13 @@ from typing import Any, Final
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.expressions import GEOMETRY, PARAMETERS, Expression, ordered, uses
+from pkm_twin.codegen.expressions import GEOMETRY, PARAMETERS, Expression, count_uses, list_dependencies
 from pkm_twin.codegen.operations import OPERATIONS
 from pkm_twin.codegen.program import (
     AT,
-    LARGE,
     MAX_ITERATIONS,
-    PARTS,
+    MAX_SUM,
+    SOLUTION_PARTS,
     STATE,
     Equations,
     Program,
@@ -39,7 +39,7 @@ _SCALAR_FUNCTIONS: Final[dict[str, Any]] = {op.name: op.one or op.numbers for op
 _ARRAY_FUNCTIONS: Final[dict[str, Any]] = {op.name: op.many or op.numbers for op in OPERATIONS} | _NUMBERS
 
 
-def source(
+def write_function(
     results: Sequence[Expression],
     inputs: Mapping[str, int],
     known: Mapping[int, str] | None = None,
@@ -48,9 +48,9 @@ def source(
 
     :param known: Python expressions, by number, of values that exist already.
     """
-    counts = uses(results)
+    counts = count_uses(results)
     text: dict[int, str] = dict(known or {})
-    order = ordered(results, text)
+    order = list_dependencies(results, text)
     lines = [f"def program({', '.join(f'{name}=()' for name in inputs)}):"]
     read: dict[str, set[int]] = {}
     for e in order:
@@ -75,19 +75,19 @@ def source(
     return "\n".join(lines)
 
 
-def functions(
+def compile_functions(
     results: Sequence[Expression],
     inputs: Mapping[str, int],
     known: Mapping[int, str] | None = None,
 ) -> tuple[Callable[..., tuple[Any, ...]], Callable[..., tuple[Any, ...]]]:
-    """Compile the function of :func:`source` twice: for floats and for arrays."""
-    code = compile(source(results, inputs, known), "<program>", "exec")
-    made = []
+    """Compile the function of :func:`write_function` twice: for floats and for arrays."""
+    code = compile(write_function(results, inputs, known), "<program>", "exec")
+    compiled = []
     for library in (_SCALAR_FUNCTIONS, _ARRAY_FUNCTIONS):
         space: dict[str, Any] = dict(library)
         exec(code, space)  # noqa: S102
-        made.append(space["program"])
-    return made[0], made[1]
+        compiled.append(space["program"])
+    return compiled[0], compiled[1]
 
 
 class PlainCode:
@@ -101,11 +101,11 @@ class PlainCode:
         parts: dict[Any, Sequence[Expression]] = {"results": results}
         for q in program.equations:
             names |= q.inputs
-            parts |= {(q, name): getattr(q, name) for name in PARTS}
+            parts |= {(q, name): getattr(q, name) for name in SOLUTION_PARTS}
         known = {e.number: f"{PARAMETERS}[{k}]" for k, e in enumerate(program.prepared)}
-        self._parts = {name: functions(part, names, known) for name, part in parts.items()}
+        self._parts = {name: compile_functions(part, names, known) for name, part in parts.items()}
         given = {PARAMETERS: program.parameters, GEOMETRY: program.geometry}
-        self._prepare = functions([*program.prepared, program.missed], given)[0]
+        self._prepare = compile_functions([*program.prepared, program.missed], given)[0]
 
     def prepare(self, p: Array) -> Array:
         """Compute the expressions of parameters alone, (k, parameters) to (k, prepared + 1)."""
@@ -129,11 +129,11 @@ class PlainCode:
         with np.errstate(all="ignore"):
             for q in self.program.equations:
                 self._solve(q, named, n, steps, many=many)
-            values = self._call("results", named, many=many)
+            values = self._evaluate("results", named, many=many)
             good: Any = n[AT.alive] * (values.pop() if self.program.equations else 1.0)
             total = sum(map(abs, [*values, *(x for column in columns for x in column)]))
             own = _ARRAY_FUNCTIONS if many else _SCALAR_FUNCTIONS
-            finite = own["select"](own["less"](total, LARGE), 0.0, 2.0)
+            finite = own["select"](own["less"](total, MAX_SUM), 0.0, 2.0)
             code = own["select"](good, finite, 1.0)
         table = np.empty((count, len(values)))
         for k, value in enumerate(values):
@@ -144,36 +144,36 @@ class PlainCode:
         ends = itertools.accumulate(map(len, self.program.outputs.values()), initial=0)
         return [table[:, a:b].copy() for a, b in itertools.pairwise(ends)], status
 
-    def _call(self, part: Any, named: dict[str, Any], *, many: bool) -> list[Any]:
+    def _evaluate(self, part: Any, named: dict[str, Any], *, many: bool) -> list[Any]:
         return list(self._parts[part][many](**named))
 
     def _solve(self, q: Equations, named: dict[str, Any], n: list[Any], steps: int, *, many: bool) -> None:
         """Solve equations by Newton's method from state n; store the unknowns in ``named``."""
         named[STATE] = n
-        some: Callable[[Any], Any] = np.any if many else bool
+        any_of: Callable[[Any], Any] = np.any if many else bool
 
-        def call(part: str, given: dict[str, Any] = named) -> list[Any]:
-            return self._call((q, part), given, many=many)
+        def evaluate(part: str, inputs: dict[str, Any] = named) -> list[Any]:
+            return self._evaluate((q, part), inputs, many=many)
 
         if q.goal:
-            named[q.target] = call("goal")
-        before = x = call("home")
+            named[q.target] = evaluate("goal")
+        before = x = evaluate("home")
         for k in range(1, steps + 1):
             n[AT.part], n[AT.onward], n[AT.moving] = *progress(k, steps), n[AT.alive]
-            here = named | {q.target: call("aim"), q.unknowns: x, previous(q.unknowns): before}
+            step_inputs = named | {q.target: evaluate("aim"), q.unknowns: x, previous(q.unknowns): before}
             before = x
             if k == 1:
-                *x, size = call("begin", here)
+                *x, size = evaluate("begin", step_inputs)
             else:
-                x = call("onward", here)
-            n[AT.size], here[q.unknowns] = size, x
+                x = evaluate("onward", step_inputs)
+            n[AT.size], step_inputs[q.unknowns] = size, x
             for _ in range(MAX_ITERATIONS):
-                after = call("correct", here)
+                after = evaluate("correct", step_inputs)
                 x, n[AT.size : AT.reached] = after[: len(q.home)], after[len(q.home) :]
-                here[q.unknowns] = x
-                if not some(n[AT.moving]):
+                step_inputs[q.unknowns] = x
+                if not any_of(n[AT.moving]):
                     break
-            n[AT.alive], n[AT.reached] = call("arrive")
-            if not some(n[AT.alive]):
+            n[AT.alive], n[AT.reached] = evaluate("arrive")
+            if not any_of(n[AT.alive]):
                 break
         named[q.unknowns] = x

@@ -13,8 +13,8 @@ from pkm_twin.codegen.expressions import (
     PARAMETERS,
     Expression,
     Tape,
-    edge,
-    ordered,
+    find_prepared,
+    list_dependencies,
 )
 from pkm_twin.codegen.operations import both, less, select
 from pkm_twin.errors import PkmTwinError
@@ -22,45 +22,45 @@ from pkm_twin.errors import PkmTwinError
 UNKNOWNS: Final = "x"
 """Name of the input that holds the unknowns of Newton's method."""
 
-CLOSED: Final = 1e-8
+MAX_LAST_CORRECTION: Final = 1e-8
 """Largest last correction of Newton's method, of unit one. Convergence is quadratic, so the error
 left is its square: half a unit of rounding."""
 MAX_ITERATIONS: Final = 12
 """Most corrections of a step."""
-CONTRACTION: Final = 0.25
+MAX_CONTRACTION: Final = 0.25
 """Largest ratio of a correction to the one before."""
-FIRST: Final = 0.3
-"""Largest first correction of a guess, of unit one: a longer one may lead to another root."""
-AHEAD: Final = 0.1
-"""Largest first correction of each of several steps, which starts at an extrapolated point."""
-NEXT: Final = 0.01
-"""Largest first correction of a stream's sample, which starts from the sample before."""
+MAX_FIRST_CORRECTION: Final = 0.3
+"""Largest first correction from a guess, of unit one; a longer one may lead to another root."""
+MAX_EXTRAPOLATED_CORRECTION: Final = 0.1
+"""Largest first correction of a step that starts at an extrapolated point, of unit one."""
+MAX_STREAM_CORRECTION: Final = 0.01
+"""Largest first correction of a stream's sample, which starts from the sample before, of unit one."""
 LEAST: Final = 1e-8
 """Smallest determinant, relative to the determinant at home."""
 MAX_GROWTH: Final = LEAST**-2
 """Largest :meth:`.SparseLU.find_growth`: results keep half of their digits."""
-MARGIN: Final = 5.0
-"""Smallest ratio of determinant to correction for a guess in a single step: a longer correction may
-cross two singularities, to a determinant of the same sign. In several steps the first corrections
-are short."""
-LARGE: Final = 1e300
-"""Sum of the absolute inputs and results from which on they count as infinite."""
-RESIDUAL: Final = 1e-10
+MIN_DETERMINANT_RATIO: Final = 5.0
+"""Smallest ratio of determinant to correction from a guess in a single step. A longer correction may
+cross two singularities, to a determinant of the same sign. It does not apply to several steps, whose
+first corrections are short."""
+MAX_SUM: Final = 1e300
+"""Largest sum of the absolute inputs and results; a larger one counts as infinite."""
+MAX_RESIDUAL: Final = 1e-10
 """Largest residual of all equations, including redundant ones; lengths relative to the size."""
 
 
 STATE: Final = "n"
-"""Name of the input with the state of Newton's method, see :class:`Places`."""
+"""Name of the input with the state of Newton's method, see :class:`StateIndices`."""
 
 
 LAST: Final = "last"
 """Name of the input with the unknowns of the stream's sample before; zeros for the first one."""
 
 
-class Places(NamedTuple):
+class StateIndices(NamedTuple):
     """Indices into the state of Newton's method.
 
-    ``once``: 1 for a solution in a single step, else 0. ``part``: fraction of the motion from the
+    ``once``: 1 if the motion has a single step, else 0. ``part``: fraction of the motion from the
     known state to the target at the end of this step. ``onward``: length of the step relative to
     the step before, 0 for the first. ``size``: square of the last correction. ``moving``: 1 while
     corrections continue. ``alive``: 1 unless the sample is refused. ``reached``: fraction of the
@@ -76,7 +76,7 @@ class Places(NamedTuple):
     reached: int
 
 
-AT: Final = Places(*range(7))
+AT: Final = StateIndices(*range(7))
 
 
 def progress(k: int, steps: int) -> tuple[float, float]:
@@ -93,7 +93,7 @@ def previous(unknowns: str) -> str:
     return f"{unknowns}_before"
 
 
-PARTS: Final = ("home", "goal", "aim", "begin", "onward", "correct", "arrive")
+SOLUTION_PARTS: Final = ("home", "goal", "aim", "begin", "onward", "correct", "arrive")
 """Attributes of :class:`Equations` that are computed while the equations are solved."""
 
 
@@ -139,10 +139,10 @@ class Equations:
     goal: Sequence[Expression] = ()
     stage: int = 0
     near: Expression | None = None
-    """1 where a single step starts from ``foreseen``, unknowns predicted from another sample."""
+    """Expression: 1 where a single step starts from ``foreseen``, unknowns predicted from another sample."""
     foreseen: Sequence[Expression] = ()
     certain: Sequence[Expression] = ()
-    """Expressions that are positive where nothing else has to confirm the assembly."""
+    """Expressions that are positive where the assembly needs no further confirmation."""
 
     lone: bool = False
     """Whether samples are solved one by one, so that ``moving`` and ``alive`` need no selects."""
@@ -167,36 +167,36 @@ class Equations:
             state[AT.moving] = state[AT.alive] = self.size.tape.constant(1.0)
         return state
 
-    def _lift(self, *values: Any) -> list[Expression]:
+    def _lift_all(self, *values: Any) -> list[Expression]:
         return [self.size.tape.lift(value) for value in values]
 
     @cached_property
     def begin(self) -> list[Expression]:
-        """Unknowns to begin with, and the squared size that the first correction contracts from."""
-        once, known = self.state[AT.once], self.start is not None and not self.guessed
+        """Initial unknowns, and the squared size that the first correction is compared with."""
+        once, closed_form = self.state[AT.once], self.start is not None and not self.guessed
         first: Sequence[Any] = self.start or self.home
-        if known:
+        if closed_form:
             first = [select(once, a, b) for a, b in zip(first, self.home, strict=True)]
-        ahead = 1e300 if self.start is None else (AHEAD / CONTRACTION) ** 2
-        size = 1e300 if known else select(once, (FIRST / CONTRACTION) ** 2, ahead)
+        extrapolated = 1e300 if self.start is None else (MAX_EXTRAPOLATED_CORRECTION / MAX_CONTRACTION) ** 2
+        size = 1e300 if closed_form else select(once, (MAX_FIRST_CORRECTION / MAX_CONTRACTION) ** 2, extrapolated)
         if self.near is not None:
             pairs = zip(self.foreseen, first, strict=True)
             first = [select(self.near, a, b) for a, b in pairs]
-            size = select(self.near, (NEXT / CONTRACTION) ** 2, size)
-        return self._lift(*first, size)
+            size = select(self.near, (MAX_STREAM_CORRECTION / MAX_CONTRACTION) ** 2, size)
+        return self._lift_all(*first, size)
 
     @cached_property
-    def underway(self) -> Expression:
-        """1 in a step that ends before the target, else 0."""
-        return self._lift(less(self.state[AT.part], 1.0))[0]
+    def is_underway(self) -> Expression:
+        """Expression: 1 in a step that ends before the target, else 0."""
+        return self._lift_all(less(self.state[AT.part], 1.0))[0]
 
     @cached_property
     def aim(self) -> list[Expression]:
         """Target of a step."""
-        part, more = self.state[AT.part], self.underway
+        part, underway = self.state[AT.part], self.is_underway
         goal = self.size.tape.inputs(self.target, len(self.origin))
-        ways = zip(self.origin, goal, strict=True)
-        return self._lift(*(select(more, a + part * (b - a), b) for a, b in ways))
+        pairs = zip(self.origin, goal, strict=True)
+        return self._lift_all(*(select(underway, a + part * (b - a), b) for a, b in pairs))
 
     @cached_property
     def correct(self) -> list[Expression]:
@@ -207,36 +207,36 @@ class Equations:
         """
         state, size, determinant = self.state, self.size, self.determinant
         once, moving = state[AT.once], state[AT.moving]
-        known = self.start is not None and not self.guessed
+        closed_form = self.start is not None and not self.guessed
         x = self.size.tape.inputs(self.unknowns, len(self.home))
         new = (select(moving, a, b) for a, b in zip(self.corrected, x, strict=True))
-        sound = both(less(size, CONTRACTION**2 * state[AT.size]), less(LEAST, determinant))
-        if not known:
-            longest = select(once, MARGIN**2 * size, 0.0)
-            sound = both(sound, less(longest, determinant * determinant))
-        moves = both(moving, both(sound, less(CLOSED**2, size)))
-        return self._lift(*new, size, moves, select(moving, sound, state[AT.alive]))
+        converges = both(less(size, MAX_CONTRACTION**2 * state[AT.size]), less(LEAST, determinant))
+        if not closed_form:
+            min_determinant = select(once, MIN_DETERMINANT_RATIO**2 * size, 0.0)
+            converges = both(converges, less(min_determinant, determinant * determinant))
+        continues = both(moving, both(converges, less(MAX_LAST_CORRECTION**2, size)))
+        return self._lift_all(*new, size, continues, select(moving, converges, state[AT.alive]))
 
     @cached_property
     def arrive(self) -> list[Expression]:
         """``alive`` and ``reached`` after a step; a sample that is still moving is refused."""
         n = self.state
         alive = select(n[AT.moving], 0.0, n[AT.alive])
-        return self._lift(alive, select(alive, n[AT.part] + float(self.stage), n[AT.reached]))
+        return self._lift_all(alive, select(alive, n[AT.part] + float(self.stage), n[AT.reached]))
 
     @cached_property
     def held(self) -> Expression:
-        """1 where all equations hold and ``branch`` is positive, else 0."""
-        held = less(self.residual, RESIDUAL**2)
+        """Expression: 1 where all equations hold and ``branch`` is positive, else 0."""
+        held = less(self.residual, MAX_RESIDUAL**2)
         for value in self.branch:
             held = both(held, less(0.0, value))
-        return self._lift(held)[0]
+        return self._lift_all(held)[0]
 
 
 def holding(equations: Iterable[Equations], *, certain: bool = True) -> list[Expression]:
-    """Return one expression in a list, 1 where all equations hold; nothing without equations.
+    """Return a list of one expression, 1 where all equations hold; an empty list without equations.
 
-    :param certain: whether it has to be :func:`certainty` too.
+    :param certain: also require :func:`certainty`.
     """
     equations = list(equations)
     flags = [q.held for q in equations] + (certainty(equations) if certain else [])
@@ -244,7 +244,7 @@ def holding(equations: Iterable[Equations], *, certain: bool = True) -> list[Exp
 
 
 def certainty(equations: Iterable[Equations]) -> list[Expression]:
-    """Return one expression in a list, 1 where the assembly is certain; nothing where it always is."""
+    """Return a list of one expression, 1 where the assembly is certain; empty if it always is."""
     flags = [q.size.tape.lift(less(0.0, value)) for q in equations for value in q.certain]
     return [reduce(both, flags)] if flags else []
 
@@ -271,7 +271,7 @@ class Program:
         known = {**self.inputs, PARAMETERS: self.parameters, GEOMETRY: self.geometry}
         for q in self.equations:
             known |= q.inputs
-        for e in ordered(self.results):
+        for e in list_dependencies(self.results):
             name, index = e.source or ("", -1)
             if not index < known.get(name, 0):
                 raise PkmTwinError(f"the program reads {name}[{index}], which is no input")
@@ -286,13 +286,13 @@ class Program:
         """All expressions that are computed."""
         rows = [e for row in self.outputs.values() for e in row]
         for q in self.equations:
-            rows += [e for name in PARTS for e in getattr(q, name)]
+            rows += [e for name in SOLUTION_PARTS for e in getattr(q, name)]
         return rows + holding(self.equations)
 
     @cached_property
     def prepared(self) -> list[Expression]:
         """Expressions of parameters alone that samples use: computed once per machine."""
-        return edge(self.results)
+        return find_prepared(self.results)
 
     @property
     def missed(self) -> Expression:

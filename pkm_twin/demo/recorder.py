@@ -22,7 +22,7 @@ from pkm_twin.bags.definitions import message_class
 from pkm_twin.bags.reader import BagMessage, BagWriter
 from pkm_twin.errors import PkmTwinError
 
-PATIENCE = 120.0
+MAX_WAIT = 120.0
 """Longest wait for an answer, s. On an idle computer answers take less than a thousandth of this,
 but a node that starts for the first time compiles its programs."""
 CLOCK_PERIOD = 5_000_000
@@ -30,11 +30,11 @@ CLOCK_PERIOD = 5_000_000
 MAX_LEAD_TIME = 50_000_000
 """Longest time by which a bag runs ahead of its answers, ns: half of what a node allows between a
 joint state and its wrench, which arrive independently."""
-DEPTH = 20_000
+QUEUE_DEPTH = 20_000
 """Depth of the recorder's queues: more messages than a stage publishes before they are taken."""
 
-STATE = "sensor_msgs/msg/JointState"
-TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
+JOINT_STATE_TYPE = "sensor_msgs/msg/JointState"
+TRAJECTORY_TYPE = "trajectory_msgs/msg/JointTrajectory"
 
 
 class Recorder:
@@ -48,21 +48,21 @@ class Recorder:
         self.newest = 0
         """Stamp of the last message of the paced topic, ns."""
 
-    def listen(self, prefix: str, topics: dict[str, str], paced: str = "") -> None:
+    def start_recording(self, prefix: str, topics: dict[str, str], paced: str = "") -> None:
         """Record topics from now on, each under ``prefix`` followed by its name.
 
         :param topics: types by topic.
         :param paced: the topic (with headers) whose stamps ``newest`` follows.
         """
         self.newest = 0
-        qos = QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.RELIABLE)
+        qos = QoSProfile(depth=QUEUE_DEPTH, reliability=ReliabilityPolicy.RELIABLE)
         for topic, kind in topics.items():
             name = f"/{prefix}{topic}"
             self._writer.add_topic(name, kind)
             self.counts[name] = 0
             self._subscriptions.append(
                 self._node.create_subscription(
-                    message_class(kind), topic, self._keep(name, topic == paced), qos, raw=True
+                    message_class(kind), topic, self._record_topic(name, topic == paced), qos, raw=True
                 )
             )
 
@@ -71,20 +71,20 @@ class Recorder:
         """Number of messages received."""
         return sum(self.counts.values())
 
-    def stop(self) -> None:
+    def stop_recording(self) -> None:
         """Stop recording the current topics."""
         for subscription in self._subscriptions:
             self._node.destroy_subscription(subscription)
         self._subscriptions.clear()
 
-    def _keep(self, name: str, paced: bool) -> Callable[[bytes], None]:
-        def callback(data: bytes) -> None:
+    def _record_topic(self, name: str, paced: bool) -> Callable[[bytes], None]:
+        def write(data: bytes) -> None:
             self.counts[name] += 1
             if paced:
-                self.newest = stamp(data)
+                self.newest = read_stamp(data)
             self._writer.write(name, data, time.time_ns())
 
-        return callback
+        return write
 
 
 class Lockstep:
@@ -109,17 +109,19 @@ class Lockstep:
         self._first = self._last = self._now = self._heard = 0
         self._node = executor.get_nodes()[0]
         self._clock = self._node.create_publisher(Clock, "/clock", 10)
-        self._answers = self._node.create_subscription(DiagnosticArray, "/diagnostics", self._hear, 10)
+        self._answers = self._node.create_subscription(
+            DiagnosticArray, "/diagnostics", self._read_diagnostics_stamp, 10
+        )
 
     def close(self) -> None:
         """Stop the clock."""
         self._node.destroy_publisher(self._clock)
         self._node.destroy_subscription(self._answers)
 
-    def _hear(self, array: DiagnosticArray) -> None:
+    def _read_diagnostics_stamp(self, array: DiagnosticArray) -> None:
         self._heard = array.header.stamp.sec
 
-    def begin(self, time: int) -> None:
+    def start(self, time: int) -> None:
         """Wait until the stamps of the node's diagnostics reach ``time``, ns."""
         self._now = time
         self._wait(lambda: self._heard >= time // 10**9)
@@ -128,15 +130,15 @@ class Lockstep:
         """Wait until a message may be published."""
         if message.log_time >= self._now + CLOCK_PERIOD:
             self._now = message.log_time
-            self._tick()
+            self._publish_clock()
         if message.topic != self._topic:
             return
-        self._last = stamp(message.data)
+        self._last = read_stamp(message.data)
         self._first = self._first or self._last
-        if self._ahead() > MAX_LEAD_TIME:
-            self._wait(lambda: self._ahead() <= MAX_LEAD_TIME // 2)
+        if self._lead_time() > MAX_LEAD_TIME:
+            self._wait(lambda: self._lead_time() <= MAX_LEAD_TIME // 2)
 
-    def _ahead(self) -> int:
+    def _lead_time(self) -> int:
         return self._last - max(self._recorder.newest, self._first)
 
     @property
@@ -147,32 +149,32 @@ class Lockstep:
     def _wait(self, condition: Callable[[], bool]) -> None:
         total = -1
 
-        def holds() -> bool:
+        def check() -> bool:
             nonlocal total
             if self._recorder.total == total:
-                # The clock is not delivered reliably: publish it again as long as no answer comes.
-                self._tick()
+                # Publish the clock again as long as no answer comes, because its delivery is not reliable.
+                self._publish_clock()
             total = self._recorder.total
             return condition()
 
-        wait_for(self._executor, holds, self._what, self._child)
+        wait_for(self._executor, check, self._what, self._child)
 
-    def _tick(self) -> None:
+    def _publish_clock(self) -> None:
         message = Clock()
         message.clock.sec, message.clock.nanosec = divmod(self._now, 10**9)
         self._clock.publish(message)
 
 
-def stamp(data: bytes) -> int:
-    """Read the stamp, ns, of an encoded message that begins with a header."""
+def read_stamp(data: bytes) -> int:
+    """Read the stamp, ns, of an encoded message whose first field is a header."""
     seconds, nanoseconds = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
     return int(seconds) * 10**9 + int(nanoseconds)
 
 
 @contextmanager
-def process(command: Sequence[str]) -> Iterator[subprocess.Popen[bytes]]:
+def run_process(command: Sequence[str]) -> Iterator[subprocess.Popen[bytes]]:
     """Run a child process in a session of its own; end it with SIGINT and wait for it."""
-    # Return the environment for a child, changed so that ROS wheels find their libraries.
+    # Remove a variable, without which the child's ROS wheels find their libraries again.
     environment = dict(os.environ)
     environment.pop("_ROS_WHEELS_BOOTSTRAP_COMPLETE", None)
     child = subprocess.Popen(command, start_new_session=True, env=environment)  # noqa: S603
@@ -193,18 +195,20 @@ def wait_for(
 ) -> None:
     """Spin until the condition holds.
 
-    :raises PkmTwinError: the condition fails for :data:`PATIENCE`, or the child ends before.
+    :raises PkmTwinError: the condition fails for :data:`MAX_WAIT`, or the child ends before.
     """
-    deadline = time.monotonic() + PATIENCE
+    deadline = time.monotonic() + MAX_WAIT
     while not condition():
         executor.spin_once(timeout_sec=0.1)
         if child.poll() is not None:
             raise PkmTwinError(f"waiting for {what}: it ended with code {child.returncode}")
         if time.monotonic() > deadline:
-            raise PkmTwinError(f"waiting for {what}: nothing for {PATIENCE:g} s; this machine is too slow or too busy")
+            raise PkmTwinError(f"waiting for {what}: nothing for {MAX_WAIT:g} s; this machine is too slow or too busy")
 
 
-def drain(executor: SingleThreadedExecutor, recorder: Recorder, answered: Callable[[], bool] = lambda: True) -> None:
+def receive_remaining(
+    executor: SingleThreadedExecutor, recorder: Recorder, answered: Callable[[], bool] = lambda: True
+) -> None:
     """Receive messages until none has come for half a second.
 
     :param answered: returns whether all expected messages have come; otherwise the wait is ten

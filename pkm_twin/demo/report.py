@@ -38,8 +38,8 @@ class Panel:
     lines: list[tuple[Array, Array, dict[str, Any]]]
 
 
-def _select_window(time: Array, seconds: float, whole: Array) -> Mask:
-    begin = float(whole[len(whole) // 8]) if len(whole) else 0.0
+def _select_window(time: Array, seconds: float, all_times: Array) -> Mask:
+    begin = float(all_times[len(all_times) // 8]) if len(all_times) else 0.0
     return (time >= begin) & (time <= begin + seconds)
 
 
@@ -56,26 +56,26 @@ def report_dynamics(bag: Path, recording: Path, prefix: str) -> tuple[list[Fact]
         for found in (torques, residuals)
     )
     measured = np.zeros_like(predicted) if r.effort is None else r.effort[answered]
-    near = _select_window(time, 2.0, time)
-    rms = f", residual RMS {_rms(residual[near])[0]:.2g} {unit}" if near.any() else ""
+    window = _select_window(time, 2.0, time)
+    rms = f", residual RMS {_rms(residual[window])[0]:.2g} {unit}" if window.any() else ""
     panel = Panel(
         f"{prefix}:\neffort of {robot.joint_names[0]}{rms}",
         f"effort ({unit})",
         [
-            (time[near], measured[near, 0], {"color": "0.6", "lw": 2.5, "label": "recorded"}),
-            (time[near], predicted[near, 0], {"color": plots.COLOURS[1], "lw": 1, "label": "twin"}),
+            (time[window], measured[window, 0], {"color": "0.6", "lw": 2.5, "label": "recorded"}),
+            (time[window], predicted[window, 0], {"color": plots.COLOURS[1], "lw": 1, "label": "twin"}),
         ],
     )
     sent = sum(1 for _ in read_messages(bag, ["/delta_dynamics/joint_trajectory"]))
     filled = read_messages(recording, [f"/{prefix}/delta_dynamics/joint_trajectory_ff"])
     findings = [
-        share(prefix, "joint states answered", len(stamps), len(r.stamps)),
-        share(prefix, "trajectories answered", sum(1 for _ in filled), sent),
+        judge_share(prefix, "joint states answered", len(stamps), len(r.stamps)),
+        judge_share(prefix, "trajectories answered", sum(1 for _ in filled), sent),
     ]
     if not stamps:
         return findings, panel
 
-    def left(what: str, rows: Mask, bound: float) -> Fact:
+    def judge_residual(what: str, rows: Mask, bound: float) -> Fact:
         part = _rms(residual[rows]) / np.abs(measured).max(0)
         return judge(
             f"{prefix}: residual RMS {what}",
@@ -102,14 +102,14 @@ def report_dynamics(bag: Path, recording: Path, prefix: str) -> tuple[list[Fact]
         free = np.asarray(nearest > 0.5, np.bool_)
     free = free[answered]
     findings += [
-        told(prefix, "peak effort", _format_list(np.abs(predicted).max(0), unit)),
-        told(prefix, "RMS effort", _format_list(_rms(predicted), unit)),
-        left("without load", free, 0.05),
+        unjudged_fact(prefix, "peak effort", _format_list(np.abs(predicted).max(0), unit)),
+        unjudged_fact(prefix, "RMS effort", _format_list(_rms(predicted), unit)),
+        judge_residual("without load", free, 0.05),
     ]
     if r.wrench is not None:
         # Samples with a cutting force, which the node received.
         # Without the wrench the residual is 15 %.
-        findings.append(left("while cutting", ~free, 0.01))
+        findings.append(judge_residual("while cutting", ~free, 0.01))
     if r.load is not None and r.load.times:
         begin, end = r.load.times[0]
         held = (time > begin + 0.5) & (time < end - 0.5)
@@ -152,19 +152,19 @@ def report_stiffness(bag: Path, recording: Path, prefix: str) -> tuple[list[Fact
     """Compare published deflections with the finite-element frame, and list dominant elements."""
     wrenches = _read_by_stamp(bag, "/wrench")
     energies = _read_by_stamp(recording, f"/{prefix}/stiffness_monitor/strain_energy")
-    moved = _read_by_stamp(recording, f"/{prefix}/stiffness_monitor/deflection")
+    deflections = _read_by_stamp(recording, f"/{prefix}/stiffness_monitor/deflection")
     truth = _read_by_stamp(bag, "/ground_truth/deflection")
     robot = load(inspect(bag).metadata["pkm_twin"]["robot"])
     start = min(wrenches)
-    common = sorted(set(wrenches) & set(energies) & set(moved))
+    common = sorted(set(wrenches) & set(energies) & set(deflections))
     values = {stamp: {v.key: v.value for v in energies[stamp].status[0].values} for stamp in common}
     pose = np.array([[float(values[s][name]) for name in robot.pose_names] for s in common])
-    local = np.array([_xyz(moved[s].transform.translation) for s in common]).reshape(-1, 3)
+    local = np.array([_xyz(deflections[s].transform.translation) for s in common]).reshape(-1, 3)
     fixed = np.einsum("nij,nj->ni", robot.rotation(pose.reshape(-1, len(robot.pose_names))), local)
-    judged = [s for s in common if s in truth]
-    true = np.array([_xyz(truth[s].transform.translation) for s in judged]).reshape(-1, 3)
+    compared = [s for s in common if s in truth]
+    true = np.array([_xyz(truth[s].transform.translation) for s in compared]).reshape(-1, 3)
     panel = Panel(f"{prefix}: deflection (dots: finite elements)", "deflection (µm)", [])
-    times = [(np.array(stamps) - start) / 1e9 for stamps in (common, judged)]
+    times = [(np.array(stamps) - start) / 1e9 for stamps in (common, compared)]
     curves: dict[str, Any] = {"lw": 0.8}
     dots = {"marker": "o", "ls": "", "ms": 4, "mec": "black", "mew": 0.4}
     for time, moves, style in zip(times, (fixed, true), (curves, dots), strict=True):
@@ -173,22 +173,22 @@ def report_stiffness(bag: Path, recording: Path, prefix: str) -> tuple[list[Fact
             name = {} if style is dots else {"label": axis}
             line = (time[part], 1e6 * moves[part, i], {"color": plots.COLOURS[i], **style, **name})
             panel.lines.append(line)
-    findings = [share(prefix, "wrenches answered", len(common), len(wrenches))]
+    findings = [judge_share(prefix, "wrenches answered", len(common), len(wrenches))]
     if not common:
         return findings, panel
     dominant = Counter(energies[s].status[0].message for s in common)
     findings.append(
-        told(
+        unjudged_fact(
             prefix,
             "dominant element over time",
             ", ".join(f"{e} {100 * n / len(common):.0f} %" for e, n in dominant.most_common(4)),
         )
     )
     largest = np.linalg.norm(fixed, axis=1).max()
-    findings.append(told(prefix, "largest deflection", f"{1e6 * largest:.2f} µm"))
-    findings.append(share(prefix, "deflections with ground truth", len(judged), len(truth)))
-    if judged:
-        place = np.searchsorted(common, judged)
+    findings.append(unjudged_fact(prefix, "largest deflection", f"{1e6 * largest:.2f} µm"))
+    findings.append(judge_share(prefix, "deflections with ground truth", len(compared), len(truth)))
+    if compared:
+        place = np.searchsorted(common, compared)
         greatest = 1e6 * np.linalg.norm(true, axis=1).max()
         error = np.sqrt(np.mean(np.sum((fixed[place] - true) ** 2, 1)) / np.mean(np.sum(true**2, 1)))
         findings.append(
@@ -214,7 +214,7 @@ def _read_by_stamp(bag: Path, topic: str) -> dict[int, Any]:
     return {stamp_of(m.message.header): m.message for m in read_messages(bag, [topic])}
 
 
-def share(bag: str, what: str, count: int, total: int) -> Fact:
+def judge_share(bag: str, what: str, count: int, total: int) -> Fact:
     """Judge a count as a fraction of a total by :data:`MIN_ANSWERED`."""
     return judge(
         f"{bag}: {what}",
@@ -224,7 +224,7 @@ def share(bag: str, what: str, count: int, total: int) -> Fact:
     )
 
 
-def told(bag: str, what: str, words: str) -> Fact:
+def unjudged_fact(bag: str, what: str, words: str) -> Fact:
     """Make a fact that is reported without a verdict."""
     return Fact("", words, text=f"{bag}: {what}")
 

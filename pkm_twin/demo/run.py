@@ -25,7 +25,17 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from pkm_twin.bags.reader import BagMessage, BagWriter, inspect
 from pkm_twin.demo import tracking
-from pkm_twin.demo.recorder import DEPTH, PATIENCE, STATE, TRAJECTORY, Lockstep, Recorder, drain, process, wait_for
+from pkm_twin.demo.recorder import (
+    JOINT_STATE_TYPE,
+    MAX_WAIT,
+    QUEUE_DEPTH,
+    TRAJECTORY_TYPE,
+    Lockstep,
+    Recorder,
+    receive_remaining,
+    run_process,
+    wait_for,
+)
 from pkm_twin.demo.report import REPORTS, draw
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.report import Fact, Report, Verdict
@@ -39,7 +49,7 @@ from pkm_twin.ros.signals import INTERRUPTED, first_signal
 class Stage:
     """One bag, the node that answers it, and the node's output topics with their types.
 
-    ``asked``: the input whose messages are all answered, with their stamps, on ``answer``.
+    ``paced_input``: the input whose messages are all answered, with their stamps, on ``answer``.
     """
 
     bag: str
@@ -47,51 +57,51 @@ class Stage:
     parameters: tuple[str, ...]
     inputs: tuple[str, ...]
     outputs: dict[str, str]
-    asked: str
+    paced_input: str
     answer: str
 
     @property
     def arguments(self) -> list[str]:
         """Arguments of the node, with queues that do not overflow on a busy computer."""
         queues = [f"qos_overrides.{t}.subscription.reliability:=reliable" for t in self.inputs]
-        queues += [f"qos_overrides.{t}.publisher.depth:={DEPTH}" for t in self.outputs]
-        given = ("use_sim_time:=true", "future_tolerance:=1.0", PATIENT_QUEUE, *self.parameters, *queues)
+        queues += [f"qos_overrides.{t}.publisher.depth:={QUEUE_DEPTH}" for t in self.outputs]
+        given = ("use_sim_time:=true", "future_tolerance:=1.0", QUEUE_WAIT_PARAMETER, *self.parameters, *queues)
         return ["--ros-args", *(word for parameter in given for word in ("-p", parameter))]
 
 
-# Late torques do no harm here, as they only are recorded.
-PATIENT = f"stale_after:={PATIENCE}"
-PATIENT_QUEUE = f"max_wait:={PATIENCE}"
-JOINTS = "/joint_states"
+# Accept late torques, because they are only recorded.
+STALE_PARAMETER = f"stale_after:={MAX_WAIT}"
+QUEUE_WAIT_PARAMETER = f"max_wait:={MAX_WAIT}"
+JOINT_STATES = "/joint_states"
 DYNAMICS_OUTPUTS = {
-    "/delta_dynamics/joint_torques": STATE,
-    "/delta_dynamics/torque_residual": STATE,
-    "/delta_dynamics/joint_trajectory_ff": TRAJECTORY,
+    "/delta_dynamics/joint_torques": JOINT_STATE_TYPE,
+    "/delta_dynamics/torque_residual": JOINT_STATE_TYPE,
+    "/delta_dynamics/joint_trajectory_ff": TRAJECTORY_TYPE,
 }
 STAGES = (
     Stage(
         "delta_cu_pick_and_place",
         "delta_dynamics.nodes.twin",
-        ("mechanism:=delta_cu", PATIENT),
-        (JOINTS, "/delta_dynamics/joint_trajectory"),
+        ("mechanism:=delta_cu", STALE_PARAMETER),
+        (JOINT_STATES, "/delta_dynamics/joint_trajectory"),
         DYNAMICS_OUTPUTS,
-        JOINTS,
+        JOINT_STATES,
         "/delta_dynamics/joint_torques",
     ),
     Stage(
         "prru_milling",
         "delta_dynamics.nodes.twin",
-        ("mechanism:=prru", "use_wrench:=true", PATIENT),
-        (JOINTS, "/wrench", "/delta_dynamics/joint_trajectory"),
+        ("mechanism:=prru", "use_wrench:=true", STALE_PARAMETER),
+        (JOINT_STATES, "/wrench", "/delta_dynamics/joint_trajectory"),
         DYNAMICS_OUTPUTS,
-        JOINTS,
+        JOINT_STATES,
         "/delta_dynamics/joint_torques",
     ),
     Stage(
         "upr_rpu_milling",
         "stiffness_monitor.node",
         ("mechanism:=upr_rpu",),
-        (JOINTS, "/wrench"),
+        (JOINT_STATES, "/wrench"),
         {
             "/stiffness_monitor/compliance": "std_msgs/msg/Float64MultiArray",
             "/stiffness_monitor/strain_energy": "diagnostic_msgs/msg/DiagnosticArray",
@@ -107,12 +117,12 @@ STAGES = (
 def run_stage(stage: Stage, bag: Path, recorder: Recorder, executor: SingleThreadedExecutor, console: Console) -> None:
     """Start the node, play the bag as fast as it is answered, and record the answers."""
     node = executor.get_nodes()[0]
-    recorder.listen(stage.bag, stage.outputs, stage.answer)
+    recorder.start_recording(stage.bag, stage.outputs, stage.answer)
     report = inspect(bag)
     seconds = (report.end_time - report.start_time) / 1e9
     what = f"{stage.module} to answer {stage.bag}"
     with (
-        process([sys.executable, "-m", stage.module, *stage.arguments]) as twin,
+        run_process([sys.executable, "-m", stage.module, *stage.arguments]) as twin,
         Progress(
             TextColumn("{task.description}"),
             BarColumn(),
@@ -128,20 +138,20 @@ def run_stage(stage: Stage, bag: Path, recorder: Recorder, executor: SingleThrea
             f"{stage.module} to come up",
             twin,
         )
-        lockstep = Lockstep(stage.asked, recorder, executor, twin, what)
-        lockstep.begin(report.start_time)
+        lockstep = Lockstep(stage.paced_input, recorder, executor, twin, what)
+        lockstep.start(report.start_time)
         begin, before = time.monotonic(), recorder.total
 
-        def pace(message: BagMessage) -> None:
+        def pace_and_show(message: BagMessage) -> None:
             lockstep.pace(message)
             done = (message.log_time - report.start_time) / 1e9
             progress.update(bar, completed=done, messages=recorder.total - before)
 
-        play(bag, topics=stage.inputs, wait_for_subscribers=PATIENCE, progress=False, pace=pace)
-        drain(executor, recorder, lambda: lockstep.answered)
+        play(bag, topics=stage.inputs, wait_for_subscribers=MAX_WAIT, progress=False, pace=pace_and_show)
+        receive_remaining(executor, recorder, lambda: lockstep.answered)
         lockstep.close()
         progress.update(bar, completed=seconds, messages=recorder.total - before)
-    recorder.stop()
+    recorder.stop_recording()
     taken = time.monotonic() - begin
     if taken > seconds:
         console.print(

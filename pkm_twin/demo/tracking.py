@@ -24,8 +24,16 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from pkm_twin import load
 from pkm_twin.bags.reader import read_messages
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.demo.recorder import DEPTH, STATE, TRAJECTORY, Recorder, drain, process, wait_for
-from pkm_twin.demo.report import Panel, share, told
+from pkm_twin.demo.recorder import (
+    JOINT_STATE_TYPE,
+    QUEUE_DEPTH,
+    TRAJECTORY_TYPE,
+    Recorder,
+    receive_remaining,
+    run_process,
+    wait_for,
+)
+from pkm_twin.demo.report import Panel, judge_share, unjudged_fact
 from pkm_twin.errors import BagError
 from pkm_twin.messages.reading import JointReader
 from pkm_twin.messages.stamps import SECOND, stamp_of
@@ -35,6 +43,7 @@ from pkm_twin.streams.path import JointPath
 MIN_IMPROVEMENT: Final = 5.0
 """Smallest ratio of tracking errors without and with feedforward, at the smallest perturbation."""
 ROBOT: Final = "delta_cu"
+"""Robot of the tracking demonstration."""
 PERIOD: Final = 2e-3
 """Period of the machine's joint states, s, which a busy computer can still record."""
 SPREADS: Final = (0.01, 0.2)
@@ -48,48 +57,48 @@ QUEUE_PARAMETER: Final = "qos_overrides./joint_states.publisher.depth"
 TWIN_TOPIC: Final = "/delta_dynamics/joint_trajectory"
 
 
-class _Watch:
-    """Follows the machine's clock, ns, and whether it stands still or has finished its path."""
+class _MachineWatch:
+    """Follows the machine's clock, ns, and whether the machine is at rest or has finished its path."""
 
     def __init__(self) -> None:
         self.newest = 0
-        self.stands = self.done = False
+        self.is_at_rest = self.done = False
         self._since: int | None = None
 
-    def take(self, state: JointState) -> None:
-        """Take a joint state; with its brakes on the machine's velocities are exactly zero."""
+    def update(self, state: JointState) -> None:
+        """Update with a joint state, whose velocities are exactly zero while the brakes are on."""
         self.newest = stamp_of(state.header)
-        self.stands = not any(state.velocity)
-        if self._since is None and not self.stands:
+        self.is_at_rest = not any(state.velocity)
+        if self._since is None and not self.is_at_rest:
             self._since = self.newest
         if self._since is not None:
             self.done |= self.newest > self._since + 1.1 * DURATION * SECOND
 
-    def begin(self) -> None:
-        """Begin to watch another path."""
-        self.stands = self.done = False
+    def start(self) -> None:
+        """Start to watch another path."""
+        self.is_at_rest = self.done = False
         self._since = None
 
 
 def run(spread: float, recorder: Recorder, executor: SingleThreadedExecutor, console: Console) -> None:
     """Record a run without and a run with feedforward on a machine with this perturbation."""
     node = executor.get_nodes()[0]
-    recorder.listen(prefix(spread), {"/joint_states": STATE, INPUT_TOPIC: TRAJECTORY})
-    watch = _Watch()
-    states = node.create_subscription(JointState, "/joint_states", watch.take, DEPTH)
+    recorder.start_recording(topic_prefix(spread), {"/joint_states": JOINT_STATE_TYPE, INPUT_TOPIC: TRAJECTORY_TYPE})
+    watch = _MachineWatch()
+    states = node.create_subscription(JointState, "/joint_states", watch.update, QUEUE_DEPTH)
     answers: list[JointTrajectory] = []
-    heard = node.create_subscription(JointTrajectory, f"{TWIN_TOPIC}_ff", answers.append, 10)
+    twin_answers = node.create_subscription(JointTrajectory, f"{TWIN_TOPIC}_ff", answers.append, 10)
     depth = QoSProfile(depth=1)
     twin, machine = (node.create_publisher(JointTrajectory, t, depth) for t in (TWIN_TOPIC, INPUT_TOPIC))
     reset = node.create_client(Trigger, "/machine_sim/reset")
     module = [sys.executable, "-m"]
-    # The twin only answers trajectories: its joint states come from an empty topic.
-    asked = [*module, "delta_dynamics.nodes.twin", "--ros-args", "-p", f"mechanism:={ROBOT}"]
-    asked += ["-r", "joint_states:=/delta_dynamics/joint_states"]
-    moved = [*module, "delta_dynamics.nodes.simulation", "--ros-args", "-p", f"mechanism:={ROBOT}"]
-    moved += ["-p", "clock:=simulated", "-p", f"period:={PERIOD}"]
-    # Deep queues, as a busy computer catches up in bursts.
-    moved += ["-p", f"spread:={spread}", "-p", f"{QUEUE_PARAMETER}:={DEPTH}"]
+    # The twin answers trajectories alone, so give it an empty topic of joint states.
+    twin_command = [*module, "delta_dynamics.nodes.twin", "--ros-args", "-p", f"mechanism:={ROBOT}"]
+    twin_command += ["-r", "joint_states:=/delta_dynamics/joint_states"]
+    machine_command = [*module, "delta_dynamics.nodes.simulation", "--ros-args", "-p", f"mechanism:={ROBOT}"]
+    machine_command += ["-p", "clock:=simulated", "-p", f"period:={PERIOD}"]
+    # Use deep queues, because a busy computer catches up in bursts.
+    machine_command += ["-p", f"spread:={spread}", "-p", f"{QUEUE_PARAMETER}:={QUEUE_DEPTH}"]
     console.print(f"machine_sim at {100 * spread:g} % spread: PD, then with feedforward")
     # Make a trajectory from home and back, at rest at both ends, that starts on receipt.
     robot = load(ROBOT)
@@ -98,42 +107,42 @@ def run(spread: float, recorder: Recorder, executor: SingleThreadedExecutor, con
     # 64 (x - x^2)^3 is 1 at x = 1/2, and its first two derivatives vanish at both ends.
     blend = 64.0 * np.array([-1.0, 3.0, -3.0, 1.0, 0.0, 0.0, 0.0])
     rows = [np.outer(np.polyval(np.polyder(blend, k), x) / DURATION**k, (0.5, -0.4, 0.6)) for k in range(3)]
-    plain = JointTrajectory(joint_names=list(robot.joint_names))
+    trajectory_without_effort = JointTrajectory(joint_names=list(robot.joint_names))
     for k in range(POINTS):
         point = JointTrajectoryPoint(
             positions=(home + rows[0][k]).tolist(), velocities=rows[1][k].tolist(), accelerations=rows[2][k].tolist()
         )
         time = round(x[k] * DURATION * SECOND)
         point.time_from_start.sec, point.time_from_start.nanosec = divmod(time, SECOND)
-        plain.points.append(point)
-    with process(moved) as first, process(asked) as second:
+        trajectory_without_effort.points.append(point)
+    with run_process(machine_command) as first, run_process(twin_command) as second:
 
-        def await_that(condition: Callable[[], bool], what: str) -> None:
+        def wait_for_machine(condition: Callable[[], bool], what: str) -> None:
             wait_for(executor, condition, what, first)
 
-        def answered() -> bool:
+        def publish_until_answered() -> bool:
             # Publish repeatedly: discovery is not complete in both directions at once.
             if not answers:
-                twin.publish(plain)
+                twin.publish(trajectory_without_effort)
             return bool(answers)
 
-        await_that(lambda: watch.newest > 0, "machine_sim")
-        wait_for(executor, answered, "delta_dynamics", second)
-        # The machine and the recorder.
-        await_that(lambda: machine.get_subscription_count() >= 2, "machine_sim")
-        for trajectory in (plain, answers[0]):
-            await_that(reset.service_is_ready, "machine_sim's reset")
+        wait_for_machine(lambda: watch.newest > 0, "machine_sim")
+        wait_for(executor, publish_until_answered, "delta_dynamics", second)
+        # Wait until the machine and the recorder subscribe.
+        wait_for_machine(lambda: machine.get_subscription_count() >= 2, "machine_sim")
+        for trajectory in (trajectory_without_effort, answers[0]):
+            wait_for_machine(reset.service_is_ready, "machine_sim's reset")
             done = reset.call_async(Trigger.Request())
-            await_that(done.done, "machine_sim's reset")
-            watch.begin()
-            await_that(lambda: watch.stands, "the machine at its start")
-            watch.begin()
+            wait_for_machine(done.done, "machine_sim's reset")
+            watch.start()
+            wait_for_machine(lambda: watch.is_at_rest, "the machine at its start")
+            watch.start()
             machine.publish(trajectory)
-            await_that(lambda: watch.done, "the path's end")
+            wait_for_machine(lambda: watch.done, "the path's end")
     # Receive the messages that are still in the queues.
-    drain(executor, recorder)
-    recorder.stop()
-    for subscription in (states, heard):
+    receive_remaining(executor, recorder)
+    recorder.stop_recording()
+    for subscription in (states, twin_answers):
         node.destroy_subscription(subscription)
     node.destroy_client(reset)
     for publisher in (twin, machine):
@@ -155,7 +164,7 @@ class Run:
         return float(np.sqrt(np.mean(self.error**2)))
 
 
-def prefix(spread: float) -> str:
+def topic_prefix(spread: float) -> str:
     """Return the prefix of a perturbation's topics in the recording."""
     return f"machine_sim_{100 * spread:g}_percent"
 
@@ -166,7 +175,7 @@ def report(recording: Path) -> tuple[list[Fact], Panel]:
     panel = Panel("machine_sim: tracking error by model error", "error, all joints (mrad)", [])
     robot = load(ROBOT)
     for i, spread in enumerate(SPREADS):
-        name = prefix(spread)
+        name = topic_prefix(spread)
         # Read the runs without and with feedforward from the recording.
         reader = JointReader(load(ROBOT), with_effort=True)
         messages = read_messages(recording, [f"/{name}/joint_states"])
@@ -191,17 +200,17 @@ def report(recording: Path) -> tuple[list[Fact], Panel]:
         if len(found) != 2 or len(starts) != 2:
             raise BagError(f"{name}: {len(found)} of two runs were recorded", path=recording)
         plain, ahead = found[False], found[True]
-        there = sum(len(run.time) for run in (plain, ahead))
-        all_in_all = sum(round(run.duration / PERIOD) for run in (plain, ahead))
-        findings.append(share(name, "joint states recorded", there, all_in_all))
-        for what, line, way in (("PD", "-", plain), ("PD and feedforward", "--", ahead)):
-            size = 1e3 * np.linalg.norm(way.error, axis=1)
+        recorded = sum(len(run.time) for run in (plain, ahead))
+        published = sum(round(run.duration / PERIOD) for run in (plain, ahead))
+        findings.append(judge_share(name, "joint states recorded", recorded, published))
+        for what, line, one in (("PD", "-", plain), ("PD and feedforward", "--", ahead)):
+            size = 1e3 * np.linalg.norm(one.error, axis=1)
             style = {"ls": line, "color": plots.COLOURS[i], "lw": 1.2}
-            panel.lines.append((way.time, size, {**style, "label": f"{what}, {100 * spread:g} %"}))
-            peaks = ", ".join(f"{peak:.3g}" for peak in np.abs(way.effort).max(0))
-            value = f"{1e3 * way.rms:.3f} mrad RMS, {1e3 * np.abs(way.error).max():.3f} worst"
-            findings.append(told(name, f"tracking error, {what}", value))
-            findings.append(told(name, f"peak effort, {what}", f"{peaks} {robot.effort_unit}"))
+            panel.lines.append((one.time, size, {**style, "label": f"{what}, {100 * spread:g} %"}))
+            peaks = ", ".join(f"{peak:.3g}" for peak in np.abs(one.effort).max(0))
+            value = f"{1e3 * one.rms:.3f} mrad RMS, {1e3 * np.abs(one.error).max():.3f} worst"
+            findings.append(unjudged_fact(name, f"tracking error, {what}", value))
+            findings.append(unjudged_fact(name, f"peak effort, {what}", f"{peaks} {robot.effort_unit}"))
         ratio = plain.rms / ahead.rms
         what = f"feedforward at {100 * spread:g} % parameter error"
         bound = f"{MIN_IMPROVEMENT:g} or more" if spread == min(SPREADS) else ""

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.design.tolerance import Tolerances, drawn, greatest, rms
+from pkm_twin.design.tolerance import Tolerances, drawn, largest_length, rms_length
 from pkm_twin.machine.uncertainty import Tolerance
 from pkm_twin.robot.robot import Robot
 
@@ -84,9 +84,9 @@ class ErrorBudget:
                 found.sigma[paths[0]],
                 found.bounds[paths[0]],
                 found.units[paths[0]],
-                (rms(shift), greatest(shift)),
-                (rms(turn), greatest(turn)),
-                rms(self.calibrated[name].round(DECIMALS)),
+                (rms_length(shift), largest_length(shift)),
+                (rms_length(turn), largest_length(turn)),
+                rms_length(self.calibrated[name].round(DECIMALS)),
                 sum(found.variance[path] for path in paths),
                 found.texts[paths[0]],
                 any(np.any(np.abs(found.sensitivity[path]) > 1e-9) for path in paths),
@@ -103,13 +103,13 @@ class ErrorBudget:
     def sizes(self) -> ErrorSizes:
         """Sizes of the standard deviations over all states."""
         shift, turn = self.deviations
-        return ErrorSizes(rms(shift), greatest(shift), rms(turn), greatest(turn))
+        return ErrorSizes(rms_length(shift), largest_length(shift), rms_length(turn), largest_length(turn))
 
     @property
     def rms_deflection(self) -> float | None:
         """RMS displacement under the wrench without errors, m; None without wrench or elasticity."""
         bent = self.errors.deflection
-        return None if bent is None else rms(bent[..., :3])
+        return None if bent is None else rms_length(bent[..., :3])
 
     @cached_property
     def bounds(self) -> tuple[float, float]:
@@ -134,7 +134,7 @@ class ErrorBudget:
     def calibrated_position(self) -> float:
         """RMS position error that a calibration without noise leaves, m."""
         squares = sum(left.round(DECIMALS) ** 2 for left in self.calibrated.values())
-        return rms(np.sqrt(squares))
+        return rms_length(np.sqrt(squares))
 
 
 def draw_machines(budget: ErrorBudget, sigma: Mapping[str, float | Tolerance], count: int, seed: int) -> ExactErrors:
@@ -142,4 +142,11 @@ def draw_machines(budget: ErrorBudget, sigma: Mapping[str, float | Tolerance], c
     chosen = np.unique(np.linspace(0, len(budget.q) - 1, 25).round().astype(int))
     shift, turn = np.split(drawn(budget.robot, sigma, budget.q[chosen], count, seed), 2, -1)
     first_order, _ = budget.deviations
-    return ExactErrors(count, len(chosen), rms(shift), greatest(shift), rms(turn), rms(first_order[chosen]))
+    return ExactErrors(
+        count,
+        len(chosen),
+        rms_length(shift),
+        largest_length(shift),
+        rms_length(turn),
+        rms_length(first_order[chosen]),
+    )

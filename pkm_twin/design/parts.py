@@ -29,7 +29,7 @@ from pkm_twin.errors import (
     PkmTwinError,
     SingularityError,
     UnknownNameError,
-    unknown_number,
+    unknown_number_error,
 )
 from pkm_twin.kinematics.constraints import (
     Equation,
@@ -49,10 +49,11 @@ from pkm_twin.robot.rejection import SINGULARITY_BOUND
 from pkm_twin.robot.robot import Robot
 
 MAX_OPEN_FRACTION: Final = 1e-6
-"""Largest fraction of an error's rows that may stay open if the parts can be assembled."""
+"""Largest residual of an error's rows, relative to them, at which the parts can be assembled."""
 STENCIL: Final = 1e-3 * np.array([-2.0, -1.0, 1.0, 2.0])
+"""Displacements at which the central difference evaluates, rad or in machine sizes."""
 STENCIL_WEIGHTS: Final = np.array([1.0, -8.0, 8.0, -1.0]) / 12e-3
-"""Fourth-order finite difference; errors of a rigid part change its rows smoothly."""
+"""Weights of the central difference of fourth order."""
 
 CLEARANCE: Final = ("clearance[0]", "clearance[1]", "clearance[2]")
 """Keys of a joint's clearance along the base axes at home."""
@@ -82,8 +83,8 @@ class Part:
     unit: str
 
 
-def part_of(robot: Robot, path: str) -> Part | None:
-    """Return the part that a path names; None if it names a number of the file.
+def find_part(robot: Robot, path: str) -> Part | None:
+    """Find the part error that a path names; return None if it names a number of the file.
 
     Paths separated by commas share one error, with the opposite sign after a ``-``.
 
@@ -91,21 +92,21 @@ def part_of(robot: Robot, path: str) -> Part | None:
     """
     keys, effects = full_keys(path), dict[Effect, Array]()
     if "," in path:
-        found: list[Part] = []
+        parts: list[Part] = []
         for word in path.split(","):
-            one = word.strip()
-            part = part_of(robot, one.removeprefix("-"))
-            if part is None or part.unit != (found or [part])[0].unit:
-                raise ParameterError(f"tolerance {path}", one, "parts alone, in m or in rad")
-            found.append(part)
+            word_part = word.strip()
+            part = find_part(robot, word_part.removeprefix("-"))
+            if part is None or part.unit != (parts or [part])[0].unit:
+                raise ParameterError(f"tolerance {path}", word_part, "parts alone, in m or in rad")
+            parts.append(part)
             for what, vector in part.effects.items():
-                effects[what] = effects.get(what, 0.0) + (-vector if one.startswith("-") else vector)
-        return Part(effects, f"{found[0].text}, and {len(found) - 1} more alike", found[0].unit)
+                effects[what] = effects.get(what, 0.0) + (-vector if word_part.startswith("-") else vector)
+        return Part(effects, f"{parts[0].text}, and {len(parts) - 1} more alike", parts[0].unit)
     if keys[0] not in (*ERROR_KEYS, "limbs"):
         numbers = robot.file_numbers()
         if keys[0] in {split_path(number)[0] for number in numbers}:
             return None
-        raise unknown_number(path, [*map(join_path, _error_keys(robot)), *numbers])
+        raise unknown_number_error(path, [*map(join_path, _error_keys(robot)), *numbers])
     texts, unit_ = [], ""
     for kind, name, where, azimuth in robot.named(keys):
         entry = _part_effects(robot, kind, name, where, rotation_about_z(azimuth), path)
@@ -116,10 +117,10 @@ def part_of(robot: Robot, path: str) -> Part | None:
         unit_ = entry[2]
     if effects:
         return Part(effects, texts[0] + (", and its copies alike" if len(texts) > 1 else ""), unit_)
-    # Name the first unknown word.
+    # The path names no error: report its first unknown word.
     known = list(_error_keys(robot))
     for k in range(len(keys) + 1):
-        words = {str(one[k]) for one in known if one[:k] == keys[:k] and len(one) > k}
+        words = {str(word_part[k]) for word_part in known if word_part[:k] == keys[:k] and len(word_part) > k}
         if k < len(keys) and words and str(keys[k]) not in words:
             raise UnknownNameError(path, keys[k], words)
         if not words or k == len(keys):
@@ -138,23 +139,23 @@ def _error_keys(robot: Robot) -> Iterator[list[str | int]]:
     return ([*place, *split_path(end)] for place, kind in places.items() for end in ERROR_KEYS[kind])
 
 
-def error_of(path: str) -> str:
-    """Return the error of a path: a clearance is one error along three axes."""
+def name_error(path: str) -> str:
+    """Return the name of a path's error, which the three axes of a clearance share."""
     return re.sub(r"(\.clearance)\[\d\]$", r"\1", path)
 
 
-def matching(robot: Robot, pattern: str) -> list[str]:
-    """Return the errors of the machine's parts that match a pattern, with * for any text.
+def match_errors(robot: Robot, pattern: str) -> list[str]:
+    """List the part errors that match a pattern, in which * stands for any text.
 
-    :raises ParameterError: nothing matches.
+    :raises ParameterError: no error matches.
     """
     fits = re.compile(".*".join(map(re.escape, pattern.split("*")))).fullmatch
     found = []
     for path in map(join_path, _error_keys(robot)):
-        if fits(error_of(path)):
+        if fits(name_error(path)):
             with contextlib.suppress(ParameterError):
-                part_of(robot, path)
-                found.append(error_of(path))
+                find_part(robot, path)
+                found.append(name_error(path))
     if not found:
         raise ParameterError("tolerance", pattern, "a pattern that fits a part, as rods.*.length")
     return list(dict.fromkeys(found))
@@ -202,22 +203,22 @@ def _lengthen_body(robot: Robot, body: str, path: str) -> dict[Effect, Array]:
     """
     graph = robot.graph
     joints = [j for j in graph.joints.values() if not j.virtual]
-    far, ring = {BASE: 0}, [BASE]
-    for near in ring:
+    distance, reached = {BASE: 0}, [BASE]
+    for near in reached:
         for joint in joints:
             for one, other in ((joint.inner, joint.outer), (joint.outer, joint.inner)):
-                if one == near and other not in far:
-                    far[other] = far[near] + 1
-                    ring.append(other)
+                if one == near and other not in distance:
+                    distance[other] = distance[near] + 1
+                    reached.append(other)
     own = [j for j in joints if body in (j.inner, j.outer)]
-    towards = [j for j in own if min(far.get(b, 0) for b in (j.inner, j.outer)) < far.get(body, 0)]
-    if len(towards) != 1:
+    inner_joints = [j for j in own if min(distance.get(b, 0) for b in (j.inner, j.outer)) < distance.get(body, 0)]
+    if len(inner_joints) != 1:
         raise ParameterError(
             path,
-            ", ".join(j.name for j in towards) or None,
+            ", ".join(j.name for j in inner_joints) or None,
             "a body with one joint towards the base; move the joints of others by joints.NAME.at",
         )
-    start = towards[0]
+    start = inner_joints[0]
     if start.name in robot.without_point:
         raise ParameterError(f"joints.{start.name}.at", None, f"the point where {body} begins")
     moved: dict[Effect, Array] = {}
@@ -233,10 +234,10 @@ def _lengthen_body(robot: Robot, body: str, path: str) -> dict[Effect, Array]:
     line = np.mean(list(moved.values()), 0) - start.at if moved else np.zeros(3)
     if len(moved) == len(own) - 1 and all(joint.kind == "revolute" for joint in own):
         axis = start.axes[0]
-        flat = line - axis * (axis @ line)
+        across = line - axis * (axis @ line)
         parallel = all(np.linalg.norm(np.cross(j.axes[0], axis)) < MAX_OPEN_FRACTION for j in own)
-        if parallel and float(np.linalg.norm(flat)) > MAX_OPEN_FRACTION * graph.size:
-            line = flat
+        if parallel and float(np.linalg.norm(across)) > MAX_OPEN_FRACTION * graph.size:
+            line = across
     if not float(np.linalg.norm(line)) > MAX_OPEN_FRACTION * graph.size:
         raise ParameterError(path, start.name, "a body with points apart from that joint")
     return dict.fromkeys(moved, unit(line))
@@ -258,7 +259,7 @@ class Assembly:
             shifts.append(origins[name] - rotation @ robot.engine.tree.at[name])
         self.placed = replace(home, rotation=np.stack(rotations, -3), shift=np.stack(shifts, -2))
 
-    # Equations, of bodies anywhere and errors of any size.
+    # Equations for any positions of bodies and any size of errors.
 
     def equations(
         self, placed: Placement, errors: Mapping[Effect, Array], only: Container[str] | None = None
@@ -308,7 +309,7 @@ class Assembly:
                 found.append(keep_pair(rod.name, bodies, points, (first, second), apart))
         return found
 
-    # To first order.
+    # First-order effects of the errors.
 
     @cached_property
     def _equations(self) -> list[Equation]:
@@ -332,7 +333,7 @@ class Assembly:
         return q, r
 
     def _solve_twists(self, values: Array) -> Array:
-        """Return the least-squares twists, of unit one, that make rows (..., rows, k) zero."""
+        """Return the dimensionless least-squares twists that make rows (..., rows, k) zero."""
         q, r = self._factors
         return np.asarray(-np.linalg.solve(r, q.swapaxes(-1, -2) @ values), np.float64)
 
@@ -349,8 +350,8 @@ class Assembly:
                     total[..., k] += weight / scale * next(moved).T
         return total[..., None]
 
-    def platform(self, parts: Sequence[Part]) -> tuple[Array, Array]:
-        """Return how errors move the platform, and the fraction of each that stays open, 0 to 1.
+    def platform_effects(self, parts: Sequence[Part]) -> tuple[Array, Array]:
+        """Return the platform's displacements by errors, and the fraction of each error that cannot be assembled.
 
         :returns: displacement of the reference point and small rotation per unit of each error,
         base axes, shape (..., 6, parts); largest open fraction of each error's rows, shape
@@ -359,8 +360,8 @@ class Assembly:
         columns = np.concatenate([self._differentiate(part) for part in parts], -1)
         found = self._solve_twists(columns)
         left = columns - self._factors[0] @ (self._factors[0].swapaxes(-1, -2) @ columns)
-        whole = np.maximum(np.linalg.norm(columns, axis=-2), np.finfo(float).tiny)
-        missed = (np.linalg.norm(left, axis=-2) / whole).reshape(-1, len(parts)).max(0, initial=0.0)
+        sizes = np.maximum(np.linalg.norm(columns, axis=-2), np.finfo(float).tiny)
+        open_fraction = (np.linalg.norm(left, axis=-2) / sizes).reshape(-1, len(parts)).max(0, initial=0.0)
         name, placed = self.graph.platform, self.placed
         k = 6 * (placed.index[name] - 1)
         arm = placed.point(name, self.graph.origin) - placed.middle
@@ -369,20 +370,20 @@ class Assembly:
         for column, part in enumerate(parts):
             if ("origin", name) in part.effects:
                 moved[..., column] += placed.turn(name) @ part.effects["origin", name]
-        return np.concatenate([moved, turn], -2), np.asarray(missed, np.float64)
+        return np.concatenate([moved, turn], -2), np.asarray(open_fraction, np.float64)
 
-    # Of any size.
+    # Effects of errors of any size.
 
-    def like(self, graph: Graph) -> Assembly:
-        """Return the assembly of a machine with other numbers, to be solved from these bodies."""
-        # Compute the factors once, before they are shared.
+    def with_graph(self, graph: Graph) -> Assembly:
+        """Return an assembly with another graph, whose solution starts from the present bodies."""
+        # Compute the factors before the copy, which shares them.
         _ = self._factors
         other = copy.copy(self)
         other.graph = graph
         return other
 
-    def displaced(self, errors: Mapping[Effect, Array]) -> Array:
-        """Compute how far errors move the platform, by Newton's method on all rows.
+    def solve_displacements(self, errors: Mapping[Effect, Array]) -> Array:
+        """Compute the platform's displacements by errors of any size, by Newton's method.
 
         :param errors: by effect, shape (count, 3) or (count, 1).
         :returns: displacement of the reference point and rotation vector, base axes, shape
@@ -398,15 +399,15 @@ class Assembly:
             shift=np.broadcast_to(start.shift, (count, *start.shift.shape)),
         )
 
-        def look(placed: Placement) -> tuple[Array, None]:
+        def residuals(placed: Placement) -> tuple[Array, None]:
             return placed.values(self.equations(placed, errors)), None
 
-        def solve(_: None, values: Array) -> Array:
+        def correct(_: None, values: Array) -> Array:
             return np.moveaxis(self._solve_twists(np.moveaxis(values, 0, -1)), -1, 0)
 
-        # The derivatives are those without errors, so steps need not halve.
+        # The derivatives stay those without errors, so convergence is linear: do not require halved steps.
         placed, closed = newton(
-            placed, look, Placement.moved, solve, iterations=30, gain=math.inf, most=MAX_OPEN_FRACTION
+            placed, residuals, Placement.moved, correct, iterations=30, gain=math.inf, most=MAX_OPEN_FRACTION
         )
         if closed:
             name, origin = self.graph.platform, self.graph.origin
@@ -414,7 +415,7 @@ class Assembly:
             turn = placed.turn(name) @ start.turn(name).swapaxes(-1, -2)
             moved = there - start.point(name, self.robot.graph.origin)
             return np.concatenate([moved, rotation_vector(turn)], -1)
-        worst = int(np.abs(look(placed)[0]).max(-1).max(0).argmax())
+        worst = int(np.abs(residuals(placed)[0]).max(-1).max(0).argmax())
         raise PkmTwinError(
             f"{self.robot.name}: rigid parts with errors of this size cannot be assembled at "
             f"{np.round(self.q.reshape(-1, self.q.shape[-1])[worst], 6).tolist()}"

@@ -98,26 +98,26 @@ class PathMotion:
     Derivatives are those of one machine, by its numbers (d).
     """
 
-    def __init__(self, many: Variants, path: PosePath) -> None:
-        self.many, self.path = many, path
+    def __init__(self, machines: Variants, path: PosePath) -> None:
+        self.machines, self.path = machines, path
 
     def _for_machines(self, values: Array) -> Array:
-        """Repeat samples for every machine, so that their count is not taken for machines."""
-        return np.broadcast_to(values, (len(self.many), *values.shape))
+        """Repeat samples for every machine, so that the first axis is the machine."""
+        return np.broadcast_to(values, (len(self.machines), *values.shape))
 
     @cached_property
     def _motion(self) -> list[Array]:
         """Joint positions, velocities, accelerations and efforts, shape (k, t, n) each."""
         path = self.path
         samples = path.pose, path.rate, path.acceleration, path.wrench
-        return self.many.run(programs.torques_at_pose, *map(self._for_machines, samples))[0]
+        return self.machines.run(programs.torques_at_pose, *map(self._for_machines, samples))[0]
 
     @cached_property
     def q(self) -> Array:
         """Joint positions, shape (k, t, n)."""
-        if self.many.robot.has_masses:
+        if self.machines.robot.has_masses:
             return self._motion[0]
-        return self.many.inverse(self._for_machines(self.path.pose))
+        return self.machines.inverse(self._for_machines(self.path.pose))
 
     @property
     def qd(self) -> Array:
@@ -137,19 +137,19 @@ class PathMotion:
     @cached_property
     def jacobian(self) -> Array:
         """Pose rates per joint rate, shape (k, t, m, n); the unit matrix if undefined."""
-        found = self.many.jacobian(self.q)
+        found = self.machines.jacobian(self.q)
         good = np.isfinite(found).all((-1, -2), keepdims=True)
         return np.where(good, found, np.eye(*found.shape[-2:]))
 
     @cached_property
     def singularity(self) -> Array:
         """Singularity index of every sample, shape (k, t)."""
-        return self.many.singularity(self.q)
+        return self.machines.singularity(self.q)
 
     @cached_property
     def compliance(self) -> Array:
         """Compliance of every sample, shape (k, t, 6, 6)."""
-        return self.many.compliance(self._for_machines(self.path.pose))
+        return self.machines.compliance(self._for_machines(self.path.pose))
 
     @cached_property
     def deflection(self) -> Array:
@@ -164,21 +164,21 @@ class PathMotion:
         :param weights: w, shape (t, n); ``rates``: r, ``changes``: c, shape (t, n), None for zero.
         """
         state = (self.q, self.qd, self.qdd, self._for_machines(self.path.wrench), weights[None])
-        (by_q, by_qd, by_qdd), _ = self.many.run(programs.torque_gradient, *state)
-        (of_geometry, of_masses), _ = self.many.run(programs.torque_numbers, *state)
+        (by_q, by_qd, by_qdd), _ = self.machines.run(programs.torque_gradient, *state)
+        (of_geometry, of_masses), _ = self.machines.run(programs.torque_numbers, *state)
         if rates is not None:
             by_qd = by_qd + rates
         if changes is not None:
             by_qdd = by_qdd + changes
         held = self._add_constant_poses(by_q, (by_qd, by_qdd))
         rows = np.concatenate([of_geometry + held, of_masses], -1)
-        return np.asarray(rows[0] @ self.many.rigid_slopes)
+        return np.asarray(rows[0] @ self.machines.rigid_slopes)
 
     def singularity_slopes(self) -> Array:
         """Return the derivatives of each sample's index, shape (t, d)."""
         ones = np.ones((1, len(self.path.time), 1))
-        (by_q, by_geometry), _ = self.many.run(programs.singularity_slopes, self.q, ones)
-        return self._by_geometry(by_geometry + self._add_constant_poses(by_q))
+        (by_q, by_geometry), _ = self.machines.run(programs.singularity_slopes, self.q, ones)
+        return self._by_numbers_of_geometry(by_geometry + self._add_constant_poses(by_q))
 
     def compliance_slopes(self, weights: Array) -> Array:
         """Return the derivatives of each sample's weighted sum of C's entries, (t, d).
@@ -186,35 +186,35 @@ class PathMotion:
         :param weights: shape (t, 6, 6).
         """
         flat = weights.reshape(1, len(weights), 36)
-        (by_q, numbers), _ = self.many.run(programs.compliance_slopes, self.q, flat)
-        count = len(self.many.robot.engine.geometry)
-        by_geometry = self._by_geometry(numbers[..., :count] + self._add_constant_poses(by_q))
-        elastic = self.many.functions.elastic.slopes_at(self.many.values)[0]
+        (by_q, numbers), _ = self.machines.run(programs.compliance_slopes, self.q, flat)
+        count = len(self.machines.robot.engine.geometry)
+        by_geometry = self._by_numbers_of_geometry(numbers[..., :count] + self._add_constant_poses(by_q))
+        elastic = self.machines.functions.elastic.slopes_at(self.machines.values)[0]
         return np.asarray(by_geometry + numbers[0, :, count:] @ elastic)
 
-    def _by_geometry(self, rows: Array) -> Array:
-        return np.asarray(rows[0] @ self.many.geometry_slopes)
+    def _by_numbers_of_geometry(self, rows: Array) -> Array:
+        return np.asarray(rows[0] @ self.machines.geometry_slopes)
 
     def _add_constant_poses(self, by_q: Array, by_rates: tuple[Array, Array] | None = None) -> Array:
-        """Return what constant poses add to derivatives by the geometry, shape (1, t, g).
+        """Return the part of derivatives by the geometry through q, qd and qdd at constant poses, (1, t, g).
 
         :param by_rates: derivatives by qd and qdd; None for zero.
         """
-        back = np.swapaxes(self.jacobian, -1, -2)
+        jacobian_transposed = np.swapaxes(self.jacobian, -1, -2)
         weights = np.zeros((*by_q.shape[:-1], 3, by_q.shape[-1]))
         qd, qdd = np.zeros_like(self.q), np.zeros_like(self.q)
 
-        def asked() -> list[Array]:
+        def pose_derivatives() -> list[Array]:
             flat = weights.reshape(*weights.shape[:-2], -1)
-            return self.many.run(programs.pose_motion, self.q, qd, qdd, flat)[0]
+            return self.machines.run(programs.pose_motion, self.q, qd, qdd, flat)[0]
 
         if by_rates is not None:
             qd, qdd = self.qd, self.qdd
-            weights[..., 2, :] = _solve(back, by_rates[1])
-            weights[..., 1, :] = _solve(back, by_rates[0] - asked()[1])
-            by_q = by_q - asked()[0]
-        weights[..., 0, :] = _solve(back, by_q)
-        return -asked()[2]
+            weights[..., 2, :] = _solve(jacobian_transposed, by_rates[1])
+            weights[..., 1, :] = _solve(jacobian_transposed, by_rates[0] - pose_derivatives()[1])
+            by_q = by_q - pose_derivatives()[0]
+        weights[..., 0, :] = _solve(jacobian_transposed, by_q)
+        return -pose_derivatives()[2]
 
 
 def _solve(matrix: Array, right: Array) -> Array:
@@ -222,7 +222,7 @@ def _solve(matrix: Array, right: Array) -> Array:
     try:
         return np.asarray(np.linalg.solve(matrix, right[..., None])[..., 0], np.float64)
     except np.linalg.LinAlgError:
-        # Some matrix is singular: its machine is in a singularity.
+        # A machine is in a singularity: solve for the others.
         good = np.abs(np.linalg.det(matrix)) > 0.0
         sound = np.where(good[..., None, None], matrix, np.eye(matrix.shape[-1]))
         found = np.linalg.solve(sound, right[..., None])[..., 0]

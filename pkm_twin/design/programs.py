@@ -44,49 +44,51 @@ class NumberFunctions:
 
 
 Numbers = Literal["geometry", "masses", "elasticity"]
-Asked = tuple[Kernel, tuple[Numbers, ...]]
+Request = tuple[Kernel, tuple[Numbers, ...]]
 """A program, and the attributes of :class:`Variants` that are its inputs, in this order."""
-Ask = Callable[[Robot], Asked]
+MakeRequest = Callable[[Robot], Request]
 
 
-def asks(kernel: Callable[[Robot], Kernel], *numbers: Numbers) -> Ask:
+def make_request(kernel: Callable[[Robot], Kernel], *numbers: Numbers) -> MakeRequest:
     """Return a program of a robot with its inputs, by default the geometry alone."""
     return lambda robot: (kernel(robot), numbers or ("geometry",))
 
 
-forward: Final = asks(lambda robot: robot.engine.own_forward)
+forward: Final = make_request(lambda robot: robot.engine.own_forward)
 """From q to pose, position and rotation."""
-anywhere: Final = asks(lambda robot: free_forward(robot.engine))
+forward_of_all_structures: Final = make_request(lambda robot: free_forward(robot.engine))
 """The same as :func:`forward`, one program for machines of every structure."""
-project_redundant: Final = asks(lambda robot: robot.projection_kernel)
+project_redundant: Final = make_request(lambda robot: robot.projection_kernel)
 """From q, qd, qdd of the leading drives to those of all drives."""
-inverse: Final = asks(lambda robot: robot.engine.followed_inverse)
+inverse: Final = make_request(lambda robot: robot.engine.followed_inverse)
 """From the pose to q of some assembly."""
-jacobian: Final = asks(lambda robot: robot.engine.jacobian)
+jacobian: Final = make_request(lambda robot: robot.engine.jacobian)
 """From q to pose rates per joint rate."""
-acceleration: Final = asks(lambda robot: robot.engine.acceleration)
+acceleration: Final = make_request(lambda robot: robot.engine.acceleration)
 """From q, qd, qdd to the pose's second derivative."""
-singularity: Final = asks(lambda robot: robot.singularity_kernel())
+singularity: Final = make_request(lambda robot: robot.singularity_kernel())
 """From q to the singularity index."""
-torques: Final = asks(torques_kernel, "masses", "geometry")
+torques: Final = make_request(torques_kernel, "masses", "geometry")
 """From q, qd, qdd and wrench to efforts."""
-torques_at_pose: Final = asks(iterated_pose_torques, "masses", "geometry")
+torques_at_pose: Final = make_request(iterated_pose_torques, "masses", "geometry")
 """From pose, rate, acceleration and wrench to q, qd, qdd and efforts."""
-loads: Final = asks(loads_kernel, "masses", "geometry")
+loads: Final = make_request(loads_kernel, "masses", "geometry")
 """From q, qd, qdd and wrench to the joints' loads and positions."""
-masses: Final = asks(masses_kernel, "masses", "geometry")
+masses: Final = make_request(masses_kernel, "masses", "geometry")
 """From q to the mass matrix."""
-compliance: Final = asks(lambda robot: robot.cached(Elastic).compliance, "geometry", "elasticity")
+compliance: Final = make_request(lambda robot: robot.cached(Elastic).compliance, "geometry", "elasticity")
 """From q to the compliance and its frame's pivot ratio."""
-torque_gradient: Final = asks(motion_gradient, "masses", "geometry")
+torque_gradient: Final = make_request(motion_gradient, "masses", "geometry")
 """Derivatives of the torques by q, qd and qdd."""
-torque_numbers: Final = asks(numbers_gradient, "masses", "geometry")
+torque_numbers: Final = make_request(numbers_gradient, "masses", "geometry")
 """Derivatives of the torques by geometry and masses."""
-platform_slopes: Final = asks(lambda robot: platform_gradient(robot.engine))
+platform_slopes: Final = make_request(lambda robot: platform_gradient(robot.engine))
 """Derivatives of pose, position and rotation by geometry."""
-pose_motion: Final = asks(lambda robot: pose_motion_gradient(robot.engine))
+pose_motion: Final = make_request(lambda robot: pose_motion_gradient(robot.engine))
 """Derivatives of pose, rate and acceleration by q, qd and geometry."""
-singularity_slopes: Final = asks(lambda robot: singularity_gradient(robot.engine))
+singularity_slopes: Final = make_request(lambda robot: singularity_gradient(robot.engine))
 """Derivatives of the index by q and geometry."""
-compliance_slopes: Final = asks(lambda robot: compliance_gradient(robot.cached(Elastic)), "geometry", "elasticity")
+compliance_slopes: Final = make_request(
+    lambda robot: compliance_gradient(robot.cached(Elastic)), "geometry", "elasticity"
+)
 """Derivatives of the compliance by q and all numbers."""

@@ -29,22 +29,22 @@ Index = NDArray[np.intp]
 class Quantity:
     """Define one of :data:`QUANTITIES`.
 
-    ``of``: returns the pieces of k machines, shape (k, t, c) if ``sampled``, else (k, c).
+    ``evaluate``: returns the pieces of k machines, shape (k, t, c) if ``sampled``, else (k, c).
     ``slopes``: returns the derivatives of one machine's pieces, given their indices along c, by its
     numbers, shape (pieces, d); if sampled, the machine's path has one sample per piece. ``least``:
-    the smallest piece counts.
+    True if the smallest piece is the quantity, not the largest.
     """
 
     name: str
     meaning: str
-    of: Callable[[PathMotion], Array]
+    evaluate: Callable[[PathMotion], Array]
     slopes: Callable[[PathMotion, Index], Array]
     sampled: bool = False
     least: bool = False
 
     def pieces(self, followed: PathMotion) -> Array:
         """Return the pieces of k machines, shape (k, pieces)."""
-        found = self.of(followed)
+        found = self.evaluate(followed)
         return found.reshape(len(found), -1)
 
     def width(self, robot: Robot) -> int:
@@ -72,10 +72,10 @@ class Constraint:
     bound: float
 
     @classmethod
-    def of(cls, text: str) -> Constraint:
+    def parse(cls, text: str) -> Constraint:
         """Parse ``singularity>=0.1`` or ``peak-effort<=20``.
 
-        :raises ParameterError: another form, quantity, or side.
+        :raises ParameterError: another form, an unknown quantity, or a bound on the wrong side.
         """
         match = re.fullmatch(r"\s*([\w-]+)\s*(<=|>=)\s*(\S+)\s*", text)
         try:
@@ -92,10 +92,10 @@ class Constraint:
 
     @property
     def scale(self) -> float:
-        """Scale that makes misses of unit one."""
+        """Scale that makes the excess dimensionless."""
         return max(abs(self.bound), 1e-12)
 
-    def misses(self, pieces: Array) -> Array:
+    def excess(self, pieces: Array) -> Array:
         """Return the pieces' excess over the bound, relative to it: positive if violated."""
         side = -1.0 if self.quantity.least else 1.0
         return side * (pieces - self.bound) / self.scale
@@ -120,7 +120,7 @@ def effort_scales(robot: Robot) -> Array:
 def _peak_slopes(f: PathMotion, places: Index) -> Array:
     rows = np.arange(len(places))
     weights = np.zeros(f.efforts.shape[1:])
-    scale = effort_scales(f.many.robot)[places]
+    scale = effort_scales(f.machines.robot)[places]
     weights[rows, places] = np.sign(f.efforts[0, rows, places]) * scale
     return f.effort_slopes(weights)
 
@@ -138,7 +138,7 @@ def _rms_gradient(f: PathMotion, values: Array, place: int) -> Array:
 
 
 def _rms_slopes(f: PathMotion, places: Index) -> Array:
-    scales, rows = effort_scales(f.many.robot), []
+    scales, rows = effort_scales(f.machines.robot), []
     for place in places:
         weights = np.zeros(f.efforts.shape[1:])
         weights[:, place] = scales[place] * _rms_gradient(f, f.efforts, place)
@@ -147,7 +147,10 @@ def _rms_slopes(f: PathMotion, places: Index) -> Array:
 
 
 def _list_gear_numbers(robot: Robot) -> list[Any]:
-    """Return transmission ratios, rotor inertias and efficiencies of the drives."""
+    """Return transmission ratios, rotor inertias and efficiencies of the drives.
+
+    :raises ParameterError: a joint has no section ``drive``.
+    """
     drives = [drive for drive in robot.drives if drive is not None]
     if len(drives) < robot.joints_count:
         raise ParameterError("drive", None, "a section drive for each joint, for motor-torque")
@@ -160,31 +163,31 @@ def _motor_torques(f: PathMotion) -> tuple[Array, Array, Array, Array, Array]:
 
     Torques as in :mod:`pkm_twin.paths.sizing`, shape (k, t, n); numbers, shape (k, 1, n).
     """
-    turns, inertia, share = np.split(_cached_numbers(f, _list_gear_numbers)(f.many.values)[:, None], 3, -1)
-    through = f.efforts - inertia * turns**2 * f.qdd
-    losses = np.where(through * f.qd < 0.0, share, 1.0 / share)
-    return inertia * turns * f.qdd + through * losses / turns, losses, turns, inertia, share
+    turns, inertia, efficiency = np.split(_cached_numbers(f, _list_gear_numbers)(f.machines.values)[:, None], 3, -1)
+    transmitted = f.efforts - inertia * turns**2 * f.qdd
+    losses = np.where(transmitted * f.qd < 0.0, efficiency, 1.0 / efficiency)
+    return inertia * turns * f.qdd + transmitted * losses / turns, losses, turns, inertia, efficiency
 
 
 def _motor_slopes(f: PathMotion, places: Index) -> Array:
     torques, losses, *numbers = _motor_torques(f)
     loss, tau, qdd = losses[0], f.efforts[0], f.qdd[0]
-    turns, inertia, share = (values[0] for values in numbers)
-    through = tau - inertia * turns**2 * qdd
+    turns, inertia, efficiency = (values[0] for values in numbers)
+    transmitted = tau - inertia * turns**2 * qdd
     # Derivatives by turns, inertia and efficiency at constant effort and motion.
-    own = (
+    by_numbers = (
         inertia * qdd * (1.0 - loss) - tau * loss / turns**2,
         turns * qdd * (1.0 - loss),
-        through / turns * np.where(through * f.qd[0] < 0.0, 1.0, -1.0 / share**2),
+        transmitted / turns * np.where(transmitted * f.qd[0] < 0.0, 1.0, -1.0 / efficiency**2),
     )
-    slopes = _cached_numbers(f, _list_gear_numbers).slopes_at(f.many.values)[0].reshape(3, len(turns[0]), -1)
+    slopes = _cached_numbers(f, _list_gear_numbers).slopes_at(f.machines.values)[0].reshape(3, len(turns[0]), -1)
     rows = []
     for place in places:
         weights = np.zeros(tau.shape)
         weights[:, place] = _rms_gradient(f, torques, place)
-        along = f.effort_slopes(weights * loss / turns, None, weights * inertia * turns * (1.0 - loss))
-        direct = sum((weights * by).sum(0)[place] * s[place] for by, s in zip(own, slopes, strict=True))
-        rows.append(along.sum(0) + direct)
+        by_efforts = f.effort_slopes(weights * loss / turns, None, weights * inertia * turns * (1.0 - loss))
+        by_gear = sum((weights * by).sum(0)[place] * s[place] for by, s in zip(by_numbers, slopes, strict=True))
+        rows.append(by_efforts.sum(0) + by_gear)
     return np.array(rows)
 
 
@@ -207,9 +210,9 @@ def _deflection_slopes(f: PathMotion, places: Index) -> Array:
     del places
     moved = f.deflection[0, :, :3]
     size = np.linalg.norm(moved, axis=-1, keepdims=True)
-    way = np.zeros((len(moved), 6))
-    way[:, :3] = moved / np.maximum(size, 1e-300)
-    return f.compliance_slopes(way[:, :, None] * f.path.wrench[:, None, :])
+    direction = np.zeros((len(moved), 6))
+    direction[:, :3] = moved / np.maximum(size, 1e-300)
+    return f.compliance_slopes(direction[:, :, None] * f.path.wrench[:, None, :])
 
 
 def _moving_masses(robot: Robot) -> list[Any]:
@@ -220,7 +223,7 @@ def _moving_masses(robot: Robot) -> list[Any]:
 
 def _cached_numbers(f: PathMotion, of: Callable[[Robot], list[Any]]) -> FileNumbers:
     """Return a function of the machines' numbers, created once."""
-    functions = f.many.functions
+    functions = f.machines.functions
     found = vars(functions).get(of.__name__)
     if found is None:
         found = FileNumbers(functions.robot, functions.paths, of)
@@ -234,14 +237,14 @@ QUANTITIES: Final = {
         Quantity(
             "peak-effort",
             "greatest effort of any joint",
-            lambda f: np.abs(f.efforts) * effort_scales(f.many.robot),
+            lambda f: np.abs(f.efforts) * effort_scales(f.machines.robot),
             _peak_slopes,
             True,
         ),
         Quantity(
             "rms-effort",
             "greatest RMS effort of a joint",
-            lambda f: _rms_over_time(f, f.efforts) * effort_scales(f.many.robot),
+            lambda f: _rms_over_time(f, f.efforts) * effort_scales(f.machines.robot),
             _rms_slopes,
         ),
         Quantity(
@@ -261,8 +264,10 @@ QUANTITIES: Final = {
         Quantity(
             "mass",
             "mass of all bodies and rods without payload",
-            lambda f: _cached_numbers(f, _moving_masses)(f.many.values),
-            lambda f, places: np.repeat(_cached_numbers(f, _moving_masses).slopes_at(f.many.values)[0], len(places), 0),
+            lambda f: _cached_numbers(f, _moving_masses)(f.machines.values),
+            lambda f, places: np.repeat(
+                _cached_numbers(f, _moving_masses).slopes_at(f.machines.values)[0], len(places), 0
+            ),
         ),
         Quantity(
             "singularity",
@@ -277,7 +282,7 @@ QUANTITIES: Final = {
 
 
 def find_quantity(name: str, field: str) -> Quantity:
-    """Return the quantity of a name.
+    """Find a quantity by its name.
 
     :raises UnknownNameError: there is no such quantity.
     """

@@ -29,7 +29,7 @@ from pkm_twin.robot.robot import Robot
 Index = NDArray[np.intp]
 
 MISS_TOLERANCE: Final = 1e-6
-"""Excess of a bound, relative to it, that counts as none."""
+"""Largest excess of a bound, relative to it, at which the bound counts as kept."""
 GAIN_TOLERANCE: Final = 1e-7
 """Relative gain below which the search ends."""
 DIFFERENCE_STEP: Final = 1e-4
@@ -52,8 +52,8 @@ class DesignPoint:
         return self.miss <= MISS_TOLERANCE
 
 
-class _OutsideError(Exception):
-    """Report a machine that cannot follow the path."""
+class _CannotFollowError(Exception):
+    """Ends a search step at a machine that cannot follow the path."""
 
 
 class Problem:
@@ -76,7 +76,7 @@ class Problem:
 
         Machines that cannot follow the path have NaN.
         """
-        # Samples of all machines that are computed at a time.
+        # Number of machines whose samples are computed together.
         size = max(1, 200_000 // len(self.path.time))
         parts = []
         for k in range(0, len(y), size):
@@ -87,7 +87,7 @@ class Problem:
         return [np.concatenate(rows) for rows in zip(*parts, strict=True)]
 
     def point(self, y: Array, constraints: Sequence[Constraint]) -> DesignPoint:
-        """Return a machine with all quantities that its file has data for."""
+        """Describe a machine by all quantities for which its file has data."""
         followed = PathMotion(self.machines(y[None]), self.path)
         found: dict[str, float] = {}
         for name, quantity in QUANTITIES.items():
@@ -99,11 +99,11 @@ class Problem:
             except ParameterError:
                 if wanted:
                     raise
-        misses = [c.misses(np.array(found[c.quantity.name])) for c in constraints]
+        misses = [c.excess(np.array(found[c.quantity.name])) for c in constraints]
         values = self.variables.values(y[None])[0]
         follows = bool(np.isfinite(followed.q).all())
         return DesignPoint(
-            dict(zip(self.variables.names, self.variables.named(y), strict=True)),
+            dict(zip(self.variables.names, self.variables.values_by_name(y), strict=True)),
             dict(zip(self.variables.paths, values.tolist(), strict=True)),
             found,
             max([0.0, *map(float, misses)]) if follows else np.inf,
@@ -118,17 +118,17 @@ class Search:
         self._all = [aim, *(c.quantity for c in constraints)]
 
     def evaluate(self, y: Array) -> tuple[Array, Array, list[Array]]:
-        """Return aims, largest misses (infinite if a machine fails) and pieces of points (k, d)."""
+        """Return aims, largest excesses and pieces of points (k, d); infinite if a machine cannot follow the path."""
         pieces = self.problem.pieces(y, self._all)
         misses = np.zeros(len(y))
         for constraint, found in zip(self.constraints, pieces[1:], strict=True):
-            misses = np.maximum(misses, constraint.misses(constraint.quantity.worst(found)))
+            misses = np.maximum(misses, constraint.excess(constraint.quantity.worst(found)))
         aims = self.aim.worst(pieces[0])
         lost = ~(np.isfinite(aims) & np.isfinite(misses))
         return np.where(lost, np.inf, aims), np.where(lost, np.inf, misses), pieces
 
     def descend(self, y: Array) -> tuple[Array, float, float]:
-        """Return the best machine near one that follows the path, its aim and its miss."""
+        """Search from a machine that follows the path; return the best machine, its aim and its excess."""
         aims, misses, pieces = self.evaluate(y[None])
         best, aim, miss = y, float(aims[0]), float(misses[0])
         scale = max(abs(aim), 1e-300)
@@ -139,7 +139,7 @@ class Search:
                 np.union1d(old, self._pieces_near_worst(k, found[0]))
                 for k, (old, found) in enumerate(zip(chosen, pieces, strict=True))
             ]
-            run = _Run(self, chosen, scale, best, aim, radius)
+            run = _BoxSearch(self, chosen, scale, best, aim, radius)
             found, outside = run.solve()
             aims, misses, new = self.evaluate(found[None])
             if is_better(float(aims[0]), float(misses[0]), aim, miss):
@@ -160,7 +160,7 @@ class Search:
             if step < 1e-9 and not outside:
                 break
             if fresh:
-                # Pieces that were not included grew: include them.
+                # Other pieces became the largest: include them.
                 chosen = [
                     np.union1d(old, self._pieces_near_worst(k, p[0]))
                     for k, (old, p) in enumerate(zip(chosen, new, strict=True))
@@ -181,7 +181,7 @@ class Search:
         padded = np.pad(table, ((1, 1), (0, 0)), constant_values=-np.inf)
         peaks = (table >= padded[:-2]) & (table >= padded[2:])
         worst = float(table.max())
-        # Pieces above seven tenths of the largest.
+        # Take pieces above seven tenths of the largest.
         reach = worst - 0.3 * max(abs(worst), 0.3 if quantity.least else 0.0)
         flat = table.ravel()
         order = np.flatnonzero(peaks.ravel() & (flat >= reach))
@@ -189,14 +189,14 @@ class Search:
 
 
 def is_better(aim: float, miss: float, old_aim: float, old_miss: float) -> bool:
-    """Return whether a machine is better: smaller miss, or smaller aim if both keep bounds."""
+    """Return whether a machine is better: smaller excess, or smaller aim if both keep all bounds."""
     if miss > MISS_TOLERANCE or old_miss > MISS_TOLERANCE:
         return miss < old_miss or (miss <= MISS_TOLERANCE and old_miss > MISS_TOLERANCE)
     return aim < old_aim
 
 
-class _Run:
-    """Run SLSQP on chosen pieces, in a box around a machine: variables y, aim's bound s."""
+class _BoxSearch:
+    """Minimise a bound s of the aim by SLSQP, for chosen pieces and machines y in a box around a machine."""
 
     def __init__(
         self,
@@ -234,7 +234,7 @@ class _Run:
                 },
                 options={"maxiter": 60, "ftol": 0.1 * GAIN_TOLERANCE},
             )
-        except _OutsideError:
+        except _CannotFollowError:
             return self._best[2], True
         y = np.clip(result.x[:d], low, high)
         self._margins(np.append(y, result.x[-1]))
@@ -260,14 +260,14 @@ class _Run:
         for k, (quantity, chosen) in enumerate(zip(search._all, self.chosen, strict=True)):
             found, by = _evaluate_pieces(problem, quantity, chosen, many, y)
             if not (np.isfinite(found).all() and np.isfinite(by).all()):
-                raise _OutsideError
+                raise _CannotFollowError
             if k == 0:
                 values.append(found / self.scale)
                 slopes.append(by / self.scale)
             else:
                 constraint = search.constraints[k - 1]
                 side = (-1.0 if quantity.least else 1.0) / constraint.scale
-                values.append(constraint.misses(found))
+                values.append(constraint.excess(found))
                 slopes.append(side * by)
         aim = float(values[0].max())
         miss = max([0.0, *(float(row.max()) for row in values[1:])])
@@ -284,20 +284,20 @@ def _evaluate_pieces(
     path = problem.path.at(chosen // width) if width else problem.path
     places = chosen % width if width else chosen
 
-    def of(many: Variants) -> tuple[PathMotion, Array]:
+    def evaluate(many: Variants) -> tuple[PathMotion, Array]:
         followed = PathMotion(many, path)
         if width:
-            return followed, quantity.of(followed)[:, np.arange(len(chosen)), places]
+            return followed, quantity.evaluate(followed)[:, np.arange(len(chosen)), places]
         return followed, quantity.pieces(followed)[:, chosen]
 
-    followed, (found,) = of(one)
+    followed, (found,) = evaluate(one)
     if not np.isfinite(found).all():
-        raise _OutsideError
+        raise _CannotFollowError
     if not problem.robot.redundant:
         return found, quantity.slopes(followed, places) @ problem.variables.slopes
-    # Redundant drives have no exact derivatives.
+    # Redundant drives have no exact derivatives: take differences.
     steps = DIFFERENCE_STEP * np.eye(len(y))
-    ahead, behind = (of(problem.machines(y + side * steps))[1] for side in (1.0, -1.0))
+    ahead, behind = (evaluate(problem.machines(y + side * steps))[1] for side in (1.0, -1.0))
     return found, (ahead - behind).T / (2.0 * DIFFERENCE_STEP)
 
 
@@ -372,7 +372,7 @@ def design(
     aims = [find_quantity(name, "minimise") for name in names]
     if any(aim.least for aim in aims):
         raise ParameterError("minimise", names, "a quantity that is better when it is less")
-    constraints = tuple(Constraint.of(text) for text in subject_to)
+    constraints = tuple(Constraint.parse(text) for text in subject_to)
     deflects = any(q.name == "deflection" for q in (*aims, *(c.quantity for c in constraints)))
     if deflects and not path.wrench.any():
         raise ParameterError("wrench", None, "a wrench that deflects the platform")
@@ -389,7 +389,7 @@ def design(
         search = Search(problem, aim, bounds)
         values, misses, _ = search.evaluate(tries)
         rejected = max(rejected, int(np.isinf(misses).sum()))
-        # Machines that keep the bounds by their aims, before others by their misses.
+        # Sort machines that keep the bounds by their aims, then the others by their excess.
         ranks = np.where(misses <= MISS_TOLERANCE, -np.inf, misses), values
         order = [k for k in np.lexsort(ranks[::-1]).tolist() if np.isfinite(misses[k])]
         found: tuple[Array, float, float] | None = None
@@ -405,25 +405,25 @@ def design(
     if least is None:
         if rejected >= len(first):
             raise PkmTwinError(f"{robot.name}: none of {len(first)} machines tried can follow the path")
-        kept = ", ".join(map(str, constraints))
-        raise PkmTwinError(f"{robot.name}: no machine found that follows the path and keeps {kept}")
+        bounds_text = ", ".join(map(str, constraints))
+        raise PkmTwinError(f"{robot.name}: no machine found that follows the path and keeps {bounds_text}")
     front: list[Array] = [least]
     if len(aims) > 1:
         other = search_from(aims[1], constraints, np.vstack([first, least]))
         assert other is not None  # noqa: S101  the first end of the front keeps the bounds
         front = _trace_front(problem, aims, constraints, (least, other), points, search_from)
-    told = [problem.point(y, constraints) for y in front]
-    # The machine nearest to both smallest aims, relative to their ranges.
-    table = np.array([[point.quantities[name] for name in names] for point in told])
+    points_found = [problem.point(y, constraints) for y in front]
+    # Choose the machine that is nearest to both smallest aims, relative to their ranges.
+    table = np.array([[point.quantities[name] for name in names] for point in points_found])
     span = np.ptp(table, 0)
-    near = (table - table.min(0)) / np.where(span > 0.0, span, 1.0)
-    best = told[int(np.argmin((near**2).sum(1)))]
+    distances = (table - table.min(0)) / np.where(span > 0.0, span, 1.0)
+    best = points_found[int(np.argmin((distances**2).sum(1)))]
     before = problem.point(problem.variables.start, constraints)
     return Design(
         robot.with_file_values(best.numbers),
         best,
         before,
-        tuple(told) if len(aims) > 1 else (),
+        tuple(points_found) if len(aims) > 1 else (),
         tuple(names),
         constraints,
         problem.count,
@@ -453,7 +453,7 @@ def _trace_front(
     points: int,
     search_from: Callable[[Quantity, Sequence[Constraint], Array], Array | None],
 ) -> list[Array]:
-    """Return machines between the front's ends: smallest first aim for bounds of the second."""
+    """Trace a Pareto front: minimise the first aim for evenly spaced bounds of the second."""
     first, second = aims
     rows = problem.pieces(np.array(ends), [second])[0]
     high, low = second.worst(rows)

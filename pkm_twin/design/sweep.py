@@ -146,7 +146,7 @@ def sweep(
             table[name][first : first + size] = values
         done += size
         progress(done)
-    named = np.array([variables.named(y) for y in points])
+    named = np.array([variables.values_by_name(y) for y in points])
     return Sweep(
         shape,
         {n: named[:, i].reshape(shape) for i, n in enumerate(variables.names)},

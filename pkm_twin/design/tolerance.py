@@ -17,9 +17,9 @@ from pkm_twin.design.parts import (
     MAX_OPEN_FRACTION,
     Assembly,
     Effect,
-    error_of,
-    matching,
-    part_of,
+    find_part,
+    match_errors,
+    name_error,
 )
 from pkm_twin.design.variants import variants
 from pkm_twin.errors import ParameterError, PkmTwinError
@@ -62,27 +62,27 @@ class Tolerances:
         """Paths of each error: the three axes of a clearance."""
         found: dict[str, list[str]] = {}
         for path in self.sigma:
-            found.setdefault(error_of(path), []).append(path)
+            found.setdefault(name_error(path), []).append(path)
         return found
 
     def effect(self, error: str) -> Array:
         """Return the standard deviation by one error of :attr:`together`, shape (..., 6)."""
-        return _root_of_squares([self.part(path) for path in self.together[error]])
+        return _root_sum_squares([self.part(path) for path in self.together[error]])
 
     @cached_property
     def worst(self) -> Array:
         """Largest effect of all errors together on each component, shape (..., 6)."""
         each = [
-            _root_of_squares([self.bounds[path] * self.sensitivity[path] for path in paths])
+            _root_sum_squares([self.bounds[path] * self.sensitivity[path] for path in paths])
             for paths in self.together.values()
         ]
         return np.asarray(sum(each), np.float64)
 
     @cached_property
     def is_exact(self) -> bool:
-        """True if :attr:`farthest` is attained: few errors, none of a free direction.
+        """True if :attr:`farthest` is attained: at most 12 errors, none of them with a free direction.
 
-        Up to 12 errors all combinations of signs are tried: 2,048 different ones.
+        With 12 errors there are 2,048 different combinations of signs.
         """
         single = all(len(paths) == 1 for paths in self.together.values())
         return single and len(self.bounds) <= 12
@@ -107,7 +107,7 @@ class Tolerances:
             apart = np.linalg.norm(self.worst.reshape(*shape, 2, 3), axis=-1)
             return np.asarray(np.minimum(sum(lengths), apart), np.float64)
         each = np.array([self.bounds[path] * self.sensitivity[path] for path in self.sigma])
-        # Reversing all signs gives the same length.
+        # The sign of the first error is fixed, because reversing all signs gives the same length.
         signs = np.array([(1.0, *row) for row in product((1.0, -1.0), repeat=len(each) - 1)])
         rows = each.reshape(len(each), -1, 6)
         found = [
@@ -123,7 +123,7 @@ class Tolerances:
     @cached_property
     def deviation(self) -> Array:
         """Standard deviation by all errors together, shape (..., 6)."""
-        return _root_of_squares([self.part(path) for path in self.sigma])
+        return _root_sum_squares([self.part(path) for path in self.sigma])
 
     @cached_property
     def only_turns(self) -> bool:
@@ -149,14 +149,14 @@ class Tolerances:
         return {path: self.part(path) ** 2 / whole for path in self.sigma}
 
 
-def _root_of_squares(parts: Sequence[Array]) -> Array:
+def _root_sum_squares(parts: Sequence[Array]) -> Array:
     """Return the root of the sum of squares."""
     return np.asarray(np.sqrt(sum(part**2 for part in parts)), np.float64)
 
 
 def is_play(path: str) -> bool:
-    """Return whether an error is a play, which calibration cannot identify."""
-    return error_of(path).endswith((".backlash", ".clearance"))
+    """Return whether an error is play (backlash or clearance), which calibration cannot identify."""
+    return name_error(path).endswith((".backlash", ".clearance"))
 
 
 def expand_patterns(robot: Robot, given: Mapping[str, float | Tolerance]) -> dict[str, float | Tolerance]:
@@ -165,10 +165,10 @@ def expand_patterns(robot: Robot, given: Mapping[str, float | Tolerance]) -> dic
     :raises ParameterError: a pattern that matches nothing, or a play without a bound.
     """
     found: dict[str, float | Tolerance] = {}
-    # An entry for a single part takes precedence over a pattern.
+    # Expand patterns first, so that entries for single parts replace theirs.
     for path in sorted(given, key=lambda path: "*" not in str(path)):
         value = given[path]
-        for name in matching(robot, path) if "*" in str(path) else [path]:
+        for name in match_errors(robot, path) if "*" in str(path) else [path]:
             play = isinstance(name, str) and is_play(name)
             if play and getattr(value, "bound", None) is None:
                 raise ParameterError(f"tolerance {name}", value, "a bound, the whole play")
@@ -207,12 +207,12 @@ def tolerances(
 
     A * in a path stands for any text: each matching part has its own error.
 
-    :param sigma: standard deviation by path, m or rad, at most :data:`MAX_DEVIATION`; or how the
-        error is distributed.
+    :param sigma: standard deviation by path, m or rad, at most :data:`MAX_DEVIATION`; or the
+        error's distribution.
     :param q: joint positions, shape (..., n), rad or m.
     :param wrench: on the platform, shape (6,) or (..., 6), N and N m, for ``deflection``.
     :raises ParameterError: an unknown path, an invalid standard deviation, a number
-        that moves nothing, or an error with which the rigid parts of an overconstrained machine
+        that does not affect the platform, or an error with which the rigid parts of an overconstrained machine
         cannot be assembled.
     :raises SingularityError: a state in which the loops do not determine the bodies. Others as of
         ``forward``.
@@ -221,7 +221,7 @@ def tolerances(
     if not sigma:
         raise ParameterError("tolerance", None, "at least one PATH with its standard deviation")
     given_sizes = expand_patterns(robot, sigma)
-    parts = {path: part_of(robot, path) for path in given_sizes}
+    parts = {path: find_part(robot, path) for path in given_sizes}
     known = {path: part for path, part in parts.items() if part is not None}
     numbers = [path for path in given_sizes if path not in known]
     slopes = dict(platform_derivatives(robot, states, numbers).by)
@@ -233,10 +233,10 @@ def tolerances(
     for path, value in given_sizes.items():
         most = {"m": MAX_DEVIATION * robot.graph.size, "rad": MAX_DEVIATION}.get(units[path])
         number = schema.number(low=0.0, high=most, unit=units[path])
-        told = value.size if isinstance(value, Tolerance) else value
-        size = schema.checked(number, f"tolerance {path}", told)
+        value_size = value.size if isinstance(value, Tolerance) else value
+        size = schema.checked(number, f"tolerance {path}", value_size)
         one = value if isinstance(value, Tolerance) else Tolerance(deviation=size)
-        # Parts are at most half of a play away from its middle.
+        # A part is at most half the play from the middle.
         sizes[path] = Tolerance(bound=size / 2.0) if is_play(path) else one
     for path in numbers:
         if states.size and not slopes[path].any():
@@ -244,20 +244,20 @@ def tolerances(
     if known:
         rows = states.reshape(-1, robot.joints_count)
         found = [
-            Assembly(robot, rows[start : start + STATES_PER_BLOCK]).platform(list(known.values()))
+            Assembly(robot, rows[start : start + STATES_PER_BLOCK]).platform_effects(list(known.values()))
             for start in range(0, max(1, len(rows)), STATES_PER_BLOCK)
         ]
         table = np.concatenate([twist for twist, _ in found])
         table = table.reshape(*states.shape[:-1], 6, len(known))
         for k, (path, part) in enumerate(known.items()):
             slopes[path] = np.ascontiguousarray(table[..., k])
-            missed = max(float(part_missed[k]) for _, part_missed in found)
-            if missed > MAX_OPEN_FRACTION:
+            open_fraction = max(float(part_missed[k]) for _, part_missed in found)
+            if open_fraction > MAX_OPEN_FRACTION:
                 raise ParameterError(
                     f"tolerance {path}",
                     part.text,
                     f"errors after which the closed loops of {robot.name} still assemble (this one "
-                    f"alone leaves {100 * missed:.2g} % of it open); parts with commas between "
+                    f"alone leaves {100 * open_fraction:.2g} % of it open); parts with commas between "
                     f"share an error: {path},OTHER_PART=SIZE",
                 )
     return Tolerances(
@@ -297,21 +297,25 @@ def drawn(robot: Robot, sigma: Mapping[str, float | Tolerance], q: ArrayLike, co
         if getattr(sizes[paths[0]], "bound", None) is None:
             errors |= {path: known.sigma[path] * rng.normal(size=count) for path in paths}
         else:
-            # The parts of a clearance touch: any direction, with the bound's length.
-            way = rng.normal(size=(len(paths), count)) if len(paths) > 1 else None
-            unit = rng.uniform(-1.0, 1.0, (1, count)) if way is None else (way / np.linalg.norm(way, axis=0))
+            # The parts of a joint with clearance touch each other: a random direction, with the bound's length.
+            directions = rng.normal(size=(len(paths), count)) if len(paths) > 1 else None
+            unit = (
+                rng.uniform(-1.0, 1.0, (1, count))
+                if directions is None
+                else (directions / np.linalg.norm(directions, axis=0))
+            )
             errors |= {one: known.bounds[one] * row for one, row in zip(paths, unit, strict=True)}
-    parts = [path for path in errors if part_of(robot, path) is not None]
+    parts = [path for path in errors if find_part(robot, path) is not None]
     assembly = Assembly(robot, states)
     if len(parts) == len(errors):
-        return assembly.displaced(_add_effects(robot, errors))
+        return assembly.solve_displacements(_add_effects(robot, errors))
     own = {path: robot.number(path) + errors[path] for path in errors if path not in parts}
     machines = variants(robot, own)
     if parts:
-        # Each machine has its own numbers and its own part errors.
+        # Solve machine by machine, because each has its own numbers and part errors.
         found = np.concatenate(
             [
-                assembly.like(machine.graph).displaced(
+                assembly.with_graph(machine.graph).solve_displacements(
                     _add_effects(robot, {path: errors[path][k : k + 1] for path in parts})
                 )
                 for k, machine in enumerate(machines)
@@ -334,7 +338,7 @@ def _add_effects(robot: Robot, errors: Mapping[str, Array]) -> dict[Effect, Arra
     """Sum the effects of errors of parts, (count,) each."""
     effects: dict[Effect, Array] = {}
     for path, values in errors.items():
-        part = part_of(robot, path)
+        part = find_part(robot, path)
         for what, vector in part.effects.items() if part else ():
             effects[what] = effects.get(what, 0.0) + values[:, None] * vector
     return effects
@@ -357,11 +361,11 @@ def workspace_states(robot: Robot, count: int, seed: int = 0) -> Array:
     return np.asarray(kept, np.float64)
 
 
-def rms(vectors: Array) -> float:
+def rms_length(vectors: Array) -> float:
     """Return the root mean square length of vectors (..., 3)."""
     return float(np.sqrt((vectors**2).sum(-1).mean()))
 
 
-def greatest(vectors: Array) -> float:
+def largest_length(vectors: Array) -> float:
     """Return the largest length of vectors (..., 3)."""
     return float(np.linalg.norm(vectors, axis=-1).max())

@@ -95,7 +95,7 @@ class Variables:
         """Return the numbers of the file for points (k, d), shape (k, p)."""
         return np.asarray(self.own + (y - self.start) @ self.slopes.T)
 
-    def named(self, y: Array) -> list[float]:
+    def values_by_name(self, y: Array) -> list[float]:
         """Return the values of the variables at a point (d,)."""
         return [float(v) for v in self.low + y * (self.high - self.low)]
 

@@ -69,8 +69,8 @@ class Variants:
         self.values: Array = np.stack([np.atleast_1d(row) for row in rows], -1)
         """Values of the paths, shape (k, paths)."""
         self.functions = robot.cached(programs.NumberFunctions, self.paths)
-        self._own: dict[int, Robot | PkmTwinError] = {}
-        self._patterns: dict[int, str] = {}
+        self._robots: dict[int, Robot | PkmTwinError] = {}
+        self._structure_patterns: dict[int, str] = {}
         self._prepared: dict[int, tuple[Code, Array]] = {}
 
     def __len__(self) -> int:
@@ -82,13 +82,13 @@ class Variants:
         :raises PkmTwinError: a file with its numbers is rejected.
         """
         k = range(len(self))[index]
-        if k not in self._own:
+        if k not in self._robots:
             try:
                 given = dict(zip(self.paths, self.values[k].tolist(), strict=True))
-                self._own[k] = self.robot.with_file_values(given)
+                self._robots[k] = self.robot.with_file_values(given)
             except PkmTwinError as error:
-                self._own[k] = error
-        found = self._own[k]
+                self._robots[k] = error
+        found = self._robots[k]
         if isinstance(found, PkmTwinError):
             raise found
         return found
@@ -102,7 +102,7 @@ class Variants:
         home, graph = self.robot.graph.home, self.robot.graph
         reach = [graph.size if graph.joints[name].slides else 1.0 for name in graph.actuated]
         steps = np.linspace(-1.0, 1.0, len(home)) + 0.3
-        # Assembled at home alone, a machine may have no freedom.
+        # Also test a pose near home: a machine that can only be assembled at home has no freedom.
         away = 1e-3 * np.array([0.0 * steps, steps, -steps]) * reach
         rest = [np.zeros_like(home)] * 2 * self.robot.redundant
         ask = programs.project_redundant if self.robot.redundant else programs.forward
@@ -225,7 +225,7 @@ class Variants:
             if isinstance(value, cached_property):
                 vars(made).pop(name, None)
         made.values = values
-        made._own, made._patterns, made._prepared = {}, {}, {}
+        made._robots, made._structure_patterns, made._prepared = {}, {}, {}
         if checked:
             vars(made)["_out_of_range"] = np.zeros(len(values), bool)
         return made
@@ -290,7 +290,7 @@ class Variants:
         Numbers that depend on a parameter may be any function of it.
         """
         paths = [self.paths[column] for column in columns]
-        # More numbers have too many corners.
+        # Check sample by sample: so many numbers would have too many corners.
         if len(columns) > 5 or any(split_path(path)[0] == PARAMETERS for path in paths):
             return False
         ends = zip(rows.min(0).tolist(), rows.max(0).tolist(), strict=True)
@@ -306,33 +306,33 @@ class Variants:
             return False
         return True
 
-    def _join(self, names: Sequence[programs.Numbers]) -> Array:
+    def _join_inputs(self, names: Sequence[programs.Numbers]) -> Array:
         """Return a program's inputs of each machine, shape (k, size)."""
         return np.concatenate([getattr(self, name) for name in names], 1)
 
-    def _prepare(self, ask: programs.Ask, robot: Robot) -> tuple[Code, Array]:
+    def _prepare(self, ask: programs.MakeRequest, robot: Robot) -> tuple[Code, Array]:
         """Return a robot's program, and its inputs of each machine, shape (k, prepared + 1)."""
         kernel, numbers = ask(robot)
         code = kernel.code
         found = self._prepared.get(id(code))
         if found is None:
-            rows = self._join(numbers)
+            rows = self._join_inputs(numbers)
             prepared = code.prepare(rows) if len(rows) else np.zeros((0, 1))
             found = self._prepared[id(code)] = code, prepared
         return found
 
-    def run(self, ask: programs.Ask, *inputs: ArrayLike) -> tuple[list[Array], Mask]:
+    def run(self, ask: programs.MakeRequest, *inputs: ArrayLike) -> tuple[list[Array], Mask]:
         """Return outputs (k, ..., size) each, and which are valid, shape (k, ..., 1)."""
         code, prepared = self._prepare(ask, self.robot)
         k = len(self)
         arrays, shapes = code.checked(inputs), []
         for array in arrays:
             each = array.ndim > 1 and array.shape[0] == k
-            # A shape that begins with 1 gives all machines the same k samples.
+            # With a first axis of 1 all machines have the same samples.
             shapes.append((each, array.shape[1 if each or array.shape[:2] == (1, k) else 0 : -1]))
         batch = common_batch(*(shape for _, shape in shapes))
         count = math.prod(batch)
-        # As the code takes them: (k or 1, samples or 1, size).
+        # Shapes of the compiled code: (k or 1, samples or 1, size).
         rows = []
         for array, (each, shape) in zip(arrays, shapes, strict=True):
             machines, size, one = k if each else 1, array.shape[-1], math.prod(shape) == 1
@@ -341,26 +341,26 @@ class Variants:
                 values = np.broadcast_to(values, (machines, *batch, size))
             rows.append(np.ascontiguousarray(values.reshape(machines, 1 if one else count, size)))
         if (prepared[:, -1] <= MAX_GEOMETRY_MISMATCH).all():
-            outputs, status = code.run_each(prepared, *rows)
+            outputs, status = code.run_machines(prepared, *rows)
             good = np.ones((k, count), bool) if status is None else status[..., 0] == 0.0
         else:
             outputs = [np.full((k, count, size), np.nan) for size in code.sizes[1]]
             good = np.zeros((k, count), bool)
             for one_code, rest, own in self._programs_by_structure(ask):
                 picked = [row[own] if len(row) > 1 else row for row in rows]
-                found, status = one_code.run_each(rest[own], *picked)
+                found, status = one_code.run_machines(rest[own], *picked)
                 for table, values in zip(outputs, found, strict=True):
                     table[own] = values
                 good[own] = True if status is None else status[..., 0] == 0.0
         shaped = [values.reshape(k, *batch, values.shape[-1]) for values in outputs]
         return shaped, np.asarray(good).reshape(k, *batch, 1)
 
-    def _programs_by_structure(self, ask: programs.Ask) -> Iterator[tuple[Code, Array, NDArray[np.intp]]]:
+    def _programs_by_structure(self, ask: programs.MakeRequest) -> Iterator[tuple[Code, Array, NDArray[np.intp]]]:
         """Yield each structure's program with the machines that it is valid for."""
-        # Without an assembly at home there are no inputs for any program.
-        left = np.asarray(~np.isnan(self._join(ask(self.robot)[1])).any(1))
+        # A machine without an assembly at home has no inputs for the programs.
+        remaining = np.asarray(~np.isnan(self._join_inputs(ask(self.robot)[1])).any(1))
         others = self.functions.others
-        robots = itertools.chain([self.robot, *others], self._build_robots(left))
+        robots = itertools.chain([self.robot, *others], self._build_robots(remaining))
         for robot in robots:
             try:
                 code, prepared = self._prepare(ask, robot)
@@ -368,36 +368,36 @@ class Variants:
                 if robot is self.robot:
                     raise
                 continue
-            fits = left & (prepared[:, -1] <= MAX_GEOMETRY_MISMATCH)
+            fits = remaining & (prepared[:, -1] <= MAX_GEOMETRY_MISMATCH)
             if fits.any() and robot is not self.robot and robot not in others:
                 others.append(robot)
             yield code, prepared, np.flatnonzero(fits)
-            left &= ~fits
+            remaining &= ~fits
 
-    def _build_robots(self, left: Mask) -> Iterator[Robot]:
+    def _build_robots(self, remaining: Mask) -> Iterator[Robot]:
         """Yield the first of the remaining machines as robots, checking again after each."""
-        while left.any():
-            first, *others = np.flatnonzero(left).tolist()
+        while remaining.any():
+            first, *others = np.flatnonzero(remaining).tolist()
             try:
                 robot = self[first]
                 if _inertia_order(robot) == _inertia_order(self.robot):
                     yield robot
             except PkmTwinError:
-                # Machines with the same zeros and parallels cannot be built either.
-                pattern = self._pattern(first)
+                # Other machines of this structure cannot be built, either.
+                pattern = self._structure_pattern(first)
                 for other in others:
-                    left[other] = self._pattern(other) != pattern
-            left[first] = False
+                    remaining[other] = self._structure_pattern(other) != pattern
+            remaining[first] = False
 
-    def _pattern(self, k: int) -> str:
+    def _structure_pattern(self, k: int) -> str:
         """Return a text of a machine's zeros and parallels."""
-        if k not in self._patterns:
+        if k not in self._structure_patterns:
             given = dict(zip(self.paths, self.values[k].tolist(), strict=True))
             try:
-                self._patterns[k] = describe_pattern(Tree(self.robot.numbered(given).graph))
+                self._structure_patterns[k] = describe_pattern(Tree(self.robot.numbered(given).graph))
             except PkmTwinError:
-                self._patterns[k] = "none"
-        return self._patterns[k]
+                self._structure_patterns[k] = "none"
+        return self._structure_patterns[k]
 
 
 def _inertia_order(robot: Robot) -> list[tuple[str, str]]:

@@ -15,7 +15,7 @@ from textwrap import indent
 from typing import Any, Final
 
 from pkm_twin.codegen.code import STEPS
-from pkm_twin.codegen.expressions import Expression, Tape, count, ordered, uses
+from pkm_twin.codegen.expressions import Expression, Tape, count, count_uses, list_dependencies
 from pkm_twin.codegen.operations import (
     OPERATIONS,
     SAMPLE,
@@ -29,9 +29,9 @@ from pkm_twin.codegen.operations import (
 )
 from pkm_twin.codegen.program import (
     AT,
-    LARGE,
     LAST,
     MAX_ITERATIONS,
+    MAX_SUM,
     STATE,
     UNKNOWNS,
     Equations,
@@ -42,24 +42,24 @@ from pkm_twin.codegen.program import (
 from pkm_twin.export.c_functions import C_FUNCTIONS
 from pkm_twin.export.schedule import LATENCIES, LATENCY, TURN_LATENCY, Work, order_work
 
-LADDER: Final = (1, *STEPS)
-"""Steps of Newton's method, one attempt after the other."""
-CORRECTIONS: Final = MAX_ITERATIONS * sum(LADDER)
-"""Most corrections of a call."""
+ATTEMPTS: Final = (1, *STEPS)
+"""Numbers of steps of Newton's method in each attempt."""
+MAX_CORRECTIONS: Final = MAX_ITERATIONS * sum(ATTEMPTS)
+"""Largest number of corrections of a call."""
 
 
-LONGEST: Final = 44
-"""Characters of an expression that is written into another one."""
+MAX_INLINE_CHARACTERS: Final = 44
+"""Largest number of characters of an expression that is written into another one."""
 
 
-def table(name: str, values: Sequence[float]) -> str:
-    """Write a constant table, four numbers a line."""
+def write_table(name: str, values: Sequence[float]) -> str:
+    """Write a constant table, with four numbers per line."""
     texts = [c_number(value).strip("()") for value in values]
     rows = [", ".join(texts[k : k + 4]) for k in range(0, len(texts), 4)]
     return f"static const double {name}[{len(texts)}] = {{\n    " + ",\n    ".join(rows) + "\n};\n"
 
 
-HEAD: Final = """\
+C_HEAD: Final = """\
 #include <math.h>
 
 #if defined(__FINITE_MATH_ONLY__) && (__FINITE_MATH_ONLY__ > 0)
@@ -76,7 +76,7 @@ HEAD: Final = """\
 """
 
 
-def bare(text: str) -> str:
+def strip_brackets(text: str) -> str:
     """Remove the brackets around a whole expression, if it has any."""
     if not (text.startswith("(") and text.endswith(")")):
         return text
@@ -88,63 +88,63 @@ def bare(text: str) -> str:
     return text[1:-1]
 
 
-class Lines:
+class StraightLineCode:
     """Straight-line C of some expressions, as the body of a function.
 
-    Lines are in the order in which a processor can begin them, so that it computes several chains of
-    operations side by side: it looks a few hundred instructions ahead, and no compiler moves more.
+    Statements are in an order in which a processor computes several chains of operations in parallel:
+    it looks only a few hundred instructions ahead, and compilers move statements no farther.
 
-    :param known: texts of expressions that are given.
+    :param known: texts of expressions that exist already, by number.
     """
 
     def __init__(self, results: Sequence[Expression], known: Mapping[int, str]) -> None:
         self.doubles = 0
         self.needed: set[Operation] = set()
-        self._known, self._text, self._used = known, dict(known), uses(results)
+        self._known, self._text, self._used = known, dict(known), count_uses(results)
         self._work: dict[int, Work] = {}
         """Work to compute the text of an expression, by the expression's number."""
         self._statements: list[tuple[str, Work]] = []
-        for k, angles in enumerate(_angles(results, known)):
-            self._turn(k, angles)
-        self._write(results)
+        for k, angles in enumerate(_group_angles(results, known)):
+            self._write_sines_cosines(k, angles)
+        self._write_statements(results)
         self.results = [self._text[e.number] for e in results]
         self.lines = [self._statements[k][0] for k in order_work([work for _, work in self._statements])]
 
-    def _turn(self, k: int, angles: Mapping[int, Sequence[Expression]]) -> None:
-        """Write sines and cosines of several angles in one call, by the number of the angle."""
+    def _write_sines_cosines(self, k: int, angles: Mapping[int, Sequence[Expression]]) -> None:
+        """Write one call for the sines and cosines of several angles, which are given by number."""
         size = len(angles)
-        self._write([x for turn in angles.values() for x in turn[0].args])
+        self._write_statements([x for turn in angles.values() for x in turn[0].args])
         self.needed.add(sin)
         lines = [f"    double a{k}[{size}], s{k}[{size}], c{k}[{size}];"]
         self.doubles += 3 * size
         work = Work.join([self._work[angle] for angle in angles if angle in self._work], TURN_LATENCY)
         for i, (angle, turn) in enumerate(angles.items()):
-            lines.append(f"    a{k}[{i}] = {bare(self._text[angle])};")
+            lines.append(f"    a{k}[{i}] = {strip_brackets(self._text[angle])};")
             for e in turn:
                 self._text[e.number] = f"{'s' if e.op is sin else 'c'}{k}[{i}]"
                 self._work[e.number] = Work(frozenset({len(self._statements)}))
         lines.append(f"    @_turn(a{k}, s{k}, c{k}, {size});")
         self._statements.append(("\n".join(lines), work))
 
-    def _write(self, results: Sequence[Expression]) -> None:
-        for e in ordered(results, self._text):
+    def _write_statements(self, results: Sequence[Expression]) -> None:
+        for e in list_dependencies(results, self._text):
             work = Work()
             if e.source is not None:
                 text = "{}[{}]".format(*e.source)
             elif e.op is None:
                 text = c_number(e.value)
             else:
-                text, work = self._operation(e, e.op)
+                text, work = self._write_operation(e, e.op)
                 once = self._used.get(e.number, 2) == 1
-                # A product that is used once becomes part of a fused operation.
-                if not once or (e.op is not mul and len(text) > LONGEST):
+                # Write a product that is used once in place, where it may become part of a fused operation.
+                if not once or (e.op is not mul and len(text) > MAX_INLINE_CHARACTERS):
                     name = f"v{self.doubles}"
-                    self._statements.append((f"    const double {name} = {bare(text)};", work))
+                    self._statements.append((f"    const double {name} = {strip_brackets(text)};", work))
                     text, work = name, Work(frozenset({len(self._statements) - 1}))
                     self.doubles += 1
             self._text[e.number], self._work[e.number] = text, work
 
-    def _operation(self, e: Expression, op: Operation) -> tuple[str, Work]:
+    def _write_operation(self, e: Expression, op: Operation) -> tuple[str, Work]:
         parts = fused(e, self._used, self._known)
         first, values = True, list(e.args)
         if parts is not None:
@@ -161,11 +161,11 @@ class Lines:
         return f"PKM_FMA({x}, {y}, {z})", work
 
 
-def _angles(results: Sequence[Expression], known: Mapping[int, str]) -> list[dict[int, list[Expression]]]:
-    """Group sines and cosines by their angle; first those whose angles depend on no others."""
+def _group_angles(results: Sequence[Expression], known: Mapping[int, str]) -> list[dict[int, list[Expression]]]:
+    """Group sines and cosines by depth, each group by angle: depth 0 has angles that depend on no others."""
     depth: dict[int, int] = {}
     groups: dict[int, dict[int, list[Expression]]] = {}
-    for e in ordered(results, known):
+    for e in list_dependencies(results, known):
         here = max((depth.get(x.number, 0) for x in e.args), default=0)
         turns = e.op is sin or e.op is cos
         depth[e.number] = here + turns
@@ -174,13 +174,13 @@ def _angles(results: Sequence[Expression], known: Mapping[int, str]) -> list[dic
     return [groups[k] for k in sorted(groups)]
 
 
-ROWS: Final = ("home", "origin", "start", "onward", "corrected", "branch", "certain", "goal", "foreseen")
-NUMBERS: Final = ("size", "determinant", "residual", "near")
-"""What equations have as expressions, in a row and alone."""
+EQUATION_ROWS: Final = ("home", "origin", "start", "onward", "corrected", "branch", "certain", "goal", "foreseen")
+EQUATION_NUMBERS: Final = ("size", "determinant", "residual", "near")
+"""Attributes of :class:`Equations`: sequences of expressions, and single expressions."""
 
 
-class Folding:
-    """Programs rewritten on one tape, with numbers in place of some inputs."""
+class Substitution:
+    """Rewrites programs on one tape, with numbers or expressions in place of some inputs."""
 
     def __init__(self) -> None:
         self.tape = Tape()
@@ -189,7 +189,7 @@ class Folding:
         """Substitute numbers, or expressions of this tape, for the given inputs."""
         results = list(results)
         made: dict[int, Expression] = {}
-        for e in ordered(results):
+        for e in list_dependencies(results):
             value: Any = e.value
             if e.source is not None:
                 name, k = e.source
@@ -200,10 +200,10 @@ class Folding:
         return [made[e.number] for e in results]
 
     def equations(self, q: Equations, given: Mapping[str, Sequence[Any]]) -> Equations:
-        """Substitute in equations; their known state is constant then."""
-        rows = {name: getattr(q, name) for name in ROWS}
+        """Substitute inputs in equations, whose known state then is constant."""
+        rows = {name: getattr(q, name) for name in EQUATION_ROWS}
         folded: dict[str, Any] = {name: row and self(row, given) for name, row in rows.items()}
-        for name in NUMBERS:
+        for name in EQUATION_NUMBERS:
             value = getattr(q, name)
             folded[name] = value and self([value], given)[0]
         return replace(q, **folded, lone=True)
@@ -213,10 +213,10 @@ class Folding:
 class Routine:
     """One public function.
 
-    ``outputs``: expressions by argument. ``equations``: are solved one after the other.
-    ``state``: what it leaves to its next call, by the input ``last``. ``upon``: a function whose
-    body it calls and goes on from. ``judge``: a function of inputs of the same names, by whose status
-    results are accepted whose assembly is not certain.
+    ``outputs``: expressions by argument. ``equations``: solved one after the other. ``state``: values
+    for its next call, which reads them as the input ``last``. ``upon``: a function whose body it
+    calls first. ``judge``: a function of the same inputs, whose status decides whether results with
+    an uncertain assembly are valid.
     """
 
     name: str
@@ -229,40 +229,40 @@ class Routine:
     judge: Routine | None = None
 
     @property
-    def given(self) -> dict[str, Sequence[Expression]]:
-        """All that it writes."""
+    def written_arguments(self) -> dict[str, Sequence[Expression]]:
+        """Arguments that it writes: the outputs and the state."""
         return {**self.outputs, **({"state": self.state} if self.state else {})}
 
     @property
     def results(self) -> list[Expression]:
         """Outputs, then the state."""
-        return [e for row in self.given.values() for e in row]
+        return [e for row in self.written_arguments.values() for e in row]
 
     @property
     def body(self) -> list[Expression]:
-        """Results, then whether the closures hold, 1 or 0, and whether no judge is needed."""
+        """Results, then 1 or 0: whether the closures hold, and whether the assembly is certain."""
         return [*self.results, *holding(self.equations, certain=False), *certainty(self.equations)]
 
     @property
-    def worst(self) -> tuple[int, int]:
-        """Most operations of a call: with all attempts, and with one.
+    def max_operations(self) -> tuple[int, int]:
+        """Largest number of operations of a call, with all attempts and with one.
 
-        A stream's sample has one attempt more, from the sample before.
+        A stream's sample has a further attempt, from the sample before.
         """
         solved = [q for q in self.equations if q.home]
         step = sum(MAX_ITERATIONS * count(q.correct) + count([*q.begin, *q.onward, *q.aim]) for q in solved)
         rest = count([*self.body, *(e for q in self.equations for e in q.goal)])
         more = len(self.state) > 1
-        steps, attempts = (sum(LADDER), len(LADDER)) if solved else (1, 1)
-        further = 0 if self.judge is None else self.judge.worst[0]
+        steps, attempts = (sum(ATTEMPTS), len(ATTEMPTS)) if solved else (1, 1)
+        further = 0 if self.judge is None else self.judge.max_operations[0]
         first = (1 + more) * (step + rest)
         return (steps + more) * step + (attempts + more) * rest + further, first
 
 
-HOT: Final = "PKM_HOT "
-"""Before the functions that a control loop calls."""
-_LARGE_BITS: Final = hex(struct.unpack("<Q", struct.pack("<d", LARGE))[0])
-_FIXED: Final = f"""\
+CONTROL_LOOP_PREFIX: Final = "PKM_HOT "
+"""Prefix of the functions that a control loop calls."""
+MAX_SUM_BITS: Final = hex(struct.unpack("<Q", struct.pack("<d", MAX_SUM))[0])
+C_RUNTIME: Final = f"""\
 /* Where the compiler can, one form for this processor family's vector units, chosen at load. */
 #ifdef PKM_CLONES
 #define PKM_HOT __attribute__((flatten, target_clones("arch=x86-64-v3", "default")))
@@ -277,7 +277,7 @@ typedef union {{
     unsigned long long bits;
 }} @_double;
 
-/* Whether all magnitudes are below {LARGE!r}: magnitudes are in the order of their bits. */
+/* Whether all magnitudes are below {MAX_SUM!r}: magnitudes are in the order of their bits. */
 static int @_finite(const double *values, int count)
 {{
     @_double one;
@@ -290,7 +290,7 @@ static int @_finite(const double *values, int count)
         most = (one.bits > most) ? one.bits : most;
     }}
     largest = most;
-    return (largest < {_LARGE_BITS}ULL) ? 1 : 0;
+    return (largest < {MAX_SUM_BITS}ULL) ? 1 : 0;
 }}
 
 /* Status of results r, behind which stands whether the closures hold. */
@@ -318,11 +318,11 @@ static void @_give(int status, const double *values, double *out, int count)
 """
 
 
-class Unit:
-    """The C text of one machine's functions, which grows with each that is added.
+class CSource:
+    """The C source of one machine's functions, to which functions are appended.
 
-    :param prefix: of all names.
-    :param parameters: expressions of the tape that a caller gives as a table of numbers.
+    :param prefix: beginning of all names.
+    :param parameters: expressions that a caller gives as a table of numbers.
     """
 
     def __init__(self, prefix: str, parameters: Sequence[Expression], routines: Sequence[Routine]) -> None:
@@ -331,71 +331,71 @@ class Unit:
         self._needed: set[Operation] = set()
         self._parts: list[str] = []
         self._solvers: dict[tuple[int, ...], tuple[str, dict[int, int]]] = {}
-        """By numbers of the expressions: a solver's name, and places in its table."""
+        """Name of a solver and indices into its table, by the numbers of its expressions."""
         self._functions: dict[str, str] = {}
         self._routines = routines
         self._bodies: dict[str, tuple[str, list[Expression]]] = {}
-        """By routine: how to call its body, and what that gives."""
+        """Call of a routine's body and its results, by the routine's name."""
         self.doubles: dict[str, int] = {}
-        """Local doubles of every static function, by name."""
-        self.rooms = 0
-        """Most of a public one."""
+        """Number of local doubles of each static function, by name."""
+        self.max_local_doubles = 0
+        """Largest number of local doubles of a public function."""
 
     def text(self) -> str:
         """Return the source: helpers and all functions."""
         needed = (C_FUNCTIONS.get(op, op.helper) for op in OPERATIONS if op in self._needed)
-        steps = ", ".join(map(str, LADDER))
+        steps = ", ".join(map(str, ATTEMPTS))
         ladder = f"""\
 /* Attempts of Newton's method; fewer shorten the worst case, and reject some valid states. */
 #ifndef PKM_ATTEMPTS
-#define PKM_ATTEMPTS {len(LADDER)}
+#define PKM_ATTEMPTS {len(ATTEMPTS)}
 #endif
-#if (PKM_ATTEMPTS < 1) || (PKM_ATTEMPTS > {len(LADDER)})
-#error "PKM_ATTEMPTS: 1 to {len(LADDER)}"
+#if (PKM_ATTEMPTS < 1) || (PKM_ATTEMPTS > {len(ATTEMPTS)})
+#error "PKM_ATTEMPTS: 1 to {len(ATTEMPTS)}"
 #endif
-static const int @_steps[{len(LADDER)}] = {{{steps}}};
+static const int @_steps[{len(ATTEMPTS)}] = {{{steps}}};
 """
-        parts = [*dict.fromkeys(filter(None, needed)), _FIXED, ladder, *self._parts]
+        parts = [*dict.fromkeys(filter(None, needed)), C_RUNTIME, ladder, *self._parts]
         return "\n".join(parts).replace("@", self.prefix)
 
-    def add(self, text: str) -> None:
+    def append(self, text: str) -> None:
         """Append a text; ``@`` stands for the prefix."""
         self._parts.append(text)
 
-    def function(
+    def write_function(
         self,
         name: str,
         results: Sequence[Expression],
         known: Mapping[int, str],
         called: Mapping[str, str] | None = None,
     ) -> str:
-        """Write a static function that computes the results; return its call, with ``%s``.
+        """Write a static function that computes the results; return its call, with ``%s`` for the target.
 
-        ``%s`` is for its target. Functions with the same text are written once.
+        Functions with the same text are written once.
 
         :param known: texts of expressions that stand in tables of its arguments.
-        :param called: what callers give for an argument of another name.
+        :param called: arguments of the call, where their names differ from the function's.
         """
-        order = ordered(results, known)
-        below = [x for e in order for x in e.args]
-        tables = {known[e.number] for e in (*results, *below) if e.number in known}
+        order = list_dependencies(results, known)
+        arguments_of_order = [x for e in order for x in e.args]
+        tables = {known[e.number] for e in (*results, *arguments_of_order) if e.number in known}
         arguments = sorted({text.partition("[")[0] for text in tables})
         arguments += sorted({e.source[0] for e in order if e.source is not None})
-        made = Lines(results, known)
-        self._needed |= made.needed
-        lines = made.lines + [f"    r[{k}] = {bare(text)};" for k, text in enumerate(made.results)]
+        code = StraightLineCode(results, known)
+        self._needed |= code.needed
+        lines = code.lines + [f"    r[{k}] = {strip_brackets(text)};" for k, text in enumerate(code.results)]
         head = ", ".join([*(f"const double *{a}" for a in arguments), "double *r"])
         text = f"({head})\n{{\n" + "\n".join(lines) + "\n}\n"
         if self._functions.setdefault(text, name) == name:
             self._parts.append(f"static void @_{name}{text}")
         name = self._functions[text]
-        self.doubles[name] = made.doubles
+        self.doubles[name] = code.doubles
         return f"@_{name}({', '.join([*((called or {}).get(a, a) for a in arguments), '%s'])})"
 
-    def solver(self, q: Equations) -> tuple[str, dict[int, int]]:
-        """Write Newton's method for the unknowns with a number of steps, once per program.
+    def write_solver(self, q: Equations) -> tuple[str, dict[int, int]]:
+        """Write Newton's method for the unknowns with a given number of steps, once per program.
 
-        :returns: its name, and places in its table ``h`` by the expression's number.
+        :returns: the function's name, and indices into its table ``h`` by the expression's number.
         """
         work = [*q.begin, *q.onward, *q.correct, *q.aim]
         key = tuple(e.number for e in work)
@@ -403,25 +403,25 @@ static const int @_steps[{len(LADDER)}] = {{{steps}}};
             name = "reach" if q.unknowns != UNKNOWNS else "assembly" if q.near is None else "beside"
             others = sum(known.startswith(name) for known, _ in self._solvers.values())
             name += str(others + 1) if others else ""
-            # What does not change in a step is computed once, and the last serves the results.
-            ahead = _without((q.unknowns, STATE), q.correct)
-            self._solvers[key] = name, {e.number: k for k, e in enumerate(ahead)}
-            self._write_solver(name, q, ahead)
+            # Compute values that are constant in a step once per step; results reuse those of the last step.
+            step_constants = _find_independent_values((q.unknowns, STATE), q.correct)
+            self._solvers[key] = name, {e.number: k for k, e in enumerate(step_constants)}
+            self._write_solver(name, q, step_constants)
         return self._solvers[key]
 
     def _write_solver(self, name: str, q: Equations, ahead: Sequence[Expression]) -> None:
         n, m = len(q.home), len(q.origin)
         known = {e.number: f"h[{k}]" for k, e in enumerate(ahead)}
         aim = {q.target: "aim"}
-        prepare = self.function(f"{name}_ahead", ahead, {}, aim) % "h" if ahead else "(void)h"
-        begin = self.function(f"{name}_begin", q.begin, known, aim) % "next"
-        onward = self.function(f"{name}_onward", q.onward, {}) % "next"
-        correct = self.function(f"{name}_correct", q.correct, known, aim) % "next"
-        target = self.function(f"{name}_aim", q.aim, {}) % "aim"
+        prepare = self.write_function(f"{name}_ahead", ahead, {}, aim) % "h" if ahead else "(void)h"
+        begin = self.write_function(f"{name}_begin", q.begin, known, aim) % "next"
+        onward = self.write_function(f"{name}_onward", q.onward, {}) % "next"
+        correct = self.write_function(f"{name}_correct", q.correct, known, aim) % "next"
+        target = self.write_function(f"{name}_aim", q.aim, {}) % "aim"
         more = "" if q.near is None else "const double *qd, const double *last, "
         x, x_before = q.unknowns, previous(q.unknowns)
-        self.add(table(f"@_{name}_home", [e.value for e in q.home]))
-        self.add(f"""\
+        self.append(write_table(f"@_{name}_home", [e.value for e in q.home]))
+        self.append(f"""\
 /* Newton's method from the known assembly in so many steps; 0 where it does not get there. */
 static int @_{name}({more}const double *{q.target}, int steps, double *h, double *{x})
 {{
@@ -471,30 +471,30 @@ static int @_{name}({more}const double *{q.target}, int steps, double *h, double
 }}
 """)
 
-    def signature(self, routine: Routine, *, given: bool) -> str:
-        """Head of a public function, or of its form with parameters."""
+    def write_signature(self, routine: Routine, *, given: bool) -> str:
+        """Write the head of a public function, or of its form with parameters."""
         arguments = [f"const double *{name}" for name in routine.inputs]
         arguments += [f"double *{name}" for name in routine.outputs]
         first = ["const double *parameters"] if given else []
         first += ["double *state"] if routine.state else []
         return f"int @_{routine.name}{'_with' if given else ''}({', '.join(first + arguments)})"
 
-    def routine(self, routine: Routine, kind: str = "") -> None:
+    def write_routine(self, routine: Routine, kind: str = "") -> None:
         """Write a function with parameters.
 
-        :param kind: what stands before it: ``static`` or :data:`HOT`.
+        :param kind: prefix: ``static`` or :data:`CONTROL_LOOP_PREFIX`.
         """
         known, given = dict(self._known), {"p": "parameters"}
-        # Compilers do not see that nothing is read without a value.
+        # Initialise local arrays, because compilers cannot see that they are written before they are read.
         rooms: dict[str, int] = {}
         solving: list[str] = []
         for k, q in enumerate(routine.equations):
             if q.goal:
                 rooms["goal"], given[q.target] = len(q.goal), "goal"
-                goal = self.function(f"{routine.name}_goal", q.goal, {}, given) % "goal"
+                goal = self.write_function(f"{routine.name}_goal", q.goal, {}, given) % "goal"
                 solving.append(f"{goal};")
             if q.home:
-                name, ahead = self.solver(q)
+                name, ahead = self.write_solver(q)
                 known |= {number: f"h{k}[{at}]" for number, at in ahead.items()}
                 rooms |= {f"h{k}": len(ahead) or 1, q.unknowns: len(q.home)}
                 to = f"{given.get(q.target, q.target)}, @_steps[rung], h{k}, {q.unknowns}"
@@ -509,8 +509,8 @@ static int @_{name}({more}const double *{q.target}, int steps, double *h, double
             solving.append(f"{call % 'b'};")
             known |= {e.number: f"b[{k}]" for k, e in enumerate(found) if e.op is not None}
         above = [other.body for other in self._routines if other.upon is routine]
-        body = [*routine.body, *_read_of(routine.body, above)]
-        call = self.function(f"{routine.name}_of", body, known, given)
+        body = [*routine.body, *_find_shared_values(routine.body, above)]
+        call = self.write_function(f"{routine.name}_of", body, known, given)
         self._bodies[routine.name] = call, body
         rooms["r"] = len(body)
         work = "\n".join([*solving, f"{call % 'r'};", f"status = @_judged(r, {len(routine.results)});"])
@@ -528,47 +528,49 @@ static int @_{name}({more}const double *{q.target}, int steps, double *h, double
         if routine.judge is not None:
             certain = f"(r[{len(body) - 1}] > 0.0)"
             if any(q.home for q in routine.equations):
-                # It is judged of the first attempt alone.
+                # Only the first attempt can be certain.
                 certain = f"((rung == 1) && {certain})"
             (size,) = map(len, routine.judge.outputs.values())
             names = ", ".join(["parameters", *routine.judge.inputs, "other"])
             lines += [f"    if ((status == 0) && !{certain}) {{", f"        double other[{size}];"]
             lines += [f"        status = @_{routine.judge.name}_with({names});", "    }"]
         at = 0
-        for name, row in routine.given.items():
+        for name, row in routine.written_arguments.items():
             source = f"&r[{at}]" if at else "r"
             lines.append(f"    @_give(status, {source}, {name}, {len(row)});")
             at += len(row)
         lines.append("    return status;")
-        self.rooms = max(self.rooms, sum(rooms.values()))
-        self.add(f"{kind}{self.signature(routine, given=True)}\n{{\n" + "\n".join(lines) + "\n}\n")
+        self.max_local_doubles = max(self.max_local_doubles, sum(rooms.values()))
+        self.append(f"{kind}{self.write_signature(routine, given=True)}\n{{\n" + "\n".join(lines) + "\n}\n")
 
-    def own(self, routine: Routine) -> None:
+    def write_own(self, routine: Routine) -> None:
         """Write the function that calls a routine with this machine's own parameters."""
         first = ["@_own", "state"] if routine.state else ["@_own"]
         names = ", ".join([*first, *routine.inputs, *routine.outputs])
-        self.add(f"{self.signature(routine, given=False)}\n{{\n    return @_{routine.name}_with({names});\n}}\n")
+        self.append(
+            f"{self.write_signature(routine, given=False)}\n{{\n    return @_{routine.name}_with({names});\n}}\n"
+        )
 
 
-def _read_of(body: Sequence[Expression], above: Iterable[Sequence[Expression]]) -> list[Expression]:
-    """Find intermediate values of a body that other results, computed after it, read."""
-    inner = {e.number for e in ordered(body) if e.op is not None and e.level == SAMPLE}
+def _find_shared_values(body: Sequence[Expression], others: Iterable[Sequence[Expression]]) -> list[Expression]:
+    """Find the intermediate values of a body that functions that call it read, too."""
+    inner = {e.number for e in list_dependencies(body) if e.op is not None and e.level == SAMPLE}
     known = {e.number for e in body}
     found: dict[int, Expression] = {}
-    for results in above:
-        beyond = [e for e in ordered(results, known) if e.number not in inner]
-        read = [*results, *(x for e in beyond for x in e.args)]
+    for results in others:
+        outside = [e for e in list_dependencies(results, known) if e.number not in inner]
+        read = [*results, *(x for e in outside for x in e.args)]
         found |= {e.number: e for e in read if e.number in inner - known}
     return list(found.values())
 
 
-def _without(names: Container[str], results: Sequence[Expression]) -> list[Expression]:
-    """Find values that do not depend on the named inputs, but are read by values that do."""
-    moved: set[int] = set()
+def _find_independent_values(names: Container[str], results: Sequence[Expression]) -> list[Expression]:
+    """Find the values that do not depend on the named inputs, but are arguments of values that do."""
+    dependent: set[int] = set()
     found: dict[int, Expression] = {}
-    for e in ordered(results):
-        if (e.source or ("",))[0] in names or any(x.number in moved for x in e.args):
-            moved.add(e.number)
-            still = (x for x in e.args if x.number not in moved and x.op is not None)
-            found |= {x.number: x for x in still}
+    for e in list_dependencies(results):
+        if (e.source or ("",))[0] in names or any(x.number in dependent for x in e.args):
+            dependent.add(e.number)
+            independent = (x for x in e.args if x.number not in dependent and x.op is not None)
+            found |= {x.number: x for x in independent}
     return list(found.values())

@@ -24,22 +24,22 @@ from delta_dynamics.torques.virtual_work import (
     torques,
 )
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.expressions import GEOMETRY, PARAMETERS, Expression, edge
+from pkm_twin.codegen.expressions import GEOMETRY, PARAMETERS, Expression, find_prepared
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import LAST, Equations
-from pkm_twin.errors import ParameterError, warn
-from pkm_twin.export.c99 import HEAD, HOT, Folding, Routine, Unit, table
+from pkm_twin.errors import ParameterError, warn_of_file
+from pkm_twin.export.c99 import C_HEAD, CONTROL_LOOP_PREFIX, CSource, Routine, Substitution, write_table
 from pkm_twin.export.c_templates import (
-    ABOUT,
-    BESIDE,
     CMAKE,
-    PARAMETERS_OF,
-    STATELESS,
-    WORST,
+    HEADER_TEXT,
+    OPERATIONS_TEXT,
+    PARAMETERS_TEXT,
+    STATELESS_TEXT,
+    STREAM_TEXT,
     write_example,
     write_readme,
 )
-from pkm_twin.export.c_transmission import TransmissionTerms, directions
+from pkm_twin.export.c_transmission import TransmissionTerms, second_derivative_directions
 from pkm_twin.kinematics.programs import actuator_program
 from pkm_twin.machine.inertia import Layout
 from pkm_twin.machine.members import RigidError
@@ -49,8 +49,8 @@ from stiffness_monitor.compliance import MIN_PIVOT_RATIO
 from stiffness_monitor.programs import Elastic
 
 
-def identifier(name: str) -> str:
-    """Return a robot's name as a part of a C identifier; a letter beyond ASCII as its code."""
+def c_identifier(name: str) -> str:
+    """Return a robot's name as a part of a C identifier, with codes in place of letters beyond ASCII."""
     plain = "".join(c if c.isascii() else f"u{ord(c):04x}" for c in name)
     return re.sub(r"[^A-Za-z0-9_]", "_", plain) or "robot"
 
@@ -58,37 +58,37 @@ def identifier(name: str) -> str:
 def c_package(robot: Robot) -> dict[str, str]:
     """Write the files of a C package, text by name.
 
-    A robot without masses has no functions of dynamics, one without elastic members none of
-    elasticity.
+    Without masses there are no functions of dynamics, without elastic members none of elasticity.
     """
-    made = Package(robot)
+    package = Package(robot)
+    doubles = package.unit.max_local_doubles + max(package.unit.doubles.values())
     return {
-        f"{made.prefix}.h": made.header(),
-        f"{made.prefix}.c": made.source(),
-        "example.c": write_example(robot, made.prefix, made.title),
-        "CMakeLists.txt": CMAKE.format(name=made.prefix),
-        "README.md": write_readme(robot, made.prefix, made.unit.rooms + max(made.unit.doubles.values())),
+        f"{package.prefix}.h": package.header(),
+        f"{package.prefix}.c": package.source(),
+        "example.c": write_example(robot, package.prefix, package.title),
+        "CMakeLists.txt": CMAKE.format(name=package.prefix),
+        "README.md": write_readme(robot, package.prefix, doubles),
     }
 
 
 class Package:
-    """A robot's header, source and the files beside them.
+    """The C header and source of a robot.
 
-    :param names: of the functions, without ``terms`` all of them by default. ``terms``: those of
-        :class:`delta_dynamics.torques.equations.Terms`, side by side.
+    :param names: names of the functions; by default all except ``terms``, which returns those of
+        :class:`delta_dynamics.torques.equations.Terms` in one table.
     """
 
     def __init__(self, robot: Robot, names: Collection[str] = ()) -> None:
         self.robot, self._names = robot, names
-        self._stateless = STATELESS if robot.friction.presliding.any() else ""
+        self._stateless = STATELESS_TEXT if robot.friction.presliding.any() else ""
         if self._stateless:
-            warn("friction", self._stateless)
-        self.prefix = f"pkm_{identifier(robot.name)}"
+            warn_of_file("friction", self._stateless)
+        self.prefix = f"pkm_{c_identifier(robot.name)}"
         self.macro = self.prefix.upper()
         self.n, self.m = robot.joints_count, len(robot.pose_names)
         self.massive = robot.has_masses
         self.elastic: Elastic | None = None
-        if self._wants("compliance") or self._wants("strain_energy"):
+        if self._is_wanted("compliance") or self._is_wanted("strain_energy"):
             try:
                 made = robot.cached(Elastic)
                 _ = made.response
@@ -96,22 +96,22 @@ class Package:
             except RigidError:
                 pass
             except ParameterError as error:
-                # Sections that contradict the masses, or of some parts alone.
-                warn(robot.name, f"no functions of elasticity: {error}")
-        self.fold = Folding()
+                # Sections contradict the masses, or some parts have none.
+                warn_of_file(robot.name, f"no functions of elasticity: {error}")
+        self.fold = Substitution()
         self.payload = self.fold.tape.inputs(PARAMETERS, 13)
         self.hidden: list[Routine] = []
-        self.routines = self._routines()
+        self.routines = self._list_routines()
         rows = [[e for row in r.outputs.values() for e in row] for r in (*self.hidden, *self.routines)]
-        # A table of no numbers is none in C.
-        edges = {e.number: e for row in rows for e in edge(row)}
+        # C has no empty tables: use a parameter if no results depend on any.
+        edges = {e.number: e for row in rows for e in find_prepared(row)}
         self.parameters = [*edges.values()] or [self.payload[0]]
-        self.unit = Unit(self.prefix, self.parameters, self.routines)
-        self._write()
+        self.unit = CSource(self.prefix, self.parameters, self.routines)
+        self._write_functions()
 
-    # Programs.
+    # Routines from compiled programs.
 
-    def _read(
+    def _substitute_numbers(
         self, kernel: Kernel, own: Sequence[Any] | Array = (), **more: Sequence[float]
     ) -> tuple[dict[str, list[Expression]], list[Equations]]:
         """Return the outputs and equations of a kernel with this machine's numbers inserted.
@@ -123,12 +123,12 @@ class Package:
         rows = {name: self.fold(row, given) for name, row in program.outputs.items()}
         return rows, [self.fold.equations(q, given) for q in program.equations]
 
-    def _routines(self) -> list[Routine]:
+    def _list_routines(self) -> list[Routine]:
         robot, n = self.robot, self.n
         q, rates, wrench = {"q": n}, {"q": n, "qd": n}, {"wrench": 6}
         result: list[Routine] = []
 
-        def add(
+        def add_routine(
             name: str,
             summary: str,
             inputs: Mapping[str, int],
@@ -138,10 +138,10 @@ class Package:
             judge: Routine | None = None,
             **outputs: str,
         ) -> None:
-            if self._wants(name):
+            if self._is_wanted(name):
                 rows: dict[str, list[Expression]] = {}
                 for kernel in reversed([kernels] if callable(kernels) else kernels):
-                    found, equations = self._read(kernel(), own)
+                    found, equations = self._substitute_numbers(kernel(), own)
                     rows |= found
                 made = {key: rows[row] for key, row in outputs.items()}
                 last = rows.get(LAST, ())
@@ -159,9 +159,9 @@ class Package:
                     )
                 )
 
-        engine, p = robot.engine, self._inertial() if self.massive else ()
+        engine, p = robot.engine, self._inertial_inputs() if self.massive else ()
         if self.massive:
-            add(
+            add_routine(
                 "torques",
                 "Actuator efforts tau (N m or N) for a motion.",
                 rates | {"qdd": n} | wrench,
@@ -169,7 +169,7 @@ class Package:
                 p,
                 tau="efforts",
             )
-            add(
+            add_routine(
                 "torques_moving",
                 "The efforts of _torques on a base that moves. base, in its own axes: angular "
                 "velocity, angular acceleration, and acceleration of its origin less gravity.",
@@ -178,7 +178,7 @@ class Package:
                 p,
                 tau="efforts",
             )
-            add(
+            add_routine(
                 "torques_and_singularity",
                 "Both for the time of one: actuator efforts tau, and the singularity index.",
                 rates | {"qdd": n} | wrench,
@@ -187,7 +187,7 @@ class Package:
                 tau="efforts",
                 index="measure",
             )
-            add(
+            add_routine(
                 "torques_next",
                 "The efforts of _torques",
                 rates | {"qdd": n} | wrench,
@@ -196,7 +196,7 @@ class Package:
                 "torques",
                 tau="efforts",
             )
-            add(
+            add_routine(
                 "torques_and_singularity_next",
                 "The results of _torques_and_singularity",
                 rates | {"qdd": n} | wrench,
@@ -206,9 +206,9 @@ class Package:
                 tau="efforts",
                 index="measure",
             )
-        add("forward", "Pose of joint positions.", q, lambda: engine.forward, pose="pose")
-        if self._wants("inverse"):
-            add(
+        add_routine("forward", "Pose of joint positions.", q, lambda: engine.forward, pose="pose")
+        if self._is_wanted("inverse"):
+            add_routine(
                 "inverse",
                 "Joint positions of a pose, accepted only if _forward of them is the pose.",
                 {"pose": self.m},
@@ -218,7 +218,7 @@ class Package:
             )
             if self.massive:
                 self._add_at_pose(result, p)
-        add(
+        add_routine(
             "platform",
             "Position (m) of the platform's reference point in base axes, and the platform's "
             "rotation from home, row by row.",
@@ -228,7 +228,7 @@ class Package:
             rotation="rotation",
         )
         if self.massive:
-            add(
+            add_routine(
                 "mass_matrix",
                 "Mass matrix of the actuated joints, row by row.",
                 q,
@@ -236,7 +236,7 @@ class Package:
                 p,
                 m="matrix",
             )
-            add(
+            add_routine(
                 "accelerations",
                 "Joint accelerations that efforts tau cause.",
                 rates | {"tau": n} | wrench,
@@ -246,14 +246,14 @@ class Package:
                 qdd="accelerations",
             )
         if robot.redundant:
-            add(
+            add_routine(
                 "null_efforts",
                 "Efforts that move nothing, of unit length over their limits, row by row.",
                 q,
                 lambda: null_kernel(robot),
                 n="efforts",
             )
-            add(
+            add_routine(
                 "project_redundant",
                 "Positions, rates and accelerations of all joints, by those that lead: "
                 f"{', '.join(robot.graph.leads)}.",
@@ -264,7 +264,7 @@ class Package:
                 changes="qdd",
             )
         if "terms" in self._names:
-            add(
+            add_routine(
                 "terms",
                 "Terms of the equations of motion: mass matrix, bias, energies, twists of "
                 "the platform, rates and drift of passive joints with friction.",
@@ -273,21 +273,21 @@ class Package:
                 p,
                 terms="terms",
             )
-        add(
+        add_routine(
             "jacobian",
             "Pose rates per joint rate, row by row.",
             q,
             lambda: engine.jacobian,
             j="rates",
         )
-        add(
+        add_routine(
             "platform_jacobian",
             "Velocity of the platform's reference point and angular velocity, base axes, per joint rate, row by row.",
             q,
             lambda: engine.jacobian,
             j="twist",
         )
-        add(
+        add_routine(
             "singularity",
             "Singularity index: 0 in a singularity, 1 at best.",
             q,
@@ -327,22 +327,22 @@ class Package:
             ),
         )
         for name, summary, inputs, kernel, outputs in programs:
-            if not self._wants(f"{name}_at_pose"):
+            if not self._is_wanted(f"{name}_at_pose"):
                 continue
-            rows, equations = self._read(kernel(self.robot, certified=True), own)
+            rows, equations = self._substitute_numbers(kernel(self.robot, certified=True), own)
             made = {key: rows[row] for key, row in outputs.items()}
             result.append(Routine(f"{name}_at_pose", inputs, made, equations, summary, judge=self._confirmed_inverse))
 
     @cached_property
     def _confirmed_inverse(self) -> Routine | None:
-        """Undeclared function that judges poses whose assembly is not certain; None on a machine's own tree."""
+        """Static function that judges poses whose assembly is uncertain; None if joints are iterated."""
         if self.robot.engine.posed is None:
             return None
-        rows, equations = self._read(self.robot.engine.inverse)
+        rows, equations = self._substitute_numbers(self.robot.engine.inverse)
         self.hidden.append(Routine("inverse_confirmed", {"pose": self.m}, rows, equations, ""))
         return self.hidden[-1]
 
-    def _wants(self, name: str) -> bool:
+    def _is_wanted(self, name: str) -> bool:
         return not self._names or name in self._names
 
     def _add_transmission(self, result: list[Routine]) -> None:
@@ -365,10 +365,13 @@ class Package:
                 {"pose": m, "stiffness": m * m, "damping": m * m, "tau": n},
             ),
         ):
-            if not self._wants(name):
+            if not self._is_wanted(name):
                 continue
             kernel = transmission_kernel(robot, certified=True, curved=curved)
-            found = [self._read(kernel, rate=way) for way in (directions(m) if curved else [[]])]
+            found = [
+                self._substitute_numbers(kernel, rate=way)
+                for way in (second_derivative_directions(m) if curved else [[]])
+            ]
             rows, equations = found[0]
             terms = TransmissionTerms(robot, self.fold, rows["ratio"])
             equations = terms.limit_growth(equations)
@@ -377,9 +380,9 @@ class Package:
             else:
                 outputs = {"q": rows["q"], **terms.actuator_side()}
             result.append(Routine(name, inputs, outputs, equations, summary, judge=self._confirmed_inverse))
-        if self._wants("actuator_to_joint"):
+        if self._is_wanted("actuator_to_joint"):
             kernel = robot.engine.kernel("actuator to joint", actuator_program)
-            rows, equations = self._read(kernel)
+            rows, equations = self._substitute_numbers(kernel)
             result.append(
                 Routine(
                     "actuator_to_joint",
@@ -392,10 +395,10 @@ class Package:
             )
 
     def _add_elastic(self, elastic: Elastic, result: list[Routine]) -> None:
-        rows, equations = self._read(elastic.response)
+        rows, equations = self._substitute_numbers(elastic.response)
         (row,) = rows.values()
         k = len(elastic.names)
-        # No frame that is a mechanism.
+        # Reject frames that are mechanisms.
         sound = self.fold.tape.lift(row[-1] - MIN_PIVOT_RATIO)
         equations = [replace(q, branch=[*q.branch, sound]) for q in equations]
         compliance = Routine(
@@ -411,11 +414,11 @@ class Package:
             {"energies": row[k : 2 * k]},
             equations,
             f"Strain energy (J) of each element: {', '.join(elastic.names)}.",
-            upon=compliance if self._wants("compliance") else None,
+            upon=compliance if self._is_wanted("compliance") else None,
         )
-        result += [routine for routine in (compliance, energy) if self._wants(routine.name)]
+        result += [routine for routine in (compliance, energy) if self._is_wanted(routine.name)]
 
-    def _inertial(self) -> Array:
+    def _inertial_inputs(self) -> Array:
         """Return the run-time inputs of the dynamics as functions of the payload's numbers."""
         mass, com, inertia = self.payload[0], self.payload[1:4], self.payload[4:].reshape(3, 3)
         layout = Layout(self.robot.massive().tree)
@@ -429,25 +432,25 @@ class Package:
 
     # The source.
 
-    def _write(self) -> None:
+    def _write_functions(self) -> None:
         unit = self.unit
         own = self.fold(self.parameters, {PARAMETERS: self.payload_values})
-        unit.add(table("@_own", [e.value for e in own]))
+        unit.append(write_table("@_own", [e.value for e in own]))
         if self.massive:
             self._write_parameters()
         for routine in self.hidden:
-            unit.routine(routine, "static ")
+            unit.write_routine(routine, "static ")
         for routine in self.routines:
-            unit.routine(routine, HOT if routine.name.startswith("torques_and_s") else "")
-            unit.own(routine)
+            unit.write_routine(routine, CONTROL_LOOP_PREFIX if routine.name.startswith("torques_and_s") else "")
+            unit.write_own(routine)
 
     def _write_parameters(self) -> None:
         unit, size = self.unit, len(self.parameters)
         mass, com, inertia = self.payload[0], self.payload[1:4], self.payload[4:].reshape(3, 3)
         margins = [self.fold.tape.lift(m) for m in payload_margins(mass, com, inertia)]
         results = [*self.parameters, *margins]
-        call = unit.function("prepare", results, {})
-        unit.add(f"""\
+        call = unit.write_function("prepare", results, {})
+        unit.append(f"""\
 int @_parameters(double mass, const double *com, const double *inertia, double *out)
 {{
     double p[13], r[{len(results)}];
@@ -475,7 +478,7 @@ int @_parameters(double mass, const double *com, const double *inertia, double *
         """Return the source file with all functions."""
         return (
             f"/* SPDX-License-Identifier: Apache-2.0 */\n/* {self.title} */\n"
-            f'#include "{self.prefix}.h"\n\n{HEAD}\n{self.unit.text()}'
+            f'#include "{self.prefix}.h"\n\n{C_HEAD}\n{self.unit.text()}'
         )
 
     @property
@@ -488,34 +491,34 @@ int @_parameters(double mass, const double *com, const double *inertia, double *
         """Write the header: the declarations, with the arguments of each function."""
         guard, size = f"{self.macro}_H", len(self.parameters)
         robot = self.robot
-        joints = _listed(zip(robot.joint_names, robot.joint_units, strict=True))
-        pose = _listed(zip(robot.pose_names, robot.pose_units, strict=True))
+        joints = _list_with_units(zip(robot.joint_names, robot.joint_units, strict=True))
+        pose = _list_with_units(zip(robot.pose_names, robot.pose_units, strict=True))
         sizes = [("JOINTS", self.n), ("POSE", self.m), ("PARAMETERS", size)]
         sizes += [("STATE", len(routine.state)) for routine in self.routines if routine.state][:1]
         if self.elastic is not None:
             sizes.append(("ELEMENTS", len(self.elastic.names)))
-        # In capitals as macros are, and with the robot's own spelling as the functions have it.
-        with_default_inertia = dict.fromkeys([self.macro, f"PKM_{self.prefix.removeprefix('pkm_')}"])
-        lines = [f"#define {m}_{name} {count}" for m in with_default_inertia for name, count in sizes]
+        # Define macros in capitals, and with the robot's own spelling, which the functions have.
+        spelled = dict.fromkeys([self.macro, f"PKM_{self.prefix.removeprefix('pkm_')}"])
+        lines = [f"#define {m}_{name} {count}" for m in spelled for name, count in sizes]
         parts = []
         for routine in self.routines:
-            most = WORST.format(*routine.worst)
+            most = OPERATIONS_TEXT.format(*routine.max_operations)
             shape = ", ".join(f"{name}[{len(row)}]" for name, row in routine.outputs.items())
             takes = ", ".join(f"{name}[{count}]" for name, count in routine.inputs.items())
             what = f"{routine.summary} {most} {takes} -> {shape}."
             if routine.state:
-                what = f"{routine.summary}{BESIDE.format(size=len(routine.state))}{most}"
+                what = f"{routine.summary}{STREAM_TEXT.format(size=len(routine.state))}{most}"
             parts.append(
                 _write_comment(what)
-                + f"\n{self.unit.signature(routine, given=False)};\n"
-                + f"{self.unit.signature(routine, given=True)};\n"
+                + f"\n{self.unit.write_signature(routine, given=False)};\n"
+                + f"{self.unit.write_signature(routine, given=True)};\n"
             )
         if self.massive:
-            what = _write_comment(PARAMETERS_OF.format(size=size, mass=MAX_MASS, reach=MAX_LENGTH))
+            what = _write_comment(PARAMETERS_TEXT.format(size=size, mass=MAX_MASS, reach=MAX_LENGTH))
             parts.append(
                 f"{what}\nint @_parameters(double mass, const double *com, const double *inertia, double *out);\n"
             )
-        about = _write_comment(ABOUT.format(joints=joints, pose=pose) + self._stateless)
+        about = _write_comment(HEADER_TEXT.format(joints=joints, pose=pose) + self._stateless)
         text = "\n".join(
             [
                 "/* SPDX-License-Identifier: Apache-2.0 */",
@@ -539,13 +542,13 @@ int @_parameters(double mass, const double *com, const double *inertia, double *
         return text.replace("@", self.prefix)
 
 
-def _listed(pairs: Any) -> str:
+def _list_with_units(pairs: Any) -> str:
     return ", ".join(f"{name} ({unit})" for name, unit in pairs)
 
 
 def _write_comment(text: str) -> str:
     """Write a C comment in lines of at most 95 characters."""
-    # What a name may hold must neither end the comment nor be a trigraph in it.
+    # Change characters of names that would end the comment or form a trigraph.
     safe = "".join(c if c.isprintable() else " " for c in text)
     for bad in ("*/", "/*", "??"):
         safe = safe.replace(bad, " ".join(bad))

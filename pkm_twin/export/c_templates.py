@@ -10,32 +10,32 @@ import numpy as np
 
 from delta_dynamics.torques.virtual_work import inverse_dynamics
 from pkm_twin.codegen.program import MAX_ITERATIONS
-from pkm_twin.export.c99 import CORRECTIONS, LADDER, table
+from pkm_twin.export.c99 import ATTEMPTS, MAX_CORRECTIONS, write_table
 from pkm_twin.robot.robot import Robot
 
-ABOUT: Final = """\
+HEADER_TEXT: Final = """\
 Joints q: {joints}. Pose: {pose}. SI units, base axes, z up. wrench: force (N) and moment (N m)
 that the surroundings apply to the platform at its reference point. Every function returns 0:
 valid; 1: no assembly, or a singularity; 2: an input or a result is NaN or infinite. If it is not
 0, all outputs are NaN. The forms _with take parameters for another payload.
 """
-STATELESS: Final = "Friction has no state here: coulomb sign(rate), without presliding (dahl)."
-BESIDE: Final = """, found from the assembly of the sample before instead of from home.
+STATELESS_TEXT: Final = "Friction has no state here: coulomb sign(rate), without presliding (dahl)."
+STREAM_TEXT: Final = """, found from the assembly of the sample before instead of from home.
 state[{size}] is the caller's, one of each stream. Fill it with zeros before the first sample;
 each call writes it. A sample that does not follow the one before is solved from home.
 """
-WORST: Final = "At most {:,} operations, {:,} with PKM_ATTEMPTS=1."
-PARAMETERS_OF: Final = """\
+OPERATIONS_TEXT: Final = "At most {:,} operations, {:,} with PKM_ATTEMPTS=1."
+PARAMETERS_TEXT: Final = """\
 The parameters, out[{size}], for another payload: mass (kg), com[3] (m) from the platform's
 reference point and inertia[9] (kg m2) about the com, in axes fixed to the platform that are the
 base's at home. Status 2, too, for a payload that a robot file may not have: a mass below zero or
 above {mass:g} kg, a com beyond {reach:g} m, an inertia that is not symmetric, has a negative
 principal moment, one above the sum of the others, or more than the mass can have.
 """
-MASSLESS: Final = """
+MASSLESS_TEXT: Final = """
 The robot's file gives no masses, so there are no functions of dynamics.
 """
-PAYLOAD: Final = """
+PAYLOAD_TEXT: Final = """
 ## Another payload
 
     double parameters[{macro}_PARAMETERS];
@@ -161,7 +161,7 @@ def write_example(robot: Robot, prefix: str, title: str) -> str:
         given |= {"rates": rates, "changes": changes, "wrench": np.zeros(6)}
     for name, (_, values) in tests.items():
         given[f"right_{name}"] = np.round(values, 9) + 0.0
-    rows = [table(name, values.tolist()).removeprefix("static ") for name, values in given.items()]
+    rows = [write_table(name, values.tolist()).removeprefix("static ") for name, values in given.items()]
     sizes = ", ".join(f"{name}[{len(values)}]" for name, (_, values) in tests.items())
     calls = [
         f'bad |= differs("{name}", @_{call}, {name}, right_{name}, {len(values)});\n'
@@ -182,10 +182,10 @@ def write_readme(robot: Robot, prefix: str, doubles: int) -> str:
         name=prefix,
         robot=prefix.removeprefix("pkm_"),
         joints=", ".join(robot.joint_names),
-        corrections=f"{CORRECTIONS:,}",
-        attempts=len(LADDER),
+        corrections=f"{MAX_CORRECTIONS:,}",
+        attempts=len(ATTEMPTS),
         turns=MAX_ITERATIONS,
         stack=doubles * 8 // 1000 + 3,
-        dynamics="" if robot.has_masses else MASSLESS,
-        payload=PAYLOAD.format(name=prefix, macro=prefix.upper()) if robot.has_masses else "",
+        dynamics="" if robot.has_masses else MASSLESS_TEXT,
+        payload=PAYLOAD_TEXT.format(name=prefix, macro=prefix.upper()) if robot.has_masses else "",
     )

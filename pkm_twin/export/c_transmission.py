@@ -19,22 +19,22 @@ from pkm_twin.codegen.cholesky import SparseCholesky
 from pkm_twin.codegen.expressions import Expression, Objects
 from pkm_twin.codegen.lu import SparseLU, pivot_order
 from pkm_twin.codegen.program import MAX_GROWTH, Equations
-from pkm_twin.export.c99 import Folding
+from pkm_twin.export.c99 import Substitution
 from pkm_twin.robot.robot import Robot
 
 
 class TransmissionTerms:
-    """The ratio B of a transmission as expressions, and what follows from it.
+    """The ratio B of a transmission as expressions, with rates, efforts and gains by it.
 
-    :param fold: has the tape of the expressions. ``ratio``: B, row by row.
+    :param fold: gives the tape of the expressions. ``ratio``: B, row by row.
     """
 
-    def __init__(self, robot: Robot, fold: Folding, ratio: Sequence[Expression]) -> None:
+    def __init__(self, robot: Robot, fold: Substitution, ratio: Sequence[Expression]) -> None:
         self.robot, self.tape = robot, fold.tape
         self.m = len(robot.pose_names)
         self.ratio: Objects = np.array(ratio, dtype=object).reshape(-1, self.m)
         if robot.redundant:
-            # P = (B' W B)^-1 B' W: of all efforts, those with the least sum of (effort / limit)^2.
+            # P = (B' W B)^-1 B' W gives the efforts with the smallest sum of (effort / limit)^2.
             self._weighted = self.ratio * (robot.effort_scale**2)[:, None]
             square = self.ratio.T @ self._weighted
             lower = {(i, j): square[i, j] for i in range(self.m) for j in range(i + 1)}
@@ -48,7 +48,7 @@ class TransmissionTerms:
     def actuator_side(self) -> dict[str, list[Expression]]:
         """Return rates and efforts of the actuators by the inputs ``velocity`` and ``effort``."""
         velocity, effort = (self.tape.inputs(name, self.m) for name in ("velocity", "effort"))
-        return {"qd": self._lift(self.ratio @ velocity), "tau": self._lift(self._efforts(effort))}
+        return {"qd": self._lift_all(self.ratio @ velocity), "tau": self._lift_all(self._actuator_efforts(effort))}
 
     def limit_growth(self, equations: Sequence[Equations]) -> list[Equations]:
         """Return equations that also reject poses where a pivot of B vanishes."""
@@ -60,42 +60,42 @@ class TransmissionTerms:
     def gains(self, changes: Sequence[Sequence[Expression]]) -> dict[str, list[Expression]]:
         """Return Ka and Da by the inputs ``stiffness``, ``damping`` and ``tau``.
 
-        :param changes: second derivatives of q along each of :func:`directions`, shape (n,) each.
+        :param changes: second derivatives of q along each of :func:`second_derivative_directions`, shape (n,) each.
         """
         m = self.m
-        wanted, damping = (self.tape.inputs(name, m * m).reshape(m, m) for name in ("stiffness", "damping"))
+        stiffness, damping = (self.tape.inputs(name, m * m).reshape(m, m) for name in ("stiffness", "damping"))
         # The sum of w_i d2q_i/dx2, shape (m, m).
         weights = self.tape.inputs("tau", len(self.ratio))
-        along = [np.array(change, dtype=object) @ weights for change in changes]
+        second_derivatives = [np.array(change, dtype=object) @ weights for change in changes]
         result = np.empty((self.m, self.m), dtype=object)
-        for value, (j, k) in zip(along, _pairs(self.m), strict=True):
-            # The second derivative along a + b, less those along a and b, is twice that by both.
+        for value, (j, k) in zip(second_derivatives, _list_index_pairs(self.m), strict=True):
+            # The mixed derivative is half of the second derivative along a + b less those along a and b.
             result[j, k] = result[k, j] = value if j == k else 0.5 * (value - result[j, j] - result[k, k])
-        bend = result
+        curvature = result
         return {
-            "ka": self._lift(self._congruent(wanted + bend)),
-            "da": self._lift(self._congruent(damping)),
+            "ka": self._lift_all(self._transform_to_actuators(stiffness + curvature)),
+            "da": self._lift_all(self._transform_to_actuators(damping)),
         }
 
-    def _lift(self, values: Any) -> list[Expression]:
+    def _lift_all(self, values: Any) -> list[Expression]:
         return [self.tape.lift(value) for value in np.ravel(values)]
 
-    def _efforts(self, joint: Objects) -> Objects:
-        """Return P' f."""
+    def _actuator_efforts(self, joint: Objects) -> Objects:
+        """Return the actuators' efforts P' f for efforts f on the pose."""
         if not self.robot.redundant:
             return self._lu.solve_transposed(joint)
         return np.asarray(self._weighted @ np.array(self._root.solve(list(joint)), dtype=object))
 
-    def _congruent(self, matrix: Objects) -> Objects:
-        """Return P' A P, shape (n, n)."""
-        half = np.array([self._efforts(column) for column in matrix.T], dtype=object)
-        return np.array([self._efforts(column) for column in half.T], dtype=object)
+    def _transform_to_actuators(self, matrix: Objects) -> Objects:
+        """Return P' A P, the gains of the actuators for gains A of the pose, shape (n, n)."""
+        half = np.array([self._actuator_efforts(column) for column in matrix.T], dtype=object)
+        return np.array([self._actuator_efforts(column) for column in half.T], dtype=object)
 
 
-def _pairs(m: int) -> list[tuple[int, int]]:
+def _list_index_pairs(m: int) -> list[tuple[int, int]]:
     return [(j, j) for j in range(m)] + [(j, k) for j in range(m) for k in range(j)]
 
 
-def directions(m: int) -> list[list[float]]:
-    """Return the rates of the pose along which second derivatives are needed."""
-    return [np.maximum(*np.eye(m)[[j, k]]).tolist() for j, k in _pairs(m)]
+def second_derivative_directions(m: int) -> list[list[float]]:
+    """Return the pose rates along which :meth:`TransmissionTerms.gains` needs second derivatives."""
+    return [np.maximum(*np.eye(m)[[j, k]]).tolist() for j, k in _list_index_pairs(m)]

@@ -18,15 +18,15 @@ from typing import Final
 
 from delta_dynamics.torques.virtual_work import MASSLESS_RATIO
 from pkm_twin.errors import ParameterError
-from pkm_twin.export.c99 import table
+from pkm_twin.export.c99 import write_table
 from pkm_twin.export.c_package import Package
-from pkm_twin.export.fmu_xml import Description, Variable, build_of, quoted, text_of
+from pkm_twin.export.fmu_xml import Description, Variable, quote_name, write_build_description, write_model_description
 from pkm_twin.machine.inertia import list_loaded_joints
 from pkm_twin.robot.robot import Robot
 
 VERSIONS: Final = (2, 3)
 KINDS: Final = ("dynamics", "torques")
-MODEL: Final = "fmu.c"
+MODEL_FILE: Final = "fmu.c"
 CONSTANTS: Final = f"""\
 #define LEAST {MASSLESS_RATIO!r}
 /* Of the plant: a rate that is none, forces and motions that are equal, rows that depend. */
@@ -43,7 +43,7 @@ CONSTANTS: Final = f"""\
 
 
 class Fmu:
-    """The files of an FMU; ``identifier`` is the name of its functions and binaries.
+    """The files of an FMU; ``identifier``: prefix of its functions and name of its binaries.
 
     ``kind``: dynamics (states q and qd, inputs tau and wrench) or torques (inputs q, qd, qdd and
     wrench). ``version`` of FMI: 2 or 3.
@@ -73,25 +73,25 @@ class Fmu:
         self._row_names = [*robot.joint_names, *(joint.name for joint in passive)]
         self._passive = [float(joint.viscous) for joint in passive]
         self._starts: dict[str, int] = {}
-        self.variables = self._variables()
-        self.files = self._files()
+        self.variables = self._list_variables()
+        self.files = self._write_files()
 
     # Variables.
 
-    def _variables(self) -> list[Variable]:
+    def _list_variables(self) -> list[Variable]:
         robot, n = self.robot, self.n
         found: list[Variable] = []
 
-        def add(group: str, rows: Sequence[Variable]) -> list[int]:
+        def add_group(group: str, rows: Sequence[Variable]) -> list[int]:
             self._starts[group] = len(found)
             found.extend(rows)
             return list(range(len(found) - len(rows), len(found)))
 
-        names = [quoted(name) for name in robot.joint_names]
+        names = [quote_name(name) for name in robot.joint_names]
         units = robot.joint_units
         efforts = ["N.m" if unit == "rad" else "N" for unit in units]
 
-        def joints(
+        def joint_variables(
             what: str, text: str, kind: str, ends: str = "", start: Sequence[float] | None = None
         ) -> list[Variable]:
             own = efforts if what == "tau" else [unit + ends for unit in units]
@@ -103,31 +103,31 @@ class Fmu:
 
         still = [0.0] * n
         home, moves = robot.graph.home, "s" if self.dynamic else "i"
-        add("TIME", [Variable("time", "t", "s", "Time")])
-        q = add("Q", joints("q", "position", moves, start=home.tolist()))
-        qd = add("QD", joints("qd", "velocity", moves, "/s", still))
+        add_group("TIME", [Variable("time", "t", "s", "Time")])
+        q = add_group("Q", joint_variables("q", "position", moves, start=home.tolist()))
+        qd = add_group("QD", joint_variables("qd", "velocity", moves, "/s", still))
         if self.dynamic:
-            # A state that can be seen is an output that depends on itself.
+            # States are outputs, each of which depends on itself.
             for k in (*q, *qd):
                 found[k] = replace(found[k], needs=[k])
-            add(
+            add_group(
                 "DQ",
                 [
                     replace(v, name=f"der({found[k].name})", derivative=k, needs=[j])
-                    for k, j, v in zip(q, qd, joints("qd", "velocity", "d", "/s"), strict=True)
+                    for k, j, v in zip(q, qd, joint_variables("qd", "velocity", "d", "/s"), strict=True)
                 ],
             )
-            accelerations = add(
+            accelerations = add_group(
                 "DQD",
                 [
                     replace(v, name=f"der({found[k].name})", derivative=k)
-                    for k, v in zip(qd, joints("qdd", "acceleration", "d", "/s2"), strict=True)
+                    for k, v in zip(qd, joint_variables("qdd", "acceleration", "d", "/s2"), strict=True)
                 ],
             )
-            moved = add("TAU", joints("tau", "effort", "i", start=still))
+            moved = add_group("TAU", joint_variables("tau", "effort", "i", start=still))
         else:
-            moved = add("QDD", joints("qdd", "acceleration", "i", "/s2", still))
-        wrench = add(
+            moved = add_group("QDD", joint_variables("qdd", "acceleration", "i", "/s2", still))
+        wrench = add_group(
             "WRENCH",
             [
                 Variable(
@@ -142,31 +142,31 @@ class Fmu:
             ],
         )
         every = [*q, *qd, *moved, *wrench]
-        add("PAYLOAD", self._payload())
+        add_group("PAYLOAD", self._payload_variables())
         if self.dynamic:
             for k in accelerations:
                 found[k] = replace(found[k], needs=every)
-            # Step of the integrator in co-simulation, s, where the importer sets no other.
-            add("STEP", [Variable("step", "p", "s", "longest internal step of co-simulation", 1e-4)])
+            # Step of the integrator in co-simulation, s, unless the importer sets another one.
+            add_group("STEP", [Variable("step", "p", "s", "longest internal step of co-simulation", 1e-4)])
         else:
-            efforts_at = joints("tau", "effort that the motion needs", "o")
-            add("TAU", [replace(v, needs=every) for v in efforts_at])
-        add(
+            efforts_at = joint_variables("tau", "effort that the motion needs", "o")
+            add_group("TAU", [replace(v, needs=every) for v in efforts_at])
+        add_group(
             "POSE",
             [
                 Variable(f"pose.{name}", "o", unit, "pose of the platform", needs=q)
-                for name, unit in zip(map(quoted, robot.pose_names), robot.pose_units, strict=True)
+                for name, unit in zip(map(quote_name, robot.pose_names), robot.pose_units, strict=True)
             ],
         )
         if not self.dynamic:
-            add("SINGULARITY", [Variable("singularity", "o", "", "0 in a singularity, 1 at best", needs=q)])
+            add_group("SINGULARITY", [Variable("singularity", "o", "", "0 in a singularity, 1 at best", needs=q)])
         text = "0 valid, 1 no assembly or a singularity, 2 not finite"
-        add("STATUS", [Variable("status", "o", "", text, needs=every, whole=True)])
-        add(
+        add_group("STATUS", [Variable("status", "o", "", text, needs=every, whole=True)])
+        add_group(
             "INDICATORS",
             [
                 Variable(
-                    f"stick_slip.{quoted(self._row_names[row])}",
+                    f"stick_slip.{quote_name(self._row_names[row])}",
                     "d",
                     "",
                     "falls through zero where the joint begins to stick or to slide",
@@ -177,7 +177,7 @@ class Fmu:
         )
         return found
 
-    def _payload(self) -> list[Variable]:
+    def _payload_variables(self) -> list[Variable]:
         load = self.robot.payload
         rows = [Variable("payload.mass", "p", "kg", "mass of the payload", float(load.mass))]
         place = "from the platform's reference point, axes fixed to the platform, base's at home"
@@ -192,9 +192,9 @@ class Fmu:
 
     # Files.
 
-    def _files(self) -> dict[str, str]:
+    def _write_files(self) -> dict[str, str]:
         prefix = self.identifier
-        # Write the wrapper's source, with ``TOKEN`` in place of its token.
+        # Write the wrapper's source; its token is a hash of the files and is inserted below.
         robot, size = self.robot, len(self.variables)
         defined = {
             "N": self.n,
@@ -215,7 +215,7 @@ class Fmu:
             tables["PASSIVE_VISCOUS"] = self._passive
             tables["FRICTION"] = self._dry
         kinds = "".join(v.kind for v in self.variables)
-        constants = [table(name, values) for name, values in tables.items() if values]
+        constants = [write_table(name, values) for name, values in tables.items() if values]
         constants.append(f'static const char KIND[] = "{kinds}";\n')
         if self._rows:
             rows = ", ".join(map(str, self._rows))
@@ -236,33 +236,33 @@ class Fmu:
         sources = {
             f"{prefix}.h": self._package.header(),
             f"{prefix}.c": self._package.source(),
-            MODEL: "\n".join(parts).replace("@", self.identifier),
+            MODEL_FILE: "\n".join(parts).replace("@", self.identifier),
         }
         described = Description(
             self.robot.name or prefix,
             prefix,
             "",
-            self._text,
+            self._description,
             self.variables,
             [k for k, v in enumerate(self.variables) if v.name.startswith("stick_slip.")],
             bool(self._rows),
             [name for name in sources if name.endswith(".c")],
         )
-        first = text_of(described, self.version)
+        first = write_model_description(described, self.version)
         digest = hashlib.sha256("".join([first, *sources.values()]).encode()).hexdigest()
         token = "-".join(digest[a:b] for a, b in ((0, 8), (8, 12), (12, 16), (16, 20), (20, 32)))
         token = f"{{{token}}}"
         described = replace(described, token=token)
-        sources[MODEL] = sources[MODEL].replace("#define COUNT", f'#define TOKEN "{token}"\n#define COUNT', 1)
+        sources[MODEL_FILE] = sources[MODEL_FILE].replace("#define COUNT", f'#define TOKEN "{token}"\n#define COUNT', 1)
         if self.version == 3:
-            sources["buildDescription.xml"] = build_of(described)
+            sources["buildDescription.xml"] = write_build_description(described)
         return {
-            "modelDescription.xml": text_of(described, self.version),
+            "modelDescription.xml": write_model_description(described, self.version),
             **{f"sources/{name}": text for name, text in sources.items()},
         }
 
     @property
-    def _text(self) -> str:
+    def _description(self) -> str:
         name = self.robot.name or self.identifier
         if self.dynamic:
             return f"Motion of {name} under joint efforts and a wrench on its platform"
@@ -282,7 +282,7 @@ class Fmu:
         }.get((platform.machine(), self.version))
         if compiler is not None and folder is not None and platform.system() == "Linux":
             name = f"binaries/{folder}/{self.identifier}.so"
-            files[name] = self._binary(compiler)
+            files[name] = self._compile_binary(compiler)
         made = io.BytesIO()
         with zipfile.ZipFile(made, "w", zipfile.ZIP_DEFLATED) as archive:
             for name, content in files.items():
@@ -292,7 +292,7 @@ class Fmu:
                 archive.writestr(entry, content)
         return made.getvalue()
 
-    def _binary(self, compiler: str) -> bytes:
+    def _compile_binary(self, compiler: str) -> bytes:
         with tempfile.TemporaryDirectory() as folder:
             names = []
             for name, text in self.files.items():

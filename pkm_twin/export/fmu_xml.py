@@ -23,17 +23,17 @@ UNITS: Final[dict[str, dict[str, int]]] = {
     "N": {"kg": 1, "m": 1, "s": -2},
     "N.m": {"kg": 1, "m": 2, "s": -2},
 }
-"""Units by their base units' exponents."""
-PLAIN: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
+"""Units by the exponents of their base units."""
+PLAIN_NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 
 @dataclass(frozen=True)
 class Variable:
-    """A variable; its value reference is its index.
+    """A variable of the FMU; its value reference is its index.
 
     ``kind``: t time, i input, p parameter, s state, d derivative or event indicator, o output.
-    ``start``: of what has one. ``derivative``: place of the state that it is the derivative of.
-    ``needs``: places of the inputs and states that it depends on.
+    ``start``: start value, if any. ``derivative``: index of the state whose derivative it is.
+    ``needs``: indices of the inputs and states that it depends on.
     """
 
     name: str
@@ -68,7 +68,7 @@ class Variable:
 class Description:
     """The content of modelDescription.xml, for both versions.
 
-    ``indicators``: places of the event indicators. ``resets``: whether events change rates.
+    ``indicators``: indices of the event indicators. ``resets``: True if events change rates.
     """
 
     name: str
@@ -85,20 +85,20 @@ class Description:
         return [k for k, v in enumerate(self.variables) if v.kind == "s"]
 
     def unknowns(self, kinds: str) -> list[tuple[int, Variable]]:
-        """List the variables of kinds, outputs (``so``) or derivatives (``d``), with indices."""
+        """List the variables of the given kinds with their indices: outputs (``so``) or derivatives (``d``)."""
         return [(k, v) for k, v in enumerate(self.variables) if v.kind in kinds and k not in self.indicators]
 
 
-def quoted(name: str) -> str:
-    """Quote a name for use in a structured one."""
-    if PLAIN.fullmatch(name):
+def quote_name(name: str) -> str:
+    """Quote a name for use in FMI's structured names, such as ``q.NAME``."""
+    if PLAIN_NAME.fullmatch(name):
         return name
     safe = "".join(c if c.isascii() and c.isprintable() else "_" for c in name)
     safe = safe.replace("\\", "\\\\").replace("'", "\\'").replace('"', '\\"')
     return f"'{safe}'"
 
 
-def text_of(d: Description, version: int) -> str:
+def write_model_description(d: Description, version: int) -> str:
     """Write modelDescription.xml of FMI 2 or 3."""
     second = version == 2
     # FMI 2 counts variables from 1, references of FMI 3 begin at 0.
@@ -169,7 +169,7 @@ def text_of(d: Description, version: int) -> str:
     return '<?xml version="1.0" encoding="UTF-8"?>\n' + ET.tostring(top, encoding="unicode") + "\n"
 
 
-def build_of(d: Description) -> str:
+def write_build_description(d: Description) -> str:
     """Write ``sources/buildDescription.xml`` of FMI 3.0."""
     top = ET.Element("fmiBuildDescription", fmiVersion="3.0")
     build = ET.SubElement(top, "BuildConfiguration", modelIdentifier=d.identifier)

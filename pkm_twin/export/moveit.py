@@ -22,8 +22,14 @@ import yaml
 
 from delta_dynamics import inverse_dynamics, mass_matrix
 from pkm_twin.errors import ParameterError
-from pkm_twin.export.c_package import c_package, identifier
-from pkm_twin.export.ros2_control import fill_templates, literal, number, package_name, printable
+from pkm_twin.export.c_package import c_identifier, c_package
+from pkm_twin.export.ros2_control import (
+    fill_templates,
+    package_name,
+    printable_name,
+    write_cpp_number,
+    write_cpp_string,
+)
 from pkm_twin.kinematics.pose import Coordinate, Entry
 from pkm_twin.machine.loop_tree import LoopTree, Single
 from pkm_twin.machine.urdf_write import GROUND, PLATFORM, list_single_joints
@@ -31,18 +37,18 @@ from pkm_twin.robot.clearance import distance
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.robot_urdf import robot_tree, robot_urdf
 
-GROUP: Final = "actuated"
+PLANNING_GROUP: Final = "actuated"
 """The planning group."""
-LIMB: Final = "limb"
+LIMB_GROUP: Final = "limb"
 """The chain from the ground to the platform, for the numeric solver."""
-POSITION: Final = 1e-4
+MAX_POSITION_ERROR: Final = 1e-4
 """Largest distance between a goal and the machine's pose, m: MoveIt's tolerance of goals."""
-ORIENTATION: Final = 1e-3
+MAX_ROTATION_ERROR: Final = 1e-3
 """Largest rotation between a goal and the machine's pose, rad."""
-SINGULAR: Final = 0.01
-"""Least singularity index of solutions, as of the controllers of ros2_control."""
-CONTROLLER: Final = "delta_dynamics"
-"""The node whose action fills goals with effort, as MoveIt's controller."""
+MIN_SINGULARITY_INDEX: Final = 0.01
+"""Smallest singularity index of solutions: that of the exported ros2_control controllers."""
+CONTROLLER_NAME: Final = "delta_dynamics"
+"""Name of MoveIt's controller: the node whose action adds efforts to goals."""
 
 
 def moveit_package(robot: Robot, kinematics: str = "") -> dict[str, str]:
@@ -60,25 +66,25 @@ def moveit_package(robot: Robot, kinematics: str = "") -> dict[str, str]:
     parts = list_single_joints(tree)
     root = ET.Element("robot", name=tree.name)
     joints = list(robot.joint_names)
-    group = ET.SubElement(root, "group", name=GROUP)
+    group = ET.SubElement(root, "group", name=PLANNING_GROUP)
     for joint in joints:
         ET.SubElement(group, "joint", name=joint)
-    # Actuated joints between the ground and the platform.
+    # List the actuated joints between the ground and the platform.
     above = {part.child: part for part in parts}
     found, link = [], PLATFORM
     while link in above:
         found += [above[link].name] if above[link].name in joints else []
         link = above[link].parent
     if found:
-        limb = ET.SubElement(root, "group", name=LIMB)
+        limb = ET.SubElement(root, "group", name=LIMB_GROUP)
         ET.SubElement(limb, "chain", base_link=GROUND, tip_link=PLATFORM)
-    home = ET.SubElement(root, "group_state", name="home", group=GROUP)
+    home = ET.SubElement(root, "group_state", name="home", group=PLANNING_GROUP)
     for joint, value in zip(joints, robot.inverse(robot.home()).tolist(), strict=True):
         ET.SubElement(home, "joint", name=joint, value=f"{value:.12g}")
     ET.SubElement(root, "virtual_joint", name="ground", type="fixed", parent_frame="world", child_link=GROUND)
     for joint in robot.passive_joints:
         ET.SubElement(root, "passive_joint", name=joint)
-    touching = dict.fromkeys(_touching(tree), "Default")
+    touching = dict.fromkeys(_find_touching_links(tree), "Default")
     touching |= dict.fromkeys(_list_joined_links(tree, parts), "Adjacent")
     for (first, second), reason in touching.items():
         ET.SubElement(root, "disable_collisions", link1=first, link2=second, reason=reason)
@@ -87,16 +93,19 @@ def moveit_package(robot: Robot, kinematics: str = "") -> dict[str, str]:
     package = package_name(robot, "moveit_config")
     solver = kinematics or f"{package}/Kinematics"
     settings = {"kinematics_solver_search_resolution": 0.005, "kinematics_solver_timeout": 0.05}
-    solvers = {LIMB: "kdl_kinematics_plugin/KDLKinematicsPlugin" if (f'name="{LIMB}"' in groups) else "", GROUP: solver}
+    solvers = {
+        LIMB_GROUP: "kdl_kinematics_plugin/KDLKinematicsPlugin" if (f'name="{LIMB_GROUP}"' in groups) else "",
+        PLANNING_GROUP: solver,
+    }
     texts = {
         f"config/{name}.urdf": robot_urdf(robot, hardware=""),
         f"config/{name}.srdf": groups,
-        "config/joint_limits.yaml": _yaml(_joint_limits(robot, accelerations(robot))),
-        "config/kinematics.yaml": _yaml(
+        "config/joint_limits.yaml": _write_yaml(_write_joint_limits(robot, home_accelerations(robot))),
+        "config/kinematics.yaml": _write_yaml(
             {group: {"kinematics_solver": s, **settings} for group, s in solvers.items() if s}
         ),
-        "config/moveit_controllers.yaml": _yaml(_controllers(robot)),
-        "config/ompl_planning.yaml": _yaml(
+        "config/moveit_controllers.yaml": _write_yaml(_write_controllers(robot)),
+        "config/ompl_planning.yaml": _write_yaml(
             {
                 "planning_plugins": ["ompl_interface/OMPLPlanner"],
                 "request_adapters": [
@@ -110,18 +119,18 @@ def moveit_package(robot: Robot, kinematics: str = "") -> dict[str, str]:
                     "default_planning_response_adapters/ValidateSolution",
                 ],
                 "planner_configs": {"RRTConnect": {"type": "geometric::RRTConnect", "range": 0.0}},
-                GROUP: {"default_planner_config": "RRTConnect", "planner_configs": ["RRTConnect"]},
+                PLANNING_GROUP: {"default_planner_config": "RRTConnect", "planner_configs": ["RRTConnect"]},
             }
         ),
         "launch/move_group.launch.py": LAUNCH.format(name=name, package=package),
     }
     texts |= {f"c/{path}": text for path, text in c_package(robot).items()}
-    return dict(sorted((texts | fill_templates("moveit_package", _words(robot, package))).items()))
+    return dict(sorted((texts | fill_templates("moveit_package", _template_words(robot, package))).items()))
 
 
-def _words(robot: Robot, package: str) -> dict[str, str]:
+def _template_words(robot: Robot, package: str) -> dict[str, str]:
     """Return the texts that replace the words between two ``@`` in the templates."""
-    own, shown = identifier(robot.name), printable(robot)
+    own, shown = c_identifier(robot.name), printable_name(robot)
     limits = robot.limits.position
     ends = np.array([[-np.inf, np.inf]] * robot.joints_count) if limits is None else limits
     drives = zip(robot.joint_names, ends.tolist(), strict=True)
@@ -134,17 +143,20 @@ def _words(robot: Robot, package: str) -> dict[str, str]:
         "JOINTNAMES": ", ".join(f"`{joint}`" for joint in robot.joint_names),
         "POSENAMES": ", ".join(robot.pose_names),
         "POSE": ", ".join(map(_write_coordinate, robot.coordinates)),
-        "DRIVES": "\n".join(f"  {{{literal(joint)}, {number(low)}, {number(high)}}}," for joint, (low, high) in drives),
-        "POSITION": f"{POSITION:g}",
-        "ORIENTATION": f"{ORIENTATION:g}",
-        "SINGULARITY": f"{SINGULAR:g}",
+        "DRIVES": "\n".join(
+            f"  {{{write_cpp_string(joint)}, {write_cpp_number(low)}, {write_cpp_number(high)}}},"
+            for joint, (low, high) in drives
+        ),
+        "MAX_POSITION_ERROR": f"{MAX_POSITION_ERROR:g}",
+        "MAX_ROTATION_ERROR": f"{MAX_ROTATION_ERROR:g}",
+        "SINGULARITY": f"{MIN_SINGULARITY_INDEX:g}",
     }
 
 
 def _write_coordinate(c: Coordinate) -> str:
     """Write a pose coordinate in C++, from position p and rotation r (row-major)."""
 
-    def entry(of: Entry) -> str:
+    def write_entry(of: Entry) -> str:
         row, column, sign = of
         return f"{'-' if sign < 0.0 else ''}r[{3 * row + column}]"
 
@@ -152,13 +164,13 @@ def _write_coordinate(c: Coordinate) -> str:
         return f"p[{c.axis}]"
     first, *rest = c.entries
     if rest:
-        return f"std::atan2({entry(first)}, {entry(rest[0])})"
-    others = ", ".join(entry((row, first[1], 1.0)) for row in range(3) if row != first[0])
-    return f"std::atan2({entry(first)}, std::hypot({others}))"
+        return f"std::atan2({write_entry(first)}, {write_entry(rest[0])})"
+    others = ", ".join(write_entry((row, first[1], 1.0)) for row in range(3) if row != first[0])
+    return f"std::atan2({write_entry(first)}, std::hypot({others}))"
 
 
-def accelerations(robot: Robot) -> list[float]:
-    """Return the acceleration of each drive alone at home, with the weight, rad/s2 or m/s2, (n,).
+def home_accelerations(robot: Robot) -> list[float]:
+    """Return the acceleration that each drive can give its joint at home, rad/s2 or m/s2, (n,).
 
     Infinite without effort limits.
     """
@@ -169,15 +181,14 @@ def accelerations(robot: Robot) -> list[float]:
     weight = np.abs(inverse_dynamics(robot, q, 0.0 * q, 0.0 * q))
     inertia = np.diag(mass_matrix(robot, q))
     with np.errstate(divide="ignore"):
-        # Fraction of the effort left at home after gravity that a planner may use to
-        # accelerate.
+        # A planner may use half of the effort that remains at home after gravity.
         return list(0.5 * np.maximum(limits - weight, 0.0) / inertia)
 
 
 def _list_joined_links(tree: LoopTree, parts: Sequence[Single]) -> list[tuple[str, str]]:
     """Return pairs of links that a joint, or a cut loop, connects.
 
-    A link without mass and shape stands between the axes of one joint: it joins its neighbours.
+    A link without mass and shape is between the axes of one joint, which then connects its neighbours.
     """
     pairs = [(part.parent, part.child) for part in parts]
     pairs += [(closure.inner, closure.outer) for closure in tree.closures]
@@ -189,8 +200,8 @@ def _list_joined_links(tree: LoopTree, parts: Sequence[Single]) -> list[tuple[st
     return list(dict.fromkeys((min(pair), max(pair)) for pair in pairs))
 
 
-def _touching(tree: LoopTree) -> list[tuple[str, str]]:
-    """Find pairs of links whose shapes intersect at home: bars that meet in a point of a body."""
+def _find_touching_links(tree: LoopTree) -> list[tuple[str, str]]:
+    """Find pairs of links whose shapes intersect at home, as bars do that meet in a point."""
     pairs = []
     for one, other in combinations(tree.capsules, 2):
         gap = distance(one.start, one.end - one.start, other.start, other.end - other.start)
@@ -199,12 +210,12 @@ def _touching(tree: LoopTree) -> list[tuple[str, str]]:
     return list(dict.fromkeys(pairs))
 
 
-def _joint_limits(robot: Robot, accelerations: Sequence[float]) -> dict[str, Any]:
+def _write_joint_limits(robot: Robot, home_accelerations: Sequence[float]) -> dict[str, Any]:
     velocities = robot.limits.velocity
     limits = {}
     for k, joint in enumerate(robot.joint_names):
         velocity = np.inf if velocities is None else float(velocities[k])
-        acceleration = float(accelerations[k])
+        acceleration = float(home_accelerations[k])
         limits[joint] = {
             "has_velocity_limits": velocity < np.inf,
             "max_velocity": velocity if velocity < np.inf else 0.0,
@@ -214,12 +225,12 @@ def _joint_limits(robot: Robot, accelerations: Sequence[float]) -> dict[str, Any
     return {"default_velocity_scaling_factor": 0.1, "default_acceleration_scaling_factor": 0.1, "joint_limits": limits}
 
 
-def _controllers(robot: Robot) -> dict[str, Any]:
+def _write_controllers(robot: Robot) -> dict[str, Any]:
     return {
         "moveit_controller_manager": ("moveit_simple_controller_manager/MoveItSimpleControllerManager"),
         "moveit_simple_controller_manager": {
-            "controller_names": [CONTROLLER],
-            CONTROLLER: {
+            "controller_names": [CONTROLLER_NAME],
+            CONTROLLER_NAME: {
                 "action_ns": "follow_joint_trajectory",
                 "type": "FollowJointTrajectory",
                 "default": True,
@@ -229,7 +240,7 @@ def _controllers(robot: Robot) -> dict[str, Any]:
     }
 
 
-def _yaml(data: dict[str, Any]) -> str:
+def _write_yaml(data: dict[str, Any]) -> str:
     return yaml.safe_dump(data, sort_keys=False)
 
 

@@ -14,42 +14,42 @@ from typing import Any, Final
 
 from pkm_twin.codegen.expressions import PARAMETERS, Expression
 from pkm_twin.codegen.operations import OPERATIONS
-from pkm_twin.codegen.plain import source
+from pkm_twin.codegen.plain import write_function
 from pkm_twin.codegen.program import (
-    AHEAD,
     AT,
-    CLOSED,
-    CONTRACTION,
-    FIRST,
     LEAST,
-    MARGIN,
-    RESIDUAL,
+    MAX_CONTRACTION,
+    MAX_EXTRAPOLATED_CORRECTION,
+    MAX_FIRST_CORRECTION,
+    MAX_LAST_CORRECTION,
+    MAX_RESIDUAL,
+    MIN_DETERMINANT_RATIO,
     STATE,
     certainty,
     previous,
 )
-from pkm_twin.export.c99 import Folding, Routine
+from pkm_twin.export.c99 import Routine, Substitution
 from pkm_twin.export.c_package import Package
 from pkm_twin.kinematics.programs import SAME_POSE
 from pkm_twin.robot.robot import Robot
 
-FUNCTIONS: Final = ("forward", "inverse", "jacobian", "torques", "joint_to_actuator", "actuator_to_joint", "gains")
-CORRECTIONS: Final = 6
-"""Corrections of a call. Of 10,000 states each of delta_cu, prru, rps3 and five_bar, 5 reach all
+FUNCTION_NAMES: Final = ("forward", "inverse", "jacobian", "torques", "joint_to_actuator", "actuator_to_joint", "gains")
+MAX_CORRECTIONS: Final = 6
+"""Largest number of corrections of a call. Of 10,000 states each of delta_cu, prru, rps3 and five_bar, 5 reach all
 that 12 reach; one more makes the derivatives exact."""
 MORE_STEPS: Final = (9,)
-"""Steps of the further attempts, as of exported C. Of 10,000 states each of a humanoid's ankle and
+"""Numbers of steps of the further attempts, as in exported C. Of 10,000 states each of a humanoid's ankle and
 of delta_cu, 9 steps reach all, 3 steps 96 % and 99.8 %, one step 91 % and 99.7 %."""
 LIBRARIES: Final = {
     "numpy": "import numpy as xp",
     "jax": "import jax\nimport jax.numpy as xp",
     "torch": "import torch as xp",
 }
-_UNSAFE: Final = re.compile(r'[^ -~]|["\\]')
-"""What a name may not bring into a docstring."""
-_CALLED: Final = re.compile(rf"\b({'|'.join(op.name for op in OPERATIONS if not op.infix)})\(")
+UNSAFE_CHARACTERS: Final = re.compile(r'[^ -~]|["\\]')
+"""Characters of names that are replaced in docstrings."""
+OPERATION_CALLS: Final = re.compile(rf"\b({'|'.join(op.name for op in OPERATIONS if not op.infix)})\(")
 
-_HEAD: Final = '''\
+FILE_HEAD: Final = '''\
 # SPDX-License-Identifier: Apache-2.0
 # Written by pkm-twin export python, which overwrites changes.
 """{name} for {library}. Functions take arrays (..., size) and return arrays and a mask (...).
@@ -68,25 +68,25 @@ CORRECTIONS = {corrections}
 MORE_STEPS = {steps}
 """Steps of further attempts from home, for states that one step does not reach."""
 '''
-_EAGER: Final = """
+EAGER_CODE: Final = """
 
 def _is_done(valid):
     return bool(valid.all())
 """
-_TRACED: Final = """
+TRACED_CODE: Final = """
 
 def _is_done(valid):
     # What is traced does not depend on values.
     return False
 """
-_LOOP: Final = """
+LOOP_CODE: Final = """
 
 def _repeat(step, state):
     for _ in range(CORRECTIONS):
         state = step(state)
     return state
 """
-_SCAN: Final = """
+SCAN_CODE: Final = """
 
 def jit(function):
     # For a CPU, where XLA's fusion computes shared terms again for each result.
@@ -96,8 +96,8 @@ def jit(function):
 def _repeat(step, state):
     return jax.lax.scan(lambda s, _: (step(s), None), state, None, length=CORRECTIONS)[0]
 """
-_ONWARD: Final = f"({', '.join('ahead' if k == AT.onward else '0.0' for k in range(len(AT)))})"
-_RUNTIME: Final = f"""
+ONWARD_STATE: Final = f"({', '.join('ahead' if k == AT.onward else '0.0' for k in range(len(AT)))})"
+RUNTIME_CODE: Final = f"""
 
 def _like(value, x):
     return value if hasattr(value, "dtype") else xp.zeros_like(x) + value
@@ -144,7 +144,7 @@ def _call(inputs, equations, results, sizes):
     rounding = float(xp.finfo(zero.dtype).eps)
     # Rounding of two solutions of one state may be larger than the margins in double precision.
     margin = min(0.0, {SAME_POSE!r} - 1e2 * rounding)
-    closed, residual = max({CLOSED!r}, rounding**0.5) ** 2, max({RESIDUAL!r}, 1e3 * rounding) ** 2
+    closed, residual = max({MAX_LAST_CORRECTION!r}, rounding**0.5) ** 2, max({MAX_RESIDUAL!r}, 1e3 * rounding) ** 2
     for target, goal, unknowns, home, origin, start, onward, correct, certain in equations:
         if goal is not None:
             given[target] = goal(**given)
@@ -154,9 +154,9 @@ def _call(inputs, equations, results, sizes):
         def follow(steps, valid):
             # In so many steps on the straight line from home, shorter ones at the end.
             x = before = tuple(value + zero for value in home)
-            size, part, way = {(FIRST / CONTRACTION) ** 2!r}, 0.0, 1.0
+            size, part, way = {(MAX_FIRST_CORRECTION / MAX_CONTRACTION) ** 2!r}, 0.0, 1.0
             if steps > 1 and start is not None:
-                size = {(AHEAD / CONTRACTION) ** 2!r}
+                size = {(MAX_EXTRAPOLATED_CORRECTION / MAX_CONTRACTION) ** 2!r}
             elif certain or steps > 1:
                 size = 1e30
             for k in range(1, steps + 1):
@@ -169,15 +169,15 @@ def _call(inputs, equations, results, sizes):
                 def step(state):
                     x, size, moving, valid = state
                     *new, now, determinant = correct(**aim, **{{unknowns: x}})
-                    sound = (now < {CONTRACTION**2!r} * size) & (determinant > {LEAST!r})
+                    sound = (now < {MAX_CONTRACTION**2!r} * size) & (determinant > {LEAST!r})
                     if steps == 1 and not certain:
-                        sound = sound & ({MARGIN**2!r} * now < determinant * determinant)
+                        sound = sound & ({MIN_DETERMINANT_RATIO**2!r} * now < determinant * determinant)
                     valid = valid & (sound | ~moving)
                     x = tuple(xp.where(valid, a, b) for a, b in zip(new, x))
                     return x, xp.where(moving, now, size), moving & sound & (now > closed), valid
 
                 if k > 1:
-                    x, before = onward(x, before, {_ONWARD}), x
+                    x, before = onward(x, before, {ONWARD_STATE}), x
                 elif start is not None and (steps == 1 or not certain):
                     x = start(**aim)
                 x = tuple(value + zero for value in x)
@@ -222,58 +222,58 @@ def python_file(robot: Robot, library: str) -> str:
 
     :param library: a key of :data:`LIBRARIES`.
     """
-    package = Package(robot, FUNCTIONS)
+    package = Package(robot, FUNCTION_NAMES)
     payload = {PARAMETERS: package.payload_values}
     joints, pose = (
         ", ".join(f"{name} ({unit})" for name, unit in zip(*pair, strict=True))
         for pair in ((robot.joint_names, robot.joint_units), (robot.pose_names, robot.pose_units))
     )
-    head = _HEAD.format(
-        name=_UNSAFE.sub("?", robot.name),
+    head = FILE_HEAD.format(
+        name=UNSAFE_CHARACTERS.sub("?", robot.name),
         library=library,
         imports=LIBRARIES[library],
-        corrections=CORRECTIONS,
+        corrections=MAX_CORRECTIONS,
         steps=MORE_STEPS,
-        joints=_UNSAFE.sub("?", joints),
-        pose=_UNSAFE.sub("?", pose),
+        joints=UNSAFE_CHARACTERS.sub("?", joints),
+        pose=UNSAFE_CHARACTERS.sub("?", pose),
     )
-    parts = [head, _EAGER if library == "numpy" else _TRACED]
-    parts += [_SCAN if library == "jax" else _LOOP, _RUNTIME]
+    parts = [head, EAGER_CODE if library == "numpy" else TRACED_CODE]
+    parts += [SCAN_CODE if library == "jax" else LOOP_CODE, RUNTIME_CODE]
     if library == "numpy":
-        # What is not valid is masked.
+        # Suppress warnings of numpy for samples that are masked.
         parts.append('\n\n_call = xp.errstate(all="ignore")(_call)\n')
-    parts += [_write_function(one, payload, "_") for one in package.hidden]
-    parts += [_write_function(one, payload) for one in package.routines]
+    parts += [_write_routine(one, payload, "_") for one in package.hidden]
+    parts += [_write_routine(one, payload) for one in package.routines]
     return "".join(parts)
 
 
-def _write_function(routine: Routine, payload: Mapping[str, Sequence[Any]], prefix: str = "") -> str:
-    """Return the text of a function and of its parts.
+def _write_routine(routine: Routine, payload: Mapping[str, Sequence[Any]], prefix: str = "") -> str:
+    """Write a function with the functions that it calls.
 
-    :param prefix: of the name of a function that others call.
+    :param prefix: beginning of the name, for a function that only others call.
     """
-    fold, name = Folding(), routine.name
+    fold, name = Substitution(), routine.name
     known, parts, rows = dict(routine.inputs), [], []
     judged: list[Expression] = []
     branches: list[Expression] = []
 
-    def write(what: str, results: Sequence[Expression], inputs: Mapping[str, int] = known) -> str:
-        text = _CALLED.sub(r"_\1(", source(results, inputs))
+    def write_part(what: str, results: Sequence[Expression], inputs: Mapping[str, int] = known) -> str:
+        text = OPERATION_CALLS.sub(r"_\1(", write_function(results, inputs))
         text = text.replace("program", f"_{name}_{what}", 1)
         parts.append(f"\n\n{text}\n")
         return f"_{name}_{what}"
 
     for k, q in enumerate(fold.equations(q, payload) for q in routine.equations):
-        goal = write(f"goal_{k}", q.goal) if q.goal else None
+        goal = write_part(f"goal_{k}", q.goal) if q.goal else None
         known[q.target] = len(q.origin)
         start = onward = correct = None
         if q.home:
-            start = write(f"start_{k}", q.start) if q.start else None
+            start = write_part(f"start_{k}", q.start) if q.start else None
             known[q.unknowns] = len(q.home)
-            correct = write(f"correct_{k}", q.results)
+            correct = write_part(f"correct_{k}", q.results)
             # The unknowns of a step and of the one before, and the state of Newton's method.
             size = {q.unknowns: len(q.home), previous(q.unknowns): len(q.home), STATE: len(AT)}
-            onward = write(f"onward_{k}", q.onward, size)
+            onward = write_part(f"onward_{k}", q.onward, size)
         home, origin = (tuple(e.value for e in row) for row in (q.home, q.origin))
         certain = q.start is not None and not q.guessed
         rows.append(
@@ -283,7 +283,7 @@ def _write_function(routine: Routine, payload: Mapping[str, Sequence[Any]], pref
         branches += q.branch
     own = list(routine.outputs.values()) + ([] if routine.judge is None else [certainty(routine.equations)])
     outputs = [e for row in own for e in fold(row, payload)]
-    results = write("results", [*outputs, *judged, *branches])
+    results = write_part("results", [*outputs, *judged, *branches])
     sizes = [len(row) for row in own]
     shapes = [f"{key} (..., {size})" for key, size in routine.inputs.items()]
     gives = [f"{key} (..., {len(row)})" for key, row in routine.outputs.items()]

@@ -22,17 +22,17 @@ import yaml
 from delta_dynamics.simulation.machine import tune_position_control
 from pkm_twin.codegen.arrays import ROUNDING_NOISE, Array
 from pkm_twin.errors import check_limit
-from pkm_twin.export.c_package import c_package, identifier
+from pkm_twin.export.c_package import c_identifier, c_package
 from pkm_twin.machine.graph import POSE
 from pkm_twin.machine.sections import MAX_LENGTH, MAX_MASS
 from pkm_twin.robot.robot import Robot
 
 CONTROLLER: Final = "feedforward_controller"
-GRAVITY: Final = "gravity_controller"
-TRAJECTORIES: Final = "joint_trajectory_controller"
+GRAVITY_CONTROLLER: Final = "gravity_controller"
+TRAJECTORY_CONTROLLER: Final = "joint_trajectory_controller"
 DAMPING_TIME: Final = 0.1
 """Time constant, s, of the damping of the gravity controller, by the masses at home."""
-SHARED: Final = {
+REDUNDANCY_FUNCTIONS: Final = {
     "none idle": "  (void)q;\n  (void)n;\n  return 0;",
     "idle": """\
   const int status = pkm_{}_null_efforts(model_positions(q).data(), n.data());
@@ -52,12 +52,12 @@ SHARED: Final = {
   }}
   return status;""",
 }
-"""Bodies of functions of the model: where drives share the effort, and where each has its own."""
+"""Bodies of C++ functions: for machines with more drives than degrees of freedom, and for others."""
 
 
 def package_name(robot: Robot, kind: str = "ros2_control") -> str:
-    """Name of a robot's ROS package: lower case, digits and single underscores (REP 144)."""
-    name = re.sub(r"_+", "_", identifier(robot.name or robot.mechanism).lower()).strip("_")
+    """Return the name of a robot's ROS package: lower case, digits and single underscores (REP 144)."""
+    name = re.sub(r"_+", "_", c_identifier(robot.name or robot.mechanism).lower()).strip("_")
     return f"{name if name[:1].isalpha() else f'robot_{name}'.rstrip('_')}_{kind}"
 
 
@@ -65,51 +65,51 @@ def ros2_control_package(robot: Robot, bandwidth: float = 0.0) -> dict[str, str]
     """Write the package: the text of each file by its path.
 
     :param bandwidth: of the controller's gains by the masses at home, Hz; zero: no gains.
-    :raises ParameterError: a robot whose file gives no masses, or a bandwidth that no machine has.
+    :raises ParameterError: a robot whose file gives no masses, or an invalid bandwidth.
     """
     if bandwidth != 0.0:
         check_limit("bandwidth", bandwidth, "Hz")
     robot.massive()
     package = package_name(robot)
-    words = _words(robot, package)
+    words = _template_words(robot, package)
     result = {f"c/{name}": text for name, text in c_package(robot).items()}
-    result["config/controllers.yaml"] = _controllers(robot, package, bandwidth)
+    result["config/controllers.yaml"] = _write_controllers(robot, package, bandwidth)
     for path, text in fill_templates("ros2_control_package", words).items():
-        # Headers are included as PACKAGE/NAME.hpp.
+        # Headers are included by PACKAGE/NAME.hpp.
         result[path.replace("include/", f"include/{package}/")] = text
     return dict(sorted(result.items()))
 
 
 def fill_templates(folder: str, words: Mapping[str, str]) -> dict[str, str]:
     """Return a folder's templates by path, with the words between two ``@`` replaced."""
-    templates = _templates(files("pkm_twin.export") / folder)
+    templates = _iterate_templates(files("pkm_twin.export") / folder)
     return {p: re.sub(r"@([A-Z]+)@", lambda word: words[word[1]], text) for p, text in templates}
 
 
-def printable(robot: Robot) -> str:
+def printable_name(robot: Robot) -> str:
     """Return the robot's name without characters that comments, tables or literals reject."""
     return re.sub(r"[^\w .:+-]", "_", robot.name or robot.mechanism)
 
 
-def _templates(folder: Traversable, above: str = "") -> Iterable[tuple[str, str]]:
+def _iterate_templates(folder: Traversable, above: str = "") -> Iterable[tuple[str, str]]:
     for item in sorted(folder.iterdir(), key=lambda item: item.name):
         if item.is_dir():
-            yield from _templates(item, f"{above}{item.name}/")
+            yield from _iterate_templates(item, f"{above}{item.name}/")
         else:
             yield f"{above}{item.name}", item.read_text(encoding="utf-8")
 
 
-def _words(robot: Robot, package: str) -> dict[str, str]:
+def _template_words(robot: Robot, package: str) -> dict[str, str]:
     """Return the texts that replace the words between two ``@`` in the templates."""
-    own = identifier(robot.name)
-    shown = printable(robot)
+    own = c_identifier(robot.name)
+    shown = printable_name(robot)
     load, controller = robot.payload, robot.controller
-    home = _start(robot)
-    directions = _directions(robot)
-    # How far every joint may go from home, all at once and in any direction, shape (n,).
+    home = _start_position(robot)
+    directions = _choose_twist_components(robot)
+    # Find a range about home in which all joints may move at once in any directions, shape (n,).
     units = np.array([1.0 if unit == "rad" else robot.graph.size for unit in robot.joint_units])
     if robot.redundant:
-        # Joints that move by themselves contradict each other.
+        # Redundant drives cannot move independently.
         ranges = np.asarray(robot.graph.sharing[0] / 4.0 * units, np.float64)
     else:
         if robot.limits.position is not None:
@@ -119,7 +119,7 @@ def _words(robot: Robot, package: str) -> dict[str, str]:
         size = 0.2
         for _ in range(20):
             index, good = robot.try_singularity(home + size * units * signs)
-            # Least singularity index of the motions that the package's own test makes.
+            # The package's own test moves in this range: keep it away from singularities.
             if good.all() and (index > 0.05).all():
                 break
             size /= 2.0
@@ -129,14 +129,14 @@ def _words(robot: Robot, package: str) -> dict[str, str]:
     controller, limits, friction = robot.controller, robot.limits, robot.friction
     n = robot.joints_count
     position = np.array([[-np.inf, np.inf]] * n) if limits.position is None else limits.position
-    # A negative sign turns them round; ends without a limit stay without one.
+    # A negative factor swaps the limits; infinite ones stay infinite.
     ends = np.sort(controller.offsets[:, None] + controller.factors[:, None] * position, axis=1)
     effort = np.full(n, np.inf) if limits.effort is None else np.asarray(limits.effort)
-    # The rates that rounding of the positions makes, in the controller's numbers, (n,).
+    # Bound the rates that rounding of positions causes, in the controller's numbers, (n,).
     controller = robot.controller
     units = np.array([1.0 if unit == "rad" else robot.graph.size for unit in robot.joint_units])
     largest = np.abs(controller.offsets) + np.abs(controller.factors) * units
-    # Usual period of a fast control loop, s: rounding of positions over it is no motion.
+    # The period is that of a fast control loop, 1 ms.
     columns = (
         controller.factors,
         controller.offsets,
@@ -145,11 +145,11 @@ def _words(robot: Robot, package: str) -> dict[str, str]:
         effort / np.abs(controller.factors),
         friction.viscous,
         friction.coulomb,
-        _damping(robot),
+        _gravity_damping(robot),
         np.asarray(ROUNDING_NOISE * largest / 1e-3, np.float64),
     )
     lines = [
-        f"  {{{literal(name)}, {', '.join(number(column[k]) for column in columns)}}},"
+        f"  {{{write_cpp_string(name)}, {', '.join(write_cpp_number(column[k]) for column in columns)}}},"
         for k, name in enumerate(controller.names)
     ]
     return {
@@ -162,22 +162,25 @@ def _words(robot: Robot, package: str) -> dict[str, str]:
         "JOINTNAMES": ", ".join(f"`{name}`" for name in controller.names),
         "POSENAMES": ", ".join(POSE[k] for k in directions),
         "POSE": _write_row(directions),
-        "PAYLOAD": "{" + ", ".join([number(load.mass), _write_row(load.com), _write_row(np.ravel(load.inertia))]) + "}",
+        "PAYLOAD": "{"
+        + ", ".join([write_cpp_number(load.mass), _write_row(load.com), _write_row(np.ravel(load.inertia))])
+        + "}",
         "DRIVES": "\n".join(lines),
         "STOP": f"{DAMPING_TIME:g}",
-        "MAXMASS": number(MAX_MASS),
-        "MAXLENGTH": number(MAX_LENGTH),
+        "MAXMASS": write_cpp_number(MAX_MASS),
+        "MAXLENGTH": write_cpp_number(MAX_LENGTH),
         "START": _write_row(controller.controller_positions(home)),
         "RANGE": _write_row(steps),
-        "NULLEFFORTS": SHARED["idle" if robot.redundant else "none idle"].format(own),
-        "PROJECTION": SHARED["project_redundant" if robot.redundant else "independent"].format(own),
+        "NULLEFFORTS": REDUNDANCY_FUNCTIONS["idle" if robot.redundant else "none idle"].format(own),
+        "PROJECTION": REDUNDANCY_FUNCTIONS["project_redundant" if robot.redundant else "independent"].format(own),
     }
 
 
-def _directions(robot: Robot) -> list[int]:
+def _choose_twist_components(robot: Robot) -> list[int]:
     """Return the indices of the twist's components that belong to the pose's coordinates.
 
-    Of a pose with coordinates of its own, those in which the joints move the platform best at home.
+    If the pose has other coordinates, choose the components with the largest volume of the Jacobian at
+    home.
     """
     names = robot.pose_names
     if set(names) <= set(POSE):
@@ -186,20 +189,20 @@ def _directions(robot: Robot) -> list[int]:
     twist[:3] /= robot.graph.size
     twist /= np.linalg.norm(twist, axis=0)
     choices = list(combinations(range(len(POSE)), len(names)))
-    # Rounded: equals stay in their order, whatever the arithmetic.
+    # Round the volumes, so that the first of equal ones is chosen independently of rounding.
     sizes = [round(float(np.prod(np.linalg.svd(twist[list(rows)], compute_uv=False))), 6) for rows in choices]
     return list(choices[int(np.argmax(sizes))])
 
 
-def _damping(robot: Robot) -> Array:
+def _gravity_damping(robot: Robot) -> Array:
     """Return the gravity controller's damping in the controller's numbers, shape (n,)."""
     # Critical damping of a bandwidth f is 4 pi f times the mass.
     _, damping = tune_position_control(robot, 1.0 / (4.0 * np.pi * DAMPING_TIME))
-    # Digits that other arithmetic does not change.
+    # Round to digits that do not depend on the processor's arithmetic.
     return np.array([float(f"{d:.6g}") for d in damping / robot.controller.factors**2])
 
 
-def _start(robot: Robot) -> Array:
+def _start_position(robot: Robot) -> Array:
     """Return home, or the middle of the limits where they exclude home, shape (n,)."""
     home, limits = robot.graph.home, robot.limits.position
     if limits is None or ((limits[:, 0] <= home) & (home <= limits[:, 1])).all():
@@ -208,14 +211,14 @@ def _start(robot: Robot) -> Array:
     return middle if robot.try_forward(middle)[1] else home
 
 
-def _controllers(robot: Robot, package: str, bandwidth: float) -> str:
+def _write_controllers(robot: Robot, package: str, bandwidth: float) -> str:
     controller = robot.controller
     joints = list(controller.names)
-    # Efforts of the controller's numbers per the controller's numbers.
+    # Convert the gains to the controller's efforts and positions.
     gains = [values / controller.factors**2 for values in tune_position_control(robot, bandwidth)]
     own: dict[str, Any] = {
         "gains": {
-            # Digits that other arithmetic does not change.
+            # Round to digits that do not depend on the processor's arithmetic.
             name: {"p": float(f"{p:.6g}"), "d": float(f"{d:.6g}")}
             for name, p, d in zip(joints, *gains, strict=True)
         },
@@ -225,13 +228,15 @@ def _controllers(robot: Robot, package: str, bandwidth: float) -> str:
         "controller_manager": {
             "update_rate": 500,
             "joint_state_broadcaster": {"type": "joint_state_broadcaster/JointStateBroadcaster"},
-            CONTROLLER: {"type": f"{package}/FeedforwardController", "fallback_controllers": [GRAVITY]},
-            GRAVITY: {"type": f"{package}/GravityController"},
-            TRAJECTORIES: {"type": "joint_trajectory_controller/JointTrajectoryController"},
+            CONTROLLER: {"type": f"{package}/FeedforwardController", "fallback_controllers": [GRAVITY_CONTROLLER]},
+            GRAVITY_CONTROLLER: {"type": f"{package}/GravityController"},
+            TRAJECTORY_CONTROLLER: {"type": "joint_trajectory_controller/JointTrajectoryController"},
         },
         CONTROLLER: own,
-        GRAVITY: {"gains": {name: {"d": float(d)} for name, d in zip(joints, _damping(robot), strict=True)}},
-        TRAJECTORIES: {
+        GRAVITY_CONTROLLER: {
+            "gains": {name: {"d": float(d)} for name, d in zip(joints, _gravity_damping(robot), strict=True)}
+        },
+        TRAJECTORY_CONTROLLER: {
             "joints": joints,
             "command_joints": [f"{CONTROLLER}/{joint}" for joint in joints],
             "command_interfaces": ["position", "velocity", "acceleration"],
@@ -239,13 +244,13 @@ def _controllers(robot: Robot, package: str, bandwidth: float) -> str:
             "allow_nonzero_velocity_at_trajectory_end": False,
         },
     }
-    # In every namespace.
+    # Apply the sections in every namespace.
     sections = {f"/**/{name}": {"ros__parameters": part} for name, part in settings.items()}
     head = "# Written by pkm-twin export ros2-control. Effort per controller's unit and its rate.\n"
     return head + yaml.safe_dump(sections, sort_keys=False)
 
 
-def number(value: float) -> str:
+def write_cpp_number(value: float) -> str:
     """Write a double exactly, for C++."""
     value = float(value)
     if math.isinf(value):
@@ -254,11 +259,11 @@ def number(value: float) -> str:
 
 
 def _write_row(values: Iterable[Any]) -> str:
-    items = [str(v) if isinstance(v, int) else number(v) for v in values]
+    items = [str(v) if isinstance(v, int) else write_cpp_number(v) for v in values]
     return "{" + ", ".join(items) + "}"
 
 
-def literal(text: str) -> str:
+def write_cpp_string(text: str) -> str:
     """Write a C++ string literal; special characters are octal."""
     plain = re.compile(rb"[A-Za-z0-9 _./:+-]")
     return '"' + "".join(chr(byte) if plain.match(bytes([byte])) else f"\\{byte:03o}" for byte in text.encode()) + '"'

@@ -250,7 +250,7 @@ def geometric(robot: Robot, q: Array, only: Sequence[str] = ()) -> tuple[str, ..
         # Can the machine be assembled with another number?
         beside = many.with_values(own + 1e-6 * np.eye(len(paths)))
         each = np.broadcast_to(q, (len(paths), *q.shape))
-        possible = beside.run(programs.anywhere, each)[1].all((1, 2))
+        possible = beside.run(programs.forward_of_all_structures, each)[1].all((1, 2))
         # What does not move the platform is no number of the geometry.
         good = possible & (np.abs(twists).max((0, 1)) > 1e-6)
         found = [path for path, one in zip(paths, good, strict=True) if one]

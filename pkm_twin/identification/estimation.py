@@ -17,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.errors import PkmTwinError, install
+from pkm_twin.errors import PkmTwinError, write_install_command
 from pkm_twin.identification.samples import huber
 from pkm_twin.streams.noise import estimate_deviation
 
@@ -211,7 +211,7 @@ def nearest(z: Array, factor: Array, start: Array, scales: Array, cones: Cones) 
     except ImportError:
         raise PkmTwinError(
             "the data require a mass or an inertia that no body can have, and the nearest possible "
-            f"one needs cvxpy: {install('fit')}"
+            f"one needs cvxpy: {write_install_command('fit')}"
         ) from None
     # In deviations from the solution: each counts alike, however much the data know of it.
     moved = scales[:, None] * factor

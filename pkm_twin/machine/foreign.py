@@ -11,7 +11,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Final
 
-from pkm_twin.errors import ParameterError, warn
+from pkm_twin.errors import ParameterError, warn_of_file
 from pkm_twin.machine import urdf_xml
 from pkm_twin.machine.graph import group_connected
 from pkm_twin.machine.loop_tree import Fault, Joint, Link
@@ -62,15 +62,15 @@ def check_elements(
         if tag in REJECTED and _is_effective(part):
             raise ParameterError(where, f"<{tag}>", REJECTED[tag])
         if tag in IGNORED and _is_effective(part):
-            warn(path, f"{where}: {IGNORED[tag]} is ignored")
+            warn_of_file(path, f"{where}: {IGNORED[tag]} is ignored")
         elif tag.partition(":")[0] in ("drake", "isaac") and owner:
-            warn(path, f"{where} is not read")
+            warn_of_file(path, f"{where} is not read")
         if tag == "plugin":
             plugin = f"{part.get('name', '')} {part.get('filename', '')}".strip()
             if "mimic" in plugin.lower():
                 raise ParameterError("plugin", plugin, "joints without coupling")
             if re.search("Buoyancy|Hydrodynamics|LiftDrag|Thruster|Wind|Spring|GravityComp", plugin):
-                warn(path, f"forces of the plugin {plugin} are ignored")
+                warn_of_file(path, f"forces of the plugin {plugin} are ignored")
         try:
             faults += check_elements(path, part, f"{tag}.{name}" if name else owner, joints)
         except ParameterError as error:
@@ -117,7 +117,7 @@ def read_gravity(
         raise ParameterError(f"link.{off[0]}.gravity", "false", "all moving links alike")
     if not off:
         return stated
-    warn(path, "gravity is switched off on every link that can move")
+    warn_of_file(path, "gravity is switched off on every link that can move")
     return [0.0, 0.0, 0.0]
 
 

@@ -22,7 +22,7 @@ from typing import Any, Final
 
 from pkm_twin.codegen import operations
 from pkm_twin.codegen.expressions import reference
-from pkm_twin.errors import ParameterError, unknown_number
+from pkm_twin.errors import ParameterError, unknown_number_error
 
 PARAMETERS: Final = "parameters"
 """Name of the parameters' section, the first key of their paths."""
@@ -345,7 +345,7 @@ class Book:
         rest = {path: v for path, v in values.items() if not path.startswith(start)}
         kept = {path: one for path, one in self.formulas.items() if path not in rest}
         for name in new.keys() - self.values.keys():
-            raise unknown_number(start + name, [start + known for known in self.values])
+            raise unknown_number_error(start + name, [start + known for known in self.values])
         if not values:
             return self, rest
         book = replace(self._replace_numbers(new), formulas=kept, data={})

@@ -17,7 +17,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.errors import ParameterError, warn
+from pkm_twin.errors import ParameterError, warn_of_file
 from pkm_twin.machine.graph import choose_spanning_pairs
 from pkm_twin.machine.joints import TYPES, Free, Freedom, JointType, name_single_freedoms
 from pkm_twin.machine.names import plain_name
@@ -268,7 +268,7 @@ def hold_in_world(path: Path, joints: dict[str, Joint], choose_link: Callable[[]
     if any(WORLD in (joint.inner, joint.outer) for joint in joints.values()):
         return
     ground = choose_link()
-    warn(path, f"no joint holds the machine in the world: link {ground.name} is taken for the ground")
+    warn_of_file(path, f"no joint holds the machine in the world: link {ground.name} is taken for the ground")
     name = free_name("world_fixed", {*joints})
     joints[name] = Joint.fixed(name, WORLD, ground.name, ground.frame)
 

@@ -18,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.errors import ParameterError, install, warn
+from pkm_twin.errors import ParameterError, warn_of_file, write_install_command
 from pkm_twin.machine import urdf_xml
 from pkm_twin.machine.loop_tree import WORLD, Fault, Joint, Link, LoopTree
 from pkm_twin.machine.precision import rounding_error
@@ -51,7 +51,9 @@ def read(path: Path, top: ET.Element, actuated: Sequence[str] | None = None) -> 
     try:
         import mujoco
     except ImportError:
-        raise ParameterError(str(path), "an MJCF file without the mujoco package", install("mjcf")) from None
+        raise ParameterError(
+            str(path), "an MJCF file without the mujoco package", write_install_command("mjcf")
+        ) from None
     words = _require_bounded(path, top, path.parent)
     try:
         model = mujoco.MjModel.from_xml_path(str(path))
@@ -72,7 +74,7 @@ def read(path: Path, top: ET.Element, actuated: Sequence[str] | None = None) -> 
             model = spec.compile()
         except (ValueError, AttributeError):
             raise ParameterError(str(path), ValueError(text), "a model that MuJoCo compiles") from None
-        warn(path, f"read without its meshes, as its bodies have inertias: {text}")
+        warn_of_file(path, f"read without its meshes, as its bodies have inertias: {text}")
     return _Reader(mujoco, model, path).tree(rounding_error(words), actuated)
 
 
@@ -175,11 +177,11 @@ class _Reader:
         if self._is_switched_off("CONSTRAINT", "EQUALITY") and m.neq:
             raise ParameterError("option.flag", "equality disabled", "closures that are enabled")
         if self._is_switched_off("GRAVITY"):
-            warn(self.path, "gravity is switched off by <flag>")
+            warn_of_file(self.path, "gravity is switched off by <flag>")
         if getattr(m, "nflex", 0):
             raise ParameterError("flex", self._get_name("FLEX", 0), "a machine of rigid bodies")
         if getattr(m, "nplugin", 0):
-            warn(self.path, "forces of plugins are ignored")
+            warn_of_file(self.path, "forces of plugins are ignored")
         for what, kind, arrays in IGNORED:
             values = [np.abs(array) for name in arrays if (array := getattr(m, name, None)) is not None]
             names = [
@@ -188,12 +190,12 @@ class _Reader:
                 if any(np.any(array[i]) for array in values) and not (kind == "JOINT" and i in self.locks)
             ]
             if names:
-                warn(self.path, f"{what} of {kind.lower()} {', '.join(names)} is ignored")
+                warn_of_file(self.path, f"{what} of {kind.lower()} {', '.join(names)} is ignored")
         gears = {self._get_name("ACTUATOR", i): float(m.actuator_gear[i][0]) for i in range(m.nu)}
         if geared := [f"{name} ({gear:g})" for name, gear in gears.items() if gear != 1.0]:
-            warn(self.path, f"efforts are at the joints, not before the gear of {', '.join(geared)}")
+            warn_of_file(self.path, f"efforts are at the joints, not before the gear of {', '.join(geared)}")
         if m.opt.density or m.opt.viscosity:
-            warn(self.path, "the fluid of density and viscosity is ignored")
+            warn_of_file(self.path, "the fluid of density and viscosity is ignored")
         for body in range(1, m.nbody):
             self._add_body(body)
         for site in range(m.nsite):
@@ -239,7 +241,7 @@ class _Reader:
             else:
                 other = self.names[kind, i] = urdf_xml.free_name(f"{name}_{kind.lower()}", taken)
                 first = owners[name][0].lower()
-                warn(self.path, f"{kind.lower()} {name} is read as {other}: a {first} is {name}")
+                warn_of_file(self.path, f"{kind.lower()} {name} is read as {other}: a {first} is {name}")
         return taken
 
     def _find_name(self, kind: str, index: int) -> str | None:

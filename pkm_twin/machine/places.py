@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from pkm_twin.codegen.expressions import Expression, plain
-from pkm_twin.errors import ParameterError, unknown_number
+from pkm_twin.errors import ParameterError, unknown_number_error
 from pkm_twin.machine import schema
 from pkm_twin.settings import settings_of
 
@@ -101,7 +101,7 @@ def replace_numbers(section: T, changes: Mapping[tuple[Key, ...], Any], path: st
         leaf = () in deeper
         single = np.isscalar(old) or isinstance(old, Expression)
         if isinstance(old, bool | str | None) or leaf != single:
-            raise unknown_number(here, [])
+            raise unknown_number_error(here, [])
         result[name] = deeper[()] if leaf else replace_numbers(old, deeper, here)
     if whole:
         made = object.__new__(type(section))
@@ -160,9 +160,9 @@ def number_in(data: Any, keys: Iterable[Key], path: str) -> float:
             names: list[Key] = list(there) if isinstance(there, Mapping) else []
             names += range(len(there)) if isinstance(there, list | tuple) else ()
             near = [join_path([*before, name, *keys[i + 1 :]]) for name in names]
-            raise unknown_number(path, near) from None
+            raise unknown_number_error(path, near) from None
     if isinstance(there, bool) or not isinstance(there, int | float):
-        raise unknown_number(path, [])
+        raise unknown_number_error(path, [])
     return float(there)
 
 

@@ -87,7 +87,7 @@ def _make_numbers_field(
         found = _check_nested(field, value, shape, bounds, least)
         return frozen(found) if shape else found
 
-    bound = words + bounds.span + ("; one stands for all" if spread else "")
+    bound = words + bounds.bounds_text + ("; one stands for all" if spread else "")
     return key(check, bound, default, **more)
 
 
@@ -134,7 +134,7 @@ def mapping(entry: Any, *, default: Any = MISSING, **more: Any) -> Any:
 
     bound = f"a mapping of names to {what}"
     if not section:
-        bound += entry.metadata["setting"].span
+        bound += entry.metadata["setting"].bounds_text
     return key(check, bound, default, entries=entry if section else None, **more)
 
 
@@ -192,7 +192,7 @@ def interval(*, count: int = 0, default: Any = MISSING, **more: Any) -> Any:
             return frozen([pair(f"{field}[{i}]", v) for i, v in enumerate(items)])
         return frozen([pair(field, value)] * count if count else pair(field, value))
 
-    bound = "[min, max]" + bounds.span
+    bound = "[min, max]" + bounds.bounds_text
     return key(check, f"{bound}, or {count} of them" if count else bound, default, **more)
 
 
@@ -355,7 +355,7 @@ def _check_nested(field: str, value: Any, shape: Sequence[int], bounds: Key, lea
     if shape:
         items = _check_list(field, value, shape[0], "numbers", least)
         return [_check_nested(f"{field}[{i}]", item, shape[1:], bounds) for i, item in enumerate(items)]
-    bound = f"a finite number{bounds.span}"
+    bound = f"a finite number{bounds.bounds_text}"
     if bounds.high is not None and "{" not in bounds.unit:
         bound += f" {bounds.unit}".rstrip()
     if not _is_number(value):
@@ -367,7 +367,7 @@ def _check_nested(field: str, value: Any, shape: Sequence[int], bounds: Key, lea
     if math.isfinite(result) and abs(result) > MAX_SIZE:
         bound += f", at most {MAX_SIZE:g} in size"
     endless = result == math.inf and bounds.high == math.inf
-    if not (abs(result) <= MAX_SIZE or endless) or not bounds.allows(result):
+    if not (abs(result) <= MAX_SIZE or endless) or not bounds.is_within_bounds(result):
         told = f"{value} = {result:g}" if isinstance(value, Written) else value
         raise ParameterError(field, told, bound)
     return result

@@ -20,7 +20,7 @@ from typing import Any, Final
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.errors import ParameterError, UnknownNameError, warn
+from pkm_twin.errors import ParameterError, UnknownNameError, warn_of_file
 from pkm_twin.machine import foreign, urdf_xml
 from pkm_twin.machine.joints import TURN, TYPES
 from pkm_twin.machine.loop_tree import WORLD, Joint, Link, LoopTree, hold_in_world, make_link, span_tree
@@ -305,7 +305,7 @@ def _read_link(path: Path, element: ET.Element, name: str, rounding: float) -> L
         raise ParameterError(f"{where}.fluid_added_mass", "given", "a machine in air")
     stated = set() if inertial is None else {part.tag for part in inertial.iter()}
     if missing := [key for key in ("mass", "ixx", "iyy", "izz") if key not in stated]:
-        warn(path, f"link {name} has no {', '.join(missing)}: SDF then has 1 kg and 1 kg m2")
+        warn_of_file(path, f"link {name} has no {', '.join(missing)}: SDF then has 1 kg and 1 kg m2")
     inertia = urdf_xml.find_single_child(inertial, "inertia", where)
     return make_link(
         name,
@@ -332,7 +332,7 @@ def _read_joint(path: Path, part: ET.Element, model: Model) -> Joint:
     if frame is not None and frame.tag == "frame":
         far = float(np.linalg.norm(place(ends[0]).position - at.position))
         if far > 1e-6:  # m; files are written with six decimals or more
-            warn(
+            warn_of_file(
                 path,
                 f"{where}: the frame {ends[0]} is drawn {far:.3g} m from the joint; "
                 "a joint of SDF holds its links as they are drawn",
@@ -406,7 +406,7 @@ def read_welds(path: Path, top: ET.Element, model: str, places: Mapping[str, Pos
         ends = [(plugin.findtext(tag) or "").strip() for tag in tags]
         other = (plugin.findtext("child_model") or model).strip()
         if other not in (model, MODEL):
-            warn(path, f"{kind} plugin: {ends[1]!r} of model {other!r} is not part of this machine")
+            warn_of_file(path, f"{kind} plugin: {ends[1]!r} of model {other!r} is not part of this machine")
             continue
         for tag, end in zip(tags, ends, strict=True):
             if end not in places:

@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from pkm_twin.errors import ParameterError, unknown_number
+from pkm_twin.errors import ParameterError, unknown_number_error
 from pkm_twin.machine import schema
 
 
@@ -86,7 +86,7 @@ def match_numbers(name: str, entry: UncertaintyEntry, numbers: Mapping[str, tupl
     below = {path: v for path, (v, _) in numbers.items() if path == name or path.startswith(parts)}
     field = f"uncertainty.{name}"
     if not below:
-        raise unknown_number(field, (f"uncertainty.{path}" for path in numbers))
+        raise unknown_number_error(field, (f"uncertainty.{path}" for path in numbers))
     if entry.deviation is not None and len(below) > 1:
         raise ParameterError(field, entry.deviation, "relative, because the path names several numbers")
     return below

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
-from pkm_twin.errors import ParameterError, UnknownNameError, warn
+from pkm_twin.errors import ParameterError, UnknownNameError, warn_of_file
 from pkm_twin.machine import urdf_xml
 from pkm_twin.machine.loop_tree import Fault, Joint
 from pkm_twin.machine.strict_yaml import read_yaml
@@ -149,7 +149,9 @@ def limit_commands(path: Path, top: ET.Element, joints: dict[str, Joint]) -> Non
             stated.setdefault(kind, {})[parameter.get("name", "")] = (parameter.text or "").strip()
         for kind, bounds in stated.items():
             if kind not in ("position", "velocity", "effort"):
-                warn(path, f"ros2_control.{name}: {', '.join(bounds)} of the command interface {kind} is not read")
+                warn_of_file(
+                    path, f"ros2_control.{name}: {', '.join(bounds)} of the command interface {kind} is not read"
+                )
                 continue
             where = f"ros2_control.{name}.{kind}"
             if name not in joints:

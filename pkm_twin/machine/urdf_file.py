@@ -19,7 +19,7 @@ from typing import Any, Final
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.errors import ParameterError, UnknownNameError, warn
+from pkm_twin.errors import ParameterError, UnknownNameError, warn_of_file
 from pkm_twin.machine import foreign, sdf_file, urdf_xml
 from pkm_twin.machine.joints import TYPES
 from pkm_twin.machine.loop_tree import Fault, Joint, Link, LoopTree, make_link, order_from_root
@@ -111,7 +111,7 @@ def read(path: Path, robot: ET.Element, actuated: Sequence[str] | None = None) -
         if element.tag == "gazebo" and "reference" not in element.attrib and element.find("gravity") is not None:
             unknown.add("gazebo.gravity")
     if unknown:
-        warn(path, f"elements that are not read: {', '.join(sorted(unknown))}")
+        warn_of_file(path, f"elements that are not read: {', '.join(sorted(unknown))}")
     beside = read_companion_yaml(path)
     closures = _read_closures(robot, beside, links, joints)
     _warn_of_units(path, robot, joints, closures)
@@ -403,13 +403,13 @@ def _warn_of_units(path: Path, robot: ET.Element, joints: dict[str, Joint], clos
     where = max(sizes, key=sizes.__getitem__, default="")
     # No parallel machine is drawn in offsets of more than 10 m.
     if where and sizes[where] > 10.0:
-        warn(path, f"{where}: an offset of {sizes[where]:g} m; a URDF uses metres; are these millimetres?")
+        warn_of_file(path, f"{where}: an offset of {sizes[where]:g} m; a URDF uses metres; are these millimetres?")
     for top in robot:
         angles = [word for e in top.iter() for word in e.get("rpy", "").split()]
         largest = max((abs(urdf_xml.parse_number(word, "rpy")) for word in angles), default=0.0)
         if largest > 2.0 * math.pi + 1e-6:
             name = f"{top.tag}.{top.get('name')}.rpy"
-            warn(path, f"{name}: {largest:g} rad; a URDF uses radians; are these degrees?")
+            warn_of_file(path, f"{name}: {largest:g} rad; a URDF uses radians; are these degrees?")
 
 
 def read_visuals(
@@ -434,7 +434,7 @@ def read_visuals(
                 if not mesh.get("filename"):
                     raise ParameterError(f"{where}.filename", None, "the file of the mesh")
             except ParameterError as error:
-                warn(path, f"{error}; this mesh is not shown")
+                warn_of_file(path, f"{error}; this mesh is not shown")
                 continue
             file = str(mesh.get("filename"))
             yield Visual(path, file, bodies[name], scale, places[name] @ pose)

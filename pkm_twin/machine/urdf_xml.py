@@ -14,7 +14,7 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, UnknownNameError
-from pkm_twin.files import decimal, read_bounded
+from pkm_twin.files import parse_decimal, read_bounded
 from pkm_twin.machine.formulas import MAX_SIZE
 from pkm_twin.machine.names import plain_name
 from pkm_twin.machine.rotations import Pose, from_quaternion, from_rpy
@@ -172,7 +172,7 @@ def parse_vector(text: str | None, where: str, size: int) -> Array:
 def parse_number(text: str | None, where: str, low: float = -math.inf) -> float:
     """Parse a finite number; ``low``: zero if it may not be negative."""
     try:
-        value = decimal(text or "")
+        value = parse_decimal(text or "")
     except (TypeError, ValueError):
         raise ParameterError(where, text, "a number") from None
     if not math.isfinite(value) or abs(value) > MAX_SIZE:

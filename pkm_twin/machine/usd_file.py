@@ -18,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.errors import ParameterError, install, warn
+from pkm_twin.errors import ParameterError, warn_of_file, write_install_command
 from pkm_twin.machine.loop_tree import WORLD, Fault, Joint, Link, LoopTree, hold_in_world, order_from_root, span_tree
 from pkm_twin.machine.rotations import Pose, about, from_quaternion
 from pkm_twin.machine.urdf_control import UNCOUPLED_JOINTS, list_actuated_joints
@@ -39,7 +39,9 @@ def read(path: Path, actuated: Sequence[str] | None = None) -> LoopTree:
     try:
         from pxr import Tf, Usd
     except ImportError:
-        raise ParameterError(str(path), "a USD file without the usd-core package", install("usd")) from None
+        raise ParameterError(
+            str(path), "a USD file without the usd-core package", write_install_command("usd")
+        ) from None
     if not path.is_file():
         raise ParameterError(str(path), "no regular file", "a USD file")
     try:
@@ -78,7 +80,7 @@ class _Reader:
             if not prim.IsA(self.physics.Joint):
                 continue
             if not self._read_value(prim, "physics:jointEnabled", True):
-                warn(self.path, f"{prim.GetPath()} is switched off and left out")
+                warn_of_file(self.path, f"{prim.GetPath()} is switched off and left out")
                 continue
             joint = self._read_joint(prim)
             if joint.inner == joint.outer:
@@ -99,7 +101,7 @@ class _Reader:
                 error = ParameterError(str(prim.GetPath()), "a mimic joint", UNCOUPLED_JOINTS)
                 self.faults.append(((joint.name,), error))
         if rubbing:
-            warn(self.path, f"jointFriction of PhysX is ignored, of {', '.join(rubbing)}")
+            warn_of_file(self.path, f"jointFriction of PhysX is ignored, of {', '.join(rubbing)}")
         hold_in_world(self.path, joints, lambda: self.links[self.names[self.bodies[0].GetPath()]])
         types = {name: joint.kind for name, joint in joints.items()}
         marked = driven, "a drive", "a drive with a stiffness or a damping"

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.errors import require
+from pkm_twin.errors import import_extra
 from pkm_twin.files import replace_file
 from pkm_twin.maps import figures
 from pkm_twin.maps.store import reading, source, writing
@@ -41,7 +41,7 @@ def write_page(data: Dataset, path: Path) -> Path:
 
     :raises MissingExtraError: plotly is not installed.
     """
-    require("plotly", "maps")
+    import_extra("plotly", "maps")
     kind = figures.find_kind(data)
     with reading(source(data)):
         first, *rest = figures.write_lines(data)
@@ -99,7 +99,7 @@ def _case_layout(data: Dataset, case: int, values: Array) -> tuple[float, str, d
 
 
 def _draw_layers(data: Dataset) -> tuple[Any, list[dict[str, Any]]]:
-    graph = require("plotly.graph_objects", "maps")
+    graph = import_extra("plotly.graph_objects", "maps")
     units = figures.list_units(data)
     dims = list(units)
     upwards = data.attrs["height"] or dims[2]
@@ -175,7 +175,7 @@ def _draw_layers(data: Dataset) -> tuple[Any, list[dict[str, Any]]]:
 
 
 def _draw_planes(data: Dataset) -> tuple[Any, list[dict[str, Any]]]:
-    graph = require("plotly.graph_objects", "maps")
+    graph = import_extra("plotly.graph_objects", "maps")
     figure, buttons = graph.Figure(), []
     every = [(k, p) for k in range(len(data.case)) for p in figures.full_planes(data, k)]
     for k, p in every:

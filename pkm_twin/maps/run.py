@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 import pkm_twin
-from pkm_twin.errors import ParameterError, PkmTwinError, require
+from pkm_twin.errors import ParameterError, PkmTwinError, import_extra
 from pkm_twin.maps.kind import Values
 from pkm_twin.maps.store import MapError, Parts, join, save_part, writing
 from pkm_twin.maps.sweep import Chunk, Map
@@ -74,7 +74,7 @@ def run(
     :raises MissingExtraError: a package that is not installed.
     """
     # Check before hours of work.
-    require("h5netcdf", "maps")
+    import_extra("h5netcdf", "maps")
     if workers is not None and workers < 1:
         raise PkmTwinError(f"workers is {workers}; it has to be 1 or more")
     with writing(out):
@@ -183,7 +183,7 @@ def compute_on_cluster(sweep: Task, work: Work, scheduler: str) -> Iterator[tupl
 
     :raises ClusterError: no scheduler answers, it has no workers, or chunks keep losing theirs.
     """
-    distributed = require("distributed", "cluster")
+    distributed = import_extra("distributed", "cluster")
     # Its log is long; one line of ours reports the error.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     arguments = distributed.Security().get_connection_args("client")

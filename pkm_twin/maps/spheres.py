@@ -23,7 +23,7 @@ from delta_dynamics.torques.isotropy import (
     tilted_pose,
 )
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.errors import ParameterError, require
+from pkm_twin.errors import ParameterError, import_extra
 from pkm_twin.maps.kind import FLAG, NON_NEGATIVE, UNIT_INTERVAL, Space, Variable, describe, scalar
 from pkm_twin.report import plots
 from pkm_twin.robot.robot import Robot
@@ -263,7 +263,7 @@ def _draw_index(data: Dataset, index: str) -> Figure:
 
 def make_page(data: Dataset) -> Any:
     """Return the spheres as a plotly figure to turn; a menu chooses the index."""
-    graph = require("plotly.graph_objects", "maps")
+    graph = import_extra("plotly.graph_objects", "maps")
     from pkm_twin.maps.page import BAR, FLAT_LIGHT, MARGIN, MENU, make_button, round_digits
 
     ways, places = data.way.values, _sphere_centres(data)

@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.errors import PkmTwinError, require
+from pkm_twin.errors import PkmTwinError, import_extra
 from pkm_twin.files import replace_file
 from pkm_twin.maps.kind import FORMAT_VERSION, Values
 
@@ -299,7 +299,7 @@ def join(sweep: Map, parts: Parts, out: Path) -> None:
 
 
 def _write_file(sweep: Map, parts: Parts, sink: _Sink) -> None:
-    h5netcdf = require("h5netcdf", "maps")
+    h5netcdf = import_extra("h5netcdf", "maps")
     summaries = sweep.summaries(parts.grid())
     with h5netcdf.File(sink, "w") as file:
         file.dimensions = sweep.sizes | {
@@ -312,7 +312,7 @@ def _write_file(sweep: Map, parts: Parts, sink: _Sink) -> None:
         for name, small in (sweep.coordinates | summaries).items():
             array = np.asarray(small.values)
             if array.dtype.kind == "U":
-                variable = file.create_variable(name, small.dims, require("h5py", "maps").string_dtype())
+                variable = file.create_variable(name, small.dims, import_extra("h5py", "maps").string_dtype())
                 for index in np.ndindex(array.shape):
                     variable[index] = str(array[index])
             else:
@@ -376,8 +376,8 @@ def open_map(path: Path) -> Dataset:
 
     :raises MapError: no map, a damaged one, or one with impossible numbers.
     """
-    xarray = require("xarray", "maps")
-    require("h5netcdf", "maps")
+    xarray = import_extra("xarray", "maps")
+    import_extra("h5netcdf", "maps")
     with writing(path):
         if not path.exists():
             raise MapError(path, "no such file")

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
-from pkm_twin.errors import ParameterError, UnknownNameError, one_line, warn
+from pkm_twin.errors import ParameterError, UnknownNameError, one_line, warn_of_file
 from pkm_twin.machine import usd_file
 from pkm_twin.machine.strict_yaml import read_yaml
 from pkm_twin.robot.plausibility import findings
@@ -95,14 +95,14 @@ def load(
         graph = robot_read.graph
         if robot_read.redundant:
             follows = [name for name in graph.actuated if name not in graph.leads]
-            warn(
+            warn_of_file(
                 path,
                 f"{len(graph.actuated)} actuated joints ({reading.marked}) for "
                 f"{len(graph.leads)} degrees of freedom: the positions of {', '.join(follows)} "
                 f"follow from {', '.join(graph.leads)}",
             )
         for note in reading.notes:
-            warn(path, note)
+            warn_of_file(path, note)
         return _warn_of_implausible(path, replace(robot_read, home_choice=reading.home, visuals=reading.visuals))
     for key in ("platform", "base", "actuated", "carry"):
         if getattr(part, key):
@@ -117,7 +117,7 @@ def _warn_of_implausible(path: Path, robot: Robot) -> Robot:
     """Return the robot, after a warning of each implausible number in a user's file."""
     if path.parent != config_folder():
         for finding in findings(robot):
-            warn(path, finding.text)
+            warn_of_file(path, finding.text)
     return robot
 
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import reference
-from pkm_twin.errors import ParameterError, UnknownNameError, warn
+from pkm_twin.errors import ParameterError, UnknownNameError, warn_of_file
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate, name_angles
 from pkm_twin.kinematics.rounding import repair_rounded
 from pkm_twin.kinematics.scheme import check_masses, choose_coordinates, choose_leads
@@ -501,7 +501,7 @@ def _remove_rounding(
     repaired = repair_rounded(graph, rounding_error(word for part in parts for word in written(part)))
     if repaired is None or not repaired.moves:
         return specs
-    warn(name, repaired.text)
+    warn_of_file(name, repaired.text)
     found = {kind: dict(entries) for kind, entries in specs.items()}
     for key, joint in repaired.graph.joints.items():
         spec = found["joints"][key]

@@ -19,8 +19,8 @@ from numpy.typing import ArrayLike
 
 from delta_dynamics.torques.elastic_reactions import elastic_reactions
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.errors import ParameterError, warn
-from pkm_twin.files import replacing
+from pkm_twin.errors import ParameterError, warn_of_file
+from pkm_twin.files import write_atomically
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import BASE, Joint
 from pkm_twin.machine.rotations import skew
@@ -328,7 +328,7 @@ def read_bearings(path: Path, names: tuple[str, ...], robot: Robot) -> dict[str,
         if left and (len(left) == len(fitting) or str(pattern) in names):
             raise next(iter(left.values()))
         if left:
-            warn(path, f"{path}: bearings.{pattern} does not fit {', '.join(left)}: no life there")
+            warn_of_file(path, f"{path}: bearings.{pattern} does not fit {', '.join(left)}: no life there")
     return found
 
 
@@ -395,7 +395,7 @@ def summarise_loads(
     with ExitStack() as files:
         writer: Any = None
         if out is not None:
-            hidden = files.enter_context(replacing(out))
+            hidden = files.enter_context(write_atomically(out))
             text = files.enter_context(hidden.open("w", newline="", encoding="utf-8"))
             writer = csv.writer(text)
         for block in joint_loads(motion):

@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from pkm_twin.errors import ParameterError, UnknownNameError, warn
+from pkm_twin.errors import ParameterError, UnknownNameError, warn_of_file
 from pkm_twin.files import parse_numbers
 from pkm_twin.paths.geometry import Path, Space, lines, through
 from pkm_twin.recordings.origin import states_origin
@@ -56,7 +56,7 @@ def read_waypoints(
     for name, unit, values in zip(names, units, points.T, strict=True):
         if unit == "rad" and "angle" not in dialect.units and np.abs(values).max() > 2.0 * np.pi:
             most = float(np.abs(values).max())
-            warn(file, f"{name} up to {most:.4g} rad, beyond a turn; degrees? a header {name} [deg]")
+            warn_of_file(file, f"{name} up to {most:.4g} rad, beyond a turn; degrees? a header {name} [deg]")
     other = {*WRENCH, *(name for name in kinds if name.rpartition(".")[2] in EFFORTS[1:])}
     for name in (*table, *table.left_out):
         if (name not in kinds and not states_origin(name)) or name in other:

@@ -12,7 +12,7 @@ import numpy as np
 
 from pkm_twin.bags.storage import is_bag
 from pkm_twin.codegen.arrays import Array, Mask
-from pkm_twin.errors import FileError, ParameterError, UnknownNameError, one_line, warn
+from pkm_twin.errors import FileError, ParameterError, UnknownNameError, one_line, warn_of_file
 from pkm_twin.machine.joint_map import JointMap
 from pkm_twin.machine.sections import DriveSpec
 from pkm_twin.mechanisms.catalogue import load
@@ -337,11 +337,11 @@ def check_units(path: Path, robot: Robot, time: Array, q: Array, qd: Array | Non
     """
     if "angle" not in dialect.units and _is_in_degrees(robot, q):
         most = float(np.abs(q).max())
-        warn(path, f"positions up to {most:.4g}; expected rad; are these degrees? --units deg")
+        warn_of_file(path, f"positions up to {most:.4g}; expected rad; are these degrees? --units deg")
     step = float(np.median(np.diff(time))) if len(time) > 1 else 0.0
     if qd is None and step > 0.2:
         unit = "milliseconds? --units ms" if step < 200.0 else "microseconds? --units us"
-        warn(path, f"time: steps of {step:g} s; expected seconds; are these {unit}")
+        warn_of_file(path, f"time: steps of {step:g} s; expected seconds; are these {unit}")
 
 
 def _is_in_degrees(robot: Robot, q: Array) -> bool:

@@ -25,8 +25,8 @@ from typing import Any, BinaryIO, Final, TextIO
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.errors import FileError, ParameterError, UnknownNameError, warn
-from pkm_twin.files import STANDARD, decimal, open_regular, replacing
+from pkm_twin.errors import FileError, ParameterError, UnknownNameError, warn_of_file
+from pkm_twin.files import STANDARD, open_regular, parse_decimal, write_atomically
 from pkm_twin.robot.robot import Robot
 
 MAX_BYTES: Final = 1024**3
@@ -279,7 +279,7 @@ def _read_csv(
                     if not cell.strip():
                         value = math.nan
                     else:
-                        value = decimal(cell)
+                        value = parse_decimal(cell)
                         if not math.isfinite(value):
                             raise ValueError(f"{cell!r} is not finite")
                     cells.append(value)
@@ -348,7 +348,7 @@ def _split_rows(path: Path, lines: Iterator[str], first: str, dialect: Dialect) 
         separator = there[0] if len(there) == 1 and "," not in first else ","
         if separator != ",":
             name = "tabs" if separator == "\t" else separator
-            warn(path, f"columns are separated by {name}")
+            warn_of_file(path, f"columns are separated by {name}")
     rows = csv.reader(lines, delimiter=separator)
     yield next(rows, [])
     comma = dialect.decimal == ","
@@ -356,7 +356,7 @@ def _split_rows(path: Path, lines: Iterator[str], first: str, dialect: Dialect) 
         if dialect.decimal is None and separator != "," and not comma:
             comma = any("," in cell for cell in row)
             if comma:
-                warn(path, "numbers have a decimal comma")
+                warn_of_file(path, "numbers have a decimal comma")
         yield [cell.replace(",", ".") for cell in row] if comma else row
 
 
@@ -430,7 +430,7 @@ def write_table(columns: Mapping[str, Array], path: Path) -> None:
         named = {re.sub(r"^(?=[\d_])", "x", re.sub(r"\W", "_", name)): v for name, v in columns.items()}
         if len(named) < len(columns):
             raise ParameterError("out", str(path), "CSV: names of columns are the same in MATLAB")
-    with replacing(path) as hidden:
+    with write_atomically(path) as hidden:
         if path.suffix == ".parquet":
             import pyarrow
             from pyarrow import parquet

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from pkm_twin.console import writing
+from pkm_twin.console import convert_write_errors
 from pkm_twin.files import replace_file
 
 # Colours of Okabe and Ito (2008), which colour-blind readers can distinguish.
@@ -100,7 +100,7 @@ def save(figure: Any, path: Path, dpi: int = DPI) -> Path:
     :raises PkmTwinError: the file cannot be written.
     """
     data = rendered(figure, dpi, path.suffix[1:] or "png")
-    with writing(path):
+    with convert_write_errors(path):
         replace_file(path, data)
     return path
 

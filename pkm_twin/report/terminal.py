@@ -11,7 +11,7 @@ from typing import Final
 
 import click
 
-from pkm_twin.console import print_json, tell
+from pkm_twin.console import print_json, print_message
 from pkm_twin.files import STANDARD
 from pkm_twin.report.report import Fact, Report, Table, Verdict
 
@@ -36,7 +36,7 @@ def present(report: Report, as_json: bool, *, piped: bool = False) -> None:
         if text:
             click.echo(text, err=piped)
     if report.error:
-        tell(report.error)
+        print_message(report.error)
 
 
 def text_of(report: Report) -> str:

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import reference
-from pkm_twin.errors import ParameterError, UnknownNameError, unknown_number
+from pkm_twin.errors import ParameterError, UnknownNameError, unknown_number_error
 from pkm_twin.kinematics.pose import Coordinate
 from pkm_twin.kinematics.scheme import Start
 from pkm_twin.machine import schema
@@ -475,7 +475,7 @@ class Mechanism(Common):
         """
         keys = full_keys(path)
         if not keys or keys[0] not in settings_of(type(self)):
-            raise unknown_number(path, self.file_numbers())
+            raise unknown_number_error(path, self.file_numbers())
         return number_in(schema.plain(getattr(self, str(keys[0]))), keys[1:], path)
 
     def with_file_values(self: R, values: Mapping[str, Any]) -> R:

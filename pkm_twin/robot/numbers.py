@@ -15,7 +15,7 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import GEOMETRY, Expression, Tape, tangents
-from pkm_twin.codegen.plain import functions
+from pkm_twin.codegen.plain import compile_functions
 from pkm_twin.machine.geometry import list_geometry
 from pkm_twin.machine.inertia import Layout
 from pkm_twin.machine.tree import Tree
@@ -36,7 +36,7 @@ class FileNumbers:
         made = robot.numbered(dict(zip(paths, given, strict=True)))
         self._given = list(given)
         self._results: list[Expression] = [tape.lift(value) for value in of(made)]
-        _, self._run = functions(self._results, {GEOMETRY: len(paths)})
+        _, self._run = compile_functions(self._results, {GEOMETRY: len(paths)})
 
     @cached_property
     def slopes(self) -> Array:
@@ -54,7 +54,7 @@ class FileNumbers:
             for k, value in enumerate(row)
             if isinstance(value, Expression) or value
         ]
-        run = functions([e for _, _, e in found], {GEOMETRY: len(self._given)})[1]
+        run = compile_functions([e for _, _, e in found], {GEOMETRY: len(self._given)})[1]
         return [(i, k) for i, k, _ in found], run
 
     def slopes_at(self, values: Array) -> Array:

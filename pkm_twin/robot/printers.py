@@ -17,7 +17,7 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
-from pkm_twin.files import decimal
+from pkm_twin.files import parse_decimal
 from pkm_twin.robot.robot import Robot
 
 ANGLES: Final = np.array([210.0, 330.0, 90.0])
@@ -334,6 +334,6 @@ def _find_step_length(number: Callable[..., float], steppers: list[dict[str, str
 
 def _read_number(text: str, key: str) -> float:
     try:
-        return decimal(text)
+        return parse_decimal(text)
     except ValueError:
         raise ParameterError(key, text, "a number") from None

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pkm_twin.codegen.arrays import Array, Mask
-from pkm_twin.codegen.code import GOOD, REFUSED
+from pkm_twin.codegen.code import REJECTED, VALID
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.engine import Engine, engine_of
@@ -158,16 +158,16 @@ class Robot(Mechanism):
         (q,), status = self.engine.quick_inverse(_NONE, pose)
         if status is None:
             return q, None
-        left = status[..., 0] == REFUSED
+        left = status[..., 0] == REJECTED
         places = np.broadcast_to(np.asarray(pose, np.float64), (*left.shape, len(self.pose_names)))
         (q[left],), again = self.engine.inverse(_NONE, places[left])
-        status[left] = [GOOD, 1.0] if again is None else again
+        status[left] = [VALID, 1.0] if again is None else again
         return q, status if status[..., 0].any() else None
 
     def try_inverse(self, pose: ArrayLike) -> tuple[Array, Mask]:
         """Return joint positions (..., n), NaN for an invalid pose, and which poses are valid, (...)."""
         q, status = self._invert(pose)
-        good = np.ones(q.shape[:-1], bool) if status is None else status[..., 0] == GOOD
+        good = np.ones(q.shape[:-1], bool) if status is None else status[..., 0] == VALID
         return q, np.asarray(good)
 
     def forward(self, q: ArrayLike) -> Array:

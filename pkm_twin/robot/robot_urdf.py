@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from pkm_twin.errors import warn
+from pkm_twin.errors import warn_of_file
 from pkm_twin.kinematics.passive import rod_axes
 from pkm_twin.kinematics.pose import describe_angles
 from pkm_twin.machine import schema
@@ -99,7 +99,7 @@ def _warn_of_losses(robot: Robot, where: str) -> None:
     if np.any(robot.sharing_entries().get("redundancy", {}).get("preload", 0.0)):
         lost.append("redundancy.preload")
     if lost:
-        warn(robot.name or robot.mechanism, f"{where} has no place for {', '.join(lost)}")
+        warn_of_file(robot.name or robot.mechanism, f"{where} has no place for {', '.join(lost)}")
 
 
 def robot_tree(robot: Robot) -> LoopTree:

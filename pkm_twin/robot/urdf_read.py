@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.errors import ParameterError, warn
+from pkm_twin.errors import ParameterError, warn_of_file
 from pkm_twin.kinematics.linkage import Linkage
 from pkm_twin.kinematics.rounding import repair_rounded
 from pkm_twin.machine import graph as graphs
@@ -110,7 +110,7 @@ def read_urdf(path: str | Path, **part: Any) -> dict[str, Any]:
     """
     reading = read_tree(path, Part(**part))
     for note in reading.notes:
-        warn(path, note)
+        warn_of_file(path, note)
     return reading.description
 
 

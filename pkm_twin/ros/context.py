@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from pkm_twin.bags.definitions import message_class
-from pkm_twin.errors import PkmTwinError, install
+from pkm_twin.errors import PkmTwinError, write_install_command
 
 
 def middleware_arguments(arguments: Sequence[str]) -> list[str]:
@@ -51,7 +51,9 @@ def own_node(name: str, needs: str, *, sim_time: bool = False, namespace: str = 
         from rclpy.parameter import Parameter
         from rclpy.signals import SignalHandlerOptions
     except ImportError as error:
-        raise PkmTwinError(f"{needs} needs ROS 2: source its setup, or {install('jazzy')} ({error})") from error
+        raise PkmTwinError(
+            f"{needs} needs ROS 2: source its setup, or {write_install_command('jazzy')} ({error})"
+        ) from error
     context = rclpy.Context()
     rclpy.init(args=middleware_arguments([]), context=context, signal_handler_options=SignalHandlerOptions.NO)
     node = None

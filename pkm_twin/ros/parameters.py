@@ -129,7 +129,7 @@ class ParameterNode(LifecycleNode):
         for name, (field, row) in settings_of(kind).items():
             if field not in given:
                 own = dataclasses.replace(row, name=name, fixed=fixed or row.fixed)
-                given[field] = row.value(self._declare(row.parameter(defaults[field]), own))
+                given[field] = row.to_field_value(self._declare(row.to_parameter_value(defaults[field]), own))
         return kind(**given)
 
     def check_parameter(self, name: str, value: Any) -> None:
@@ -139,8 +139,8 @@ class ParameterNode(LifecycleNode):
         """
         _, row = self.rows.get(name, (None, Setting("")))
         # rclpy accepts NaN.
-        if row.low is not None and not row.allows(value):
-            raise ParameterError(name, value, row.span.removeprefix(", "))
+        if row.low is not None and not row.is_within_bounds(value):
+            raise ParameterError(name, value, row.bounds_text.removeprefix(", "))
         if row.choices and value not in row.choices:
             raise UnknownNameError(name, value, row.choices)
 

@@ -35,7 +35,7 @@ from pkm_twin.ros.joints import header, named, xyz
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.run import run
 from pkm_twin.ros.wrench import declare_mounts, declare_vector
-from pkm_twin.settings import changeable, with_parameters
+from pkm_twin.settings import list_changeable, with_parameters
 from pkm_twin.state.scene import Load, Scales, Scene, Shape
 from pkm_twin.state.state import STATE, MachineState, State, moving_state_kernel, state_kernel
 from pkm_twin.streams.monitor import Pace
@@ -164,7 +164,7 @@ class MachineStateNode(TwinNode):
         )
         self.create_guarded_subscription("wrench", lambda m: self.core.store_wrench(m, self.now()))
         self.follow(
-            changeable(WrenchSettings),
+            list_changeable(WrenchSettings),
             lambda values: with_parameters(self.core.settings, values),
             self.core.change_settings,
         )

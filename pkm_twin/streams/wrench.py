@@ -17,7 +17,7 @@ from pkm_twin.machine import rotations
 from pkm_twin.messages.reading import JointReader, WrenchSample, read_wrench
 from pkm_twin.messages.stamps import SECOND, StampRules
 from pkm_twin.robot.robot import Robot
-from pkm_twin.settings import FUTURE, SECONDS, ZERO_STAMP, setting
+from pkm_twin.settings import DURATION_BOUNDS, FUTURE_TOLERANCE_TEXT, ZERO_STAMP_TEXT, setting
 from pkm_twin.streams.monitor import Core, counting
 
 Triple = tuple[float, float, float]
@@ -77,9 +77,9 @@ class WrenchSettings:
     )
     base_frame: str = setting("base_link", "frame id of the base", fixed=True)
     accept_empty_frame: bool = setting(False, "accept an empty frame id as wrench_frame")
-    max_state_age: float = setting(0.1, "largest time between a wrench and the nearest joint state", **SECONDS)
-    future_tolerance: float = setting(0.1, FUTURE, **SECONDS)
-    accept_zero_stamp: bool = setting(False, ZERO_STAMP)
+    max_state_age: float = setting(0.1, "largest time between a wrench and the nearest joint state", **DURATION_BOUNDS)
+    future_tolerance: float = setting(0.1, FUTURE_TOLERANCE_TEXT, **DURATION_BOUNDS)
+    accept_zero_stamp: bool = setting(False, ZERO_STAMP_TEXT)
     sensor_xyz: Triple = setting(
         ZERO, "position of the sensor from the platform's reference point, platform axes", name="sensor.xyz", unit="m"
     )

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.errors import one_line, warn
+from pkm_twin.errors import one_line, warn_of_file
 from pkm_twin.machine.urdf_file import Visual
 from pkm_twin.robot.robot import Robot
 
@@ -32,7 +32,7 @@ def read_body_meshes(robot: Robot) -> dict[str, tuple[Array, NDArray[np.int64]]]
         except Exception as error:
             # Mesh readers may raise any exception.
             why = one_line(str(error)) or type(error).__name__
-            warn(visual.urdf, f"mesh {visual.mesh!r}: {why}; it is not shown")
+            warn_of_file(visual.urdf, f"mesh {visual.mesh!r}: {why}; it is not shown")
         else:
             found.setdefault(visual.body, []).append(part)
     result = {}

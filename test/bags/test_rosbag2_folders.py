@@ -18,7 +18,7 @@ from mcap.writer import CompressionType
 
 from pkm_twin.bags.reader import DamagedBagError, inspect, open_bag, read_messages
 from pkm_twin.bags.recover import recover
-from pkm_twin.bags.storage import write_conversion
+from pkm_twin.bags.storage import conversion_command
 from pkm_twin.errors import BagError
 from test.bags.folders import describe, make_folder
 
@@ -100,9 +100,9 @@ def test_sqlite_is_refused_with_the_command_that_converts_it(bag: Path, tmp_path
         for act in (inspect, lambda path: recover(path, tmp_path / "new.mcap")):
             with pytest.raises(BagError, match="ros2 bag convert -i") as caught:
                 act(path)
-            assert write_conversion(path) in str(caught.value)
+            assert conversion_command(path) in str(caught.value)
             assert caught.value.reason == "not_mcap"
-    assert f"'{folder}'" in write_conversion(folder)
+    assert f"'{folder}'" in conversion_command(folder)
 
 
 @pytest.mark.parametrize(

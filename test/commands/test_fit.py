@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from delta_dynamics import inverse_dynamics
-from pkm_twin.apps.commands.excite import MAX_CONDITION, Excite, excite
+from pkm_twin.apps.commands.excite import MAX_CONDITION_NUMBER, Excite, excite
 from pkm_twin.bags.reader import open_bag
 from pkm_twin.identification.identifiable import identifiable
 from pkm_twin.identification.samples import Filtering, find_lines
@@ -137,7 +137,7 @@ def test_excite_says_what_to_change_where_a_fit_would_know_little(tmp_path, tria
     short = {"duration": 1.0, "harmonics": 3, "acceleration": 0.1} if trials == 10 else {}
     out = tmp_path / "excite.mcap"
     report = excite.run(Excite(robot="five_bar", what="friction", trials=trials, out=out, **short))
-    assert bool(report.notes) == (report.data["condition"] > MAX_CONDITION) == bool(short)
+    assert bool(report.notes) == (report.data["condition"] > MAX_CONDITION_NUMBER) == bool(short)
 
 
 def elastic_machine(path):

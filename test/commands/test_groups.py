@@ -7,7 +7,7 @@ import subprocess
 import sys
 
 from pkm_twin.apps.cli import app
-from pkm_twin.apps.groups import WIDE, commands, group_by_task
+from pkm_twin.apps.groups import MAX_HELP_WIDTH, commands, group_by_task
 from test.support.command import REPOSITORY, typed_line
 
 ALL = commands()
@@ -21,7 +21,7 @@ def test_every_command_has_one_task():
 def test_help_lists_every_purpose_whole(twin):
     words = " ".join(twin("--help").out.split())
     for name, command in app.commands.items():
-        assert f" {name} {command.get_short_help_str(WIDE)}" in words
+        assert f" {name} {command.get_short_help_str(MAX_HELP_WIDTH)}" in words
     assert "..." not in words.split("Robots:")[1]
 
 

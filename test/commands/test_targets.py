@@ -12,7 +12,7 @@ import pytest
 
 from pkm_twin.bags.reader import BagWriter, open_bag
 from pkm_twin.errors import BagError
-from pkm_twin.files import replace_file, replacing
+from pkm_twin.files import replace_file, write_atomically
 from test.bags.test_recordings import FOLDER
 from test.commands.test_fit_compliance import SOFT, THIRD, table
 from test.support.command import forked
@@ -172,13 +172,13 @@ def test_two_recorders_of_one_bag_leave_one_of_two_whole_bags(tmp_path):
 def test_a_target_that_fails_stays_as_it_was(tmp_path):
     target = tmp_path / "a.yaml"
     target.write_text("before")
-    with pytest.raises(OSError, match="No space"), replacing(target) as hidden:
+    with pytest.raises(OSError, match="No space"), write_atomically(target) as hidden:
         hidden.write_text("half")
         raise OSError(28, "No space left on device", str(hidden))
     assert target.read_text() == "before"
     assert [p.name for p in tmp_path.iterdir()] == [target.name]
     # Under its own name, which alone is known.
-    with pytest.raises(OSError, match="No space") as caught, replacing(target) as hidden:
+    with pytest.raises(OSError, match="No space") as caught, write_atomically(target) as hidden:
         raise OSError(28, "No space left on device", str(hidden))
     assert caught.value.filename == str(target)
 

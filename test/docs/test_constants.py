@@ -21,12 +21,12 @@ def word(pattern):
 def test_newtons_judgement():
     assert numbers(ENGINE, r"at most (\d+) corrections .*? until one is below (\S+) \(") == [
         program.MAX_ITERATIONS,
-        program.CLOSED,
+        program.MAX_LAST_CORRECTION,
     ]
-    assert word("at most a **{}** of the one before it") == program.CONTRACTION
+    assert word("at most a **{}** of the one before it") == program.MAX_CONTRACTION
     pattern = r"stays above (\S+); without a closed form, .*? above (\S+) times each correction"
-    assert numbers(ENGINE, pattern) == [program.LEAST, program.MARGIN]
-    assert numbers(ENGINE, r"redundant ones too, is at most (\S+) \(") == [program.RESIDUAL]
+    assert numbers(ENGINE, pattern) == [program.LEAST, program.MIN_DETERMINANT_RATIO]
+    assert numbers(ENGINE, r"redundant ones too, is at most (\S+) \(") == [program.MAX_RESIDUAL]
     pattern = r"tried again in (\d+), (\d+), (\d+), (\d+), (\d+) and (\d+) \*\*steps"
     assert numbers(ENGINE, pattern) == list(STEPS)
 

@@ -15,7 +15,7 @@ import pytest
 from delta_dynamics import inverse_dynamics
 from pkm_twin import robot_names
 from pkm_twin.codegen.program import MAX_ITERATIONS
-from pkm_twin.export.c99 import CORRECTIONS, HEAD
+from pkm_twin.export.c99 import C_HEAD, MAX_CORRECTIONS
 from pkm_twin.export.c_functions import ARCTANGENT_C
 from pkm_twin.export.c_package import c_package
 from test.machine.random_machines import FILES
@@ -226,7 +226,7 @@ __attribute__((destructor)) static void report(void) { fprintf(stderr, "%ld 0", 
 """
     (tmp_path / f"{package.prefix}.c").write_text(head + text)
     number = str(list(counted.heads).index("forward"))
-    for flags, most in (((), CORRECTIONS), (("-DPKM_ATTEMPTS=1",), MAX_ITERATIONS)):
+    for flags, most in (((), MAX_CORRECTIONS), (("-DPKM_ATTEMPTS=1",), MAX_ITERATIONS)):
         program = counted.build(*PLAIN, *flags)
         turns = [watched(program, q, number, "1")[0] for q in wild(robot, rng, 40)]
         assert 3 <= max(turns) <= most
@@ -465,7 +465,7 @@ def test_arctangents_are_those_of_numpy(compiler, tmp_path, rng):
     special = [-1e300, -1.0, -0.0, 0.0, 5e-324, 1.0]
     pairs = np.concatenate([pairs, [[y, x] for y in special for x in special]])
     call = "double at(double y, double x) { return pkm_atan2(y, x); }\n"
-    (tmp_path / "at.c").write_text(HEAD + ARCTANGENT_C.replace("@", "pkm") + call)
+    (tmp_path / "at.c").write_text(C_HEAD + ARCTANGENT_C.replace("@", "pkm") + call)
     compile_in(tmp_path, compiler, "-O3", *STRICT, "-shared", "-fPIC", "at.c", "-o", "at.so", "-lm")
     at = ctypes.CDLL(str(tmp_path / "at.so")).at
     at.restype, at.argtypes = ctypes.c_double, [ctypes.c_double] * 2

@@ -12,7 +12,7 @@ import pytest
 
 from pkm_twin import robot_names
 from pkm_twin.errors import ParameterError, RobotWarning
-from pkm_twin.export.c_package import c_package, identifier
+from pkm_twin.export.c_package import c_identifier, c_package
 from test.support.robots import (
     load,
     loaded,
@@ -188,9 +188,9 @@ def test_sections_that_contradict_masses_leave_elasticity_out_with_the_reason(va
 
 def test_names_become_identifiers():
     for name in ("my robot-2", "3rps", "größe", "a/b.c", "", "*/", "int"):
-        assert re.fullmatch(r"[A-Za-z0-9_]+", identifier(name))
+        assert re.fullmatch(r"[A-Za-z0-9_]+", c_identifier(name))
     # Letters beyond ASCII tell names apart, and two packages can be linked into one program.
-    assert len({identifier(name) for name in ("é", "ü", "e", "_", "é_1", "ü_1")}) == 6
+    assert len({c_identifier(name) for name in ("é", "ü", "e", "_", "é_1", "ü_1")}) == 6
 
 
 def test_friction_laws_are_those_of_python(tmp_path, rng):

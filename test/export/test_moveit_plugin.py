@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from pkm_twin.export.moveit import ORIENTATION, POSITION, moveit_package
+from pkm_twin.export.moveit import MAX_POSITION_ERROR, MAX_ROTATION_ERROR, moveit_package
 from pkm_twin.kinematics.pose import values
 from test.support.robots import load, partly_long, random_joints
 
@@ -180,15 +180,15 @@ def test_a_goal_is_what_the_machine_has_in_all_directions(plugin, states):
     robot, rng = plugin.robot, np.random.default_rng(6)
     goals = np.repeat(goals_of(robot, states), 6, axis=0)
     shift = rng.uniform(-1.5, 1.5, (len(goals), 6)) * np.eye(6)[np.arange(len(goals)) % 6]
-    goals[:, :3] += POSITION * shift[:, :3]
-    turned = Rotation.from_rotvec(ORIENTATION * shift[:, 3:]) * Rotation.from_quat(goals[:, 3:])
+    goals[:, :3] += MAX_POSITION_ERROR * shift[:, :3]
+    turned = Rotation.from_rotvec(MAX_ROTATION_ERROR * shift[:, 3:]) * Rotation.from_quat(goals[:, 3:])
     goals[:, 3:] = turned.as_quat()
     placed = zip(goals[:, :3], turned.as_matrix(), strict=True)
     q, good = robot.try_inverse([values(robot.coordinates, p, r) for p, r in placed])
     near = good.copy()
-    near[good] = np.linalg.norm(goals[good, :3] - robot.platform(q[good])[0], axis=1) <= POSITION
+    near[good] = np.linalg.norm(goals[good, :3] - robot.platform(q[good])[0], axis=1) <= MAX_POSITION_ERROR
     relative = Rotation.from_matrix(robot.platform(q[good])[1]).inv() * turned[good]
-    near[good] &= relative.magnitude() <= ORIENTATION
+    near[good] &= relative.magnitude() <= MAX_ROTATION_ERROR
     code, found, _ = plugin.solve(goals)
     np.testing.assert_array_equal(code == SUCCESS, near)
     assert near.any() and (near.all() if robot.joints_count == 6 else not near.all())

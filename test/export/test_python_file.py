@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pkm_twin.codegen import cache
-from pkm_twin.export.python_file import FUNCTIONS, python_file
+from pkm_twin.export.python_file import FUNCTION_NAMES, python_file
 from test.export.c_programs import functions, inputs_of
 from test.machine.random_machines import FILES
 from test.support.robots import load, partly_long, random_motion
@@ -34,7 +34,7 @@ class Made:
 
             jax.config.update("jax_enable_x64", True)
             # What is compiled stays from run to run: each operation is a program of a moment.
-            if (kept := cache.folder()) is not None:
+            if (kept := cache.find_folder()) is not None:
                 jax.config.update("jax_compilation_cache_dir", str(kept / "jax"))
                 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
             self.uncompiled = jax.disable_jit
@@ -64,7 +64,7 @@ def cases(robot):
     """Names, inputs and right results of all functions in random states."""
     given = inputs_of(robot, random_motion(robot, np.random.default_rng(8), COUNT))
     for name, ask in functions(robot).items():
-        if name in FUNCTIONS:
+        if name in FUNCTION_NAMES:
             yield name, given[name], ask(*given[name])
 
 

@@ -13,7 +13,7 @@ import pytest
 
 import delta_dynamics as dynamics
 import stiffness_monitor as elasticity
-from pkm_twin.codegen.arrays import doubles, later
+from pkm_twin.codegen.arrays import check_later, doubles
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from stiffness_monitor.compliance import member_deflections
@@ -471,10 +471,10 @@ class TestEstimators:
 
 
 def test_times_of_samples():
-    assert later(1.0, None) == 1.0 and later(1.0, 0.5) == 1.0
+    assert check_later(1.0, None) == 1.0 and check_later(1.0, 0.5) == 1.0
     for time, last in ((np.nan, None), (np.inf, 1.0), (1.0, 1.0), (0.5, 1.0), (np.nan, 1.0)):
         with pytest.raises(ValueError, match="time of a sample"):
-            later(time, last)
+            check_later(time, last)
 
 
 def test_a_state_that_moves_no_mass_has_no_accelerations():

@@ -196,12 +196,12 @@ def test_both_back_ends_agree_and_one_sample_has_the_bits_of_its_batch(name, rng
 def test_large_batches_in_threads_have_the_same_bits(rng, monkeypatch):
     """Of one machine and of many, with samples that are refused."""
     robot = load("prru")
-    q = random_joints(robot, rng, 3 * codes.WORTH + 7)
+    q = random_joints(robot, rng, 3 * codes.MIN_SAMPLES_PER_THREAD + 7)
     motion = (q, *rng.normal(size=(2, *q.shape)))
     few = tuple(array[:101].copy() for array in motion)
     few[0][5, 0] = 40.0
     out_of_reach = np.concatenate((q, few[0]))
-    many = variants(robot, {"geometry.limb_length": rng.uniform(0.5, 0.7, 3 * codes.WORTH // 50)})
+    many = variants(robot, {"geometry.limb_length": rng.uniform(0.5, 0.7, 3 * codes.MIN_SAMPLES_PER_THREAD // 50)})
 
     def answers():
         with pytest.raises(UnreachableError) as refused:
@@ -229,7 +229,7 @@ def test_a_call_keeps_its_arguments_while_other_threads_allocate(monkeypatch):
         return batch(address)
 
     monkeypatch.setitem(code.__dict__, "_loaded", (header, prepare, interrupted, one))
-    x = np.arange(codes.SMALL + 5.0)[:, None]
+    x = np.arange(codes.MAX_BUFFERED_SAMPLES + 5.0)[:, None]
     (y,), status = Kernel(code)(NONE, x)
     assert status is None and len(taken) > 0
     np.testing.assert_array_equal(y, 2.0 * x)
@@ -365,10 +365,10 @@ def test_a_lock_that_is_not_released_delays_and_does_not_block(tmp_path, monkeyp
     monkeypatch.setenv("PKM_TWIN_CACHE", str(tmp_path))
     monkeypatch.setattr(cache, "LOCK_TIMEOUT", 0.05)
     entered = []
-    with cache.alone("0" * 32), cache.alone("0" * 32):
+    with cache.lock_program("0" * 32), cache.lock_program("0" * 32):
         entered.append("both")
     (tmp_path / f"{'1' * 32}.lock").mkdir()
-    with cache.alone("1" * 32):
+    with cache.lock_program("1" * 32):
         entered.append("without")
     assert entered == ["both", "without"]
 

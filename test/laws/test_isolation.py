@@ -13,8 +13,8 @@ from delta_dynamics.estimates.isolation import (
     CLAMPING,
     PLATFORM,
     UNKNOWN,
+    CandidatePositions,
     ContactLocator,
-    Places,
     map_limbs,
 )
 from test.laws.contacts import place_and_jacobian, spot
@@ -26,12 +26,12 @@ NAMES = ["delta_cu", "linear_delta", "rps3", "stewart", "prru", "upr_rpu", "five
 @pytest.mark.parametrize("name", partly_long(NAMES, "delta_cu", "five_bar"))
 def test_jacobians_are_derivatives_of_the_places(name: str, rng: np.random.Generator) -> None:
     robot = load(name)
-    places, n = Places(robot), robot.joints_count
+    places, n = CandidatePositions(robot), robot.joints_count
     assert places.prior.sum() == pytest.approx(0.8)
     for q in random_joints(robot, rng, 2):
-        _, jacobian, _ = places.at(q)
+        _, jacobian, _ = places.evaluate(q)
         step = 1e-6
-        columns = [(places.at(q + step * e)[0] - places.at(q - step * e)[0]) for e in np.eye(n)]
+        columns = [(places.evaluate(q + step * e)[0] - places.evaluate(q - step * e)[0]) for e in np.eye(n)]
         slope = np.stack(columns, 1) / (2 * step)
         np.testing.assert_allclose(jacobian, slope, atol=1e-6 * max(1.0, np.abs(slope).max()))
 
@@ -121,20 +121,20 @@ def test_what_one_joint_alone_feels_is_its_arm() -> None:
     # How far along it is not determined: one effort has one number.
     assert place.body == "arm II"
     assert place.deviation > 0.2 * np.linalg.norm(
-        np.ptp(locator.places.at(q)[0][[p == "arm II" for p in locator.places.parts]], axis=0)
+        np.ptp(locator.places.evaluate(q)[0][[p == "arm II" for p in locator.places.parts]], axis=0)
     )
 
 
 @pytest.mark.parametrize("count", often(10, 60))
 def test_what_two_limbs_clamp_is_told_from_a_collision(count: int, rng: np.random.Generator) -> None:
     """Opposite forces on two limbs that approach each other, and a force on one of them."""
-    assert not len(Places(load("delta_cu")).pairs[0])
+    assert not len(CandidatePositions(load("delta_cu")).pairs[0])
     robot = load("stewart")
-    locator, places = ContactLocator(robot), Places(robot)
+    locator, places = ContactLocator(robot), CandidatePositions(robot)
     a, b = places.pairs
     named: dict[str, list[str]] = {"both": [], "one": []}
     for q in random_joints(robot, rng, count):
-        at, jacobian, _ = places.at(q)
+        at, jacobian, _ = places.evaluate(q)
         apart = at[a] - at[b]
         far = np.linalg.norm(apart, axis=1)
         k = int(rng.choice(np.flatnonzero(far < 0.35 * robot.graph.size)))

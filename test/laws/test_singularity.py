@@ -14,7 +14,7 @@ from scipy.optimize import minimize_scalar
 from delta_dynamics import reactions
 from pkm_twin import robot_names
 from pkm_twin.certify.maximal import Maximal
-from pkm_twin.certify.rows import stacked
+from pkm_twin.certify.rows import stack_rows
 from pkm_twin.errors import SingularityError
 from pkm_twin.kinematics.linkage import Linkage
 from pkm_twin.kinematics.singularity import Placed, singularity_on_numbers
@@ -83,7 +83,7 @@ def expected(robot, judge, q):
     exact = [judge.drives().columns]
     wrong = [judge.rod_rows(rod).columns / rod.length for rod in judge.machine.rods]
     for joint in judge.machine.joints:
-        rows = stacked(judge.joint_rows(joint), judge.size).columns
+        rows = stack_rows(judge.joint_rows(joint), judge.size).columns
         if joint.name not in placed.tree.cut:
             exact.append(rows)
             continue

@@ -13,8 +13,8 @@ from pkm_twin import variants
 from pkm_twin.certify.description import across
 from pkm_twin.certify.maximal import Maximal, rotation_of
 from pkm_twin.design import drawn, tolerances
-from pkm_twin.design.parts import Assembly, part_of
-from pkm_twin.design.tolerance import rms, workspace_states
+from pkm_twin.design.parts import Assembly, find_part
+from pkm_twin.design.tolerance import rms_length, workspace_states
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.identification.calibration import calibrate, geometric, left_by_calibration
 from pkm_twin.identification.calibration_state import Poses
@@ -192,8 +192,8 @@ def test_an_error_of_a_part_is_a_drive_that_makes_it(name, rng):
         found = tolerances(robot, {path: 1e-4}, q).sensitivity[path]
         scale = max(1.0, np.abs(expected).max())
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-8 * scale, err_msg=path)
-        exact = Assembly(robot, q[0]).displaced(
-            {what: 3e-3 * vector[None] for what, vector in part_of(robot, path).effects.items()}
+        exact = Assembly(robot, q[0]).solve_displacements(
+            {what: 3e-3 * vector[None] for what, vector in find_part(robot, path).effects.items()}
         )[0]
         judge, state, way = judged(data, path, q[0])
         place, turn = judge.platform(state + 3e-3 * way)
@@ -323,7 +323,7 @@ def test_one_longer_arm_and_all_arms_alike_or_by_themselves():
     up = np.minimum(0.025, 0.1525 - np.abs(across))
     q = robot.inverse(np.stack([across, 0.0 * across, up - 0.755], -1))
     alike, each = (
-        rms(tolerances(robot, {path: 1e-4}, q).deviation[:, :3])
+        rms_length(tolerances(robot, {path: 1e-4}, q).deviation[:, :3])
         for path in ("limbs.bodies.arm.length", "bodies.arm_*.length")
     )
     assert alike == pytest.approx(4.3e-5, rel=0.02) and each == pytest.approx(6.8e-5, rel=0.02)
@@ -337,9 +337,9 @@ def test_the_farthest_platform_is_that_of_one_combination_of_signs():
         effects = {}
         signs = np.array(list(itertools.product((-1.0, 1.0), repeat=6)))
         for path, column in zip(found.sigma, signs.T, strict=True):
-            for what, vector in part_of(robot, path).effects.items():
+            for what, vector in find_part(robot, path).effects.items():
                 effects[what] = effects.get(what, 0.0) + 3e-5 * column[:, None] * vector
-        errors = Assembly(robot, q).displaced(effects).reshape(64, 2, 3)
+        errors = Assembly(robot, q).solve_displacements(effects).reshape(64, 2, 3)
         assert found.is_exact
         assert found.farthest == pytest.approx(np.linalg.norm(errors, axis=-1).max(0), rel=2e-3)
         more = tolerances(robot, rods | {"joints.motor_3.clearance": Tolerance(bound=1e-9)}, q)
@@ -374,9 +374,9 @@ def test_bounds_hold_for_machines_that_are_drawn_within_them():
             slopes = np.array([there[path][0] for path in paths])
             size = found.bounds[paths[0]] * slopes / np.linalg.norm(slopes)
             for path, value in zip(paths, size, strict=True):
-                for what, vector in part_of(robot, path).effects.items():
+                for what, vector in find_part(robot, path).effects.items():
                     effects[what] = effects.get(what, 0.0) + value * vector[None]
-        exact = Assembly(robot, state).displaced(effects)[0]
+        exact = Assembly(robot, state).solve_displacements(effects)[0]
         assert exact[0] == pytest.approx(worst[0], rel=2e-3)
     # A play is the whole of it: parts stand half of it away at most.
     for play, part in (("backlash", "offset"), ("clearance[1]", "at[1]")):
@@ -397,8 +397,8 @@ def test_what_a_calibration_leaves_is_what_it_leaves():
     """Poses of a machine with one longer arm, whose file has one length for all of them."""
     robot, path, error = load("delta"), "bodies.arm I.length", 1e-4
     q = workspace_states(robot, 60)
-    effects = part_of(robot, path).effects
-    moved = Assembly(robot, q).displaced({k: error * v[None] for k, v in effects.items()})[0]
+    effects = find_part(robot, path).effects
+    moved = Assembly(robot, q).solve_displacements({k: error * v[None] for k, v in effects.items()})[0]
     place, turn = robot.platform(q)
     found = calibrate(robot, Poses(q, place + moved[:, :3], turn), geometric(robot, q))
     there, _ = found.robot.platform(found.joint_map.positions(q))
@@ -408,8 +408,8 @@ def test_what_a_calibration_leaves_is_what_it_leaves():
         q,
         q,
     )
-    assert rms(left[:, :3, 0]) == pytest.approx(rms(place + moved[:, :3] - there), rel=0.03)
-    assert rms(left[:, :3, 0]) < 0.9 * rms(moved[:, :3])
+    assert rms_length(left[:, :3, 0]) == pytest.approx(rms_length(place + moved[:, :3] - there), rel=0.03)
+    assert rms_length(left[:, :3, 0]) < 0.9 * rms_length(moved[:, :3])
 
 
 def test_numbers_of_a_file_without_parts_vary_as_the_file_says():

@@ -11,7 +11,7 @@ import pytest
 
 from delta_dynamics import inverse_dynamics, mass_matrix, torque_deviation
 from delta_dynamics.torques.derivatives import torque_effects
-from delta_dynamics.torques.uncertainty import AVERAGED, Noise, effort_parts
+from delta_dynamics.torques.uncertainty import NOISE_AVERAGING_TIME, Noise, effort_parts
 from pkm_twin import Robot, variants
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.design.variants import Variants
@@ -195,7 +195,7 @@ def test_what_stands_out_is_clipped_once_it_is_settled() -> None:
         noise.advance(STEP)
         noise.learn(np.array([100.0]), 0.0)
     # Each counts as at most nine times the average, over a second.
-    assert noise.variance[0] < 1.3 * np.exp(8.0 * 100 * STEP / AVERAGED)
+    assert noise.variance[0] < 1.3 * np.exp(8.0 * 100 * STEP / NOISE_AVERAGING_TIME)
     # Before, all is noise.
     assert learnt(np.full((100, 1), 100.0)).variance[0] == pytest.approx(1e4)
 

@@ -454,11 +454,11 @@ def test_a_frame_that_is_singular_at_home_has_programs_of_its_own(rng):
 def test_closures_that_are_left_out_follow_from_the_others():
     robot = soft("bolted", np.random.default_rng(7), 0.6)
     elastic, engine = robot.cached(Elastic), robot.engine
-    chosen = elastic.followers
+    chosen = elastic.dependent_coordinates
     assert chosen is not None
     for x, q in engine.samples:
-        frame = elastic._frame(Motion(engine.tree, x, q))
-        assert len(chosen.rows) < len(frame.held)
+        frame = elastic._build_frame(Motion(engine.tree, x, q))
+        assert len(chosen.rows) < len(frame.constraints)
         assert np.abs(np.array(solve_dependents(frame, chosen)[2], float)).max() < 1e-12
         fewer = replace(chosen, rows=chosen.rows[1:], chosen=chosen.chosen[1:])
         square = frame.table()[list(fewer.rows)][:, list(fewer.chosen)].astype(float)

@@ -13,7 +13,7 @@ import pkm_twin.certify as judges
 from delta_dynamics import forward_dynamics, inverse_dynamics, mass_matrix
 from pkm_twin import load
 from pkm_twin.certify import certificate as certification
-from pkm_twin.certify.certificate import ENGINES, Certificate, certify, certify_variants, drawn
+from pkm_twin.certify.certificate import ENGINES, Certificate, certify, certify_variants, draw_variant
 from pkm_twin.codegen.code import Code
 from pkm_twin.errors import PkmTwinError, SingularityError
 from pkm_twin.kinematics import engine
@@ -155,7 +155,7 @@ def test_drawn_machines_share_their_programs(name, monkeypatch):
     monkeypatch.setattr(engine, "Code", lambda *given: made.append(given) or Code(*given))
     robots, orders = [], set()
     for seed in range(4):
-        robot = drawn(load(FILES[name]), seed)
+        robot = draw_variant(load(FILES[name]), seed)
         made.clear()
         q = robot.inverse(robot.home())
         zero = np.zeros_like(q)

@@ -6,7 +6,7 @@ import pytest
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load, variants
-from pkm_twin.certify.certificate import certificate_of
+from pkm_twin.certify.certificate import certify_robot
 from pkm_twin.machine.strict_yaml import read_yaml
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.robot.outline import base_face, platform_face
@@ -59,7 +59,7 @@ def test_its_expressions_are_those_of_python(name):
 @pytest.mark.parametrize("name", partly_long(NAMES, "delta_1130.yaml"))
 def test_every_engine_agrees(name):
     """Of the Delta with its drives given as rotors and gears."""
-    result = certificate_of(load(MACHINES / name), states=2)
+    result = certify_robot(load(MACHINES / name), states=2)
     assert result.good, [item for item in result.items if not item.good]
     assert all("not installed" in reason for reason in result.missing.values())
 

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from pkm_twin.certify.certificate import certificate_of
+from pkm_twin.certify.certificate import certify_robot
 from pkm_twin.certify.description import expand, read
 from pkm_twin.certify.maximal import Maximal, random_states
 from pkm_twin.machine.joints import TYPES
@@ -52,7 +52,7 @@ def test_jacobian_is_the_places_slope(name):
 def test_screws_and_tables_are_certified_by_all():
     robots = slide(0.02), slide(-0.3), driven(0.5, [0.2, 0.05, 0.0]), puck(table=True)
     for robot in robots:
-        result = certificate_of(robot, states=2)
+        result = certify_robot(robot, states=2)
         assert not result.missing and result.good, [i for i in result.items if not i.good]
 
 

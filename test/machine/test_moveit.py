@@ -11,7 +11,7 @@ from delta_dynamics import inverse_dynamics
 from pkm_twin import robot_names
 from pkm_twin.apps.cli import main
 from pkm_twin.errors import ParameterError
-from pkm_twin.export.moveit import GROUP, LIMB, moveit_package
+from pkm_twin.export.moveit import LIMB_GROUP, PLANNING_GROUP, moveit_package
 from test.support.robots import load, parameters_of, partly_long
 
 
@@ -36,7 +36,7 @@ def test_every_name_of_the_srdf_is_in_the_urdf(exported):
     assert srdf.get("name") == urdf.get("name") == robot.name
     links = {link.get("name") for link in urdf.findall("link")}
     moving = {j.get("name"): j for j in urdf.findall("joint") if j.get("type") != "fixed"}
-    group = [joint.get("name") for joint in srdf.find(f"group[@name='{GROUP}']")]
+    group = [joint.get("name") for joint in srdf.find(f"group[@name='{PLANNING_GROUP}']")]
     assert group == list(robot.joint_names)
     passive = [joint.get("name") for joint in srdf.findall("passive_joint")]
     # MoveIt waits for the state of every joint that is neither.
@@ -98,15 +98,15 @@ def test_a_numeric_solver_is_offered_where_its_chain_has_a_drive(exported):
     assert link == "base_link"
     driven = bool(set(chain) & set(robot.joint_names))
     solvers = settings(folder, "kinematics")
-    assert set(solvers) == {GROUP} | ({LIMB} if driven else set())
+    assert set(solvers) == {PLANNING_GROUP} | ({LIMB_GROUP} if driven else set())
     library = ET.parse(folder / "kinematics.xml").getroot()
-    assert solvers[GROUP]["kinematics_solver"] == library.find("class").get("name")
+    assert solvers[PLANNING_GROUP]["kinematics_solver"] == library.find("class").get("name")
     package = ET.parse(folder / "package.xml").find("name").text
     assert library.get("path") == f"{package}_kinematics"
     srdf = ET.parse(folder / f"config/{robot.name}.srdf").getroot()
-    assert (srdf.find(f"group[@name='{LIMB}']") is not None) is driven
+    assert (srdf.find(f"group[@name='{LIMB_GROUP}']") is not None) is driven
     files = moveit_package(robot, "mine/Kinematics")
-    solver = yaml.safe_load(files["config/kinematics.yaml"])[GROUP]["kinematics_solver"]
+    solver = yaml.safe_load(files["config/kinematics.yaml"])[PLANNING_GROUP]["kinematics_solver"]
     assert solver == "mine/Kinematics"
 
 

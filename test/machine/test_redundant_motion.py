@@ -77,7 +77,7 @@ def test_a_plant_under_computed_efforts_follows_the_path(planar):
 def test_a_simulated_machine_follows_a_trajectory_with_all_drives(planar):
     n, free = 4, np.full(4, np.inf)
     machine = Simulation(planar, MachineSettings(planar.graph.home, free, *tune_position_control(planar, 8.0)), SECOND)
-    assert machine.stable_share == 1.0
+    assert machine.stable_fraction == 1.0
     t = np.linspace(0.0, 0.4, 81)
     share, slope = 1 - np.cos(np.pi * t / 0.4), np.pi / 0.4
     size = np.array([0.01, 0.008, 0.05])
@@ -92,7 +92,7 @@ def test_a_simulated_machine_follows_a_trajectory_with_all_drives(planar):
     for k in range(1, 401):
         machine.advance()
         if k % 50 == 0:
-            seen = machine.measured()
+            seen = machine.read_sensors()
             np.testing.assert_allclose(seen.q, q[k // 5], atol=1e-3)
             np.testing.assert_allclose(seen.effort, efforts[k // 5], atol=0.15 * np.abs(efforts).max())
     # A drive that follows has no stop: the machine stops there and says so.

@@ -157,12 +157,12 @@ class Action(SimpleNamespace):
     """The action over a controller that is none: what a test says of the machine and the time."""
 
     def accept(self, goal):
-        self.served._accepted(goal)
+        self.served._on_accepted(goal)
         return goal
 
     def cancel(self, goal):
         goal.is_cancel_requested = True
-        self.served._cancel(goal)
+        self.served._on_cancel(goal)
 
     @property
     def holds(self):
@@ -226,7 +226,7 @@ def test_a_goal_whose_controller_was_killed_is_aborted_within_two_seconds(action
 def test_a_controller_that_was_started_again_has_lost_the_goal(action):
     goal = action.accept(Goal(1))
     handle = action.controller.take()
-    action.node.look(action.code.ASKING_CHECKS)
+    action.node.look(action.code.SILENT_CHECKS_BEFORE_REQUEST)
     assert len(handle.results) == 2
     handle.end(UNKNOWN)
     assert goal.how == ABORTED and "lost the goal" in goal.ends[0].error_string
@@ -369,7 +369,7 @@ def test_a_trajectory_that_was_forwarded_is_not_ended_by_a_hold_point(action):
     goal = action.accept(Goal(1))
     action.controller.take()
     action.cancel(goal)
-    action.served.other_motion()
+    action.served.cancel_hold_points()
     for place in (0.15, 0.18, 0.19, 0.19, 0.19):
         action.place = {"a": place, "b": 0.2}
         action.node.look(1)
@@ -415,7 +415,7 @@ def test_a_malformed_goal_is_rejected_before_it_is_accepted(action):
         given = {"names": robot.joint_names, "times": times, "q": q, "qd": 0 * q, "qdd": 0 * q}
         given |= changes
         message = make.trajectory(*given.values())
-        return served._judge(SimpleNamespace(trajectory=message)), message
+        return served._check_request(SimpleNamespace(trajectory=message)), message
 
     action.node.active = True
     assert judge()[0] == accept

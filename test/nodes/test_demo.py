@@ -65,7 +65,7 @@ def test_a_node_that_waits_for_its_turn_answers_everything(executor, beginning, 
 
         Before, it can hold what every new process on this machine needs, or miss its discovery.
         """
-        with demo_recorder.process(command) as child:
+        with demo_recorder.run_process(command) as child:
             ended = threading.Event()
 
             def starve():
@@ -85,7 +85,7 @@ def test_a_node_that_waits_for_its_turn_answers_everything(executor, beginning, 
                 ended.set()
                 thread.join()
 
-    monkeypatch.setattr(demo, "process", process)
+    monkeypatch.setattr(demo, "run_process", process)
     recording = tmp_path / "demo.mcap"
     with BagWriter(recording) as writer:
         recorder = demo_recorder.Recorder(node, writer)
@@ -100,7 +100,7 @@ def test_a_node_that_waits_for_its_turn_answers_everything(executor, beginning, 
 
 
 def test_a_node_that_never_answers_is_told_of(executor, beginning, tmp_path, monkeypatch):
-    monkeypatch.setattr(demo_recorder, "PATIENCE", 1.0)
+    monkeypatch.setattr(demo_recorder, "MAX_WAIT", 1.0)
 
     class Silent:
         """A process that runs and does nothing."""
@@ -118,4 +118,4 @@ def test_a_node_that_never_answers_is_told_of(executor, beginning, tmp_path, mon
 def test_stamps_of_encoded_messages(little):
     order, mark = ("little", b"\0\1\0\0") if little else ("big", b"\0\0\0\0")
     data = mark + (17).to_bytes(4, order) + (5).to_bytes(4, order)
-    assert demo_recorder.stamp(data) == 17_000_000_005
+    assert demo_recorder.read_stamp(data) == 17_000_000_005

@@ -140,7 +140,7 @@ def test_a_stream_that_begins_anew_at_earlier_stamps_is_estimated_as_before(back
         for topic in node.published.values():
             topic.clear()
         for tick, (*motion, effort) in enumerate(zip(*moved, efforts, strict=True)):
-            estimates.take(Torques(begin + 1_000_000 * tick, tuple(motion), effort, effort, effort + rest, False))
+            estimates.update(Torques(begin + 1_000_000 * tick, tuple(motion), effort, effort, effort + rest, False))
         counts.append({topic: len(told) for topic, told in node.published.items()})
         assert not node.published["~/contact"]
         pushed = [m.wrench.force.x for m in node.published["~/external_wrench"]]
@@ -162,7 +162,7 @@ def stood(estimates, begin, seconds, effort):
     for stamp in stamps.tolist():
         measured = held + 1e-3 * rng.normal(size=3) if effort is None else np.array(effort)
         motion = home, still, still
-        estimates.take(Torques(stamp, motion, held, held, measured, False, None, still))
+        estimates.update(Torques(stamp, motion, held, held, measured, False, None, still))
     return int(stamps[-1]) + 1_000_000
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from delta_dynamics import feedforward, inverse_dynamics
-from delta_dynamics.feedforward import SLICE, Feedforward, Settings
+from delta_dynamics.feedforward import POINTS_PER_SLICE, Feedforward, Settings
 from pkm_twin.errors import ParameterError, SingularityError
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.robot.workspace import passive_values
@@ -312,7 +312,7 @@ class TestTrajectories:
 
 class TestSlices:
     def test_a_long_trajectory_is_that_of_its_points(self, make):
-        count = 2 * SLICE + 7
+        count = 2 * POINTS_PER_SLICE + 7
         times = np.arange(count) / 500
         q, qd, qdd = motion(0.1 * times)
         message = make.trajectory(NAMES, [round(t * SECOND) for t in times], q, qd, qdd)
@@ -344,20 +344,20 @@ class TestSlices:
         assert (end.value.value == expected).all()
 
     def test_a_bad_point_is_told_by_its_number(self, make, limitless):
-        count = SLICE + 9
+        count = POINTS_PER_SLICE + 9
         rows = [[0.3] * 3] * count
-        rows[SLICE + 4] = UNREACHABLE
+        rows[POINTS_PER_SLICE + 4] = UNREACHABLE
         zero = [[0.0] * 3] * count
         message = make.trajectory(NAMES, [i * STEP for i in range(count)], rows, zero, zero)
         reason, text = reject(core(limitless).trajectory, message, NOW)
         assert reason == "unreachable"
-        assert f"in the points from point {SLICE} on: " in text and "sample 4" in text
+        assert f"in the points from point {POINTS_PER_SLICE} on: " in text and "sample 4" in text
 
     def test_a_passive_joint_keeps_its_range(self, make):
         data = parameters_of("linear_delta")
         data["limbs"]["rods"]["left"]["swivel"] = 0.22
         free = load("linear_delta")
-        count = SLICE + 50
+        count = POINTS_PER_SLICE + 50
         away = np.linspace(0.0, 0.06, count)
         q = free.inverse(free.home() + away[:, None] * [1.0, 0.0, 0.0])
         zero = np.zeros_like(q)
@@ -366,7 +366,7 @@ class TestSlices:
         tight = robot_of_data(data, "tight")
         turned = passive_values(tight, q)
         first = int((turned > 0.22).any(1).argmax())
-        assert first > SLICE
+        assert first > POINTS_PER_SLICE
         reason, text = reject(Feedforward(tight).trajectory, message, NOW)
         assert reason == "limit"
         value = f"{turned[first].max():g} rad, allowed 0 to 0.22"

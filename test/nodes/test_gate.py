@@ -153,7 +153,7 @@ def test_it_is_open_exactly_where_no_silence_passed_the_deadline(gaps):
     time = 0
     send(core, make, time)
     for gap in gaps:
-        core.watch(time + gap)
+        core.close_if_silent(time + gap)
         assert core.stream.stopped is (gap > DEADLINE)
         time += gap
         assert send(core, make, time) is not None

@@ -245,10 +245,10 @@ class TestSimulation:
             mapped.commands(SimpleNamespace(data=both.efforts(effort).tolist()))
             plain.advance()
             mapped.advance()
-        close(mapped.measured().q, plain.measured().q)
-        close(mapped.measured().qd, plain.measured().qd)
-        close(mapped.measured().effort, plain.measured().effort)
-        assert np.abs(plain.measured().qd).max() > 0.0
+        close(mapped.read_sensors().q, plain.read_sensors().q)
+        close(mapped.read_sensors().qd, plain.read_sensors().qd)
+        close(mapped.read_sensors().effort, plain.read_sensors().effort)
+        assert np.abs(plain.read_sensors().qd).max() > 0.0
 
     def test_a_trajectory_with_effort(self, both):
         plain, mapped = self.machines(both)
@@ -266,9 +266,9 @@ class TestSimulation:
         for _ in range(60):
             plain.advance()
             mapped.advance()
-        assert np.abs(plain.measured().q - both.plain.inverse(both.plain.home())).max() > 1e-4
-        close(mapped.measured().q, plain.measured().q)
-        close(mapped.measured().effort, plain.measured().effort)
+        assert np.abs(plain.read_sensors().q - both.plain.inverse(both.plain.home())).max() > 1e-4
+        close(mapped.read_sensors().q, plain.read_sensors().q)
+        close(mapped.read_sensors().effort, plain.read_sensors().effort)
 
     def test_numbers_that_are_no_efforts(self, both):
         machine = self.machines(both)[1]

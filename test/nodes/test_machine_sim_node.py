@@ -97,7 +97,7 @@ def test_lockstep_gives_the_core_s_numbers(peer, machine):
         state = answer(peer, effort.tolist())
         core.commands(Float64MultiArray(data=effort.tolist()))
         core.advance()
-        want = core.measured()
+        want = core.read_sensors()
         if k == 0:
             # Braked, its clock went on alone.
             ahead = stamp_of(state) - want.stamp

@@ -63,12 +63,12 @@ raise SystemExit(node.run(node.NODE))
     def test_an_exception_in_a_callback_stops_the_stream_and_not_the_node(self, peer, launch):
         code = """
 import delta_dynamics.nodes.twin as node
-solve = node.Feedforward._joint_state
+solve = node.Feedforward._compute_efforts
 def broken(self, message, *times):
     if message.position[0] == 0.125:
         raise ZeroDivisionError("made for the test")
     return solve(self, message, *times)
-node.Feedforward._joint_state = broken
+node.Feedforward._compute_efforts = broken
 raise SystemExit(node.run(node.NODE))
 """
         twin = launched(peer, launch, "broken", "stale_after:=5.0", code=code).ready()

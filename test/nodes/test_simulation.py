@@ -46,7 +46,7 @@ def go(machine, periods, effort=None):
         if effort is not None:
             machine.commands(command(effort))
         machine.advance()
-        states.append(machine.measured())
+        states.append(machine.read_sensors())
     return states
 
 
@@ -253,7 +253,7 @@ def growth_in_time(robot, machine):
         effort=0 * q,
         time_from_start=SimpleNamespace(sec=0, nanosec=0),
     )
-    machine.__dict__["stable_share"] = 1.0
+    machine.__dict__["stable_fraction"] = 1.0
     machine.trajectory(
         SimpleNamespace(
             header=SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=0)),
@@ -305,7 +305,7 @@ def test_every_pair_of_period_and_bandwidth_follows_a_trajectory_or_rejects_it(m
             except MessageError as error:
                 assert error.reason == "unstable control"
                 assert machine.trajectories.rejected[error.reason] == 1
-                assert machine.stable_share * turns < 1.0
+                assert machine.stable_fraction * turns < 1.0
                 continue
             followed += 1
             rates = np.array([np.abs(s.qd) for s in go(machine, 40)]).max(0)

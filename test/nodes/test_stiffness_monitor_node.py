@@ -308,7 +308,7 @@ import stiffness_monitor.node as node
 from pkm_twin.errors import SingularityError
 def singular(self, answer):
     raise SingularityError("correction", (), 0.0, 1e-9)
-node.SetpointCorrection.take = node.StiffnessAlarmTopics.take = singular
+node.SetpointCorrection.update = node.StiffnessAlarmTopics.update = singular
 raise SystemExit(node.run(node.NODE))
 """
 

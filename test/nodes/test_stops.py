@@ -66,7 +66,7 @@ class Chain:
             with self.twin.stream.reacting(self.stop):
                 self.twin.stop("stale input", "no accepted joint state")
         self.pass_on()
-        self.gate.watch(self.steady)
+        self.gate.close_if_silent(self.steady)
         if self.gate.stream.stopped:
             self.law.judge(self.gate.stop_command(self.steady), self.steady / SECOND, STALE)
 

@@ -45,7 +45,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from delta_dynamics import inverse_dynamics
 from delta_dynamics.simulation.machine import tune_position_control
 from pkm_twin import Robot, load
-from pkm_twin.export.ros2_control import CONTROLLER, GRAVITY, TRAJECTORIES, package_name
+from pkm_twin.export.ros2_control import CONTROLLER, GRAVITY_CONTROLLER, TRAJECTORY_CONTROLLER, package_name
 from pkm_twin.robot.effort_limits import effort_limits
 
 MOCK = "mock_components/GenericSystem"
@@ -116,10 +116,12 @@ class Chain:
         self.other, self.robot, self.part = other, load(given), part
         self.bandwidth = bandwidth
         use, source, target = (
-            ("twin", TRAJECTORIES, "delta_dynamics") if part == "twin" else ("plugin", CONTROLLER, TRAJECTORIES)
+            ("twin", TRAJECTORY_CONTROLLER, "delta_dynamics")
+            if part == "twin"
+            else ("plugin", CONTROLLER, TRAJECTORY_CONTROLLER)
         )
         self.states = other.hear(JointTrajectoryControllerState, f"/{source}/controller_state", 50000)
-        self.fallen = other.hear(JointTrajectoryControllerState, f"/{GRAVITY}/controller_state", 50000)
+        self.fallen = other.hear(JointTrajectoryControllerState, f"/{GRAVITY_CONTROLLER}/controller_state", 50000)
         self.hardware = other.hear(JointState, "/joint_states", 50000)
         self.counts = other.hear(DiagnosticArray, "/diagnostics", 1000)
         self.send = other.node.create_publisher(JointTrajectory, f"/{target}/joint_trajectory", QoSProfile(depth=10))
@@ -245,7 +247,7 @@ class Chain:
         robot = self.robot
         share = Path(get_package_share_directory(package_name(robot)))
         sections = yaml.safe_load((share / "config" / "controllers.yaml").read_text())
-        gains = sections[f"/**/{GRAVITY}"]["ros__parameters"]["gains"]
+        gains = sections[f"/**/{GRAVITY_CONTROLLER}"]["ros__parameters"]["gains"]
         d = np.array([gains[name]["d"] for name in robot.controller.names])
         states = [s for s in self.fallen if np.isfinite(s.feedback.positions).all()]
         columns = [np.array([getattr(s.feedback, k) for s in states]) for k in KINDS[:2]]
@@ -255,7 +257,7 @@ class Chain:
         error = np.abs(carried - (weight - d * np.nan_to_num(columns[1]))).max()
         lost = int(np.isnan(columns[1]).any(1).sum())
         print(
-            f"{self.part}: {what}: {GRAVITY}, {len(states)} states, {lost} of them without a "
+            f"{self.part}: {what}: {GRAVITY_CONTROLLER}, {len(states)} states, {lost} of them without a "
             f"velocity: effort {carried[-1].tolist()}, less weight and damping at what is measured "
             f"{error:.1e} at most; moved {np.abs(at - at[0]).max():.1e}"
         )
@@ -285,7 +287,7 @@ class Chain:
         )
         self.fallen.clear()
         self.hardware.clear()
-        self.other.until(lambda: self.fallen, GRAVITY)
+        self.other.until(lambda: self.fallen, GRAVITY_CONTROLLER)
         self.other.spin(3.0)
         self.report()
         self.compare_gravity(f"payload {ADDED_PAYLOAD:g} kg more at {CONTROLLER} alone")
@@ -302,7 +304,7 @@ class Chain:
         for what, seconds in (("velocity", 3.0), ("position", 0.0)):
             self.fallen.clear()
             self.set_parameter("topic_system", "lost", what)
-            self.other.until(lambda: self.fallen, GRAVITY)
+            self.other.until(lambda: self.fallen, GRAVITY_CONTROLLER)
             self.other.spin(seconds)
             if seconds:
                 self.compare_gravity(f"{what} lost")
@@ -318,9 +320,9 @@ class Chain:
         self.set_parameter("topic_system", "lost", "")
         self.fallen.clear()
         client = self.other.node.create_client(SwitchController, "/controller_manager/switch_controller")
-        request = SwitchController.Request(activate_controllers=[GRAVITY], strictness=2)
+        request = SwitchController.Request(activate_controllers=[GRAVITY_CONTROLLER], strictness=2)
         print(f"{self.part}: activated again: {self._call(client, request).ok}")
-        self.other.until(lambda: self.fallen, GRAVITY)
+        self.other.until(lambda: self.fallen, GRAVITY_CONTROLLER)
         self.other.spin(1.0)
         self.compare_gravity("position good again")
 

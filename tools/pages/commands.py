@@ -158,7 +158,7 @@ def section(name: str, command: Any, inner: dict[str, Any], own: Sequence[Word],
         if not (alone or told or names):
             plain.append(f"`{words.split()[-1]}`")
             continue
-        typed = words if alone else f"{name} {command.show(words.split()[-1])}"
+        typed = words if alone else f"{name} {command.spell_command(words.split()[-1])}"
         usage = " ".join(w.name for w in every if w.argument and w.name not in typed.split())
         lines += [f"`{f'pkm-twin {typed} {usage}'.rstrip()}`: {first(one.help)}", ""]
         options = ", ".join(f"`{word.name}`" for word in told if not word.argument)

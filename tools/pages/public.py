@@ -52,7 +52,7 @@ def groups() -> Iterator[tuple[str, list[str]]]:
     source = (ROOT / "pkm_twin/export/c_package.py").read_text(encoding="utf-8")
     calls = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Call)]
     static = {arg for call in calls if ast.unparse(call.func) == "self.hidden.append" for arg in call.args}
-    named = [c.args[0] for c in calls if ast.unparse(c.func) in ("add", "Routine") and c not in static]
+    named = [c.args[0] for c in calls if ast.unparse(c.func) in ("add_routine", "Routine") and c not in static]
     functions = [n.value for n in named if isinstance(n, ast.Constant) and n.value != "terms"]
     yield "exported C pkm_ROBOT_", ["parameters", *functions]
     above = ""

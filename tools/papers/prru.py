@@ -122,7 +122,11 @@ EQUATIONS: Final = (
     _equation(
         "40-41",
         "driving forces F_d",
-        ("delta_dynamics.inverse_dynamics", TORQUES + "driving_forces", "delta_dynamics.torques.at_pose._pose_torques"),
+        (
+            "delta_dynamics.inverse_dynamics",
+            TORQUES + "driving_forces",
+            "delta_dynamics.torques.at_pose._write_pose_torques",
+        ),
         FORCES,
     ),
     _equation(
@@ -136,7 +140,7 @@ EQUATIONS: Final = (
     _equation(
         "45",
         "unit vector of the pose rates",
-        ("delta_dynamics.torques.isotropy._directions",),
+        ("delta_dynamics.torques.isotropy._normalise_directions",),
         INDICES,
     ),
     _equation("46", "eta_KE by the direction", ("delta_dynamics.energy_transfer",), INDICES),

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from pkm_twin.apps.frame import command
 from pkm_twin.apps.options import AcceptOption, BeyondLimitsOption, OverwriteOption, RobotArgument, TableOptions
-from pkm_twin.console import progress
+from pkm_twin.console import draw_progress
 from pkm_twin.errors import ParameterError, one_line
 from pkm_twin.files import replace_file
 from pkm_twin.identification.calibration import Calibration, Estimate, geometric
@@ -128,25 +128,25 @@ def calibrate(given: Calibrate) -> Report:
     :raises ParameterError: poses of another machine, or too few; see
         :func:`pkm_twin.identification.calibration.calibrate`.
     """
-    kinds, known, within = given.parse_options()
+    kinds, known_noise, within = given.parse_options()
     machine, measured = given.machine(), None
     if given.poses is not None:
-        read = partial(read_measured, kinds=kinds, noise=known) if kinds else read_poses
+        read = partial(read_measured, kinds=kinds, noise=known_noise) if kinds else read_poses
         measured = read(given.poses, machine, dialect=given.dialect)
     notes = []
     if measured is not None:
         q = machine.controller.positions(measured.joints)
         notes = [f"beyond limits: {item}" for item in given.list_beyond_limits(machine, q)]
     if given.plan is not None:
-        some = measured if isinstance(measured, Measured) else None
+        known_measurements = measured if isinstance(measured, Measured) else None
         chosen = plan_of(
             machine,
             kinds,
-            measured=some,
+            measured=known_measurements,
             within=within,
             count=given.count,
             accuracy=given.accuracy,
-            noise=known,
+            noise=known_noise,
             **given.free,
         )
         replace_file(given.plan, chosen.table(machine).encode())
@@ -154,15 +154,15 @@ def calibrate(given: Calibrate) -> Report:
     if given.poses is None or measured is None:
         raise ParameterError("poses", None, "a CSV of measured poses, or --plan FILE.csv")
     paths = geometric(machine, q, given.only)
-    with progress("steps", 2 * STEPS) as update:
+    with draw_progress("steps", 2 * STEPS) as update:
         done = 0
 
-        def step(count: int) -> None:
+        def add_steps(count: int) -> None:
             nonlocal done
             done += count
             update(done)
 
-        result = calibrated(machine, measured, paths, accept=given.accept, progress=step, **given.free)
+        result = calibrated(machine, measured, paths, accept=given.accept, progress=add_steps, **given.free)
     source = f"calibrated with {one_line(given.poses.name, 100)}"
     marks = [*(f"accepted anyway: {fault}" for fault in result.faults), *notes]
     head = [f"{machine.name}, {source}: {len(measured.joints)} poses."]

@@ -11,7 +11,7 @@ import click
 
 from pkm_twin.apps.frame import command
 from pkm_twin.apps.options import RobotArgument, SeedOption
-from pkm_twin.console import progress
+from pkm_twin.console import draw_progress
 from pkm_twin.report import Column, Fact, Report, Table, Verdict
 from pkm_twin.settings import setting
 
@@ -53,7 +53,7 @@ def certify(given: Certify) -> Report:
     unknown = [name for name in given.engine if name not in ENGINES]
     if unknown:
         raise click.UsageError(f"no engine {unknown[0]!r}; there are {', '.join(ENGINES)}")
-    with progress("states", given.states * (given.variants + 1)) as update:
+    with draw_progress("states", given.states * (given.variants + 1)) as update:
         found = certify_variants(
             given.machine(),
             given.variants,
@@ -80,8 +80,8 @@ def certify(given: Certify) -> Report:
             f"{found.skipped} of {found.drawn} states drawn were skipped: pkm_twin meets a "
             "singularity on the way from home",
         )
-    # The one that is nearest to its bound, or farthest beyond it.
-    worst = max(found.items, key=_share, default=None)
+    # Report the comparison with the largest ratio of difference to bound.
+    worst = max(found.items, key=_relative_to_bound, default=None)
     most = (
         ""
         if worst is None
@@ -100,6 +100,6 @@ def certify(given: Certify) -> Report:
     )
 
 
-def _share(item: Item) -> float:
-    """Return the worst difference over its bound; a bound of 0 allows none."""
+def _relative_to_bound(item: Item) -> float:
+    """Return the largest difference over its bound; infinite for a difference with a bound of 0."""
     return item.worst / item.bound if item.bound else math.inf if item.worst else 0.0

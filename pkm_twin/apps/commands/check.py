@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from pkm_twin.apps.frame import command
 from pkm_twin.apps.options import NOT_JUDGED, REFUSED, SALVAGED, RecordingOptions, TimedPayloadOptions, payload_fact
-from pkm_twin.console import progress
+from pkm_twin.console import draw_progress
 from pkm_twin.errors import ParameterError, PkmTwinError, one_line
 from pkm_twin.report import Fact, Report, Verdict
 from pkm_twin.settings import setting
@@ -60,7 +60,7 @@ def check(given: Check) -> Report:
     if is_collection(given.bag):
         return _check_folder(given)
     try:
-        with progress("reading", None) as update:
+        with draw_progress("reading", None) as update:
             return check_one(given, given.bag, update)
     except PkmTwinError as error:
         if isinstance(error, ParameterError) and error.field.startswith("--") and error.value:
@@ -133,7 +133,7 @@ def _check_folder(given: Check) -> Report:
 
     paths, results = list_bags(given.bag), list[dict[str, Any]]()
     each, jobs = partial(_check_safely, given), min(given.jobs, len(paths))
-    with progress("checking", len(paths)) as update, ExitStack() as stack:
+    with draw_progress("checking", len(paths)) as update, ExitStack() as stack:
         run: Callable[..., Iterable[dict[str, Any]]] = map
         if jobs > 1:
             pool = ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn"))

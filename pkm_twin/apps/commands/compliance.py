@@ -57,7 +57,7 @@ def compliance(given: Compliance) -> Report:
     except ValueError as error:  # finite numbers, but so large that the result is not
         raise PkmTwinError(str(error)) from None
     c, moved = energy.compliance, energy.deflection
-    # Elements that share the first place within rounding are named together, the stable one first.
+    # Name all elements whose energy is the largest within rounding, in the order of the structure.
     first = np.isclose(energy.factors, energy.factors.max(), rtol=1e-6)
     tied = [n for n, most in zip(energy.elements, first, strict=True) if most and energy.tie]
     shares = dict(zip(energy.elements, energy.factors.tolist(), strict=True))
@@ -96,7 +96,7 @@ def compliance(given: Compliance) -> Report:
         label = "standard deviation (from the robot file's uncertainty)" if doubt.any() else None
         facts.insert(6, Fact("", doubts, text=label))
     size = np.sqrt(np.diag(c))
-    # What is zero by symmetry is printed so, not as rounding.
+    # Print rounding errors of entries that are zero by symmetry as zero.
     cells = np.where(abs(c) < 1e-9 * np.outer(size, size), 0.0, c)
     rows = {axis: row.tolist() for axis, row in zip(AXES, cells, strict=True)}
     columns = [Column("", text=name, form=".3e") for name in ("fx", "fy", "fz", "mx", "my", "mz")]

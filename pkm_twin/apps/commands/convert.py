@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pkm_twin.apps.frame import command
 from pkm_twin.apps.options import ROBOT_HELP, CutOutOptions, OutputOption
-from pkm_twin.console import refuse_existing
+from pkm_twin.console import reject_existing
 from pkm_twin.errors import FileError, UnknownNameError, one_line
 from pkm_twin.files import open_regular, replace_file
 from pkm_twin.mechanisms.catalogue import TREE_SUFFIXES, load, robot_names
@@ -58,7 +58,7 @@ def convert(given: Convert) -> Report:
         # Write a printer's geometry and probings.
         out, data = given.out or Path("printer.yaml"), given.data or Path("probes.csv")
         for target in (out, data):
-            refuse_existing(target, given.overwrite)
+            reject_existing(target, given.overwrite)
         paths = [Path(name) for name in given.source]
         texts = []
         for path in paths:

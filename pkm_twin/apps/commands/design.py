@@ -14,8 +14,8 @@ import numpy as np
 
 from pkm_twin.apps.frame import command
 from pkm_twin.apps.options import MotionOptions, OutputOption, PayloadOption, PictureOptions, SeedOption
-from pkm_twin.console import progress, writing
-from pkm_twin.errors import ParameterError, UnknownNameError, warn
+from pkm_twin.console import convert_write_errors, draw_progress
+from pkm_twin.errors import ParameterError, UnknownNameError, warn_of_file
 from pkm_twin.report import Column, Fact, Report, Table, judged, plots
 from pkm_twin.settings import setting
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 SWEEPS: Final = ("grid", "sobol")
 FILE_VALUE: Final = "file"
-"""In place of a tolerance: those of the robot's file."""
+"""Word that stands for the tolerances of the robot's file."""
 Box = Mapping[str, tuple[float, float]]
 
 
@@ -79,7 +79,7 @@ class Design(PayloadOption, MotionOptions, OutputOption, PictureOptions, SeedOpt
 def design(given: Design) -> Report:
     """Optimise a machine, sweep its numbers, or compute its budget of pose errors.
 
-    :raises PkmTwinError: what cannot be asked, or cannot be computed.
+    :raises PkmTwinError: the options contradict each other, or the machine cannot be computed.
     """
     if given.tolerance:
         others = (given.vary, given.minimise, given.sweep, given.subject_to, given.out)
@@ -120,7 +120,7 @@ def read_path(given: Design, path: Path, *, efforts: bool = True) -> tuple[Robot
             raise ParameterError(f"{path}: payload", str(motion.load), bound)
         robot = motion.load.on(robot)
     if efforts and motion.doubt:
-        warn(path, motion.doubt)
+        warn_of_file(path, motion.doubt)
     q, qd, qdd, load = motion.motion
     load = load + np.asarray(given.wrench or np.zeros(6))
     return robot, PosePath.of_joints(robot, motion.time, q, qd, qdd, load)
@@ -136,7 +136,7 @@ def report_optimum(given: Design, path: Path) -> Report:
 
     robot, way = read_path(given, path)
     box = parse_vary(given.vary)
-    with progress("searches", searches(len(given.minimise), given.points)) as update:
+    with draw_progress("searches", searches(len(given.minimise), given.points)) as update:
         found = find(
             robot,
             box,
@@ -313,7 +313,7 @@ def report_sweep(given: Design, path: Path, kind: str) -> Report:
     from pkm_twin.design import sweep as sweep_box
     from pkm_twin.design.sweep import compute_serially
     from pkm_twin.design.variables import parse_vary
-    from pkm_twin.errors import require
+    from pkm_twin.errors import import_extra
     from pkm_twin.maps.run import compute_on_cluster
 
     out = given.out
@@ -323,13 +323,13 @@ def report_sweep(given: Design, path: Path, kind: str) -> Report:
         raise click.UsageError("--sweep computes all quantities; leave out --minimise and --subject-to")
     if out is None or out.suffix != ".nc":
         raise ParameterError("out", str(out), "a name that ends in .nc, for --sweep")
-    require("h5netcdf", "maps")
-    require("xarray", "maps")
+    import_extra("h5netcdf", "maps")
+    import_extra("xarray", "maps")
     robot, way = read_path(given, path)
     box = parse_vary(given.vary)
     grid = kind == "grid"
     compute = compute_serially if given.scheduler is None else partial(compute_on_cluster, scheduler=given.scheduler)
-    with progress("machines", given.samples ** len(box) if grid else given.samples) as update:
+    with draw_progress("machines", given.samples ** len(box) if grid else given.samples) as update:
         table = sweep_box(
             robot,
             box,
@@ -341,7 +341,7 @@ def report_sweep(given: Design, path: Path, kind: str) -> Report:
             progress=update,
             compute=compute,
         )
-    with writing(out):
+    with convert_write_errors(out):
         table.dataset(robot, path.name, kind).to_netcdf(out, engine="h5netcdf")
     count, lost = int(np.prod(table.shape)), int(np.isnan(table.quantities["peak-effort"]).sum())
     return Report(

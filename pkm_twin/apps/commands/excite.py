@@ -11,7 +11,7 @@ import numpy as np
 
 from pkm_twin.apps.frame import command
 from pkm_twin.apps.options import OutputOption, RobotArgument, SeedOption, SingularityOption
-from pkm_twin.console import progress, writing
+from pkm_twin.console import convert_write_errors, draw_progress
 from pkm_twin.errors import BagError
 from pkm_twin.report import Fact, Report
 from pkm_twin.settings import setting
@@ -19,8 +19,8 @@ from pkm_twin.settings import setting
 if TYPE_CHECKING:
     from pkm_twin.robot.robot import Robot
 
-MAX_CONDITION: Final = 1e3
-"""Condition number from which on a fit knows some parameters badly."""
+MAX_CONDITION_NUMBER: Final = 1e3
+"""Condition number above which a fit determines some parameters poorly."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,14 +85,14 @@ def excite(given: Excite) -> Report:
     if given.friction:
         best = sweeps(judge, given.duration, bounds)
     else:
-        with progress("excite", given.trials) as update:
+        with draw_progress("excite", given.trials) as update:
             best = design(
                 judge, given.duration, given.harmonics, bounds, trials=given.trials, seed=given.seed, progress=update
             )
     time = np.arange(round(best.duration * bounds.rate) + 1) / bounds.rate
     time = time[time <= best.duration]
     plan = Recording(machine, time, *best.at(time))
-    with writing(given.files["table"]):
+    with convert_write_errors(given.files["table"]):
         for file in given.files.values():
             facts = {"source": "pkm-twin excite", "condition": best.condition}
             write_motion(file, plan, facts, given.overwrite)
@@ -100,9 +100,9 @@ def excite(given: Excite) -> Report:
     if other is not None:
         told = f"{other:.4g}" if np.isfinite(other) else "infinite, it does not excite all of them"
         notes.append(f"condition number of {given.compare}: {told}")
-    if not best.condition < MAX_CONDITION and not given.friction:
+    if not best.condition < MAX_CONDITION_NUMBER and not given.friction:
         notes.append(
-            f"a condition number above {MAX_CONDITION:g}: a fit will know some parameters badly; try a "
+            f"a condition number above {MAX_CONDITION_NUMBER:g}: a fit will know some parameters badly; try a "
             "longer --duration, more --harmonics or --trials, a smaller --singularity, wider "
             "limits in the robot file, or fewer kinds with --what"
         )
@@ -113,7 +113,7 @@ def excite(given: Excite) -> Report:
     )
     size = f"{len(time)} points in {best.duration:.4g} s"
     return Report(
-        f"{machine.name}: every joint alone moves up and down at {_span(machine, best.speeds)}, {size}"
+        f"{machine.name}: every joint alone moves up and down at {_format_speed_ranges(machine, best.speeds)}, {size}"
         if given.friction
         else f"{machine.name}: condition number {best.condition:.4g} over {len(judge.columns)} base parameters, {size}",
         facts=[
@@ -130,7 +130,7 @@ def excite(given: Excite) -> Report:
     )
 
 
-def _span(machine: Robot, speeds: Any) -> str:
+def _format_speed_ranges(machine: Robot, speeds: Any) -> str:
     """Format the range of the speeds (n, speeds), of rotary and of sliding joints apart."""
     units = np.array(machine.joint_units)
     rows = {unit: speeds[units == unit] for unit in machine.joint_units}

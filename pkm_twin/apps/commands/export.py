@@ -13,7 +13,7 @@ import click
 
 from pkm_twin.apps.frame import Group, command
 from pkm_twin.apps.options import OverwriteOption, RobotArgument
-from pkm_twin.console import refuse_existing, tell
+from pkm_twin.console import print_message, reject_existing
 from pkm_twin.errors import ParameterError
 from pkm_twin.extensions import Extensible
 from pkm_twin.files import replace_file, replace_files
@@ -24,16 +24,16 @@ from pkm_twin.settings import setting
 
 @dataclass(frozen=True, kw_only=True)
 class ToFolder(RobotArgument, OverwriteOption):
-    """A package of several files."""
+    """Option of the folder to write a package to."""
 
     out: Path = setting(..., "folder of the new package", metavar="FOLDER")
 
     def write(self, files: Mapping[str, str]) -> Report:
-        """Write all files or, where one may not be replaced, none."""
+        """Write all files, or none if one of them may not be replaced."""
         paths = [self.out / name for name in files]
         for path in paths:
             path.parent.mkdir(parents=True, exist_ok=True)
-            refuse_existing(path, self.overwrite)
+            reject_existing(path, self.overwrite)
         texts = (text.encode() for text in files.values())
         replace_files(dict(zip(paths, texts, strict=True)))
         written = list(map(str, paths))
@@ -42,7 +42,7 @@ class ToFolder(RobotArgument, OverwriteOption):
 
 @dataclass(frozen=True, kw_only=True)
 class ToFile(RobotArgument, OverwriteOption):
-    """One file."""
+    """Option of the file to write."""
 
     out: Path = setting(..., "the file to write", writes=True)
 
@@ -54,7 +54,7 @@ class ToFile(RobotArgument, OverwriteOption):
 
 @dataclass(frozen=True, kw_only=True)
 class TextOutput(RobotArgument, OverwriteOption):
-    """A text that is printed, or a file."""
+    """Option of a file to write instead of printing."""
 
     out: Path | None = setting(None, "a file; default: print", writes=True)
 
@@ -180,7 +180,7 @@ def fmu(given: FunctionalMockupUnit) -> Report:
 
     compiler = find_compiler()
     if compiler is None:
-        tell("warning: no C compiler found: the FMU has sources and no binary")
+        print_message("warning: no C compiler found: the FMU has sources and no binary")
     return given.write(Fmu(given.machine(), given.fmi, given.kind).archive(compiler))
 
 

@@ -13,7 +13,7 @@ import click
 
 from pkm_twin.apps.frame import command
 from pkm_twin.apps.options import ROBOT_HELP, AcceptOption, BeyondLimitsOption, RecordingOptions, TimedPayloadOptions
-from pkm_twin.console import progress, writing
+from pkm_twin.console import convert_write_errors, draw_progress
 from pkm_twin.errors import ParameterError
 from pkm_twin.files import replace_file
 from pkm_twin.report import Fact, Report
@@ -158,7 +158,7 @@ def fit(given: Fit) -> Report:
     elastic, currents = kinds is None, given.torque_constant is not None
     if elastic:
         _ = machine.elastic
-    with progress("fit", len(given.recordings)) as update:
+    with draw_progress("fit", len(given.recordings)) as update:
         read = [given.read(path, machine, deflected=elastic, currents=currents) for path in given.recordings]
         beyond = [
             f"beyond limits: {r.name}: {item}"
@@ -199,7 +199,7 @@ def fit(given: Fit) -> Report:
         f"Residual rms held out of {name}: {before:.3g} before, {after:.3g} now, {unit}."
         for name, (before, after, _, unit) in report.tables[-1].rows.items()
     ]
-    with writing(out):
+    with convert_write_errors(out):
         before = load(given.robot) if given.per_copy else machine
         lost = write_edited(out, head, fitted, before)
         report = dataclasses.replace(report, notes=[*report.notes, *lost])

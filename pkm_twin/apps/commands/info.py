@@ -50,10 +50,10 @@ def info(given: Info) -> Report:
     assumed = [joint.name for joint in robot.graph.joints.values() if joint.virtual]
     undetermined = list_undetermined(robot)
     gap = float(clearance(robot, home)) if has_clearance(robot) else None
-    odd, fault = findings(robot), find_members_fault(robot)
+    implausible, fault = findings(robot), find_members_fault(robot)
     equations = f"{engine.closures} loop equations, {engine.rank} independent"
     if engine.redundant and assumed and not undetermined:
-        # A joint that stands for what several limbs hold repeats what one of them holds alone.
+        # A joint that replaces equal constraints of several limbs repeats those of one limb.
         equations += f"; in the model joint {', '.join(assumed)} repeats constraints of the limbs"
     sections, units = robot.parameter_sections(), robot.parameter_units()
     if robot.book.values:
@@ -67,7 +67,7 @@ def info(given: Info) -> Report:
         shown += f" and {len(found) - MAX_NAMES} more" if len(found) > MAX_NAMES else ""
         text = "other pose coordinates" if found else None
         other_poses = [Fact("other_poses", found, text=text, shown=f"{shown} (`pose`, --pose)")]
-    # Of more actuated joints than degrees of freedom those that lead.
+    # Independent drives of a machine with more actuated joints than degrees of freedom.
     leads = list(robot.graph.leads)
     facts = [
         Fact("name", robot.name),
@@ -107,10 +107,10 @@ def info(given: Info) -> Report:
             Fact("", text, text="overconstrained")
             for text in group_reactions(undetermined) or ["no: rigid-body equations determine every reaction"]
         ),
-        Fact("plausibility", [dataclasses.asdict(finding) for finding in odd]),
+        Fact("plausibility", [dataclasses.asdict(finding) for finding in implausible]),
         *(
             Fact("", text, text="plausibility")
-            for text in [*(one.text for one in odd), *[fault] * bool(fault)] or ["no implausible value"]
+            for text in [*(one.text for one in implausible), *[fault] * bool(fault)] or ["no implausible value"]
         ),
         Fact("members_fault", fault or None),
         Fact("speed", slowness() or None, text="speed" if slowness() else None),
@@ -124,7 +124,7 @@ def info(given: Info) -> Report:
             facts += _report_parameters(section, value, units.get(section, ""))
     places = np.array([robot.graph.joints[name].at for name in robot.joint_names])
     notes = []
-    # Drives nearer than 2 % of the machine's size are drawn at one point.
+    # Note drives within 2 % of the machine's size, which the picture shows at one point.
     if given.picture and len(places) > 1 and np.ptp(places, axis=0).max() <= 0.02 * robot.graph.size:
         notes.append(
             f"{', '.join(robot.joint_names)} stand at one point in the picture: give each joint's `at` "
@@ -139,9 +139,9 @@ def info(given: Info) -> Report:
 
 
 def group_reactions(names: Sequence[str]) -> list[str]:
-    """Shorten reactions: what is not determined of each joint, joints that are alike in one line.
+    """Describe undetermined reactions: one line for all joints with the same undetermined components.
 
-    :param names: as :func:`delta_dynamics.reactions` has them, "JOINT: force along DIRECTION".
+    :param names: components of :func:`delta_dynamics.reactions`, "JOINT: force along DIRECTION".
     """
     joints: dict[str, dict[str, list[str]]] = {}
     others = []
@@ -154,7 +154,7 @@ def group_reactions(names: Sequence[str]) -> list[str]:
             others.append(name)
     alike: dict[str, list[str]] = {}
     for joint, kinds in joints.items():
-        words = [f"{kind} {_directions(directions)}".strip() for kind, directions in kinds.items()]
+        words = [f"{kind} {_describe_directions(directions)}".strip() for kind, directions in kinds.items()]
         alike.setdefault(" and ".join(words), []).append(joint)
     lines = []
     for what, joined in alike.items():
@@ -163,7 +163,7 @@ def group_reactions(names: Sequence[str]) -> list[str]:
     return lines + others
 
 
-def _directions(names: list[str]) -> str:
+def _describe_directions(names: list[str]) -> str:
     """Describe the directions of one joint's forces or moments."""
     if len(names) == 3:
         return "in all directions"
@@ -191,5 +191,5 @@ def _list_units(units: dict[str, str]) -> str:
 
 
 def _write_values(values: dict[str, float], units: dict[str, str]) -> str:
-    # Rounded first, so that nothing reads -0.0000.
+    # Round first and add zero, so that no number is written as -0.0000.
     return ", ".join(f"{k} {round(v, 4) + 0.0:.4f} {units[k]}" for k, v in values.items())

@@ -13,7 +13,7 @@ import numpy as np
 
 from pkm_twin.apps.frame import command
 from pkm_twin.apps.options import MotionOptions, OutputOption, PictureOptions, TimedPayloadOptions, payload_fact
-from pkm_twin.console import progress, writing
+from pkm_twin.console import convert_write_errors, draw_progress
 from pkm_twin.files import replace_file
 from pkm_twin.recordings.tables import WRENCH
 from pkm_twin.report import Column, Fact, Report, Table, plots
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from pkm_twin.paths.joint_loads import Summary
     from pkm_twin.recordings import Recording
 
-IDLE: Final = "no life, because the bearing bears a load and does not move"
+STATIC_BEARING_TEXT: Final = "no life, because the bearing bears a load and does not move"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +54,7 @@ def loads(given: Loads) -> Report:
     from pkm_twin.paths.joint_loads import format_spectra, summarise_loads
 
     motion = given.read_motion(given.motion, given.machine())
-    with progress("loads", len(motion.time)) as update, writing(given.out):
+    with draw_progress("loads", len(motion.time)) as update, convert_write_errors(given.out):
         found = summarise_loads(motion, given.bearings, given.out, update)
     if given.spectrum is not None:
         replace_file(given.spectrum, format_spectra(found).encode())
@@ -90,14 +90,14 @@ def loads(given: Loads) -> Report:
                 if open_
                 else []
             ),
-            *([f"{IDLE}: {', '.join(idle)}"] if idle else []),
+            *([f"{STATIC_BEARING_TEXT}: {', '.join(idle)}"] if idle else []),
         ],
         files={"out": given.out, "spectrum": given.spectrum},
     )
 
 
 def describe_joint(load: Summary, exponent: float, duration: float) -> dict[str, Any]:
-    """Return what is reported of one joint, units in the keys."""
+    """Return the reported values of one joint, with units in the keys."""
     open_axes = [axis for axis, good in zip(WRENCH, load.determined, strict=True) if not good]
     entry: dict[str, Any] = {"undetermined": open_axes, "turned_rad": load.turned}
     entry |= {"travelled_m": load.travelled} if load.slides else {}
@@ -181,7 +181,7 @@ def draw(motion: Recording, loads: Sequence[Summary], title: str) -> Any:
     plots.label(counted, x, "range (N)", "load cycles of one component")
     for ax in (force, counted):
         if shown:
-            # Below: beside curves that fill their axes there is no room.
+            # Put the legend below the axes, which the curves fill.
             plots.legend(ax, below=True)
     plots.write_title(figure, title)
     return figure

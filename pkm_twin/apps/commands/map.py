@@ -23,7 +23,7 @@ from pkm_twin.apps.options import (
     ToolOptions,
     payload_fact,
 )
-from pkm_twin.console import numbers, progress, refuse_existing
+from pkm_twin.console import draw_progress, parse_count_of_numbers, reject_existing
 from pkm_twin.errors import ParameterError
 from pkm_twin.extensions import Extensible
 from pkm_twin.files import replace_file
@@ -91,7 +91,7 @@ class MapOptions(PayloadOption, PageOption, OutputOption, PictureOptions, Proces
             name = name.strip() if given else text
             if name in found:
                 raise ParameterError("wrench", text, "another name for each load case")
-            found[name] = kind.loaded(machine, name, numbers(values, 6, WRENCH_HELP))
+            found[name] = kind.loaded(machine, name, parse_count_of_numbers(values, 6, WRENCH_HELP))
         return list(found.values())
 
 
@@ -120,7 +120,7 @@ class Show(PageOption, OverwriteOption, DrawingOptions):
 
 @command()
 def show(given: Show) -> Report:
-    """Show what a stored map answers, with its pictures."""
+    """Report the results of a stored map, with its pictures."""
     return report_stored_map(given.file, given.drawing(""), given.html, given.overwrite)
 
 
@@ -194,16 +194,16 @@ def compute(given: MapOptions) -> Report:
         kind,
         given.points,
         cases=cases,
-        at=None if given.at is None else numbers(given.at, len(names), f"a pose {','.join(names)}"),
+        at=None if given.at is None else parse_count_of_numbers(given.at, len(names), f"a pose {','.join(names)}"),
         least_singularity=given.singularity,
         least_clearance=given.least_clearance,
         regular=given.regular,
     )
     arrays = given.target if given.target.suffix == ".npz" else None
     if arrays is not None:
-        refuse_existing(arrays, given.overwrite)
+        reject_existing(arrays, given.overwrite)
     target = given.target.with_suffix(".nc") if arrays else given.target
-    with first_signal(KeyboardInterrupt), progress(f"{kind.name} of {machine.name}", sweep.points) as update:
+    with first_signal(KeyboardInterrupt), draw_progress(f"{kind.name} of {machine.name}", sweep.points) as update:
         try:
             run(
                 sweep, target, workers=given.jobs, scheduler=given.scheduler, overwrite=given.overwrite, progress=update
@@ -251,7 +251,7 @@ def report_stored_map(file: Path, drawing: Path | None, html: bool, overwrite: b
         page = None
         if html:
             page = (drawing or file).with_suffix(".html")
-            refuse_existing(page, overwrite)
+            reject_existing(page, overwrite)
             write_page(data, page)
         pictures = {name: lambda one=one: one for name, one in drawn.items()}
         return Report(first, facts, figures=pictures, notes=rest, files={"file": file, "page": page})
@@ -286,15 +286,15 @@ class RobotFirstGroup(Group):
     """Group whose commands (kinds) follow the robot: ``map ROBOT KIND``; ``show`` comes first."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Exchange the robot and the kind, so that the kind is the command's name."""
+        """Parse ``ROBOT KIND``: swap both words, so that the kind is the command's name."""
         if args and args[0] not in self.commands:
             alone = len(args) == 1 or args[1].startswith("-")
             options = [word for word in args if word.startswith("-")]
             args = options if alone else [args[1], args[0], *args[2:]]
         return super().parse_args(ctx, args)
 
-    def show(self, name: str) -> str:
-        """Return the name with the robot before it."""
+    def spell_command(self, name: str) -> str:
+        """Return the command's name with the robot's before it."""
         return name if name == "show" else f"ROBOT {name}"
 
 

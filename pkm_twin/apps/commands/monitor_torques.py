@@ -17,7 +17,7 @@ from pkm_twin.ros.signals import first_signal
 from pkm_twin.settings import setting
 from pkm_twin.streams.arrivals import Arrivals
 
-TYPE: Final = "sensor_msgs/msg/JointState"
+TORQUES_TYPE: Final = "sensor_msgs/msg/JointState"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +59,7 @@ def judge(topic: str, arrivals: Arrivals, offer: Offer) -> Report:
     mean = a.ages / count / SECOND if count else None
     beyond = f", {a.silences} beyond it" if a.silences else ""
 
-    def item(name: str, value: Any, unit: str, text: str, words: str, bound: str, good: bool) -> Fact:
+    def fact(name: str, value: Any, unit: str, text: str, words: str, bound: str, good: bool) -> Fact:
         # Without a message the property is unknown.
         verdict = Verdict.UNKNOWN if not count else Verdict.GOOD if good else Verdict.BAD
         return Fact(name, value, unit, text, words if count else "no message", bound, verdict)
@@ -76,15 +76,15 @@ def judge(topic: str, arrivals: Arrivals, offer: Offer) -> Report:
             bound="1 or more",
             verdict=Verdict.GOOD if count else Verdict.BAD,
         ),
-        item("longest_silence_s", silence, "s", "longest gap", f"{1e3 * silence:.1f} ms{beyond}", most, not a.silences),
-        item("oldest_s", oldest, "s", "age on arrival", ages, most, not a.late),
-        item("lost_messages", lost, "", "lost messages", str(lost), "0", not lost),
-        item("faults", dict(a.faults), "", "faults", faults, "none", not a.faults),
+        fact("longest_silence_s", silence, "s", "longest gap", f"{1e3 * silence:.1f} ms{beyond}", most, not a.silences),
+        fact("oldest_s", oldest, "s", "age on arrival", ages, most, not a.late),
+        fact("lost_messages", lost, "", "lost messages", str(lost), "0", not lost),
+        fact("faults", dict(a.faults), "", "faults", faults, "none", not a.faults),
         judged("publishers", str(offer.publishers), "1", offer.publishers == 1),
     ]
     for what, value in (("deadline", offer.deadline), ("lifespan", offer.lifespan)):
         if offer.publishers:
-            # The middleware rounds times to nanoseconds.
+            # Allow for the rounding of times to nanoseconds in the middleware.
             good = value <= a.deadline * (1.0 + 1e-9)
             words = f"{1e3 * value:g} ms" if math.isfinite(value) else "none"
             items.append(judged(f"{what} offered", words, most, good))
@@ -111,7 +111,7 @@ def monitor_torques(given: MonitorTorques) -> Report:
         name = node.resolve_topic_name(given.topic)
         now = node.get_clock().now
 
-        def take(message: Any, info: Any) -> None:
+        def record_message(message: Any, info: Any) -> None:
             try:
                 stamp = stamp_of(message.header)
             except MessageError:
@@ -130,9 +130,9 @@ def monitor_torques(given: MonitorTorques) -> Report:
         try:
             with first_signal(KeyboardInterrupt):
                 while time.monotonic() - began < given.wait or arrivals.count:
-                    subscribed = subscribed or _subscribe(node, name, take)
+                    subscribed = subscribed or _subscribe(node, name, record_message)
                     spin(0.05)
-                    # The offered QoS of the present publishers; None without any.
+                    # Read the QoS that the present publishers offer.
                     profiles = [info.qos_profile for info in node.get_publishers_info_by_topic(name)]
 
                     def find_longest(promises: tuple[Any, ...]) -> float:
@@ -169,15 +169,15 @@ def _subscribe(node: Any, topic: str, take: Any) -> bool:
     infos = node.get_publishers_info_by_topic(topic)
     if not infos:
         return False
-    other = {info.topic_type for info in infos} - {TYPE}
+    other = {info.topic_type for info in infos} - {TORQUES_TYPE}
     if other:
         raise PkmTwinError(
-            f"{topic} carries {', '.join(sorted(other))}; expected a topic of {TYPE}, which has "
+            f"{topic} carries {', '.join(sorted(other))}; expected a topic of {TORQUES_TYPE}, which has "
             "time stamps, for example delta_dynamics/joint_torques"
         )
     reliable, best_effort = ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT
     all_reliable = all(info.qos_profile.reliability == reliable for info in infos)
-    # A deep queue: a stall of this process is no loss of the topic's.
+    # Use a deep queue, so that a stall of this process does not count as lost messages.
     qos = QoSProfile(depth=1000, reliability=reliable if all_reliable else best_effort)
     node.create_subscription(JointState, topic, take, qos)
     return True

@@ -20,7 +20,7 @@ from pkm_twin.apps.options import (
     TableOptions,
     payload_fact,
 )
-from pkm_twin.console import writing
+from pkm_twin.console import convert_write_errors
 from pkm_twin.errors import check_limit
 from pkm_twin.recordings.tables import ENDINGS
 from pkm_twin.report import Column, Fact, Report, Table, plots
@@ -178,7 +178,7 @@ def path(given: Motion) -> Report:
     if given.out is not None:
         s = motion.uniform(given.rate)
         plan = Recording(machine, s.time, s.q, s.qd, s.qdd, s.effort, pose=s.pose, load=carried)
-        with writing(given.out):
+        with convert_write_errors(given.out):
             source = {"source": "pkm-twin path", "law": motion.law}
             write_motion(given.out, plan, source, given.overwrite)
     fine, robot = motion.fine, motion.robot
@@ -223,7 +223,7 @@ def path(given: Motion) -> Report:
         facts.append(Fact("shaper", shaper, text="shaper", shown=words))
     draw: Any = draw_limits
     if cut is not None:
-        more, draw = _report_cut(cut, motion)
+        more, draw = _report_milling(cut, motion)
         facts += more
     # Tables of limits and peaks; with ``soft`` the tolerance bounds the speed, too.
     rows: dict[str, list[Any]] = {}
@@ -316,7 +316,7 @@ def draw_limits(motion: TimedPath, title: str) -> Any:
     return figure
 
 
-def _report_cut(cut: SoftCut, motion: TimedPath) -> tuple[list[Fact], Any]:
+def _report_milling(cut: SoftCut, motion: TimedPath) -> tuple[list[Fact], Any]:
     """Report feed and deflection of a cut with their bounds, and draw them."""
     s, speed, tolerance = motion.fine, cut.feed, cut.tolerance
     deflection, constant_feed = cut.along(s)
@@ -334,7 +334,7 @@ def _report_cut(cut: SoftCut, motion: TimedPath) -> tuple[list[Fact], Any]:
         Fact("tolerance_m", tolerance, "m"),
     ]
 
-    def draw(motion: TimedPath, title: str) -> Any:
+    def draw_feed(motion: TimedPath, title: str) -> Any:
         figure, axes = plots.columns(1, 2)
         curves = (
             (1e3 * s.speed, "feed (mm/s)", 1e3 * speed),
@@ -349,4 +349,4 @@ def _report_cut(cut: SoftCut, motion: TimedPath) -> tuple[list[Fact], Any]:
         plots.write_title(figure, title)
         return figure
 
-    return facts, draw
+    return facts, draw_feed

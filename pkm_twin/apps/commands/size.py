@@ -79,7 +79,7 @@ class Size(TimedPayloadOptions, MotionOptions, SingularityOption, PictureOptions
 
 @command("Torques, paths and drives")
 def size(given: Size) -> Report:
-    """Compute what each drive must give, and which motors can."""
+    """Compute the duty of each drive, and the motors that suffice."""
     from pkm_twin.paths.along import EFFORT_TOLERANCE
     from pkm_twin.paths.sizing import find_smallest, net_energy, read_motors, size_drives
 
@@ -164,7 +164,7 @@ def size(given: Size) -> Report:
 def read_gear_options(given: Size, robot: Robot) -> tuple[list[Gear], list[Gears]]:
     """Return the gears of the joints, and those to choose from.
 
-    :raises ParameterError: numbers that no gear has.
+    :raises ParameterError: a ratio, inertia or efficiency is out of range.
     """
     from pkm_twin.machine.sections import MAX_LEAD
     from pkm_twin.paths.sizing import Gear, Gears, read_gears

@@ -19,7 +19,7 @@ from pkm_twin.apps.options import (
     TimedPayloadOptions,
     payload_fact,
 )
-from pkm_twin.console import progress, writing
+from pkm_twin.console import convert_write_errors, draw_progress
 from pkm_twin.recordings.tables import ENDINGS, check_target, write_table
 from pkm_twin.report import Column, Fact, Report, Table, plots
 from pkm_twin.settings import setting
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from pkm_twin.recordings import Recording
     from pkm_twin.robot.robot import Robot
 
-RESTING: Final = ("gravity", "payload", "friction", "external", "preload")
+TERMS_AT_REST: Final = ("gravity", "payload", "friction", "external", "preload")
 """Terms of an effort that can differ from zero at rest."""
 
 
@@ -66,10 +66,10 @@ class Torques(TimedPayloadOptions, MotionOptions, PoseOption, OutputOption, Pict
         if self.out is None and self.at is None:
             object.__setattr__(self, "out", Path("torques.csv"))
 
-    def resting(self, machine: Robot) -> Recording:
+    def make_resting_recording(self, machine: Robot) -> Recording:
         """Return a motion of one sample at rest at the pose.
 
-        :raises PkmTwinError: out of reach or of limits.
+        :raises PkmTwinError: the pose is out of reach or beyond the joint limits.
         """
         from pkm_twin.recordings import Recording
 
@@ -92,16 +92,16 @@ def torques(given: Torques) -> Report:
     if given.motion is None:
         if given.picture is not None or given.load_times is not None:
             raise click.UsageError("--picture and --load-times need a recording or path")
-        motion = given.resting(given.machine())
+        motion = given.make_resting_recording(given.machine())
     else:
         if given.wrench is not None:
             raise click.UsageError("--wrench needs --at; a motion has it in columns fx ... mz")
         motion = given.read_motion(given.motion, given.machine())
     beyond = given.list_beyond_limits(motion.robot, motion.q, motion.qd)
-    with progress("torques", len(motion.time)) as update:
+    with draw_progress("torques", len(motion.time)) as update:
         columns = torque_table(motion, update)
     if given.out is not None:
-        with writing(given.out):
+        with convert_write_errors(given.out):
             write_table(columns, given.out)
     robot, time = motion.robot, columns["time"]
     efforts = np.stack([columns[f"{joint}.effort"] for joint in robot.joint_names], -1)
@@ -128,8 +128,8 @@ def torques(given: Torques) -> Report:
         ]
     else:
         answer += "rest"
-        shown = [Column(name) for name in ("effort", "unit", *RESTING)]
-        terms = {joint: [columns[f"{joint}.effort_{t}"].item() for t in RESTING] for joint in rows}
+        shown = [Column(name) for name in ("effort", "unit", *TERMS_AT_REST)]
+        terms = {joint: [columns[f"{joint}.effort_{t}"].item() for t in TERMS_AT_REST] for joint in rows}
         rows = {joint: [rows[joint][1], units[joint], *terms[joint]] for joint in rows}
     if over:
         bounds = (f"{one.joint} {abs(one.value):.4g} of {one.high:g} {one.unit}" for one in over)

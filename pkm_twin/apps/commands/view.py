@@ -14,7 +14,7 @@ import click
 
 from pkm_twin.apps.frame import command
 from pkm_twin.apps.options import RecordingOptions, TimedPayloadOptions
-from pkm_twin.console import progress
+from pkm_twin.console import draw_progress
 from pkm_twin.report import Report
 from pkm_twin.settings import setting
 
@@ -45,7 +45,7 @@ def view(given: View) -> Report:
 
     :raises PkmTwinError: a recording that cannot be read, or a port that is not free.
     """
-    from pkm_twin.errors import require
+    from pkm_twin.errors import import_extra
 
     bag = given.bag
     if bag is None and (given.topic or given.load is not None):
@@ -54,7 +54,7 @@ def view(given: View) -> Report:
         raise click.UsageError("give --bag or --live, not both")
     if given.namespace and not given.live:
         raise click.UsageError("--namespace needs --live")
-    require("viser", "view")
+    import_extra("viser", "view")
     from pkm_twin import load
     from pkm_twin.view.live import Live
     from pkm_twin.view.model import Model
@@ -67,7 +67,7 @@ def view(given: View) -> Report:
         machine = load(given.robot, **given.part)
         timeline = None
         if bag is not None:
-            with progress("reading", None) as update:
+            with draw_progress("reading", None) as update:
                 timeline = Timeline.from_recording(given.read(bag, given.robot, update, limited=True))
         model = Model(machine)
         server = stack.enter_context(run_server(given.port))

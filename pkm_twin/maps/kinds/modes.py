@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.errors import require
+from pkm_twin.errors import import_extra
 from pkm_twin.machine.graph import BASE
 from pkm_twin.maps.kind import NON_NEGATIVE, UNIT_INTERVAL, Case, Space, Variable, describe
 from pkm_twin.maps.kinds.frequency import Frequency
@@ -112,7 +112,7 @@ class Modes(Frequency):
     @classmethod
     def page(cls, data: Dataset) -> Any:
         """Return a figure of the frame at rest and in a mode, with menu and animation."""
-        graph = require("plotly.graph_objects", "maps")
+        graph = import_extra("plotly.graph_objects", "maps")
         from pkm_twin.maps.page import BAR, CAMERA, MARGIN, MENU, make_button
 
         # All lines as one path, with -1 between lines that do not meet.
