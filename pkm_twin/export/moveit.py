@@ -147,8 +147,8 @@ def _template_words(robot: Robot, package: str) -> dict[str, str]:
             f"  {{{write_cpp_string(joint)}, {write_cpp_number(low)}, {write_cpp_number(high)}}},"
             for joint, (low, high) in drives
         ),
-        "MAX_POSITION_ERROR": f"{MAX_POSITION_ERROR:g}",
-        "MAX_ROTATION_ERROR": f"{MAX_ROTATION_ERROR:g}",
+        "POSITION": f"{MAX_POSITION_ERROR:g}",
+        "ORIENTATION": f"{MAX_ROTATION_ERROR:g}",
         "SINGULARITY": f"{MIN_SINGULARITY_INDEX:g}",
     }
 

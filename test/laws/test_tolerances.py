@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pkm_twin import variants
-from pkm_twin.certify.description import across
+from pkm_twin.certify.description import make_perpendicular_axes
 from pkm_twin.certify.maximal import Maximal, rotation_of
 from pkm_twin.design import drawn, tolerances
 from pkm_twin.design.parts import Assembly, find_part
@@ -104,7 +104,7 @@ def with_drives(data, path):
         made["bodies"]["half"] = CARRIER
         carrier = drive("half", "prismatic", a, along)
         inner, outer = entry["between"]
-        made["joints"]["rod foot"] = {"type": "universal", "between": [inner, "half"], "at": a, "axes": across(along)}
+        made["joints"]["rod foot"] = {"type": "universal", "between": [inner, "half"], "at": a, "axes": make_perpendicular_axes(along)}
         made["joints"]["rod head"] = {"type": "spherical", "between": [carrier, outer], "at": b}
     else:
         start, *others = towards(data, name)
