@@ -104,7 +104,12 @@ def with_drives(data, path):
         made["bodies"]["half"] = CARRIER
         carrier = drive("half", "prismatic", a, along)
         inner, outer = entry["between"]
-        made["joints"]["rod foot"] = {"type": "universal", "between": [inner, "half"], "at": a, "axes": make_perpendicular_axes(along)}
+        made["joints"]["rod foot"] = {
+            "type": "universal",
+            "between": [inner, "half"],
+            "at": a,
+            "axes": make_perpendicular_axes(along),
+        }
         made["joints"]["rod head"] = {"type": "spherical", "between": [carrier, outer], "at": b}
     else:
         start, *others = towards(data, name)
