@@ -15,6 +15,7 @@ from pkm_twin.identification.judge import ALL
 from pkm_twin.identification.rows import Rows
 from pkm_twin.identification.samples import Motion
 from pkm_twin.identification.suspects import DELAY, GAIN, OFF, Lengths, errors_of
+from pkm_twin.identification.words import USUAL_SCALE
 from pkm_twin.machine.friction import list_reversal_keys
 
 MASS_ERROR: Final = 0.3
@@ -31,8 +32,8 @@ class Columns:
 
     ``certain``: efforts by the file's values, (k, n); ``columns``: derivatives, (k, n, c).
     ``fast``, ``fast_certain``: their parts that grow with the square of the rate of time.
-    ``deviation``: of the prior; ``low``: least value, less the file's; ``kinds``: friction, masses,
-    payload, offset or error, (c,) each.
+    ``deviation``: of the prior; ``low``, ``high``: least and greatest value, less the file's;
+    ``kinds``: friction, masses, payload, offset or error, (c,) each.
     """
 
     rows: Rows
@@ -42,6 +43,7 @@ class Columns:
     fast: Array
     deviation: Array
     low: Array
+    high: Array
     kinds: tuple[str, ...]
     turning: Mask
     """Friction, whose sign is that of the velocity, (c,)."""
@@ -77,12 +79,14 @@ class Columns:
         kinds += ["error"] * (len(lengths.suspects) + len(gains))
         more = np.concatenate(tables, -1)
         count = more.shape[-1]
+        scales = np.arange(count) >= count - len(gains)
         return replace(
             numbers,
             columns=np.concatenate([numbers.columns, more], -1),
             fast=np.concatenate([numbers.fast, 0.0 * more], -1),
             deviation=np.concatenate([numbers.deviation, deviation]),
-            low=np.concatenate([numbers.low, np.full(count, -np.inf)]),
+            low=np.concatenate([numbers.low, np.where(scales, 1.0 - USUAL_SCALE, -np.inf)]),
+            high=np.concatenate([numbers.high, np.where(scales, 1.0 - 1.0 / USUAL_SCALE, np.inf)]),
             kinds=(*numbers.kinds, *kinds),
             turning=np.concatenate([numbers.turning, np.zeros(count, np.bool_)]),
             gains=len(gains),
@@ -183,6 +187,7 @@ def _differentiate(rows: Rows, table: Array, rest: Array, motion: Motion) -> Col
         np.concatenate(fast, -1),
         np.array(deviation),
         np.array(low),
+        np.full(len(low), np.inf),
         tuple(kinds),
         np.array(turning),
     )

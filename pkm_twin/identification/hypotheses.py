@@ -28,6 +28,7 @@ from pkm_twin.identification.judge import ALTERNATIVE, SIGMAS
 from pkm_twin.identification.parameters import file_parameters
 from pkm_twin.identification.rows import LARGEST, Rows, rows_of
 from pkm_twin.identification.samples import Motion, held_payload
+from pkm_twin.identification.suspects import OFF
 from pkm_twin.identification.words import LATEST, UNITS, late_text, listed, position_text, scale_text, usual_scale
 from pkm_twin.messages.reading import rotate_to_base
 from pkm_twin.recordings import Load, Recording
@@ -169,31 +170,33 @@ class Search:
         odds = tuple(np.exp(np.array(logs) - log).tolist())
         return Hypothesis(text, log - price, found[best], classes[best], classes=odds)
 
-    def _find_logs(self, model: Model, name: str, bounded: bool) -> Array:
-        """Return a class's log evidence at each share, less what possible numbers cost."""
+    def _find_widths(self, name: str) -> Array:
+        """Return factors on the prior's deviations in a class, (c,)."""
         kinds = np.array(self.columns.kinds)
         free = ~np.isin(kinds, ("friction", "masses", "payload")) | np.isin(kinds, name.split())
         # Numbers that are as the file's are so within a tenth of the prior's deviations.
-        wide = np.where(free, 1.0, 0.1)
-        wide = np.where((kinds == "payload") & ("heavy" in name), HEAVY, wide)
-        model = model.widened(wide)
+        return np.where((kinds == "payload") & ("heavy" in name), HEAVY, np.where(free, 1.0, 0.1))
+
+    def _find_logs(self, model: Model, name: str, bounded: bool) -> Array:
+        """Return a class's log evidence at each share, less what possible numbers cost."""
+        model = model.widened(self._find_widths(name))
         used = np.ones(len(model.deviation), np.bool_)
         logs = model.logs(used)
-        low = self.columns.low
-        bound = np.isfinite(low) & (model.deviation > 0.0)
+        low, high = self.columns.low, self.columns.high
+        bound = (np.isfinite(low) | np.isfinite(high)) & (model.deviation > 0.0)
         if not bounded or not bound.any():
             return logs
         for k in np.flatnonzero(logs > logs.max() - 2.0 * ODDS):
             mean, inner = model.posterior_at(int(k), used)
             mean = mean[bound] * model.deviation[bound]
-            if (mean >= low[bound]).all():
+            if (mean >= low[bound]).all() and (mean <= high[bound]).all():
                 continue
             inner = inner[np.ix_(bound, bound)] * np.outer(model.deviation[bound], model.deviation[bound])
             size = np.maximum(np.sqrt(np.diag(inner)), 1e-150)
             root = np.linalg.cholesky(inner / np.outer(size, size) + 1e-9 * np.eye(len(size)))
-            back = scipy.linalg.solve_triangular(root, np.eye(len(size)), lower=True) / size
-            aim = back @ (mean - low[bound])
-            logs[k] -= 0.5 * scipy.optimize.nnls(back * size, aim)[1] ** 2
+            back = scipy.linalg.solve_triangular(root, np.eye(len(size)), lower=True)
+            limits = low[bound] / size, high[bound] / size
+            logs[k] -= scipy.optimize.lsq_linear(back, back @ (mean / size), limits, method="bvls").cost
         return logs
 
     @cached_property
@@ -203,9 +206,10 @@ class Search:
             # No cause can gain what it costs.
             return [self.sound]
         found = [self.sound, *self._weigh_efforts(), *self._weigh_delays(), *self._weigh_loads()]
-        best = max(found, key=lambda one: one.log)
+        best, *others = sorted(found, key=lambda one: -one.log)
         pushed = self.rows.recording.wrench is not None and self.rows.recording.wrench.any()
-        if best.share > SHARES[0] or best.log > self.sound.log + ODDS or pushed:
+        clearly_sound = best is self.sound and best.share <= SHARES[0] and others[0].log < best.log - ODDS
+        if pushed or not clearly_sound:
             found += self._weigh_positions()
         return sorted(found, key=lambda one: -one.log)
 
@@ -278,14 +282,15 @@ class Search:
                     size /= 1.0 - size * own
                 yield replace(one, text=scale_text(names, size), scale=size if which.all() else 1.0)
 
-    def _find_gains(self, gains: Array | None = None, kinds: str = "") -> tuple[Array, Array]:
+    def _find_gains(self, gains: Array | None = None, kinds: str = "", usual: float = 1.0) -> tuple[Array, Array]:
         """Return each joint's gain, a part of its efforts, beside a delay; its deviation.
 
         :param gains: factors that multiply the model's efforts. ``kinds``: numbers estimated too.
+            ``usual``: prior deviation of a gain.
         """
         c, n = self.columns, len(self.joints)
         used = np.arange(len(c.kinds)) >= len(c.kinds) - c.gains
-        deviation = np.where(used, 1.0, c.deviation)
+        deviation = np.where(used, usual, c.deviation)
         used |= np.isin(c.kinds, kinds.split())
         used[self.late] = True
         model = Model.of([self.spectra], [np.arange(len(used))], deviation, SHARES, gains)
@@ -388,9 +393,9 @@ class Search:
             and scaled.share <= 0.12
             and abs(scaled.log - sound.log) <= ODDS >= best.log - scaled.log
         ):
-            told = self._tell_scale(scaled.scale, scaled.kinds)
-            if told is not None:
-                return told
+            text, _ = self._tell_scale(scaled.scale, scaled.kinds)
+            if text:
+                return Explanation(text, not usual_scale(scaled.scale))
             best = next(one for one in self.all if one is not scaled)
         if best.text and best.log - sound.log > ODDS:
             if best.text == NO_MACHINE or best.share > 0.12:
@@ -403,17 +408,17 @@ class Search:
             return Explanation(unknown, fault=True)
         gains, deviations = self._find_gains()
         j, mean = int(np.abs(gains).argmax()), float(gains.mean())
-        clear = 0.0
-        for kinds, part in zip(CLASSES, sound.classes, strict=True):
-            each, sizes = self._find_gains(kinds=kinds) if part > 1e-3 else (0.0 * gains, deviations)
-            # A gain of 10 %, two usual deviations, is named.
-            clear += part * bool(abs(each[j]) > 0.1 + SIGMAS * sizes[j])
-        if not sound.kinds and clear > CERTAIN:
-            if (np.abs(gains - mean) < 0.5 * abs(mean)).all():
-                told = self._tell_scale(1.0 / (1.0 - mean))
-                return told or Explanation("")
-            scale = 1.0 / (1.0 - float(gains[j]))
-            return Explanation(scale_text(self.joints[j], scale), not usual_scale(scale))
+        # A gain of 10 %, two usual deviations, is named.
+        if not sound.kinds and abs(gains[j]) > 2.0 * OFF + SIGMAS * deviations[j]:
+            if (np.abs(gains - mean) >= 0.5 * abs(mean)).any():
+                scale = 1.0 / (1.0 - float(gains[j]))
+                return Explanation(scale_text(self.joints[j], scale), not usual_scale(scale))
+            # A payload and friction look like it in slow motions, where the file has no friction.
+            beside, _ = self._find_gains(kinds="friction payload", usual=OFF)
+            scale = 1.0 / (1.0 - mean)
+            text, clear = self._tell_scale(scale)
+            if clear or abs(beside[j]) > 2.0 * OFF:
+                return Explanation(text, clear and not usual_scale(scale))
         if sound.kinds in ("payload", "heavy payload") and self.rows.recording.load is None:
             held = self._weigh_payload(self.spectra, 0.0)
             return Explanation(held.text, load=held.load)
@@ -429,8 +434,8 @@ class Search:
         order = np.argsort(-parts)[:LISTED].tolist()
         return tuple((found[k][0], float(parts[k])) for k in order if parts[k] > 1e-6)
 
-    def _tell_scale(self, scale: float, kinds: str = "") -> Explanation | None:
-        """Return that all efforts are scaled; None where heavier masses explain them better.
+    def _tell_scale(self, scale: float, kinds: str = "") -> tuple[str, bool]:
+        """Say that all efforts are scaled, nothing where heavier masses explain them better, and whether it is clear.
 
         A heavier machine has the friction of its file, efforts of another scale have not. Friction
         may be less than the other hypotheses' discrepancy of 1 %. Where it is not the file's both are
@@ -448,11 +453,11 @@ class Search:
         model = Model.of([spectra], [places], deviation)
         masses, efforts = (model.log_evidence(places != len(beside) + k) for k in (0, 1))
         if "friction" not in kinds and masses > efforts + ALTERNATIVE:
-            return None
+            return "", False
         clear = "friction" not in kinds and efforts > masses + ALTERNATIVE
         others = [] if clear else [f"all masses are {scale:.3g} times the file's"]
         names = listed([*self.joints], len(self.joints))
-        return Explanation(scale_text(names, scale, *others), not usual_scale(scale))
+        return scale_text(names, scale, *others), clear
 
     def _weigh_positions(self) -> Iterator[Hypothesis]:
         """Weigh other positions, with the efforts as they are or turned alike, and wrenches."""

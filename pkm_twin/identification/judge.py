@@ -370,23 +370,17 @@ class Fitted:
         """Return the numbers' mean, and their covariance about it over all sets of kinds of errors.
 
         The mean is that of the found errors: numbers that are used without the others predict best.
-        Errors that are known to be there, such as those of lengths, are in all sets. The sets are
-        weighed by all rows, as errors are selected; each set's numbers are those of the fitted rows.
+        Errors that are known to be there, such as those of lengths, and those that are as likely as
+        not are in all sets. The sets are weighed by all rows, as errors are selected; each set's
+        numbers are those of the fitted rows.
 
         :param used: columns of the found errors: their shares of the discrepancy are taken.
         """
         kinds: list[list[int]] = list(self.kinds.values())
-        always = self.with_columns(self.certain, self.known)
+        always = self.with_columns(self.certain, [*self.known, *(k for one in chosen for k in one.places)])
         usual = {*self.known, *(k for own in kinds for k in own)}
-        rare = [
-            [*one.places, *(k for other in one.others for k in other if k not in usual)]
-            for one in chosen
-            if not usual & set(one.places)
-        ]
-        # Three may be absent; more are taken for certain.
-        kinds += rare[:3]
-        for places in rare[3:]:
-            always[places] = True
+        others = [[k for other in one.others for k in other if k not in usual] for one in chosen]
+        kinds += [own for own in others if own][:3]
         shares, all_shares = self.model.logs(used), self.whole.logs(used)
         logs, masks = [], []
         for which in product((False, True), repeat=len(kinds)):
