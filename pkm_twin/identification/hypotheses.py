@@ -413,11 +413,11 @@ class Search:
             if (np.abs(gains - mean) >= 0.5 * abs(mean)).any():
                 scale = 1.0 / (1.0 - float(gains[j]))
                 return Explanation(scale_text(self.joints[j], scale), not usual_scale(scale))
-            # A payload and friction look like it in slow motions, where the file has no friction.
+            # Of all drives it must be there beside a payload and friction too: they look like it in slow motions.
             beside, _ = self._find_gains(kinds="friction payload", usual=OFF)
-            scale = 1.0 / (1.0 - mean)
-            text, clear = self._tell_scale(scale)
-            if clear or abs(beside[j]) > 2.0 * OFF:
+            if abs(beside[j]) > 2.0 * OFF:
+                scale = 1.0 / (1.0 - mean)
+                text, clear = self._tell_scale(scale)
                 return Explanation(text, clear and not usual_scale(scale))
         if sound.kinds in ("payload", "heavy payload") and self.rows.recording.load is None:
             held = self._weigh_payload(self.spectra, 0.0)
