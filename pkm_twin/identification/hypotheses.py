@@ -413,11 +413,11 @@ class Search:
             if (np.abs(gains - mean) >= 0.5 * abs(mean)).any():
                 scale = 1.0 / (1.0 - float(gains[j]))
                 return Explanation(scale_text(self.joints[j], scale), not usual_scale(scale))
-            # Of all drives it must be there beside a payload and friction too: they look like it in slow motions.
+            # A payload and friction that the file does not have look like it in slow motions.
             beside, _ = self._find_gains(kinds="friction payload", usual=OFF)
-            if abs(beside[j]) > 2.0 * OFF:
-                scale = 1.0 / (1.0 - mean)
-                text, clear = self._tell_scale(scale)
+            scale = 1.0 / (1.0 - mean)
+            text, clear = self._tell_scale(scale)
+            if clear or abs(beside[j]) > 2.0 * OFF:
                 return Explanation(text, clear and not usual_scale(scale))
         if sound.kinds in ("payload", "heavy payload") and self.rows.recording.load is None:
             held = self._weigh_payload(self.spectra, 0.0)
@@ -454,7 +454,9 @@ class Search:
         masses, efforts = (model.log_evidence(places != len(beside) + k) for k in (0, 1))
         if "friction" not in kinds and masses > efforts + ALTERNATIVE:
             return "", False
-        clear = "friction" not in kinds and efforts > masses + ALTERNATIVE
+        # The file's friction tells them apart only where nothing else is left of the efforts.
+        left = model.posterior(places != len(beside) + 1).share
+        clear = "friction" not in kinds and efforts > masses + ALTERNATIVE and left <= SHARES[0]
         others = [] if clear else [f"all masses are {scale:.3g} times the file's"]
         names = listed([*self.joints], len(self.joints))
         return scale_text(names, scale, *others), clear
