@@ -173,7 +173,7 @@ def test_the_ratio_of_least_motor_torque_is_that_of_brute_force(picking):
     for k, step in ((2, 1e-5), (3, 1e-10)):
         values = np.tile([20.0, length, 0.8, 9e-6], (2, 1))
         values[:, k] += [step, -step]
-        ahead, behind = quantity.pieces(PathMotion(f.many.with_values(values), path))
+        ahead, behind = quantity.pieces(PathMotion(f.machines.with_values(values), path))
         np.testing.assert_allclose(slopes[:, k], (ahead - behind) / (2 * step), rtol=1e-5)
     with pytest.raises(ParameterError, match="drive"):
         design(load("delta"), BOX, path, "motor-torque", starts=4)
