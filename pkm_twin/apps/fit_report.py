@@ -33,7 +33,7 @@ def report_fit(result: Result, marks: Sequence[str] = ()) -> tuple[Report, list[
     units = dict(zip(result.channels, result.units, strict=True))
     own = tuple(units[channel.name] for channel in verdict.channels)
     shown = [n for n in result.numbers if n.status != "not excited"]
-    idle = [label(n) for n in result.of("not excited")]
+    idle = [label(n) for n in result.list_numbers("not excited")]
     # RMS residuals before and after the fit, measured peak, and unit of each measured channel.
     held = {}
     for judged in result.judged:
@@ -59,7 +59,7 @@ def report_fit(result: Result, marks: Sequence[str] = ()) -> tuple[Report, list[
         names = tuple(map(_element_name, result.numbers))
         facts = _report_elastic(result)
         more = list(map(_describe_group, result.groups))
-    notes = [*marks, *verdict.lines(own), *more]
+    notes = [*marks, *verdict.list_sentences(own), *more]
     if idle:
         notes.append(f"not excited, the file's value stays: {', '.join(idle)}")
     if e.bound:
@@ -118,7 +118,7 @@ def report_fit(result: Result, marks: Sequence[str] = ()) -> tuple[Report, list[
             Fact("verdict", verdict.as_json(own)),
             Fact("accepted", result.accepted),
             Fact("condition", e.condition, text="condition number"),
-            Fact("combinations_determined", result.combinations, text="combinations identified"),
+            Fact("combinations_determined", result.identifiable_count, text="combinations identified"),
             Fact("held_by_a_physical_bound", bool(e.bound)),
             Fact("samples_fitted", result.samples),
             Fact("parameters", parameters),

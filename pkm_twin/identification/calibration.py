@@ -22,8 +22,8 @@ from pkm_twin.design.tolerance import Tolerances, is_play, tolerances, workspace
 from pkm_twin.design.variants import Variants
 from pkm_twin.errors import ParameterError, PkmTwinError, UnreachableError
 from pkm_twin.identification.calibration_fit import (
-    HALF,
-    MOVED,
+    MAX_COST_RATIO,
+    MIN_COST_SAVING,
     Fault,
     Fitted,
     Outlier,
@@ -185,7 +185,7 @@ class Scale(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Calibration(Estimate):
-    """A robot that was calibrated."""
+    """Result of a kinematic calibration: the fitted parameters and the robot with them."""
 
     instrument: Instrument
     agreements: tuple[Agreement, ...]
@@ -207,7 +207,7 @@ class Calibration(Estimate):
 
     @property
     def joint_map(self) -> JointMap:
-        """With the fitted numbers."""
+        """Return the joint map with the fitted values."""
         return self.instrument.map
 
     def fitted(self, robot: Robot, source: str) -> dict[str, FittedNumber]:
@@ -325,7 +325,7 @@ def unknowns(robot: Robot, measured: Measured, paths: Sequence[str], free: Free)
     fitted = [(path, *known[path]) for path in paths if path not in homes]
     parameters = [Parameter(path, unit, value, prior if unit == "m" else angle) for path, value, unit in fitted]
     parameters += mapped
-    # Where the instrument stands is not known at all.
+    # Nothing is known of the instrument's place: the prior is 100 machine sizes and 10 rad wide.
     far = 100.0 * robot.engine.tree.size
     for name in [*(FRAME if free.frame else ()), *(TARGET if free.target else ())]:
         turns = name[-2] == "r"
@@ -340,7 +340,7 @@ def placed(robot: Robot, measured: Measured, paths: Sequence[str], frame: bool =
     for one in measured.readings:
         if frame and one.kind is PLACE:
             place_frame(state, one.values)
-        state.instrument.own |= one.kind.begin(one.seen(state)[0], one.values[:, 0])
+        state.instrument.own |= one.kind.begin(one.compute_poses(state)[0], one.values[:, 0])
     return state
 
 
@@ -374,8 +374,8 @@ def calibrate(
         learnt, apart = (whole_of(poses, np.flatnonzero(rows)) for rows in (~held, held))
     fit_of = partial(_calibrated, robot, learnt, apart, paths, progress)
 
-    def other_place() -> Calibration | None:
-        """Return the machine with the instrument's frame; None where that is no machine either."""
+    def calibrate_with_frame() -> Calibration | None:
+        """Repeat the calibration with the instrument's frame free; return None if it is rejected too."""
         if free.frame or apart is None:
             return None
         try:
@@ -387,17 +387,17 @@ def calibrate(
     try:
         result = fit_of(free)
     except (UnsettledError, UnreachableError) as error:
-        other = other_place()
+        other = calibrate_with_frame()
         if other is None:
             raise
         raise RejectedPosesError(place_fault(other.instrument)) from error
     # Ratios that are a little off look like a shift of the instrument.
-    saved = MOVED * (1 + sum(p.name.endswith(".ratio") for p in result.parameters))
+    saved = MIN_COST_SAVING * (1 + sum(p.name.endswith(".ratio") for p in result.parameters))
     if result.faults or result.cost > saved or result.placed:
-        other = other_place()
+        other = calibrate_with_frame()
         if other is not None and (
             result.faults
-            or (result.cost - other.cost > saved and other.cost < HALF * result.cost)
+            or (result.cost - other.cost > saved and other.cost < MAX_COST_RATIO * result.cost)
             or other.agreements[0].noise < 0.5 * result.agreements[0].noise
         ):
             result = replace(result, faults=(place_fault(other.instrument), *result.faults))
@@ -437,7 +437,7 @@ def _calibrated(
     covariance, steps = found.covariance, found.steps
     deviations = np.sqrt(np.diag(covariance)).tolist()
     told = [replace(p, deviation=d) for p, d in zip(parameters, deviations, strict=True)]
-    scale, told, row = _scaled(robot, found.state, learnt, told, covariance)
+    scale, told, row = _judge_scale(robot, found.state, learnt, told, covariance)
     if scale is not None and not scale.determined:
         near = [
             replace(p, prior=KEPT * p.prior)
@@ -449,7 +449,7 @@ def _calibrated(
         steps += found.steps
     told = [replace(p, value=float(v)) for p, v in zip(told, found.values, strict=True)]
     built = robot.with_file_values(found.state.numbers)
-    agreements, outliers = _compared(robot, built, learnt, apart, before, found, parameters)
+    agreements, outliers = _compare_measurements(robot, built, learnt, apart, before, found, parameters)
     changes = [p for p in told if p.name not in (*FRAME, *TARGET, *learnt.own)]
     count = len({k for m in (learnt, apart) if m for one in m.readings for k in one.lines.tolist()})
     left = [(one.unit, one.noise) for one in agreements]
@@ -481,7 +481,7 @@ def _calibrated(
     )
 
 
-def _compared(
+def _compare_measurements(
     robot: Robot,
     built: Robot,
     learnt: Measured,
@@ -499,7 +499,7 @@ def _compared(
         held = old, [part / one[:, None] for part, one in zip(new, left, strict=True)]
     else:
         pairs = (robot, before), (built, found.state)
-        first, last = (apart.parts(state.at(machine, apart.joints)) for machine, state in pairs)
+        first, last = (apart.parts(state.evaluate_at(machine, apart.joints)) for machine, state in pairs)
         held, readings, parts = (first, last), (*readings, *apart.readings), [*new, *last]
     outliers = outliers_of(readings, parts, noise * (len(readings) // len(noise)))
     bad = [one.line for one in outliers]
@@ -530,14 +530,14 @@ def _looks_placed(robot: Robot, measured: Measured, found: Fitted, told: Sequenc
     return float(left[1] @ left[1]) < 0.8 * float(left[0] @ left[0])
 
 
-def _scaled(
+def _judge_scale(
     robot: Robot, state: State, measured: Measured, told: list[Parameter], covariance: Array
 ) -> tuple[Scale | None, list[Parameter], Array | None]:
     """How well the scale is known, and the numbers with those marked that depend on it alone.
 
     And the scale's derivatives, where it is not determined.
     """
-    lines = line_slopes(robot, state.between(measured.joints, POSES), [p.name for p in told])
+    lines = line_slopes(robot, state.sample_between(measured.joints, POSES), [p.name for p in told])
     if lines is None:
         return None, told, None
     row = lines.scale

@@ -30,11 +30,14 @@ STEPS: Final = 60
 """Most steps of a fit."""
 MAX_CHANGE: Final = 5.0
 """Prior standard deviations by which no number changes."""
-MOVED: Final = 14.0
-"""Squares of prior standard deviations, summed over all numbers, that another place of the
-instrument must save: with sound priors six free numbers save so much in 3 of 100 cases."""
-HALF: Final = 0.5
-"""And the part of all squares below which they then are: an error of the model saves a few too."""
+MIN_COST_SAVING: Final = 14.0
+"""Least reduction of the cost by a free frame of the instrument at which the frame is the cause.
+
+The cost is the sum of squared parameter changes over their prior standard deviations. By chance
+six free numbers reduce it by so much in 3 of 100 cases."""
+MAX_COST_RATIO: Final = 0.5
+"""Largest ratio of the cost with the instrument's frame free to the cost without, at which the
+frame is the cause: a model error that is not the frame's is also reduced, but by less."""
 MAX_OUTLIERS: Final = 0.25
 """Part of the poses that may be outliers."""
 

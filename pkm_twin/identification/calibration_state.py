@@ -48,7 +48,7 @@ class Poses:
     rotation: Array | None = None
 
     def part(self, rows: Mask) -> Poses:
-        """Return some of the measurements."""
+        """Return the measurements that a mask selects, (k,)."""
         turned = None if self.rotation is None else self.rotation[rows]
         return Poses(self.joints[rows], self.position[rows], turned)
 
@@ -64,7 +64,7 @@ class Instrument:
     own: dict[str, float] = field(default_factory=dict)
     """Numbers of single measurements, such as a plane's height, by name."""
 
-    def seen(self, position: Array, rotation: Array) -> tuple[Array, Array]:
+    def compute_reading(self, position: Array, rotation: Array) -> tuple[Array, Array]:
         """Compute what the instrument should see: positions and rotations in its own frame."""
         turn = self.frame.as_matrix()
         return self.place + (position + rotation @ self.target) @ turn.T, turn @ rotation
@@ -83,12 +83,15 @@ class State:
     platform: tuple[Array, Array]
     instrument: Instrument
 
-    def at(self, robot: Robot, joints: Array) -> State:
-        """Return the state at other measurements, of a loaded robot with these numbers."""
+    def evaluate_at(self, robot: Robot, joints: Array) -> State:
+        """Return the state at other measured joint positions.
+
+        :param robot: loaded with the current parameter values. ``joints``: controller units, (k, n).
+        """
         q = self.instrument.map.positions(joints)
         return replace(self, q=q, platform=robot.platform(q))
 
-    def between(self, joints: Array, count: int) -> State:
+    def sample_between(self, joints: Array, count: int) -> State:
         """Return the same at up to ``count`` new joint states on lines between measured ones."""
         rng = np.random.default_rng(0)
         first, second = rng.integers(len(joints), size=(2, count))

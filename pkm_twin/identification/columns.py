@@ -51,13 +51,13 @@ class Columns:
     """Number of gain columns, which stand last: one for each joint, and one for all joints."""
 
     @classmethod
-    def of(cls, rows: Rows) -> Columns:
+    def from_rows(cls, rows: Rows) -> Columns:
         """Return the model of the recorded motion, with the usual errors."""
         numbers = _differentiate(rows, rows.table, rows.rest, rows.signals.motion)
         size = np.maximum(np.sqrt(np.mean(rows.effort**2, 0)), 1e-300)
         values = rows.model.parameters.values
         errors, _ = errors_of(rows, values)
-        lengths = Lengths.of(rows.model.robot)
+        lengths = Lengths.from_robot(rows.model.robot)
         tables = [
             -rows.change[..., None],
             np.broadcast_to(np.eye(len(size)), (*rows.effort.shape, len(size))),
@@ -128,7 +128,7 @@ class Columns:
         """Return the statistics of some rows, with other efforts, or time at another rate."""
         r, s, more = self.rows, self.rows.signals, rate**2 - 1.0
         joints = slice(None) if order is None else list(order)
-        return Spectra.of(
+        return Spectra.from_signals(
             Signals(
                 (self.certain + more * self.fast_certain)[inner],
                 (self.columns + more * self.fast)[inner],

@@ -47,8 +47,8 @@ MAX_RESIDUAL: Final = 0.05
 """Largest good torque residual RMS, part of the joint's peak effort."""
 LEAST: Final = 40
 """Samples that a piece needs: fewer than for a fit, as nothing is fitted."""
-MORE: Final = 3.0
-"""And how many times the bound of the whole recording it may be there."""
+MAX_LOCAL_RATIO: Final = 3.0
+"""Largest RMS residual over 0.25 s, as a multiple of the limit for the whole recording."""
 STUCK: Final = 0.05
 """Time for which a joint, or an effort, stays the same before it counts as at rest, or stuck, s."""
 NEAR: Final = 0.5
@@ -148,7 +148,7 @@ class Compared:
         """
         away = np.abs(self.raw)
         usual, limit = estimate_deviation(self.raw), self.limit
-        far = away > MORE * limit + 4.0 * np.minimum(usual, limit)
+        far = away > MAX_LOCAL_RATIO * limit + 4.0 * np.minimum(usual, limit)
         beyond: Mask = np.asarray(far.any(1), np.bool_)
         # Two in a row: one is noise's.
         rows = np.flatnonzero(beyond[1:] & beyond[:-1])
@@ -157,7 +157,7 @@ class Compared:
     @property
     def good(self) -> Mask:
         """Which joints' efforts agree with the model, shape (n,)."""
-        return np.asarray((self.rms <= self.limit) & (self.local()[0] <= MORE * self.limit))
+        return np.asarray((self.rms <= self.limit) & (self.local()[0] <= MAX_LOCAL_RATIO * self.limit))
 
     @property
     def delayed(self) -> str:
@@ -184,7 +184,8 @@ def moving(robot: Robot, q: Array) -> Array:
     return one - rows.swapaxes(-1, -2) @ (rows / robot.effort_scale**2)
 
 
-def _each(matrices: Array, rows: Array) -> Array:
+def _multiply_each(matrices: Array, rows: Array) -> Array:
+    """Multiply each matrix (k, n, n) with its vector (k, n)."""
     return np.asarray(np.einsum("kij,kj->ki", matrices, rows), np.float64)
 
 
@@ -197,18 +198,18 @@ def compare(r: Recording, bound: float = MAX_RESIDUAL) -> Compared | None:
 
     :param bound: of a good residual, RMS, as a part of the peak effort.
     """
-    first, made = _compared(r, bound), r
+    first, made = _compare_recording(r, bound), r
     c = first
     for _ in range(PASSES):
         if c is None or abs(c.late - made.late) <= c.period:
             break
         made = made.on_time(c.late - made.late)
-        c = _compared(made, bound) if len(made.time) >= LEAST else None
+        c = _compare_recording(made, bound) if len(made.time) >= LEAST else None
     return first if c is None or not c.good.all() else c
 
 
-def _compared(r: Recording, bound: float) -> Compared | None:
-    """Compare a recording with the model, its delay to the first order."""
+def _compare_recording(r: Recording, bound: float) -> Compared | None:
+    """Compare measured and modelled efforts; the delay is estimated and removed to first order."""
     robot, reach = r.robot, friction_reach(r.robot)
     rates = None if r.qd is None or r.qdd is None else (r.qd, r.qdd)
     pieces, how = tracks(r.time, r.q, r.measured, r.wrench, rates=rates, least=LEAST)
@@ -219,7 +220,7 @@ def _compared(r: Recording, bound: float) -> Compared | None:
         qd = zero_resting_rates(track.qd, ~track.moves(how), reach)
         made = by_held(r, inverse_dynamics, track.time, track.q, qd, track.qdd, track.wrench)
         made = made + Dahl.remembered(robot.friction, track.q, qd)[0]
-        return _each(alike, made)
+        return _multiply_each(alike, made)
 
     def moved(track: Track) -> Array:
         return efforts(track, moving(robot, track.q))
@@ -230,8 +231,8 @@ def _compared(r: Recording, bound: float) -> Compared | None:
         alike = moving(robot, track.q)
         expected = efforts(track, alike)
         _, doubt = Dahl.remembered(robot.friction, track.q, track.sure(how))
-        slack = _each(np.abs(alike), np.where(track.moves(how), doubt, reach))
-        left = beyond_friction(_each(alike, track.effort) - expected, slack > 0.0, slack)
+        slack = _multiply_each(np.abs(alike), np.where(track.moves(how), doubt, reach))
+        left = beyond_friction(_multiply_each(alike, track.effort) - expected, slack > 0.0, slack)
         change = np.gradient(expected, period, axis=0)
         qd = zero_resting_rates(track.qd, ~track.moves(how), reach)
         rubs = np.concatenate([alike * part[:, None] for part in (qd, np.sign(qd))], -1)

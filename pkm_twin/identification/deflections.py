@@ -23,7 +23,7 @@ from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.estimation import Estimate, estimate
 from pkm_twin.identification.fit import Judged, Result, refuse_faults
 from pkm_twin.identification.identifiable import above_zero
-from pkm_twin.identification.judge import Case, Suspect, Verdict, judge
+from pkm_twin.identification.judge import Case, Suspect, Verdict, fit_and_judge
 from pkm_twin.identification.parameters import FITTED_RATIO, Group, Number, groups_of, number_of
 from pkm_twin.identification.rows import HELD_OUT
 from pkm_twin.messages.reading import rotate_to_base
@@ -42,8 +42,8 @@ STIFFEST: Final = 0.02
 """Least factor at which the model is made linear."""
 ALIKE: Final = 1e-3
 """Loads whose directions, and poses whose places, differ by no more of their size are one."""
-SCALE: Final = 50.0
-"""How many times softer or stiffer than the file says a machine may be as a whole."""
+MAX_STIFFNESS_RATIO: Final = 50.0
+"""Largest ratio of the machine's overall stiffness to the file's, and of its inverse."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -57,7 +57,7 @@ class ElasticFit(Result):
     groups: tuple[Group, ...]
     zeros: Array
     measured: Mask
-    told: int
+    known_count: int
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -70,9 +70,9 @@ class ElasticFit(Result):
         return UNITS
 
     @property
-    def combinations(self) -> int:
-        """How many combinations of the factors are known."""
-        return self.told
+    def identifiable_count(self) -> int:
+        """Number of combinations of the compliance factors that the data determine."""
+        return self.known_count
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +87,7 @@ class _Part:
     response: ElementResponse
 
     @classmethod
-    def of(cls, robot: Robot, r: Recording) -> _Part:
+    def from_recording(cls, robot: Robot, r: Recording) -> _Part:
         """Return a recording that a fit can begin with.
 
         :raises PkmTwinError: it is too short, or has no loads or deflections.
@@ -168,7 +168,7 @@ def fit_elements(
     """
     parts = []
     for i, recording in enumerate(recordings):
-        parts.append(_Part.of(robot, recording))
+        parts.append(_Part.from_recording(robot, recording))
         if progress is not None:
             progress(i + 1)
     _check_loads(parts, robot)
@@ -183,7 +183,7 @@ def fit_elements(
     # What a bound holds at zero would be no compliance, and no file's.
     factors = np.maximum(found.values[: len(names)], STIFFEST)
     zeros = found.values[len(names) :].reshape(len(parts), 6)
-    verdict = _verdict(robot, parts, found, factors, zeros)
+    verdict = _judge_fit(robot, parts, found, factors, zeros)
     if not faults:
         odd = verdict.answer == "does not explain"
         faults = _list_unexplained(robot, parts, factors, zeros, odd)
@@ -205,7 +205,7 @@ def fit_elements(
         groups=groups_of(names, factors, plain, own),
         measured=np.array([part.measured for part in parts]),
         samples=sum(part.split for part in parts),
-        told=int(np.sum(np.linalg.eigvalsh(plain / PRIOR**2) < FITTED_RATIO**2)),
+        known_count=int(np.sum(np.linalg.eigvalsh(plain / PRIOR**2) < FITTED_RATIO**2)),
         accepted=tuple(faults),
     )
 
@@ -265,7 +265,7 @@ def _scale_faults(parts: Sequence[_Part]) -> list[str]:
             continue
         if both < 0.0:
             faults.append(f"{part.name}: the platform moves against its loads: signs, or the axes of either")
-        elif not 1.0 / SCALE <= both / own <= SCALE:
+        elif not 1.0 / MAX_STIFFNESS_RATIO <= both / own <= MAX_STIFFNESS_RATIO:
             faults.append(
                 f"{part.name}: deflections are {both / own:.3g} times what the robot's file makes "
                 "of the loads: units? m and rad, N and N m"
@@ -382,10 +382,11 @@ def _judged(part: _Part, factors: Array, zero: Array, covariance: Array) -> Judg
     return Judged(part.name, part.time[end], measured, before[end], after[end], spread[end])
 
 
-def _verdict(robot: Robot, parts: Sequence[_Part], found: Estimate, factors: Array, zeros: Array) -> Verdict:
-    """Judge the factors and zeros (recordings, 6) of a fit.
+def _judge_fit(robot: Robot, parts: Sequence[_Part], found: Estimate, factors: Array, zeros: Array) -> Verdict:
+    """Judge the fitted compliance factors and zero offsets (recordings, 6).
 
-    The factors are not those of the posterior, which is linear: the difference is uncertain.
+    The posterior is of the linearised model; its difference to the nonlinear fit is added to
+    the covariance.
     """
     measured = np.any([part.measured for part in parts], 0)
     change = np.concatenate([factors - 1.0, zeros.ravel()])
@@ -414,7 +415,7 @@ def _verdict(robot: Robot, parts: Sequence[_Part], found: Estimate, factors: Arr
             )
         )
     names = [name for name, good in zip(AXES, measured.tolist(), strict=True) if good]
-    verdict, _ = judge(names, suspects, cases, found.prior)
+    verdict, _ = fit_and_judge(names, suspects, cases, found.prior)
     off = verdict.change - change
     return replace(verdict, covariance=verdict.covariance + np.outer(off, off))
 

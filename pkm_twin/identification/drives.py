@@ -117,7 +117,7 @@ def _constants(
         sizes = inverse @ current
         left = current - table @ sizes
         # Neighbouring rows are not independent: by blocks.
-        blocks = np.array([inverse[0, part] @ left[part] for part in _parts(len(left))])
+        blocks = np.array([inverse[0, part] @ left[part] for part in _split_blocks(len(left))])
         deviation = float(np.sqrt(np.sum(blocks**2)))
         if not deviation < 0.1 * abs(sizes[0]):
             raise PkmTwinError(
@@ -129,7 +129,8 @@ def _constants(
     return found[0], found[1], used
 
 
-def _parts(count: int) -> list[slice]:
+def _split_blocks(count: int) -> list[slice]:
+    """Split ``count`` samples into 30 contiguous blocks of nearly equal length."""
     ends = np.linspace(0, count, 31).astype(int)
     return [slice(int(a), int(b)) for a, b in pairwise(ends)]
 
@@ -153,12 +154,13 @@ class Law:
 
 @dataclass(frozen=True, eq=False)
 class DriveFriction:
-    """What weights say of a drive.
+    """Torque constant and friction law of a drive, identified with hanging weights.
 
-    ``torque_constant``: N m/A, with its standard deviation; ``zero``: A, current at no load (an
-    offset of the sensor or a preload). ``laws``: the simplest first. ``chosen``: the simplest that
-    no law with one more term is better than by evidence. ``chance``: probability that the simpler
-    of the two laws that were compared last would leave so much more if it were true, NaN for none.
+    ``torque_constant``: N m/A, with its standard deviation; ``zero``: current without load, A (an
+    offset of the sensor or a preload). ``laws``: all fitted friction laws, the simplest first.
+    ``chosen``: the simplest law that no additional term improves significantly. ``chance``: p-value
+    of the last F test of an additional term, NaN if there was none. ``viscous_told``: True if the
+    speeds differ enough to separate viscous from Coulomb friction.
     """
 
     torque_constant: float

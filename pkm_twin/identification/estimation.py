@@ -85,9 +85,9 @@ def estimate(
         root = np.sqrt(weights) / noise
         rows = (scaled * root[..., None]).reshape(-1, k)
         gram, side = rows.T @ rows, rows.T @ (change * root).ravel()
-        # No model is better than 1e-5 of the efforts: a direction that shows less is not seen.
+        # A direction whose effect is below 1e-5 of the efforts is not identifiable.
         least = 1e-5**2 * samples * float(np.sum((size / noise) ** 2))
-        # A direction is the data's where they tell it five times better than the prior.
+        # Directions that the data determine five times better than the prior are fitted.
         told = _directions(gram, side, max(5.0**2, least))
         before, z = z, told[0]
         residual = change - scaled @ z

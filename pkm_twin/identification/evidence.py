@@ -6,10 +6,11 @@
 The columns X are those of the numbers that are fitted and of usual errors. The likelihood is
 evaluated in the cosine transform along time, where stationary signals are independent (Whittle,
 1953). There the noise is white in the band of the motion, with a measured density, and the
-discrepancy, which stands for every error without a column, has a share s of the spectrum of the
-measured signal (Kennedy, O'Hagan, Bayesian calibration of computer models, 2001). The share is
-unknown, uniform in its logarithm. For each share the posterior of x is normal, and the evidence,
-the probability of the signals, is a determinant and a sum of squares (MacKay, 1992).
+discrepancy, which stands for every error without a column, has the spectrum of the measured
+signal times the square of an unknown ratio (Kennedy, O'Hagan, Bayesian calibration of computer
+models, 2001). The ratio's prior is uniform in its logarithm. For each ratio the posterior of x is
+normal, and the evidence, the probability of the signals, is a determinant and a sum of squares
+(MacKay, 1992).
 """
 
 from __future__ import annotations
@@ -25,14 +26,14 @@ import scipy  # type: ignore[import-untyped]  # its parts come when they are ask
 from pkm_twin.codegen.arrays import Array, Indices, Mask
 from pkm_twin.identification.samples import EXACT
 
-SHARES: Final = np.geomspace(1e-3, 0.5, 8)
-"""Shares of the measured spectrum that the discrepancy may have; below, it is rounding."""
+DISCREPANCY_RATIOS: Final = np.geomspace(1e-3, 0.5, 8)
+"""Candidate ratios of the discrepancy to the measured signal, both RMS; below them is rounding."""
 BANDS: Final = 12
 """Bands of frequency, equally wide in the logarithm, in which the spectra are taken as flat."""
 PASSED: Final = 0.8
 """Part of the filter's band in which it takes nothing away."""
 NEGLIGIBLE: Final = 6.0
-"""Log evidence below the best share's at which a share no longer counts: one in 400."""
+"""Log evidence below the best ratio's at which a ratio no longer counts: one in 400."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +74,7 @@ class Spectra:
     power: Array
 
     @classmethod
-    def of(cls, s: Signals) -> Spectra:
+    def from_signals(cls, s: Signals) -> Spectra:
         """Transform the signals of a recording."""
         k, n = s.measured.shape
         table = np.concatenate([s.certain[..., None], s.columns], -1) * s.counts[..., None]
@@ -97,15 +98,15 @@ class Spectra:
         noise = np.maximum(np.maximum(s.noise, EXACT * rms) ** 2 * used, 1e-300)
         return cls(np.stack(grams, 1), np.diff(edges).astype(float), noise[:, None], p.T)
 
-    def information(self, share: float, gains: Array | None = None, order: Sequence[int] | None = None) -> Information:
-        """Return what the measured signals tell of x with a share of discrepancy.
+    def information(self, ratio: float, gains: Array | None = None, order: Sequence[int] | None = None) -> Information:
+        """Return the information matrix of x and the terms of the likelihood beside it.
 
-        :param gains: factors on the model's signals by channel, (n,). ``order``: whose model is of
-            each channel.
+        :param ratio: of the discrepancy to the measured signal. ``gains``: factors on the model's
+            signals, (n,). ``order``: the channel whose model each measured channel is compared with.
         """
         n = len(self.noise)
         count = self.grams.shape[-1] - n
-        weights = 1.0 / (self.noise + share**2 * self.power)
+        weights = 1.0 / (self.noise + ratio**2 * self.power)
         total, side, square = np.zeros((count, count)), np.zeros(count), 0.0
         for j, i in enumerate(range(n) if order is None else order):
             gram = np.tensordot(weights[j], self.grams[i], 1)
@@ -120,13 +121,13 @@ class Spectra:
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """The posterior of x, normal: log evidence, share of the discrepancy, mean, covariance.
+    """The posterior of x, normal: log evidence, ratio of the discrepancy, mean, covariance.
 
     The mean and the covariance have the columns that are ``used`` only; others are zero.
     """
 
     log: float
-    share: float
+    discrepancy_ratio: float
     mean: Array
     covariance: Array
 
@@ -135,50 +136,51 @@ class Posterior:
 class Model:
     """Recordings and the prior of x: zero mean and ``deviation``, (c,).
 
-    ``parts``: by share of the discrepancy the information, its side, its square and its log
+    ``parts``: by ratio of the discrepancy the information, its side, its square and its log
     normalisation, all recordings together.
     """
 
     parts: tuple[Information, ...]
     deviation: Array
-    shares: Array
+    ratios: Array
 
     @classmethod
-    def of(
+    def from_spectra(
         cls,
         spectra: Sequence[Spectra],
         places: Sequence[Indices],
         deviation: Array,
-        shares: Array = SHARES,
+        ratios: Array = DISCREPANCY_RATIOS,
         gains: Array | None = None,
         order: Sequence[int] | None = None,
     ) -> Model:
-        """Sum the information of all recordings.
+        """Sum the information of all recordings, for each ratio of the discrepancy.
 
-        :param places: of each recording's columns among x. ``gains``, ``order``: of the channels,
-            as of :meth:`Spectra.information`.
+        :param places: indices in x of each recording's columns. ``deviation``: prior standard
+            deviations of x, (c,).
+        :param gains, order: gain and order of the channels, as in :meth:`Spectra.information`.
         """
         count, parts = len(deviation), []
-        for share in shares:
+        for ratio in ratios:
             total, side, square, log = np.zeros((count, count)), np.zeros(count), 0.0, 0.0
             for one, place in zip(spectra, places, strict=True):
-                own = one.information(float(share), gains, order)
+                own = one.information(float(ratio), gains, order)
                 total[np.ix_(place, place)] += own[0]
                 side[place] += own[1]
                 square, log = square + own[2], log + own[3]
             scaled = total * np.outer(deviation, deviation)
             parts.append((scaled, side * deviation, square, log))
-        return cls(tuple(parts), deviation, shares)
+        return cls(tuple(parts), deviation, ratios)
 
     def widened(self, factors: Array) -> Model:
         """Return the model with other deviations of the prior, (c,) times these."""
         parts = tuple(
             (total * np.outer(factors, factors), side * factors, square, log) for total, side, square, log in self.parts
         )
-        return Model(parts, self.deviation * factors, self.shares)
+        return Model(parts, self.deviation * factors, self.ratios)
 
     def _solve(self, k: int, used: Mask) -> tuple[float, Array, Array]:
-        """Return the log evidence at the share k, the Cholesky factor, and L^-1 X'V^-1 y."""
+        """Return the log evidence at the ratio k, the Cholesky factor, and L^-1 X'V^-1 y."""
         total, side, square, log = self.parts[k]
         a = total[np.ix_(used, used)]
         a[np.diag_indices(len(a))] += 1.0 + 1e-10 * a.diagonal()
@@ -191,13 +193,13 @@ class Model:
         return log, root, half
 
     def logs(self, used: Mask) -> Array:
-        """Return the log evidence at each share, with some of the columns."""
+        """Return the log evidence at each ratio, with some of the columns."""
         return np.array([self._solve(k, used)[0] for k in range(len(self.parts))])
 
     def log_evidence(self, used: Mask, near: Array | None = None) -> float:
-        """Return the log evidence over all shares, with some of the columns.
+        """Return the log evidence with the selected columns, summed over the ratios of the discrepancy.
 
-        :param near: log weights of the shares: negligible ones are left out; default none.
+        :param near: log weights of the ratios; ratios of negligible weight are skipped. None: none.
         """
         keys = np.arange(len(self.parts))
         if near is not None:
@@ -205,27 +207,27 @@ class Model:
         return float(np.logaddexp.reduce([self._solve(int(k), used)[0] for k in keys]))
 
     def posterior_at(self, k: int, used: Mask) -> tuple[Array, Array]:
-        """Return mean and covariance of the used columns at the share k, in prior deviations."""
+        """Return mean and covariance of the used columns at the ratio k, in prior deviations."""
         _, root, half = self._solve(k, used)
         mean = scipy.linalg.lapack.dtrtrs(root, half, lower=True, trans=1)[0]
         return mean, scipy.linalg.lapack.dpotrs(root, np.eye(len(half)), lower=True)[0]
 
-    def posterior(self, used: Mask, shares: Array | None = None) -> Posterior:
+    def posterior(self, used: Mask, ratios: Array | None = None) -> Posterior:
         """Return the posterior with some of the columns.
 
-        :param shares: log weights of the shares, default the evidence's.
+        :param ratios: log weights of the ratios, default the evidence's.
         """
         logs = self.logs(used)
-        weights = logs if shares is None else shares
+        weights = logs if ratios is None else ratios
         weights = np.exp(weights - weights.max())
         weights = np.where(weights > np.exp(-NEGLIGIBLE), weights, 0.0)
         weights /= weights.sum()
         count, d = len(self.deviation), self.deviation[used]
         means, inverses = [], []
         for k in np.flatnonzero(weights):
-            at_share = self.posterior_at(int(k), used)
-            means.append(at_share[0])
-            inverses.append(at_share[1])
+            at_ratio = self.posterior_at(int(k), used)
+            means.append(at_ratio[0])
+            inverses.append(at_ratio[1])
         each = weights[weights > 0.0]
         mean = np.tensordot(each, means, 1)
         away = (np.array(means) - mean) * np.sqrt(each)[:, None]
@@ -235,7 +237,7 @@ class Model:
         covariance[np.ix_(used, used)] = own * np.outer(d, d)
         return Posterior(
             float(np.logaddexp.reduce(logs)),
-            float(self.shares[int(np.argmax(weights))]),
+            float(self.ratios[int(np.argmax(weights))]),
             full,
             covariance,
         )

@@ -42,13 +42,15 @@ STATES: Final = 200
 
 
 @dataclass(frozen=True)
-class Bounds:
-    """What a trajectory keeps to. ``share``: of the file's limits, and of the position range.
+class TrajectoryLimits:
+    """Limits of an excitation trajectory.
 
-    ``acceleration``: of every joint, rad/s2 or m/s2, None: none. ``singularity``: least index.
-    ``rate``: points a second of the written trajectory, which limit its highest frequency.
+    ``share``: fraction of the file's limits and of the position range that is used.
+    ``acceleration``: limit of every joint, rad/s2 or m/s2; None: no limit. ``singularity``:
+    smallest singularity index. ``rate``: sampling rate of the written trajectory, Hz, which
+    limits its highest frequency.
 
-    :raises ParameterError: an acceleration that no machine has.
+    :raises ParameterError: the acceleration is not a plausible limit.
     """
 
     share: float = 0.9
@@ -101,7 +103,7 @@ class Judge:
     weights: Array
 
     @classmethod
-    def of(cls, robot: Robot, parameters: FileParameters) -> Judge:
+    def from_robot(cls, robot: Robot, parameters: FileParameters) -> Judge:
         """By random states: which columns are independent, what makes them of one size.
 
         :raises PkmTwinError: nothing of the parameters shows in any motion.
@@ -146,28 +148,28 @@ class Judge:
         return self.condition(*(rows[::step] for rows in states))
 
 
-def excite(
+def optimize_excitation(
     judge: Judge,
     duration: float = 10.0,
     terms: int = 6,
-    bounds: Bounds | None = None,
+    bounds: TrajectoryLimits | None = None,
     *,
     trials: int = 300,
     seed: int = 0,
     progress: Callable[[int], None] | None = None,
 ) -> Excitation:
-    """Choose the best of many trajectories.
+    """Draw random Fourier series within the limits and return the most informative one (D-optimal).
 
-    :param duration: s. ``terms``: harmonics of each joint, at least 3.
-    :param trials: how many trajectories are looked at; ``progress`` is called with the number.
-    :raises PkmTwinError: no trajectory at all keeps to the limits, or the harmonics need more
-        points a second than it is written with.
+    :param duration: s. ``terms``: number of harmonics of each joint, at least 3.
+    :param trials: number of trajectories drawn; ``progress`` is called with the number so far.
+    :raises PkmTwinError: no trajectory drawn is within the limits, or the sampling rate of the
+        written trajectory is too low for the harmonics.
     """
-    robot, keep = judge.robot, bounds or Bounds()
+    robot, keep = judge.robot, bounds or TrajectoryLimits()
     centre, reach = position_range(robot)
     reach *= keep.share
     harmonics = _harmonics(robot, duration, terms, reach, keep)
-    whole = _Fine.of(duration, harmonics)
+    whole = _TimeGrid.from_harmonics(duration, harmonics)
     basis = _resting(harmonics)
     rng = np.random.default_rng(seed)
     shape = (len(centre), basis.shape[1])
@@ -206,7 +208,7 @@ def excite(
     return Excitation(duration, harmonics, centre, final[0], final[1], condition)
 
 
-def _harmonics(robot: Robot, duration: float, terms: int, reach: Array, keep: Bounds) -> Array:
+def _harmonics(robot: Robot, duration: float, terms: int, reach: Array, keep: TrajectoryLimits) -> Array:
     """Different multiples of 1 / duration, up to where velocity and position limits meet."""
     # Ten points or more in a period of the highest harmonic.
     highest = keep.rate / 10.0
@@ -241,7 +243,7 @@ def _resting(harmonics: Array) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class _Fine:
+class _TimeGrid:
     """States between which no joint leaves its limits.
 
     ``margin``: what a trigonometric polynomial reaches at its samples is at least this part of what
@@ -254,15 +256,15 @@ class _Fine:
     """Of positions, rates and accelerations, (states, 2 h) each."""
 
     @classmethod
-    def of(cls, duration: float, harmonics: Array) -> _Fine:
-        """By the highest harmonic."""
+    def from_harmonics(cls, duration: float, harmonics: Array) -> _TimeGrid:
+        """Return a time grid that resolves the highest harmonic."""
         count = max(1200, 20 * round(float(harmonics[-1])))
         time = np.asarray(np.arange(count) * (duration / count), np.float64)
         eye = np.eye(2 * len(harmonics)).reshape(-1, 2, len(harmonics))
         q, qd, qdd = _series(time, duration, harmonics, np.zeros(len(eye)), np.moveaxis(eye, 1, 0))
         return cls(time, float(np.cos(np.pi * harmonics[-1] / count)), (q, qd, qdd))
 
-    def scaled(self, robot: Robot, keep: Bounds, reach: Array, pair: Array) -> Array:
+    def scaled(self, robot: Robot, keep: TrajectoryLimits, reach: Array, pair: Array) -> Array:
         """Scale the series (2, n, h) to the limits of position, rate and acceleration."""
         values = np.moveaxis(pair, 0, 1).reshape(pair.shape[1], -1)
         peak = [np.abs(basis @ values.T).max(0) / self.margin for basis in self.bases]
@@ -276,7 +278,7 @@ class _Fine:
 
 def _clear_of(
     robot: Robot,
-    keep: Bounds,
+    keep: TrajectoryLimits,
     duration: float,
     harmonics: Array,
     centre: Array,
@@ -293,7 +295,7 @@ def _clear_of(
     return None
 
 
-def clear(robot: Robot, keep: Bounds, q: Array, qd: Array, qdd: Array, margin: float) -> bool:
+def clear(robot: Robot, keep: TrajectoryLimits, q: Array, qd: Array, qdd: Array, margin: float) -> bool:
     """Assembly, singularity index, workspace and efforts.
 
     :param margin: part of the effort limits up to which these states may go.
@@ -310,7 +312,7 @@ def clear(robot: Robot, keep: Bounds, q: Array, qd: Array, qdd: Array, margin: f
     return bool((np.abs(efforts) <= margin * keep.share * robot.limits.effort).all())
 
 
-def _remedy(robot: Robot, keep: Bounds, centre: Array) -> str:
+def _remedy(robot: Robot, keep: TrajectoryLimits, centre: Array) -> str:
     """Return what would let joints move about their centre (n,): the bound of the index, or limits.
 
     Motions shrink towards the centre, so that its index decides.
@@ -382,13 +384,13 @@ def _sweep(time: Array, reach: float, speed: float) -> Array:
     return result
 
 
-def sweeps(judge: Judge, duration: float, bounds: Bounds | None = None) -> Sweeps:
+def sweeps(judge: Judge, duration: float, bounds: TrajectoryLimits | None = None) -> Sweeps:
     """Sweeps inside all limits.
 
     :param duration: s; longer where limits of velocity or acceleration, or ramps, ask for it.
     :raises PkmTwinError: a joint that cannot move alone.
     """
-    robot, keep = judge.robot, bounds or Bounds()
+    robot, keep = judge.robot, bounds or TrajectoryLimits()
     centre, reach = position_range(robot)
     reach *= keep.share
     n, ratios = len(centre), np.array(SPEEDS)

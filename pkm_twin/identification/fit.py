@@ -55,11 +55,11 @@ class Judged:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Result:
-    """What recordings say of a robot's file.
+    """Result of an identification: numbers of a robot's file from recordings.
 
-    ``estimate``: of least squares; ``numbers``: corrected by what the verdict's suspects change.
-    ``verdict``: whether the model explains the recordings. ``accepted``: why this machine cannot
-    have made them, although they were fitted.
+    ``estimate``: the parameters, their covariance and prior. ``numbers``: the same as numbers of
+    the file. ``verdict``: whether the model explains the recordings. ``accepted``: reasons why this
+    machine cannot have made the recordings, which the user accepted.
     """
 
     robot: Robot
@@ -81,11 +81,11 @@ class Result:
         return self.robot.effort_units
 
     @property
-    def combinations(self) -> int:
-        """How many combinations of the numbers are known."""
+    def identifiable_count(self) -> int:
+        """Number of combinations of the parameters that the data determine."""
         return self.estimate.directions
 
-    def of(self, status: Status) -> tuple[Number, ...]:
+    def list_numbers(self, status: Status) -> tuple[Number, ...]:
         """List the numbers of a status."""
         return tuple(number for number in self.numbers if number.status == status)
 
@@ -136,7 +136,7 @@ def fit(
     :raises PkmTwinError: recordings that are too short, that show nothing, or that this machine
         cannot have made.
     """
-    problem = Problem.of(robot, recordings, what, progress=progress, known=known)
+    problem = Problem.from_recordings(robot, recordings, what, progress=progress, known=known)
     why = explained or [explain(made) for made in problem.whole]
     names = [made.recording.name for made in problem.whole]
     faults = [f"{name}: {one.cause}" for name, one in zip(names, why, strict=True) if one.fault]
@@ -146,7 +146,7 @@ def fit(
         faults = [
             f"{made.recording.name}: {late_text('all joints', late)}"
             for made, late in zip(problem.whole, delays(problem), strict=True)
-            # What was not put on time has no delay that the efforts show.
+            # A delay that was not corrected for is too uncertain to be a fault.
             if abs(late) > LATEST and made.recording.late
         ]
     refuse_faults(faults, accept)
@@ -179,7 +179,7 @@ def on_time(problem: Problem) -> Problem:
         ):
             break
         try:
-            other = Problem.of(problem.robot, moved, problem.what)
+            other = Problem.from_recordings(problem.robot, moved, problem.what)
         except PkmTwinError:
             break
         if np.mean(other.both.noise / problem.both.noise) >= 1.0:

@@ -116,8 +116,8 @@ def fit_with_laws(
         # Without memory slow reversals would be another machine's: faults are looked for with it.
         asked.remove(Dahl.name)
         best = fit(_remembering(robot, recordings, what), recordings, what, **options)
-        before = Problem.of(robot, [made.recording for made in best.problem.whole], what)
-        choice = _compared(Dahl.name, best.verdict, before, best.problem)
+        before = Problem.from_recordings(robot, [made.recording for made in best.problem.whole], what)
+        choice = _compare_fits(Dahl.name, best.verdict, before, best.problem)
         choices.append(replace(choice, taken=True, asked=True))
     else:
         best = fit(robot, recordings, what, **options)
@@ -128,13 +128,13 @@ def fit_with_laws(
         for name in names:
             try:
                 found, opened = _opened(best.problem, name)
-                one = Problem.of(opened, recordings, what, passes=1)
+                one = Problem.from_recordings(opened, recordings, what, passes=1)
                 one.check_count()
             except PkmTwinError:
                 if asked:
                     raise
                 continue
-            tried.append((_compared(name, best.verdict, best.problem, one), found, opened))
+            tried.append((_compare_fits(name, best.verdict, best.problem, one), found, opened))
         if not tried:
             break
         choice, found, opened = max(tried, key=lambda one: (one[0].taken, -one[0].after))
@@ -144,7 +144,7 @@ def fit_with_laws(
         choices.append(choice)
         if not choice.taken:
             break
-        problem = Problem.of(opened, recordings, what)
+        problem = Problem.from_recordings(opened, recordings, what)
         problem.check_count()
         result = fitted(problem, best.accepted)
         more += _searched(best.robot, result, choice.law, found)
@@ -202,7 +202,7 @@ def fit_recordings(
     if constant is None:
         seen = robot
         if "friction" in what and Dahl.name in (laws or ()):
-            # What a memory does at reversals is no payload.
+            # Friction hysteresis changes the efforts after reversals, which would look like a payload.
             seen = _remembering(robot, [recorded_of(r) for r in recordings], what)
         found = [explain_recording(seen, r) for r in recordings]
     rows = [one.rows for one in found if one.rows is not None]
@@ -273,7 +273,7 @@ def _unexplained(result: Fit) -> bool:
     return bool(kinds - {LINE}) or any(channel.left_ratio > 1.0 for channel in verdict.channels)
 
 
-def _compared(name: str, verdict: Verdict, before: Problem, after: Problem) -> Choice:
+def _compare_fits(name: str, verdict: Verdict, before: Problem, after: Problem) -> Choice:
     """Two fits by what was held out, over the noise of a verdict."""
     band = np.array([max(channel.noise, 1e-300) for channel in verdict.channels])
     parts = []
@@ -299,11 +299,11 @@ def _remembering(robot: Robot, recordings: Sequence[Recording], what: Sequence[K
 
     :raises PkmTwinError: their motion does not show it.
     """
-    static = on_time(Problem.of(robot, recordings, what))
+    static = on_time(Problem.from_recordings(robot, recordings, what))
     recordings = [rows.recording for rows in static.whole]
     rough = _changed(robot, _Search(static, Dahl.name).found())
     # Without a memory efforts near reversals are taken for outliers, and for noise.
-    again = Problem.of(rough, recordings, static.what)
+    again = Problem.from_recordings(rough, recordings, static.what)
     found = _changed(robot, _Search(again, Dahl.name).found(judged=True))
     return replace(found, open_laws=(*robot.open_laws, Dahl.name))
 
@@ -366,7 +366,7 @@ class _Search:
         self._speed, self._travel = np.sqrt(np.mean(qd**2, 0)), np.ptp(q, axis=0)
         counts = np.concatenate([some.counts for some in parts])
         if self.law.memory:
-            # It shows where joints turn round, at any rate, once the state is known.
+            # Hysteresis shows after reversals; samples whose friction state is unknown are left out.
             most = PARTS[-1] * self._travel
             unknown = self._filtered(lambda q, rates: Dahl.states(q, rates, most).unknown)
             counts = (unknown < KNOWN_FRACTION).astype(np.float64)
@@ -375,7 +375,7 @@ class _Search:
         self._left = np.concatenate([some.target for some in parts]) * self._weight
         self._basic = []
         for j, joint in enumerate(self.robot.joint_names):
-            # Whatever else is fitted may have taken a part of what the law does.
+            # The parameters fitted before may have absorbed a part of the law's efforts.
             own = before.columns[:, j] * self._weight[:, j, None]
             if self.law.memory:
                 own = np.delete(own, before.parameters.names.index(f"{joint}.coulomb"), -1)
@@ -409,13 +409,13 @@ class _Search:
         else:
             waves = np.linspace(1.0, max(float(self._waves.max()), 2.0), 800)
             grid = np.maximum(self._travel, 1e-12) / waves[:, None]
-        gains = np.concatenate([self._gains(key, grid[a : a + 24])[0] for a in range(0, len(grid), 24)])
+        gains = np.concatenate([self._compute_gains(key, grid[a : a + 24])[0] for a in range(0, len(grid), 24)])
         best = gains.argmax(0)
         joints = np.arange(gains.shape[1])
         seen = gains[best, joints] > 0.0
         if judged:
             # Coulomb friction without one is the other hypothesis.
-            without = self._gains(key, np.zeros((1, len(joints))))[0][0]
+            without = self._compute_gains(key, np.zeros((1, len(joints))))[0][0]
             seen = gains[best, joints] - without > SIGMAS**2
         if not seen.any():
             where = " at reversals: slow ones show it" if judged else ""
@@ -426,15 +426,15 @@ class _Search:
         part = (np.sqrt(5.0) - 1.0) / 2.0
         for _ in range(14):
             pair = np.stack([high - part * (high - low), low + part * (high - low)])
-            left, right = self._gains(key, np.exp(pair))[0]
+            left, right = self._compute_gains(key, np.exp(pair))[0]
             high = np.where(left > right, pair[1], high)
             low = np.where(left > right, low, pair[0])
         middle = 0.5 * (low + high)
         step = np.full(len(middle), 0.02)
         if not self.law.turns:
-            # A small part of a period over the travel.
+            # A phase change of at most 15 % of a period at the far end of the travel.
             step = np.minimum(step, 0.15 * np.exp(middle) / np.maximum(self._travel, 1e-12))
-        gains, sizes = self._gains(key, np.exp(middle + step * np.array([[0.0], [1.0], [-1.0]])))
+        gains, sizes = self._compute_gains(key, np.exp(middle + step * np.array([[0.0], [1.0], [-1.0]])))
         here, up, down = gains
         bend = np.maximum(2.0 * here - up - down, 1e-300) / step**2
         value = np.exp(middle)
@@ -445,10 +445,10 @@ class _Search:
         words = [word for word, one in self.law.parameters.items() if one.linear]
         return {key: Searched(value, value * relative, dict(zip(words, slopes.T, strict=True)))}
 
-    def _gains(self, key: str, grid: Array) -> tuple[Array, Array]:
-        """Return how far chi square falls for values (g, n) of a parameter, (g, n).
+    def _compute_gains(self, key: str, grid: Array) -> tuple[Array, Array]:
+        """Return how far each value of a nonlinear parameter, (g, n), reduces chi square, (g, n).
 
-        And the other parameters of the law with each, (g, n, others).
+        Also the law's linear parameters fitted with each value, (g, n, others).
         """
         n, linear = self.robot.joints_count, [(word, one) for word, one in self.law.parameters.items() if one.linear]
 

@@ -110,7 +110,7 @@ def _efforts(r: Recording) -> list[Measured]:
     except (PkmTwinError, ValueError, np.linalg.LinAlgError):
         return found
     owners = {key: g.names[0] for g in result.problem.parameters.groups for key in g.keys(g.values)}
-    for one in result.of("fitted"):
+    for one in result.list_numbers("fitted"):
         part, _, law = owners[one.key].rpartition(".")
         if part in names and law in ("viscous", "coulomb"):
             found.append(Measured(f"friction {law}", part, one.after, one.deviation, one.unit))
@@ -131,7 +131,7 @@ def _elasticity(r: Recording) -> list[Measured]:
         fit = fit_elements(r.robot, [deflected])
     except PkmTwinError:
         return []
-    known = fit.of("fitted")
+    known = fit.list_numbers("fitted")
     found = [Measured("compliance factor", str(n.key[-1]), n.after, n.deviation, "1") for n in known]
     if known and has_modes(r.robot):
         softer = {str(n.key[-1]): n.after for n in fit.numbers}
@@ -304,8 +304,8 @@ class Judged:
         return self.change is not None or bool(self.beyond[-1])
 
     @property
-    def changed(self) -> str | None:
-        """When the mean changed; None where it did not."""
+    def change_time(self) -> str | None:
+        """Time at which the mean changed, as text; None if it did not."""
         return None if self.change is None else self.series.days[self.change].isoformat(timespec="minutes")
 
     @property
@@ -318,7 +318,7 @@ class Judged:
         text += f", control limits {self.low:.4g} to {self.high:.4g}"
         if self.change is not None:
             move = f"from {self.before:.4g} to {self.after:.4g} {s.unit}"
-            return f"{text}; DRIFT: {move} on {self.changed}"
+            return f"{text}; DRIFT: {move} on {self.change_time}"
         return text + "; DRIFT: the last recording is outside the control limits" * self.drifts
 
     def as_json(self) -> dict[str, Any]:
@@ -336,7 +336,7 @@ class Judged:
             "high": self.high,
             "beyond": int(self.beyond.sum()),
             "last_beyond": bool(self.beyond[-1]),
-            "changed": self.changed,
+            "changed": self.change_time,
             "chance": self.chance,
             "before": self.before,
             "after": self.after,

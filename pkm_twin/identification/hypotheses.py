@@ -27,7 +27,7 @@ from pkm_twin.identification.evidence import Model, Spectra
 from pkm_twin.identification.judge import ALTERNATIVE, SIGMAS
 from pkm_twin.identification.parameters import file_parameters
 from pkm_twin.identification.rows import LARGEST, Rows, rows_of
-from pkm_twin.identification.samples import Motion, held_payload
+from pkm_twin.identification.samples import Motion, find_held_payload
 from pkm_twin.identification.suspects import OFF
 from pkm_twin.identification.words import LATEST, UNITS, late_text, listed, position_text, scale_text, usual_scale
 from pkm_twin.messages.reading import rotate_to_base
@@ -47,8 +47,8 @@ CLASSES: Final = {
 """Kinds of numbers that differ from the file, and the log prior odds against it."""
 LISTED: Final = 6
 """Causes that are listed with their probabilities, at most."""
-SHARES: Final = np.geomspace(0.01, 1.0, 7)
-"""Shares of the discrepancy: no model of a machine is better than 1 % of its efforts."""
+DISCREPANCY_RATIOS: Final = np.geomspace(0.01, 1.0, 7)
+"""Candidate ratios of the model error to the measured efforts, both RMS; no model is better than 1 %."""
 UNIT: Final = 5.0
 """Log prior odds against another unit, scale or rate: one recording in 150."""
 RARE: Final = 8.0
@@ -78,7 +78,7 @@ class Hypothesis:
 
     text: str
     log: float
-    share: float
+    discrepancy_ratio: float
     kinds: str = ""
     load: Load | None = None
     late: float = 0.0
@@ -109,14 +109,14 @@ class Explanation:
         return "; ".join(text for text in (self.steps, self.text) if text)
 
 
-class Search:
-    """The hypotheses of one recording.
+class HypothesisSearch:
+    """Weigh the hypotheses that may explain how one recording differs from the model.
 
-    :param rows: with all parameters of the file.
+    :param rows: filtered rows whose regressor has columns for all parameters of the file.
     """
 
     def __init__(self, rows: Rows) -> None:
-        self.rows, self.columns = rows, Columns.of(rows)
+        self.rows, self.columns = rows, Columns.from_rows(rows)
         self.joints = rows.model.robot.joint_names
         self.late = self.columns.kinds.index("error")
         self.spectra = self.columns.spectra()
@@ -129,7 +129,7 @@ class Search:
         price: float,
         spectra: Spectra,
         classes: Sequence[str] = tuple(CLASSES),
-        shares: Array = SHARES,
+        ratios: Array = DISCREPANCY_RATIOS,
         *,
         gains: Array | None = None,
         order: Sequence[int] | None = None,
@@ -153,18 +153,18 @@ class Search:
             base = np.where(of_file | (more == 0.0), base, base / np.where(more > 0.0, more, 1.0))
         places = [np.arange(len(base))]
         if screened and len(classes) > len(FEW):
-            # Few classes and one share show whether a hypothesis can be probable.
-            few = Model.of([spectra], places, base, SHARES[1:2], gains, order)
+            # Improbable hypotheses are discarded by two classes and one ratio of the discrepancy.
+            few = Model.from_spectra([spectra], places, base, DISCREPANCY_RATIOS[1:2], gains, order)
             log = max(self._find_logs(few, name, False)[0] for name in FEW)
             self.first = log if self.first is None else self.first
             if log < self.first - 40.0:
                 return Hypothesis(text, log - price, 1.0)
-        model = Model.of([spectra], places, base, shares, gains, order)
+        model = Model.from_spectra([spectra], places, base, ratios, gains, order)
         logs, found = [], []
         for name in classes:
             own = self._find_logs(model, name, bounded)
             logs.append(own.max() + np.log(np.mean(np.exp(own - own.max()))) - CLASSES[name])
-            found.append(float(shares[int(own.argmax())]))
+            found.append(float(ratios[int(own.argmax())]))
         best = int(np.argmax(logs))
         log = float(np.logaddexp.reduce(logs))
         odds = tuple(np.exp(np.array(logs) - log).tolist())
@@ -202,13 +202,15 @@ class Search:
     @cached_property
     def all(self) -> list[Hypothesis]:
         """The hypotheses, the most probable first."""
-        if self.sound.share <= SHARES[1] and not self.sound.kinds:
+        if self.sound.discrepancy_ratio <= DISCREPANCY_RATIOS[1] and not self.sound.kinds:
             # No cause can gain what it costs.
             return [self.sound]
         found = [self.sound, *self._weigh_efforts(), *self._weigh_delays(), *self._weigh_loads()]
         best, *others = sorted(found, key=lambda one: -one.log)
         pushed = self.rows.recording.wrench is not None and self.rows.recording.wrench.any()
-        clearly_sound = best is self.sound and best.share <= SHARES[0] and others[0].log < best.log - ODDS
+        clearly_sound = (
+            best is self.sound and best.discrepancy_ratio <= DISCREPANCY_RATIOS[0] and others[0].log < best.log - ODDS
+        )
         if pushed or not clearly_sound:
             found += self._weigh_positions()
         return sorted(found, key=lambda one: -one.log)
@@ -260,7 +262,7 @@ class Search:
 
         def log(x: float) -> float:
             some = gains(way * float(np.exp(x)))
-            return self.weigh("", 0.0, self.spectra, classes, SHARES[2:3], gains=some, bounded=False).log
+            return self.weigh("", 0.0, self.spectra, classes, DISCREPANCY_RATIOS[2:3], gains=some, bounded=False).log
 
         # Heavier masses would be in the place of a scale.
         classes = ("", "friction") if which.all() and way > 0.0 else FEW
@@ -293,7 +295,7 @@ class Search:
         deviation = np.where(used, usual, c.deviation)
         used |= np.isin(c.kinds, kinds.split())
         used[self.late] = True
-        model = Model.of([self.spectra], [np.arange(len(used))], deviation, SHARES, gains)
+        model = Model.from_spectra([self.spectra], [np.arange(len(used))], deviation, DISCREPANCY_RATIOS, gains)
         found = model.posterior(used)
         some = slice(len(used) - c.gains, None)
         each = found.mean[some]
@@ -350,7 +352,7 @@ class Search:
             used = np.isin(c.kinds, ["offset", *kinds.split()])
             used[[self.late, more or self.late]] = True
         deviation = c.deviation * np.where(c.payload, HEAVY, 1.0)
-        return Model.of([spectra], [np.arange(len(used))], deviation, SHARES).posterior(used).mean
+        return Model.from_spectra([spectra], [np.arange(len(used))], deviation, DISCREPANCY_RATIOS).posterior(used).mean
 
     def _weigh_loads(self) -> Iterator[Hypothesis]:
         """Weigh a payload that is held for a while only."""
@@ -360,7 +362,7 @@ class Search:
         left = r.effort - c.certain - c.columns @ np.where(payload, 0.0, self._find_mean(self.spectra))
         weight = r.counts / np.maximum(np.var(r.effort, 0), 1e-300)
         kilogram = c.columns[..., int(payload.argmax())]
-        _, spans, held = held_payload(r.time, kilogram, left, weight)
+        _, spans, held = find_held_payload(r.time, kilogram, left, weight)
         if spans and not held.all():
             part = replace(c, columns=np.where(payload, held[:, None, None], 1.0) * c.columns)
             yield self._weigh_payload(part.spectra(), UNIT + 3.0 * len(spans), tuple(spans))
@@ -384,13 +386,13 @@ class Search:
         """Return what explains the recording most probably."""
         best, sound = self.all[0], self.sound
         unknown = (
-            f"{NO_MACHINE}: {100 * sound.share:.2g} % of their variation is left (another "
+            f"{NO_MACHINE}: {100 * sound.discrepancy_ratio:.2g} % of their variation is left (another "
             "machine, another motion, an unknown load, or noise?)"
         )
         scaled = next((one for one in self.all if one.scale > 0.0 and one.scale != 1.0), best)
         if (
             scaled.scale != 1.0
-            and scaled.share <= 0.12
+            and scaled.discrepancy_ratio <= 0.12
             and abs(scaled.log - sound.log) <= ODDS >= best.log - scaled.log
         ):
             text, _ = self._tell_scale(scaled.scale, scaled.kinds)
@@ -398,13 +400,13 @@ class Search:
                 return Explanation(text, not usual_scale(scaled.scale))
             best = next(one for one in self.all if one is not scaled)
         if best.text and best.log - sound.log > ODDS:
-            if best.text == NO_MACHINE or best.share > 0.12:
+            if best.text == NO_MACHINE or best.discrepancy_ratio > 0.12:
                 return Explanation(unknown, fault=True)
             if 0.0 < abs(best.late) < LATEST and not self.rows.recording.late:
                 r = self.rows.recording.on_time(best.late)
                 return explain(rows_of(self.rows.model.robot, self.rows.model.parameters, r))
             return Explanation(best.text, fault=True, load=best.load)
-        if sound.share > 0.3:
+        if sound.discrepancy_ratio > 0.3:
             return Explanation(unknown, fault=True)
         gains, deviations = self._find_gains()
         j, mean = int(np.abs(gains).argmax()), float(gains.mean())
@@ -450,13 +452,13 @@ class Search:
         table = np.concatenate([c.columns[..., beside], c.certain[..., None], smooth[..., None]], -1)
         spectra = replace(c, columns=table, fast=0.0 * table).spectra()
         places, deviation = np.arange(len(beside) + 2), np.append(c.deviation[beside], [1.0, 1.0])
-        model = Model.of([spectra], [places], deviation)
+        model = Model.from_spectra([spectra], [places], deviation)
         masses, efforts = (model.log_evidence(places != len(beside) + k) for k in (0, 1))
         if "friction" not in kinds and masses > efforts + ALTERNATIVE:
             return "", False
         # The file's friction tells them apart only where nothing else is left of the efforts.
-        left = model.posterior(places != len(beside) + 1).share
-        clear = "friction" not in kinds and efforts > masses + ALTERNATIVE and left <= SHARES[0]
+        left = model.posterior(places != len(beside) + 1).discrepancy_ratio
+        clear = "friction" not in kinds and efforts > masses + ALTERNATIVE and left <= DISCREPANCY_RATIOS[0]
         others = [] if clear else [f"all masses are {scale:.3g} times the file's"]
         names = listed([*self.joints], len(self.joints))
         return scale_text(names, scale, *others), clear
@@ -523,7 +525,7 @@ def explain(rows: Rows) -> Explanation:
     if period > 1.0:
         text = f"samples {period:.3g} s apart show no motion (is the time in ms?)"
         return Explanation(text, fault=True)
-    search = Search(rows)
+    search = HypothesisSearch(rows)
     found = search.explain()
     return found if found.considered else replace(found, considered=search.list_causes())
 

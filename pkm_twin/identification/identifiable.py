@@ -179,7 +179,7 @@ def of_masses(robot: Robot) -> Iterator[Identifiable]:
         inside = [b for b in range(len(names)) if own[b][:, part].any()]
         if not touched[:, part].any():
             continue
-        group = _Group([keys[k] for k in part], values[part], reference[part], own[inside][:, :, part])
+        group = _BodyGroup([keys[k] for k in part], values[part], reference[part], own[inside][:, :, part])
         payload = keys[part[0]][0] == LOAD
         yield Identifiable(
             "payload" if payload else "inertia",
@@ -194,10 +194,11 @@ def of_masses(robot: Robot) -> Iterator[Identifiable]:
         )
 
 
-class _Group:
-    """Numbers that move the same bodies, and ten numbers of these by them, (bodies, 10, k).
+class _BodyGroup:
+    """Numbers of the file that change the same bodies' inertial parameters.
 
-    The ten are about the file's centres of mass.
+    ``own``: derivatives of the bodies' ten inertial parameters, about the file's centres of mass,
+    by these k numbers, (bodies, 10, k).
     """
 
     def __init__(self, keys: list[Keys], values: Array, reference: Array, own: Array) -> None:

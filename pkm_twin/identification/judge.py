@@ -144,10 +144,10 @@ class Verdict:
     def __str__(self) -> str:
         return f"the model {SENTENCE[self.answer]} the recordings"
 
-    def lines(self, units: tuple[str, ...]) -> list[str]:
-        """Write what it says beyond its answer, in plain sentences.
+    def list_sentences(self, units: tuple[str, ...]) -> list[str]:
+        """List the sentences that explain the answer: causes, residuals and what is not excluded.
 
-        :param units: of the channels' measurements.
+        :param units: units of the channels' measurements.
         """
         told = [f"likely cause: {one}" for one in self.findings]
         if self.slow:
@@ -238,7 +238,7 @@ class Case:
     def spectra(self, count: int) -> Spectra:
         """Return the statistics of the first rows."""
         some = slice(0, count)
-        return Spectra.of(
+        return Spectra.from_signals(
             Signals(
                 (self.measured - self.target)[some],
                 self.columns[some],
@@ -284,7 +284,7 @@ class Fitted:
             deviations.append(case.own_sizes)
             first = last
         self.model, self.whole = (
-            Model.of(
+            Model.from_spectra(
                 [c.spectra(k) for c, k in zip(cases, counts, strict=True)], self.places, np.concatenate(deviations)
             )
             for counts in ([c.split for c in cases], [len(c.target) for c in cases])
@@ -381,13 +381,13 @@ class Fitted:
         usual = {*self.known, *(k for own in kinds for k in own)}
         others = [[k for other in one.others for k in other if k not in usual] for one in chosen]
         kinds += [own for own in others if own][:3]
-        shares, all_shares = self.model.logs(used), self.whole.logs(used)
+        shares, all_logs = self.model.logs(used), self.whole.logs(used)
         logs, masks = [], []
         for which in product((False, True), repeat=len(kinds)):
             inside = [k for own, on in zip(kinds, which, strict=True) if on for k in own]
             masks.append(self.with_columns(always, inside))
             prior = [PRESENT if on else 1.0 - PRESENT for on in which]
-            logs.append(self.whole.log_evidence(masks[-1], all_shares) + float(np.log(prior).sum()))
+            logs.append(self.whole.log_evidence(masks[-1], all_logs) + float(np.log(prior).sum()))
         weights = np.exp(np.array(logs) - max(logs))
         weights[weights < 1e-3] = 0.0
         weights /= weights.sum()
@@ -440,12 +440,13 @@ class Fitted:
         ]
 
 
-def judge(
+def fit_and_judge(
     channels: Sequence[str], errors: Sequence[Suspect], cases: Sequence[Case], sizes: Array
 ) -> tuple[Verdict, Fitted]:
-    """Fit numbers to recordings, and judge the fit.
+    """Fit parameters to recordings and judge whether the model explains them.
 
-    :param errors: the usual errors, (s,). ``sizes``: prior deviations of the numbers, (p,).
+    :param errors: errors that machines and recordings commonly have, (s,).
+    :param sizes: prior standard deviations of the parameters, (p,).
     """
     fitted = Fitted(errors, cases, sizes)
     chosen, used = fitted.select(fitted.certain)

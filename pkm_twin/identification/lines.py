@@ -49,7 +49,7 @@ def line_slopes(robot: Robot, state: State, names: Sequence[str]) -> LineSlopes 
     Lines shorter than 0.3 of the longest, and angles within 30 degrees of 0 or pi, are left out.
     """
     some = np.unique(np.linspace(0, len(state.q) - 1, POSES).astype(int))
-    position = state.instrument.seen(*state.platform)[0][some]
+    position = state.instrument.compute_reading(*state.platform)[0][some]
     columns = derivatives(
         robot, replace(state, q=state.q[some], platform=(state.platform[0][some], state.platform[1][some])), names
     )[:, :3]

@@ -284,9 +284,9 @@ class Readings:
     values: Array
     lines: Indices
 
-    def seen(self, state: State) -> tuple[Array, Array]:
+    def compute_poses(self, state: State) -> tuple[Array, Array]:
         """Positions (m, 3), of pairs their differences, and rotations (m, 3, 3)."""
-        position, rotation = state.instrument.seen(*state.platform)
+        position, rotation = state.instrument.compute_reading(*state.platform)
         p = position[self.first]
         return (p if self.second is None else p - position[self.second]), rotation[self.first]
 
@@ -296,7 +296,7 @@ class Readings:
 
     def slopes(self, state: State, columns: Array, names: Sequence[str]) -> Array:
         """Differentiate what is computed, (m, a, p), from derivatives of the poses, (k, 6, p)."""
-        (p, r), own = self.seen(state), self.own(state)
+        (p, r), own = self.compute_poses(state), self.own(state)
         moved = columns[self.first]
         if self.second is not None:
             moved = moved - columns[self.second]
@@ -340,7 +340,7 @@ class Measured:
 
     def parts(self, state: State) -> list[Array]:
         """Measured less computed, (m, a) a kind."""
-        return [one.kind.residual(one.values, *one.seen(state), one.own(state)) for one in self.readings]
+        return [one.kind.residual(one.values, *one.compute_poses(state), one.own(state)) for one in self.readings]
 
     def slopes(self, robot: Robot, state: State, names: Sequence[str]) -> list[Array]:
         """Differentiate what is computed by named parameters, (m, a, p) a kind."""

@@ -38,8 +38,8 @@ OBSERVED: Final = 0.5
 """
 FITTED_RATIO: Final = 0.2
 """A number that is known this much better than before is fitted."""
-SHOWN: Final = 0.1
-"""Part of the greatest weight below which an element is no part of a combination."""
+MIN_RELATIVE_WEIGHT: Final = 0.1
+"""Smallest weight of an element in a combination, as a fraction of the largest weight."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,8 +88,8 @@ class FileParameters:
         return tuple((where, cone) for where, group in pairs for cone in group.cones)
 
 
-def _scaled(group: Identifiable, robot: Robot) -> Identifiable:
-    """Scale a rotor: it may weigh as much as all that the joints move at home."""
+def _scale_rotor(group: Identifiable, robot: Robot) -> Identifiable:
+    """Set a rotor inertia's scale to the mass matrix's largest diagonal entry at home."""
     if group.kind != "rotor":
         return group
     moved = float(np.diag(mass_matrix(robot, robot.graph.home)).max())
@@ -101,7 +101,7 @@ def file_parameters(robot: Robot, what: Sequence[Kind] = KINDS) -> FileParameter
 
     :raises ParameterError: the robot's file gives no masses.
     """
-    kept = [_scaled(g, robot) for g in robot.cached(identifiable) if g.kind in what]
+    kept = [_scale_rotor(g, robot) for g in robot.cached(identifiable) if g.kind in what]
     place = {name: k for k, name in enumerate(parameter_names(robot))}
     tree = robot.engine.tree
     mixing = np.zeros((len(place), sum(len(group.names) for group in kept)))
@@ -236,8 +236,8 @@ def groups_of(names: Sequence[str], factors: Array, covariance: Array, wide: Arr
     values, vectors = np.linalg.eigh(own)
     unknown = vectors[:, values > FITTED_RATIO**2]
     shared = np.abs(unknown @ unknown.T)
-    open_ = np.flatnonzero(np.diag(shared) > SHOWN**2).tolist()
-    pairs = ((i, j) for i, j in combinations(open_, 2) if shared[i, j] > SHOWN)
+    open_ = np.flatnonzero(np.diag(shared) > MIN_RELATIVE_WEIGHT**2).tolist()
+    pairs = ((i, j) for i, j in combinations(open_, 2) if shared[i, j] > MIN_RELATIVE_WEIGHT)
     found = [sorted(members) for members in group_connected(open_, pairs)]
     result = list[Group]()
     for members in found:
@@ -260,7 +260,7 @@ def groups_of(names: Sequence[str], factors: Array, covariance: Array, wide: Arr
 def weights_of(names: Sequence[T], vector: Array) -> dict[T, float]:
     """Weights of a direction by name, the greatest above zero, without those that hardly count."""
     vector = vector * np.sign(vector[np.argmax(np.abs(vector))])
-    least = SHOWN * float(np.abs(vector).max())
+    least = MIN_RELATIVE_WEIGHT * float(np.abs(vector).max())
     return {n: w for n, w in zip(names, vector.tolist(), strict=True) if abs(w) > least}
 
 

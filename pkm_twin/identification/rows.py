@@ -246,13 +246,13 @@ def rows_of(robot: Robot, parameters: FileParameters, recording: Recording, wind
     carried = None if r.carried is None else replace(robot, payload=r.carried.payload)
     model = Model(robot, parameters, carried)
     try:
-        parts = [_Piece.of(model, track, how) for track in pieces]
+        parts = [_Piece.from_track(model, track, how) for track in pieces]
     except (UnreachableError, SingularityError) as error:
         raise PkmTwinError(f"{r.name}: {position_text(error)}") from None
     if all(not part.moves.any() for part in parts):
         raise PkmTwinError(f"{r.name}: no excitation, the joints stand still")
     first, outliers = _drop_outliers(parts, parameters, how.keep_every)
-    told = [part.told(model, first) for part in parts]
+    told = [part.apply_first_fit(model, first) for part in parts]
     both = zip(parts, told, strict=True)
     f = filtered([part.columns(one) for part, one in both], pieces[0].period, how)
     # Where standing still is in the filter's reach, friction's sign is not known.
@@ -279,13 +279,13 @@ def rows_of(robot: Robot, parameters: FileParameters, recording: Recording, wind
     )
 
 
-def _signals(r: Recording, model: Model, how: Filtering, told: Sequence[_Told], first: Array) -> Signals:
+def _signals(r: Recording, model: Model, how: Filtering, told: Sequence[_FirstFit], first: Array) -> Signals:
     """Return the signals of a recording's rows.
 
     :param told: by piece. ``first``: parameters of a first fit.
     """
     tracks = [one.track for one in told]
-    left = in_motion([one.left for one in told], [one.moves for one in told])
+    left = in_motion([one.residuals for one in told], [one.moves for one in told])
     longest = max(tracks, key=lambda t: len(t.time))
     speed = np.sqrt(np.mean(np.concatenate([track.qd for track in tracks]) ** 2, 0))
     f = filtered([one.columns(speed, how) for one in told], longest.period, how)
@@ -319,7 +319,7 @@ class _Piece:
     """1 where the direction of friction is known, shape (k, n)."""
 
     @classmethod
-    def of(cls, model: Model, track: Track, how: Filtering) -> _Piece:
+    def from_track(cls, model: Model, track: Track, how: Filtering) -> _Piece:
         """Of a track."""
         memory, moves = model.memory(track, how), track.moves(how)
         table, rest = model.columns(track, memory)
@@ -327,7 +327,7 @@ class _Piece:
             moves = np.where(model.robot.friction.presliding > 0.0, memory.unknown < KNOWN_FRACTION, moves)
         return cls(track, table, track.effort - rest, rest, moves.astype(np.float64))
 
-    def columns(self, told: _Told) -> dict[str, Array]:
+    def columns(self, told: _FirstFit) -> dict[str, Array]:
         """Return what rows are made of, by name, (samples, ...) each."""
         return {
             "time": self.track.time,
@@ -339,24 +339,25 @@ class _Piece:
             "change": np.gradient(told.efforts, self.track.period, axis=0),
         }
 
-    def told(self, model: Model, first: Array) -> _Told:
-        """Take over what a first fit says of it."""
+    def apply_first_fit(self, model: Model, first: Array) -> _FirstFit:
+        """Return this piece's efforts and residuals by the parameters of the first robust fit."""
         told, rubs = self.rest + self.table @ first, model.of_drives
         load = told - self.table[..., rubs] @ first[rubs]
-        return _Told(self.track, told, load, self.target - self.table @ first, self.moves)
+        return _FirstFit(self.track, told, load, self.target - self.table @ first, self.moves)
 
 
 @dataclass(frozen=True, eq=False)
-class _Told:
-    """What a first fit says of a piece before the filter; its efforts also less friction, (k, n).
+class _FirstFit:
+    """Efforts of one piece by the first fit, before filtering, (k, n) each.
 
-    ``left``: what it leaves of the measured ones; ``moves``: of the piece.
+    ``load``: the efforts without the drives' friction. ``residuals``: measured less fitted.
+    ``moves``: 1 where the direction of friction is known.
     """
 
     track: Track
     efforts: Array
     load: Array
-    left: Array
+    residuals: Array
     moves: Array
 
     def columns(self, speed: Array, how: Filtering) -> dict[str, Array]:
@@ -449,7 +450,7 @@ class Problem:
     whole: tuple[Rows, ...]
 
     @classmethod
-    def of(
+    def from_recordings(
         cls,
         robot: Robot,
         recordings: Sequence[Recording],
@@ -458,12 +459,12 @@ class Problem:
         progress: Callable[[int], None] | None = None,
         known: Sequence[Rows] = (),
     ) -> Problem:
-        """Filter recordings.
+        """Filter recordings and build their regressors.
 
-        :param passes: in which friction that grows with the load, or a memory that is open, is
-            taken by the fitted numbers, not by the file's.
-        :param progress: called with the number of recordings that are done.
-        :param known: rows of the same robot, which are not read again.
+        :param passes: number of repetitions in which load-dependent friction and hysteresis use
+            the values of the previous fit instead of the file's.
+        :param progress: called with the number of recordings processed so far.
+        :param known: rows of the same robot that are used again instead of being recomputed.
         """
         everything, whole = file_parameters(robot), list[Rows]()
         for i, recording in enumerate(recordings):
@@ -524,7 +525,7 @@ class Problem:
 
     @cached_property
     def estimate(self) -> Estimate:
-        """Of the parameters alone."""
+        """Return the estimate of the file's parameters, without the delays."""
         e, k = self.both, slice(0, -len(self.rows))
         return replace(e, values=e.values[k], covariance=e.covariance[k, k], prior=e.prior[k])
 

@@ -417,17 +417,18 @@ def shaken_efforts(r: Recording, track: Track, how: Filtering, efforts: Callable
     return in_motion([change], [track.moves(how)[: len(change)]])[0]
 
 
-def held_payload(
+def find_held_payload(
     time: Array, column: Array, residual: Array, weight: Array
 ) -> tuple[float, list[tuple[float, float]], Mask]:
-    """Find the mass that explains most of a residual while it is held, and when that is.
+    """Fit the payload that best explains a residual, and the time spans in which it is held.
 
-    The block of times that explains most gives the mass; it is held where more than half of it is
-    seen, and from the samples on, and until those, that separate both best.
+    The time span that reduces the weighted squares most gives a first mass. The payload is held in
+    all blocks of time whose own mass is above half of it; the first and last sample of each span
+    are those at which the squares are least.
 
-    :param time: rising, shape (k,), s; the others (k, n): efforts of a kilogram, the residual, and
-        the weights of its squares.
-    :returns: kg, 0 where nothing is explained; spans of time, s; the samples of these, (k,).
+    :param time: increasing, s, shape (k,). ``column``: efforts per kilogram of payload.
+        ``residual``: of the efforts. ``weight``: of its squares; (k, n) each.
+    :returns: mass, kg, 0 if no mass explains any of it; time spans, s; mask of held samples, (k,).
     """
     # Held or not for a quarter of a second; at most 400 times.
     span = max(0.25, float(time[-1] - time[0]) / 400)

@@ -31,7 +31,7 @@ from pkm_twin.identification.judge import (
     Suspect,
     Verdict,
     basis_of,
-    judge,
+    fit_and_judge,
 )
 from pkm_twin.identification.parameters import FileParameters
 from pkm_twin.identification.rows import BLOCK, Problem, Rows
@@ -56,10 +56,10 @@ DELAY: Final = 0.02
 """Usual delay of efforts, s: what buses and controllers buffer."""
 STEP: Final = 1e-4
 """Of difference quotients by an offset or a give, rad or machine sizes."""
-USUAL: Final = 5e-3
-"""Standard deviation of a length of which the file does not say it, as a part of the machine's
-extent, and of an angle, rad: parts made to a drawing and assembled without calibration are within
-1 %, which is two of it."""
+DEFAULT_GEOMETRY_DEVIATION: Final = 5e-3
+"""Default standard deviation of a length, as a fraction of the machine's extent, and of an angle, rad.
+
+Parts made to a drawing and assembled without calibration are within 1 %, two standard deviations."""
 _PLACES: Final = re.compile(r"geometry\.|origin\[|(joints|rods)\.[^.]+\.(at|ends)\[")
 
 
@@ -134,7 +134,7 @@ class Lengths:
     mixing: Array
 
     @classmethod
-    def of(cls, robot: Robot) -> Lengths:
+    def from_robot(cls, robot: Robot) -> Lengths:
         """All that the robot's file gives; an entry of its ``uncertainty`` is one suspect."""
         known = robot.file_numbers()
         units = {p: unit for p, (_, unit) in known.items() if _PLACES.match(p)}
@@ -155,7 +155,7 @@ class Lengths:
         extent = robot.graph.size
         for path in paths:
             if path not in told:
-                usual = USUAL * (extent if units[path] == "m" else 1.0)
+                usual = DEFAULT_GEOMETRY_DEVIATION * (extent if units[path] == "m" else 1.0)
                 causes.append((Suspect(GEOMETRY, path, units[path], usual, known=True), {path: 1.0}))
         mixing = np.zeros((len(paths), len(causes)))
         for k, (_, weights) in enumerate(causes):
@@ -239,7 +239,7 @@ OF_THE_FILE: Final = {
 def verdict_of(problem: Problem) -> Verdict:
     """Fit the chosen numbers of a problem, and judge whether the model explains its recordings."""
     robot, everything, values = problem.robot, problem.everything, problem.values
-    chosen, lengths = problem.chosen, Lengths.of(robot)
+    chosen, lengths = problem.chosen, Lengths.from_robot(robot)
     kinds = np.array([g.kind for g in everything.groups for _ in g.names])
     cases, errors = list[Case](), list[Suspect]()
     for rows in problem.whole:
@@ -270,7 +270,7 @@ def verdict_of(problem: Problem) -> Verdict:
     errors += [
         Suspect(OF_THE_FILE[kinds[k]], everything.names[k], everything.units[k]) for k in np.flatnonzero(~chosen)
     ]
-    verdict, fitted = judge(robot.joint_names, errors, cases, problem.both.prior[: chosen.sum()])
+    verdict, fitted = fit_and_judge(robot.joint_names, errors, cases, problem.both.prior[: chosen.sum()])
     slow = bool((chosen & np.isin(kinds, ("rotor", "payload", "inertia"))).any()) and not _shows_inertia(
         cases, errors, kinds[chosen] == "friction"
     )

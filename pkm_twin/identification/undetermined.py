@@ -20,10 +20,10 @@ from pkm_twin.identification.parameters import OBSERVED
 from pkm_twin.machine.graph import Graph, list_limbs
 from pkm_twin.machine.places import split_path
 
-LINES: Final = 10
-"""Largest number of lines that list undetermined numbers."""
-NAMED: Final = 6
-"""Names in a list before the others are counted."""
+MAX_SENTENCES: Final = 10
+"""Largest number of sentences about undetermined numbers."""
+MAX_LISTED_NAMES: Final = 6
+"""Number of names that a message lists; further names are only counted."""
 AXES: Final = "xyz"
 
 
@@ -95,7 +95,7 @@ class _Numbers:
     origin: NDArray[np.int64]
 
     @classmethod
-    def of(cls, graph: Graph, names: Sequence[str], scales: Array) -> _Numbers:
+    def from_names(cls, graph: Graph, names: Sequence[str], scales: Array) -> _Numbers:
         points: dict[tuple[str, int], NDArray[np.int64]] = {}
         axes: dict[tuple[str, int], NDArray[np.int64]] = {}
         origin = np.full(3, -1)
@@ -210,7 +210,7 @@ def undetermined(graph: Graph, names: Sequence[str], scales: Array, directions: 
     :param names: of the numbers, as paths. ``scales``: their prior deviations, (p,).
     :param directions: in units of these, orthonormal, (p, u).
     """
-    n = _Numbers.of(graph, names, scales)
+    n = _Numbers.from_names(graph, names, scales)
     left = directions
     found: dict[tuple[str, str], list[str]] = {}
     for change in _changes(n):
@@ -234,9 +234,9 @@ def undetermined(graph: Graph, names: Sequence[str], scales: Array, directions: 
         kind.format(items=_listed(names_of), axes=_and(sorted(set(axes)))) for (kind, names_of), axes in merged.items()
     ]
     rest = list(_combinations(names, left))
-    if len(told) + len(rest) > LINES:
-        shown = told[: LINES - 1]
-        more = left.shape[1] + sum(len(found[k]) for k in list(found)[LINES - 1 :] if k in found)
+    if len(told) + len(rest) > MAX_SENTENCES:
+        shown = told[: MAX_SENTENCES - 1]
+        more = left.shape[1] + sum(len(found[k]) for k in list(found)[MAX_SENTENCES - 1 :] if k in found)
         weights = np.sqrt(np.sum(left**2, 1))
         return [
             *shown,
@@ -266,9 +266,9 @@ def _greatest(names: Sequence[str], weights: Array) -> list[str]:
 
 def _listed(items: Sequence[str]) -> str:
     """With commas, the first of many."""
-    if len(items) <= NAMED:
+    if len(items) <= MAX_LISTED_NAMES:
         return ", ".join(items)
-    return f"{', '.join(items[:NAMED])} and {len(items) - NAMED} more"
+    return f"{', '.join(items[:MAX_LISTED_NAMES])} and {len(items) - MAX_LISTED_NAMES} more"
 
 
 def _and(items: Sequence[str]) -> str:

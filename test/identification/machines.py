@@ -67,7 +67,7 @@ def machine(robot: Robot, rng: np.random.Generator, duration: float = 12.0, rate
 def of_prior(robot: Robot, rng: np.random.Generator) -> Drawn:
     """A drawn machine whose lengths are off by what is usual; its payload is light or heavy."""
     m = machine(robot, rng, 8.0)
-    lengths = Lengths.of(robot)
+    lengths = Lengths.from_robot(robot)
     usual = np.array([one.usual for one in lengths.suspects])
     platform, radius = robot.graph.bodies[robot.graph.platform].mass, robot.size
     mass = platform * np.exp(rng.uniform(np.log(0.1), np.log(1.5)))

@@ -18,7 +18,7 @@ from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.calibration import calibrate, geometric
 from pkm_twin.identification.calibration_state import Poses
 from pkm_twin.identification.measurements import whole_of
-from pkm_twin.identification.undetermined import LINES, undetermined
+from pkm_twin.identification.undetermined import MAX_SENTENCES, undetermined
 from test.support.robots import data_of, load, random_joints
 from test.support.tables import write_columns
 
@@ -160,7 +160,7 @@ def test_whatever_stays_open_ten_lines_are_enough() -> None:
     for count in (1, 5, 30, len(names)):
         basis = np.linalg.qr(rng.normal(size=(len(names), count)))[0]
         told = undetermined(graph, names, np.full(len(names), 0.01), basis)
-        assert 1 <= len(told) <= LINES
+        assert 1 <= len(told) <= MAX_SENTENCES
         assert max(map(len, told)) < 300
     assert undetermined(graph, names, np.ones(len(names)), np.zeros((len(names), 0))) == []
 

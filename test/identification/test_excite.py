@@ -6,7 +6,7 @@ import pytest
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin.errors import ParameterError, PkmTwinError
-from pkm_twin.identification.excitation import Bounds, Judge, excite
+from pkm_twin.identification.excitation import Judge, TrajectoryLimits, optimize_excitation
 from pkm_twin.identification.parameters import file_parameters
 from test.support.robots import load
 
@@ -22,10 +22,10 @@ from test.support.robots import load
 )
 def test_limits_hold_at_any_time_of_a_long_trajectory(name, duration, terms):
     robot, rng = load(name), np.random.default_rng(3)
-    judge = Judge.of(robot, file_parameters(robot, ("friction", "payload")))
+    judge = Judge.from_robot(robot, file_parameters(robot, ("friction", "payload")))
     # All of the limits: what is beyond them between the states shows.
-    bounds = Bounds(share=1.0, acceleration=20.0)
-    found = excite(judge, duration, terms, bounds, trials=12)
+    bounds = TrajectoryLimits(share=1.0, acceleration=20.0)
+    found = optimize_excitation(judge, duration, terms, bounds, trials=12)
     time = np.sort(rng.uniform(0.0, duration, 40 * round(found.harmonics[-1])))
     q, qd, qdd = found.at(time)
     low, high = robot.limits.position.T
@@ -42,16 +42,16 @@ def test_limits_hold_at_any_time_of_a_long_trajectory(name, duration, terms):
 
 def test_harmonics_need_points_to_show_them():
     robot = load("five_bar")
-    judge = Judge.of(robot, file_parameters(robot, ("friction",)))
+    judge = Judge.from_robot(robot, file_parameters(robot, ("friction",)))
     with pytest.raises(PkmTwinError, match="50 harmonics in 2 s reach 25 Hz"):
-        excite(judge, 2.0, 50, Bounds(rate=100.0))
+        optimize_excitation(judge, 2.0, 50, TrajectoryLimits(rate=100.0))
     for rate in (10.0, 100.0):
-        found = excite(judge, 30.0, 6, Bounds(rate=rate), trials=10)
+        found = optimize_excitation(judge, 30.0, 6, TrajectoryLimits(rate=rate), trials=10)
         assert found.harmonics[-1] / found.duration <= rate / 10.0
 
 
 @pytest.mark.parametrize("acceleration", [0.0, -1.0, np.nan, np.inf, 1e300])
 def test_an_acceleration_is_a_machines_or_rejected(acceleration):
     with pytest.raises(ParameterError) as error:
-        Bounds(acceleration=acceleration)
+        TrajectoryLimits(acceleration=acceleration)
     assert error.value.field == "acceleration"

@@ -17,7 +17,7 @@ from pkm_twin.identification.fit import fit
 from pkm_twin.identification.parameters import file_parameters
 from pkm_twin.identification.rows import rows_of
 from pkm_twin.identification.samples import derivative
-from pkm_twin.identification.suspects import USUAL, Lengths
+from pkm_twin.identification.suspects import DEFAULT_GEOMETRY_DEVIATION, Lengths
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.recordings import Load, Recording
 from test.identification.machines import machine, noisy, of_prior
@@ -54,7 +54,7 @@ def test_columns_are_differences_of_the_efforts(name: str) -> None:
     heavy = robot.changed(payload={"mass": 0.4})
     none = robot.changed(payload={"mass": 0.0, "inertia": [0.0, 0.0, 0.0]})
     values = file_parameters(heavy).values
-    lengths = Lengths.of(robot)
+    lengths = Lengths.from_robot(robot)
     found = lengths.columns(rows, values)
     size = np.abs(inverse_dynamics(robot, *rows.signals.motion.joints)).max() / robot.graph.size
     tried = 0
@@ -95,7 +95,7 @@ def test_drawn_lengths_change_the_efforts_as_their_columns_say(name: str) -> Non
     m = machine(robot, rng, 4.0, 1000.0)
     everything = file_parameters(robot)
     rows = rows_of(robot, everything, noisy(m.recorded(), rng))
-    lengths = Lengths.of(robot)
+    lengths = Lengths.from_robot(robot)
     columns = lengths.columns(rows, everything.values)
     motion = [CubicSpline(m.time, values)(rows.time) for values in (m.q, m.qd, m.qdd)]
     here = inverse_dynamics(robot, *motion)
@@ -111,13 +111,13 @@ def test_drawn_lengths_change_the_efforts_as_their_columns_say(name: str) -> Non
 
 def test_the_file_says_how_well_its_lengths_are_known() -> None:
     robot = load("delta_cu")
-    usual = {one.where: one.usual for one in Lengths.of(robot).suspects}
-    assert usual["geometry.arm_length"] == USUAL * robot.graph.size
+    usual = {one.where: one.usual for one in Lengths.from_robot(robot).suspects}
+    assert usual["geometry.arm_length"] == DEFAULT_GEOMETRY_DEVIATION * robot.graph.size
     own = unsure(robot, {"geometry.arm_length": {"deviation": 1e-4}, "inertia": {"relative": 0.1}})
-    usual = {one.where: one.usual for one in Lengths.of(own).suspects}
+    usual = {one.where: one.usual for one in Lengths.from_robot(own).suspects}
     assert usual["geometry.arm_length"] == 1e-4
-    assert usual["geometry.forearm_length"] == USUAL * robot.graph.size
-    all_in_one = Lengths.of(unsure(robot, {"geometry": {"relative": 1e-3}}))
+    assert usual["geometry.forearm_length"] == DEFAULT_GEOMETRY_DEVIATION * robot.graph.size
+    all_in_one = Lengths.from_robot(unsure(robot, {"geometry": {"relative": 1e-3}}))
     assert len(all_in_one.suspects) == 1
     assert all_in_one.mixing[all_in_one.paths.index("geometry.arm_length"), 0] == robot.number("geometry.arm_length")
 

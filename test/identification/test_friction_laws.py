@@ -9,7 +9,7 @@ import pytest
 from delta_dynamics import inverse_dynamics
 from pkm_twin.errors import ParameterError, PkmTwinError, UnknownNameError
 from pkm_twin.identification.drives import fitted_constants, given_constants
-from pkm_twin.identification.excitation import Bounds, Judge, sweeps
+from pkm_twin.identification.excitation import Judge, TrajectoryLimits, sweeps
 from pkm_twin.identification.fit import fit
 from pkm_twin.identification.friction_laws import fit_with_laws, laws_of
 from pkm_twin.identification.parameters import file_parameters
@@ -137,8 +137,8 @@ def test_a_line_is_found_with_its_frequency_and_no_other(rng):
 @pytest.mark.parametrize("name", ["five_bar", "delta_cu"])
 def test_sweeps_stay_inside_the_limits_and_move_one_joint_at_a_time(name):
     robot = load(name)
-    judge = Judge.of(robot, file_parameters(robot, ("friction",)))
-    found = sweeps(judge, 60.0, Bounds(share=1.0))
+    judge = Judge.from_robot(robot, file_parameters(robot, ("friction",)))
+    found = sweeps(judge, 60.0, TrajectoryLimits(share=1.0))
     time = np.linspace(0.0, found.duration, 20001)
     q, qd, qdd = found.at(time)
     step = time[1]
@@ -149,10 +149,10 @@ def test_sweeps_stay_inside_the_limits_and_move_one_joint_at_a_time(name):
     low, high = robot.limits.position.T
     assert (q >= low - 1e-12).all() and (q <= high + 1e-12).all()
     assert (np.abs(qd) <= robot.limits.velocity * (1.0 + 1e-12)).all()
-    assert (robot.singularity(q[::50]) > Bounds().singularity * 0.99).all()
+    assert (robot.singularity(q[::50]) > TrajectoryLimits().singularity * 0.99).all()
     assert np.isfinite(found.condition)
     for least in (0.05, 1.0):
-        slow = sweeps(judge, 60.0, Bounds(share=1.0, acceleration=least * np.abs(qdd).max()))
+        slow = sweeps(judge, 60.0, TrajectoryLimits(share=1.0, acceleration=least * np.abs(qdd).max()))
         change = slow.at(np.linspace(0.0, slow.duration, 40001))[2]
         assert np.abs(change).max() <= least * np.abs(qdd).max() * (1.0 + 1e-9)
     # Both ways, at three speeds each.
@@ -169,7 +169,7 @@ def test_sweeps_stay_inside_the_limits_and_move_one_joint_at_a_time(name):
 def test_sweeps_alone_show_the_friction_of_every_joint(name, seeds):
     """Fast ones, too, whose ramps a coarse encoder smooths: errors are as large as they say."""
     robot, errors, away = load(name), [], []
-    found = sweeps(Judge.of(robot, file_parameters(robot, ("friction",))), 20.0, Bounds(rate=200.0))
+    found = sweeps(Judge.from_robot(robot, file_parameters(robot, ("friction",))), 20.0, TrajectoryLimits(rate=200.0))
     time = np.arange(0.0, found.duration, 0.005)
     motion = found.at(time)
     size = np.abs(inverse_dynamics(robot, *motion)).max(0)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pkm_twin.identification.judge import Case, Suspect, Verdict, judge
+from pkm_twin.identification.judge import Case, Suspect, Verdict, fit_and_judge
 from test.support.robots import partly_long
 
 ROWS, CHANNELS, FITTED, ERRORS = 300, 2, 3, 12
@@ -31,7 +31,7 @@ def judged(
         ROWS,
     )
     suspects = [Suspect("length", str(k), "m", float(u), known=True) for k, u in enumerate(usual)]
-    verdict, _ = judge(["a", "b"], suspects, [case], np.full(explained.shape[-1], 1e3))
+    verdict, _ = fit_and_judge(["a", "b"], suspects, [case], np.full(explained.shape[-1], 1e3))
     return verdict, covariance, found
 
 

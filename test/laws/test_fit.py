@@ -124,7 +124,7 @@ def test_a_payload_of_a_delta_has_a_mass_and_no_place():
     recorded = Recording(robot, time, q, effort=inverse_dynamics(robot, q, qd, qdd))
     result = fit(load("delta"), [recorded], ("payload",))
     assert by_name(result)["payload.mass"].after == pytest.approx(0.3, rel=0.01)
-    idle = {number.name for number in result.of("not excited")}
+    idle = {number.name for number in result.list_numbers("not excited")}
     assert {f"payload.com[{k}]" for k in range(3)} <= idle
 
 

@@ -66,21 +66,21 @@ def excite(given: Excite) -> Report:
 
     :raises PkmTwinError: no trajectory keeps to the limits.
     """
-    from pkm_twin.identification.excitation import Bounds, Judge, sweeps
-    from pkm_twin.identification.excitation import excite as design
+    from pkm_twin.identification.excitation import Judge, TrajectoryLimits, sweeps
+    from pkm_twin.identification.excitation import optimize_excitation as design
     from pkm_twin.identification.parameters import file_parameters, kinds_of
     from pkm_twin.recordings import Recording, read
     from pkm_twin.recordings.bags import write_motion
 
     machine = given.machine()
-    judge = Judge.of(machine, file_parameters(machine, kinds_of(given.what)))
+    judge = Judge.from_robot(machine, file_parameters(machine, kinds_of(given.what)))
     other = None
     if given.compare is not None:
         recorded = read(given.compare, machine)
         other = judge.recorded_condition(recorded.time, recorded.q)
         if other is None:
             raise BagError("too few joint states in a row", path=given.compare, reason="too short")
-    bounds = Bounds(given.share, given.acceleration, given.singularity, given.rate)
+    bounds = TrajectoryLimits(given.share, given.acceleration, given.singularity, given.rate)
     best: Any
     if given.friction:
         best = sweeps(judge, given.duration, bounds)
