@@ -101,8 +101,8 @@ class _Sample:
 
     time: float
     predicted: Array
-    reach: Array
-    rest: Array
+    load_map: Array
+    element_compliance: Array
     loads: Array
     effects: Array
     measured: Array
@@ -125,30 +125,33 @@ class _Fit:
 class _Window:
     """Hold k samples in d measured directions, each divided by its noise.
 
-    ``owner``: element of each column, (r,). ``reach``: (k, d, r), ``rest``: (k, r, r), ``loads``: (k, r) as in
-    :mod:`stiffness_monitor.response`. ``common``: effects of the causes, then of the zeros,
-    (k, d, c + d). ``residual``: measured less predicted, (k, d). ``prior``: (c + d,), of both.
+    ``element_of_column``: index of each column's element, (r,). ``load_map``: A of
+    :mod:`stiffness_monitor.response`, effect of the columns' forces on the platform, (k, d, r);
+    ``element_compliance``: its M, with the platform locked, (k, r, r). ``loads``: the columns' forces
+    under the wrench, (k, r). ``bias_effects``: effects of the file's uncertain numbers, then of the
+    sensors' offsets, (k, d, c + d). ``residual``: measured less predicted, (k, d). ``prior``: inverse
+    prior variance of these numbers and offsets, (c + d,).
     """
 
-    owner: Indices
-    reach: Array
-    rest: Array
+    element_of_column: Indices
+    load_map: Array
+    element_compliance: Array
     loads: Array
-    common: Array
+    bias_effects: Array
     residual: Array
     prior: Array
 
     def predict_change(self, chosen: Sequence[int], factors: Array) -> tuple[Array, Array]:
         """Return the deflection change by elements' factors, (k, d), and its derivatives."""
-        affected = np.isin(self.owner, chosen)
-        by_element = np.equal.outer(self.owner[affected], np.asarray(chosen)).astype(float)
+        affected = np.isin(self.element_of_column, chosen)
+        by_element = np.equal.outer(self.element_of_column[affected], np.asarray(chosen)).astype(float)
         change = by_element @ (factors - 1.0)
-        reach = self.reach[..., affected]
-        matrix = np.eye(len(change)) + self.rest[:, affected][..., affected] * change
-        right = np.concatenate([np.swapaxes(reach, -1, -2), self.loads[:, affected, None]], -1)
+        load_map = self.load_map[..., affected]
+        matrix = np.eye(len(change)) + self.element_compliance[:, affected][..., affected] * change
+        right = np.concatenate([np.swapaxes(load_map, -1, -2), self.loads[:, affected, None]], -1)
         solved = np.linalg.solve(matrix, right)
         columns, column_forces = np.swapaxes(solved[..., :-1], -1, -2), solved[..., -1]
-        change_of_deflection = reach @ (change * column_forces)[..., None]
+        change_of_deflection = load_map @ (change * column_forces)[..., None]
         return change_of_deflection[..., 0], (columns * column_forces[:, None]) @ by_element
 
     def fit(self, chosen: Sequence[int], start: Array) -> _Fit:
@@ -157,7 +160,7 @@ class _Window:
         prior = np.concatenate([np.zeros(e), self.prior])
         for _ in range(20):
             change, slopes = self.predict_change(chosen, factors)
-            table = np.concatenate([slopes, self.common], -1).reshape(-1, len(prior))
+            table = np.concatenate([slopes, self.bias_effects], -1).reshape(-1, len(prior))
             target = (self.residual - change).ravel()
             information = table.T @ table + np.diag(prior)
             # Scale the unknowns: zeros and factors differ by orders of magnitude.
@@ -199,7 +202,7 @@ class StiffnessAlarm:
         """Store the elements' names and the standard deviations that the file gives them."""
         response = element_response(self.robot, pose)
         self._file_deviations = _file_deviations(self.robot, pose, len(response.names))
-        self.names, self._owner = response.names, response.owner
+        self.names, self._element_of_column = response.names, response.owner
 
     @property
     def count(self) -> int:
@@ -255,14 +258,14 @@ class StiffnessAlarm:
         # Each element's factor alone, to first order, and its standard error, without common causes.
         count = len(self.names)
         _, slopes = window.predict_change(range(count), np.ones(count))
-        rows, columns = slopes.reshape(-1, count), window.common.reshape(-1, len(window.prior))
+        rows, columns = slopes.reshape(-1, count), window.bias_effects.reshape(-1, len(window.prior))
         columns = np.concatenate([columns, np.diag(np.sqrt(window.prior))])
         basis = np.linalg.qr(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300))[0]
         basis = basis[: len(rows)]
         rows = rows - basis @ (basis.T @ rows)
         information = np.maximum(np.sum(rows**2, 0), 1e-300)
         values, deviations = 1.0 + rows.T @ window.residual.ravel() / information, 1.0 / np.sqrt(information)
-        bounds = self._departure_bounds(np.sqrt(variance_factor) * deviations, range(len(self.names)))
+        bounds = self._alarm_thresholds(np.sqrt(variance_factor) * deviations, range(len(self.names)))
         if not (np.abs(values - 1.0) > 0.5 * bounds).any():
             # To first order no factor exceeds half its bound, so a full search would find no departure.
             return ()
@@ -270,15 +273,15 @@ class StiffnessAlarm:
         chosen = yield from self._select_elements(window, variance_factor)
         return (yield from self._describe_departures(window, variance_factor, chosen))
 
-    def _departure_bounds(self, deviations: Array, elements: Sequence[int]) -> Array:
-        """Return the differences from 1 of the factors that give no alarm."""
+    def _alarm_thresholds(self, deviations: Array, elements: Sequence[int]) -> Array:
+        """Return the largest difference from 1 of each element's factor that gives no alarm, (elements,)."""
         s = self.settings
         file_deviations = self._file_deviations[list(elements)]
         return np.asarray(np.maximum(s.min_departure, s.sigmas * np.hypot(deviations, file_deviations)), np.float64)
 
     def _relative_departures(self, fit: _Fit, variance_factor: float, elements: Sequence[int]) -> Array:
         """Return the factors' differences from 1 over their bounds, (elements,)."""
-        bounds = self._departure_bounds(fit.deviations(variance_factor), elements)
+        bounds = self._alarm_thresholds(fit.deviations(variance_factor), elements)
         return np.asarray(np.abs(fit.factors - 1.0) / bounds, np.float64)
 
     def _select_elements(self, window: _Window, variance_factor: float) -> Generator[None, None, list[int]]:
@@ -318,7 +321,7 @@ class StiffnessAlarm:
             fit.deviations(variance_factor),
             self._relative_departures(fit, variance_factor, chosen),
         )
-        bounds = self._departure_bounds(deviations, chosen)
+        bounds = self._alarm_thresholds(deviations, chosen)
         found = []
         for position in np.argsort(-departures).tolist():
             others = []
@@ -344,25 +347,25 @@ class StiffnessAlarm:
         return tuple(found)
 
     def _build_window(self) -> tuple[_Window, float, float]:
-        """Divide the samples by their noise.
+        """Build the window of samples, each divided by its noise, for the fit.
 
-        :returns: the window, the factor by which autocorrelation widens variances, and the
-        deflections' standard deviation over their noise in the clearest direction.
+        :returns: the window; the factor by which autocorrelation of the noise increases variances;
+        the deflections' largest ratio of standard deviation to noise over the directions.
         """
         directions = np.flatnonzero(self.settings.directions)
-        predicted, reach, rest, loads, effects, measured = (
+        predicted, load_map, element_compliance, loads, effects, measured = (
             np.array([getattr(sample, name) for sample in self._samples])
-            for name in ("predicted", "reach", "rest", "loads", "effects", "measured")
+            for name in ("predicted", "load_map", "element_compliance", "loads", "effects", "measured")
         )
-        residual, reach, effects = (a[:, directions] for a in (measured - predicted, reach, effects))
+        residual, load_map, effects = (a[:, directions] for a in (measured - predicted, load_map, effects))
         zeros = np.broadcast_to(np.eye(len(directions)), (len(predicted), len(directions), len(directions)))
-        common = np.concatenate([effects, zeros], -1)
+        bias_effects = np.concatenate([effects, zeros], -1)
         prior = np.repeat([1.0, 0.0], [effects.shape[-1], len(directions)])
-        plain = _Window(self._owner, reach, rest, loads, common, residual, prior)
+        plain = _Window(self._element_of_column, load_map, element_compliance, loads, bias_effects, residual, prior)
         _, slopes = plain.predict_change(range(len(self.names)), np.ones(len(self.names)))
         size = np.std(measured[:, directions], 0)
         # Estimate the noise from what elements, causes and zeros do not explain, and its correlation in time.
-        table, min_noise = np.concatenate([slopes, common], -1), 1e-3 * size
+        table, min_noise = np.concatenate([slopes, bias_effects], -1), 1e-3 * size
         noise, unexplained = np.maximum(min_noise, 1e-30), residual
         for _ in range(2):
             rows = (table / noise[:, None]).reshape(-1, table.shape[-1])
@@ -381,7 +384,13 @@ class StiffnessAlarm:
         signal_to_noise = float((size / noise).max())
         scale_factors = noise[:, None]
         window = _Window(
-            self._owner, reach / scale_factors, rest, loads, common / scale_factors, residual / noise, prior
+            self._element_of_column,
+            load_map / scale_factors,
+            element_compliance,
+            loads,
+            bias_effects / scale_factors,
+            residual / noise,
+            prior,
         )
         return window, variance_factor, signal_to_noise
 
@@ -482,20 +491,21 @@ class StiffnessWatch(Core):
         if self._judging is not None or self._due - self._judged < SECOND:
             return None
         self._judged = self._due
-        mine = self._judging = object()
+        evaluation = self._judging = object()
 
-        def evaluate() -> Generator[None, None, bool]:
+        def evaluate_if_current() -> Generator[None, None, bool]:
+            """Evaluate the alarm in slices; store the departures unless a reset has made them void."""
             try:
                 found = yield from self._alarm.judging()
-                if self._judging is not mine:
+                if self._judging is not evaluation:
                     return False
                 self.departures = found
                 return True
             finally:
-                if self._judging is mine:
+                if self._judging is evaluation:
                     self._judging = None
 
-        return evaluate()
+        return evaluate_if_current()
 
     def _use_waiting_deflections(self) -> None:
         latest = self._answers.latest

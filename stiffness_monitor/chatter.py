@@ -117,7 +117,9 @@ class Lobes:
         return int(np.flatnonzero(self.depths == self.depths.max())[-1])
 
     def steady(self, margin: float = SPEED_MARGIN) -> tuple[float, float, bool]:
-        """Return the best speed (rpm) if the spindle's speed is uncertain, its depth, and whether that is open.
+        """Return the speed (rpm) with the largest depth that stays stable under speed errors.
+
+        Also returns that depth, m, and True if it is the largest depth tried (no limit was found).
 
         The depth (m) is stable at all speeds within the margin, and at the next ones on both sides. If
         the range of speeds is narrower than the margin, its middle is taken. Speeds must rise.
@@ -321,7 +323,7 @@ def lobes_from_modes(modes: ToolModes, milling: Milling, speeds: ArrayLike, deep
     """Find limit depths as :func:`stability_lobes`, from the tool point's modes."""
     plane = CuttingPlaneModes.of(modes, milling)
     at = np.atleast_1d(np.asarray(speeds, np.float64))
-    last, safe = _check_range(plane, milling, at, deepest)
+    last, safe = _find_depth_range(plane, milling, at, deepest)
     return _find_limit_depths(plane, milling, at, last, safe)
 
 
@@ -341,7 +343,7 @@ def refine_lobes(
     """
     plane = CuttingPlaneModes.of(modes, milling)
     even = np.linspace(low, high, points)
-    last, safe = _check_range(plane, milling, even, deepest)
+    last, safe = _find_depth_range(plane, milling, even, deepest)
     new = np.union1d(even, plane.lobe_speeds(milling, low, high))
     found = _find_limit_depths(plane, milling, new, last, safe)
     while True:
@@ -359,8 +361,10 @@ def refine_lobes(
         )
 
 
-def _check_range(plane: CuttingPlaneModes, milling: Milling, at: Array, deepest: float | None) -> tuple[float, float]:
-    """Return the deepest depth to try and the zero-order depth, m; errors as :func:`lobes_from_modes`."""
+def _find_depth_range(
+    plane: CuttingPlaneModes, milling: Milling, at: Array, deepest: float | None
+) -> tuple[float, float]:
+    """Return the largest depth to try and the zero-order depth, m; reject inputs as :func:`lobes_from_modes`."""
     if at.ndim != 1:
         raise ParameterError("speeds", at.shape, "one speed after another")
     for speed in (at.min(), at.max()) if at.size else ():

@@ -115,20 +115,22 @@ def _response_kernel(robot: Robot) -> Kernel:
 def _evaluate_checked(robot: Robot, q: ArrayLike, wrench: ArrayLike) -> Array:
     q, wrench = doubles(q, "joint positions"), vectors(wrench, 6, "the wrench")
     (rows,), status = robot.cached(Elastic).response(NO_PARAMETERS, q, wrench)
-    check(robot, q, wrench, rows[..., -1], status)
+    raise_first_rejection(robot, q, wrench, rows[..., -1], status)
     return rows
 
 
-def check(robot: Robot, q: ArrayLike, wrench: ArrayLike, measure: Array, status: Array | None) -> None:
-    """Raise the typed error of the first rejected sample, if there is one.
+def raise_first_rejection(
+    robot: Robot, q: ArrayLike, wrench: ArrayLike, pivot_ratio: Array, status: Array | None
+) -> None:
+    """Raise the error of the first rejected sample, if any.
 
-    :param measure: smallest pivot ratio of the frame, 0 if it is a mechanism. ``status``: the
+    :param pivot_ratio: smallest pivot ratio of the frame, 0 if it is a mechanism. ``status``: the
     program's status.
     """
-    if status is None and (measure > MIN_PIVOT_RATIO).all():
+    if status is None and (pivot_ratio > MIN_PIVOT_RATIO).all():
         return
-    codes = np.zeros(measure.shape) if status is None else status[..., 0]
-    for index in np.ndindex(*measure.shape):
+    codes = np.zeros(pivot_ratio.shape) if status is None else status[..., 0]
+    for index in np.ndindex(*pivot_ratio.shape):
         if status is not None and codes[index]:
             place = np.broadcast_to(np.asarray(q, float), (*codes.shape, robot.joints_count))
             load = np.broadcast_to(np.asarray(wrench, float), (*codes.shape, 6))[index]
@@ -137,7 +139,7 @@ def check(robot: Robot, q: ArrayLike, wrench: ArrayLike, measure: Array, status:
             if not math.isfinite(sum(x * x for x in load.tolist())):
                 where = f" at sample {index}" if index else ""
                 raise ValueError(f"wrench, or its energy,{where} is not finite, or leads to a result that is not")
-        found = 0.0 if codes[index] else float(measure[index])
+        found = 0.0 if codes[index] else float(pivot_ratio[index])
         if not found > MIN_PIVOT_RATIO:
             frame = "the elastic frame of the pose"
             raise SingularityError(frame, index, found, MIN_PIVOT_RATIO)
@@ -181,7 +183,7 @@ def member_deflections(robot: Robot, q: ArrayLike, wrench: ArrayLike) -> dict[st
     """
     elastic = robot.cached(Elastic)
     (rows, measure), status = elastic.deflections(NO_PARAMETERS, q, wrench)
-    check(robot, q, wrench, measure[..., 0], status)
+    raise_first_rejection(robot, q, wrench, measure[..., 0], status)
     names = [member.name for member in elastic.plan.members]
     table = rows.reshape(*rows.shape[:-1], len(names), 2, DEFLECTION_PARTS + 1, 3)
     return {name: (table[..., k, 0, :, :], table[..., k, 1, :, :]) for k, name in enumerate(names)}

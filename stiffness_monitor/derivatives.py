@@ -130,7 +130,7 @@ def _write_compliance(s: SymbolicFrame) -> Program:
 
 def _write_energies(s: SymbolicFrame) -> Program:
     s.factorise()
-    s.load(s.t.tape.inputs("wrench", 6))
+    s.apply_wrench(s.t.tape.inputs("wrench", 6))
     return s.program({"wrench": 6}, {"energies": s.energies()})
 
 

@@ -212,7 +212,7 @@ class Frame:
             for form, rigidity in (modes[:1] if self.static and member.strut else modes)
         ]
 
-    def table(self) -> Any:
+    def build_constraint_matrix(self) -> Any:
         """Return the closures' constraint matrix, shape (rows, size)."""
         table = np.zeros((len(self.constraints), self.size), dtype=object)
         for line, row in zip(table, self.constraints, strict=True):

@@ -204,7 +204,7 @@ def assemble(model: StructuralModel, elements: int, kept: int | None = None) -> 
     if frame.constraints:
         # Basis of the closures' null space, (size, fewer); the first six rows are unit.
         table = np.zeros((len(frame.constraints), size))
-        table[:, : frame.size] = frame.table()
+        table[:, : frame.size] = frame.build_constraint_matrix()
         dependent, chosen = frame.choose_dependents(table[None, :, : frame.size])
         free = [k for k in range(size) if k not in chosen]
         null = np.eye(size)[:, free]

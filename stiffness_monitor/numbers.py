@@ -57,7 +57,7 @@ def substitute_numbers(structure: Structure, graph: Graph, numbers: Numbers) -> 
         rigidities[beam.name] = [next(remaining) for _ in range(4)]
     compliances = {name: [next(remaining) for _ in values] for name, values in structure.compliances.items()}
     for value in (v for values in compliances.values() for v in values):
-        finite = _is_finite(value)
+        finite = _is_elastic(value)
         value.tape.assumed.append((finite, finite.value))
     return replace(structure, beams=tuple(beams), compliances=compliances), rigidities
 
@@ -69,7 +69,7 @@ def constant_pattern(structure: Structure, tree: Tree) -> str:
         for body, at in (beam.inner, beam.outer):
             local = marks(tree.axes[body].T @ (at - tree.at[body]))
             parts.append((beam.name, beam.element, beam.parts, body, _find_point(places, at), local))
-    flags = {n: [float(_is_finite(v)) for v in row] for n, row in structure.compliances.items()}
+    flags = {n: [float(_is_elastic(v)) for v in row] for n, row in structure.compliances.items()}
     return repr((parts, flags, structure.order))
 
 
@@ -88,6 +88,6 @@ def _find_point(points: Sequence[Array], at: Any) -> int | None:
     return next(coinciding, None)
 
 
-def _is_finite(compliance: Any) -> Any:
-    """Return an expression: 1 if a compliance is above zero and below 1e300, which is free, else 0."""
+def _is_elastic(compliance: Any) -> Any:
+    """Return an expression: 1 for a compliance above 0 (rigid) and below 1e300 (free), else 0."""
     return sign(compliance) * sign(maximum(0.0, 1e300 - compliance))

@@ -29,7 +29,7 @@ from pkm_twin.kinematics.traced import Traced
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor.frame import PLATFORM, Frame, Row, bending_shape, sum_forms
 from stiffness_monitor.numbers import constant_pattern, list_numbers, substitute_numbers
-from stiffness_monitor.structure import FREE, place_plan, plan_structure
+from stiffness_monitor.structure import FREE, evaluate_plan, plan_structure
 
 DEFLECTION_PARTS: Final = 4
 """Parts that a member is divided into to draw its deflection."""
@@ -78,7 +78,7 @@ class Elastic:
             return None
         engine = self.robot.engine
         frames = [self._build_frame(Motion(engine.tree, x, q)) for x, q in engine.samples]
-        tables = np.array([frame.table() for frame in frames], np.float64)
+        tables = np.array([frame.build_constraint_matrix() for frame in frames], np.float64)
         # The frame may be singular at home: take the samples of the largest rank.
         ranks = np.array([len(independent_rows(table[None, :, PLATFORM:])) for table in tables])
         most = ranks == ranks.max()
@@ -88,7 +88,7 @@ class Elastic:
 
     def _build_frame(self, motion: Motion) -> Frame:
         """Return the frame in a numeric state, every rigidity and compliance one."""
-        model = place_plan(self.plan, motion.point, motion.direction, lambda _: [1.0] * 4, lambda *_: 1.0)
+        model = evaluate_plan(self.plan, motion.point, motion.direction, lambda _: [1.0] * 4, lambda *_: 1.0)
         return Frame(model, static=True)
 
     @cached_property
@@ -182,7 +182,7 @@ class SymbolicFrame:
 
     def _build_frame(self, motion: Motion) -> Frame:
         compliances = self.structure.compliances
-        model = place_plan(
+        model = evaluate_plan(
             self.plan,
             motion.point,
             motion.direction,
@@ -239,8 +239,8 @@ class SymbolicFrame:
                 value = _sum_products(inverse[i:], [w[k][i] * w[k][j] for k in range(i, PLATFORM)])
                 self.compliance[i, j] = self.compliance[j, i] = value
 
-    def load(self, wrench: Any) -> None:
-        """Apply a wrench to the platform; set coordinates ``x`` and the columns' ``amounts``.
+    def apply_wrench(self, wrench: Any) -> None:
+        """Apply a wrench to the platform; set coordinates ``x`` and the columns' ``deformations``.
 
         The platform moves by C P; elements move with it, and their work is the wrench's (2UPR-RPU
         paper, equations 29, 31 and 32).
@@ -250,7 +250,7 @@ class SymbolicFrame:
         for j in reversed(range(len(x) - PLATFORM)):
             x[j] = -_sum_products([root.factors[i, j] for i in root.below[j]], [x[i] for i in root.below[j]])
         ordered = [x[root.place[i]] for i in range(len(x))]
-        self.amounts = [_sum_products(c.row.values(), [ordered[i] for i in c.row]) for c in self.columns]
+        self.deformations = [_sum_products(c.row.values(), [ordered[i] for i in c.row]) for c in self.columns]
         self.x = {k: ordered[i] for k, i in self.place.items()}
         for k, row in self.dependent_rows.items():
             self.x[k] = _sum_products(row.values(), [self.x[c] for c in row])
@@ -262,7 +262,7 @@ class SymbolicFrame:
         d (b . x)^2 / 2 summed over an element's columns.
         """
         energies: dict[str, Any] = dict.fromkeys(self.elastic.names, 0.0)
-        for column, amount in zip(self.columns, self.amounts, strict=True):
+        for column, amount in zip(self.columns, self.deformations, strict=True):
             energies[column.element] += 0.5 * column.rigidity * (amount * amount)
         return list(energies.values())
 
@@ -280,7 +280,7 @@ def solve_dependents(frame: Frame, chosen: DependentCoordinates) -> tuple[dict[i
     :returns: their rows of the other coordinates, the factors of the system, and the residuals of
         the redundant closures, which must be zero.
     """
-    table = frame.table()[list(chosen.rows)]
+    table = frame.build_constraint_matrix()[list(chosen.rows)]
     lu = SparseLU(table[:, list(chosen.chosen)], chosen.pivots)
     others = sorted({k for r in chosen.rows for k in frame.constraints[r]} - set(chosen.chosen))
     solutions = [lu.solve(-table[:, k]) for k in others]
@@ -309,7 +309,7 @@ def write_response(s: SymbolicFrame) -> Program:
     for value in wrench:
         scale = maximum(scale, absolute(value))
     # Scale the load to unit size, so that squares of tiny or huge loads neither underflow nor overflow.
-    s.load(wrench / maximum(scale, 1e-300))
+    s.apply_wrench(wrench / maximum(scale, 1e-300))
     # U_ij, U = sum of U_ij = P' C P / 2 and mu_ij = U_ij / U (2UPR-RPU paper, equations 37 and 38).
     energies, square = s.energies(), scale * scale
     total = sum(energies, 0.0)
@@ -321,8 +321,8 @@ def write_response(s: SymbolicFrame) -> Program:
 
 def _write_deflections(s: SymbolicFrame) -> Program:
     s.factorise()
-    s.load(s.t.tape.inputs("wrench", 6))
-    amounts, rows = iter(s.amounts), []
+    s.apply_wrench(s.t.tape.inputs("wrench", 6))
+    amounts, rows = iter(s.deformations), []
     for bar in s.frame.bars:
         member = bar.member
         bends = [next(amounts) for _ in s.frame.columns(bar)][2:]

@@ -30,9 +30,10 @@ from stiffness_monitor.programs import NO_PARAMETERS, Elastic
 class ElementResponse:
     """Hold the platform's compliance as a function of the elements' compliance factors.
 
-    ``names``: of the elements, as ``strain_energy`` has them. ``owner``: shape (r,), which element
-    a column is of. ``compliance``: of the file, (..., 6, 6). ``reach``: A, (..., 6, r), and
-    ``rest``: M, (..., r, r), of the module's equation.
+    A, M and the columns of G are those of the module's equation. ``names``: of the elements, as in
+    ``strain_energy``. ``owner``: index of the element of each column, (r,). ``compliance``: with the
+    file's values, (..., 6, 6). ``reach``: A, the effect of the columns' forces on the platform,
+    (..., 6, r). ``rest``: M, shape (..., r, r).
     """
 
     names: tuple[str, ...]
@@ -65,7 +66,7 @@ class ElementResponse:
         return self.compliance + self.reach @ np.swapaxes(change * columns, -1, -2)
 
     def derivatives(self, factors: ArrayLike | None = None) -> Array:
-        """Return the compliance's derivatives by the factors, (..., elements, 6, 6)."""
+        """Return the compliance's derivatives with respect to the factors, (..., elements, 6, 6)."""
         columns = self.reach if factors is None else self.columns(factors)[1]
         return np.stack(
             [

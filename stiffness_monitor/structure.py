@@ -7,7 +7,7 @@ displacements of its own; a joint between two bodies that are already attached i
 
 The plan states which part is attached to which, once, at home. In it a point or direction is a pair
 of its body and its vector at home, a section is its beam's name, and a compliance is 0, infinite or
-the joint's name and the entry. :func:`place_plan` replaces these by numbers or expressions. For a
+the joint's name and the entry. :func:`evaluate_plan` replaces these by numbers or expressions. For a
 geometry of expressions the plan is that of their known values.
 """
 
@@ -190,7 +190,7 @@ def structural_model(robot: Robot, q: ArrayLike) -> StructuralModel:
     :raises UnreachableError: no assembly of the robot; a singularity as ``forward``.
     """
     structure, posture = robot.elastic, Posture(robot, q)
-    model = place_plan(
+    model = evaluate_plan(
         plan_structure(robot.graph, structure),
         posture.place,
         posture.turn,
@@ -210,7 +210,7 @@ def structural_model(robot: Robot, q: ArrayLike) -> StructuralModel:
     return replace(model, bodies=tuple(bodies))
 
 
-def place_plan(
+def evaluate_plan(
     plan: StructuralModel,
     place: Callable[[str, Array], Any],
     turn: Turn,
@@ -223,24 +223,25 @@ def place_plan(
     :param section: returns a beam's section. ``compliance``: returns an entry of a joint's compliance.
     """
 
-    def place_support(support: Support, own: Any = None) -> Support:
+    def evaluate_support(support: Support, member_axes: Any = None) -> Support:
+        """Return a support with its axes, compliance and position in the pose."""
         values = (v if isinstance(v, float) else compliance(*v) for v in support.compliance)
-        axes = own if support.axes is None else joint_axes_matrix(support.axes, turn)
+        axes = member_axes if support.axes is None else joint_axes_matrix(support.axes, turn)
         at = None if support.at is None else place(*support.at)
         return replace(support, axes=axes, compliance=tuple(values), at=at)
 
-    def place_part(part: Member | Carried) -> Member | Carried:
+    def evaluate_part(part: Member | Carried) -> Member | Carried:
         if isinstance(part, Carried):
-            return replace(part, at=place(*part.at), support=place_support(part.support))
+            return replace(part, at=place(*part.at), support=evaluate_support(part.support))
         made = replace(part, start=place(*part.start), end=place(*part.end), section=section(part.section))
-        outer = None if made.outer is None else place_support(made.outer, made.axes)
-        return replace(made, inner=place_support(made.inner, made.axes), outer=outer)
+        outer = None if made.outer is None else evaluate_support(made.outer, made.axes)
+        return replace(made, inner=evaluate_support(made.inner, made.axes), outer=outer)
 
     return replace(
         plan,
         origin=place(*plan.origin),
-        parts=tuple(place_part(part) for part in plan.parts),
-        closures=tuple(replace(c, at=place(*c.at), support=place_support(c.support)) for c in plan.closures),
+        parts=tuple(evaluate_part(part) for part in plan.parts),
+        closures=tuple(replace(c, at=place(*c.at), support=evaluate_support(c.support)) for c in plan.closures),
     )
 
 
@@ -349,15 +350,15 @@ class _StructurePlanner:
     def _member_support(self, joint: Joint, body: str, end: tuple[str, Array]) -> Support:
         """Return the support of a member's end by a joint, which may be away from that end."""
         lever = joint.at - end[1]
-        # With a free tape both positions are separate inputs, so keep the lever, even of length zero, for derivatives.
-        is_free_tape = getattr(getattr(lever[0], "tape", None), "free", False)
-        if not joint.type.placed or not (is_free_tape or np.abs(references(lever)).max() >= SNAP):
+        # If geometry stays symbolic, keep the lever even at zero length: its derivatives are not zero.
+        is_symbolic = getattr(getattr(lever[0], "tape", None), "free", False)
+        if not joint.type.placed or not (is_symbolic or np.abs(references(lever)).max() >= SNAP):
             return self._joint_support(joint, body, end[1])
         own = joint.outer if body == joint.inner else joint.inner
         return replace(self._joint_support(joint, body, joint.at), at=(own, joint.at))
 
     def _joint_compliance(self, name: str) -> list[Any]:
-        """Return a joint's compliance in a plan; infinite entries are set by its freedoms."""
+        """Return a joint's compliance for the plan: infinite entries of the file are 0 here, and set free later."""
         values = enumerate(self.structure.compliances.get(name, RIGID))
         return [(name, k) if 0.0 < reference(value) < FREE else 0.0 for k, value in values]
 

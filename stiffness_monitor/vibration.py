@@ -66,11 +66,11 @@ class ToolModes:
         own = 2.0 * np.pi * self.frequencies
         return responses(2.0 * np.pi * at, own, self.damping, self.shapes) + self.rest
 
-    def strongest(self, frequencies: ArrayLike) -> tuple[float, float, Array]:
-        """Find where the tool point moves most per force, between first and last frequency.
+    def find_peak_response(self, frequencies: ArrayLike) -> tuple[float, float, Array]:
+        """Find the largest dynamic compliance of the tool point between the first and last frequency.
 
-        Returns the frequency, Hz, the displacement per force, m/N, and its direction (3,), base
-        axes. Peaks are checked too: they may be narrower than the steps of the frequencies.
+        Returns its frequency, Hz, the compliance, m/N, and its direction (3,), base axes. Peaks
+        are checked too: they may be narrower than the steps of the frequencies.
         """
         grid = doubles(frequencies, "frequencies")
         peaks = self.frequencies * np.sqrt(np.maximum(1.0 - 2.0 * self.damping**2, 0.0))
@@ -90,7 +90,7 @@ class ToolModes:
             raise ParameterError("frequencies", f"{low:g},{high:g}", "Hz, 0 or more, rising")
         grid = np.linspace(low, high, points)
         static = self.receptance([0.0])[0, :3, :3].real
-        return ToolResponse(grid, self.receptance(grid)[:, :3, :3], static, *self.strongest(grid))
+        return ToolResponse(grid, self.receptance(grid)[:, :3, :3], static, *self.find_peak_response(grid))
 
 
 @dataclass(frozen=True, eq=False)

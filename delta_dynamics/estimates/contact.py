@@ -167,7 +167,7 @@ class FrictionLearner:
     def __init__(self, joints: int) -> None:
         # By joint: the mean opposing effort and the time of motion, [backwards, forwards] each.
         self._means = [[[0.0, 0.0], [0.0, 0.0]] for _ in range(joints)]
-        # The same means at the last sample without contact.
+        # The mean opposing efforts of _means at the last sample without contact.
         self._means_without_contact = [[0.0, 0.0] for _ in range(joints)]
 
     def learn(self, step: float, external: Array, qd: Array, *, touching: bool = False) -> Array:
@@ -275,7 +275,7 @@ class ContactMonitor:
         self._last = time
         self._greatest = np.maximum(self._greatest, np.abs(parts.whole))
         was_idle = self.drives.idle
-        idle = self.drives.push(time, still, effort, parts.rest)
+        idle = self.drives.push(time, still, effort, parts.static)
         if idle and not was_idle:
             self._noise = self._saved_noise
         elif was_idle and not idle:

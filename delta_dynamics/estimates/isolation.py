@@ -36,8 +36,8 @@ POSITIONS_PER_BAR: Final = 5
 """Positions along a bar that are compared."""
 CONTACT_FRICTION: Final = 0.3
 """Coefficient of friction of a contact: a thin body transmits little force along itself."""
-MODEL_DEVIATION: Final = 0.05
-"""Standard deviation of an external effort relative to it: gains of the drives, geometry."""
+RELATIVE_MODEL_ERROR: Final = 0.05
+"""Standard deviation of an estimated external effort, as a fraction of it: errors of drive gains and geometry."""
 CORRELATION_TIME: Final = 0.02
 """Correlation time of the efforts' errors, s."""
 DECAY_TIME: Final = 0.1
@@ -67,9 +67,10 @@ class ContactPlace:
 
 
 def map_limbs(robot: Robot) -> dict[str, str]:
-    """Return the limb of each moving body and rod: connected without base and platform.
+    """Return the limb's name for each moving body and rod.
 
-    A limb has the name of its actuated joint's limb, or of its first body where it has none.
+    A limb is a set of parts that remain connected without base and platform. Its name is that of
+    its actuated joints' limbs in the file, or that of its first body if it has no actuated joint.
     """
     graph = robot.graph
     limb = {name: names[0] for names in list_limbs(graph) for name in names}
@@ -238,7 +239,7 @@ class ContactLocator:
         :param q: joint positions (n,), with rates ``qd`` and external efforts (n,), N m or N.
         :param deviation: standard deviations of the efforts, (n,).
         """
-        weights = 1.0 / np.hypot(deviation, MODEL_DEVIATION * np.abs(external))
+        weights = 1.0 / np.hypot(deviation, RELATIVE_MODEL_ERROR * np.abs(external))
         y = external * weights
         if not y.any():
             return

@@ -27,6 +27,7 @@ class Stepper:
     """
 
     def __init__(self, weights: Any, damping: Array | None = None) -> None:
+        """Store the method's weights and the damping; without it weights apply element by element."""
         self._weights, self._damping = weights, damping
         self._multiply: Callable[..., Any] = np.multiply if damping is None else np.matmul
 

@@ -217,8 +217,8 @@ class Resistance:
             low[:n], high[:n] = bound_static_friction(held, self._dry[:n] + dry, share)
         return low, high
 
-    def row_velocities(self, here: Terms) -> Array:
-        """Return the velocities of all rows by joint velocities, shape (n + k, n)."""
+    def build_row_jacobian(self, here: Terms) -> Array:
+        """Return the matrix from joint velocities to those of the n drives and k passive joints, (n + k, n)."""
         return np.concatenate([self._drives, here.rows]) if self._passive else self._drives
 
     def apply_state(self, q: Array, qd: Array) -> Terms:
@@ -229,7 +229,7 @@ class Resistance:
         """Determine which rows move, and in which direction."""
         qd = here.qd
         rates = np.concatenate([qd, here.rows @ qd]) if self._passive else qd
-        self._still = np.abs(rates) <= ZERO_VELOCITY * np.abs(self.row_velocities(here) * here.qd).max(1)
+        self._still = np.abs(rates) <= ZERO_VELOCITY * np.abs(self.build_row_jacobian(here) * here.qd).max(1)
         self._states = np.where(self._still, 0.0, np.sign(rates)).astype(np.int8)
         self._law = None
         return here
@@ -259,7 +259,7 @@ class Resistance:
         law = self._law
         if law is not None:
             self._set_load(law, here, effort, wrench)
-            # Forces of rows that depend on the held ones stay as they are, within their bounds.
+            # Sticking rows that depend linearly on law.held keep their forces: check the bounds of law.held only.
             if not len(law.held) or ((law.low <= law.force) & (law.force <= law.high)).all():
                 return law
         n, still = len(here.q), self._still
@@ -279,7 +279,7 @@ class Resistance:
             low[:n][down] = -math.inf
             # Solve for the forces that hold the resting rows z, while the others keep their friction.
             z, inverse, motion = np.flatnonzero(resists), _inverse(here.mass), law.first
-            rows = self.row_velocities(here)[z]
+            rows = self.build_row_jacobian(here)[z]
             if self._passive:
                 motion = np.concatenate([motion, here.rows @ motion + here.drift])
             force, states = solve_resisting_forces(rows @ inverse @ rows.T, motion[z], low[z], high[z], self._states[z])
@@ -333,7 +333,7 @@ class Resistance:
             if bad:
                 raise ValueError("the mass matrix is not positive")
             return result, np.zeros(0)
-        rows = self.row_velocities(here)[law.held]
+        rows = self.build_row_jacobian(here)[law.held]
         matrix = np.zeros((n + h, n + h))
         matrix[:n, :n] = here.mass
         matrix[:n, n:] = rows.T
@@ -354,7 +354,7 @@ class Resistance:
         free = self._drives
         if len(law.held):
             # Basis of the joint velocities at which held rows rest.
-            free = np.linalg.svd(self.row_velocities(here)[law.held])[2][len(law.held) :].T
+            free = np.linalg.svd(self.build_row_jacobian(here)[law.held])[2][len(law.held) :].T
             free[law.held[law.held < len(free)]] = 0.0
         root = np.linalg.inv(np.linalg.cholesky(free.T @ here.mass @ free))
         decays, turned = np.linalg.eigh(root @ (free.T @ damping @ free) @ root.T)
@@ -383,7 +383,7 @@ class Resistance:
         resists = self._rubs.copy()
         resists[:n] |= up | down
         z = np.flatnonzero(resists)
-        rows = self.row_velocities(here)[z]
+        rows = self.build_row_jacobian(here)[z]
         states = np.zeros(len(z), np.int8)
         if len(z):
             force, states = solve_resisting_forces(rows @ inverse @ rows.T, rows @ rates, low[z], high[z], states)
@@ -405,7 +405,7 @@ class Resistance:
         before, after = here.q[law.moves], end.q[law.moves]
         begins, ends = [law.ceiling - before, before - law.floor], [law.ceiling - after, after - law.floor]
         if len(law.slides):
-            first, last = (self.row_velocities(t)[law.slides] for t in (here, end))
+            first, last = (self.build_row_jacobian(t)[law.slides] for t in (here, end))
             begins.append(law.signs * (first @ here.qd))
             ends.append(law.signs * (last @ end.qd) + ZERO_VELOCITY * (np.abs(last) @ np.abs(end.qd)))
         if len(law.held):
@@ -426,7 +426,7 @@ class Resistance:
         self._states[law.still] = 0
         if self._passive and len(law.held):
             # Remove the velocity that integration errors give held rows of passive joints.
-            rows = self.row_velocities(end)[law.held]
+            rows = self.build_row_jacobian(end)[law.held]
             across = np.linalg.solve(end.mass, rows.T)
             drift = np.linalg.lstsq(rows @ across, rows @ end.qd, rcond=1e-12)[0]
             qd = end.qd - across @ drift

@@ -15,10 +15,10 @@ from delta_dynamics.torques.virtual_work import (
     Forces,
     add_friction_and_rotors,
     efforts_of_motion,
-    leading_accelerations,
     mass_entries,
     remaining_efforts,
     solve_accelerations,
+    solve_leading_accelerations,
 )
 from pkm_twin.codegen.arrays import Array, vectors
 from pkm_twin.codegen.code import REJECTED, VALID
@@ -96,7 +96,9 @@ def forward_dynamics_at_pose(
     """
     load = np.zeros(6) if wrench is None else wrench
     efforts = vectors(tau, robot.joints_count, "efforts")
-    q, qd, qdd, acceleration = evaluate_at_pose(robot, pose_accelerations, robot.inertial, pose, rate, efforts, load)
+    q, qd, qdd, acceleration = evaluate_at_pose(
+        robot, pose_acceleration_kernel, robot.inertial, pose, rate, efforts, load
+    )
     return PoseMotion(q, qd, qdd, np.broadcast_to(efforts, q.shape), acceleration)
 
 
@@ -106,7 +108,7 @@ def mass_matrix_at_pose(robot: Robot, pose: ArrayLike) -> Array:
     Parameters and errors as in :func:`inverse_dynamics_at_pose`.
     """
     n = robot.joints_count
-    flat = evaluate_at_pose(robot, pose_masses, robot.inertial, pose)[0]
+    flat = evaluate_at_pose(robot, pose_mass_kernel, robot.inertial, pose)[0]
     return flat.reshape(*flat.shape[:-1], n, n)
 
 
@@ -172,13 +174,19 @@ def iterated_pose_torques(robot: Robot) -> Kernel:
     return engine.kernel("followed torques at pose", write, repr(engine.inverse_pivots))
 
 
-def pose_masses(robot: Robot, *, certified: bool) -> Kernel:
-    """Return the program from a pose to the mass matrices of joints and of pose coordinates."""
+def pose_mass_kernel(robot: Robot, *, certified: bool) -> Kernel:
+    """Build the kernel that computes the mass matrices in joint and in pose coordinates from a pose.
+
+    :param certified: see :meth:`PoseKernel.__call__`.
+    """
     return _compile_at_pose(robot, "mass matrix", _write_pose_masses, certified=certified)
 
 
-def pose_accelerations(robot: Robot, *, certified: bool) -> Kernel:
-    """Return the program from pose, rate, efforts and wrench to q, qd, qdd and x''."""
+def pose_acceleration_kernel(robot: Robot, *, certified: bool) -> Kernel:
+    """Build the kernel that computes q, qd, qdd and the pose's second derivative.
+
+    Inputs: pose, pose rate, efforts and wrench. ``certified``: as of :func:`pose_mass_kernel`.
+    """
     return _compile_at_pose(robot, "accelerations", _write_pose_accelerations, certified=certified)
 
 
@@ -353,7 +361,7 @@ def _write_pose_accelerations(t: Traced, scheme: CarriedScheme | None, *, certif
     if scheme is None:
         own = _IteratedMachine(t)
         qd, _ = own.drift(rate)
-        leads = leading_accelerations(t, own.parts, qd, tau)
+        leads = solve_leading_accelerations(t, own.parts, qd, tau)
         t.set_rates(qd)
         t.set_accelerations(leads)
         found: dict[str, Numbers] = {"acceleration": programs.pose_accelerations(t)}

@@ -79,10 +79,10 @@ def _derivatives(
     rows: bool,
 ) -> TorqueDerivatives:
     inputs = _list_inputs(motion, wrench, weights, rows=rows)
-    by_q, by_qd, by_qdd = robot.evaluate(motion_gradient(robot), *inputs, p=robot.inertial)
+    by_q, by_qd, by_qdd = robot.evaluate(motion_gradient_kernel(robot), *inputs, p=robot.inertial)
     found: dict[str, Array] = {}
     if by:
-        table = _numbers_table(robot, inputs) @ differentiate_numbers(robot, by)
+        table = _evaluate_number_gradient(robot, inputs) @ differentiate_numbers(robot, by)
         found = {path: np.ascontiguousarray(table[..., k]) for k, path in enumerate(by)}
     return TorqueDerivatives(by_q, by_qd, by_qdd, found)
 
@@ -99,12 +99,13 @@ def torque_effects(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wr
 def _effects_kernel(robot: Robot) -> Kernel:
     chosen = robot.cached(CauseSlopes, geometry_and_masses).chosen
 
-    def write(t: Traced) -> Program:
+    def write_effort_gradient(t: Traced) -> Program:
+        """Write the gradient of the efforts with respect to the numbers that the causes change."""
         program = torque_program(t)
         numbers = [*t.geometry, *t.tape.inputs(PARAMETERS, program.parameters)]
         return gradient_program(t, program, {"numbers": [numbers[k] for k in chosen]})
 
-    return robot.massive().kernel(f"torque gradient by {chosen}", write, free=True)
+    return robot.massive().kernel(f"torque gradient by {chosen}", write_effort_gradient, free=True)
 
 
 def _list_inputs(motion: Sequence[ArrayLike], wrench: ArrayLike | None, weights: Array, *, rows: bool) -> list[Array]:
@@ -117,29 +118,32 @@ def _list_inputs(motion: Sequence[ArrayLike], wrench: ArrayLike | None, weights:
 
 
 def differentiate_numbers(robot: Robot, by: Sequence[str]) -> Array:
-    """Return the derivatives of geometry and masses by numbers of the file, (numbers, paths)."""
+    """Return the derivatives of geometry and masses with respect to numbers of the file, (values, paths)."""
     return robot.cached(FileNumbers, tuple(by), geometry_and_masses).slopes
 
 
 def torques_by_numbers(
     robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike, slopes: Array
 ) -> Array:
-    """Compute the derivatives of the efforts by numbers of the file, shape (..., n, paths).
+    """Compute the derivatives of the efforts with respect to numbers of the file, (..., n, paths).
 
     :param robot: also one of :meth:`Robot.numbered`; with ``slopes`` of :func:`differentiate_numbers`.
         Others as of :func:`torque_derivatives`.
     """
     inputs = _list_inputs((q, qd, qdd), wrench, np.eye(robot.joints_count), rows=True)
-    return _numbers_table(robot, inputs) @ slopes
+    return _evaluate_number_gradient(robot, inputs) @ slopes
 
 
-def _numbers_table(robot: Robot, inputs: Sequence[Array]) -> Array:
-    """Return the derivatives by geometry and masses, side by side on the last axis."""
-    return np.concatenate(robot.evaluate(numbers_gradient(robot), *inputs, p=robot.inertial), -1)
+def _evaluate_number_gradient(robot: Robot, inputs: Sequence[Array]) -> Array:
+    """Return the efforts' derivatives with respect to geometry, then masses, on the last axis."""
+    return np.concatenate(robot.evaluate(number_gradient_kernel(robot), *inputs, p=robot.inertial), -1)
 
 
-def motion_gradient(robot: Robot) -> Kernel:
-    """Return the program of q, qd, qdd, wrench and weights to derivatives by q, qd and qdd."""
+def motion_gradient_kernel(robot: Robot) -> Kernel:
+    """Build the kernel that computes the efforts' derivatives with respect to q, qd and qdd.
+
+    Inputs: q, qd, qdd, wrench, and one weight per effort: the gradient is of the weighted sum.
+    """
 
     def write(t: Traced) -> Program:
         program = torque_program(t)
@@ -148,8 +152,11 @@ def motion_gradient(robot: Robot) -> Kernel:
     return robot.massive().kernel("torque gradient", write)
 
 
-def numbers_gradient(robot: Robot) -> Kernel:
-    """Return the program of the same inputs to derivatives by the geometry and by the masses."""
+def number_gradient_kernel(robot: Robot) -> Kernel:
+    """Build the kernel that computes the efforts' derivatives with respect to geometry and masses.
+
+    Its inputs are those of :func:`motion_gradient_kernel`.
+    """
 
     def write(t: Traced) -> Program:
         program = torque_program(t)

@@ -80,10 +80,14 @@ class Equations:
 
 def motion_kernel(robot: Robot) -> Kernel:
     """Return the program of :class:`Terms` from q and qd, row by row."""
-    return robot.massive().kernel("motion", _write_motion)
+    return robot.massive().kernel("motion", _write_terms)
 
 
-def _write_motion(t: Traced) -> Program:
+def _write_terms(t: Traced) -> Program:
+    """Write the entries of :class:`Terms`: mass matrix, bias forces, energies, velocities per joint rate.
+
+    Bias forces are those of gravity and velocities: the joint accelerations are zero, the base is at rest.
+    """
     layout, parts = solve_and_split(t)
     bodies, rods, gravity, *_, passive = parts
     n, graph, motion = t.joints, t.scheme.graph, t.motion

@@ -427,15 +427,15 @@ def loads_kernel(robot: Robot) -> Kernel:
 
     :raises ParameterError: a robot without masses.
     """
-    return robot.massive().kernel("loads", _write_loads)
+    return robot.massive().kernel("loads", _write_positions_and_wrenches)
 
 
-def _write_loads(t: Traced) -> Program:
-    """Write the places of bodies, rods and joints, and the wrench that each body needs.
+def _write_positions_and_wrenches(t: Traced) -> Program:
+    """Write the positions of bodies, rods and joints, and the wrench that each body's motion requires.
 
-    A body: origin, force, moment about it. A rod: both ends, the forces they need, the direction of
-    its pair. A joint: point, three directions, and the one across a universal joint's axes, or a
-    screw's pitch.
+    Body: origin, force, moment about the origin. Rod: both ends, the force required at each, the
+    direction to its parallel rod. Joint: its point and three directions; then the direction
+    perpendicular to both axes of a universal joint, or a screw's pitch.
     """
     t.solve()
     layout = Layout(t.tree)

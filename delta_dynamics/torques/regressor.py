@@ -227,7 +227,7 @@ def _write_regressor(t: Traced) -> Program:
 
     for rod in graph.rods.values():
         forces = Forces(motion)
-        forces.rod(rod, 1.0)
+        forces.add_rod(rod, 1.0)
         add_powers(forces, rod.inner, rod.outer)
     for joint in list_loaded_joints(graph):
         for three in np.eye(3):

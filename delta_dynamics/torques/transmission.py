@@ -21,7 +21,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from delta_dynamics.torques.at_pose import evaluate_at_pose, pose_masses
+from delta_dynamics.torques.at_pose import evaluate_at_pose, pose_mass_kernel
 from pkm_twin.codegen.arrays import Array, vectors
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.errors import ParameterError
@@ -236,7 +236,7 @@ class Transmission:
         :raises ParameterError: the robot's file gives no masses.
         """
         place, m = self._check_joint_values(position, "positions"), len(self.joints)
-        found = evaluate_at_pose(self.robot, pose_masses, self.robot.inertial, place)[1]
+        found = evaluate_at_pose(self.robot, pose_mass_kernel, self.robot.inertial, place)[1]
         return found.reshape(*found.shape[:-1], m, m)
 
     def _solve(self, position: ArrayLike) -> tuple[Array, Array]:

@@ -22,9 +22,13 @@ share of the greatest effort."""
 
 
 class EffortParts(NamedTuple):
-    """Efforts of a motion: at rest, with its velocities, and the whole, shape (n,), N m or N."""
+    """Efforts at one sample, shape (n,), N m or N.
 
-    rest: Array
+    ``static``: at zero velocities and accelerations. ``moving``: at the sample's velocities and zero
+    accelerations. ``whole``: of the sample.
+    """
+
+    static: Array
     moving: Array
     whole: Array
 
@@ -33,21 +37,21 @@ class EffortParts(NamedTuple):
 
         :param greatest: the greatest efforts that the robot's motion needs, shape (n,).
         """
-        sizes = np.abs(self.rest) + np.abs(self.moving - self.rest)
+        sizes = np.abs(self.static) + np.abs(self.moving - self.static)
         sizes = sizes + np.abs(self.whole - self.moving)
         return np.asarray(np.hypot(DEFAULT_MASS_ERROR * sizes, DEFAULT_FRICTION_ERROR * greatest), np.float64)
 
 
 def effort_parts(robot: Robot, q: Array, qd: Array, qdd: Array, wrench: Array | None, mass: Array) -> EffortParts:
-    """Split the efforts of one sample into rest, rates and accelerations, see ``EffortParts``.
+    """Compute the efforts of one sample without motion, with its velocities, and with its accelerations too.
 
     :param robot: without friction that grows with the load, so that efforts are linear in qdd.
     :param mass: its mass matrix at q, shape (n, n).
     """
     still = np.zeros_like(q)
     moving = inverse_dynamics(robot, q, qd, still, wrench)
-    rest = inverse_dynamics(robot, q, still, still, wrench)
-    return EffortParts(rest, moving, moving + mass @ qdd)
+    static = inverse_dynamics(robot, q, still, still, wrench)
+    return EffortParts(static, moving, moving + mass @ qdd)
 
 
 def usual_effort(robot: Robot) -> Array:
@@ -103,7 +107,7 @@ class Noise:
         return self._time > self._learning
 
     def advance(self, step: float) -> None:
-        """Advance the time, s, whether the next error counts or not."""
+        """Advance the time by one step, s; call it at each sample, also where its error is not learnt."""
         self._step = step
         self._time += step
 

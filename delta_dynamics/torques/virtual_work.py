@@ -90,7 +90,7 @@ def stream_torques(robot: Robot) -> Kernel:
 def mass_matrix(robot: Robot, q: ArrayLike) -> Array:
     """Compute the mass matrix on the actuated joints, payload included, shape (..., n, n)."""
     # The cached function is fast for one sample: a simulation evaluates it several thousand times a second.
-    return _reshape_square(robot, robot.function(masses_kernel, robot.inertial)(q))
+    return _reshape_to_rows(robot, robot.function(masses_kernel, robot.inertial)(q))
 
 
 def masses_kernel(robot: Robot) -> Kernel:
@@ -98,7 +98,8 @@ def masses_kernel(robot: Robot) -> Kernel:
     return robot.massive().kernel("mass matrix", _write_mass_matrix)
 
 
-def _reshape_square(robot: Robot, flat: Array) -> Array:
+def _reshape_to_rows(robot: Robot, flat: Array) -> Array:
+    """Reshape the last axis to (n, size / n): one row per joint."""
     n = robot.joints_count
     return flat.reshape(*flat.shape[:-1], n, flat.shape[-1] // n)
 
@@ -107,7 +108,7 @@ def body_mass_matrix(robot: Robot, q: ArrayLike, body: str) -> Array:
     """Return one body's part of the mass matrix, (..., n, n); the platform's with payload."""
     p, where = np.zeros_like(robot.inertial), Layout(robot.massive().tree).body(body)
     p[where] = robot.inertial[where]
-    return _reshape_square(robot, robot.evaluate(masses_kernel(robot), q, p=p)[0])
+    return _reshape_to_rows(robot, robot.evaluate(masses_kernel(robot), q, p=p)[0])
 
 
 def forward_dynamics(
@@ -181,7 +182,7 @@ class Forces:
         for name, matrix in self._couples(bodies):
             self._add_euler(name, matrix)
         for mass, rod in zip(rods, self.motion.graph.rods.values(), strict=True):
-            self.rod(rod, mass)
+            self.add_rod(rod, mass)
 
     def body(self, name: str, ten: Objects) -> None:
         """Add the force and moment that the acceleration of one body needs."""
@@ -211,11 +212,11 @@ class Forces:
             found[lead] = found[lead] + inertia if lead in found else inertia
         return list(found.items())
 
-    def rod(self, rod: Rod, mass: Any) -> None:
-        """Add the forces that the acceleration of a thin uniform rod needs.
+    def add_rod(self, rod: Rod, mass: Any) -> None:
+        """Add the inertial forces of a thin uniform rod of mass m at its two ends.
 
-        m (2 a + b) / 6 at its end of acceleration a and m (a + 2 b) / 6 at the other: its rotation
-        is in it (Delta-CU paper, equations 15 and 16).
+        m (2 a + b) / 6 at the end with acceleration a and m (a + 2 b) / 6 at the end with b; they
+        include the rod's rotation (Delta-CU paper, equations 15 and 16).
         """
         self._share_ends(rod, mass, self.motion.acceleration)
 
@@ -360,7 +361,7 @@ def add_friction_and_rotors(
     """
     rotors = [rotor * change for rotor, change in zip(parts[ROTORS_PART], changes, strict=True)]
     basic = _basic_friction(parts, rates)
-    for k, values in enumerate(_law_values(t, parts)):
+    for k, values in enumerate(_friction_law_parameters(t, parts)):
         # Drives of a redundant machine have no load-dependent friction law.
         load = 0.0 if t.drives.others else loads[k] + rotors[k]
         basic[k] = basic[k] + friction.evaluate_laws(t.graph.laws, values, q[k], rates[k], load)
@@ -375,8 +376,8 @@ def _basic_friction(parts: list[Objects], qd: Numbers) -> list[Any]:
     return [viscous * v + coulomb * sign(v) + offset for viscous, coulomb, offset, v in rows]
 
 
-def _law_values(t: Traced, parts: list[Objects]) -> list[dict[str, Any]]:
-    """Return the parameters of each drive's other friction laws; an empty list without laws."""
+def _friction_law_parameters(t: Traced, parts: list[Objects]) -> list[dict[str, Any]]:
+    """Return the parameters of each drive's friction laws beyond viscous and Coulomb; an empty list without."""
     laws = Layout(t.tree).laws(parts[LAWS_PART])
     return [{key: v[k] for key, v in laws.items()} for k in range(t.drives.count if laws else 0)]
 
@@ -395,9 +396,9 @@ def driving_forces(t: Traced, parts: list[Objects], qd: Objects, qdd: Objects, b
     forces.inertia(bodies, rods)
     forces.passive(passive)
     forces.wrench(wrench)
-    # The 3-PRRU paper has F_d = -J^-T (J_M' Q_M + sum of J_Hij' Q_Hij) - Q_S (equations 40 and 41), the
-    # Delta-CU paper solves the same sum for tau (equation 23). With closures K u + J qd = 0 of the unknown
-    # rates u, -J^-T is here J' K^-T, and both generalised forces have the other sign than Q.
+    # Virtual work: F_d = -J^-T (J_M' Q_M + sum of J_Hij' Q_Hij) - Q_S (3-PRRU paper, equations 40 and 41;
+    # equivalent to equation 23 of the Delta-CU paper). With constraints K u + J qd = 0 on the dependent
+    # rates u, the map -J^-T to joint efforts is J' K^-T. generalised() returns -Q, so the signs are reversed.
     minus_q, minus_q_s = forces.generalised()
     f_d: Objects = minus_q_s - t.jq[t.scheme.independent].T @ t.lu.solve_transposed(minus_q)
     return f_d
@@ -426,16 +427,17 @@ def torque_program(t: Traced, *, on_bodies: bool = False, base: int = 0) -> Prog
 
 def _write_accelerations(t: Traced) -> Program:
     layout, parts = solve_and_split(t)
-    leads = leading_accelerations(t, parts, t.drives.given("qd"), t.tape.inputs("tau", t.drives.count))
+    leads = solve_leading_accelerations(t, parts, t.drives.given("qd"), t.tape.inputs("tau", t.drives.count))
     outputs = {"accelerations": t.lift(t.drives.followed(leads, t.du))}
     sizes = t.inputs("q", "qd", "tau", wrench=6)
     return Program(sizes, layout.size, outputs, t.equations())
 
 
-def leading_accelerations(t: Traced, parts: list[Objects], qd: Objects, tau: Objects) -> list[Any]:
-    """Return accelerations of the leading drives under efforts of all drives and a wrench.
+def solve_leading_accelerations(t: Traced, parts: list[Objects], qd: Objects, tau: Objects) -> list[Any]:
+    """Solve for the accelerations of the leading (independent) drives under all drives' efforts and a wrench.
 
-    The unknowns' accelerations are left as those at zero accelerations of the drives.
+    Afterwards the dependent coordinates of ``t`` have the accelerations that belong to zero
+    accelerations of the drives, not to the result.
     """
     driving, still = t.drives.on_leads([*tau]), np.zeros(t.joints)
     loads = driving_forces(t, parts, qd, still)
@@ -453,7 +455,7 @@ def remaining_efforts(
         and ``rates``: positions and rates of all drives.
     """
     rest: Objects = np.array(driving) - add_friction_and_rotors(t, parts, loads, q, rates, changes)[0]
-    laws = _law_values(t, parts)
+    laws = _friction_law_parameters(t, parts)
     if laws and not t.drives.others:
         basic = _basic_friction(parts, rates)
         for k, values in enumerate(laws):

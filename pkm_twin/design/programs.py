@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import Final, Literal
 
 from delta_dynamics.torques.at_pose import iterated_pose_torques
-from delta_dynamics.torques.derivatives import motion_gradient, numbers_gradient
+from delta_dynamics.torques.derivatives import motion_gradient_kernel, number_gradient_kernel
 from delta_dynamics.torques.reactions import loads_kernel
 from delta_dynamics.torques.virtual_work import masses_kernel
 from delta_dynamics.torques.virtual_work import torques as torques_kernel
@@ -78,9 +78,9 @@ masses: Final = make_request(masses_kernel, "masses", "geometry")
 """From q to the mass matrix."""
 compliance: Final = make_request(lambda robot: robot.cached(Elastic).compliance, "geometry", "elasticity")
 """From q to the compliance and its frame's pivot ratio."""
-torque_gradient: Final = make_request(motion_gradient, "masses", "geometry")
+torque_gradient: Final = make_request(motion_gradient_kernel, "masses", "geometry")
 """Derivatives of the torques by q, qd and qdd."""
-torque_numbers: Final = make_request(numbers_gradient, "masses", "geometry")
+torque_numbers: Final = make_request(number_gradient_kernel, "masses", "geometry")
 """Derivatives of the torques by geometry and masses."""
 platform_slopes: Final = make_request(lambda robot: platform_gradient(robot.engine))
 """Derivatives of pose, position and rotation by geometry."""

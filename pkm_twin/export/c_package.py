@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from delta_dynamics.torques.at_pose import PoseKernel, pose_accelerations, pose_masses, pose_torques
+from delta_dynamics.torques.at_pose import PoseKernel, pose_acceleration_kernel, pose_mass_kernel, pose_torques
 from delta_dynamics.torques.equations import motion_kernel
 from delta_dynamics.torques.transmission import transmission_kernel
 from delta_dynamics.torques.virtual_work import (
@@ -315,14 +315,14 @@ class Package:
                 "mass_matrix",
                 "Mass matrix of the actuated joints at a pose, row by row.",
                 {"pose": self.m},
-                pose_masses,
+                pose_mass_kernel,
                 {"m": "matrix"},
             ),
             (
                 "accelerations",
                 "Accelerations of the pose's coordinates, and of the joints, that efforts tau cause.",
                 motion | {"tau": self.n, "wrench": 6},
-                pose_accelerations,
+                pose_acceleration_kernel,
                 {"acceleration": "acceleration", "qdd": "qdd"},
             ),
         )

@@ -105,7 +105,7 @@ EQUATIONS: Final = (
     _equation((16, 27), "limb compliance C_i", (UPR_RPU + "make_parts", LIMBS), LIMB),
     _equation((17, 28), "limb stiffness K_i", (LIMBS,), LIMB),
     _equation((18,), "deformation of a UPR limb", (LIMBS,), LIMB),
-    _equation((29, 31, 32), "deformations, virtual work", (SOLVED + "load",), LIMB),
+    _equation((29, 31, 32), "deformations, virtual work", (SOLVED + "apply_wrench",), LIMB),
     _equation(
         (30,),
         "balance of the platform, J_i",
