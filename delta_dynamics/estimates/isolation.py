@@ -97,7 +97,7 @@ def _twist_kernel(robot: Robot) -> Kernel:
         t.solve()
         columns, rows = t.rate_columns(), []
         for body in t.graph.bodies:
-            rows += [*np.ravel(t.motion.turned(body)), *t.motion.origin[body]]
+            rows += [*np.ravel(t.motion.rotation_from_home(body)), *t.motion.origin[body]]
         for column, own in zip(columns, np.eye(t.joints), strict=True):
             t.motion.set_rates(column, own)
             for body in t.graph.bodies:

@@ -28,7 +28,7 @@ from pkm_twin.codegen.lu import SparseLU
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics import programs
 from pkm_twin.kinematics.motion import BaseMotion
-from pkm_twin.kinematics.posed import CarriedScheme
+from pkm_twin.kinematics.posed import PlatformFirstScheme
 from pkm_twin.kinematics.programs import certify_assembly, follow_pose, pose_factors, solve_pose
 from pkm_twin.kinematics.traced import Traced
 from pkm_twin.machine.inertia import ROTORS_PART, Layout, list_loaded_joints, make_frame_change
@@ -167,7 +167,7 @@ def pose_torques(robot: Robot, *, certified: bool) -> Kernel:
 def iterated_pose_torques(robot: Robot) -> Kernel:
     """Return :func:`pose_torques` by iteration on the machine's own tree, valid for other dimensions.
 
-    Poses are accepted as by :attr:`.engine.Engine.followed_inverse`.
+    Poses are accepted as by :attr:`.engine.Engine.generic_inverse`.
     """
     engine = robot.massive()
     write = partial(_write_pose_torques, scheme=None, certified=True)
@@ -193,7 +193,7 @@ def pose_acceleration_kernel(robot: Robot, *, certified: bool) -> Kernel:
 class _PoseDrivenMachine:
     """Write motion and forces of a machine whose tree is driven by the pose, as expressions."""
 
-    def __init__(self, t: Traced, scheme: CarriedScheme, *, certified: bool) -> None:
+    def __init__(self, t: Traced, scheme: PlatformFirstScheme, *, certified: bool) -> None:
         self.t, self.scheme, self.certified = t, scheme, certified
         self.posed, self.q = solve_pose(t, scheme)
         self.layout = Layout(t.tree)
@@ -319,7 +319,7 @@ class _IteratedMachine:
         }
 
 
-def _write_pose_torques(t: Traced, scheme: CarriedScheme | None, *, certified: bool) -> Program:
+def _write_pose_torques(t: Traced, scheme: PlatformFirstScheme | None, *, certified: bool) -> Program:
     m = len(t.scheme.coordinates)
     sizes = {"rate": m, "acceleration": m, "wrench": 6}
     rate, acceleration = (t.tape.inputs(name, m) for name in ("rate", "acceleration"))
@@ -339,7 +339,7 @@ def _write_pose_torques(t: Traced, scheme: CarriedScheme | None, *, certified: b
     return made.program({"q": made.q, "qd": rates, "qdd": changes, "tau": tau}, **sizes)
 
 
-def _write_pose_masses(t: Traced, scheme: CarriedScheme | None, *, certified: bool) -> Program:
+def _write_pose_masses(t: Traced, scheme: PlatformFirstScheme | None, *, certified: bool) -> Program:
     m = len(t.scheme.coordinates)
     if scheme is None:
         own: _IteratedMachine | _PoseDrivenMachine = _IteratedMachine(t)
@@ -354,7 +354,7 @@ def _write_pose_masses(t: Traced, scheme: CarriedScheme | None, *, certified: bo
     return own.program({"matrix": t.drives.shared_on_both(mass), "on pose": np.ravel(on_pose)})
 
 
-def _write_pose_accelerations(t: Traced, scheme: CarriedScheme | None, *, certified: bool) -> Program:
+def _write_pose_accelerations(t: Traced, scheme: PlatformFirstScheme | None, *, certified: bool) -> Program:
     m = len(t.scheme.coordinates)
     sizes = {"rate": m, "tau": t.drives.count, "wrench": 6}
     rate, tau = t.tape.inputs("rate", m), t.tape.inputs("tau", t.drives.count)
@@ -372,7 +372,7 @@ def _write_pose_accelerations(t: Traced, scheme: CarriedScheme | None, *, certif
     # Only friction that grows with the load needs the drives' loads.
     by_load = bool(t.graph.laws) and not t.drives.others
     loads = made.lead.solve_transposed(on_pose) if by_load else np.zeros(m)
-    rest = remaining_efforts(t, made.parts, t.drives.on_leads([*tau]), loads, made.q, rates, drift)
+    rest = remaining_efforts(t, made.parts, t.drives.leading_efforts([*tau]), loads, made.q, rates, drift)
     forces = made.drives[t.drives.leading].T @ rest - (0.0 if by_load else on_pose)
     acceleration = np.array(solve_accelerations(made.masses(), forces), dtype=object)
     outputs = {"q": made.q, "qd": rates, "qdd": made.drives @ acceleration + drift, "acceleration": acceleration}

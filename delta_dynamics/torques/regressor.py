@@ -213,7 +213,7 @@ def _write_regressor(t: Traced) -> Program:
     t.set_accelerations(qdd, BaseMotion.at_rest(gravity))
     bodies: list[Any] = []
     for body in t.tree.links:
-        own = motion.turned(body).T
+        own = motion.rotation_from_home(body).T
         rows = [motion.change[body], motion.omega[body], motion.alpha[body]]
         rows += [speed[body] for speed, _ in twists] + [omega[body] for _, omega in twists]
         bodies += [entry for row in rows for entry in own @ row]

@@ -365,7 +365,7 @@ def add_friction_and_rotors(
         # Drives of a redundant machine have no load-dependent friction law.
         load = 0.0 if t.drives.others else loads[k] + rotors[k]
         basic[k] = basic[k] + friction.evaluate_laws(t.graph.laws, values, q[k], rates[k], load)
-    rows = loads, t.drives.on_leads(basic), t.drives.on_leads(rotors)
+    rows = loads, t.drives.leading_efforts(basic), t.drives.leading_efforts(rotors)
     efforts = [load + rubs + rotor for load, rubs, rotor in zip(*rows, strict=True)]
     return efforts, [rubs + rotor for rubs, rotor in zip(basic, rotors, strict=True)]
 
@@ -428,7 +428,7 @@ def torque_program(t: Traced, *, on_bodies: bool = False, base: int = 0) -> Prog
 def _write_accelerations(t: Traced) -> Program:
     layout, parts = solve_and_split(t)
     leads = solve_leading_accelerations(t, parts, t.drives.given("qd"), t.tape.inputs("tau", t.drives.count))
-    outputs = {"accelerations": t.lift(t.drives.followed(leads, t.du))}
+    outputs = {"accelerations": t.lift(t.drives.drive_accelerations(leads, t.du))}
     sizes = t.inputs("q", "qd", "tau", wrench=6)
     return Program(sizes, layout.size, outputs, t.equations())
 
@@ -439,7 +439,7 @@ def solve_leading_accelerations(t: Traced, parts: list[Objects], qd: Objects, ta
     Afterwards the dependent coordinates of ``t`` have the accelerations that belong to zero
     accelerations of the drives, not to the result.
     """
-    driving, still = t.drives.on_leads([*tau]), np.zeros(t.joints)
+    driving, still = t.drives.leading_efforts([*tau]), np.zeros(t.joints)
     loads = driving_forces(t, parts, qd, still)
     q, rates, changes = t.drives.variables("q"), t.tree.drive_rates(qd, t.u), t.tree.drive_rates(still, t.du)
     rest = remaining_efforts(t, parts, driving, loads, q, rates, changes)

@@ -14,7 +14,7 @@ from delta_dynamics.torques.virtual_work import masses_kernel
 from delta_dynamics.torques.virtual_work import torques as torques_kernel
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.kinematics.gradients import free_forward, platform_gradient, pose_motion_gradient
-from pkm_twin.kinematics.singularity import singularity_gradient
+from pkm_twin.kinematics.singularity import compile_singularity_gradient
 from pkm_twin.robot.derivatives import list_geometry_numbers
 from pkm_twin.robot.numbers import FileNumbers, geometry_and_masses
 from pkm_twin.robot.robot import Robot
@@ -54,13 +54,13 @@ def make_request(kernel: Callable[[Robot], Kernel], *numbers: Numbers) -> MakeRe
     return lambda robot: (kernel(robot), numbers or ("geometry",))
 
 
-forward: Final = make_request(lambda robot: robot.engine.own_forward)
+forward: Final = make_request(lambda robot: robot.engine.generic_forward)
 """From q to pose, position and rotation."""
 forward_of_all_structures: Final = make_request(lambda robot: free_forward(robot.engine))
 """The same as :func:`forward`, one program for machines of every structure."""
 project_redundant: Final = make_request(lambda robot: robot.projection_kernel)
 """From q, qd, qdd of the leading drives to those of all drives."""
-inverse: Final = make_request(lambda robot: robot.engine.followed_inverse)
+inverse: Final = make_request(lambda robot: robot.engine.generic_inverse)
 """From the pose to q of some assembly."""
 jacobian: Final = make_request(lambda robot: robot.engine.jacobian)
 """From q to pose rates per joint rate."""
@@ -86,7 +86,7 @@ platform_slopes: Final = make_request(lambda robot: platform_gradient(robot.engi
 """Derivatives of pose, position and rotation by geometry."""
 pose_motion: Final = make_request(lambda robot: pose_motion_gradient(robot.engine))
 """Derivatives of pose, rate and acceleration by q, qd and geometry."""
-singularity_slopes: Final = make_request(lambda robot: singularity_gradient(robot.engine))
+singularity_slopes: Final = make_request(lambda robot: compile_singularity_gradient(robot.engine))
 """Derivatives of the index by q and geometry."""
 compliance_slopes: Final = make_request(
     lambda robot: compliance_gradient(robot.cached(Elastic)), "geometry", "elasticity"

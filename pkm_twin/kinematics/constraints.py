@@ -50,8 +50,8 @@ class Equation(NamedTuple):
     scale: Any
 
     @property
-    def angle(self) -> bool:
-        """Whether it is about directions alone."""
+    def is_angular(self) -> bool:
+        """Whether the equation constrains directions only."""
         return self.force is NONE
 
 
@@ -106,35 +106,35 @@ def keep_pair(part: str, bodies: tuple[str, str], points: Pair, vectors: Pair, l
 
 
 def constraint_equations(
-    part: str, bodies: tuple[str, str], held: Constraint, points: Pair, turns: Turns, size: Any
+    part: str, bodies: tuple[str, str], constraint: Constraint, points: Pair, turns: Turns, size: Any
 ) -> list[Equation]:
     """Return the equations of one constraint of a joint.
 
     :param points: of the joint on both bodies, m. ``size``: of the machine, m.
     """
     apart, scale = points[1] - points[0], 1.0 / size
-    if held.kind == "point":
+    if constraint.kind == "point":
         # [()] makes an array of one expression that expression.
         return [Equation(part, bodies, apart[..., i][()], points, unit, NONE, scale) for i, unit in enumerate(UNITS)]
-    inner = turns[0](held.inner)
-    if held.kind == "angle":
-        vectors = inner, turns[1](held.outer)
-        return [keep_angle(part, bodies, points, vectors, snapped(held.inner @ held.outer))]
+    inner = turns[0](constraint.inner)
+    if constraint.kind == "angle":
+        vectors = inner, turns[1](constraint.outer)
+        return [keep_angle(part, bodies, points, vectors, snapped(constraint.inner @ constraint.outer))]
     # The inner body bears the force where the outer body's point is.
     there, along = (points[1], points[1]), dot(inner, apart)
-    if held.kind == "plane":
+    if constraint.kind == "plane":
         return [Equation(part, bodies, along, there, inner, NONE, scale)]
-    mark = turns[1](held.outer)
-    sine, cosine = dot(inner, cross(turns[0](held.outer), mark)), dot(turns[0](held.outer), mark)
+    mark = turns[1](constraint.outer)
+    sine, cosine = dot(inner, cross(turns[0](constraint.outer), mark)), dot(turns[0](constraint.outer), mark)
     angle = np.arctan2(sine, cosine)
     # The angle is known up to full revolutions.
-    angle = angle + 2.0 * np.pi * np.round((along / held.slide - angle) / (2.0 * np.pi))
-    value = along - held.slide * angle
-    return [Equation(part, bodies, value, there, inner, -held.slide * inner, scale)]
+    angle = angle + 2.0 * np.pi * np.round((along / constraint.slide - angle) / (2.0 * np.pi))
+    value = along - constraint.slide * angle
+    return [Equation(part, bodies, value, there, inner, -constraint.slide * inner, scale)]
 
 
 def drive_equation(joint: Joint, goal: Any, points: Pair, turns: Turns, size: Any) -> Equation:
-    """Return the equation of a joint of one freedom that is held.
+    """Return the equation of a joint of one freedom that is constraint.
 
     :param goal: its motion from home, rad or m, shape (...).
     """

@@ -1,10 +1,11 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""All drives of a machine, of which there may be more than it has freedoms.
+"""All drives of a machine, of which there may be more than it has degrees of freedom.
 
-As many as there are freedoms lead: the closures are solved for their m values, of which the others
-follow. Rates of all n drives are B qd of the leading ones, B' tau of all efforts is what the
-leading drives would have to give alone. Rows N of efforts that move nothing have N B = 0; on them
-the sum of (effort / limit)^2 is made least. Where all drives lead, B is one and N has no rows.
+As many drives as there are degrees of freedom lead: the closures are solved for their m positions,
+from which those of the others follow. Rates of all n drives are B qd, with qd of the leading ones;
+B' tau are the efforts of the leading drives alone that are equivalent to tau of all. Rows of N are
+efforts that move nothing, N B = 0; along them the sum of (effort / limit)^2 is minimised. Where all
+drives lead, B is the identity and N has no rows.
 """
 
 from __future__ import annotations
@@ -20,13 +21,13 @@ from pkm_twin.codegen.expressions import Numbers, Objects
 from pkm_twin.codegen.operations import absolute, cos, sin, sqrt
 
 LEADS: Final = "leads"
-"""Input of the drives that lead, where ``q`` is of all and has more."""
+"""Name of the input of the leading drives, where ``q`` has those of all drives."""
 TIME: Final = 0.01
-"""Time in which rates may contradict by as much as positions may at all, s."""
+"""Time that converts the tolerance of positions to that of rates, s."""
 
 
 class Drives:
-    """The drives of a machine on expressions; all but the inputs after its closures are solved.
+    """The drives of a symbolic machine; only their inputs are known before its closures are solved.
 
     :param t: the machine, a :class:`~pkm_twin.kinematics.traced.Traced`, which imports this.
     """
@@ -46,14 +47,14 @@ class Drives:
         return leads
 
     def variables(self, name: str) -> list[Any]:
-        """Return the inputs of all drives, to read and to differentiate by, shape (n,)."""
+        """Return the inputs of all drives, by which results can be differentiated, shape (n,)."""
         values = list(self.t.tape.inputs(name, self.count))
         for k, lead in zip(self.leading, self.t.q, strict=True):
             values[k] = lead if name == "q" else values[k]
         return values
 
     def judge(self, name: str, leads: Numbers, rest: Numbers, time: float) -> None:
-        """Require that rates or accelerations of the other drives follow from the leading ones."""
+        """Check that the other drives' rates or accelerations follow from the leading ones'."""
         values, own = self._given.get(name, ((), ()))
         if own is leads:
             for k in self.others:
@@ -61,13 +62,13 @@ class Drives:
                 self._margins.append(self._tolerance(k) / time - absolute(apart))
 
     def tolerance_margins(self) -> list[Any]:
-        """Return numbers that are above zero where no drive contradicts the leading ones."""
+        """Return margins that are positive where no drive contradicts the leading ones."""
         q, found = self.t.tape.inputs("q", self.count), list(self._margins)
         for k in self.others:
             x, step = self.t.x, self.t.tree.drives[k]
             away = q[k] - self.graph.joints[step.joint].home
             if step.circle:
-                # No closure counts turns: that of the drive is within half a turn of home.
+                # Closures do not count turns: the drive must be within half a turn of home.
                 found.append(np.pi + self._tolerance(k) - absolute(away))
                 c, s = x[step.position], x[step.position + 1]
                 away, facing = s * cos(away) - c * sin(away), c * cos(away) + s * sin(away)
@@ -84,7 +85,7 @@ class Drives:
 
     @cached_property
     def null_rows(self) -> list[list[Any]]:
-        """N: per drive that does not lead, the efforts that move nothing; its own effort is one."""
+        """N: per redundant drive, the efforts that move nothing if its own effort is one."""
         t = self.t
         steps = [t.tree.drives[k] for k in self.others]
         kept = t.jq[t.scheme.independent] if steps else np.zeros((0, 0))
@@ -118,9 +119,9 @@ class Drives:
         return SparseCholesky(lower, [lower[i, i] for i in range(len(rows))])
 
     def shared(self, leads: Sequence[Any], *, preload: bool = False) -> list[Any]:
-        """Return efforts of all drives that act like these of the leading ones alone, shape (n,).
+        """Return efforts of all drives equivalent to ``leads`` of the leading ones, shape (n,).
 
-        Nearest to the preload, or least, each over its limit.
+        Relative to their limits they are the nearest to the preload, or the smallest.
         """
         if not self.others:
             return list(leads)
@@ -136,29 +137,29 @@ class Drives:
         return efforts
 
     def shared_on_both(self, matrix: Objects) -> list[Any]:
-        """Return a matrix from accelerations to efforts for all drives, (n n,) by row."""
+        """Return the matrix from accelerations to efforts of all drives, (n n,) by row."""
         rows: Any = matrix.tolist()
         for _ in range(2):
             rows = [self.shared(row) for row in zip(*rows, strict=True)]
         return [value for row in rows for value in row]
 
-    def on_leads(self, efforts: Sequence[Any]) -> list[Any]:
-        """Return B' tau: efforts of the leading drives alone that act like these of all, shape (m,)."""
+    def leading_efforts(self, efforts: Sequence[Any]) -> list[Any]:
+        """Return B' tau: the leading drives' efforts equivalent to those of all, shape (m,)."""
         result = [efforts[k] for k in self.leading]
         for k, row in zip(self.others, self.null_rows, strict=True):
             result = [a - row[j] * efforts[k] for a, j in zip(result, self.leading, strict=True)]
         return result
 
-    def followed(self, leads: Sequence[Any], still: Numbers) -> list[Any]:
-        """Return accelerations of all drives.
+    def drive_accelerations(self, leads: Sequence[Any], bias: Numbers) -> list[Any]:
+        """Return the accelerations of all drives.
 
-        :param leads: of the leading drives; ``still``: of the unknowns while these are zero.
+        :param leads: of the leading drives; ``bias``: of the unknowns while ``leads`` are zero.
         """
         result: list[Any] = [0.0] * self.count
         for k, value in zip(self.leading, leads, strict=True):
             result[k] = value
         for k, row in zip(self.others, self.null_rows, strict=True):
-            result[k] = still[self.t.tree.drives[k].rate]
+            result[k] = bias[self.t.tree.drives[k].rate]
             for j, value in zip(self.leading, leads, strict=True):
                 result[k] = result[k] - row[j] * value
         return result

@@ -24,7 +24,7 @@ from pkm_twin.errors import ParameterError, SingularityError
 from pkm_twin.kinematics.iterations import newton, solve_damped
 from pkm_twin.kinematics.linkage import hold
 from pkm_twin.kinematics.pose import Coordinate
-from pkm_twin.kinematics.posed import CarriedScheme
+from pkm_twin.kinematics.posed import PlatformFirstScheme
 from pkm_twin.kinematics.programs import (
     POSE_WEIGHT,
     acceleration_program,
@@ -41,10 +41,10 @@ from pkm_twin.kinematics.scheme import Scheme, Start
 from pkm_twin.kinematics.traced import NO_NUMBERS, Traced
 from pkm_twin.machine.graph import Graph
 
-MET: Final = 1e-9
-"""Largest miss of a closure that holds, over the machine's size."""
+MAX_GAP: Final = 1e-9
+"""Largest residual of a closure that counts as satisfied, relative to the machine's size."""
 TO_THE_END: Final[Mapping[str, float]] = {"gain": math.inf, "tolerance": 0.0}
-"""Options of Newton's method that takes all its steps: the values of least squares are wanted."""
+"""Options with which Newton's method takes all its steps, towards the least-squares residual."""
 
 
 class Engine(Scheme):
@@ -55,27 +55,27 @@ class Engine(Scheme):
         return {}
 
     def _walk(self, pose: Array, state: Array, step: Array) -> list[Array]:
-        """Return values of closures and pose equations, their derivatives, and the state after a step."""
+        """Return residuals of closures and pose equations, their Jacobian, the state after a step."""
         return self.kernel("walk", walk_program)(NO_NUMBERS, state, pose, step)[0]
 
-    def _look(self, q: Array, x: Array) -> tuple[Array, Array]:
-        """Return the closures and their derivatives by the unknowns, of unit one."""
+    def _evaluate_closures(self, q: Array, x: Array) -> tuple[Array, Array]:
+        """Return the closures' dimensionless residuals and their Jacobian by the unknowns."""
         still = np.zeros(self.tree.unknown_rates + self.joints)
         values, table, _ = self._walk(self.home_pose, np.concatenate([x, q]), still)
         k = len(self.parts)
         return values[:k], table.reshape(len(values), -1)[:k, : self.tree.unknown_rates]
 
-    def _moved(self, q: Array, x: Array, step: Array) -> Array:
-        """Return the unknowns after a step along their rates for a time of one."""
+    def _retract(self, q: Array, x: Array, step: Array) -> Array:
+        """Return the unknowns after a step along their rates."""
         steps = np.concatenate([step, np.zeros(self.joints)])
         return self._walk(self.home_pose, np.concatenate([x, q]), steps)[2][: len(x)]
 
     def reach(self, q: Array, limit: float = 1.0, precision: float = 1e-4) -> tuple[float, Array, float]:
         """Follow the straight line from home to q up to a singularity.
 
-        :param limit: part of the way beyond which nothing is looked for.
-        :returns: the part of the way, the unknowns there, and the closures' least reciprocal
-            condition on it.
+        :param limit: fraction of the line at which to stop.
+        :returns: the fraction of the line that was reached, the unknowns there, and the smallest
+            reciprocal condition number of the closures up to there.
         """
         home = self.graph.lead_home
         x, done = np.array(self.tree.home, float), 0.0
@@ -84,7 +84,7 @@ class Engine(Scheme):
         while step > precision and done < 1.0:
             way = min(1.0, done + step)
             there = home + way * (q - home)
-            new, closed = newton(x, partial(self._look, there), partial(self._moved, there))
+            new, closed = newton(x, partial(self._evaluate_closures, there), partial(self._retract, there))
             # Beyond a singularity is another assembly.
             sign, measure = self._regularity(new, there) if closed else (0.0, 0.0)
             if not closed or sign != side or way > limit:
@@ -94,40 +94,41 @@ class Engine(Scheme):
         return done, x, least
 
     def ending(self, q: Array, reached: float) -> tuple[str, float, float | None]:
-        """Explain why no assembly is found beyond a part of the straight line from home to q.
+        """Explain why no assembly is found beyond a fraction of the straight line from home to q.
 
-        :returns: the part that falls short the most, by how much (m), and None; or, where there is
-            an assembly behind a singularity, the closures' least reciprocal condition on the way.
+        :returns: the joint or rod whose closure has the largest gap at q, the gap (m), and None;
+            or, where an assembly exists behind a singularity, the closures' smallest reciprocal
+            condition number on the line in place of None.
         """
         _, x, least = self.reach(q, max(reached, 1e-12) + 1 / 8)
-        look = partial(self._look, q)
-        x, _ = newton(x, look, partial(self._moved, q), solve_damped, iterations=20, **TO_THE_END)
-        values = look(x)[0]
+        evaluate_closures = partial(self._evaluate_closures, q)
+        x, _ = newton(x, evaluate_closures, partial(self._retract, q), solve_damped, iterations=20, **TO_THE_END)
+        values = evaluate_closures(x)[0]
         if not np.isfinite(values).all():
             return self.parts[0], math.inf, None
         worst = int(np.abs(values).argmax())
         miss = float(abs(values[worst])) * self.tree.size
-        # Where nothing falls short there is an assembly, but the way does not lead to it.
-        return self.parts[worst], miss, least if miss < MET * self.tree.size else None
+        # Without a gap there is an assembly at q, but the line from home does not lead to it.
+        return self.parts[worst], miss, least if miss < MAX_GAP * self.tree.size else None
 
     def _regularity(self, x: Array, q: Array) -> tuple[float, float]:
-        """Return the sign of the independent closures' determinant, and their reciprocal condition."""
-        matrix = self._look(q, x)[1][self.independent]
+        """Return the closures' determinant's sign and their reciprocal condition number."""
+        matrix = self._evaluate_closures(q, x)[1][self.independent]
         s = np.linalg.svd(matrix, compute_uv=False)
         return float(np.linalg.slogdet(matrix)[0]), float(s[-1] / s[0]) if s.size and s[0] > 0.0 else 0.0
 
     def shortest_pose(self, pose: Array) -> tuple[str, float, bool]:
-        """Return the closure with the largest miss while the platform is held in a pose.
+        """Return the closure with the largest gap while the platform is fixed in a pose.
 
-        :returns: its joint or rod, by how much it misses, m, and whether all closures are met in
-            the pose: then a singularity ends the path from home to it.
+        :returns: its joint or rod, its gap, m, and whether all closures are satisfied in the pose:
+            then a singularity ends the path from home to it.
         """
         short = self.posed.find_shortfall(pose) if self.posed is not None else None
         if short is not None:
-            return *short, not short[1] > MET * self.tree.size
+            return *short, not short[1] > MAX_GAP * self.tree.size
         still = np.zeros(self.tree.unknown_rates + self.joints)
 
-        def look(state: Array) -> tuple[Array, Array]:
+        def evaluate_closures(state: Array) -> tuple[Array, Array]:
             values, table, _ = self._walk(pose, state, still)
             return values, table.reshape(len(values), -1)
 
@@ -135,24 +136,24 @@ class Engine(Scheme):
             return self._walk(pose, state, step)[2]
 
         home = np.array([*self.tree.home, *self.graph.lead_home], float)
-        state, _ = newton(home, look, move, solve_damped, iterations=40, **TO_THE_END)
-        values = look(state)[0]
+        state, _ = newton(home, evaluate_closures, move, solve_damped, iterations=40, **TO_THE_END)
+        values = evaluate_closures(state)[0]
         if not np.isfinite(values).all():
             return self.graph.platform, math.inf, False
         misses, names = np.abs(values), self.parts
         if not names:
-            # A serial chain: what falls short is the platform itself.
+            # A serial chain has no closures: the platform itself does not reach the pose.
             return self.graph.platform, float(misses.max()) * self.tree.size / POSE_WEIGHT, False
         worst = int(misses[: len(names)].argmax())
-        return names[worst], float(misses[worst]) * self.tree.size, float(misses.max()) < MET
+        return names[worst], float(misses[worst]) * self.tree.size, float(misses.max()) < MAX_GAP
 
-    # As programs.
+    # Compiled programs.
 
     def kernel(self, name: str, write: Callable[[Traced], Program], extra: str = "", *, free: bool = False) -> Kernel:
         """Return the compiled program of a name on this geometry, the same object every time.
 
-        :param extra: text of what the program hangs on beside the machine's structure.
-        :param free: the program takes no number of the geometry for constant.
+        :param extra: text of what the program depends on beside the machine's structure.
+        :param free: treat no number of the geometry as a constant.
         """
         known = self._kernels.get(name)
         if known is None:
@@ -169,15 +170,16 @@ class Engine(Scheme):
         *,
         free: bool = False,
     ) -> Kernel:
-        """Return a program with more numbers than the geometry's: :attr:`Traced.more` there.
+        """Return a program that has further inputs beside the geometry: :attr:`Traced.more`.
 
+        :param more: values of these inputs.
         :param extra: as of :meth:`kernel`, and ``free``.
         """
         key = self.structure.also(f"{name} {extra}", write, Traced)
         numbers = np.concatenate([self.geometry, more])
         made = Kernel(_code(key, self, write, more, free=free), numbers)
         if not made.holds:
-            # It takes for constant what is none here: a program of these numbers' own.
+            # One of its constants has another value here: write a program for these values.
             exact = key.also(f"{self.graph.key} {more.tolist()}")
             made = Kernel(_code(exact, self, write, more), numbers)
         return made
@@ -193,46 +195,48 @@ class Engine(Scheme):
         return self.kernel("jacobian", jacobian_program)
 
     @cached_property
-    def posed(self) -> CarriedScheme | None:
-        """The machine that is driven by its pose, None where its joints do not follow so.
+    def posed(self) -> PlatformFirstScheme | None:
+        """The machine driven by its pose; None if its joints do not follow from the pose.
 
-        A screw turns more than once, and a joint that alone carries the platform would be cut.
+        None for machines with screws, which turn more than once, and where the tree would cut an
+        actuated joint.
         """
         if any(joint.type.threaded() for joint in self.graph.joints.values()):
             return None
         try:
-            scheme = CarriedScheme(self, by_pose=True)
+            scheme = PlatformFirstScheme(self, by_pose=True)
         except ParameterError:
             return None
         return scheme if all(n in scheme.tree.steps for n in self.graph.actuated) else None
 
     @cached_property
-    def ahead(self) -> CarriedScheme | None:
-        """The machine with the platform before its limbs, if all limbs have closed forms so.
+    def ahead(self) -> PlatformFirstScheme | None:
+        """The machine with its platform placed first, if all limbs then have closed forms.
 
-        Then Newton's method has the platform's coordinates alone, fewer than all coordinates, and a
-        scalar equation or two a limb. Machines with a closed form or a virtual joint keep their
-        tree, and those whose platform has coordinates that follow from the pose: these could not be
-        found from a pose beyond a singularity of the coordinates, which only that tree notices.
+        Newton's method then has only the platform's coordinates as unknowns, and one or two scalar
+        equations per limb. Machines with a closed form of all unknowns or with a virtual joint keep
+        their tree. So do those whose platform has coordinates that are no pose coordinates: beyond
+        a singularity of the pose coordinates these cannot be found from a pose, and only the
+        machine's own tree detects that.
         """
         if self.start is not None or not self.solved[1]:
             return None
         if any(joint.virtual for joint in self.graph.joints.values()):
             return None
         try:
-            scheme = CarriedScheme(self, by_pose=False)
-            if any(c.place is None and not c.held for c in scheme.chain.carriers):
+            scheme = PlatformFirstScheme(self, by_pose=False)
+            if any(c.place is None and not c.constrained for c in scheme.chain.carriers):
                 return None
             fewer = len(scheme.solved[1]) < self.tree.unknown_rates
             return scheme if fewer and scheme.has_closed_limbs else None
         except (ParameterError, SingularityError):
-            # A drive that reaches the platform alone cannot come after it.
+            # A drive that alone connects the platform to the base cannot be placed after it.
             return None
 
     def posed_kernel(self, name: str, write: Callable[..., Program]) -> Kernel:
-        """Return the compiled program of a name that solves the machine driven by its pose.
+        """Return the named compiled program, which solves the machine driven by its pose.
 
-        :param write: writes it, of a :class:`Traced` and ``scheme``, :attr:`posed` or None.
+        :param write: writes it from a :class:`Traced` and ``scheme``: :attr:`posed` or None.
         """
         scheme = self.posed
         if scheme is None:
@@ -248,20 +252,20 @@ class Engine(Scheme):
 
     @property
     def inverse(self) -> Kernel:
-        """Pose to q, as ``forward`` confirms."""
+        """Pose to q; ``forward`` confirms the result."""
         return self.posed_kernel("inverse", inverse_program)
 
     @property
-    def own_forward(self) -> Kernel:
-        """The program of :attr:`forward` with the machine's own tree.
+    def generic_forward(self) -> Kernel:
+        """Forward kinematics on the machine's own tree, without closed forms of limbs.
 
-        It holds for machines of other dimensions too, whose limbs may have no closed form.
+        It is valid for changed dimensions too, for which the closed forms may not exist.
         """
         return self.kernel("forward on own tree", forward_program)
 
     @property
-    def followed_inverse(self) -> Kernel:
-        """The program of :attr:`inverse` with the machine's own tree, as :attr:`own_forward`."""
+    def generic_inverse(self) -> Kernel:
+        """Inverse kinematics on the machine's own tree, as :attr:`generic_forward`."""
         write = partial(inverse_program, scheme=None)
         return self.kernel("followed inverse", write, repr(self.inverse_pivots))
 
@@ -289,9 +293,9 @@ class Engine(Scheme):
 
 
 _engines: Final[WeakValueDictionary[ProgramKey, Engine]] = WeakValueDictionary()
-"""Engines that something still holds, by geometry: however many machines there are in between."""
+"""Engines that are still referenced, by geometry."""
 _codes: Final[WeakValueDictionary[ProgramKey, Code]] = WeakValueDictionary()
-"""Programs that something still holds: machines of one structure share them."""
+"""Programs that are still referenced; machines of one structure share them."""
 
 
 def engine_of(graph: Graph, coordinates: Sequence[Coordinate], start: Start | None = None) -> Engine:
@@ -312,7 +316,7 @@ def _code(
     *,
     free: bool = False,
 ) -> Code:
-    """Return the program of a key; write it on an engine if it is not cached."""
+    """Return the program of a key; write it for an engine if it is not cached."""
     code = _codes.get(key)
     if code is None:
         code = _codes.setdefault(key, Code(lambda: write(Traced(engine, more, free=free)), key))

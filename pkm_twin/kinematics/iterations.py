@@ -21,11 +21,11 @@ MAX_ITERATIONS: Final = 12
 MAX_STEP: Final = 0.2
 """Largest damped step, rad or parts of the machine's size: derivatives hold about that far."""
 MAX_VALUE: Final = 1e-9
-"""Largest value of an equation that holds."""
+"""Largest residual of an equation that counts as satisfied."""
 
 
 def solve_least_norm(table: Array, values: Array) -> Array:
-    """Return the least step that cancels values as far as their derivatives allow."""
+    """Return the smallest step that cancels the values as far as their derivatives allow."""
     return np.asarray(np.linalg.lstsq(table, -values, rcond=RANK)[0], np.float64)
 
 
@@ -43,7 +43,7 @@ def solve_damped(table: Array, values: Array) -> Array:
 
 def newton(
     x: S,
-    look: Callable[[S], tuple[Array, Any]],
+    evaluate: Callable[[S], tuple[Array, Any]],
     move: Callable[[S, Array], S],
     solve: Callable[[Any, Array], Array] = solve_least_norm,
     *,
@@ -54,16 +54,16 @@ def newton(
 ) -> tuple[S, bool]:
     """Solve for the state where all values vanish; return the last state, and whether they do.
 
-    :param look: returns the values in a state, and what ``solve`` needs of their derivatives.
+    :param evaluate: returns the residuals in a state, and their derivatives for ``solve``.
     :param move: returns the state after a step of rates.
-    :param solve: returns the step that cancels values, of ``look``'s second and first result.
+    :param solve: returns the step that cancels the residuals, from derivatives and residuals.
     :param gain: each step must be below this part of the one before, else the method ends.
     :param tolerance: size of the step that is the last one; ``most``: largest value that counts as
         zero then.
     """
     last = np.inf
     for _ in range(iterations):
-        values, table = look(x)
+        values, table = evaluate(x)
         if not np.isfinite(values).all():
             break
         step = solve(table, values)

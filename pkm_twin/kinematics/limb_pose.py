@@ -225,20 +225,21 @@ class LimbPose:
     def _turn_to(self, step: Step, a: Any, b: Any, d: Any, b_home: Any, square: Any) -> tuple[Any, Any]:
         """Turn a step from home until a cos + b sin = d, on the side where home is.
 
-        :param b_home: b at home, where the turn is none. ``square``: as of :meth:`_meet`.
+        :param b_home: b at home, where the turn is none. ``square``: as of :meth:`_limit_turn`.
         :returns: the root sqrt(a^2 + b^2 - d^2), and a sin - b cos: the root with its sign.
         """
         n = a * a + b * b
-        d, root = self._meet(d, n, square)
+        d, root = self._limit_turn(d, n, square)
         side = -sign_of(b_home) * root
         self.x[step.position] = (a * d - b * side) / n
         self.x[step.position + 1] = step.sign * ((b * d + a * side) / n)
         return root, side
 
-    def _meet(self, d: Any, n: Any, square: Any) -> tuple[Any, Any]:
-        """Return d and sqrt(n - d^2), of a turn that is to bring a cos + c sin to d.
+    def _limit_turn(self, d: Any, n: Any, square: Any) -> tuple[Any, Any]:
+        """Limit d to the range of a cos + c sin; return it and sqrt(n - d^2).
 
-        :param n: a^2 + c^2. ``square``: of the distance that falls by 2 d, 0: d is a length.
+        :param n: a^2 + c^2. ``square``: squared distance, which decreases by 2 d; 0: d is a
+            length.
         """
         if self.closest and not n > d * d:
             nearest = sqrt(n) * sign_of(d)
@@ -277,8 +278,8 @@ class LimbPose:
     def _spin(self, limb: Limb) -> None:
         """Turn a body about its line to the closing joint, whose axes keep their angle."""
         link, joint = self.tree.links[limb.spin], self.motion.graph.joints[limb.part]
-        (step,), (held,) = link.steps, (c for c in joint.constraints if c.kind == "angle")
-        mine, other = held.inner, held.outer
+        (step,), (constraint,) = link.steps, (c for c in joint.constraints if c.kind == "angle")
+        mine, other = constraint.inner, constraint.outer
         if limb.tip == joint.outer:
             mine, other = other, mine
         v = snapped_all(link.axes.T @ mine)

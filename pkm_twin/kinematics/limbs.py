@@ -49,13 +49,13 @@ class Closures(Protocol):
 
     @property
     def varying(self) -> list[int]:
-        """Unknown rates of coordinates that are not held at their value at home."""
+        """Indices of the unknown rates of coordinates that closures do not keep at home."""
 
     def varies(self, step: Step) -> bool:
-        """Return whether a step is passive, and its value not held."""
+        """Return whether a step is passive, and no closure keeps it at its home value."""
 
-    def holds(self, step: Step) -> bool:
-        """Return whether closures hold a passive step at its value at home."""
+    def is_constrained(self, step: Step) -> bool:
+        """Return whether the closures keep a passive step at its home value."""
 
     def at(self, x: Numbers, q: Numbers) -> tuple[Motion, list[Row]]:
         """Return motion and closures in a state."""
@@ -77,7 +77,7 @@ def find_hanging_limbs(scheme: Closures) -> tuple[Limb, ...]:
     for name in tree.cut:
         joint = graph.joints[name]
         rows = tuple(k for k, part in enumerate(scheme.parts) if part == name)
-        kinds = [held.kind for held in joint.constraints]
+        kinds = [constraint.kind for constraint in joint.constraints]
         if kinds != ["point"] or not set(rows) <= set(scheme.independent):
             continue
         for tip, beyond in ((joint.inner, joint.outer), (joint.outer, joint.inner)):
@@ -234,7 +234,7 @@ def _find_candidates(scheme: Closures, placed: Collection[str]) -> Iterator[Limb
                 [body for body in tree.chain_to_base(end)[::-1] if body not in placed] for end in (tip, beyond)
             )
             links = [tree.links[body] for body in (*low, *high)]
-            if any(scheme.holds(step) for link in links for step in link.steps):
+            if any(scheme.is_constrained(step) for link in links for step in link.steps):
                 continue
             bodies = tuple(body for body in tree.links if body in (*low, *high))
             steps, tops = ([s for b in ends for s in _main_steps(tree.links[b])] for ends in (low, high))
@@ -255,7 +255,8 @@ def _find_candidates(scheme: Closures, placed: Collection[str]) -> Iterator[Limb
                 if drives and (kind != "turns" or first != ways):
                     # Actuated joints may only follow the turns.
                     continue
-                # A single turn leaves its plane; what has no reach leaves the distance.
+                # A single turn cannot close across its plane, a limb of fixed length not the
+                # distance: these equations are left to Newton's method.
                 if 0 <= left <= (len(turns) == 1) + (reach is None):
                     yield Limb(
                         kind,

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""A graph at home and near it, on numbers: closures, rank, mobility."""
+"""Numerical closures, rank and mobility of a graph at home and near it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from pkm_twin.machine.tree import Tree
 SAMPLES: Final = 6
 """States around home, besides home, in which pivots must not be small."""
 REACH: Final = 0.6
-"""How far from home, rad or half the size: pivots that are good at home alone come near zero."""
+"""Largest distance of samples from home, rad or half the size: far enough to show small pivots."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Mobility:
 
 
 class Linkage:
-    """A graph's tree and closures, on numbers."""
+    """Evaluate a graph's spanning tree and closures numerically (``Traced``: symbolically)."""
 
     def __init__(self, graph: Graph, first: tuple[str, ...] = ()) -> None:
         self.graph, self.tree = graph, Tree(graph, first=first)
@@ -53,26 +53,26 @@ class Linkage:
         return len(self.graph.leads)
 
     def at(self, x: Numbers, q: Numbers) -> tuple[Motion, list[Row]]:
-        """Return the motion and the closures in a state, on numbers."""
+        """Return the motion and the closures in a state, evaluated numerically."""
         motion = Motion(self.tree, x, q)
         return motion, motion.closures()
 
     def scaled(self, rows: Sequence[Row]) -> tuple[Array, Array]:
-        """Return the derivatives of rows by u and by qd, every row and column of unit one."""
+        """Return the dimensionless derivatives of closures by u and by qd."""
         ju, jq = (numbers(m) for m in matrices(self.tree, rows))
         left = np.array([row.scale for row in rows]).reshape(-1, 1)
         drives = np.array([self.drive_scale(name) for name in self.graph.leads])
         return left * ju / np.array(self.tree.scales), left * jq / drives
 
     def drive_scale(self, name: str) -> float:
-        """Return what makes a joint's rate of unit one."""
+        """Return the factor that makes a joint's rate dimensionless."""
         return 1.0 / self.tree.size if self.graph.joints[name].slides else 1.0
 
     def close(self, q: Numbers, start: Numbers | None = None) -> Array | None:
         """Solve for the unknowns of a state near a known one; None if they are not found."""
         scales = np.array(self.tree.scales)
 
-        def look(x: Numbers) -> tuple[Array, Array]:
+        def evaluate_closures(x: Numbers) -> tuple[Array, Array]:
             _, rows = self.at(x, q)
             values = np.array([row.scale * float(row.value) for row in rows])
             return values, self.scaled(rows)[0]
@@ -83,7 +83,7 @@ class Linkage:
         x = np.array(self.tree.home if start is None else start, float)
         if not self.at(x, q)[1]:
             return x
-        x, closed = newton(x, look, move)
+        x, closed = newton(x, evaluate_closures, move)
         return x if closed else None
 
     @cached_property
@@ -93,7 +93,7 @@ class Linkage:
         first = _firsts.setdefault(graph.key, self)
         if first is not self:
             return first.samples
-        # The one that chooses pose coordinates is followed by the one that has them.
+        # Loading a machine builds two linkages, before and after the choice of pose coordinates.
         hold(self)
         states = [(np.array(self.tree.home, float), home)]
         random = np.random.default_rng(0)
@@ -113,8 +113,8 @@ class Linkage:
         return states
 
     @cached_property
-    def _sampled(self) -> tuple[Array, Array]:
-        """Scaled derivatives by u and qd in the samples, shape (k, rows, ...)."""
+    def _sampled_jacobians(self) -> tuple[Array, Array]:
+        """Dimensionless derivatives of closures by u and qd at the samples, (k, rows, ...)."""
         pairs = [self.scaled(self.at(x, q)[1]) for x, q in self.samples]
         return np.array([a for a, _ in pairs]), np.array([b for _, b in pairs])
 
@@ -129,8 +129,8 @@ class Linkage:
 
     def regular_state(self) -> tuple[Motion, Array]:
         """Return a sampled state of the highest rank, and the scaled derivatives by u there."""
-        k = int(np.argmax([rank_of(ju) for ju in self._sampled[0]]))
-        return self.at(*self.samples[k])[0], np.asarray(self._sampled[0][k], np.float64)
+        k = int(np.argmax([rank_of(ju) for ju in self._sampled_jacobians[0]]))
+        return self.at(*self.samples[k])[0], np.asarray(self._sampled_jacobians[0][k], np.float64)
 
     @cached_property
     def mobility(self) -> Mobility:
@@ -156,7 +156,7 @@ def rank_of(matrix: Array) -> int:
 
 
 _firsts: Final[WeakValueDictionary[str, Linkage]] = WeakValueDictionary()
-"""The first linkage of a graph that something still holds."""
+"""The first linkage of each graph that is still referenced."""
 _recent: Final[deque[Linkage]] = deque(maxlen=16)
 """Kept so that a file that is loaded again uses the same engine."""
 

@@ -1,8 +1,8 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Placement, closures, velocities and accelerations of a tree, on numbers and expressions alike.
+"""Placement, closures, velocities and accelerations of a tree, numerical or symbolic.
 
-Nothing is differentiated: columns of Jacobians are axes and levers, accelerations are the
-recursion of rigid bodies in base axes (Featherstone, Rigid Body Dynamics Algorithms, 2008, chapter
+Nothing is differentiated: columns of Jacobians are axes and levers, accelerations follow from the
+recursion for rigid bodies in base axes (Featherstone, Rigid Body Dynamics Algorithms, 2008, chapter
 2). Rates u belong to the unknowns, qd to the actuated joints.
 """
 
@@ -25,7 +25,7 @@ from pkm_twin.machine.joints import UNITS, Constraint
 from pkm_twin.machine.tree import Step, Tree
 
 Columns = dict[tuple[str, int], Any]
-"""By rate ("u" or "q", index): a vector, or a number."""
+"""Jacobian columns: a vector or number per rate, whose key is ("u" or "q", index)."""
 
 
 class BaseMotion(NamedTuple):
@@ -51,7 +51,7 @@ FIXED: Final = BaseMotion(_ZERO, _ZERO, _ZERO)
 
 
 def numbers(values: Any) -> Array:
-    """Convert an array of objects that are floats to floats."""
+    """Convert an object array of numbers to an array of floats."""
     return np.asarray(np.array(values, dtype=float), np.float64)
 
 
@@ -67,28 +67,28 @@ def _no_bias() -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """Describe a scalar equation of a closure by the tree's rates: ``value`` is zero.
+    """One scalar equation of a closure, in the tree's coordinates: ``value`` is zero.
 
     ``columns``: its derivatives by the rates. ``bias``: its second derivative in time at zero
-    accelerations of the unknowns (Delta-CU paper, equations 4 and 5). ``scale`` makes it of unit
-    one; ``angle``: it is about directions. ``part``: the joint or rod.
+    accelerations of the unknowns (Delta-CU paper, equations 4 and 5). ``scale`` makes it
+    dimensionless; ``is_angular``: it constrains directions only. ``part``: the joint or rod.
     """
 
     part: str
     value: Any
     columns: Columns
     scale: Any
-    angle: bool = False
+    is_angular: bool = False
     bias: Callable[[], Any] = _no_bias
 
 
 class Motion:
-    """A tree in one state; rates and accelerations are taken after, in this order.
+    """A tree in one state. Rates, and then accelerations, are set after its construction.
 
     :param x: unknowns, as ``tree.home``.
     :param q: positions of the actuated joints, shape (n,).
-    :param bodies: those that are placed, in the tree's order; default all.
-    :param start: the body from whose frame they are placed, in its axes.
+    :param bodies: bodies to place, in the tree's order; default all.
+    :param start: the body relative to whose frame they are placed.
     """
 
     def __init__(
@@ -125,7 +125,7 @@ class Motion:
                     if step.circle:
                         c, s = x[step.position], step.sign * x[step.position + 1]
                     else:
-                        angle = self._value(step, x, q, origin, step.offset)
+                        angle = self._step_displacement(step, x, q, origin, step.offset)
                         s, c = sin(angle), cos(angle)
                     turned = np.array(
                         [own[:, 0] * c + own[:, 1] * s, own[:, 1] * c - own[:, 0] * s, own[:, 2]],
@@ -134,14 +134,15 @@ class Motion:
                 else:
                     self.axis[id(step)] = turned @ step.local
                 if step.slide:
-                    way = step.slide * self._value(step, x, q, origin)
+                    way = step.slide * self._step_displacement(step, x, q, origin)
                     lever = lever + self.axis[id(step)] * way
             self.rotation[link.body] = turned
             self.lever[link.body] = lever
             self.origin[link.body] = self.origin[link.parent] + lever
 
     @staticmethod
-    def _value(step: Step, x: Numbers, q: Numbers, origin: Array, offset: float = 0.0) -> Any:
+    def _step_displacement(step: Step, x: Numbers, q: Numbers, origin: Array, offset: float = 0.0) -> Any:
+        """Return a step's signed displacement from home, from q if it is actuated, else from x."""
         k = step.position
         value = q[k] - (origin[k] - step.sign * offset) if step.actuated else x[k]
         return -value if step.sign < 0.0 else value
@@ -154,26 +155,26 @@ class Motion:
         return self.rotation[body] @ snapped_all(tree.axes[body].T @ (point - tree.at[body]))
 
     def point(self, body: str, point: Array) -> Any:
-        """Return where a point of a body is."""
+        """Return the position of a point of a body."""
         return self.origin[body] + self.arm(body, point)
 
     def direction(self, body: str, vector: Array) -> Any:
-        """Return where a vector of a body points."""
+        """Return a vector that is fixed in a body, in base axes."""
         return self.rotation[body] @ snapped_all(self.tree.axes[body].T @ vector)
 
-    def turned(self, body: str) -> Any:
+    def rotation_from_home(self, body: str) -> Any:
         """Return the rotation of a body relative to home, shape (3, 3)."""
         return self.rotation[body] @ self.tree.axes[body].T
 
     def platform(self) -> tuple[Any, Any]:
         """Return the reference point's position, and the platform's rotation relative to home."""
         graph = self.graph
-        return self.point(graph.platform, graph.origin), self.turned(graph.platform)
+        return self.point(graph.platform, graph.origin), self.rotation_from_home(graph.platform)
 
     # Columns: velocity of a point of a body, and angular velocity, by rates.
 
     def linear_jacobian(self, body: str, at: Any) -> Columns:
-        """Return the velocity per rate of the point of a body that is at a place.
+        """Return the velocity, per rate, of the body's point that is at position ``at``.
 
         Linear rows of the 3-PRRU paper's velocity maps J_M and J_Hij (equations 18 and 26).
         """
@@ -195,7 +196,7 @@ class Motion:
                     column = column + step.slide * axis
                 out[key] = step.sign * column
             if absolute:
-                # Nothing of the parents' turning is inherited, only their translation.
+                # The body's rotation is absolute: only the parents' translation is inherited.
                 at = origin
         return out
 
@@ -225,36 +226,36 @@ class Motion:
             a, b = joint.inner, joint.outer
             points = self.point(a, joint.at), self.point(b, joint.at)
             turns = partial(self.direction, a), partial(self.direction, b)
-            for held in joint.constraints:
+            for constraint in joint.constraints:
                 found = constraint_equations(
-                    joint.name, (joint.inner, joint.outer), held, points, turns, self.tree.size
+                    joint.name, (joint.inner, joint.outer), constraint, points, turns, self.tree.size
                 )
                 columns = self._differences(found[0])
-                rows += [self._row(one, columns, partial(self._bias, joint, held, one)) for one in found]
+                rows += [self._row(one, columns, partial(self._bias, joint, constraint, one)) for one in found]
         return rows + [self._rod(rod) for rod in self.graph.rods.values()]
 
     def _differences(self, one: Equation) -> Columns:
         """Return the outer body's velocity less the inner one's per rate, linear or angular."""
-        if one.angle:
+        if one.is_angular:
             return difference(*(self.angular_jacobian(body) for body in one.bodies[::-1]))
         return difference(*map(self.linear_jacobian, one.bodies[::-1], one.points[::-1]))
 
     def _row(self, one: Equation, columns: Columns, bias: Callable[[], Any] = _no_bias) -> Row:
         """Return an equation with its derivatives by the rates."""
-        load = one.moment if one.angle else one.force
+        load = one.moment if one.is_angular else one.force
         by_rates = {k: c @ load for k, c in columns.items()}
-        return Row(one.part, one.value, by_rates, one.scale, one.angle, bias)
+        return Row(one.part, one.value, by_rates, one.scale, one.is_angular, bias)
 
-    def _bias(self, joint: Joint, held: Constraint, one: Equation) -> Any:
-        """Return an equation's second derivative, of velocities and given accelerations."""
+    def _bias(self, joint: Joint, constraint: Constraint, one: Equation) -> Any:
+        """Return an equation's second derivative from velocities and given accelerations."""
         a, b, at = joint.inner, joint.outer, joint.at
         wa, wb = self.omega[a], self.omega[b]
-        if held.kind == "point":
+        if constraint.kind == "point":
             return one.force @ (self.acceleration(b, at) - self.acceleration(a, at))
-        ea = self.direction(a, held.inner)
+        ea = self.direction(a, constraint.inner)
         va = cross(wa, ea)
-        if held.kind == "angle":
-            ub = self.direction(b, held.outer)
+        if constraint.kind == "angle":
+            ub = self.direction(b, constraint.outer)
             vb = cross(wb, ub)
             turning = (self.alpha[b] - self.alpha[a]) @ one.moment
             return turning + cross(wa, va) @ ub + cross(wb, vb) @ ea + 2.0 * (va @ vb)
@@ -319,7 +320,7 @@ class Motion:
         base = self._base
         self.alpha: dict[str, Any] = {BASE: base.alpha}
         self.change: dict[str, Any] = {BASE: base.change}
-        self._spin: dict[str, Any] = {BASE: _spin(base.omega, base.alpha)}
+        self._spin: dict[str, Any] = {BASE: _acceleration_matrix(base.omega, base.alpha)}
         for link in self.tree.links.values():
             parent = link.parent
             w = self.omega[parent]
@@ -343,7 +344,7 @@ class Motion:
                 if step.turns:
                     al = al + axis * second + cross(self._before[id(step)], axis) * rate
             self.alpha[link.body], self.change[link.body] = al, acc
-            self._spin[link.body] = _spin(self.omega[link.body], al)
+            self._spin[link.body] = _acceleration_matrix(self.omega[link.body], al)
 
     def velocity(self, body: str, point: Array) -> Any:
         """Return the velocity of a point of a body, given at home (Delta-CU paper, equations 7, 8)."""
@@ -354,11 +355,11 @@ class Motion:
         return self.change[body] + self._spin[body] @ self.arm(body, point)
 
     def spin(self, body: str) -> Any:
-        """Return the matrix from a lever to the acceleration across it, shape (3, 3)."""
+        """Return [alpha]x + [omega]x [omega]x of a body, shape (3, 3)."""
         return self._spin[body]
 
     def retracted(self, x: Numbers, du: Numbers) -> list[Any]:
-        """Return the unknowns after a step of small rates."""
+        """Return the unknowns after a small step du; rotations stay on their manifold."""
         new = list(x)
         for link in self.tree.links.values():
             for step in link.steps:
@@ -421,7 +422,8 @@ def _quaternion_matrix(parts: Numbers) -> Objects:
     )
 
 
-def _spin(w: Any, al: Any) -> Objects:
+def _acceleration_matrix(w: Any, al: Any) -> Objects:
+    """Return [al]x + [w]x [w]x, which maps a lever to the relative acceleration of its end."""
     x, y, z = w
     xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
     return np.array(

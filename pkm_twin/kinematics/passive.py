@@ -108,7 +108,7 @@ def _values(t: Traced) -> list[Any]:
             values += [] if tree.graph.joints[step.joint].actuated else [value + home]
             values += [step.slide * value] if step.turns and step.slide else []
     for rod in t.graph.rods.values():
-        span = motion.turned(rod.inner).T @ _across_ends(t, rod)
+        span = motion.rotation_from_home(rod.inner).T @ _across_ends(t, rod)
         b, a, x = _rod_sides(rod, span)
         values += [atan2(a, x), atan2(b, sqrt(x * x + a * a))]
     return values
@@ -123,7 +123,7 @@ def _rates(t: Traced, qd: Numbers, u: Numbers) -> list[Any]:
             k = steps[0].rate
             if steps[0].free:
                 rates += list(u[k + 3 : k + 6])
-            inner, r = motion.turned(link.parent), _relative(t, link)
+            inner, r = motion.rotation_from_home(link.parent), _relative(t, link)
             omega = inner.T @ (motion.omega[link.body] - motion.omega[link.parent])
             # omega = a' x + b' (0, cos a, sin a) + c' (sin b, -sin a cos b, cos a cos b): the rates
             # are not finite where cos b is zero, as no three angles are everywhere.
@@ -137,7 +137,7 @@ def _rates(t: Traced, qd: Numbers, u: Numbers) -> list[Any]:
             rates += [] if t.graph.joints[step.joint].actuated else [rate]
             rates += [step.slide * rate] if step.turns and step.slide else []
     for rod in t.graph.rods.values():
-        inner, apart = motion.turned(rod.inner), _across_ends(t, rod)
+        inner, apart = motion.rotation_from_home(rod.inner), _across_ends(t, rod)
         ends = [motion.velocity(body, end) for body, end in zip((rod.inner, rod.outer), rod.ends, strict=True)]
         # As the inner body sees it.
         slip = inner.T @ (ends[1] - ends[0] - cross(motion.omega[rod.inner], apart))
@@ -151,7 +151,7 @@ def _rates(t: Traced, qd: Numbers, u: Numbers) -> list[Any]:
 
 def _relative(t: Traced, link: Link) -> Objects:
     """Return the rotation of a link relative to its parent."""
-    turned: Objects = t.motion.turned(link.parent).T @ t.motion.turned(link.body)
+    turned: Objects = t.motion.rotation_from_home(link.parent).T @ t.motion.rotation_from_home(link.body)
     return turned
 
 

@@ -1,10 +1,11 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""A machine whose platform is carried by a chain of its pose coordinates.
+"""A machine whose platform is placed first, by a chain of virtual joints, and then its limbs.
 
-The chain has a slide or a turn for each coordinate of the platform that its joints leave free. If
-those of the pose are actuated, the machine's own joints follow: solving the closures of this graph
-is the inverse kinematics, limb by limb, and generalised forces on the pose coordinates give the
-machine's efforts. If the machine's own joints are actuated, it is the forward kinematics.
+The chain has a prismatic or revolute joint for each coordinate of the platform that the machine's
+joints leave free. If the joints of the pose coordinates are actuated, the machine's own joints
+follow: solving the closures of this graph is the inverse kinematics, limb by limb, and generalised
+forces on the pose coordinates give the machine's efforts. If the machine's own joints are actuated,
+it is the forward kinematics.
 """
 
 from __future__ import annotations
@@ -35,38 +36,38 @@ from pkm_twin.machine.joints import UNITS, Freedom
 from pkm_twin.machine.tree import Link, Tree
 
 OPEN_STATES: Final = 4
-"""States of an open tree, of which one alone could keep a coordinate by chance."""
-STILL: Final = 1e-8
-"""Largest change of a coordinate, of unit one, that counts as none: rounding of sampled states."""
+"""Number of random states of an open tree: in a single one a coordinate may be zero by chance."""
+MAX_ROUNDING_CHANGE: Final = 1e-8
+"""Largest dimensionless change of a coordinate that is attributed to rounding of sampled states."""
 
 
 @dataclass(frozen=True)
 class Carrier:
-    """One slide or turn of the chain, along or about a base axis at home.
+    """One joint of the chain, along or about a base axis at home.
 
-    ``place``: index of its pose coordinate, None of another coordinate of the platform. ``held``:
-    whether closures hold that at its value at home. ``joint``: the joint of the machine that it
-    replaces, through whose point it turns; empty: none, and the reference point. ``end``: the body
-    that it carries, empty: a massless one.
+    ``place``: index of its pose coordinate; None if it is another coordinate of the platform.
+    ``constrained``: whether the closures keep it at its home value. ``joint``: the machine's joint
+    that it replaces, whose point is on its axis; empty: it replaces none, and its axis goes through
+    the reference point. ``end``: the body that it moves; empty: a massless one.
     """
 
     name: str
     coordinate: Coordinate
     axis: int
     place: int | None
-    held: bool = False
+    constrained: bool = False
     joint: str = ""
     end: str = ""
 
     @property
     def turns(self) -> bool:
-        """Whether it turns about its axis; else it slides along it."""
+        """Whether the joint is revolute; else it is prismatic."""
         return self.coordinate.axis is None
 
 
 @dataclass(frozen=True)
 class PoseChain:
-    """Slides and turns from the base to the platform."""
+    """Prismatic and revolute joints from the base to the platform."""
 
     carriers: tuple[Carrier, ...]
 
@@ -76,9 +77,9 @@ class PoseChain:
         return tuple(f"pose {carrier.name}" for carrier in self.carriers)
 
     def attach(self, graph: Graph, *, by_pose: bool) -> Graph:
-        """Return the graph with the chain, of a rotation as 3-PRRU paper, equation 1.
+        """Return the graph with the chain added; rotations as in the 3-PRRU paper, equation 1.
 
-        :param by_pose: whether the pose coordinates are actuated in place of the machine's joints.
+        :param by_pose: actuate the pose coordinates in place of the machine's joints.
         """
         chain: list[tuple[int, Joint]] = []
         massless: dict[str, Body] = {}
@@ -123,15 +124,15 @@ class PoseChain:
 def find_pose_chain(scheme: Scheme) -> PoseChain:
     """Find the chain of a machine's pose.
 
-    It replaces joints that are the pose coordinates already, as a platform's universal joint on the
-    base, or carries the platform beside the machine's joints.
+    It replaces joints whose coordinates are the pose coordinates already, as a universal joint
+    between base and platform; else it is added beside the machine's joints.
     """
     graph, given = scheme.graph, scheme.coordinates
     entries = {c.entries for c in given if c.entries}
     sequence = next(t for t in poses.TURNS.values() if entries <= {c.entries for c in t})
     every = [*(poses.COORDINATES[name] for name in "xyz"), *sequence]
     closed = _vary(scheme, every, scheme.samples)
-    # Coordinates that the joints to the platform keep by themselves, as in a plane, need no joint.
+    # Coordinates that the tree's joints keep constant, as in a planar machine, need no joint.
     opened = _vary(scheme, every, _open_states(scheme))
     carriers = []
     for c, varies, moves in zip(every, closed, opened, strict=True):
@@ -144,7 +145,7 @@ def find_pose_chain(scheme: Scheme) -> PoseChain:
         elif moves:
             kind = "slide" if c.axis is not None else "turn"
             name = f"{'xyz'[_axis_of(c)]} {kind}"
-            carriers.append(Carrier(name, c, _axis_of(c), None, held=not varies))
+            carriers.append(Carrier(name, c, _axis_of(c), None, constrained=not varies))
     own = [carrier for carrier in carriers if carrier.place is not None]
     joints = _replace_joints(scheme, own)
     if joints:
@@ -157,7 +158,7 @@ def _vary(scheme: Scheme, coordinates: Sequence[Coordinate], states: Sequence[tu
     placed = [tuple(numbers(part) for part in scheme.at(x, q)[0].platform()) for x, q in states]
     table = np.array([poses.values(coordinates, *state) for state in placed], float)
     scales = [scheme.tree.size if c.axis is not None else 1.0 for c in coordinates]
-    return [len(states) == 1 or bool(change > STILL) for change in np.ptp(table, axis=0) / scales]
+    return [len(states) == 1 or bool(change > MAX_ROUNDING_CHANGE) for change in np.ptp(table, axis=0) / scales]
 
 
 def _open_states(scheme: Scheme) -> list[tuple[Array, Array]]:
@@ -191,10 +192,10 @@ def _replace_joints(
     body: str = BASE,
     passed: frozenset[str] = frozenset(),
 ) -> tuple[Carrier, ...]:
-    """Return the carriers of a chain of joints from a body to the platform, which are the pose.
+    """Return carriers that replace a chain of joints from a body to the platform.
 
-    Empty where there is no such chain. Turns need not go through one point, but where slides are
-    given too, they go through the reference point.
+    The joints' coordinates are the pose coordinates; empty if there is no such chain. Rotation axes
+    need not meet in one point, but if there are slides too, they go through the reference point.
     """
     graph = scheme.graph
     if not carriers:
@@ -227,66 +228,70 @@ def _is_along(freedom: Freedom, carrier: Carrier) -> bool:
     return bool(abs(abs(freedom.axis[carrier.axis]) - 1.0) < SNAP)
 
 
-class CarriedScheme(Scheme):
-    """How the closures of a machine are solved whose platform is placed before its limbs.
+class PlatformFirstScheme(Scheme):
+    """Solution scheme of a machine whose platform is placed before its limbs.
 
-    It is driven by its pose, or by its own joints: then the coordinates of the platform are the
-    unknowns, with those of limbs without closed form.
+    Its inputs are the pose, or the machine's own joint positions: then the unknowns are the
+    platform's coordinates, and those of limbs without closed form.
     """
 
     def __init__(self, machine: Scheme, *, by_pose: bool) -> None:
+        """Build the tree in which a chain of virtual joints, or a free joint, places the platform.
+
+        :param by_pose: the pose is the input.
+        """
         self.machine, self.by_pose = machine, by_pose
         self.chain = find_pose_chain(machine)
-        varying = [c for c in self.chain.carriers if not c.held]
+        varying = [c for c in self.chain.carriers if not c.constrained]
         self._free = not by_pose and sum(c.turns for c in varying) == 3
         first = (machine.graph.platform,) if self._free else self.chain.joints
-        super().__init__(self.carry(machine.graph), machine.coordinates, first=first)
+        super().__init__(self.attach_chain(machine.graph), machine.coordinates, first=first)
 
-    def carry(self, graph: Graph) -> Graph:
-        """Return the graph with the chain, where the platform is not free."""
+    def attach_chain(self, graph: Graph) -> Graph:
+        """Return the graph with the chain; without it if the platform has a free joint."""
         return graph if self._free else self.chain.attach(graph, by_pose=self.by_pose)
 
     @cached_property
-    def held(self) -> list[int]:
-        """Unknown rates of coordinates of the platform that closures hold."""
+    def constrained_rates(self) -> list[int]:
+        """Indices of the unknown rates of platform coordinates that the closures keep at home."""
         carriers = zip(self.chain.joints, self.chain.carriers, strict=True)
-        names = () if self._free else [name for name, carrier in carriers if carrier.held]
+        names = () if self._free else [name for name, carrier in carriers if carrier.constrained]
         return [self.tree.steps[name].rate for name in names]
 
     @cached_property
     def varying(self) -> list[int]:
-        """The other unknown rates."""
-        return [k for k in range(self.tree.unknown_rates) if k not in self.held]
+        """Indices of the other unknown rates."""
+        return [k for k in range(self.tree.unknown_rates) if k not in self.constrained_rates]
 
     @cached_property
-    def _holding(self) -> tuple[list[int], Order]:
-        """Closures that hold coordinates of the platform, and pivots of them by these."""
-        ju, _ = self._sampled
+    def _constraining(self) -> tuple[list[int], Order]:
+        """The closures that keep platform coordinates at home, and their elimination order."""
+        ju, _ = self._sampled_jacobians
         first = ju[:, self.independent]
-        follow = np.linalg.solve(first[:, :, self.varying], first[:, :, self.held])
-        table = ju[:, :, self.held] - ju[:, :, self.varying] @ follow
+        follow = np.linalg.solve(first[:, :, self.varying], first[:, :, self.constrained_rates])
+        table = ju[:, :, self.constrained_rates] - ju[:, :, self.varying] @ follow
         rows = independent_rows(table)
-        if len(rows) < len(self.held):
+        if len(rows) < len(self.constrained_rates):
             raise mobility_error(self)
         return rows, pivot_order(table[:, rows])
 
     @property
-    def holding(self) -> list[int]:
-        """Closures that hold coordinates of the platform; no other closure does."""
-        return self._holding[0]
+    def constraining_closures(self) -> list[int]:
+        """Indices of the closures that keep platform coordinates at their home values."""
+        return self._constraining[0]
 
     @property
-    def holding_pivots(self) -> Order:
-        """Pivots of these closures by the coordinates that they hold."""
-        return self._holding[1]
+    def constraining_pivots(self) -> Order:
+        """Elimination order of these closures in the coordinates that they keep at home."""
+        return self._constraining[1]
 
     @cached_property
     def samples(self) -> list[tuple[Array, Array]]:
-        """States of the machine at home and near it, as states of this tree."""
-        return [self._carry_over(x, q) for x, q in self.machine.samples]
+        """The machine's states at home and near it, in the coordinates of this tree."""
+        return [self._convert_state(x, q) for x, q in self.machine.samples]
 
-    def _carry_over(self, x: Array, q: Array) -> tuple[Array, Array]:
-        """Return the unknowns and the drives of a state of the machine."""
+    def _convert_state(self, x: Array, q: Array) -> tuple[Array, Array]:
+        """Convert a state (x, q) of the machine to this tree's coordinates."""
         motion, _ = self.machine.at(x, q)
         position, rotation = (numbers(part) for part in motion.platform())
         x = np.array(self.tree.home, float)
@@ -304,7 +309,7 @@ class CarriedScheme(Scheme):
                 else:
                     x[step.position] = value - float(self.graph.origin[_axis_of(c)])
             elif link.joint not in self.chain.joints:
-                _set_joint(self.tree, link, motion, x)
+                _compute_joint_coordinates(self.tree, link, motion, x)
         return x, q
 
     @cached_property
@@ -314,10 +319,10 @@ class CarriedScheme(Scheme):
 
     @cached_property
     def platform_pivots(self) -> Order | None:
-        """Equations and slides by which :meth:`close_platform` eliminates; None: it has no solution.
+        """Elimination order (equation, slide) of :meth:`close_platform`; None: it does not apply.
 
-        It is tried if limbs leave slides and at most one turn of the platform to Newton's method,
-        and holds if it gives the sampled states again.
+        It applies if closed limbs leave to Newton's method only slides and at most one turn of the
+        platform, and if it reproduces the sampled states.
         """
         places, rates = self.solved
         steps = [self.tree.steps[name] for name in self.chain.joints] if self.by_pose else []
@@ -339,10 +344,10 @@ class CarriedScheme(Scheme):
         return pivots if (np.abs(apart) < SAME_STATE).all() else None
 
     def _affine_rows(self, tree: Tree, q: Numbers) -> tuple[Objects, Objects, Objects]:
-        """Return what limbs leave to the platform: d + G slides + h cos + k sin = 0.
+        """Return the platform's remaining equations: d + G slides + h cos + k sin = 0.
 
-        :returns: values at slides and turn of 0, shape (rows,), derivatives there by all unknown
-            rates, shape (rows, rates), and those after a quarter turn.
+        :returns: residuals with slides and turn at 0, (rows,); their derivatives by all unknown
+            rates, (rows, rates); the derivatives after a quarter turn.
         """
         found = []
         for cosine in (1.0, 0.0):
@@ -356,13 +361,13 @@ class CarriedScheme(Scheme):
         return found[0], found[1], found[3]
 
     def close_platform(self, tree: Tree, q: Numbers, pivots: Order) -> tuple[list[Any], Any]:
-        """Find the unknowns of the platform in closed form, on numbers and expressions alike.
+        """Find the platform's unknowns in closed form, numerically or symbolically.
 
-        Slides are eliminated; of both turns that solve the last equation, a cos + b sin = c, the
-        one on home's side is taken (of a 3-RPS: Lee and Shah 1988).
+        Slides are eliminated; the last equation, a cos + b sin = c, has two solutions, of which the
+        one on home's side is taken (for a 3-RPS: Lee and Shah 1988).
 
-        :returns: the unknowns, and the square by which rounding grows: where a pivot or the root
-            vanishes, any unknowns would meet the equations.
+        :returns: the unknowns, and the squared growth of rounding errors, which is infinite where a
+            pivot or the root vanishes: there any unknowns would satisfy the equations.
         """
         steps = {step.rate: step for step in tree.steps.values() if not step.actuated}
         order, slides = [row for row, _ in pivots], [column for _, column in pivots]
@@ -396,7 +401,7 @@ class CarriedScheme(Scheme):
 
     @property
     def has_closed_limbs(self) -> bool:
-        """Whether Newton's method has the coordinates of the platform alone."""
+        """Whether Newton's unknowns are the platform's coordinates only."""
         stem = self.tree.chain_to_base(self.graph.platform)
         opened = [entry for entry in self.order if not isinstance(entry, Limb)]
         passive = (b for b in opened if not all(s.actuated for s in self.tree.links[b].steps))
@@ -404,15 +409,15 @@ class CarriedScheme(Scheme):
 
     @property
     def judged(self) -> list[int]:
-        """Closures that no closed form meets by itself."""
+        """Indices of the closures that no limb's closed form satisfies by construction."""
         solved = {k for limb in self.limbs for k in limb.rows}
         return [k for k in range(len(self.parts)) if k not in solved]
 
     def find_shortfall(self, pose: Array) -> tuple[str, float] | None:
-        """Return the joint or rod that closes the first limb which falls short, and the gap, m.
+        """Return the joint or rod that closes the first limb which is too short, and the gap, m.
 
-        The machine is driven by its pose. None: not known, because a limb has no closed form. The
-        gap is 0 where the closures are met.
+        For a machine driven by its pose. None: not known, because a limb has no closed form.
+        The gap is 0 if all closures are satisfied.
         """
         rates = self.solved[1]
         inner = {
@@ -425,7 +430,8 @@ class CarriedScheme(Scheme):
             return None
         limbs: list[LimbPose] = []
 
-        def look(x: Array) -> tuple[Array, Array]:
+        def evaluate_closures(x: Array) -> tuple[Array, Array]:
+            """Return the dimensionless residuals of Newton's equations at x, and their Jacobian."""
             motion, limbs[:] = place_in_order(self.tree, self.order, np.array(x, dtype=object), pose, closest=True)
             rows = self.solved_rows(motion.closures(), limbs)
             values = [row.scale * float(row.value) for row in rows]
@@ -437,16 +443,16 @@ class CarriedScheme(Scheme):
             return np.array(Motion(self.tree, x, pose).retracted(x, change), float)
 
         with np.errstate(all="ignore"):
-            if not newton(np.array(self.tree.home, float), look, move)[1]:
+            if not newton(np.array(self.tree.home, float), evaluate_closures, move)[1]:
                 return None
         misses = {limb.part: found.miss for limb, found in zip(self.limbs, limbs, strict=True)}
         return next((short for short in misses.items() if short[1] > 0.0), (self.parts[0], 0.0))
 
     @cached_property
     def drive_pivots(self) -> Order:
-        """Pivots of the leading drives' rates by those of the pose, good in states near home."""
+        """Elimination order of the leading drives' rates by the pose's rates, good near home."""
         graph, tree = self.machine.graph, self.tree
-        ju, jq = self._sampled
+        ju, jq = self._sampled_jacobians
         steps = {step.joint: step.rate for link in tree.links.values() for step in link.steps}
         rates = [self.varying.index(steps[name]) for name in graph.leads]
         tables = []
@@ -455,11 +461,11 @@ class CarriedScheme(Scheme):
         return pivot_order(np.array(tables))
 
 
-def _set_joint(tree: Tree, link: Link, motion: Motion, x: Array) -> None:
-    """Write the unknowns of a link's joint, of bodies that another motion has placed."""
+def _compute_joint_coordinates(tree: Tree, link: Link, motion: Motion, x: Array) -> None:
+    """Write a joint's passive coordinates, from its bodies' poses in ``motion``, into x."""
 
     def rotation(body: str) -> Array:
-        return np.eye(3) if body == BASE else numbers(motion.turned(body))
+        return np.eye(3) if body == BASE else numbers(motion.rotation_from_home(body))
 
     inner, outer = rotation(link.parent), rotation(link.body)
     relative = inner.T @ outer
@@ -492,7 +498,7 @@ def _set_joint(tree: Tree, link: Link, motion: Motion, x: Array) -> None:
         elif step.slide:
             x[step.position] = step.sign * angle
     elif len(turns) == 2:
-        # Two turns, about a, then about b: the first takes b, the second a, to where they are.
+        # Turns about a, then b: the first angle follows from b's direction, the second from a's.
         first, second = turns
         a, b = first.axis, second.axis
         angles = _angle(a, b, relative @ b), -_angle(b, a, relative.T @ a)
@@ -501,6 +507,6 @@ def _set_joint(tree: Tree, link: Link, motion: Motion, x: Array) -> None:
 
 
 def _angle(axis: Array, start: Array, end: Array) -> float:
-    """Return the angle about an axis from one vector to another, both across it."""
+    """Return the angle about an axis between the components of two vectors across it."""
     start, end = (v - (v @ axis) * axis for v in (start, end))
     return math.atan2(np.cross(start, end) @ axis, start @ end)

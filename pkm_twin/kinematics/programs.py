@@ -22,7 +22,7 @@ from pkm_twin.codegen.program import (
 )
 from pkm_twin.kinematics import pose as poses
 from pkm_twin.kinematics.motion import Motion, Row, matrices
-from pkm_twin.kinematics.posed import CarriedScheme
+from pkm_twin.kinematics.posed import PlatformFirstScheme
 from pkm_twin.kinematics.traced import POSED, Traced
 
 POSE_WEIGHT: Final = 100.0
@@ -101,7 +101,7 @@ def placement_program(t: Traced) -> Program:
     t.solve()
     rows: list[Any] = []
     for body in t.graph.bodies:
-        rows += [*np.ravel(t.motion.turned(body)), *t.motion.origin[body]]
+        rows += [*np.ravel(t.motion.rotation_from_home(body)), *t.motion.origin[body]]
     return Program(t.inputs("q"), 0, {"bodies": t.lift(rows)}, t.equations())
 
 
@@ -144,7 +144,7 @@ def ahead_forward_program(t: Traced) -> Program:
     return forward_program(t.ahead)
 
 
-def inverse_program(t: Traced, scheme: CarriedScheme | None) -> Program:
+def inverse_program(t: Traced, scheme: PlatformFirstScheme | None) -> Program:
     """Write the program from a pose to the joints of which ``forward`` is the pose.
 
     The joints of a pose may belong to another assembly too, so the closures are solved of them.
@@ -185,7 +185,7 @@ def confirm_pose(t: Traced, leads: Numbers, *, rates: bool = False) -> tuple[Equ
     return t.equations(branch=t.lift(same), goal=t.lift(leads), stage=1)
 
 
-def quick_inverse_program(t: Traced, scheme: CarriedScheme) -> Program:
+def quick_inverse_program(t: Traced, scheme: PlatformFirstScheme) -> Program:
     """Write the program from a pose to joints that are certainly those of :func:`inverse_program`.
 
     A pose is accepted if the determinant of the drives has its sign at home, and if the start of
@@ -196,14 +196,14 @@ def quick_inverse_program(t: Traced, scheme: CarriedScheme) -> Program:
     return Program({"pose": len(posed.q)}, 0, {"q": t.lift(q)}, equations, single=True)
 
 
-def solve_pose(t: Traced, scheme: CarriedScheme) -> tuple[Traced, list[Any]]:
+def solve_pose(t: Traced, scheme: PlatformFirstScheme) -> tuple[Traced, list[Any]]:
     """Return the machine that is driven by its pose, solved, and all its drives' positions."""
-    posed = t.carried(scheme)
+    posed = t.platform_first(scheme)
     posed.solve()
     return posed, posed.tree.joint_positions(t.graph.actuated, posed.x)
 
 
-def transmission_program(t: Traced, scheme: CarriedScheme | None, *, certified: bool, curved: bool) -> Program:
+def transmission_program(t: Traced, scheme: PlatformFirstScheme | None, *, certified: bool, curved: bool) -> Program:
     """Write the program from a pose to the drives' positions and their rates per pose rate.
 
     :param certified: whether poses are accepted as by :func:`quick_inverse_program`; else all are.
@@ -250,7 +250,7 @@ def actuator_program(t: Traced) -> Program:
     rows = zip(*[poses.rates(t.scheme.coordinates, rotation, v, w) for v, w in twists], strict=True)
     velocity = [np.array(t.drives.shared(row), dtype=object) @ qd for row in rows]
     factors = pose_factors(t)
-    effort = factors.solve_transposed(t.drives.on_leads([*tau]))
+    effort = factors.solve_transposed(t.drives.leading_efforts([*tau]))
     outputs = {
         "pose": t.lift(poses.values(t.scheme.coordinates, position, rotation)),
         "velocity": t.lift(velocity),
@@ -276,14 +276,14 @@ def pose_accelerations(t: Traced) -> list[Any]:
     motion, body = t.motion, t.graph.platform
     return poses.accelerations(
         t.scheme.coordinates,
-        motion.turned(body),
+        motion.rotation_from_home(body),
         motion.omega[body],
         motion.acceleration(body, t.graph.origin),
         motion.alpha[body],
     )
 
 
-def certify_assembly(t: Traced, scheme: CarriedScheme, posed: Traced, q: Sequence[Any]) -> list[Any]:
+def certify_assembly(t: Traced, scheme: PlatformFirstScheme, posed: Traced, q: Sequence[Any]) -> list[Any]:
     """Return numbers that are above zero if ``forward`` of q is certainly the pose.
 
     With x the pose, A = dq/dx and home 0, the way from home is read from both ends: A0^-1 (q - q0)
@@ -334,9 +334,10 @@ def follow_pose(t: Traced, *, rates: bool = False) -> tuple[tuple[Equations, ...
     motion, rows, equations, lu = system(everything, goal)
     step = -lu.solve([rows[k].value for k in scheme.independent] + equations)
 
-    def moved(state: Objects, step: Objects) -> list[Expression]:
-        turned = motion.retracted(state[:size], step[:split])
-        return t.lift([*turned, *(state[size:] + step[split:])])
+    def retract(state: Objects, step: Objects) -> list[Expression]:
+        """Return the state after a step; rotations stay on their manifold."""
+        retracted = motion.retracted(state[:size], step[:split])
+        return t.lift([*retracted, *(state[size:] + step[split:])])
 
     onward = tape.inputs(STATE, len(AT))[AT.onward]
     way = onward * (everything - tape.inputs(previous(POSED), len(home)))
@@ -345,8 +346,8 @@ def follow_pose(t: Traced, *, rates: bool = False) -> tuple[tuple[Equations, ...
         t.lift(home),
         t.lift(origin),
         None,
-        moved(everything + way, np.zeros(len(step))),
-        moved(everything, step),
+        retract(everything + way, np.zeros(len(step))),
+        retract(everything, step),
         t.square(step, [*tree.scales, *t.drive_scales]),
         tape.lift(system(home, origin)[3].inverse_determinant / lu.inverse_determinant),
         t.square([r.value for r in rows] + equations, [r.scale for r in rows] + t.pose_scales),

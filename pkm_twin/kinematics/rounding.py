@@ -128,10 +128,10 @@ def repair(graph: Graph, precision: float) -> Repair | None:
     loops = _Loops(graph)
     sizes = np.linalg.svd(loops.equations(Placement.at_home(graph, (1,)))[1][0], compute_uv=False)
     rank = int((sizes > precision).sum())
-    # Rounding may show at home or only beside it.
+    # Rounding may become visible at home or only away from it.
     if loops.are_exact(rank, loops.walk(rank, 2, 1)) and not (sizes[rank:] > EXACT).any():
         return Repair(graph, {})
-    # Of a plane linkage least changes alone make axes that meet in a point far away.
+    # In a planar linkage least changes alone would make axes that meet in a distant point.
     loops.graph = align_axes(graph, precision)
     if loops.are_exact(rank, loops.walk(rank, CHECKED, STEPS, seed=1)):
         return loops.repair()
@@ -142,7 +142,7 @@ def repair(graph: Graph, precision: float) -> Repair | None:
             return None
         if not loops.close(rank, positions):
             return None
-        # Few positions can close by numbers that fit these alone.
+        # Dimensions fitted to few positions may close the loops only there: check further ones.
         if loops.are_exact(rank, loops.walk(rank, CHECKED, STEPS, seed=1)):
             return loops.repair()
     return None
@@ -209,7 +209,7 @@ def repair_few(graph: Graph, freedoms: int) -> Repair | None:
             left, strength, _ = np.linalg.svd(apart, full_matrices=False)
             own = left[:, strength > noise]
             rest = gap - own @ (own.T @ gap)
-            # Of vectors that do the same the first is taken.
+            # Of equivalent vectors the first is taken.
             if float(np.linalg.norm(rest)) < least * (1.0 - 1e-6):
                 best, least, remaining, added = slot, float(np.linalg.norm(rest)), rest, own
         if best is None:
@@ -240,7 +240,7 @@ class _Loops:
 
     @property
     def slots(self) -> list[Slot]:
-        """All vectors of the graph."""
+        """All points and directions of the graph that rounding may have changed."""
         graph = self.graph
         found: list[Slot] = []
         for joint in graph.joints.values():
@@ -276,9 +276,9 @@ class _Loops:
         return bool(miss < CLOSED and (self.sizes(positions)[:, rank:] < EXACT).all())
 
     def openings(self, rank: int, positions: Placement) -> tuple[Array, dict[Slot, Array], float]:
-        """Return how far loops stay open whatever the bodies do, and its change by the vectors.
+        """Return the gaps that no motion of bodies closes, and their derivatives by the vectors.
 
-        :returns: openings, shape (k,); derivatives by each vector, (k, 3); the bound below which
+        :returns: gaps, shape (k,); derivatives by each vector, (k, 3); the bound below which
             a singular value of these is noise.
         """
         value, table = self.equations(positions)
@@ -355,14 +355,16 @@ class _Loops:
             points = placed.point(a, joint.at), placed.point(b, joint.at)
             turns = partial(rotate, placed.turn(a)), partial(rotate, placed.turn(b))
             for key in joint.type.holds:
-                for held in CONSTRAINTS[key](joint.axes, joint.pitch):
+                for constraint in CONSTRAINTS[key](joint.axes, joint.pitch):
                     frames = [_Frame(("at", name, 0), joint.at)] * 2
                     if key not in ("point", "turns"):
                         frames = [
                             frame._replace(tilt=("axis", name, k), axis=joint.axes[k])
-                            for frame, k in zip(frames, held.axes, strict=True)
+                            for frame, k in zip(frames, constraint.axes, strict=True)
                         ]
-                    for one in constraint_equations(joint.name, (joint.inner, joint.outer), held, points, turns, size):
+                    for one in constraint_equations(
+                        joint.name, (joint.inner, joint.outer), constraint, points, turns, size
+                    ):
                         found.append((frames, one))
         for rod in self.graph.rods.values():
             start, end = rod.ends

@@ -99,11 +99,11 @@ class Scheme(Linkage):
 
     @cached_property
     def independent(self) -> list[int]:
-        """Independent loop constraints, which are solved; the others only judge the result.
+        """Indices of independent closures, which are solved; the others only check the result.
 
-        :raises ParameterError: something can move while the actuated joints are held.
+        :raises ParameterError: something can move while the actuated joints are locked.
         """
-        ju, _ = self._sampled
+        ju, _ = self._sampled_jacobians
         rows = independent_rows(ju[:, :, self.varying])
         if len(rows) < len(self.varying):
             raise mobility_error(self)
@@ -111,36 +111,36 @@ class Scheme(Linkage):
 
     @property
     def varying(self) -> list[int]:
-        """Unknown rates that are solved: those of coordinates that closures do not hold at home."""
+        """Indices of the unknown rates that are solved: all but :attr:`constrained_rates`."""
         return list(range(self.tree.unknown_rates))
 
     @property
-    def held(self) -> list[int]:
-        """Unknown rates of coordinates that closures hold at their value at home."""
+    def constrained_rates(self) -> list[int]:
+        """Indices of the unknown rates whose coordinates the closures keep at home."""
         return []
 
     def varies(self, step: Step) -> bool:
-        """Return whether a step is passive, and its value not held."""
-        return not step.actuated and step.rate not in self.held
+        """Return whether a step is passive, and no closure keeps it at its home value."""
+        return not step.actuated and step.rate not in self.constrained_rates
 
-    def holds(self, step: Step) -> bool:
-        """Return whether closures hold a passive step at its value at home."""
-        return not step.actuated and step.rate in self.held
+    def is_constrained(self, step: Step) -> bool:
+        """Return whether the closures keep a passive step at its home value."""
+        return not step.actuated and step.rate in self.constrained_rates
 
     @property
-    def holding(self) -> list[int]:
-        """Closures that hold the coordinates of :attr:`held`."""
+    def constraining_closures(self) -> list[int]:
+        """Indices of the closures that keep these coordinates at home."""
         return []
 
     @property
-    def holding_pivots(self) -> Order:
-        """Pivots of the closures :attr:`holding` by the coordinates :attr:`held`."""
+    def constraining_pivots(self) -> Order:
+        """Elimination order of :attr:`constraining_closures` by :attr:`constrained_rates`."""
         return ()
 
     @cached_property
     def pivots(self) -> Order:
-        """Pivots of the independent closures by the unknowns, good in states near home."""
-        return pivot_order(self._sampled[0][:, self.independent][:, :, self.varying])
+        """Elimination order of the independent closures in the unknowns, good near home."""
+        return pivot_order(self._sampled_jacobians[0][:, self.independent][:, :, self.varying])
 
     @cached_property
     def order(self) -> tuple[str | Limb, ...]:
@@ -151,11 +151,11 @@ class Scheme(Linkage):
 
     @property
     def platform_pivots(self) -> Order | None:
-        """Pivots of the platform's closed form; None: Newton's method finds its unknowns."""
+        """Elimination order of the platform's closed form; None: it has none."""
         return None
 
     def close_platform(self, tree: Tree, q: Numbers, pivots: Order) -> tuple[list[Any], Any]:
-        """Find the platform's unknowns in closed form, and the square by which rounding grows."""
+        """Return the platform's unknowns in closed form, and the squared growth of rounding."""
         raise NotImplementedError
 
     @property
@@ -165,7 +165,7 @@ class Scheme(Linkage):
 
     @property
     def ahead(self) -> Any:
-        """The same machine with the platform before its limbs; None: it has no fewer unknowns."""
+        """The machine with the platform placed before its limbs; None if that saves no unknowns."""
         return None
 
     @property
@@ -175,12 +175,12 @@ class Scheme(Linkage):
 
     @cached_property
     def solved(self) -> tuple[list[int], list[int]]:
-        """Indices of Newton's unknowns, and of their rates: without limbs in closed form."""
+        """Indices of Newton's unknowns and their rates: all but those of closed-form limbs."""
         inner = {body for limb in self.limbs for body in limb.bodies}
         places, rates = list(range(len(self.tree.home))), list(range(self.tree.unknown_rates))
         for link in self.tree.links.values():
             for step in link.steps:
-                if self.holds(step) or (self.varies(step) and link.body in inner):
+                if self.is_constrained(step) or (self.varies(step) and link.body in inner):
                     size = 2 if step.circle else 1
                     places = [k for k in places if not 0 <= k - step.position < size]
                     rates.remove(step.rate)
@@ -189,18 +189,18 @@ class Scheme(Linkage):
     def place(self, tree: Tree, x: Objects, q: Numbers) -> tuple[Motion, list[LimbPose]]:
         """Place all bodies; limbs in closed form write their unknowns into ``x``.
 
-        :param tree: this linkage's, or the same on expressions of its geometry.
+        :param tree: this linkage's tree, or the same tree with a symbolic geometry.
         """
         return place_in_order(tree, self.order, x, q)
 
     def solved_rows(self, rows: Sequence[Row], poses: Sequence[LimbPose]) -> list[Row]:
-        """Return Newton's equations: independent closures of no limb, and equations that limbs leave."""
+        """Return Newton's equations: closures outside limbs, and those that limbs leave open."""
         limbs = {k for limb in self.limbs for k in limb.rows}
         return [rows[k] for k in self.independent if k not in limbs] + [row for pose in poses for row in pose.rows]
 
     @cached_property
     def solved_pivots(self) -> Order:
-        """Pivots of Newton's equations, good in states near home."""
+        """Elimination order of Newton's equations, well conditioned near home."""
         if not self.limbs:
             return self.pivots
         samples = []
@@ -212,7 +212,7 @@ class Scheme(Linkage):
 
     @cached_property
     def inverse_pivots(self) -> Order:
-        """Pivots of independent closures and pose by the unknowns and q, good in states near home."""
+        """Elimination order of closures and pose equations by unknowns and q, good near home."""
         samples = []
         for x, q in self.samples:
             there, closed = self.at(x, q)
@@ -223,7 +223,7 @@ class Scheme(Linkage):
 
     @cached_property
     def jacobian_pivots(self) -> Order:
-        """Pivots of the pose's rates by those of the leading joints, good in states near home."""
+        """Elimination order of the pose Jacobian by the leading joints' rates, good near home."""
         n, tables = len(self.varying), []
         for x, q in self.samples:
             motion, rows = self.at(x, q)
@@ -238,11 +238,11 @@ class Scheme(Linkage):
         return pivot_order(np.array(tables))
 
     def check(self) -> None:
-        """Refuse a graph that its actuated joints and pose coordinates do not determine.
+        """Reject a graph that its actuated joints and pose coordinates do not determine.
 
         :raises ParameterError: by the field.
         """
-        near = [rank_of(np.hstack([a, b])) for a, b in zip(*self._sampled, strict=True)]
+        near = [rank_of(np.hstack([a, b])) for a, b in zip(*self._sampled_jacobians, strict=True)]
         if len(near) > 1 and near[0] < min(near[1:]):
             raise singular_home(self, near[0], min(near[1:]))
         if self.mobility.freedoms != self.joints:
@@ -272,7 +272,7 @@ class Scheme(Linkage):
         return np.array([0.0 if c.axis is None else origin[c.axis] for c in self.coordinates])
 
     def _inverse_matrix(self, motion: Motion, rows: Sequence[Row], pose: Numbers) -> Array:
-        """Return scaled derivatives of independent closures and pose equations by u and qd."""
+        """Return the dimensionless Jacobian of closures and pose equations by u and qd."""
         ju, jq = self.scaled(rows)
         extra = self.pose_rows(motion, pose)
         table = np.array(self._pose_scales)[:, None] * numbers(extra)
@@ -299,8 +299,8 @@ def choose_leads(graph: Graph, wanted: Sequence[str] = (), pose: int = 0) -> tup
     """Choose the drives that lead: all, or the most independent ones of redundant drives.
 
     :param wanted: names, in place of that choice. ``pose``: number of pose coordinates, 0: any.
-    :raises MobilityError: there are more for a deviation alone, or one of them cannot move.
-    :raises ParameterError: names that are no such drives.
+    :raises MobilityError: they are redundant only because of a small deviation, or one cannot move.
+    :raises ParameterError: the wanted drives do not exist or do not determine the machine.
     """
     linkage, names = Linkage(graph), graph.actuated
     freedoms = linkage.mobility.freedoms
@@ -326,17 +326,17 @@ def choose_leads(graph: Graph, wanted: Sequence[str] = (), pose: int = 0) -> tup
                 f"{freedoms} of {', '.join(names)} that determine the machine at home",
             )
         return tuple(names[k] for k in places)
-    # Rounding does not choose among those that are alike.
+    # Rounding must not choose among equivalent sets: take the first.
     return tuple(names[k] for k in next(c for c, size in sizes.items() if size > 0.999 * best))
 
 
 def choose_coordinates(graph: Graph) -> tuple[str, ...]:
-    """Choose pose coordinates that determine the platform at home, as people command it.
+    """Choose the usual pose coordinates that determine the platform at home.
 
     If rotations alone determine it, as of an ankle, these are those that move most; else the first
     coordinates that do.
 
-    :raises ParameterError: something is free to move while the actuated joints are held.
+    :raises ParameterError: something is free to move while the actuated joints are locked.
     """
     rates = _pose_rates(graph)
     for least in POSE_MOVES:
@@ -363,7 +363,7 @@ def list_coordinates(graph: Graph) -> list[tuple[str, ...]]:
 
 
 def _pick_independent(rates: Mapping[str, Array], names: Sequence[str], least: float) -> list[str]:
-    """Pick the first of some coordinates that are independent, at singular values above a least."""
+    """Pick the first independent coordinates: singular values of their rates exceed ``least``."""
     chosen: list[str] = []
     for name in names:
         table = np.array([rates[own] for own in (*chosen, name)])
@@ -373,9 +373,9 @@ def _pick_independent(rates: Mapping[str, Array], names: Sequence[str], least: f
 
 
 def _pose_rates(graph: Graph) -> dict[str, Array]:
-    """Return the rate of each coordinate at home per rate of each leading drive, of unit one.
+    """Return the dimensionless rate of each coordinate at home per rate of each leading drive.
 
-    :raises ParameterError: something is free to move while the actuated joints are held.
+    :raises ParameterError: something is free to move while the actuated joints are locked.
     """
     scheme = Scheme(graph, tuple(poses.COORDINATES.values()))
     motion, closed = scheme.at(scheme.tree.home, graph.lead_home)
@@ -388,10 +388,10 @@ def _pose_rates(graph: Graph) -> dict[str, Array]:
 
 
 def check_masses(scheme: Scheme, graph: Graph) -> None:
-    """Refuse actuated joints that move no mass at all.
+    """Reject actuated joints that can move no mass.
 
     :param graph: has the masses; the scheme's own graph may have those of another machine.
-    :raises ParameterError: by a massless body that must move alone.
+    :raises ParameterError: names a massless body that can move alone.
     """
     motion, rows = scheme.at(scheme.tree.home, graph.lead_home)
     ju, jq = (numbers(m) for m in matrices(scheme.tree, rows))
@@ -405,7 +405,7 @@ def check_masses(scheme: Scheme, graph: Graph) -> None:
             np.sqrt(graph.joints[name].rotor_inertia) * rate for name, rate in zip(graph.actuated, rates, strict=True)
         ]
         for body in graph.bodies.values():
-            # A root R of the inertia, R' R.
+            # A square root R of the inertia: R' R = inertia.
             moments, axes = np.linalg.eigh(body.inertia)
             root = np.sqrt(np.maximum(moments, 0.0))[:, None] * axes.T
             column += [*(math.sqrt(body.mass) * numbers(motion.velocity(body.name, body.com)))]

@@ -2,7 +2,7 @@
 """How far a machine is from a singularity of any kind: 0 in one, 1 at best.
 
 The lesser of two numbers. Bodies that fixed joints hold together are one. A body moves by
-(v, L omega): v of the middle of its joints, L the distance of the farthest of them from there, at
+(v, L omega): v of the centre of its joints, L the distance of the farthest of them from there, at
 least the platform's. Closures err in lengths, angles times the platform's L. Hence neither units,
 scale nor the reference point count.
 
@@ -58,12 +58,12 @@ from pkm_twin.machine.tree import Tree
 
 
 def singularity_kernel(engine: Engine) -> Kernel:
-    """Compile the program from q to the measure (1)."""
+    """Compile the program that returns the singularity measure (1) at q."""
     return engine.kernel("singularity", _singularity)
 
 
-def singularity_gradient(engine: Engine) -> Kernel:
-    """Compile the program from q and a weight (1) to derivatives by q and by the geometry."""
+def compile_singularity_gradient(engine: Engine) -> Kernel:
+    """Compile the singularity measure's derivatives by q and by the geometry, times a weight."""
 
     def write(t: Traced) -> Program:
         by: dict[str, Numbers] = {"q": t.drives.variables("q"), "geometry": t.geometry}
@@ -73,11 +73,11 @@ def singularity_gradient(engine: Engine) -> Kernel:
 
 
 def find_carriers(graph: Graph) -> frozenset[str]:
-    """Return the joints on which bodies hang where the actuated joints are locked.
+    """Return the joints of the spanning tree with which the actuated joints are locked.
 
-    What locked, fixed and screw joints hold together is one part. A part hangs on the joint
-    through which it is nearest to the base, counted in joints. A part that has several such joints
-    hangs on none: all of them may err. So nothing depends on the order of entries.
+    Bodies joined by locked, fixed and screw joints are one part. A part's tree joint is the one
+    through which it is nearest to the base, counted in joints. A part with several such joints has
+    no tree joint: all of them are closures. So nothing depends on the order of entries.
     """
     rigid = [j for j in graph.joints.values() if j.actuated or not j.type.cost]
     parts = group_connected([BASE, *graph.bodies], [(j.inner, j.outer) for j in rigid])
@@ -101,19 +101,19 @@ def find_carriers(graph: Graph) -> frozenset[str]:
     return frozenset(carriers)
 
 
-class Placed(Motion):
-    """A tree of its own, with the places that another motion of the same bodies has found.
+class KinematicCopy(Motion):
+    """A second spanning tree of the same bodies, in the poses that another motion has found.
 
-    It has the freedoms of all that holds in truth: joints that stand for other parts are left out.
+    Virtual joints, which stand for other parts, are left out.
     """
 
     def __init__(self, motion: Motion) -> None:
         graph = weld(motion.graph)
-        # Locked are all drives, those that follow too.
+        # All drives are locked, redundant ones too.
         true = {n: replace(j, follows=False) for n, j in graph.joints.items() if not j.virtual}
         self.graph: Graph = replace(graph, joints=true)
         self.tree = Tree(self.graph, find_carriers(self.graph))
-        # Closures err in metres.
+        # Errors of closures are in metres.
         self.tree.size = 1.0
         self._found = motion
         self.origin: dict[str, Any] = {BASE: np.zeros(3)}
@@ -128,11 +128,11 @@ class Placed(Motion):
                     self.axis[id(step)] = motion.direction(body, step.axis)
 
     def point(self, body: str, point: Array) -> Any:
-        """Return where a point of a body is."""
+        """Return the position of a point of a body."""
         return self._found.point(body, point)
 
     def direction(self, body: str, vector: Array) -> Any:
-        """Return where a vector of a body points."""
+        """Return a vector that is fixed in a body, in base axes."""
         return self._found.direction(body, vector)
 
     def closures(self) -> list[Row]:
@@ -156,13 +156,13 @@ def _singularity(t: Traced) -> Program:
 
 
 def singularity_measure(t: Traced) -> Any:
-    """Return the measure of a solved motion for other programs; rates are overwritten."""
+    """Return the singularity measure of a solved symbolic machine; its rates are overwritten."""
     point = all(c.axis is not None for c in t.scheme.coordinates)
-    return minimum(_held(t), _moved(t, point))
+    return minimum(_constraint_singularity(t), _motion_singularity(t, point))
 
 
 def singularity_at_home(graph: Graph) -> float:
-    """Return the measure at home, on numbers: nothing is compiled. The platform's turns count.
+    """Return the singularity measure at home numerically, with the platform's rotations.
 
     :raises SingularityError: something moves although the actuated joints are locked.
     """
@@ -170,17 +170,17 @@ def singularity_at_home(graph: Graph) -> float:
 
 
 def singularity_on_numbers(linkage: Linkage, q: Array, *, point: bool = False) -> float:
-    """Return the measure at joint positions near home, on numbers: nothing is compiled.
+    """Return the singularity measure at joint positions near home numerically.
 
     :param q: of the actuated joints that lead, shape (m,); ``point``: the pose has no angle.
     :raises SingularityError: something moves although the actuated joints are locked.
     """
-    state = _Numbers(linkage, q)
-    return float(minimum(_held(state), _moved(state, point)))
+    state = _NumericTraced(linkage, q)
+    return float(minimum(_constraint_singularity(state), _motion_singularity(state, point)))
 
 
-class _Numbers:
-    """A linkage on numbers, with the attributes of :class:`Traced` that the measure uses."""
+class _NumericTraced:
+    """Numerical stand-in for :class:`Traced`, with the attributes that the measure reads."""
 
     def __init__(self, linkage: Linkage, q: Array) -> None:
         self.graph, self.joints = linkage.graph, linkage.joints
@@ -198,21 +198,22 @@ class _Numbers:
         return list(self._rates.T)
 
 
-def _held(t: Traced | _Numbers) -> Any:
-    placed = Placed(t.motion)
+def _constraint_singularity(t: Traced | _NumericTraced) -> Any:
+    """Return the measure's first number, from the closures while the actuated joints are locked."""
+    placed = KinematicCopy(t.motion)
     unknown = placed.tree.unknown_rates
     if not unknown:
         return 1.0
     _, radius = placed.graph.frame(placed.graph.platform)
     errors = [
-        {key: v * (radius if row.angle else row.scale) for key, v in row.columns.items()}
+        {key: v * (radius if row.is_angular else row.scale) for key, v in row.columns.items()}
         for row in placed.closures()
         if any(kind == "u" for kind, _ in row.columns)
     ]
     bodies = []
     for name in placed.graph.bodies:
-        middle, reach = placed.graph.frame(name)
-        linear = placed.linear_jacobian(name, placed.point(name, middle))
+        centre, reach = placed.graph.frame(name)
+        linear = placed.linear_jacobian(name, placed.point(name, centre))
         turning = placed.angular_jacobian(name)
         bodies += [{k: v[i] for k, v in linear.items()} for i in range(3)]
         bodies += [{k: reach * v[i] for k, v in turning.items()} for i in range(3)]
@@ -220,18 +221,18 @@ def _held(t: Traced | _Numbers) -> Any:
     return minimum(1.0, 0.5 * unknown / np.sqrt(len(errors)) / sqrt(response))
 
 
-def _moved(t: Traced | _Numbers, point: bool) -> Any:
-    """Return the second number, from bodies' motions per platform twist.
+def _motion_singularity(t: Traced | _NumericTraced, point: bool) -> Any:
+    """Return the measure's second number, from the bodies' motions per platform twist.
 
     :param point: the pose has no angle, so the platform counts as its reference point.
     """
     n, graph = t.joints, weld(t.graph)
-    rates = _Rates(t, graph)
+    rates = _TwistMatrices(t, graph)
     tool = (graph.origin, 0.0) if point else graph.frame(graph.platform)
-    twist = rates.motion_of(graph.platform, tool)[: 3 if point else 6]
+    twist = rates.twist_matrix(graph.platform, tool)[: 3 if point else 6]
     table = _gram([{("u", j): v for j, v in enumerate(row)} for row in twist], n)
     lower = {(a, b): table[a, b] for a in range(n) for b in range(a + 1)}
-    # Pivots stay above zero where the platform stands still while a joint moves.
+    # Pivots stay positive where the platform stands still while a joint moves.
     size = t.motion.tree.size
     lengths = [1.0 if graph.joints[name].slides else size * size for name in graph.leads]
     root = SparseCholesky(lower, [table[k, k] + length for k, length in enumerate(lengths)])
@@ -242,13 +243,14 @@ def _moved(t: Traced | _Numbers, point: bool) -> Any:
     return sqrt(n / farthest)
 
 
-class _Rates:
-    """Hold the motion of bodies by the joint rates, D = S U.
+class _TwistMatrices:
+    """Compute the bodies' twist matrices D = S U.
 
-    S: a body's motion by the rates between the base and the body. U: these by the joint rates.
+    S: a body's twist per rate of the tree's joints between it and the base. U: these rates per rate
+    of the leading joints.
     """
 
-    def __init__(self, t: Traced | _Numbers, graph: Graph) -> None:
+    def __init__(self, t: Traced | _NumericTraced, graph: Graph) -> None:
         self.motion, self.graph, self.n = t.motion, graph, t.joints
         columns, own = t.rate_columns(), np.eye(t.joints)
         unknown = t.motion.tree.unknown_rates
@@ -258,10 +260,13 @@ class _Rates:
         self._halves: dict[tuple[str, int], list[Any]] = {}
         self._products: dict[tuple[tuple[str, int], tuple[str, int]], Any] = {}
 
-    def columns(self, name: str, frame: tuple[Any, Any]) -> dict[tuple[str, int], list[Any]]:
-        """Return S: per rate the velocity of a body's middle, and angular velocity times its reach."""
-        middle, reach = frame
-        linear = self.motion.linear_jacobian(name, self.motion.point(name, middle))
+    def tree_columns(self, name: str, frame: tuple[Any, Any]) -> dict[tuple[str, int], list[Any]]:
+        """Return S: per tree rate, the centre's velocity and the angular velocity times radius.
+
+        :param frame: centre and radius.
+        """
+        centre, reach = frame
+        linear = self.motion.linear_jacobian(name, self.motion.point(name, centre))
         turning = self.motion.angular_jacobian(name)
         still = [0.0] * 3
         return {
@@ -269,10 +274,10 @@ class _Rates:
             for k in dict.fromkeys([*linear, *turning])
         }
 
-    def motion_of(self, name: str, frame: tuple[Any, Any]) -> list[list[Any]]:
-        """Return D, six rows with a column per joint."""
+    def twist_matrix(self, name: str, frame: tuple[Any, Any]) -> list[list[Any]]:
+        """Return D: the body's scaled twist (6 rows) per rate of each leading joint (columns)."""
         rows: list[list[Any]] = [[0.0] * self.n for _ in range(6)]
-        for key, six in self.columns(name, frame).items():
+        for key, six in self.tree_columns(name, frame).items():
             for row, value in zip(rows, six, strict=True):
                 for j, rate in enumerate(self._by_joints[key]):
                     row[j] = row[j] + value * rate
@@ -284,10 +289,10 @@ class _Rates:
         From D's rows, or from S'S and U (T'T)^-1 U', whichever takes fewer operations.
         """
         frame = self.graph.frame(name)
-        columns = list(self.columns(name, frame).items())
+        columns = list(self.tree_columns(name, frame).items())
         total: Any = 0.0
         if len(columns) > self.n:
-            for row in self.motion_of(name, frame):
+            for row in self.twist_matrix(name, frame):
                 half = root.forward(row)
                 total = total + sum((v * v * e for v, e in zip(half, root.inverses, strict=True)), 0.0)
             return total
@@ -312,7 +317,7 @@ class _Rates:
 
 
 def _gram(rows: list[Columns], size: int) -> Objects:
-    """Sum over rows of the products of their entries of unknown rates, shape (size, size)."""
+    """Return R'R of the rows' entries of unknown rates, shape (size, size)."""
     table = np.zeros((size, size), dtype=object)
     for row in rows:
         entries = [(k, value) for (kind, k), value in row.items() if kind == "u"]

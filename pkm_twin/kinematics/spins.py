@@ -40,7 +40,7 @@ def without_spins(graph: Graph) -> tuple[Graph, dict[str, float]]:
     linkage = Linkage(graph)
     motion, ju = linkage.regular_state()
     tree, owners = linkage.tree, linkage.tree.owners
-    # What is in no loop hangs loose and is left to be found so.
+    # A body in no loop moves freely; a later check reports it.
     ways: dict[str, set[str]] = {BASE: set()}
     for link in tree.links.values():
         ways[link.body] = ways[link.parent] | {link.joint or f"free body {link.body}"}
@@ -76,7 +76,7 @@ def without_spins(graph: Graph) -> tuple[Graph, dict[str, float]]:
                 break
             name, axes, way, lost = found
         spins = spins @ null(lost[None], RANK)
-        joints[name] = _held(joints[name], axes)
+        joints[name] = _lock_joint(joints[name], axes)
         held[name] = 0.0
         for one in graph.bodies.values():
             rates = twist(motion, one.name, one.com) @ way
@@ -88,11 +88,11 @@ def without_spins(graph: Graph) -> tuple[Graph, dict[str, float]]:
 
 def hold(graph: Graph, hinges: Sequence[str]) -> Graph:
     """Fix some hinges of a graph."""
-    fixed = {name: _held(graph.joints[name], np.zeros((0, 3))) for name in hinges}
+    fixed = {name: _lock_joint(graph.joints[name], np.zeros((0, 3))) for name in hinges}
     return replace(graph, joints={**graph.joints, **fixed})
 
 
-def _held(joint: Joint, axes: Array) -> Joint:
+def _lock_joint(joint: Joint, axes: Array) -> Joint:
     """Return a hinge made fixed, without axes, or a ball joint made universal, on two."""
     return replace(
         joint,
@@ -123,7 +123,7 @@ def idle_bodies(graph: Graph, motion: Motion, free: Array) -> list[tuple[list[st
         for way in alone.T if own else ():
             turning = moved[own[0]][3:] @ way
             if float(np.linalg.norm(turning)) > MIN_MOTION:
-                turned = np.asarray(motion.turned(own[0]), float)
+                turned = np.asarray(motion.rotation_from_home(own[0]), float)
                 found.append((own, unit(turned.T @ turning), way))
     return found
 

@@ -32,11 +32,11 @@ from pkm_twin.machine.graph import Graph
 from pkm_twin.machine.tree import Tree
 
 if TYPE_CHECKING:
-    from pkm_twin.kinematics.posed import CarriedScheme
+    from pkm_twin.kinematics.posed import PlatformFirstScheme
 
 NO_NUMBERS: Final = np.zeros(0)
 POSED: Final = "y"
-"""Name of the unknowns of a pose."""
+"""Name of the unknowns when the input is a pose."""
 
 
 class Factors(NamedTuple):
@@ -54,7 +54,7 @@ class Factors(NamedTuple):
 
 
 class Traced:
-    """A machine's motion on expressions of its geometry: what programs are written with."""
+    """Symbolic motion of a machine in its geometry's numbers, from which programs are written."""
 
     unknowns_name, drives_name = UNKNOWNS, "q"
 
@@ -70,20 +70,20 @@ class Traced:
         self._span()
 
     def _span(self) -> None:
-        """Take the tree and the inputs of the actuated joints."""
+        """Build the spanning tree and the inputs of the actuated joints."""
         self.tree, self.joints = Tree(self.graph, first=self.scheme.tree.first), self.scheme.joints
         self.drives = Drives(self)
         self.target = LEADS if self.drives.others else self.drives_name
         self.q = self.tape.inputs(self.target, self.joints)
-        """Of the drives that lead, all where there are no others."""
+        """Positions of the leading drives: all drives, unless some are redundant."""
 
-    def carried(self, scheme: CarriedScheme) -> Traced:
-        """Return the machine with the platform before its limbs."""
+    def platform_first(self, scheme: PlatformFirstScheme) -> Traced:
+        """Return the symbolic machine whose tree places the platform first, then the limbs."""
         other = copy(self)
-        # No cached property of this tree is the other's.
+        # Cached properties are those of this tree.
         vars(other).clear()
         vars(other).update(tape=self.tape, geometry=self.geometry, more=self.more)
-        other.scheme, other.graph = scheme, scheme.carry(self.graph)
+        other.scheme, other.graph = scheme, scheme.attach_chain(self.graph)
         if scheme.by_pose:
             other.unknowns_name, other.drives_name = POSED, "pose"
         other._span()
@@ -91,12 +91,12 @@ class Traced:
 
     @property
     def ahead(self) -> Traced:
-        """The machine as its forward kinematics are solved, with the fewest unknowns."""
-        return self if self.scheme.ahead is None else self.carried(self.scheme.ahead)
+        """The symbolic machine whose forward kinematics have the fewest unknowns."""
+        return self if self.scheme.ahead is None else self.platform_first(self.scheme.ahead)
 
-    def _placed(self, unknowns: Numbers) -> tuple[Motion, list[LimbPose], Objects]:
-        """Return the motion, the limbs and all unknowns for the unknowns of Newton's method."""
-        # Coordinates that are held have their values at home.
+    def _place(self, unknowns: Numbers) -> tuple[Motion, list[LimbPose], Objects]:
+        """Return the motion, the limbs and all unknowns for given unknowns of Newton's method."""
+        # Constrained coordinates keep their home values.
         x = np.array(self.tree.home, dtype=object)
         x[self.scheme.solved[0]] = unknowns
         motion, limbs = self.scheme.place(self.tree, x, self.q)
@@ -110,7 +110,7 @@ class Traced:
         if scheme.platform_pivots is not None:
             self.unknowns, growth = scheme.close_platform(tree, self.q, scheme.platform_pivots)
             self.margins = self.lift([MAX_GROWTH - growth])
-        self.motion, self.limbs, self.x = self._placed(self.unknowns)
+        self.motion, self.limbs, self.x = self._place(self.unknowns)
         self.rows = self.motion.closures()
         self.ju, self.jq = matrices(tree, self.rows)
         self.lu = SparseLU(self.ju[scheme.independent][:, scheme.varying], scheme.pivots)
@@ -120,18 +120,18 @@ class Traced:
             self.newton = SparseLU(self._table(self.solved), scheme.solved_pivots)
 
     def _table(self, solved: Sequence[Row]) -> Objects:
-        """Return the derivatives of Newton's equations by the rates of its unknowns."""
+        """Return the Jacobian of Newton's equations by the rates of its unknowns."""
         return matrices(self.tree, solved)[0][:, self.scheme.solved[1]]
 
     @property
     def drive_scales(self) -> list[Any]:
-        """Factors that make joint rates of unit one."""
+        """Factors that make the leading joints' rates dimensionless."""
         joints = (self.graph.joints[name] for name in self.graph.leads)
         return [1.0 / self.tree.size if joint.slides else 1.0 for joint in joints]
 
     @property
     def pose_scales(self) -> list[Any]:
-        """Factors that make pose coordinates of unit one."""
+        """Factors that make pose coordinates dimensionless."""
         size = self.tree.size
         return [1.0 if c.axis is None else 1.0 / size for c in self.scheme.coordinates]
 
@@ -167,7 +167,7 @@ class Traced:
         state = self.tape.inputs(STATE, len(AT))
         onward = [x + state[AT.onward] * (x - last) for x, last in zip(self.unknowns, before, strict=False)]
         if not places:
-            # Nothing is corrected: the result alone is judged.
+            # Nothing is corrected: only the result is checked.
             branch, determinant = [*branch, *self.lift([determinant - LEAST])], 1.0
         judged = [self.rows[k] for k in scheme.judged]
         start: Sequence[Any] = []
@@ -191,9 +191,9 @@ class Traced:
         return (solved,)
 
     def limit_growth(self, lu: SparseLU, rows: Numbers, columns: Numbers) -> list[Expression]:
-        """Return numbers that are above zero where no pivot of factors vanishes.
+        """Return a margin that is positive where no pivot of ``lu`` vanishes.
 
-        :param rows: factors that make rows and ``columns`` of the matrix of unit one.
+        :param rows: factors that make rows and ``columns`` of the matrix dimensionless.
         """
         growth = lu.find_growth(rows, columns)
         return self.lift([MAX_GROWTH - growth]) if isinstance(growth, Expression) else []
@@ -210,25 +210,25 @@ class Traced:
 
     @property
     def determinant(self) -> Any:
-        """Determinant of all closures over that at home, of Newton's equations and the limbs."""
+        """Determinant of all closures, relative to home."""
         home = self._at_home
         result = home.newton.inverse_determinant / self.newton.inverse_determinant
         for here, there in zip(self.limbs, home.limbs, strict=True):
             for (slope, _), (at_home, _) in zip(here.slopes, there.slopes, strict=True):
                 result = result * (slope / at_home)
-        if self.scheme.held:
-            holding = self._holding(self.ju, self.lu)
-            at_home = self._holding(snapped_all(matrices(self.tree, self.home.closures())[0]), home.lu)
-            result = result * (at_home.inverse_determinant / holding.inverse_determinant)
+        if self.scheme.constrained_rates:
+            constraining = self._factor_constraining(self.ju, self.lu)
+            at_home = self._factor_constraining(snapped_all(matrices(self.tree, self.home.closures())[0]), home.lu)
+            result = result * (at_home.inverse_determinant / constraining.inverse_determinant)
         return result
 
-    def _holding(self, ju: Objects, lu: SparseLU) -> SparseLU:
-        """Return factors of the closures that hold coordinates of the platform, by these."""
-        scheme, table = self.scheme, ju[self.scheme.holding]
-        held = ju[scheme.independent][:, scheme.held]
-        follow = np.array([lu.solve(column) for column in held.T], dtype=object).T
-        matrix = table[:, scheme.held] - table[:, scheme.varying] @ follow
-        return SparseLU(matrix, scheme.holding_pivots)
+    def _factor_constraining(self, ju: Objects, lu: SparseLU) -> SparseLU:
+        """Factor the closures that keep platform coordinates at home, in these coordinates."""
+        scheme, table = self.scheme, ju[self.scheme.constraining_closures]
+        constrained = ju[scheme.independent][:, scheme.constrained_rates]
+        follow = np.array([lu.solve(column) for column in constrained.T], dtype=object).T
+        matrix = table[:, scheme.constrained_rates] - table[:, scheme.varying] @ follow
+        return SparseLU(matrix, scheme.constraining_pivots)
 
     @cached_property
     def home(self) -> Motion:
@@ -251,7 +251,7 @@ class Traced:
 
     @property
     def _here(self) -> Factors:
-        """Limbs and factors in the state that is solved."""
+        """Limbs and factors in the current state."""
         jq = self.jq[self.scheme.independent]
         return Factors(self.limbs, jq, self.lu, self.solved, self.newton)
 
@@ -264,7 +264,7 @@ class Traced:
         return -(at.jq.T @ at.lu.solve_transposed(unit))
 
     def rates_of_reaches(self, names: Sequence[str], *, home: bool = False) -> Objects:
-        """Return :meth:`rates_of_joints`, in fewer operations for joints that set a limb's reach.
+        """Return :meth:`rates_of_joints`; joints that change a limb's length take few operations.
 
         :param home: at home.
         """
@@ -290,16 +290,16 @@ class Traced:
     def _guess(self) -> list[Expression]:
         """Return a guess of the unknowns to second order: the tangent at home, corrected once.
 
-        This costs less than a correction by derivatives there, and the guess is nearer.
+        This costs less than a Newton step with derivatives at the guess, and is nearer.
         """
         scheme, home = self.scheme, self.tree.home
         _, jq, lu, _, newton = self._at_home
         away = self.q - self.graph.lead_home
-        # Solved per joint: a sample then only multiplies by what is prepared.
+        # Columns per joint are constants at home: an evaluation only multiplies by them.
         columns = snapped_all([self._unknown(-lu.solve(jq[:, j])) for j in range(self.joints)])
         moved = self.home.retracted(home, columns.T @ away)
         tangent = [moved[k] for k in scheme.solved[0]]
-        motion, limbs, _ = self._placed(tangent)
+        motion, limbs, _ = self._place(tangent)
         solved = scheme.solved_rows(motion.closures(), limbs)
         return self.retracted(tangent, -newton.solve([row.value for row in solved]))
 
@@ -316,7 +316,7 @@ class Traced:
         return self.tape.lift(total)
 
     def gradient(self, sums: Sequence[tuple[Any, Any]], by: Sequence[Expression]) -> list[Any]:
-        """Differentiate a sum of results times factors by inputs, the closures held closed.
+        """Differentiate a sum of results times factors by inputs while the closures stay satisfied.
 
         The unknowns x follow from f(x, q, g) = 0: with J' m = ds/du, J = df/du, the derivative is
         ds - m df (adjoint of the implicit function theorem).
@@ -382,13 +382,13 @@ class Traced:
         return [self._unknown(self.lu.solve(-self.jq[kept][:, j])) for j in range(self.joints)]
 
     def _unknown(self, varying: Numbers) -> Objects:
-        """Return all unknown rates by those that are not held."""
+        """Return all unknown rates from the solved ones; constrained rates are zero."""
         rates = np.zeros(self.tree.unknown_rates, dtype=object)
         rates[self.scheme.varying] = varying
         return rates
 
     def twists(self, body: str, at: Any, columns: Sequence[Objects]) -> list[tuple[Any, Any]]:
-        """Return velocity at a place and angular velocity of a body per joint rate.
+        """Return velocity of a body's point at a place and angular velocity, per joint rate.
 
         :param columns: :meth:`rate_columns`.
         """

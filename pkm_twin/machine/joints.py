@@ -135,7 +135,7 @@ class JointType:
     @classmethod
     def constraints(cls, axes: Array, pitch: float) -> tuple[Constraint, ...]:
         """Return the joint's constraints; arguments as for :meth:`freedoms`."""
-        return tuple(held for key in cls.holds for held in CONSTRAINTS[key](axes, pitch))
+        return tuple(constraint for key in cls.holds for constraint in CONSTRAINTS[key](axes, pitch))
 
 
 CONSTRAINTS: Final[dict[str, Callable[[Array, float], Sequence[Constraint]]]] = {

@@ -96,7 +96,7 @@ class Assembly:
     def move(self, link: str) -> Pose:
         """Return how a link has moved since it was drawn, in the root's axes."""
         if link not in self._moves:
-            turn = numbers(self._motion.turned(self._bodies[link]))
+            turn = numbers(self._motion.rotation_from_home(self._bodies[link]))
             at = numbers(self._motion.point(self._bodies[link], np.zeros(3)))
             self._moves[link] = Pose(turn, at)
         return self._moves[link]

@@ -46,7 +46,7 @@ def followed(engine, q, steps=128):
     x, home = np.array(engine.tree.home, float), engine.graph.home
     for k in range(1, steps + 1):
         there = home + k / steps * (q - home)
-        x, closed = newton(x, partial(engine._look, there), partial(engine._moved, there))
+        x, closed = newton(x, partial(engine._evaluate_closures, there), partial(engine._retract, there))
         if not closed:
             return None
     return x

@@ -17,7 +17,7 @@ from pkm_twin.certify.maximal import Maximal
 from pkm_twin.certify.rows import stack_rows
 from pkm_twin.errors import SingularityError
 from pkm_twin.kinematics.linkage import Linkage
-from pkm_twin.kinematics.singularity import Placed, singularity_on_numbers
+from pkm_twin.kinematics.singularity import KinematicCopy, singularity_on_numbers
 from pkm_twin.machine.graph import weld
 from pkm_twin.machine.graph_description import graph_description
 from pkm_twin.mechanisms.catalogue import robot_of_data
@@ -76,7 +76,7 @@ def twists(judge, graph):
 
 def expected(robot, judge, q):
     """The measure by its definition, on numbers, from a matrix of all bodies' free motion."""
-    placed = Placed(robot.engine.at(robot.engine.tree.home, robot.graph.home)[0])
+    placed = KinematicCopy(robot.engine.at(robot.engine.tree.home, robot.graph.home)[0])
     graph = weld(robot.graph)
     judge.assemble(q)
     bodies, radius = twists(judge, graph), frame(graph, graph.platform)[1]

@@ -199,7 +199,7 @@ def _program(t: Traced, points: list[tuple[str, Array]]) -> Program:
     rows: list[Any] = []
     for body, point in points:
         at = motion.point(body, point)
-        rows += [*at, *motion.acceleration(body, point), *np.ravel(motion.turned(body))]
+        rows += [*at, *motion.acceleration(body, point), *np.ravel(motion.rotation_from_home(body))]
         rows += [*motion.omega[body], *motion.alpha[body]]
         for columns in (motion.linear_jacobian(body, at), motion.angular_jacobian(body)):
             table: Any = np.zeros((3, n), dtype=object)
