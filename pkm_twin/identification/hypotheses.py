@@ -186,8 +186,12 @@ class HypothesisSearch:
         bound = (np.isfinite(low) | np.isfinite(high)) & (model.deviation > 0.0)
         if not bounded or not bound.any():
             return logs
-        for k in np.flatnonzero(logs > logs.max() - 2.0 * ODDS):
-            mean, inner = model.posterior_at(int(k), used)
+        free = np.ones(len(logs), np.bool_)
+        # A bound may cost a share so much that others count, whose bounds are then counted too.
+        while (near := free & (logs > logs.max() - 2.0 * ODDS)).any():
+            k = int(np.argmax(np.where(near, logs, -np.inf)))
+            free[k] = False
+            mean, inner = model.posterior_at(k, used)
             mean = mean[bound] * model.deviation[bound]
             if (mean >= low[bound]).all() and (mean <= high[bound]).all():
                 continue
