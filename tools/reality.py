@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 
 from pkm_twin import Robot, load
 from pkm_twin.apps.fit_report import report_drive
-from pkm_twin.identification.calibration import HELD_OUT, Calibration, Errors, calibrate, geometric
+from pkm_twin.identification.calibration import HELD_OUT, Calibration, Errors, calibrate, list_geometric_paths
 from pkm_twin.identification.calibration_state import Poses, rotations
 from pkm_twin.identification.drives import GRAVITY, drive_friction
 from pkm_twin.identification.measurements import read_poses
@@ -101,7 +101,7 @@ def section() -> str:
     robot = load(DATA / "hexapod.yaml")
     poses = recorded(robot)
     count = len(poses.joints)
-    paths = geometric(robot, robot.controller.positions(poses.joints))
+    paths = list_geometric_paths(robot, robot.controller.positions(poses.joints))
     rows: dict[str, list[list[Errors]]] = {"the file": [], "`calibrate`": [], ALONE: []}
     for k in range(HELD_OUT):
         # `calibrate` holds out the last of every four poses.
@@ -140,7 +140,7 @@ def _transfer(robot: Robot, poses: Poses) -> str:
     """Calibrated on one half of the grid, leg lengths of the other."""
     left = poses.position[:, 0] < 0.0
     one, other = poses.part(left), poses.part(~left)
-    paths = geometric(robot, robot.controller.positions(one.joints))
+    paths = list_geometric_paths(robot, robot.controller.positions(one.joints))
     found = calibrate(robot, one, paths)
     miss = lengths(robot, found, other)
     miss = miss - miss.mean(0)

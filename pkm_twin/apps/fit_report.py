@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.identification.compare import lateness
+from pkm_twin.identification.compare import describe_delay
 from pkm_twin.identification.deflections import ElasticFit
 from pkm_twin.identification.drives import DriveFriction, Law
 from pkm_twin.identification.fit import Fit, Judged, Result
@@ -47,7 +47,7 @@ def report_fit(result: Result, marks: Sequence[str] = ()) -> tuple[Report, list[
         # Describe how the signals of each recording were filtered.
         more = []
         for made, delay in zip(result.problem.whole, result.delays, strict=True):
-            how, late = made.how, lateness(delay, made.period)
+            how, late = made.how, describe_delay(delay, made.period)
             cutoff = "no low-pass" if how.cutoff is None else f"low-pass at {how.cutoff:.3g} Hz"
             more.append(
                 f"{made.recording.name}: efforts are {late or 'on time'}; "

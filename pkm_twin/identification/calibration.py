@@ -29,33 +29,33 @@ from pkm_twin.identification.calibration_fit import (
     Outlier,
     RejectedPosesError,
     UnsettledError,
-    faults_of,
+    find_outliers,
     fit,
-    outliers_of,
+    list_faults,
     place_fault,
 )
 from pkm_twin.identification.calibration_state import (
-    BESIDE,
     FRAME,
+    OTHER_PARAMETERS,
     TARGET,
     Instrument,
     Parameter,
     Poses,
     State,
     Transmission,
-    numbers,
+    list_map_parameters,
+    list_map_values,
+    make_state,
     place_frame,
-    start_of,
-    written,
 )
-from pkm_twin.identification.lines import POSES, line_slopes
+from pkm_twin.identification.lines import MAX_POSES, line_slopes
 from pkm_twin.identification.measurements import (
-    PLACE,
+    POSITION_KIND,
     Measured,
-    left_over,
-    whole_of,
+    find_redundancy,
+    select_poses,
 )
-from pkm_twin.identification.parameters import OBSERVED, weights_of
+from pkm_twin.identification.parameters import OBSERVED_RATIO, list_weights
 from pkm_twin.identification.undetermined import Pair, find_determined_pairs, undetermined
 from pkm_twin.machine.formulas import PARAMETERS
 from pkm_twin.machine.joint_map import JointMap
@@ -65,10 +65,10 @@ from pkm_twin.robot.numbers import FileNumbers
 from pkm_twin.robot.robot import Robot
 
 HELD_OUT: Final = 4
-"""Every so many whole poses one is held out."""
+"""One whole pose in so many is held out to judge the fit."""
 NOT_GEOMETRY: Final = ("limits.", "gravity", "payload.", "joint_map.")
-KEPT: Final = 0.1
-"""Part of its prior deviation to which a length is kept that is known worse, without a scale."""
+TIGHT_PRIOR_RATIO: Final = 0.1
+"""Factor on the prior deviations of poorly known lengths while the scale is not determined."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,7 +78,7 @@ class Free:
     ``offsets``: of the joints' sensors; ``frame``, ``target``: where the instrument stands, and
     its target on the platform. ``prior``: standard deviation of lengths, m; angles have it at the
     platform's radius. ``transmission``: which ratios of the joint map; ``auto``: those of sliding
-    joints that have one. ``only``: beginnings of paths, as of :func:`geometric`, of what is fitted
+    joints that have one. ``only``: beginnings of paths, as of :func:`list_geometric_paths`, of what is fitted
     of the joint map; empty, or with a ``transmission`` that is asked for: all.
     """
 
@@ -89,10 +89,10 @@ class Free:
     transmission: Transmission = Transmission.AUTO
     only: tuple[str, ...] = ()
 
-    def mapped(self, robot: Robot, q: Array) -> list[Parameter]:
+    def list_map_parameters(self, robot: Robot, q: Array) -> list[Parameter]:
         """Numbers of the joint map that are fitted to joint states (k, n)."""
         angle = self.prior / robot.size
-        found = numbers(robot, q, self.transmission, self.offsets, self.prior, angle)
+        found = list_map_parameters(robot, q, self.transmission, self.offsets, self.prior, angle)
         if not self.only or self.transmission not in (Transmission.AUTO, Transmission.FILE):
             return found
         return [one for one in found if one.name.startswith(tuple(self.only))]
@@ -108,27 +108,27 @@ class Estimate:
 
     @property
     def _unknown(self) -> Array:
-        """Orthonormal directions, in units of the priors, that the poses do not tell, (p, u)."""
+        """Orthonormal directions, in units of the priors, that the poses do not determine, (p, u)."""
         prior = np.array([p.prior for p in self.parameters])
         values, vectors = np.linalg.eigh(self.covariance / np.outer(prior, prior))
-        return np.asarray(vectors[:, values > OBSERVED**2], np.float64)
+        return np.asarray(vectors[:, values > OBSERVED_RATIO**2], np.float64)
 
     @property
     def undetermined(self) -> list[str]:
-        """What the poses do not determine, at most ten sentences: the file's values stay."""
+        """Sentences, at most ten, on what the poses do not determine: there the file's values stay."""
         names = [p.name for p in self.parameters]
         prior = np.array([p.prior for p in self.parameters])
         return undetermined(self.robot.graph, names, prior, self._unknown)
 
     @property
     def unobserved(self) -> tuple[dict[str, float], ...]:
-        """Combinations of numbers that the poses do not tell: weights in units of the priors.
+        """Combinations of numbers that the poses do not determine: weights in units of the priors.
 
         What the file says stays along them; a number that is not observed may be in one whose
         other combinations are.
         """
         names = [p.name for p in self.parameters]
-        return tuple(weights_of(names, column) for column in self._unknown.T)
+        return tuple(list_weights(names, column) for column in self._unknown.T)
 
 
 class Errors(NamedTuple):
@@ -211,7 +211,7 @@ class Calibration(Estimate):
         return self.instrument.map
 
     def fitted(self, robot: Robot, source: str) -> dict[str, FittedNumber]:
-        """Numbers of the file by path.
+        """Return the fitted numbers of the file by path.
 
         :param robot: before. ``source``: what they are from, in words.
         """
@@ -219,15 +219,15 @@ class Calibration(Estimate):
         values = {
             p.name: FittedNumber(p.value, p.deviation, p.unit, source if p.observed else unknown)
             for p in self.parameters
-            if not p.name.startswith(BESIDE) and p.name not in self.instrument.own
+            if not p.name.startswith(OTHER_PARAMETERS) and p.name not in self.instrument.own
         }
         mapped = {p.name: (p.value, p.deviation) for p in self.parameters}
-        own = written(robot, self.joint_map, mapped)
+        own = list_map_values(robot, self.joint_map, mapped)
         return values | {path: FittedNumber(*number, source) for path, number in own.items()}
 
 
-def geometric(robot: Robot, q: Array, only: Sequence[str] = ()) -> tuple[str, ...]:
-    """Numbers of the robot's file that move its platform at joint states (k, n).
+def list_geometric_paths(robot: Robot, q: Array, only: Sequence[str] = ()) -> tuple[str, ...]:
+    """List the paths of the file's numbers that move the platform at joint states (k, n).
 
     A number that cannot change alone, because the machine would not assemble, is none.
 
@@ -251,7 +251,7 @@ def geometric(robot: Robot, q: Array, only: Sequence[str] = ()) -> tuple[str, ..
         beside = many.with_values(own + 1e-6 * np.eye(len(paths)))
         each = np.broadcast_to(q, (len(paths), *q.shape))
         possible = beside.run(programs.forward_of_all_structures, each)[1].all((1, 2))
-        # What does not move the platform is no number of the geometry.
+        # Numbers that do not move the platform are left out.
         good = possible & (np.abs(twists).max((0, 1)) > 1e-6)
         found = [path for path, one in zip(paths, good, strict=True) if one]
     known = [*found, *(f"joint_map.{joint}.offset" for joint in robot.joint_names)]
@@ -267,7 +267,7 @@ def left_by_calibration(robot: Robot, errors: Callable[[Array], Array], states: 
     :param errors: of joint states (k, n) the twists by each error, shape (k, 6, p).
     :param states: with measured poses, shape (s, n); ``q``: where the errors count, shape (k, n).
     """
-    paths = geometric(robot, states)
+    paths = list_geometric_paths(robot, states)
 
     def slopes(rows: Array) -> Array:
         """By the numbers that it fits, and by the zeros of the joints."""
@@ -313,12 +313,12 @@ def calibrated_errors(robot: Robot, found: Tolerances, q: Array) -> dict[str, Ar
     return left | {path: stays[:, :3, k] for k, path in enumerate(known)}
 
 
-def unknowns(robot: Robot, measured: Measured, paths: Sequence[str], free: Free) -> list[Parameter]:
+def list_parameters(robot: Robot, measured: Measured, paths: Sequence[str], free: Free) -> list[Parameter]:
     """List what is fitted, with its present values: numbers of machine, instrument and kinds."""
     robot.check_independent("calibrations", "a pose does not give the others' zeros")
     known, prior = robot.file_numbers(), free.prior
     angle = prior / robot.size
-    mapped = free.mapped(robot, robot.controller.positions(measured.joints))
+    mapped = free.list_map_parameters(robot, robot.controller.positions(measured.joints))
     # A joint's value at home and its sensor's offset are one number.
     own = {one.name for one in mapped}
     homes = {f"joints.{j}.home" for j in robot.joint_names if f"joint_map.{j}.offset" in own}
@@ -333,12 +333,12 @@ def unknowns(robot: Robot, measured: Measured, paths: Sequence[str], free: Free)
     return parameters + [Parameter(n, unit, 0.0, far) for n, (unit, far) in measured.own.items()]
 
 
-def placed(robot: Robot, measured: Measured, paths: Sequence[str], frame: bool = False) -> State:
+def make_start(robot: Robot, measured: Measured, paths: Sequence[str], frame: bool = False) -> State:
     """Place the machine at the measured poses, with a first guess of instrument and target."""
-    state = start_of(robot, measured.joints, paths)
+    state = make_state(robot, measured.joints, paths)
     state.instrument.own = dict.fromkeys(measured.own, 0.0)
     for one in measured.readings:
-        if frame and one.kind is PLACE:
+        if frame and one.kind is POSITION_KIND:
             place_frame(state, one.values)
         state.instrument.own |= one.kind.begin(one.compute_poses(state)[0], one.values[:, 0])
     return state
@@ -360,7 +360,7 @@ def calibrate(
 
     :param poses: whole poses, of which every fourth is held out, or measurements of some
         quantities, of which none is.
-    :param paths: numbers of the robot's file, of :func:`geometric`.
+    :param paths: numbers of the robot's file, of :func:`list_geometric_paths`.
     :param accept: calibrate with poses that this machine was not in, too.
     :param options: of :class:`Free`.
     :raises ParameterError: too few poses, poses of another machine, unit or frame, poses that tell
@@ -371,7 +371,7 @@ def calibrate(
         learnt = poses
     else:
         held = np.arange(len(poses.joints)) % HELD_OUT == HELD_OUT - 1
-        learnt, apart = (whole_of(poses, np.flatnonzero(rows)) for rows in (~held, held))
+        learnt, apart = (select_poses(poses, np.flatnonzero(rows)) for rows in (~held, held))
     fit_of = partial(_calibrated, robot, learnt, apart, paths, progress)
 
     def calibrate_with_frame() -> Calibration | None:
@@ -391,7 +391,7 @@ def calibrate(
         if other is None:
             raise
         raise RejectedPosesError(place_fault(other.instrument)) from error
-    # Ratios that are a little off look like a shift of the instrument.
+    # A small error of a ratio looks like a shift of the instrument, so each adds to the bound.
     saved = MIN_COST_SAVING * (1 + sum(p.name.endswith(".ratio") for p in result.parameters))
     if result.faults or result.cost > saved or result.placed:
         other = calibrate_with_frame()
@@ -418,9 +418,9 @@ def _calibrated(
 
     :param apart: whole poses that are not learnt from.
     """
-    parameters = unknowns(robot, learnt, paths, free)
+    parameters = list_parameters(robot, learnt, paths, free)
     if apart is not None:
-        # A pose that is measured again tells no more numbers.
+        # A repeated pose determines no further number.
         different = len(np.unique(np.round(learnt.joints / 1e-4), axis=0))
         if 3 * different * len(learnt.readings) < len(parameters) + 6 or not len(apart.joints):
             raise ParameterError(
@@ -428,9 +428,9 @@ def _calibrated(
                 f"{different} different ones to learn from",
                 f"enough for {len(parameters)} numbers to be fitted",
             )
-    beside = {p.name for p in parameters if p.name.startswith(BESIDE)} | learnt.own.keys()
+    beside = {p.name for p in parameters if p.name.startswith(OTHER_PARAMETERS)} | learnt.own.keys()
     machine = [p.name for p in parameters if p.name not in beside]
-    start = placed(robot, learnt, machine, free.frame)
+    start = make_start(robot, learnt, machine, free.frame)
     first = [p for p in parameters if p.name in (*FRAME, *TARGET, *learnt.own)]
     before = fit(robot, start, learnt, first, progress).state if first else start
     found = fit(robot, before, learnt, parameters, progress)
@@ -440,8 +440,8 @@ def _calibrated(
     scale, told, row = _judge_scale(robot, found.state, learnt, told, covariance)
     if scale is not None and not scale.determined:
         near = [
-            replace(p, prior=KEPT * p.prior)
-            if p.unit == "m" and p.deviation > KEPT * p.prior and p.name in machine
+            replace(p, prior=TIGHT_PRIOR_RATIO * p.prior)
+            if p.unit == "m" and p.deviation > TIGHT_PRIOR_RATIO * p.prior and p.name in machine
             else p
             for p in told
         ]
@@ -453,7 +453,7 @@ def _calibrated(
     changes = [p for p in told if p.name not in (*FRAME, *TARGET, *learnt.own)]
     count = len({k for m in (learnt, apart) if m for one in m.readings for k in one.lines.tolist()})
     left = [(one.unit, one.noise) for one in agreements]
-    faults = faults_of(left, outliers, count, changes, free.prior, robot.engine.tree.size)
+    faults = list_faults(left, outliers, count, changes, free.prior, robot.engine.tree.size)
     good = np.array([p.observed for p in told])
     if apart is not None and not good.any() and not faults:
         raise ParameterError("poses", count, "poses farther apart: these determine none of the numbers")
@@ -490,18 +490,18 @@ def _compare_measurements(
     found: Fitted,
     parameters: Sequence[Parameter],
 ) -> tuple[tuple[Agreement, ...], tuple[Outlier, ...]]:
-    """Compare the measurements with the machines, and find what does not fit the others."""
+    """Compare the measurements with both machines, before and after the fit, and find outliers."""
     noise, old, new = found.weights.noise, learnt.parts(before), learnt.parts(found.state)
     readings, parts = learnt.readings, new
     if apart is None:
         slopes = learnt.slopes(robot, found.state, [p.name for p in parameters])
-        left = left_over(slopes, noise, np.array([p.prior for p in parameters]))
+        left = find_redundancy(slopes, noise, np.array([p.prior for p in parameters]))
         held = old, [part / one[:, None] for part, one in zip(new, left, strict=True)]
     else:
         pairs = (robot, before), (built, found.state)
         first, last = (apart.parts(state.evaluate_at(machine, apart.joints)) for machine, state in pairs)
         held, readings, parts = (first, last), (*readings, *apart.readings), [*new, *last]
-    outliers = outliers_of(readings, parts, noise * (len(readings) // len(noise)))
+    outliers = find_outliers(readings, parts, noise * (len(readings) // len(noise)))
     bad = [one.line for one in outliers]
 
     def errors(part: Array, lines: Indices) -> Errors:
@@ -520,7 +520,7 @@ def _compare_measurements(
 
 
 def _looks_placed(robot: Robot, measured: Measured, found: Fitted, told: Sequence[Parameter]) -> bool:
-    """Whether another place of the instrument would explain a part of what a fit leaves."""
+    """Return whether a free frame of the instrument would reduce the residual by more than 20 %."""
     over, asked = found.weights.over, [(p.before - p.value) / p.prior for p in told]
     target = np.append(over(measured.parts(found.state)), asked)
     own = np.vstack([found.table, np.eye(len(told))])
@@ -533,18 +533,18 @@ def _looks_placed(robot: Robot, measured: Measured, found: Fitted, told: Sequenc
 def _judge_scale(
     robot: Robot, state: State, measured: Measured, told: list[Parameter], covariance: Array
 ) -> tuple[Scale | None, list[Parameter], Array | None]:
-    """How well the scale is known, and the numbers with those marked that depend on it alone.
+    """Return how well the scale is known, and the parameters, marked where the scale limits them.
 
     And the scale's derivatives, where it is not determined.
     """
-    lines = line_slopes(robot, state.sample_between(measured.joints, POSES), [p.name for p in told])
+    lines = line_slopes(robot, state.sample_between(measured.joints, MAX_POSES), [p.name for p in told])
     if lines is None:
         return None, told, None
     row = lines.scale
     prior = np.array([p.prior for p in told])
     before, after = (float(np.sqrt(row @ c @ row)) for c in (np.diag(prior**2), covariance))
     length = any(one.kind.length for one in measured.readings)
-    # Measured lengths tell the scale where they halve its deviation; else 0.01 mm in 100 mm is enough.
+    # Measured lengths determine the scale if they halve its deviation; else 0.01 mm in 100 mm is enough.
     known = after < 0.5 * before and (length or after < 1e-4)
     scale = Scale(before, after, known, *lines.deviations(covariance))
     if known or not before > 0.0:

@@ -20,16 +20,16 @@ from pkm_twin.identification.calibration_state import (
     Instrument,
     Parameter,
     State,
-    moved,
+    update_state,
 )
 from pkm_twin.identification.measurements import Measured, Readings, Weights
-from pkm_twin.identification.samples import OUTLIER
+from pkm_twin.identification.samples import MIN_OUTLIER_DISTANCE
 from pkm_twin.robot.robot import Robot
 
-STEPS: Final = 60
-"""Most steps of a fit."""
+MAX_STEPS: Final = 60
+"""Largest number of steps of a fit."""
 MAX_CHANGE: Final = 5.0
-"""Prior standard deviations by which no number changes."""
+"""Largest plausible change of a number, prior standard deviations."""
 MIN_COST_SAVING: Final = 14.0
 """Least reduction of the cost by a free frame of the instrument at which the frame is the cause.
 
@@ -39,7 +39,7 @@ MAX_COST_RATIO: Final = 0.5
 """Largest ratio of the cost with the instrument's frame free to the cost without, at which the
 frame is the cause: a model error that is not the frame's is also reduced, but by less."""
 MAX_OUTLIERS: Final = 0.25
-"""Part of the poses that may be outliers."""
+"""Largest fraction of the poses that may be outliers."""
 
 
 class UnsettledError(ParameterError):
@@ -67,7 +67,7 @@ def fit(
     parameters: Sequence[Parameter],
     progress: Callable[[int], None],
 ) -> Fitted:
-    """Robust least squares over all parameters, the noise found with them.
+    """Fit all parameters by robust least squares, and estimate the noise with them.
 
     :raises ParameterError: it does not settle.
     """
@@ -82,11 +82,11 @@ def fit(
         return np.concatenate([noise.over(measured.parts(state)), (centre - values) / prior])
 
     names = [p.name for p in parameters]
-    damping, problem, idle = 0.0, f"{STEPS} steps", 0
-    for steps in range(1, STEPS + 1):
+    damping, problem, idle = 0.0, f"{MAX_STEPS} steps", 0
+    for steps in range(1, MAX_STEPS + 1):
         progress(1)
         columns = measured.slopes(robot, state, names)
-        # From then on noise and weights stay: else they and the fit may go round in circles.
+        # After 12 steps noise and weights stay fixed, as they and the fit may otherwise alternate.
         if steps <= 12:
             noise = measured.weighed(measured.parts(state), columns, prior)
         table = noise.over(columns)
@@ -104,9 +104,9 @@ def fit(
             try:
                 new = dict(zip(names, (values + move).tolist(), strict=True))
                 turn = np.array([dict(zip(names, move.tolist(), strict=True)).get(name, 0.0) for name in FRAME[3:]])
-                trial = moved(robot, state, measured.joints, new, turn)
+                trial = update_state(robot, state, measured.joints, new, turn)
             except PkmTwinError as error:
-                # No machine has such numbers, or none of them is in these poses: a smaller step.
+                # With these numbers the machine cannot be assembled in the poses: take a smaller step.
                 trial, problem = None, str(error)
             else:
                 row = right(trial, values + move, noise)
@@ -118,7 +118,7 @@ def fit(
         if trial is None:
             break
         state, values = trial, values + move
-        # Three steps of which none gains what one deviation would.
+        # Stop after three steps that hardly reduce the cost.
         idle = idle + 1 if gained * (sums[0] - sums[1]) < 0.02 else 0
         if settled or idle >= 3:
             return Fitted(state, values, covariance, table * prior, noise, steps)
@@ -132,8 +132,8 @@ def fit(
 def _move(left: Array, right: Array, damping: Array) -> Array:
     """Compute a Gauss-Newton step, damped where damping is not zero (Levenberg, Marquardt).
 
-    Along a direction that the poses tell badly the machine may turn away from its tangent: without
-    damping a step then goes beyond, and back, for ever.
+    Along directions that the poses hardly determine the machine is far from linear: undamped
+    steps may overshoot again and again.
     """
     rows, end = (left, right)
     if damping.any():
@@ -143,7 +143,7 @@ def _move(left: Array, right: Array, damping: Array) -> Array:
 
 
 class Fault(NamedTuple):
-    """What is wrong with the poses, and what would be right."""
+    """Reason to reject the poses, and what would be right."""
 
     what: str
     right: str
@@ -153,7 +153,7 @@ class Fault(NamedTuple):
 
 
 class RejectedPosesError(ParameterError):
-    """Poses that this machine was not in."""
+    """Error: this machine cannot have been in the poses."""
 
     def __init__(self, fault: Fault) -> None:
         Exception.__init__(self, one_line(f"{fault}; --accept calibrates anyway", 2000))
@@ -161,7 +161,7 @@ class RejectedPosesError(ParameterError):
 
 
 class Away(NamedTuple):
-    """What a measurement is off by, m or rad, and over the noise."""
+    """Residual of a measurement, m or rad, and as a multiple of the noise."""
 
     kind: str
     unit: str
@@ -178,11 +178,11 @@ class Outlier:
 
     @property
     def worst(self) -> Away:
-        """Of its measurements the one that fits least."""
+        """The measurement of the line with the largest residual over its noise."""
         return max(self.away, key=lambda one: one.sigmas)
 
     def size(self, unit: str) -> float | None:
-        """Greatest of one unit; None: there is none."""
+        """Return the largest residual of one unit; None if there is none."""
         return max((one.size for one in self.away if one.unit == unit), default=None)
 
     def __str__(self) -> str:
@@ -190,8 +190,8 @@ class Outlier:
         return f"line {self.line} is off: {sizes}; {self.worst.sigmas:.3g} sigma"
 
 
-def outliers_of(readings: Sequence[Readings], parts: Sequence[Array], noise: Sequence[float]) -> tuple[Outlier, ...]:
-    """Outliers among residuals (m, a) of readings, the worst first."""
+def find_outliers(readings: Sequence[Readings], parts: Sequence[Array], noise: Sequence[float]) -> tuple[Outlier, ...]:
+    """Find outliers among the residuals (m, a) of readings, the worst first."""
     lines: dict[int, list[Away]] = {}
     for one, part, sigma in zip(readings, parts, noise, strict=True):
         sizes = np.linalg.norm(part, axis=1)
@@ -199,11 +199,11 @@ def outliers_of(readings: Sequence[Readings], parts: Sequence[Array], noise: Seq
             over = size / sigma / part.shape[1] ** 0.5
             lines.setdefault(line, []).append(Away(one.kind.name, one.kind.unit, size, over))
     found = [Outlier(line, tuple(away)) for line, away in lines.items()]
-    bad = [one for one in found if one.worst.sigmas > OUTLIER]
+    bad = [one for one in found if one.worst.sigmas > MIN_OUTLIER_DISTANCE]
     return tuple(sorted(bad, key=lambda one: -one.worst.sigmas))
 
 
-def faults_of(
+def list_faults(
     left: Sequence[tuple[str, float]],
     outliers: Sequence[Outlier],
     count: int,
@@ -211,13 +211,13 @@ def faults_of(
     prior: float,
     size: float,
 ) -> list[Fault]:
-    """Why a machine like the file's was not in so many poses.
+    """List the reasons why a machine like the file's cannot have been in the poses.
 
     :param left: unit and noise an axis of each kind of measurement. ``changes``: the
         machine's numbers. ``prior``: of lengths, m. ``size``: of the machine, m.
     """
     faults = []
-    # Poses that are off by more, 2 % of the machine's size or 50 mrad, are not its own.
+    # A noise above the prior deviation, 2 % of the size or 50 mrad means another machine's poses.
     bounds = {
         "m": (max(prior, 0.02 * size), "poses of this machine in m and rad"),
         "rad": (

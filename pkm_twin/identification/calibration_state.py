@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""A machine that is being calibrated: its numbers as they are now, and what an instrument sees."""
+"""State of a calibration: the machine with its current parameter values, and the instrument."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.design.variants import Variants
 from pkm_twin.errors import ParameterError
-from pkm_twin.identification.parameters import OBSERVED
+from pkm_twin.identification.parameters import OBSERVED_RATIO
 from pkm_twin.machine.joint_map import JointMap
 from pkm_twin.machine.rotations import skew
 from pkm_twin.robot.robot import Robot
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
 FRAME: Final = tuple(f"frame.{axis}" for axis in ("x", "y", "z", "rx", "ry", "rz"))
 TARGET: Final = ("target.x", "target.y", "target.z")
-BESIDE: Final = (*FRAME, *TARGET, "joint_map.")
-"""Names, or their beginnings, of what is fitted beside the machine's own numbers."""
+OTHER_PARAMETERS: Final = (*FRAME, *TARGET, "joint_map.")
+"""Names, or prefixes of names, of fitted parameters that are not the machine's geometry."""
 
 
 def rotations() -> Any:
@@ -55,7 +55,7 @@ class Poses:
 
 @dataclass
 class Instrument:
-    """What is fitted beside the machine: its joints' sensors, where the instrument stands."""
+    """Parameters beside the machine's geometry: joint map, and pose and target of the instrument."""
 
     map: JointMap
     frame: Rotation = field(default_factory=lambda: rotations().identity())
@@ -65,14 +65,14 @@ class Instrument:
     """Numbers of single measurements, such as a plane's height, by name."""
 
     def compute_reading(self, position: Array, rotation: Array) -> tuple[Array, Array]:
-        """Compute what the instrument should see: positions and rotations in its own frame."""
+        """Compute the positions and rotations that the instrument reads, in its own frame."""
         turn = self.frame.as_matrix()
         return self.place + (position + rotation @ self.target) @ turn.T, turn @ rotation
 
 
 @dataclass
 class State:
-    """The machine with numbers as they are now, at the measured poses.
+    """The machine with its current parameter values, at the measured poses.
 
     ``machine``: alone among its variants. ``platform``: positions (k, 3) and rotations (k, 3, 3) of
     its reference point.
@@ -92,7 +92,7 @@ class State:
         return replace(self, q=q, platform=robot.platform(q))
 
     def sample_between(self, joints: Array, count: int) -> State:
-        """Return the same at up to ``count`` new joint states on lines between measured ones."""
+        """Return the state at up to ``count`` joint states on lines between measured ones."""
         rng = np.random.default_rng(0)
         first, second = rng.integers(len(joints), size=(2, count))
         part = rng.uniform(size=(count, 1))
@@ -103,32 +103,32 @@ class State:
 
     @property
     def numbers(self) -> dict[str, float]:
-        """Of the file, by path."""
+        """Current values of the file's numbers, by path."""
         return dict(zip(self.machine.paths, self.machine.values[0].tolist(), strict=False))
 
 
-def start_of(robot: Robot, joints: Array, paths: Sequence[str]) -> State:
+def make_state(robot: Robot, joints: Array, paths: Sequence[str]) -> State:
     """Return the state of the robot as it is, with an instrument at its base.
 
     :param joints: of the measurements, in the controller's numbers, (k, n).
     :raises UnreachableError: a joint state without an assembly, by limb, sample and miss.
     """
-    instrument = Instrument(centred(robot, robot.controller.positions(joints)))
+    instrument = Instrument(centre_map(robot, robot.controller.positions(joints)))
     machine = Variants(robot, {path: robot.number(path) for path in paths})
     q = instrument.map.positions(joints)
     return State(machine, q, robot.platform(q), instrument)
 
 
 def place_frame(state: State, position: Array) -> None:
-    """Guess the instrument's frame: the best rigid motion to measured positions."""
+    """Set the instrument's frame to the rigid motion that best fits measured positions."""
     tool, model = state.instrument, state.platform[0]
     centres = position.mean(0), model.mean(0)
     tool.frame, _ = rotations().align_vectors(position - centres[0], model - centres[1])
     tool.place = centres[0] - tool.frame.apply(centres[1])
 
 
-def moved(robot: Robot, state: State, joints: Array, values: Mapping[str, float], turn: Array) -> State:
-    """Return the machine with new numbers.
+def update_state(robot: Robot, state: State, joints: Array, values: Mapping[str, float], turn: Array) -> State:
+    """Return the state with new parameter values.
 
     :param joints: of the measurements, in the controller's numbers, (k, n).
     :param values: of all that is fitted, by name.
@@ -137,7 +137,7 @@ def moved(robot: Robot, state: State, joints: Array, values: Mapping[str, float]
     """
     tool = state.instrument
     new = Instrument(
-        changed(robot, tool.map, values),
+        change_map(robot, tool.map, values),
         rotations().from_rotvec(turn) * tool.frame,
         np.array([values.get(n, v) for n, v in zip(FRAME[:3], tool.place, strict=True)]),
         np.array([values.get(n, v) for n, v in zip(TARGET, tool.target, strict=True)]),
@@ -154,15 +154,15 @@ def moved(robot: Robot, state: State, joints: Array, values: Mapping[str, float]
     return State(machine, q, (position[0], rotation[0]), new)
 
 
-def derivatives(robot: Robot, state: State, names: Sequence[str]) -> Array:
-    """Of what the instrument sees of positions and rotations, by named parameters: (k, 6, p).
+def differentiate_poses(robot: Robot, state: State, names: Sequence[str]) -> Array:
+    """Differentiate the positions and rotations that the instrument sees by parameters, (k, 6, p).
 
     Zero by numbers of single measurements.
     """
     tool, machine = state.instrument, state.machine
     position, rotation = state.platform
     by_joints = machine.platform_jacobian(state.q[None])[0]
-    by_name = by_map(robot, tool.map, state.q, by_joints)
+    by_name = differentiate_map(robot, tool.map, state.q, by_joints)
     if any(name in machine.paths for name in names):
         slopes = np.moveaxis(machine.platform_slopes(state.q), -1, 0)
         by_name |= dict(zip(machine.paths, slopes, strict=True))
@@ -188,10 +188,9 @@ def derivatives(robot: Robot, state: State, names: Sequence[str]) -> Array:
 
 SHARED: Final = "joint_map.*.ratio"
 RATIO_DEVIATION: Final = 0.05
-"""Standard deviation of a ratio without the poses, part of it; and of its change over the travel
-of the poses."""
+"""Prior standard deviation of a ratio, as a fraction of it, and of its change over the travel."""
 CONTROLLER: Final = "controller units"
-"""Of a joint's sensor whose numbers are not the model's in rad or m, and have no unit's name."""
+"""Unit of a joint's sensor that is scaled and whose unit has no name."""
 
 
 class Transmission(StrEnum):
@@ -215,28 +214,30 @@ class Parameter:
     value: float = np.nan
     deviation: float = np.nan
     scaled: bool = False
-    """Whether it hangs on a scale that was not measured."""
+    """Whether its uncertainty is mainly that of a scale that was not measured."""
 
     @property
     def observed(self) -> bool:
-        """Whether the poses tell it: they, not the prior, make its deviation."""
-        return self.deviation < OBSERVED * self.prior and not self.scaled
+        """Whether the poses determine it: its deviation is below half of the prior's."""
+        return self.deviation < OBSERVED_RATIO * self.prior and not self.scaled
 
 
-def unit_of(robot: Robot, joint: int) -> str:
-    """Of a joint's numbers as the controller has them."""
+def find_unit(robot: Robot, joint: int) -> str:
+    """Return the unit of a joint's positions in the controller."""
     own = robot.controller
     plain = abs(own.factors[joint]) == 1.0
     return own.units[joint] or (robot.joint_units[joint] if plain else CONTROLLER)
 
 
-def per(controller: str, model: str) -> str:
+def write_ratio_unit(controller: str, model: str) -> str:
     """Return the unit of a ratio."""
     return f"{controller} per {model}" if " " in controller else f"{controller}/{model}"
 
 
-def numbers(robot: Robot, q: Array, how: Transmission, offsets: bool, prior: float, angle: float) -> list[Parameter]:
-    """List what is fitted of the joint map.
+def list_map_parameters(
+    robot: Robot, q: Array, how: Transmission, offsets: bool, prior: float, angle: float
+) -> list[Parameter]:
+    """List the parameters of the joint map that are fitted.
 
     :param q: the poses' joints, (k, n). ``prior``, ``angle``: standard deviations of lengths, m,
         and angles, rad.
@@ -252,14 +253,14 @@ def numbers(robot: Robot, q: Array, how: Transmission, offsets: bool, prior: flo
     farthest = np.abs(q).max(0)
     travel = np.maximum(np.ptp(q, axis=0), 1e-9)
     for i, joint in enumerate(robot.joint_names):
-        path, unit, ratio = f"joint_map.{joint}", unit_of(robot, i), float(abs(own.factors[i]))
-        # An offset is what the controller reads at zero: a ratio that is not sure moves it.
+        path, unit, ratio = f"joint_map.{joint}", find_unit(robot, i), float(abs(own.factors[i]))
+        # The offset is the reading at zero, so an error of the ratio changes it with the distance.
         size = prior if sliding[i] else angle
         size = float(np.hypot(size, RATIO_DEVIATION * farthest[i] if fitted[i] else 0.0))
         if offsets:
             found.append(Parameter(f"{path}.offset", unit, float(own.offsets[i]), size * ratio))
         if fitted[i] and how is not Transmission.SHARED:
-            its = per(unit, robot.joint_units[i])
+            its = write_ratio_unit(unit, robot.joint_units[i])
             found.append(Parameter(f"{path}.ratio", its, ratio, RATIO_DEVIATION * ratio))
         if how is Transmission.TRAVEL:
             change, prior_change = float(own.changes[i]), 2.0 * RATIO_DEVIATION / float(travel[i])
@@ -269,14 +270,14 @@ def numbers(robot: Robot, q: Array, how: Transmission, offsets: bool, prior: flo
     return found
 
 
-def centred(robot: Robot, q: Array) -> JointMap:
-    """Return the file's map with the middle of the poses' travel as the place of even ratios."""
+def centre_map(robot: Robot, q: Array) -> JointMap:
+    """Return the file's joint map with ratio changes centred on the middle of the poses' travel."""
     own = robot.controller
     middle = np.round(0.5 * (q.max(0) + q.min(0)), 3)
     return replace(own, centres=np.where(own.changes == 0.0, middle, own.centres))
 
 
-def changed(robot: Robot, own: JointMap, values: Mapping[str, float]) -> JointMap:
+def change_map(robot: Robot, own: JointMap, values: Mapping[str, float]) -> JointMap:
     """Return a map with other numbers, by the names above.
 
     :raises ParameterError: a ratio that is not positive.
@@ -293,7 +294,7 @@ def changed(robot: Robot, own: JointMap, values: Mapping[str, float]) -> JointMa
     return replace(own, offsets=offsets, factors=np.sign(old.factors) * ratios, changes=changes)
 
 
-def by_map(robot: Robot, own: JointMap, q: Array, twists: Array) -> dict[str, Array]:
+def differentiate_map(robot: Robot, own: JointMap, q: Array, twists: Array) -> dict[str, Array]:
     """Differentiate the platform's pose by the map's numbers at fixed controller positions.
 
     :param q: the model's, (k, n). ``twists``: of the platform by q, (k, 6, n).
@@ -313,7 +314,7 @@ def by_map(robot: Robot, own: JointMap, q: Array, twists: Array) -> dict[str, Ar
     return found
 
 
-def written(
+def list_map_values(
     robot: Robot, own: JointMap, values: Mapping[str, tuple[float, float]]
 ) -> dict[str, tuple[float, float, str]]:
     """Return value, standard deviation and unit of a fitted joint map by path in the file.
@@ -322,10 +323,10 @@ def written(
     """
     found = {}
     for i, joint in enumerate(robot.joint_names):
-        path, unit = f"joint_map.{joint}", unit_of(robot, i)
+        path, unit = f"joint_map.{joint}", find_unit(robot, i)
         units = {
             "offset": unit,
-            "ratio": per(unit, robot.joint_units[i]),
+            "ratio": write_ratio_unit(unit, robot.joint_units[i]),
             "ratio_change": f"1/{robot.joint_units[i]}",
         }
         for name, its in units.items():

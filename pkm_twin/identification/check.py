@@ -16,24 +16,24 @@ from delta_dynamics import inverse_dynamics, torque_deviation
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import PkmTwinError, SingularityError, UnreachableError, one_line
 from pkm_twin.identification.compare import (
-    LEAST,
     MAX_RESIDUAL,
-    STUCK,
+    MIN_PIECE_SAMPLES,
+    MIN_REST_TIME,
     Compared,
-    by_held,
-    compared_of,
-    idle_of,
-    lateness,
+    compare_part,
+    cut_recording,
+    describe_delay,
+    evaluate_loaded,
+    find_idle,
     missing_samples,
     near_change,
     near_jumps,
-    recorded_of,
 )
 from pkm_twin.identification.fit import Fit, fit
 from pkm_twin.identification.friction_laws import fit_recordings
 from pkm_twin.identification.hypotheses import NO_MACHINE, Explanation, explain_recording
-from pkm_twin.identification.judge import LOUD
-from pkm_twin.identification.words import LATEST, listed, position_text, scale_text
+from pkm_twin.identification.judge import MAX_NOISE_RATIO
+from pkm_twin.identification.words import MAX_DELAY, list_joints, position_text, scale_text
 from pkm_twin.recordings import Recording
 from pkm_twin.report import Fact, Verdict, judged
 from pkm_twin.robot.limits import list_limits
@@ -53,9 +53,9 @@ COMPUTED: Final = "the efforts of this table are the model's; expected columns J
 DEVIATIONS: Final = (1, 2, 3)
 """Multiples of the model's standard deviation within which residuals are counted."""
 MIN_SINGULARITY: Final = 1e-3
-"""Least good singularity index, 0 in a singularity, 1 at best."""
+"""Smallest good singularity index: 0 in a singularity, 1 at best."""
 MIN_COMPARED: Final = 0.1
-"""Least part of the recording whose efforts are compared."""
+"""Smallest fraction of the samples whose efforts must be compared for a verdict."""
 
 
 @dataclass(frozen=True)
@@ -74,10 +74,9 @@ class Checked:
     compared: Compared | None = None
     left_out: Mask = field(default_factory=lambda: np.zeros(0, np.bool_))
     causes: tuple[str, ...] = ()
-    """What explains efforts that contradict the model: with it they agree. Or, before any are
-    compared, why they are not one machine's."""
+    """Causes with which contradicting efforts agree with the model, or why none were compared."""
     findings: tuple[str, ...] = ()
-    """What `fit` says of them, where nothing explains them."""
+    """Findings of `fit`, if no cause explains the efforts."""
     explanation: Explanation | None = None
     """Most probable explanation of the efforts, the same as that of `fit`; None if none was searched for."""
     hint: str = ""
@@ -96,12 +95,12 @@ class Checked:
         r, c = self.recording, self.compared
         if c is None or r.qd is None or r.qdd is None:
             return False
-        away = np.abs(by_held(r, inverse_dynamics, r.time, *r.motion) - r.measured)
+        away = np.abs(evaluate_loaded(r, inverse_dynamics, r.time, *r.motion) - r.measured)
         return bool((away <= 1e-6 * c.peak).all())
 
     @property
     def agreement(self) -> str:
-        """How well efforts and model agree, in words."""
+        """Sentence on how well efforts and model agree."""
         r, c = self.recording, self.compared
         assert c is not None  # noqa: S101  without efforts no recording is good
         if self.planned:
@@ -135,16 +134,16 @@ class Checked:
         return f"{self.answer}: {what}" + (f"; not judged: {', '.join(unknown)}" if unknown else "")
 
     def named(self, verdict: Verdict) -> list[str]:
-        """List what got this verdict."""
+        """List the items with this verdict."""
         return [str(item.text) for item in self.items if item.verdict is verdict]
 
 
-def checked(r: Recording, residual: float) -> Checked:
+def compare_with_model(r: Recording, residual: float) -> Checked:
     """Compare a recording with the model, without a look for causes.
 
     :param residual: largest good one, RMS, part of the peak effort.
     """
-    items = [*_file(r), *_motion(r), *_limits(r), _singularity(r)]
+    items = [*_judge_file(r), *_judge_motion(r), *_judge_limits(r), _judge_singularity(r)]
     left_out = np.zeros(len(r.time), np.bool_)
     bound = f"RMS below {100 * residual:g} % of peak"
     reason = why_no_torques(r.robot)
@@ -158,16 +157,16 @@ def checked(r: Recording, residual: float) -> Checked:
         items.append(judged(RESIDUAL, fault or reason, bound, None))
         return Checked(r, items, unjudged=reason, causes=(fault,) if fault else ())
     try:
-        idle = idle_of(r)
+        idle = find_idle(r)
         left_out = idle | near_jumps(r.steps, len(r.time))
-        compared = compared_of(r, left_out, residual)
-        bands = {} if compared is None else _bands(r, compared)
+        compared = compare_part(r, left_out, residual)
+        bands = {} if compared is None else _compare_uncertainty(r, compared)
     # ValueError: numbers within bounds whose result is not finite.
     except (UnreachableError, SingularityError, ValueError) as error:
         text = one_line(str(error))
         causes = (position_text(error),) if isinstance(error, (UnreachableError, SingularityError)) else ()
         return Checked(r, [*items, judged(RESIDUAL, text, bound, False)], causes=causes)
-    shares, unjudged = _shares(r, idle, compared)
+    shares, unjudged = _judge_shares(r, idle, compared)
     items += shares
     if compared is not None and compared.hidden.any() and compared.good.all():
         names = ", ".join(np.array(r.robot.joint_names)[compared.hidden])
@@ -176,11 +175,11 @@ def checked(r: Recording, residual: float) -> Checked:
         stuck = _stuck_efforts(r, compared)
         if stuck:
             items.append(judged(MEASURED, stuck, "change as the model's", False))
-        items += _residuals(r, compared, bands, bound)
+        items += _judge_residuals(r, compared, bands, bound)
     return Checked(r, items, bands, unjudged, compared, left_out)
 
 
-def _file(r: Recording) -> list[Fact]:
+def _judge_file(r: Recording) -> list[Fact]:
     if r.bag is None:
         found = f"a table of {len(r.time)} rows, all numbers finite"
         return [judged("file", found, "finite numbers", True)]
@@ -196,7 +195,7 @@ def _file(r: Recording) -> list[Fact]:
     ]
 
 
-def _motion(r: Recording) -> list[Fact]:
+def _judge_motion(r: Recording) -> list[Fact]:
     """Judge time stamps, steps and velocities."""
     if len(r.time) < 3:
         return [judged("rate", f"{len(r.time)} joint states", "3 or more", None)]
@@ -219,10 +218,10 @@ def _motion(r: Recording) -> list[Fact]:
         ),
         judged(POSITION_STEPS, fault or "no jumps", "within rates and limits", not fault),
     ]
-    return items if r.qd is None or r.steps.publishers else items + _velocities(r, r.qd)
+    return items if r.qd is None or r.steps.publishers else items + _judge_velocities(r, r.qd)
 
 
-def stuck_from(time: Array, values: Array, told: Array, count: int = 1) -> tuple[int, int] | None:
+def find_stuck(time: Array, values: Array, told: Array, count: int = 1) -> tuple[int, int] | None:
     """Find the first and last sample of a signal that is stuck; None where it is not.
 
     :param values: shape (k,); ``told``: what it should be but for a constant, NaN where that is not
@@ -237,19 +236,19 @@ def stuck_from(time: Array, values: Array, told: Array, count: int = 1) -> tuple
     for begin, end in np.flatnonzero(np.diff(steps == 0.0, prepend=0, append=0)).reshape(-1, 2):
         known = told[begin : end + 1]
         known = known[np.isfinite(known)]
-        long = end - begin >= count and time[end] - time[begin] > STUCK
+        long = end - begin >= count and time[end] - time[begin] > MIN_REST_TIME
         if long and len(known) and np.ptp(known) > size:
             return int(begin), int(end)
     return None
 
 
-def _velocities(r: Recording, qd: Array) -> list[Fact]:
-    """How far measured velocities are from what the positions move by, over short times."""
+def _judge_velocities(r: Recording, qd: Array) -> list[Fact]:
+    """Compare measured velocities with the rates of the positions over short times."""
     names, span = r.robot.joint_names, np.diff(r.time)
     bound = f"RMS below {100 * MAX_RATE:g} % of the positions' rate"
     turned = np.cumsum(0.5 * (qd[1:] + qd[:-1]) * span[:, None], 0)
     for j, told in enumerate(np.concatenate([0.0 * turned[:1], turned]).T):
-        found = stuck_from(r.time, r.q[:, j], told)
+        found = find_stuck(r.time, r.q[:, j], told)
         if found is not None:
             begin, end = r.time[list(found)]
             text = f"the position of {names[j]} stands still from {begin:.3f} s to {end:.3f} s"
@@ -270,7 +269,7 @@ def _velocities(r: Recording, qd: Array) -> list[Fact]:
     return [judged(VELOCITIES, text, bound, good, number=number, limit=MAX_RATE)]
 
 
-def _limits(r: Recording) -> list[Fact]:
+def _judge_limits(r: Recording) -> list[Fact]:
     """Effort limits; position and velocity limits are already a node's reason to reject."""
     recorded = {"position": r.q, "velocity": r.qd, "effort": r.effort}
     items = []
@@ -289,7 +288,7 @@ def _limits(r: Recording) -> list[Fact]:
     return items
 
 
-def _singularity(r: Recording) -> Fact:
+def _judge_singularity(r: Recording) -> Fact:
     what = "singularity index"
     bound = f"{MIN_SINGULARITY:g} or more"
     try:
@@ -302,7 +301,7 @@ def _singularity(r: Recording) -> Fact:
     return judged(what, value, bound, least >= MIN_SINGULARITY, number=least, limit=MIN_SINGULARITY)
 
 
-def _shares(r: Recording, idle: Mask, compared: Compared | None) -> tuple[list[Fact], str]:
+def _judge_shares(r: Recording, idle: Mask, compared: Compared | None) -> tuple[list[Fact], str]:
     """Return the samples that are left out, and the reason where too few remain for a verdict."""
     items, total = [], max(float(r.time[-1]), 1e-9)
     used = 0 if compared is None else sum(len(track.time) for track in compared.tracks)
@@ -327,7 +326,7 @@ def _shares(r: Recording, idle: Mask, compared: Compared | None) -> tuple[list[F
     why = max(left_out, key=lambda reason: left_out[reason])
     part = left_out[why]
     if part < 0.5 * (1.0 - share):
-        why = f"are near jumps or gaps, or in pieces of fewer than {LEAST} samples: record longer"
+        why = f"are near jumps or gaps, or in pieces of fewer than {MIN_PIECE_SAMPLES} samples: record longer"
         part = 1.0 - share - sum(left_out.values())
     told = f"efforts can be compared in {text}, {bound} needed for a verdict"
     return items, f"{told}; {100 * part:.3g} % {why}"
@@ -351,7 +350,7 @@ def _stuck_efforts(r: Recording, c: Compared) -> str:
             continue
         values[np.abs(values) >= most * (1.0 - MAX_RELATIVE_CHANGE)] = np.nan
         told[rows] = moved[:, j]
-        found = stuck_from(r.time, values, told, CONSTANT_SAMPLES)
+        found = find_stuck(r.time, values, told, CONSTANT_SAMPLES)
         if found is not None:
             begin, end = found
             change = np.nanmax(told[begin : end + 1]) - np.nanmin(told[begin : end + 1])
@@ -363,7 +362,7 @@ def _stuck_efforts(r: Recording, c: Compared) -> str:
     return "; ".join(texts)
 
 
-def _residuals(r: Recording, c: Compared, bands: Mapping[str, Mapping[str, Any]], bound: str) -> list[Fact]:
+def _judge_residuals(r: Recording, c: Compared, bands: Mapping[str, Mapping[str, Any]], bound: str) -> list[Fact]:
     good, begins, (worst, at) = c.good, c.begins(), c.local()
     items = []
     for i, (name, unit) in enumerate(zip(r.robot.joint_names, r.robot.effort_units, strict=True)):
@@ -384,24 +383,24 @@ def _residuals(r: Recording, c: Compared, bands: Mapping[str, Mapping[str, Any]]
         told = {"number": float(c.rms[i]), "limit": float(c.limit[i]), "unit": unit}
         used = bound
         if c.limit[i] > c.bound * c.peak[i]:
-            used = f"RMS below {c.limit[i]:.3g} {unit}, {LOUD:g} times the noise"
+            used = f"RMS below {c.limit[i]:.3g} {unit}, {MAX_NOISE_RATIO:g} times the noise"
         items.append(judged(f"{RESIDUAL} of {name}", text, used, bool(good[i]), **told))
-    late = lateness(c.late, c.period)
+    late = describe_delay(c.late, c.period)
     if good.all() and late:
         late += ", taken out"
-        told = {"number": c.late, "limit": LATEST, "unit": "s"}
-        most = f"at most {1e3 * LATEST:g} ms"
+        told = {"number": c.late, "limit": MAX_DELAY, "unit": "s"}
+        most = f"at most {1e3 * MAX_DELAY:g} ms"
         items.append(judged("efforts against positions", late, most, not c.delayed, **told))
     return items
 
 
-def _bands(r: Recording, c: Compared) -> dict[str, dict[str, Any]]:
+def _compare_uncertainty(r: Recording, c: Compared) -> dict[str, dict[str, Any]]:
     """By joint, where the robot's file has an ``uncertainty``."""
     if not r.robot.uncertainty:
         return {}
     parts = []
     for track, rows in zip(c.tracks, c.inner, strict=True):
-        made = by_held(r, torque_deviation, track.time, *track.joints, track.wrench)
+        made = evaluate_loaded(r, torque_deviation, track.time, *track.joints, track.wrench)
         parts.append(made[rows])
     spread = np.concatenate(parts)
     inside = {str(k): np.mean(np.abs(c.residual) <= k * spread, 0) for k in DEVIATIONS}
@@ -415,8 +414,8 @@ def _bands(r: Recording, c: Compared) -> dict[str, dict[str, Any]]:
     }
 
 
-FULL: Final = 0.01
-"""Part of the samples whose effort is at its greatest where a sensor is saturated,"""
+MIN_SATURATED_FRACTION: Final = 0.01
+"""Smallest fraction of the samples at the greatest effort from which it is saturated."""
 
 
 def check(r: Recording, residual: float = MAX_RESIDUAL, thorough: bool = True) -> Checked:
@@ -425,12 +424,12 @@ def check(r: Recording, residual: float = MAX_RESIDUAL, thorough: bool = True) -
     :param residual: largest good one, RMS, part of the peak effort.
     :param thorough: also ask what `fit` finds, which takes some seconds.
     """
-    found = checked(r, residual)
+    found = compare_with_model(r, residual)
     c, bad, played = found.compared, found.named(Verdict.BAD), POSITION_STEPS in found.named(Verdict.BAD)
     if r.step_fault or (found.causes and (found.unjudged or not played)):
         return replace(found, causes=found.causes or (r.step_fault,))
-    # Of positions that are none the efforts say nothing; noise needs no explanation.
-    unlike = c is not None and (not c.good.all() or (thorough and (c.rms > LOUD * c.noise).any()))
+    # Efforts of invalid positions mean nothing; residuals that are noise need no explanation.
+    unlike = c is not None and (not c.good.all() or (thorough and (c.rms > MAX_NOISE_RATIO * c.noise).any()))
     one = _explain(found) if played or (unlike and VELOCITIES not in bad) else None
     found = replace(found, explanation=one)
     if played:
@@ -445,12 +444,12 @@ def check(r: Recording, residual: float = MAX_RESIDUAL, thorough: bool = True) -
         return replace(found, causes=(one.text,))
     if MEASURED in bad:
         return found
-    causes = _saturated(r, c) or tuple(
-        text for text, after in _contact(r, c) if _agrees(r, found.left_out | after, c.bound)
+    causes = _find_saturated(r, c) or tuple(
+        text for text, after in _find_contact(r, c) if _agrees(r, found.left_out | after, c.bound)
     )
     findings: tuple[str, ...] = ()
     if thorough and not causes:
-        causes, findings = _of_fit(found, c.bound)
+        causes, findings = _explain_by_fit(found, c.bound)
     return replace(found, causes=causes, findings=findings)
 
 
@@ -461,7 +460,7 @@ def _explain(found: Checked) -> Explanation | None:
         # Of drives that share: the signs of some, or the scale of all.
         opposed = ~c.good & (np.sum(c.measured * c.expected, 0) < 0.0)
         scale = float(np.sum(c.measured * c.expected) / max(float(np.sum(c.expected**2)), 1e-300))
-        names = listed(np.array(r.robot.joint_names)[opposed].tolist(), len(opposed))
+        names = list_joints(np.array(r.robot.joint_names)[opposed].tolist(), len(opposed))
         tried = [(f"efforts of {names} have the wrong sign", np.where(opposed, -1.0, 1.0))] * bool(opposed.any())
         for text, factors in (*tried, (scale_text("all joints", scale), np.full(len(opposed), 1.0 / scale))):
             if _agrees(replace(r, effort=factors * r.measured), found.left_out, c.bound):
@@ -477,14 +476,14 @@ def _explain(found: Checked) -> Explanation | None:
 def _agrees(r: Recording, without: Mask, bound: float) -> bool:
     """Return whether the efforts agree with the model, apart from some samples."""
     try:
-        compared = compared_of(r, without, bound)
+        compared = compare_part(r, without, bound)
     except (PkmTwinError, ValueError):
         return False
     return compared is not None and bool(compared.good.all()) and not compared.delayed
 
 
-def _contact(r: Recording, c: Compared) -> Iterator[tuple[str, Mask]]:
-    """When something else begins to act on the machine, and the samples from then on."""
+def _find_contact(r: Recording, c: Compared) -> Iterator[tuple[str, Mask]]:
+    """Find when something else begins to act on the machine; yield text and samples from then."""
     begins = c.begins()
     if begins is None:
         return
@@ -500,8 +499,8 @@ def _contact(r: Recording, c: Compared) -> Iterator[tuple[str, Mask]]:
         yield text, r.time >= begins - 2.0 * c.edge
 
 
-def _saturated(r: Recording, c: Compared) -> tuple[str, ...]:
-    """Joints whose effort stays at its greatest while the model needs more, and else agrees."""
+def _find_saturated(r: Recording, c: Compared) -> tuple[str, ...]:
+    """Find joints whose effort saturates while the model needs more and otherwise agrees."""
     assert r.effort is not None  # noqa: S101
     if r.robot.redundant:
         return ()
@@ -516,7 +515,9 @@ def _saturated(r: Recording, c: Compared) -> tuple[str, ...]:
         usual = float(estimate_deviation(less)) if len(less) else 0.0
         slack = limit[j] + 4.0 * usual
         enough = (
-            full.mean() > FULL and full.sum() >= 30 and (np.abs(expected[full, j]) > most - slack).mean() > 1.0 - FULL
+            full.mean() > MIN_SATURATED_FRACTION
+            and full.sum() >= 30
+            and (np.abs(expected[full, j]) > most - slack).mean() > 1.0 - MIN_SATURATED_FRACTION
         )
         if not enough or (len(less) and rms(less) > slack):
             return ()
@@ -528,15 +529,15 @@ def _saturated(r: Recording, c: Compared) -> tuple[str, ...]:
     return tuple(texts)
 
 
-def _of_fit(found: Checked, bound: float) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Whether other friction, or all that a fit varies, explains the efforts; else its findings."""
+def _explain_by_fit(found: Checked, bound: float) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return causes if other friction or all fitted numbers explain the efforts, else findings."""
     r = found.recording
     try:
-        part = [recorded_of(r, found.left_out)]
+        part = [cut_recording(r, found.left_out)]
         first = fit(r.robot, part, ("friction",), accept=True, explained=[Explanation("")])
         rubbing = r.robot.with_file_values({one.name: one.after for one in first.numbers})
         if not first.accepted and _agrees(replace(r, robot=rubbing), found.left_out, bound):
-            return (_fitted("friction other than the file's explains", first),), ()
+            return (_describe_fit("friction other than the file's explains", first),), ()
         last, *_ = fit_recordings(r.robot, [r], accept=True)
         verdict = last.verdict
         if last.accepted:
@@ -545,11 +546,11 @@ def _of_fit(found: Checked, bound: float) -> tuple[tuple[str, ...], tuple[str, .
         return (), ()
     if verdict.answer == "explains":
         text = "friction, masses or payload other than the file's explain"
-        return (_fitted(text, last),), ()
+        return (_describe_fit(text, last),), ()
     return (), tuple(map(str, verdict.findings[:2]))
 
 
-def _fitted(what: str, made: Fit) -> str:
-    """Find what explains the efforts, and how late they are then."""
-    late = lateness(made.delays[0], made.problem.whole[0].period)
+def _describe_fit(what: str, made: Fit) -> str:
+    """Write what explains the efforts, and their delay."""
+    late = describe_delay(made.delays[0], made.problem.whole[0].period)
     return f"{what} the efforts" + (f", which are {late}" if late else "") + ": `pkm-twin fit`"

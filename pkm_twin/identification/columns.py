@@ -11,10 +11,10 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.identification.evidence import Signals, Spectra
-from pkm_twin.identification.judge import ALL
+from pkm_twin.identification.judge import ALL_JOINTS
 from pkm_twin.identification.rows import Rows
 from pkm_twin.identification.samples import Motion
-from pkm_twin.identification.suspects import DELAY, GAIN, OFF, Lengths, errors_of
+from pkm_twin.identification.suspects import DELAY_DEVIATION, GAIN, GAIN_DEVIATION, Lengths, list_errors
 from pkm_twin.identification.words import USUAL_SCALE
 from pkm_twin.machine.friction import list_reversal_keys
 
@@ -56,26 +56,26 @@ class Columns:
         numbers = _differentiate(rows, rows.table, rows.rest, rows.signals.motion)
         size = np.maximum(np.sqrt(np.mean(rows.effort**2, 0)), 1e-300)
         values = rows.model.parameters.values
-        errors, _ = errors_of(rows, values)
+        errors, _ = list_errors(rows, values)
         lengths = Lengths.from_robot(rows.model.robot)
         tables = [
             -rows.change[..., None],
             np.broadcast_to(np.eye(len(size)), (*rows.effort.shape, len(size))),
         ]
-        deviation, kinds = [DELAY, *(OFFSET_SHARE * size)], ["error", *["offset"] * len(size)]
+        deviation, kinds = [DELAY_DEVIATION, *(OFFSET_SHARE * size)], ["error", *["offset"] * len(size)]
         gains = [(one, column) for one, column in errors if one.kind == GAIN]
         errors = [(one, column) for one, column in errors if one.kind != GAIN]
         for one, column in errors:
             rms = np.sqrt(np.mean(column**2, 0))
             j = int(rms.argmax())
-            if rms[j] > 0.0 and one.where != ALL:
+            if rms[j] > 0.0 and one.where != ALL_JOINTS:
                 tables.append(column[..., None])
                 deviation.append(one.usual or ERROR_SHARE * size[j] / rms[j])
                 kinds.append("error")
         tables.append(lengths.columns(rows, values))
         deviation += [float(one.usual or 0.0) for one in lengths.suspects]
         tables.append(np.stack([column for _, column in gains], -1))
-        deviation += [OFF] * len(gains)
+        deviation += [GAIN_DEVIATION] * len(gains)
         kinds += ["error"] * (len(lengths.suspects) + len(gains))
         more = np.concatenate(tables, -1)
         count = more.shape[-1]

@@ -19,19 +19,19 @@ from delta_dynamics.torques.virtual_work import inverse_dynamics, null_efforts
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.estimation import estimate
-from pkm_twin.identification.judge import LOUD
-from pkm_twin.identification.rows import BLOCK
+from pkm_twin.identification.judge import MAX_NOISE_RATIO
+from pkm_twin.identification.rows import BLOCK_ROWS
 from pkm_twin.identification.samples import (
     Filtering,
     Track,
+    estimate_noise_density,
     filtered,
+    find_passed_band,
     kept_rows,
-    noise_of,
-    passed_band,
-    shaken_efforts,
+    simulate_noise,
     tracks,
 )
-from pkm_twin.identification.words import LATEST, late_text
+from pkm_twin.identification.words import MAX_DELAY, late_text
 from pkm_twin.machine.friction import Dahl
 from pkm_twin.recordings import Load, Recording, at_rest, split_by_load
 from pkm_twin.report import Fact, judged
@@ -42,19 +42,19 @@ from pkm_twin.streams.rates import rms
 from pkm_twin.streams.steps import Steps, find_sampling
 
 MAX_MISSING: Final = 0.01
-"""Samples that may be missing, part of those that there should be."""
+"""Largest fraction of the expected samples that may be missing."""
 MAX_RESIDUAL: Final = 0.05
-"""Largest good torque residual RMS, part of the joint's peak effort."""
-LEAST: Final = 40
-"""Samples that a piece needs: fewer than for a fit, as nothing is fitted."""
+"""Largest good RMS torque residual, as a fraction of the joint's peak effort."""
+MIN_PIECE_SAMPLES: Final = 40
+"""Smallest number of samples of a piece: fewer than for a fit, as nothing is fitted."""
 MAX_LOCAL_RATIO: Final = 3.0
 """Largest RMS residual over 0.25 s, as a multiple of the limit for the whole recording."""
-STUCK: Final = 0.05
-"""Time for which a joint, or an effort, stays the same before it counts as at rest, or stuck, s."""
-NEAR: Final = 0.5
-"""Around a pick or release the payload is neither held nor gone, s, at most;"""
-PASSES: Final = 4
-"""How often late efforts are put on time: the delay is found to the first order."""
+MIN_REST_TIME: Final = 0.05
+"""Shortest time, s, for which a constant position is a rest and a constant effort is stuck."""
+MAX_PAYLOAD_MARGIN: Final = 0.5
+"""Longest time before and after a pick or release that is not compared, s."""
+MAX_DELAY_PASSES: Final = 4
+"""Largest number of delay corrections: each finds the delay to first order."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,16 +92,16 @@ class Compared:
 
     @property
     def edge(self) -> float:
-        """How far the filter spreads a step in time, s."""
+        """Time over which the filter spreads a step, s."""
         return 0.0 if self.how.cutoff is None else 1.0 / self.how.cutoff
 
     @property
     def rests(self) -> Mask:
-        """Where a joint rests, and where the filter mixes a rest with the motion, (k, n).
+        """Mask of rests of each joint, and of the rows that the filter mixes with them, (k, n).
 
         Dry friction holds any effort there, and a rest does not change it.
         """
-        spans = 0.5 * STUCK, self.edge
+        spans = 0.5 * MIN_REST_TIME, self.edge
         long, near = (np.ones((2 * round(span / self.period) + 1, 1)) for span in spans)
         parts = []
         for track, rows in zip(self.tracks, self.inner, strict=True):
@@ -111,7 +111,7 @@ class Compared:
 
     @property
     def rms(self) -> Array:
-        """Of the residual, shape (n,)."""
+        """RMS of the residual, shape (n,)."""
         return rms(self.residual)
 
     @property
@@ -121,7 +121,7 @@ class Compared:
         What is as large as the noise in the band explains the recording, as the verdict of a fit
         has it.
         """
-        return np.maximum(self.bound * self.peak, LOUD * self.noise)
+        return np.maximum(self.bound * self.peak, MAX_NOISE_RATIO * self.noise)
 
     def local(self) -> tuple[Array, Array]:
         """Return the largest RMS over a short time and the time of its middle, s, (n,) each."""
@@ -142,7 +142,7 @@ class Compared:
         return worst, at
 
     def begins(self) -> float | None:
-        """When the residual first leaves the local bound of any joint, s; None: never.
+        """Return when the residual first exceeds the local limit of any joint, s; None: never.
 
         Before the filter, which spreads a step in time.
         """
@@ -150,7 +150,7 @@ class Compared:
         usual, limit = estimate_deviation(self.raw), self.limit
         far = away > MAX_LOCAL_RATIO * limit + 4.0 * np.minimum(usual, limit)
         beyond: Mask = np.asarray(far.any(1), np.bool_)
-        # Two in a row: one is noise's.
+        # A single row may be noise, so two in a row are required.
         rows = np.flatnonzero(beyond[1:] & beyond[:-1])
         return float(self.time[rows[0]]) if len(rows) else None
 
@@ -162,17 +162,17 @@ class Compared:
     @property
     def delayed(self) -> str:
         """Efforts that are later than a recording's may be, in words; or empty."""
-        return late_text("all joints", self.late) if abs(self.late) > LATEST else ""
+        return late_text("all joints", self.late) if abs(self.late) > MAX_DELAY else ""
 
 
-def by_held(r: Recording, function: Callable[..., Array], time: Array, *motion: Array) -> Array:
+def evaluate_loaded(r: Recording, function: Callable[..., Array], time: Array, *motion: Array) -> Array:
     """Evaluate a function of the robot, loaded while it holds its payload, and a motion, (k, n)."""
-    parts = split_by_load(r.robot, r.load, time, BLOCK)
+    parts = split_by_load(r.robot, r.load, time, BLOCK_ROWS)
     return np.concatenate([function(robot, *(v[rows] for v in motion)) for robot, rows in parts])
 
 
-def moving(robot: Robot, q: Array) -> Array:
-    """Return the matrix from efforts to the least efforts with the same motion, shape (k, n, n).
+def make_motion_projection(robot: Robot, q: Array) -> Array:
+    """Return the projection of efforts on the smallest ones with the same motion, (k, n, n).
 
     Least over their limits. Drives that share may do so otherwise than the model says: what they
     give against each other moves nothing. One where no drives share.
@@ -200,11 +200,11 @@ def compare(r: Recording, bound: float = MAX_RESIDUAL) -> Compared | None:
     """
     first, made = _compare_recording(r, bound), r
     c = first
-    for _ in range(PASSES):
+    for _ in range(MAX_DELAY_PASSES):
         if c is None or abs(c.late - made.late) <= c.period:
             break
         made = made.on_time(c.late - made.late)
-        c = _compare_recording(made, bound) if len(made.time) >= LEAST else None
+        c = _compare_recording(made, bound) if len(made.time) >= MIN_PIECE_SAMPLES else None
     return first if c is None or not c.good.all() else c
 
 
@@ -212,23 +212,23 @@ def _compare_recording(r: Recording, bound: float) -> Compared | None:
     """Compare measured and modelled efforts; the delay is estimated and removed to first order."""
     robot, reach = r.robot, friction_reach(r.robot)
     rates = None if r.qd is None or r.qdd is None else (r.qd, r.qdd)
-    pieces, how = tracks(r.time, r.q, r.measured, r.wrench, rates=rates, least=LEAST)
+    pieces, how = tracks(r.time, r.q, r.measured, r.wrench, rates=rates, least=MIN_PIECE_SAMPLES)
     if not pieces:
         return None
 
     def efforts(track: Track, alike: Array) -> Array:
         qd = zero_resting_rates(track.qd, ~track.moves(how), reach)
-        made = by_held(r, inverse_dynamics, track.time, track.q, qd, track.qdd, track.wrench)
+        made = evaluate_loaded(r, inverse_dynamics, track.time, track.q, qd, track.qdd, track.wrench)
         made = made + Dahl.remembered(robot.friction, track.q, qd)[0]
         return _multiply_each(alike, made)
 
     def moved(track: Track) -> Array:
-        return efforts(track, moving(robot, track.q))
+        return efforts(track, make_motion_projection(robot, track.q))
 
     period, every, how = pieces[0].period, how.keep_every, replace(how, keep_every=1)
     sharp: list[dict[str, Array]] = []
     for track in pieces:
-        alike = moving(robot, track.q)
+        alike = make_motion_projection(robot, track.q)
         expected = efforts(track, alike)
         _, doubt = Dahl.remembered(robot.friction, track.q, track.sure(how))
         slack = _multiply_each(np.abs(alike), np.where(track.moves(how), doubt, reach))
@@ -246,12 +246,12 @@ def _compare_recording(r: Recording, bound: float) -> Compared | None:
         name: np.concatenate([one[name][rows] for one, rows in zip(sharp, inside, strict=True)])
         for name in ("left", "change")
     }
-    late = _late(*(one[::every] for one in (left, change, rubs)))
+    late = _estimate_delay(*(one[::every] for one in (left, change, rubs)))
     longest = max(pieces, key=lambda track: len(track.time))
     raw = [one["left"] for one in sharp]
     long = [one for one in raw if len(one) >= 256] or [max(raw, key=len)]
-    shaken = np.zeros_like(r.q) if rates is not None else shaken_efforts(r, longest, how, moved)
-    density = noise_of(long, shaken, period, how)
+    shaken = np.zeros_like(r.q) if rates is not None else simulate_noise(r, longest, how, moved)
+    density = estimate_noise_density(long, shaken, period, how)
     size = np.abs(expected).max(0)
     units = np.array(robot.effort_units)
 
@@ -259,7 +259,7 @@ def _compare_recording(r: Recording, bound: float) -> Compared | None:
         return np.array([sizes[units == unit].max() for unit in units])
 
     residual = left + late * change
-    noise = density * np.sqrt(passed_band(how, 1.0 / period) / period)
+    noise = density * np.sqrt(find_passed_band(how, 1.0 / period) / period)
     # A joint with next to no effort is judged as if it had a twentieth of the greatest of its unit.
     # Noise as large as half of the efforts hides efforts that are twice the model's.
     return Compared(
@@ -271,7 +271,7 @@ def _compare_recording(r: Recording, bound: float) -> Compared | None:
         cut["left"] + late * cut["change"],
         noise,
         np.maximum(size, 0.05 * greatest(size)),
-        LOUD * noise > 0.5 * greatest(rms(expected + residual)),
+        MAX_NOISE_RATIO * noise > 0.5 * greatest(rms(expected + residual)),
         r.late + late,
         period,
         tuple(starts),
@@ -282,29 +282,29 @@ def _compare_recording(r: Recording, bound: float) -> Compared | None:
     )
 
 
-def _late(left: Array, change: Array, rubs: Array) -> float:
-    """How late the efforts are, s; 0 where other friction of the drives explains it as well.
+def _estimate_delay(left: Array, change: Array, rubs: Array) -> float:
+    """Estimate the efforts' delay, s; 0 where other friction of the drives explains it as well.
 
     :param left: residuals, ``change``: the efforts', (k, n) each; ``rubs``: of friction, (k, n, f).
     """
     table = np.concatenate([-change[..., None], rubs], -1)
     sizes = np.sqrt(np.mean(rubs**2, (0, 1)))
     scales = max(float(rms(left).max()), 1e-12) / np.maximum(sizes, 1e-12)
-    found = estimate(table, left, np.zeros(table.shape[-1]), np.array([LATEST, *scales]))
+    found = estimate(table, left, np.zeros(table.shape[-1]), np.array([MAX_DELAY, *scales]))
     late, sure = float(found.values[0]), 3.0 * np.sqrt(found.covariance[0, 0])
-    # At the bound it is another error's.
-    return late if sure < abs(late) < LATEST else 0.0
+    # A delay at the bound is the effect of another error.
+    return late if sure < abs(late) < MAX_DELAY else 0.0
 
 
-def lateness(late: float, period: float) -> str:
-    """How late efforts are against the positions, in words; empty within a tenth of a sample."""
+def describe_delay(late: float, period: float) -> str:
+    """Describe how late efforts are against the positions; empty within a tenth of a sample."""
     if abs(late) <= 0.1 * period:
         return ""
     return f"{1e3 * abs(late):.3g} ms {'late' if late > 0.0 else 'early'}"
 
 
 def missing_samples(time: Array) -> Fact:
-    """How many samples are missing, judged.
+    """Judge how many samples are missing.
 
     :param time: rising, shape (k,), k 2 or more, s.
     """
@@ -327,7 +327,7 @@ def near_jumps(steps: Steps, count: int) -> Mask:
     return found
 
 
-def recorded_of(r: Recording, leave_out: Mask | None = None) -> Recording:
+def cut_recording(r: Recording, leave_out: Mask | None = None) -> Recording:
     """Remove samples near a pick, a release or a step, and those of idle drives.
 
     :param leave_out: the latter two, (samples,), where they are known. A gap divides the recording.
@@ -336,40 +336,40 @@ def recorded_of(r: Recording, leave_out: Mask | None = None) -> Recording:
         leave_out = near_jumps(r.steps, len(r.time))
         # Currents are not compared with efforts, and what has no state is the fit's to reject.
         with suppress(PkmTwinError, ValueError):
-            leave_out |= idle_of(r) & (r.efforts != "current")
-        # Where nothing would be left, the efforts themselves are the fault.
+            leave_out |= find_idle(r) & (r.efforts != "current")
+        # If no sample would remain, keep all: the efforts themselves are the fault.
         leave_out &= not leave_out.all()
     return r.part(~(leave_out | near_change(r)[0]))
 
 
 def near_change(r: Recording, load: Load | None = None) -> tuple[Mask, float]:
     """Find samples next to a pick or release, shape (samples,), and how near they are, s."""
-    load, within = load or r.load, NEAR
+    load, within = load or r.load, MAX_PAYLOAD_MARGIN
     if load is None or not load.times:
         return np.zeros(len(r.time), np.bool_), within
-    if len(r.time) >= LEAST:
+    if len(r.time) >= MIN_PIECE_SAMPLES:
         rates = None if r.qd is None or r.qdd is None else (r.qd, r.qdd)
-        pieces, how = tracks(r.time, r.q, np.zeros_like(r.q), rates=rates, least=LEAST)
+        pieces, how = tracks(r.time, r.q, np.zeros_like(r.q), rates=rates, least=MIN_PIECE_SAMPLES)
         if how.cutoff is not None:
-            within = min(NEAR, 4.0 / how.cutoff)
+            within = min(MAX_PAYLOAD_MARGIN, 4.0 / how.cutoff)
         elif any(piece.qd.any() for piece in pieces):
             # Not filtered from a fifth of the rate of the samples on.
-            within = min(NEAR, 20.0 * pieces[0].period)
+            within = min(MAX_PAYLOAD_MARGIN, 20.0 * pieces[0].period)
     return load.near_change(r.time, within), within
 
 
-def compared_of(r: Recording, idle: Mask, bound: float = MAX_RESIDUAL) -> Compared | None:
+def compare_part(r: Recording, idle: Mask, bound: float = MAX_RESIDUAL) -> Compared | None:
     """Filter efforts to the band of the motion, without samples whose drives are idle."""
-    part = recorded_of(r, idle)
+    part = cut_recording(r, idle)
     return None if len(part.time) < 3 else compare(part, bound)
 
 
-def idle_of(r: Recording) -> Mask:
+def find_idle(r: Recording) -> Mask:
     """Find samples with zero efforts, or constant ones at standstill, against the model."""
     assert r.effort is not None  # noqa: S101
     still = np.zeros_like(r.q)
     wrench = np.zeros((len(r.time), 6)) if r.wrench is None else r.wrench
-    needed = by_held(r, inverse_dynamics, r.time, r.q, still, still, wrench)
+    needed = evaluate_loaded(r, inverse_dynamics, r.time, r.q, still, still, wrench)
     rates = r.qd
     if rates is None:
         rates = np.gradient(r.q, r.time, axis=0) if len(r.time) > 1 else still

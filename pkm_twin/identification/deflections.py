@@ -22,26 +22,26 @@ from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.estimation import Estimate, estimate
 from pkm_twin.identification.fit import Judged, Result, refuse_faults
-from pkm_twin.identification.identifiable import above_zero
+from pkm_twin.identification.identifiable import make_nonnegative_cone
 from pkm_twin.identification.judge import Case, Suspect, Verdict, fit_and_judge
-from pkm_twin.identification.parameters import FITTED_RATIO, Group, Number, groups_of, number_of
+from pkm_twin.identification.parameters import FITTED_RATIO, Group, Number, group_elements, make_number
 from pkm_twin.identification.rows import HELD_OUT
 from pkm_twin.messages.reading import rotate_to_base
 from pkm_twin.recordings import Recording
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor.response import ElementResponse, element_response
 
-PRIOR: Final = 1.0
-"""An element's compliance may be off by all of its value."""
+COMPLIANCE_DEVIATION: Final = 1.0
+"""Prior standard deviation of an element's compliance, as a fraction of the file's value."""
 AXES: Final = ("dx", "dy", "dz", "rx", "ry", "rz")
 """Directions of a deflection, as the columns of a table call them."""
 UNITS: Final = ("m",) * 3 + ("rad",) * 3
 WRENCH: Final = ("fx", "fy", "fz", "mx", "my", "mz")
-LEAST_SAMPLES: Final = 12
-STIFFEST: Final = 0.02
-"""Least factor at which the model is made linear."""
-ALIKE: Final = 1e-3
-"""Loads whose directions, and poses whose places, differ by no more of their size are one."""
+MIN_SAMPLES: Final = 12
+MIN_FACTOR: Final = 0.02
+"""Smallest compliance factor at which the model is linearised."""
+MAX_RELATIVE_DIFFERENCE: Final = 1e-3
+"""Largest relative difference of load directions, and of poses, that count as the same."""
 MAX_STIFFNESS_RATIO: Final = 50.0
 """Largest ratio of the machine's overall stiffness to the file's, and of its inverse."""
 
@@ -66,7 +66,7 @@ class ElasticFit(Result):
 
     @property
     def units(self) -> tuple[str, ...]:
-        """Of the directions."""
+        """Units of the directions."""
         return UNITS
 
     @property
@@ -77,7 +77,7 @@ class ElasticFit(Result):
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """A recording's loads and deflections, and the model in its poses; the fitted part is first."""
+    """Loads and deflections of a recording, and the model in its poses."""
 
     name: str
     time: Array
@@ -95,8 +95,8 @@ class _Part:
         if r.wrench is None or r.deflection is None:
             raise PkmTwinError(f"{r.name}: no wrench or no deflection")
         count = int(np.isfinite(r.deflection).any(1).sum())
-        if count < LEAST_SAMPLES:
-            raise PkmTwinError(f"{r.name}: too short to fit, {count} deflections; {LEAST_SAMPLES} or more")
+        if count < MIN_SAMPLES:
+            raise PkmTwinError(f"{r.name}: too short to fit, {count} deflections; {MIN_SAMPLES} or more")
         if not r.wrench.any():
             raise PkmTwinError(f"{r.name}: no load, every wrench is zero")
         values = r.deflection[:, np.isfinite(r.deflection).any(0)]
@@ -115,7 +115,7 @@ class _Part:
 
     @cached_property
     def measured(self) -> Mask:
-        """Which directions were, (6,)."""
+        """Mask of the measured directions, (6,)."""
         return np.asarray(np.isfinite(self.deflection).any(0))
 
     @property
@@ -129,21 +129,21 @@ class _Part:
         return round((1.0 - HELD_OUT) * len(self.time))
 
     def left(self) -> float:
-        """Return the part of the variation that compliances fitted to it alone leave."""
+        """Return the fraction of the variation that compliances fitted to this recording leave."""
         count = len(self.response.names)
         try:
             found, _ = _solve([self], count)
         except (PkmTwinError, np.linalg.LinAlgError):
             return np.inf
-        factors = np.maximum(found.values[:count], STIFFEST)
-        return _part_left(self, factors, found.values[count:])
+        factors = np.maximum(found.values[:count], MIN_FACTOR)
+        return _find_unexplained_part(self, factors, found.values[count:])
 
     def moved(self, factors: Array) -> tuple[Array, Array]:
-        """Deflections by the model (k, 6), and their derivatives by the factors (k, 6, e)."""
+        """Return the model's deflections (k, 6) and their derivatives by the factors (k, 6, e)."""
         return self.response.deflection(self.wrench, factors)
 
     def rows(self, factors: Array) -> tuple[Array, Array, Array]:
-        """Of what is fitted: derivatives (k, 6, e), target and what counts, (k, 6) each."""
+        """Return derivatives (k, 6, e), target and weights, 1 or 0, (k, 6), of the fitted samples."""
         moved, slopes = (one[: self.split] for one in self.moved(factors))
         target = self.deflection[: self.split] - moved + slopes @ factors
         counts = np.isfinite(target)
@@ -180,21 +180,21 @@ def fit_elements(
     except PkmTwinError as error:
         cause, _ = _best_repair(robot, parts[0], np.inf)
         raise PkmTwinError(f"{error}" + (f" ({cause}?)" if cause else "")) from None
-    # What a bound holds at zero would be no compliance, and no file's.
-    factors = np.maximum(found.values[: len(names)], STIFFEST)
+    # A factor at its bound zero would be no valid compliance.
+    factors = np.maximum(found.values[: len(names)], MIN_FACTOR)
     zeros = found.values[len(names) :].reshape(len(parts), 6)
     verdict = _judge_fit(robot, parts, found, factors, zeros)
     if not faults:
         odd = verdict.answer == "does not explain"
         faults = _list_unexplained(robot, parts, factors, zeros, odd)
         refuse_faults(faults, accept)
-    numbers = _numbers(robot, names, factors, found, verdict)
+    numbers = _make_numbers(robot, names, factors, found, verdict)
     if all(number.status == "not excited" for number in numbers):
         raise PkmTwinError("no excitation: the loads identify no element's compliance")
     plain = found.covariance[: len(names), : len(names)]
     found = replace(found, covariance=verdict.covariance)
     own = found.covariance[: len(names), : len(names)]
-    judged = tuple(_judged(part, factors, zero, own) for part, zero in zip(parts, zeros, strict=True))
+    judged = tuple(_judge_held_out(part, factors, zero, own) for part, zero in zip(parts, zeros, strict=True))
     return ElasticFit(
         robot=robot,
         estimate=found,
@@ -202,15 +202,15 @@ def fit_elements(
         judged=judged,
         zeros=zeros,
         verdict=verdict,
-        groups=groups_of(names, factors, plain, own),
+        groups=group_elements(names, factors, plain, own),
         measured=np.array([part.measured for part in parts]),
         samples=sum(part.split for part in parts),
-        known_count=int(np.sum(np.linalg.eigvalsh(plain / PRIOR**2) < FITTED_RATIO**2)),
+        known_count=int(np.sum(np.linalg.eigvalsh(plain / COMPLIANCE_DEVIATION**2) < FITTED_RATIO**2)),
         accepted=tuple(faults),
     )
 
 
-def _numbers(
+def _make_numbers(
     robot: Robot, names: Sequence[str], factors: Array, found: Estimate, verdict: Verdict
 ) -> tuple[Number, ...]:
     """Of the elements: known by the noise alone, their deviations by the verdict too."""
@@ -222,12 +222,12 @@ def _numbers(
         plain, told = (float(before * one) for one in deviations)
         key = "element_compliance", name
         after = float(before * factor)
-        numbers.append(number_of(key, "", before, after, (plain, told), PRIOR * before))
+        numbers.append(make_number(key, "", before, after, (plain, told), COMPLIANCE_DEVIATION * before))
     return tuple(numbers)
 
 
 def _check_loads(parts: Sequence[_Part], robot: Robot) -> None:
-    """One load in one pose gives one deflection, whatever its size.
+    """Reject loads of one direction in one pose, which cannot separate the elements.
 
     :raises PkmTwinError: that is all there is.
     """
@@ -239,7 +239,10 @@ def _check_loads(parts: Sequence[_Part], robot: Robot) -> None:
     singular = np.linalg.svd(loads, compute_uv=False)
     q = np.concatenate([part.q for part in parts]) * robot.joint_scales
     apart = float(np.ptp(q, axis=0).max())
-    if singular[1:].max(initial=0.0) < ALIKE * singular[0] and apart < ALIKE * robot.size:
+    if (
+        singular[1:].max(initial=0.0) < MAX_RELATIVE_DIFFERENCE * singular[0]
+        and apart < MAX_RELATIVE_DIFFERENCE * robot.size
+    ):
         raise PkmTwinError(
             "no excitation: one load direction in one pose; use other directions or other poses to distinguish elements"
         )
@@ -260,7 +263,7 @@ def _scale_faults(parts: Sequence[_Part]) -> list[str]:
         seen, told = (v / np.where(size > 0.0, size, np.inf) for v in (seen, told))
         both, own, other = (float(np.nansum(v)) for v in (seen * told, seen**2, told**2))
         like = both / max(np.sqrt(own * other), 1e-300)
-        # Deflections that go with the loads tell a wrong scale.
+        # Only deflections that correlate with the model's can show a wrong scale.
         if abs(like) < 0.5:
             continue
         if both < 0.0:
@@ -273,7 +276,7 @@ def _scale_faults(parts: Sequence[_Part]) -> list[str]:
     return faults
 
 
-def _part_left(part: _Part, factors: Array, zero: Array) -> float:
+def _find_unexplained_part(part: _Part, factors: Array, zero: Array) -> float:
     """Return the unexplained part of the deflections' variation, beside neighbours' noise.
 
     Over all measured directions that vary by more than their noise or would by the robot's file,
@@ -302,7 +305,7 @@ def _list_unexplained(robot: Robot, parts: Sequence[_Part], factors: Array, zero
     """
     faults = []
     for part, zero in zip(parts, zeros, strict=True):
-        left = _part_left(part, factors, zero)
+        left = _find_unexplained_part(part, factors, zero)
         if left < 0.3 and not odd:
             continue
         cause, best = _best_repair(robot, part, left)
@@ -322,7 +325,7 @@ def _list_unexplained(robot: Robot, parts: Sequence[_Part], factors: Array, zero
 def _best_repair(robot: Robot, part: _Part, most: float) -> tuple[str, float]:
     """Return the fault whose repair leaves the smallest residual, and that residual."""
     cause, best = "", 0.8 * most
-    for text, other in _repairs(robot, part):
+    for text, other in _list_repairs(robot, part):
         left = other.left()
         if left < best:
             cause, best = text, left
@@ -330,21 +333,22 @@ def _best_repair(robot: Robot, part: _Part, most: float) -> tuple[str, float]:
 
 
 def _solve(parts: Sequence[_Part], count: int) -> tuple[Estimate, Array]:
-    """Of the factors and the zeros, by steps of linear least squares; and the columns of both."""
+    """Estimate factors and zeros by steps of linear least squares; return also their columns."""
     factors = np.ones(count)
-    scales = np.concatenate([np.full(count, PRIOR), *(np.maximum(part.size, 1e-12) for part in parts)])
+    scales = np.concatenate([np.full(count, COMPLIANCE_DEVIATION), *(np.maximum(part.size, 1e-12) for part in parts)])
     start = np.concatenate([factors, np.zeros(6 * len(parts))])
-    cones = [(slice(k, k + 1), above_zero(0, 1)) for k in range(count)]
+    cones = [(slice(k, k + 1), make_nonnegative_cone(0, 1)) for k in range(count)]
     for _ in range(20):
         rows = [part.rows(factors) for part in parts]
         tables = [
-            np.concatenate([slopes, _zeros(i, len(parts), counts)], -1) for i, (slopes, _, counts) in enumerate(rows)
+            np.concatenate([slopes, _make_zero_columns(i, len(parts), counts)], -1)
+            for i, (slopes, _, counts) in enumerate(rows)
         ]
         target, judged = (np.concatenate([one[k] for one in rows]) for k in (1, 2))
         table = np.concatenate(tables)
-        begin = _level(table * scales, target - table @ start, judged)
+        begin = _estimate_noise(table * scales, target - table @ start, judged)
         found = estimate(table, target, start, scales, cones, judged, begin)
-        new = np.maximum(found.values[:count], STIFFEST)
+        new = np.maximum(found.values[:count], MIN_FACTOR)
         moved = np.abs(new - factors) / np.sqrt(np.diag(found.covariance)[:count])
         factors = new
         if moved.max() < 1e-2:
@@ -355,7 +359,7 @@ def _solve(parts: Sequence[_Part], count: int) -> tuple[Estimate, Array]:
     )
 
 
-def _level(table: Array, change: Array, judged: Array) -> Array | None:
+def _estimate_noise(table: Array, change: Array, judged: Array) -> Array | None:
     """Return what all factors and zeros together leave of a change, by direction (6,).
 
     None where there are hardly more equations than those.
@@ -372,8 +376,8 @@ def _level(table: Array, change: Array, judged: Array) -> Array | None:
     return np.asarray(np.sqrt(np.sum(left**2, 0) / np.maximum(free * np.sum(judged, 0), 1.0)), np.float64)
 
 
-def _judged(part: _Part, factors: Array, zero: Array, covariance: Array) -> Judged:
-    """Judge the held-out part, without the instrument's zero."""
+def _judge_held_out(part: _Part, factors: Array, zero: Array, covariance: Array) -> Judged:
+    """Predict the held-out part, without the instrument's zero."""
     end = slice(part.split, None)
     before, _ = part.moved(np.ones(len(factors)))
     after, slopes = part.moved(factors)
@@ -396,9 +400,9 @@ def _judge_fit(robot: Robot, parts: Sequence[_Part], found: Estimate, factors: A
         moved, slopes = part.moved(factors)
         left = part.deflection - moved - zero
         counts = np.isfinite(left)
-        suspects, errors = zip(*_errors(robot, part, factors), strict=True)
+        suspects, errors = zip(*_list_errors(robot, part, factors), strict=True)
         own = np.where(counts, moved, 0.0)
-        columns = np.concatenate([slopes, _zeros(i, len(parts), np.ones_like(own))], -1)
+        columns = np.concatenate([slopes, _make_zero_columns(i, len(parts), np.ones_like(own))], -1)
         target = np.where(counts, left + columns @ change, 0.0)
         cases.append(
             Case(
@@ -409,7 +413,7 @@ def _judge_fit(robot: Robot, parts: Sequence[_Part], found: Estimate, factors: A
                 np.stack(errors, -1)[:, measured],
                 own[:, measured],
                 counts[:, measured].astype(np.float64),
-                _noise(left, own, columns.shape[-1])[measured],
+                _find_noise(left, own, columns.shape[-1])[measured],
                 1.0,
                 part.split,
             )
@@ -420,15 +424,15 @@ def _judge_fit(robot: Robot, parts: Sequence[_Part], found: Estimate, factors: A
     return replace(verdict, covariance=verdict.covariance + np.outer(off, off))
 
 
-def _zeros(recording: int, count: int, values: Array) -> Array:
+def _make_zero_columns(recording: int, count: int, values: Array) -> Array:
     """Columns of the instruments' zeros of so many recordings, at one of them, (k, 6, 6 count)."""
     columns = np.zeros((*values.shape, 6 * count))
     columns[..., 6 * recording : 6 * recording + 6] = values[..., None] * np.eye(6)
     return columns
 
 
-def _noise(left: Array, moved: Array, fitted: int) -> Array:
-    """Deviation of a deflection's noise by direction, shape (6,)."""
+def _find_noise(left: Array, moved: Array, fitted: int) -> Array:
+    """Estimate the standard deviation of the deflections' noise, (6,)."""
     result = np.zeros(6)
     for k in range(6):
         good = np.isfinite(left[:, k])
@@ -446,7 +450,7 @@ def _noise(left: Array, moved: Array, fitted: int) -> Array:
     return result
 
 
-def _errors(robot: Robot, part: _Part, factors: Array) -> Iterator[tuple[Suspect, Array]]:
+def _list_errors(robot: Robot, part: _Part, factors: Array) -> Iterator[tuple[Suspect, Array]]:
     """Errors of a machine or a recording, with the derivatives of the deflections, (k, 6)."""
     q, wrench = part.q, part.wrench
     moved, _ = part.moved(factors)
@@ -484,7 +488,7 @@ def _errors(robot: Robot, part: _Part, factors: Array) -> Iterator[tuple[Suspect
             yield pose, moved * here[:, None] * e
 
 
-def _repairs(robot: Robot, r: _Part) -> Iterator[tuple[str, _Part]]:
+def _list_repairs(robot: Robot, r: _Part) -> Iterator[tuple[str, _Part]]:
     """Faults of a recording, and the recording without each."""
     rotation = robot.rotation(robot.forward(r.q))
     back = np.swapaxes(rotation, -1, -2)

@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 from delta_dynamics import inverse_dynamics
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, PkmTwinError
-from pkm_twin.identification.compare import by_held
+from pkm_twin.identification.compare import evaluate_loaded
 from pkm_twin.identification.samples import WINDOWS, low_pass, tracks
 from pkm_twin.machine.friction import list_friction_keys
 from pkm_twin.recordings import Recording, Table
@@ -43,12 +43,12 @@ class TorqueConstants:
     values: Array
     deviations: Array
 
-    def applied(self, recorded: Recording) -> Recording:
+    def convert(self, recorded: Recording) -> Recording:
         """Convert a recording whose efforts are currents, A, to efforts."""
         return replace(recorded, effort=recorded.measured * self.values)
 
     def lines(self, robot: Robot) -> list[str]:
-        """In words, of those that were fitted."""
+        """Write a line for each fitted constant."""
         rows = zip(robot.joint_names, self.values, self.deviations, robot.effort_units, strict=True)
         return [
             f"torque constant of {joint}: {value:.4g} +- {deviation:.2g} {unit}/A, from the masses of the file"
@@ -57,8 +57,8 @@ class TorqueConstants:
         ]
 
 
-def given_constants(robot: Robot, words: str) -> TorqueConstants:
-    """Of one number, or one a joint with commas between.
+def parse_constants(robot: Robot, words: str) -> TorqueConstants:
+    """Parse one number, or one number a joint, separated by commas.
 
     :raises ParameterError: other words, or a number that is zero or not finite.
     """
@@ -72,23 +72,23 @@ def given_constants(robot: Robot, words: str) -> TorqueConstants:
     return TorqueConstants(np.broadcast_to(values, (n,)).copy(), np.zeros(n))
 
 
-def fitted_constants(robot: Robot, recordings: Sequence[Recording]) -> TorqueConstants:
-    """By the file's masses: from recordings whose efforts are currents, A.
+def fit_constants(robot: Robot, recordings: Sequence[Recording]) -> TorqueConstants:
+    """Fit torque constants to recordings of currents, A, by the masses of the file.
 
     Viscous, Coulomb and load-dependent friction and an offset of the current are free beside.
 
     :raises PkmTwinError: recordings that do not show a constant.
     """
-    values, deviations, windows = _constants(robot, recordings, None)
-    # What the next shorter window of the differentiation changes is uncertain too.
-    other, _, _ = _constants(robot, recordings, [WINDOWS[abs(WINDOWS.index(window) - 1)] for window in windows])
+    values, deviations, windows = _fit_constants(robot, recordings, None)
+    # The difference to the next shorter differentiation window counts as uncertainty.
+    other, _, _ = _fit_constants(robot, recordings, [WINDOWS[abs(WINDOWS.index(window) - 1)] for window in windows])
     return TorqueConstants(values, np.hypot(deviations, other - values))
 
 
-def _constants(
+def _fit_constants(
     robot: Robot, recordings: Sequence[Recording], windows: Sequence[int] | None
 ) -> tuple[Array, Array, list[int]]:
-    """Constants, standard deviations, and the windows of the differentiation."""
+    """Return constants, standard deviations, and the windows of the differentiation."""
     tables: list[list[Array]] = [[] for _ in robot.joint_names]
     currents: list[list[Array]] = [[] for _ in robot.joint_names]
     used = []
@@ -99,7 +99,7 @@ def _constants(
         smooth = replace(r, robot=robot.changed(friction=dict.fromkeys(list_friction_keys(), 0.0)))
         for track in pieces:
             motion = track.q, track.qd, track.qdd, track.wrench
-            load = by_held(smooth, inverse_dynamics, track.time, *motion)
+            load = evaluate_loaded(smooth, inverse_dynamics, track.time, *motion)
             way = np.sign(track.qd)
             columns = [load, track.qd, way, np.ones_like(load), np.abs(load) * way, track.effort]
             flat = low_pass(np.concatenate(columns, 1), track.period, how)
@@ -116,7 +116,7 @@ def _constants(
         inverse = np.linalg.pinv(table / scale, rcond=1e-9) / scale[:, None]
         sizes = inverse @ current
         left = current - table @ sizes
-        # Neighbouring rows are not independent: by blocks.
+        # Neighbouring rows are not independent, so the variance is estimated by blocks.
         blocks = np.array([inverse[0, part] @ left[part] for part in _split_blocks(len(left))])
         deviation = float(np.sqrt(np.sum(blocks**2)))
         if not deviation < 0.1 * abs(sizes[0]):
@@ -175,7 +175,7 @@ class DriveFriction:
 Runs = tuple[Array, Array, Array, Array | None, Array | None]
 
 
-def runs_of(table: Table, lever: float | None = None) -> Runs:
+def list_runs(table: Table, lever: float | None = None) -> Runs:
     """Torques, currents up and down, speeds and drives of a table, for :func:`drive_friction`.
 
     :param lever: travel per radian of the motor, m, for masses.
@@ -216,10 +216,10 @@ def drive_friction(
     if any(one.shape != (count,) for one in every):
         raise ParameterError("runs", count, "as many torques as currents up and down, and speeds")
     both = np.stack([load, np.ones(count)], -1)
-    if count < 3 or not np.isfinite(every).all() or not _determined(both):
+    if count < 3 or not np.isfinite(every).all() or not _is_determined(both):
         raise ParameterError("runs", count, "3 or more with finite currents, at 2 weights or more")
     middle, half = 0.5 * (rise + fall), 0.5 * (rise - fall)
-    (slope, zero), covariance = _line(both, middle)
+    (slope, zero), covariance = _solve_line(both, middle)
     if not abs(slope) > 3.0 * np.sqrt(covariance[0, 0]):
         raise ParameterError(
             "torque constant",
@@ -227,19 +227,19 @@ def drive_friction(
             "currents that grow with the weights: are the columns up and down of the same run?",
         )
     constant = 1.0 / slope
-    # A drive whose current falls with the load counts it the other way round.
+    # If the current falls with the load, the drive counts it with the opposite sign.
     friction = half * np.sign(np.mean(half))
     columns = {"viscous": rate, "load-dependent": np.abs(load * slope)}
     terms = {"Coulomb": np.ones(count)}
-    told = _determined(np.stack([terms["Coulomb"], rate], -1))
-    laws, chance = [_law(terms, friction, which, told)], np.nan
+    told = _is_determined(np.stack([terms["Coulomb"], rate], -1))
+    laws, chance = [_fit_law(terms, friction, which, told)], np.nan
     chosen = laws[0]
     while True:
         richer = []
         for name in columns.keys() - terms.keys():
             more = {**terms, name: columns[name]}
-            if count > len(more) and _determined(np.stack(list(more.values()), -1)):
-                law = _law(more, friction, which, told)
+            if count > len(more) and _is_determined(np.stack(list(more.values()), -1)):
+                law = _fit_law(more, friction, which, told)
                 # The F test of one more term.
                 freedoms, square = count - len(more), max(law.residual**2, 1e-300)
                 ratio = freedoms * (chosen.residual**2 - law.residual**2) / square
@@ -255,16 +255,16 @@ def drive_friction(
     return DriveFriction(float(abs(constant)), deviation, float(zero), tuple(laws), chosen, float(chance), told)
 
 
-def _determined(table: Array) -> bool:
-    """Whether no column is nearly a combination of the others, and there are runs enough."""
+def _is_determined(table: Array) -> bool:
+    """Return whether the runs determine all columns' coefficients."""
     norms = np.linalg.norm(table, axis=0)
     if len(table) < table.shape[1] or not norms.all():
         return False
     return bool(np.linalg.svd(table / norms, compute_uv=False)[-1] > 0.02)
 
 
-def _line(table: Array, values: Array) -> tuple[Array, Array]:
-    """Least squares: numbers, and their covariance from the residuals."""
+def _solve_line(table: Array, values: Array) -> tuple[Array, Array]:
+    """Solve least squares; return the coefficients and their covariance from the residuals."""
     found, *_ = np.linalg.lstsq(table, values, rcond=None)
     left = values - table @ found
     freedoms = max(1, len(values) - table.shape[1])
@@ -272,17 +272,17 @@ def _line(table: Array, values: Array) -> tuple[Array, Array]:
     return np.asarray(found, np.float64), np.asarray(variance * np.linalg.pinv(table.T @ table))
 
 
-def _law(terms: dict[str, Array], friction: Array, drive: Array, told: bool) -> Law:
+def _fit_law(terms: dict[str, Array], friction: Array, drive: Array, told: bool) -> Law:
     table = np.stack(list(terms.values()), -1)
-    found, covariance = _line(table, friction)
+    found, covariance = _solve_line(table, friction)
 
     def missed(groups: NDArray[Any]) -> float:
-        """Of runs that a fit without their group predicts."""
+        """Return the RMS error of runs as predicted by a fit without their group."""
         left = []
         for one in np.unique(groups):
             out = groups == one
-            if _determined(table[~out]):
-                left.append(friction[out] - table[out] @ _line(table[~out], friction[~out])[0])
+            if _is_determined(table[~out]):
+                left.append(friction[out] - table[out] @ _solve_line(table[~out], friction[~out])[0])
         return float(np.sqrt(np.mean(np.concatenate(left) ** 2))) if left else np.nan
 
     names = ["Coulomb" if told else "Coulomb or viscous", *list(terms)[1:]]

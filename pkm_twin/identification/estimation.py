@@ -73,10 +73,10 @@ def estimate(
     used = np.asarray(counts, bool)
     change = target - table @ start
     scaled = table * scales
-    size = np.sqrt(_mean(target**2, counts))
+    size = np.sqrt(_average(target**2, counts))
     # Its square, and what is divided by it, are far from the ends of the numbers.
     floor = 1e-9 * max(float(size.max()), 1e-60)
-    guess = np.sqrt(_mean(change**2, counts)) if begin is None else begin
+    guess = np.sqrt(_average(change**2, counts)) if begin is None else begin
     noise = np.maximum(guess, floor)
     weights = counts.copy()
     told: Any = None
@@ -88,7 +88,7 @@ def estimate(
         # A direction whose effect is below 1e-5 of the efforts is not identifiable.
         least = 1e-5**2 * samples * float(np.sum((size / noise) ** 2))
         # Directions that the data determine five times better than the prior are fitted.
-        told = _directions(gram, side, max(5.0**2, least))
+        told = _solve_directions(gram, side, max(5.0**2, least))
         before, z = z, told[0]
         residual = change - scaled @ z
         parts = [residual[used[:, j], j] for j in range(n)]
@@ -101,13 +101,13 @@ def estimate(
     z, values, vectors, kept = told
     noise = np.sqrt(np.sum(weights * residual**2, 0) / np.maximum(np.sum(weights, 0) - k / n, 1.0))
     noise = np.maximum(noise, floor)
-    factor = _factor(scaled, residual * weights, counts, noise, values, vectors, kept)
+    factor = _factor_covariance(scaled, residual * weights, counts, noise, values, vectors, kept)
     spread = factor @ factor.T
     fitted = start + scales * z
-    bound = beyond(fitted, cones)
+    bound = find_violations(fitted, cones)
     if bound:
-        fitted = nearest(z, factor, start, scales, cones)
-        # The bound is exact, but how far it moves the numbers beside it is an estimate.
+        fitted = find_nearest(z, factor, start, scales, cones)
+        # The change by the bound is an estimate, so it adds to the covariance.
         moved = (fitted - start) / scales - z
         spread = spread + np.outer(moved, moved)
     condition = float(np.sqrt(values[kept].max() / values[kept].min())) if kept.any() else np.inf
@@ -123,20 +123,20 @@ def estimate(
     )
 
 
-def _mean(values: Array, counts: Array) -> Array:
-    """Over the samples that count, shape (n,)."""
+def _average(values: Array, counts: Array) -> Array:
+    """Return the mean over the samples that count, (n,)."""
     return np.asarray(np.sum(values * counts, 0) / np.maximum(np.sum(counts, 0), 1.0), np.float64)
 
 
-def _directions(gram: Array, side: Array, least: float) -> tuple[Array, Array, Array, Any]:
-    """Solution in the directions whose information is above ``least``; eigenvalues, vectors."""
+def _solve_directions(gram: Array, side: Array, least: float) -> tuple[Array, Array, Array, Any]:
+    """Solve in the directions whose information exceeds ``least``; return also the eigenpairs."""
     values, vectors = np.linalg.eigh(gram)
     kept = values > max(least, 1e-13 * float(values.max(initial=0.0)))
     inverse = np.where(kept, 1.0 / np.where(kept, values, 1.0), 0.0)
     return vectors @ (inverse * (vectors.T @ side)), values, vectors, kept
 
 
-def _factor(
+def _factor_covariance(
     scaled: Array,
     residual: Array,
     counts: Array,
@@ -179,8 +179,8 @@ def _factor(
     return np.concatenate([vectors[:, kept] @ root, vectors[:, ~kept]], 1)
 
 
-def beyond(values: Array, cones: Cones) -> Bound:
-    """Columns of each cone whose matrix is not positive semidefinite, but for rounding."""
+def find_violations(values: Array, cones: Cones) -> Bound:
+    """Find the columns of each cone whose matrix is not positive semidefinite, up to rounding."""
     found = []
     for where, cone in cones:
         block = cone @ values[where]
@@ -192,12 +192,12 @@ def beyond(values: Array, cones: Cones) -> Bound:
     return tuple(found)
 
 
-def possible(values: Array, cones: Cones) -> bool:
-    """Whether every cone's matrix is positive semidefinite, but for rounding."""
-    return not beyond(values, cones)
+def is_possible(values: Array, cones: Cones) -> bool:
+    """Return whether every cone's matrix is positive semidefinite, up to rounding."""
+    return not find_violations(values, cones)
 
 
-def nearest(z: Array, factor: Array, start: Array, scales: Array, cones: Cones) -> Array:
+def find_nearest(z: Array, factor: Array, start: Array, scales: Array, cones: Cones) -> Array:
     """Return the possible parameters nearest to a solution, in its standard deviations.
 
     :param factor: of the scaled parameters' covariance, shape (k, k).
@@ -205,7 +205,7 @@ def nearest(z: Array, factor: Array, start: Array, scales: Array, cones: Cones) 
     if all(len(cone) == 1 and np.count_nonzero(cone) == 1 for _, cone in cones):
         sizes = np.linalg.norm(factor, axis=0)
         root = np.linalg.inv(factor / sizes) / sizes[:, None]
-        return _bounded(root, root @ z, start, scales, cones)
+        return _solve_bounded(root, root @ z, start, scales, cones)
     try:
         cvxpy: Any = importlib.import_module("cvxpy")
     except ImportError:
@@ -219,7 +219,7 @@ def nearest(z: Array, factor: Array, start: Array, scales: Array, cones: Cones) 
     physical = start + scales * z + moved @ unknown
     limits = []
     for where, cone in cones:
-        basis = _reached(cone, scales[where])
+        basis = _scale_basis(cone, scales[where])
         if basis.shape[1] == 1:
             row = np.einsum("ia,ijk,jb->k", basis, cone, basis)
             limits.append(row @ physical[where] >= 0.0)
@@ -235,18 +235,18 @@ def nearest(z: Array, factor: Array, start: Array, scales: Array, cones: Cones) 
         raise PkmTwinError(f"no possible masses and inertias near the data: {problem.status}")
     result = start + scales * z + moved @ np.asarray(unknown.value, np.float64)
     result[np.abs(result) < 1e-9 * scales] = 0.0
-    return _inside(result, start, cones)
+    return _move_inside(result, start, cones)
 
 
-def _reached(cone: Array, scales: Array) -> Array:
-    """Scaled basis of what the cone's matrices reach, shape (d, r)."""
+def _scale_basis(cone: Array, scales: Array) -> Array:
+    """Return a scaled basis of the rows that the cone's matrices use, (d, r)."""
     reach = np.concatenate([np.abs(cone[..., k] * scales[k]) for k in range(cone.shape[-1])], 1)
     used = reach.max(1) > 0.0
     basis = np.diag(1.0 / np.sqrt(np.where(used, reach.max(1), 1.0)))[:, used]
     return np.asarray(basis, np.float64)
 
 
-def _bounded(root: Array, aim: Array, start: Array, scales: Array, cones: Cones) -> Array:
+def _solve_bounded(root: Array, aim: Array, start: Array, scales: Array, cones: Cones) -> Array:
     from scipy.optimize import lsq_linear  # type: ignore[import-untyped]
 
     low = np.full(len(start), -np.inf)
@@ -258,10 +258,10 @@ def _bounded(root: Array, aim: Array, start: Array, scales: Array, cones: Cones)
     return np.asarray(np.maximum(start + scales * found.x, least), np.float64)
 
 
-def _inside(values: Array, start: Array, cones: Cones) -> Array:
+def _move_inside(values: Array, start: Array, cones: Cones) -> Array:
     """Move a solver's result inwards by its excess, towards the file's values."""
     for share in (0.0, 1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3):
         moved = values + share * (start - values)
-        if possible(moved, cones):
+        if is_possible(moved, cones):
             return moved
     return values

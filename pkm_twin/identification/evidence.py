@@ -24,16 +24,16 @@ import numpy as np
 import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
 
 from pkm_twin.codegen.arrays import Array, Indices, Mask
-from pkm_twin.identification.samples import EXACT
+from pkm_twin.identification.samples import MIN_RELATIVE_NOISE
 
 DISCREPANCY_RATIOS: Final = np.geomspace(1e-3, 0.5, 8)
 """Candidate ratios of the discrepancy to the measured signal, both RMS; below them is rounding."""
 BANDS: Final = 12
-"""Bands of frequency, equally wide in the logarithm, in which the spectra are taken as flat."""
-PASSED: Final = 0.8
-"""Part of the filter's band in which it takes nothing away."""
-NEGLIGIBLE: Final = 6.0
-"""Log evidence below the best ratio's at which a ratio no longer counts: one in 400."""
+"""Number of frequency bands, of equal logarithmic width, in which spectra are taken as constant."""
+FLAT_BAND: Final = 0.8
+"""Fraction of the filter's band in which its gain is one."""
+NEGLIGIBLE_LOG_WEIGHT: Final = 6.0
+"""Log evidence below the best ratio's from which a ratio is skipped: a weight of 1 in 400."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +80,7 @@ class Spectra:
         table = np.concatenate([s.certain[..., None], s.columns], -1) * s.counts[..., None]
         both = scipy.fft.dct(table, axis=0, norm="ortho")
         seen = scipy.fft.dct(s.measured * s.counts, axis=0, norm="ortho")
-        last = max(min(BANDS + 2, k), round(PASSED * s.band * k) if s.band < 1.0 else k)
+        last = max(min(BANDS + 2, k), round(FLAT_BAND * s.band * k) if s.band < 1.0 else k)
         edges = np.unique(np.geomspace(1, last, BANDS + 1).astype(int))
         edges[0] = 0
         grams, power = [], []
@@ -95,7 +95,7 @@ class Spectra:
         p = np.maximum((wide[:-2] + 2.0 * wide[1:-1] + wide[2:]) / 4.0, 1e-6 * p.max(0))
         rms = np.sqrt(np.mean(s.measured**2, 0))
         used = np.maximum(s.counts.mean(0), 1.0 / k)
-        noise = np.maximum(np.maximum(s.noise, EXACT * rms) ** 2 * used, 1e-300)
+        noise = np.maximum(np.maximum(s.noise, MIN_RELATIVE_NOISE * rms) ** 2 * used, 1e-300)
         return cls(np.stack(grams, 1), np.diff(edges).astype(float), noise[:, None], p.T)
 
     def information(self, ratio: float, gains: Array | None = None, order: Sequence[int] | None = None) -> Information:
@@ -203,7 +203,7 @@ class Model:
         """
         keys = np.arange(len(self.parts))
         if near is not None:
-            keys = keys[near > near.max() - NEGLIGIBLE]
+            keys = keys[near > near.max() - NEGLIGIBLE_LOG_WEIGHT]
         return float(np.logaddexp.reduce([self._solve(int(k), used)[0] for k in keys]))
 
     def posterior_at(self, k: int, used: Mask) -> tuple[Array, Array]:
@@ -220,7 +220,7 @@ class Model:
         logs = self.logs(used)
         weights = logs if ratios is None else ratios
         weights = np.exp(weights - weights.max())
-        weights = np.where(weights > np.exp(-NEGLIGIBLE), weights, 0.0)
+        weights = np.where(weights > np.exp(-NEGLIGIBLE_LOG_WEIGHT), weights, 0.0)
         weights /= weights.sum()
         count, d = len(self.deviation), self.deviation[used]
         means, inverses = [], []

@@ -28,17 +28,17 @@ from pkm_twin.identification.samples import tracks
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import describe_singularity_bound, position_range, reachable
 
-SHRINK: Final = 0.85
-SLOWEST: Final = 20.0
-"""How many times as fast as the lowest harmonic the highest one is at most."""
-SPEEDS: Final = (1.0, 4.0, 16.0)
-"""Of the sweeps, over the slowest; ramps may ask for less."""
-RAMP: Final = 0.1
-"""Part of a full traverse that is accelerated, at each end."""
-LENGTH: Final = 4.0 + 8.0 * RAMP
-"""Time of a sweep, up and down, by that of half a traverse."""
-STATES: Final = 200
-"""Of one sweep, at which limits are checked."""
+SHRINK_FACTOR: Final = 0.85
+MAX_HARMONIC_RATIO: Final = 20.0
+"""Largest ratio of the highest harmonic to the lowest."""
+SWEEP_SPEEDS: Final = (1.0, 4.0, 16.0)
+"""Speeds of the sweeps, as multiples of the slowest; ramps may reduce them."""
+RAMP_FRACTION: Final = 0.1
+"""Fraction of a full traverse in which a sweep accelerates, and brakes."""
+SWEEP_DURATION: Final = 4.0 + 8.0 * RAMP_FRACTION
+"""Duration of a sweep up and down, over that of half a traverse at constant speed."""
+SWEEP_STATES: Final = 200
+"""Number of states of each part of a sweep at which limits are checked."""
 
 
 @dataclass(frozen=True)
@@ -81,10 +81,12 @@ class Excitation:
 
     def at(self, time: Array) -> tuple[Array, Array, Array]:
         """Positions, rates and accelerations, shape (k, n) each."""
-        return _series(time, self.duration, self.harmonics, self.centre, np.stack([self.sines, self.cosines]))
+        return _evaluate_series(time, self.duration, self.harmonics, self.centre, np.stack([self.sines, self.cosines]))
 
 
-def _series(time: Array, duration: float, harmonics: Array, centre: Array, pair: Array) -> tuple[Array, Array, Array]:
+def _evaluate_series(
+    time: Array, duration: float, harmonics: Array, centre: Array, pair: Array
+) -> tuple[Array, Array, Array]:
     w = 2 * np.pi * harmonics / duration
     s, c = np.sin(np.outer(time, w)), np.cos(np.outer(time, w))
     a, b = pair[0].T, pair[1].T
@@ -94,7 +96,7 @@ def _series(time: Array, duration: float, harmonics: Array, centre: Array, pair:
 
 @dataclass(frozen=True, eq=False)
 class Judge:
-    """What the information of a motion is measured by: base columns of a file's parameters."""
+    """Measure of a motion's information: the regressor's independent columns, scaled."""
 
     robot: Robot
     parameters: FileParameters
@@ -104,7 +106,7 @@ class Judge:
 
     @classmethod
     def from_robot(cls, robot: Robot, parameters: FileParameters) -> Judge:
-        """By random states: which columns are independent, what makes them of one size.
+        """Choose independent columns and their scales from random states.
 
         :raises PkmTwinError: nothing of the parameters shows in any motion.
         """
@@ -123,7 +125,7 @@ class Judge:
         return cls(robot, parameters, columns, scales, weights)
 
     def singular_values(self, q: Array, qd: Array, qdd: Array) -> Array:
-        """Of the weighted, scaled regressor over the base parameters, per sample, (b,)."""
+        """Return the singular values of the scaled regressor, per root sample, (b,)."""
         table = regressor(self.robot, q, qd, qdd) @ self.parameters.mixing[:, list(self.columns)]
         table = table * self.weights[:, None] * self.scales[list(self.columns)]
         values = np.linalg.svd(table.reshape(-1, len(self.columns)), compute_uv=False)
@@ -168,9 +170,9 @@ def optimize_excitation(
     robot, keep = judge.robot, bounds or TrajectoryLimits()
     centre, reach = position_range(robot)
     reach *= keep.share
-    harmonics = _harmonics(robot, duration, terms, reach, keep)
+    harmonics = _choose_harmonics(robot, duration, terms, reach, keep)
     whole = _TimeGrid.from_harmonics(duration, harmonics)
-    basis = _resting(harmonics)
+    basis = _make_resting_basis(harmonics)
     rng = np.random.default_rng(seed)
     shape = (len(centre), basis.shape[1])
     coarse = np.linspace(0.0, duration, 120, endpoint=False)
@@ -182,9 +184,9 @@ def optimize_excitation(
         free = amount if fresh or best is None else best[1] + step * amount
         pair = np.moveaxis((free @ basis.T).reshape(shape[0], 2, -1), 1, 0)
         small = whole.scaled(robot, keep, reach, pair)
-        fitted = _clear_of(robot, keep, duration, harmonics, centre, small, coarse)
+        fitted = _shrink_until_clear(robot, keep, duration, harmonics, centre, small, coarse)
         if fitted is not None:
-            motion = _series(coarse, duration, harmonics, centre, fitted)
+            motion = _evaluate_series(coarse, duration, harmonics, centre, fitted)
             values = judge.singular_values(*motion)
             score = float(np.sum(np.log(np.maximum(values, 1e-12))))
             if best is None or score > best[0]:
@@ -196,19 +198,19 @@ def optimize_excitation(
         if progress is not None:
             progress(trial + 1)
     if best is None:
-        raise PkmTwinError(f"no trajectory found inside the limits; {_remedy(robot, keep, centre)}")
-    final = _clear_of(robot, keep, duration, harmonics, centre, best[2], whole.time, whole.margin)
+        raise PkmTwinError(f"no trajectory found inside the limits; {_describe_remedy(robot, keep, centre)}")
+    final = _shrink_until_clear(robot, keep, duration, harmonics, centre, best[2], whole.time, whole.margin)
     if final is None:
         raise PkmTwinError(
             "the best trajectory leaves the limits between the states of the trials; try another "
             "--seed or a smaller --singularity"
         )
     few = whole.time[:: -(-len(whole.time) // 2400)]
-    condition = judge.condition(*_series(few, duration, harmonics, centre, final))
+    condition = judge.condition(*_evaluate_series(few, duration, harmonics, centre, final))
     return Excitation(duration, harmonics, centre, final[0], final[1], condition)
 
 
-def _harmonics(robot: Robot, duration: float, terms: int, reach: Array, keep: TrajectoryLimits) -> Array:
+def _choose_harmonics(robot: Robot, duration: float, terms: int, reach: Array, keep: TrajectoryLimits) -> Array:
     """Different multiples of 1 / duration, up to where velocity and position limits meet."""
     # Ten points or more in a period of the highest harmonic.
     highest = keep.rate / 10.0
@@ -226,17 +228,17 @@ def _harmonics(robot: Robot, duration: float, terms: int, reach: Array, keep: Tr
         top = float(np.min(meeting, initial=min(5.0, highest)))
     most = max(terms, int(top * duration))
     # In a long trajectory the slowest harmonic would take all of the position range.
-    least = max(1, min(round(most / SLOWEST), most - terms + 1))
+    least = max(1, min(round(most / MAX_HARMONIC_RATIO), most - terms + 1))
     return np.unique(np.round(np.linspace(least, most, terms))).astype(np.float64)
 
 
-def _resting(harmonics: Array) -> Array:
+def _make_resting_basis(harmonics: Array) -> Array:
     """Basis of sines and cosines of no velocity and acceleration at the ends, (2 h, 2 h - 2)."""
     h = len(harmonics)
     rows = np.zeros((2, 2 * h))
     rows[0, :h], rows[1, h:] = harmonics, harmonics**2
     rows /= np.linalg.norm(rows, axis=1, keepdims=True)
-    # High harmonics begin small: they are what velocity limits bind first.
+    # High harmonics start small, because velocity limits restrict them first.
     damped = np.concatenate([1.0 / harmonics, 1.0 / harmonics])
     basis = damped[:, None] * np.linalg.svd(rows)[2][2:].T
     return np.asarray(basis - rows.T @ (rows @ basis), np.float64)
@@ -244,7 +246,7 @@ def _resting(harmonics: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _TimeGrid:
-    """States between which no joint leaves its limits.
+    """Time grid dense enough that limits kept at its points hold between them too.
 
     ``margin``: what a trigonometric polynomial reaches at its samples is at least this part of what
     it reaches between them (Ehlich, Zeller, 1964, doi:10.1007/BF01111276).
@@ -261,7 +263,7 @@ class _TimeGrid:
         count = max(1200, 20 * round(float(harmonics[-1])))
         time = np.asarray(np.arange(count) * (duration / count), np.float64)
         eye = np.eye(2 * len(harmonics)).reshape(-1, 2, len(harmonics))
-        q, qd, qdd = _series(time, duration, harmonics, np.zeros(len(eye)), np.moveaxis(eye, 1, 0))
+        q, qd, qdd = _evaluate_series(time, duration, harmonics, np.zeros(len(eye)), np.moveaxis(eye, 1, 0))
         return cls(time, float(np.cos(np.pi * harmonics[-1] / count)), (q, qd, qdd))
 
     def scaled(self, robot: Robot, keep: TrajectoryLimits, reach: Array, pair: Array) -> Array:
@@ -276,7 +278,7 @@ class _TimeGrid:
         return np.asarray(pair / np.max(use, 0, initial=1e-300)[:, None], np.float64)
 
 
-def _clear_of(
+def _shrink_until_clear(
     robot: Robot,
     keep: TrajectoryLimits,
     duration: float,
@@ -289,14 +291,16 @@ def _clear_of(
     """Shrink the series until it keeps clear of everything; None where it never does."""
     for _ in range(20):
         blocks = (time[k : k + 4096] for k in range(0, len(time), 4096))
-        if all(clear(robot, keep, *_series(some, duration, harmonics, centre, pair), margin) for some in blocks):
+        if all(
+            is_clear(robot, keep, *_evaluate_series(some, duration, harmonics, centre, pair), margin) for some in blocks
+        ):
             return pair
-        pair = SHRINK * pair
+        pair = SHRINK_FACTOR * pair
     return None
 
 
-def clear(robot: Robot, keep: TrajectoryLimits, q: Array, qd: Array, qdd: Array, margin: float) -> bool:
-    """Assembly, singularity index, workspace and efforts.
+def is_clear(robot: Robot, keep: TrajectoryLimits, q: Array, qd: Array, qdd: Array, margin: float) -> bool:
+    """Return whether states are within the limits: assembly, singularity, workspace and efforts.
 
     :param margin: part of the effort limits up to which these states may go.
     """
@@ -312,7 +316,7 @@ def clear(robot: Robot, keep: TrajectoryLimits, q: Array, qd: Array, qdd: Array,
     return bool((np.abs(efforts) <= margin * keep.share * robot.limits.effort).all())
 
 
-def _remedy(robot: Robot, keep: TrajectoryLimits, centre: Array) -> str:
+def _describe_remedy(robot: Robot, keep: TrajectoryLimits, centre: Array) -> str:
     """Return what would let joints move about their centre (n,): the bound of the index, or limits.
 
     Motions shrink towards the centre, so that its index decides.
@@ -343,11 +347,11 @@ class Sweeps:
     @property
     def lengths(self) -> Array:
         """Durations from the centre to one end and back, s, shape (n, speeds)."""
-        return np.asarray(0.5 * LENGTH * self.reach[:, None] / self.speeds)
+        return np.asarray(0.5 * SWEEP_DURATION * self.reach[:, None] / self.speeds)
 
     @property
     def duration(self) -> float:
-        """Of all sweeps, s."""
+        """Duration of all sweeps, s."""
         return 2.0 * float(self.lengths.sum())
 
     def at(self, time: Array) -> tuple[Array, Array, Array]:
@@ -359,16 +363,18 @@ class Sweeps:
         for way, (k, j) in product((1.0, -1.0), np.ndindex(self.speeds.T.shape)):
             length = float(self.lengths[j, k])
             inside = (time >= start) & (time <= start + length)
-            place, rate, change = way * _sweep(time[inside] - start, float(self.reach[j]), float(self.speeds[j, k]))
+            place, rate, change = way * _evaluate_sweep(
+                time[inside] - start, float(self.reach[j]), float(self.speeds[j, k])
+            )
             q[inside, j] = self.centre[j] + place
             qd[inside, j], qdd[inside, j] = rate, change
             start += length
         return q, qd, qdd
 
 
-def _sweep(time: Array, reach: float, speed: float) -> Array:
+def _evaluate_sweep(time: Array, reach: float, speed: float) -> Array:
     """Position, rate and acceleration, (3, k), from the centre up and back, at rest in between."""
-    ramp = RAMP * 2.0 * reach / speed
+    ramp = RAMP_FRACTION * 2.0 * reach / speed
     whole, wave = reach / speed + ramp, np.pi / ramp
     result = np.zeros((3, len(time)))
     for begin, place, way in ((0.0, 0.0, 1.0), (whole, reach, -1.0)):
@@ -384,8 +390,8 @@ def _sweep(time: Array, reach: float, speed: float) -> Array:
     return result
 
 
-def sweeps(judge: Judge, duration: float, bounds: TrajectoryLimits | None = None) -> Sweeps:
-    """Sweeps inside all limits.
+def design_sweeps(judge: Judge, duration: float, bounds: TrajectoryLimits | None = None) -> Sweeps:
+    """Design sweeps of single joints within all limits.
 
     :param duration: s; longer where limits of velocity or acceleration, or ramps, ask for it.
     :raises PkmTwinError: a joint that cannot move alone.
@@ -393,10 +399,10 @@ def sweeps(judge: Judge, duration: float, bounds: TrajectoryLimits | None = None
     robot, keep = judge.robot, bounds or TrajectoryLimits()
     centre, reach = position_range(robot)
     reach *= keep.share
-    n, ratios = len(centre), np.array(SPEEDS)
+    n, ratios = len(centre), np.array(SWEEP_SPEEDS)
     limits = robot.limits.velocity
     most = np.full(n, np.inf) if limits is None else keep.share * np.broadcast_to(limits, n)
-    lengths = LENGTH * np.sum(1.0 / ratios) * n / duration
+    lengths = SWEEP_DURATION * np.sum(1.0 / ratios) * n / duration
 
     def speeds(j: int) -> Array:
         """By the duration, and the limits of the fastest sweep."""
@@ -404,26 +410,26 @@ def sweeps(judge: Judge, duration: float, bounds: TrajectoryLimits | None = None
         if keep.acceleration is not None:
             # A ramp of half a cosine has pi / 2 of its mean acceleration.
             change = keep.share * keep.acceleration
-            fastest = min(fastest, np.sqrt(4.0 * RAMP * reach[j] * change / np.pi))
+            fastest = min(fastest, np.sqrt(4.0 * RAMP_FRACTION * reach[j] * change / np.pi))
         slowest = min(lengths * reach[j], fastest / ratios[-1])
         # A ramp has ten points or more: a faster one is a step of the written positions.
-        return np.asarray(np.minimum(slowest * ratios, 2.0 * RAMP * reach[j] * keep.rate / 10.0))
+        return np.asarray(np.minimum(slowest * ratios, 2.0 * RAMP_FRACTION * reach[j] * keep.rate / 10.0))
 
     for j in range(n):
         for _ in range(30):
             alone = Sweeps(centre[j : j + 1], reach[j : j + 1], speeds(j)[None])
             ends = np.append(0.0, np.cumsum(np.tile(alone.lengths, 2)))
-            time = np.concatenate([np.linspace(*pair, STATES) for pair in pairwise(ends)])
+            time = np.concatenate([np.linspace(*pair, SWEEP_STATES) for pair in pairwise(ends)])
             q = np.tile(centre, (len(time), 1))
             qd, qdd = np.zeros_like(q), np.zeros_like(q)
             q[:, j], qd[:, j], qdd[:, j] = (one[:, 0] for one in alone.at(time))
-            if clear(robot, keep, q, qd, qdd, 1.0):
+            if is_clear(robot, keep, q, qd, qdd, 1.0):
                 break
-            reach[j] *= SHRINK
+            reach[j] *= SHRINK_FACTOR
         else:
             raise PkmTwinError(
-                f"{robot.joint_names[j]} cannot move alone inside the limits; {_remedy(robot, keep, centre)}"
+                f"{robot.joint_names[j]} cannot move alone inside the limits; {_describe_remedy(robot, keep, centre)}"
             )
     found = Sweeps(centre, reach, np.array([speeds(j) for j in range(n)]))
-    motion = found.at(np.linspace(0.0, found.duration, 3 * n * STATES))
+    motion = found.at(np.linspace(0.0, found.duration, 3 * n * SWEEP_STATES))
     return Sweeps(centre, reach, found.speeds, judge.condition(*motion))

@@ -14,27 +14,27 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError
-from pkm_twin.identification.compare import MAX_RESIDUAL, PASSES
-from pkm_twin.identification.estimation import Estimate, beyond, nearest
+from pkm_twin.identification.compare import MAX_DELAY_PASSES, MAX_RESIDUAL
+from pkm_twin.identification.estimation import Estimate, find_nearest, find_violations
 from pkm_twin.identification.hypotheses import Explanation, explain
 from pkm_twin.identification.identifiable import KINDS, Kind
-from pkm_twin.identification.judge import Verdict, basis_of
+from pkm_twin.identification.judge import Verdict, make_basis
 from pkm_twin.identification.parameters import (
     Number,
     Status,
-    numbers_of_group,
+    make_group_numbers,
 )
 from pkm_twin.identification.rows import Problem, Rows
-from pkm_twin.identification.samples import EXACT, Filtering
-from pkm_twin.identification.suspects import verdict_of
-from pkm_twin.identification.words import LATEST, late_text
+from pkm_twin.identification.samples import MIN_RELATIVE_NOISE, Filtering
+from pkm_twin.identification.suspects import judge_problem
+from pkm_twin.identification.words import MAX_DELAY, late_text
 from pkm_twin.recordings import Recording
 from pkm_twin.robot.robot import Robot
 
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """What was held out of a recording: ``time`` (k,), s; measured, before and after (k, n).
+    """Held-out samples of a recording: ``time`` (k,), s; efforts measured, before and after, (k, n).
 
     Efforts that are late against the positions are on time here, as in ``check``.
 
@@ -49,7 +49,7 @@ class Judged:
     deviation: Array
 
     def rms(self, which: Array) -> Array:
-        """Of measured less predicted, shape (n,)."""
+        """Return the RMS of measured less predicted efforts, (n,)."""
         return np.asarray(np.sqrt(np.mean((self.measured - which) ** 2, 0)), np.float64)
 
 
@@ -77,7 +77,7 @@ class Result:
 
     @property
     def units(self) -> tuple[str, ...]:
-        """Of the channels."""
+        """Units of the channels."""
         return self.robot.effort_units
 
     @property
@@ -102,7 +102,7 @@ class Fit(Result):
 
     @property
     def filtering(self) -> tuple[Filtering, ...]:
-        """Of the recordings."""
+        """Filtering of each recording."""
         return tuple(made.how for made in self.problem.whole)
 
     @property
@@ -112,7 +112,7 @@ class Fit(Result):
 
     @property
     def outliers(self) -> int:
-        """Efforts that were replaced."""
+        """Number of efforts that were replaced as outliers."""
         return sum(made.outliers for made in self.problem.whole)
 
 
@@ -141,19 +141,19 @@ def fit(
     names = [made.recording.name for made in problem.whole]
     faults = [f"{name}: {one.cause}" for name, one in zip(names, why, strict=True) if one.fault]
     if not faults:
-        # Of another machine's recording the delay says nothing.
-        problem = on_time(problem)
+        # The delay of another machine's recording has no meaning.
+        problem = correct_delays(problem)
         faults = [
             f"{made.recording.name}: {late_text('all joints', late)}"
             for made, late in zip(problem.whole, delays(problem), strict=True)
             # A delay that was not corrected for is too uncertain to be a fault.
-            if abs(late) > LATEST and made.recording.late
+            if abs(late) > MAX_DELAY and made.recording.late
         ]
     refuse_faults(faults, accept)
     problem.check_count()
-    faults = faults or _worse(problem)
+    faults = faults or _list_worse(problem)
     refuse_faults(faults, accept)
-    return fitted(problem, tuple(faults))
+    return solve_and_judge(problem, tuple(faults))
 
 
 def delays(problem: Problem) -> tuple[float, ...]:
@@ -162,19 +162,21 @@ def delays(problem: Problem) -> tuple[float, ...]:
     return tuple(made.recording.late + late for made, late in pairs)
 
 
-def on_time(problem: Problem) -> Problem:
-    """Put late efforts on time, where that leaves less of them unexplained.
+def correct_delays(problem: Problem) -> Problem:
+    """Correct the efforts' delays, if that reduces the residual.
 
     Its delays are to the first order, good for a sample or so.
     """
-    found = [_searched(made, late, problem.both.noise) for made, late in zip(problem.rows, problem.delays, strict=True)]
-    for _ in range(PASSES):
+    found = [
+        _search_delay(made, late, problem.both.noise) for made, late in zip(problem.rows, problem.delays, strict=True)
+    ]
+    for _ in range(MAX_DELAY_PASSES):
         moved = [
             made.recording.on_time(late) if abs(late) > made.period else made.recording
             for made, late in zip(problem.whole, found, strict=True)
         ]
         if not any(
-            now is not made.recording and abs(now.late) < 2.0 * LATEST
+            now is not made.recording and abs(now.late) < 2.0 * MAX_DELAY
             for now, made in zip(moved, problem.whole, strict=True)
         ):
             break
@@ -188,17 +190,17 @@ def on_time(problem: Problem) -> Problem:
     return problem
 
 
-def _searched(rows: Rows, late: float, noise: Array) -> float:
-    """How late efforts are, s: as was found to the first order, or where they leave least.
+def _search_delay(rows: Rows, late: float, noise: Array) -> float:
+    """Return the delay of efforts, s: the first-order estimate, or that of the least residual.
 
     :param noise: of the efforts, (n,).
     """
     period, count = rows.period * rows.how.keep_every, len(rows.time)
-    most = min(int(2.0 * LATEST / period), count // 4)
+    most = min(int(2.0 * MAX_DELAY / period), count // 4)
     inner = slice(most, count - most)
     weight = rows.counts[inner] / noise
     table = rows.table[inner] * weight[..., None]
-    basis = basis_of(table.reshape(-1, table.shape[-1]))
+    basis = make_basis(table.reshape(-1, table.shape[-1]))
     left = []
     for step in range(2 * most + 1):
         target = rows.effort[step : count - 2 * most + step] - rows.rest[inner]
@@ -208,23 +210,23 @@ def _searched(rows: Rows, late: float, noise: Array) -> float:
     return far if abs(far - late) > period else late
 
 
-def fitted(problem: Problem, accepted: tuple[str, ...] = ()) -> Fit:
+def solve_and_judge(problem: Problem, accepted: tuple[str, ...] = ()) -> Fit:
     """Solve a problem and judge the solution.
 
     :param accepted: why the machine cannot have made the recordings, although they are fitted.
     :raises PkmTwinError: recordings that show nothing.
     """
-    parameters, verdict = problem.parameters, verdict_of(problem)
+    parameters, verdict = problem.parameters, judge_problem(problem)
     if accepted:
         verdict = replace(verdict, answer="does not explain")
     # The posterior's numbers, or the nearest that a machine can have.
     start, cones, first = parameters.values, parameters.cones, problem.estimate
     aim, wide = start + verdict.change, verdict.covariance
-    bound, near = beyond(aim, cones), aim
+    bound, near = find_violations(aim, cones), aim
     if bound:
         sizes, vectors = np.linalg.eigh(verdict.plain / np.outer(first.prior, first.prior))
         factor = vectors * np.sqrt(np.maximum(sizes, 1e-12 * sizes.max()))
-        near = nearest((aim - start) / first.prior, factor, start, first.prior, cones)
+        near = find_nearest((aim - start) / first.prior, factor, start, first.prior, cones)
         # How far a bound moves the numbers next to it is an estimate.
         wide = wide + np.outer(near - aim, near - aim)
     best = replace(first, values=near, covariance=wide, bound=bound)
@@ -232,7 +234,7 @@ def fitted(problem: Problem, accepted: tuple[str, ...] = ()) -> Fit:
     numbers: list[Number] = []
     for group, k in zip(parameters.groups, parameters.slices, strict=True):
         both = verdict.plain[k, k], told[k, k]
-        numbers += numbers_of_group(group, best.values[k], best.prior[k], both)
+        numbers += make_group_numbers(group, best.values[k], best.prior[k], both)
     if all(n.status == "not excited" for n in numbers):
         raise PkmTwinError(
             f"no excitation: the motion does not identify {', '.join(problem.what)}; pkm-twin "
@@ -255,7 +257,7 @@ def fitted(problem: Problem, accepted: tuple[str, ...] = ()) -> Fit:
     )
 
 
-def _worse(problem: Problem) -> list[str]:
+def _list_worse(problem: Problem) -> list[str]:
     """List recordings whose held-out part the fitted values predict worse than the file's.
 
     Where the file's explain it, the fitted follow noise: the machine is not at fault.
@@ -265,7 +267,7 @@ def _worse(problem: Problem) -> list[str]:
     for end in problem.held_out:
         old, new = (np.sqrt(np.mean(end.counts * (end.target - end.table @ v) ** 2, 0)) for v in values)
         j = int(np.argmax(new / np.maximum(old, 1e-300)))
-        if new[j] > 1.2 * old[j] and new[j] > EXACT * np.std(end.effort[:, j]):
+        if new[j] > 1.2 * old[j] and new[j] > MIN_RELATIVE_NOISE * np.std(end.effort[:, j]):
             why = "another machine, or a motion that is too short or changes?"
             if (old <= MAX_RESIDUAL * np.abs(end.effort).max(0)).all():
                 why = (

@@ -18,15 +18,15 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import BagError, ParameterError, PkmTwinError, UnknownNameError
-from pkm_twin.identification.compare import missing_samples, recorded_of
-from pkm_twin.identification.drives import FIT, fitted_constants, given_constants
-from pkm_twin.identification.fit import Fit, fit, fitted, on_time, refuse_faults
+from pkm_twin.identification.compare import cut_recording, missing_samples
+from pkm_twin.identification.drives import FIT, fit_constants, parse_constants
+from pkm_twin.identification.fit import Fit, correct_delays, fit, refuse_faults, solve_and_judge
 from pkm_twin.identification.hypotheses import Explanation, describe_positions, explain_recording
-from pkm_twin.identification.identifiable import KINDS, LOAD, Kind, of_drives
-from pkm_twin.identification.judge import SIGMAS, Verdict, basis_of
+from pkm_twin.identification.identifiable import KINDS, PAYLOAD, Kind, list_drive_parameters
+from pkm_twin.identification.judge import SIGMAS, Verdict, make_basis
 from pkm_twin.identification.parameters import Number, file_parameters
 from pkm_twin.identification.rows import Problem
-from pkm_twin.identification.samples import EXACT, filtered
+from pkm_twin.identification.samples import MIN_RELATIVE_NOISE, filtered
 from pkm_twin.identification.suspects import LINE
 from pkm_twin.machine.friction import BASIC, KNOWN_FRACTION, LAWS, Dahl, select_compiled_laws
 from pkm_twin.recordings import Recording
@@ -34,12 +34,12 @@ from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.steps import find_sampling
 
 AUTO: Final = "auto"
-SPEEDS: Final = np.geomspace(0.01, 1.0, 17)
-"""Stribeck speeds that are tried, over the rms speed."""
-PARTS: Final = np.geomspace(1e-4, 0.1, 24)
-"""Presliding distances that are tried, over the travel."""
-WORSE: Final = 1.02
-"""Held-out residual of a joint over that without a law, from which the law is not the joint's."""
+STRIBECK_SPEEDS: Final = np.geomspace(0.01, 1.0, 17)
+"""Candidate Stribeck speeds, as multiples of the RMS speed."""
+PRESLIDING_DISTANCES: Final = np.geomspace(1e-4, 0.1, 24)
+"""Candidate presliding distances, as fractions of the travel."""
+MAX_RESIDUAL_RATIO: Final = 1.02
+"""Largest ratio of a joint's held-out residual with a law to that without at which it is taken."""
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class Choice:
 
 @dataclass(frozen=True)
 class Searched:
-    """A parameter that efforts are not linear in, with its standard deviation, (n,) each.
+    """A nonlinear parameter of a friction law, with its standard deviation, (n,) each.
 
     ``others``: the standard deviations that it causes in the law's other parameters, by key, (n,).
     The phase of a cogging, for example, follows its period at the far end of the travel.
@@ -82,8 +82,8 @@ class Searched:
     others: dict[str, Array]
 
 
-def laws_of(words: str) -> tuple[str, ...] | None:
-    """Names of laws with commas between; None: whatever the recordings say.
+def parse_laws(words: str) -> tuple[str, ...] | None:
+    """Parse the names of friction laws, separated by commas; None: the recordings decide.
 
     :raises UnknownNameError: another word.
     """
@@ -115,19 +115,19 @@ def fit_with_laws(
     if Dahl.name in asked:
         # Without memory slow reversals would be another machine's: faults are looked for with it.
         asked.remove(Dahl.name)
-        best = fit(_remembering(robot, recordings, what), recordings, what, **options)
+        best = fit(_add_hysteresis(robot, recordings, what), recordings, what, **options)
         before = Problem.from_recordings(robot, [made.recording for made in best.problem.whole], what)
         choice = _compare_fits(Dahl.name, best.verdict, before, best.problem)
         choices.append(replace(choice, taken=True, asked=True))
     else:
         best = fit(robot, recordings, what, **options)
     recordings = [made.recording for made in best.problem.whole]
-    while asked if laws is not None else _unexplained(best):
+    while asked if laws is not None else _is_unexplained(best):
         names = asked[:1] or [one for one in select_compiled_laws(tuple(LAWS)) if one not in best.robot.laws]
         tried = []
         for name in names:
             try:
-                found, opened = _opened(best.problem, name)
+                found, opened = _add_law(best.problem, name)
                 one = Problem.from_recordings(opened, recordings, what, passes=1)
                 one.check_count()
             except PkmTwinError:
@@ -146,13 +146,13 @@ def fit_with_laws(
             break
         problem = Problem.from_recordings(opened, recordings, what)
         problem.check_count()
-        result = fitted(problem, best.accepted)
-        more += _searched(best.robot, result, choice.law, found)
-        # What the uncertainty of the searched parameters adds to that of the others.
+        result = solve_and_judge(problem, best.accepted)
+        more += _list_numbers(best.robot, result, choice.law, found)
+        # The uncertainty of the nonlinear parameters adds to that of the linear ones.
         for searched in found.values():
             for word, values in searched.others.items():
                 own_keys = [n.key for n in result.numbers if word in n.key]
-                wider |= {key: float(values[_joint_of(result.robot, key)]) for key in own_keys}
+                wider |= {key: float(values[_find_joint(result.robot, key)]) for key in own_keys}
         own = (replace(n, deviation=float(np.hypot(n.deviation, wider.get(n.key, 0.0)))) for n in result.numbers)
         best = replace(result, numbers=(*own, *more))
     file = {
@@ -203,10 +203,10 @@ def fit_recordings(
         seen = robot
         if "friction" in what and Dahl.name in (laws or ()):
             # Friction hysteresis changes the efforts after reversals, which would look like a payload.
-            seen = _remembering(robot, [recorded_of(r) for r in recordings], what)
+            seen = _add_hysteresis(robot, [cut_recording(r) for r in recordings], what)
         found = [explain_recording(seen, r) for r in recordings]
     rows = [one.rows for one in found if one.rows is not None]
-    made = [one.recording for one in rows] or [recorded_of(r) for r in recordings]
+    made = [one.recording for one in rows] or [cut_recording(r) for r in recordings]
     explained = list(found)
     for k, one in enumerate(found):
         if one.steps and not one.fault:
@@ -231,7 +231,7 @@ def fit_recordings(
         made = [r if r.load is None else replace(r, load=replace(r.load, sought=True)) for r in made]
     if constant is not None:
         if constant != FIT:
-            constants = given_constants(robot, constant)
+            constants = parse_constants(robot, constant)
         elif {"payload", "inertia"} & set(what):
             raise ParameterError(
                 "--torque-constant",
@@ -239,16 +239,16 @@ def fit_recordings(
                 "--what friction,rotor: the masses of the file are its scale",
             )
         else:
-            constants = fitted_constants(robot, made)
-        made, notes = [constants.applied(r) for r in made], constants.lines(robot) + notes
+            constants = fit_constants(robot, made)
+        made, notes = [constants.convert(r) for r in made], constants.lines(robot) + notes
     options = {"accept": accept, "progress": progress, "explained": explained, "known": rows}
     result, choices = fit_with_laws(robot, made, what, laws, **options)
     result = replace(result, explained=tuple(found))
-    return result if robot is file else _beside(file, result), choices, notes
+    return result if robot is file else _compare_with_file(file, result), choices, notes
 
 
-def _beside(file: Robot, result: Fit) -> Fit:
-    """Compare a fit that started with another payload with a fit from the file's."""
+def _compare_with_file(file: Robot, result: Fit) -> Fit:
+    """Convert a fit that started from a recording's payload to one from the file's payload."""
     problem = result.problem
     own = file_parameters(replace(problem.robot, payload=file.payload), problem.what)
     change = own.values - problem.parameters.values
@@ -256,16 +256,16 @@ def _beside(file: Robot, result: Fit) -> Fit:
     judged = tuple(replace(one, before=one.before + end.table @ change) for one, end in each)
     numbers = list[Number]()
     for n in result.numbers:
-        if n.key[0] == LOAD and n.before != file.number(n.name):
-            # What is not excited is the start's, which the file gets with the rest.
+        if n.key[0] == PAYLOAD and n.before != file.number(n.name):
+            # Numbers that are not excited keep the start's values, which the file receives as well.
             status = "combination" if n.status == "not excited" else n.status
             n = replace(n, before=file.number(n.name), status=status)
         numbers.append(n)
     return replace(result, numbers=tuple(numbers), judged=judged)
 
 
-def _unexplained(result: Fit) -> bool:
-    """Whether another law may be what is missing; never of recordings that cannot be its."""
+def _is_unexplained(result: Fit) -> bool:
+    """Return whether another friction law may explain the rest; False after accepted faults."""
     if result.accepted:
         return False
     verdict = result.verdict
@@ -274,11 +274,11 @@ def _unexplained(result: Fit) -> bool:
 
 
 def _compare_fits(name: str, verdict: Verdict, before: Problem, after: Problem) -> Choice:
-    """Two fits by what was held out, over the noise of a verdict."""
+    """Compare the held-out residuals of two fits, over the noise of a verdict."""
     band = np.array([max(channel.noise, 1e-300) for channel in verdict.channels])
     parts = []
     for end, other in zip(before.held_out, after.held_out, strict=True):
-        noise = np.maximum(end.signals.noise, EXACT * np.sqrt(np.mean(end.effort**2, 0)))
+        noise = np.maximum(end.signals.noise, MIN_RELATIVE_NOISE * np.sqrt(np.mean(end.effort**2, 0)))
         old, new = (
             rows.target - rows.table @ problem.estimate.values for rows, problem in ((end, before), (other, after))
         )
@@ -289,43 +289,43 @@ def _compare_fits(name: str, verdict: Verdict, before: Problem, after: Problem) 
     count = sum(one.size for one, *_ in parts)
     before_rms, after_rms = np.sqrt(sums[:2].sum(-1) / count)
     sigmas = sums[2].sum() / np.sqrt(max(sums[3].sum(), 1e-300))
-    no_joint_worse = (sums[1] <= WORSE**2 * sums[0]).all()
+    no_joint_worse = (sums[1] <= MAX_RESIDUAL_RATIO**2 * sums[0]).all()
     good = sigmas > SIGMAS and after_rms < before_rms and no_joint_worse
     return Choice(name, bool(good), float(before_rms), float(after_rms), float(sigmas))
 
 
-def _remembering(robot: Robot, recordings: Sequence[Recording], what: Sequence[Kind]) -> Robot:
+def _add_hysteresis(robot: Robot, recordings: Sequence[Recording], what: Sequence[Kind]) -> Robot:
     """Return the robot with Dahl's law, near what the recordings show of its distance.
 
     :raises PkmTwinError: their motion does not show it.
     """
-    static = on_time(Problem.from_recordings(robot, recordings, what))
+    static = correct_delays(Problem.from_recordings(robot, recordings, what))
     recordings = [rows.recording for rows in static.whole]
-    rough = _changed(robot, _Search(static, Dahl.name).found())
-    # Without a memory efforts near reversals are taken for outliers, and for noise.
+    rough = _set_values(robot, _Search(static, Dahl.name).found())
+    # Without hysteresis efforts near reversals count as outliers and noise, so search again with it.
     again = Problem.from_recordings(rough, recordings, static.what)
-    found = _changed(robot, _Search(again, Dahl.name).found(judged=True))
+    found = _set_values(robot, _Search(again, Dahl.name).found(judged=True))
     return replace(found, open_laws=(*robot.open_laws, Dahl.name))
 
 
-def _changed(robot: Robot, found: dict[str, Searched]) -> Robot:
-    """Return the robot with what was found."""
+def _set_values(robot: Robot, found: dict[str, Searched]) -> Robot:
+    """Return the robot with the values found."""
     return robot.changed(friction={key: one.value.tolist() for key, one in found.items()})
 
 
-def _opened(before: Problem, name: str) -> tuple[dict[str, Searched], Robot]:
+def _add_law(before: Problem, name: str) -> tuple[dict[str, Searched], Robot]:
     """Add one law to the robot, with its nonlinear parameters as found.
 
     :raises PkmTwinError: the motion does not show it.
     """
     robot = before.robot
     found = _Search(before, name).found()
-    robot = _changed(robot, found) if found else robot
+    robot = _set_values(robot, found) if found else robot
     return found, replace(robot, open_laws=(*robot.open_laws, name))
 
 
-def _searched(robot: Robot, result: Fit, name: str, found: dict[str, Searched]) -> list[Number]:
-    """Write what was found of a law's nonlinear parameters as numbers of the file.
+def _list_numbers(robot: Robot, result: Fit, name: str, found: dict[str, Searched]) -> list[Number]:
+    """Return a law's nonlinear parameters as numbers of the file.
 
     :param robot: before.
     """
@@ -335,7 +335,7 @@ def _searched(robot: Robot, result: Fit, name: str, found: dict[str, Searched]) 
         value, deviation = one.value, one.deviation
         for number in (n for n in result.numbers if first in n.key):
             path = tuple(key if part == first else part for part in number.key)
-            k = _joint_of(result.robot, number.key)
+            k = _find_joint(result.robot, number.key)
             unit = law.parameters[key].in_units(slides=robot.joint_units[k] == "m")
             old = float(np.asarray(getattr(robot.friction, key))[k])
             if result.verdict.deviations == "withheld":
@@ -344,9 +344,9 @@ def _searched(robot: Robot, result: Fit, name: str, found: dict[str, Searched]) 
     return more
 
 
-def _joint_of(robot: Robot, key: tuple[str | int, ...]) -> int:
+def _find_joint(robot: Robot, key: tuple[str | int, ...]) -> int:
     """Return the actuated joint of a number of friction: by its group, in order."""
-    groups = [g for g in of_drives(robot) if g.kind == "friction"]
+    groups = [g for g in list_drive_parameters(robot) if g.kind == "friction"]
     for group in groups:
         if key in group.keys(group.values):
             joint = group.names[0].rpartition(".")[0]
@@ -355,7 +355,7 @@ def _joint_of(robot: Robot, key: tuple[str | int, ...]) -> int:
 
 
 class _Search:
-    """The parameters of a law that efforts are not linear in, by the residual of a fit without."""
+    """Search of a law's nonlinear parameters in the residual of a fit without the law."""
 
     def __init__(self, before: Problem, name: str) -> None:
         self.robot, self.law = before.robot, LAWS[name]
@@ -367,7 +367,7 @@ class _Search:
         counts = np.concatenate([some.counts for some in parts])
         if self.law.memory:
             # Hysteresis shows after reversals; samples whose friction state is unknown are left out.
-            most = PARTS[-1] * self._travel
+            most = PRESLIDING_DISTANCES[-1] * self._travel
             unknown = self._filtered(lambda q, rates: Dahl.states(q, rates, most).unknown)
             counts = (unknown < KNOWN_FRACTION).astype(np.float64)
         noise = [np.broadcast_to(some.signals.noise, some.target.shape) for some in parts]
@@ -379,13 +379,13 @@ class _Search:
             own = before.columns[:, j] * self._weight[:, j, None]
             if self.law.memory:
                 own = np.delete(own, before.parameters.names.index(f"{joint}.coulomb"), -1)
-            self._basic.append(basis_of(own))
+            self._basic.append(make_basis(own))
         cutoffs = [rows.how.cutoff for rows in self._rows if rows.how.cutoff is not None]
         fastest = self._travel * min(cutoffs, default=np.inf) / np.maximum(self._speed, 1e-300)
         self._waves = np.minimum(200.0, fastest)
 
     def _filtered(self, columns: Callable[[Array, Array], Array]) -> Array:
-        """Columns of positions and rates of tracks, (samples, n, c), at the fitted rows."""
+        """Evaluate columns, (samples, n, c), along the tracks and filter them to the fitted rows."""
         made = []
         for rows in self._rows:
             parts = [{"": columns(t.q, t.sure(rows.how))} for t in rows.tracks]
@@ -393,7 +393,7 @@ class _Search:
         return np.concatenate(made)
 
     def found(self, *, judged: bool = False) -> dict[str, Searched]:
-        """By key what was found; nothing where all is linear.
+        """Return the nonlinear parameters by key; none if the law is linear.
 
         :param judged: whether a memory has to be clear, joint by joint.
         :raises PkmTwinError: the residual shows no value.
@@ -403,9 +403,9 @@ class _Search:
             return {}
         (key,) = keys
         if self.law.memory:
-            grid = PARTS[:, None] * np.maximum(self._travel, 1e-12)
+            grid = PRESLIDING_DISTANCES[:, None] * np.maximum(self._travel, 1e-12)
         elif self.law.parameters[key].unit.endswith("/s"):
-            grid = SPEEDS[:, None] * np.maximum(self._speed, 1e-12)
+            grid = STRIBECK_SPEEDS[:, None] * np.maximum(self._speed, 1e-12)
         else:
             waves = np.linspace(1.0, max(float(self._waves.max()), 2.0), 800)
             grid = np.maximum(self._travel, 1e-12) / waves[:, None]

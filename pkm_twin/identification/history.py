@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import FileError, ParameterError, PkmTwinError, one_line
-from pkm_twin.identification.compare import compared_of, idle_of
+from pkm_twin.identification.compare import compare_part, find_idle
 from pkm_twin.identification.friction_laws import fit_recordings
 from pkm_twin.recordings import ReadOptions, Recording, read
 from pkm_twin.robot.plausibility import why_no_torques
@@ -27,8 +27,8 @@ MAX_NUMBER: Final = 1e9
 """Largest size of a number: N, N m, kg, Hz or a factor."""
 APPLICATION: Final = 0x706B6D74
 """SQLite's application_id of a history: "pkmt"."""
-FEWEST: Final = 6
-"""Recordings below which no series is judged."""
+MIN_RECORDINGS: Final = 6
+"""Smallest number of recordings of a series that is judged."""
 HISTORY: Final = "a history that `pkm-twin check --history` wrote"
 _TABLES: Final = """
 CREATE TABLE IF NOT EXISTS checks (
@@ -68,21 +68,21 @@ class Series:
     @property
     def label(self) -> str:
         """Machine, quantity and part in words."""
-        return f"{self.machine}: {WORDS.get(self.quantity, self.quantity)} of {self.part}"
+        return f"{self.machine}: {QUANTITY_NAMES.get(self.quantity, self.quantity)} of {self.part}"
 
     @property
     def days(self) -> list[datetime]:
-        """The times of its recordings."""
+        """Times of the recordings."""
         return [datetime.fromtimestamp(time, UTC) for time in self.time]
 
 
-UNKNOWN: Final = "payload beyond the load"
-WORDS: Final = {
+UNKNOWN_PAYLOAD: Final = "payload beyond the load"
+QUANTITY_NAMES: Final = {
     "friction viscous": "viscous friction",
     "friction coulomb": "Coulomb friction",
-    UNKNOWN: "unknown payload",
+    UNKNOWN_PAYLOAD: "unknown payload",
 }
-"""Quantities whose name in a history's file is not the field's."""
+"""Names in reports of quantities that a history's file names otherwise."""
 
 
 def measure(recording: Recording) -> list[Measured]:
@@ -91,14 +91,14 @@ def measure(recording: Recording) -> list[Measured]:
     Friction and payload are those that `fit` finds, with its standard deviations. What the
     recording or the robot's file lacks, or the motion does not excite, is left out.
     """
-    return [*_efforts(recording), *_elasticity(recording)]
+    return [*_measure_efforts(recording), *_measure_elasticity(recording)]
 
 
-def _efforts(r: Recording) -> list[Measured]:
+def _measure_efforts(r: Recording) -> list[Measured]:
     if r.effort is None or why_no_torques(r.robot):
         return []
-    idle = idle_of(r)
-    compared = compared_of(r, idle)
+    idle = find_idle(r)
+    compared = compare_part(r, idle)
     if compared is None:
         return []
     names, units = r.robot.joint_names, r.robot.effort_units
@@ -116,11 +116,11 @@ def _efforts(r: Recording) -> list[Measured]:
             found.append(Measured(f"friction {law}", part, one.after, one.deviation, one.unit))
         elif one.key == ("payload", "mass"):
             beyond = one.after - known
-            found.append(Measured(UNKNOWN, "platform", beyond, one.deviation, one.unit))
+            found.append(Measured(UNKNOWN_PAYLOAD, "platform", beyond, one.deviation, one.unit))
     return found
 
 
-def _elasticity(r: Recording) -> list[Measured]:
+def _measure_elasticity(r: Recording) -> list[Measured]:
     from pkm_twin.identification.deflections import fit_elements
     from stiffness_monitor.modes import has_modes, natural_frequencies
 
@@ -149,7 +149,7 @@ def recorded_at(recording: Recording, path: Path) -> float:
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[sqlite3.Connection]:
+def _open_database(path: Path) -> Iterator[sqlite3.Connection]:
     try:
         with closing(sqlite3.connect(path, timeout=60.0, isolation_level=None)) as base:
             yield base
@@ -178,7 +178,7 @@ def check_file(path: Path) -> None:
     :raises ParameterError: by the file.
     """
     if path.exists():
-        with _opened(path) as base:
+        with _open_database(path) as base:
             _check_base(path, base, new=True)
 
 
@@ -219,7 +219,7 @@ def append(
     row = recorded, when, machine, robot, os.fspath(file), int(good)
     for one in numbers:
         _check_row(f"{one.quantity} of {one.part}", recorded, one.value, one.deviation)
-    with _opened(path) as base:
+    with _open_database(path) as base:
         base.execute("PRAGMA foreign_keys = ON")
         base.execute("BEGIN IMMEDIATE")
         _check_base(path, base, new=True)
@@ -248,13 +248,13 @@ def append_recording(path: Path, recording: Recording, file: Path, good: bool, m
 
 
 def read_history(path: Path, machine: str | None = None) -> list[Series]:
-    """All series of a history, by machine, quantity and part, in the order of recording.
+    """Read all series of a history, by machine, quantity and part, in the order of recording.
 
     :raises ParameterError: no such file, no history, or a number that is none.
     """
     if not path.is_file():
         raise FileError(path, FileNotFoundError(), HISTORY)
-    with _opened(path) as base:
+    with _open_database(path) as base:
         _check_base(path, base, new=False)
         rows = base.execute(
             "SELECT machine, quantity, part, unit, recorded, value, deviation FROM numbers "
@@ -296,7 +296,7 @@ class Judged:
     @property
     def known(self) -> bool:
         """True if the series has enough recordings to be judged."""
-        return len(self.series.value) >= FEWEST
+        return len(self.series.value) >= MIN_RECORDINGS
 
     @property
     def drifts(self) -> bool:
@@ -310,7 +310,7 @@ class Judged:
 
     @property
     def line(self) -> str:
-        """The series in a line."""
+        """One line of text on the series."""
         s = self.series
         text = f"{s.label}: {s.value[-1]:.4g} {s.unit}"
         if not self.known:
@@ -345,7 +345,7 @@ class Judged:
 
 
 def judge_history(path: Path, machine: str | None, baseline: int, false_alarm: float) -> list[Judged]:
-    """Judge every series of a history, or of one machine in it, as :func:`judged`.
+    """Judge every series of a history, or of one machine in it, as :func:`judge_series`.
 
     :param false_alarm: chance of a false alarm in any series, shared evenly (Bonferroni).
     :raises ParameterError: no history, or one without numbers of this machine.
@@ -354,10 +354,10 @@ def judge_history(path: Path, machine: str | None, baseline: int, false_alarm: f
     if not found:
         wanted = f" of a machine {machine!r}" if machine else ""
         raise ParameterError(str(path), "no numbers", f"recordings with efforts{wanted}")
-    return [judged(one, baseline, false_alarm / len(found)) for one in found]
+    return [judge_series(one, baseline, false_alarm / len(found)) for one in found]
 
 
-def judged(series: Series, baseline: int, alarm: float) -> Judged:
+def judge_series(series: Series, baseline: int, alarm: float) -> Judged:
     """Control limits and a change of the mean of one series.
 
     Limits: where a single further recording lies but for the chance ``alarm``, by mean and standard
@@ -370,7 +370,7 @@ def judged(series: Series, baseline: int, alarm: float) -> Judged:
     from scipy import stats  # type: ignore[import-untyped]
 
     y, k = series.value, len(series.value)
-    if k < FEWEST:
+    if k < MIN_RECORDINGS:
         none = math.nan
         return Judged(series, 0, none, none, none, np.zeros(k, bool), None, none, none, none)
     first = min(baseline, k)
@@ -383,7 +383,7 @@ def judged(series: Series, baseline: int, alarm: float) -> Judged:
     left = sums[splits - 1] / splits
     right = (sums[-1] - sums[splits - 1]) / (k - splits)
     within = squares[-1] - splits * left**2 - (k - splits) * right**2
-    # What rounding leaves of a constant is no spread.
+    # The variation of a constant by rounding is not noise.
     least = (1e-12 * (abs(mean) + float(np.abs(y).max()))) ** 2
     noise = np.sqrt(np.maximum(within, k * least) / (k - 2))
     apart = np.abs(right - left) / np.sqrt(1.0 / splits + 1.0 / (k - splits))

@@ -22,20 +22,28 @@ import scipy  # type: ignore[import-untyped]  # its parts come when they are ask
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError, SingularityError, UnreachableError
 from pkm_twin.identification.columns import OFFSET_SHARE, Columns
-from pkm_twin.identification.compare import idle_of, recorded_of
+from pkm_twin.identification.compare import cut_recording, find_idle
 from pkm_twin.identification.evidence import Model, Spectra
-from pkm_twin.identification.judge import ALTERNATIVE, SIGMAS
+from pkm_twin.identification.judge import ALTERNATIVE_LOG_ODDS, SIGMAS
 from pkm_twin.identification.parameters import file_parameters
-from pkm_twin.identification.rows import LARGEST, Rows, rows_of
+from pkm_twin.identification.rows import MAX_EFFORT, Rows, make_rows
 from pkm_twin.identification.samples import Motion, find_held_payload
-from pkm_twin.identification.suspects import OFF
-from pkm_twin.identification.words import LATEST, UNITS, late_text, listed, position_text, scale_text, usual_scale
+from pkm_twin.identification.suspects import GAIN_DEVIATION
+from pkm_twin.identification.words import (
+    EFFORT_UNITS,
+    MAX_DELAY,
+    is_usual_scale,
+    late_text,
+    list_joints,
+    position_text,
+    scale_text,
+)
 from pkm_twin.messages.reading import rotate_to_base
 from pkm_twin.recordings import Load, Recording
 from pkm_twin.robot.robot import Robot
 
-HEAVY: Final = 30.0
-"""Deviation of a heavy payload over that of a usual one."""
+HEAVY_PAYLOAD_RATIO: Final = 30.0
+"""Prior deviation of a heavy payload, as a multiple of that of a usual one."""
 CLASSES: Final = {
     "": 0.0,
     "payload": 2.0,
@@ -45,23 +53,23 @@ CLASSES: Final = {
     "friction heavy payload": 5.0,
 }
 """Kinds of numbers that differ from the file, and the log prior odds against it."""
-LISTED: Final = 6
-"""Causes that are listed with their probabilities, at most."""
+MAX_LISTED_CAUSES: Final = 6
+"""Largest number of causes that are listed with their probabilities."""
 DISCREPANCY_RATIOS: Final = np.geomspace(0.01, 1.0, 7)
 """Candidate ratios of the model error to the measured efforts, both RMS; no model is better than 1 %."""
-UNIT: Final = 5.0
+UNIT_PRICE: Final = 5.0
 """Log prior odds against another unit, scale or rate: one recording in 150."""
-RARE: Final = 8.0
+RARE_PRICE: Final = 8.0
 """Log prior odds against any other cause: one in 3,000."""
-CERTAIN: Final = 0.99
-"""Probability from which a cause is named,"""
-ODDS: Final = float(np.log(CERTAIN / (1.0 - CERTAIN)))
-"""and its log odds."""
-SEARCHED: Final = 1.5
-"""Longest delay that is looked for, s."""
-RATES: Final = (2.0, 0.5, 3.0, 1 / 3, 4.0, 0.25, 5.0, 0.2, 10.0, 0.1, 1e3, 1e-3)
-"""Rates of time: wrong periods, and ms."""
-ANGLES: Final = {
+MIN_PROBABILITY: Final = 0.99
+"""Smallest probability of a cause that is named."""
+MIN_LOG_ODDS: Final = float(np.log(MIN_PROBABILITY / (1.0 - MIN_PROBABILITY)))
+"""Log odds of MIN_PROBABILITY."""
+MAX_SEARCHED_DELAY: Final = 1.5
+"""Longest delay of efforts that is searched for, s."""
+TIME_RATES: Final = (2.0, 0.5, 3.0, 1 / 3, 4.0, 0.25, 5.0, 0.2, 10.0, 0.1, 1e3, 1e-3)
+"""Candidate ratios of the true speed to the recorded one: wrong periods, and ms for s."""
+POSITION_FACTORS: Final = {
     "positions are in degrees": np.pi / 180.0,
     "positions are in rad, and were taken for degrees": 180.0 / np.pi,
     "positions are in mm": 1e-3,
@@ -147,15 +155,15 @@ class HypothesisSearch:
         kinds = np.array(c.kinds)
         of_file = np.isin(kinds, ("friction", "masses", "payload"))
         if gains is not None and gains.any():
-            # Errors are as large in the efforts as before: a scale is of what the machine needs.
+            # A gain scales the model alone; the errors keep their size in the measured efforts.
             power = np.einsum("jbcc->jc", spectra.grams)[:, 1 : len(base) + 1]
             more = np.sqrt((gains[:, None] ** 2 * power).sum(0) / np.maximum(power.sum(0), 1e-300))
             base = np.where(of_file | (more == 0.0), base, base / np.where(more > 0.0, more, 1.0))
         places = [np.arange(len(base))]
-        if screened and len(classes) > len(FEW):
+        if screened and len(classes) > len(SEARCH_CLASSES):
             # Improbable hypotheses are discarded by two classes and one ratio of the discrepancy.
             few = Model.from_spectra([spectra], places, base, DISCREPANCY_RATIOS[1:2], gains, order)
-            log = max(self._find_logs(few, name, False)[0] for name in FEW)
+            log = max(self._find_logs(few, name, False)[0] for name in SEARCH_CLASSES)
             self.first = log if self.first is None else self.first
             if log < self.first - 40.0:
                 return Hypothesis(text, log - price, 1.0)
@@ -174,8 +182,8 @@ class HypothesisSearch:
         """Return factors on the prior's deviations in a class, (c,)."""
         kinds = np.array(self.columns.kinds)
         free = ~np.isin(kinds, ("friction", "masses", "payload")) | np.isin(kinds, name.split())
-        # Numbers that are as the file's are so within a tenth of the prior's deviations.
-        return np.where((kinds == "payload") & ("heavy" in name), HEAVY, np.where(free, 1.0, 0.1))
+        # Numbers that agree with the file do so within a tenth of the prior deviations.
+        return np.where((kinds == "payload") & ("heavy" in name), HEAVY_PAYLOAD_RATIO, np.where(free, 1.0, 0.1))
 
     def _find_logs(self, model: Model, name: str, bounded: bool) -> Array:
         """Return a class's log evidence at each share, less what possible numbers cost."""
@@ -187,8 +195,8 @@ class HypothesisSearch:
         if not bounded or not bound.any():
             return logs
         free = np.ones(len(logs), np.bool_)
-        # A bound may cost a share so much that others count, whose bounds are then counted too.
-        while (near := free & (logs > logs.max() - 2.0 * ODDS)).any():
+        # A bound may reduce the best ratio's evidence so that other ratios count, with their bounds.
+        while (near := free & (logs > logs.max() - 2.0 * MIN_LOG_ODDS)).any():
             k = int(np.argmax(np.where(near, logs, -np.inf)))
             free[k] = False
             mean, inner = model.posterior_at(k, used)
@@ -207,13 +215,15 @@ class HypothesisSearch:
     def all(self) -> list[Hypothesis]:
         """The hypotheses, the most probable first."""
         if self.sound.discrepancy_ratio <= DISCREPANCY_RATIOS[1] and not self.sound.kinds:
-            # No cause can gain what it costs.
+            # The residual is too small for any cause to outweigh its prior odds.
             return [self.sound]
         found = [self.sound, *self._weigh_efforts(), *self._weigh_delays(), *self._weigh_loads()]
         best, *others = sorted(found, key=lambda one: -one.log)
         pushed = self.rows.recording.wrench is not None and self.rows.recording.wrench.any()
         clearly_sound = (
-            best is self.sound and best.discrepancy_ratio <= DISCREPANCY_RATIOS[0] and others[0].log < best.log - ODDS
+            best is self.sound
+            and best.discrepancy_ratio <= DISCREPANCY_RATIOS[0]
+            and others[0].log < best.log - MIN_LOG_ODDS
         )
         if pushed or not clearly_sound:
             found += self._weigh_positions()
@@ -224,39 +234,39 @@ class HypothesisSearch:
         n, eye, sp = len(self.joints), np.eye(len(self.joints)), self.spectra
         offset = np.array([kind == "offset" for kind in self.columns.kinds])
         none = np.where(offset, 1.0 / OFFSET_SHARE, 0.0)
-        yield self.weigh(NO_MACHINE, RARE, sp, ("",), gains=np.zeros(n), factors=none)
+        yield self.weigh(NO_MACHINE, RARE_PRICE, sp, ("",), gains=np.zeros(n), factors=none)
         whole = [np.ones(n), *eye] if n > 1 else [np.ones(1)]
         signs = [1.0 - 2.0 * one for one in whole]
         if n > 2:
-            each = np.array([self.weigh("", 0.0, sp, FEW, gains=s).log for s in signs[1:]])
+            each = np.array([self.weigh("", 0.0, sp, SEARCH_CLASSES, gains=s).log for s in signs[1:]])
             signs += [1.0 - 2.0 * (eye[np.argsort(each)[-k:]].sum(0)) for k in range(2, n)]
         for sign in signs:
             turned = [self.joints[j] for j in np.flatnonzero(sign < 0.0)]
-            text = f"efforts of {listed(turned, n)} have the wrong sign"
-            price = RARE + 2.0 * (len(turned) - 1 if len(turned) < n else 0)
+            text = f"efforts of {list_joints(turned, n)} have the wrong sign"
+            price = RARE_PRICE + 2.0 * (len(turned) - 1 if len(turned) < n else 0)
             yield self.weigh(text, price, sp, gains=sign)
         for which in whole:
-            names = listed([self.joints[j] for j in np.flatnonzero(which)], n)
+            names = list_joints([self.joints[j] for j in np.flatnonzero(which)], n)
             for way in (1.0, -1.0):
                 yield from self._weigh_scales(names, which, way)
         orders = [np.arange(n) for _ in combinations(range(n), 2)]
         for order, (i, k) in zip(orders, combinations(range(n), 2), strict=True):
             order[[i, k]] = k, i
             text = f"efforts of {self.joints[i]} and {self.joints[k]} are exchanged"
-            yield self.weigh(text, RARE, self.columns.spectra(order=order.tolist()))
+            yield self.weigh(text, RARE_PRICE, self.columns.spectra(order=order.tolist()))
         for order in [np.roll(range(n), 1), np.roll(range(n), -1)] if n > 2 else []:
             text = "columns of the efforts are in another order"
-            yield self.weigh(text, RARE, self.columns.spectra(order=order.tolist()))
+            yield self.weigh(text, RARE_PRICE, self.columns.spectra(order=order.tolist()))
         back = np.where(self.columns.turning, -1.0, 1.0)
         p = self.rows.model.parameters
         rubs = np.array([g.kind == "friction" for g in p.groups for _ in g.names])
         certain = self.columns.certain - 2.0 * (self.rows.table[..., rubs] @ p.values[rubs])
         backwards = replace(self.columns, columns=self.columns.columns * back, certain=certain)
-        yield self.weigh("time runs backwards", RARE, backwards.spectra())
-        for rate in RATES:
+        yield self.weigh("time runs backwards", RARE_PRICE, backwards.spectra())
+        for rate in TIME_RATES:
             text = f"the motion was {rate:.3g} times as fast as its time stamps are ("
             text += "ms for s?)" if rate >= 1e3 or rate <= 1e-3 else "time steps?)"
-            yield self.weigh(text, UNIT, self.columns.spectra(rate=rate))
+            yield self.weigh(text, UNIT_PRICE, self.columns.spectra(rate=rate))
 
     def _weigh_scales(self, names: str, which: Array, way: float) -> Iterator[Hypothesis]:
         """Weigh the most probable scale of some drives' efforts."""
@@ -269,7 +279,7 @@ class HypothesisSearch:
             return self.weigh("", 0.0, self.spectra, classes, DISCREPANCY_RATIOS[2:3], gains=some, bounded=False).log
 
         # Heavier masses would be in the place of a scale.
-        classes = ("", "friction") if which.all() and way > 0.0 else FEW
+        classes = ("", "friction") if which.all() and way > 0.0 else SEARCH_CLASSES
         grid = np.log(2.0) * np.arange(-12.0, 12.5)
         logs = [log(x) for x in grid]
         k = int(np.argmax(logs))
@@ -278,10 +288,13 @@ class HypothesisSearch:
             lambda x: -log(x), bounds=ends, method="bounded", options={"xatol": 0.005}
         )
         scale = way * float(np.exp(best.x))
-        if way < 0.0 or not usual_scale(scale):
-            # A unit that has a name is likelier than any scale.
-            units = [u for u in UNITS.values() if way > 0.0 and 0.5 < u / scale < 2.0]
-            for size, price in ((scale, UNIT + (RARE if way < 0.0 else 0.0)), *((u, UNIT - 2.0) for u in units)):
+        if way < 0.0 or not is_usual_scale(scale):
+            # A scale that is that of a known unit has better prior odds.
+            units = [u for u in EFFORT_UNITS.values() if way > 0.0 and 0.5 < u / scale < 2.0]
+            for size, price in (
+                (scale, UNIT_PRICE + (RARE_PRICE if way < 0.0 else 0.0)),
+                *((u, UNIT_PRICE - 2.0) for u in units),
+            ):
                 one = self.weigh("", price, self.spectra, gains=gains(size))
                 if one.kinds in ("", "friction") and size == scale:
                     own = float(np.mean(self._find_gains(gains(size), one.kinds)[0][which > 0.0]))
@@ -303,7 +316,7 @@ class HypothesisSearch:
         found = model.posterior(used)
         some = slice(len(used) - c.gains, None)
         each = found.mean[some]
-        # A joint's gain is its own and that of all.
+        # A joint's gain is the sum of its own and the common one.
         tie = np.concatenate([np.eye(n), np.ones((n, c.gains - n))], 1)
         deviations = np.sqrt(np.diag(tie @ found.covariance[some, some] @ tie.T))
         return np.asarray(tie @ each, np.float64), np.asarray(deviations, np.float64)
@@ -312,8 +325,8 @@ class HypothesisSearch:
         """Weigh efforts of all joints, or of one, that belong to another time."""
         r, c = self.rows, self.columns
         n, k, period = len(self.joints), len(r.time), float(np.median(np.diff(r.time)))
-        most = min(int(SEARCHED / period), k // 4)
-        if most * period < LATEST:
+        most = min(int(MAX_SEARCHED_DELAY / period), k // 4)
+        if most * period < MAX_DELAY:
             return
         inner = slice(most, k - most)
         own = np.array([kind not in ("offset", "error") for kind in c.kinds])
@@ -338,11 +351,11 @@ class HypothesisSearch:
             spectra = c.spectra(effort, inner)
             one = self.weigh("", 0.0, spectra, screened=False)
             late = float(step * period) + self._find_mean(spectra, one.kinds)[self.late]
-            text = late_text(listed([self.joints[j] for j in which], n), late)
+            text = late_text(list_joints([self.joints[j] for j in which], n), late)
             one = replace(one, text=text, late=late if len(which) == n else 0.0)
-            # As if all rows had been compared.
+            # Scale the evidence of the compared rows to all rows.
             gain = (one.log - before.log) * k / (k - 2 * most)
-            yield replace(one, log=self.sound.log + gain - RARE)
+            yield replace(one, log=self.sound.log + gain - RARE_PRICE)
 
     def _find_mean(self, spectra: Spectra, kinds: str | None = None, more: int = 0) -> Array:
         """Return the posterior mean of the columns, (c,).
@@ -355,7 +368,7 @@ class HypothesisSearch:
         if kinds is not None:
             used = np.isin(c.kinds, ["offset", *kinds.split()])
             used[[self.late, more or self.late]] = True
-        deviation = c.deviation * np.where(c.payload, HEAVY, 1.0)
+        deviation = c.deviation * np.where(c.payload, HEAVY_PAYLOAD_RATIO, 1.0)
         return Model.from_spectra([spectra], [np.arange(len(used))], deviation, DISCREPANCY_RATIOS).posterior(used).mean
 
     def _weigh_loads(self) -> Iterator[Hypothesis]:
@@ -369,7 +382,7 @@ class HypothesisSearch:
         _, spans, held = find_held_payload(r.time, kilogram, left, weight)
         if spans and not held.all():
             part = replace(c, columns=np.where(payload, held[:, None, None], 1.0) * c.columns)
-            yield self._weigh_payload(part.spectra(), UNIT + 3.0 * len(spans), tuple(spans))
+            yield self._weigh_payload(part.spectra(), UNIT_PRICE + 3.0 * len(spans), tuple(spans))
 
     def _weigh_payload(self, spectra: Spectra, price: float, spans: tuple[tuple[float, float], ...] = ()) -> Hypothesis:
         """Weigh a payload, with the mass that it has at the file's centre."""
@@ -397,34 +410,34 @@ class HypothesisSearch:
         if (
             scaled.scale != 1.0
             and scaled.discrepancy_ratio <= 0.12
-            and abs(scaled.log - sound.log) <= ODDS >= best.log - scaled.log
+            and abs(scaled.log - sound.log) <= MIN_LOG_ODDS >= best.log - scaled.log
         ):
             text, _ = self._tell_scale(scaled.scale, scaled.kinds)
             if text:
-                return Explanation(text, not usual_scale(scaled.scale))
+                return Explanation(text, not is_usual_scale(scaled.scale))
             best = next(one for one in self.all if one is not scaled)
-        if best.text and best.log - sound.log > ODDS:
+        if best.text and best.log - sound.log > MIN_LOG_ODDS:
             if best.text == NO_MACHINE or best.discrepancy_ratio > 0.12:
                 return Explanation(unknown, fault=True)
-            if 0.0 < abs(best.late) < LATEST and not self.rows.recording.late:
+            if 0.0 < abs(best.late) < MAX_DELAY and not self.rows.recording.late:
                 r = self.rows.recording.on_time(best.late)
-                return explain(rows_of(self.rows.model.robot, self.rows.model.parameters, r))
+                return explain(make_rows(self.rows.model.robot, self.rows.model.parameters, r))
             return Explanation(best.text, fault=True, load=best.load)
         if sound.discrepancy_ratio > 0.3:
             return Explanation(unknown, fault=True)
         gains, deviations = self._find_gains()
         j, mean = int(np.abs(gains).argmax()), float(gains.mean())
         # A gain of 10 %, two usual deviations, is named.
-        if not sound.kinds and abs(gains[j]) > 2.0 * OFF + SIGMAS * deviations[j]:
+        if not sound.kinds and abs(gains[j]) > 2.0 * GAIN_DEVIATION + SIGMAS * deviations[j]:
             if (np.abs(gains - mean) >= 0.5 * abs(mean)).any():
                 scale = 1.0 / (1.0 - float(gains[j]))
-                return Explanation(scale_text(self.joints[j], scale), not usual_scale(scale))
-            # A payload and friction that the file does not have look like it in slow motions.
-            beside, _ = self._find_gains(kinds="friction payload", usual=OFF)
+                return Explanation(scale_text(self.joints[j], scale), not is_usual_scale(scale))
+            # In slow motions payload and friction that the file lacks look like a gain.
+            beside, _ = self._find_gains(kinds="friction payload", usual=GAIN_DEVIATION)
             scale = 1.0 / (1.0 - mean)
             text, clear = self._tell_scale(scale)
-            if clear or abs(beside[j]) > 2.0 * OFF:
-                return Explanation(text, clear and not usual_scale(scale))
+            if clear or abs(beside[j]) > 2.0 * GAIN_DEVIATION:
+                return Explanation(text, clear and not is_usual_scale(scale))
         if sound.kinds in ("payload", "heavy payload") and self.rows.recording.load is None:
             held = self._weigh_payload(self.spectra, 0.0)
             return Explanation(held.text, load=held.load)
@@ -437,7 +450,7 @@ class HypothesisSearch:
             text = f"other numbers in the file: {kinds}" if kinds else "the file as it is"
             found.append((text, self.sound.log + float(np.log(max(part, 1e-300)))))
         parts = scipy.special.softmax([log for _, log in found])
-        order = np.argsort(-parts)[:LISTED].tolist()
+        order = np.argsort(-parts)[:MAX_LISTED_CAUSES].tolist()
         return tuple((found[k][0], float(parts[k])) for k in order if parts[k] > 1e-6)
 
     def _tell_scale(self, scale: float, kinds: str = "") -> tuple[str, bool]:
@@ -458,13 +471,13 @@ class HypothesisSearch:
         places, deviation = np.arange(len(beside) + 2), np.append(c.deviation[beside], [1.0, 1.0])
         model = Model.from_spectra([spectra], [places], deviation)
         masses, efforts = (model.log_evidence(places != len(beside) + k) for k in (0, 1))
-        if "friction" not in kinds and masses > efforts + ALTERNATIVE:
+        if "friction" not in kinds and masses > efforts + ALTERNATIVE_LOG_ODDS:
             return "", False
         # The file's friction tells them apart only where nothing else is left of the efforts.
         left = model.posterior(places != len(beside) + 1).discrepancy_ratio
-        clear = "friction" not in kinds and efforts > masses + ALTERNATIVE and left <= DISCREPANCY_RATIOS[0]
+        clear = "friction" not in kinds and efforts > masses + ALTERNATIVE_LOG_ODDS and left <= DISCREPANCY_RATIOS[0]
         others = [] if clear else [f"all masses are {scale:.3g} times the file's"]
-        names = listed([*self.joints], len(self.joints))
+        names = list_joints([*self.joints], len(self.joints))
         return scale_text(names, scale, *others), clear
 
     def _weigh_positions(self) -> Iterator[Hypothesis]:
@@ -474,7 +487,7 @@ class HypothesisSearch:
         ones, q = np.ones(n), motion.q
         for text, wrench in wrenches(r.recording, motion):
             yield from self._weigh_motion(text, replace(motion, wrench=wrench), ones)
-        for text, scale in ANGLES.items():
+        for text, scale in POSITION_FACTORS.items():
             other = replace(motion, q=scale * q, qd=scale * motion.qd, qdd=scale * motion.qdd)
             yield from self._weigh_motion(text, other, ones)
         if n > 1:
@@ -505,18 +518,18 @@ class HypothesisSearch:
             made = self.columns.with_motion(motion, turned, order)
         except (PkmTwinError, ValueError, np.linalg.LinAlgError):
             return
-        if not np.isfinite(made.columns).all() or not np.abs(made.certain).max() < LARGEST:
+        if not np.isfinite(made.columns).all() or not np.abs(made.certain).max() < MAX_EFFORT:
             return
         spectra = made.spectra()
-        yield self.weigh(text, RARE, spectra)
+        yield self.weigh(text, RARE_PRICE, spectra)
         if both and order is None:
-            yield self.weigh(both, RARE, spectra, gains=turned)
+            yield self.weigh(both, RARE_PRICE, spectra, gains=turned)
         elif both:
-            yield self.weigh(both, RARE, made.spectra(order=order))
+            yield self.weigh(both, RARE_PRICE, made.spectra(order=order))
 
 
-FEW: Final = ("", "friction masses payload")
-"""Classes by which a scale or sign is searched."""
+SEARCH_CLASSES: Final = ("", "friction masses payload")
+"""Classes of machines with which scales and signs are searched."""
 NO_MACHINE: Final = "no machine like the file's explains the efforts, and no single mistake does"
 
 
@@ -541,10 +554,10 @@ def explain_recording(robot: Robot, r: Recording) -> Explanation:
 
     :raises PkmTwinError: a recording whose efforts cannot be compared with the robot's.
     """
-    rows = rows_of(robot, file_parameters(robot), recorded_of(r))
+    rows = make_rows(robot, file_parameters(robot), cut_recording(r))
     found = explain(rows)
     if found.load is not None:
-        loaded = explain(rows_of(robot, rows.model.parameters, replace(rows.recording, load=found.load)))
+        loaded = explain(make_rows(robot, rows.model.parameters, replace(rows.recording, load=found.load)))
         found = loaded if loaded.fault else found
     return replace(found, steps="" if r.step_fault else r.play_fault, rows=rows)
 
@@ -553,14 +566,14 @@ def describe_positions(r: Recording) -> str:
     """Say why positions that step are no motion of the machine: it cannot take them, or they jump."""
     if not r.play_fault and not r.steps.publishers and r.effort is not None:
         try:
-            idle_of(r)
+            find_idle(r)
         except (UnreachableError, SingularityError) as error:
             return position_text(error)
     return f"position steps that are no motion: {r.play_fault or r.step_fault}"
 
 
 def wrenches(r: Recording, motion: Motion) -> Iterator[tuple[str, Array]]:
-    """Yield faults of a recording's wrenches, and the wrenches of a motion without each."""
+    """Yield possible faults of the wrenches, each with the corrected wrenches."""
     if r.wrench is None or not r.wrench.any():
         return
     rotation, axes = r.robot.rotation(r.robot.forward(motion.q)), "platform"

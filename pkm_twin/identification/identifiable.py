@@ -25,7 +25,7 @@ from pkm_twin.robot.robot import Robot
 
 Kind = Literal["friction", "rotor", "payload", "inertia"]
 KINDS: Final[tuple[Kind, ...]] = ("friction", "rotor", "payload", "inertia")
-LOAD: Final = "payload"
+PAYLOAD: Final = "payload"
 """Name of the payload among the bodies."""
 
 
@@ -51,12 +51,12 @@ class Identifiable:
     cones: tuple[Array, ...] = ()
 
 
-def above_zero(k: int, count: int) -> Array:
+def make_nonnegative_cone(k: int, count: int) -> Array:
     """Return the cone of a parameter that is not negative."""
     return np.asarray(np.eye(count)[k].reshape(1, 1, -1), np.float64)
 
 
-def pseudo_inertia() -> Array:
+def make_inertia_cone() -> Array:
     """Return the cone of ten numbers that a body can have, shape (4, 4, 10).
 
     Wensing, Kim, Slotine, Linear matrix inequalities for physically consistent inertial parameter
@@ -80,11 +80,11 @@ def identifiable(robot: Robot) -> tuple[Identifiable, ...]:
     """
     # The engine's own graph may be that of a machine with other masses.
     robot.massive()
-    return (*of_drives(robot), *of_masses(robot.with_default_inertia))
+    return (*list_drive_parameters(robot), *list_mass_parameters(robot.with_default_inertia))
 
 
-def of_drives(robot: Robot) -> tuple[Identifiable, ...]:
-    """Friction of each joint that has some, and the rotors, one for joints of one number."""
+def list_drive_parameters(robot: Robot) -> tuple[Identifiable, ...]:
+    """List the friction of each joint that has some, and rotors; joints may share one number."""
     graph, friction = robot.graph, robot.friction
     found, rotors = [], dict[Keys, list[str]]()
     # A memory that is open to a fit has columns along a motion, which a regressor has not.
@@ -107,7 +107,7 @@ def of_drives(robot: Robot) -> tuple[Identifiable, ...]:
                 np.array([math.nan]),
                 lambda new: {key: less * float(new[0])},
                 others={f"{joint}.{word}": np.ones(1) for joint in joints if linear},
-                cones=() if signed else (above_zero(0, 1),),
+                cones=() if signed else (make_nonnegative_cone(0, 1),),
             )
         )
 
@@ -131,35 +131,35 @@ def of_drives(robot: Robot) -> tuple[Identifiable, ...]:
 
 
 def _tens(robot: Robot) -> list[Any]:
-    """Ten numbers of each body and of the payload about the base's origin, masses of rods."""
+    """List ten inertial parameters of each body and the payload about the origin, and rod masses."""
     graph, load = robot.graph, robot.payload
     tens = [standard_parameters(body.mass, body.com, body.inertia) for body in graph.bodies.values()]
     tens.append(standard_parameters(load.mass, graph.origin + load.com, load.inertia))
     return [*(value for ten in tens for value in ten), *(rod.mass for rod in graph.rods.values())]
 
 
-def of_masses(robot: Robot) -> Iterator[Identifiable]:
+def list_mass_parameters(robot: Robot) -> Iterator[Identifiable]:
     """Masses, centres and inertias of payload, bodies and rods, by what they move together.
 
     :param robot: of a file that gives all of them.
     """
     graph, load = robot.graph, robot.payload
-    every: list[Keys] = [(LOAD, "mass"), *((LOAD, "com", i) for i in range(3))]
-    every += [*((LOAD, "inertia", *ij) for ij in np.ndindex(3, 3)), *robot.mass_keys()]
+    every: list[Keys] = [(PAYLOAD, "mass"), *((PAYLOAD, "com", i) for i in range(3))]
+    every += [*((PAYLOAD, "inertia", *ij) for ij in np.ndindex(3, 3)), *robot.mass_keys()]
     # Of an inertia matrix the upper half, for both.
-    keys = [key for key in every if key <= _mirrored(key)]
-    both = [dict.fromkeys((key, _mirrored(key))) for key in keys]
+    keys = [key for key in every if key <= _mirror_key(key)]
+    both = [dict.fromkeys((key, _mirror_key(key))) for key in keys]
     tie = np.repeat(np.eye(len(keys)), [len(pair) for pair in both], 0)
     values = np.array([robot.number(join_path(key)) for key in keys])
     # Masses above zero: as much as each may be off.
     masses = [body.mass for body in graph.bodies.values()]
     heavy = max(graph.bodies[graph.platform].mass, 0.1 * sum(masses))
     reference = values.copy()
-    for k in _places(keys, "mass", "density"):
-        reference[k] = max(values[k], heavy if keys[k][0] == LOAD or not values[k] else 0.0)
+    for k in _find_places(keys, "mass", "density"):
+        reference[k] = max(values[k], heavy if keys[k][0] == PAYLOAD or not values[k] else 0.0)
     made = FileNumbers(robot, [join_path(key) for pair in both for key in pair], _tens)
     slopes = made.slopes_at((tie @ reference)[None])[0] @ tie
-    names = [*graph.bodies, LOAD]
+    names = [*graph.bodies, PAYLOAD]
     tens = slopes[: 10 * len(names)].reshape(len(names), 10, -1)
     rods = dict(zip(graph.rods, slopes[10 * len(names) :], strict=True))
     coms = [*(body.com for body in graph.bodies.values()), graph.origin + load.com]
@@ -180,11 +180,11 @@ def of_masses(robot: Robot) -> Iterator[Identifiable]:
         if not touched[:, part].any():
             continue
         group = _BodyGroup([keys[k] for k in part], values[part], reference[part], own[inside][:, :, part])
-        payload = keys[part[0]][0] == LOAD
+        payload = keys[part[0]][0] == PAYLOAD
         yield Identifiable(
             "payload" if payload else "inertia",
             tuple(map(join_path, group.keys)),
-            tuple(_unit(key) for key in group.keys),
+            tuple(_find_unit(key) for key in group.keys),
             group.begin,
             group.scales([extents[b] for b in inside]),
             group.numbers,
@@ -203,18 +203,18 @@ class _BodyGroup:
 
     def __init__(self, keys: list[Keys], values: Array, reference: Array, own: Array) -> None:
         self.keys, self.values, self.reference, self.own = keys, values, reference, own
-        self.masses = _places(keys, "mass", "density")
-        self.coms, self.inertias = _places(keys, "com"), _places(keys, "inertia")
+        self.masses = _find_places(keys, "mass", "density")
+        self.coms, self.inertias = _find_places(keys, "com"), _find_places(keys, "inertia")
         # Centres that are parts of a length, 0 to 1.
         self.parts = np.array([not isinstance(keys[k][-1], int) for k in self.coms], bool)
 
     @property
     def begin(self) -> Array:
-        """The parameters of the file as it is: masses, inertias, and no change of centres."""
+        """Parameters at the file's values: masses, inertias, and no change of centres."""
         return np.where(np.isin(np.arange(len(self.keys)), self.coms), 0.0, self.values)
 
     def scales(self, far: Sequence[float]) -> Array:
-        """How far each may be off; ``far``: extents of the bodies, m."""
+        """Return the scale of each parameter's error; ``far``: extents of the bodies, m."""
         result = self.reference.copy()
         for k in (*self.coms, *self.inertias):
             b = int(np.flatnonzero(self.own[:, :, k].any(1))[0])
@@ -244,14 +244,14 @@ class _BodyGroup:
                 )
             flat = table.reshape(-1, len(self.inertias))
             found = np.linalg.lstsq(flat, np.concatenate(target), rcond=None)[0]
-            result[self.inertias] = possible_inertia(found) if whole > 0.0 else 0.0
+            result[self.inertias] = find_possible_inertia(found) if whole > 0.0 else 0.0
         return dict(zip(self.keys, result.tolist(), strict=True))
 
     def cones(self) -> Iterator[Array]:
-        """Matrices that have to be positive semidefinite, (d, d, k) each."""
+        """Yield the matrices that must be positive semidefinite, (d, d, k) each."""
         eye = np.eye(len(self.keys))
         if not len(self.coms):
-            yield from (above_zero(k, len(eye)) for k in self.masses)
+            yield from (make_nonnegative_cone(k, len(eye)) for k in self.masses)
             return
         for k in self.coms[self.parts]:
             total, once = eye[self.masses].sum(0), eye[k] * self.reference[self.masses].sum()
@@ -259,13 +259,13 @@ class _BodyGroup:
             yield ((1.0 - self.values[k]) * total - once).reshape(1, 1, -1)
         # Copies of a body depend on the same masses.
         for ten in {tuple(ten[0].tolist()): ten for ten in self.own[::-1]}.values():
-            cone = np.einsum("ijt,tk->ijk", pseudo_inertia(), ten)
+            cone = np.einsum("ijt,tk->ijk", make_inertia_cone(), ten)
             axes, sizes, _ = np.linalg.svd(cone.reshape(4, -1), full_matrices=False)
             axes = axes[:, sizes > 1e-12 * sizes[0]]
             yield np.einsum("ia,ijk,jb->abk", axes, cone, axes)
 
 
-def possible_inertia(inertia: Array) -> Array:
+def find_possible_inertia(inertia: Array) -> Array:
     """Return the nearest inertia (6,), or principal ones (k,), without negative second moments.
 
     A solver stops beside the edge of what a body can be.
@@ -282,20 +282,20 @@ def possible_inertia(inertia: Array) -> Array:
     return np.asarray(whole[upper], np.float64)
 
 
-def _mirrored(key: Keys) -> Keys:
+def _mirror_key(key: Keys) -> Keys:
     """Return the key of the equal entry of an inertia matrix; else the key itself."""
     return (*key[:-2], key[-1], key[-2]) if isinstance(key[-2], int) else key
 
 
-def _word(key: Keys) -> str:
+def _find_word(key: Keys) -> str:
     """``mass``, ``density``, ``com`` or ``inertia``."""
     return [str(k) for k in key if not isinstance(k, int)][-1].rpartition("_")[2]
 
 
-def _places(keys: Sequence[Keys], *words: str) -> Indices:
-    return np.flatnonzero([_word(key) in words for key in keys])
+def _find_places(keys: Sequence[Keys], *words: str) -> Indices:
+    return np.flatnonzero([_find_word(key) in words for key in keys])
 
 
-def _unit(key: Keys) -> str:
+def _find_unit(key: Keys) -> str:
     units = {"mass": "kg", "density": "kg/m3", "inertia": "kg m2"}
-    return units.get(_word(key), "m" if isinstance(key[-1], int) else "")
+    return units.get(_find_word(key), "m" if isinstance(key[-1], int) else "")

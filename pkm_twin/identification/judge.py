@@ -23,7 +23,7 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.identification.evidence import Model, Posterior, Signals, Spectra
-from pkm_twin.identification.samples import EXACT
+from pkm_twin.identification.samples import MIN_RELATIVE_NOISE
 
 Answer = Literal["explains", "explains partly", "does not explain"]
 Deviations = Literal["as estimated", "widened", "withheld"]
@@ -33,21 +33,21 @@ SENTENCE: Final[dict[Answer, str]] = {
     "does not explain": "does not explain",
 }
 SIGMAS: Final = 4.5
-"""Standard deviations beyond which no normal error of usual size is: one in 150,000."""
-PRESENT: Final = 0.2
+"""Standard deviations that a normal error exceeds in one of 150,000 cases."""
+PRESENT_PROBABILITY: Final = 0.2
 """Prior probability that a machine or a recording has any error of one kind."""
-FOUND: Final = float(np.log(99.0))
+FOUND_LOG_ODDS: Final = float(np.log(99.0))
 """Log odds from which an error is found: 99 %."""
-ALTERNATIVE: Final = 3.0
+ALTERNATIVE_LOG_ODDS: Final = 3.0
 """Log evidence below the best error's up to which another one is named with it: one in 20."""
-LOUD: Final = 1.5
-"""Residual over noise, in the band of the motion, from which more than noise is left."""
+MAX_NOISE_RATIO: Final = 1.5
+"""Largest ratio of residual to noise, in the band of the motion, that noise alone explains."""
 MAX_UNEXPLAINED: Final = 0.2
-"""Part of a channel's measured variation that may stay unexplained."""
-ALL: Final = "all joints"
-"""Where an error is that all of them share."""
-UNKNOWN: Final = "no known error"
-"""What is named where a column fits whose size cannot be."""
+"""Largest fraction of a channel's measured variation that may stay unexplained."""
+ALL_JOINTS: Final = "all joints"
+"""Place of an error that all joints share."""
+UNKNOWN_ERROR: Final = "no known error"
+"""Name of a finding whose error explains the signal but has an impossible size."""
 GEOMETRY: Final = "geometry"
 
 
@@ -89,8 +89,8 @@ class Finding:
 
     def __str__(self) -> str:
         return (
-            f"{self.suspect} {_sized(self.size, self.suspect.unit)} +- "
-            f"{_sized(self.deviation, self.suspect.unit)}, {self.sigmas:.3g} sigma"
+            f"{self.suspect} {_write_size(self.size, self.suspect.unit)} +- "
+            f"{_write_size(self.deviation, self.suspect.unit)}, {self.sigmas:.3g} sigma"
             + "".join(f", or {other}" for other in self.others)
         )
 
@@ -135,10 +135,10 @@ class Verdict:
 
     @property
     def deviations(self) -> Deviations:
-        """What becomes of the standard deviations."""
+        """How the standard deviations are reported."""
         if self.answer == "does not explain":
             return "withheld"
-        loud = any(channel.left_ratio > LOUD for channel in self.channels)
+        loud = any(channel.left_ratio > MAX_NOISE_RATIO for channel in self.channels)
         return "widened" if self.findings or self.hints or loud else "as estimated"
 
     def __str__(self) -> str:
@@ -168,7 +168,7 @@ class Verdict:
         return told
 
     def as_json(self, units: tuple[str, ...]) -> dict[str, Any]:
-        """Plain data.
+        """Return plain data for JSON.
 
         :param units: of the channels' measurements.
         """
@@ -192,7 +192,7 @@ class Verdict:
         }
 
 
-def _sized(size: float, unit: str) -> str:
+def _write_size(size: float, unit: str) -> str:
     return f"{size:.3g} {unit}" if unit else f"{100 * size:.2g} %"
 
 
@@ -296,7 +296,7 @@ class Fitted:
         self.kinds: dict[tuple[str, bool], list[int]] = {}
         for k, one in enumerate(errors):
             if one.usual and not one.known:
-                own = self.kinds.setdefault((one.kind, one.where == ALL), [])
+                own = self.kinds.setdefault((one.kind, one.where == ALL_JOINTS), [])
                 own.append(self.count + k)
 
     def with_columns(self, used: Mask, places: Sequence[int]) -> Mask:
@@ -313,8 +313,8 @@ class Fitted:
         """
         alike = dict[tuple[str, bool], list[int]]()
         for k, one in enumerate(self.errors):
-            alike.setdefault((one.kind, one.where == ALL), []).append(self.count + k)
-        odds = float(np.log(PRESENT / (1.0 - PRESENT)))
+            alike.setdefault((one.kind, one.where == ALL_JOINTS), []).append(self.count + k)
+        odds = float(np.log(PRESENT_PROBABILITY / (1.0 - PRESENT_PROBABILITY)))
         found = [
             ([k], odds - float(np.log(len(own)))) for (kind, _), own in alike.items() for k in own if kind != GEOMETRY
         ]
@@ -354,14 +354,14 @@ class Fitted:
             near = [
                 k
                 for k in np.argsort(-np.array(odds)).tolist()
-                if odds[k] > odds[best] - ALTERNATIVE
+                if odds[k] > odds[best] - ALTERNATIVE_LOG_ODDS
                 and possible[k]
                 and not {*self.candidates[best][0]} & {*self.candidates[k][0]}
             ]
             places = self.candidates[best][0]
             others = tuple(self.candidates[k][0] for k in near[:3])
             chosen.append(Selected(places, odds[best], others))
-            if odds[best] < FOUND:
+            if odds[best] < FOUND_LOG_ODDS:
                 break
             used = self.with_columns(used, places)
         return chosen, used
@@ -386,7 +386,7 @@ class Fitted:
         for which in product((False, True), repeat=len(kinds)):
             inside = [k for own, on in zip(kinds, which, strict=True) if on for k in own]
             masks.append(self.with_columns(always, inside))
-            prior = [PRESENT if on else 1.0 - PRESENT for on in which]
+            prior = [PRESENT_PROBABILITY if on else 1.0 - PRESENT_PROBABILITY for on in which]
             logs.append(self.whole.log_evidence(masks[-1], all_logs) + float(np.log(prior).sum()))
         weights = np.exp(np.array(logs) - max(logs))
         weights[weights < 1e-3] = 0.0
@@ -398,11 +398,11 @@ class Fitted:
             one = self.model.posterior(masks[k], shares)
             away = one.mean[some] - mean
             covariance += weights[k] * (one.covariance[some, some] + np.outer(away, away))
-        # What the recordings hardly tell keeps the file's values.
+        # Combinations that the recordings hardly determine keep the file's values.
         plain = self.model.posterior(used).covariance[some, some]
         sizes = self.model.deviation[some]
         values, vectors = np.linalg.eigh(plain / np.outer(sizes, sizes))
-        # The recordings tell a combination where they know it five times better than the prior.
+        # A combination is determined if its deviation is a fifth of the prior's.
         told = vectors[:, values < 1.0 / 26.0]
         change = sizes * (told @ (told.T @ (mean / sizes)))
         return change, covariance + np.outer(mean - change, mean - change)
@@ -414,7 +414,7 @@ class Fitted:
             return first
         if first.kind == GEOMETRY:
             return Suspect(GEOMETRY, "lengths and angles", "usual errors", 1.0)
-        return replace(first, where=ALL)
+        return replace(first, where=ALL_JOINTS)
 
     def describe(self, posterior: Posterior, one: Selected) -> Finding:
         """Return a selected error with its size, the root mean square of several columns'."""
@@ -427,8 +427,8 @@ class Fitted:
             size = float(np.sqrt(np.mean((mean / scale) ** 2)))
             deviation = size / np.sqrt(2.0 * max(one.odds, 1e-9))
         if own.positive and (mean < 0.0).any():
-            # The signal is there, but this cannot be its cause.
-            own = replace(own, kind=UNKNOWN)
+            # The size is impossible, so the cause of the signal is another error.
+            own = replace(own, kind=UNKNOWN_ERROR)
         others = tuple(dict.fromkeys(map(self.name, one.others)))
         return Finding(own, size, deviation, abs(size) / max(deviation, 1e-300), others)
 
@@ -453,20 +453,20 @@ def fit_and_judge(
     first, last = (fitted.model.posterior(one) for one in (fitted.certain, used))
     seen = fitted.whole.posterior(used)
     wide = fitted.whole.posterior(fitted.with_columns(used, [k for o in chosen for k in o.places]))
-    found = [fitted.describe(seen if one.odds >= FOUND else wide, one) for one in chosen]
-    sure = sum(one.odds >= FOUND for one in chosen)
+    found = [fitted.describe(seen if one.odds >= FOUND_LOG_ODDS else wide, one) for one in chosen]
+    sure = sum(one.odds >= FOUND_LOG_ODDS for one in chosen)
     mean, covariance = fitted.average(used, chosen)
     taken = fitted.count + sum(len(one.places) for one in chosen)
     both = [fitted.residuals(one) for one in (first, last)]
-    told = tuple(_channel(name, k, cases, both, taken) for k, name in enumerate(channels))
-    # Ten times its usual size an error, beyond doubt, is another model's.
+    told = tuple(_judge_channel(name, k, cases, both, taken) for k, name in enumerate(channels))
+    # An error certainly above ten times its usual size shows that the model is another one.
     absurd = [
         one for one in found[:sure] if abs(one.size) - SIGMAS * one.deviation > 10.0 * (one.suspect.usual or np.inf)
     ]
     answer: Answer = "explains"
     if absurd or max(channel.left for channel in told) > MAX_UNEXPLAINED:
         answer = "does not explain"
-    elif sure or any(max(channel.left_ratio, channel.held_out) > LOUD for channel in told):
+    elif sure or any(max(channel.left_ratio, channel.held_out) > MAX_NOISE_RATIO for channel in told):
         answer = "explains partly"
     own = tuple(last.mean[place[fitted.count + len(errors) :]] for place in fitted.places)
     some = slice(0, fitted.count)
@@ -483,14 +483,14 @@ def fit_and_judge(
     ), fitted
 
 
-def basis_of(table: Array) -> Array:
+def make_basis(table: Array) -> Array:
     """Return an orthonormal basis of a table's columns."""
     norms = np.linalg.norm(table, axis=0)
     vectors, sizes, _ = np.linalg.svd(table[:, norms > 0.0] / norms[norms > 0.0], False)
     return np.asarray(vectors[:, sizes > 1e-7 * sizes.max(initial=0.0)], np.float64)
 
 
-def _channel(name: str, j: int, cases: Sequence[Case], both: Sequence[Sequence[Array]], taken: int) -> Channel:
+def _judge_channel(name: str, j: int, cases: Sequence[Case], both: Sequence[Sequence[Array]], taken: int) -> Channel:
     """Compare a channel's residual with its noise, over all recordings.
 
     :param both: residuals before and after the found errors, (k, n) of each recording.
@@ -510,7 +510,7 @@ def _channel(name: str, j: int, cases: Sequence[Case], both: Sequence[Sequence[A
     for case in cases:
         part = float(case.counts[:, j].sum()) / rows
         own = case.measured[:, j]
-        floor = max(float(case.noise[j]), EXACT * float(np.sqrt(np.mean(own**2))))
+        floor = max(float(case.noise[j]), MIN_RELATIVE_NOISE * float(np.sqrt(np.mean(own**2))))
         level += part * case.band * floor**2
         variation += part * float(np.var(own))
     now = mean(after) / (1.0 - share)

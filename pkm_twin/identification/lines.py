@@ -11,11 +11,11 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.identification.calibration_state import State, derivatives
+from pkm_twin.identification.calibration_state import State, differentiate_poses
 from pkm_twin.robot.robot import Robot
 
-POSES: Final = 24
-"""Poses between which distances and angles are taken."""
+MAX_POSES: Final = 24
+"""Largest number of poses between which distances and angles are taken."""
 
 
 class LineSlopes(NamedTuple):
@@ -48,9 +48,9 @@ def line_slopes(robot: Robot, state: State, names: Sequence[str]) -> LineSlopes 
 
     Lines shorter than 0.3 of the longest, and angles within 30 degrees of 0 or pi, are left out.
     """
-    some = np.unique(np.linspace(0, len(state.q) - 1, POSES).astype(int))
+    some = np.unique(np.linspace(0, len(state.q) - 1, MAX_POSES).astype(int))
     position = state.instrument.compute_reading(*state.platform)[0][some]
-    columns = derivatives(
+    columns = differentiate_poses(
         robot, replace(state, q=state.q[some], platform=(state.platform[0][some], state.platform[1][some])), names
     )[:, :3]
     ways = position[:, None] - position

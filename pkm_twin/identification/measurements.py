@@ -13,8 +13,8 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array, Indices
 from pkm_twin.errors import ParameterError, UnknownNameError
-from pkm_twin.identification.calibration_state import Poses, State, derivatives, rotations
-from pkm_twin.identification.samples import CLEAR, FINEST, huber
+from pkm_twin.identification.calibration_state import Poses, State, differentiate_poses, rotations
+from pkm_twin.identification.samples import MAX_SOUND_DISTANCE, MIN_NOISE, huber
 from pkm_twin.recordings.tables import DEFAULT_DIALECT, Dialect, Table, read_table
 from pkm_twin.robot.robot import Robot
 
@@ -188,8 +188,8 @@ class _Range(_Ball):
         return min(found, key=lambda own: float(np.sum((values - self.value(p, p, own)[:, 0]) ** 2)))
 
 
-PLACE: Final = Kind("position", "m", FINEST, (0, 1, 2), length=True, believed=0.0)
-TURN: Final = _Rotation("rotation", "rad", FINEST, (3, 4, 5), believed=0.0)
+POSITION_KIND: Final = Kind("position", "m", MIN_NOISE, (0, 1, 2), length=True, believed=0.0)
+ROTATION_KIND: Final = _Rotation("rotation", "rad", MIN_NOISE, (3, 4, 5), believed=0.0)
 """Of whole poses."""
 KINDS: Final = {
     kind.name: kind
@@ -226,8 +226,8 @@ KINDS: Final = {
 GROUPS: Final = {"tilt": ("roll", "pitch"), "position": COORDINATES[:3], "pose": COORDINATES}
 
 
-def kinds_of(texts: Sequence[str]) -> tuple[Kind, ...]:
-    """Kinds by names, separated by commas.
+def parse_kinds(texts: Sequence[str]) -> tuple[Kind, ...]:
+    """Parse the names of kinds, separated by commas.
 
     :raises UnknownNameError: no such kind.
     """
@@ -344,7 +344,7 @@ class Measured:
 
     def slopes(self, robot: Robot, state: State, names: Sequence[str]) -> list[Array]:
         """Differentiate what is computed by named parameters, (m, a, p) a kind."""
-        columns = derivatives(robot, state, names)
+        columns = differentiate_poses(robot, state, names)
         return [one.slopes(state, columns, names) for one in self.readings]
 
     def weighed(self, parts: list[Array], slopes: list[Array], prior: Array) -> Weights:
@@ -364,18 +364,18 @@ class Measured:
         for _ in range(5):
             away = [size / s for size, s in zip(sizes, noise, strict=True)]
             weights = [huber(one) for one in away]
-            left = left_over(slopes, noise, prior)
+            left = find_redundancy(slopes, noise, prior)
             for k, kind in enumerate(kinds):
-                good = away[k] < CLEAR
+                good = away[k] < MAX_SOUND_DISTANCE
                 square = kind.believed * usual[k] ** 2 + float(np.sum(parts[k][good] ** 2))
                 count = kind.believed + float(np.sum(left[k][good])) * parts[k].shape[1]
                 if kind.name not in self.noise:
-                    noise[k] = max(float(np.sqrt(square / max(count, 1.0))), FINEST)
+                    noise[k] = max(float(np.sqrt(square / max(count, 1.0))), MIN_NOISE)
         scales = [np.sqrt(w) / s for w, s in zip(weights, noise, strict=True)]
         return Weights(tuple(noise), tuple(scales))
 
 
-def left_over(slopes: Sequence[Array], noise: Sequence[float], prior: Array) -> list[Array]:
+def find_redundancy(slopes: Sequence[Array], noise: Sequence[float], prior: Array) -> list[Array]:
     """Part of each measurement that the others and the priors decide, 0 to 1, (m,) a kind."""
     rows = [(table * prior / s).reshape(-1, len(prior)) for table, s in zip(slopes, noise, strict=True)]
     whole = np.concatenate(rows)
@@ -386,16 +386,16 @@ def left_over(slopes: Sequence[Array], noise: Sequence[float], prior: Array) -> 
     return [part.reshape(len(table), -1).mean(1) for part, table in zip(each, slopes, strict=True)]
 
 
-def whole_of(poses: Poses, rows: Indices) -> Measured:
+def select_poses(poses: Poses, rows: Indices) -> Measured:
     """Return some of the whole poses, or of their positions, as measurements."""
     every, lines = np.arange(len(rows)), rows + 2
-    readings = [Readings(PLACE, every, None, poses.position[rows], lines)]
+    readings = [Readings(POSITION_KIND, every, None, poses.position[rows], lines)]
     if poses.rotation is not None:
-        readings.append(Readings(TURN, every, None, poses.rotation[rows], lines))
+        readings.append(Readings(ROTATION_KIND, every, None, poses.rotation[rows], lines))
     return Measured(poses.joints[rows], tuple(readings))
 
 
-def measured_of(
+def make_measured(
     joints: Array,
     second: Array | None,
     values: Mapping[str, Array],
@@ -514,7 +514,7 @@ def read_measured(
         raise ParameterError(table.line(row), "an empty cell", "every joint's position")
     names = [kind.name for kind in kinds]
     values = dict(zip(names, table.stack(names).T, strict=True))
-    return measured_of(q, second, values, np.arange(len(q)) + 2, noise)
+    return make_measured(q, second, values, np.arange(len(q)) + 2, noise)
 
 
 def _read(

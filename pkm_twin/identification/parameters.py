@@ -19,8 +19,8 @@ from pkm_twin.identification.identifiable import (
     KINDS,
     Identifiable,
     Kind,
+    find_possible_inertia,
     identifiable,
-    possible_inertia,
 )
 from pkm_twin.machine.graph import group_connected
 from pkm_twin.machine.inertia import STANDARD_PARAMETERS, make_frame_change
@@ -32,12 +32,11 @@ T = TypeVar("T")
 Status = Literal["fitted", "combination", "not excited"]
 
 COMPLIANCE: Final = "compliance"
-"""What is fitted to deflections, not to efforts."""
-OBSERVED: Final = 0.5
-"""One that is known this much better is observed: the measurements, not the prior, say most of it.
-"""
+"""Name of the kind of number that is fitted to deflections instead of efforts."""
+OBSERVED_RATIO: Final = 0.5
+"""Largest ratio of a parameter's deviation to the prior's at which it counts as observed."""
 FITTED_RATIO: Final = 0.2
-"""A number that is known this much better than before is fitted."""
+"""Largest ratio of a number's deviation to the prior's at which it counts as fitted."""
 MIN_RELATIVE_WEIGHT: Final = 0.1
 """Smallest weight of an element in a combination, as a fraction of the largest weight."""
 
@@ -77,7 +76,7 @@ class FileParameters:
 
     @cached_property
     def slices(self) -> tuple[slice, ...]:
-        """Where each group's parameters stand."""
+        """Slice of each group's parameters."""
         ends = np.cumsum([0, *(len(group.names) for group in self.groups)])
         return tuple(slice(int(a), int(b)) for a, b in pairwise(ends))
 
@@ -117,8 +116,8 @@ def file_parameters(robot: Robot, what: Sequence[Kind] = KINDS) -> FileParameter
     return FileParameters(tuple(kept), mixing)
 
 
-def kinds_of(what: str) -> tuple[Kind, ...]:
-    """Write the kinds of numbers in words with commas between.
+def parse_kinds(what: str) -> tuple[Kind, ...]:
+    """Parse the kinds of numbers, separated by commas.
 
     :raises UnknownNameError: another word.
     """
@@ -157,7 +156,7 @@ class Number:
         return join_path(self.key)
 
 
-def number_of(
+def make_number(
     key: Keys, unit: str, before: float, value: float, deviations: tuple[float, float], prior: float
 ) -> Number:
     """Return a number with its standard deviation by the noise alone.
@@ -173,7 +172,7 @@ def number_of(
     return Number(key, unit, before, value, wide, status)
 
 
-def numbers_of_group(
+def make_group_numbers(
     group: Identifiable, values: Array, prior: Array, covariances: tuple[Array, Array]
 ) -> list[Number]:
     """Return a group's numbers of the file, their deviations by the derivatives of its keys.
@@ -192,15 +191,15 @@ def numbers_of_group(
     for slope, (key, value), unit in each:
         plain, wide = (float(np.sqrt(max(slope @ one @ slope, 0.0))) for one in covariances)
         usual = float(np.linalg.norm(slope * prior))
-        numbers.append(number_of(key, unit, before[key], value, (plain, wide), usual))
+        numbers.append(make_number(key, unit, before[key], value, (plain, wide), usual))
         whole.append(Number(key, unit, before[key], value, wide, "combination"))
     moments: dict[Keys, list[int]] = {}
     for k, one in enumerate(numbers):
         if isinstance(one.key[-1], int) and isinstance(one.key[-2], int):
-            moments.setdefault(_base(one.key), []).append(k)
+            moments.setdefault(_find_base(one.key), []).append(k)
     for places in moments.values():
         inertia = np.array([numbers[k].after for k in places])
-        off = np.abs(possible_inertia(inertia) - inertia).max()
+        off = np.abs(find_possible_inertia(inertia) - inertia).max()
         for k in places if off > 1e-12 * np.abs(inertia).max() else ():
             numbers[k] = numbers[k] if numbers[k].status != "not excited" else whole[k]
     return numbers
@@ -223,8 +222,10 @@ class Group:
     known: tuple[Combination, ...]
 
 
-def groups_of(names: Sequence[str], factors: Array, covariance: Array, wide: Array | None = None) -> tuple[Group, ...]:
-    """Elements that share a direction that is not known, and the directions that are.
+def group_elements(
+    names: Sequence[str], factors: Array, covariance: Array, wide: Array | None = None
+) -> tuple[Group, ...]:
+    """Group the elements that the data do not separate, with the combinations that are known.
 
     :param factors: shape (elements,), known to 1 before. ``covariance``: of them, and of more
         behind them, by the noise alone. ``wide``: with what the model does not explain; default
@@ -246,7 +247,7 @@ def groups_of(names: Sequence[str], factors: Array, covariance: Array, wide: Arr
         values, vectors = np.linalg.eigh(own[np.ix_(members, members)])
         told = []
         for vector in vectors[:, values <= FITTED_RATIO**2].T:
-            named = weights_of(range(len(members)), vector)
+            named = list_weights(range(len(members)), vector)
             weights = np.zeros(len(members))
             weights[list(named)] = list(named.values())
             weights /= np.linalg.norm(weights)
@@ -257,8 +258,8 @@ def groups_of(names: Sequence[str], factors: Array, covariance: Array, wide: Arr
     return tuple(result)
 
 
-def weights_of(names: Sequence[T], vector: Array) -> dict[T, float]:
-    """Weights of a direction by name, the greatest above zero, without those that hardly count."""
+def list_weights(names: Sequence[T], vector: Array) -> dict[T, float]:
+    """List a direction's weights by name, without small ones; the largest is positive."""
     vector = vector * np.sign(vector[np.argmax(np.abs(vector))])
     least = MIN_RELATIVE_WEIGHT * float(np.abs(vector).max())
     return {n: w for n, w in zip(names, vector.tolist(), strict=True) if abs(w) > least}
@@ -271,7 +272,7 @@ def fitted_yaml(text: str, fitted: Sequence[Number], recordings: Sequence[str]) 
     """
     groups: dict[Keys, list[Number]] = {}
     for number in fitted:
-        groups.setdefault(_base(number.key), []).append(number)
+        groups.setdefault(_find_base(number.key), []).append(number)
     values: dict[Keys, Any] = {}
     notes: dict[Keys, str] = {}
     source = ", ".join(recordings)
@@ -292,8 +293,8 @@ def fitted_yaml(text: str, fitted: Sequence[Number], recordings: Sequence[str]) 
     return edit_yaml(text, values, notes)
 
 
-def _base(key: Keys) -> Keys:
-    """Of the number, vector or matrix that a number stands in."""
+def _find_base(key: Keys) -> Keys:
+    """Return the key of the number, vector or matrix that a number belongs to."""
     base: Keys = tuple(k for k in key if not isinstance(k, int))
     # A section of a list is no place in a vector.
     return (*key[:2], *base[1:]) if key[:1] == ("limbs",) and isinstance(key[1], int) else base

@@ -11,8 +11,8 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
-from pkm_twin.identification.calibration import Estimate, Free, geometric, placed, unknowns
-from pkm_twin.identification.calibration_state import derivatives
+from pkm_twin.identification.calibration import Estimate, Free, list_geometric_paths, list_parameters, make_start
+from pkm_twin.identification.calibration_state import differentiate_poses
 from pkm_twin.identification.lines import line_slopes
 from pkm_twin.identification.measurements import (
     KINDS,
@@ -25,9 +25,9 @@ from pkm_twin.machine.rotations import skew
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import within_limits
 
-CANDIDATES: Final = 300
+MAX_CANDIDATES: Final = 300
 MAX_MEASUREMENTS: Final = 150
-"""Measurements of a plan."""
+"""Largest number of measurements of a plan."""
 
 
 def parse_within(text: str | None) -> dict[str, tuple[float, float]]:
@@ -107,29 +107,29 @@ def plan(
     if len(pair) > 1:
         raise ParameterError("--measure", "distance", "distance alone, or other kinds, in a plan")
     q = _candidates(robot, measured, dict(within or {}), kinds)
-    paths = geometric(robot, q, (free := Free(**options)).only)
+    paths = list_geometric_paths(robot, q, (free := Free(**options)).only)
     joints = np.asarray(robot.controller.controller_positions(q))
     first = np.arange(len(q))
     second = np.roll(first, len(q) // 2) if pair == {True} else None
     noise = dict(noise or {})
     position = robot.platform(q)[0]
     all_poses = Measured(joints, tuple(Readings(k, first, second, k.likely(position), first) for k in kinds), noise)
-    parameters = unknowns(robot, all_poses, paths, free)
+    parameters = list_parameters(robot, all_poses, paths, free)
     names = [p.name for p in parameters]
     prior = np.array([p.prior for p in parameters])
     fitted = [name for name in names if name in paths]
-    state = placed(robot, all_poses, fitted)
+    state = make_start(robot, all_poses, fitted)
     covariance: Array = np.eye(len(names))
     if measured is not None:
-        there = placed(robot, measured, fitted)
+        there = make_start(robot, measured, fitted)
         state.instrument.own |= {k: v for k, v in there.instrument.own.items() if k in names}
         known = [measured.noise.get(one.kind.name, one.kind.noise) for one in measured.readings]
         table = np.concatenate(_over(measured.slopes(robot, there, names), prior, known))
         covariance = np.asarray(np.linalg.inv(covariance + table.T @ table), np.float64)
     usual = [noise.get(kind.name, kind.noise) for kind in kinds]
     rows = np.stack(_over(all_poses.slopes(robot, state, names), prior, usual), 1)
-    places = derivatives(robot, state, names)[:, :3] * prior
-    # A motion of the whole workspace is where the instrument stands, not an error of the machine.
+    places = differentiate_poses(robot, state, names)[:, :3] * prior
+    # A rigid motion of the workspace is the instrument's pose, not an error of the machine.
     rigid = np.concatenate([np.broadcast_to(np.eye(3), (len(q), 3, 3)), -skew(state.platform[0])], -1).reshape(-1, 6)
     flat = places.reshape(len(rigid), -1)
     places = (flat - rigid @ np.linalg.lstsq(rigid, flat, rcond=1e-9)[0]).reshape(places.shape)
@@ -177,7 +177,7 @@ def _candidates(
     within: dict[str, tuple[float, float]],
     kinds: Sequence[Kind],
 ) -> Array:
-    """Joint states (k, n) from which poses are chosen.
+    """Draw the joint states (k, n) from which poses are chosen.
 
     :raises ParameterError: the workspace is not known, or none of it can be reached.
     """
@@ -188,7 +188,7 @@ def _candidates(
         poses = robot.forward(robot.controller.positions(measured.joints))
         box = np.stack([poses.min(0), poses.max(0)], -1)
     elif limits is not None and np.isfinite(limits).all():
-        drawn = rng.uniform(limits[:, 0], limits[:, 1], (20 * CANDIDATES, len(limits)))
+        drawn = rng.uniform(limits[:, 0], limits[:, 1], (20 * MAX_CANDIDATES, len(limits)))
         poses, good = robot.try_forward(drawn)
         if good.any():
             box = np.stack([poses[good].min(0), poses[good].max(0)], -1)
@@ -206,9 +206,9 @@ def _candidates(
             None,
             f"the range of {missing}, as {missing}=-0.1:0.1: the file has no joint limits",
         )
-    poses = rng.uniform(box[:, 0], box[:, 1], (20 * CANDIDATES, len(box)))
+    poses = rng.uniform(box[:, 0], box[:, 1], (20 * MAX_CANDIDATES, len(box)))
     q, good = robot.try_inverse(poses)
     good &= within_limits(robot, q)
     if good.sum() < len(names):
         raise ParameterError("--within", dict(within) or None, "poses that the machine reaches")
-    return np.asarray(q[good][:CANDIDATES], np.float64)
+    return np.asarray(q[good][:MAX_CANDIDATES], np.float64)

@@ -21,20 +21,20 @@ from pkm_twin.identification.estimation import Estimate, estimate
 from pkm_twin.identification.identifiable import Kind
 from pkm_twin.identification.parameters import FileParameters, file_parameters
 from pkm_twin.identification.samples import (
-    EXACT,
-    LEAST,
+    MIN_RELATIVE_NOISE,
+    MIN_SAMPLES,
     Filtering,
     Line,
     Motion,
     Track,
-    by_blocks,
-    calm,
+    estimate_noise_density,
+    evaluate_blocks,
     filtered,
     find_lines,
-    in_motion,
-    noise_of,
-    passed_band,
-    shaken_efforts,
+    find_passed_band,
+    fit_spline,
+    select_motion,
+    simulate_noise,
     tracks,
 )
 from pkm_twin.identification.words import position_text
@@ -50,11 +50,11 @@ from pkm_twin.recordings.recording import Recording
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.noise import estimate_deviation
 
-BLOCK: Final = 2048
-LARGEST: Final = 1e9
-"""Effort that no drive has, N m or N."""
+BLOCK_ROWS: Final = 2048
+MAX_EFFORT: Final = 1e9
+"""Largest effort that a drive can have, N m or N."""
 HELD_OUT: Final = 1 / 3
-"""Part of each recording, its end, that is judged and not fitted."""
+"""Fraction of each recording, at its end, that is predicted and not fitted."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,7 @@ class Model:
 
     @property
     def of_drives(self) -> Mask:
-        """Which parameters are friction of the drives."""
+        """Mask of the parameters that are friction of the drives."""
         keys, drives = list_friction_keys(), set(self.robot.joint_names)
         pairs = [name.rpartition(".")[::2] for name in self.parameters.names]
         return np.array([joint in drives and key in keys for joint, key in pairs])
@@ -86,7 +86,7 @@ class Model:
             own, rest = self._columns(motion.part(rows))
             return np.concatenate([own, rest[..., None]], -1)
 
-        both = by_blocks(len(motion.q), BLOCK, block)
+        both = evaluate_blocks(len(motion.q), BLOCK_ROWS, block)
         if memory is not None:
             place = {name: k for k, name in enumerate(self.parameters.names)}
             for j in np.flatnonzero(self._drives("presliding") > 0.0):
@@ -105,12 +105,12 @@ class Model:
         return np.array([known.get(f"{joint}.{key}", value) for joint, value in own])
 
     def memory(self, track: Track, how: Filtering) -> Memory | None:
-        """Of the drives' friction along a track; None without."""
+        """Return the friction hysteresis along a track; None if no drive has any."""
         distance = self._drives("presliding")
         return Dahl.states(track.q, track.sure(how), distance) if distance.any() else None
 
     def efforts(self, motion: Motion, values: Array, memory: Memory | None = None) -> Array:
-        """With values of the parameters, (k, n); memory as of :meth:`columns`."""
+        """Compute efforts for parameter values, (k, n); memory as in :meth:`columns`."""
         table, rest = self.columns(motion, memory)
         return np.asarray(rest + table @ values, np.float64)
 
@@ -180,22 +180,22 @@ class Rows:
 
     @property
     def signals(self) -> Signals:
-        """Of the same rows."""
+        """Signals of the same rows, computed at the first use."""
         return self.make()
 
     @property
     def period(self) -> float:
-        """Of the samples, s."""
+        """Sampling period, s."""
         return self.tracks[0].period
 
     @property
     def effort(self) -> Array:
-        """As measured, filtered, shape (k, n)."""
+        """Measured efforts, filtered, shape (k, n)."""
         return self.target + self.rest
 
     @property
     def held_from(self) -> int:
-        """The first row that is held out."""
+        """Index of the first held-out row."""
         return round((1.0 - HELD_OUT) * len(self.time))
 
     @property
@@ -213,16 +213,16 @@ class Rows:
         return replace(self, **{name: getattr(self, name)[rows] for name in cut})
 
     def only(self, columns: Mask, values: Array) -> Rows:
-        """With some of the parameters, the others at these values, (parameters,)."""
+        """Return rows with some of the parameters; the others stay at these values, (parameters,)."""
         stay = self.table[..., ~columns] @ values[~columns]
         return replace(self, table=self.table[..., columns], target=self.target - stay, rest=self.rest + stay)
 
     def again(self, parameters: FileParameters, window: int) -> Rows:
         """Read the recording again with other parameters or another window of differentiation."""
-        return rows_of(self.model.robot, parameters, self.recording, window)
+        return make_rows(self.model.robot, parameters, self.recording, window)
 
 
-def rows_of(robot: Robot, parameters: FileParameters, recording: Recording, window: int | None = None) -> Rows:
+def make_rows(robot: Robot, parameters: FileParameters, recording: Recording, window: int | None = None) -> Rows:
     """Return a recording's filtered rows.
 
     :param window: of the differentiation, samples; None chooses it.
@@ -230,18 +230,18 @@ def rows_of(robot: Robot, parameters: FileParameters, recording: Recording, wind
         machine cannot take its positions.
     """
     r = recording
-    if len(r.time) < LEAST:
-        raise PkmTwinError(f"{r.name}: too short to fit, {len(r.time)} samples; {LEAST} or more in a row")
+    if len(r.time) < MIN_SAMPLES:
+        raise PkmTwinError(f"{r.name}: too short to fit, {len(r.time)} samples; {MIN_SAMPLES} or more in a row")
     for joint, effort in zip(robot.joint_names, r.measured.T, strict=True):
-        worst = float(effort[np.argmax(~(np.abs(effort) < LARGEST))])
-        if not abs(worst) < LARGEST:
-            raise PkmTwinError(f"{r.name}: effort of {joint} is {worst:g}; below {LARGEST:g} is what a drive has")
+        worst = float(effort[np.argmax(~(np.abs(effort) < MAX_EFFORT))])
+        if not abs(worst) < MAX_EFFORT:
+            raise PkmTwinError(f"{r.name}: effort of {joint} is {worst:g}; below {MAX_EFFORT:g} is what a drive has")
         if np.ptp(effort) < 1e-9:
             only = effort[0] + 0.0  # no minus before zero
             raise PkmTwinError(f"{r.name}: effort of {joint} is {only:g} throughout: nothing was measured")
     pieces, how = tracks(r.time, r.q, r.measured, r.wrench, r.held, window)
     if not pieces:
-        raise PkmTwinError(f"{r.name}: too short to fit, no {LEAST // 2} samples without a gap")
+        raise PkmTwinError(f"{r.name}: too short to fit, no {MIN_SAMPLES // 2} samples without a gap")
     # With the friction laws on trial, as the robot has them.
     carried = None if r.carried is None else replace(robot, payload=r.carried.payload)
     model = Model(robot, parameters, carried)
@@ -261,7 +261,7 @@ def rows_of(robot: Robot, parameters: FileParameters, recording: Recording, wind
         float(estimate_deviation(one[some])) if some.any() else 0.0 for one, some in zip(left.T, moves.T, strict=True)
     ]
     # And what it may add is below what else is left.
-    least = np.maximum(usual, EXACT * np.sqrt(np.mean(f["target"] ** 2, 0)))
+    least = np.maximum(usual, MIN_RELATIVE_NOISE * np.sqrt(np.mean(f["target"] ** 2, 0)))
     counts = (moves & (np.abs(f["doubt"]) < least)).astype(np.float64)
     return Rows(
         r,
@@ -275,22 +275,22 @@ def rows_of(robot: Robot, parameters: FileParameters, recording: Recording, wind
         counts,
         f["change"],
         outliers,
-        cache(lambda: _signals(r, model, how, told, first)),
+        cache(lambda: _make_signals(r, model, how, told, first)),
     )
 
 
-def _signals(r: Recording, model: Model, how: Filtering, told: Sequence[_FirstFit], first: Array) -> Signals:
+def _make_signals(r: Recording, model: Model, how: Filtering, told: Sequence[_FirstFit], first: Array) -> Signals:
     """Return the signals of a recording's rows.
 
     :param told: by piece. ``first``: parameters of a first fit.
     """
     tracks = [one.track for one in told]
-    left = in_motion([one.residuals for one in told], [one.moves for one in told])
+    left = select_motion([one.residuals for one in told], [one.moves for one in told])
     longest = max(tracks, key=lambda t: len(t.time))
     speed = np.sqrt(np.mean(np.concatenate([track.qd for track in tracks]) ** 2, 0))
     f = filtered([one.columns(speed, how) for one in told], longest.period, how)
-    shaken = shaken_efforts(r, longest, how, lambda track: model.efforts(track, first, model.memory(track, how)))
-    noise = noise_of(left, shaken, longest.period, how)
+    shaken = simulate_noise(r, longest, how, lambda track: model.efforts(track, first, model.memory(track, how)))
+    noise = estimate_noise_density(left, shaken, longest.period, how)
     size = np.sqrt(np.mean(np.concatenate([track.effort for track in tracks]) ** 2, 0))
     spectral = find_lines(left, longest.period, how, size, longest.wrench)
     rate = 1.0 / (longest.period * how.keep_every)
@@ -302,14 +302,14 @@ def _signals(r: Recording, model: Model, how: Filtering, told: Sequence[_FirstFi
         f["effort"],
         f["own"],
         noise * np.sqrt(rate),
-        passed_band(how, rate),
+        find_passed_band(how, rate),
         spectral,
     )
 
 
 @dataclass(frozen=True, eq=False)
 class _Piece:
-    """One even piece before the filter."""
+    """Regressor and efforts of one evenly sampled piece, before filtering."""
 
     track: Track
     table: Array
@@ -320,7 +320,7 @@ class _Piece:
 
     @classmethod
     def from_track(cls, model: Model, track: Track, how: Filtering) -> _Piece:
-        """Of a track."""
+        """Evaluate the model along a track."""
         memory, moves = model.memory(track, how), track.moves(how)
         table, rest = model.columns(track, memory)
         if memory is not None:
@@ -374,7 +374,7 @@ class _FirstFit:
             laws.append(np.exp(-((track.qd / np.maximum(share * speed, 1e-300)) ** 2)) * sign)
         # Nearly all of the motion is below this part of the filter's cut-off.
         cutoff = None if how.cutoff is None else 0.4 * how.cutoff
-        motion, force = (calm(values, track.period, cutoff) for values in (track.q, load))
+        motion, force = (fit_spline(values, track.period, cutoff) for values in (track.q, load))
         return {
             "effort": self.efforts,
             "q": motion[0],
@@ -389,7 +389,7 @@ class _FirstFit:
 
 
 def _drop_outliers(parts: list[_Piece], parameters: FileParameters, every: int) -> tuple[Array, int]:
-    """Efforts far from a first robust fit take its values, but not many of them or in a row.
+    """Replace isolated efforts far from a first robust fit by its values.
 
     :returns: that fit's parameters, and how many efforts.
     """
@@ -426,14 +426,14 @@ def prior_scales(parameters: FileParameters, table: Array, effort: Array) -> Arr
         scales[k] = size[joint] / shown if shown > 0.0 else 0.0
     kinds = [name.rpartition(".")[2] for name in parameters.names]
     for k in np.flatnonzero(scales == 0.0):
-        # As uncertain as the others of its sort, where its joint does not move.
+        # If its joint does not move, a parameter gets the largest scale of its kind.
         alike = [s for s, kind in zip(scales, kinds, strict=True) if kind == kinds[k] and s > 0.0]
         scales[k] = max(alike, default=1.0)
     return scales
 
 
-FEW: Final = 5.0
-"""Independent measured values for each fitted number, below which there are too few."""
+MIN_VALUES_PER_NUMBER: Final = 5.0
+"""Smallest number of independent measured values for each fitted number."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -469,7 +469,7 @@ class Problem:
         everything, whole = file_parameters(robot), list[Rows]()
         for i, recording in enumerate(recordings):
             same = (one for one in known if one.recording is recording and one.model.robot is robot)
-            whole.append(next(same, None) or rows_of(robot, everything, recording))
+            whole.append(next(same, None) or make_rows(robot, everything, recording))
             if progress is not None:
                 progress(i + 1)
         problem = cls(robot, tuple(what), everything, tuple(whole))
@@ -482,25 +482,25 @@ class Problem:
 
     @cached_property
     def parameters(self) -> FileParameters:
-        """Those that are fitted."""
+        """Parameters that are fitted."""
         return file_parameters(self.robot, self.what)
 
     @cached_property
     def chosen(self) -> Mask:
-        """Which of all parameters they are."""
+        """Mask of the fitted ones among all parameters."""
         groups = self.everything.groups
         return np.array([group.kind in self.what for group in groups for _ in group.names])
 
     @cached_property
     def rows(self) -> tuple[Rows, ...]:
-        """With these parameters alone."""
+        """Rows with the fitted parameters alone."""
         return tuple(made.only(self.chosen, self.everything.values) for made in self.whole)
 
     @cached_property
     def columns(self) -> Array:
-        """Of parameters and delays, (samples, n, both): the fitted rows one after the other."""
+        """Regressor of parameters and delays, (samples, n, both), over all fitted rows."""
         used = [made.fitted for made in self.rows]
-        # Late by a delay is less the delay times the change.
+        # To first order a delay subtracts the efforts' derivative times the delay.
         late = [np.concatenate([-made.change * (i == j) for j, made in enumerate(used)]) for i in range(len(used))]
         table = np.concatenate([made.table for made in used])
         return np.concatenate([table, np.stack(late, -1)], -1)
@@ -531,18 +531,18 @@ class Problem:
 
     @property
     def delays(self) -> tuple[float, ...]:
-        """How late the efforts of each recording are, s."""
+        """Delay of each recording's efforts, s."""
         return tuple(self.both.values[-len(self.rows) :].tolist())
 
     @property
     def held_out(self) -> list[Rows]:
-        """What is not fitted, without the delays."""
+        """Held-out rows, corrected for the delays."""
         pairs = zip(self.rows, self.delays, strict=True)
         return [made.held_out(late) for made, late in pairs]
 
     @property
     def values(self) -> Array:
-        """All parameters, those that are fitted as they were found."""
+        """Values of all parameters: fitted ones as estimated, others as in the file."""
         values = self.everything.values.copy()
         values[self.chosen] = self.estimate.values
         return values
@@ -555,9 +555,9 @@ class Problem:
         directions = self.both.directions
         used = ((made.fitted.counts.sum(), made.signals.band) for made in self.rows)
         values = sum(float(count) * band for count, band in used)
-        if values < FEW * directions:
+        if values < MIN_VALUES_PER_NUMBER * directions:
             raise PkmTwinError(
                 f"too few samples: {values:.0f} independent efforts for {directions} numbers of "
-                f"{', '.join(self.what)}, {FEW * directions:.0f} or more are needed; record a "
+                f"{', '.join(self.what)}, {MIN_VALUES_PER_NUMBER * directions:.0f} or more are needed; record a "
                 "motion with more changes of speed (`pkm-twin excite`), or fit less with --what"
             )

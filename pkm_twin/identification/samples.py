@@ -24,13 +24,13 @@ from pkm_twin.recordings import Recording
 from pkm_twin.streams.noise import SIGMAS, estimate_noise
 
 DEGREE: Final = 4
-"""Of the local polynomial."""
+"""Degree of the local polynomial of the differentiation."""
 WINDOWS: Final = (7, 9, 11, 15, 19, 25, 33, 43, 57, 75, 99, 131)
-"""Samples that may be fitted."""
-BAND: Final = 10.0
-"""Cut-off of the low-pass filter, by the motion's mean frequency."""
-LEAST: Final = 200
-"""Samples that a recording needs."""
+"""Candidate windows of the differentiation, samples."""
+CUTOFF_RATIO: Final = 10.0
+"""Ratio of the low-pass filter's cut-off to the motion's mean frequency."""
+MIN_SAMPLES: Final = 200
+"""Smallest number of samples of a recording."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +69,7 @@ class Track(Motion):
     missed: Array
 
     def moves(self, how: Filtering) -> Mask:
-        """Where a joint moves, clear of what noise makes of its rates, shape (k, n)."""
+        """Return the mask of samples whose joint rates exceed those of noise, (k, n)."""
         weights = scipy.signal.savgol_coeffs(how.window, DEGREE, 1, self.period)
         slow = SIGMAS * np.array(how.position_noise) * np.linalg.norm(weights)
         mean = (self.qd[:-2] + self.qd[1:-1] + self.qd[2:]) / 3.0
@@ -77,13 +77,13 @@ class Track(Motion):
         return np.asarray(np.abs(self.qd) > np.maximum(np.maximum(rough, slow), 1e-9))
 
     def sure(self, how: Filtering) -> Array:
-        """Rates, zero where noise may be all of them, shape (k, n)."""
+        """Return the rates, zero where they may be noise alone, (k, n)."""
         return np.where(self.moves(how), self.qd, 0.0)
 
 
 @dataclass(frozen=True)
 class Filtering:
-    """What was done to the signals: window in samples, cut-off in Hz (None: none), rate kept."""
+    """Processing of the signals: window, samples; cut-off, Hz (None: unfiltered); decimation."""
 
     window: int
     position_noise: tuple[float, ...]
@@ -124,14 +124,14 @@ def local_fit(values: Array, window: int, degree: int, order: int, period: float
     return np.asarray(fitted, np.float64)
 
 
-def calm(values: Array, period: float, cutoff: float | None) -> list[Array]:
+def fit_spline(values: Array, period: float, cutoff: float | None) -> list[Array]:
     """Signals (samples, n) below a frequency, Hz, with their first and second derivative.
 
     A least-squares spline with two knots a period: unlike a filter's, its ends take nothing for
     granted of what is beyond them, so that derivatives hold there too. None: as they are.
     """
     if cutoff is None:
-        return [values, *(derivative(values, order, period) for order in (1, 2))]
+        return [values, *(differentiate(values, order, period) for order in (1, 2))]
     last, degree = (len(values) - 1) * period, 5
     places = np.linspace(0.0, last, 1 + max(1, round(2.0 * cutoff * last)))
     knots = np.concatenate([np.zeros(degree), places, np.full(degree, last)])
@@ -140,14 +140,16 @@ def calm(values: Array, period: float, cutoff: float | None) -> list[Array]:
     return [np.asarray(spline(time, order), np.float64) for order in range(3)]
 
 
-def derivative(values: Array, order: int, period: float) -> Array:
-    """Along the first axis: central differences of sixth order, polynomials at the ends."""
+def differentiate(values: Array, order: int, period: float) -> Array:
+    """Differentiate along the first axis: central differences of sixth order, polynomials at the ends."""
     inner, ends = (local_fit(values, points, degree, order, period) for points, degree in ((7, 6), (9, 4)))
     return np.concatenate([ends[:3], inner[3:-3], ends[-3:]])
 
 
-def even_pieces(time: Array, columns: list[Array], least: int = LEAST // 2) -> list[tuple[Array, list[Array]]]:
-    """Pieces without gaps, on even stamps, interpolated by cubic splines where they are not.
+def split_even_pieces(
+    time: Array, columns: list[Array], least: int = MIN_SAMPLES // 2
+) -> list[tuple[Array, list[Array]]]:
+    """Split a recording at gaps into pieces, resampled evenly by cubic splines where needed.
 
     :param least: samples that a piece needs.
     """
@@ -175,7 +177,7 @@ def tracks(
     held: Array | None = None,
     window: int | None = None,
     rates: tuple[Array, Array] | None = None,
-    least: int = LEAST // 2,
+    least: int = MIN_SAMPLES // 2,
 ) -> tuple[list[Track], Filtering]:
     """Return a recording as evenly sampled motion, without the ends of each piece.
 
@@ -189,7 +191,7 @@ def tracks(
     if len(time) < 2:
         return [], Filtering(0, (), None, 1)
     period = float(np.median(np.diff(time)))
-    pieces = even_pieces(time, [q, effort, wrench, held, *(rates or ())], least)
+    pieces = split_even_pieces(time, [q, effort, wrench, held, *(rates or ())], least)
     if not pieces:
         return [], Filtering(0, (), None, 1)
     positions = [own[0] for _, own in pieces]
@@ -210,7 +212,7 @@ def tracks(
     change = np.sqrt(np.mean(np.concatenate([p.qdd for p in result]) ** 2, 0))
     moving = speed > 0.0
     mean = float(np.max(change[moving] / speed[moving], initial=0.0)) / (2 * np.pi)
-    cutoff = BAND * mean
+    cutoff = CUTOFF_RATIO * mean
     # Without a motion, or faster than the samples, nothing is filtered.
     filtered = 0.0 < cutoff < 0.2 / period
     keep = max(1, int(0.2 / (cutoff * period))) if filtered else 1
@@ -219,13 +221,13 @@ def tracks(
 
 def kept_rows(count: int, period: float, how: Filtering) -> slice:
     """Return the slice of samples that :func:`low_pass` keeps."""
-    # What the filter makes up at the ends dies out in a period of its cut-off.
+    # The filter's end effects decay within a period of its cut-off.
     edge = 0 if how.cutoff is None else min(int(1.0 / (how.cutoff * period)), count // 4)
     return slice(edge, count - edge, how.keep_every)
 
 
 def low_pass(values: Array, period: float, how: Filtering) -> Array:
-    """Signals along the first axis, filtered without phase, thinned out, ends left out."""
+    """Filter signals along the first axis without phase, decimate them and cut the ends."""
     if how.cutoff is None:
         return values
     sections = scipy.signal.butter(4, 2.0 * how.cutoff * period, output="sos")
@@ -243,44 +245,44 @@ def filtered(pieces: Sequence[Mapping[str, Array]], period: float, how: Filterin
     return {name: part.reshape(len(part), *shape) for (name, shape), part in named}
 
 
-def by_blocks(rows: int, block: int, evaluate: Callable[[slice], Array]) -> Array:
-    """Rows that are evaluated some at a time, so that memory stays flat."""
+def evaluate_blocks(rows: int, block: int, evaluate: Callable[[slice], Array]) -> Array:
+    """Evaluate rows in blocks, to bound the memory."""
     starts = range(0, rows, block)
     return np.concatenate([evaluate(slice(a, min(a + block, rows))) for a in starts])
 
 
-EXACT: Final = 1e-3
-"""Noise, as part of the measured rms, below which no recording is judged more strictly."""
-OUTLIER: Final = 6.0
-"""Distance from which a pose is an outlier."""
-CLEAR: Final = 3.0
+MIN_RELATIVE_NOISE: Final = 1e-3
+"""Smallest noise with which a recording is judged, as a fraction of the measured RMS."""
+MIN_OUTLIER_DISTANCE: Final = 6.0
+"""Smallest residual of an outlier, standard deviations of the noise."""
+MAX_SOUND_DISTANCE: Final = 3.0
 """Distance up to which poses count for the noise: of 100,000 good ones one is farther off."""
-FINEST: Final = 1e-9
-"""Noise that no instrument is below, m or rad."""
-UNFILTERED: Final = 0.25
-"""Part of the samples' rate above which there is noise alone, where nothing is filtered."""
-HIGHEST: Final = 0.48
-"""Part of the samples' rate up to which the noise is looked at."""
-AROUND: Final = 12
-"""Frequencies on each side that a peak is held against."""
-PEAK: Final = 4.0
-"""Density over its surroundings' from which one may be a peak."""
-LIKELY: Final = -16.0
-"""Logarithm of the probability by chance below which it is."""
+MIN_NOISE: Final = 1e-9
+"""Smallest noise of an instrument, m or rad."""
+NOISE_BAND_START: Final = 0.25
+"""Fraction of the sampling rate above which unfiltered signals are taken as noise alone."""
+NOISE_BAND_END: Final = 0.48
+"""Fraction of the sampling rate up to which the noise is evaluated."""
+PEAK_NEIGHBOURS: Final = 12
+"""Number of frequencies on each side with which a peak is compared."""
+MIN_PEAK_RATIO: Final = 4.0
+"""Smallest ratio of a peak's spectral density to that of its neighbours."""
+MAX_LOG_CHANCE: Final = -16.0
+"""Largest log probability of a peak by chance at which it is reported."""
 
 
 def huber(away: Array, bound: float = 1.5) -> Array:
-    """Weights of residuals by their sizes over the noise, of any shape."""
+    """Return Huber weights of residuals from their sizes over the noise, of any shape."""
     return np.asarray(bound / np.maximum(away, bound), np.float64)
 
 
-def passed_band(how: Filtering, rate: float) -> float:
+def find_passed_band(how: Filtering, rate: float) -> float:
     """Return the part of white noise at a sampling rate that the filter passes."""
     # The width for white noise of a Butterworth filter of fourth order, forwards and backwards.
     return 1.0 if how.cutoff is None else min(1.0, 2.0 * 0.898 * how.cutoff / rate)
 
 
-def in_motion(values: Sequence[Array], moves: Sequence[Array | Mask]) -> list[Array]:
+def select_motion(values: Sequence[Array], moves: Sequence[Array | Mask]) -> list[Array]:
     """Noise of pieces, (samples, n) each, where the direction of friction is known; else zero.
 
     Larger in turn, so that its power is that of a joint that moves all the time.
@@ -306,7 +308,7 @@ class Line:
     sigmas: float
 
 
-def noise_of(residual: Sequence[Array], shaken: Array, period: float, how: Filtering) -> Array:
+def estimate_noise_density(residual: Sequence[Array], shaken: Array, period: float, how: Filtering) -> Array:
     """Density of the efforts' noise in the band of the motion, N m or N per root hertz, (n,).
 
     Above the band nothing but noise is left: the loudest octave there counts. The positions' noise
@@ -317,7 +319,7 @@ def noise_of(residual: Sequence[Array], shaken: Array, period: float, how: Filte
     :param shaken: what the positions' noise changes in the fitted efforts, (samples, n).
     """
     rate = 1.0 / period
-    begin = UNFILTERED * rate if how.cutoff is None else how.cutoff
+    begin = NOISE_BAND_START * rate if how.cutoff is None else how.cutoff
     loudest = np.zeros(shaken.shape[1])
     # Half of the samples are in pieces of a segment or more, so that all pieces have one grid.
     lengths = np.sort([len(piece) for piece in residual])
@@ -325,14 +327,14 @@ def noise_of(residual: Sequence[Array], shaken: Array, period: float, how: Filte
     segment = min(256, int(lengths[half]), len(shaken))
     frequency, density = _spectrum(residual, rate, segment)
     _, passed = _spectrum([shaken], rate, segment)
-    while begin < 0.9 * HIGHEST * rate:
-        inside = (frequency >= begin) & (frequency < min(2.0 * begin, HIGHEST * rate))
+    while begin < 0.9 * NOISE_BAND_END * rate:
+        inside = (frequency >= begin) & (frequency < min(2.0 * begin, NOISE_BAND_END * rate))
         if np.count_nonzero(inside) > 2:
             both = (np.mean(one[inside], 0) for one in (density, passed))
             above, own = both
             loudest = np.maximum(loudest, above - own)
         begin *= 2.0
-    inside = frequency <= (HIGHEST * rate if how.cutoff is None else how.cutoff)
+    inside = frequency <= (NOISE_BAND_END * rate if how.cutoff is None else how.cutoff)
     return np.asarray(np.sqrt(loudest + np.mean(passed[inside], 0)), np.float64)
 
 
@@ -348,7 +350,7 @@ def find_lines(
     Lines of the measured wrench are those of a force on the platform, such as a cutter's.
 
     :param residual: measured less fitted, every sample, (samples, n) by piece. ``size``: RMS of
-        the measured efforts, (n,): a line below :data:`EXACT` of it is rounding. ``wrench``: of the
+        the measured efforts, (n,): a line below :data:`MIN_RELATIVE_NOISE` of it is rounding. ``wrench``: of the
         longest piece, (samples, 6), where it is measured.
     """
     whole, rate = max(residual, key=len), 1.0 / period
@@ -358,26 +360,26 @@ def find_lines(
     frequency, density = _spectrum([whole], rate, segment)
     # Segments overlap by half, with a Hann window: so many independent ones.
     freedoms = 2.0 * 0.95 * max(1.0, 2.0 * len(whole) / segment - 1.0)
-    begin = UNFILTERED * rate if how.cutoff is None else 1.2 * how.cutoff
-    inside = np.flatnonzero((frequency > begin) & (frequency < HIGHEST * rate))
-    if len(inside) < 2 * AROUND:
+    begin = NOISE_BAND_START * rate if how.cutoff is None else 1.2 * how.cutoff
+    inside = np.flatnonzero((frequency > begin) & (frequency < NOISE_BAND_END * rate))
+    if len(inside) < 2 * PEAK_NEIGHBOURS:
         return ()
     forces = np.zeros((len(frequency), 0)) if wrench is None else _spectrum([wrench], rate, segment)[1]
     own = np.concatenate([density, forces], 1)[inside]
-    ground = scipy.ndimage.median_filter(own, (2 * AROUND + 1, 1), mode="nearest")
+    ground = scipy.ndimage.median_filter(own, (2 * PEAK_NEIGHBOURS + 1, 1), mode="nearest")
     ratio = own / np.maximum(ground, 1e-300)
     # A chi square whose mean is a tenth above its median; the best of so many frequencies.
     chance = scipy.stats.chi2.logsf(0.9 * ratio * freedoms, freedoms) + np.log(len(inside))
-    clear = (chance < LIKELY) & (ratio > PEAK)
+    clear = (chance < MAX_LOG_CHANCE) & (ratio > MIN_PEAK_RATIO)
     # The residual's line may be at the frequency of the spectrum next to the wrench's.
     clear &= ~scipy.ndimage.binary_dilation(clear[:, len(size) :].any(1))[:, None]
     found, step = list[Line](), float(frequency[1] - frequency[0])
     for j in np.flatnonzero(clear[:, : len(size)].any(0)).tolist():
         peak = int(np.where(clear[:, j], own[:, j], 0.0).argmax())
-        near = slice(max(peak - AROUND // 2, 0), peak + AROUND // 2 + 1)
+        near = slice(max(peak - PEAK_NEIGHBOURS // 2, 0), peak + PEAK_NEIGHBOURS // 2 + 1)
         rms = float(np.sqrt(2.0 * step * np.sum(np.maximum(own - ground, 0.0)[near, j])))
         sigmas = float(scipy.stats.norm.isf(np.exp(max(chance[peak, j], -700.0))))
-        if rms > EXACT * size[j]:
+        if rms > MIN_RELATIVE_NOISE * size[j]:
             found.append(Line(j, float(frequency[inside[peak]]), step, rms, sigmas))
     return tuple(found)
 
@@ -393,7 +395,7 @@ def _spectrum(pieces: Sequence[Array], rate: float, segment: int) -> tuple[Array
     return np.asarray(both[0][0], np.float64), np.asarray(0.5 * density, np.float64)
 
 
-def shaken_efforts(r: Recording, track: Track, how: Filtering, efforts: Callable[[Track], Array]) -> Array:
+def simulate_noise(r: Recording, track: Track, how: Filtering, efforts: Callable[[Track], Array]) -> Array:
     """Return how much noise of the positions changes the efforts, (samples, n).
 
     :param efforts: of a motion, shape (samples, n).
@@ -410,11 +412,11 @@ def shaken_efforts(r: Recording, track: Track, how: Filtering, efforts: Callable
             q + shake,
             np.zeros_like(q),
             window=how.window,
-            least=min(LEAST // 2, len(track.time)),
+            least=min(MIN_SAMPLES // 2, len(track.time)),
         )
         told.append(np.concatenate([efforts(t) for t in pieces]))
     change = told[1] - told[0]
-    return in_motion([change], [track.moves(how)[: len(change)]])[0]
+    return select_motion([change], [track.moves(how)[: len(change)]])[0]
 
 
 def find_held_payload(

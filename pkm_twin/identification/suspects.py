@@ -20,9 +20,9 @@ from delta_dynamics.torques.derivatives import differentiate_numbers, torques_by
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import ParameterError
 from pkm_twin.identification.judge import (
-    ALL,
-    ALTERNATIVE,
-    FOUND,
+    ALL_JOINTS,
+    ALTERNATIVE_LOG_ODDS,
+    FOUND_LOG_ODDS,
     GEOMETRY,
     SIGMAS,
     Case,
@@ -30,12 +30,12 @@ from pkm_twin.identification.judge import (
     Fitted,
     Suspect,
     Verdict,
-    basis_of,
     fit_and_judge,
+    make_basis,
 )
 from pkm_twin.identification.parameters import FileParameters
-from pkm_twin.identification.rows import BLOCK, Problem, Rows
-from pkm_twin.identification.samples import EXACT, by_blocks
+from pkm_twin.identification.rows import BLOCK_ROWS, Problem, Rows
+from pkm_twin.identification.samples import MIN_RELATIVE_NOISE, evaluate_blocks
 from pkm_twin.machine.friction import list_reversal_keys
 from pkm_twin.machine.places import join_path
 from pkm_twin.machine.uncertainty import match_numbers
@@ -50,12 +50,12 @@ OFFSET: Final = "sensor offset"
 ELASTIC: Final = "elastic drive"
 SPEED: Final = "time at another rate"
 LINE: Final = "line in the spectrum"
-OFF: Final = 0.05
-"""Usual size of a gain: constants of drives and current sensors are known to some per cent."""
-DELAY: Final = 0.02
-"""Usual delay of efforts, s: what buses and controllers buffer."""
-STEP: Final = 1e-4
-"""Of difference quotients by an offset or a give, rad or machine sizes."""
+GAIN_DEVIATION: Final = 0.05
+"""Prior deviation of a gain: constants of drives and current sensors are known to some per cent."""
+DELAY_DEVIATION: Final = 0.02
+"""Prior deviation of the efforts' delay, s: buffers of buses and controllers."""
+DIFFERENCE_STEP: Final = 1e-4
+"""Step of difference quotients, rad or machine sizes."""
 DEFAULT_GEOMETRY_DEVIATION: Final = 5e-3
 """Default standard deviation of a length, as a fraction of the machine's extent, and of an angle, rad.
 
@@ -67,7 +67,7 @@ Errors = list[tuple[Suspect, Array]]
 """Each with the derivative of the measured efforts by its size, (k, n)."""
 
 
-def errors_of(rows: Rows, values: Array) -> tuple[Errors, Array]:
+def list_errors(rows: Rows, values: Array) -> tuple[Errors, Array]:
     """List the errors that every robot and recording may have, at a recording's rows.
 
     And what the differentiation misses, joint by joint, (k, n, n).
@@ -79,23 +79,23 @@ def errors_of(rows: Rows, values: Array) -> tuple[Errors, Array]:
     pairs = list(zip(robot.joint_units, efforts, strict=True))
     # A radian for joints that turn, the machine's size for those that slide.
     eye, lengths = np.eye(len(names)), np.array([robot.size if u == "m" else 1.0 for u in robot.joint_units])
-    # Without dry friction: its sign has no derivative, and turns where a rate is near zero.
+    # Dry friction is left out: it has no derivative where a rate changes sign.
     dry = list_reversal_keys()
     own = [name.rpartition(".")[2] for name in rows.model.parameters.names]
     smooth = np.where([word in dry for word in own], 0.0, values)
 
     def need(q: Array | float = 0.0, qd: Array | float = 0.0, qdd: Array | float = 0.0) -> Array:
-        """Efforts of a motion that differs by so much."""
+        """Compute the efforts of a motion that differs by these amounts."""
         q, qd, qdd = motion.q + q, motion.qd + qd, motion.qdd + qdd
         return rows.model.efforts(replace(motion, q=q, qd=qd, qdd=qdd), smooth)
 
     here, told, change = need(), s.effort, rows.change
     load, square, *static = np.moveaxis(s.own, -1, 0)
-    # A law of the robot is fitted.
+    # A law that the robot has is fitted and no error.
     share = None if "load-dependent" in robot.laws else 0.05
     found: Errors = []
     for kind, units, usual, column in (
-        (GAIN, [""] * len(names), OFF, told),
+        (GAIN, [""] * len(names), GAIN_DEVIATION, told),
         (LATE, ["s"] * len(names), 2e-3, -change),
         (LOAD, [""] * len(names), share, load),
         (SQUARE, [f"{e} s2/{u}2" for u, e in pairs], None, square),
@@ -104,20 +104,20 @@ def errors_of(rows: Rows, values: Array) -> tuple[Errors, Array]:
         each = zip(names, units, eye, strict=True)
         found += [(Suspect(kind, name, unit, usual), column * e) for name, unit, e in each]
     for name, (unit, _), length, e in zip(names, pairs, lengths, eye, strict=True):
-        step = STEP * length * e
-        apart = (need(-step) - need(step)) / (2.0 * STEP * length)
+        step = DIFFERENCE_STEP * length * e
+        apart = (need(-step) - need(step)) / (2.0 * DIFFERENCE_STEP * length)
         found.append((Suspect(OFFSET, name, unit, 0.01 * float(length)), apart))
     for j, (name, (u, effort)) in enumerate(zip(names, pairs, strict=True)):
         # The load turns the drive's outer side back by so much.
-        size = STEP * lengths[j] / max(float(np.abs(s.load[0][:, j]).max()), 1e-300)
+        size = DIFFERENCE_STEP * lengths[j] / max(float(np.abs(s.load[0][:, j]).max()), 1e-300)
         back = (-size * one[:, [j]] * eye[j] for one in s.load)
         unit = f"{u}/({effort})" if " " in effort else f"{u}/{effort}"
         found.append((Suspect(ELASTIC, name, unit, positive=True), (need(*back) - here) / size))
-    fast, slow = (need(0.0, h * motion.qd, (2.0 * h + h**2) * motion.qdd) for h in (STEP, -STEP))
+    fast, slow = (need(0.0, h * motion.qd, (2.0 * h + h**2) * motion.qdd) for h in (DIFFERENCE_STEP, -DIFFERENCE_STEP))
     found += [
-        (Suspect(GAIN, ALL, usual=OFF), told),
-        (Suspect(LOAD, ALL, usual=share), load),
-        (Suspect(SPEED, ALL), (fast - slow) / (2.0 * STEP)),
+        (Suspect(GAIN, ALL_JOINTS, usual=GAIN_DEVIATION), told),
+        (Suspect(LOAD, ALL_JOINTS, usual=share), load),
+        (Suspect(SPEED, ALL_JOINTS), (fast - slow) / (2.0 * DIFFERENCE_STEP)),
     ]
     return found, (need(0.0, *s.missed) - here)[..., None] * eye
 
@@ -135,7 +135,7 @@ class Lengths:
 
     @classmethod
     def from_robot(cls, robot: Robot) -> Lengths:
-        """All that the robot's file gives; an entry of its ``uncertainty`` is one suspect."""
+        """List the file's lengths and angles; an entry of its ``uncertainty`` is one suspect."""
         known = robot.file_numbers()
         units = {p: unit for p, (_, unit) in known.items() if _PLACES.match(p)}
         paths = tuple(path for path, unit in units.items() if unit in ("m", "rad"))
@@ -169,14 +169,14 @@ class Lengths:
         :param values: of all parameters of the file.
         """
         model, motion = rows.model, rows.signals.motion
-        machine = _weighing(model.robot, model.parameters, values, "inertia")
+        machine = _set_masses(model.robot, model.parameters, values, "inertia")
         if model.carried is None:
-            machine = _weighing(machine, model.parameters, values, "payload")
+            machine = _set_masses(machine, model.parameters, values, "payload")
         else:
-            machine = machine.numbered(_payload(model.carried))
-        bare = machine.numbered(dict.fromkeys(_payload(machine), 0.0))
+            machine = machine.numbered(_list_payload_numbers(model.carried))
+        bare = machine.numbered(dict.fromkeys(_list_payload_numbers(machine), 0.0))
         held = motion.held[:, None, None]
-        away = bool((np.abs(held - 1.0) > EXACT).any())
+        away = bool((np.abs(held - 1.0) > MIN_RELATIVE_NOISE).any())
         slopes, of_bare = (
             differentiate_numbers(one, self.paths) @ self.mixing if needed else np.zeros(0)
             for one, needed in ((machine, True), (bare, away))
@@ -190,10 +190,10 @@ class Lengths:
                 told = less + held[some] * (told - less)
             return told
 
-        return by_blocks(len(held), BLOCK, block)
+        return evaluate_blocks(len(held), BLOCK_ROWS, block)
 
 
-def _weighing(robot: Robot, parameters: FileParameters, values: Array, kind: str) -> Robot:
+def _set_masses(robot: Robot, parameters: FileParameters, values: Array, kind: str) -> Robot:
     """Return the robot with fitted masses, or payload, its geometry as it is."""
     numbers: dict[str, float] = {}
     for where, group in zip(parameters.slices, parameters.groups, strict=True):
@@ -207,11 +207,11 @@ def _weighing(robot: Robot, parameters: FileParameters, values: Array, kind: str
             }
     if not numbers:
         return robot
-    return robot.numbered({path: v for path, v in numbers.items() if _given(robot, path)})
+    return robot.numbered({path: v for path, v in numbers.items() if _is_given(robot, path)})
 
 
-def _given(robot: Robot, path: str) -> bool:
-    """Whether the file has the number, and it is not derived of others."""
+def _is_given(robot: Robot, path: str) -> bool:
+    """Return whether the file has the number and does not derive it from others."""
     try:
         robot.number(path)
     except ParameterError:
@@ -219,7 +219,7 @@ def _given(robot: Robot, path: str) -> bool:
     return True
 
 
-def _payload(robot: Robot) -> dict[str, float]:
+def _list_payload_numbers(robot: Robot) -> dict[str, float]:
     load = robot.payload
     numbers = {"payload.mass": float(load.mass)}
     numbers |= {f"payload.com[{i}]": float(v) for i, v in enumerate(load.com)}
@@ -236,14 +236,14 @@ OF_THE_FILE: Final = {
 """Suspects that were not fitted, by the kind of the file's numbers."""
 
 
-def verdict_of(problem: Problem) -> Verdict:
+def judge_problem(problem: Problem) -> Verdict:
     """Fit the chosen numbers of a problem, and judge whether the model explains its recordings."""
     robot, everything, values = problem.robot, problem.everything, problem.values
     chosen, lengths = problem.chosen, Lengths.from_robot(robot)
     kinds = np.array([g.kind for g in everything.groups for _ in g.names])
     cases, errors = list[Case](), list[Suspect]()
     for rows in problem.whole:
-        usual, missed = errors_of(rows, values)
+        usual, missed = list_errors(rows, values)
         # The columns of numbers that are not fitted are those of a motion without noise; the sign
         # of a velocity is filtered as the efforts are.
         calm, _ = rows.model.columns(rows.signals.motion)
@@ -252,7 +252,7 @@ def verdict_of(problem: Problem) -> Verdict:
         errors = [*(error for error, _ in usual), *lengths.suspects]
         columns = np.concatenate([own, lengths.columns(rows, values), others], -1)
         delay = np.concatenate([-rows.change[..., None], missed], -1)
-        sizes = np.append(DELAY, np.ones(missed.shape[-1]))
+        sizes = np.append(DELAY_DEVIATION, np.ones(missed.shape[-1]))
         cases.append(
             Case(
                 rows.effort - rows.rest - rows.table @ everything.values,
@@ -299,15 +299,15 @@ def _compare_file_masses(verdict: Verdict, fitted: Fitted, masses: Mask) -> Verd
     certain = fitted.certain.copy()
     certain[: fitted.count][masses] = False
     other = copy(fitted)
-    scale = [one.kind == GAIN and one.where == ALL for one in fitted.errors].index(True)
+    scale = [one.kind == GAIN and one.where == ALL_JOINTS for one in fitted.errors].index(True)
     factors = np.ones(len(certain))
-    factors[fitted.count + scale] = 1.0 / OFF
+    factors[fitted.count + scale] = 1.0 / GAIN_DEVIATION
     other.whole = fitted.whole.widened(factors)
     selected, used = other.select(certain)
-    if len(selected) != 1 or selected[0].odds < FOUND:
+    if len(selected) != 1 or selected[0].odds < FOUND_LOG_ODDS:
         return verdict
-    log = other.whole.log_evidence(used) - FOUND
-    if log < fitted.whole.log_evidence(fitted.used) - ALTERNATIVE:
+    log = other.whole.log_evidence(used) - FOUND_LOG_ODDS
+    if log < fitted.whole.log_evidence(fitted.used) - ALTERNATIVE_LOG_ODDS:
         return verdict
     found = fitted.describe(other.whole.posterior(used), selected[0])
     alike = Suspect("the masses that were fitted", "all of them")
@@ -329,7 +329,7 @@ def _compare_elastic_drives(verdict: Verdict, fitted: Fitted) -> Verdict:
     stiff[delays] = False
     other = fitted.with_columns(stiff, elastic)
     logs = [fitted.whole.log_evidence(one) for one in (late, other, stiff)]
-    if logs[1] < max(logs[0] - ALTERNATIVE, logs[2]):
+    if logs[1] < max(logs[0] - ALTERNATIVE_LOG_ODDS, logs[2]):
         return verdict
     one, two = (fitted.whole.posterior(used) for used in (late, other))
     gives, errors = two.mean[elastic], np.sqrt(np.diag(two.covariance)[elastic])
@@ -342,7 +342,7 @@ def _compare_elastic_drives(verdict: Verdict, fitted: Fitted) -> Verdict:
     )
     place = max(delays, key=lambda k: abs(one.mean[k]))
     size, deviation = float(one.mean[place]), float(np.sqrt(one.covariance[place, place]))
-    hint = Finding(Suspect(LATE, ALL, "s"), size, deviation, abs(size) / deviation, (Suspect(ELASTIC, sizes),))
+    hint = Finding(Suspect(LATE, ALL_JOINTS, "s"), size, deviation, abs(size) / deviation, (Suspect(ELASTIC, sizes),))
     change = (two.mean - one.mean)[: fitted.count]
     return replace(
         verdict,
@@ -356,10 +356,10 @@ def _shows_inertia(cases: Sequence[Case], errors: Sequence[Suspect], friction: M
     which = [one.kind for one in errors].index(SPEED)
     square, part, count = 0.0, 0.0, 0.0
     for case in cases:
-        floor = np.maximum(case.noise, EXACT * np.sqrt(np.mean(case.measured**2, 0)))
+        floor = np.maximum(case.noise, MIN_RELATIVE_NOISE * np.sqrt(np.mean(case.measured**2, 0)))
         weight = case.counts[..., None] / np.maximum(floor, 1e-300)[:, None]
         table = np.concatenate([case.fitted[..., friction], case.own], -1) * weight
-        basis = basis_of(table.reshape(-1, table.shape[-1]))
+        basis = make_basis(table.reshape(-1, table.shape[-1]))
         column = (case.errors[..., which] * weight[..., 0]).ravel()
         left = column - basis @ (basis.T @ column)
         square += float(left @ left)

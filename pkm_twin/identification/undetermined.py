@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.identification.parameters import OBSERVED
+from pkm_twin.identification.parameters import OBSERVED_RATIO
 from pkm_twin.machine.graph import Graph, list_limbs
 from pkm_twin.machine.places import split_path
 
@@ -59,9 +59,9 @@ def find_determined_pairs(
                 share = variance / float(covariance[first, first] + covariance[second, second])
                 if scale is not None:
                     by_scale = float(row @ covariance @ scale) ** 2
-                    if by_scale > OBSERVED * variance * float(scale @ covariance @ scale):
+                    if by_scale > OBSERVED_RATIO * variance * float(scale @ covariance @ scale):
                         continue
-                if share < OBSERVED**2:
+                if share < OBSERVED_RATIO**2:
                     possible.append((share, Pair(first, second, sign, max(variance, 0.0) ** 0.5)))
     group = {place: {place} for place in unobserved}
     found = []
@@ -84,7 +84,7 @@ class Change(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Numbers:
-    """Which numbers, by place, are whose."""
+    """Indices of the numbers that are a point, an axis or the origin."""
 
     graph: Graph
     names: Sequence[str]
@@ -141,18 +141,18 @@ class _Numbers:
         return [one for one in found if one]
 
     def point(self, point: tuple[str, int]) -> Array:
-        """Where it is at home, (3,)."""
+        """Return a point's position at home, (3,)."""
         name, end = point
         joints, rods = self.graph.joints, self.graph.rods
         return joints[name].at if name in joints else np.asarray(rods[name].ends[end], np.float64)
 
     def side(self, body: str) -> list[tuple[str, int]]:
-        """Points on a body."""
+        """List the points on a body."""
         return [point for point in self.points if body in self.bodies(point)]
 
 
-def _changes(n: _Numbers) -> Iterator[Change]:
-    """All that are looked for, the particular ones first."""
+def _list_changes(n: _Numbers) -> Iterator[Change]:
+    """Yield the changes that are searched for, the particular ones first."""
     eye = np.eye(len(n.names))
     for k, name in enumerate(n.names):
         yield Change("{items} alone", name, eye[k])
@@ -205,7 +205,7 @@ def _changes(n: _Numbers) -> Iterator[Change]:
 
 
 def undetermined(graph: Graph, names: Sequence[str], scales: Array, directions: Array) -> list[str]:
-    """At most ten sentences.
+    """Describe the undetermined combinations in at most ten sentences.
 
     :param names: of the numbers, as paths. ``scales``: their prior deviations, (p,).
     :param directions: in units of these, orthonormal, (p, u).
@@ -213,7 +213,7 @@ def undetermined(graph: Graph, names: Sequence[str], scales: Array, directions: 
     n = _Numbers.from_names(graph, names, scales)
     left = directions
     found: dict[tuple[str, str], list[str]] = {}
-    for change in _changes(n):
+    for change in _list_changes(n):
         size = float(np.linalg.norm(change.vector))
         if not left.shape[1] or size == 0.0:
             continue
@@ -224,14 +224,15 @@ def undetermined(graph: Graph, names: Sequence[str], scales: Array, directions: 
         if inner @ inner < 0.1:
             continue
         found.setdefault((change.kind, change.axis), []).append(change.item)
-        # What is orthogonal to it, in the space that is left.
+        # Keep the part of the remaining space that is orthogonal to the change.
         left = left @ np.linalg.svd(inner[None])[2][1:].T
     # Those that differ by the axis alone are one sentence.
     merged: dict[tuple[str, tuple[str, ...]], list[str]] = {}
     for (kind, axis), items in found.items():
         merged.setdefault((kind, tuple(dict.fromkeys(items))), []).append(axis)
     told = [
-        kind.format(items=_listed(names_of), axes=_and(sorted(set(axes)))) for (kind, names_of), axes in merged.items()
+        kind.format(items=_write_list(names_of), axes=_join_words(sorted(set(axes))))
+        for (kind, names_of), axes in merged.items()
     ]
     rest = list(_combinations(names, left))
     if len(told) + len(rest) > MAX_SENTENCES:
@@ -240,7 +241,7 @@ def undetermined(graph: Graph, names: Sequence[str], scales: Array, directions: 
         weights = np.sqrt(np.sum(left**2, 1))
         return [
             *shown,
-            f"{more} further combinations, mostly of {_listed(_greatest(names, weights))}",
+            f"{more} further combinations, mostly of {_write_list(_find_greatest(names, weights))}",
         ]
     return [*told, *rest]
 
@@ -248,28 +249,28 @@ def undetermined(graph: Graph, names: Sequence[str], scales: Array, directions: 
 def _combinations(names: Sequence[str], left: Array) -> Iterator[str]:
     """Describe combinations of numbers that no named change explains."""
     for vector in left.T:
-        shown = _greatest(names, np.abs(vector))
+        shown = _find_greatest(names, np.abs(vector))
         if len(shown) > 4:
             weights = np.sqrt(np.sum(left**2, 1))
             many = "further combinations" if left.shape[1] > 1 else "further combination"
-            yield f"{left.shape[1]} {many}, mostly of {_listed(_greatest(names, weights))}"
+            yield f"{left.shape[1]} {many}, mostly of {_write_list(_find_greatest(names, weights))}"
             return
     for vector in left.T:
-        shown = sorted(_greatest(names, np.abs(vector)), key=names.index)
-        yield f"{_and(shown)} changed together"
+        shown = sorted(_find_greatest(names, np.abs(vector)), key=names.index)
+        yield f"{_join_words(shown)} changed together"
 
 
-def _greatest(names: Sequence[str], weights: Array) -> list[str]:
+def _find_greatest(names: Sequence[str], weights: Array) -> list[str]:
     order = np.argsort(-weights, kind="stable")
     return [names[k] for k in order if weights[k] > 0.1 * weights.max()]
 
 
-def _listed(items: Sequence[str]) -> str:
-    """With commas, the first of many."""
+def _write_list(items: Sequence[str]) -> str:
+    """Join names with commas; of many only the first."""
     if len(items) <= MAX_LISTED_NAMES:
         return ", ".join(items)
     return f"{', '.join(items[:MAX_LISTED_NAMES])} and {len(items) - MAX_LISTED_NAMES} more"
 
 
-def _and(items: Sequence[str]) -> str:
+def _join_words(items: Sequence[str]) -> str:
     return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} and {items[-1]}"

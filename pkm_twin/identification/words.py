@@ -10,13 +10,13 @@ from pkm_twin.errors import one_line
 
 USUAL_SCALE: Final = 1.22
 """Scale, or its inverse, up to which a drive's constant is usual: 4.5 deviations of 5 %."""
-LATEST: Final = 0.05
+MAX_DELAY: Final = 0.05
 """Delay of efforts that a recording may have, s: buffers of a bus and a filter."""
-UNITS: Final = {"N mm or mN m": 1e3, "kgf or kgf m": 1.0 / 9.80665}
-"""Units of efforts that are named, by how many are a newton or a newton metre."""
+EFFORT_UNITS: Final = {"N mm or mN m": 1e3, "kgf or kgf m": 1.0 / 9.80665}
+"""Units of efforts that messages name: how many of each are a newton or a newton metre."""
 
 
-def usual_scale(scale: float) -> bool:
+def is_usual_scale(scale: float) -> bool:
     """Return whether efforts of a scale can be a machine's: it is nearly right."""
     return 1.0 / USUAL_SCALE < scale < USUAL_SCALE
 
@@ -36,13 +36,13 @@ def scale_text(names: str, scale: float, *others: str) -> str:
     sign = " and of the wrong sign" if scale < 0.0 else ""
     alike = "".join(f"; or {other}" for other in others)
     alike += ", the recording cannot tell" if others else ""
-    unit = "".join(f" ({name}?)" for name, size in UNITS.items() if 0.9 < abs(scale) / size < 1.1)
+    unit = "".join(f" ({name}?)" for name, size in EFFORT_UNITS.items() if 0.9 < abs(scale) / size < 1.1)
     return (
         f"efforts of {names} are {abs(scale):.3g} times what the robot's file makes of the motion"
         f"{sign}: units? N m and N{unit}" + alike
     )
 
 
-def listed(names: Sequence[str], count: int) -> str:
+def list_joints(names: Sequence[str], count: int) -> str:
     """Return the names of joints, of so many, in words."""
     return "all joints" if len(names) == count > 1 else " and ".join(names)

@@ -17,7 +17,7 @@ from pkm_twin import Robot
 from pkm_twin.apps.commands.calibrate import Calibrate
 from pkm_twin.apps.commands.calibrate import calibrate as command
 from pkm_twin.errors import ParameterError, PkmTwinError
-from pkm_twin.identification.calibration import calibrate, geometric
+from pkm_twin.identification.calibration import calibrate, list_geometric_paths
 from pkm_twin.identification.calibration_state import Poses
 from pkm_twin.identification.measurements import read_poses
 from test.support.command import Commands
@@ -76,7 +76,7 @@ def test_poses_of_no_use_are_refused(scale: float, different: int, text: str) ->
     robot = load("delta_cu")
     q = np.random.default_rng(1).uniform(-0.5, 0.9, (different, 3)).repeat(40 // different, 0)
     with pytest.raises(ParameterError, match=text):
-        calibrate(robot, Poses(q, scale * robot.platform(q)[0]), geometric(robot, q))
+        calibrate(robot, Poses(q, scale * robot.platform(q)[0]), list_geometric_paths(robot, q))
 
 
 @pytest.mark.parametrize(
@@ -100,7 +100,7 @@ def crooked(seed: int, only: list[str], count: int) -> tuple[Robot, Poses]:
     robot, rng = load("rps3"), np.random.default_rng([seed, 77])
     q = random_joints(robot, rng, count, 0.05)
     sizes, known = {"m": 1e-3, "": 3e-3}, robot.file_numbers()
-    moved = {p: known[p] for p in geometric(robot, q, only) if not p.endswith(".home")}
+    moved = {p: known[p] for p in list_geometric_paths(robot, q, only) if not p.endswith(".home")}
     values = {p: v + sizes[unit] * rng.normal() for p, (v, unit) in moved.items()}
     position, rotation = robot.with_file_values(values).platform(q)
     turn = Rotation.from_rotvec(1e-4 * rng.normal(size=position.shape)).as_matrix()
@@ -110,7 +110,7 @@ def crooked(seed: int, only: list[str], count: int) -> tuple[Robot, Poses]:
 
 def settles(seed: int, only: list[str], count: int = 60) -> None:
     robot, poses = crooked(seed, only, count)
-    result = calibrate(robot, poses, geometric(robot, poses.joints, only))
+    result = calibrate(robot, poses, list_geometric_paths(robot, poses.joints, only))
     assert result.agreements[0].held_out[1].rms < 2.0 * NOISE * np.sqrt(3.0)
     assert 0.7 * NOISE < result.agreements[0].noise < 1.4 * NOISE
 
@@ -128,7 +128,7 @@ def test_others_settle_too(seed: int) -> None:
 
 def test_only_numbers_that_there_are_can_be_chosen() -> None:
     with pytest.raises(ParameterError, match="the beginning of a geometric number's path"):
-        geometric(load("delta_cu"), np.zeros((1, 3)), ["inertia"])
+        list_geometric_paths(load("delta_cu"), np.zeros((1, 3)), ["inertia"])
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from pkm_twin.bags.reader import inspect, read_messages
 from pkm_twin.identification.check import MEASURED, check
 from pkm_twin.identification.hypotheses import explain
 from pkm_twin.identification.parameters import file_parameters
-from pkm_twin.identification.rows import rows_of
+from pkm_twin.identification.rows import make_rows
 from pkm_twin.paths import cycle, timed
 from pkm_twin.recordings import Recording
 from pkm_twin.recordings.topics import JOINT_STATE
@@ -428,7 +428,7 @@ class TestCauses:
         (text,) = self.cause(wrong)
         assert word in text
         # So does a fit.
-        fault = explain(rows_of(robot, file_parameters(robot), wrong)).text
+        fault = explain(make_rows(robot, file_parameters(robot), wrong)).text
         assert fault is not None and word in fault
 
     def test_a_saturated_sensor(self, rng):

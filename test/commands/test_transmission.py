@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from pkm_twin import Robot
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
-from pkm_twin.identification.calibration import HELD_OUT, calibrate, geometric
+from pkm_twin.identification.calibration import HELD_OUT, calibrate, list_geometric_paths
 from pkm_twin.identification.calibration_state import Poses, Transmission
 from pkm_twin.identification.measurements import read_poses
 from pkm_twin.machine.joint_map import JointMap, JointMapEntry
@@ -97,7 +97,7 @@ def test_a_measured_hexapod_is_predicted_as_well_as_by_a_fit_of_each_leg(
     position[rng.choice(np.flatnonzero(learnt), wrong, replace=False)] += 0.02
     motors = q * factors + robot.controller.offsets + 0.2 * rng.normal(size=6)
     poses = Poses(motors, position, rotation)
-    found = calibrate(robot, poses, geometric(robot, robot.controller.positions(motors)))
+    found = calibrate(robot, poses, list_geometric_paths(robot, robot.controller.positions(motors)))
     legs = fit_a_leg(robot, poses.part(learnt))
     away = np.sqrt(np.mean(leg_poses(legs, poses.part(~learnt)) ** 2))
     assert found.agreements[0].held_out[1].rms < 1.02 * away

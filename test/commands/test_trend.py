@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from pkm_twin.errors import ParameterError
-from pkm_twin.identification.history import Measured, Series, append, judged, measure, read_history
+from pkm_twin.identification.history import Measured, Series, append, judge_series, measure, read_history
 from pkm_twin.recordings import read
 from test.commands.conftest import REPOSITORY
 from test.support.robots import load, often
@@ -30,7 +30,7 @@ def series(values):
 @pytest.mark.parametrize("count", often(300, 5000))
 def test_false_alarms_are_as_rare_as_asked_for(count, rng):
     """Of series without drift; a rate that is fifty times too high is far outside the noise."""
-    alarms = [judged(series(rng.normal(5.0, 0.3, 30)), 15, 0.05).drifts for _ in range(count)]
+    alarms = [judge_series(series(rng.normal(5.0, 0.3, 30)), 15, 0.05).drifts for _ in range(count)]
     # Two ways to be wrong, each at most as often.
     assert np.mean(alarms) < 0.1 + 4 * np.sqrt(0.1 / count)
 
@@ -39,11 +39,11 @@ def test_false_alarms_are_as_rare_as_asked_for(count, rng):
 def test_a_step_is_found_where_it_is(step, rng):
     values = rng.normal(0.0, 1.0, 40)
     values[25:] += step
-    found = judged(series(values), 15, 1e-3)
+    found = judge_series(series(values), 15, 1e-3)
     assert found.drifts
     assert found.change == 25
     assert found.after - found.before == pytest.approx(step, abs=1.5)
-    calm = judged(series(values[:25]), 15, 1e-3)
+    calm = judge_series(series(values[:25]), 15, 1e-3)
     assert calm.change is None
 
 
@@ -51,7 +51,7 @@ def test_limits_are_those_of_a_further_recording(rng):
     """Student's interval of prediction, judged by the share of further ones inside it."""
     inside = []
     for _ in range(2000):
-        found = judged(series(rng.normal(size=9)), 8, 0.1)
+        found = judge_series(series(rng.normal(size=9)), 8, 0.1)
         inside.append(not found.beyond[-1])
     assert np.mean(inside) == pytest.approx(0.9, abs=0.03)
 

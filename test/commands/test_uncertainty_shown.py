@@ -6,7 +6,7 @@ import pytest
 import yaml
 
 from delta_dynamics import inverse_dynamics, torque_deviation
-from pkm_twin.identification.check import DEVIATIONS, compared_of
+from pkm_twin.identification.check import DEVIATIONS, compare_part
 from pkm_twin.recordings import read
 from test.commands.conftest import DELTA, rewrite
 from test.support.robots import load, parameters_of
@@ -33,7 +33,7 @@ def part(tmp_path):
 def test_check_counts_the_residuals_inside_the_model_s_band(twin, unsure, part):
     data = twin.told("check", part, "--robot", unsure)
     recording = read(part, str(unsure))
-    compared = compared_of(recording, np.zeros(len(recording.time), bool))
+    compared = compare_part(recording, np.zeros(len(recording.time), bool))
     (track,) = compared.tracks
     rows = np.isin(track.time, compared.time)
     spread = torque_deviation(recording.robot, track.q, track.qd, track.qdd)[rows]

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from pkm_twin import Robot
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.identification.calibration import geometric
-from pkm_twin.identification.measurements import Measured, measured_of
+from pkm_twin.identification.calibration import list_geometric_paths
+from pkm_twin.identification.measurements import Measured, make_measured
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from test.support.robots import random_joints
 
@@ -48,7 +48,7 @@ def case(drawn: Robot, kinds: Sequence[str], count: int, seed: int, flat: bool =
     else:
         q = random_joints(drawn, rng, count)
     read = np.asarray(drawn.controller.controller_positions(q))
-    paths = geometric(drawn, q)
+    paths = list_geometric_paths(drawn, q)
     truth = {}
     for path in paths:
         turned = any(word in path for word in ("axis", "axes", "angle", "azimuth"))
@@ -75,7 +75,7 @@ def case(drawn: Robot, kinds: Sequence[str], count: int, seed: int, flat: bool =
     }
     values = {kind: columns[kind] + rng.normal(scale=NOISE[kind], size=count) for kind in kinds}
     second = read[other] if "distance" in kinds else None
-    return Case(drawn, measured_of(read, second, values, np.arange(count) + 2, {}), paths, truth)
+    return Case(drawn, make_measured(read, second, values, np.arange(count) + 2, {}), paths, truth)
 
 
 class Towers(NamedTuple):

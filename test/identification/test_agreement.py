@@ -13,7 +13,7 @@ import pytest
 from delta_dynamics import inverse_dynamics
 from pkm_twin import Robot
 from pkm_twin.errors import PkmTwinError
-from pkm_twin.identification.check import check, recorded_of
+from pkm_twin.identification.check import check, cut_recording
 from pkm_twin.identification.compare import compare
 from pkm_twin.identification.fit import Fit, find_worse, fit
 from pkm_twin.identification.friction_laws import fit_recordings
@@ -149,7 +149,7 @@ def test_drives_that_are_off_before_the_motion_are_left_out_of_both() -> None:
         effort=np.concatenate([np.zeros((count, 3)), sound.measured]),
     )
     assert check(recorded).answer == "good"
-    result = fit(m.robot, [recorded_of(recorded)], ("friction", "payload"))
+    result = fit(m.robot, [cut_recording(recorded)], ("friction", "payload"))
     assert result.verdict.answer == "explains"
 
 

@@ -15,9 +15,9 @@ from pkm_twin import Robot
 from pkm_twin.apps.commands.calibrate import Calibrate
 from pkm_twin.apps.commands.calibrate import calibrate as command
 from pkm_twin.errors import PkmTwinError
-from pkm_twin.identification.calibration import calibrate, geometric
+from pkm_twin.identification.calibration import calibrate, list_geometric_paths
 from pkm_twin.identification.calibration_state import Poses
-from pkm_twin.identification.measurements import whole_of
+from pkm_twin.identification.measurements import select_poses
 from pkm_twin.identification.undetermined import MAX_SENTENCES, undetermined
 from test.support.robots import data_of, load, random_joints
 from test.support.tables import write_columns
@@ -31,7 +31,7 @@ def sound(seed: int) -> tuple[Robot, tuple[str, ...], Poses]:
     """A Delta whose lengths are a few millimetres off, and its sensors by a few degrees."""
     robot, rng = load("delta_cu"), np.random.default_rng([seed, 31])
     q = random_joints(robot, rng, 60, 0.02)
-    paths = geometric(robot, q)
+    paths = list_geometric_paths(robot, q)
     known = {p: robot.file_numbers()[p] for p in paths}
     size = {"m": 3e-3, "rad": 0.03, "": 0.03}
     truth = robot.with_file_values({p: v + size[u] * rng.normal() for p, (v, u) in known.items()})
@@ -120,7 +120,7 @@ def test_noise_is_that_of_the_good_poses() -> None:
     parts[0][::20] += 0.1
     still = Poses(np.zeros((400, 3)), np.zeros((400, 3)), np.zeros((400, 3, 3)))
     none = [np.zeros((400, 3, 1))] * 2
-    found = whole_of(still, np.arange(400)).weighed(parts, none, np.ones(1))
+    found = select_poses(still, np.arange(400)).weighed(parts, none, np.ones(1))
     assert found.noise == pytest.approx((1e-4, 1e-3), rel=0.15)
     weights = (found.noise[0] * found.scales[0]) ** 2
     assert weights[::20].max() < 0.01

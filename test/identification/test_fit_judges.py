@@ -19,9 +19,9 @@ from pkm_twin.identification.estimation import estimate
 from pkm_twin.identification.fit import Fit, fit
 from pkm_twin.identification.friction_laws import fit_recordings, fit_with_laws
 from pkm_twin.identification.hypotheses import explain
-from pkm_twin.identification.identifiable import above_zero
+from pkm_twin.identification.identifiable import make_nonnegative_cone
 from pkm_twin.identification.parameters import file_parameters
-from pkm_twin.identification.rows import rows_of
+from pkm_twin.identification.rows import make_rows
 from pkm_twin.recordings import Load, Recording
 from pkm_twin.report import Verdict
 from test.identification.machines import IMPOSSIBLE, WRONG, Drawn, machine, noisy, shifted, unit_of
@@ -69,7 +69,7 @@ def worst(result: Fit, m: Drawn) -> float:
 
 def fault_of(robot: Robot, record: Recording) -> str | None:
     """Why a machine cannot have made a recording."""
-    found = explain(rows_of(robot, file_parameters(robot), record))
+    found = explain(make_rows(robot, file_parameters(robot), record))
     return found.text if found.fault else None
 
 
@@ -358,7 +358,7 @@ def test_a_bound_that_is_active_counts_in_the_standard_deviations() -> None:
         table = np.stack([slow, slow + rng.normal(size=4000)], -1)[:, None]
         drift = np.cumsum(rng.normal(size=4000))
         target = table @ [0.0, 1.0] + 0.02 * (drift - drift.mean())[:, None]
-        cones = [(slice(0, 1), above_zero(0, 1))]
+        cones = [(slice(0, 1), make_nonnegative_cone(0, 1))]
         found = estimate(table, target, np.ones(2), np.ones(2), cones)
         assert found.values[0] >= 0.0
         if found.bound:

@@ -15,8 +15,8 @@ from pkm_twin import Robot
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.identification.fit import fit
 from pkm_twin.identification.parameters import file_parameters
-from pkm_twin.identification.rows import rows_of
-from pkm_twin.identification.samples import derivative
+from pkm_twin.identification.rows import make_rows
+from pkm_twin.identification.samples import differentiate
 from pkm_twin.identification.suspects import DEFAULT_GEOMETRY_DEVIATION, Lengths
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.recordings import Load, Recording
@@ -50,7 +50,7 @@ def test_columns_are_differences_of_the_efforts(name: str) -> None:
     load = Load(0.4, times=((3.0, 6.0),), sought=True)
     record = replace(noisy(m.recorded(), np.random.default_rng(4)), load=load)
     everything = file_parameters(robot)
-    rows = rows_of(robot, everything, record)
+    rows = make_rows(robot, everything, record)
     heavy = robot.changed(payload={"mass": 0.4})
     none = robot.changed(payload={"mass": 0.0, "inertia": [0.0, 0.0, 0.0]})
     values = file_parameters(heavy).values
@@ -83,7 +83,7 @@ def test_a_sine_is_differentiated_to_its_ends(order: int) -> None:
     rates = 2.0 * np.pi * np.array([0.5, 1.0, 3.0])
     phases = np.outer(time, rates) + np.array([0.3, 1.0, 2.0])
     exact = rates**order * np.sin(phases + order * np.pi / 2.0)
-    found = derivative(np.sin(phases), order, time[1])
+    found = differentiate(np.sin(phases), order, time[1])
     assert np.abs(found - exact).max() < 0.05 * rates.max() ** order
     assert np.abs(found - exact)[3:-3].max() < 1e-3 * rates.max() ** order
 
@@ -94,7 +94,7 @@ def test_drawn_lengths_change_the_efforts_as_their_columns_say(name: str) -> Non
     robot, rng = load(name), np.random.default_rng(8)
     m = machine(robot, rng, 4.0, 1000.0)
     everything = file_parameters(robot)
-    rows = rows_of(robot, everything, noisy(m.recorded(), rng))
+    rows = make_rows(robot, everything, noisy(m.recorded(), rng))
     lengths = Lengths.from_robot(robot)
     columns = lengths.columns(rows, everything.values)
     motion = [CubicSpline(m.time, values)(rows.time) for values in (m.q, m.qd, m.qdd)]

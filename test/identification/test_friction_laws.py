@@ -8,10 +8,10 @@ import pytest
 
 from delta_dynamics import inverse_dynamics
 from pkm_twin.errors import ParameterError, PkmTwinError, UnknownNameError
-from pkm_twin.identification.drives import fitted_constants, given_constants
-from pkm_twin.identification.excitation import Judge, TrajectoryLimits, sweeps
+from pkm_twin.identification.drives import fit_constants, parse_constants
+from pkm_twin.identification.excitation import Judge, TrajectoryLimits, design_sweeps
 from pkm_twin.identification.fit import fit
-from pkm_twin.identification.friction_laws import fit_with_laws, laws_of
+from pkm_twin.identification.friction_laws import fit_with_laws, parse_laws
 from pkm_twin.identification.parameters import file_parameters
 from pkm_twin.identification.samples import Filtering, find_lines
 from pkm_twin.recordings import Recording
@@ -81,11 +81,11 @@ def test_laws_are_tried_with_a_known_payload():
 
 
 def test_names_of_laws():
-    assert laws_of("auto") is None
-    assert laws_of("coulomb") == ()
-    assert laws_of("load-dependent, stribeck") == ("stribeck", "load-dependent")
+    assert parse_laws("auto") is None
+    assert parse_laws("coulomb") == ()
+    assert parse_laws("load-dependent, stribeck") == ("stribeck", "load-dependent")
     with pytest.raises(UnknownNameError):
-        laws_of("stribek")
+        parse_laws("stribek")
 
 
 @pytest.mark.parametrize("name", partly_long(["delta_cu", "five_bar", "prru"], "five_bar"))
@@ -95,18 +95,18 @@ def test_torque_constants_follow_from_known_masses(name, rng):
     constants = rng.uniform(0.05, 2.0, len(m.size)) * rng.choice([-1.0, 1.0], len(m.size))
     effort = inverse_dynamics(robot, m.q, m.qd, m.qdd)
     record = noisy(m.recorded(effort=effort / constants), rng)
-    found = fitted_constants(robot, [record])
+    found = fit_constants(robot, [record])
     assert (np.abs(found.values - constants) < 4.0 * found.deviations).all()
     assert (found.deviations < 0.02 * np.abs(constants)).all()
     words = ",".join(str(value) for value in constants)
-    given = given_constants(robot, words).applied(record)
+    given = parse_constants(robot, words).convert(record)
     assert np.allclose(given.effort, record.effort * constants, rtol=1e-12)
     noise = rng.normal(size=effort.shape)
     with pytest.raises(PkmTwinError):
-        fitted_constants(robot, [m.recorded(effort=noise)])
+        fit_constants(robot, [m.recorded(effort=noise)])
     for wrong in ("0", "nan", "a", "1,2,3,4,5,6,7"):
         with pytest.raises(ParameterError):
-            given_constants(robot, wrong)
+            parse_constants(robot, wrong)
 
 
 def test_a_line_is_found_with_its_frequency_and_no_other(rng):
@@ -138,7 +138,7 @@ def test_a_line_is_found_with_its_frequency_and_no_other(rng):
 def test_sweeps_stay_inside_the_limits_and_move_one_joint_at_a_time(name):
     robot = load(name)
     judge = Judge.from_robot(robot, file_parameters(robot, ("friction",)))
-    found = sweeps(judge, 60.0, TrajectoryLimits(share=1.0))
+    found = design_sweeps(judge, 60.0, TrajectoryLimits(share=1.0))
     time = np.linspace(0.0, found.duration, 20001)
     q, qd, qdd = found.at(time)
     step = time[1]
@@ -152,7 +152,7 @@ def test_sweeps_stay_inside_the_limits_and_move_one_joint_at_a_time(name):
     assert (robot.singularity(q[::50]) > TrajectoryLimits().singularity * 0.99).all()
     assert np.isfinite(found.condition)
     for least in (0.05, 1.0):
-        slow = sweeps(judge, 60.0, TrajectoryLimits(share=1.0, acceleration=least * np.abs(qdd).max()))
+        slow = design_sweeps(judge, 60.0, TrajectoryLimits(share=1.0, acceleration=least * np.abs(qdd).max()))
         change = slow.at(np.linspace(0.0, slow.duration, 40001))[2]
         assert np.abs(change).max() <= least * np.abs(qdd).max() * (1.0 + 1e-9)
     # Both ways, at three speeds each.
@@ -169,7 +169,9 @@ def test_sweeps_stay_inside_the_limits_and_move_one_joint_at_a_time(name):
 def test_sweeps_alone_show_the_friction_of_every_joint(name, seeds):
     """Fast ones, too, whose ramps a coarse encoder smooths: errors are as large as they say."""
     robot, errors, away = load(name), [], []
-    found = sweeps(Judge.from_robot(robot, file_parameters(robot, ("friction",))), 20.0, TrajectoryLimits(rate=200.0))
+    found = design_sweeps(
+        Judge.from_robot(robot, file_parameters(robot, ("friction",))), 20.0, TrajectoryLimits(rate=200.0)
+    )
     time = np.arange(0.0, found.duration, 0.005)
     motion = found.at(time)
     size = np.abs(inverse_dynamics(robot, *motion)).max(0)

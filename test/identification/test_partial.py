@@ -14,12 +14,12 @@ from pkm_twin import Robot
 from pkm_twin.identification.calibration import (
     Free,
     calibrate,
-    geometric,
-    placed,
-    unknowns,
+    list_geometric_paths,
+    list_parameters,
+    make_start,
 )
-from pkm_twin.identification.calibration_state import FRAME, moved
-from pkm_twin.identification.measurements import KINDS, Measured, kinds_of, measured_of
+from pkm_twin.identification.calibration_state import FRAME, update_state
+from pkm_twin.identification.measurements import KINDS, Measured, make_measured, parse_kinds
 from pkm_twin.identification.plan import plan
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from test.identification.partial_cases import Towers, case, published
@@ -45,9 +45,9 @@ def test_derivatives_are_those_of_what_is_computed(name: str) -> None:
     kinds = [k for k in KINDS if robot.coordinates[-1].axis is None or k not in ("roll", "pitch", "yaw")]
     drawn = case(robot, kinds, 5, 1)
     paths = drawn.paths[:3]
-    parameters = unknowns(robot, drawn.measured, paths, Free(frame=True, target=True))
+    parameters = list_parameters(robot, drawn.measured, paths, Free(frame=True, target=True))
     names = [p.name for p in parameters]
-    state = placed(robot, drawn.measured, paths)
+    state = make_start(robot, drawn.measured, paths)
     state.instrument.own |= {"plane.slope_x": 0.2, "plane.slope_y": -0.3}
     table = np.concatenate(drawn.measured.slopes(robot, state, names))[:, 0]
     before = {p.name: p.before for p in parameters} | state.instrument.own
@@ -56,7 +56,7 @@ def test_derivatives_are_those_of_what_is_computed(name: str) -> None:
         turn = np.zeros(3)
         if name in FRAME[3:]:
             turn[FRAME.index(name) - 3] = step
-        other = moved(robot, state, drawn.measured.joints, before | {name: before[name] + step}, turn)
+        other = update_state(robot, state, drawn.measured.joints, before | {name: before[name] + step}, turn)
         return -np.concatenate(drawn.measured.parts(other))[:, 0]
 
     for k, name in enumerate(names):
@@ -88,7 +88,7 @@ def test_numbers_that_are_reported_are_right_and_the_rest_is_named(count: int, p
     for seed in range(count):
         name, kinds, rows = MACHINES[(seed + 1) % len(MACHINES)]
         robot = printer if name == "printer" else load(name)
-        names = [kind.name for kind in kinds_of([kinds])]
+        names = [kind.name for kind in parse_kinds([kinds])]
         one = case(robot, names, rows, seed, flat=name == "printer")
         found = calibrate(robot, one.measured, one.paths)
         told = [p for p in found.parameters if p.name in one.truth and p.observed]
@@ -116,7 +116,7 @@ def test_distances_and_angles_of_new_poses_err_by_what_is_stated(
     robot = printer if name == "printer" else load(name)
     over: list[tuple[float, float, float]] = []
     for seed in range(1000, 1012):
-        one = case(robot, [k.name for k in kinds_of([kinds])], rows, seed, flat=name == "printer")
+        one = case(robot, [k.name for k in parse_kinds([kinds])], rows, seed, flat=name == "printer")
         found = calibrate(robot, one.measured, one.paths)
         own = robot.controller
         offsets = [one.truth[f"joint_map.{joint}.offset"] for joint in robot.joint_names]
@@ -186,7 +186,7 @@ def partial(data: dict[str, np.ndarray], rows: slice) -> Measured:
     height, distance = np.full(len(read), np.nan), np.full(len(read), np.nan)
     height[:count], distance[count:] = 0.0, 1e-3 * lengths
     values = {"height": height} | ({"distance": distance} if len(lengths) else {})
-    return measured_of(read, second, values, np.arange(len(read)) + 2, {})
+    return make_measured(read, second, values, np.arange(len(read)) + 2, {})
 
 
 @pytest.mark.parametrize("count", often(1, 25))
@@ -195,7 +195,7 @@ def test_heights_alone_fit_as_well_as_the_published_algorithm(count: int, printe
         start, data = probed(seed, 0)
         measured = partial(data, slice(0))
         q = printer.controller.positions(measured.joints)
-        found = calibrate(printer, measured, geometric(printer, q))
+        found = calibrate(printer, measured, list_geometric_paths(printer, q))
         _, rms, _ = published(start, data["travel"], None)
         assert found.agreements[0].fitted[1].rms <= 1e-3 * rms + 1e-7
         assert found.scale is not None and not found.scale.determined
@@ -212,7 +212,7 @@ def test_distances_that_were_left_out_are_predicted(count: int, printer: Robot) 
         start, data = probed(100 + seed, 12)
         measured = partial(data, slice(0, 8))
         q = printer.controller.positions(measured.joints)
-        found = calibrate(printer, measured, geometric(printer, q))
+        found = calibrate(printer, measured, list_geometric_paths(printer, q))
         assert found.scale is not None and found.scale.determined
         robot = found.robot
         ends = [robot.platform(found.joint_map.positions(-1e-3 * data[key][8:]))[0] for key in ("first", "second")]
@@ -264,7 +264,7 @@ def test_a_wrong_probe_is_named(printer: Robot) -> None:
 
 def test_a_plan_keeps_its_promise(printer: Robot) -> None:
     """Its deviations are those of a calibration there, and less than of poses drawn blindly."""
-    kinds = kinds_of(["distance"])
+    kinds = parse_kinds(["distance"])
     box = {"x": (-0.06, 0.06), "y": (-0.06, 0.06), "z": (0.0, 0.0)}
     noise = {"distance": 5e-5}
     chosen = plan(printer, kinds, within=box, accuracy=1e-4, noise=noise)
@@ -276,9 +276,9 @@ def test_a_plan_keeps_its_promise(printer: Robot) -> None:
     def deviations(first: np.ndarray, second: np.ndarray) -> float:
         ends = [printer.platform(printer.controller.positions(q))[0] for q in (first, second)]
         lengths = np.linalg.norm(ends[0] - ends[1], axis=1)
-        table = measured_of(first, second, {"distance": lengths}, np.arange(len(first)) + 2, noise)
+        table = make_measured(first, second, {"distance": lengths}, np.arange(len(first)) + 2, noise)
         q = printer.controller.positions(table.joints)
-        found = calibrate(printer, table, geometric(printer, q))
+        found = calibrate(printer, table, list_geometric_paths(printer, q))
         assert found.scale is not None
         if first is chosen.joints:
             pairs = zip(found.parameters, chosen.known.parameters, strict=True)
@@ -298,6 +298,6 @@ def test_a_plan_keeps_its_promise(printer: Robot) -> None:
 
 def test_what_a_plan_cannot_reach_it_does_not_promise(printer: Robot) -> None:
     box = {"x": (-0.06, 0.06), "y": (-0.06, 0.06), "z": (0.0, 0.0)}
-    chosen = plan(printer, kinds_of(["height"]), within=box, accuracy=1e-6)
+    chosen = plan(printer, parse_kinds(["height"]), within=box, accuracy=1e-6)
     assert chosen.needed(1e-6) is None
     assert chosen.known.undetermined

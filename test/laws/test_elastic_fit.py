@@ -10,7 +10,7 @@ import pytest
 
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.deflections import fit_elements
-from pkm_twin.identification.parameters import groups_of
+from pkm_twin.identification.parameters import group_elements
 from stiffness_monitor.response import element_response
 from test.laws.deflections import SENSORS, frame_recording, noisy, twin_recording
 from test.support.robots import load
@@ -88,7 +88,7 @@ def test_elements_in_series_that_always_share_a_load_are_one_group():
     covariance = np.diag([1e-4, 1.0, 1e-4, 1.0])
     turned = np.eye(4)
     turned[:2, :2] = turned[2:, 2:] = np.sqrt(0.5) * np.array([[1.0, 1.0], [1.0, -1.0]])
-    groups = groups_of(tuple("abcd"), np.array([1.0, 2.0, 3.0, 4.0]), turned @ covariance @ turned)
+    groups = group_elements(tuple("abcd"), np.array([1.0, 2.0, 3.0, 4.0]), turned @ covariance @ turned)
     assert [group.elements for group in groups] == [("a", "b"), ("c", "d")]
     (first,) = groups[0].known
     assert first.weights == pytest.approx({"a": np.sqrt(0.5), "b": np.sqrt(0.5)})

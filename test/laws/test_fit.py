@@ -14,9 +14,9 @@ import pytest
 from delta_dynamics import inverse_dynamics
 from pkm_twin import Robot
 from pkm_twin.errors import ParameterError, PkmTwinError
-from pkm_twin.identification.estimation import estimate, possible
+from pkm_twin.identification.estimation import estimate, is_possible
 from pkm_twin.identification.fit import Fit, fit
-from pkm_twin.identification.identifiable import pseudo_inertia
+from pkm_twin.identification.identifiable import make_inertia_cone
 from pkm_twin.identification.parameters import file_parameters, fitted_yaml
 from pkm_twin.machine.inertia import standard_parameters
 from pkm_twin.mechanisms.entries import write_edited
@@ -167,15 +167,15 @@ def test_refusals_by_name():
 def test_the_nearest_possible_body_takes_an_impossible_one_s_place():
     pytest.importorskip("cvxpy")
     rng = np.random.default_rng(6)
-    cone = ((slice(0, 10), pseudo_inertia()),)
+    cone = ((slice(0, 10), make_inertia_cone()),)
     true = standard_parameters(2.0, np.array([0.1, 0.0, 0.0]), np.diag([0.0, 0.02, 0.02]))
     table = rng.normal(size=(60, 3, 10))
     target = table @ true + rng.normal(0.0, 0.3, (60, 3))
     start = standard_parameters(1.0, np.zeros(3), 0.01 * np.eye(3))
     alone = estimate(table, target, start, np.ones(10))
     held = estimate(table, target, start, np.ones(10), cone)
-    assert not possible(alone.values, cone)
-    assert held.bound and possible(held.values, cone)
+    assert not is_possible(alone.values, cone)
+    assert held.bound and is_possible(held.values, cone)
     # The nearest: not farther from the truth, which is possible.
     measure = np.linalg.inv(alone.covariance)
     apart = [v - true for v in (alone.values, held.values)]

@@ -16,7 +16,7 @@ from pkm_twin.design import drawn, tolerances
 from pkm_twin.design.parts import Assembly, find_part
 from pkm_twin.design.tolerance import rms_length, workspace_states
 from pkm_twin.errors import ParameterError, UnknownNameError
-from pkm_twin.identification.calibration import calibrate, geometric, left_by_calibration
+from pkm_twin.identification.calibration import calibrate, left_by_calibration, list_geometric_paths
 from pkm_twin.identification.calibration_state import Poses
 from pkm_twin.machine.uncertainty import Tolerance
 from pkm_twin.mechanisms.catalogue import robot_of_data
@@ -405,7 +405,7 @@ def test_what_a_calibration_leaves_is_what_it_leaves():
     effects = find_part(robot, path).effects
     moved = Assembly(robot, q).solve_displacements({k: error * v[None] for k, v in effects.items()})[0]
     place, turn = robot.platform(q)
-    found = calibrate(robot, Poses(q, place + moved[:, :3], turn), geometric(robot, q))
+    found = calibrate(robot, Poses(q, place + moved[:, :3], turn), list_geometric_paths(robot, q))
     there, _ = found.robot.platform(found.joint_map.positions(q))
     left = left_by_calibration(
         robot,

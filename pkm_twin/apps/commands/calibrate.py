@@ -15,11 +15,19 @@ from pkm_twin.apps.options import AcceptOption, BeyondLimitsOption, OverwriteOpt
 from pkm_twin.console import draw_progress
 from pkm_twin.errors import ParameterError, one_line
 from pkm_twin.files import replace_file
-from pkm_twin.identification.calibration import Calibration, Estimate, geometric
+from pkm_twin.identification.calibration import Calibration, Estimate, list_geometric_paths
 from pkm_twin.identification.calibration import calibrate as calibrated
-from pkm_twin.identification.calibration_fit import STEPS
+from pkm_twin.identification.calibration_fit import MAX_STEPS
 from pkm_twin.identification.calibration_state import Transmission
-from pkm_twin.identification.measurements import KINDS, Kind, Measured, kinds_of, parse_noise, read_measured, read_poses
+from pkm_twin.identification.measurements import (
+    KINDS,
+    Kind,
+    Measured,
+    parse_kinds,
+    parse_noise,
+    read_measured,
+    read_poses,
+)
 from pkm_twin.identification.plan import MAX_MEASUREMENTS, Plan, parse_within
 from pkm_twin.identification.plan import plan as plan_of
 from pkm_twin.mechanisms.entries import edit_robot_text, write_edited
@@ -96,7 +104,7 @@ class Calibrate(RobotArgument, TableOptions, BeyondLimitsOption, AcceptOption, O
 
         :raises ParameterError: other words, or the noise of what is not measured.
         """
-        kinds = kinds_of(self.measure or (["position"] if self.plan else []))
+        kinds = parse_kinds(self.measure or (["position"] if self.plan else []))
         noise = parse_noise(self.noise)
         for name in noise.keys() - {kind.name for kind in kinds}:
             measured = ", ".join(kind.name for kind in kinds) or "none: whole poses have their own"
@@ -153,8 +161,8 @@ def calibrate(given: Calibrate) -> Report:
         return report_plan(machine, chosen, given.accuracy, given.plan)
     if given.poses is None or measured is None:
         raise ParameterError("poses", None, "a CSV of measured poses, or --plan FILE.csv")
-    paths = geometric(machine, q, given.only)
-    with draw_progress("steps", 2 * STEPS) as update:
+    paths = list_geometric_paths(machine, q, given.only)
+    with draw_progress("steps", 2 * MAX_STEPS) as update:
         done = 0
 
         def add_steps(count: int) -> None:

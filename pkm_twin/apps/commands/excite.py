@@ -66,14 +66,14 @@ def excite(given: Excite) -> Report:
 
     :raises PkmTwinError: no trajectory keeps to the limits.
     """
-    from pkm_twin.identification.excitation import Judge, TrajectoryLimits, sweeps
+    from pkm_twin.identification.excitation import Judge, TrajectoryLimits, design_sweeps
     from pkm_twin.identification.excitation import optimize_excitation as design
-    from pkm_twin.identification.parameters import file_parameters, kinds_of
+    from pkm_twin.identification.parameters import file_parameters, parse_kinds
     from pkm_twin.recordings import Recording, read
     from pkm_twin.recordings.bags import write_motion
 
     machine = given.machine()
-    judge = Judge.from_robot(machine, file_parameters(machine, kinds_of(given.what)))
+    judge = Judge.from_robot(machine, file_parameters(machine, parse_kinds(given.what)))
     other = None
     if given.compare is not None:
         recorded = read(given.compare, machine)
@@ -83,7 +83,7 @@ def excite(given: Excite) -> Report:
     bounds = TrajectoryLimits(given.share, given.acceleration, given.singularity, given.rate)
     best: Any
     if given.friction:
-        best = sweeps(judge, given.duration, bounds)
+        best = design_sweeps(judge, given.duration, bounds)
     else:
         with draw_progress("excite", given.trials) as update:
             best = design(

@@ -107,12 +107,12 @@ class Fit(TimedPayloadOptions, RecordingOptions, BeyondLimitsOption, AcceptOptio
 
         :raises ParameterError: unknown words, or options that do not go together.
         """
-        from pkm_twin.identification.friction_laws import laws_of
-        from pkm_twin.identification.parameters import COMPLIANCE, kinds_of
+        from pkm_twin.identification.friction_laws import parse_laws
+        from pkm_twin.identification.parameters import COMPLIANCE, parse_kinds
 
-        laws, _ = laws_of(self.friction), self.load
+        laws, _ = parse_laws(self.friction), self.load
         if COMPLIANCE not in [word.strip() for word in self.what.split(",")]:
-            return kinds_of(self.what), laws
+            return parse_kinds(self.what), laws
         if self.per_copy or self.payload is not None or self.load_times is not None:
             rest = "no --per-copy, --payload or --load-times, which are for efforts"
             raise ParameterError("--what", self.what, rest)
@@ -146,10 +146,10 @@ def fit(given: Fit) -> Report:
     if given.drive is not None:
         # Fit a drive's torque constant and friction to weights that it lifts.
         from pkm_twin.apps.fit_report import report_drive
-        from pkm_twin.identification.drives import drive_friction, runs_of
+        from pkm_twin.identification.drives import drive_friction, list_runs
         from pkm_twin.recordings import read_table
 
-        runs = runs_of(read_table(given.drive, dialect=given.dialect), given.lever)
+        runs = list_runs(read_table(given.drive, dialect=given.dialect), given.lever)
         return report_drive(drive_friction(*runs))
     if not given.robot or not given.recordings:
         raise click.UsageError("a robot and recordings are missing; give both, or --drive TABLE")

@@ -40,7 +40,7 @@ def trend(given: Trend) -> Report:
 
     :raises ParameterError: no history, or one without numbers of this machine.
     """
-    from pkm_twin.identification.history import FEWEST, judge_history
+    from pkm_twin.identification.history import MIN_RECORDINGS, judge_history
 
     results = judge_history(given.history, given.machine, given.baseline, given.false_alarm)
     drifting = sum(one.drifts for one in results)
@@ -52,7 +52,7 @@ def trend(given: Trend) -> Report:
         answer = "drift unknown: too few recordings"
     notes = [one.line for one in results]
     if few:
-        notes.append(f"not judged: {few} series with fewer than {FEWEST} recordings")
+        notes.append(f"not judged: {few} series with fewer than {MIN_RECORDINGS} recordings")
     return Report(
         answer=answer,
         facts=[
