@@ -71,8 +71,8 @@ def pick_and_place() -> str:
     r = recorded("delta_cu_pick_and_place")
     assert r.load is not None and r.qd is not None and r.effort is not None
     near = r.load.near_change(r.time, AROUND)
-    held = r.load.held(r.time) & ~near
-    free = ~r.load.held(r.time) & ~near
+    held = r.load.is_on_platform(r.time) & ~near
+    free = ~r.load.is_on_platform(r.time) & ~near
     peak = float(np.abs(r.effort[free]).max())
     rows = ["| window (ms) | read off at its middle | at its newest end |", "|---|---|---|"]
     for window in (31, 41, 51, 61):

@@ -17,7 +17,7 @@ from delta_dynamics.torques.uncertainty import NOISE_AVERAGING_TIME, Noise, effo
 from delta_dynamics.torques.virtual_work import inverse_dynamics, mass_matrix
 from pkm_twin.codegen.arrays import Array, check_later, common_batch, finite, one_vector, vectors
 from pkm_twin.messages.stamps import SECOND
-from pkm_twin.robot.mechanism import SHARED
+from pkm_twin.robot.mechanism import EFFORT_SHARING_NOTE
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.drives import BRAKE_TIME, DriveWatch
 from pkm_twin.streams.rest import VelocityErrorEstimator
@@ -48,7 +48,7 @@ class MomentumObserver:
         """
         if not 0.0 < bandwidth < np.inf:
             raise ValueError(f"bandwidth is {bandwidth:g} 1/s; expected more than 0")
-        robot.check_independent("contacts of measured efforts", SHARED)
+        robot.check_independent("contacts of measured efforts", EFFORT_SHARING_NOTE)
         self.robot = robot
         self.bandwidth = bandwidth
         self._still = np.zeros(robot.joints_count)
@@ -117,7 +117,7 @@ def platform_wrench(robot: Robot, q: ArrayLike, external: ArrayLike) -> Array:
     :param external: external efforts at the joints, shape (..., n):
         J' wrench with the platform's Jacobian J.
     """
-    robot.check_independent("wrenches of measured efforts", SHARED)
+    robot.check_independent("wrenches of measured efforts", EFFORT_SHARING_NOTE)
     lever = np.array([1.0, 1.0, 1.0, *(3 * [robot.size])])
     jacobian = robot.platform_jacobian(q) * lever[:, None]
     # The joints do not measure directions whose singular value is below 1e-9 of the largest.

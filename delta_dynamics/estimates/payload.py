@@ -16,7 +16,7 @@ from delta_dynamics.torques.uncertainty import Noise
 from delta_dynamics.torques.virtual_work import inverse_dynamics
 from pkm_twin.codegen.arrays import Array, check_later, one_vector
 from pkm_twin.messages.stamps import SECOND
-from pkm_twin.robot.mechanism import SHARED
+from pkm_twin.robot.mechanism import EFFORT_SHARING_NOTE
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.drives import DriveWatch
 from pkm_twin.streams.rest import VelocityErrorEstimator
@@ -68,7 +68,7 @@ class PayloadEstimator:
         :param mass_range: standard deviation of a load's mass before anything is known, kg.
         :param reach: standard deviation of its centre of mass, m.
         """
-        robot.check_independent("payloads of measured efforts", SHARED)
+        robot.check_independent("payloads of measured efforts", EFFORT_SHARING_NOTE)
         self._share = LoadShare(robot)
         self.robot = robot = self._share.robot
         names = parameter_names(robot)

@@ -32,7 +32,7 @@ from pkm_twin.kinematics.posed import PlatformFirstScheme
 from pkm_twin.kinematics.programs import certify_assembly, follow_pose, pose_factors, solve_pose
 from pkm_twin.kinematics.traced import Traced
 from pkm_twin.machine.inertia import ROTORS_PART, Layout, list_loaded_joints, make_frame_change
-from pkm_twin.robot.rejection import report_lost_digits
+from pkm_twin.robot.rejection import make_pivot_error
 from pkm_twin.robot.robot import Robot
 
 
@@ -142,7 +142,7 @@ def evaluate_at_pose(robot: Robot, kernel: PoseKernel, p: Array, *given: ArrayLi
                 raise ValueError("an input in addition to the pose is not finite, or too large")
             index = tuple(int(k) for k in np.argwhere(left)[lost[0]])
             q = robot.inverse(rows[0][index])[robot.graph.leading]
-            raise report_lost_digits("pose", index, robot.engine.reach(q)[2])
+            raise make_pivot_error("pose", index, robot.engine.reach(q)[2])
         for values, new in zip(found, again, strict=True):
             values[left] = new
     return found

@@ -31,7 +31,7 @@ from pkm_twin.machine.inertia import (
     standard_parameters,
 )
 from pkm_twin.machine.schema import frozen
-from pkm_twin.robot.mechanism import SHARED
+from pkm_twin.robot.mechanism import EFFORT_SHARING_NOTE
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import random_joints
 
@@ -94,7 +94,7 @@ def regressor(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench:
     :returns: Y, shape (..., n, p), N m or N per unit of the parameter; parameters and errors as of
         :func:`~delta_dynamics.inverse_dynamics`.
     """
-    robot.check_independent("parameters of efforts", SHARED)
+    robot.check_independent("parameters of efforts", EFFORT_SHARING_NOTE)
     load = np.zeros(6) if wrench is None else wrench
     kernel, gravity = robot.massive().kernel("regressor", _write_regressor), robot.gravity
     bodies, others = robot.evaluate(kernel, q, qd, qdd, load, p=np.ascontiguousarray(gravity))

@@ -100,7 +100,7 @@ class PayloadOption(RobotArgument):
     @property
     def load(self) -> Load | None:
         """The payload; None if the option is not given."""
-        from pkm_twin.recordings.payload import Load, parse_payload, parse_times
+        from pkm_twin.recordings.payload import Load, parse_intervals, parse_payload
 
         times = getattr(self, "load_times", None)
         if self.payload is None:
@@ -108,14 +108,14 @@ class PayloadOption(RobotArgument):
                 raise click.UsageError("--load-times needs --payload")
             return None
         try:
-            return Load(*parse_payload(self.payload), () if times is None else parse_times(times))
+            return Load(*parse_payload(self.payload), () if times is None else parse_intervals(times))
         except ParameterError as error:
             raise click.UsageError(str(error)) from None
 
     def machine(self) -> Robot:
         """Load the robot with its payload."""
         machine, carried = super().machine(), self.load
-        return machine if carried is None else carried.on(machine)
+        return machine if carried is None else carried.apply_to(machine)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,7 +152,7 @@ class TableOptions:
         """
         from pkm_twin.recordings import Dialect
 
-        return Dialect.of(self.separator, self.decimal, self.columns, self.units, self.time)
+        return Dialect.from_options(self.separator, self.decimal, self.columns, self.units, self.time)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -86,7 +86,7 @@ def report_dynamics(bag: Path, recording: Path, prefix: str) -> tuple[list[Fact]
 
     # Find samples without payload or cutting force, at least half a second away from either.
     if r.load is not None:
-        loaded = r.load.held(r.time)
+        loaded = r.load.is_on_platform(r.time)
     elif r.wrench is not None:
         force = np.linalg.norm(r.wrench[:, :3], axis=1)
         loaded = force > 0.1 * force.max()

@@ -151,7 +151,7 @@ def compare_with_model(r: Recording, residual: float) -> Checked:
         reason = "joint states without efforts: the bag has none, or NaN, in some or all of them"
         reason = "the table has no columns JOINT.effort" if r.bag is None else reason
         reason = COMPUTED if r.efforts == "model" else reason
-    fault = r.play_fault or r.step_fault
+    fault = r.play_fault or r.jump_description
     # Single jumps are left out of what is compared.
     if reason or r.steps.publishers or r.play_fault:
         items.append(judged(RESIDUAL, fault or reason, bound, None))
@@ -203,7 +203,7 @@ def _judge_motion(r: Recording) -> list[Fact]:
     median, longest = float(np.median(periods)), float(periods.max())
     gap = f"{1e3 * longest:.3f} ms at {r.time[int(periods.argmax())]:.3f} s"
     within, rate = 5.0 * median, f"{1 / median:.1f} Hz over {r.time[-1]:.3f} s"
-    fault = r.play_fault or r.step_fault
+    fault = r.play_fault or r.jump_description
     items = [
         judged("rate", rate, "", True, number=1 / median, unit="Hz"),
         missing_samples(r.time),
@@ -426,8 +426,8 @@ def check(r: Recording, residual: float = MAX_RESIDUAL, thorough: bool = True) -
     """
     found = compare_with_model(r, residual)
     c, bad, played = found.compared, found.named(Verdict.BAD), POSITION_STEPS in found.named(Verdict.BAD)
-    if r.step_fault or (found.causes and (found.unjudged or not played)):
-        return replace(found, causes=found.causes or (r.step_fault,))
+    if r.jump_description or (found.causes and (found.unjudged or not played)):
+        return replace(found, causes=found.causes or (r.jump_description,))
     # Efforts of invalid positions mean nothing; residuals that are noise need no explanation.
     unlike = c is not None and (not c.good.all() or (thorough and (c.rms > MAX_NOISE_RATIO * c.noise).any()))
     one = _explain(found) if played or (unlike and VELOCITIES not in bad) else None

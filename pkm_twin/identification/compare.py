@@ -203,7 +203,7 @@ def compare(r: Recording, bound: float = MAX_RESIDUAL) -> Compared | None:
     for _ in range(MAX_DELAY_PASSES):
         if c is None or abs(c.late - made.late) <= c.period:
             break
-        made = made.on_time(c.late - made.late)
+        made = made.compensate_effort_delay(c.late - made.late)
         c = _compare_recording(made, bound) if len(made.time) >= MIN_PIECE_SAMPLES else None
     return first if c is None or not c.good.all() else c
 
@@ -339,7 +339,7 @@ def cut_recording(r: Recording, leave_out: Mask | None = None) -> Recording:
             leave_out |= find_idle(r) & (r.efforts != "current")
         # If no sample would remain, keep all: the efforts themselves are the fault.
         leave_out &= not leave_out.all()
-    return r.part(~(leave_out | near_change(r)[0]))
+    return r.select(~(leave_out | near_change(r)[0]))
 
 
 def near_change(r: Recording, load: Load | None = None) -> tuple[Mask, float]:

@@ -172,7 +172,7 @@ def correct_delays(problem: Problem) -> Problem:
     ]
     for _ in range(MAX_DELAY_PASSES):
         moved = [
-            made.recording.on_time(late) if abs(late) > made.period else made.recording
+            made.recording.compensate_effort_delay(late) if abs(late) > made.period else made.recording
             for made, late in zip(problem.whole, found, strict=True)
         ]
         if not any(

@@ -191,7 +191,7 @@ def fit_recordings(
                 reason="frames",
             )
     file = robot
-    faults = [f"{r.name}: {describe_positions(r)}" for r in recordings if r.step_fault]
+    faults = [f"{r.name}: {describe_positions(r)}" for r in recordings if r.jump_description]
     refuse_faults(faults, accept)
     notes = [f"accepted by --accept: {fault}" for fault in faults]
     for r in recordings:
@@ -227,7 +227,7 @@ def fit_recordings(
         if len({(load.mass, load.com) for load in loads}) > 1:
             masses = ", ".join(f"{load.mass:g}" for load in loads)
             raise PkmTwinError(f"recordings with payloads of {masses} kg: fit one at a time")
-        robot = loads[0].on(robot) if loads else robot
+        robot = loads[0].apply_to(robot) if loads else robot
         made = [r if r.load is None else replace(r, load=replace(r.load, sought=True)) for r in made]
     if constant is not None:
         if constant != FIT:

@@ -420,7 +420,7 @@ class HypothesisSearch:
             if best.text == NO_MACHINE or best.discrepancy_ratio > 0.12:
                 return Explanation(unknown, fault=True)
             if 0.0 < abs(best.late) < MAX_DELAY and not self.rows.recording.late:
-                r = self.rows.recording.on_time(best.late)
+                r = self.rows.recording.compensate_effort_delay(best.late)
                 return explain(make_rows(self.rows.model.robot, self.rows.model.parameters, r))
             return Explanation(best.text, fault=True, load=best.load)
         if sound.discrepancy_ratio > 0.3:
@@ -559,7 +559,7 @@ def explain_recording(robot: Robot, r: Recording) -> Explanation:
     if found.load is not None:
         loaded = explain(make_rows(robot, rows.model.parameters, replace(rows.recording, load=found.load)))
         found = loaded if loaded.fault else found
-    return replace(found, steps="" if r.step_fault else r.play_fault, rows=rows)
+    return replace(found, steps="" if r.jump_description else r.play_fault, rows=rows)
 
 
 def describe_positions(r: Recording) -> str:
@@ -569,7 +569,7 @@ def describe_positions(r: Recording) -> str:
             find_idle(r)
         except (UnreachableError, SingularityError) as error:
             return position_text(error)
-    return f"position steps that are no motion: {r.play_fault or r.step_fault}"
+    return f"position steps that are no motion: {r.play_fault or r.jump_description}"
 
 
 def wrenches(r: Recording, motion: Motion) -> Iterator[tuple[str, Array]]:

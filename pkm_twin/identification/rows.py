@@ -239,11 +239,11 @@ def make_rows(robot: Robot, parameters: FileParameters, recording: Recording, wi
         if np.ptp(effort) < 1e-9:
             only = effort[0] + 0.0  # no minus before zero
             raise PkmTwinError(f"{r.name}: effort of {joint} is {only:g} throughout: nothing was measured")
-    pieces, how = tracks(r.time, r.q, r.measured, r.wrench, r.held, window)
+    pieces, how = tracks(r.time, r.q, r.measured, r.wrench, r.payload_fraction, window)
     if not pieces:
         raise PkmTwinError(f"{r.name}: too short to fit, no {MIN_SAMPLES // 2} samples without a gap")
     # With the friction laws on trial, as the robot has them.
-    carried = None if r.carried is None else replace(robot, payload=r.carried.payload)
+    carried = None if r.loaded_robot is None else replace(robot, payload=r.loaded_robot.payload)
     model = Model(robot, parameters, carried)
     try:
         parts = [_Piece.from_track(model, track, how) for track in pieces]

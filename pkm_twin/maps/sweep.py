@@ -46,7 +46,7 @@ from pkm_twin.maps.kinds.workspace import LAYERS, find_circle_radii, make_circle
 from pkm_twin.maps.search import GRID_SIDE, MAX_GRID_DIMENSIONS, find_workspace_box, find_worst, score_values
 from pkm_twin.robot.clearance import has_clearance, joint_clearance
 from pkm_twin.robot.robot import Robot
-from pkm_twin.robot.workspace import MIN_TILT_RADIUS, distance_unit, satisfies_limits
+from pkm_twin.robot.workspace import MIN_TILT_RADIUS, satisfies_limits, workspace_radius_unit
 
 STARTS_PER_CHUNK: Final = 16
 """Number of the worst poses of a chunk that the search may start from."""
@@ -530,7 +530,7 @@ def find_circles(robot: Robot, bounds: Array, least: float, least_clearance: flo
     low, high = bounds[robot.pose_names.index(grid.height)].tolist()
     heights = np.linspace(low, high, LAYERS)
     radius = find_circle_radii(robot, heights, least=least, least_clearance=least_clearance)
-    smallest = MIN_TILT_RADIUS if distance_unit(robot) == "rad" else 0.0
+    smallest = MIN_TILT_RADIUS if workspace_radius_unit(robot) == "rad" else 0.0
     kept = (radius >= smallest) & (radius > 0.0)
     if not kept.any():
         raise ParameterError("regular", float(radius.max()), f"a circle of {smallest:.4g} or more")

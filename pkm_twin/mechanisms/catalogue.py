@@ -14,7 +14,7 @@ from pkm_twin.machine import usd_file
 from pkm_twin.machine.strict_yaml import read_yaml
 from pkm_twin.robot.plausibility import findings
 from pkm_twin.robot.robot import Robot
-from pkm_twin.robot.urdf_read import Part, read_tree
+from pkm_twin.robot.urdf_read import UrdfSelection, read_tree
 
 CATALOGUE: Final = {
     "delta": "pkm_twin.mechanisms.delta:Delta",
@@ -88,7 +88,7 @@ def load(
     :raises UnknownNameError: no such name; the closest one is named.
     :raises ParameterError: an invalid file, key, type or value, with its dotted name.
     """
-    path, part = robot_path(robot), Part(platform, base, actuated, pose, carry)
+    path, part = robot_path(robot), UrdfSelection(platform, base, actuated, pose, carry)
     if path.suffix in TREE_SUFFIXES:
         reading = read_tree(path, part)
         robot_read = robot_of_data(reading.description, path.stem)

@@ -61,7 +61,7 @@ def edit_robot_text(robot: Robot, source: str, values: Mapping[str, Fitted | Cho
     path = robot_path(source)
     text = "" if path.suffix in TREE_SUFFIXES else path.read_text(encoding="utf-8")
     data: Any = yaml.safe_load(text)
-    values = robot.resolved(values)
+    values = robot.resolve_paths(values)
     plain = [name for name in values if not name.startswith("joint_map.")]
     if not all(has_entry(data, name) for name in plain):
         moved = {name: values[name].value for name in plain if name.startswith(f"{PARAMETERS}.")}

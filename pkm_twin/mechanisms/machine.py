@@ -163,14 +163,14 @@ class Machine(TwinRobot):
             **common,
             **own,
         )
-        robot = dataclasses.replace(robot, uncertainty=robot.resolved(robot.uncertainty))
+        robot = dataclasses.replace(robot, uncertainty=robot.resolve_paths(robot.uncertainty))
         robot.check_laws()
         _ = robot.controller
         robot.engine.check()
         check_masses(robot.engine, robot.graph)
         _ = robot.passive_limits
         _ = robot.causes
-        robot.check_elements()
+        robot.check_stiffness_factors()
         return robot
 
     def changed(self: M, **sections: Mapping[str, object] | object) -> M:
@@ -219,7 +219,7 @@ class Machine(TwinRobot):
         A limb's number is that of all its copies, in the axes of azimuth zero; another azimuth
         turns its copy.
         """
-        book, values = self.book.change_numbers(self.resolved(values))
+        book, values = self.book.change_numbers(self.resolve_paths(values))
         sources = dict(self.sources)
         specs = {kind: dict(entries) for kind, entries in self.specs.items()}
         rest, origin = {}, self.described.origin
@@ -251,7 +251,7 @@ class Machine(TwinRobot):
     def with_file_values(self, values: Mapping[str, Any]) -> Any:
         """Return the machine of the same file with other numbers, where possible with its expressions."""
         data: Any = copy.deepcopy(self.book.data)
-        values = self.resolved(values)
+        values = self.resolve_paths(values)
         kept = data and (self.book.values or self.book.formulas)
         if not kept or not all(has_entry(data, path) for path in values):
             return super().with_file_values(values)

@@ -17,7 +17,7 @@ from pkm_twin.machine.friction import Dahl
 from pkm_twin.paths.joint_path import only_turns, reference_velocity
 from pkm_twin.paths.motion import Samples
 from pkm_twin.paths.sizing import rms
-from pkm_twin.recordings.origin import origin_columns
+from pkm_twin.recordings.origin import effort_model_columns
 from pkm_twin.recordings.payload import split_by_load
 from pkm_twin.recordings.recording import Recording
 from pkm_twin.recordings.tables import WRENCH
@@ -66,7 +66,7 @@ class EffortComparison:
         """
         motion, doubt = self.motion, self.unlike
         if motion.computed is not None:
-            origin, away = motion.origin, relative_difference(motion.computed, self.model)
+            origin, away = motion.effort_model, relative_difference(motion.computed, self.model)
             other = "" if origin is None else origin.differs_from(motion.robot)
             worst = int(away.argmax())
             if away[worst] > (MAX_EFFORT_DIFFERENCE if origin is None or other else 1e-3):
@@ -275,4 +275,4 @@ def torque_table(m: Recording, progress: Callable[[int], None] | None = None) ->
         if np.abs(m.effort - model).max() <= EFFORT_TOLERANCE * np.abs(model).max():
             # The file is a plan of this machine, not a measurement.
             table = {name: v for name, v in table.items() if not name.endswith(".measured")}
-    return table | origin_columns(m.robot, m.load, m.wrench, m.time)
+    return table | effort_model_columns(m.robot, m.load, m.wrench, m.time)

@@ -59,7 +59,7 @@ def split_at_payloads(
     except (TypeError, ValueError):
         raise ParameterError("payload", payload, expected) from None
     masses = [None if mass == own else mass for mass in given]
-    robots = {m: robot if m is None else Load(m).on(robot) for m in dict.fromkeys(masses)}
+    robots = {m: robot if m is None else Load(m).apply_to(robot) for m in dict.fromkeys(masses)}
     result = [PayloadChange(robots[masses[0]], masses[0])]
     stretches = list(path.stretches)
     for mark, mass in zip(path.marks[1:], masses[1:], strict=True):

@@ -185,7 +185,7 @@ class TimedPath:
             for (begin, end), change in zip(pairwise(edges), self.carried, strict=True)
             if change.mass is not None and end > begin
         ]
-        return Load.of(spans, "path") if spans else None
+        return Load.from_intervals(spans, "path") if spans else None
 
     def _efforts(self, t: Array, q: Array, qd: Array, qdd: Array) -> Array | None:
         """Return efforts at times (k,) with the payload then; None for a robot without masses."""

@@ -13,7 +13,7 @@ import numpy as np
 from pkm_twin.errors import ParameterError, UnknownNameError, warn_of_file
 from pkm_twin.files import parse_numbers
 from pkm_twin.paths.geometry import Path, Space, lines, through
-from pkm_twin.recordings.origin import states_origin
+from pkm_twin.recordings.origin import is_effort_model_column
 from pkm_twin.recordings.payload import Load
 from pkm_twin.recordings.tables import (
     DEFAULT_DIALECT,
@@ -21,7 +21,7 @@ from pkm_twin.recordings.tables import (
     PAYLOAD,
     WRENCH,
     Dialect,
-    kinds_of,
+    column_quantities,
     read_table,
 )
 from pkm_twin.robot.robot import Robot
@@ -44,7 +44,7 @@ def read_waypoints(
         robot file's centre of mass.
     :raises ParameterError: a column is missing, unknown, or a number is out of range.
     """
-    kinds = kinds_of(robot)
+    kinds = column_quantities(robot)
     table = read_table(file, kinds, dialect)
     joints = [f"{name}.position" for name in robot.joint_names]
     space: Space = "pose" if any(name in table for name in robot.pose_names) else "joint"
@@ -59,7 +59,7 @@ def read_waypoints(
             warn_of_file(file, f"{name} up to {most:.4g} rad, beyond a turn; degrees? a header {name} [deg]")
     other = {*WRENCH, *(name for name in kinds if name.rpartition(".")[2] in EFFORTS[1:])}
     for name in (*table, *table.left_out):
-        if (name not in kinds and not states_origin(name)) or name in other:
+        if (name not in kinds and not is_effort_model_column(name)) or name in other:
             where, few = f"{file}: column", robot.pose_names if space == "pose" else joints
             if space == "pose":
                 where = f"{file}: {robot.name} moves in {', '.join(few)}; column"
@@ -69,7 +69,7 @@ def read_waypoints(
         kilograms, centre = table[PAYLOAD[0]], table.fill(PAYLOAD[1:])
         for mass in np.unique(kilograms[kilograms != robot.payload.mass]).tolist():
             try:
-                Load(mass).on(robot)
+                Load(mass).apply_to(robot)
             except ParameterError as error:
                 where = f"{table.line(int((kilograms == mass).argmax()))}, column payload"
                 raise ParameterError(where, error.value, error.bound) from None

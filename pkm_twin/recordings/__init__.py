@@ -4,7 +4,7 @@
 from pkm_twin.recordings.payload import Load, split_by_load
 from pkm_twin.recordings.read import read
 from pkm_twin.recordings.recording import ReadOptions, Recording, at_rest
-from pkm_twin.recordings.tables import Dialect, Table, kinds_of, read_table, write_table
+from pkm_twin.recordings.tables import Dialect, Table, column_quantities, read_table, write_table
 
 __all__ = [
     "Dialect",
@@ -13,7 +13,7 @@ __all__ = [
     "Recording",
     "Table",
     "at_rest",
-    "kinds_of",
+    "column_quantities",
     "read",
     "read_table",
     "split_by_load",

@@ -28,7 +28,7 @@ from pkm_twin.messages.reading import (
     rotate_to_base,
 )
 from pkm_twin.messages.stamps import SECOND, StampRules
-from pkm_twin.recordings.origin import Origin, origin_columns, origin_facts
+from pkm_twin.recordings.origin import EffortModel, effort_model_columns, effort_model_facts
 from pkm_twin.recordings.payload import metadata_error, read_load
 from pkm_twin.recordings.recording import MODEL_VALUES_NOTE, ReadOptions, Recording
 from pkm_twin.recordings.tables import write_table
@@ -42,9 +42,9 @@ NO_STAMPS: Final = (
     "expected joint states with the time of each sample in header.stamp; without them, record a "
     "table with a column time"
 )
-"""Error for a bag without stamps; log times are times of writing."""
+"""Error for a bag without stamps: log times cannot replace them, because they are the times of writing."""
 MAX_DEFLECTION_OFFSET: Final = 0.02
-"""Largest time from a deflection to its wrench and joint state, s."""
+"""Largest time between a deflection and its wrench or joint state, s."""
 
 
 def read_bag(
@@ -52,7 +52,7 @@ def read_bag(
 ) -> Recording:
     """Read a bag's joint states and its other measurements; messages are checked as by a node.
 
-    Of a bag without joint states, where ``how`` takes it, the motion of its JointTrajectory.
+    If the bag has no joint states and ``how`` allows it, the motion of its JointTrajectory is read.
 
     :param progress: called with the number of messages read so far.
     :raises BagError: the bag is damaged, names no robot, or lacks what is asked for.
@@ -74,9 +74,9 @@ def read_bag(
     if (how.trajectory or how.planned) and JOINT_STATE not in kinds and TRAJECTORY in kinds:
         plan = read_trajectory(bag, machine)
         if plan is not None:
-            origin = Origin.of_bag(bag)
-            computed = None if origin is None else plan.effort
-            return replace(plan, load=held, source=str(path), origin=origin, computed=computed)
+            effort_model = EffortModel.from_bag(bag)
+            computed = None if effort_model is None else plan.effort
+            return replace(plan, load=held, source=str(path), effort_model=effort_model, computed=computed)
     topics = choose_topics(bag, machine, how.topics, how.deflected)
     found = _read_messages(bag, machine, topics, how, progress)
     frame = found.wrenches[0].frame if found.wrenches else ""
@@ -177,23 +177,23 @@ class _Found(NamedTuple):
 def _read_messages(
     bag: Bag, robot: Robot, topics: Topics, how: ReadOptions, progress: Callable[[int], None] | None
 ) -> _Found:
-    """Yield the accepted messages of the chosen topics, joint states in the order of their stamps.
+    """Read the accepted messages of the chosen topics, joint states in the order of their stamps.
 
     :raises BagError: no joint state is accepted.
     """
     reader, rules = JointReader(robot, limited=how.limited), StampRules(future_tolerance=2**62)
-    # Wrenches of one frame: the first that is accepted, or the option's.
-    accepted = how.wrench_frame
+    required_frame = how.wrench_frame
 
-    def accept_wrench(message: Any, now: int) -> WrenchSample:
-        nonlocal accepted
-        given = message.header.frame_id
-        if accepted is None and given in (PLATFORM, how.base_frame):
-            accepted = given
+    def read_wrench_in_frame(message: Any, now: int) -> WrenchSample:
+        """Read a wrench; without an option, the first known frame is required of all later ones."""
+        nonlocal required_frame
+        frame = message.header.frame_id
+        if required_frame is None and frame in (PLATFORM, how.base_frame):
+            required_frame = frame
         try:
-            return read_wrench(message, now, rules, accepted or PLATFORM, accept_empty=False)
+            return read_wrench(message, now, rules, required_frame or PLATFORM, accept_empty=False)
         except MessageError as error:
-            if error.reason != "frame" or not given:
+            if error.reason != "frame" or not frame:
                 raise
             raise MessageError(
                 "frame",
@@ -217,7 +217,7 @@ def _read_messages(
                     raise MessageError("stamp order", f"stamp {sample.stamp} is not after the last")
                 found.samples.append(sample)
             elif message.topic == topics.wrench:
-                found.wrenches.append(accept_wrench(message.message, message.log_time))
+                found.wrenches.append(read_wrench_in_frame(message.message, message.log_time))
             else:
                 moved = read_deflection(message.message, message.log_time, rules)
                 found.deflections.append(moved)
@@ -243,7 +243,7 @@ def _stack_values(values: list[Array | None]) -> Array | None:
 
 
 def _sort_wrenches(samples: list[WrenchSample]) -> tuple[Stamps, Array]:
-    """Sort wrenches (k, 6) by their stamps; of one stamp the last is kept."""
+    """Sort wrenches (k, 6) by stamp; of those with the same stamp the last is kept."""
     by_stamp = {one.stamp: one.wrench for one in samples}
     at = sorted(by_stamp)
     return np.array(at, np.int64), np.array([by_stamp[stamp] for stamp in at])
@@ -270,16 +270,16 @@ TOPIC: Final = "/delta_dynamics/joint_trajectory"
 def write_motion(path: Path, r: Recording, facts: Mapping[str, Any], overwrite: bool = False) -> None:
     """Write a planned motion: a bag with one JointTrajectory, FILE.mcap, or a table.
 
-    A table has time, the joints' motion and efforts, the pose with its rates, and the origin of
-    the efforts (``origin``). In a bag numbers are the controller's, and a zero stamp means a start on
-    receipt.
+    A table has time, the joints' motion and efforts, the pose with its rates, and the model of the
+    efforts (:mod:`~pkm_twin.recordings.origin`). In a bag, joint values are in the controller's
+    units and offsets, and a zero stamp means "start on receipt".
 
-    :param r: with rates and accelerations.
-    :param facts: of the bag's metadata, beside its robot and payload.
+    :param r: must have velocities and accelerations.
+    :param facts: metadata of the bag in addition to robot and payload.
     :raises BagError: the bag exists or cannot be written.
     """
     if path.suffix != ".mcap":
-        write_table(_make_columns(r) | origin_columns(r.robot, r.load, r.wrench, r.time), path)
+        write_table(_make_columns(r) | effort_model_columns(r.robot, r.load, r.wrench, r.time), path)
         return
     if r.wrench is not None and r.wrench.any():
         raise ParameterError("out", str(path), "a table: a bag's trajectory has no wrench")
@@ -312,7 +312,7 @@ def write_motion(path: Path, r: Recording, facts: Mapping[str, Any], overwrite: 
         "joint_names": list(own.names),
         "points": points,
     }
-    told = {**facts, **origin_facts(r.robot, r.load)}
+    told = {**facts, **effort_model_facts(r.robot, r.load)}
     metadata = {"pkm_twin": {key: str(value) for key, value in told.items()}}
     with write_whole_bag(path, overwrite, metadata) as bag:
         bag.add_topic(TOPIC, TRAJECTORY, definition=DEFINITIONS[TRAJECTORY])

@@ -1,8 +1,8 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""The origin of a file's efforts: robot, gravity, wrench and payload.
+"""The model from which a file's efforts were computed: robot, gravity, wrench and payload.
 
-A table has them as columns, so that every program reads it: those that do not vary by sample are
-constant. A bag has the robot, gravity and payload in its metadata.
+A table states them in columns, which are constant if the value does not vary, so that any program
+can read them. A bag has the robot, gravity and payload in its metadata.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from pkm_twin.recordings.tables import WRENCH, Table
 from pkm_twin.robot.robot import Robot
 
 COMPUTED_WITH: Final = "computed_with"
-"""Key of the digest; the name of a table's column ends in the robot's name."""
+"""Key of the digest; in a table, the column's name is this key, a dot and the robot's name."""
 MARK: Final = f"{COMPUTED_WITH}."
 GRAVITY: Final = ("gravity.x", "gravity.y", "gravity.z")
 
 
 @dataclass(frozen=True)
-class Origin:
-    """The robot that computed a file's efforts.
+class EffortModel:
+    """The robot model and gravity from which a file's efforts were computed.
 
-    ``digest``: of all numbers of the robot's file. ``gravity``: m/s2, base axes.
+    ``robot``: its name. ``digest``: hash of all numbers of the robot file. ``gravity``: m/s2, base axes.
     """
 
     robot: str
@@ -41,18 +41,18 @@ class Origin:
     gravity: tuple[float, ...]
 
     @classmethod
-    def of(cls, robot: Robot) -> Origin:
-        """Return the origin of efforts that a robot computes."""
+    def from_robot(cls, robot: Robot) -> EffortModel:
+        """Return the model of efforts that are computed with a robot."""
         numbers = json.dumps([robot.mechanism, robot.parameter_sections()], sort_keys=True)
-        # A table's number, of 53 bits, holds six bytes exactly.
+        # Six bytes fit exactly into the 53-bit mantissa of a number in a table.
         digest = hashlib.sha256(numbers.encode()).digest()[:6]
         return cls(robot.name, int.from_bytes(digest), tuple(robot.gravity.tolist()))
 
     @classmethod
-    def of_table(cls, table: Table) -> Origin | None:
-        """Return the origin that a table's columns state; None where there are none.
+    def from_table(cls, table: Table) -> EffortModel | None:
+        """Return the model that a table's columns state; None if they state none.
 
-        :raises ParameterError: rows of several robots, or a column that is missing.
+        :raises ParameterError: rows state different robots, or a column is missing.
         """
         names = [name for name in table if name.startswith(MARK)]
         if not names:
@@ -64,10 +64,10 @@ class Origin:
         return cls(names[0].removeprefix(MARK), int(digest), tuple(gravity))
 
     @classmethod
-    def of_bag(cls, bag: Bag) -> Origin | None:
-        """Return the origin that a bag's metadata states; None where it states none.
+    def from_bag(cls, bag: Bag) -> EffortModel | None:
+        """Return the model that a bag's metadata states; None if it states none.
 
-        :raises BagError: a value that is no number.
+        :raises BagError: a value is not a number.
         """
         facts = bag.report.metadata.get("pkm_twin", {})
         digest = facts.get(COMPUTED_WITH)
@@ -81,8 +81,8 @@ class Origin:
         return cls(facts.get("robot", ""), int(digest), tuple(gravity))
 
     def differs_from(self, robot: Robot) -> str:
-        """Describe how the origin differs from a robot; empty if all numbers are equal."""
-        own = Origin.of(robot)
+        """Describe how this model differs from a robot; empty if all numbers are equal."""
+        own = EffortModel.from_robot(robot)
         if self.digest == own.digest:
             return ""
         if self.gravity != own.gravity:
@@ -91,26 +91,26 @@ class Origin:
         return f"the file was computed with other numbers of the robot {self.robot}"
 
 
-def states_origin(name: str) -> bool:
-    """Return whether a table's column states the robot that computed it."""
+def is_effort_model_column(name: str) -> bool:
+    """Return whether a table's column states the robot or gravity from which efforts were computed."""
     return name in GRAVITY or name.startswith(MARK)
 
 
-def origin_columns(robot: Robot, load: Load | None, wrench: Array | None, time: Array) -> dict[str, Array]:
+def effort_model_columns(robot: Robot, load: Load | None, wrench: Array | None, time: Array) -> dict[str, Array]:
     """Return a table's columns of robot, gravity, wrench and payload, shape (samples,) each.
 
     :param wrench: shape (samples, 6); ``time``: (samples,), s.
     """
-    own, one = Origin.of(robot), np.ones(len(time))
+    own, one = EffortModel.from_robot(robot), np.ones(len(time))
     columns = {} if wrench is None else dict(zip(WRENCH, wrench.T, strict=True))
     columns |= payload_columns(robot, load, time)
     columns |= {MARK + own.robot: own.digest * one}
     return columns | {name: v * one for name, v in zip(GRAVITY, own.gravity, strict=True)}
 
 
-def origin_facts(robot: Robot, load: Load | None) -> dict[str, Any]:
+def effort_model_facts(robot: Robot, load: Load | None) -> dict[str, Any]:
     """Return a bag's metadata of robot, gravity and payload."""
-    own = Origin.of(robot)
+    own = EffortModel.from_robot(robot)
     facts = {"robot": own.robot, COMPUTED_WITH: own.digest, "gravity": " ".join(map(repr, own.gravity))}
     if load is not None:
         # Times have the resolution of the bag's stamps.

@@ -25,12 +25,13 @@ SOURCES = {"bag": "recording", "table": "table, as sampled", "path": "path's way
 
 @dataclass(frozen=True)
 class Load:
-    """A payload in addition to the robot's file, and the times at which the platform holds it.
+    """A payload that replaces the one in the robot file, and the time intervals in which it is on the platform.
 
-    mass in kg, com in m from the platform's reference point; times in s since the first joint
-    state, each from its begin until before its end, infinite where it never ends; empty where it is
-    there all the time. ``source``: ``bag``, ``table``, ``path`` or ``option``. ``masses``: by
-    interval, kg, where they differ; ``mass`` is then the greatest.
+    mass in kg, com (centre of mass) in m from the platform's reference point. ``times``: intervals
+    in s since the first joint state; the begin belongs to the interval, the end does not and may be
+    infinite; empty if the payload is always on the platform. ``source``: ``bag``, ``table``,
+    ``path`` or ``option``. ``masses``: one for each interval, kg, if they differ; ``mass`` is then
+    the greatest.
     """
 
     mass: float
@@ -42,10 +43,10 @@ class Load:
     masses: tuple[float, ...] = ()
 
     @classmethod
-    def of(
+    def from_intervals(
         cls, spans: Sequence[tuple[float, float, float]], source: str, com: tuple[float, float, float] | None = None
     ) -> Load:
-        """Build the load of intervals, each with begin, end (s) and mass (kg)."""
+        """Build the payload from intervals, each with its begin, end (s) and mass (kg)."""
         masses = tuple(mass for *_, mass in spans)
         alike = len(set(masses)) == 1
         times = tuple((begin, end) for begin, end, _ in spans)
@@ -55,13 +56,13 @@ class Load:
 
     @property
     def spans(self) -> list[tuple[float, float, float]]:
-        """Intervals as :meth:`of` takes them."""
+        """Intervals as :meth:`from_intervals` takes them."""
         times = self.times or ((0.0, math.inf),)
         masses = self.masses or (self.mass,) * len(times)
         return [(*span, mass) for span, mass in zip(times, masses, strict=True)]
 
-    def carried(self, time: Array) -> Array:
-        """Return the mass at times (n,), kg; NaN where the robot file's payload applies."""
+    def mass_at(self, time: Array) -> Array:
+        """Return the payload's mass at times (n,), kg; NaN where the payload of the robot file applies."""
         if not self.times:
             return np.full(len(time), self.mass)
         found = np.full(len(time), np.nan)
@@ -69,13 +70,13 @@ class Load:
             found[(time >= begin) & (time < end)] = mass
         return found
 
-    def held(self, time: Array) -> Mask:
+    def is_on_platform(self, time: Array) -> Mask:
         """Return at which times the payload is on the platform, shape (n,)."""
-        return np.isfinite(self.carried(time))
+        return np.isfinite(self.mass_at(time))
 
-    def farthest(self, own: float) -> float:
-        """Return the mass that differs most from the robot's own, kg."""
-        return max(self.masses or (self.mass,), key=lambda mass: abs(mass - own))
+    def mass_farthest_from(self, robot_mass: float) -> float:
+        """Return the payload mass that differs most from the mass in the robot file, kg."""
+        return max(self.masses or (self.mass,), key=lambda mass: abs(mass - robot_mass))
 
     def near_change(self, time: Array, within: float) -> Mask:
         """Return whether a pick or release is less than ``within`` seconds away, shape (n,)."""
@@ -85,8 +86,8 @@ class Load:
         near = [np.abs(time - edge) < within for edge in edges]
         return np.asarray(np.logical_or.reduce(near), np.bool_)
 
-    def on(self, robot: Robot, mass: float | None = None) -> Robot:
-        """Return the robot with this payload.
+    def apply_to(self, robot: Robot, mass: float | None = None) -> Robot:
+        """Return a copy of the robot that carries this payload.
 
         :param mass: one of ``masses``, by default the greatest.
         :raises ParameterError: the robot cannot carry this payload, or its mass is many times that
@@ -98,7 +99,7 @@ class Load:
         return loaded
 
     def as_json(self) -> dict[str, Any]:
-        """Return plain data with units in the keys; without times if it is always held."""
+        """Return the payload as JSON data with units in the keys; without times if it is always on the platform."""
         several = {"masses_kg": list(self.masses)} if self.masses else {}
         return several | {
             "mass_kg": self.mass,
@@ -118,10 +119,10 @@ class Load:
 
 
 def payload_columns(robot: Robot, carried: Load | None, time: Array) -> dict[str, Array]:
-    """Return a table's payload columns; the robot file's payload applies outside the intervals."""
+    """Return a table's payload columns, which have the robot file's payload outside the intervals."""
     if carried is None:
         return {}
-    own, mass = robot.payload, carried.carried(time)
+    own, mass = robot.payload, carried.mass_at(time)
     held = np.isfinite(mass)
     centre = () if carried.com is None else zip(carried.com, own.com.tolist(), strict=True)
     columns = (np.where(held, mass, own.mass), *(np.where(held, *pair) for pair in centre))
@@ -131,7 +132,7 @@ def payload_columns(robot: Robot, carried: Load | None, time: Array) -> dict[str
 def read_table_load(robot: Robot, table: Table, time: Array) -> Load | None:
     """Read the payload from a table's columns; None if it is the robot's own.
 
-    :raises ParameterError: a negative mass, several centres, or a part of a centre.
+    :raises ParameterError: a mass is negative, the centre of mass varies, or one of its columns is missing.
     """
     mass = table.get(PAYLOAD[0])
     if mass is None:
@@ -154,11 +155,11 @@ def read_table_load(robot: Robot, table: Table, time: Array) -> Load | None:
     ends = [*time[edges[1:-1]].tolist(), math.inf]
     spans = [(float(time[b]), end, float(mass[b])) for b, end in zip(edges[:-1], ends, strict=True) if held[b]]
     com = centred[0].tolist() if centred.size else None
-    return Load.of(spans, "table", None if com is None else (com[0], com[1], com[2]))
+    return Load.from_intervals(spans, "table", None if com is None else (com[0], com[1], com[2]))
 
 
 MASS, PICKED, RELEASED, CENTRE = ("payload_mass_kg", "payload_picked_s", "payload_released_s", "payload_com_m")
-"""Keys of a bag's metadata on its payload; several intervals have blanks between."""
+"""Keys of the payload in a bag's metadata; the numbers of several intervals are separated by blanks."""
 
 
 def read_load(bag: Bag) -> Load | None:
@@ -186,7 +187,7 @@ def read_load(bag: Bag) -> Load | None:
         except ParameterError:
             raise metadata_error(bag, CENTRE, facts[CENTRE], "x y z") from None
     each = masses * len(picked) if len(masses) == 1 else masses
-    return Load.of(list(zip(picked, released, each, strict=True)), "bag", com)
+    return Load.from_intervals(list(zip(picked, released, each, strict=True)), "bag", com)
 
 
 def _read_numbers(bag: Bag, facts: Mapping[str, str], name: str) -> list[float]:
@@ -220,7 +221,7 @@ def parse_payload(text: str) -> tuple[float, tuple[float, float, float] | None]:
     return numbers[0], (numbers[1], numbers[2], numbers[3]) if len(numbers) == 4 else None
 
 
-def parse_times(text: str) -> tuple[tuple[float, float], ...]:
+def parse_intervals(text: str) -> tuple[tuple[float, float], ...]:
     """Parse the intervals of ``FROM,TO[,FROM,TO...]``, s.
 
     :raises ParameterError: the numbers are not pairs, finite and rising.
@@ -233,17 +234,19 @@ def parse_times(text: str) -> tuple[tuple[float, float], ...]:
 
 
 def split_by_load(robot: Robot, carried: Load | None, time: Array, longest: int) -> Iterator[tuple[Robot, slice]]:
-    """Yield the loaded robot and the consecutive samples (at most ``longest``) that have its load.
+    """Split samples where the payload changes; yield the robot with its payload and the slice of samples.
 
-    A payload to be fitted is the robot file's.
+    While the payload is to be fitted, the robot has the payload of its file.
+
+    :param longest: greatest number of samples of a slice.
     """
     carried = None if carried is None or carried.sought else carried
-    mass = np.full(len(time), np.nan) if carried is None else carried.carried(time)
+    mass = np.full(len(time), np.nan) if carried is None else carried.mass_at(time)
     own = -1.0
     mass = np.where(np.isfinite(mass), mass, own)
     loaded = {own: robot}
     if carried is not None:
-        loaded |= {one: carried.on(robot, one) for one in {*(carried.masses or (carried.mass,))}}
+        loaded |= {one: carried.apply_to(robot, one) for one in {*(carried.masses or (carried.mass,))}}
     edges = [0, *(np.flatnonzero(np.diff(mass)) + 1).tolist(), len(time)]
     for begin, end in pairwise(edges):
         for start in range(begin, end, longest):

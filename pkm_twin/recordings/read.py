@@ -18,7 +18,7 @@ from pkm_twin.machine.sections import DriveSpec
 from pkm_twin.mechanisms.catalogue import load
 from pkm_twin.messages.reading import MAX_DEFLECTION_M, MAX_DEFLECTION_RAD, MAX_EFFORT, MAX_FORCE, MIN_NORMAL
 from pkm_twin.recordings.bags import read_bag
-from pkm_twin.recordings.origin import Origin, states_origin
+from pkm_twin.recordings.origin import EffortModel, is_effort_model_column
 from pkm_twin.recordings.payload import read_table_load
 from pkm_twin.recordings.recording import MODEL_VALUES_NOTE, ReadOptions, Recording
 from pkm_twin.recordings.tables import (
@@ -30,7 +30,7 @@ from pkm_twin.recordings.tables import (
     WRENCH,
     Dialect,
     Table,
-    kinds_of,
+    column_quantities,
     read_table,
 )
 from pkm_twin.robot.derivatives import joint_rates
@@ -39,19 +39,20 @@ from pkm_twin.robot.robot import Robot
 
 RECORDING: Final = "an MCAP file, a rosbag2 folder, or a table with columns time, JOINT.position ..."
 COORDINATES: Final = ("joints", "pose")
-SIDES: Final = ("joint", "controller", "motor")
-GRAVITY_TERM: Final = "effort_gravity"
-"""Suffix of a column that is in every table of `torques`."""
+VALUE_SIDES: Final = ("joint", "controller", "motor")
+"""Where joint values are measured: at the joint, in the controller's units and offsets, or at the motor shaft."""
+GRAVITY_COLUMN_SUFFIX: Final = "effort_gravity"
+"""Suffix of the gravity column, which every table of the command `torques` has."""
 SAMPLES_PER_BLOCK: Final = 4096
 """Samples computed at a time, so that memory stays flat."""
-MAX_SIZES: Final = dict(
+MAX_COLUMN_VALUES: Final = dict(
     zip(
         (*WRENCH, *DEFLECTION),
         np.repeat([MAX_FORCE, MAX_FORCE, MAX_DEFLECTION_M, MAX_DEFLECTION_RAD], 3).tolist(),
         strict=True,
     )
 )
-"""Greatest values of a table's columns, as of messages: N, N m, m, rad."""
+"""Largest plausible magnitude of each column of a table, N, N m, m or rad; messages have the same bounds."""
 MIN_STEP: Final = 1e-9
 """Smallest step between two times, s: the resolution of a bag's stamps."""
 MAX_DURATION: Final = 1e6
@@ -99,7 +100,7 @@ def read(
 
 def _read_table_recording(path: Path, name: str | Robot | None, how: ReadOptions) -> Recording:
     if name is None:
-        # Reject a file that cannot be a recording before the missing robot.
+        # Report an unreadable file first, and a missing robot name only afterwards.
         try:
             columns = list(read_table(path))
         except ParameterError as error:
@@ -109,7 +110,7 @@ def _read_table_recording(path: Path, name: str | Robot | None, how: ReadOptions
             raise ParameterError(str(path), f"columns {one_line(', '.join(columns), 80)}", RECORDING)
         raise ParameterError("--robot", None, "a robot, because a table does not name its robot")
     robot = name if isinstance(name, Robot) else load(name)
-    table, side = (read_table(path, kinds_of(robot, how.side), how.dialect), _find_map(robot, how.side))
+    table, side = (read_table(path, column_quantities(robot, how.side), how.dialect), _find_map(robot, how.side))
     joints = robot.joint_names if side is None else side.names
     _reject_misspelt_columns(table, robot, joints, how)
 
@@ -151,9 +152,9 @@ def _read_table_recording(path: Path, name: str | Robot | None, how: ReadOptions
             str(path), ", ".join(table), f"columns time, {needed}{or_pose}; other names: --columns OURS=THEIRS"
         )
     time, notes, effort, word = read_times(path, times), [], None, how.efforts[0]
-    origin = Origin.of_table(table)
+    effort_model = EffortModel.from_table(table)
     # A table with the terms of the model has computed efforts.
-    computed = any(f"{joint}.{GRAVITY_TERM}" in table for joint in robot.joint_names)
+    computed = any(f"{joint}.{GRAVITY_COLUMN_SUFFIX}" in table for joint in robot.joint_names)
     if computed:
         # Reject computed efforts without the wrench or payload that they were computed with.
         own = how.load is not None or robot.payload.mass > 0.0
@@ -173,9 +174,9 @@ def _read_table_recording(path: Path, name: str | Robot | None, how: ReadOptions
                     )
     if posed:
         assert pose is not None  # noqa: S101  one of the two is there
-        # Joint positions, and rates if given, from those of the pose.
+        # Compute joint positions, and their rates if given, from the pose and its rates.
         q = robot.inverse(pose)
-        # A table of poses has rates of coordinates, a table of joints those of joints.
+        # The rates of a table of poses are those of the pose coordinates.
         qd, qdd = (table.stack_if([f"{name}.{what}" for name in robot.pose_names]) for what in RATES[1:])
         if set(robot.joint_names) & set(robot.pose_names) or qd is None or qdd is None:
             q, qd, qdd = q, None, None
@@ -203,7 +204,7 @@ def _read_table_recording(path: Path, name: str | Robot | None, how: ReadOptions
                 raise ParameterError(str(path), f"no {what}", f"a column {axes[0]} or more of {', '.join(axes)}")
     efforts = (f"{joint}.{what}" for joint in joints for what in EFFORTS)
     # As in messages, reject impossible numbers and numbers below every sensor's resolution.
-    for name, bound in (MAX_SIZES | dict.fromkeys(efforts, MAX_EFFORT)).items():
+    for name, bound in (MAX_COLUMN_VALUES | dict.fromkeys(efforts, MAX_EFFORT)).items():
         sizes = np.abs(table.get(name, np.zeros(1)))
         bad = np.flatnonzero((sizes > bound) | ((sizes < MIN_NORMAL) & (sizes > 0.0)))
         if len(bad):
@@ -225,8 +226,8 @@ def _read_table_recording(path: Path, name: str | Robot | None, how: ReadOptions
         pose,
         held,
         efforts="model" if computed and word == "effort" else word,
-        computed=stack_columns("effort") if (computed or origin is not None) and not posed else None,
-        origin=origin,
+        computed=stack_columns("effort") if (computed or effort_model is not None) and not posed else None,
+        effort_model=effort_model,
         source=str(path),
         notes=(
             *notes,
@@ -242,8 +243,8 @@ def _find_map(robot: Robot, side: str) -> JointMap | None:
 
     :raises ParameterError: motors of a robot without drives.
     """
-    if side not in SIDES:
-        raise UnknownNameError("side", side, SIDES)
+    if side not in VALUE_SIDES:
+        raise UnknownNameError("side", side, VALUE_SIDES)
     own = robot.controller
     if side != "motor":
         return own if side == "controller" else None
@@ -270,11 +271,11 @@ def _reject_misspelt_columns(table: Table, robot: Robot, joints: Sequence[str], 
         for name in (*table, *table.left_out):
             joint, dot, what = name.rpartition(".")
             computed = what in (*EFFORTS, *WRENCH) or what.startswith("effort_")
-            known = computed or name in inputs or states_origin(name)
+            known = computed or name in inputs or is_effort_model_column(name)
             if dot and joint in joints and not known:
                 raise UnknownNameError(f"{table.path}: column", name, inputs)
     if how.deflected:
-        known = ("time", *MAX_SIZES, *PAYLOAD, *robot.pose_names, *inputs)
+        known = ("time", *MAX_COLUMN_VALUES, *PAYLOAD, *robot.pose_names, *inputs)
         for name in table:
             _, dot, what = name.rpartition(".")
             if name not in known and (not dot or what == "position"):
@@ -305,11 +306,11 @@ def read_times(path: Path, values: Array) -> Array:
     return time
 
 
-def check_pose(path: Path, robot: Robot, q: Array, pose: Array, how: str = "") -> None:
-    """Reject a table whose joint positions and pose are not those of one machine.
+def check_pose(path: Path, robot: Robot, q: Array, pose: Array, hint: str = "") -> None:
+    """Reject a table whose pose disagrees with the forward kinematics of its joint positions.
 
-    :param how: what else the table may be read as.
-    :raises ParameterError: by the sample that is farthest off.
+    :param hint: appended to the error: how else the table can be read.
+    :raises ParameterError: they disagree; the error names the sample with the largest deviation.
     """
     for begin in range(0, len(q), SAMPLES_PER_BLOCK):
         rows = slice(begin, begin + SAMPLES_PER_BLOCK)
@@ -317,7 +318,7 @@ def check_pose(path: Path, robot: Robot, q: Array, pose: Array, how: str = "") -
         off = found - pose[rows]
         turns = [i for i, unit in enumerate(robot.pose_units) if unit != "m"]
         off[:, turns] = (off[:, turns] + np.pi) % (2.0 * np.pi) - np.pi
-        # Joint positions without a pose are rejected later, with their reason.
+        # Joint positions without a forward-kinematics solution are rejected later, with the reason.
         size = np.where(good, np.linalg.norm(off * robot.pose_scales, axis=1), 0.0)
         worst = int(size.argmax())
         # Tolerance between pose and joint positions: 1e-3 of the machine's size.
@@ -326,14 +327,16 @@ def check_pose(path: Path, robot: Robot, q: Array, pose: Array, how: str = "") -
             raise ParameterError(
                 f"{path}: {names}, sample {begin + worst}",
                 f"{1e3 * size[worst]:.4g} mm from the pose of the joint positions on {robot.name}",
-                f"a table of this machine{how}",
+                f"a table of this machine{hint}",
             )
 
 
 def check_units(path: Path, robot: Robot, time: Array, q: Array, qd: Array | None, dialect: Dialect) -> None:
-    """Warn of positions, and of times without velocities to compare them with, that are probably in other units.
+    """Warn if positions, or times, are probably in other units (degrees, ms or us).
 
-    :param time: shape (samples,); q and qd, shape (samples, n), qd where the file tells it.
+    Times are checked only if the file has no velocities, with which they would be compared later.
+
+    :param time: shape (samples,); q and qd: shape (samples, n); qd is None if the file has no velocities.
     """
     if "angle" not in dialect.units and _is_in_degrees(robot, q):
         most = float(np.abs(q).max())
@@ -345,20 +348,22 @@ def check_units(path: Path, robot: Robot, time: Array, q: Array, qd: Array | Non
 
 
 def _is_in_degrees(robot: Robot, q: Array) -> bool:
-    """Return whether most joint states are none of the robot, and all are if they are in degrees.
+    """Return whether most joint states are unreachable in rad and all are reachable if read as degrees.
 
-    What is beyond a limit by a little is in rad: most have a joint more than half a turn from zero.
+    States slightly beyond a limit are in rad: only those with a joint more than half a turn from
+    zero count as unreachable.
     """
     turns = np.array([unit == "rad" for unit in robot.joint_units])
     if not turns.any():
         return False
     some = q[:: max(1, len(q) // 500)]
 
-    def possible(states: Array) -> Mask:
+    def is_reachable(states: Array) -> Mask:
+        """Return which states are within the limits and have a forward-kinematics solution."""
         outside, _ = beyond_limits(robot, states)
         return np.asarray(robot.try_forward(states)[1] & ~outside, np.bool_)
 
     far = np.abs(some[:, turns]).max(1) > np.pi
-    if np.mean(far & ~possible(some)) <= 0.5:
+    if np.mean(far & ~is_reachable(some)) <= 0.5:
         return False
-    return bool(possible(np.where(turns, some * UNITS["deg"][1], some)).all())
+    return bool(is_reachable(np.where(turns, some * UNITS["deg"][1], some)).all())

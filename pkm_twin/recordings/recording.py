@@ -14,7 +14,7 @@ import numpy as np
 from pkm_twin.bags.reader import Bag
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import BagError, MessageError, ParameterError, PkmTwinError, one_line
-from pkm_twin.recordings.origin import Origin
+from pkm_twin.recordings.origin import EffortModel
 from pkm_twin.recordings.payload import Load
 from pkm_twin.recordings.tables import DEFAULT_DIALECT, Dialect
 from pkm_twin.recordings.topics import COLUMNS, Topics
@@ -99,8 +99,8 @@ class Recording:
     tell, the ``model``'s, which only a plan has, or a ``current``, A."""
     computed: Array | None = None
     """Efforts that a model computed according to the file, shape (samples, n)."""
-    origin: Origin | None = None
-    """The robot that computed the efforts, if the file names it."""
+    effort_model: EffortModel | None = None
+    """The robot model from which the efforts were computed, if the file states it."""
     doubt: str = ""
     """Sentence on efforts of the file that the robot's model does not give; empty without such efforts."""
     late: float = 0.0
@@ -160,7 +160,7 @@ class Recording:
         return steps if alone.jumps.any() else alone
 
     @cached_property
-    def step_fault(self) -> str:
+    def jump_description(self) -> str:
         """Description of the positions' jumps with their times; empty without any."""
         steps, found = self.steps, self.steps.first
         if steps.publishers:
@@ -197,25 +197,26 @@ class Recording:
         return sum(self.bag.report.topics[name].count for name in names if name is not None)
 
     @property
-    def held(self) -> Array | None:
-        """Fraction of :attr:`carried` on the platform, shape (samples,), by the mass.
+    def payload_fraction(self) -> Array | None:
+        """How much of the payload of :attr:`loaded_robot` is on the platform at each sample, shape (samples,).
 
-        It is 0 while the robot has its file's payload.
+        It is 0 for the payload mass of the robot file, 1 for that of :attr:`loaded_robot`, and linear
+        in the mass between them.
         """
         if self.load is None:
             return None
-        mass, own = self.load.carried(self.time), self.robot.payload.mass
+        mass, own = self.load.mass_at(self.time), self.robot.payload.mass
         if not self.load.masses:
             return np.isfinite(mass).astype(np.float64)
-        return np.nan_to_num((mass - own) / (self.load.farthest(own) - own))
+        return np.nan_to_num((mass - own) / (self.load.mass_farthest_from(own) - own))
 
     @property
-    def carried(self) -> Robot | None:
-        """The robot with its known payload; of several payloads the one that differs most from the file's."""
+    def loaded_robot(self) -> Robot | None:
+        """The robot with the known payload; of several masses, the one that differs most from the robot file's."""
         load = self.load
         if load is None or load.sought:
             return None
-        return load.on(self.robot, load.farthest(self.robot.payload.mass))
+        return load.apply_to(self.robot, load.mass_farthest_from(self.robot.payload.mass))
 
     @property
     def measured(self) -> Array:
@@ -249,8 +250,8 @@ class Recording:
         wrench = np.zeros((len(self.time), 6)) if self.wrench is None else self.wrench
         return self.q, self.qd, self.qdd, wrench
 
-    def part(self, rows: Any) -> Recording:
-        """Return some of the samples, by a slice, mask or indices; times stay as they are."""
+    def select(self, rows: Any) -> Recording:
+        """Return the recording of some samples only, by a slice, mask or indices; times are not shifted."""
         values = {
             name: getattr(self, name)
             for name in ("time", "q", "qd", "qdd", "effort", "wrench", "deflection", "pose", "still", "computed")
@@ -259,17 +260,17 @@ class Recording:
 
     @property
     def without_repeats(self) -> Recording:
-        """Without the samples that repeat the one before while a joint moves: they are missing."""
+        """The recording without samples that repeat the previous one although a joint moves."""
         again = find_repeats(self.time, self.q)
         if not again.any():
             return self
         text = f"{again.sum()} of {len(again)} samples repeat the one before: left out"
-        return replace(self, notes=(*self.notes, text)).part(~again)
+        return replace(self, notes=(*self.notes, text)).select(~again)
 
-    def on_time(self, late: float) -> Recording:
-        """Return the recording with efforts shifted back by a delay, s, in whole samples.
+    def compensate_effort_delay(self, late: float) -> Recording:
+        """Shift efforts earlier by a delay, s, rounded to whole sampling periods.
 
-        A remainder of half a sample at most is left: copied efforts keep their noise.
+        Fractions of a period stay, because interpolation would change the noise of the efforts.
         """
         period = float(np.median(np.diff(self.time)))
         late = period * round(late / period)
@@ -279,7 +280,7 @@ class Recording:
         known = (there > ends[0]) & (there < ends[1])
         known &= np.diff(self.time)[after - 1] < MAX_GAP_PERIODS * period
         effort = np.stack([np.interp(there, self.time, one) for one in self.measured.T], -1)
-        return replace(self, effort=effort, late=self.late + late).part(known)
+        return replace(self, effort=effort, late=self.late + late).select(known)
 
     def check_rates(self) -> None:
         """Reject velocities that contradict the positions, and accelerations that contradict the velocities.
@@ -312,8 +313,8 @@ class Recording:
         :raises PkmTwinError: too few samples in a row, or as :meth:`check_rates`.
         """
         self.check_rates()
-        if self.qd is not None and len(self.time) > 2 and self.step_fault:
-            self = replace(self, notes=(*self.notes, f"positions jump: {self.step_fault}"))
+        if self.qd is not None and len(self.time) > 2 and self.jump_description:
+            self = replace(self, notes=(*self.notes, f"positions jump: {self.jump_description}"))
         with np.errstate(all="ignore"):
             self = self._with_gap_note()
         if self.qd is not None and self.qdd is not None:
@@ -352,9 +353,10 @@ class Recording:
     def _project_motion(self, qd: Array, qdd: Array, still: Mask | None, rows: Any) -> Recording:
         """Return some samples with these velocities and accelerations; measured ones are kept.
 
-        What is differentiated becomes a motion of all drives: noise contradicts nothing.
+        Differentiated velocities and accelerations are projected onto the motions that the mechanism
+        permits, so that their noise does not violate the loop closures.
         """
-        r = replace(self, qd=qd, qdd=qdd, still=still).part(rows)
+        r = replace(self, qd=qd, qdd=qdd, still=still).select(rows)
         rate, change = nearest_motion(r.robot, *r.motion[:3])
         r = r if self.qd is not None else replace(r, qd=rate)
         return r if self.qdd is not None else replace(r, qdd=change)

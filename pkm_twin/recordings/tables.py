@@ -32,10 +32,10 @@ from pkm_twin.robot.robot import Robot
 MAX_BYTES: Final = 1024**3
 """Largest table that is read: some millions of samples."""
 MAX_LINE: Final = 1024**2
-"""Longest line of it, characters."""
+"""Longest line of a table that is read, characters."""
 ROWS_PER_BLOCK: Final = 4096
 """Rows written at a time, so that memory stays flat."""
-ENDINGS: Final = (".csv", ".parquet", ".mat")
+WRITABLE_SUFFIXES: Final = (".csv", ".parquet", ".mat")
 """Suffixes of tables that can be written."""
 NOT_READ: Final = {
     ".mat": "CSV or Parquet; in MATLAB: writetable(T, 'FILE.csv')",
@@ -60,13 +60,13 @@ UNITS: Final = {
     "ns": ("time", 1e-9),
     "percent": ("effort", 1e-2),
 }
-"""Units of a table: kind of quantity, and size in SI."""
+"""Units of a table: for each its quantity and its factor to SI."""
 RATES: Final = ("position", "velocity", "acceleration")
 EFFORTS: Final = ("effort", "measured", "current")
 WRENCH: Final = ("fx", "fy", "fz", "mx", "my", "mz")
 DEFLECTION: Final = ("dx", "dy", "dz", "rx", "ry", "rz")
 PAYLOAD: Final = ("payload.mass", "payload.x", "payload.y", "payload.z")
-"""Mass (kg) and centre (m) of what the platform holds."""
+"""Columns of the mass (kg) and the centre of mass (m) of the payload on the platform."""
 COLUMN_ALIASES: Final = {"payload": PAYLOAD[0]}
 """Other names of columns."""
 _UNIT: Final = re.compile(r"(.*?)(?:\s*[\[(]\s*(\w+)(?:/s2?)?\s*[\])]|_(mm|cm|[uµ]m|deg|mrad|ms|us|ns))")
@@ -74,10 +74,11 @@ _UNIT: Final = re.compile(r"(.*?)(?:\s*[\[(]\s*(\w+)(?:/s2?)?\s*[\])]|_(mm|cm|[u
 
 @dataclass(frozen=True)
 class Dialect:
-    """How a table is written; None: as its header row says.
+    """The format of a table: separator, decimal mark, column names and units.
 
-    ``columns``: the table's name by ours; ``*`` in both stands for the same text. ``units``: by
-    angle, length and time, of columns whose header has none; rates are always per second.
+    ``separator``, ``decimal``: found from the header row if None. ``columns``: from our name of a
+    column to the table's; ``*`` in both stands for the same text. ``units``: from angle, length or
+    time to the unit of columns whose header has none; rates are always per second.
     """
 
     separator: str | None = None
@@ -86,7 +87,7 @@ class Dialect:
     units: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
-    def of(
+    def from_options(
         cls,
         separator: str | None = None,
         decimal: str | None = None,
@@ -94,9 +95,9 @@ class Dialect:
         units: str | None = None,
         time: str | None = None,
     ) -> Dialect:
-        """Build the dialect from a command's options.
+        """Build the dialect from the options of a command.
 
-        :raises ParameterError: by the option.
+        :raises ParameterError: an option is invalid; the error names it.
         """
         if separator is not None and separator not in SEPARATORS:
             raise ParameterError("--separator", separator, "one of , ; tab")
@@ -123,7 +124,7 @@ class Dialect:
         return cls(None if separator is None else SEPARATORS[separator], decimal, names, chosen)
 
     def size(self, kind: str) -> float:
-        """Return the size in SI of a number without a unit."""
+        """Return the factor to SI of a quantity's numbers in columns without a unit."""
         return UNITS[self.units[kind]][1] if kind in self.units else 1.0
 
 
@@ -137,7 +138,7 @@ class Table(dict[str, Array]):
         super().__init__(columns)
         self.path = path
         self.left_out: list[str] = []
-        """Columns beside those that are known with cells that are no numbers."""
+        """Columns that are not known and have cells that are not numbers."""
         self._first = 2 + above
 
     @property
@@ -150,9 +151,9 @@ class Table(dict[str, Array]):
         return f"{self.path}: line {self._first + row}"
 
     def require(self, names: Iterable[str]) -> None:
-        """Reject a table without one of these columns.
+        """Reject a table that lacks any of these columns.
 
-        :raises ParameterError: by the first that is missing.
+        :raises ParameterError: a column is missing; the error names the first.
         """
         for name in names:
             if name not in self:
@@ -163,7 +164,7 @@ class Table(dict[str, Array]):
     def stack(self, names: Sequence[str]) -> Array:
         """Return columns side by side, shape (rows, names).
 
-        :raises ParameterError: by the first that is missing.
+        :raises ParameterError: a column is missing; the error names the first.
         """
         self.require(names)
         return np.stack([self[name] for name in names], -1)
@@ -182,10 +183,10 @@ class Table(dict[str, Array]):
         return np.stack([self.get(n, np.full(self.rows, missing)) for n in names], -1)
 
 
-def kinds_of(robot: Robot, side: str = "joint") -> dict[str, str]:
-    """Return the kind of quantity of each column of a robot's motion: angle, length, time, or other.
+def column_quantities(robot: Robot, side: str = "joint") -> dict[str, str]:
+    """Return the quantity of each column of a motion table: angle, length, time, effort or other (empty).
 
-    :param side: side of the joint values; those of the motor are angles.
+    :param side: where joint values are measured, one of ``VALUE_SIDES``; those of the motor are angles.
     """
     kinds = {"time": "time"}
     names = robot.joint_names if side == "joint" else robot.controller.names
@@ -199,7 +200,7 @@ def kinds_of(robot: Robot, side: str = "joint") -> dict[str, str]:
     kinds |= dict.fromkeys((*DEFLECTION[:3], *PAYLOAD[1:], "blend"), "length")
     kinds |= dict.fromkeys(DEFLECTION[3:], "angle")
     kinds |= dict.fromkeys((*WRENCH, PAYLOAD[0], "dwell", "arc"), "")
-    # A joint that has a coordinate's name is measured as the joint.
+    # If a joint and a pose coordinate have the same name, rates and efforts are the joint's.
     pose = zip(robot.pose_names, robot.pose_units, strict=True)
     return kinds | {name: UNITS[unit][0] for name, unit in pose}
 
@@ -409,10 +410,10 @@ def require_pyarrow(path: Path) -> None:
 def check_target(path: Path) -> None:
     """Reject a table's name that cannot be written, before the computation.
 
-    :raises ParameterError: the ending is none of :data:`ENDINGS`, or pyarrow is missing for it.
+    :raises ParameterError: the ending is none of :data:`WRITABLE_SUFFIXES`, or pyarrow is missing for it.
     """
-    if path.suffix not in ENDINGS and str(path) != STANDARD:
-        raise ParameterError("out", str(path), f"a name that ends in {' or '.join(ENDINGS)}")
+    if path.suffix not in WRITABLE_SUFFIXES and str(path) != STANDARD:
+        raise ParameterError("out", str(path), f"a name that ends in {' or '.join(WRITABLE_SUFFIXES)}")
     require_pyarrow(path)
 
 

@@ -73,7 +73,7 @@ class Topics:
     frame: str = ""
     """Frame of the accepted wrenches."""
     turns: bool = False
-    """True if that frame turns with the platform."""
+    """True if this frame rotates with the platform."""
 
     def __str__(self) -> str:
         if self.joint_states == COLUMNS:
@@ -89,11 +89,11 @@ class Topics:
 def choose_topics(bag: Bag, robot: Robot, wanted: Sequence[str] = (), deflected: bool = False) -> Topics:
     """Find the joint-state topic that carries the robot's joints, and the wrench topic.
 
-    The twin's own outputs, and what no sensor publishes, are left out. Of several that fit,
-    ``/joint_states``, ``/wrench`` and ``/measured_deflection`` are taken. ``wanted`` names them
-    otherwise: who names the joint states alone wants no wrench.
+    The twin's own outputs, and topics that no sensor publishes, are left out. Of several
+    candidates, ``/joint_states``, ``/wrench`` and ``/measured_deflection`` are preferred.
 
-    :param deflected: also the topic of measured deflections.
+    :param wanted: topics to use instead; if only a joint-state topic is given, no wrench is read.
+    :param deflected: also find the topic of measured deflections.
     :raises BagError: a wanted topic is missing or of another type, no topic has the joints, or
         several fit.
     """
@@ -125,7 +125,7 @@ def choose_topics(bag: Bag, robot: Robot, wanted: Sequence[str] = (), deflected:
         raise _make_choice_error(bag, text, "no joint states")
     for name in filled:
         require_definition(bag, name)
-    # Joint names are the controller's, which published them.
+    # The names in messages are the controller's names of the joints.
     own = robot.controller.names
     seen = _read_joint_names(bag, filled, set(own))
     fit = [name for name in filled if set(own) <= seen[name]]

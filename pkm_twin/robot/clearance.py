@@ -80,7 +80,7 @@ def joint_clearance(robot: Robot, q: ArrayLike, refuse: bool = True) -> Array:
 
 def member_gaps(robot: Robot, q: ArrayLike, refuse: bool = True) -> Array:
     """Return the distances of all :func:`member_pairs`, shape (..., pairs), m."""
-    (gaps,), status = _make_kernel(robot)(np.array([beam.radius for beam in robot.beams]), q)
+    (gaps,), status = _make_clearance_kernel(robot)(np.array([beam.radius for beam in robot.beams]), q)
     if status is not None and refuse:
         reject_joints(robot, robot.engine, status, q)
     return gaps
@@ -91,12 +91,13 @@ def member_pairs(robot: Robot) -> list[tuple[Beam, Beam]]:
     return [pair for pair in combinations(robot.beams, 2) if pair[0].limb != pair[1].limb]
 
 
-def _make_kernel(robot: Robot) -> Kernel:
+def _make_clearance_kernel(robot: Robot) -> Kernel:
     if not has_clearance(robot):
         raise ParameterError("members", None, "a section that gives the members' outer diameters")
     ends = [(beam.limb, *((body, point.tolist()) for body, point in (beam.inner, beam.outer))) for beam in robot.beams]
 
-    def write(t: Traced) -> Program:
+    def write_clearance_program(t: Traced) -> Program:
+        """Write the program of the gaps between all pairs of members, modelled as capsules."""
         t.solve()
         segments, radii = {}, {}
         for beam, radius in zip(robot.beams, t.tape.inputs("p", len(robot.beams)), strict=True):
@@ -109,4 +110,4 @@ def _make_kernel(robot: Robot) -> Kernel:
         outputs = {"clearance": t.lift(gaps)}
         return Program(t.inputs("q"), len(segments), outputs, t.equations())
 
-    return robot.engine.kernel(f"clearance {ends!r}", write)
+    return robot.engine.kernel(f"clearance {ends!r}", write_clearance_program)

@@ -132,10 +132,10 @@ def differentiate_pose(robot: Robot, q: ArrayLike) -> Array:
     return _differentiate_by_geometry(robot, q, np.eye(len(robot.pose_names), len(robot.pose_names) + 12))
 
 
-def list_position_effects(robot: Robot, q: ArrayLike) -> Array:
-    """Return the platform's motion by one standard deviation of each cause, joints held.
+def position_errors_by_source(robot: Robot, q: ArrayLike) -> Array:
+    """Return the platform's displacement by one standard deviation of each uncertainty, joints locked.
 
-    :returns: translations of the reference point, shape (..., 3, causes), m.
+    :returns: displacements of the reference point, shape (..., 3, uncertainties), m.
     """
     causes, m = robot.cached(CauseSlopes, list_geometry_numbers), len(robot.pose_names)
     table = _differentiate_by_geometry(robot, q, np.eye(3, m + 12, m))[..., list(causes.chosen)]

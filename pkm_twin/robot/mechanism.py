@@ -45,8 +45,8 @@ from pkm_twin.machine.uncertainty import Tolerance, UncertaintyEntry, list_cause
 from pkm_twin.machine.urdf_file import Visual
 from pkm_twin.settings import settings_of
 
-SHARED: Final = "a controller may share efforts in any way"
-"""Why measured efforts of redundant drives have no unique explanation."""
+EFFORT_SHARING_NOTE: Final = "a controller may share efforts in any way"
+"""Why measured efforts of a redundantly actuated machine have no unique cause: internal loads may be superposed."""
 FREE_FALL: Final = (0.0, 0.0, -9.81)
 """Gravity of files without one, base axes, m/s2."""
 R = TypeVar("R", bound="Mechanism")
@@ -130,7 +130,7 @@ class Mechanism(Common):
         robot = dataclasses.replace(robot, name=name, home_joint=robot.chosen_home())
         _ = robot.controller
         _ = robot.causes
-        robot.check_elements()
+        robot.check_stiffness_factors()
         return robot
 
     @property
@@ -300,8 +300,8 @@ class Mechanism(Common):
         """Friction laws of the drives in addition to the basic one, see ``machine.friction``."""
         return find_law_names(self.friction, self.open_laws)
 
-    def with_laws(self, graph: Graph) -> Graph:
-        """Add the robot's friction laws to a graph, from which programs of efforts are made."""
+    def with_friction_laws(self, graph: Graph) -> Graph:
+        """Return a graph with the robot's friction laws, for programs that compute efforts."""
         laws = select_compiled_laws(self.laws)
         return dataclasses.replace(graph, laws=laws) if laws else graph
 
@@ -339,12 +339,12 @@ class Mechanism(Common):
     @property
     def joint_unit(self) -> str:
         """Unit of q if all joints have the same, else ``rad or m``."""
-        return _find_common_unit(self.joint_units)
+        return _join_units(self.joint_units)
 
     @property
     def effort_unit(self) -> str:
         """Unit of the efforts if all joints have the same, else ``N m or N``."""
-        return _find_common_unit(self.effort_units)
+        return _join_units(self.effort_units)
 
     def parameter_sections(self) -> dict[str, Any]:
         """Return the parameters by section, as plain data."""
@@ -386,10 +386,10 @@ class Mechanism(Common):
         """
         return self.structure().elements
 
-    def check_elements(self) -> None:
-        """Reject factors of unknown elements.
+    def check_stiffness_factors(self) -> None:
+        """Reject stiffness factors for names that are not elastic elements of this robot.
 
-        :raises ParameterError: an unknown name, or nothing is elastic.
+        :raises ParameterError: a name is unknown, or the robot has no elastic elements.
         """
         for name in self.element_compliance:
             if name not in self.element_names:
@@ -445,16 +445,16 @@ class Mechanism(Common):
 
         :raises ParameterError: an unknown path.
         """
-        values = self.resolved(values)
+        values = self.resolve_paths(values)
         made = replace_numbers(self, {tuple(full_keys(path)): value for path, value in values.items()})
         return self._replace_fields(**{f.name: getattr(made, f.name) for f in dataclasses.fields(self)})
 
     def own_path(self, path: str) -> str:
-        """Return the path in the robot's file of a number that several paths name."""
+        """Return the canonical path of a number that several paths of the robot file name."""
         return path
 
-    def resolved(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Return values by :meth:`own_path`.
+    def resolve_paths(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Replace each path of a number by its canonical path, see :meth:`own_path`.
 
         :raises ParameterError: two paths name the same number.
         """
@@ -545,9 +545,10 @@ class Mechanism(Common):
             else:
                 new[key] = settings_of(type(self))[key][1].check(key, value)
         made = dataclasses.replace(self, **new)
-        made.check_elements()
+        made.check_stiffness_factors()
         return made
 
 
-def _find_common_unit(units: Sequence[str]) -> str:
+def _join_units(units: Sequence[str]) -> str:
+    """Return the distinct units joined by "or", such as "rad or m"."""
     return " or ".join(sorted(set(units), reverse=True))

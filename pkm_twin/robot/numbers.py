@@ -96,7 +96,7 @@ class CauseSlopes:
 
 def geometry_and_masses(robot: Robot) -> list[Any]:
     """Return the numbers of ``Engine.geometry``, then those of ``Robot.inertial``."""
-    graph, load = robot.with_laws(robot.graph), robot.payload
+    graph, load = robot.with_friction_laws(robot.graph), robot.payload
     layout = Layout(Tree(graph))
     inertial = layout.pack(graph, robot.gravity, robot.friction)
     inertial = inertial + layout.payload(load.mass, load.com, load.inertia)

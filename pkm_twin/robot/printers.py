@@ -275,8 +275,8 @@ def _read_klipper(text: str) -> Printer:
             sections.setdefault(name, {})[entry[1]] = entry[2].strip()
     steppers = [sections.get(f"stepper_{limb}", {}) for limb in "abc"]
 
-    def number(stepper: int, key: str, default: float | None = None) -> float:
-        # Entries that b and c leave out are those of a.
+    def read_stepper_value(stepper: int, key: str, default: float | None = None) -> float:
+        # Steppers b and c default to the entries of stepper_a.
         value = steppers[stepper].get(key, steppers[0].get(key))
         if value is None and default is None:
             raise ParameterError(f"[stepper_{'abc'[stepper]}] {key}", None, "a value")
@@ -288,28 +288,33 @@ def _read_klipper(text: str) -> Printer:
     if "delta_radius" not in sections.get("printer", {}):
         raise ParameterError("[printer] delta_radius", None, "a linear Delta's radius, mm")
     radius = _read_number(sections["printer"]["delta_radius"], "delta_radius")
-    arms = np.array([number(k, "arm_length") for k in range(3)])
+    arms = np.array([read_stepper_value(k, "arm_length") for k in range(3)])
     angles = np.array(
         [_read_number(s["angle"], "angle") if "angle" in s else a for s, a in zip(steppers, ANGLES, strict=True)]
     )
-    ends = np.array([number(k, "position_endstop") for k in range(3)])
+    ends = np.array([read_stepper_value(k, "position_endstop") for k in range(3)])
     ends = ends + _find_carriage_heights(arms, radius, "arm_length")
-    steps = np.array([_find_step_length(number, steppers, k) for k in range(3)])
+    steps = np.array([_find_step_length(read_stepper_value, steppers, k) for k in range(3)])
     stored = sections.get("delta_calibrate", {})
 
-    def carriages(key: str) -> list[float]:
+    def read_carriage_positions(key: str) -> list[float]:
+        """Convert the three step counts of an entry to carriage positions, mm."""
         values = [_read_number(value, key) for value in stored[key].split(",")]
         if len(values) != 3:
             raise ParameterError(f"[delta_calibrate] {key}", len(values), "3 step counts")
         return [float(v) for v in -np.array(values) * steps]
 
     heights = [
-        [*carriages(f"{key}_pos"), _read_number(stored[key], key)]
+        [*read_carriage_positions(f"{key}_pos"), _read_number(stored[key], key)]
         for key in stored
         if re.fullmatch(r"(manual_)?height\d+", key) and f"{key}_pos" in stored
     ]
     distances = [
-        [*carriages(f"{key}_pos1"), *carriages(f"{key}_pos2"), _read_number(stored[key], key)]
+        [
+            *read_carriage_positions(f"{key}_pos1"),
+            *read_carriage_positions(f"{key}_pos2"),
+            _read_number(stored[key], key),
+        ]
         for key in stored
         if re.fullmatch(r"distance\d+", key) and f"{key}_pos1" in stored
     ]
@@ -319,17 +324,17 @@ def _read_klipper(text: str) -> Printer:
     return Printer(radius, angles, arms, ends, *shapes)
 
 
-def _find_step_length(number: Callable[..., float], steppers: list[dict[str, str]], k: int) -> float:
+def _find_step_length(read_stepper_value: Callable[..., float], steppers: list[dict[str, str]], k: int) -> float:
     """Return the carriage's travel per step, mm."""
     if "step_distance" in {**steppers[0], **steppers[k]}:
-        return float(number(k, "step_distance"))
+        return float(read_stepper_value(k, "step_distance"))
     gear = steppers[k].get("gear_ratio", steppers[0].get("gear_ratio", "1:1"))
     turns = 1.0
     for pair in gear.split(","):
         driven, _, driving = pair.partition(":")
         turns *= _read_number(driven, "gear_ratio") / _read_number(driving or "1", "gear_ratio")
-    full = number(k, "full_steps_per_rotation", 200.0)
-    return float(number(k, "rotation_distance") / (full * number(k, "microsteps") * turns))
+    full = read_stepper_value(k, "full_steps_per_rotation", 200.0)
+    return float(read_stepper_value(k, "rotation_distance") / (full * read_stepper_value(k, "microsteps") * turns))
 
 
 def _read_number(text: str, key: str) -> float:

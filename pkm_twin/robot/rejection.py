@@ -108,7 +108,7 @@ def reject_joints(
     if gap is not None:
         raise UnreachableError("joint state", robot.name_limb(gap[0]), index, gap[1])
     if reached == 1.0 and try_program(engine.forward, given["q"])[1]:
-        raise report_lost_digits("joint state", index, engine.reach(sample)[2])
+        raise make_pivot_error("joint state", index, engine.reach(sample)[2])
     drive, change = _find_correction(robot, engine, sample)
     if change < np.inf and robot.graph.joints[drive].slides:
         raise UnreachableError("joint state", robot.name_limb(drive), index, change)
@@ -119,8 +119,11 @@ def reject_joints(
     raise UnreachableError("joint state", limb, index, miss, reached)
 
 
-def report_lost_digits(what: str, index: tuple[int, ...], measure: float) -> SingularityError:
-    """Return the error of a state whose equations lose a pivot, :meth:`.SparseLU.find_growth`.
+def make_pivot_error(what: str, index: tuple[int, ...], measure: float) -> SingularityError:
+    """Return the error for a state at which the elimination of the loop closures loses a pivot.
+
+    The loss is found by :meth:`.SparseLU.find_growth`.
+
 
     :param measure: reciprocal condition of the closures, dimensionless.
     """

@@ -61,7 +61,7 @@ class Robot(Mechanism):
 
     @cached_property
     def _massive_engine(self) -> Engine:
-        return self._make_engine(self.with_laws(self.graph)) if self.laws else self.engine
+        return self._make_engine(self.with_friction_laws(self.graph)) if self.laws else self.engine
 
     @cached_property
     def _cached(self) -> dict[object, Any]:

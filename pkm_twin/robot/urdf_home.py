@@ -110,8 +110,11 @@ class Assembly:
         """Return a joint's frame on one of its links."""
         return self.move((joint.inner, joint.outer)[end]) @ joint.frames[end]
 
-    def twist(self, link: str, point: Array) -> tuple[Array, Array]:
-        """Return a point's velocity and the angular velocity per step's rate, (3, count) each."""
+    def point_jacobian(self, link: str, point: Array) -> tuple[Array, Array]:
+        """Return the Jacobians of a point's velocity and of its link's angular velocity, (3, count) each.
+
+        Their columns are the joint coordinates (``steps``) of the assembly.
+        """
         linear, angular = np.zeros((2, 3, len(self.steps)))
         motion, body = self._motion, self._bodies[link]
         for (_, k), column in motion.linear_jacobian(body, point).items():
@@ -151,7 +154,7 @@ class Assembly:
             part: Array = np.zeros((len(found), len(self.steps)))
             for side, link in enumerate((closure.inner, closure.outer)):
                 point = self.frame(closure, side).position
-                linear, angular = self.twist(link, point)
+                linear, angular = self.point_jacobian(link, point)
                 arm = np.array([one.points[side] for one in found]) - point
                 rows = force @ linear + (moment + cross(arm, force)) @ angular
                 part = part + (rows if side else -rows)
@@ -398,7 +401,8 @@ class HomeSearch:
         inside = [home for home in found if self._is_inside_limits(home.values)] or found
         chosen = None
         if inside:
-            # The best conditioned; of indices within 5 % the nearest to all joints' zeros.
+            # Take the best-conditioned assembly; of those within 5 % of the best conditioning index, the
+            # one nearest to the zero of all joints.
             best = max(home.index for home in inside)
             good = [home for home in inside if home.index * 1.05 >= best]
             chosen = min(good, key=lambda home: float(np.linalg.norm(home.values / self.units)))
@@ -429,12 +433,12 @@ class HomeSearch:
             return near
         if chosen is not None:
             return chosen
-        # No assembly is regular: creating the robot rejects it with the reason.
+        # Every assembly is singular: return the nearest; creating the robot raises the error.
         values = self.assembly.move_nearest_to_drawing(closed)
         return self._make_home(values, self.assembly.measure_gap(), "near")
 
     def _close_drawing(self) -> Home | None:
-        """Close the drawing with the actuated joints where they should be."""
+        """Close the loops near the drawing, with the actuated joints at their wanted values."""
         values = self.wanted.copy()
         self.assembly.place(values)
         miss = self.assembly.measure_gap()

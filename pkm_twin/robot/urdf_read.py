@@ -60,16 +60,16 @@ class UrdfReading:
 
 
 @dataclass(frozen=True)
-class Part:
-    """The part of a file with links and joints that is the machine.
+class UrdfSelection:
+    """Which links and joints of a URDF form the machine.
 
     ``platform``: the link that carries the tool; default: the first of ``PLATFORMS``. ``base``: the
     link that is the ground and gives the base axes; default: the root. ``actuated``: joints with
     motors, in the order of q; default: those that the file marks. ``pose``: names of the pose
-    coordinates. ``carry``: links that hang on moving bodies are carried, fixed as drawn.
+    coordinates. ``carry``: keep links attached to moving bodies, rigidly in their drawn position.
 
-    With ``base`` or ``actuated`` everything is left out that is neither between base and platform
-    nor in a loop with these.
+    If ``base`` or ``actuated`` is given, only the links and joints between base and platform, and
+    the loops through them, are kept.
     """
 
     platform: str | None = None
@@ -81,7 +81,7 @@ class Part:
     def __post_init__(self) -> None:
         """Check the kinds of names.
 
-        :raises ParameterError: a link that is no text, or names that are no list of texts.
+        :raises ParameterError: a link's name is not a text, or names are not a list of texts.
         """
         for field in ("platform", "base"):
             name = getattr(self, field)
@@ -96,8 +96,8 @@ class Part:
                 raise ParameterError(field, names, "a list of names")
 
     @property
-    def cuts(self) -> bool:
-        """True if other parts of the file are left out."""
+    def is_partial(self) -> bool:
+        """True if some links or joints of the file are left out."""
         return self.base is not None or self.actuated is not None or self.carry
 
 
@@ -106,15 +106,15 @@ def read_urdf(path: str | Path, **part: Any) -> dict[str, Any]:
 
     As :func:`read_tree`, whose notes are given as warnings.
 
-    :param part: fields of :class:`Part`.
+    :param part: fields of :class:`UrdfSelection`.
     """
-    reading = read_tree(path, Part(**part))
+    reading = read_tree(path, UrdfSelection(**part))
     for note in reading.notes:
         warn_of_file(path, note)
     return reading.description
 
 
-def read_tree(path: str | Path, part: Part = Part()) -> UrdfReading:
+def read_tree(path: str | Path, part: UrdfSelection = UrdfSelection()) -> UrdfReading:
     """Read a URDF file as a ``mechanism: machine`` description, vectors in base axes at home.
 
     A file whose top element is ``<mujoco>`` is read as MJCF, with the mujoco package, and one of
@@ -140,7 +140,7 @@ def read_tree(path: str | Path, part: Part = Part()) -> UrdfReading:
     ground = tree.root if part.base is None else part.base
     ground = urdf_xml.find_link("base", ground, tree.links)
     notes, carried = list[str](), tuple[Link, ...]()
-    if part.cuts:
+    if part.is_partial:
         cut = cut_out(tree, ground, tool, carry=part.carry)
         _require_motors(part, tree, cut.tree, ground, tool)
         tree, carried = cut.tree, cut.carried
@@ -152,7 +152,7 @@ def read_tree(path: str | Path, part: Part = Part()) -> UrdfReading:
             raise error
     _require_closed(path, tree)
     bodies = _map_bodies(tree, tool, ground)
-    _require_open(tree, bodies, tool, ground)
+    _reject_fully_actuated_loops(tree, bodies, tool, ground)
     assembly = Assembly(tree)
     _require_moving(tree, bodies, tool)
     home = HomeSearch(assembly, lambda: _build_graph(assembly, bodies, tool, ground)).home()
@@ -160,7 +160,7 @@ def read_tree(path: str | Path, part: Part = Part()) -> UrdfReading:
     graph = home.graph or _build_graph(assembly, bodies, tool, ground)
     data = _describe_graph(assembly, graph, ground)
     if carried:
-        move = _find_placed_links(assembly, ground)[tool]
+        move = _find_link_transforms(assembly, ground)[tool]
         mass, com, inertia = _sum_masses([link.moved(move) for link in carried])
         com = _round_vector(com - graph.origin).tolist()
         data["payload"] = {"mass": mass, "com": com, "inertia": inertia.tolist()}
@@ -180,7 +180,7 @@ def read_tree(path: str | Path, part: Part = Part()) -> UrdfReading:
         notes.append(home.repair.text)
     if home.held:
         notes.append(f"held, as they only let a part spin about itself: {', '.join(home.held)}")
-    # Mass times distance from the axis, kg m, of a part that is not balanced.
+    # Report held joints whose bodies have a static unbalance (mass times distance from the axis) above 1e-6 kg m.
     heavy = {name: value for name, value in home.held.items() if value > 1e-6}
     if heavy:
         notes.append(
@@ -189,7 +189,7 @@ def read_tree(path: str | Path, part: Part = Part()) -> UrdfReading:
         )
     if controller:
         data["joint_map"] = controller
-    frames = {name: move @ tree.links[name].frame for name, move in _find_placed_links(assembly, ground).items()}
+    frames = {name: move @ tree.links[name].frame for name, move in _find_link_transforms(assembly, ground).items()}
     shown = list[Visual]()
     if top is not None and top.tag == "robot":
         shown += read_visuals(path, top, frames, bodies)
@@ -197,7 +197,7 @@ def read_tree(path: str | Path, part: Part = Part()) -> UrdfReading:
 
 
 def _require_closed(path: Path, tree: LoopTree) -> None:
-    """Reject too many joints to be assembled, and passive joints and free links that no closure holds.
+    """Reject too many joints to be assembled, links without connection, and passive joints without a closure.
 
     :raises ParameterError: their number, or their names.
     """
@@ -219,7 +219,7 @@ def _require_closed(path: Path, tree: LoopTree) -> None:
         )
 
 
-def _require_motors(part: Part, whole: LoopTree, tree: LoopTree, base: str, tool: str) -> None:
+def _require_motors(part: UrdfSelection, whole: LoopTree, tree: LoopTree, base: str, tool: str) -> None:
     """Reject a linkage without motors, and motors outside it.
 
     :raises ParameterError: the motors outside, and the joints that can be driven.
@@ -233,8 +233,8 @@ def _require_motors(part: Part, whole: LoopTree, tree: LoopTree, base: str, tool
         )
 
 
-def _require_open(tree: LoopTree, bodies: dict[str, str], tool: str, ground: str) -> None:
-    """Reject loops in which every joint is marked as actuated: the last one is a closure.
+def _reject_fully_actuated_loops(tree: LoopTree, bodies: dict[str, str], tool: str, ground: str) -> None:
+    """Reject a loop in which all joints are actuated: the joint that closes the loop must be passive.
 
     :raises ParameterError: the actuated joints and the degrees of freedom.
     """
@@ -275,8 +275,8 @@ def _require_moving(tree: LoopTree, bodies: dict[str, str], tool: str) -> None:
     )
 
 
-def _find_placed_links(assembly: Assembly, ground: str) -> dict[str, Pose]:
-    """Return each link's motion from where it is drawn to its place in the base's axes."""
+def _find_link_transforms(assembly: Assembly, ground: str) -> dict[str, Pose]:
+    """Return the transform of each link from its drawn pose to its pose in the assembled machine, base axes."""
     view = (assembly.move(ground) @ assembly.tree.links[ground].frame).inverse()
     return {name: view @ assembly.move(name) for name in assembly.tree.links}
 
@@ -286,7 +286,7 @@ def _describe_graph(assembly: Assembly, graph: Graph, ground: str) -> dict[str, 
     tree = assembly.tree
     data = graph_description(graph)
     if tree.gravity is not None:
-        gravity = _find_placed_links(assembly, ground)[tree.root].rotation @ tree.gravity
+        gravity = _find_link_transforms(assembly, ground)[tree.root].rotation @ tree.gravity
         data["gravity"] = _round_vector(gravity).tolist()
     for name, entry in data["joints"].items():
         ends = tree.joints[name].limits.get("position") if name in tree.joints else None
@@ -304,7 +304,7 @@ def _describe_graph(assembly: Assembly, graph: Graph, ground: str) -> dict[str, 
 
 def _build_graph(assembly: Assembly, bodies: dict[str, str], tool: str, ground: str) -> Graph:
     """Return the graph of the machine at the placed values."""
-    tree, moves = assembly.tree, _find_placed_links(assembly, ground)
+    tree, moves = assembly.tree, _find_link_transforms(assembly, ground)
     home = dict(zip(assembly.steps, assembly.values.tolist(), strict=True))
     passive = [n for n, j in tree.joints.items() if j.kind != "fixed" and n not in tree.actuated]
     joints = [tree.joints[name] for name in (*tree.actuated, *passive)]

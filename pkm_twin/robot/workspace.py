@@ -84,8 +84,8 @@ def singularity_of_pose(robot: Robot, pose: ArrayLike) -> Array:
     return measure
 
 
-def has_joint_angles(robot: Robot) -> bool:
-    """Return whether the machine bounds the angles of its passive joints."""
+def has_passive_joint_limits(robot: Robot) -> bool:
+    """Return whether the angles of passive joints are limited."""
     return robot.limit_angles(np.zeros(len(robot.pose_names))) is not None
 
 
@@ -139,7 +139,7 @@ def satisfies_limits(
     """
     inside = np.array(within_limits(robot, q) & known)
     bound = getattr(robot.limits, "joint_angle", None)
-    if bound is not None and has_joint_angles(robot):
+    if bound is not None and has_passive_joint_limits(robot):
         # NaN is not below.
         inside &= joint_angle_at(robot, pose) <= bound
     if robot.passive_limits:
@@ -163,8 +163,8 @@ def belong_to_workspace(robot: Robot, q: Array, pose: Array, known: Mask, least:
     return inside
 
 
-def distance_unit(robot: Robot) -> str:
-    """Return the unit of the distance from a pose cylinder's axis: ``m`` or ``rad``."""
+def workspace_radius_unit(robot: Robot) -> str:
+    """Return the unit of the workspace cylinder's radius, which is in pose coordinates: ``m`` or ``rad``."""
     return robot.pose_units[robot.pose_names.index(robot.grid().lateral[0])]
 
 
@@ -194,16 +194,16 @@ def regular_workspace(
     :param step: first search along a ray, rad; a bisection refines it to 1e-9 rad.
     """
     grid = robot.grid()
-    if grid.kind == "box" or grid.zero_torsion or distance_unit(robot) != "rad":
+    if grid.kind == "box" or grid.zero_torsion or workspace_radius_unit(robot) != "rad":
         raise ParameterError("mechanism", robot.mechanism, "a height and two tilts side by side (as upr_rpu)")
     heights = np.atleast_1d(doubles(z, "heights"))
     steps = math.ceil(math.pi / 2 / step) - 1
-    radius = circle_radii(robot, heights, step, steps, directions)
+    radius = compute_circle_radii(robot, heights, step, steps, directions)
     kept = (radius >= least_radius) & (radius > 0.0)
     return RegularWorkspace(heights[kept], radius[kept])
 
 
-def circle_radii(
+def compute_circle_radii(
     robot: Robot,
     heights: Array,
     step: float,
@@ -212,7 +212,7 @@ def circle_radii(
     least: float = MIN_WORKSPACE_INDEX,
     least_clearance: float = 0.0,
 ) -> Array:
-    """Find the radii of the largest circles about the axis with reachable insides, (n,), m or rad.
+    """Find the radii of the largest circles about the axis whose interior is reachable, (n,), m or rad.
 
     A radius is 0 if the axis itself is out of reach.
 
@@ -231,15 +231,15 @@ def circle_radii(
         kept[kept] = singularity_of_pose(robot, poses[kept]) >= least
         return ~kept
 
-    rung, left = np.zeros(len(heights), np.int64), np.zeros((len(heights), rays), bool)
+    exit_step, left = np.zeros(len(heights), np.int64), np.zeros((len(heights), rays), bool)
     # About 65536 poses at a time.
     at_once = max(1, 2**16 // (STEPS_PER_BLOCK * rays))
     for start in range(0, len(heights), at_once):
         part = slice(start, start + at_once)
-        rung[part], left[part] = _first_rungs(outside, heights[part], turn, step, steps)
-    low, high = step * np.maximum(rung - 1, 0), step * rung
+        exit_step[part], left[part] = _find_first_exit(outside, heights[part], turn, step, steps)
+    low, high = step * np.maximum(exit_step - 1, 0), step * exit_step
     # Only the shortest rays of a height matter, so drop longer ones.
-    row, ray = np.nonzero(left & (rung > 0)[:, None])
+    row, ray = np.nonzero(left & (exit_step > 0)[:, None])
     ends = np.isin(np.arange(len(heights)), row)
     for _ in range(32):
         middle = (low + high) / 2
@@ -248,17 +248,18 @@ def circle_radii(
         low, high = np.where(nearer, low, middle), np.where(nearer, middle, high)
         kept = gone | ~nearer[row]
         row, ray = row[kept], ray[kept]
-    return np.where(ends, low, step * rung)
+    return np.where(ends, low, step * exit_step)
 
 
-def _first_rungs(
+def _find_first_exit(
     outside: Callable[[Array, Array, Array], Mask], heights: Array, turn: Array, step: float, steps: int
 ) -> tuple[NDArray[np.int64], Mask]:
-    """Find the first multiple of a step outside on any ray, shape (n,), and these rays, (n, rays).
+    """Search outward in equal steps for the first step at which any ray leaves the workspace.
 
-    Without such a ray it is the last multiple.
+    :returns: number of the step, shape (n,), the last one if no ray leaves; and which rays leave
+        there, shape (n, rays).
     """
-    rung = np.zeros(len(heights), np.int64)
+    exit_step = np.zeros(len(heights), np.int64)
     left = outside(heights[:, None], np.zeros(1), turn)
     inner = np.flatnonzero(~left.any(-1))
     for start in range(1, steps + 1, STEPS_PER_BLOCK):
@@ -269,9 +270,9 @@ def _first_rungs(
         hit = gone.any(-1)
         ended = hit.any(-1)
         first = np.where(ended, hit.argmax(-1), len(block) - 1)
-        rung[inner], left[inner] = block[first], gone[np.arange(len(inner)), first]
+        exit_step[inner], left[inner] = block[first], gone[np.arange(len(inner)), first]
         inner = inner[~ended]
-    return rung, left
+    return exit_step, left
 
 
 def describe_singularity_bound(index: float, bound: str = "--singularity ") -> str:

@@ -22,7 +22,7 @@ from pkm_twin.errors import ParameterError, PkmTwinError, one_line
 from pkm_twin.robot.clearance import has_clearance, joint_clearance
 from pkm_twin.robot.limits import beyond_limits
 from pkm_twin.robot.robot import Robot
-from pkm_twin.robot.workspace import has_joint_angles, passive_values
+from pkm_twin.robot.workspace import has_passive_joint_limits, passive_values
 from pkm_twin.view.scene import Deflection
 from stiffness_monitor import PlatformResponse, platform_response
 from stiffness_monitor.compliance import member_deflections
@@ -83,7 +83,7 @@ class Model:
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
         self._settings = Settings()
-        self._angles = has_joint_angles(robot)
+        self._angles = has_passive_joint_limits(robot)
         self._why: dict[str, str] = {}
         home = robot.home()
         self.start = State(robot.inverse(home), home)

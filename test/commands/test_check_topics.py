@@ -11,7 +11,7 @@ from mcap.writer import Writer
 from pkm_twin.bags.reader import BagWriter, open_bag
 from pkm_twin.errors import BagError
 from pkm_twin.recordings import ReadOptions, read, read_table
-from pkm_twin.recordings.origin import states_origin
+from pkm_twin.recordings.origin import is_effort_model_column
 from pkm_twin.recordings.topics import JOINT_STATE, WRENCH
 from test.commands.conftest import COLLISION, DELTA, JOINTS, MILLING, checked, items_of, rewrite
 from test.support.mapped import sides
@@ -92,7 +92,7 @@ class TestTopics:
             out = tmp_path / f"{source.stem}.csv"
             twin.good("torques", name, source, "--no-picture", "--out", out)
             table = read_table(out)
-            tables.append({n: v for n, v in table.items() if not states_origin(n)})
+            tables.append({n: v for n, v in table.items() if not is_effort_model_column(n)})
         assert list(tables[1]) == list(tables[0])
         for name, values in tables[0].items():
             np.testing.assert_allclose(tables[1][name], values, rtol=1e-6, atol=1e-6)

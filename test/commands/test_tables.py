@@ -74,7 +74,7 @@ def saved(kind, robot, time, q):
     if kind in text:
         path.write_text(text[kind]())
         names = f"{joints[0]}=q1,{joints[1]}=q2"
-        other = Dialect.of(columns=names, units="deg,ms", time="t")
+        other = Dialect.from_options(columns=names, units="deg,ms", time="t")
         return path, other if kind == "other names" else Dialect()
     if kind == "Parquet":
         pytest.importorskip("pyarrow")
@@ -128,7 +128,7 @@ def test_a_recording_is_the_same_in_all_kinds_of_files(kind, motion):
 def test_what_cannot_be_is_refused(options, motion):
     Path("a.csv").write_text(plain(*motion).replace("time", "t"))
     with pytest.raises(ParameterError):
-        read("a.csv", motion[0], ReadOptions(dialect=Dialect.of(**options)))
+        read("a.csv", motion[0], ReadOptions(dialect=Dialect.from_options(**options)))
 
 
 @pytest.mark.parametrize("header", ["time [mm]", "time_ms,time"])
@@ -194,11 +194,11 @@ def test_values_of_the_controller_and_of_the_motor_are_made_the_joints(name, tmp
         ("controller", "ms", controller),
     ):
         out.write_text(written(["time", *header], [1e3 * time, *np.hstack(values).T]))
-        r = read(out, robot, ReadOptions(dialect=Dialect.of(units=units), side=side))
+        r = read(out, robot, ReadOptions(dialect=Dialect.from_options(units=units), side=side))
         for found, expected in ((r.q, q), (r.qd, qd), (r.effort, effort)):
             np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
     with pytest.raises(ParameterError, match="side motor"):
-        read(out, robot, ReadOptions(dialect=Dialect.of(units="percent"), side="controller"))
+        read(out, robot, ReadOptions(dialect=Dialect.from_options(units="percent"), side="controller"))
     pose = robot.forward(q)
     words = [*(f"{joint}.position" for joint in names), *robot.pose_names]
     out.write_text(written(["time", *words], [time, *q.T, *pose.T]))
@@ -257,7 +257,7 @@ def test_columns_that_nobody_asked_for_are_left_alone(kind, motion):
         rows = [f"{head},{','.join(others)}", *map(",".join, zip(lines, more, strict=True))]
         path.write_text("\n".join(rows))
     assert read(path, robot).q == pytest.approx(q, abs=1e-12)
-    asked = Dialect.of(columns=f"{robot.joint_names[0]}.effort=state")
+    asked = Dialect.from_options(columns=f"{robot.joint_names[0]}.effort=state")
     with pytest.raises(ParameterError, match=r"RUN|Parquet"):
         read(path, robot, ReadOptions(dialect=asked))
 
@@ -266,7 +266,7 @@ def test_times_in_nanoseconds_since_1970_are_read_or_named(motion):
     robot, time, q = motion
     joints = [f"{joint}.position" for joint in robot.joint_names]
     Path("a.csv").write_text(written(["time", *joints], [1.7377e18 + 1e9 * time, *q.T]))
-    r = read("a.csv", robot, ReadOptions(dialect=Dialect.of(units="ns")))
+    r = read("a.csv", robot, ReadOptions(dialect=Dialect.from_options(units="ns")))
     np.testing.assert_allclose(r.time, time, atol=1e-6)
     with pytest.raises(ParameterError, match="--units ns"):
         read("a.csv", robot)

@@ -152,7 +152,7 @@ def test_tables_are_read_as_recordings_have_them(tmp_path: Path, how: str) -> No
         head = head.replace("meas_ori_", "q").replace("cmd_", "wanted_cmd_")
         path.write_text("\n".join([head, *rows]))
         unit = "m"
-    poses = read_poses(path, robot, Dialect.of(columns=columns, units=unit))
+    poses = read_poses(path, robot, Dialect.from_options(columns=columns, units=unit))
     assert poses.joints[:, 3] == pytest.approx(raw["leg_length_4"])
     assert poses.position[:, 1] == pytest.approx(1e-3 * raw["meas_pos_y"])
     turn = Rotation.from_quat(np.stack([raw[f"meas_ori_{c}"] for c in "xyzw"], -1))
@@ -172,7 +172,7 @@ def test_micrometres_have_two_spellings(tmp_path: Path, header: str) -> None:
 def test_columns_that_there_are_not_are_rejected(tmp_path: Path, columns: list[str]) -> None:
     path = recording(tmp_path)
     with pytest.raises(ParameterError):
-        read_poses(path, load(EXAMPLES / "hexapod.yaml"), Dialect.of(columns=columns))
+        read_poses(path, load(EXAMPLES / "hexapod.yaml"), Dialect.from_options(columns=columns))
 
 
 @pytest.mark.parametrize("how", ["shared", "travel"])

@@ -81,7 +81,7 @@ def test_a_table_of_torques_gives_the_answers_of_its_source(name, ending, twin, 
     assert same == table
     r = read(out, name, ReadOptions(planned=True))
     np.testing.assert_allclose(r.wrench, wrench.T)
-    carried = r.load.carried(r.time)
+    carried = r.load.mass_at(r.time)
     np.testing.assert_allclose(np.where(np.isnan(carried), robot.payload.mass, carried), 0.7 * held)
 
 

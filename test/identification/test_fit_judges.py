@@ -95,7 +95,7 @@ def test_a_recording_with_gaps_is_fitted_like_the_whole_one() -> None:
     keep = np.ones(len(whole.time), bool)
     for begin in np.cumsum([110, 30, 180, 340]):
         keep[begin : begin + 8] = False
-    cut = whole.part(keep)
+    cut = whole.select(keep)
     (one, _, none), (other, _, (note,)) = (fit_recordings(m.robot, [record], KINDS) for record in (whole, cut))
     missing = missing_samples(cut.time)
     assert not none and missing.verdict is Verdict.BAD

@@ -74,7 +74,7 @@ def test_laws_are_tried_with_a_known_payload():
     m = machine(load("five_bar"), rng, 8.0)
     truth, _ = rubbing(m, "load-dependent")
     payload = Load(0.4, (0.0, 0.0, 0.0))
-    effort = inverse_dynamics(payload.on(truth), m.q, m.qd, m.qdd)
+    effort = inverse_dynamics(payload.apply_to(truth), m.q, m.qd, m.qdd)
     record = replace(m.recorded(effort=effort), load=payload)
     _, choices = fit_with_laws(m.robot, [noisy(record, rng, 0.005)], ("friction",))
     assert [one.law for one in choices if one.taken] == ["load-dependent"]
@@ -183,7 +183,7 @@ def test_sweeps_alone_show_the_friction_of_every_joint(name, seeds):
         truth = robot.changed(friction={key: value.tolist() for key, value in friction.items()})
         effort = inverse_dynamics(truth, *motion)
         record = noisy(Recording(robot, time, motion[0], effort=effort), rng, 0.01, 1e4)
-        assert record.step_fault == ""
+        assert record.jump_description == ""
         numbers = fit(robot, [record], ("friction",)).numbers
         for key, values in friction.items():
             own = [one for one in numbers if key in one.name][: len(values)]

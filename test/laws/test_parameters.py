@@ -245,7 +245,7 @@ class TestInertia:
         with pytest.raises(ParameterError, match=r"payload\.inertia"):
             robot.changed(payload={"mass": 0.0})
         # A payload that is put down takes its inertia along.
-        for none in (Load(0.0).on(robot), robot.changed(payload=PayloadEvent(0.0, 0.0).load)):
+        for none in (Load(0.0).apply_to(robot), robot.changed(payload=PayloadEvent(0.0, 0.0).load)):
             assert none.payload.mass == 0.0 and not none.payload.inertia.any()
 
     def test_any_turned_body_is_taken(self, load_data, rng):

@@ -18,7 +18,7 @@ from pkm_twin.design.variants import Variants
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.places import drop_missing
 from pkm_twin.mechanisms.catalogue import robot_of_data
-from pkm_twin.robot.derivatives import list_position_effects
+from pkm_twin.robot.derivatives import position_errors_by_source
 from stiffness_monitor import compliance, compliance_deviation, strain_energy
 from stiffness_monitor.derivatives import compliance_effects, energy_effects
 from test.support.robots import joint_range, load, massive, random_joints, unsure
@@ -94,7 +94,7 @@ def test_effects_are_differences_of_machines_with_other_numbers() -> None:
         return (call(high) - call(low)) / 0.02
 
     for found, call in (
-        (list_position_effects(robot, q), lambda r: r.platform(q)[0]),
+        (position_errors_by_source(robot, q), lambda r: r.platform(q)[0]),
         (torque_effects(robot, q, still, still, loads[0]), lambda r: inverse_dynamics(r, q, still, still, loads[0])),
         (compliance_effects(robot, pose), lambda r: compliance(r, pose)),
         (energy_effects(robot, pose, loads), lambda r: strain_energy(r, pose, loads).energies),

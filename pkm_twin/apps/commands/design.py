@@ -115,10 +115,10 @@ def read_path(given: Design, path: Path, *, efforts: bool = True) -> tuple[Robot
     robot = given.machine()
     motion = given.read_motion(path, robot)
     if motion.load is not None and efforts:
-        if motion.load.masses or not motion.load.held(motion.time).all():
+        if motion.load.masses or not motion.load.is_on_platform(motion.time).all():
             bound = "one that is held throughout; --payload gives one"
             raise ParameterError(f"{path}: payload", str(motion.load), bound)
-        robot = motion.load.on(robot)
+        robot = motion.load.apply_to(robot)
     if efforts and motion.doubt:
         warn_of_file(path, motion.doubt)
     q, qd, qdd, load = motion.motion

@@ -11,7 +11,7 @@ import numpy as np
 
 from pkm_twin.apps.frame import command
 from pkm_twin.apps.options import OutputOption, PictureOptions, PoseOption, ToolOptions
-from pkm_twin.recordings.tables import ENDINGS, write_table
+from pkm_twin.recordings.tables import WRITABLE_SUFFIXES, write_table
 from pkm_twin.report import Fact, Report, plots
 from pkm_twin.settings import setting
 
@@ -39,7 +39,7 @@ class FrequencyResponse(PoseOption, ToolOptions, OutputOption, PictureOptions):
         None, "range of the table, Hz; default: 0 to above the sixth mode", count=2, metavar="LOW,HIGH"
     )
     points: int = setting(2001, "rows of the table", low=2, high=10**6)
-    out: Path | None = setting(None, "table to write, .csv, .parquet or .mat", writes=True, endings=ENDINGS)
+    out: Path | None = setting(None, "table to write, .csv, .parquet or .mat", writes=True, endings=WRITABLE_SUFFIXES)
 
 
 @command("Stiffness, workspace and vibration")

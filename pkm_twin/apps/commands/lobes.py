@@ -11,7 +11,7 @@ from pkm_twin.apps.commands.frf import report_modes
 from pkm_twin.apps.frame import command
 from pkm_twin.apps.options import MillingOptions, OutputOption, PictureOptions, PoseOption, ToolOptions
 from pkm_twin.errors import ParameterError
-from pkm_twin.recordings.tables import ENDINGS, write_table
+from pkm_twin.recordings.tables import WRITABLE_SUFFIXES, write_table
 from pkm_twin.report import Fact, Report, plots
 from pkm_twin.settings import setting
 
@@ -42,7 +42,7 @@ class Lobes(MillingOptions, PoseOption, ToolOptions, OutputOption, PictureOption
     deepest: float | None = setting(
         None, "largest depth to compute, m; default: 25 times the depth stable at every speed"
     )
-    out: Path | None = setting(None, "table to write, .csv, .parquet or .mat", writes=True, endings=ENDINGS)
+    out: Path | None = setting(None, "table to write, .csv, .parquet or .mat", writes=True, endings=WRITABLE_SUFFIXES)
 
 
 @command("Stiffness, workspace and vibration")

@@ -22,7 +22,7 @@ from pkm_twin.apps.options import (
 )
 from pkm_twin.console import convert_write_errors
 from pkm_twin.errors import check_limit
-from pkm_twin.recordings.tables import ENDINGS
+from pkm_twin.recordings.tables import WRITABLE_SUFFIXES
 from pkm_twin.report import Column, Fact, Report, Table, plots
 from pkm_twin.settings import setting
 
@@ -116,7 +116,7 @@ class Motion(PayloadOption, TableOptions, SingularityOption, OutputOption, Pictu
         None,
         "file to write: .mcap (a JointTrajectory with efforts), or a table, .csv, .parquet or .mat",
         writes=True,
-        endings=(".mcap", *ENDINGS),
+        endings=(".mcap", *WRITABLE_SUFFIXES),
     )
 
 

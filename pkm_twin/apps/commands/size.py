@@ -269,7 +269,7 @@ def report_workspace(given: Size) -> Report:
         # 0 is allowed for one of the two: only the other is asked for.
         check_limit("over-workspace", value or MIN_LIMIT)
     robot, held = given.machine(), given.load
-    robot = robot if held is None else held.on(robot)
+    robot = robot if held is None else held.apply_to(robot)
     worst = worst_over_workspace(robot, speed, change, singularity=given.singularity, lever=given.lever)
     names = robot.pose_names
     turns = only_turns(robot)

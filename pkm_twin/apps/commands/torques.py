@@ -20,7 +20,7 @@ from pkm_twin.apps.options import (
     payload_fact,
 )
 from pkm_twin.console import convert_write_errors, draw_progress
-from pkm_twin.recordings.tables import ENDINGS, check_target, write_table
+from pkm_twin.recordings.tables import WRITABLE_SUFFIXES, check_target, write_table
 from pkm_twin.report import Column, Fact, Report, Table, plots
 from pkm_twin.settings import setting
 
@@ -59,7 +59,7 @@ class Torques(TimedPayloadOptions, MotionOptions, PoseOption, OutputOption, Pict
         None, "with --at: wrench on the platform, N and N m, base axes", count=6, metavar="fx,fy,fz,mx,my,mz"
     )
     out: Path | None = setting(
-        None, "table to write, .csv, .parquet or .mat; default: torques.csv", writes=True, endings=ENDINGS
+        None, "table to write, .csv, .parquet or .mat; default: torques.csv", writes=True, endings=WRITABLE_SUFFIXES
     )
 
     def __post_init__(self) -> None:

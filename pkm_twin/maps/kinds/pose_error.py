@@ -10,7 +10,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.machine.places import split_path
 from pkm_twin.maps.kind import Case, Found, Kind, largest_axis
-from pkm_twin.robot.derivatives import list_position_effects
+from pkm_twin.robot.derivatives import position_errors_by_source
 from pkm_twin.robot.robot import Robot
 
 
@@ -38,7 +38,7 @@ class PoseError(Kind):
 
         To first order, independent causes. The element is the cause with the largest contribution.
         """
-        effects = list_position_effects(robot, q)[..., _moving_causes(robot)].swapaxes(-1, -2)
+        effects = position_errors_by_source(robot, q)[..., _moving_causes(robot)].swapaxes(-1, -2)
         value, direction = largest_axis(effects.swapaxes(-1, -2) @ effects)
         along = np.abs((effects * direction[..., None, :]).sum(-1))
         return Found(np.sqrt(np.maximum(value, 0.0)), direction, along.argmax(-1))
@@ -60,7 +60,7 @@ def _moving_causes(robot: Robot) -> NDArray[np.intp]:
                 "numbers that move the platform at home, where this one is a place that parts "
                 "share; errors of single parts: pkm-twin design --tolerance",
             )
-    found = np.flatnonzero(list_position_effects(robot, robot.graph.home).any(0))
+    found = np.flatnonzero(position_errors_by_source(robot, robot.graph.home).any(0))
     if not len(found):
         what = "the standard deviation of a length or angle that moves the platform"
         if robot.tolerances:

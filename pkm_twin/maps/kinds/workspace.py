@@ -27,10 +27,10 @@ from pkm_twin.robot.clearance import has_clearance, member_gaps, member_pairs
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import (
     MIN_WORKSPACE_INDEX,
-    circle_radii,
-    distance_unit,
-    has_joint_angles,
+    compute_circle_radii,
+    has_passive_joint_limits,
     joint_angle_at,
+    workspace_radius_unit,
 )
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ class Workspace(Kind):
 
     def cases(self, robot: Robot) -> tuple[Case, ...]:
         """Return singularity index, and clearance and passive angle if the file gives them."""
-        known = (True, has_clearance(robot), has_joint_angles(robot))
+        known = (True, has_clearance(robot), has_passive_joint_limits(robot))
         cases = (SINGULARITY, CLEARANCE, ANGLE)
         return tuple(case for case, there in zip(cases, known, strict=True) if there)
 
@@ -156,7 +156,7 @@ class Workspace(Kind):
 def make_regular_variables(robot: Robot, heights: Array, least: float, least_clearance: float) -> dict[str, Variable]:
     """Return the largest circles about the axis at heights (n,), and the cylinder, for a file."""
     radius = find_circle_radii(robot, heights, least=least, least_clearance=least_clearance)
-    best, unit = largest_cylinder(heights, radius), distance_unit(robot)
+    best, unit = largest_cylinder(heights, radius), workspace_radius_unit(robot)
     return make_circle_variables(robot, heights, radius) | {
         "cylinder_low": scalar(best.low, "largest cylinder, low", "m"),
         "cylinder_high": scalar(best.high, "largest cylinder, high", "m"),
@@ -166,7 +166,7 @@ def make_regular_variables(robot: Robot, heights: Array, least: float, least_cle
 
 def make_circle_variables(robot: Robot, heights: Array, radius: Array) -> dict[str, Variable]:
     """Return circles about the axis at heights (n,), m, of radii (n,), for a file."""
-    what = describe("largest circle, radius", distance_unit(robot), NON_NEGATIVE)
+    what = describe("largest circle, radius", workspace_radius_unit(robot), NON_NEGATIVE)
     return {
         "height": Variable(("height",), heights, describe("height of the circles", "m")),
         "circle": Variable(("height",), radius, what),
@@ -192,7 +192,9 @@ def find_circle_radii(
     z = np.atleast_1d(np.asarray(heights, np.float64))
     lateral = [robot.pose_names.index(name) for name in robot.grid().lateral]
     step = float(np.abs(robot.search_box()[lateral]).max()) / steps
-    return circle_radii(robot, z, step, steps, least=max(least, MIN_WORKSPACE_INDEX), least_clearance=least_clearance)
+    return compute_circle_radii(
+        robot, z, step, steps, least=max(least, MIN_WORKSPACE_INDEX), least_clearance=least_clearance
+    )
 
 
 @dataclass(frozen=True)
