@@ -105,20 +105,20 @@ def setting(default: Any, text: str, **more: Any) -> Any:
     return field(default=default, metadata={"setting": Setting(text, **more)})
 
 
-def settings_of(kind: Any) -> Mapping[str, tuple[str, Any]]:
-    """Return the field's name and its setting, by the name of the parameter."""
-    return _settings_of(kind)
+def map_parameters(kind: Any) -> Mapping[str, tuple[str, Any]]:
+    """Return, for each parameter name, the name of the dataclass field and its Setting."""
+    return _collect_settings(kind)
 
 
 @cache
-def _settings_of(kind: Any) -> Mapping[str, tuple[str, Any]]:
+def _collect_settings(kind: Any) -> Mapping[str, tuple[str, Any]]:
     found = {f.name: f.metadata["setting"] for f in dataclasses.fields(kind) if f.metadata}
     return {row.name or name: (name, row) for name, row in found.items()}
 
 
 def list_changeable(kind: type[DataclassInstance]) -> list[str]:
     """List the parameters that may change while the node runs."""
-    return [name for name, (_, row) in settings_of(kind).items() if not row.fixed]
+    return [name for name, (_, row) in map_parameters(kind).items() if not row.fixed]
 
 
 def with_parameters(settings: S, values: Mapping[str, Any]) -> S:
@@ -126,6 +126,6 @@ def with_parameters(settings: S, values: Mapping[str, Any]) -> S:
 
     :raises ParameterError: the settings reject a value.
     """
-    rows = settings_of(type(settings))
+    rows = map_parameters(type(settings))
     fields = {rows[name][0]: rows[name][1].to_field_value(values[name]) for name in rows.keys() & values}
     return dataclasses.replace(settings, **fields)

@@ -17,7 +17,7 @@ from pkm_twin.identification.calibration_state import Poses, rotations
 from pkm_twin.identification.drives import GRAVITY, drive_friction
 from pkm_twin.identification.measurements import read_poses
 from pkm_twin.recordings import Dialect, read_table
-from pkm_twin.report.terminal import text_of
+from pkm_twin.report.terminal import format_report
 from test.support.pages import write_section
 
 Array = NDArray[np.float64]
@@ -117,7 +117,7 @@ def section() -> str:
     halves = _transfer(robot, poses)
     columns = read_table(DATA / "leg_currents.csv")
     drive = drive_friction(GRAVITY * SPOOL * columns["mass_kg"], columns["iq_up_A"], columns["iq_down_A"])
-    told = text_of(report_drive(drive))
+    told = format_report(report_drive(drive))
     return SECTION.format(count=count, table=table, halves=halves, drive=told)
 
 

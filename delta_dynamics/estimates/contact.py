@@ -19,7 +19,7 @@ from pkm_twin.codegen.arrays import Array, check_later, common_batch, finite, on
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.mechanism import EFFORT_SHARING_NOTE
 from pkm_twin.robot.robot import Robot
-from pkm_twin.streams.drives import BRAKE_TIME, DriveWatch
+from pkm_twin.streams.drives import MAX_BRAKE_TIME, DriveWatch
 from pkm_twin.streams.rest import VelocityErrorEstimator
 
 
@@ -288,7 +288,7 @@ class ContactMonitor:
             return None
         step = time - last
         if idle:
-            if not was_idle and time - self._since < BRAKE_TIME:
+            if not was_idle and time - self._since < MAX_BRAKE_TIME:
                 # The brake took over the weight, which looked like a contact.
                 self._touching = False
             return self._make_contact(q, external, idle)

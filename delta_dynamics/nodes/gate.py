@@ -129,7 +129,7 @@ class CommandGate(TwinNode):
         for publisher in self.get_publishers_info_by_topic(self.resolve_topic_name(TORQUES)):
             promised = publisher.qos_profile.deadline.nanoseconds / SECOND
             if promised > deadline:
-                name = health.node_of(publisher)
+                name = health.endpoint_node_name(publisher)
                 bound = f"{promised:g} s" if promised < MAX_DEADLINE else "none"
                 return (
                     f"{name} offers torques with deadline {bound}, command_gate requests "

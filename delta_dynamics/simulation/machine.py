@@ -273,7 +273,7 @@ class Simulation(Core):
             t = self._reader.trajectory(message, self.now)
             if self.stable_fraction < 1.0:
                 raise MessageError("unstable control", self.control_fault())
-        self._path = (t.stamp or self.now, JointPath(t).from_here(self._encoder_positions))
+        self._path = (t.stamp or self.now, JointPath(t).start_from(self._encoder_positions))
 
     @cached_property
     def stable_fraction(self) -> float:

@@ -245,7 +245,7 @@ def _draw_residuals(judged: Judged, units: Mapping[str, str]) -> Any:
     time = judged.time[::step]
     # Break lines where samples were left out.
     gaps = 1 + np.flatnonzero(np.diff(time) > 5.0 * np.median(np.diff(time)))
-    figure, ((*axes,),) = plots.columns(1, len(rows))
+    figure, ((*axes,),) = plots.make_subplots(1, len(rows))
     for ax, (name, (before, now, deviation)) in zip(axes, rows.items(), strict=True):
         for values, colour, width, word in ((before, 1, 1.6, "before"), (now, 0, 0.8, "now")):
             broken = np.where(np.isin(np.arange(len(time)), gaps), np.nan, values)
@@ -270,7 +270,7 @@ def _draw_changes(shown: Mapping[str, Number]) -> Any:
     }
     # Draw the twenty parameters that changed most.
     order = sorted(moved, key=lambda name: -abs(moved[name]))[:20]
-    figure, ((ax,),) = plots.columns(1, 1, 1.6 + 0.28 * len(order))
+    figure, ((ax,),) = plots.make_subplots(1, 1, 1.6 + 0.28 * len(order))
     places = np.arange(len(order))[::-1]
     colours = [plots.COLOURS[0 if shown[name].status == "fitted" else 4] for name in order]
     ax.barh(places, [moved[name] for name in order], 0.6, color=colours)

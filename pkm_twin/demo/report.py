@@ -18,8 +18,7 @@ from pkm_twin.codegen.arrays import Array, Indices, Mask
 from pkm_twin.messages.stamps import stamp_of
 from pkm_twin.recordings import ReadOptions, Recording, read
 from pkm_twin.recordings.recording import differentiate_motion
-from pkm_twin.report import Fact, plots
-from pkm_twin.report import judged as judge
+from pkm_twin.report import Fact, make_judged_fact, plots
 
 MIN_ANSWERED = 0.95
 """Smallest fraction of the samples that must be answered."""
@@ -77,7 +76,7 @@ def report_dynamics(bag: Path, recording: Path, prefix: str) -> tuple[list[Fact]
 
     def judge_residual(what: str, rows: Mask, bound: float) -> Fact:
         part = _rms(residual[rows]) / np.abs(measured).max(0)
-        return judge(
+        return make_judged_fact(
             f"{prefix}: residual RMS {what}",
             _format_list(100 * part, "% of peak"),
             f"below {100 * bound:g} %",
@@ -133,13 +132,13 @@ def _judge_payload(prefix: str, r: Recording, residual: Array, free: Mask, answe
     kilogram -= inverse_dynamics(r.robot, *state)
     mass = float(np.sum(kilogram * change) / np.sum(kilogram**2))
     return [
-        judge(
+        make_judged_fact(
             f"{prefix}: step of the residual at the pick",
             f"{step:.3f} {' or '.join(dict.fromkeys(r.robot.effort_units))}, {step / scatter:.1f} times its scatter",
             "above 3 times",
             bool(step > 3 * scatter),
         ),
-        judge(
+        make_judged_fact(
             f"{prefix}: payload mass seen in the residual",
             f"{mass:.3f} kg (recorded with {r.load.mass:.3f} kg)",
             "within 10 %",
@@ -192,7 +191,7 @@ def report_stiffness(bag: Path, recording: Path, prefix: str) -> tuple[list[Fact
         greatest = 1e6 * np.linalg.norm(true, axis=1).max()
         error = np.sqrt(np.mean(np.sum((fixed[place] - true) ** 2, 1)) / np.mean(np.sum(true**2, 1)))
         findings.append(
-            judge(
+            make_judged_fact(
                 f"{prefix}: RMS difference to the frame's deflection",
                 f"{100 * error:.1f} % (frame's largest {greatest:.2f} µm)",
                 f"below {100 * MAX_DEFLECTION_ERROR:g} %",
@@ -216,7 +215,7 @@ def _read_by_stamp(bag: Path, topic: str) -> dict[int, Any]:
 
 def judge_share(bag: str, what: str, count: int, total: int) -> Fact:
     """Judge a count as a fraction of a total by :data:`MIN_ANSWERED`."""
-    return judge(
+    return make_judged_fact(
         f"{bag}: {what}",
         f"{count} of {total}",
         f"{100 * MIN_ANSWERED:g} % or more",
@@ -239,7 +238,7 @@ def _xyz(vector: Any) -> list[float]:
 
 def draw(panels: Sequence[Panel], path: Path) -> Path:
     """Draw one picture with a panel for each stage."""
-    figure, columns = plots.columns(2, 2, 8)
+    figure, columns = plots.make_subplots(2, 2, 8)
     axes = [columns[k % 2][k // 2] for k in range(4)]
     for ax, panel in zip(axes, panels, strict=False):
         for time, values, style in panel.lines:

@@ -37,7 +37,7 @@ from pkm_twin.demo.report import Panel, judge_share, unjudged_fact
 from pkm_twin.errors import BagError
 from pkm_twin.messages.reading import JointReader
 from pkm_twin.messages.stamps import SECOND, stamp_of
-from pkm_twin.report import Fact, judged, plots
+from pkm_twin.report import Fact, make_judged_fact, plots
 from pkm_twin.streams.path import JointPath
 
 MIN_IMPROVEMENT: Final = 5.0
@@ -215,5 +215,5 @@ def report(recording: Path) -> tuple[list[Fact], Panel]:
         what = f"feedforward at {100 * spread:g} % parameter error"
         bound = f"{MIN_IMPROVEMENT:g} or more" if spread == min(SPREADS) else ""
         value = f"{ratio:.1f} times better"
-        findings.append(judged(f"{name}: {what}", value, bound, bool(ratio >= MIN_IMPROVEMENT)))
+        findings.append(make_judged_fact(f"{name}: {what}", value, bound, bool(ratio >= MIN_IMPROVEMENT)))
     return findings, panel

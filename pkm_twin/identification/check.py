@@ -35,7 +35,7 @@ from pkm_twin.identification.hypotheses import NO_MACHINE, Explanation, explain_
 from pkm_twin.identification.judge import MAX_NOISE_RATIO
 from pkm_twin.identification.words import MAX_DELAY, list_joints, position_text, scale_text
 from pkm_twin.recordings import Recording
-from pkm_twin.report import Fact, Verdict, judged
+from pkm_twin.report import Fact, Verdict, make_judged_fact
 from pkm_twin.robot.limits import list_limits
 from pkm_twin.robot.plausibility import why_no_torques
 from pkm_twin.streams.drives import CONSTANT_SAMPLES, MAX_RELATIVE_CHANGE
@@ -154,7 +154,7 @@ def compare_with_model(r: Recording, residual: float) -> Checked:
     fault = r.play_fault or r.jump_description
     # Single jumps are left out of what is compared.
     if reason or r.steps.publishers or r.play_fault:
-        items.append(judged(RESIDUAL, fault or reason, bound, None))
+        items.append(make_judged_fact(RESIDUAL, fault or reason, bound, None))
         return Checked(r, items, unjudged=reason, causes=(fault,) if fault else ())
     try:
         idle = find_idle(r)
@@ -165,7 +165,7 @@ def compare_with_model(r: Recording, residual: float) -> Checked:
     except (UnreachableError, SingularityError, ValueError) as error:
         text = one_line(str(error))
         causes = (position_text(error),) if isinstance(error, (UnreachableError, SingularityError)) else ()
-        return Checked(r, [*items, judged(RESIDUAL, text, bound, False)], causes=causes)
+        return Checked(r, [*items, make_judged_fact(RESIDUAL, text, bound, False)], causes=causes)
     shares, unjudged = _judge_shares(r, idle, compared)
     items += shares
     if compared is not None and compared.hidden.any() and compared.good.all():
@@ -174,7 +174,7 @@ def compare_with_model(r: Recording, residual: float) -> Checked:
     if compared is not None and not unjudged:
         stuck = _stuck_efforts(r, compared)
         if stuck:
-            items.append(judged(MEASURED, stuck, "change as the model's", False))
+            items.append(make_judged_fact(MEASURED, stuck, "change as the model's", False))
         items += _judge_residuals(r, compared, bands, bound)
     return Checked(r, items, bands, unjudged, compared, left_out)
 
@@ -182,7 +182,7 @@ def compare_with_model(r: Recording, residual: float) -> Checked:
 def _judge_file(r: Recording) -> list[Fact]:
     if r.bag is None:
         found = f"a table of {len(r.time)} rows, all numbers finite"
-        return [judged("file", found, "finite numbers", True)]
+        return [make_judged_fact("file", found, "finite numbers", True)]
     report = r.bag.report
     whole = None if report.warnings else True
     text = "; ".join(report.warnings) or "complete; checksums and counts agree"
@@ -190,24 +190,24 @@ def _judge_file(r: Recording) -> list[Fact]:
     reasons = ", ".join(f"{k}: {v}" for k, v in r.rejected.items())
     value = f"{refused} of {total}" + (f" ({reasons}; first: {r.first_reject})" if refused else "")
     return [
-        judged("file", text, "complete and consistent", False if report.miscounts else whole),
-        judged(REJECTED, value, "at most 0 %", not refused, number=refused, limit=0),
+        make_judged_fact("file", text, "complete and consistent", False if report.miscounts else whole),
+        make_judged_fact(REJECTED, value, "at most 0 %", not refused, number=refused, limit=0),
     ]
 
 
 def _judge_motion(r: Recording) -> list[Fact]:
     """Judge time stamps, steps and velocities."""
     if len(r.time) < 3:
-        return [judged("rate", f"{len(r.time)} joint states", "3 or more", None)]
+        return [make_judged_fact("rate", f"{len(r.time)} joint states", "3 or more", None)]
     periods = np.diff(r.time)
     median, longest = float(np.median(periods)), float(periods.max())
     gap = f"{1e3 * longest:.3f} ms at {r.time[int(periods.argmax())]:.3f} s"
     within, rate = 5.0 * median, f"{1 / median:.1f} Hz over {r.time[-1]:.3f} s"
     fault = r.play_fault or r.jump_description
     items = [
-        judged("rate", rate, "", True, number=1 / median, unit="Hz"),
+        make_judged_fact("rate", rate, "", True, number=1 / median, unit="Hz"),
         missing_samples(r.time),
-        judged(
+        make_judged_fact(
             "longest gap",
             gap,
             f"at most {1e3 * within:.3f} ms",
@@ -216,7 +216,7 @@ def _judge_motion(r: Recording) -> list[Fact]:
             limit=within,
             unit="s",
         ),
-        judged(POSITION_STEPS, fault or "no jumps", "within rates and limits", not fault),
+        make_judged_fact(POSITION_STEPS, fault or "no jumps", "within rates and limits", not fault),
     ]
     return items if r.qd is None or r.steps.publishers else items + _judge_velocities(r, r.qd)
 
@@ -253,7 +253,7 @@ def _judge_velocities(r: Recording, qd: Array) -> list[Fact]:
             begin, end = r.time[list(found)]
             text = f"the position of {names[j]} stands still from {begin:.3f} s to {end:.3f} s"
             text += " while its velocity does not (encoder?)"
-            return [judged(VELOCITIES, text, bound, False)]
+            return [make_judged_fact(VELOCITIES, text, bound, False)]
     part, faults = rate_faults(r.robot, r.stamps, r.q, qd, r.steps.jumps)
     if not len(part):
         return []
@@ -266,7 +266,7 @@ def _judge_velocities(r: Recording, qd: Array) -> list[Fact]:
     )
     if good is None:
         text += ", no more than noise"
-    return [judged(VELOCITIES, text, bound, good, number=number, limit=MAX_RATE)]
+    return [make_judged_fact(VELOCITIES, text, bound, good, number=number, limit=MAX_RATE)]
 
 
 def _judge_limits(r: Recording) -> list[Fact]:
@@ -284,7 +284,7 @@ def _judge_limits(r: Recording) -> list[Fact]:
         good = bool((used <= 0).all())
         text, only = f"least margin {margins}", [(0.0 - most, unit) for unit, most in worst.items()]
         least = {"number": only[0][0], "limit": 0.0, "unit": only[0][1]} if len(only) == 1 else {}
-        items.append(judged(f"{what} limits", text, "0 or more", good, **least))
+        items.append(make_judged_fact(f"{what} limits", text, "0 or more", good, **least))
     return items
 
 
@@ -294,11 +294,11 @@ def _judge_singularity(r: Recording) -> Fact:
     try:
         measure = r.robot.singularity(r.q)
     except (UnreachableError, SingularityError) as error:
-        return judged(what, str(error), bound, False)
+        return make_judged_fact(what, str(error), bound, False)
     worst = int(measure.argmin())
     value = f"{measure[worst]:.4f} at {r.time[worst]:.3f} s"
     least = float(measure[worst])
-    return judged(what, value, bound, least >= MIN_SINGULARITY, number=least, limit=MIN_SINGULARITY)
+    return make_judged_fact(what, value, bound, least >= MIN_SINGULARITY, number=least, limit=MIN_SINGULARITY)
 
 
 def _judge_shares(r: Recording, idle: Mask, compared: Compared | None) -> tuple[list[Fact], str]:
@@ -311,10 +311,10 @@ def _judge_shares(r: Recording, idle: Mask, compared: Compared | None) -> tuple[
         seconds = float(np.sum(np.gradient(r.time)[idle])) if len(r.time) > 1 else 0.0
         text = f"{seconds:.3f} s of {total:.3f} s, left out: efforts zero or constant at standstill"
         some = "some efforts measured"
-        items.append(judged(IDLE, text, some, enough or None, number=seconds, unit="s"))
+        items.append(make_judged_fact(IDLE, text, some, enough or None, number=seconds, unit="s"))
     text = f"{100 * share:.3g} % of {len(r.time)} samples"
     bound = f"at least {100 * MIN_COMPARED:g} %"
-    items.append(judged(COMPARED, text, bound, enough or None, number=share, limit=MIN_COMPARED))
+    items.append(make_judged_fact(COMPARED, text, bound, enough or None, number=share, limit=MIN_COMPARED))
     if enough:
         return items, ""
     near, within = near_change(r)
@@ -384,13 +384,13 @@ def _judge_residuals(r: Recording, c: Compared, bands: Mapping[str, Mapping[str,
         used = bound
         if c.limit[i] > c.bound * c.peak[i]:
             used = f"RMS below {c.limit[i]:.3g} {unit}, {MAX_NOISE_RATIO:g} times the noise"
-        items.append(judged(f"{RESIDUAL} of {name}", text, used, bool(good[i]), **told))
+        items.append(make_judged_fact(f"{RESIDUAL} of {name}", text, used, bool(good[i]), **told))
     late = describe_delay(c.late, c.period)
     if good.all() and late:
         late += ", taken out"
         told = {"number": c.late, "limit": MAX_DELAY, "unit": "s"}
         most = f"at most {1e3 * MAX_DELAY:g} ms"
-        items.append(judged("efforts against positions", late, most, not c.delayed, **told))
+        items.append(make_judged_fact("efforts against positions", late, most, not c.delayed, **told))
     return items
 
 

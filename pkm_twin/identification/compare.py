@@ -34,7 +34,7 @@ from pkm_twin.identification.samples import (
 from pkm_twin.identification.words import MAX_DELAY, late_text
 from pkm_twin.machine.friction import Dahl
 from pkm_twin.recordings import Load, Recording, at_rest, split_by_load
-from pkm_twin.report import Fact, judged
+from pkm_twin.report import Fact, make_judged_fact
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.drives import idle_samples
 from pkm_twin.streams.noise import estimate_deviation
@@ -316,7 +316,7 @@ def missing_samples(time: Array) -> Fact:
         numbers = {"number": share, "limit": MAX_MISSING}
         text += f" ({100 * share:.3g} %)" if sampling.missing else ""
     bound = f"at most {100 * MAX_MISSING:g} %"
-    return judged("missing samples", text, bound, good, **numbers)
+    return make_judged_fact("missing samples", text, bound, good, **numbers)
 
 
 def near_jumps(steps: Steps, count: int) -> Mask:

@@ -14,7 +14,7 @@ import numpy as np
 from pkm_twin.codegen.expressions import Expression, plain
 from pkm_twin.errors import ParameterError, unknown_number_error
 from pkm_twin.machine import schema
-from pkm_twin.settings import settings_of
+from pkm_twin.settings import map_parameters
 
 T = TypeVar("T")
 Key = str | int
@@ -87,7 +87,7 @@ def replace_numbers(section: T, changes: Mapping[tuple[Key, ...], Any], path: st
     names: dict[Any, Any] = {}
     whole = dataclasses.is_dataclass(section)
     if dataclasses.is_dataclass(section):
-        names = {name: field for name, (field, _) in settings_of(type(section)).items()}
+        names = {name: field for name, (field, _) in map_parameters(type(section)).items()}
         held = {f.name: getattr(section, f.name) for f in dataclasses.fields(section)}
     result: Any = list(held) if isinstance(held, tuple) else copy.copy(held)
     result = held.astype(object) if isinstance(held, np.ndarray) else result
@@ -121,7 +121,7 @@ def check_number(section: Any, keys: Sequence[Key], path: str) -> None:
     inner, left = section, list(keys)
     while left:
         if dataclasses.is_dataclass(inner):
-            field, row = settings_of(type(inner))[str(left[0])]
+            field, row = map_parameters(type(inner))[str(left[0])]
             value = getattr(inner, field)
             if not dataclasses.is_dataclass(value) and not isinstance(value, Mapping):
                 row.check(path, schema.plain(value))

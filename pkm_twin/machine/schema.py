@@ -20,7 +20,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.operations import absolute, maximum, minimum
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.machine.formulas import MAX_SIZE, Written
-from pkm_twin.settings import Setting, settings_of
+from pkm_twin.settings import Setting, map_parameters
 
 MAX_INERTIA: Final = 1e12
 """Largest entry of an inertia matrix, kg m2."""
@@ -286,7 +286,7 @@ def build(kind: type[T], data: object, path: str = "") -> T:
     """
     if not isinstance(data, Mapping):
         raise ParameterError(path or "parameters", data, "a mapping of keys to values")
-    keys = settings_of(kind)
+    keys = map_parameters(kind)
     for name in data:
         if name not in keys:
             raise UnknownNameError(_join_path(path, str(name)), name, keys)
@@ -311,7 +311,7 @@ def plain(value: Any) -> Any:
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {
             name: plain(getattr(value, field))
-            for name, (field, row) in settings_of(type(value)).items()
+            for name, (field, row) in map_parameters(type(value)).items()
             if not row.rare or np.any(getattr(value, field))
         }
     if isinstance(value, np.ndarray):
@@ -325,7 +325,7 @@ def units(kind: type, data: Mapping[str, Any], words: Mapping[str, str]) -> dict
     :param kind: the section's schema.
     :param words: units that replace ``{joint}`` and ``{effort}``.
     """
-    keys = settings_of(kind)
+    keys = map_parameters(kind)
     result: dict[str, Any] = {}
     for name, value in data.items():
         row = keys[name][1] if name in keys else Key()

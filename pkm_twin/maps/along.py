@@ -103,7 +103,7 @@ class Along:
         indices = [one.element for one in self.found if one.element is not None and self.elements]
         # An element has one colour in all panels.
         blamed = np.unique(np.concatenate(indices)).tolist() if indices else []
-        figure, ((*axes,),) = plots.columns(1, len(self.found))
+        figure, ((*axes,),) = plots.make_subplots(1, len(self.found))
         for ax, case, one, text in zip(axes, self.cases, self.found, self.sentences, strict=True):
             scale, unit = figures.choose_prefix(float(np.nanmax(np.abs(one.value))), case.unit)
             values = scale * one.value

@@ -229,7 +229,7 @@ def planes(data: Dataset, case: int) -> Figure:
         widths = np.clip(spans / spans.max(), 0.5, 1.0).tolist()
     with plots.pyplot().rc_context({"font.size": 9}):
         figure: Figure
-        figure, columns = plots.columns(count, 1, height, gridspec_kw={"width_ratios": widths})
+        figure, columns = plots.make_subplots(count, 1, height, gridspec_kw={"width_ratios": widths})
         axes, over = [column[0] for column in columns], ""
         for one, ax in zip(drawn, axes, strict=True):
             if not flat:

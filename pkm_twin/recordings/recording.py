@@ -162,7 +162,7 @@ class Recording:
     @cached_property
     def jump_description(self) -> str:
         """Description of the positions' jumps with their times; empty without any."""
-        steps, found = self.steps, self.steps.first
+        steps, found = self.steps, self.steps.jump_indices
         if steps.publishers:
             counts = " and ".join(map(str, steps.publishers))
             jump = f"{len(found)} of {len(self.time) - 1} steps jump"

@@ -11,7 +11,7 @@ from typing import Final
 from pkm_twin.report import plots
 from pkm_twin.report.report import Report, Table
 
-SHELL: Final = """<!DOCTYPE html>
+PAGE_TEMPLATE: Final = """<!DOCTYPE html>
 <html lang="en">
 <head>
 <meta charset="utf-8">
@@ -43,13 +43,13 @@ def page(title: str, report: Report, more: Sequence[Table] = (), figures: Sequen
     parts = [f"<p>{html.escape(report.answer)}</p>", f"<ul>{notes}</ul>"]
     for fact in report.facts:
         if fact.text is not None:
-            parts.append(f"<p>{html.escape(f'{fact.text}: {fact.words}')}</p>")
+            parts.append(f"<p>{html.escape(f'{fact.text}: {fact.formatted}')}</p>")
     parts += [f'<div class="plot">{figure}</div>' for figure in figures]
     parts += [_write_table(table) for table in (*report.tables, *more) if table.rows]
     for draw in report.figures.values():
-        data = base64.b64encode(plots.rendered(draw(), 100)).decode()
+        data = base64.b64encode(plots.render(draw(), 100)).decode()
         parts.append(f'<img alt="" src="data:image/png;base64,{data}">')
-    return SHELL.format(title=html.escape(title), body="\n".join(parts))
+    return PAGE_TEMPLATE.format(title=html.escape(title), body="\n".join(parts))
 
 
 def _write_table(table: Table) -> str:

@@ -21,8 +21,8 @@ TERMS: Final = ("gravity", "inertia", "velocity", "payload", "friction", "extern
 """Terms of an effort, in the order of the plots."""
 MAX_SINGLE_COLUMN_TIME: Final = 5.0
 """Longest motion with one column of plots, s; a longer one has a second column at its largest effort."""
-DASHES: Final = ("-", "--", ":", "-.")
-"""Styles of lines that can lie on one another."""
+LINE_STYLES: Final = ("-", "--", ":", "-.")
+"""Line styles of curves that may coincide."""
 WIDTH: Final = 9.0
 """Width of every figure, inches: on a page of 900 pixels, letters of 8 points are 11 pixels high."""
 DPI: Final = 200
@@ -40,10 +40,10 @@ def pyplot() -> Any:
     return pyplot
 
 
-def columns(count: int, rows: int, height: float | None = None, **options: Any) -> tuple[Any, list[Any]]:
-    """Make a figure of ``count`` columns with ``rows`` axes each; ``height`` in inches."""
+def make_subplots(columns: int, rows: int, height: float | None = None, **options: Any) -> tuple[Any, list[Any]]:
+    """Make a figure with ``columns`` columns of ``rows`` axes each; ``height`` in inches."""
     figure, axes = pyplot().subplots(
-        rows, count, figsize=(WIDTH, height or max(3 * rows, 4.2)), squeeze=False, layout="constrained", **options
+        rows, columns, figsize=(WIDTH, height or max(3 * rows, 4.2)), squeeze=False, layout="constrained", **options
     )
     return figure, list(axes.T)
 
@@ -57,7 +57,7 @@ def label(ax: Any, x: str, y: str, title: str = "", size: float | None = None) -
     ax.grid(alpha=0.3)
 
 
-def rendered(figure: Any, dpi: int, form: str = "png") -> bytes:
+def render(figure: Any, dpi: int, form: str = "png") -> bytes:
     """Render a figure as an image and close it.
 
     Texts are not parsed as formulas: names of files and joints may contain a dollar sign.
@@ -95,17 +95,17 @@ def legend(ax: Any, below: bool = False) -> None:
 
 
 def save(figure: Any, path: Path, dpi: int = DPI) -> Path:
-    """Write a figure as PNG, SVG or PDF, to stdout as PNG, whole or not at all, and close it.
+    """Write a figure as PNG, SVG or PDF, to stdout as PNG, atomically, and close it.
 
     :raises PkmTwinError: the file cannot be written.
     """
-    data = rendered(figure, dpi, path.suffix[1:] or "png")
+    data = render(figure, dpi, path.suffix[1:] or "png")
     with convert_write_errors(path):
         replace_file(path, data)
     return path
 
 
-def torques(motion: Any, table: Mapping[str, Any], title: str) -> Any:
+def draw_torques(motion: Any, table: Mapping[str, Any], title: str) -> Any:
     """Draw efforts and their terms, one row per actuated joint; grey where beyond the limits.
 
     For a motion longer than MAX_SINGLE_COLUMN_TIME the terms are drawn in a second column, one
@@ -113,12 +113,12 @@ def torques(motion: Any, table: Mapping[str, Any], title: str) -> Any:
     """
     robot, time = motion.robot, np.asarray(table["time"])
     whole = time[-1] - time[0] <= MAX_SINGLE_COLUMN_TIME
-    figure, columns_ = columns(1 if whole else 2, len(robot.joint_names), sharey="row")
+    figure, columns = make_subplots(1 if whole else 2, len(robot.joint_names), sharey="row")
     efforts = np.array([table[f"{joint}.effort"] for joint in robot.joint_names])
     for k, (joint, unit) in enumerate(zip(robot.joint_names, robot.effort_units, strict=True)):
         peak = int(np.abs(efforts[k]).argmax())
-        for axes in columns_:
-            _draw_efforts(axes[k], joint, table, terms=axes is columns_[-1])
+        for axes in columns:
+            _draw_efforts(axes[k], joint, table, terms=axes is columns[-1])
             label(axes[k], "time (s)", f"effort ({unit})")
         axes[k].set_title(f"{joint}: {efforts[k, peak]:.4g} {unit} at {time[peak]:.4g} s")
         if not whole:

@@ -47,13 +47,13 @@ class Fact:
     numbers: Mapping[str, Any] = field(default_factory=dict)
 
     @property
-    def words(self) -> str:
-        """The value as the terminal shows it, with its unit."""
-        return self.shown or f"{number(self.value)} {self.unit}".strip()
+    def formatted(self) -> str:
+        """The value with its unit, as printed in the terminal."""
+        return self.shown or f"{format_number(self.value)} {self.unit}".strip()
 
 
-def judged(what: str, value: str, bound: str, good: bool | None, **numbers: Any) -> Fact:
-    """Make the fact of a property that is judged by a bound.
+def make_judged_fact(what: str, value: str, bound: str, good: bool | None, **numbers: Any) -> Fact:
+    """Make a fact with its value, its bound and the verdict.
 
     :param good: whether the property keeps the bound; None if this cannot be decided.
     :param numbers: ``number``, ``limit`` and ``unit`` for JSON.
@@ -89,7 +89,7 @@ class Column:
         if isinstance(value, float) and abs(value) < least:
             value = 0.0
         scales = self.scale != 1.0 and isinstance(value, int | float)
-        return number(value * self.scale if scales else value, self.form)
+        return format_number(value * self.scale if scales else value, self.form)
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ class Table:
         """Headings and formatted rows of the columns that are shown as text."""
         shown = [(k, column) for k, column in enumerate(self.columns) if column.text is not None]
         rows = self.rows.items()
-        # Only numbers of the same unit can be compared with the largest.
+        # Rounding to 0 is relative to the column's largest number, which needs the same unit in all rows.
         least = []
         for k, column in shown:
             values = [row[k] for row in self.rows.values() if column.unit]
@@ -169,7 +169,7 @@ class Report:
         """
         found = {fact.name: fact.value for fact in self.facts if fact.name}
         items = [
-            {"what": f.text, "value": f.words, "bound": f.bound, "verdict": f.verdict, **f.numbers}
+            {"what": f.text, "value": f.formatted, "bound": f.bound, "verdict": f.verdict, **f.numbers}
             for f in self.facts
             if f.verdict is not None
         ]
@@ -182,24 +182,24 @@ class Report:
         found |= {"units": units} if units and "units" not in found else {}
         found |= {"verdict": self.verdict} if self.verdict is not None else {}
         found |= {"error": self.error} if self.error else {}
-        return dict(plain(found))
+        return dict(to_json_data(found))
 
 
-def plain(value: Any) -> Any:
-    """Convert data for JSON: arrays become lists, numbers that are not finite None."""
+def to_json_data(value: Any) -> Any:
+    """Convert values for JSON: arrays become lists, NaN and infinity become None."""
     if hasattr(value, "tolist"):
         value = value.tolist()
     if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): to_json_data(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
+        return [to_json_data(item) for item in value]
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     return str(value) if isinstance(value, Path | StrEnum) else value
 
 
-def number(value: Any, form: str = ".4g") -> str:
-    """Format a value as text; None and NaN are a dash."""
+def format_number(value: Any, form: str = ".4g") -> str:
+    """Format a value as text; None and NaN become a dash."""
     value = value.tolist() if hasattr(value, "tolist") else value
     if value is None or value != value:
         return "-"
@@ -208,7 +208,7 @@ def number(value: Any, form: str = ".4g") -> str:
     if isinstance(value, float):
         return f"{value + 0.0:{form}}"
     if isinstance(value, list | tuple):
-        return ", ".join(number(item, form) for item in value)
+        return ", ".join(format_number(item, form) for item in value)
     if isinstance(value, Mapping):
-        return ", ".join(f"{key} {number(item, form)}" for key, item in value.items())
+        return ", ".join(f"{key} {format_number(item, form)}" for key, item in value.items())
     return str(value)

@@ -17,8 +17,7 @@ from pkm_twin.report.report import Fact, Report, Table, Verdict
 
 WIDTH: Final = 100
 """Widest table, characters."""
-BLANK: Final = "\u00a0"
-"""No-break space."""
+NO_BREAK_SPACE: Final = "\u00a0"
 COLOURS: Final = {Verdict.GOOD: "green", Verdict.BAD: "red", Verdict.UNKNOWN: "yellow"}
 
 
@@ -32,19 +31,19 @@ def present(report: Report, as_json: bool, *, piped: bool = False) -> None:
     elif report.raw:
         click.echo(report.raw, nl=False)
     else:
-        text = text_of(report)
+        text = format_report(report)
         if text:
             click.echo(text, err=piped)
     if report.error:
         print_message(report.error)
 
 
-def text_of(report: Report) -> str:
-    """Write the report as the terminal shows it."""
+def format_report(report: Report) -> str:
+    """Return the report as the text that the terminal shows."""
     found = [report.answer] if report.answer else []
     for fact in report.facts:
         if fact.text is not None and fact.verdict is None:
-            found.append(f"{fact.text}: {fact.words}" if fact.text else fact.words)
+            found.append(f"{fact.text}: {fact.formatted}" if fact.text else fact.formatted)
     if judged := [fact for fact in report.facts if fact.verdict is not None]:
         found += ["", *_layout_judged(judged)] if found else _layout_judged(judged)
     for table in report.tables:
@@ -59,31 +58,31 @@ def text_of(report: Report) -> str:
 
 def _layout_judged(facts: Sequence[Fact]) -> Iterator[str]:
     # A verdict stays on its row's first line, where it is coloured.
-    words = [fact.verdict.words.replace(" ", BLANK) if fact.verdict else "" for fact in facts]
+    words = [fact.verdict.words.replace(" ", NO_BREAK_SPACE) if fact.verdict else "" for fact in facts]
     rows = [
-        (f.text or f.name, f.words, "" if f.bound is None else str(f.bound), word)
+        (f.text or f.name, f.formatted, "" if f.bound is None else str(f.bound), word)
         for f, word in zip(facts, words, strict=True)
     ]
-    lines = aligned([("", "value", "limit", "verdict"), *rows], "<<<<")
+    lines = align_rows([("", "value", "limit", "verdict"), *rows], "<<<<")
     yield next(lines)
     for fact, word, line in zip(facts, words, lines, strict=True):
         first, *rest = line.split("\n")
-        shown = click.style(word.replace(BLANK, " "), fg=COLOURS[fact.verdict or Verdict.UNKNOWN])
+        shown = click.style(word.replace(NO_BREAK_SPACE, " "), fg=COLOURS[fact.verdict or Verdict.UNKNOWN])
         yield "\n".join([first[: -len(word)] + shown, *rest])
 
 
 def table_lines(table: Table) -> list[str]:
-    """Return a table's title, headings and rows; numeric columns are right-aligned."""
+    """Return a table's title, headings and rows; numeric columns are right-align_rows."""
     head, *rows = table.cells
     shown = [k for k, column in enumerate(table.columns) if column.text is not None]
     words = [any(isinstance(row[k], str) for row in table.rows.values()) for k in shown]
     sides = "<" + "".join("<" if word else ">" for word in words)
     titled = [table.title] if table.title else []
-    lines = aligned([head, *rows] if any(cell.strip() for cell in head) else rows, sides)
+    lines = align_rows([head, *rows] if any(cell.strip() for cell in head) else rows, sides)
     return [*titled, *lines]
 
 
-def aligned(rows: Sequence[Sequence[str]], sides: str) -> Iterator[str]:
+def align_rows(rows: Sequence[Sequence[str]], sides: str) -> Iterator[str]:
     """Align rows in columns; ``sides`` has < (left) or > (right) for each column.
 
     The first row is the headings. In a table wider than :data:`WIDTH` headings are wrapped, and if
@@ -93,7 +92,7 @@ def aligned(rows: Sequence[Sequence[str]], sides: str) -> Iterator[str]:
         rows, sides = [row[1:] for row in rows], sides[1:]
     # Text in brackets (a unit) is not broken. A blank cell has no width to wrap to.
     rows = [
-        [re.sub(r"\([^)]*\)", lambda unit: unit[0].replace(" ", BLANK), c) if c.strip() else "" for c in row]
+        [re.sub(r"\([^)]*\)", lambda unit: unit[0].replace(" ", NO_BREAK_SPACE), c) if c.strip() else "" for c in row]
         for row in rows
     ]
     columns = list(zip(*rows, strict=True))
@@ -112,4 +111,4 @@ def aligned(rows: Sequence[Sequence[str]], sides: str) -> Iterator[str]:
         lines = itertools.zip_longest(*cells, fillvalue="")
         yield "\n".join(
             "  ".join(f"{c:{s}{w}}" for c, s, w in zip(line, sides, widths, strict=True)).rstrip() for line in lines
-        ).replace(BLANK, " ")
+        ).replace(NO_BREAK_SPACE, " ")

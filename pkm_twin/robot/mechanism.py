@@ -43,7 +43,7 @@ from pkm_twin.machine.reach import PassiveLimit, position_box
 from pkm_twin.machine.sections import DriveSpec, JointLimits, Payload, friction_of, limits_of
 from pkm_twin.machine.uncertainty import Tolerance, UncertaintyEntry, list_causes
 from pkm_twin.machine.urdf_file import Visual
-from pkm_twin.settings import settings_of
+from pkm_twin.settings import map_parameters
 
 EFFORT_SHARING_NOTE: Final = "a controller may share efforts in any way"
 """Why measured efforts of a redundantly actuated machine have no unique cause: internal loads may be superposed."""
@@ -348,7 +348,7 @@ class Mechanism(Common):
 
     def parameter_sections(self) -> dict[str, Any]:
         """Return the parameters by section, as plain data."""
-        return {name: schema.plain(getattr(self, name)) for name in settings_of(type(self))}
+        return {name: schema.plain(getattr(self, name)) for name in map_parameters(type(self))}
 
     def parameter_units(self) -> dict[str, Any]:
         """Return the units of the parameters by section; empty for a parameter without unit."""
@@ -474,7 +474,7 @@ class Mechanism(Common):
         :raises ParameterError: an unknown path.
         """
         keys = full_keys(path)
-        if not keys or keys[0] not in settings_of(type(self)):
+        if not keys or keys[0] not in map_parameters(type(self)):
             raise unknown_number_error(path, self.file_numbers())
         return number_in(schema.plain(getattr(self, str(keys[0]))), keys[1:], path)
 
@@ -534,7 +534,7 @@ class Mechanism(Common):
         if not set(sections) <= set(self.changeable):
             known = self.parameter_sections()
             for key in sections:
-                if key not in known and key not in settings_of(Common):
+                if key not in known and key not in map_parameters(Common):
                     raise UnknownNameError(key, key, known)
             return type(self).from_data(merge_data(drop_missing(known), sections), self.name)
         new: dict[str, Any] = {}
@@ -543,7 +543,7 @@ class Mechanism(Common):
             if isinstance(value, Mapping) and not isinstance(old, Mapping):
                 new[key] = schema.build(type(old), {**drop_missing(schema.plain(old)), **value}, key)
             else:
-                new[key] = settings_of(type(self))[key][1].check(key, value)
+                new[key] = map_parameters(type(self))[key][1].check(key, value)
         made = dataclasses.replace(self, **new)
         made.check_stiffness_factors()
         return made

@@ -35,7 +35,7 @@ class Variation:
 
 
 @dataclass(frozen=True)
-class _Number:
+class _VariedParameter:
     """A parameter that is varied: its path, kind and value."""
 
     path: tuple[str, ...]
@@ -98,7 +98,7 @@ def vary_robot(
     return Variation(made, drawn)
 
 
-def _iterate_numbers(data: Any, units: Any, path: tuple[str, ...]) -> Iterator[_Number]:
+def _iterate_numbers(data: Any, units: Any, path: tuple[str, ...]) -> Iterator[_VariedParameter]:
     """Yield the numbers that are varied, in the order of the file."""
     for key, value in data.items():
         here = (*path, key)
@@ -111,7 +111,7 @@ def _iterate_numbers(data: Any, units: Any, path: tuple[str, ...]) -> Iterator[_
             continue
         kind = _find_kind(here, unit)
         if kind is not None:
-            yield _Number(here, kind, value)
+            yield _VariedParameter(here, kind, value)
 
 
 def _find_kind(path: tuple[str, ...], unit: str) -> str | None:

@@ -294,22 +294,22 @@ def describe_causes(robot: Robot, q: Array, pose: Array, known: Mask, least: flo
     """
     left, found = np.array(known), {"no assembly": ~known}
 
-    def judged(what: str, kept: Mask) -> None:
+    def count_failures(what: str, kept: Mask) -> None:
         nonlocal left
         found[what] = left & ~kept
         left = left & kept
 
-    judged("an actuator beyond its limits", within_limits(robot, q))
-    judged("a passive joint beyond its limits", satisfies_limits(robot, q, pose, -math.inf, left))
+    count_failures("an actuator beyond its limits", within_limits(robot, q))
+    count_failures("a passive joint beyond its limits", satisfies_limits(robot, q, pose, -math.inf, left))
     index = robot.try_singularity(q)[0]
     best = float(index[left].max(initial=0.0))
     hint = f" (best: {best:.3g}; {describe_singularity_bound(best)} passes)" if best < least else ""
-    judged(f"a singularity index below {least:g}{hint}", index >= least)
+    count_failures(f"a singularity index below {least:g}{hint}", index >= least)
     if has_clearance(robot):
         gap = joint_clearance(robot, q, refuse=False)
         home = float(joint_clearance(robot, robot.graph.home))
         what = "limbs interfere" if least_clearance == 0.0 else f"limbs within {least_clearance:g} m"
-        judged(f"{what} (clearance {home:.3g} m at home)", np.asarray(gap > least_clearance))
+        count_failures(f"{what} (clearance {home:.3g} m at home)", np.asarray(gap > least_clearance))
     shares = {what: 100.0 * float(out.mean()) for what, out in found.items()}
     ranked = sorted(shares.items(), key=lambda item: -item[1])
     texts = [f"{what} in {share:.3g} %" for what, share in ranked if share >= 0.1]

@@ -45,8 +45,8 @@ class Incompatibility(NamedTuple):
 
 
 @dataclass
-class _Repetition:
-    """Decide when lines of one reason are logged."""
+class _LogThrottle:
+    """Decide when repeated log lines with the same reason are printed."""
 
     pause: float = 0.0
     due: float = -math.inf
@@ -84,7 +84,7 @@ class Health:
         """Topics for which the diagnostics warn until the first message."""
         self.limitations: list[str] = []
         """Settings that the node was started with and that are not possible here."""
-        self._logged: dict[str, _Repetition] = {}
+        self._logged: dict[str, _LogThrottle] = {}
         self._last_exception = ""
         self._last_kind = ""
         self._reported = (0, 0, 0, 0, 0)
@@ -104,7 +104,7 @@ class Health:
 
     def log_throttled(self, reason: str, text: str) -> None:
         """Log a line of a reason; the pauses between lines of a reason double."""
-        held = self._logged.setdefault(reason, _Repetition()).begin_line(time.monotonic())
+        held = self._logged.setdefault(reason, _LogThrottle()).begin_line(time.monotonic())
         if held is not None:
             more = f" ({held} more since the last line)" if held else ""
             self._node.get_logger().warning(shorten(text) + more)
@@ -238,7 +238,7 @@ def find_incompatibility(speaker: TopicEndpointInfo, listener: TopicEndpointInfo
     return Incompatibility(QOS, "liveliness")
 
 
-def node_of(end: TopicEndpointInfo) -> str:
+def endpoint_node_name(end: TopicEndpointInfo) -> str:
     """Return the full name of an endpoint's node, which rmw may not know yet."""
     if end.node_name == "_NODE_NAME_UNKNOWN_":
         return "a node whose name is not known yet"

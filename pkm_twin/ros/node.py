@@ -68,7 +68,7 @@ class GuardedNode(ParameterNode):
     """Topics and services that the node can have."""
 
     def __init__(self, name: str) -> None:
-        # rclpy subscribes to the clock while it makes the node.
+        # Set these first: rclpy's constructor subscribes to /clock, so callbacks may run while the node is created.
         self.health = Health(self, self.now)
         self.active = False
         self.active_since = 0
@@ -378,7 +378,7 @@ class TwinNode(GuardedNode):
             service.callback_group = self.low_rate
             self.low_rate.add_entity(service)
         if self.executor_kind == "single":
-            self.create_guarded_timer(LOW_RATE_PERIOD, self.low_rate.open)
+            self.create_guarded_timer(LOW_RATE_PERIOD, self.low_rate.enable)
         # The middleware holds no reference of the handle.
         self._jump_handle = self.get_clock().create_jump_callback(
             JumpThreshold(

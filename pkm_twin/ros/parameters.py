@@ -17,7 +17,7 @@ from rclpy.parameter import Parameter
 from pkm_twin.errors import ParameterError, PkmTwinError, UnknownNameError
 from pkm_twin.mechanisms.catalogue import load
 from pkm_twin.robot.robot import Robot
-from pkm_twin.settings import Setting, settings_of
+from pkm_twin.settings import Setting, map_parameters
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -126,7 +126,7 @@ class ParameterNode(LifecycleNode):
         :raises ParameterError: a value that is rejected.
         """
         defaults = {field.name: field.default for field in dataclasses.fields(kind)}
-        for name, (field, row) in settings_of(kind).items():
+        for name, (field, row) in map_parameters(kind).items():
             if field not in given:
                 own = dataclasses.replace(row, name=name, fixed=fixed or row.fixed)
                 given[field] = row.to_field_value(self._declare(row.to_parameter_value(defaults[field]), own))

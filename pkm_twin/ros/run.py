@@ -49,7 +49,7 @@ def set_priority(priority: int) -> None:
 
 
 class _Executor:
-    """Run rclpy's executor, of the kind that all nodes choose, one turn at a time."""
+    """Spin an rclpy executor one iteration at a time; an EventsExecutor if all nodes request it."""
 
     def __init__(self, nodes: Sequence[TwinNode]) -> None:
         events = all(node.executor_kind == "events" for node in nodes)

@@ -50,21 +50,22 @@ def first_signal(raising: Callable[[], BaseException], numbers: Sequence[signal.
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    came = False
+    received = False
 
-    def end(*_: object) -> None:
-        nonlocal came
-        came = True
+    def handle_signal(*_: object) -> None:
+        """Record the signal; raise unless another signal was handled less than IGNORE_TIME ago."""
+        nonlocal received
+        received = True
         now = time.monotonic()
         if now - _Process.requested > IGNORE_TIME:
             _Process.requested = now
             raise raising()
 
-    before = [signal.signal(number, end) for number in numbers]
+    before = [signal.signal(number, handle_signal) for number in numbers]
     try:
         yield
     finally:
-        if came:
+        if received:
             ignore_signals()
         elif not _Process.ending:
             for number, handler in zip(numbers, before, strict=True):
@@ -104,9 +105,10 @@ class NodeSignals:
         """True while the first signal raises KeyboardInterrupt, and a later one if that was lost."""
         self.came = False
         for number in _node_signals():
-            signal.signal(number, self._take)
+            signal.signal(number, self._handle_signal)
 
-    def _take(self, *_: object) -> None:
+    def _handle_signal(self, *_: object) -> None:
+        """Record the signal; raise KeyboardInterrupt while the node is being created."""
         self.came = True
         now = time.monotonic()
         if self.raises and now - _Process.requested > IGNORE_TIME:

@@ -30,8 +30,8 @@ class LowRateGroup(MutuallyExclusiveCallbackGroup):
         super().__init__()
         self._turns = 0
 
-    def open(self) -> None:
-        """Let the next three turns of the executor check the group."""
+    def enable(self) -> None:
+        """Include this callback group in the next three spins of the executor."""
         self._turns = 3
 
     def end_turn(self) -> None:

@@ -36,8 +36,14 @@ from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.run import run
 from pkm_twin.ros.wrench import declare_mounts, declare_vector
 from pkm_twin.settings import list_changeable, with_parameters
-from pkm_twin.state.scene import Load, Scales, Scene, Shape
-from pkm_twin.state.state import STATE, MachineState, State, moving_state_kernel, state_kernel
+from pkm_twin.state.scene import Scales, Scene, Shape, WrenchEffects
+from pkm_twin.state.state import (
+    STATE_TOPICS,
+    MachineState,
+    State,
+    make_state_program,
+    make_state_program_with_velocities,
+)
 from pkm_twin.streams.monitor import Pace
 from pkm_twin.streams.wrench import PLATFORM, Mount, WrenchSettings
 from stiffness_monitor.compliance import kernels, member_deflections, platform_response
@@ -109,7 +115,7 @@ class Transforms:
 class MachineStateNode(TwinNode):
     """The node ``machine_state``, for rviz2, Foxglove, robot_state_publisher and plots."""
 
-    topics = STATE
+    topics = STATE_TOPICS
 
     def __init__(self) -> None:
         super().__init__("machine_state")
@@ -254,11 +260,11 @@ class MachineStateNode(TwinNode):
         if not self._markers.get_subscription_count():
             return
         self._drawn = state.stamp
-        shapes = self._scene.shapes(state, self._compute_load(state))
+        shapes = self._scene.shapes(state, self._compute_wrench_effects(state))
         own = header(state.stamp, self.core.settings.base_frame)
         self._markers.publish(make_markers(own, shapes, Duration(seconds=1.0).to_msg()))
 
-    def _compute_load(self, state: State) -> Load | None:
+    def _compute_wrench_effects(self, state: State) -> WrenchEffects | None:
         """Compute the effects of the wrench on the machine; None if the wrench is unknown."""
         wrench = self.core.find_wrench(state) if self._elastic else None
         if wrench is None:
@@ -266,7 +272,7 @@ class MachineStateNode(TwinNode):
         robot = self.core.robot
         try:
             found = platform_response(robot, state.q, wrench)
-            return Load(
+            return WrenchEffects(
                 wrench,
                 found.compliance,
                 found.deflection,
@@ -281,7 +287,7 @@ class MachineStateNode(TwinNode):
 
 def _warm_up(robot: Robot) -> bool:
     """Compile, or load, all programs before the node's topics exist; return whether the robot is elastic."""
-    for kernel in (state_kernel(robot), moving_state_kernel(robot)):
+    for kernel in (make_state_program(robot), make_state_program_with_velocities(robot)):
         kernel.warm_up()
     home = robot.inverse(robot.home())
     robot.placements(home)

@@ -35,18 +35,18 @@ SIZES: Final = {"line": 0.004, "arrow": 0.012, "joint": 0.02, "letter": 0.06}
 
 
 @dataclass(frozen=True, eq=False)
-class Load:
-    """The effects of a wrench on the machine, in base axes at the platform's reference point.
+class WrenchEffects:
+    """Deflection, compliance and strain energy of the machine under a wrench, base axes, at the reference point.
 
-    ``wrench`` (6,), N and N m; ``compliance`` (6, 6); ``deflection`` (6,), m and rad. ``factors``:
-    fraction of the strain energy of each element; ``dominant``: the element with the largest one.
-    ``members``: points (k, 3) along each member and their displacements (k, 3), m.
+    ``wrench`` (6,), N and N m; ``compliance`` (6, 6); ``deflection`` (6,), m and rad.
+    ``energy_fractions``: fraction of the strain energy of each element; ``dominant``: the element
+    with the largest one. ``members``: points (k, 3) along each member and their displacements (k, 3), m.
     """
 
     wrench: Array
     compliance: Array
     deflection: Array
-    factors: Mapping[str, float]
+    energy_fractions: Mapping[str, float]
     dominant: str
     members: Mapping[str, tuple[Array, Array]]
 
@@ -117,11 +117,11 @@ class Scene:
                 self.joints.setdefault(name, (body, end))
         self.joints = {name: place for name, place in self.joints.items() if name not in bodies}
 
-    def shapes(self, state: State, load: Load | None = None) -> list[Shape]:
+    def shapes(self, state: State, load: WrenchEffects | None = None) -> list[Shape]:
         """Return the shapes of the machine in a state, and of the load's effects."""
         places = self.place_bars(state.q)
         # Energies relative to the largest one; nothing without energy.
-        factors = {} if load is None else load.factors
+        factors = {} if load is None else load.energy_fractions
         greatest = max(factors.values(), default=0.0)
         shares = {name: value / greatest for name, value in factors.items()} if greatest > 0.0 else {}
         shapes = self._draw_bars(places, shares)
@@ -180,7 +180,7 @@ class Scene:
             shapes.append(Shape("cylinder", "bars", k, colour, size, middle, quaternion, text=bar.part, lasting=True))
         return shapes
 
-    def _draw_arrows(self, state: State, load: Load) -> list[Shape]:
+    def _draw_arrows(self, state: State, load: WrenchEffects) -> list[Shape]:
         """Draw force and moment as arrows from the reference point."""
         shaft = SIZES["arrow"] * self._size
         size = (shaft, 2.0 * shaft, 3.0 * shaft)

@@ -21,7 +21,7 @@ from pkm_twin.streams.wrench import Mount, TimeCache, TimeSynchronizer, check_or
 
 _TRANSFORM_TYPE: Final = "tf2_msgs/TFMessage"
 
-STATE: Final = table(
+STATE_TOPICS: Final = table(
     Topic("in", "joint_states", JOINTS, "positions, and velocities where present"),
     Topic("in", "wrench", WRENCH, "the load to draw"),
     Topic(
@@ -78,13 +78,13 @@ class State:
     twist: Array | None
 
 
-def state_kernel(robot: Robot) -> Kernel:
-    """Return the program of a state without velocities."""
+def make_state_program(robot: Robot) -> Kernel:
+    """Return the compiled program that computes the platform's pose and the passive joints from q."""
     return robot.engine.kernel("state", state_program)
 
 
-def moving_state_kernel(robot: Robot) -> Kernel:
-    """Return the program of a state with velocities."""
+def make_state_program_with_velocities(robot: Robot) -> Kernel:
+    """Return the compiled program that computes pose, passive joints and their velocities from q and qd."""
     return robot.engine.kernel("moving state", moving_state_program)
 
 
@@ -147,9 +147,9 @@ class MachineState(TimeSynchronizer):
         robot, q, qd = self.robot, sample.q, sample.qd
         rates = twist = None
         if qd is None:
-            position, flat, passive = robot.evaluate(state_kernel(robot), q)
+            position, flat, passive = robot.evaluate(make_state_program(robot), q)
         else:
-            found = robot.evaluate(moving_state_kernel(robot), q, qd)
+            found = robot.evaluate(make_state_program_with_velocities(robot), q, qd)
             position, flat, passive, passive_rates, twist = found
             rates = np.concatenate((qd, passive_rates))
         rotation, joints = flat.reshape(3, 3), np.concatenate((q, passive))

@@ -19,8 +19,8 @@ from pkm_twin.streams.steps import farthest
 
 
 @dataclass(slots=True)
-class _State:
-    """A sample's stamp and its result of :func:`stream_kernel`."""
+class _EvaluatedSample:
+    """A sample's stamp, and the joint positions, pose and singularity index from :func:`stream_kernel`."""
 
     stamp: int
     numbers: Array
@@ -54,8 +54,8 @@ class Continuity:
 
     def reset(self) -> None:
         """Forget the last sample."""
-        self._last: _State | None = None
-        self._before: _State | None = None
+        self._last: _EvaluatedSample | None = None
+        self._before: _EvaluatedSample | None = None
 
     def retract(self) -> None:
         """Undo the newest step; possible once after a step."""
@@ -72,7 +72,7 @@ class Continuity:
         last = self._last
         before = self._nothing if last is None else last.numbers
         result = self._call(q, before)
-        state = _State(stamp, result)
+        state = _EvaluatedSample(stamp, result)
         *beyond, measure = result.tolist()[self._state_size :]
         if last is not None:
             period = (stamp - last.stamp) / SECOND

@@ -20,7 +20,7 @@ CONSTANT_SAMPLES: Final = 10
 """Fewest samples without a change."""
 MAX_RELATIVE_CHANGE: Final = 1e-9
 """Largest change that counts as none, as a fraction of the largest effort."""
-BRAKE_TIME: Final = 0.5
+MAX_BRAKE_TIME: Final = 0.5
 """Longest time for which a brake opens or closes, s."""
 
 
@@ -68,7 +68,8 @@ class DriveWatch:
             self.repeated = self.repeated + 1 if same else 0
         self._last = time, efforts
         before = self.idle
-        # Efforts that agree with the model within 5 % carry the machine, also constant ones.
+        # If the efforts are within 5 % of the model, the drives hold the machine and no brake does, even if
+        # the efforts are constant.
         wanted = expected.tolist()
         off = max(map(abs, map(sub, efforts, wanted))) > 0.05 * max(map(abs, wanted))
         frozen = self._frozen >= 0.1 and self.repeated >= CONSTANT_SAMPLES
@@ -79,7 +80,7 @@ class DriveWatch:
             self.idle = True
         else:
             # While a brake opens or has just closed, it carries a part of the drive's effort.
-            self.idle = off and time - self._released < BRAKE_TIME
+            self.idle = off and time - self._released < MAX_BRAKE_TIME
         self.changes += self.idle and not before
         return self.idle
 

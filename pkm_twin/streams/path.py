@@ -37,13 +37,14 @@ class JointPath:
         """Time of the last point, s."""
         return float(self.points.times[-1])
 
-    def from_here(self, q: Array) -> JointPath:
+    def start_from(self, q: Array) -> JointPath:
         """Add a point at rest at q, shape (n,), at time 0 unless the path has a point there."""
         p = self.points
         if p.times[0] == 0.0:
             return self
 
-        def begun(values: Array | None, first: Array) -> Array | None:
+        def prepend_first(values: Array | None, first: Array) -> Array | None:
+            """Put the first row in front of the values; None stays None."""
             return None if values is None else np.vstack([first, values])
 
         rest = np.zeros_like(q)
@@ -52,8 +53,8 @@ class JointPath:
                 p,
                 times=np.concatenate([[0.0], p.times]),
                 q=np.vstack([q, p.q]),
-                qd=begun(p.qd, rest),
-                qdd=begun(p.qdd, rest),
+                qd=prepend_first(p.qd, rest),
+                qdd=prepend_first(p.qdd, rest),
                 effort=None if p.effort is None else np.vstack([p.effort[:1], p.effort]),
             )
         )

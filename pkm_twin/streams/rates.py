@@ -24,7 +24,7 @@ MIN_BLOCK_TIME: Final = 0.05
 MIN_STEPS: Final = 5
 """Fewest steps between samples in a block."""
 STANDSTILL_FRACTION: Final = 0.03
-"""Moves below this fraction of the other quantity's moves count as standing still."""
+"""A quantity stands still if its change is below this fraction of the other's, of position and integrated velocity."""
 MAX_RATE: Final = 0.15
 """Largest relative RMS difference of the moves of a whole recording."""
 MAX_ACCELERATION_ERROR: Final = 0.6
@@ -68,13 +68,14 @@ class RateAgreement:
     Joints are judged if the root of the sum of their squared moves is at least 0.01 rad, or 0.01 of
     the machine's size; delayed velocities may cause an RMS difference of 0.4 of the moves.
 
-    :param blocks: number of blocks that are kept and judged.
+    :param blocks: number of the latest blocks of time that are compared.
     """
 
     def __init__(self, robot: Robot, blocks: int = 20) -> None:
         self._names, self._count = robot.joint_names, blocks
         sizes = [robot.size if unit == "m" else 1.0 for unit in robot.joint_units]
-        self._least = 0.01 * np.array(sizes)
+        # 1 % of the machine's size, or 0.01 rad.
+        self._min_move = 0.01 * np.array(sizes)
         self.reset()
 
     def reset(self) -> None:
@@ -116,7 +117,7 @@ class RateAgreement:
     def _judge(self) -> None:
         moved, told = np.moveaxis(np.array(self._blocks), 1, 0)
         size = np.maximum(rms(moved), rms(told))
-        moves = size * np.sqrt(len(moved)) >= self._least
+        moves = size * np.sqrt(len(moved)) >= self._min_move
         if not moves.any():
             return
         error = np.where(moves, rms(told - moved) / np.maximum(size, 1e-300), 0.0)

@@ -67,8 +67,8 @@ class Steps:
     publishers: tuple[int, ...]
 
     @property
-    def first(self) -> list[tuple[int, int]]:
-        """Step and joint of each jump; the joint is the one that jumped farthest."""
+    def jump_indices(self) -> list[tuple[int, int]]:
+        """Index of the step, and of the joint that jumped farthest, for each jump."""
         rows = np.flatnonzero(self.jumps.any(1))
         return [(int(k), int(np.argmax(self.jumps[k] * self.sizes[k]))) for k in rows]
 
@@ -108,7 +108,8 @@ def find_steps(time: Array, q: Array, qd: Array | None, limit: Sequence[float] |
     near = span[:, 0] <= (MAX_GAP_PERIODS if qd is not None else 1.5) * period
     sizes = np.maximum(np.maximum(move - high * span, low * span - move), 0.0)
     if qd is None and near.any():
-        # 95 % of the moves belong to the motion. Medians over several steps do not follow fast changes of the velocity.
+        # Also allow the 95 % quantile of these moves: medians over several samples lag behind fast changes
+        # of the velocity.
         slack = slack + SIGMAS * np.quantile(sizes[near], 0.95, axis=0)
     sizes = np.where(near[:, None] & (sizes > slack), sizes, 0.0)
     if limit is not None:
@@ -258,7 +259,8 @@ def _count_publisher_samples(q: Array, slack: Array) -> tuple[int, ...]:
         counts[nearest] += 1
     if len(counts) < 2 or min(counts) < MIN_PUBLISHER_FRACTION * len(rows) or jumps > MIN_JUMPING_FRACTION * len(rows):
         return ()
-    # A single publisher with a temporary offset changes rarely between the tracks.
+    # A publisher with a temporary offset rarely switches between the two sequences of positions; two
+    # publishers alternate often.
     if turns < min(counts) / LOOKBACK_SAMPLES:
         return ()
     return tuple(counts)

@@ -58,11 +58,12 @@ class State:
 
 
 @dataclass(frozen=True, eq=False)
-class Numbers:
-    """The quantities of a state; ``None`` where unknown; ``why`` has the reason.
+class StateQuantities:
+    """The quantities that are shown for a state; ``None`` if unknown, with the reason in ``why``.
 
     ``singularity``: 1 best, 0 singular; ``clearance``: of limbs, m; ``effort``: to hold the weight
-    and the wrench at rest, shape (n,), N m or N; ``energy``: of the wrench.
+    and the wrench at rest, shape (n,), N m or N; ``energy``: the response
+    to the wrench, with its strain energy.
     """
 
     position: Array
@@ -244,15 +245,15 @@ class Model:
             return _reject(state, "the wrench is not finite")
         return replace(state, wrench=values, refusal="")
 
-    def write_link(self, state: State) -> str:
-        """Write robot, pose and wrench as the query of an address."""
+    def write_url(self, state: State) -> str:
+        """Write robot, pose and wrench as the query of a URL."""
         parts = {"robot": self.robot.name, "pose": _write_numbers(state.pose)}
         if state.wrench.any():
             parts["load"] = _write_numbers(state.wrench)
         return f"?{urlencode(parts, safe=',')}"
 
-    def open_link(self, state: State, link: str) -> State:
-        """Return the state in an address of :meth:`write_link`, or the old state with a refusal."""
+    def read_url(self, state: State, link: str) -> State:
+        """Return the state that a page's URL (of :meth:`write_url`) encodes, or the old state with a refusal."""
         parts = {name: given[-1] for name, given in parse_qs(link.rpartition("?")[2]).items()}
         if parts.get("robot") != self.robot.name:
             return _reject(state, f"the link is not of the robot {self.robot.name}")
@@ -290,7 +291,7 @@ class Model:
         told = what.format(1e6 * worst.found.value.item())
         return worst.q, f"{told} along ({along})"
 
-    def compute_numbers(self, state: State) -> Numbers:
+    def compute_numbers(self, state: State) -> StateQuantities:
         """Compute the quantities of a state; the reasons of failures are in ``why``."""
         robot, why = self.robot, dict(self._why)
         measure = float(robot.singularity(state.q))
@@ -313,7 +314,7 @@ class Model:
         if effort is not None and robot.limits.effort is not None:
             over = np.abs(effort) > robot.limits.effort
         # A clearance below 5 mm is marked as low.
-        return Numbers(
+        return StateQuantities(
             position,
             rotation,
             measure,

@@ -117,9 +117,9 @@ class Page:
             self._loads = gui.add_html("")
             if "energy" not in model.compute_numbers(self.state).why:
                 self.moving.append(SoftestPoseSearch(self))
-        self._link = gui.add_text("link", model.write_link(self.state))
+        self._link = gui.add_text("link", model.write_url(self.state))
         self.call_on(
-            self._link.on_update, "link", lambda: self.show_state(model.open_link(self.state, self._link.value))
+            self._link.on_update, "link", lambda: self.show_state(model.read_url(self.state, self._link.value))
         )
         gui.add_html(texts.write_buttons(model.robot.name))
         self._update()
@@ -216,7 +216,7 @@ class Page:
                 _set_sliders(self._joints, state.q)
                 _set_sliders(self._pose, state.pose)
                 _set_sliders(self._wrench, state.wrench)
-                self._link.value = self.model.write_link(state)
+                self._link.value = self.model.write_url(state)
             self._status.content = texts.describe_state(self.model, state, numbers)
             self._loads.content = texts.describe_load(numbers)
             if energy is None or energy.dominant == "none":
@@ -276,16 +276,16 @@ class SoftestPoseSearch:
         if found is None:
             return
         if not found.done():
-            self._note.content = texts.write_note(f"searching the workspace: {100 * self._progress:.0f} %")
+            self._note.content = texts.format_note(f"searching the workspace: {100 * self._progress:.0f} %")
             return
         self._found, self._progress = None, 0.0
         try:
             q, answer = found.result()
         except PkmTwinError as error:
-            self._note.content = texts.write_note(str(error))
+            self._note.content = texts.format_note(str(error))
             return
         page.show_state(page.model.to_joints(page.state, q))
-        self._note.content = texts.write_note(answer)
+        self._note.content = texts.format_note(answer)
 
 
 def _set_sliders(handles: Sequence[Any], values: Array) -> None:

@@ -161,14 +161,14 @@ class ModePanel:
         try:
             self._modes = modes(self._page.model.robot, state.pose, MODE_COUNT)
         except (PkmTwinError, ValueError) as error:
-            self._note.content = texts.write_note(one_line(str(error)))
+            self._note.content = texts.format_note(one_line(str(error)))
             return
         shape, names = self._modes.shapes[k], self._modes.nodes
         sizes = np.linalg.norm(shape[:, :3], axis=1)
         text = f"{texts.format_number(float(self._modes.frequencies[k]))} Hz, drives locked"
         if sizes[0] < 0.1 * sizes.max():
             text += f"; {names[int(sizes.argmax())]} moves most, the platform hardly"
-        self._note.content = texts.write_note(text)
+        self._note.content = texts.format_note(text)
         part = MAX_SHOWN_DEFLECTION / 3 * self._page.model.robot.graph.size / sizes.max()
         # Node names are a member's name and a number.
         owners = [name.rpartition(" ")[0] for name in names[1:]]

@@ -199,20 +199,21 @@ class Scene:
             member = moved.members.get(self._find_member(spot))
             return point if member is None else point + _interpolate_along(*member, point[None])[0]
 
-        def draw_bar(bar: Bar, pieces: int, name: str) -> Array:
+        def compute_bar_points(bar: Bar, pieces: int, name: str) -> Array:
+            """Return points along a bar that follow the deflection of its member, (pieces + 1, 3)."""
             first, last = move_point(bar.start), move_point(bar.end)
             shares = np.linspace(0.0, 1.0, pieces + 1)[:, None]
             if (member := moved.members.get(name)) is None:
                 return np.asarray(first + shares * (last - first), np.float64)
             start, end = posture.place(*bar.start), posture.place(*bar.end)
-            ways = _interpolate_along(*member, start + shares * (end - start))
-            bow = ways - ways[0] - shares * (ways[-1] - ways[0])
+            displaced = _interpolate_along(*member, start + shares * (end - start))
+            bow = displaced - displaced[0] - shares * (displaced[-1] - displaced[0])
             return np.asarray(first + shares * (last - first) + bow, np.float64)
 
         names = [beam.name for beam in self.robot.beams]
         names += [""] * (len(self.bars) - len(names))
-        lines = list(map(draw_bar, self.bars, self.pieces, names))
-        motors = [draw_bar(bar, 1, "") for bar in self._drives.values()]
+        lines = list(map(compute_bar_points, self.bars, self.pieces, names))
+        motors = [compute_bar_points(bar, 1, "") for bar in self._drives.values()]
         ends = np.concatenate([np.stack([a[:-1], a[1:]], axis=1) for a in (*lines, *motors)])
         thick = np.array([bar.radius for bar in self.bars])
         parts = dict.fromkeys(graph.rods, ROD) | {BASE: GROUND, graph.platform: PLATFORM}

@@ -11,7 +11,7 @@ import numpy as np
 
 from pkm_twin.robot.robot import Robot
 from pkm_twin.view.live import LiveValues
-from pkm_twin.view.model import Grade, Model, Numbers, State
+from pkm_twin.view.model import Grade, Model, State, StateQuantities
 from pkm_twin.view.scene import colour_by_share
 from pkm_twin.view.timeline import Instant, Timeline
 
@@ -92,12 +92,12 @@ def write_buttons(name: str) -> str:
     )
 
 
-def write_note(text: str) -> str:
-    """Return a line of plain text."""
+def format_note(text: str) -> str:
+    """Return text as one escaped line of the panel's HTML."""
     return f'<div id="note" style="{_BLOCK_STYLE}">{escape(text)}</div>'
 
 
-def describe_state(model: Model, state: State, numbers: Numbers) -> str:
+def describe_state(model: Model, state: State, numbers: StateQuantities) -> str:
     """Describe singularity index, clearance, joints with their efforts at rest, and why a state is rejected."""
     gap = None if numbers.clearance is None else 1e3 * numbers.clearance
     rows = [
@@ -117,7 +117,7 @@ def describe_state(model: Model, state: State, numbers: Numbers) -> str:
     return f'<div style="{_BLOCK_STYLE}">{_write_table(rows)}{said}{_write_joint_rows(model, state, numbers)}</div>'
 
 
-def _write_joint_rows(model: Model, state: State, numbers: Numbers) -> str:
+def _write_joint_rows(model: Model, state: State, numbers: StateQuantities) -> str:
     robot = model.robot
     effort: Sequence[float | None] = [None] * len(state.q)
     if numbers.effort is not None:
@@ -137,7 +137,7 @@ def _write_joint_rows(model: Model, state: State, numbers: Numbers) -> str:
     return _write_table(rows) + (f"<div>efforts: {escape(why)}</div>" if why else "")
 
 
-def describe_load(numbers: Numbers) -> str:
+def describe_load(numbers: StateQuantities) -> str:
     """Describe the platform's deflection, and the elements by their share of the strain energy."""
     energy = numbers.energy
     if energy is None:

@@ -42,14 +42,14 @@ def process():
 @pytest.fixture(scope="module", autouse=True)
 def coarse_pictures():
     """Pictures of few pixels, with their parts where matplotlib puts them at first."""
-    drawn = plots.rendered
+    drawn = plots.render
 
     def coarse(figure, dpi, form="png"):
         figure.set_layout_engine("none")
         return drawn(figure, 30, form)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(plots, "rendered", coarse)
+        patch.setattr(plots, "render", coarse)
         yield
 
 

@@ -11,8 +11,8 @@ import pytest
 from pkm_twin.apps.frame import Group, command
 from pkm_twin.apps.options import OutputOption, PictureOptions, RobotArgument
 from pkm_twin.errors import ParameterError
-from pkm_twin.report import Column, Fact, Report, Table, Verdict, judged, plots
-from pkm_twin.report.terminal import WIDTH, table_lines, text_of
+from pkm_twin.report import Column, Fact, Report, Table, Verdict, make_judged_fact, plots
+from pkm_twin.report.terminal import WIDTH, format_report, table_lines
 from pkm_twin.settings import setting
 
 
@@ -44,7 +44,7 @@ def weigh(given: Weigh) -> Report:
         "2 kg",
         [Fact("mass", 2.0, "kg", "mass"), Fact("lost", float("nan"))],
         [Table("parts", columns, {"arm": [1.5, 0.25], "rod": [0.5, None]})],
-        {"": lambda: plots.columns(1, 1)[0]},
+        {"": lambda: plots.make_subplots(1, 1)[0]},
         verdict=Verdict.BAD if given.bad else None,
     )
 
@@ -158,7 +158,7 @@ def test_another_command_of_a_group_is_wrong_usage():
 
 
 def test_judged_facts_are_items():
-    report = Report(facts=[judged("rate", "900 Hz", "1 kHz", False), judged("gaps", "?", "", None)])
+    report = Report(facts=[make_judged_fact("rate", "900 Hz", "1 kHz", False), make_judged_fact("gaps", "?", "", None)])
     assert [item["verdict"] for item in report.data["items"]] == ["bad", "unknown"]
 
 
@@ -184,7 +184,7 @@ def test_a_wide_table_fits_the_terminal_and_loses_no_word():
     few = Table("", columns[:2], {"a": [1.0] * 2})
     wide = Table("", [*columns, Column("", "", "what it is")], rows)
     for table in (few, wide):
-        lines = text_of(Report("", tables=[table])).splitlines()
+        lines = format_report(Report("", tables=[table])).splitlines()
         assert max(map(len, lines)) <= WIDTH
         assert table is wide or len(lines) == 2
         words = " ".join(cell for row in table.cells for cell in row).split()

@@ -10,7 +10,7 @@ import pytest
 
 from pkm_twin import load, robot_names
 from pkm_twin.apps.commands.info import Info, info
-from pkm_twin.report.terminal import text_of
+from pkm_twin.report.terminal import format_report
 from stiffness_monitor import compliance, strain_energy
 from test.commands.conftest import REPOSITORY
 from test.support.command import forked
@@ -42,9 +42,9 @@ class TestInfo:
 
     def test_every_parameter_is_shown_with_its_unit(self, twin, name):
         report = info.run(Info(robot=name))
-        assert twin("info", name).out == text_of(report) + "\n"
-        assert "-0.0000" not in text_of(report)
-        rows = {fact.text: fact.words for fact in report.facts if fact.text}
+        assert twin("info", name).out == format_report(report) + "\n"
+        assert "-0.0000" not in format_report(report)
+        rows = {fact.text: fact.formatted for fact in report.facts if fact.text}
         robot = load(name)
         units = robot.parameter_units()
 
@@ -68,7 +68,7 @@ class TestInfo:
 def test_closures_that_are_redundant_make_a_machine_overconstrained(name):
     """Or it is told which joint of the model repeats what the limbs hold."""
     report = info.run(Info(robot=name))
-    data, shown = report.data, {fact.text: fact.words for fact in report.facts}
+    data, shown = report.data, {fact.text: fact.formatted for fact in report.facts}
     redundant, open_reactions = data["redundant_closures"], data["overconstrained"]
     repeats = f"joint {'+'.join(data['assumed_joints'])} repeats"
     assert (repeats in shown["loop constraints"]) == bool(redundant and not open_reactions)

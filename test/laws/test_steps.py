@@ -72,7 +72,7 @@ def test_a_wrong_stretch_jumps_at_both_ends(rng, size, count, measured):
         at, joint = int(rng.integers(100, 5000)), int(rng.integers(3))
         q[at : at + count, joint] += size
         found = find_steps(time, q, qd if measured else None, LIMIT)
-        assert found.first == [(at - 1, joint), (at + count - 1, joint)]
+        assert found.jump_indices == [(at - 1, joint), (at + count - 1, joint)]
         assert found.sizes[found.jumps] == pytest.approx(abs(size), rel=0.2)
 
 
@@ -80,7 +80,7 @@ def test_a_step_beyond_the_velocity_limit_jumps(rng):
     time, q, _ = drawn(rng, rate=20.0)
     q[60:] += 4.0
     assert not find_steps(time[:60], q[:60], None, LIMIT).jumps.any()
-    assert find_steps(time, q, None, LIMIT).first[0][0] == 59
+    assert find_steps(time, q, None, LIMIT).jump_indices[0][0] == 59
 
 
 @pytest.mark.parametrize("measured", [True, False])

@@ -91,14 +91,14 @@ def test_a_picture_answers_and_the_star_has_its_cells_colour(stored):
 
 
 def test_a_long_title_is_wrapped_and_keeps_values_with_their_units():
-    figure, _ = plots.columns(1, 1)
+    figure, _ = plots.make_subplots(1, 1)
     words = " ".join(f"part_{k} bears {k}.25 N m;" for k in range(9))
     count = plots.write_title(figure, words)
     rows = figure.get_suptitle().split("\n")
     assert count == len(rows) > 1 and max(map(len, rows)) < 90
     assert " ".join(rows) == words
     assert not any(row.endswith(("25", "N")) for row in rows)
-    plots.rendered(figure, 20)
+    plots.render(figure, 20)
 
 
 @pytest.mark.parametrize(("seconds", "panels"), [(2.0, 2), (20.0, 4)])
@@ -111,7 +111,7 @@ def test_efforts_have_their_residual_and_a_long_motion_the_seconds_of_its_peak(s
         effort = np.exp(-((time - 0.7 * seconds) ** 2))
         table |= {f"{joint}.effort": effort, f"{joint}.measured": effort + 0.01}
         table |= {f"{joint}.effort_{term}": 0.0 * effort for term in plots.TERMS}
-    figure = plots.torques(SimpleNamespace(robot=robot), table, "title")
+    figure = plots.draw_torques(SimpleNamespace(robot=robot), table, "title")
     assert len(figure.axes) == panels
     for ax in figure.axes:
         (residual,) = [one for one in ax.lines if one.get_label() == "measured - sum"]

@@ -24,7 +24,7 @@ from pkm_twin.errors import MessageError
 from pkm_twin.messages.reading import JointReader
 from pkm_twin.messages.stamps import StampRules
 from pkm_twin.robot.effort_limits import EffortLimits, effort_limits
-from pkm_twin.state.state import STATE, MachineState
+from pkm_twin.state.state import STATE_TOPICS, MachineState
 from pkm_twin.streams.topics import JOINTS, NUMBERS, TRAJECTORY
 from pkm_twin.streams.wrench import WrenchSettings
 from pkm_twin.view.live import Live
@@ -338,7 +338,7 @@ def test_joint_numbers_leave_through_the_publishers_that_ask_for_converted_ones(
     tables = {
         "delta_dynamics": (TWIN, GATE, SIMULATION),
         "stiffness_monitor": (STIFFNESS,),
-        "pkm_twin": (STATE,),
+        "pkm_twin": (STATE_TOPICS,),
     }
     found = set()
     for package, own in tables.items():

@@ -9,7 +9,7 @@ import pytest
 from pkm_twin import robot_names
 from pkm_twin.errors import MessageError
 from pkm_twin.machine import rotations
-from pkm_twin.state.scene import Load, Scales, Scene, choose_heat_colour
+from pkm_twin.state.scene import Scales, Scene, WrenchEffects, choose_heat_colour
 from pkm_twin.state.state import MachineState
 from pkm_twin.streams.wrench import WrenchSettings
 from stiffness_monitor import compliance, strain_energy
@@ -44,7 +44,7 @@ def loaded(robot, q, wrench=WRENCH):
     """What a load does to a machine at these joint positions."""
     pose = robot.forward(q)
     energy = strain_energy(robot, pose, wrench)
-    return Load(
+    return WrenchEffects(
         np.asarray(wrench, float),
         compliance(robot, pose),
         energy.deflection,
@@ -168,9 +168,9 @@ class TestScene:
         # Colours: the hottest is the dominant element, wherever it is.
         shown = {bar.element: shape.colour for bar, shape in zip(scene.bars, groups["bars"], strict=True)}
         shown |= {shape.text: shape.colour for shape in groups.get("joints", [])}
-        greatest = max(load.factors.values())
-        assert set(load.factors) <= set(shown)
-        for name, share in load.factors.items():
+        greatest = max(load.energy_fractions.values())
+        assert set(load.energy_fractions) <= set(shown)
+        for name, share in load.energy_fractions.items():
             assert shown[name] == choose_heat_colour(share / greatest)
         assert shown[load.dominant] == choose_heat_colour(1.0)
         assert [shape.text for shape in groups["dominant"]] == [load.dominant]

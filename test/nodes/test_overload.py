@@ -72,7 +72,7 @@ def test_an_old_stamp_has_the_cause_that_fits_its_age(age, cause):
 
 def test_lines_of_one_reason_are_logged_with_growing_pauses():
     health = pytest.importorskip("pkm_twin.ros.health", exc_type=ImportError)
-    one, lines = health._Repetition(), deque()
+    one, lines = health._LogThrottle(), deque()
     for tick in range(3000):
         held = one.begin_line(0.1 * tick)
         if held is not None:

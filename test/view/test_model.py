@@ -118,11 +118,11 @@ def test_a_link_carries_pose_and_load(name, rng):
     wrench = np.array([3.0, -2.0, 5.0, 0.1, 0.0, -0.3])
     state = model.apply_wrench(model.to_pose(model.start, states(model, 8, rng)[0].pose), wrench)
     for given in (state, model.apply_wrench(state, np.zeros(6))):
-        opened = model.open_link(model.start, f"http://127.0.0.1:8080/{model.write_link(given)}")
+        opened = model.read_url(model.start, f"http://127.0.0.1:8080/{model.write_url(given)}")
         assert opened.refusal == ""
         np.testing.assert_allclose(opened.pose, given.pose, rtol=1e-8, atol=1e-12)
         np.testing.assert_array_equal(opened.wrench, given.wrench)
-        assert model.write_link(opened) == model.write_link(given)
+        assert model.write_url(opened) == model.write_url(given)
 
 
 @every_model
@@ -146,7 +146,7 @@ def test_zero_but_for_rounding_has_no_sign():
     assert [texts.format_number(x) for x in (-0.0, -1e-13, 1e-13, -2.0)] == ["0", "0", "0", "-2"]
     model = model_of("five_bar")
     pushed = model.apply_wrench(model.start, np.array([-0.0, 5.0, -1e-13, 0.0, 0.0, 0.0]))
-    assert model.write_link(pushed).endswith("load=0,5,0,0,0,0")
+    assert model.write_url(pushed).endswith("load=0,5,0,0,0,0")
     slider = SimpleNamespace(value=1.0, min=-100.0, max=100.0)
     pytest.importorskip("pkm_twin.view.page")._set_sliders([slider], np.array([-1e-14]))
     assert str(slider.value) == "0.0"
@@ -154,7 +154,7 @@ def test_zero_but_for_rounding_has_no_sign():
 
 def test_a_link_that_says_something_else_changes_nothing():
     model = model_of("five_bar")
-    good = model.write_link(model.start)
+    good = model.write_url(model.start)
     for link in (
         "",
         "?",
@@ -167,7 +167,7 @@ def test_a_link_that_says_something_else_changes_nothing():
         "?robot=five_bar&pose=0,x",
         "?robot=five_bar&pose=9,9",
     ):
-        state = model.open_link(model.start, link)
+        state = model.read_url(model.start, link)
         assert state.refusal, link
         assert state.q is model.start.q
         assert not state.wrench.any()

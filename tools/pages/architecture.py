@@ -77,7 +77,7 @@ def places():
 
 def draw(path):
     """Draw folders as boxes with arrows from importing to imported folders."""
-    figure, ((ax,),) = plots.columns(1, 1, 8)
+    figure, ((ax,),) = plots.make_subplots(1, 1, 8)
     at = places()
     ends, boxes = np.array(list(at.values())), {}
     for name, place in at.items():

@@ -50,7 +50,7 @@ def draw(path):
 
     found = motor + turn(elbow - motor, moved)
     blue, red = plots.COLOURS[:2]
-    figure, ((first,), (second,), (third,)) = plots.columns(3, 1, 3.2)
+    figure, ((first,), (second,), (third,)) = plots.make_subplots(3, 1, 3.2)
     for ax, title in (
         (first, "1. the pose places the platform"),
         (second, "2. reach: one distance"),

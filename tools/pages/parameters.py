@@ -19,7 +19,7 @@ from pkm_twin.machine.sections import DriveSpec, friction_of
 from pkm_twin.machine.uncertainty import UncertaintyEntry
 from pkm_twin.mechanisms import delta, linear_delta, machine, prru, upr_rpu
 from pkm_twin.robot.mechanism import Common, Mechanism
-from pkm_twin.settings import settings_of
+from pkm_twin.settings import map_parameters
 
 HEAD = """# Robot files
 
@@ -82,7 +82,7 @@ def default(field):
 def rows(kind, without=(), prefix=""):
     """Yield a line per key; nested sections follow the key that holds them."""
     fields = {field.name: field for field in dataclasses.fields(kind)}
-    for name, (own, row) in settings_of(kind).items():
+    for name, (own, row) in map_parameters(kind).items():
         if name in without:
             continue
         other = TITLES.get(row.section or row.entries)
@@ -113,16 +113,16 @@ def table(kind, without=(), prefix=""):
 
 def page():
     """Write the page."""
-    common, shared = set(settings_of(Common)), set(settings_of(Mechanism))
+    common, shared = set(map_parameters(Common)), set(map_parameters(Mechanism))
     parts = [HEAD.rstrip(), "## Every file\n\n" + "\n".join(rows(Common))]
     listed = "\n".join(rows(Mechanism, common))
     parts.append(f"## Every mechanism but `machine`\n\n{listed}")
     for name, kind in ROBOTS.items():
         own = shared - {"limits"} if name == "upr_rpu" else shared
-        flat = {key for key, (_, row) in settings_of(kind).items() if row.section is None}
-        keep = set(settings_of(kind)) - (flat - own)
+        flat = {key for key, (_, row) in map_parameters(kind).items() if row.section is None}
+        keep = set(map_parameters(kind)) - (flat - own)
         parts.append(f"## `mechanism: {name}`\n\n" + "\n".join(rows(kind, keep)))
-        for key, (_, row) in settings_of(kind).items():
+        for key, (_, row) in map_parameters(kind).items():
             if row.section is not None and key not in own:
                 parts.append(f"### `{key}`\n\n{table(row.section)}")
     parts.append(f"## `mechanism: machine`\n\n{table(machine.MachineFile, common)}")

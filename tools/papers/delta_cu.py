@@ -187,7 +187,7 @@ def draw_motion(file: Path) -> None:
     robot = load("delta_cu")
     time = np.linspace(0.0, 5.0, 251)
     q, qd, qdd = find_motion(time)
-    figure, columns = plots.columns(2, 1)
+    figure, columns = plots.make_subplots(2, 1)
     curves = (
         (
             find_velocity(robot, q, qd),
@@ -212,7 +212,7 @@ def draw_torques(file: Path) -> None:
     """Draw the arms' torques in the example, the printed ones as dots."""
     time = np.linspace(0.0, 5.0, 251)
     torques = inverse_dynamics(load("delta_cu"), *find_motion(time), LOAD)
-    figure, ((ax,),) = plots.columns(1, 1)
+    figure, ((ax,),) = plots.make_subplots(1, 1)
     _draw_curves(ax, time, torques, find_printed_torques(), ("arm I", "arm II", "arm III"))
     question = "Figures 5 to 7: which torque does each arm need? Dots: tables 4 to 6"
     plots.label(ax, "time (s)", "torque (N m)", question)
@@ -221,7 +221,7 @@ def draw_torques(file: Path) -> None:
 
 def _draw_curves(ax: Any, time: Array, values: Array, printed: Array, names: Sequence[str]) -> None:
     for k, name in enumerate(names):
-        style = {"color": plots.COLOURS[k], "linestyle": plots.DASHES[k]}
+        style = {"color": plots.COLOURS[k], "linestyle": plots.LINE_STYLES[k]}
         ax.plot(time, values[:, k], label=name, **style)
         ax.plot(TIME, printed[:, k], "o", color=plots.COLOURS[k], fillstyle="none")
     ax.legend()

@@ -16,7 +16,7 @@ from pkm_twin.apps.frame import command
 from pkm_twin.apps.options import MotionOptions, OutputOption, PayloadOption, PictureOptions, SeedOption
 from pkm_twin.console import convert_write_errors, draw_progress
 from pkm_twin.errors import ParameterError, UnknownNameError, warn_of_file
-from pkm_twin.report import Column, Fact, Report, Table, judged, plots
+from pkm_twin.report import Column, Fact, Report, Table, make_judged_fact, plots
 from pkm_twin.settings import setting
 
 if TYPE_CHECKING:
@@ -233,11 +233,13 @@ def judge_limits(found: Found, path: PosePath) -> Iterator[Fact]:
         unit, good = robot.effort_units[k], bool(peaks[k] <= limit[k])
         what = f"effort of {robot.joint_names[k]} on the path"
         numbers = {"number": float(peaks[k]), "limit": float(limit[k]), "unit": unit}
-        yield judged(what, f"{peaks[k]:.4g} {unit}", f"{limit[k]:g} {unit}", good, **numbers)
+        yield make_judged_fact(what, f"{peaks[k]:.4g} {unit}", f"{limit[k]:g} {unit}", good, **numbers)
     index = found.least_singularity(path)
     what = "singularity index on the path"
     numbers = {"number": index, "limit": MIN_SINGULARITY_INDEX, "unit": ""}
-    yield judged(what, f"{index:.4g}", f"{MIN_SINGULARITY_INDEX:g} or more", index >= MIN_SINGULARITY_INDEX, **numbers)
+    yield make_judged_fact(
+        what, f"{index:.4g}", f"{MIN_SINGULARITY_INDEX:g} or more", index >= MIN_SINGULARITY_INDEX, **numbers
+    )
 
 
 def describe_bound(value: float, bound: tuple[float, float]) -> str:
@@ -274,7 +276,7 @@ def draw_design(robot: Robot, found: Found, path: PosePath, answer: str) -> Any:
     from pkm_twin.design.variants import Variants
 
     if found.front:
-        figure, ((ax,),) = plots.columns(1, 1)
+        figure, ((ax,),) = plots.make_subplots(1, 1)
         first, second = found.minimise
         table = np.array([[p.quantities[first], p.quantities[second]] for p in found.front])
         ax.plot(*table.T, "o-", color=plots.COLOURS[0], label="Pareto front")
@@ -290,7 +292,7 @@ def draw_design(robot: Robot, found: Found, path: PosePath, answer: str) -> Any:
     numbers = found.best.numbers
     both = [{n: [robot.number(n)] for n in numbers}, {n: [v] for n, v in numbers.items()}]
     efforts = [PathMotion(Variants(robot, one), path).efforts[0] for one in both]
-    figure, (axes,) = plots.columns(1, 2)
+    figure, (axes,) = plots.make_subplots(1, 2)
     most = np.nanmax(np.abs(efforts)) * 1.05
     for ax, table, title in zip(axes, efforts, ("before", "after"), strict=True):
         for k, joint in enumerate(robot.joint_names):

@@ -98,11 +98,11 @@ def report_modes(machine: Robot, pose: list[float], frequencies: Array, damping:
 
 def draw(found: ToolResponse, modes: ToolModes, title: str) -> Any:
     """Draw magnitude and phase of the response along each axis over the frequency."""
-    figure, axes = plots.columns(1, 2)
+    figure, axes = plots.make_subplots(1, 2)
     size, phase = axes[0]
     grid = found.frequencies
     for k, name in enumerate("xyz"):
-        one, style = found.response[:, k, k], {"color": plots.COLOURS[k], "ls": plots.DASHES[k]}
+        one, style = found.response[:, k, k], {"color": plots.COLOURS[k], "ls": plots.LINE_STYLES[k]}
         size.semilogy(grid, 1e6 * np.abs(one), label=f"along {name}", **style)
         phase.plot(grid, np.degrees(np.angle(one)), **style)
     for frequency in modes.frequencies[modes.frequencies <= grid[-1]]:

@@ -17,7 +17,7 @@ from pkm_twin.apps.options import PictureOptions, RobotArgument
 from pkm_twin.codegen.code import slowness
 from pkm_twin.kinematics.scheme import list_coordinates
 from pkm_twin.machine.formulas import PARAMETERS
-from pkm_twin.report import Fact, Report, number
+from pkm_twin.report import Fact, Report, format_number
 from pkm_twin.robot.clearance import clearance, has_clearance
 from pkm_twin.robot.plausibility import find_members_fault, findings, why_no_torques
 
@@ -182,7 +182,7 @@ def _report_parameters(name: str, value: Any, unit: Any) -> Iterator[Fact]:
         for key, item in value.items():
             yield from _report_parameters(f"{name}: {key}", item, unit[key])
     else:
-        shown = "none" if value is None else f"{number(value, '.6g')} {unit}".strip()
+        shown = "none" if value is None else f"{format_number(value, '.6g')} {unit}".strip()
         yield Fact("", value, text=name, shown=shown)
 
 

@@ -94,7 +94,7 @@ def _limit_data(speed: float, depth: float, is_open: bool) -> dict[str, Any]:
 
 def draw(found: Limits, milling: Milling, title: str) -> Any:
     """Draw the limit of the depth over the speed, with the best speed."""
-    figure, axes = plots.columns(1, 1)
+    figure, axes = plots.make_subplots(1, 1)
     ax = axes[0][0]
     depth = 1e3 * found.depths
     ax.plot(found.speeds, depth, color="black", lw=1.2)

@@ -11,7 +11,7 @@ from typing import Any, Final
 from pkm_twin.apps.frame import command
 from pkm_twin.errors import MessageError, PkmTwinError
 from pkm_twin.messages.stamps import SECOND, stamp_of
-from pkm_twin.report import Fact, Report, Verdict, judged
+from pkm_twin.report import Fact, Report, Verdict, make_judged_fact
 from pkm_twin.ros.context import listening_node
 from pkm_twin.ros.signals import first_signal
 from pkm_twin.settings import setting
@@ -80,14 +80,14 @@ def judge(topic: str, arrivals: Arrivals, offer: Offer) -> Report:
         fact("oldest_s", oldest, "s", "age on arrival", ages, most, not a.late),
         fact("lost_messages", lost, "", "lost messages", str(lost), "0", not lost),
         fact("faults", dict(a.faults), "", "faults", faults, "none", not a.faults),
-        judged("publishers", str(offer.publishers), "1", offer.publishers == 1),
+        make_judged_fact("publishers", str(offer.publishers), "1", offer.publishers == 1),
     ]
     for what, value in (("deadline", offer.deadline), ("lifespan", offer.lifespan)):
         if offer.publishers:
             # Allow for the rounding of times to nanoseconds in the middleware.
             good = value <= a.deadline * (1.0 + 1e-9)
             words = f"{1e3 * value:g} ms" if math.isfinite(value) else "none"
-            items.append(judged(f"{what} offered", words, most, good))
+            items.append(make_judged_fact(f"{what} offered", words, most, good))
     bad = [fact.text or "" for fact in items if fact.verdict is Verdict.BAD]
     facts = [
         Fact("topic", topic),

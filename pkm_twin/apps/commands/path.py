@@ -282,7 +282,7 @@ def draw_limits(motion: TimedPath, title: str) -> Any:
     from pkm_twin.paths.constraints import limit_names
     from pkm_twin.paths.joint_path import only_turns
 
-    figure, axes = plots.columns(1, 2)
+    figure, axes = plots.make_subplots(1, 2)
     used, time = motion.used, motion.fine.time
     top, low = axes[0]
     names = limit_names(motion.robot)
@@ -335,7 +335,7 @@ def _report_milling(cut: SoftCut, motion: TimedPath) -> tuple[list[Fact], Any]:
     ]
 
     def draw_feed(motion: TimedPath, title: str) -> Any:
-        figure, axes = plots.columns(1, 2)
+        figure, axes = plots.make_subplots(1, 2)
         curves = (
             (1e3 * s.speed, "feed (mm/s)", 1e3 * speed),
             (1e6 * deflection, "deflection (µm)", 1e6 * tolerance),

@@ -334,7 +334,7 @@ def draw(taken: EffortComparison, duties: Sequence[DriveDuty], answer: str) -> A
     from pkm_twin.paths.sizing import RPM
 
     shown = duties[:4]
-    figure, axes = plots.columns(1, len(shown))
+    figure, axes = plots.make_subplots(1, len(shown))
     m = taken.motion
     for k, (ax, d) in enumerate(zip(axes[0], shown, strict=True)):
         chosen = select_motors(d)[-1] if d.fits else d

@@ -75,7 +75,7 @@ def draw(results: Sequence[Judged], answer: str) -> Any:
 
     order = sorted(results, key=lambda one: (not one.drifts, -len(one.series.value)))[:4]
     width = min(2, len(order))
-    figure, by_column = plots.columns(width, math.ceil(len(order) / width))
+    figure, by_column = plots.make_subplots(width, math.ceil(len(order) / width))
     axes = np.array(by_column).T.ravel()
     for ax in axes[len(order) :]:
         ax.set_visible(False)
