@@ -220,7 +220,7 @@ class MotionOptions(RecordingOptions):
         from pkm_twin.paths.along import compare_efforts, zero_resting_motion
 
         compared = compare_efforts(zero_resting_motion(self.read(path, robot, planned=True).with_rates()))
-        return compared if getattr(self, "payload", None) is not None else compared.checked()
+        return compared if getattr(self, "payload", None) is not None else compared.check_source()
 
 
 @dataclass(frozen=True, kw_only=True)

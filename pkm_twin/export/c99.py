@@ -40,12 +40,12 @@ from pkm_twin.codegen.program import (
     previous,
 )
 from pkm_twin.export.c_functions import C_FUNCTIONS
-from pkm_twin.export.schedule import LATENCIES, LATENCY, TURN_LATENCY, Work, order_work
+from pkm_twin.export.schedule import DEFAULT_LATENCY, LATENCIES, TURN_LATENCY, Work, order_work
 
-ATTEMPTS: Final = (1, *STEPS)
-"""Numbers of steps of Newton's method in each attempt."""
-MAX_CORRECTIONS: Final = MAX_ITERATIONS * sum(ATTEMPTS)
-"""Largest number of corrections of a call."""
+STEPS_PER_ATTEMPT: Final = (1, *STEPS)
+"""Number of continuation steps of each attempt; Newton's method solves each step."""
+MAX_NEWTON_CORRECTIONS: Final = MAX_ITERATIONS * sum(STEPS_PER_ATTEMPT)
+"""Largest number of Newton corrections in one call, over all attempts."""
 
 
 MAX_INLINE_CHARACTERS: Final = 44
@@ -150,7 +150,7 @@ class StraightLineCode:
         if parts is not None:
             first, product, rest = parts
             values = [*product.args, rest]
-        work = Work.join([self._work.get(v.number, Work()) for v in values], LATENCIES.get(op, LATENCY))
+        work = Work.join([self._work.get(v.number, Work()) for v in values], LATENCIES.get(op, DEFAULT_LATENCY))
         x, *others = (self._text[v.number] for v in values)
         if parts is None:
             self.needed.add(op)
@@ -174,9 +174,9 @@ def _group_angles(results: Sequence[Expression], known: Mapping[int, str]) -> li
     return [groups[k] for k in sorted(groups)]
 
 
-EQUATION_ROWS: Final = ("home", "origin", "start", "onward", "corrected", "branch", "certain", "goal", "foreseen")
-EQUATION_NUMBERS: Final = ("size", "determinant", "residual", "near")
-"""Attributes of :class:`Equations`: sequences of expressions, and single expressions."""
+ROW_FIELDS: Final = ("home", "origin", "start", "onward", "corrected", "branch", "certain", "goal", "foreseen")
+SCALAR_FIELDS: Final = ("size", "determinant", "residual", "near")
+"""Fields of :class:`Equations` that hold sequences of expressions, and single expressions."""
 
 
 class Substitution:
@@ -201,9 +201,9 @@ class Substitution:
 
     def equations(self, q: Equations, given: Mapping[str, Sequence[Any]]) -> Equations:
         """Substitute inputs in equations, whose known state then is constant."""
-        rows = {name: getattr(q, name) for name in EQUATION_ROWS}
+        rows = {name: getattr(q, name) for name in ROW_FIELDS}
         folded: dict[str, Any] = {name: row and self(row, given) for name, row in rows.items()}
-        for name in EQUATION_NUMBERS:
+        for name in SCALAR_FIELDS:
             value = getattr(q, name)
             folded[name] = value and self([value], given)[0]
         return replace(q, **folded, lone=True)
@@ -240,7 +240,7 @@ class Routine:
 
     @property
     def body(self) -> list[Expression]:
-        """Results, then 1 or 0: whether the closures hold, and whether the assembly is certain."""
+        """Results, then flags (1 or 0): closures are satisfied; the assembly mode is certain."""
         return [*self.results, *holding(self.equations, certain=False), *certainty(self.equations)]
 
     @property
@@ -253,7 +253,7 @@ class Routine:
         step = sum(MAX_ITERATIONS * count(q.correct) + count([*q.begin, *q.onward, *q.aim]) for q in solved)
         rest = count([*self.body, *(e for q in self.equations for e in q.goal)])
         more = len(self.state) > 1
-        steps, attempts = (sum(ATTEMPTS), len(ATTEMPTS)) if solved else (1, 1)
+        steps, attempts = (sum(STEPS_PER_ATTEMPT), len(STEPS_PER_ATTEMPT)) if solved else (1, 1)
         further = 0 if self.judge is None else self.judge.max_operations[0]
         first = (1 + more) * (step + rest)
         return (steps + more) * step + (attempts + more) * rest + further, first
@@ -344,16 +344,16 @@ class CSource:
     def text(self) -> str:
         """Return the source: helpers and all functions."""
         needed = (C_FUNCTIONS.get(op, op.helper) for op in OPERATIONS if op in self._needed)
-        steps = ", ".join(map(str, ATTEMPTS))
+        steps = ", ".join(map(str, STEPS_PER_ATTEMPT))
         ladder = f"""\
 /* Attempts of Newton's method; fewer shorten the worst case, and reject some valid states. */
 #ifndef PKM_ATTEMPTS
-#define PKM_ATTEMPTS {len(ATTEMPTS)}
+#define PKM_ATTEMPTS {len(STEPS_PER_ATTEMPT)}
 #endif
-#if (PKM_ATTEMPTS < 1) || (PKM_ATTEMPTS > {len(ATTEMPTS)})
-#error "PKM_ATTEMPTS: 1 to {len(ATTEMPTS)}"
+#if (PKM_ATTEMPTS < 1) || (PKM_ATTEMPTS > {len(STEPS_PER_ATTEMPT)})
+#error "PKM_ATTEMPTS: 1 to {len(STEPS_PER_ATTEMPT)}"
 #endif
-static const int @_steps[{len(ATTEMPTS)}] = {{{steps}}};
+static const int @_steps[{len(STEPS_PER_ATTEMPT)}] = {{{steps}}};
 """
         parts = [*dict.fromkeys(filter(None, needed)), C_RUNTIME, ladder, *self._parts]
         return "\n".join(parts).replace("@", self.prefix)

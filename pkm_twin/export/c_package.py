@@ -96,7 +96,7 @@ class Package:
             except RigidError:
                 pass
             except ParameterError as error:
-                # Sections contradict the masses, or some parts have none.
+                # Cross-sections contradict the masses, or some bodies have no cross-section.
                 warn_of_file(robot.name, f"no functions of elasticity: {error}")
         self.fold = Substitution()
         self.payload = self.fold.tape.inputs(PARAMETERS, 13)
@@ -374,7 +374,7 @@ class Package:
             ]
             rows, equations = found[0]
             terms = TransmissionTerms(robot, self.fold, rows["ratio"])
-            equations = terms.limit_growth(equations)
+            equations = terms.reject_singular_poses(equations)
             if curved:
                 outputs = terms.gains([rows["change"] for rows, _ in found])
             else:

@@ -10,7 +10,7 @@ import numpy as np
 
 from delta_dynamics.torques.virtual_work import inverse_dynamics
 from pkm_twin.codegen.program import MAX_ITERATIONS
-from pkm_twin.export.c99 import ATTEMPTS, MAX_CORRECTIONS, write_table
+from pkm_twin.export.c99 import MAX_NEWTON_CORRECTIONS, STEPS_PER_ATTEMPT, write_table
 from pkm_twin.robot.robot import Robot
 
 HEADER_TEXT: Final = """\
@@ -182,8 +182,8 @@ def write_readme(robot: Robot, prefix: str, doubles: int) -> str:
         name=prefix,
         robot=prefix.removeprefix("pkm_"),
         joints=", ".join(robot.joint_names),
-        corrections=f"{MAX_CORRECTIONS:,}",
-        attempts=len(ATTEMPTS),
+        corrections=f"{MAX_NEWTON_CORRECTIONS:,}",
+        attempts=len(STEPS_PER_ATTEMPT),
         turns=MAX_ITERATIONS,
         stack=doubles * 8 // 1000 + 3,
         dynamics="" if robot.has_masses else MASSLESS_TEXT,

@@ -50,8 +50,8 @@ class TransmissionTerms:
         velocity, effort = (self.tape.inputs(name, self.m) for name in ("velocity", "effort"))
         return {"qd": self._lift_all(self.ratio @ velocity), "tau": self._lift_all(self._actuator_efforts(effort))}
 
-    def limit_growth(self, equations: Sequence[Equations]) -> list[Equations]:
-        """Return equations that also reject poses where a pivot of B vanishes."""
+    def reject_singular_poses(self, equations: Sequence[Equations]) -> list[Equations]:
+        """Return the equations with a condition that rejects poses where a pivot of B vanishes."""
         *first, last = equations
         if self.robot.redundant or not isinstance(self._growth, Expression):
             return [*equations]

@@ -58,7 +58,7 @@ def moveit_package(robot: Robot, kinematics: str = "") -> dict[str, str]:
     :raises ParameterError: the robot has a ``joint_map``: plans are in the numbers of the URDF.
     """
     robot.check_independent("plans of MoveIt", "it moves each joint by itself")
-    if not robot.controller.plain or robot.controller.names != tuple(robot.joint_names):
+    if not robot.controller.is_identity or robot.controller.names != tuple(robot.joint_names):
         raise ParameterError("joint_map", list(robot.controller.names), "none: MoveIt plans in the URDF's numbers")
     name = re.sub(r"\W", "_", robot.name or robot.mechanism)
     # Write the SRDF: groups, passive joints, home state, and links that always touch.

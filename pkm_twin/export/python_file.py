@@ -35,11 +35,11 @@ from pkm_twin.robot.robot import Robot
 
 FUNCTION_NAMES: Final = ("forward", "inverse", "jacobian", "torques", "joint_to_actuator", "actuator_to_joint", "gains")
 MAX_CORRECTIONS: Final = 6
-"""Largest number of corrections of a call. Of 10,000 states each of delta_cu, prru, rps3 and five_bar, 5 reach all
-that 12 reach; one more makes the derivatives exact."""
+"""Largest number of Newton corrections in one call. Of 10,000 states each of delta_cu, prru, rps3 and
+five_bar, 5 reach all that 12 reach; one more makes the derivatives exact."""
 MORE_STEPS: Final = (9,)
-"""Numbers of steps of the further attempts, as in exported C. Of 10,000 states each of a humanoid's ankle and
-of delta_cu, 9 steps reach all, 3 steps 96 % and 99.8 %, one step 91 % and 99.7 %."""
+"""Numbers of continuation steps of the further attempts, as in exported C. Of 10,000 states each of a
+humanoid's ankle and of delta_cu, 9 steps reach all, 3 steps 96 % and 99.8 %, one step 91 % and 99.7 %."""
 LIBRARIES: Final = {
     "numpy": "import numpy as xp",
     "jax": "import jax\nimport jax.numpy as xp",

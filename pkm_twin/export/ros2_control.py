@@ -132,7 +132,7 @@ def _template_words(robot: Robot, package: str) -> dict[str, str]:
     # A negative factor swaps the limits; infinite ones stay infinite.
     ends = np.sort(controller.offsets[:, None] + controller.factors[:, None] * position, axis=1)
     effort = np.full(n, np.inf) if limits.effort is None else np.asarray(limits.effort)
-    # Bound the rates that rounding of positions causes, in the controller's numbers, (n,).
+    # Bound the velocity errors that rounding of positions causes, in the controller's units, (n,).
     controller = robot.controller
     units = np.array([1.0 if unit == "rad" else robot.graph.size for unit in robot.joint_units])
     largest = np.abs(controller.offsets) + np.abs(controller.factors) * units
@@ -145,7 +145,7 @@ def _template_words(robot: Robot, package: str) -> dict[str, str]:
         effort / np.abs(controller.factors),
         friction.viscous,
         friction.coulomb,
-        _gravity_damping(robot),
+        _find_gravity_damping(robot),
         np.asarray(ROUNDING_NOISE * largest / 1e-3, np.float64),
     )
     lines = [
@@ -194,8 +194,8 @@ def _choose_twist_components(robot: Robot) -> list[int]:
     return list(choices[int(np.argmax(sizes))])
 
 
-def _gravity_damping(robot: Robot) -> Array:
-    """Return the gravity controller's damping in the controller's numbers, shape (n,)."""
+def _find_gravity_damping(robot: Robot) -> Array:
+    """Return the gravity controller's damping in the controller's joint units, shape (n,)."""
     # Critical damping of a bandwidth f is 4 pi f times the mass.
     _, damping = tune_position_control(robot, 1.0 / (4.0 * np.pi * DAMPING_TIME))
     # Round to digits that do not depend on the processor's arithmetic.
@@ -234,7 +234,7 @@ def _write_controllers(robot: Robot, package: str, bandwidth: float) -> str:
         },
         CONTROLLER: own,
         GRAVITY_CONTROLLER: {
-            "gains": {name: {"d": float(d)} for name, d in zip(joints, _gravity_damping(robot), strict=True)}
+            "gains": {name: {"d": float(d)} for name, d in zip(joints, _find_gravity_damping(robot), strict=True)}
         },
         TRAJECTORY_CONTROLLER: {
             "joints": joints,

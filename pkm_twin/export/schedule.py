@@ -12,11 +12,11 @@ from typing import Final
 
 from pkm_twin.codegen.operations import Operation, atan2, inv, sqrt
 
-LATENCY: Final = 4
+DEFAULT_LATENCY: Final = 4
 LATENCIES: Final[Mapping[Operation, int]] = {inv: 13, sqrt: 18, atan2: 75}
 TURN_LATENCY: Final = 60
-"""Cycles until a result is there: of a product or sum, of some operations, and of sines and cosines.
-Of x86-64 processors of 2017 to 2023 (Fog, Instruction tables), of functions as measured."""
+"""Cycles until a result is available: by default (products, sums), by operation, of sines.
+For x86-64 processors of 2017 to 2023 (Fog, Instruction tables); functions as measured."""
 PER_CYCLE: Final = 2.0
 """Operations that begin in a cycle, with loads and stores beside them: as measured."""
 

@@ -336,7 +336,7 @@ def _list_numbers(robot: Robot, result: Fit, name: str, found: dict[str, Searche
         for number in (n for n in result.numbers if first in n.key):
             path = tuple(key if part == first else part for part in number.key)
             k = _find_joint(result.robot, number.key)
-            unit = law.parameters[key].in_units(slides=robot.joint_units[k] == "m")
+            unit = law.parameters[key].unit_of_drive(slides=robot.joint_units[k] == "m")
             old = float(np.asarray(getattr(robot.friction, key))[k])
             if result.verdict.deviations == "withheld":
                 deviation = np.full(len(value), np.nan)

@@ -296,7 +296,7 @@ def certify_assembly(t: Traced, scheme: PlatformFirstScheme, posed: Traced, q: S
     drives = at_home.inverse_determinant / here.inverse_determinant
     closures = drives * posed.determinant
     if t.scheme.start is not None:
-        return [closures - CERTAIN_REGULAR, *t.scheme.start.find_sides(posed.motion)]
+        return [closures - CERTAIN_REGULAR, *t.scheme.start.find_conditions(posed.motion)]
     move = posed.q - posed.graph.lead_home
     way = np.array([q[k] for k in t.drives.leading], dtype=object) - t.graph.lead_home
     ends = ((lu.solve(way) - move) * np.array(t.pose_scales, dtype=object) for lu in (at_home, here))

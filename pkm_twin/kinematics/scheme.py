@@ -45,10 +45,10 @@ class Start(Protocol):
     def place(self, tree: Tree, q: Numbers) -> list[Any]:
         """Return the tree's unknowns at q, on numbers and expressions alike."""
 
-    def find_sides(self, motion: Motion) -> list[Any]:
+    def find_conditions(self, motion: Motion) -> list[Any]:
         """Return numbers that are all above zero where bodies that are placed are in its assembly."""
 
-    def find_miss(self, tree: Tree, q: Numbers) -> tuple[str, float] | None:
+    def find_gap(self, tree: Tree, q: Numbers) -> tuple[str, float] | None:
         """Return the joint or rod that falls short at q, and by how much (m); None: not known."""
         return None
 

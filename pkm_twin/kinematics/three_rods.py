@@ -82,14 +82,14 @@ class ThreeRods:
             x[step.position] = (step.local @ point) * step.sign / step.slide
         return x
 
-    def find_sides(self, motion: Motion) -> list[Any]:
+    def find_conditions(self, motion: Motion) -> list[Any]:
         """Return a number above zero where the body is on the side of the centres' plane as at home."""
         ends = self._list_ends(motion.graph)
         c1, c2, c3 = (motion.point(near, end) - motion.point(self.body, own) for near, end, own in ends)
         n = cross(c2 - c1, c3 - c1)
         return [-(c1 @ n) * (n @ self._find_up(motion.graph))]
 
-    def find_miss(self, tree: Tree, q: Numbers) -> tuple[str, float] | None:
+    def find_gap(self, tree: Tree, q: Numbers) -> tuple[str, float] | None:
         """Return the rod farthest from the two nearest ones, and by how much (m) the spheres miss.
 
         None where they meet, or where their centres are on one line.

@@ -121,8 +121,8 @@ def read_gravity(
     return [0.0, 0.0, 0.0]
 
 
-def flag(element: ET.Element, tag: str, default: bool) -> bool:
-    """Read a truth value in an element of its own."""
+def read_flag(element: ET.Element, tag: str, default: bool) -> bool:
+    """Read a boolean from a child element."""
     text = element.findtext(tag)
     where = element.get("name") or element.get("reference")
     return default if text is None else urdf_xml.parse_boolean(text, f"{where}.{tag}")

@@ -43,8 +43,8 @@ class Parameter:
     high: float | None = None
     linear: bool = True
 
-    def in_units(self, *, slides: bool) -> str:
-        """Return the unit for a prismatic or a rotary drive."""
+    def unit_of_drive(self, *, slides: bool) -> str:
+        """Return the parameter's unit for a prismatic or a rotary drive."""
         effort, joint = ("N", "m") if slides else ("N m", "rad")
         text = self.unit.replace("{effort} per {joint}/s", "N s/m" if slides else "N m s/rad")
         return text.format(effort=effort, joint=joint)

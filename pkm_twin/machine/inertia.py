@@ -77,7 +77,7 @@ def list_loaded_joints(graph: Graph) -> tuple[Joint, ...]:
 def drive_units(graph: Graph, joint: str) -> dict[str, str]:
     """Return the units of a joint's friction parameters and rotor inertia."""
     slides = graph.joints[joint].slides
-    units = {key: one.in_units(slides=slides) for key, one in list_friction_keys().items()}
+    units = {key: one.unit_of_drive(slides=slides) for key, one in list_friction_keys().items()}
     return units | {"rotor_inertia": "kg" if slides else "kg m2"}
 
 

@@ -88,8 +88,8 @@ class JointMap:
         return cls(names, factors, offsets, changes, centres, tuple(row.unit for row in rows))
 
     @property
-    def plain(self) -> bool:
-        """True if numbers are the same on both sides."""
+    def is_identity(self) -> bool:
+        """True if the joint map changes neither positions nor efforts."""
         return bool((self.factors == 1.0).all() and (self.offsets == 0.0).all() and self.even)
 
     @property

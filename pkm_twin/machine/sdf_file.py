@@ -65,7 +65,7 @@ def read(path: Path, top: ET.Element, actuated: Sequence[str] | None = None) -> 
     moments = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
     rounding = rounding_error((e.text or "").strip() for e in element.iter() if e.tag in moments)
     faults = foreign.check_elements(path, [element], joints={part: name for name, part in model.all("joint")})
-    weight = {name: foreign.flag(part, "gravity", True) for name, part in model.all("link")}
+    weight = {name: foreign.read_flag(part, "gravity", True) for name, part in model.all("link")}
     for name, part in model.all("link"):
         links[name] = _read_link(path, part, name, rounding).moved(model.place(name))
     places = {name: link.frame for name, link in links.items()}
@@ -124,7 +124,7 @@ def _find_model(path: Path, top: ET.Element) -> tuple[ET.Element, ET.Element, li
         if stated is not None:
             gravity = urdf_xml.parse_vector(stated.text, "world.gravity", 3).tolist()
     models = [(root, one) for root in (top, *worlds) for one in root.findall("model")]
-    moving = [(root, one) for root, one in models if not foreign.flag(one, "static", False)]
+    moving = [(root, one) for root, one in models if not foreign.read_flag(one, "static", False)]
     if not moving:
         _reject_includes(top.iter("include"))
     if len(moving) != 1:
@@ -151,7 +151,7 @@ class Model:
         own = element.get("name", "")
         self.prefix: str = f"{outer.prefix}{own}::" if outer and outer.outer else ""
         self.static: bool = outer is not None and (
-            outer.static or (outer.outer is None and foreign.flag(element, "static", False))
+            outer.static or (outer.outer is None and foreign.read_flag(element, "static", False))
         )
         self.parts: dict[str, ET.Element] = {}
         for part in sorted(element, key=lambda part: part.tag == "joint"):

@@ -136,8 +136,8 @@ def read(path: Path, robot: ET.Element, actuated: Sequence[str] | None = None) -
     for element in robot.findall("gazebo"):
         link = element.get("reference", "")
         if link in links:
-            off = foreign.flag(element, "turnGravityOff", False)
-            weight[link] = foreign.flag(element, "gravity", not off)
+            off = foreign.read_flag(element, "turnGravityOff", False)
+            weight[link] = foreign.read_flag(element, "gravity", not off)
     places = [e for e in robot.iter() if e.tag in ("axis", "parent_axis", "child_axis") or "origin" in e.tag]
     return LoopTree(
         robot.get("name") or path.stem,

@@ -44,8 +44,8 @@ class Along:
     loaded: bool
 
     @property
-    def beyond(self) -> int:
-        """Number of samples that would not count in a map."""
+    def excluded_count(self) -> int:
+        """Number of samples that a map would exclude."""
         return int((~self.counted).sum())
 
     @property

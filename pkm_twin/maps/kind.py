@@ -70,7 +70,7 @@ def name_labels(dim: str, words: Iterable[str]) -> Variable:
 
 
 class Found(NamedTuple):
-    """Hold a quantity in k poses: ``value`` (k,), ``direction`` (k, axes), ``element`` (k,).
+    """Values of a quantity in k poses: ``value`` (k,), ``direction`` (k, axes), ``element`` (k,).
 
     ``element``: index of the critical element. ``shares``: fractions of the elements, shape (k,
     elements). A kind without directions, elements or shares leaves them out.
@@ -270,8 +270,8 @@ class Space:
         q, known = self.robot.try_inverse(poses)
         return np.where(known[:, None], q, self.robot.graph.home), poses, known
 
-    def counts(self, q: Array, pose: Array, known: Mask, case: Case) -> Mask:
-        """Return which known joint positions (k, n) and poses (k, m) belong to the workspace."""
+    def is_in_workspace(self, q: Array, pose: Array, known: Mask, case: Case) -> Mask:
+        """Return the mask of joint positions (k, n) and poses (k, m) in the workspace, (k,)."""
         bound = -math.inf if case.interfering else self.least_clearance
         return belong_to_workspace(self.robot, q, pose, known & self.is_encircled(pose), self.least, bound)
 

@@ -47,7 +47,7 @@ def find_worst(space: Space, case: Case, starts: Array, tell: Callable[[float], 
         low, high = low + 1e-9 * (high - low), high - 1e-9 * (high - low)
 
     def inside(x: Array) -> NDArray[np.bool_]:
-        return space.counts(*space.evaluate_point(x), case)
+        return space.is_in_workspace(*space.evaluate_point(x), case)
 
     def score(x: Array, what: Kind = kind) -> Array:
         q = space.evaluate_point(x)[0]
@@ -75,7 +75,7 @@ def find_worst(space: Space, case: Case, starts: Array, tell: Callable[[float], 
         more, other = evolve(score, edge, low, high, kind, rng, inside)
         x, best = (more, other) if other > best else (x, best)
     if not np.isfinite(best):
-        without = replace(space, least=0.0).counts(*space.evaluate_point(tried), case)
+        without = replace(space, least=0.0).is_in_workspace(*space.evaluate_point(tried), case)
         if without.any() and not inside(tried).any():
             best = float(robot.try_singularity(space.evaluate_point(tried)[0][without])[0].max())
             raise ParameterError(
@@ -96,7 +96,7 @@ def find_worst(space: Space, case: Case, starts: Array, tell: Callable[[float], 
     # Poses near the worst show whether the bound on the singularity index excludes worse ones.
     near = rng.normal(size=(64, len(x))) * 10.0 ** rng.uniform(-4.0, -2.0, (64, 1))
     state = space.evaluate_point(np.clip(x + near * (high - low), low, high))
-    below = replace(space, least=0.0).counts(*state, case) & ~space.counts(*state, case)
+    below = replace(space, least=0.0).is_in_workspace(*state, case) & ~space.is_in_workspace(*state, case)
     (beyond,) = evaluate_kind(kind, robot, state[0][below], [case])
     worse = score_values(beyond.value, case.largest) > score_values(found.value, case.largest)
     index = float(robot.try_singularity(q)[0][0])

@@ -214,10 +214,10 @@ class Machine(TwinRobot):
             )
 
     def numbered(self, values: Mapping[str, Any]) -> Machine:
-        """Copy the machine with other numbers at ``joints.ball_1.at[0]``, ``limbs.joints.ball.at[0]``.
+        """Copy the machine with other numbers at paths as ``joints.ball_1.at[0]``.
 
-        A limb's number is that of all its copies, in the axes of azimuth zero; another azimuth
-        turns its copy.
+        A number of a limb (``limbs.joints.ball.at[0]``) is that of all its copies, in the axes of
+        azimuth zero; another azimuth rotates its copy.
         """
         book, values = self.book.change_numbers(self.resolve_paths(values))
         sources = dict(self.sources)
@@ -262,7 +262,7 @@ class Machine(TwinRobot):
 
     def check_number(self, path: str) -> None:
         """Check a number in each of the entries that have it."""
-        path = self.own_path(path)
+        path = self.canonical_path(path)
         keys = full_keys(path)
         for moved in self.book.list_dependent([str(keys[-1])]) if keys[0] == PARAMETERS else ():
             self.check_number(moved.path)
@@ -275,7 +275,7 @@ class Machine(TwinRobot):
 
     def number(self, path: str) -> float:
         """Return the number at a path; in a limb the number of its first copy."""
-        path = self.own_path(path)
+        path = self.canonical_path(path)
         keys = full_keys(path)
         if keys[0] == PARAMETERS:
             return number_in(dict(self.book.values), keys[1:], path)
@@ -285,8 +285,8 @@ class Machine(TwinRobot):
             return find_entry_number(self.specs[kind][name], where, azimuth, path)
         return super().number(path)
 
-    def own_path(self, path: str) -> str:
-        """Return the path at the joint's entry of a drive's friction or limit: friction.viscous[0]."""
+    def canonical_path(self, path: str) -> str:
+        """Convert a drive's path, as ``friction.viscous[0]``, to the path in its joint's entry."""
         section, key, k, *rest = [*split_path(path), "", ""]
         drive = section in ("friction", "limits") and isinstance(k, int)
         if not drive or int(k) >= self.joints_count:
@@ -487,18 +487,19 @@ def _remove_rounding(
     Warns by how much vectors were moved. Entries that no small change repairs stay as they are.
     """
 
-    def written(part: Any, inside: bool = False) -> Iterator[str]:
+    def list_numbers(part: Any, inside: bool = False) -> Iterator[str]:
+        """Yield the numbers of points and directions in a file's data, as text."""
         if isinstance(part, Mapping):
             for key, one in part.items():
-                yield from written(one, inside or key in _GEOMETRY)
+                yield from list_numbers(one, inside or key in _GEOMETRY)
         elif isinstance(part, (list, tuple)):
             for one in part:
-                yield from written(one, inside)
+                yield from list_numbers(one, inside)
         elif inside and isinstance(part, float):
             yield repr(part)
 
     parts = [data.get(key) for key in ("joints", "rods", "limbs")]
-    repaired = repair_rounded(graph, rounding_error(word for part in parts for word in written(part)))
+    repaired = repair_rounded(graph, rounding_error(word for part in parts for word in list_numbers(part)))
     if repaired is None or not repaired.moves:
         return specs
     warn_of_file(name, repaired.text)

@@ -160,8 +160,8 @@ class Prru(TwinRobot):
             bodies[slider] = Body(slider, m.slider_mass, foot)
             bodies[low] = Body(low, m.lower_link_mass, com, array(axial(lower[0], lower[1], d)))
             bodies[high] = Body(high, m.upper_link_mass, com, array(axial(upper[0], upper[1], d)))
-            fixed = _named(BASE, e=e, t=t, z=UP)
-            along = _named(low, **{"d": d, "t": t, "t x d": np.cross(t, d)})
+            fixed = _make_directions(BASE, e=e, t=t, z=UP)
+            along = _make_directions(low, **{"d": d, "t": t, "t x d": np.cross(t, d)})
             name = self.joints[i]
             joints[name] = Joint(
                 name,
@@ -191,5 +191,6 @@ class Prru(TwinRobot):
         return Parts(Graph(bodies, joints, {}, PLATFORM, origin), tuple(beams))
 
 
-def _named(body: str, **vectors: Array) -> tuple[Direction, ...]:
+def _make_directions(body: str, **vectors: Array) -> tuple[Direction, ...]:
+    """Return named directions of a body."""
     return tuple(Direction(name, body, array(vector)) for name, vector in vectors.items())

@@ -48,8 +48,8 @@ from pkm_twin.mechanisms import TwinRobot
 
 MIN_HEIGHT_RATIO: Final = 1e-2
 """Smallest height of a limb at home relative to its width: below it the limbs lie in the base."""
-MAX_ROOT: Final = 1e4
-"""Largest root over a b: two roots that are 4 a b apart have errors of about 1e-16 (root / a b)^2."""
+MAX_ROOT_RATIO: Final = 1e4
+"""Largest root of the cubic over a b; roots 4 a b apart have errors near 1e-16 (root / a b)^2."""
 _LIMB_DIRECTIONS: Final = array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 _X: Final = array([1.0, 0.0, 0.0])
 _Y: Final = array([0.0, 1.0, 0.0])
@@ -189,8 +189,8 @@ class LargestRoot(Start):
         g = minimum(1.0, maximum(-1.0, (a * a + b * b + square - l3 * l3) / (2.0 * b * h)))
         beta = atan2(-rho, a) - atan2(sqrt((1.0 - g) * (1.0 + g)), g)
 
-        def direct(i: int, rho: Any, beta: Any, gamma: Any) -> tuple[Any, Any]:
-            """Return components of a limb: 0 and 1 from B to A along X and tau; 2 from A to B along y and tau."""
+        def limb_components(i: int, rho: Any, beta: Any, gamma: Any) -> tuple[Any, Any]:
+            """Return a limb's components: 0, 1 (UPR) along X, tau from B; 2 (RPU) along y, tau from A."""
             if i == 2:
                 return b * cos(beta) - a, -b * sin(beta) - rho
             side = -1.0 if i == 0 else 1.0
@@ -198,7 +198,7 @@ class LargestRoot(Start):
 
         turns: dict[str, list[Any]] = {}
         for i, limb in enumerate("123"):
-            (x, z), (x0, z0) = direct(i, rho, beta, gamma), direct(i, height, 0.0, 0.0)
+            (x, z), (x0, z0) = limb_components(i, rho, beta, gamma), limb_components(i, height, 0.0, 0.0)
             turned = atan2(x * z0 - z * x0, x * x0 + z * z0)
             if i < 2:
                 turns |= {f"U joint {limb}": [beta, turned], f"R joint {limb}": [gamma - turned]}
@@ -212,8 +212,8 @@ class LargestRoot(Start):
                 result[step.position : step.position + 2] = [cos(angle), sin(angle)]
         return result
 
-    def find_sides(self, motion: Motion) -> list[Any]:
-        """Return numbers above zero between the singularities, where the roots keep their digits.
+    def find_conditions(self, motion: Motion) -> list[Any]:
+        """Return expressions that are positive between the singularities, where roots are accurate.
 
         As the cubic is not negative at 0, its largest root is the positive one of positive slope.
         """
@@ -221,10 +221,10 @@ class LargestRoot(Start):
         a, b, z = joints["R joint 2"].at[0], joints["U joint 2"].at[0], position[2]
         square, ab = z * z, a * b * turned[1][1] * turned[1][1]
         slope = square * turned[0][0] - ab * turned[0][2] * turned[0][2]
-        return [-z * turned[1][1], slope, -(z + a * turned[2][1]), MAX_ROOT * ab - square]
+        return [-z * turned[1][1], slope, -(z + a * turned[2][1]), MAX_ROOT_RATIO * ab - square]
 
-    def find_miss(self, tree: Tree, q: Numbers) -> None:
-        """Return None: the gap is found from the nearest possible drive position."""
+    def find_gap(self, tree: Tree, q: Numbers) -> None:
+        """Return None: the gap is computed elsewhere, from the nearest reachable drive position."""
         del tree, q
 
 

@@ -293,9 +293,10 @@ class _Points:
     """
 
     def __init__(self, begin: int, points: int, lengths: tuple[int, ...]) -> None:
+        """Compute the offset and stride of each group of points."""
         self.points, self.lengths = points, lengths
-        first = _find_end(begin, lengths)
-        second = _find_end(first, lengths)
+        first = _find_point_end(begin, lengths)
+        second = _find_point_end(first, lengths)
         if (second - first) % 8 == 0:
             groups = [(slice(0, 1), begin, first - begin), (slice(1, points), first, second - first)]
         else:
@@ -306,7 +307,7 @@ class _Points:
         self._groups = [g for g in groups if len(range(*g[0].indices(points)))]
         which, start, stride = max(self._groups, key=lambda g: range(*g[0].indices(points))[-1])
         last = start + stride * (len(range(*which.indices(points))) - 1)
-        self.end = _find_end(last, lengths)
+        self.end = _find_point_end(last, lengths)
 
     def read(self, data: Any, array: int, kind: str, columns: int, *, of_length: bool = False) -> NDArray[Any]:
         """Read an array (or :data:`TIME_INDEX`) of all points, shape (points, columns)."""
@@ -342,7 +343,8 @@ def _find_offsets(begin: int, lengths: Sequence[int]) -> list[tuple[int, int]]:
     return [*places, (at, at)]
 
 
-def _find_end(begin: int, lengths: Sequence[int]) -> int:
+def _find_point_end(begin: int, lengths: Sequence[int]) -> int:
+    """Return the offset after a point's arrays and its duration of 8 bytes."""
     return _find_offsets(begin, lengths)[-1][0] + 8
 
 

@@ -60,7 +60,7 @@ _TO_MODEL: Final[Mapping[str, Callable[[JointMap, Array], Array]]] = {
     "acceleration": JointMap.rates,
     "effort": JointMap.efforts,
 }
-"""Conversions of a controller's numbers to the model's."""
+"""Conversions of a controller's joint values to the model's."""
 
 
 class JointSample(NamedTuple):
@@ -163,7 +163,7 @@ class JointReader:
         velocity = limits.velocity if self.limited else None
         reach = [100.0 if unit == "m" else 2000.0 * math.pi for unit in self.robot.joint_units]
         self.robot.controller.check_even()
-        self._map = None if self.robot.controller.plain else self.robot.controller
+        self._map = None if self.robot.controller.is_identity else self.robot.controller
         self._names = self.robot.controller.names
         self._limited = {"position": position is not None, "velocity": velocity is not None}
         self._position = [(-r, r) for r in reach] if position is None else list(map(tuple, position.tolist()))
@@ -242,7 +242,7 @@ class JointReader:
         """
         given = message if isinstance(message, TrajectoryFields) else None
         names = given.names if given else tuple(message.joint_names)
-        index = self._match_points(names, given.times.shape[1] if given else len(message.points))
+        index = self._match_trajectory_joints(names, given.times.shape[1] if given else len(message.points))
         fields = given or TrajectoryFields.of(message)
         stamp = stamp_of(fields.header)
         times = fields.times
@@ -291,7 +291,7 @@ class JointReader:
         :raises MessageError: what :meth:`trajectory` rejects of these, however many points it has.
         """
         names, points = tuple(message.joint_names), message.points
-        self._match_points(names, len(points))
+        self._match_trajectory_joints(names, len(points))
         for point in (points[0], points[-1]):
             for what in COLUMNS:
                 count = len(getattr(point, what))
@@ -299,7 +299,7 @@ class JointReader:
                     text = f"{count} {what} for {len(names)} joints"
                     raise MessageError("length" if count else "empty", text)
 
-    def _match_points(self, names: tuple[str, ...], points: int) -> list[int]:
+    def _match_trajectory_joints(self, names: tuple[str, ...], points: int) -> list[int]:
         """Return the index of each of the robot's joints among a trajectory's names."""
         if not names or not points:
             raise MessageError("empty", f"{len(names)} joint names and {points} points")

@@ -56,15 +56,15 @@ class EffortComparison:
         """Return the motion with the model's efforts."""
         return replace(self, effort=self.model, source="the model's")
 
-    def checked(self) -> EffortComparison:
-        """Reject computed efforts of the file that are not the model's.
+    def check_source(self) -> EffortComparison:
+        """Check that efforts which this robot computed for the file equal the model's.
 
         :returns: the comparison; the ``doubt`` of its motion says that measured efforts are not
             this robot's, or that another robot computed them.
         :raises ParameterError: this robot computed them, or the file does not name its robot, and
             the model computes others: the file lacks a wrench, payload or number.
         """
-        motion, doubt = self.motion, self.unlike
+        motion, doubt = self.motion, self.mismatch_warning
         if motion.computed is not None:
             origin, away = motion.effort_model, relative_difference(motion.computed, self.model)
             other = "" if origin is None else origin.differs_from(motion.robot)
@@ -81,8 +81,8 @@ class EffortComparison:
         return replace(self, motion=replace(motion, doubt=doubt))
 
     @property
-    def unlike(self) -> str:
-        """Warning that names the joint whose file efforts are not the model's; else empty."""
+    def mismatch_warning(self) -> str:
+        """Warning that names the joint whose efforts differ most from the model's; or empty."""
         worst = int(self.difference.argmax())
         if not self.difference[worst] > MAX_EFFORT_DIFFERENCE:
             return ""
@@ -100,10 +100,10 @@ def relative_difference(efforts: Array, model: Array) -> Array:
 
 
 def check_efforts(motion: Recording) -> Recording:
-    """Compare the efforts of a motion's file, if any, with the model's; errors of ``checked``."""
+    """Compare a file's efforts, if any, with the model's; errors of ``check_source``."""
     if not motion.robot.has_masses or (motion.effort is None and motion.computed is None):
         return motion
-    return compare_efforts(motion).checked().motion
+    return compare_efforts(motion).check_source().motion
 
 
 def compare_efforts(motion: Recording) -> EffortComparison:

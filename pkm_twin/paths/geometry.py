@@ -200,7 +200,7 @@ def _join_waypoints(robot: Robot, space: Space, points: Array, blends: Array, dw
             if -0.985 < turn < 1.0 - TANGENT_TOLERANCE**2:
                 radius = min(wanted, 0.5 * piece.length, 0.5 * following.length)
         if isinstance(piece, Arc):
-            marks.append(Mark(len(stretches), _total_length(pieces) + piece.to(points[end - 1])))
+            marks.append(Mark(len(stretches), _total_length(pieces) + piece.arc_length_at(points[end - 1])))
         length = piece.length - cut - radius
         if length > MIN_DISTANCE:
             # An arc is never shortened.

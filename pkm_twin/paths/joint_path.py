@@ -22,7 +22,7 @@ from pkm_twin.robot.workspace import describe_singularity_bound
 
 Index = NDArray[np.int64]
 
-MIN_POINTS: Final = 16
+MIN_INTERVALS: Final = 16
 """Smallest number of intervals of a piece."""
 Slowdown = Callable[[Array, Array], Array]
 """Function of joint positions (p, n) and the reference point's direction (p, 3): factors (p,)."""
@@ -54,7 +54,7 @@ class Curve:
         pieces, result = self.stretch.pieces, []
         for k, piece in enumerate(pieces):
             share = piece.length / self.stretch.length + 1.0 / len(pieces)
-            count = max(MIN_POINTS, len(piece.knots), round(0.5 * points * share))
+            count = max(MIN_INTERVALS, len(piece.knots), round(0.5 * points * share))
             # Closer near a stop, where the speed grows with the root of the distance.
             t = np.linspace(0.0, 1.0, count + 1)
             begins, ends = k == 0, k == len(pieces) - 1
@@ -125,9 +125,9 @@ class JointPath:
 
     ``grid``: points of each piece of ``curve``. ``s``: all of them, shape (p,), m; where two pieces
     meet there are two points of one s. ``q``, ``first``, ``second``: joint positions and
-    derivatives by s, shape (p, n). ``felt``: the reference point's path length by s times
-    ``slower``, the factor of its speed in the limit, shape (p,). ``left``: first point of each
-    interval, whose other end is the next point.
+    derivatives by s, shape (p, n). ``felt``: derivative of the reference point's path length by
+    s, times ``slower``, which scales its speed for the speed limit, shape (p,). ``left``: index of
+    the first point of each interval, whose other end is the next point.
     """
 
     curve: Curve
@@ -295,7 +295,7 @@ def joint_paths(
     result = []
     begin, robot = 0.0, carried[0].robot
     for k, stretch in enumerate(path.stretches):
-        share = max(2 * MIN_POINTS, round(points * stretch.length / path.length))
+        share = max(2 * MIN_INTERVALS, round(points * stretch.length / path.length))
         changes = [[c.robot for c in carried if (c.stretch, c.piece) <= (k, n)] for n in range(len(stretch.pieces))]
         robots = tuple(robots[-1] for robots in changes)
         curve = Curve(robot, path, stretch, begin, 0.0, robots, slowdown)

@@ -124,7 +124,7 @@ class Run:
         return x
 
     def at(self, time: Array) -> tuple[Index, Array, Array, Array]:
-        """Return interval, fraction of it, v and u at times (k,)."""
+        """Return the interval at times (k,), the fraction of it, ds/dt (v) and d2s/dt2 (u)."""
         way, v, u = self.evaluate(self._last_knot(time), time)
         s = self.part.ends
         j = np.clip(np.searchsorted(s, way, side="right") - 1, 0, len(s) - 2)
@@ -280,7 +280,7 @@ class TimedPath:
 
     @cached_property
     def fine(self) -> Samples:
-        """Motion at all points of the path and in the middle between them."""
+        """Motion at all points of the path and midway between them."""
         return self.sample(self._sample_times)
 
     @cached_property

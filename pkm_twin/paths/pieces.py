@@ -122,8 +122,8 @@ class Arc:
         """Range of s."""
         return self.radius * self.angle
 
-    def to(self, point: Array) -> float:
-        """Return s of a point of the arc."""
+    def arc_length_at(self, point: Array) -> float:
+        """Return the arc length s of a point of the arc."""
         way = point - self.centre
         return self.radius * float(np.arctan2(way @ self.along, way @ self.across) % (2 * np.pi))
 

@@ -59,7 +59,7 @@ class IntervalPrograms:
         reachable = [0.0] * (count + 1)
         value = 0.0
         for i in range(count - 1, -1, -1):
-            value = reachable[i] = _largest_start(self.low[i], self.high[i], self.slope[i], self.most[i], value)
+            value = reachable[i] = _find_largest_start(self.low[i], self.high[i], self.slope[i], self.most[i], value)
         result = [0.0] * (count + 1)
         value = 0.0
         for i in range(count):
@@ -72,8 +72,10 @@ class IntervalPrograms:
         return np.array(result)
 
 
-def _largest_start(low: Numbers, high: Numbers, slopes: Numbers, x: float, after: float) -> float:
-    """Return an interval's largest x from which some x' up to ``after`` is reached.
+def _find_largest_start(low: Numbers, high: Numbers, slopes: Numbers, x: float, after: float) -> float:
+    """Return the largest x (squared path speed) at an interval's start that has a feasible end.
+
+    The end's x' is feasible between its lower and upper lines, and up to ``after``.
 
     The gap between the largest lower and the smallest upper line on x' is convex in x and open at
     0, so Newton's steps from the right converge to where it closes.

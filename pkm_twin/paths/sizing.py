@@ -183,8 +183,10 @@ def _read_curve(field: str, value: Any) -> Array:
     return rows
 
 
-def read_entries(path: Path, key: str, of: str, needed: bool = True) -> dict[Any, Any]:
-    """Read a YAML mapping under a key, from ``of`` to data; empty if not ``needed``.
+def read_entries(path: Path, key: str, entry_kind: str, needed: bool = True) -> dict[Any, Any]:
+    """Read the YAML mapping under a key; return {} if it is missing and not ``needed``.
+
+    :param entry_kind: what the keys name, for the error.
 
     :raises ParameterError: the file cannot be read or has no such mapping.
     """
@@ -192,7 +194,7 @@ def read_entries(path: Path, key: str, of: str, needed: bool = True) -> dict[Any
     if entries is None and not needed:
         return {}
     if not isinstance(entries, dict) or not entries:
-        raise ParameterError(str(path), None, f"a mapping {key} of {of} to data")
+        raise ParameterError(str(path), None, f"a mapping {key} of {entry_kind} to data")
     return entries
 
 

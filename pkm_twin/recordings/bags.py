@@ -87,7 +87,7 @@ def read_bag(
         notes.append(f"rejected messages, left out: {refused}; first: {found.first_reject}")
     if found.others:
         notes.append(f"left alone: {found.others} messages of other joints on {topics.joint_states}")
-    if not machine.controller.plain:
+    if not machine.controller.is_identity:
         notes.append(MODEL_VALUES_NOTE)
     stamps = np.array([s.stamp for s in found.samples], np.int64)
     r = Recording(

@@ -232,7 +232,7 @@ def _read_table_recording(path: Path, name: str | Robot | None, how: ReadOptions
         notes=(
             *notes,
             *([] if side is None else [f"values read as the {how.side}'s; results: the model's"]),
-            *([] if robot.controller.plain or side is not None else [MODEL_VALUES_NOTE]),
+            *([] if robot.controller.is_identity or side is not None else [MODEL_VALUES_NOTE]),
         ),
         start=round(1e9 * float(times[0])),
     )

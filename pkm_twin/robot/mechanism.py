@@ -449,19 +449,19 @@ class Mechanism(Common):
         made = replace_numbers(self, {tuple(full_keys(path)): value for path, value in values.items()})
         return self._replace_fields(**{f.name: getattr(made, f.name) for f in dataclasses.fields(self)})
 
-    def own_path(self, path: str) -> str:
+    def canonical_path(self, path: str) -> str:
         """Return the canonical path of a number that several paths of the robot file name."""
         return path
 
     def resolve_paths(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Replace each path of a number by its canonical path, see :meth:`own_path`.
+        """Replace each path of a number by its canonical path, see :meth:`canonical_path`.
 
         :raises ParameterError: two paths name the same number.
         """
         found: dict[str, Any] = {}
         told: dict[Keys, str] = {}
         for path, value in values.items():
-            own = self.own_path(path)
+            own = self.canonical_path(path)
             first = told.setdefault(tuple(full_keys(own)), path)
             if first != path:
                 raise ParameterError("path", path, f"each number once; {first} is the same")
@@ -513,7 +513,7 @@ class Mechanism(Common):
 
         :raises ParameterError: a limit that would bound the workspace is missing.
         """
-        paths = [self.own_path(f"{self.limit_key}[{k}]").removesuffix(f"[{k}]") for k in range(self.joints_count)]
+        paths = [self.canonical_path(f"{self.limit_key}[{k}]").removesuffix(f"[{k}]") for k in range(self.joints_count)]
         place = position_box(self.graph, self.limits.position, self.passive_limits, paths)
         rows = []
         for c in self.coordinates:

@@ -104,7 +104,7 @@ def reject_joints(
         sample = sample[robot.graph.leading]
         leads = ", ".join(robot.graph.leads)
         question = f"; it is one of {leads} alone, others may lead (redundancy.leads)"
-    gap = None if engine.start is None else engine.start.find_miss(engine.tree, sample)
+    gap = None if engine.start is None else engine.start.find_gap(engine.tree, sample)
     if gap is not None:
         raise UnreachableError("joint state", robot.name_limb(gap[0]), index, gap[1])
     if reached == 1.0 and try_program(engine.forward, given["q"])[1]:

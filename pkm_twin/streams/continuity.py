@@ -81,7 +81,7 @@ class Continuity:
                 bound = farthest(velocity, period)
                 if not abs(here - there) <= bound:
                     controller = self.robot.controller
-                    unit = self.robot.joint_units[joint] if controller.plain else "of its units"
+                    unit = self.robot.joint_units[joint] if controller.is_identity else "of its units"
                     moved, _, most = controller.shown(joint, "velocity", here - there, -bound, bound)
                     text = f"moved by {moved:g} {unit} in {period:g} s, allowed {most:g}"
                     raise MessageError("jump", f"{controller.names[joint]} {text}")

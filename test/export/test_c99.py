@@ -15,7 +15,7 @@ import pytest
 from delta_dynamics import inverse_dynamics
 from pkm_twin import robot_names
 from pkm_twin.codegen.program import MAX_ITERATIONS
-from pkm_twin.export.c99 import C_HEAD, MAX_CORRECTIONS
+from pkm_twin.export.c99 import C_HEAD, MAX_NEWTON_CORRECTIONS
 from pkm_twin.export.c_functions import ARCTANGENT_C
 from pkm_twin.export.c_package import c_package
 from test.machine.random_machines import FILES
@@ -226,7 +226,7 @@ __attribute__((destructor)) static void report(void) { fprintf(stderr, "%ld 0", 
 """
     (tmp_path / f"{package.prefix}.c").write_text(head + text)
     number = str(list(counted.heads).index("forward"))
-    for flags, most in (((), MAX_CORRECTIONS), (("-DPKM_ATTEMPTS=1",), MAX_ITERATIONS)):
+    for flags, most in (((), MAX_NEWTON_CORRECTIONS), (("-DPKM_ATTEMPTS=1",), MAX_ITERATIONS)):
         program = counted.build(*PLAIN, *flags)
         turns = [watched(program, q, number, "1")[0] for q in wild(robot, rng, 40)]
         assert 3 <= max(turns) <= most

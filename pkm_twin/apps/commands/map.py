@@ -28,7 +28,7 @@ from pkm_twin.errors import ParameterError
 from pkm_twin.extensions import Extensible
 from pkm_twin.files import replace_file
 from pkm_twin.maps.kind import Kind
-from pkm_twin.maps.kinds import KINDS, OWN
+from pkm_twin.maps.kinds import BUILTIN_KINDS, KINDS
 from pkm_twin.maps.kinds.cutting_depth import CuttingDepth
 from pkm_twin.report import Fact, Report
 from pkm_twin.ros.signals import INTERRUPTED, first_signal
@@ -163,7 +163,7 @@ def compute(given: MapOptions) -> Report:
         )
         if given.out is not None:
             replace_file(given.out, found.table().encode())
-        beyond, least, low = found.beyond, found.least, found.near_singular
+        beyond, least, low = found.excluded_count, found.least, found.near_singular
         first, *rest = found.sentences
         bound = f", singularity index {least:g} or more" if least > 0.0 else ""
         under = ["under the wrench of the path"] if found.loaded else []
@@ -312,8 +312,8 @@ map_ = RobotFirstGroup(
     Extensible(
         "pkm_twin.maps",
         Kind,
-        ["show", *OWN],
-        lambda name: show if name == "show" else make_kind_command(OWN[name]),
+        ["show", *BUILTIN_KINDS],
+        lambda name: show if name == "show" else make_kind_command(BUILTIN_KINDS[name]),
         make_kind_command,
     ),
     "Stiffness, workspace and vibration",

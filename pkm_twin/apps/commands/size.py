@@ -98,7 +98,7 @@ def size(given: Size) -> Report:
     motors = {} if given.drives is None else read_motors(given.drives, given.motor)
     taken = given.read_efforts(given.motion, given.machine())
     motion, notes = taken.motion, list(taken.motion.notes)
-    doubted = taken.unlike or motion.efforts != "measured"
+    doubted = taken.mismatch_warning or motion.efforts != "measured"
     if given.efforts == "model":
         taken = taken.with_model()
     elif given.payload is not None and given.efforts is None and doubted:
@@ -137,9 +137,9 @@ def size(given: Size) -> Report:
         Fact("mean_power_W", net / duration, "W", "mean power"),
     ]
     title = answer
-    if doubt := motion.doubt or taken.unlike:
+    if doubt := motion.doubt or taken.mismatch_warning:
         answer += f"; {doubt}"
-        answer += "; --efforts model uses the model's" if taken.unlike else ""
+        answer += "; --efforts model uses the model's" if taken.mismatch_warning else ""
     if motors:
         none = f"none of {len(duties[0].fits)}"
         alike = find_smallest([duty.alike for duty in duties])

@@ -12,12 +12,13 @@ from pkm_twin.extensions import Extensible
 from pkm_twin.maps.kind import Kind
 
 
-def _all() -> Iterator[type[Kind]]:
+def _list_builtin_kinds() -> Iterator[type[Kind]]:
     for module in pkgutil.iter_modules(__path__):
         for one in vars(import_module(f"{__name__}.{module.name}")).values():
             if isinstance(one, type) and issubclass(one, Kind) and "name" in vars(one):
                 yield one
 
 
-OWN: Final = {kind.name: kind for kind in _all()}
-KINDS: Final[Extensible[type[Kind]]] = Extensible("pkm_twin.maps", Kind, OWN, OWN.__getitem__)
+BUILTIN_KINDS: Final = {kind.name: kind for kind in _list_builtin_kinds()}
+"""This package's kinds of maps, by name."""
+KINDS: Final[Extensible[type[Kind]]] = Extensible("pkm_twin.maps", Kind, BUILTIN_KINDS, BUILTIN_KINDS.__getitem__)

@@ -40,7 +40,7 @@ class Isotropy(Kind):
     )
 
     def cases(self, robot: Robot) -> tuple[Case, ...]:
-        """Return the platform's share of kinetic energy, and the driving force at its energy."""
+        """Return two cases: the platform's share of energy, and the driving force at ``energy``."""
         robot.massive()
         if self.spheres:
             spheres.check_tilts(robot)

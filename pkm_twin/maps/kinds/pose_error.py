@@ -36,7 +36,7 @@ class PoseError(Kind):
     def found(self, robot: Robot, q: Array, case: Case) -> Found:
         """Return the standard deviation in the worst direction, joints at their set points.
 
-        To first order, independent causes. The element is the cause with the largest contribution.
+        To first order, for independent causes. ``element``: the cause that contributes most.
         """
         effects = position_errors_by_source(robot, q)[..., _moving_causes(robot)].swapaxes(-1, -2)
         value, direction = largest_axis(effects.swapaxes(-1, -2) @ effects)

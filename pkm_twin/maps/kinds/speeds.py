@@ -29,7 +29,10 @@ class Speeds(Kind):
         return (replace(super().cases(robot)[0], unit=f"{unit_of_motion(robot)}/s"),)
 
     def found(self, robot: Robot, q: Array, case: Case) -> Found:
-        """Return velocity limits over joint rates of unit motions; the element is at its limit."""
+        """Return the platform's speed limit in the slowest direction; ``element``: the joint at its limit.
+
+        A joint allows its velocity limit over its largest rate per unit of motion.
+        """
         back, axes = unit_motions(robot, q)
         with np.errstate(divide="ignore"):
             room = drive_limits(robot, "velocity") / np.linalg.norm(back, axis=-1)

@@ -32,7 +32,7 @@ class Ratio(Kind):
         return tuple(f"d{name}/dt" for name in robot.pose_names)
 
     def found(self, robot: Robot, q: Array, case: Case) -> Found:
-        """Return the least singular value of dq/dx; the element moves most in its direction."""
+        """Return the least singular value of dq/dx; ``element``: the actuator that moves most."""
         table = robot.inverse_jacobian(q) * _length_factors(robot.joint_units, robot.size)[:, None]
         table = table / _length_factors(robot.pose_units, robot.size)
         _, values, ways = np.linalg.svd(table)
@@ -71,7 +71,7 @@ class JointEffort(Ratio):
         return Found(limits[..., robot.pose_names.index(case.name), 1])
 
     def arrays(self, robot: Robot, poses: Array) -> dict[str, Array]:
-        """Return the arrays of the ratio, and effort limits, shape (k, m, 2)."""
+        """Return the arrays of the kind :class:`Ratio`, and the effort limits, shape (k, m, 2)."""
         own = {"effort_limits": transmission(robot).effort_limits(poses)}
         return super().arrays(robot, poses) | own
 
@@ -94,7 +94,7 @@ class JointInertia(JointEffort):
         return Found(transmission(robot).inertia(robot.forward(q))[..., k, k])
 
     def arrays(self, robot: Robot, poses: Array) -> dict[str, Array]:
-        """Return the arrays of the ratio, and inertias, shape (k, m, m)."""
+        """Return the arrays of the kind :class:`Ratio`, and the inertias, shape (k, m, m)."""
         return Ratio.arrays(self, robot, poses) | {"inertia": transmission(robot).inertia(poses)}
 
 
