@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pkm_twin.codegen.arrays import Array, Mask, common_batch, doubles, finite, vectors
+from pkm_twin.codegen.arrays import Array, Mask, common_batch, doubles, require_finite, vectors
 from pkm_twin.machine.rotations import skew
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
@@ -77,7 +77,9 @@ def setpoint_correction(
     both = np.concatenate((place, np.broadcast_to(turn, place.shape)), -2)
     left = before + _multiply(both, offset * share[..., None])
     cause = "the deflection or the tool point"
-    return Correction(finite(given * share[..., None], cause), before, finite(left, cause), excess > 1.0)
+    return Correction(
+        require_finite(given * share[..., None], cause), before, require_finite(left, cause), excess > 1.0
+    )
 
 
 @dataclass
@@ -119,7 +121,7 @@ class SetpointStream:
             within = np.clip(corrected, limits[:, 0], limits[:, 1])
             self.at_limit += bool((within != corrected).any())
             corrected = within
-        return finite(corrected, "the corrected set point")
+        return require_finite(corrected, "the corrected set point")
 
 
 def _solve_least_norm(matrix: Array, target: Array, target_change: Array) -> tuple[Array, Array]:

@@ -15,7 +15,7 @@ from delta_dynamics.estimates.isolation import ContactLocator, ContactPlace
 from delta_dynamics.torques.stiction import LoadShare, friction_reach, zero_resting_rates
 from delta_dynamics.torques.uncertainty import NOISE_AVERAGING_TIME, Noise, effort_parts, torque_deviation, usual_effort
 from delta_dynamics.torques.virtual_work import inverse_dynamics, mass_matrix
-from pkm_twin.codegen.arrays import Array, check_later, common_batch, finite, one_vector, vectors
+from pkm_twin.codegen.arrays import Array, check_later, common_batch, one_vector, require_finite, vectors
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.mechanism import EFFORT_SHARING_NOTE
 from pkm_twin.robot.robot import Robot
@@ -126,7 +126,7 @@ def platform_wrench(robot: Robot, q: ArrayLike, external: ArrayLike) -> Array:
     common_batch(jacobian.shape[:-2], efforts.shape[:-1])
     with np.errstate(over="ignore", invalid="ignore"):
         least = (inverse @ efforts[..., None])[..., 0] * lever
-    return finite(least, "an effort")
+    return require_finite(least, "an effort")
 
 
 CONTACT_SIGMAS: Final = 6.0

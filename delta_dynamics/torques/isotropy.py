@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from delta_dynamics.torques.torque_terms import efforts_without_friction
 from delta_dynamics.torques.virtual_work import body_mass_matrix, mass_matrix
-from pkm_twin.codegen.arrays import Array, common_batch, doubles, finite, vectors
+from pkm_twin.codegen.arrays import Array, common_batch, doubles, require_finite, vectors
 from pkm_twin.errors import ParameterError, SingularityError
 from pkm_twin.machine.pose_grid import zero_torsion
 from pkm_twin.robot.derivatives import joint_accelerations
@@ -198,7 +198,7 @@ def joint_motion(robot: Robot, pose: ArrayLike, rates: ArrayLike, accelerations:
     common_batch(q.shape[:-1], rates.shape[:-1], change.shape[:-1])
     qd = np.einsum("...ij,...j->...i", inverse, rates)
     qdd = joint_accelerations(robot, q, qd, inverse, change)
-    finite(qdd, "an acceleration")
+    require_finite(qdd, "an acceleration")
     q, qd, qdd = np.broadcast_arrays(q, qd, qdd)
     return JointMotion(q.copy(), qd.copy(), qdd)
 
@@ -344,7 +344,7 @@ def _find_largest_form(forms: Array) -> tuple[Array, Array, NDArray[np.int64]]:
 
 def spread(values: ArrayLike) -> Array:
     """Return maximum minus minimum over the last axis, for an index over all directions."""
-    return np.asarray(np.ptp(finite(doubles(values), "a value"), axis=-1), np.float64)
+    return np.asarray(np.ptp(require_finite(doubles(values), "a value"), axis=-1), np.float64)
 
 
 def tilted_pose(height: ArrayLike, azimuth: ArrayLike, tilt: ArrayLike) -> Array:
@@ -352,7 +352,7 @@ def tilted_pose(height: ArrayLike, azimuth: ArrayLike, tilt: ArrayLike) -> Array
 
     The platform's axis leans by ``tilt`` towards ``azimuth`` (rad), as in the paper's maps.
     """
-    given = [finite(doubles(v), "a height or an angle") for v in (height, azimuth, tilt)]
+    given = [require_finite(doubles(v), "a height or an angle") for v in (height, azimuth, tilt)]
     common_batch(*(values.shape for values in given))
     z, a, t = np.broadcast_arrays(*given)
     return np.stack([z, *zero_torsion(t, a)], -1)

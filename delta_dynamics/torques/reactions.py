@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from delta_dynamics.torques.virtual_work import Forces, body_efforts
-from pkm_twin.codegen.arrays import Array, Mask, finite
+from pkm_twin.codegen.arrays import Array, Mask, require_finite
 from pkm_twin.codegen.expressions import PARAMETERS
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
@@ -380,7 +380,7 @@ def balance(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: A
         moved = np.einsum("...kj,...j->...k", turned[..., :n], along)
         turned[..., :n] = np.where(used[..., None, :], 0.0, turned[..., :n])
         found = replace(found, value=found.value + moved * found.unit, null=turned)
-    finite(found.value, "the motion or the wrench")
+    require_finite(found.value, "the motion or the wrench")
     return found
 
 

@@ -41,7 +41,7 @@ class Value(click.ParamType):  # type: ignore[type-arg]
     name = "value"
 
     def __init__(self, kind: Any, row: Setting) -> None:
-        """Set the type ``kind`` of one value (the field's without None) and the field's setting."""
+        """Store the value's type (``kind``: the field's type without None) and the field's setting."""
         self.kind, self.row = kind, row
 
     def convert(self, value: Any, param: Any, ctx: click.Context | None) -> Any:
@@ -49,7 +49,7 @@ class Value(click.ParamType):  # type: ignore[type-arg]
 
         :raises UsageError: the word is not one of the choices, not a number, or out of bounds.
         """
-        row, name = self.row, spell(param)
+        row, name = self.row, format_parameter_name(param)
         word = value[1:] if value[:1] == NEGATIVE_MARK and NEGATIVE_NUMBER.match(value, 1) else value
         if row.choices:
             if word not in row.choices:
@@ -203,7 +203,7 @@ class Command(click.Command):
             # does not allow.
             find_source, word = click.get_current_context().get_parameter_source, error.field
             texts = [
-                spell(one)
+                format_parameter_name(one)
                 for one in self.fields
                 if getattr(one.type, "kind", bool) is str and find_source(str(one.name)) is ParameterSource.COMMANDLINE
             ]
@@ -219,7 +219,8 @@ class Command(click.Command):
     def _check_targets(self, given: Any, overwrite: bool, source: Path | None) -> None:
         """Check that the files of options and of ``given.files`` may be written.
 
-        Words, files to read and the robot are judged before an existing target is rejected.
+        Files to read, options and the robot are checked before an existing file, so that their
+        errors are reported first.
 
         :raises PkmTwinError: a folder, a wrong ending, or a file that may not be replaced.
         """
@@ -229,11 +230,11 @@ class Command(click.Command):
             if not row.writes or target is None or str(target) == STANDARD:
                 continue
             if target.name in ("", ".."):
-                what = f"{spell(one)}: {str(target)!r}"
+                what = f"{format_parameter_name(one)}: {str(target)!r}"
                 raise PkmTwinError(f"{what} is a folder; expected a file name")
             if row.endings and target.suffix not in row.endings:
                 ending = f"a name that ends in {' or '.join(row.endings)}"
-                raise ParameterError(spell(one), str(target), ending)
+                raise ParameterError(format_parameter_name(one), str(target), ending)
             targets.append(target)
         targets += filter(None, getattr(given, "files", {}).values())
         if not overwrite and any(map(os.path.lexists, targets)):
@@ -311,7 +312,7 @@ class Group(click.Group):
         return self.spell_command(name), found, rest
 
 
-def spell(one: click.Parameter) -> str:
+def format_parameter_name(one: click.Parameter) -> str:
     """Return the name of an option or argument as the help prints it."""
     return one.human_readable_name if isinstance(one, click.Argument) else one.opts[0]
 

@@ -180,9 +180,9 @@ class RecordingOptions(TableOptions):
 
         if self.topic and not is_bag(path):
             raise click.UsageError(f"--topic is for bags; {path} is read as a table")
-        return read(path, robot, self.reading(**more), progress)
+        return read(path, robot, self.build_read_options(**more), progress)
 
-    def reading(self, **more: Any) -> ReadOptions:
+    def build_read_options(self, **more: Any) -> ReadOptions:
         """Return the options for reading a recording; ``more``: other fields of ``ReadOptions``."""
         from pkm_twin.recordings import ReadOptions
 

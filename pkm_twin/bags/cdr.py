@@ -23,7 +23,8 @@ from pkm_twin.errors import BagError
 
 _SIZES = {code: struct.calcsize(f"={code}") for code in CODES.values()}
 _UNPACK = {order: {code: struct.Struct(f"{order}{code}").unpack_from for code in _SIZES} for order in "<>"}
-_LITTLE_HEADER = b"\x00\x01\x00\x00"
+_LITTLE_ENDIAN_HEADER = b"\x00\x01\x00\x00"
+"""CDR encapsulation header of little-endian data."""
 
 
 class MessageCodec:
@@ -105,7 +106,7 @@ class MessageCodec:
 
         :raises BagError: a field is missing, unknown, out of range or of the wrong length.
         """
-        out = bytearray(_LITTLE_HEADER)
+        out = bytearray(_LITTLE_ENDIAN_HEADER)
         self._encode(self._name, message, out, self.type_name)
         return bytes(out)
 
@@ -183,7 +184,7 @@ class _Cursor:
         self._unpack = _UNPACK[order]
         self._swapped = order != ("<" if sys.byteorder == "little" else ">")
         self._end = len(data)
-        self.position = len(_LITTLE_HEADER)
+        self.position = len(_LITTLE_ENDIAN_HEADER)
 
     def make_error(self, text: str) -> BagError:
         return BagError(f"{self._type_name}: {text}", reason="cdr")
@@ -196,7 +197,7 @@ class _Cursor:
 
     def _align(self, size: int) -> None:
         # CDR aligns to the value's own size, counted from the end of the 4-byte header.
-        self.position += -(self.position - len(_LITTLE_HEADER)) % size
+        self.position += -(self.position - len(_LITTLE_ENDIAN_HEADER)) % size
 
     def read_numbers(self, code: str, count: int) -> array.array[Any]:
         # `array` has no bool: read bytes.
@@ -236,7 +237,7 @@ class _Cursor:
 
 def _append_packed(out: bytearray, code: str, values: Sequence[Any], where: str) -> None:
     size = _SIZES[code]
-    out.extend(bytes(-(len(out) - len(_LITTLE_HEADER)) % size))
+    out.extend(bytes(-(len(out) - len(_LITTLE_ENDIAN_HEADER)) % size))
     try:
         out.extend(struct.pack(f"<{len(values)}{code}", *values))
     except (struct.error, OverflowError) as error:

@@ -12,7 +12,7 @@ from pathlib import Path
 from pkm_twin.bags.format import FormatError
 from pkm_twin.bags.storage import BagFile, find_storage, list_files
 from pkm_twin.bags.strict import Check, check_files
-from pkm_twin.bags.writer import McapWriter, reject_existing, write_error
+from pkm_twin.bags.writer import McapWriter, convert_write_error, reject_existing
 from pkm_twin.errors import BagError
 from pkm_twin.files import write_atomically
 
@@ -95,7 +95,7 @@ def recover(source: str | Path, target: str | Path, *, overwrite: bool = False) 
                 raise BagError(text, path=source, reason="nothing")
             reject_existing(target, overwrite)
     except OSError as error:
-        raise write_error(error, target) from error
+        raise convert_write_error(error, target) from error
     parts = [part for check in found for part in check.segments]
     return RecoverResult(
         messages=sum(part.messages.count for part in parts),

@@ -90,7 +90,7 @@ def make_report(path: Path, storage: Storage, checks: Sequence[Check]) -> BagRep
                 fault = f"two forms of the type {info.type}: definition or encoding differ"
             if fault:
                 raise BagError(f"topic {name} has {fault}", path=file.path, reason="type")
-            # Another publisher, or another file of the bag.
+            # The topic is known from another publisher or another file of the bag: join counts and times.
             if name in topics and known.count and info.count:
                 start, end = min(known.start, info.start), max(known.end, info.end)
                 info = replace(known, count=known.count + info.count, start=start, end=end)

@@ -38,8 +38,8 @@ def reject_existing(path: Path, overwrite: bool) -> None:
         raise BagError("exists already", path=path, reason="exists")
 
 
-def write_error(error: OSError, path: Path) -> BagError:
-    """Convert an error of the operating system in writing ``path`` to a BagError."""
+def convert_write_error(error: OSError, path: Path) -> BagError:
+    """Convert the operating system's error on writing ``path`` to a BagError."""
     reason = {
         errno.ENOSPC: "disk_full",
         errno.EDQUOT: "disk_full",
@@ -114,7 +114,7 @@ class _UnbufferedFile:
             while view:
                 view = view[self._file.write(view) :]
         except OSError as error:
-            raise write_error(error, self._path) from error
+            raise convert_write_error(error, self._path) from error
 
 
 class BagWriter:
@@ -168,7 +168,7 @@ class BagWriter:
                 self._path.unlink(missing_ok=True)
             self._file = self._path.open("xb", buffering=0)
         except OSError as error:
-            raise write_error(error, self._path) from error
+            raise convert_write_error(error, self._path) from error
         try:
             self._writer = McapWriter(self._file, self._path, chunk_size, "ros2")
             for name, entries in (metadata or {}).items():
@@ -329,7 +329,7 @@ def write_whole_bag(path: Path, overwrite: bool, metadata: Mapping[str, Mapping[
         with write_atomically(path) as hidden, BagWriter(hidden, metadata=metadata, flush_period=None) as writer:
             yield writer
     except OSError as error:
-        raise write_error(error, path) from error
+        raise convert_write_error(error, path) from error
     except BagError as error:
         # Users do not know the temporary name.
         if error.path is None or error.path == path:

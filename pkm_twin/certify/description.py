@@ -127,16 +127,16 @@ class Machine:
 
     def pose_coordinates(self, rotation: Array, position: Array) -> Array:
         """Return the pose coordinates of a rotation and a position, shape (m,), m and rad."""
-        return self.select(position, Rotation.from_matrix(rotation).as_euler(self.sequence))
+        return self.select_pose_rows(position, Rotation.from_matrix(rotation).as_euler(self.sequence))
 
     @property
     def sequence(self) -> str:
         """Axes of the three angles in scipy's notation of intrinsic rotations."""
         return "XYZ" if next(iter(self.angles.values())) == "x" else "ZYX"
 
-    def select(self, places: Array, turns: Array) -> Array:
-        """Return the rows of the pose, (m, ...), among those of position and angles, (3, ...)."""
-        rows = dict(zip("xyz", places, strict=True)) | dict(zip(self.angles, turns, strict=False))
+    def select_pose_rows(self, position_rows: Array, angle_rows: Array) -> Array:
+        """Return the rows of the m pose coordinates from three position rows and three angle rows."""
+        rows = dict(zip("xyz", position_rows, strict=True)) | dict(zip(self.angles, angle_rows, strict=False))
         return np.array([rows[name] for name in self.pose])
 
 

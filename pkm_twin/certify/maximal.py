@@ -153,7 +153,7 @@ class Maximal(Engine):
         a, b, c = (np.eye(3)["XYZ".index(axis)] for axis in sequence)
         # Angular velocity per rate of each angle.
         spin = np.stack([a, first @ b, second @ c], -1)
-        return float(np.linalg.det(machine.select(twist[:3], np.linalg.solve(spin, twist[3:]))))
+        return float(np.linalg.det(machine.select_pose_rows(twist[:3], np.linalg.solve(spin, twist[3:]))))
 
     def _move_bodies(self, state: State, change: Array) -> State:
         each = change.reshape(-1, 6)
@@ -183,7 +183,7 @@ class Maximal(Engine):
 
     # Rates and forces
 
-    def move(self, rates: Array) -> None:
+    def set_velocities(self, rates: Array) -> None:
         """Set the velocities of the bodies, shape (6 bodies,)."""
         self._state = replace(self._state, velocity=rates.reshape(-1, 6))
 

@@ -83,7 +83,7 @@ class MujocoTree(Tree):
         """Return the configuration at home."""
         return np.asarray(self._start)
 
-    def place(self, full: Array, rates: Array) -> None:
+    def set_state(self, full: Array, rates: Array) -> None:
         """Set the tree's configuration and velocities, shape (size,)."""
         self._frames: dict[str, Frame] = {}
         self._data.qpos[:], self._data.qvel[:] = full, rates

@@ -60,7 +60,7 @@ class PinocchioTree(Tree):
         """Return the configuration at home."""
         return np.asarray(pin.neutral(self.model))
 
-    def place(self, full: Array, rates: Array) -> None:
+    def set_state(self, full: Array, rates: Array) -> None:
         """Set the tree's configuration and velocities, shape (size,)."""
         self._frames: dict[str, Frame] = {}
         self._state = full, rates

@@ -99,8 +99,8 @@ class Engine(ABC):
         """
 
     @abstractmethod
-    def move(self, rates: Array) -> None:
-        """Set the coordinate velocities of the present assembly, shape (size,)."""
+    def set_velocities(self, rates: Array) -> None:
+        """Set the coordinate velocities in the present configuration, shape (size,)."""
 
     @abstractmethod
     def forces(self, change: Array) -> Array:
@@ -166,7 +166,7 @@ class Engine(ABC):
             elif constraint == "crossing":
                 rows.append(cosine_row(axes[0], axes[1]))
             elif constraint == "thread":
-                slide, turn, pitch = self._slide(joint), self._turn(joint), joint.pitch
+                slide, turn, pitch = self._displacement(joint), self._rotation_angle(joint), joint.pitch
                 residual = slide.value - pitch * turn.value
                 # The angle is known up to full turns only.
                 residual = np.array([math.remainder(residual[0], 2.0 * math.pi * pitch)])
@@ -179,13 +179,15 @@ class Engine(ABC):
         """Return the value of a joint with one freedom, as a row with its derivatives."""
         if len(joint.type.steps) != 1:
             raise UnfitError(f"joints.{joint.name}: a {joint.type.name} joint has no rate")
-        return self._slide(joint) if joint.slides else self._turn(joint)
+        return self._displacement(joint) if joint.slides else self._rotation_angle(joint)
 
-    def _slide(self, joint: Joint) -> Rows:
+    def _displacement(self, joint: Joint) -> Rows:
+        """Return the displacement along a joint's axis, with its derivatives."""
         gap = self.point(joint.outer, joint.at).minus(self.point(joint.inner, joint.at))
         return dot(self.direction(joint.inner, joint.axes[0]), gap)
 
-    def _turn(self, joint: Joint) -> Rows:
+    def _rotation_angle(self, joint: Joint) -> Rows:
+        """Return the rotation angle about a joint's axis, with its derivatives."""
         axis = self.direction(joint.inner, joint.axes[0])
         relative = self.spin(joint.outer).minus(self.spin(joint.inner))
         side, other = make_perpendicular_axes(joint.axes[0])
@@ -198,13 +200,13 @@ class Engine(ABC):
             np.array([axis.rate @ relative.rate + axis.value @ relative.bias]),
         )
 
-    def held(self) -> Iterable[tuple[Joint, Sequence[str]]]:
-        """List the joints that are equations, with their constraints."""
+    def constraint_joints(self) -> Iterable[tuple[Joint, Sequence[str]]]:
+        """List the joints whose constraints are equations, with the names of these constraints."""
         return [(joint, joint.type.holds) for joint in self.machine.joints]
 
     def closures(self) -> Rows:
         """Return the equations of all joints and rods in the present state."""
-        rows = [row for joint, holds in self.held() for row in self.joint_rows(joint, holds)]
+        rows = [row for joint, holds in self.constraint_joints() for row in self.joint_rows(joint, holds)]
         rows += [self.rod_rows(rod) for rod in self.machine.rods]
         return stack_rows(rows, self.size)
 
@@ -270,7 +272,7 @@ class Engine(ABC):
         self.assemble(q)
         tangent = self.tangent()
         rates = tangent @ qd
-        self.move(rates)
+        self.set_velocities(rates)
         change = self.solve(-self.closures().bias, qdd - self.drives().bias)
         force = self.forces(change)
         if wrench is not None:

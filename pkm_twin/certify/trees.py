@@ -78,14 +78,17 @@ class Tree(Engine):
 
     @abstractmethod
     def add_body(self, name: str, parent: str, at: Array, steps: Steps | None, body: Body) -> None:
-        """Add a body to its parent by joints through a point at home; None: six freedoms."""
+        """Add a body that moves on its parent by ``steps``: single motions at the point ``at``, home, m.
+
+        Without ``steps`` (None) the body moves freely.
+        """
 
     @abstractmethod
     def finish(self) -> int:
         """Complete the model at home; return its number of velocities."""
 
     @abstractmethod
-    def place(self, full: Array, rates: Array) -> None:
+    def set_state(self, full: Array, rates: Array) -> None:
         """Set the tree's configuration and velocities, shape (size,)."""
 
     @abstractmethod
@@ -96,8 +99,8 @@ class Tree(Engine):
     def neutral(self) -> Array:
         """Return the configuration at home."""
 
-    def held(self) -> Iterable[tuple[Joint, Sequence[str]]]:
-        """List the joints that the tree leaves out, and the thread constraints of its screws."""
+    def constraint_joints(self) -> Iterable[tuple[Joint, Sequence[str]]]:
+        """List the loop-closing joints with their constraints, and the tree's screws with the thread constraint."""
         return self._held
 
     def rod_rows(self, rod: Rod) -> Rows:
@@ -119,13 +122,13 @@ class Tree(Engine):
         self._set_at_rest(full)
         return full
 
-    def move(self, rates: Array) -> None:
+    def set_velocities(self, rates: Array) -> None:
         """Set the velocities of the present assembly, shape (size,)."""
-        self.place(self._full, rates)
+        self.set_state(self._full, rates)
 
     def _set_at_rest(self, full: Array) -> None:
         self._full = full
-        self.place(full, np.zeros(self.size))
+        self.set_state(full, np.zeros(self.size))
 
     def _continue_to(self, goal: Array) -> Array:
         full, steps = self.neutral(), 64

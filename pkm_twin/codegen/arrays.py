@@ -78,8 +78,8 @@ def vectors(values: ArrayLike, size: int, what: str) -> Array:
     return array
 
 
-def finite(result: NDArray[Any], cause: str) -> Array:
-    """Check that a result is finite and return it as float64.
+def require_finite(result: NDArray[Any], cause: str) -> Array:
+    """Return a result as float64; raise an error if an entry is not finite.
 
     :param cause: the input that the error names.
     :raises ValueError: an entry is not finite.

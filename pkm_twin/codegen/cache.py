@@ -30,7 +30,8 @@ MAX_BYTES: Final = 512 * 1024 * 1024
 LOCK_TIMEOUT: Final = 60.0
 """Seconds to wait for another process that compiles the same program; it may be suspended."""
 _LOCK_PERIOD: Final = 0.01
-_NAME: Final = re.compile("[0-9a-f]{32,64}")
+_KEY_PATTERN: Final = re.compile("[0-9a-f]{32,64}")
+"""File name of a cached program: its hash in hexadecimal."""
 _LOG: Final = logging.getLogger("pkm_twin")
 
 
@@ -77,7 +78,7 @@ def read(name: str) -> tuple[dict[str, Any], bytes] | None:
     The file must belong to this user, be complete, and carry the checksum of this name.
     """
     place = find_folder()
-    if place is None or not _NAME.fullmatch(name):
+    if place is None or not _KEY_PATTERN.fullmatch(name):
         return None
     try:
         # Without O_NONBLOCK a FIFO of this name would block until somebody writes to it.

@@ -24,7 +24,7 @@ from pkm_twin.codegen.plain import PlainCode
 from pkm_twin.codegen.program import Program
 from pkm_twin.errors import ParameterError
 
-SWITCH: Final = "PKM_TWIN_PLAIN"
+PLAIN_PYTHON_VARIABLE: Final = "PKM_TWIN_PLAIN"
 """Environment variable: 1 runs programs as plain Python, as on a computer without llvmlite."""
 STEPS: Final = (3, 9, 27, 81, 243, 1024)
 """Numbers of steps in which samples that a single step does not reach are tried again."""
@@ -48,7 +48,7 @@ _NO_INPUT: Final = np.zeros(0)
 
 @remembered
 def _import_llvm() -> ModuleType | None:
-    if os.environ.get(SWITCH, "0") not in ("", "0"):
+    if os.environ.get(PLAIN_PYTHON_VARIABLE, "0") not in ("", "0"):
         return None
     try:
         from pkm_twin.codegen import llvm
@@ -66,8 +66,8 @@ def slowness() -> str:
     """Return why programs run as plain Python and what to do; empty if they are compiled."""
     if compiled():
         return ""
-    if os.environ.get(SWITCH, "0") not in ("", "0"):
-        return f"{SWITCH} is set: torques take about a thousand times longer"
+    if os.environ.get(PLAIN_PYTHON_VARIABLE, "0") not in ("", "0"):
+        return f"{PLAIN_PYTHON_VARIABLE} is set: torques take about a thousand times longer"
     return (
         "llvmlite is not installed: torques take about a thousand times longer, too long for "
         "1 kHz; install it with 'sudo apt install python3-llvmlite' or 'pip install llvmlite'"
@@ -442,7 +442,7 @@ def _make_header(program: Program, lanes: int) -> dict[str, Any]:
     return {
         "inputs": list(program.inputs.values()),
         "outputs": [len(row) for row in program.outputs.values()],
-        "parameters": program.parameters + program.geometry,
+        "parameters": program.parameters + program.geometry_count,
         "prepared": lanes * (len(program.prepared) + 1),
         "stepped": bool(program.equations) and not program.single,
     }

@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.codegen.operations import (
-    CONSTANT,
-    PARAMETER,
-    SAMPLE,
+    CONSTANT_LEVEL,
+    PARAMETER_LEVEL,
+    SAMPLE_LEVEL,
     Operation,
     add,
     cos,
@@ -52,7 +52,8 @@ class Tape:
 
     :param reference: reference values of the geometry. Expressions of the geometry alone have a
         value there, and :func:`snapped` may replace them by a constant.
-    :param free: never replace expressions by constants, as derivatives by the geometry need.
+    :param free: keep the geometry symbolic: never replace its expressions by constants. Derivatives
+        with respect to the geometry need this.
     """
 
     def __init__(self, reference: Sequence[float] = (), *, free: bool = False) -> None:
@@ -68,14 +69,14 @@ class Tape:
         """Return the expression of a constant."""
         # atan2 distinguishes 0.0 from -0.0.
         key = (None, value, math.copysign(1.0, value))
-        return self._known.get(key) or self._new(key, None, (), CONSTANT, float(value))
+        return self._known.get(key) or self._new(key, None, (), CONSTANT_LEVEL, float(value))
 
     def input(self, name: str, index: int) -> Expression:
         """Return entry ``index`` of the input ``name``."""
         key = (name, index)
         known = self._known.get(key)
         if known is None:
-            level = PARAMETER if name in (PARAMETERS, GEOMETRY) else SAMPLE
+            level = PARAMETER_LEVEL if name in (PARAMETERS, GEOMETRY) else SAMPLE_LEVEL
             value = float(self.reference[index]) if name == GEOMETRY else math.nan
             known = self._new(key, None, (), level, value)
             known.source = key
@@ -101,7 +102,7 @@ class Tape:
             return known
         level = max(map(_level_of, args))
         value = math.nan
-        if level == PARAMETER:
+        if level == PARAMETER_LEVEL:
             value = (op.one or op.numbers)(*[x.value for x in args])
         return self._new(key, op, args, level, value)
 
@@ -115,9 +116,9 @@ class Tape:
 class Expression:
     """A constant, an input or an operation on ``args``.
 
-    ``source``: name and index of an input. ``level``: what the expression depends on, CONSTANT,
-    PARAMETER or SAMPLE. ``value``: the constant, or the value at the tape's reference geometry; NaN
-    if the expression depends on the sample.
+    ``source``: name and index of an input. ``level``: what the expression depends on:
+    CONSTANT_LEVEL, PARAMETER_LEVEL or SAMPLE_LEVEL. ``value``: the constant, or the value at the
+    tape's reference geometry; NaN if the expression depends on the sample.
     """
 
     __slots__ = ("args", "level", "number", "op", "source", "tape", "value")
@@ -137,7 +138,7 @@ class Expression:
 
     def is_constant(self, value: float) -> bool:
         """Return whether the expression is this constant."""
-        return self.level == CONSTANT and self.value == value
+        return self.level == CONSTANT_LEVEL and self.value == value
 
     def _with(self, op: Operation, other: Any, *, after: bool = False) -> Any:
         """Apply an operation to this and another value, in reverse order with ``after``."""
@@ -258,7 +259,7 @@ def snapped(value: Any) -> Any:
     known = reference(value)
     for target in (0.0, 1.0, -1.0):
         if abs(known - target) < SNAP:
-            if isinstance(value, Expression) and value.level != CONSTANT:
+            if isinstance(value, Expression) and value.level != CONSTANT_LEVEL:
                 value.tape.assumed.append((value, target))
             return target
     return value
@@ -301,16 +302,16 @@ def count_uses(results: Sequence[Expression]) -> dict[int, int]:
 
 def count(results: Iterable[Expression]) -> int:
     """Count the operations per sample, without those of expressions of parameters."""
-    return sum(e.level == SAMPLE and e.op is not None for e in list_dependencies(results))
+    return sum(e.level == SAMPLE_LEVEL and e.op is not None for e in list_dependencies(results))
 
 
 def find_prepared(results: Iterable[Expression]) -> list[Expression]:
     """Find the expressions that are computed once per machine: of parameters, used by samples or as results."""
     results = list(results)
-    found = {e.number: e for e in results if e.level == PARAMETER}
+    found = {e.number: e for e in results if e.level == PARAMETER_LEVEL}
     for e in list_dependencies(results):
-        if e.level == SAMPLE:
-            found |= {x.number: x for x in e.args if x.level == PARAMETER}
+        if e.level == SAMPLE_LEVEL:
+            found |= {x.number: x for x in e.args if x.level == PARAMETER_LEVEL}
     return list(found.values())
 
 

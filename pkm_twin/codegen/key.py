@@ -20,7 +20,8 @@ Module = tuple[str, str]
 _IMPORT: Final = re.compile(rb"import[ \t]+(\([^)]*\)|.*)")
 _NAME: Final = re.compile(r"[\w.]+")
 _PACKAGE: Final = f"{os.sep}__init__.py"
-_COMPILER: Final = "pkm_twin.codegen.code"
+_COMPILER_MODULE: Final = "pkm_twin.codegen.code"
+"""Module whose source, with the sources that it imports, is part of every key."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ def _source_file(module: str) -> str:
 
 @cache
 def _find_sources(writers: frozenset[str]) -> frozenset[str]:
-    todo: list[Module] = [(name, _source_file(name)) for name in {*writers, _COMPILER} if _source_file(name)]
+    todo: list[Module] = [(name, _source_file(name)) for name in {*writers, _COMPILER_MODULE} if _source_file(name)]
     found = set(todo)
     while todo:
         new = _find_imports(*todo.pop()) - found
@@ -87,7 +88,7 @@ def _find_imports(module: str, file: str) -> frozenset[Module]:
 
     The text is searched, so imports inside functions and imports for type checking count, too.
     """
-    homes = dict((_package_root(_COMPILER, _source_file(_COMPILER)), _package_root(module, file)))
+    homes = dict((_package_root(_COMPILER_MODULE, _source_file(_COMPILER_MODULE)), _package_root(module, file)))
     found = set()
     for package, names in _read_source(file)[1]:
         for name in [package] if package else names:

@@ -43,7 +43,7 @@ from pkm_twin.codegen.program import (
     Equations,
     Program,
     holding,
-    previous,
+    previous_input_name,
 )
 
 STATUS: Final = " status"
@@ -295,8 +295,8 @@ class _Writer:
         b.store(b.or_(b.load(self.flags), bad), self.flags)
         samples.close()
 
-    def _store_progress(self, k: Value, n: Sequence[Value]) -> None:
-        """Compute :func:`.program.progress` of step k + 1."""
+    def _store_continuation_fraction(self, k: Value, n: Sequence[Value]) -> None:
+        """Compute and store how far step k + 1 goes to the target, see :func:`.program.progress`."""
         b, parts = self.function, []
         for more in (-1, 0, 1):
             share = b.fdiv(b.sitofp(b.add(k, integer_constant(more)), DOUBLE), b.sitofp(self.steps, DOUBLE))
@@ -343,9 +343,9 @@ class _Writer:
         steps = _CountingLoop(b, "step", self.steps)
         k = steps.begin()
         masks[q.is_underway.number] = b.icmp("slt", b.add(k, ONE), self.steps)
-        self._store_progress(k, n)
+        self._store_continuation_fraction(k, n)
         b.store(b.load(n[AT.alive]), n[AT.moving])
-        compute(q.aim, aim)
+        compute(q.step_target, aim)
         begin, onward, joined = (b.block(name) for name in ("begin", "onward", "turns"))
         b.cbranch(b.icmp("eq", k, ZERO), begin, onward)
         b.go_to(begin)
@@ -353,7 +353,7 @@ class _Writer:
         b.branch(joined)
         b.go_to(onward)
         here = [b.load(place) for place in x]
-        compute(q.onward, x, {q.unknowns: x, previous(q.unknowns): last})
+        compute(q.onward, x, {q.unknowns: x, previous_input_name(q.unknowns): last})
         for value, place in zip(here, last, strict=True):
             b.store(value, place)
         b.branch(joined)
@@ -364,7 +364,7 @@ class _Writer:
         kept = [*x, *n[AT.size : AT.reached]]
         compute(q.correct, kept, {q.unknowns: x, q.target: aim}, q.results)
         corrections.close(self._any_lane(self._is_positive(b.load(n[AT.moving]))))
-        compute(q.arrive, n[AT.alive : AT.reached + 1])
+        compute(q.flags_after_step, n[AT.alive : AT.reached + 1])
         steps.close(self._any_lane(self._is_positive(b.load(n[AT.alive]))))
         return [b.load(place) for place in x]
 

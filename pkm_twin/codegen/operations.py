@@ -19,10 +19,10 @@ import numpy as np
 if TYPE_CHECKING:
     from pkm_twin.codegen.assembly import Lanes, Value
 
-CONSTANT: Final = 0
-PARAMETER: Final = 1
-SAMPLE: Final = 2
-"""Levels of an expression: it depends on nothing, on parameters alone, or on the sample."""
+CONSTANT_LEVEL: Final = 0
+PARAMETER_LEVEL: Final = 1
+SAMPLE_LEVEL: Final = 2
+"""Levels of an expression: it is constant, depends on parameters only, or depends on the sample."""
 
 MAX_ANGLE: Final = 1e6
 """Largest angle of sine and cosine, rad; beyond it the reduction by quarter turns loses digits."""
@@ -149,9 +149,9 @@ class Operation:
 
 
 def _fold_sum(a: Any, b: Any) -> Any:
-    if a.level == CONSTANT and a.value == 0.0:
+    if a.level == CONSTANT_LEVEL and a.value == 0.0:
         return b
-    if b.level == CONSTANT and b.value == 0.0:
+    if b.level == CONSTANT_LEVEL and b.value == 0.0:
         return a
     if b.op is neg:
         return _fold_difference(a, *b.args)
@@ -161,9 +161,9 @@ def _fold_sum(a: Any, b: Any) -> Any:
 def _fold_difference(a: Any, b: Any) -> Any:
     if a is b:
         return a.tape.constant(0.0)
-    if b.level == CONSTANT and b.value == 0.0:
+    if b.level == CONSTANT_LEVEL and b.value == 0.0:
         return a
-    if a.level == CONSTANT and a.value == 0.0:
+    if a.level == CONSTANT_LEVEL and a.value == 0.0:
         return _fold_negation(b)
     if b.op is neg:
         return _fold_sum(a, *b.args)
@@ -172,7 +172,7 @@ def _fold_difference(a: Any, b: Any) -> Any:
 
 def _fold_product(a: Any, b: Any) -> Any:
     for u, v in ((a, b), (b, a)):
-        if u.level == CONSTANT and u.value in (0.0, 1.0, -1.0):
+        if u.level == CONSTANT_LEVEL and u.value in (0.0, 1.0, -1.0):
             return u if u.value == 0.0 else v if u.value > 0.0 else _fold_negation(v)
     if a.op is neg:
         both = b.op is neg
@@ -253,12 +253,13 @@ def _write_cosine_sine(to: Lanes, x: Value) -> tuple[Value, Value]:
     k = b.fptosi(quarters, to.integer)
     odd = b.icmp("ne", b.and_(k, to.integer_constant(1)), to.integer_constant(0))
 
-    def signed(value: Value, turns: Value) -> Value:
-        flip = b.shl(b.and_(turns, to.integer_constant(2)), to.integer_constant(62))
+    def negate_by_quadrant(value: Value, quadrant: Value) -> Value:
+        """Change the sign of a value where bit 1 of the quadrant's number is set."""
+        flip = b.shl(b.and_(quadrant, to.integer_constant(2)), to.integer_constant(62))
         return b.bitcast(b.xor(b.bitcast(value, to.integer), flip), to.type)
 
-    turned = signed(b.select(odd, cosine, sine), k)
-    return signed(b.select(odd, sine, cosine), b.add(k, to.integer_constant(1))), turned
+    turned = negate_by_quadrant(b.select(odd, cosine, sine), k)
+    return negate_by_quadrant(b.select(odd, sine, cosine), b.add(k, to.integer_constant(1))), turned
 
 
 def _write_exponential(to: Lanes, x: Value) -> Value:
@@ -345,7 +346,7 @@ def _write_select(to: Lanes, e: Any, x: Value, y: Value, z: Value) -> Value:
 
 
 def _fold_select(x: Any, y: Any, z: Any) -> Any:
-    return (y if x.value > 0.0 else z) if x.level == CONSTANT else x.tape.make(select, x, y, z)
+    return (y if x.value > 0.0 else z) if x.level == CONSTANT_LEVEL else x.tape.make(select, x, y, z)
 
 
 def _step_weight(a: Any, b: Any) -> Any:

@@ -26,7 +26,7 @@ from pkm_twin.codegen.program import (
     Equations,
     Program,
     holding,
-    previous,
+    previous_input_name,
     progress,
 )
 
@@ -104,7 +104,7 @@ class PlainCode:
             parts |= {(q, name): getattr(q, name) for name in SOLUTION_PARTS}
         known = {e.number: f"{PARAMETERS}[{k}]" for k, e in enumerate(program.prepared)}
         self._parts = {name: compile_functions(part, names, known) for name, part in parts.items()}
-        given = {PARAMETERS: program.parameters, GEOMETRY: program.geometry}
+        given = {PARAMETERS: program.parameters, GEOMETRY: program.geometry_count}
         self._prepare = compile_functions([*program.prepared, program.missed], given)[0]
 
     def prepare(self, p: Array) -> Array:
@@ -160,7 +160,8 @@ class PlainCode:
         before = x = evaluate("home")
         for k in range(1, steps + 1):
             n[AT.part], n[AT.onward], n[AT.moving] = *progress(k, steps), n[AT.alive]
-            step_inputs = named | {q.target: evaluate("aim"), q.unknowns: x, previous(q.unknowns): before}
+            guesses = {q.unknowns: x, previous_input_name(q.unknowns): before}
+            step_inputs = named | guesses | {q.target: evaluate("step_target")}
             before = x
             if k == 1:
                 *x, size = evaluate("begin", step_inputs)
@@ -173,7 +174,7 @@ class PlainCode:
                 step_inputs[q.unknowns] = x
                 if not any_of(n[AT.moving]):
                     break
-            n[AT.alive], n[AT.reached] = evaluate("arrive")
+            n[AT.alive], n[AT.reached] = evaluate("flags_after_step")
             if not any_of(n[AT.alive]):
                 break
         named[q.unknowns] = x

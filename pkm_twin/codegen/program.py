@@ -88,12 +88,12 @@ def progress(k: int, steps: int) -> tuple[float, float]:
     return c, (c - b) / (b - a)
 
 
-def previous(unknowns: str) -> str:
-    """Return the name of the input with the unknowns of the step before."""
+def previous_input_name(unknowns: str) -> str:
+    """Return the name of the input with the unknowns of the previous step."""
     return f"{unknowns}_before"
 
 
-SOLUTION_PARTS: Final = ("home", "goal", "aim", "begin", "onward", "correct", "arrive")
+SOLUTION_PARTS: Final = ("home", "goal", "step_target", "begin", "onward", "correct", "flags_after_step")
 """Attributes of :class:`Equations` that are computed while the equations are solved."""
 
 
@@ -110,7 +110,7 @@ class Equations:
     configuration where two assemblies cross, extrapolation stays on the same branch, where the
     determinant is negative; Newton's method without it would change to the other branch.
 
-    A sample is refused if a correction does not contract, the determinant is too small or a
+    A sample is rejected if a correction does not contract, the determinant is too small or a
     residual remains: the root found may belong to another assembly.
     """
 
@@ -151,7 +151,7 @@ class Equations:
     def inputs(self) -> dict[str, int]:
         """Sizes of the inputs that exist while the equations are solved, by name."""
         n = len(self.home)
-        own = {self.unknowns: n, previous(self.unknowns): n}
+        own = {self.unknowns: n, previous_input_name(self.unknowns): n}
         return own | {self.target: len(self.origin), STATE: len(AT)}
 
     @property
@@ -191,8 +191,8 @@ class Equations:
         return self._lift_all(less(self.state[AT.part], 1.0))[0]
 
     @cached_property
-    def aim(self) -> list[Expression]:
-        """Target of a step."""
+    def step_target(self) -> list[Expression]:
+        """Input values, for example joint positions, that the present step solves for."""
         part, underway = self.state[AT.part], self.is_underway
         goal = self.size.tape.inputs(self.target, len(self.origin))
         pairs = zip(self.origin, goal, strict=True)
@@ -202,7 +202,7 @@ class Equations:
     def correct(self) -> list[Expression]:
         """Unknowns after a correction, then the state from ``size`` to ``alive``.
 
-        A sample is refused if a correction does not contract or the determinant is too small. A
+        A sample is rejected if a correction does not contract or the determinant is too small. A
         start in closed form is in the right assembly; a guess may lead to another.
         """
         state, size, determinant = self.state, self.size, self.determinant
@@ -218,19 +218,19 @@ class Equations:
         return self._lift_all(*new, size, continues, select(moving, converges, state[AT.alive]))
 
     @cached_property
-    def arrive(self) -> list[Expression]:
-        """``alive`` and ``reached`` after a step; a sample that is still moving is refused."""
+    def flags_after_step(self) -> list[Expression]:
+        """``alive`` and ``reached`` after a step; a sample whose corrections have not converged is rejected."""
         n = self.state
         alive = select(n[AT.moving], 0.0, n[AT.alive])
         return self._lift_all(alive, select(alive, n[AT.part] + float(self.stage), n[AT.reached]))
 
     @cached_property
-    def held(self) -> Expression:
+    def is_solved(self) -> Expression:
         """Expression: 1 where all equations hold and ``branch`` is positive, else 0."""
-        held = less(self.residual, MAX_RESIDUAL**2)
+        solved = less(self.residual, MAX_RESIDUAL**2)
         for value in self.branch:
-            held = both(held, less(0.0, value))
-        return self._lift_all(held)[0]
+            solved = both(solved, less(0.0, value))
+        return self._lift_all(solved)[0]
 
 
 def holding(equations: Iterable[Equations], *, certain: bool = True) -> list[Expression]:
@@ -239,7 +239,7 @@ def holding(equations: Iterable[Equations], *, certain: bool = True) -> list[Exp
     :param certain: also require :func:`certainty`.
     """
     equations = list(equations)
-    flags = [q.held for q in equations] + (certainty(equations) if certain else [])
+    flags = [q.is_solved for q in equations] + (certainty(equations) if certain else [])
     return [reduce(both, flags)] if flags else []
 
 
@@ -268,7 +268,7 @@ class Program:
     """Whether a sample that one step does not reach is rejected, and not tried in more steps."""
 
     def __post_init__(self) -> None:
-        known = {**self.inputs, PARAMETERS: self.parameters, GEOMETRY: self.geometry}
+        known = {**self.inputs, PARAMETERS: self.parameters, GEOMETRY: self.geometry_count}
         for q in self.equations:
             known |= q.inputs
         for e in list_dependencies(self.results):
@@ -277,8 +277,8 @@ class Program:
                 raise PkmTwinError(f"the program reads {name}[{index}], which is no input")
 
     @property
-    def geometry(self) -> int:
-        """Number of geometry values that the program takes after its own parameters."""
+    def geometry_count(self) -> int:
+        """Number of geometry values that follow the program's own parameters in the input."""
         return len(self.results[0].tape.reference) if self.results else 0
 
     @property

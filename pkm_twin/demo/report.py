@@ -38,6 +38,7 @@ class Panel:
 
 
 def _select_window(time: Array, seconds: float, all_times: Array) -> Mask:
+    """Select ``seconds`` s of samples from one eighth of the recording on, after the start."""
     begin = float(all_times[len(all_times) // 8]) if len(all_times) else 0.0
     return (time >= begin) & (time <= begin + seconds)
 

@@ -50,8 +50,8 @@ SPREADS: Final = (0.01, 0.2)
 """Relative standard deviations of the machine's parameters."""
 DURATION: Final = 0.8
 """Duration of the motion, s."""
-POINTS: Final = 81
-"""Number of points of its trajectory."""
+TRAJECTORY_POINTS: Final = 81
+"""Number of points of the tracked trajectory."""
 INPUT_TOPIC: Final = "/machine_sim/joint_trajectory"
 QUEUE_PARAMETER: Final = "qos_overrides./joint_states.publisher.depth"
 TWIN_TOPIC: Final = "/delta_dynamics/joint_trajectory"
@@ -103,12 +103,12 @@ def run(spread: float, recorder: Recorder, executor: SingleThreadedExecutor, con
     # Make a trajectory from home and back, at rest at both ends, that starts on receipt.
     robot = load(ROBOT)
     home = robot.inverse(robot.home())
-    x = np.linspace(0.0, 1.0, POINTS)
+    x = np.linspace(0.0, 1.0, TRAJECTORY_POINTS)
     # 64 (x - x^2)^3 is 1 at x = 1/2, and its first two derivatives vanish at both ends.
     blend = 64.0 * np.array([-1.0, 3.0, -3.0, 1.0, 0.0, 0.0, 0.0])
     rows = [np.outer(np.polyval(np.polyder(blend, k), x) / DURATION**k, (0.5, -0.4, 0.6)) for k in range(3)]
     trajectory_without_effort = JointTrajectory(joint_names=list(robot.joint_names))
-    for k in range(POINTS):
+    for k in range(TRAJECTORY_POINTS):
         point = JointTrajectoryPoint(
             positions=(home + rows[0][k]).tolist(), velocities=rows[1][k].tolist(), accelerations=rows[2][k].tolist()
         )

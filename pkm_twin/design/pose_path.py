@@ -110,7 +110,7 @@ class PathMotion:
         """Joint positions, velocities, accelerations and efforts, shape (k, t, n) each."""
         path = self.path
         samples = path.pose, path.rate, path.acceleration, path.wrench
-        return self.machines.run(programs.torques_at_pose, *map(self._for_machines, samples))[0]
+        return self.machines.run_program(programs.torques_at_pose, *map(self._for_machines, samples))[0]
 
     @cached_property
     def q(self) -> Array:
@@ -158,42 +158,42 @@ class PathMotion:
 
     # Derivatives by the numbers, of one machine.
 
-    def effort_slopes(self, weights: Array, rates: Array | None = None, changes: Array | None = None) -> Array:
+    def effort_derivatives(self, weights: Array, rates: Array | None = None, changes: Array | None = None) -> Array:
         """Return the derivatives of each sample's w . tau + r . qd + c . qdd, shape (t, d).
 
         :param weights: w, shape (t, n); ``rates``: r, ``changes``: c, shape (t, n), None for zero.
         """
         state = (self.q, self.qd, self.qdd, self._for_machines(self.path.wrench), weights[None])
-        (by_q, by_qd, by_qdd), _ = self.machines.run(programs.torque_gradient, *state)
-        (of_geometry, of_masses), _ = self.machines.run(programs.torque_numbers, *state)
+        (by_q, by_qd, by_qdd), _ = self.machines.run_program(programs.torque_gradient, *state)
+        (of_geometry, of_masses), _ = self.machines.run_program(programs.torque_numbers, *state)
         if rates is not None:
             by_qd = by_qd + rates
         if changes is not None:
             by_qdd = by_qdd + changes
         held = self._add_constant_poses(by_q, (by_qd, by_qdd))
         rows = np.concatenate([of_geometry + held, of_masses], -1)
-        return np.asarray(rows[0] @ self.machines.rigid_slopes)
+        return np.asarray(rows[0] @ self.machines.rigid_jacobian)
 
-    def singularity_slopes(self) -> Array:
+    def singularity_derivatives(self) -> Array:
         """Return the derivatives of each sample's index, shape (t, d)."""
         ones = np.ones((1, len(self.path.time), 1))
-        (by_q, by_geometry), _ = self.machines.run(programs.singularity_slopes, self.q, ones)
+        (by_q, by_geometry), _ = self.machines.run_program(programs.singularity_derivatives, self.q, ones)
         return self._by_numbers_of_geometry(by_geometry + self._add_constant_poses(by_q))
 
-    def compliance_slopes(self, weights: Array) -> Array:
+    def compliance_derivatives(self, weights: Array) -> Array:
         """Return the derivatives of each sample's weighted sum of C's entries, (t, d).
 
         :param weights: shape (t, 6, 6).
         """
         flat = weights.reshape(1, len(weights), 36)
-        (by_q, numbers), _ = self.machines.run(programs.compliance_slopes, self.q, flat)
+        (by_q, numbers), _ = self.machines.run_program(programs.compliance_derivatives, self.q, flat)
         count = len(self.machines.robot.engine.geometry)
         by_geometry = self._by_numbers_of_geometry(numbers[..., :count] + self._add_constant_poses(by_q))
-        elastic = self.machines.functions.elastic.slopes_at(self.machines.values)[0]
+        elastic = self.machines.functions.elastic_inputs.slopes_at(self.machines.values)[0]
         return np.asarray(by_geometry + numbers[0, :, count:] @ elastic)
 
     def _by_numbers_of_geometry(self, rows: Array) -> Array:
-        return np.asarray(rows[0] @ self.machines.geometry_slopes)
+        return np.asarray(rows[0] @ self.machines.geometry_jacobian)
 
     def _add_constant_poses(self, by_q: Array, by_rates: tuple[Array, Array] | None = None) -> Array:
         """Return the part of derivatives by the geometry through q, qd and qdd at constant poses, (1, t, g).
@@ -206,7 +206,7 @@ class PathMotion:
 
         def pose_derivatives() -> list[Array]:
             flat = weights.reshape(*weights.shape[:-2], -1)
-            return self.machines.run(programs.pose_motion, self.q, qd, qdd, flat)[0]
+            return self.machines.run_program(programs.pose_motion, self.q, qd, qdd, flat)[0]
 
         if by_rates is not None:
             qd, qdd = self.qd, self.qdd

@@ -38,8 +38,8 @@ class NumberFunctions:
         return FileNumbers(self.robot, self.paths, geometry_and_masses)
 
     @cached_property
-    def elastic(self) -> FileNumbers:
-        """Inputs of elasticity in addition to the geometry."""
+    def elastic_inputs(self) -> FileNumbers:
+        """Inputs of the elastic model's programs that follow the geometry."""
         return FileNumbers(self.robot, self.paths, lambda made: list_numbers(made.elastic))
 
 
@@ -82,13 +82,13 @@ torque_gradient: Final = make_request(motion_gradient_kernel, "masses", "geometr
 """Derivatives of the torques by q, qd and qdd."""
 torque_numbers: Final = make_request(number_gradient_kernel, "masses", "geometry")
 """Derivatives of the torques by geometry and masses."""
-platform_slopes: Final = make_request(lambda robot: platform_gradient(robot.engine))
+platform_derivatives: Final = make_request(lambda robot: platform_gradient(robot.engine))
 """Derivatives of pose, position and rotation by geometry."""
 pose_motion: Final = make_request(lambda robot: pose_motion_gradient(robot.engine))
 """Derivatives of pose, rate and acceleration by q, qd and geometry."""
-singularity_slopes: Final = make_request(lambda robot: compile_singularity_gradient(robot.engine))
+singularity_derivatives: Final = make_request(lambda robot: compile_singularity_gradient(robot.engine))
 """Derivatives of the index by q and geometry."""
-compliance_slopes: Final = make_request(
+compliance_derivatives: Final = make_request(
     lambda robot: compliance_gradient(robot.cached(Elastic)), "geometry", "elasticity"
 )
 """Derivatives of the compliance by q and all numbers."""

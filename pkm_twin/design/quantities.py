@@ -1,8 +1,8 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Compute the quantities that a design is optimised for, and their derivatives.
 
-A quantity is the largest (for the singularity index the smallest) of several smooth pieces, for
-example of the efforts of all joints in all samples.
+A quantity is the largest (for the singularity index the smallest) of several smooth components,
+for example of the efforts of all joints in all samples.
 """
 
 from __future__ import annotations
@@ -29,31 +29,32 @@ Index = NDArray[np.intp]
 class Quantity:
     """Define one of :data:`QUANTITIES`.
 
-    ``evaluate``: returns the pieces of k machines, shape (k, t, c) if ``sampled``, else (k, c).
-    ``slopes``: returns the derivatives of one machine's pieces, given their indices along c, by its
-    numbers, shape (pieces, d); if sampled, the machine's path has one sample per piece. ``least``:
-    True if the smallest piece is the quantity, not the largest.
+    ``evaluate``: returns the components of k machines, shape (k, t, c) if ``sampled``, else (k, c).
+    ``differentiate``: returns the derivatives of one machine's components, given by their indices
+    along c, with respect to its numbers, shape (components, d); if ``sampled``, the machine's path
+    has one sample per component. ``least``: True if the quantity is the smallest component, not the
+    largest.
     """
 
     name: str
     meaning: str
     evaluate: Callable[[PathMotion], Array]
-    slopes: Callable[[PathMotion, Index], Array]
+    differentiate: Callable[[PathMotion, Index], Array]
     sampled: bool = False
     least: bool = False
 
-    def pieces(self, followed: PathMotion) -> Array:
-        """Return the pieces of k machines, shape (k, pieces)."""
+    def component_values(self, followed: PathMotion) -> Array:
+        """Return the components (of joints, samples or both) of k machines, shape (k, components)."""
         found = self.evaluate(followed)
         return found.reshape(len(found), -1)
 
-    def width(self, robot: Robot) -> int:
-        """Return the number of pieces per sample."""
+    def component_count(self, robot: Robot) -> int:
+        """Return the number of components per sample."""
         return robot.joints_count if self.name == "peak-effort" else 1
 
-    def worst(self, pieces: Array) -> Array:
-        """Return the quantity from pieces (k, p), shape (k,)."""
-        return np.asarray(pieces.min(-1) if self.least else pieces.max(-1), np.float64)
+    def worst(self, components: Array) -> Array:
+        """Return the quantity from components (k, p), shape (k,)."""
+        return np.asarray(components.min(-1) if self.least else components.max(-1), np.float64)
 
     def unit(self, robot: Robot) -> str:
         """Return the unit of the values; empty for plain numbers."""
@@ -95,17 +96,19 @@ class Constraint:
         """Scale that makes the excess dimensionless."""
         return max(abs(self.bound), 1e-12)
 
-    def excess(self, pieces: Array) -> Array:
-        """Return the pieces' excess over the bound, relative to it: positive if violated."""
+    def excess(self, components: Array) -> Array:
+        """Return the components' excess over the bound, relative to it: positive if violated."""
         side = -1.0 if self.quantity.least else 1.0
-        return side * (pieces - self.bound) / self.scale
+        return side * (components - self.bound) / self.scale
 
     def __str__(self) -> str:
         return f"{self.quantity.name}{'>=' if self.quantity.least else '<='}{self.bound:g}"
 
 
 def effort_scales(robot: Robot) -> Array:
-    """Return the factors of efforts, (n,): one, or one over the limits of mixed joints.
+    """Return the factors that make efforts comparable, (n,).
+
+    They are 1, or 1 / effort limit if the machine has both rotary and sliding joints.
 
     :raises ParameterError: rotary and sliding joints without effort limits.
     """
@@ -117,12 +120,13 @@ def effort_scales(robot: Robot) -> Array:
     return 1.0 / np.asarray(limit, np.float64)
 
 
-def _peak_slopes(f: PathMotion, places: Index) -> Array:
-    rows = np.arange(len(places))
+def _peak_derivatives(f: PathMotion, joints: Index) -> Array:
+    """Return the derivatives of peak efforts; ``joints``: the joint with the peak at each sample."""
+    rows = np.arange(len(joints))
     weights = np.zeros(f.efforts.shape[1:])
-    scale = effort_scales(f.machines.robot)[places]
-    weights[rows, places] = np.sign(f.efforts[0, rows, places]) * scale
-    return f.effort_slopes(weights)
+    scale = effort_scales(f.machines.robot)[joints]
+    weights[rows, joints] = np.sign(f.efforts[0, rows, joints]) * scale
+    return f.effort_derivatives(weights)
 
 
 def _rms_over_time(f: PathMotion, values: Array) -> Array:
@@ -137,12 +141,12 @@ def _rms_gradient(f: PathMotion, values: Array, place: int) -> Array:
     return np.asarray(f.path.weights * values[0, :, place] / max(root, 1e-300), np.float64)
 
 
-def _rms_slopes(f: PathMotion, places: Index) -> Array:
+def _rms_derivatives(f: PathMotion, places: Index) -> Array:
     scales, rows = effort_scales(f.machines.robot), []
     for place in places:
         weights = np.zeros(f.efforts.shape[1:])
         weights[:, place] = scales[place] * _rms_gradient(f, f.efforts, place)
-        rows.append(f.effort_slopes(weights).sum(0))
+        rows.append(f.effort_derivatives(weights).sum(0))
     return np.array(rows)
 
 
@@ -169,7 +173,7 @@ def _motor_torques(f: PathMotion) -> tuple[Array, Array, Array, Array, Array]:
     return inertia * turns * f.qdd + transmitted * losses / turns, losses, turns, inertia, efficiency
 
 
-def _motor_slopes(f: PathMotion, places: Index) -> Array:
+def _motor_derivatives(f: PathMotion, places: Index) -> Array:
     torques, losses, *numbers = _motor_torques(f)
     loss, tau, qdd = losses[0], f.efforts[0], f.qdd[0]
     turns, inertia, efficiency = (values[0] for values in numbers)
@@ -185,7 +189,7 @@ def _motor_slopes(f: PathMotion, places: Index) -> Array:
     for place in places:
         weights = np.zeros(tau.shape)
         weights[:, place] = _rms_gradient(f, torques, place)
-        by_efforts = f.effort_slopes(weights * loss / turns, None, weights * inertia * turns * (1.0 - loss))
+        by_efforts = f.effort_derivatives(weights * loss / turns, None, weights * inertia * turns * (1.0 - loss))
         by_gear = sum((weights * by).sum(0)[place] * s[place] for by, s in zip(by_numbers, slopes, strict=True))
         rows.append(by_efforts.sum(0) + by_gear)
     return np.array(rows)
@@ -196,9 +200,9 @@ def _energy(f: PathMotion) -> Array:
     return np.asarray((f.path.weights[:, None] * power).sum((1, 2))[:, None], np.float64)
 
 
-def _energy_slopes(f: PathMotion, places: Index) -> Array:
+def _energy_derivatives(f: PathMotion, places: Index) -> Array:
     given = (f.efforts * f.qd > 0.0)[0] * f.path.weights[:, None]
-    rows = f.effort_slopes(given * f.qd[0], given * f.efforts[0])
+    rows = f.effort_derivatives(given * f.qd[0], given * f.efforts[0])
     return np.repeat(rows.sum(0)[None], len(places), 0)
 
 
@@ -206,13 +210,13 @@ def _deflection(f: PathMotion) -> Array:
     return np.asarray(np.linalg.norm(f.deflection[..., :3], axis=-1)[..., None], np.float64)
 
 
-def _deflection_slopes(f: PathMotion, places: Index) -> Array:
+def _deflection_derivatives(f: PathMotion, places: Index) -> Array:
     del places
     moved = f.deflection[0, :, :3]
     size = np.linalg.norm(moved, axis=-1, keepdims=True)
     direction = np.zeros((len(moved), 6))
     direction[:, :3] = moved / np.maximum(size, 1e-300)
-    return f.compliance_slopes(direction[:, :, None] * f.path.wrench[:, None, :])
+    return f.compliance_derivatives(direction[:, :, None] * f.path.wrench[:, None, :])
 
 
 def _moving_masses(robot: Robot) -> list[Any]:
@@ -238,27 +242,27 @@ QUANTITIES: Final = {
             "peak-effort",
             "greatest effort of any joint",
             lambda f: np.abs(f.efforts) * effort_scales(f.machines.robot),
-            _peak_slopes,
+            _peak_derivatives,
             True,
         ),
         Quantity(
             "rms-effort",
             "greatest RMS effort of a joint",
             lambda f: _rms_over_time(f, f.efforts) * effort_scales(f.machines.robot),
-            _rms_slopes,
+            _rms_derivatives,
         ),
         Quantity(
             "motor-torque",
             "greatest RMS torque of a motor, of files with drives",
             lambda f: _rms_over_time(f, _motor_torques(f)[0]),
-            _motor_slopes,
+            _motor_derivatives,
         ),
-        Quantity("energy", "energy that the drives give, nothing regenerated", _energy, _energy_slopes),
+        Quantity("energy", "energy that the drives give, nothing regenerated", _energy, _energy_derivatives),
         Quantity(
             "deflection",
             "greatest translation of the reference point under the wrench",
             _deflection,
-            _deflection_slopes,
+            _deflection_derivatives,
             True,
         ),
         Quantity(
@@ -273,7 +277,7 @@ QUANTITIES: Final = {
             "singularity",
             "least singularity index",
             lambda f: f.singularity[..., None],
-            lambda f, _: f.singularity_slopes(),
+            lambda f, _: f.singularity_derivatives(),
             True,
             True,
         ),

@@ -2,11 +2,11 @@
 """Optimise numbers of a robot's file for a path: a local search from several starts.
 
 The starts of a Sobol sequence are computed as one batch; the search continues from the best ones.
-Scipy's SLSQP (Kraft 1988) minimises the largest piece of a quantity with exact derivatives, on the
-pieces near the largest; pieces that exceed it are added, and SLSQP runs again (an exchange method,
-Hettich and Kortanek 1993). A machine that cannot follow the path ends a run; the next run starts in
-a smaller box around the best machine so far, so that the search stays where machines can follow the
-path.
+Scipy's SLSQP (Kraft 1988) minimises the largest component of a quantity with exact derivatives, on
+the components near the largest; components that exceed it are added, and SLSQP runs again (an
+exchange method, Hettich and Kortanek 1993). A machine that cannot follow the path ends a run; the
+next run starts in a smaller box around the best machine so far, so that the search stays where
+machines can follow the path.
 """
 
 from __future__ import annotations
@@ -71,8 +71,8 @@ class Problem:
         self.count += len(y)
         return self._many.with_values(self.variables.values(y), checked=self._checked)
 
-    def pieces(self, y: Array, quantities: Sequence[Quantity]) -> list[Array]:
-        """Return the pieces of each quantity, (k, pieces), for points (k, d), in batches.
+    def component_values(self, y: Array, quantities: Sequence[Quantity]) -> list[Array]:
+        """Return the components of each quantity, (k, components), for points (k, d), in batches.
 
         Machines that cannot follow the path have NaN.
         """
@@ -82,7 +82,7 @@ class Problem:
         for k in range(0, len(y), size):
             followed = PathMotion(self.machines(y[k : k + size]), self.path)
             lost = np.asarray(~np.isfinite(followed.q).all((1, 2)))
-            found = [quantity.pieces(followed) for quantity in quantities]
+            found = [quantity.component_values(followed) for quantity in quantities]
             parts.append([np.where(lost[:, None], np.nan, rows) for rows in found])
         return [np.concatenate(rows) for rows in zip(*parts, strict=True)]
 
@@ -95,7 +95,7 @@ class Problem:
             if name == "deflection" and not (wanted or self.path.wrench.any()):
                 continue
             try:
-                found[name] = float(quantity.worst(quantity.pieces(followed))[0])
+                found[name] = float(quantity.worst(quantity.component_values(followed))[0])
             except ParameterError:
                 if wanted:
                     raise
@@ -118,26 +118,26 @@ class Search:
         self._all = [aim, *(c.quantity for c in constraints)]
 
     def evaluate(self, y: Array) -> tuple[Array, Array, list[Array]]:
-        """Return aims, largest excesses and pieces of points (k, d); infinite if a machine cannot follow the path."""
-        pieces = self.problem.pieces(y, self._all)
+        """Return aims, largest excesses and components of points (k, d); infinite for machines off the path."""
+        components = self.problem.component_values(y, self._all)
         misses = np.zeros(len(y))
-        for constraint, found in zip(self.constraints, pieces[1:], strict=True):
+        for constraint, found in zip(self.constraints, components[1:], strict=True):
             misses = np.maximum(misses, constraint.excess(constraint.quantity.worst(found)))
-        aims = self.aim.worst(pieces[0])
+        aims = self.aim.worst(components[0])
         lost = ~(np.isfinite(aims) & np.isfinite(misses))
-        return np.where(lost, np.inf, aims), np.where(lost, np.inf, misses), pieces
+        return np.where(lost, np.inf, aims), np.where(lost, np.inf, misses), components
 
     def descend(self, y: Array) -> tuple[Array, float, float]:
         """Search from a machine that follows the path; return the best machine, its aim and its excess."""
-        aims, misses, pieces = self.evaluate(y[None])
+        aims, misses, components = self.evaluate(y[None])
         best, aim, miss = y, float(aims[0]), float(misses[0])
         scale = max(abs(aim), 1e-300)
         chosen = [np.zeros(0, np.intp) for _ in self._all]
         radius, shrinks = 1.0, 0
         for _ in range(20):
             chosen = [
-                np.union1d(old, self._pieces_near_worst(k, found[0]))
-                for k, (old, found) in enumerate(zip(chosen, pieces, strict=True))
+                np.union1d(old, self._components_near_worst(k, found[0]))
+                for k, (old, found) in enumerate(zip(chosen, components, strict=True))
             ]
             run = _BoxSearch(self, chosen, scale, best, aim, radius)
             found, outside = run.solve()
@@ -145,7 +145,7 @@ class Search:
             if is_better(float(aims[0]), float(misses[0]), aim, miss):
                 gain = abs(aim - float(aims[0])) / scale + max(0.0, miss - float(misses[0]))
                 bound = radius < 1.0 and np.abs(found - best).max() > 0.9 * radius
-                best, aim, miss, pieces = found, float(aims[0]), float(misses[0]), new
+                best, aim, miss, components = found, float(aims[0]), float(misses[0]), new
                 if bound:
                     radius = min(1.0, 2.0 * radius)
                 elif gain < GAIN_TOLERANCE and not outside:
@@ -153,16 +153,16 @@ class Search:
                 continue
             passed = np.isfinite(aims[0]) and np.isfinite(misses[0])
             fresh = passed and any(
-                len(np.setdiff1d(self._pieces_near_worst(k, p[0]), old))
+                len(np.setdiff1d(self._components_near_worst(k, p[0]), old))
                 for k, (p, old) in enumerate(zip(new, chosen, strict=True))
             )
             step = float(np.abs(found - best).max())
             if step < 1e-9 and not outside:
                 break
             if fresh:
-                # Other pieces became the largest: include them.
+                # Other components became the largest: include them.
                 chosen = [
-                    np.union1d(old, self._pieces_near_worst(k, p[0]))
+                    np.union1d(old, self._components_near_worst(k, p[0]))
                     for k, (old, p) in enumerate(zip(chosen, new, strict=True))
                 ]
             radius = 0.5 * max(min(radius, step if step > 0.0 else radius), 1e-9)
@@ -171,17 +171,17 @@ class Search:
                 break
         return best, aim, miss
 
-    def _pieces_near_worst(self, k: int, pieces: Array) -> Index:
-        """Return pieces that may become the largest: peaks in time near the worst."""
+    def _components_near_worst(self, k: int, components: Array) -> Index:
+        """Return components that may become the largest: peaks in time near the worst."""
         quantity = self._all[k]
         if not quantity.sampled:
-            return np.arange(len(pieces))
+            return np.arange(len(components))
         count = len(self.problem.path.time)
-        table = (-pieces if quantity.least else pieces).reshape(count, -1)
+        table = (-components if quantity.least else components).reshape(count, -1)
         padded = np.pad(table, ((1, 1), (0, 0)), constant_values=-np.inf)
         peaks = (table >= padded[:-2]) & (table >= padded[2:])
         worst = float(table.max())
-        # Take pieces above seven tenths of the largest.
+        # Take components above seven tenths of the largest.
         reach = worst - 0.3 * max(abs(worst), 0.3 if quantity.least else 0.0)
         flat = table.ravel()
         order = np.flatnonzero(peaks.ravel() & (flat >= reach))
@@ -196,7 +196,7 @@ def is_better(aim: float, miss: float, old_aim: float, old_miss: float) -> bool:
 
 
 class _BoxSearch:
-    """Minimise a bound s of the aim by SLSQP, for chosen pieces and machines y in a box around a machine."""
+    """Minimise a bound s of the aim by SLSQP, for chosen components and machines y in a box around a machine."""
 
     def __init__(
         self,
@@ -258,7 +258,7 @@ class _BoxSearch:
         values, slopes = [], []
         many = problem.machines(y[None])
         for k, (quantity, chosen) in enumerate(zip(search._all, self.chosen, strict=True)):
-            found, by = _evaluate_pieces(problem, quantity, chosen, many, y)
+            found, by = _evaluate_components(problem, quantity, chosen, many, y)
             if not (np.isfinite(found).all() and np.isfinite(by).all()):
                 raise _CannotFollowError
             if k == 0:
@@ -276,11 +276,11 @@ class _BoxSearch:
         return np.concatenate(values), np.concatenate(slopes)
 
 
-def _evaluate_pieces(
+def _evaluate_components(
     problem: Problem, quantity: Quantity, chosen: Index, one: Variants, y: Array
 ) -> tuple[Array, Array]:
-    """Return chosen pieces of one machine at y, and their derivatives, shape (pieces, d)."""
-    width = quantity.width(problem.robot) if quantity.sampled else 0
+    """Return chosen components of one machine at y, and their derivatives, shape (components, d)."""
+    width = quantity.component_count(problem.robot) if quantity.sampled else 0
     path = problem.path.at(chosen // width) if width else problem.path
     places = chosen % width if width else chosen
 
@@ -288,13 +288,13 @@ def _evaluate_pieces(
         followed = PathMotion(many, path)
         if width:
             return followed, quantity.evaluate(followed)[:, np.arange(len(chosen)), places]
-        return followed, quantity.pieces(followed)[:, chosen]
+        return followed, quantity.component_values(followed)[:, chosen]
 
     followed, (found,) = evaluate(one)
     if not np.isfinite(found).all():
         raise _CannotFollowError
     if not problem.robot.redundant:
-        return found, quantity.slopes(followed, places) @ problem.variables.slopes
+        return found, quantity.differentiate(followed, places) @ problem.variables.slopes
     # Redundant drives have no exact derivatives: take differences.
     steps = DIFFERENCE_STEP * np.eye(len(y))
     ahead, behind = (evaluate(problem.machines(y + side * steps))[1] for side in (1.0, -1.0))
@@ -455,7 +455,7 @@ def _trace_front(
 ) -> list[Array]:
     """Trace a Pareto front: minimise the first aim for evenly spaced bounds of the second."""
     first, second = aims
-    rows = problem.pieces(np.array(ends), [second])[0]
+    rows = problem.component_values(np.array(ends), [second])[0]
     high, low = second.worst(rows)
     front = [ends[0]]
     for share in np.linspace(0.0, 1.0, max(3, points))[1:-1]:

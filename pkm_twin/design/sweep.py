@@ -77,8 +77,8 @@ class Box:
     def evaluate(self, points: Array) -> dict[str, Array]:
         """Return quantities of points (k, d) of the box, each 0 to 1, by name: shape (k,)."""
         wanted = [find_quantity(name, "quantities") for name in self.quantities]
-        found = self.problem.pieces(points, wanted)
-        return {q.name: q.worst(pieces) for q, pieces in zip(wanted, found, strict=True)}
+        found = self.problem.component_values(points, wanted)
+        return {q.name: q.worst(components) for q, components in zip(wanted, found, strict=True)}
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the state without data that each process computes once."""

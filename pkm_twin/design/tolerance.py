@@ -59,14 +59,14 @@ class Tolerances:
 
     @cached_property
     def together(self) -> dict[str, list[str]]:
-        """Paths of each error: the three axes of a clearance."""
+        """Paths of each error by its name: a clearance has three, one per axis; others have one."""
         found: dict[str, list[str]] = {}
         for path in self.sigma:
             found.setdefault(name_error(path), []).append(path)
         return found
 
     def effect(self, error: str) -> Array:
-        """Return the standard deviation by one error of :attr:`together`, shape (..., 6)."""
+        """Return the platform's standard deviation due to one error of :attr:`together`, shape (..., 6)."""
         return _root_sum_squares([self.part(path) for path in self.together[error]])
 
     @cached_property

@@ -105,8 +105,8 @@ class Variants:
         # Also test a pose near home: a machine that can only be assembled at home has no freedom.
         away = 1e-3 * np.array([0.0 * steps, steps, -steps]) * reach
         rest = [np.zeros_like(home)] * 2 * self.robot.redundant
-        ask = programs.project_redundant if self.robot.redundant else programs.forward
-        (poses, *_), good = self.run(ask, (home + away)[None], *rest)
+        request = programs.project_redundant if self.robot.redundant else programs.forward
+        (poses, *_), good = self.run_program(request, (home + away)[None], *rest)
         sound = good[..., 0] & np.isfinite(poses).all(-1)
         known = np.isfinite(self.geometry).all(1) & np.isfinite(self.masses).all(1)
         return np.asarray(sound.reshape(len(self), 3).all(1) & known)
@@ -126,7 +126,7 @@ class Variants:
     def inverse_dynamics(self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None = None) -> Array:
         """Return efforts, shape (k, ..., n), see :func:`delta_dynamics.inverse_dynamics`."""
         load = np.zeros(6) if wrench is None else wrench
-        return self.run(programs.torques, q, qd, qdd, load)[0][0]
+        return self.run_program(programs.torques, q, qd, qdd, load)[0][0]
 
     def reactions(self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None = None) -> Reactions:
         """Return reactions with arrays (k, ..., joints, 6), see :func:`delta_dynamics.reactions`.
@@ -136,7 +136,7 @@ class Variants:
         """
         self.robot.check_independent("joint loads of variants")
         load = np.zeros(6) if wrench is None else wrench
-        loads, good = self.run(programs.loads, q, qd, qdd, load)
+        loads, good = self.run_program(programs.loads, q, qd, qdd, load)
         rows, at = [part.reshape(good.size, part.shape[-1]) for part in loads], np.flatnonzero(good)
         parts = []
         for start in range(0, max(1, len(at)), SAMPLES_PER_BALANCE):
@@ -155,55 +155,57 @@ class Variants:
 
     def mass_matrix(self, q: ArrayLike) -> Array:
         """Return mass matrices, shape (k, ..., n, n), see :func:`delta_dynamics.mass_matrix`."""
-        flat = self.run(programs.masses, q)[0][0]
+        flat = self.run_program(programs.masses, q)[0][0]
         n = self.robot.joints_count
         return flat.reshape(*flat.shape[:-1], n, n)
 
     def project_redundant(self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike) -> tuple[Array, Array, Array]:
         """Return the motion of all drives, as :meth:`Robot.project_redundant`, (k, ..., n) each."""
-        first, second, third = self.run(programs.project_redundant, q, qd, qdd)[0]
+        first, second, third = self.run_program(programs.project_redundant, q, qd, qdd)[0]
         return first, second, third
 
     def forward(self, q: ArrayLike) -> Array:
         """Return poses, shape (k, ..., m), see :meth:`Robot.forward`."""
-        return self.run(programs.forward, q)[0][0]
+        return self.run_program(programs.forward, q)[0][0]
 
     def inverse(self, pose: ArrayLike) -> Array:
         """Return joint positions, shape (k, ..., n), see :meth:`Robot.inverse`."""
-        return self.run(programs.inverse, pose)[0][0]
+        return self.run_program(programs.inverse, pose)[0][0]
 
     def jacobian(self, q: ArrayLike) -> Array:
         """Return pose rates per joint rate, shape (k, ..., m, n), see :meth:`Robot.jacobian`."""
-        flat, n = self.run(programs.jacobian, q)[0][0], self.robot.joints_count
+        flat, n = self.run_program(programs.jacobian, q)[0][0], self.robot.joints_count
         return flat.reshape(*flat.shape[:-1], len(self.robot.pose_names), n)
 
     def platform_jacobian(self, q: ArrayLike) -> Array:
         """Return platform twists per joint rate, shape (k, ..., 6, n)."""
-        flat, n = self.run(programs.jacobian, q)[0][1], self.robot.joints_count
+        flat, n = self.run_program(programs.jacobian, q)[0][1], self.robot.joints_count
         return flat.reshape(*flat.shape[:-1], 6, n)
 
-    def platform_slopes(self, q: ArrayLike) -> Array:
-        """Return one machine's platform twist by each number, joints held, (..., 6, paths).
+    def differentiate_platform(self, q: ArrayLike) -> Array:
+        """Return how the platform moves with each number at constant joint positions, (..., 6, paths).
+
+        Derivatives of the first machine's position and rotation: m and rad per unit of the number.
 
         :param q: joint positions, shape (samples, n).
         """
         states = np.asarray(q, np.float64)[None]
         rows = make_twist_rows(len(self.robot.pose_names), self.platform(states)[1])
-        (found,), _ = self.run(programs.platform_slopes, states[..., None, :], rows)
-        return np.asarray(found[0] @ self.geometry_slopes, np.float64)
+        (found,), _ = self.run_program(programs.platform_derivatives, states[..., None, :], rows)
+        return np.asarray(found[0] @ self.geometry_jacobian, np.float64)
 
     def pose_acceleration(self, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike) -> Array:
         """Return the second derivative of the pose, shape (k, ..., m)."""
-        return self.run(programs.acceleration, q, qd, qdd)[0][0]
+        return self.run_program(programs.acceleration, q, qd, qdd)[0][0]
 
     def platform(self, q: ArrayLike) -> tuple[Array, Array]:
         """Return positions (k, ..., 3) and rotations (k, ..., 3, 3), see :meth:`Robot.platform`."""
-        _, position, rotation = self.run(programs.forward, q)[0]
+        _, position, rotation = self.run_program(programs.forward, q)[0]
         return position, rotation.reshape(*rotation.shape[:-1], 3, 3)
 
     def singularity(self, q: ArrayLike) -> Array:
         """Return singularity indices, shape (k, ...), see :meth:`Robot.singularity`."""
-        return np.asarray(self.run(programs.singularity, q)[0][0][..., 0], np.float64)
+        return np.asarray(self.run_program(programs.singularity, q)[0][0][..., 0], np.float64)
 
     def compliance(self, pose: ArrayLike) -> Array:
         """Return compliances, (k, ..., 6, 6), see :func:`stiffness_monitor.compliance`.
@@ -211,7 +213,7 @@ class Variants:
         :raises ParameterError: the robot's file lacks a section that elasticity needs.
         """
         _ = Elastic(self.robot)
-        (flat, measure), good = self.run(programs.compliance, self.inverse(pose))
+        (flat, measure), good = self.run_program(programs.compliance, self.inverse(pose))
         found = np.where(good & (measure > MIN_PIVOT_RATIO), flat, np.nan)
         return np.asarray(found.reshape(*flat.shape[:-1], 6, 6), np.float64)
 
@@ -245,19 +247,19 @@ class Variants:
         return found
 
     @cached_property
-    def geometry_slopes(self) -> Array:
-        """Derivatives of the first machine's geometry by the numbers, shape (row, paths)."""
+    def geometry_jacobian(self) -> Array:
+        """Derivatives of the first machine's geometry with respect to the numbers, shape (entries, paths)."""
         return np.asarray(self.functions.geometry.slopes_at(self.values[:1])[0])
 
     @cached_property
-    def rigid_slopes(self) -> Array:
-        """Derivatives of the first machine's geometry and masses, shape (row, paths)."""
+    def rigid_jacobian(self) -> Array:
+        """Derivatives of its geometry and masses with respect to the numbers, shape (entries, paths)."""
         return np.asarray(self.functions.rigid.slopes_at(self.values[:1])[0])
 
     @cached_property
     def elasticity(self) -> Array:
-        """Inputs of elasticity in addition to the geometry, shape (k, size)."""
-        return self.functions.elastic(self.values)
+        """Inputs of the elastic model's programs that follow the geometry, shape (k, size)."""
+        return self.functions.elastic_inputs(self.values)
 
     @cached_property
     def _out_of_range(self) -> Mask:
@@ -310,9 +312,9 @@ class Variants:
         """Return a program's inputs of each machine, shape (k, size)."""
         return np.concatenate([getattr(self, name) for name in names], 1)
 
-    def _prepare(self, ask: programs.MakeRequest, robot: Robot) -> tuple[Code, Array]:
-        """Return a robot's program, and its inputs of each machine, shape (k, prepared + 1)."""
-        kernel, numbers = ask(robot)
+    def _compile_and_prepare(self, request: programs.MakeRequest, robot: Robot) -> tuple[Code, Array]:
+        """Return a robot's compiled program and each machine's prepared inputs, shape (k, prepared + 1)."""
+        kernel, numbers = request(robot)
         code = kernel.code
         found = self._prepared.get(id(code))
         if found is None:
@@ -321,9 +323,12 @@ class Variants:
             found = self._prepared[id(code)] = code, prepared
         return found
 
-    def run(self, ask: programs.MakeRequest, *inputs: ArrayLike) -> tuple[list[Array], Mask]:
-        """Return outputs (k, ..., size) each, and which are valid, shape (k, ..., 1)."""
-        code, prepared = self._prepare(ask, self.robot)
+    def run_program(self, request: programs.MakeRequest, *inputs: ArrayLike) -> tuple[list[Array], Mask]:
+        """Evaluate a program for all k machines.
+
+        :returns: the outputs, shape (k, ..., size) each, and which are valid, shape (k, ..., 1).
+        """
+        code, prepared = self._compile_and_prepare(request, self.robot)
         k = len(self)
         arrays, shapes = code.checked(inputs), []
         for array in arrays:
@@ -346,7 +351,7 @@ class Variants:
         else:
             outputs = [np.full((k, count, size), np.nan) for size in code.sizes[1]]
             good = np.zeros((k, count), bool)
-            for one_code, rest, own in self._programs_by_structure(ask):
+            for one_code, rest, own in self._programs_by_structure(request):
                 picked = [row[own] if len(row) > 1 else row for row in rows]
                 found, status = one_code.run_machines(rest[own], *picked)
                 for table, values in zip(outputs, found, strict=True):
@@ -355,15 +360,15 @@ class Variants:
         shaped = [values.reshape(k, *batch, values.shape[-1]) for values in outputs]
         return shaped, np.asarray(good).reshape(k, *batch, 1)
 
-    def _programs_by_structure(self, ask: programs.MakeRequest) -> Iterator[tuple[Code, Array, NDArray[np.intp]]]:
+    def _programs_by_structure(self, request: programs.MakeRequest) -> Iterator[tuple[Code, Array, NDArray[np.intp]]]:
         """Yield each structure's program with the machines that it is valid for."""
         # A machine without an assembly at home has no inputs for the programs.
-        remaining = np.asarray(~np.isnan(self._join_inputs(ask(self.robot)[1])).any(1))
+        remaining = np.asarray(~np.isnan(self._join_inputs(request(self.robot)[1])).any(1))
         others = self.functions.others
         robots = itertools.chain([self.robot, *others], self._build_robots(remaining))
         for robot in robots:
             try:
-                code, prepared = self._prepare(ask, robot)
+                code, prepared = self._compile_and_prepare(request, robot)
             except (PkmTwinError, ValueError):
                 if robot is self.robot:
                     raise
@@ -375,7 +380,10 @@ class Variants:
             remaining &= ~fits
 
     def _build_robots(self, remaining: Mask) -> Iterator[Robot]:
-        """Yield the first of the remaining machines as robots, checking again after each."""
+        """Yield the first remaining machine as a robot until none remains.
+
+        The caller clears the entries of ``remaining`` that the robot's program covers.
+        """
         while remaining.any():
             first, *others = np.flatnonzero(remaining).tolist()
             try:

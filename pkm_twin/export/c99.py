@@ -18,7 +18,7 @@ from pkm_twin.codegen.code import STEPS
 from pkm_twin.codegen.expressions import Expression, Tape, count, count_uses, list_dependencies
 from pkm_twin.codegen.operations import (
     OPERATIONS,
-    SAMPLE,
+    SAMPLE_LEVEL,
     Operation,
     c_number,
     cos,
@@ -37,7 +37,7 @@ from pkm_twin.codegen.program import (
     Equations,
     certainty,
     holding,
-    previous,
+    previous_input_name,
 )
 from pkm_twin.export.c_functions import C_FUNCTIONS
 from pkm_twin.export.schedule import DEFAULT_LATENCY, LATENCIES, TURN_LATENCY, Work, order_work
@@ -250,7 +250,7 @@ class Routine:
         A stream's sample has a further attempt, from the sample before.
         """
         solved = [q for q in self.equations if q.home]
-        step = sum(MAX_ITERATIONS * count(q.correct) + count([*q.begin, *q.onward, *q.aim]) for q in solved)
+        step = sum(MAX_ITERATIONS * count(q.correct) + count([*q.begin, *q.onward, *q.step_target]) for q in solved)
         rest = count([*self.body, *(e for q in self.equations for e in q.goal)])
         more = len(self.state) > 1
         steps, attempts = (sum(STEPS_PER_ATTEMPT), len(STEPS_PER_ATTEMPT)) if solved else (1, 1)
@@ -397,7 +397,7 @@ static const int @_steps[{len(STEPS_PER_ATTEMPT)}] = {{{steps}}};
 
         :returns: the function's name, and indices into its table ``h`` by the expression's number.
         """
-        work = [*q.begin, *q.onward, *q.correct, *q.aim]
+        work = [*q.begin, *q.onward, *q.correct, *q.step_target]
         key = tuple(e.number for e in work)
         if key not in self._solvers:
             name = "reach" if q.unknowns != UNKNOWNS else "assembly" if q.near is None else "beside"
@@ -417,9 +417,9 @@ static const int @_steps[{len(STEPS_PER_ATTEMPT)}] = {{{steps}}};
         begin = self.write_function(f"{name}_begin", q.begin, known, aim) % "next"
         onward = self.write_function(f"{name}_onward", q.onward, {}) % "next"
         correct = self.write_function(f"{name}_correct", q.correct, known, aim) % "next"
-        target = self.write_function(f"{name}_aim", q.aim, {}) % "aim"
+        target = self.write_function(f"{name}_aim", q.step_target, {}) % "aim"
         more = "" if q.near is None else "const double *qd, const double *last, "
-        x, x_before = q.unknowns, previous(q.unknowns)
+        x, x_before = q.unknowns, previous_input_name(q.unknowns)
         self.append(write_table(f"@_{name}_home", [e.value for e in q.home]))
         self.append(f"""\
 /* Newton's method from the known assembly in so many steps; 0 where it does not get there. */
@@ -554,7 +554,7 @@ static int @_{name}({more}const double *{q.target}, int steps, double *h, double
 
 def _find_shared_values(body: Sequence[Expression], others: Iterable[Sequence[Expression]]) -> list[Expression]:
     """Find the intermediate values of a body that functions that call it read, too."""
-    inner = {e.number for e in list_dependencies(body) if e.op is not None and e.level == SAMPLE}
+    inner = {e.number for e in list_dependencies(body) if e.op is not None and e.level == SAMPLE_LEVEL}
     known = {e.number for e in body}
     found: dict[int, Expression] = {}
     for results in others:

@@ -26,7 +26,7 @@ from pkm_twin.codegen.program import (
     MIN_DETERMINANT_RATIO,
     STATE,
     certainty,
-    previous,
+    previous_input_name,
 )
 from pkm_twin.export.c99 import Routine, Substitution
 from pkm_twin.export.c_package import Package
@@ -272,7 +272,7 @@ def _write_routine(routine: Routine, payload: Mapping[str, Sequence[Any]], prefi
             known[q.unknowns] = len(q.home)
             correct = write_part(f"correct_{k}", q.results)
             # The unknowns of a step and of the one before, and the state of Newton's method.
-            size = {q.unknowns: len(q.home), previous(q.unknowns): len(q.home), STATE: len(AT)}
+            size = {q.unknowns: len(q.home), previous_input_name(q.unknowns): len(q.home), STATE: len(AT)}
             onward = write_part(f"onward_{k}", q.onward, size)
         home, origin = (tuple(e.value for e in row) for row in (q.home, q.origin))
         certain = q.start is not None and not q.guessed

@@ -246,11 +246,11 @@ def list_geometric_paths(robot: Robot, q: Array, only: Sequence[str] = ()) -> tu
     if paths:
         own = np.array([robot.number(path) for path in paths])
         many = Variants(robot, dict(zip(paths, own, strict=True)))
-        twists = many.platform_slopes(q)
+        twists = many.differentiate_platform(q)
         # Can the machine be assembled with another number?
         beside = many.with_values(own + 1e-6 * np.eye(len(paths)))
         each = np.broadcast_to(q, (len(paths), *q.shape))
-        possible = beside.run(programs.forward_of_all_structures, each)[1].all((1, 2))
+        possible = beside.run_program(programs.forward_of_all_structures, each)[1].all((1, 2))
         # Numbers that do not move the platform are left out.
         good = possible & (np.abs(twists).max((0, 1)) > 1e-6)
         found = [path for path, one in zip(paths, good, strict=True) if one]
@@ -275,7 +275,7 @@ def left_by_calibration(robot: Robot, errors: Callable[[Array], Array], states: 
         if not paths:
             return zeros
         many = Variants(robot, {path: robot.number(path) for path in paths})
-        return np.concatenate([zeros, many.platform_slopes(rows)], -1)
+        return np.concatenate([zeros, many.differentiate_platform(rows)], -1)
 
     scale = np.repeat([1.0, robot.size], 3)[:, None]
     table, wanted = ((scale * of(states)).reshape(6 * len(states), -1) for of in (slopes, errors))

@@ -164,7 +164,7 @@ def differentiate_poses(robot: Robot, state: State, names: Sequence[str]) -> Arr
     by_joints = machine.platform_jacobian(state.q[None])[0]
     by_name = differentiate_map(robot, tool.map, state.q, by_joints)
     if any(name in machine.paths for name in names):
-        slopes = np.moveaxis(machine.platform_slopes(state.q), -1, 0)
+        slopes = np.moveaxis(machine.differentiate_platform(state.q), -1, 0)
         by_name |= dict(zip(machine.paths, slopes, strict=True))
     turn = tool.frame.as_matrix()
     lever = rotation @ tool.target

@@ -18,7 +18,7 @@ from pkm_twin.codegen.program import (
     UNKNOWNS,
     Equations,
     Program,
-    previous,
+    previous_input_name,
 )
 from pkm_twin.kinematics import pose as poses
 from pkm_twin.kinematics.motion import Motion, Row, matrices
@@ -340,7 +340,7 @@ def follow_pose(t: Traced, *, rates: bool = False) -> tuple[tuple[Equations, ...
         return t.lift([*retracted, *(state[size:] + step[split:])])
 
     onward = tape.inputs(STATE, len(AT))[AT.onward]
-    way = onward * (everything - tape.inputs(previous(POSED), len(home)))
+    way = onward * (everything - tape.inputs(previous_input_name(POSED), len(home)))
     solved = Equations(
         "pose",
         t.lift(home),

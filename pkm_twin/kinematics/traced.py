@@ -21,7 +21,7 @@ from pkm_twin.codegen.expressions import (
     snapped_all,
 )
 from pkm_twin.codegen.lu import SparseLU
-from pkm_twin.codegen.program import AT, LEAST, MAX_GROWTH, STATE, UNKNOWNS, Equations, previous
+from pkm_twin.codegen.program import AT, LEAST, MAX_GROWTH, STATE, UNKNOWNS, Equations, previous_input_name
 from pkm_twin.kinematics.constraints import cross
 from pkm_twin.kinematics.drives import LEADS, TIME, Drives
 from pkm_twin.kinematics.limb_pose import LimbPose
@@ -163,7 +163,7 @@ class Traced:
         for k, value in zip(rates, step, strict=True):
             rows[k] = value
         moved = self.motion.retracted(self.x, rows)
-        before = self.tape.inputs(previous(self.unknowns_name), len(places))
+        before = self.tape.inputs(previous_input_name(self.unknowns_name), len(places))
         state = self.tape.inputs(STATE, len(AT))
         onward = [x + state[AT.onward] * (x - last) for x, last in zip(self.unknowns, before, strict=False)]
         if not places:

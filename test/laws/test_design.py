@@ -81,10 +81,10 @@ def test_joints_follow_and_gradients_are_those_of_differences(name):
     rng = np.random.default_rng(0)
     weights, rates = rng.normal(size=(2, *q.shape))
     table = rng.normal(size=(len(q), 6, 6))
-    slopes = [f.effort_slopes(weights, rates), f.singularity_slopes()]
+    slopes = [f.effort_derivatives(weights, rates), f.singularity_derivatives()]
     elastic = name != "stewart"
     if elastic:
-        slopes.append(f.compliance_slopes(table))
+        slopes.append(f.compliance_derivatives(table))
     for k, number in enumerate(own):
         step = 1e-3 * abs(own[number])
         values = np.tile(list(own.values()), (len(POINTS), 1))
@@ -107,7 +107,7 @@ def test_quantities_are_those_of_each_machine_by_itself(picking):
     many = variants(robot, {"geometry.arm_length": [0.19, 0.24], "inertia.platform_mass": 0.3})
     f = PathMotion(many, path)
     peak, rms, energy, mass = (
-        q.worst(q.pieces(f)) for q in map(QUANTITIES.get, ("peak-effort", "rms-effort", "energy", "mass"))
+        q.worst(q.component_values(f)) for q in map(QUANTITIES.get, ("peak-effort", "rms-effort", "energy", "mass"))
     )
     for k, machine in enumerate(many):
         q = machine.inverse(path.pose)
@@ -166,14 +166,14 @@ def test_the_ratio_of_least_motor_torque_is_that_of_brute_force(picking):
             path,
         ),
     )
-    slopes = quantity.slopes(f, np.arange(3))
+    slopes = quantity.differentiate(f, np.arange(3))
     for k, step in enumerate((1e-3, 1e-6)):
         ahead, behind = (torque(20.0 + s * (k == 0), length + s * (k == 1)) for s in (step, -step))
         np.testing.assert_allclose(slopes[:, k], (ahead - behind) / (2 * step), rtol=1e-5)
     for k, step in ((2, 1e-5), (3, 1e-10)):
         values = np.tile([20.0, length, 0.8, 9e-6], (2, 1))
         values[:, k] += [step, -step]
-        ahead, behind = quantity.pieces(PathMotion(f.machines.with_values(values), path))
+        ahead, behind = quantity.component_values(PathMotion(f.machines.with_values(values), path))
         np.testing.assert_allclose(slopes[:, k], (ahead - behind) / (2 * step), rtol=1e-5)
     with pytest.raises(ParameterError, match="drive"):
         design(load("delta"), BOX, path, "motor-torque", starts=4)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pkm_twin.codegen import expressions as ex
-from pkm_twin.codegen.program import STATE, Equations, Program, previous
+from pkm_twin.codegen.program import STATE, Equations, Program, previous_input_name
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.kinematics.iterations import newton, solve_damped
 from test.support.bodies import PlainKernel
@@ -34,7 +34,7 @@ def program(kind):
     given = {name: tape.input(name, 0) for name in INPUTS}
     x, q = tape.input("x", 0), given["q"]
     correction = given["pace"] * (x * x - q) / (x + x)
-    onward = x + (x - tape.input(previous("x"), 0)) * tape.input(STATE, STEPPED)
+    onward = x + (x - tape.input(previous_input_name("x"), 0)) * tape.input(STATE, STEPPED)
     miss = x * x - q + given["gap"]
     equations = Equations(
         target="q",

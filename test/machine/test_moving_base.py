@@ -67,7 +67,7 @@ def shaken(judge, q, qd, qdd, wrench, rng):
     )
     judge.assemble(at)
     tangent = judge.tangent()
-    judge.move(tangent @ rates)
+    judge.set_velocities(tangent @ rates)
     full = judge.solve(-judge.closures().bias, changes - judge.drives().bias)
     turned = judge.frame("ground").rotation
     spin, origin = judge.spin("ground"), judge.point("ground", np.zeros(3))

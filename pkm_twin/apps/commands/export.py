@@ -41,8 +41,8 @@ class ToFolder(RobotArgument, OverwriteOption):
 
 
 @dataclass(frozen=True, kw_only=True)
-class ToFile(RobotArgument, OverwriteOption):
-    """Option of the file to write."""
+class ExportFileOption(RobotArgument, OverwriteOption):
+    """Option of the exported file, which must be given."""
 
     out: Path = setting(..., "the file to write", writes=True)
 
@@ -106,7 +106,7 @@ def c(given: C) -> Report:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PythonFile(ToFile):
+class PythonFile(ExportFileOption):
     """Write kinematics, torques and the transmission as one Python file.
 
     For training and for GPUs: the file needs only the array library. jax and torch differentiate
@@ -163,7 +163,7 @@ def transmission(given: Transmission) -> Report:
 
 
 @dataclass(frozen=True, kw_only=True)
-class FunctionalMockupUnit(ToFile):
+class FunctionalMockupUnit(ExportFileOption):
     """Write a Functional Mock-up Unit, for model exchange and co-simulation.
 
     It contains C sources and, if this computer has a C compiler, a binary for this platform.
@@ -185,13 +185,13 @@ def fmu(given: FunctionalMockupUnit) -> Report:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Mjcf(ToFile):
+class Mjcf(ExportFileOption):
     """Write an MJCF for MuJoCo: bodies, loops as constraints, motors, a keyframe at home."""
 
 
 @command()
 def mjcf(given: Mjcf) -> Report:
-    """Write a model whose keyframe holds its weight."""
+    """Write an MJCF model with a keyframe in which the motors balance gravity."""
     from delta_dynamics import inverse_dynamics
     from pkm_twin.robot.robot_urdf import robot_mjcf
 
@@ -202,7 +202,7 @@ def mjcf(given: Mjcf) -> Report:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sdf(ToFile):
+class Sdf(ExportFileOption):
     """Write an SDF model: links and all joints, also those that close the loops."""
 
 

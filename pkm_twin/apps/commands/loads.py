@@ -78,7 +78,7 @@ def loads(given: Loads) -> Report:
             Fact("exponent", given.exponent),
             Fact("joints", joints),
         ],
-        _make_tables(joints),
+        _tabulate_bearing_loads(joints),
         figures={"": lambda: draw(motion, found, answer)},
         notes=[
             *motion.notes,
@@ -126,7 +126,7 @@ def describe_joint(load: Summary, exponent: float, duration: float) -> dict[str,
     return entry
 
 
-def _make_tables(joints: dict[str, Any]) -> list[Table]:
+def _tabulate_bearing_loads(joints: dict[str, Any]) -> list[Table]:
     columns = [
         Column("bearing_force_peak_N", "N", "force peak"),
         Column("bearing_force_rms_N", "N", "RMS"),

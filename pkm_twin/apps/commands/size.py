@@ -158,7 +158,7 @@ def size(given: Size) -> Report:
         own = ", ".join(f"{name} {fit or none}" for name, fit in each.items())
         notes += [best, f"smallest for each drive: {own}"]
         title = f"{title}; {best}"
-    return Report(answer, facts, _make_tables(duties), {"": lambda: draw(taken, duties, title)}, notes)
+    return Report(answer, facts, _tabulate_drive_duties(duties), {"": lambda: draw(taken, duties, title)}, notes)
 
 
 def read_gear_options(given: Size, robot: Robot) -> tuple[list[Gear], list[Gears]]:
@@ -189,7 +189,8 @@ def read_gear_options(given: Size, robot: Robot) -> tuple[list[Gear], list[Gears
     return one, choices
 
 
-def _make_tables(duties: Sequence[DriveDuty]) -> list[Table]:
+def _tabulate_drive_duties(duties: Sequence[DriveDuty]) -> list[Table]:
+    """Return the duties of rotary and sliding joints and of motors, and the use of each motor."""
     from pkm_twin.paths.sizing import net_energy
 
     tables = []
@@ -266,7 +267,7 @@ def report_workspace(given: Size) -> Report:
 
     speed, change = given.over_workspace or (0.0, 0.0)
     for value in (speed, change):
-        # 0 is allowed for one of the two: only the other is asked for.
+        # One of speed and acceleration may be 0: the search then covers the other only.
         check_limit("over-workspace", value or MIN_LIMIT)
     robot, held = given.machine(), given.load
     robot = robot if held is None else held.apply_to(robot)
