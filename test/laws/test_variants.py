@@ -461,7 +461,7 @@ def test_closures_that_are_left_out_follow_from_the_others():
         assert len(chosen.rows) < len(frame.constraints)
         assert np.abs(np.array(solve_dependents(frame, chosen)[2], float)).max() < 1e-12
         fewer = replace(chosen, rows=chosen.rows[1:], chosen=chosen.chosen[1:])
-        square = frame.table()[list(fewer.rows)][:, list(fewer.chosen)].astype(float)
+        square = frame.build_constraint_matrix()[list(fewer.rows)][:, list(fewer.chosen)].astype(float)
         fewer = replace(fewer, pivots=pivot_order(square[None]))
         assert np.abs(np.array(solve_dependents(frame, fewer)[2], float)).max() > 1e-3
 
