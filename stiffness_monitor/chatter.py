@@ -170,7 +170,7 @@ class CuttingPlaneModes:
     shapes: Array
 
     @classmethod
-    def of(cls, modes: ToolModes, milling: Milling) -> CuttingPlaneModes:
+    def project(cls, modes: ToolModes, milling: Milling) -> CuttingPlaneModes:
         """Project tool-point modes onto the cutting plane; keep at most 8, and drop those below 1 %."""
         c, s = np.cos(milling.feed), np.sin(milling.feed)
         axes = modes.rotation @ np.array([[c, -s], [s, c], [0.0, 0.0]])
@@ -321,7 +321,7 @@ def stability_lobes(
 
 def lobes_from_modes(modes: ToolModes, milling: Milling, speeds: ArrayLike, deepest: float | None = None) -> Lobes:
     """Find limit depths as :func:`stability_lobes`, from the tool point's modes."""
-    plane = CuttingPlaneModes.of(modes, milling)
+    plane = CuttingPlaneModes.project(modes, milling)
     at = np.atleast_1d(np.asarray(speeds, np.float64))
     last, safe = _find_depth_range(plane, milling, at, deepest)
     return _find_limit_depths(plane, milling, at, last, safe)
@@ -341,7 +341,7 @@ def refine_lobes(
     :param low, high: rpm. ``points``: number of evenly spaced speeds. Others, and errors, as
         :func:`lobes_from_modes`.
     """
-    plane = CuttingPlaneModes.of(modes, milling)
+    plane = CuttingPlaneModes.project(modes, milling)
     even = np.linspace(low, high, points)
     last, safe = _find_depth_range(plane, milling, even, deepest)
     new = np.union1d(even, plane.lobe_speeds(milling, low, high))
@@ -406,5 +406,5 @@ def stable_depth(
 
 def stable_depth_from_modes(modes: ToolModes, milling: Milling) -> tuple[float, int]:
     """Return the modes' zero-order stable depth, m, and the index of the chattering mode."""
-    depth, turn = CuttingPlaneModes.of(modes, milling).stable_depth(milling)
+    depth, turn = CuttingPlaneModes.project(modes, milling).stable_depth(milling)
     return depth, int(np.abs(2.0 * np.pi * modes.frequencies - turn).argmin())

@@ -18,6 +18,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from pkm_twin.codegen.arrays import Indices
 from pkm_twin.codegen.cholesky import SparseCholesky
 from pkm_twin.codegen.expressions import GEOMETRY
 from pkm_twin.codegen.kernels import Kernel
@@ -134,6 +135,13 @@ class Elastic:
     def columns(self) -> Kernel:
         """Program from q to the columns sqrt(d) b: entries, rows, columns, columns' elements."""
         return self.kernel("elastic columns", _write_columns)
+
+    @cached_property
+    def column_places(self) -> tuple[Indices, Indices, Indices]:
+        """Rows, columns and columns' elements of the entries of :attr:`columns`, the same in every pose."""
+        (_, *places), _ = self.columns(NO_PARAMETERS, self.robot.graph.home)
+        rows, columns, owner = (place.astype(int) for place in places)
+        return rows, columns, owner
 
 
 def _plain_data(value: Any) -> Any:

@@ -120,11 +120,9 @@ def elastic_columns(robot: Robot, q: Array) -> tuple[Array, Indices]:
     :returns: columns, shape (..., size, r), the platform's six displacements first; and the element
         of each column by index, shape (r,).
     """
-    program = robot.cached(Elastic).columns
-    (entries, *_), _ = program(NO_PARAMETERS, q)
-    # Take the indices from the home pose: all poses have the same, but an empty batch has none.
-    (_, *places), _ = program(NO_PARAMETERS, robot.graph.home)
-    rows, columns, owner = (p.astype(int) for p in places)
+    elastic = robot.cached(Elastic)
+    (entries, *_), _ = elastic.columns(NO_PARAMETERS, q)
+    rows, columns, owner = elastic.column_places
     own = np.zeros((*q.shape[:-1], rows.max() + 1, len(owner)))
     own[..., rows, columns] = entries
     return own, owner

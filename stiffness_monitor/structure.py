@@ -23,9 +23,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.expressions import SNAP, reference, references
+from pkm_twin.codegen.expressions import SNAP, cross, reference, references
 from pkm_twin.codegen.operations import maximum, sign, sqrt
-from pkm_twin.kinematics.constraints import cross
 from pkm_twin.kinematics.motion import reaction_directions
 from pkm_twin.machine.graph import BASE, Graph, Joint
 from pkm_twin.machine.members import Beam, Structure

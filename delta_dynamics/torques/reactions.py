@@ -8,6 +8,7 @@ actuators' efforts come out as components of lambda, independently of virtual wo
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -16,11 +17,10 @@ from numpy.typing import ArrayLike
 
 from delta_dynamics.torques.virtual_work import Forces, body_efforts
 from pkm_twin.codegen.arrays import Array, Mask, require_finite
-from pkm_twin.codegen.expressions import PARAMETERS
+from pkm_twin.codegen.expressions import PARAMETERS, cross
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
 from pkm_twin.errors import SingularityError
-from pkm_twin.kinematics.constraints import cross
 from pkm_twin.kinematics.motion import BaseMotion, reaction_directions
 from pkm_twin.kinematics.traced import Traced
 from pkm_twin.machine.graph import BASE, Graph, Joint
@@ -522,17 +522,14 @@ def _solve_full_rank(matrix: Array, right: Array) -> tuple[Array, Mask]:
     equations, unknowns = matrix.shape[-2:]
     if unknowns > equations:
         return np.zeros((len(matrix), unknowns)), np.zeros(len(matrix), bool)
-    sound = np.ones(len(matrix), bool)
+    sound, inverse, r, along = np.ones(len(matrix), bool), None, matrix, right[..., None]
     if unknowns == equations:
-        r, along = matrix, right[..., None]
-        try:
-            inverse = np.linalg.inv(r)
-        except np.linalg.LinAlgError:
-            more = np.pad(matrix, [(0, 0), (0, 1), (0, 0)])
-            return _solve_full_rank(more, np.pad(right, [(0, 0), (0, 1)]))
-    else:
+        # QR finds which sample is exactly singular.
+        with suppress(np.linalg.LinAlgError):
+            inverse = np.linalg.inv(matrix)
+    if inverse is None:
         q, r = np.linalg.qr(matrix)
-        along = q.swapaxes(-1, -2) @ right[..., None]
+        along = q.swapaxes(-1, -2) @ along
         diagonal = np.abs(np.diagonal(r, axis1=-2, axis2=-1))
         sound = diagonal.min(-1) > MIN_FULL_RANK_CONDITION * diagonal.max(-1)
         inverse = np.linalg.inv(np.where(sound[:, None, None], r, np.eye(unknowns)))

@@ -13,11 +13,10 @@ from numpy.typing import ArrayLike
 
 from pkm_twin.codegen.arrays import Array, vectors
 from pkm_twin.codegen.cholesky import SparseCholesky
-from pkm_twin.codegen.expressions import PARAMETERS, Numbers, Objects
+from pkm_twin.codegen.expressions import PARAMETERS, Numbers, Objects, cross
 from pkm_twin.codegen.kernels import BoundCall, Kernel
 from pkm_twin.codegen.operations import absolute, maximum, minimum, sign
 from pkm_twin.codegen.program import Program
-from pkm_twin.kinematics.constraints import cross
 from pkm_twin.kinematics.motion import BaseMotion, Motion
 from pkm_twin.kinematics.stream import start_from_last
 from pkm_twin.kinematics.traced import Traced

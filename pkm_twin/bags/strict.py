@@ -175,7 +175,7 @@ class Check:
 
     @property
     def left_out(self) -> str:
-        """What :func:`recover` loses: the fault with its position, or records that it leaves out; else empty."""
+        """Data that :func:`recover` loses, in words: the fault with its position, or records left out; else empty."""
         if self.fault:
             at = self.fault.offset
             return self.fault.text if at is None else f"{self.fault.text} (byte {at})"

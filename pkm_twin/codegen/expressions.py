@@ -232,6 +232,21 @@ def plain(values: Any) -> NDArray[Any]:
     return np.asarray(values, np.float64)
 
 
+def cross(a: Any, b: Any) -> NDArray[Any]:
+    """Return the vector product over the last axis.
+
+    Of single vectors, whose numbers may be expressions, it is an array of objects.
+    """
+    a, b = np.asarray(a), np.asarray(b)
+    if a.ndim != 1 or b.ndim != 1:
+        # As np.cross, which takes three times as long for the few rows that there are.
+        (ax, ay, az), (bx, by, bz) = ((v[..., 0], v[..., 1], v[..., 2]) for v in (a, b))
+        return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], -1)
+    (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
+    product = [ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx]
+    return np.array(product, object)
+
+
 def norm(vector: NDArray[Any]) -> Any:
     """Return the Euclidean norm of a vector of numbers or expressions."""
     if vector.dtype != object:

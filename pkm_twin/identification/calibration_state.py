@@ -214,11 +214,11 @@ class Parameter:
     value: float = np.nan
     deviation: float = np.nan
     scaled: bool = False
-    """Whether its uncertainty is mainly that of a scale that was not measured."""
+    """True if an unmeasured scale causes most of its uncertainty."""
 
     @property
     def observed(self) -> bool:
-        """Whether the poses determine it: its deviation is below half of the prior's."""
+        """True if the poses determine it: its deviation is below half of the prior's."""
         return self.deviation < OBSERVED_RATIO * self.prior and not self.scaled
 
 

@@ -99,7 +99,7 @@ class Spectra:
         return cls(np.stack(grams, 1), np.diff(edges).astype(float), noise[:, None], p.T)
 
     def information(self, ratio: float, gains: Array | None = None, order: Sequence[int] | None = None) -> Information:
-        """Return the information matrix of x and the terms of the likelihood beside it.
+        """Return the information matrix of x, its right side, the sum of squares and the log determinant.
 
         :param ratio: of the discrepancy to the measured signal. ``gains``: factors on the model's
             signals, (n,). ``order``: the channel whose model each measured channel is compared with.

@@ -135,7 +135,7 @@ class Verdict:
 
     @property
     def deviations(self) -> Deviations:
-        """How the standard deviations are reported."""
+        """Report of the standard deviations: as estimated, widened, or withheld."""
         if self.answer == "does not explain":
             return "withheld"
         loud = any(channel.left_ratio > MAX_NOISE_RATIO for channel in self.channels)

@@ -13,10 +13,9 @@ from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.expressions import snapped
+from pkm_twin.codegen.expressions import cross, snapped
 from pkm_twin.codegen.operations import sqrt
 from pkm_twin.machine.graph import BASE, Graph, Joint
 from pkm_twin.machine.joints import UNITS, Constraint, perpendicular_axes
@@ -51,28 +50,13 @@ class Equation(NamedTuple):
 
     @property
     def is_angular(self) -> bool:
-        """Whether the equation constrains directions only."""
+        """True for an equation that constrains the orientation only."""
         return self.force is NONE
 
 
 def dot(a: Any, b: Any) -> Any:
     """Return the scalar product over the last axis; of expressions in one order of operations."""
     return a @ b if a.ndim == b.ndim == 1 else (a * b).sum(-1)
-
-
-def cross(a: Any, b: Any) -> NDArray[Any]:
-    """Return the vector product over the last axis.
-
-    Of single vectors, whose numbers may be expressions, it is an array of objects.
-    """
-    a, b = np.asarray(a), np.asarray(b)
-    if a.ndim != 1 or b.ndim != 1:
-        # As np.cross, which takes three times as long for the few rows that there are.
-        (ax, ay, az), (bx, by, bz) = ((v[..., 0], v[..., 1], v[..., 2]) for v in (a, b))
-        return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], -1)
-    (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
-    product = [ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx]
-    return np.array(product, object)
 
 
 def keep_angle(part: str, bodies: tuple[str, str], points: Pair, vectors: Pair, known: Any) -> Equation:

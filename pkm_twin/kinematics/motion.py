@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.expressions import Numbers, Objects, snapped_all
+from pkm_twin.codegen.expressions import Numbers, Objects, cross, snapped_all
 from pkm_twin.codegen.operations import cos, sin, sqrt
-from pkm_twin.kinematics.constraints import Equation, constraint_equations, cross, keep_distance
+from pkm_twin.kinematics.constraints import Equation, constraint_equations, keep_distance
 from pkm_twin.machine.graph import BASE, Direction, Joint, Rod
 from pkm_twin.machine.joints import UNITS, Constraint
 from pkm_twin.machine.tree import Step, Tree

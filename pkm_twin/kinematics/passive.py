@@ -15,10 +15,9 @@ from typing import Any
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.expressions import Expression, Numbers, Objects
+from pkm_twin.codegen.expressions import Expression, Numbers, Objects, cross
 from pkm_twin.codegen.operations import atan2, sqrt
 from pkm_twin.codegen.program import Program
-from pkm_twin.kinematics.constraints import cross
 from pkm_twin.kinematics.engine import Engine
 from pkm_twin.kinematics.traced import Traced
 from pkm_twin.machine.graph import Rod

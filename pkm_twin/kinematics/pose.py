@@ -11,10 +11,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
-from pkm_twin.codegen.expressions import Numbers
+from pkm_twin.codegen.expressions import Numbers, cross
 from pkm_twin.codegen.operations import atan2, cos, sin, sqrt
 from pkm_twin.errors import ParameterError
-from pkm_twin.kinematics.constraints import cross
 from pkm_twin.kinematics.motion import Columns, Motion
 
 Entry = tuple[int, int, float]

@@ -61,7 +61,7 @@ class Carrier:
 
     @property
     def turns(self) -> bool:
-        """Whether the joint is revolute; else it is prismatic."""
+        """True for a revolute joint, false for a prismatic one."""
         return self.coordinate.axis is None
 
 
@@ -401,7 +401,7 @@ class PlatformFirstScheme(Scheme):
 
     @property
     def has_closed_limbs(self) -> bool:
-        """Whether Newton's unknowns are the platform's coordinates only."""
+        """True if Newton's method solves for the platform's coordinates only."""
         stem = self.tree.chain_to_base(self.graph.platform)
         opened = [entry for entry in self.order if not isinstance(entry, Limb)]
         passive = (b for b in opened if not all(s.actuated for s in self.tree.links[b].steps))

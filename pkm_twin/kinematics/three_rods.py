@@ -15,9 +15,8 @@ from typing import Any
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.expressions import Numbers, Objects, snapped, snapped_all
+from pkm_twin.codegen.expressions import Numbers, Objects, cross, snapped, snapped_all
 from pkm_twin.codegen.operations import absolute, maximum, sqrt
-from pkm_twin.kinematics.constraints import cross
 from pkm_twin.kinematics.limb_pose import sign_of, square_of
 from pkm_twin.kinematics.limbs import Closures
 from pkm_twin.kinematics.motion import Motion

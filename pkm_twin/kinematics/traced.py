@@ -18,11 +18,11 @@ from pkm_twin.codegen.expressions import (
     Objects,
     Tape,
     adjoints,
+    cross,
     snapped_all,
 )
 from pkm_twin.codegen.lu import SparseLU
 from pkm_twin.codegen.program import AT, LEAST, MAX_GROWTH, STATE, UNKNOWNS, Equations, previous_input_name
-from pkm_twin.kinematics.constraints import cross
 from pkm_twin.kinematics.drives import LEADS, TIME, Drives
 from pkm_twin.kinematics.limb_pose import LimbPose
 from pkm_twin.kinematics.motion import FIXED, BaseMotion, Columns, Motion, Row, matrices

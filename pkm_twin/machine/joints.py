@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.expressions import norm, plain, reference, references
+from pkm_twin.codegen.expressions import cross, norm, plain, reference, references
 
 UNITS: Final = np.eye(3)
 
@@ -27,19 +27,13 @@ def unit(vector: ArrayLike) -> Array:
     return np.asarray(values / norm(values))
 
 
-def cross(a: Array, b: Array) -> Array:
-    """Return the product of two vectors of numbers or expressions; np.cross takes ten times as long."""
-    (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
-    return plain([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
-
-
 def perpendicular_axes(axis: Array) -> tuple[Array, Array]:
     """Return two unit vectors that form a right-handed orthogonal triple with an axis."""
     first = np.zeros(3)
     # Rounding keeps the choice the same where two components differ by the last bit only.
     first[int(np.argmin(np.round([abs(reference(value)) for value in axis], 9)))] = 1.0
     first = unit(cross(axis, first))
-    return first, cross(axis, first)
+    return first, plain(cross(axis, first))
 
 
 @dataclass(frozen=True, eq=False)

@@ -28,7 +28,7 @@ MODEL: Final = "_model"
 MARKS: Final = ("ros2_control", "transmission", "independent", "plugin")
 """What marks actuated joints after a YAML file's name_mot: the first that names any counts."""
 ACTUATED_OPTION: Final = "`actuated=[...]` or --actuated"
-"""How a user names the actuated joints, for errors."""
+"""Words of errors for the ways to name the actuated joints."""
 UNCOUPLED_JOINTS: Final = "joints without coupling; a base and a platform (--base) can leave them out"
 """What is expected in place of joints that follow others."""
 

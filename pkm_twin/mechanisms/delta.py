@@ -26,10 +26,9 @@ from typing import Any, ClassVar, Final
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.codegen.expressions import Expression, plain, reference
+from pkm_twin.codegen.expressions import Expression, cross, plain, reference
 from pkm_twin.codegen.operations import cos, sin
 from pkm_twin.errors import ParameterError
-from pkm_twin.kinematics.constraints import cross
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate
 from pkm_twin.kinematics.three_rods import meet_spheres
 from pkm_twin.machine import schema

@@ -223,10 +223,6 @@ class LargestRoot(Start):
         slope = square * turned[0][0] - ab * turned[0][2] * turned[0][2]
         return [-z * turned[1][1], slope, -(z + a * turned[2][1]), MAX_ROOT_RATIO * ab - square]
 
-    def find_gap(self, tree: Tree, q: Numbers) -> None:
-        """Return None: the gap is computed elsewhere, from the nearest reachable drive position."""
-        del tree, q
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class UprRpu(TwinRobot):

@@ -198,11 +198,7 @@ class Recording:
 
     @property
     def payload_fraction(self) -> Array | None:
-        """How much of the payload of :attr:`loaded_robot` is on the platform at each sample, shape (samples,).
-
-        It is 0 for the payload mass of the robot file, 1 for that of :attr:`loaded_robot`, and linear
-        in the mass between them.
-        """
+        """Payload mass at each sample, (samples,): linear, 0 for the robot file's, 1 for :attr:`loaded_robot`'s."""
         if self.load is None:
             return None
         mass, own = self.load.mass_at(self.time), self.robot.payload.mass

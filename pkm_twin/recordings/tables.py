@@ -449,7 +449,5 @@ def write_table(columns: Mapping[str, Array], path: Path) -> None:
                     for values in columns.values():
                         numbers = np.asarray(values[begin : begin + ROWS_PER_BLOCK], np.float64)
                         # An undetermined reaction is an empty cell; repr keeps every digit.
-                        known = "" if np.isnan(numbers).any() else "nan"
-                        written = map(repr, numbers.tolist())
-                        cells.append([known if cell == "nan" else cell for cell in written] if not known else written)
+                        cells.append(["" if value != value else repr(value) for value in numbers.tolist()])
                     text.writelines([f"{','.join(row)}\r\n" for row in zip(*cells, strict=True)])

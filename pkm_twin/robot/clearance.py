@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pkm_twin.codegen.arrays import Array
+from pkm_twin.codegen.expressions import cross
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.operations import maximum, minimum, sqrt
 from pkm_twin.codegen.program import Program
 from pkm_twin.errors import ParameterError
-from pkm_twin.kinematics.constraints import cross
 from pkm_twin.kinematics.traced import Traced
 from pkm_twin.machine.members import Beam
 from pkm_twin.robot.rejection import reject_joints

@@ -19,8 +19,9 @@ from typing import Final
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array, Mask
+from pkm_twin.codegen.expressions import cross
 from pkm_twin.errors import ParameterError, SingularityError
-from pkm_twin.kinematics.constraints import Equation, constraint_equations, cross, keep_angle
+from pkm_twin.kinematics.constraints import Equation, constraint_equations, keep_angle
 from pkm_twin.kinematics.iterations import newton
 from pkm_twin.kinematics.linkage import Linkage
 from pkm_twin.kinematics.motion import Motion, numbers

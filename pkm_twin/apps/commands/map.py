@@ -146,10 +146,11 @@ def compute(given: MapOptions) -> Report:
         if given.out is not None and given.out.suffix != ".csv":
             raise ParameterError("out", str(given.out), "a name that ends in .csv")
         motion = read(path, machine, ReadOptions(planned=True, load=given.load))
-        motion.check_rates()
         if given.payload is None and (motion.computed is not None or (motion.effort is not None and len(motion.q) > 2)):
             doubt = check_efforts(zero_resting_motion(motion.with_rates())).doubt
             motion = replace(motion, doubt=doubt)
+        else:
+            motion.check_rates()
         found = along(
             kind,
             machine,
