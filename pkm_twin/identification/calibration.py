@@ -36,6 +36,7 @@ from pkm_twin.identification.calibration_fit import (
 )
 from pkm_twin.identification.calibration_state import (
     FRAME,
+    MAX_LINE_POSES,
     OTHER_PARAMETERS,
     TARGET,
     Instrument,
@@ -43,12 +44,12 @@ from pkm_twin.identification.calibration_state import (
     Poses,
     State,
     Transmission,
+    differentiate_lines,
     list_map_parameters,
     list_map_values,
     make_state,
     place_frame,
 )
-from pkm_twin.identification.lines import MAX_POSES, line_slopes
 from pkm_twin.identification.measurements import (
     POSITION_KIND,
     Measured,
@@ -499,7 +500,8 @@ def _compare_measurements(
         held = old, [part / one[:, None] for part, one in zip(new, left, strict=True)]
     else:
         pairs = (robot, before), (built, found.state)
-        first, last = (apart.parts(state.evaluate_at(machine, apart.joints)) for machine, state in pairs)
+        states = [(machine, state, state.instrument.map.positions(apart.joints)) for machine, state in pairs]
+        first, last = (apart.parts(replace(state, q=q, platform=machine.platform(q))) for machine, state, q in states)
         held, readings, parts = (first, last), (*readings, *apart.readings), [*new, *last]
     outliers = find_outliers(readings, parts, noise * (len(readings) // len(noise)))
     bad = [one.line for one in outliers]
@@ -537,7 +539,15 @@ def _judge_scale(
 
     And the scale's derivatives, where it is not determined.
     """
-    lines = line_slopes(robot, state.sample_between(measured.joints, MAX_POSES), [p.name for p in told])
+    # Joint states on lines between measured ones.
+    rng, joints = np.random.default_rng(0), measured.joints
+    first, second = rng.integers(len(joints), size=(2, MAX_LINE_POSES))
+    between = joints[first] + rng.uniform(size=(MAX_LINE_POSES, 1)) * (joints[second] - joints[first])
+    q = state.instrument.map.positions(between)
+    position, rotation = (one[0] for one in state.machine.platform(q[None]))
+    good = np.isfinite(position).all(1)
+    sampled = replace(state, q=q[good], platform=(position[good], rotation[good]))
+    lines = differentiate_lines(robot, sampled, [p.name for p in told])
     if lines is None:
         return None, told, None
     row = lines.scale

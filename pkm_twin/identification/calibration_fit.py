@@ -97,7 +97,11 @@ def fit(
         covariance = spread @ spread.T
         trial, gained = None, 0.0
         for _ in range(8):
-            move = _move(left, before, np.sqrt(damping) / prior)
+            # Along directions that the poses hardly determine the machine is far from linear, and
+            # steps without damping may overshoot again and again (Levenberg, Marquardt).
+            damped = np.diag(np.sqrt(damping) / prior)[: len(prior) if damping else 0]
+            rows, end = np.vstack([left, damped]), np.append(before, np.zeros(len(damped)))
+            move = np.asarray(np.linalg.lstsq(rows, end, rcond=None)[0], np.float64)
             small = bool(np.all(np.abs(move) < 1e-3 * np.sqrt(np.diag(covariance))))
             sums = [float(row @ row) for row in (before, before - left @ move)]
             settled = small or sums[0] - sums[1] < 1e-4
@@ -127,19 +131,6 @@ def fit(
         if gained > 0.75:
             damping = 0.1 * damping if damping > 0.01 else 0.0
     raise UnsettledError("poses", problem, "poses for which the fit converges: measure more, or fit less (--only)")
-
-
-def _move(left: Array, right: Array, damping: Array) -> Array:
-    """Compute a Gauss-Newton step, damped where damping is not zero (Levenberg, Marquardt).
-
-    Along directions that the poses hardly determine the machine is far from linear: undamped
-    steps may overshoot again and again.
-    """
-    rows, end = (left, right)
-    if damping.any():
-        rows = np.vstack([left, np.diag(damping)])
-        end = np.concatenate([right, np.zeros(len(damping))])
-    return np.asarray(np.linalg.lstsq(rows, end, rcond=None)[0], np.float64)
 
 
 class Fault(NamedTuple):

@@ -6,7 +6,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any, Final
+from itertools import combinations
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
@@ -83,24 +84,6 @@ class State:
     platform: tuple[Array, Array]
     instrument: Instrument
 
-    def evaluate_at(self, robot: Robot, joints: Array) -> State:
-        """Return the state at other measured joint positions.
-
-        :param robot: loaded with the current parameter values. ``joints``: controller units, (k, n).
-        """
-        q = self.instrument.map.positions(joints)
-        return replace(self, q=q, platform=robot.platform(q))
-
-    def sample_between(self, joints: Array, count: int) -> State:
-        """Return the state at up to ``count`` joint states on lines between measured ones."""
-        rng = np.random.default_rng(0)
-        first, second = rng.integers(len(joints), size=(2, count))
-        part = rng.uniform(size=(count, 1))
-        q = self.instrument.map.positions(joints[first] + part * (joints[second] - joints[first]))
-        position, rotation = self.machine.platform(q[None])
-        good = np.isfinite(position[0]).all(1)
-        return replace(self, q=q[good], platform=(position[0][good], rotation[0][good]))
-
     @property
     def numbers(self) -> dict[str, float]:
         """Current values of the file's numbers, by path."""
@@ -113,10 +96,13 @@ def make_state(robot: Robot, joints: Array, paths: Sequence[str]) -> State:
     :param joints: of the measurements, in the controller's numbers, (k, n).
     :raises UnreachableError: a joint state without an assembly, by limb, sample and miss.
     """
-    instrument = Instrument(centre_map(robot, robot.controller.positions(joints)))
-    machine = Variants(robot, {path: robot.number(path) for path in paths})
-    q = instrument.map.positions(joints)
-    return State(machine, q, robot.platform(q), instrument)
+    own = robot.controller
+    q = own.positions(joints)
+    # A ratio's change over the travel is taken about the middle of the poses' travel.
+    middle = np.round(0.5 * (q.max(0) + q.min(0)), 3)
+    centred = replace(own, centres=np.where(own.changes == 0.0, middle, own.centres))
+    machine, q = Variants(robot, {path: robot.number(path) for path in paths}), centred.positions(joints)
+    return State(machine, q, robot.platform(q), Instrument(centred))
 
 
 def place_frame(state: State, position: Array) -> None:
@@ -135,9 +121,17 @@ def update_state(robot: Robot, state: State, joints: Array, values: Mapping[str,
     :param turn: of the instrument's frame since ``state``, a rotation vector, shape (3,), rad.
     :raises ParameterError: numbers that no file may have, or no machine can be assembled with.
     """
-    tool = state.instrument
+    tool, old = state.instrument, robot.controller
+    offsets, ratios, changes = old.offsets.copy(), np.abs(old.factors), old.changes.copy()
+    for i, joint in enumerate(robot.joint_names):
+        path = f"joint_map.{joint}"
+        offsets[i] = values.get(f"{path}.offset", offsets[i])
+        ratios[i] = values.get(f"{path}.ratio", ratios[i] * values.get(SHARED, 1.0))
+        changes[i] = values.get(f"{path}.ratio_change", changes[i])
+    if not (ratios > 0.0).all():
+        raise ParameterError("joint_map", float(ratios.min()), "ratios above 0")
     new = Instrument(
-        change_map(robot, tool.map, values),
+        replace(tool.map, offsets=offsets, factors=np.sign(old.factors) * ratios, changes=changes),
         rotations().from_rotvec(turn) * tool.frame,
         np.array([values.get(n, v) for n, v in zip(FRAME[:3], tool.place, strict=True)]),
         np.array([values.get(n, v) for n, v in zip(TARGET, tool.target, strict=True)]),
@@ -157,12 +151,25 @@ def update_state(robot: Robot, state: State, joints: Array, values: Mapping[str,
 def differentiate_poses(robot: Robot, state: State, names: Sequence[str]) -> Array:
     """Differentiate the positions and rotations that the instrument sees by parameters, (k, 6, p).
 
-    Zero by numbers of single measurements.
+    The derivatives by numbers of single measurements are zero.
     """
-    tool, machine = state.instrument, state.machine
+    tool, machine, own = state.instrument, state.machine, state.instrument.map
     position, rotation = state.platform
     by_joints = machine.platform_jacobian(state.q[None])[0]
-    by_name = differentiate_map(robot, tool.map, state.q, by_joints)
+    # By the joint map's numbers, at fixed positions of the controller.
+    away, slope = state.q - own.centres, own.slopes(state.q)
+    wound = state.q + 0.5 * own.changes * away**2
+    rates = {
+        "offset": -1.0 / slope,
+        "ratio": -np.sign(own.factors) * wound / slope,
+        "ratio_change": -0.5 * own.factors * away**2 / slope,
+    }
+    by_name = {SHARED: np.sum(by_joints * (-own.factors * wound / slope)[:, None, :], -1)}
+    by_name |= {
+        f"joint_map.{joint}.{name}": by_joints[..., i] * rate[:, i, None]
+        for i, joint in enumerate(robot.joint_names)
+        for name, rate in rates.items()
+    }
     if any(name in machine.paths for name in names):
         slopes = np.moveaxis(machine.differentiate_platform(state.q), -1, 0)
         by_name |= dict(zip(machine.paths, slopes, strict=True))
@@ -186,11 +193,72 @@ def differentiate_poses(robot: Robot, state: State, names: Sequence[str]) -> Arr
     return out
 
 
+MAX_LINE_POSES: Final = 24
+"""Largest number of poses between which distances and angles are taken."""
+
+
+class LineSlopes(NamedTuple):
+    """Derivatives of distances and angles between poses by parameters.
+
+    Distances of two poses, over their length, (d, p); angles at one pose between the lines to two
+    others, rad, (a, p).
+    """
+
+    distances: Array
+    angles: Array
+
+    @property
+    def scale(self) -> Array:
+        """Derivatives of the uniform scale error, the mean relative change of all distances, (p,)."""
+        return np.asarray(self.distances.mean(0), np.float64)
+
+    def deviations(self, covariance: Array) -> tuple[float, float]:
+        """Return the standard deviations of a distance, over its length, and an angle, rad.
+
+        Root mean square over all lines, so that shear and distortion count, not only the scale.
+        """
+        variances = (np.sum((rows @ covariance) * rows, -1) for rows in self)
+        distance, angle = (float(np.sqrt(max(one.mean(), 0.0))) if one.size else np.nan for one in variances)
+        return distance, angle
+
+
+def differentiate_lines(robot: Robot, state: State, names: Sequence[str]) -> LineSlopes | None:
+    """Differentiate the distances of poses and the angles between these lines.
+
+    Lines shorter than 0.3 of the longest, and angles within 30 degrees of 0 or pi, are left out.
+
+    :returns: None if the platform does not move.
+    """
+    some = np.unique(np.linspace(0, len(state.q) - 1, MAX_LINE_POSES).astype(int))
+    position = state.instrument.compute_reading(*state.platform)[0][some]
+    columns = differentiate_poses(
+        robot, replace(state, q=state.q[some], platform=(state.platform[0][some], state.platform[1][some])), names
+    )[:, :3]
+    ways = position[:, None] - position
+    lengths = np.linalg.norm(ways, axis=-1)
+    far = lengths > max(0.3 * float(lengths.max(initial=0.0)), 1e-6)
+    if not far.any():
+        return None
+    first, second = np.nonzero(np.triu(far))
+    units = ways / np.where(far, lengths, 1.0)[..., None]
+    rates = (columns[:, None] - columns) / np.where(far, lengths, 1.0)[..., None, None]
+    distances = np.einsum("ma,map->mp", units[first, second], rates[first, second])
+    corners = [(k, i, j) for k in range(len(some)) for i, j in combinations(np.flatnonzero(far[k]), 2)]
+    k, i, j = np.array(corners, np.intp).reshape(-1, 3).T
+    cosine = np.sum(units[k, i] * units[k, j], -1)
+    wide = np.sqrt(np.maximum(1.0 - cosine**2, 0.0)) > 0.5
+    k, i, j, cosine = k[wide], i[wide], j[wide], cosine[wide, None]
+    sine = np.sqrt(1.0 - cosine**2)
+    angles = sum(
+        -np.einsum("ma,map->mp", (units[k, to] - cosine * units[k, by]) / sine, rates[k, by])
+        for by, to in ((i, j), (j, i))
+    )
+    return LineSlopes(np.asarray(distances, np.float64), np.asarray(angles, np.float64))
+
+
 SHARED: Final = "joint_map.*.ratio"
 RATIO_DEVIATION: Final = 0.05
 """Prior standard deviation of a ratio, as a fraction of it, and of its change over the travel."""
-CONTROLLER: Final = "controller units"
-"""Unit of a joint's sensor that is scaled and whose unit has no name."""
 
 
 class Transmission(StrEnum):
@@ -222,16 +290,14 @@ class Parameter:
         return self.deviation < OBSERVED_RATIO * self.prior and not self.scaled
 
 
-def find_unit(robot: Robot, joint: int) -> str:
-    """Return the unit of a joint's positions in the controller."""
-    own = robot.controller
+def list_map_units(robot: Robot, joint: int) -> dict[str, str]:
+    """Return the units of a joint's offset, ratio and change of the ratio in the joint map."""
+    own, model = robot.controller, robot.joint_units[joint]
     plain = abs(own.factors[joint]) == 1.0
-    return own.units[joint] or (robot.joint_units[joint] if plain else CONTROLLER)
-
-
-def write_ratio_unit(controller: str, model: str) -> str:
-    """Return the unit of a ratio."""
-    return f"{controller} per {model}" if " " in controller else f"{controller}/{model}"
+    # A sensor that is scaled and whose unit has no name counts in the controller's units.
+    unit = own.units[joint] or (model if plain else "controller units")
+    ratio = f"{unit} per {model}" if " " in unit else f"{unit}/{model}"
+    return {"offset": unit, "ratio": ratio, "ratio_change": f"1/{model}"}
 
 
 def list_map_parameters(
@@ -253,64 +319,19 @@ def list_map_parameters(
     farthest = np.abs(q).max(0)
     travel = np.maximum(np.ptp(q, axis=0), 1e-9)
     for i, joint in enumerate(robot.joint_names):
-        path, unit, ratio = f"joint_map.{joint}", find_unit(robot, i), float(abs(own.factors[i]))
+        path, units, ratio = f"joint_map.{joint}", list_map_units(robot, i), float(abs(own.factors[i]))
         # The offset is the reading at zero, so an error of the ratio changes it with the distance.
         size = prior if sliding[i] else angle
         size = float(np.hypot(size, RATIO_DEVIATION * farthest[i] if fitted[i] else 0.0))
         if offsets:
-            found.append(Parameter(f"{path}.offset", unit, float(own.offsets[i]), size * ratio))
+            found.append(Parameter(f"{path}.offset", units["offset"], float(own.offsets[i]), size * ratio))
         if fitted[i] and how is not Transmission.SHARED:
-            its = write_ratio_unit(unit, robot.joint_units[i])
-            found.append(Parameter(f"{path}.ratio", its, ratio, RATIO_DEVIATION * ratio))
+            found.append(Parameter(f"{path}.ratio", units["ratio"], ratio, RATIO_DEVIATION * ratio))
         if how is Transmission.TRAVEL:
-            change, prior_change = float(own.changes[i]), 2.0 * RATIO_DEVIATION / float(travel[i])
-            found.append(Parameter(f"{path}.ratio_change", f"1/{robot.joint_units[i]}", change, prior_change))
+            change, deviation = float(own.changes[i]), 2.0 * RATIO_DEVIATION / float(travel[i])
+            found.append(Parameter(f"{path}.ratio_change", units["ratio_change"], change, deviation))
     if how is Transmission.SHARED:
         found.append(Parameter(SHARED, "", 1.0, RATIO_DEVIATION))
-    return found
-
-
-def centre_map(robot: Robot, q: Array) -> JointMap:
-    """Return the file's joint map with ratio changes centred on the middle of the poses' travel."""
-    own = robot.controller
-    middle = np.round(0.5 * (q.max(0) + q.min(0)), 3)
-    return replace(own, centres=np.where(own.changes == 0.0, middle, own.centres))
-
-
-def change_map(robot: Robot, own: JointMap, values: Mapping[str, float]) -> JointMap:
-    """Return a map with other numbers, by the names above.
-
-    :raises ParameterError: a ratio that is not positive.
-    """
-    old = robot.controller
-    offsets, ratios, changes = old.offsets.copy(), np.abs(old.factors), old.changes.copy()
-    for i, joint in enumerate(robot.joint_names):
-        path = f"joint_map.{joint}"
-        offsets[i] = values.get(f"{path}.offset", offsets[i])
-        ratios[i] = values.get(f"{path}.ratio", ratios[i] * values.get(SHARED, 1.0))
-        changes[i] = values.get(f"{path}.ratio_change", changes[i])
-    if not (ratios > 0.0).all():
-        raise ParameterError("joint_map", float(ratios.min()), "ratios above 0")
-    return replace(own, offsets=offsets, factors=np.sign(old.factors) * ratios, changes=changes)
-
-
-def differentiate_map(robot: Robot, own: JointMap, q: Array, twists: Array) -> dict[str, Array]:
-    """Differentiate the platform's pose by the map's numbers at fixed controller positions.
-
-    :param q: the model's, (k, n). ``twists``: of the platform by q, (k, 6, n).
-    :returns: (k, 6) by name.
-    """
-    away = q - own.centres
-    slope = own.slopes(q)
-    wound = q + 0.5 * own.changes * away**2
-    by_offset = -1.0 / slope
-    by_ratio = -np.sign(own.factors) * wound / slope
-    by_change = -0.5 * own.factors * away**2 / slope
-    shared = -own.factors * wound / slope
-    found = {SHARED: np.sum(twists * shared[:, None, :], -1)}
-    for i, joint in enumerate(robot.joint_names):
-        for name, rate in (("offset", by_offset), ("ratio", by_ratio), ("ratio_change", by_change)):
-            found[f"joint_map.{joint}.{name}"] = twists[..., i] * rate[:, i, None]
     return found
 
 
@@ -323,12 +344,7 @@ def list_map_values(
     """
     found = {}
     for i, joint in enumerate(robot.joint_names):
-        path, unit = f"joint_map.{joint}", find_unit(robot, i)
-        units = {
-            "offset": unit,
-            "ratio": write_ratio_unit(unit, robot.joint_units[i]),
-            "ratio_change": f"1/{robot.joint_units[i]}",
-        }
+        path, units = f"joint_map.{joint}", list_map_units(robot, i)
         for name, its in units.items():
             if f"{path}.{name}" in values:
                 found[f"{path}.{name}"] = (*values[f"{path}.{name}"], its)

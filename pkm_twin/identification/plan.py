@@ -12,8 +12,7 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.identification.calibration import Estimate, Free, list_geometric_paths, list_parameters, make_start
-from pkm_twin.identification.calibration_state import differentiate_poses
-from pkm_twin.identification.lines import line_slopes
+from pkm_twin.identification.calibration_state import differentiate_lines, differentiate_poses
 from pkm_twin.identification.measurements import (
     KINDS,
     Kind,
@@ -133,7 +132,7 @@ def plan(
     rigid = np.concatenate([np.broadcast_to(np.eye(3), (len(q), 3, 3)), -skew(state.platform[0])], -1).reshape(-1, 6)
     flat = places.reshape(len(rigid), -1)
     places = (flat - rigid @ np.linalg.lstsq(rigid, flat, rcond=1e-9)[0]).reshape(places.shape)
-    lines = line_slopes(robot, state, names)
+    lines = differentiate_lines(robot, state, names)
     order, told = list[int](), list[tuple[float, float, float, Array]]()
     most = min(count or (MAX_MEASUREMENTS if accuracy else 12), MAX_MEASUREMENTS, len(q))
     while True:
