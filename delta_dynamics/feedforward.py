@@ -36,7 +36,7 @@ from pkm_twin.streams.base_motion import BaseImu
 from pkm_twin.streams.continuity import Continuity
 from pkm_twin.streams.differentiator import Differentiator
 from pkm_twin.streams.matched import WrenchWindow
-from pkm_twin.streams.monitor import Core, StreamMonitor, counting, finished
+from pkm_twin.streams.monitor import Core, StreamMonitor, finished, make_counter
 from pkm_twin.streams.rates import RateAgreement
 from pkm_twin.streams.rest import VelocityErrorEstimator, gradient_gain, velocity_error_bound
 from pkm_twin.streams.wrench import STAMP_ORDER, check_order
@@ -167,7 +167,7 @@ class Feedforward(Core):
         s = self.settings
         self.stream = StreamMonitor(s.trip_count, s.recovery_count)
         # Trajectories are independent: a rejected one does not affect the next.
-        self.trajectories = counting()
+        self.trajectories = make_counter()
         self.saturations = 0
         self.near_singular = False
         self.near_singularities = 0

@@ -17,7 +17,7 @@ from pkm_twin.messages.stamps import SECOND, StampRules
 from pkm_twin.robot.effort_limits import EffortLimits, LimitedEfforts
 from pkm_twin.robot.robot import Robot
 from pkm_twin.settings import AGE_BOUNDS, COUNT_BOUNDS, DURATION_BOUNDS, FUTURE_TOLERANCE_TEXT, setting
-from pkm_twin.streams.monitor import Core, StreamMonitor, counting
+from pkm_twin.streams.monitor import Core, StreamMonitor, make_counter
 from pkm_twin.streams.wrench import check_order
 
 OnStop = Literal["zeros", "gravity"]
@@ -60,7 +60,7 @@ class Gate(Core):
         s = self.settings
         self.stream = StreamMonitor(s.trip_count, s.recovery_count)
         self.stream.stop("waiting", "no torque yet")
-        self.states = counting()
+        self.states = make_counter()
         self._rules = StampRules(
             future_tolerance=round(s.future_tolerance * SECOND), max_age=round(s.deadline * SECOND)
         )

@@ -27,7 +27,7 @@ from pkm_twin.messages.reading import DeflectionSample, quote_name, read_deflect
 from pkm_twin.messages.stamps import SECOND, StampRules
 from pkm_twin.robot.robot import Robot
 from pkm_twin.settings import setting
-from pkm_twin.streams.monitor import Core, counting, finished
+from pkm_twin.streams.monitor import Core, finished, make_counter
 from pkm_twin.streams.noise import estimate_deviation
 from pkm_twin.streams.wrench import TimeCache, check_order
 from stiffness_monitor.compliance import strain_energy
@@ -429,7 +429,7 @@ class StiffnessWatch(Core):
     period: float = 0.1
 
     def __post_init__(self) -> None:
-        self.taken = counting()
+        self.taken = make_counter()
         self.departures: tuple[Departure, ...] | None = None
         """Departures of the last evaluation; None before the first."""
         self._alarm = StiffnessAlarm(self.robot, self.settings)

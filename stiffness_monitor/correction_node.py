@@ -21,7 +21,7 @@ from pkm_twin.robot.robot import Robot
 from pkm_twin.ros.joints import JointPublisher
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.wrench import declare_vector
-from pkm_twin.streams.monitor import Core, counting
+from pkm_twin.streams.monitor import Core, make_counter
 from stiffness_monitor.correction import SetpointStream, setpoint_correction
 from stiffness_monitor.monitor import Answer
 
@@ -48,7 +48,7 @@ class SetpointCorrection(Core):
         self._reader = JointReader(robot)
         self._offset: tuple[int, Any] | None = None
         self.bounded = 0
-        self.setpoints = counting()
+        self.setpoints = make_counter()
         """Counts of corrected and of rejected set points."""
         wanted = node.declare(
             "correct_setpoint", False, "publish joint offsets that compensate the tool point's deflection"

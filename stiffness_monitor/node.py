@@ -20,7 +20,7 @@ from std_msgs.msg import Float64MultiArray, Header, MultiArrayDimension, String
 
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.ros import health
-from pkm_twin.ros.joints import header, named, xyz
+from pkm_twin.ros.joints import header, make_joint_state, xyz
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.run import run
 from pkm_twin.ros.wrench import declare_mounts
@@ -74,12 +74,12 @@ class StiffnessMonitor(TwinNode):
                 ("~/compliance", _compliance_message),
                 (
                     "~/compliance_stamped",
-                    lambda a: named(self._base_header(a), ENTRIES, a.compliance[UPPER_TRIANGLE].tolist()),
+                    lambda a: make_joint_state(self._base_header(a), ENTRIES, a.compliance[UPPER_TRIANGLE].tolist()),
                 ),
                 ("~/strain_energy", self._energies_message),
                 (
                     "~/strain_energy_stamped",
-                    lambda a: named(
+                    lambda a: make_joint_state(
                         self._base_header(a),
                         a.energy.elements,
                         a.energy.factors.tolist(),
@@ -182,7 +182,7 @@ class StiffnessMonitor(TwinNode):
         message.layout.dim = [MultiArrayDimension(label="frequency", size=len(values), stride=len(values))]
         self._frequencies.publish(message)
         names = [f"mode_{k + 1}" for k in range(len(values))]
-        self._frequencies_stamped.publish(named(header(self._published_stamp, ""), names, values.tolist()))
+        self._frequencies_stamped.publish(make_joint_state(header(self._published_stamp, ""), names, values.tolist()))
 
     def _base_header(self, answer: Answer) -> Header:
         return header(answer.stamp, self.core.settings.base_frame)

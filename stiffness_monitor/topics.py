@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from pkm_twin.streams.topics import JOINTS, NUMBERS, STATUSES, TEXT, TRIGGER, WRENCH, Topic, table
+from pkm_twin.streams.topics import JOINTS, NUMBER_ARRAY, STATUSES, TEXT, TRIGGER, WRENCH, Topic, table
 
 _TRANSFORM: Final = "geometry_msgs/TransformStamped"
 _CORRECTED: Final = "`correct_setpoint`"
@@ -18,7 +18,7 @@ STIFFNESS: Final = table(
         "measured at the platform's reference point, or at the sensor position given by `sensor.xyz` or `/tf`",
     ),
     Topic("in", "joint_states", JOINTS, "joint positions, which determine the pose"),
-    Topic("out", "~/compliance", NUMBERS, "6x6 row-major, labels row, col; base axes, m and rad per N and N m"),
+    Topic("out", "~/compliance", NUMBER_ARRAY, "6x6 row-major, labels row, col; base axes, m and rad per N and N m"),
     Topic("out", "~/compliance_stamped", JOINTS, "its upper triangle: names `x_ry` and so on, entries as positions"),
     Topic(
         "out",
@@ -85,7 +85,7 @@ STIFFNESS: Final = table(
     Topic(
         "out",
         "~/natural_frequencies",
-        NUMBERS,
+        NUMBER_ARRAY,
         "the first six, Hz, with locked actuators at the latest joint state; needs masses in the robot's file",
     ),
     Topic("out", "~/natural_frequencies_stamped", JOINTS, "names `mode_1` and so on, frequencies (Hz) as positions"),

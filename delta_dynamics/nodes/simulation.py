@@ -275,7 +275,7 @@ class MachineSim(TwinNode):
 
     def _on_trajectory(self, data: bytes) -> None:
         with self.core.refusing(self.core.trajectories):
-            raw = RawTrajectory.of(data)
+            raw = RawTrajectory.decode(data)
         self.core.trajectory(raw.fields)
 
     def _catch_up(self) -> None:

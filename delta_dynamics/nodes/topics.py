@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from pkm_twin.streams.topics import JOINTS, NUMBERS, STATUSES, TEXT, TRAJECTORY, TRIGGER, WRENCH, Topic, table
+from pkm_twin.streams.topics import JOINTS, NUMBER_ARRAY, STATUSES, TEXT, TRAJECTORY, TRIGGER, WRENCH, Topic, table
 
 _INERTIA: Final = "geometry_msgs/InertiaStamped"
 _OBSERVED: Final = "`observe_wrench`"
@@ -26,7 +26,7 @@ TWIN: Final = table(
     Topic("out", "~/joint_trajectory_ff", TRAJECTORY, "the input with `effort` added, for joint_trajectory_controller"),
     Topic("out", "~/joint_torques", JOINTS, "names and effort, with the stamp of the input"),
     Topic("out", "~/torque_residual", JOINTS, "measured minus predicted effort, where the input carries effort"),
-    Topic("out", "~/commands", NUMBERS, "efforts in configured order", "`publish_commands`"),
+    Topic("out", "~/commands", NUMBER_ARRAY, "efforts in configured order", "`publish_commands`"),
     Topic(
         "out", "~/payload", _INERTIA, "mass and centre of mass of the load, from measured efforts", "`estimate_payload`"
     ),
@@ -85,11 +85,11 @@ GATE: Final = table(
         "the stamped torques; the publisher must offer deadline and lifespan",
     ),
     Topic("in", "joint_states", JOINTS, "the measured position", "`on_stop` gravity"),
-    Topic("out", "~/commands", NUMBERS, "for JointGroupEffortController, configured order"),
+    Topic("out", "~/commands", NUMBER_ARRAY, "for JointGroupEffortController, configured order"),
     Topic("out", "~/commands_stamped", JOINTS, "the same, with joint names and time of sending"),
 )
 SIMULATION: Final = table(
-    Topic("in", "~/commands", NUMBERS, "efforts in configured order, as for an effort controller"),
+    Topic("in", "~/commands", NUMBER_ARRAY, "efforts in configured order, as for an effort controller"),
     Topic(
         "in",
         "~/joint_trajectory",

@@ -313,7 +313,7 @@ class DeltaDynamics(TwinNode):
     def _answer_trajectory(self, data: bytes) -> Task:
         """Answer a trajectory in steps, so that the stream is answered meanwhile."""
         with self.core.refusing(self.core.trajectories):
-            raw = RawTrajectory.of(data)
+            raw = RawTrajectory.decode(data)
         steps = self.core.trajectory_steps(raw.fields, self.now())
         while True:
             yield

@@ -20,13 +20,13 @@ from delta_dynamics.torques.virtual_work import mass_matrix
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MessageError, ParameterError, PkmTwinError, UnreachableError
 from pkm_twin.machine.sections import of_mass
-from pkm_twin.messages.reading import MAX_RATE, JointReader, as_message_error, read_wrench
+from pkm_twin.messages.reading import MAX_VELOCITY, JointReader, as_message_error, read_wrench
 from pkm_twin.messages.stamps import SECOND, StampRules
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import random_joints
 from pkm_twin.settings import setting
 from pkm_twin.streams.continuity import Continuity
-from pkm_twin.streams.monitor import Core, counting
+from pkm_twin.streams.monitor import Core, make_counter
 from pkm_twin.streams.path import JointPath
 
 TimeoutAction = Literal["zeros", "hold"]
@@ -207,10 +207,10 @@ class Simulation(Core):
                 if not low <= q <= high:
                     raise ParameterError(f"start, {name}", float(q), f"{low:g} to {high:g}")
         self.robot, self.settings = robot, settings
-        self.stream = counting()
+        self.stream = make_counter()
         """Counts of effort commands, and the reason of a stop."""
-        self.trajectories = counting()
-        self.wrenches = counting()
+        self.trajectories = make_counter()
+        self.wrenches = make_counter()
         """Counts of wrenches from a topic."""
         self.saturations = 0
         self.now = start
@@ -222,7 +222,7 @@ class Simulation(Core):
         self.braked, self.failure = True, ""
         self.plant = Plant(self.robot, s.start)
         self._continuity = Continuity(
-            self.robot, MIN_SINGULARITY_INDEX, MIN_SINGULARITY_INDEX, [MAX_RATE] * self.robot.joints_count
+            self.robot, MIN_SINGULARITY_INDEX, MIN_SINGULARITY_INDEX, [MAX_VELOCITY] * self.robot.joints_count
         )
         self._begun = self.now
         self._payloads = deque(sorted(s.payloads, key=lambda event: event.time))

@@ -41,7 +41,7 @@ from pkm_twin.bags.format import (
 from pkm_twin.bags.storage import BagFile
 from pkm_twin.errors import BagError
 
-_RUN_BYTES = 1024**2
+_MAX_SEGMENT_BYTES = 1024**2
 """Largest segment of consecutive messages outside chunks, bytes, unless one message is larger."""
 
 
@@ -284,7 +284,7 @@ class Check:
             last = self.segments[-1] if self.segments else None
             begin, length = at, len(record)
             continues = last and not last.is_chunk and last.offset + last.length == at
-            if last and continues and last.length + length <= _RUN_BYTES:
+            if last and continues and last.length + length <= _MAX_SEGMENT_BYTES:
                 begin, length = last.offset, last.length + length
                 span.join(self.segments.pop().messages)
             self.segments.append(Segment(begin, length, span, is_chunk=False, has_crc=False))

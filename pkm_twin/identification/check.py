@@ -40,7 +40,7 @@ from pkm_twin.robot.limits import list_limits
 from pkm_twin.robot.plausibility import why_no_torques
 from pkm_twin.streams.drives import CONSTANT_SAMPLES, MAX_RELATIVE_CHANGE
 from pkm_twin.streams.noise import estimate_deviation
-from pkm_twin.streams.rates import MAX_RATE, STANDSTILL_FRACTION, rate_faults, rms
+from pkm_twin.streams.rates import MAX_MOVE_DIFFERENCE, STANDSTILL_FRACTION, rate_faults, rms
 
 REJECTED: Final = "messages that a node rejects"
 POSITION_STEPS: Final = "position steps"
@@ -151,9 +151,9 @@ def compare_with_model(r: Recording, residual: float) -> Checked:
         reason = "joint states without efforts: the bag has none, or NaN, in some or all of them"
         reason = "the table has no columns JOINT.effort" if r.bag is None else reason
         reason = COMPUTED if r.efforts == "model" else reason
-    fault = r.play_fault or r.jump_description
+    fault = r.backlash_description or r.jump_description
     # Single jumps are left out of what is compared.
-    if reason or r.steps.publishers or r.play_fault:
+    if reason or r.steps.publishers or r.backlash_description:
         items.append(make_judged_fact(RESIDUAL, fault or reason, bound, None))
         return Checked(r, items, unjudged=reason, causes=(fault,) if fault else ())
     try:
@@ -203,7 +203,7 @@ def _judge_motion(r: Recording) -> list[Fact]:
     median, longest = float(np.median(periods)), float(periods.max())
     gap = f"{1e3 * longest:.3f} ms at {r.time[int(periods.argmax())]:.3f} s"
     within, rate = 5.0 * median, f"{1 / median:.1f} Hz over {r.time[-1]:.3f} s"
-    fault = r.play_fault or r.jump_description
+    fault = r.backlash_description or r.jump_description
     items = [
         make_judged_fact("rate", rate, "", True, number=1 / median, unit="Hz"),
         missing_samples(r.time),
@@ -245,7 +245,7 @@ def find_stuck(time: Array, values: Array, told: Array, count: int = 1) -> tuple
 def _judge_velocities(r: Recording, qd: Array) -> list[Fact]:
     """Compare measured velocities with the rates of the positions over short times."""
     names, span = r.robot.joint_names, np.diff(r.time)
-    bound = f"RMS below {100 * MAX_RATE:g} % of the positions' rate"
+    bound = f"RMS below {100 * MAX_MOVE_DIFFERENCE:g} % of the positions' rate"
     turned = np.cumsum(0.5 * (qd[1:] + qd[:-1]) * span[:, None], 0)
     for j, told in enumerate(np.concatenate([0.0 * turned[:1], turned]).T):
         found = find_stuck(r.time, r.q[:, j], told)
@@ -262,11 +262,11 @@ def _judge_velocities(r: Recording, qd: Array) -> list[Fact]:
     number = float(part[worst])
     text, good = (
         f"RMS difference {value}",
-        False if faults else True if number <= MAX_RATE else None,
+        False if faults else True if number <= MAX_MOVE_DIFFERENCE else None,
     )
     if good is None:
         text += ", no more than noise"
-    return [make_judged_fact(VELOCITIES, text, bound, good, number=number, limit=MAX_RATE)]
+    return [make_judged_fact(VELOCITIES, text, bound, good, number=number, limit=MAX_MOVE_DIFFERENCE)]
 
 
 def _judge_limits(r: Recording) -> list[Fact]:

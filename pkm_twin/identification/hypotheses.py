@@ -559,17 +559,17 @@ def explain_recording(robot: Robot, r: Recording) -> Explanation:
     if found.load is not None:
         loaded = explain(make_rows(robot, rows.model.parameters, replace(rows.recording, load=found.load)))
         found = loaded if loaded.fault else found
-    return replace(found, steps="" if r.jump_description else r.play_fault, rows=rows)
+    return replace(found, steps="" if r.jump_description else r.backlash_description, rows=rows)
 
 
 def describe_positions(r: Recording) -> str:
     """Say why positions that step are no motion of the machine: it cannot take them, or they jump."""
-    if not r.play_fault and not r.steps.publishers and r.effort is not None:
+    if not r.backlash_description and not r.steps.publishers and r.effort is not None:
         try:
             find_idle(r)
         except (UnreachableError, SingularityError) as error:
             return position_text(error)
-    return f"position steps that are no motion: {r.play_fault or r.jump_description}"
+    return f"position steps that are no motion: {r.backlash_description or r.jump_description}"
 
 
 def wrenches(r: Recording, motion: Motion) -> Iterator[tuple[str, Array]]:

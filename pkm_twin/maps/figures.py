@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 COLOUR_MAP: Final = "viridis"
 PREFIXES: Final = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M"}
-PANELS: Final = 3
+MAX_PANELS: Final = 3
 """Largest number of planes in a picture."""
 MIN_SHOWN: Final = 5e-5
 """Coordinate, m or rad, or component of a direction, below which zero is shown."""
@@ -209,7 +209,7 @@ def full_planes(data: Dataset, case: int) -> list[int]:
 def planes(data: Dataset, case: int) -> Figure:
     """Draw up to three planes of a case through its worst pose, with one colour scale."""
     kind, part = find_kind(data), data.isel(case=case)
-    drawn = [extract_plane(data, case, k) for k in sorted(full_planes(data, case)[:PANELS])]
+    drawn = [extract_plane(data, case, k) for k in sorted(full_planes(data, case)[:MAX_PANELS])]
     count, flat = len(drawn), len(drawn[0]["names"]) > 1
     worst = float(part.worst_value)
     values = np.concatenate([one["values"].ravel() for one in drawn])
@@ -219,8 +219,8 @@ def planes(data: Dataset, case: int) -> Figure:
     label = textwrap.fill(f"{part.case_what.values} ({unit or 'dimensionless'})", 48)
     # Equal scales where all coordinates have one unit; a single panel fills the width.
     height, widths = 0.5 * plots.WIDTH, [1.0] * count
-    if count == PANELS:
-        height = plots.WIDTH / PANELS + 0.9
+    if count == MAX_PANELS:
+        height = plots.WIDTH / MAX_PANELS + 0.9
     elif count == 1 and flat and len(set(drawn[0]["units"])) == 1:
         across, up = map(np.ptp, drawn[0]["ticks"])
         height = float(np.clip(0.8 * plots.WIDTH * up / across, 3.0, 0.7 * plots.WIDTH) + 0.6)
@@ -240,7 +240,7 @@ def planes(data: Dataset, case: int) -> Figure:
                     ax.plot(one["star"][0], scale * one["values"][k, 0], "*", color="red", ms=12)
                 continue
             # Contours at fewer quantiles in a full row of panels.
-            quantiles = (0.25, 0.6, 0.9) if count < PANELS else (0.35, 0.85)
+            quantiles = (0.25, 0.6, 0.9) if count < MAX_PANELS else (0.35, 0.85)
             mesh = draw_panel(one, ax, scale, scale * low, scale * high, quantiles)
             over = kind.overlay(data, one["names"], one["through"], ax)
         if flat:

@@ -30,7 +30,7 @@ FORMAT_VERSION: Final = "2"
 """Version of the file format; files of another version are rejected."""
 NON_NEGATIVE: Final = {"valid_min": 0.0}
 UNIT_INTERVAL: Final = {"units": "1", "valid_min": 0.0, "valid_max": 1.0}
-FLAG: Final = {"valid_min": 0, "valid_max": 1}
+FLAG_BOUNDS: Final = {"valid_min": 0, "valid_max": 1}
 NO_BOUNDS: Final[Mapping[str, Any]] = MappingProxyType({})
 """Attributes that bound a variable (CF conventions, 2.5.1), checked when a file is opened."""
 Values = dict[str, NDArray[Any]]
@@ -247,7 +247,7 @@ class Space:
     circles: Array | None = None
 
     @property
-    def by_joints(self) -> bool:
+    def has_joint_limits(self) -> bool:
         """True if finite limits bound the joint positions."""
         limits = self.robot.limits.position
         return limits is not None and bool(np.isfinite(limits).all())
@@ -256,11 +256,11 @@ class Space:
     def box(self) -> Array:
         """Box of the search for worst poses: limits of joints (n, 2), or bounds of poses."""
         limits = self.robot.limits.position
-        return limits if self.by_joints and limits is not None else self.bounds
+        return limits if self.has_joint_limits and limits is not None else self.bounds
 
     def evaluate_point(self, x: Array) -> tuple[Array, Array, Mask]:
         """Return joint positions, poses, and which are known, for points (k, n) of the box."""
-        if not self.by_joints:
+        if not self.has_joint_limits:
             return self.evaluate_poses(x)
         pose, known = self.robot.try_forward(x)
         return x, np.where(known[:, None], pose, self.robot.home()), known

@@ -14,7 +14,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import import_extra
 from pkm_twin.files import replace_file
 from pkm_twin.maps import figures
-from pkm_twin.maps.store import reading, source, writing
+from pkm_twin.maps.store import convert_read_errors, convert_write_errors, source
 from pkm_twin.report import Report
 from pkm_twin.report.page import page as of_report
 
@@ -26,12 +26,12 @@ CAMERA: Final = {"eye": {"x": 1.3, "y": -1.5, "z": 0.95}, "center": {"x": 0, "y"
 FLAT_LIGHT: Final = {"ambient": 1.0, "diffuse": 0.0, "specular": 0.0, "fresnel": 0.0}
 """Light that shows colours as in the colour bar."""
 MENU: Final = {"x": 0.0, "y": 1.0, "xanchor": "left", "yanchor": "bottom", "pad": {"b": 8}}
-BAR: Final = {"len": 0.8, "thickness": 12, "title": {"side": "right"}}
+COLOUR_BAR: Final = {"len": 0.8, "thickness": 12, "title": {"side": "right"}}
 """Colour bar with its title along it, to fit narrow windows."""
 MARGIN: Final = {"l": 20, "r": 20, "t": 60, "b": 20}
 MAX_SAMPLES: Final = (15, 61)
 """Largest number of layers, and of samples along the sides of a layer."""
-STAR: Final = {"color": "red", "line": {"color": "white", "width": 1}}
+WORST_POSE_MARKER: Final = {"color": "red", "line": {"color": "white", "width": 1}}
 HELP: Final = "Coloured poses count: joints within limits, limbs apart, clear of singularities. The \
 menu chooses the case and plane, a slider one layer alone."
 
@@ -43,7 +43,7 @@ def write_page(data: Dataset, path: Path) -> Path:
     """
     import_extra("plotly", "maps")
     kind = figures.find_kind(data)
-    with reading(source(data)):
+    with convert_read_errors(source(data)):
         first, *rest = figures.write_lines(data)
         drawn, more = page(data), kind.page(data)
     parts = [drawn, *([] if more is None else [more])]
@@ -61,7 +61,7 @@ def write_page(data: Dataset, path: Path) -> Path:
     ]
     report = Report(first, notes=[*rest, HELP, *([kind.page_help] if kind.page_help else [])])
     text = of_report(str(data.attrs["title"]), report, figures=shown)
-    with writing(path):
+    with convert_write_errors(path):
         replace_file(path, text.encode())
     return path
 
@@ -70,7 +70,7 @@ def page(data: Dataset) -> Any:
     """Return a figure of all cases: layers for three coordinates, else planes."""
     figure, buttons = _draw_layers(data) if len(data.coordinate) == 3 else _draw_planes(data)
     figure.update_layout(
-        coloraxis={"colorscale": "Viridis", "colorbar": BAR},
+        coloraxis={"colorscale": "Viridis", "colorbar": COLOUR_BAR},
         updatemenus=[{"buttons": buttons, **MENU}],
     )
     # Show the menu's first entry.
@@ -122,7 +122,7 @@ def _draw_layers(data: Dataset) -> tuple[Any, list[dict[str, Any]]]:
             flatshading=True,
             lighting=FLAT_LIGHT,
         )
-    figure.add_scatter3d(mode="markers", marker=STAR | {"size": 7, "symbol": "diamond"})
+    figure.add_scatter3d(mode="markers", marker=WORST_POSE_MARKER | {"size": 7, "symbol": "diamond"})
     where = "".join(f"{n} %{{{axis}:.4~f}}<br>" for n, axis in zip(names, "xyz", strict=True))
     buttons = []
     for k, case in enumerate(data.case.values):
@@ -204,7 +204,7 @@ def _draw_planes(data: Dataset) -> tuple[Any, list[dict[str, Any]]]:
             y=star[1:2],
             mode="markers",
             showlegend=False,
-            marker=STAR | {"symbol": "star", "size": 16},
+            marker=WORST_POSE_MARKER | {"symbol": "star", "size": 16},
             hovertemplate=f"worst {worst}<extra></extra>",
         )
         layout |= {"xaxis.title.text": named[0], "yaxis.title.text": named[1] if y else what}

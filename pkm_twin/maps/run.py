@@ -26,7 +26,7 @@ from typing import Any, Final, Protocol
 import pkm_twin
 from pkm_twin.errors import ParameterError, PkmTwinError, import_extra
 from pkm_twin.maps.kind import Values
-from pkm_twin.maps.store import MapError, Parts, join, save_part, writing
+from pkm_twin.maps.store import MapError, Parts, convert_write_errors, join, save_part
 from pkm_twin.maps.sweep import Chunk, Map
 from pkm_twin.threads import one_blas_thread_for_children
 
@@ -77,7 +77,7 @@ def run(
     import_extra("h5netcdf", "maps")
     if workers is not None and workers < 1:
         raise PkmTwinError(f"workers is {workers}; it has to be 1 or more")
-    with writing(out):
+    with convert_write_errors(out):
         if out.exists() and not overwrite:
             raise MapError(out, "exists; give --overwrite to replace it")
         if out.exists() and not out.is_file():

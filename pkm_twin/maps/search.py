@@ -39,10 +39,10 @@ def find_worst(space: Space, case: Case, starts: Array, tell: Callable[[float], 
     """
     robot, kind = space.robot, space.kind
     low, high = space.box.T
-    by_joints = space.by_joints
+    has_joint_limits = space.has_joint_limits
     rng = np.random.default_rng(0)
-    first = robot.inverse(starts) if by_joints and len(starts) else starts
-    if by_joints:
+    first = robot.inverse(starts) if has_joint_limits and len(starts) else starts
+    if has_joint_limits:
         # Keep away from the ends, where rounding decides what counts.
         low, high = low + 1e-9 * (high - low), high - 1e-9 * (high - low)
 

@@ -24,7 +24,7 @@ from delta_dynamics.torques.isotropy import (
 )
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, import_extra
-from pkm_twin.maps.kind import FLAG, NON_NEGATIVE, UNIT_INTERVAL, Space, Variable, describe, scalar
+from pkm_twin.maps.kind import FLAG_BOUNDS, NON_NEGATIVE, UNIT_INTERVAL, Space, Variable, describe, scalar
 from pkm_twin.report import plots
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import reachable
@@ -94,12 +94,12 @@ def find_spheres(space: Space, energy: float) -> dict[str, Variable]:
         ),
         "sphere_force": Variable(sphere, force, describe("F_max, largest effort of the drives", unit, NON_NEGATIVE)),
         "sphere_inside": Variable(
-            sphere[:2], inside.astype(np.int8), describe("1 where all limits are kept", "", FLAG)
+            sphere[:2], inside.astype(np.int8), describe("1 where all limits are kept", "", FLAG_BOUNDS)
         ),
     }
 
 
-def list_questions(data: Dataset) -> dict[str, tuple[str, str]]:
+def list_index_labels(data: Dataset) -> dict[str, tuple[str, str]]:
     """Return the question and the scale's label of each index."""
     energy = json.loads(data.attrs["settings"])["options"]["energy"]
     unit = str(data.sphere_force.attrs["units"])
@@ -119,7 +119,7 @@ def list_questions(data: Dataset) -> dict[str, tuple[str, str]]:
 def state_ranges(data: Dataset) -> list[str]:
     """Return each index's smallest and largest value at the smallest and largest tilt."""
     lines = []
-    for index, (_, label) in list_questions(data).items():
+    for index, (_, label) in list_index_labels(data).items():
         values = data[f"sphere_{index}"].values
         drawn = [k for k in range(len(TILTS)) if np.isfinite(values[:, k]).any()]
         ranges = [
@@ -169,7 +169,7 @@ def _picture_axes() -> tuple[Array, Array]:
 
 def draw_spheres(data: Dataset) -> dict[str, Figure]:
     """Draw both indices on spheres at azimuth and tilt, each on one scale of colours."""
-    return {f"spheres_{index}": _draw_index(data, index) for index in list_questions(data)}
+    return {f"spheres_{index}": _draw_index(data, index) for index in list_index_labels(data)}
 
 
 def _draw_index(data: Dataset, index: str) -> Figure:
@@ -177,7 +177,7 @@ def _draw_index(data: Dataset, index: str) -> Figure:
 
     from pkm_twin.maps.figures import COLOUR_MAP
 
-    question, label = list_questions(data)[index]
+    question, label = list_index_labels(data)[index]
     values, inside = data[f"sphere_{index}"].values, data.sphere_inside.values
     low, high = float(np.nanmin(values)), float(np.nanquantile(values, 0.995))
     ways = data.way.values
@@ -264,7 +264,7 @@ def _draw_index(data: Dataset, index: str) -> Figure:
 def make_page(data: Dataset) -> Any:
     """Return the spheres as a plotly figure to turn; a menu chooses the index."""
     graph = import_extra("plotly.graph_objects", "maps")
-    from pkm_twin.maps.page import BAR, FLAT_LIGHT, MARGIN, MENU, make_button, round_digits
+    from pkm_twin.maps.page import COLOUR_BAR, FLAT_LIGHT, MARGIN, MENU, make_button, round_digits
 
     ways, places = data.way.values, _sphere_centres(data)
     corners = _triangles(ways)
@@ -286,7 +286,7 @@ def make_page(data: Dataset) -> Any:
         lighting=FLAT_LIGHT,
     )
     buttons = []
-    for index, (_, label) in list_questions(data).items():
+    for index, (_, label) in list_index_labels(data).items():
         values = data[f"sphere_{index}"].values
         low, high = float(np.nanmin(values)), float(np.nanquantile(values, 0.995))
         shown = np.concatenate([round_digits(values[a, t]) for a, t, _ in places])
@@ -308,7 +308,7 @@ def make_page(data: Dataset) -> Any:
     )
     hidden = {"visible": False}
     figure.update_layout(
-        coloraxis={"colorscale": "Viridis", "colorbar": BAR},
+        coloraxis={"colorscale": "Viridis", "colorbar": COLOUR_BAR},
         margin=MARGIN,
         updatemenus=[{"buttons": buttons, **MENU}],
         scene={

@@ -75,7 +75,7 @@ def source(data: Dataset) -> Path:
 
 
 @contextmanager
-def writing(path: Path) -> Iterator[None]:
+def convert_write_errors(path: Path) -> Iterator[None]:
     """Convert errors of the system (a full disk, a missing folder) to errors with the path.
 
     :param path: named if the system names none.
@@ -89,7 +89,7 @@ def writing(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def reading(path: Path) -> Iterator[None]:
+def convert_read_errors(path: Path) -> Iterator[None]:
     """Convert any error that a damaged file causes to one error.
 
     :raises MapError: the file is not a valid map.
@@ -219,7 +219,7 @@ def save_part(folder: Path, index: int, values: Values) -> None:
     path = _part_path(folder, index)
     # A worker of a killed run may still write the same chunk.
     hidden = path.with_suffix(f".{os.getpid()}.tmp")
-    with writing(path):
+    with convert_write_errors(path):
         try:
             with hidden.open("wb") as file:
                 np.savez(file, **values)  # type: ignore[arg-type]
@@ -291,7 +291,7 @@ def join(sweep: Map, parts: Parts, out: Path) -> None:
                     raise
             if sink.error is not None:
                 raise sink.error
-            seal(file)
+            append_checksum(file)
             os.fsync(file.fileno())
         os.replace(hidden, out)
     finally:
@@ -378,7 +378,7 @@ def open_map(path: Path) -> Dataset:
     """
     xarray = import_extra("xarray", "maps")
     import_extra("h5netcdf", "maps")
-    with writing(path):
+    with convert_write_errors(path):
         if not path.exists():
             raise MapError(path, "no such file")
         if not path.is_file():
@@ -399,7 +399,7 @@ def open_map(path: Path) -> Dataset:
         if not sealed and CHECKSUM_ATTRIBUTE.keys() <= data.attrs.keys():
             what = "damaged, or written by another program: its checksum is missing"
             raise MapError(path, what)
-        with reading(path):
+        with convert_read_errors(path):
             wrong = find_invalid_number(data)
         if wrong:
             raise MapError(path, f"no map of `pkm-twin map`, or damaged: {wrong}")
@@ -409,7 +409,7 @@ def open_map(path: Path) -> Dataset:
     return data
 
 
-def seal(file: BinaryIO) -> None:
+def append_checksum(file: BinaryIO) -> None:
     """Append the checksum of a whole file at its end."""
     size = file.seek(0, 2)
     digest = _digest(file, size)
@@ -471,7 +471,7 @@ def write_arrays(path: Path, file: Path, kind: Kind, robot: Robot) -> None:
 
     ``position``: shape (k, m), by ``names``. ``value``: shape (k, cases), by ``cases``.
     """
-    with open_map(file) as data, reading(file):
+    with open_map(file) as data, convert_read_errors(file):
         cases = data["value"].values.reshape(-1, data.sizes["case"])
         if "pose" in data:
             poses = data["pose"].values

@@ -24,7 +24,7 @@ import pkm_twin
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.maps.kind import (
-    FLAG,
+    FLAG_BOUNDS,
     FORMAT_VERSION,
     NON_NEGATIVE,
     UNIT_INTERVAL,
@@ -131,7 +131,7 @@ class Map(Space):
             fields["plane_dominant"] = Field(plane, blame, "i2")
         if self.kind.has_shares:
             fields["plane_factor"] = Field((*plane, "element"), share)
-        reach = describe("1 where all limits are kept", "", FLAG)
+        reach = describe("1 where all limits are kept", "", FLAG_BOUNDS)
         return fields | {"plane_reach": Field(plane, reach, "i1")}
 
     @property

@@ -205,7 +205,7 @@ class RawTrajectory:
     """Lengths of a point's arrays, in the order of :data:`POINT_ARRAYS`."""
 
     @classmethod
-    def of(cls, data: bytes) -> RawTrajectory:
+    def decode(cls, data: bytes) -> RawTrajectory:
         """Decode a message whose points all have arrays of the same lengths.
 
         :raises MessageError: the bytes are not such a message.

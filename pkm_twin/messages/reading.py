@@ -30,7 +30,7 @@ R = TypeVar("R")
 MIN_NORMAL: Final = sys.float_info.min
 """Smallest normal number: a smaller value that is not zero comes from damaged data."""
 
-MAX_RATE: Final = 1e4
+MAX_VELOCITY: Final = 1e4
 """Largest joint velocity, rad/s or m/s, where the robot has no limit: beyond all machines."""
 MAX_ACCELERATION: Final = 1e7
 """Largest joint acceleration, rad/s^2 or m/s^2: beyond all machines."""
@@ -40,7 +40,7 @@ MAX_POINTS: Final = 100_000
 """Most points of a trajectory."""
 CONVERSION_ROUNDING: Final = 4.0 * sys.float_info.epsilon
 """Relative rounding error of a number that is converted to other units and back."""
-MAX_SHOWN: Final = 80
+MAX_NAME_CHARACTERS: Final = 80
 """Most characters of a name from a message that an error shows."""
 COLUMNS: Final = {
     "positions": "position",
@@ -106,7 +106,7 @@ class TrajectoryFields:
     columns: Mapping[str, Array | Ragged | None]
 
     @classmethod
-    def of(cls, message: Any) -> TrajectoryFields:
+    def from_message(cls, message: Any) -> TrajectoryFields:
         """Read the fields of a trajectory_msgs/JointTrajectory, live or decoded."""
         points = message.points
         names = tuple(message.joint_names)
@@ -167,7 +167,7 @@ class JointReader:
         self._names = self.robot.controller.names
         self._limited = {"position": position is not None, "velocity": velocity is not None}
         self._position = [(-r, r) for r in reach] if position is None else list(map(tuple, position.tolist()))
-        rates = [MAX_RATE] * joints if velocity is None else velocity.tolist()
+        rates = [MAX_VELOCITY] * joints if velocity is None else velocity.tolist()
         if self._map is not None:
             # A value at its limit must still be accepted after the rounding of the conversion.
             shift = np.abs(self._map.offsets / self._map.factors).tolist()
@@ -243,7 +243,7 @@ class JointReader:
         given = message if isinstance(message, TrajectoryFields) else None
         names = given.names if given else tuple(message.joint_names)
         index = self._match_trajectory_joints(names, given.times.shape[1] if given else len(message.points))
-        fields = given or TrajectoryFields.of(message)
+        fields = given or TrajectoryFields.from_message(message)
         stamp = stamp_of(fields.header)
         times = fields.times
         bad = (times[1] < 0) | (times[1] >= SECOND)
@@ -406,8 +406,8 @@ class JointReader:
 
 
 def quote_name(name: str) -> str:
-    """Quote a name from a message; cut it after MAX_SHOWN characters."""
-    return repr(name if len(name) <= MAX_SHOWN else name[:MAX_SHOWN] + "...")
+    """Quote a name from a message; cut it after MAX_NAME_CHARACTERS characters."""
+    return repr(name if len(name) <= MAX_NAME_CHARACTERS else name[:MAX_NAME_CHARACTERS] + "...")
 
 
 def as_message_error(call: Callable[P, R], *arguments: P.args, **options: P.kwargs) -> R:

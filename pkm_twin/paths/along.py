@@ -59,12 +59,12 @@ class EffortComparison:
     def check_source(self) -> EffortComparison:
         """Check that efforts which this robot computed for the file equal the model's.
 
-        :returns: the comparison; the ``doubt`` of its motion says that measured efforts are not
+        :returns: the comparison; the ``effort_warning`` of its motion says that measured efforts are not
             this robot's, or that another robot computed them.
         :raises ParameterError: this robot computed them, or the file does not name its robot, and
             the model computes others: the file lacks a wrench, payload or number.
         """
-        motion, doubt = self.motion, self.mismatch_warning
+        motion, effort_warning = self.motion, self.mismatch_warning
         if motion.computed is not None:
             origin, away = motion.effort_model, relative_difference(motion.computed, self.model)
             other = "" if origin is None else origin.differs_from(motion.robot)
@@ -77,8 +77,8 @@ class EffortComparison:
                         "a file with the wrench (fx ... mz) and payload that its efforts were computed with, "
                         "or without efforts",
                     )
-                doubt = other
-        return replace(self, motion=replace(motion, doubt=doubt))
+                effort_warning = other
+        return replace(self, motion=replace(motion, effort_warning=effort_warning))
 
     @property
     def mismatch_warning(self) -> str:

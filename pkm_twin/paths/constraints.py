@@ -110,7 +110,10 @@ class Limits:
 
 @dataclass(frozen=True)
 class Forces:
-    """Hold a, b, w, k and g of the efforts at points of a path, shape (p, n) each."""
+    """Hold the coefficients of the efforts a u + b v^2 + w v + g + k at points of a path, (p, n) each.
+
+    ``k``: dry friction of a moving joint; ``g``: effort at rest; ``w``: viscous friction.
+    """
 
     a: Array
     b: Array
@@ -119,7 +122,7 @@ class Forces:
     g: Array
 
     @classmethod
-    def of(
+    def from_inverse_dynamics(
         cls,
         part: JointPath,
         points: Index,
@@ -128,11 +131,11 @@ class Forces:
         second: Array,
         wrench: Array | None = None,
     ) -> Forces:
-        """Compute the five from the inverse dynamics at q with derivatives by s, (p, n) each.
+        """Compute the coefficients from the inverse dynamics at q with derivatives by s, (p, n) each.
 
         :param points: of the stretch, whose payloads are carried, (p,).
         :param wrench: on the platform all the time, (6,); None: no wrench.
-        :raises ParameterError: friction of a law that these five do not describe.
+        :raises ParameterError: a friction law that these coefficients do not describe.
         """
         if part.curve.robot.laws:
             raise ParameterError(
@@ -185,8 +188,8 @@ class Rows:
     most: Array
 
     @classmethod
-    def of(cls, part: JointPath, forces: Forces | None, limits: Limits) -> Rows:
-        """Return the rows of a stretch's points."""
+    def from_limits(cls, part: JointPath, forces: Forces | None, limits: Limits) -> Rows:
+        """Return the finite limits of acceleration, effort (with ``forces``) and velocity as rows."""
         zero = np.zeros_like(part.first)
         tables = [(limits.acceleration, (part.first, part.second, zero, zero, zero))]
         if forces is not None:

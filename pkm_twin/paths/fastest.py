@@ -85,7 +85,7 @@ def run_by_law(part: JointPath, law: Law, limits: Limits, wrench: Array | None) 
         float((np.abs(jerk) / limits.jerk).max()) ** (1 / 3),
     )
     if needs_forces(part, limits):
-        forces = Forces.of(part, part.left[interval], *part.between(interval, share), wrench)
+        forces = Forces.from_inverse_dynamics(part, part.left[interval], *part.interpolate(interval, share), wrench)
         square = forces.a * u[:, None] + forces.b * (v**2)[:, None]
         linear, fixed = forces.w * v[:, None], forces.g + forces.k
         for sign in (1.0, -1.0):
@@ -268,7 +268,7 @@ def _solve_stretch(part: JointPath, limits: Limits, wrench: Array | None) -> Run
         if stopped.any():
             way = part.curve.begin + float(part.s[part.left[int(stopped.argmax())]])
             raise ParameterError("path", f"no motion after {way:.4g} m", "limits that let the machine pass")
-        run = Run.of(part, x)
+        run = Run.from_profile(part, x)
         # Where the joints turn back and nothing bounds their acceleration, the path's speed has no bound.
         unbounded = np.diff(run.knots) <= np.finfo(float).eps * run.duration
         if unbounded.any():
@@ -289,7 +289,7 @@ def _solve_stretch(part: JointPath, limits: Limits, wrench: Array | None) -> Run
         tight = bad & (parts == 1)
         share[tight] /= over[tight]
         if (parts > 1).any():
-            ends, part, share = part.ends, part.refined(parts), np.repeat(share, parts)
+            ends, part, share = part.ends, part.refine(parts), np.repeat(share, parts)
             rows = _limit_rows(part, limits, wrench)
             x = np.interp(part.ends, ends, x)
     return slow_within_limits(run, limits, wrench, used.max(0))
@@ -339,7 +339,7 @@ def _solve_with_jerk(part: JointPath, limits: Limits, wrench: Array | None) -> R
         )
         programs = MAX_PROGRAMS if divided else 1
         if divided:
-            ends, part = part.ends, part.refined(parts)
+            ends, part = part.ends, part.refine(parts)
             rows = _limit_rows(part, limits, wrench)
             x = np.interp(part.ends, ends, x**0.75) ** (4 / 3)
     return slow_within_limits(best, limits, wrench)
@@ -353,8 +353,8 @@ def _limit_rows(part: JointPath, limits: Limits, wrench: Array | None) -> Rows:
     forces, robot = None, part.curve.robot
     if needs_forces(part, limits):
         points = np.arange(len(part.s))
-        forces = Forces.of(part, points, part.q, part.first, part.second, wrench)
-    rows = Rows.of(part, forces, limits.part(1.0 - LIMIT_RESERVE))
+        forces = Forces.from_inverse_dynamics(part, points, part.q, part.first, part.second, wrench)
+    rows = Rows.from_limits(part, forces, limits.part(1.0 - LIMIT_RESERVE))
     held = np.abs(rows.fixed + rows.dry)
     if held.size and not held.max() < 1.0:
         row, column = np.unravel_index(int(held.argmax()), held.shape)

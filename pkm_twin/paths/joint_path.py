@@ -150,7 +150,7 @@ class JointPath:
         """The intervals' ends, shape (intervals + 1,), m."""
         return np.append(self.s[self.left], self.s[-1])
 
-    def first_of(self, piece: int) -> int:
+    def find_first_interval(self, piece: int) -> int:
         """Return the first interval of a piece; the number of intervals if there is none."""
         return sum(len(own) - 1 for own in self.grid[:piece])
 
@@ -179,7 +179,7 @@ class JointPath:
         c5 = 6.0 * d - 3.0 * (u + v) - 0.5 * (x - y)
         return np.stack([self.q[a], u, 0.5 * x, c3, c4, c5])
 
-    def between(self, interval: Index, part: Array) -> tuple[Array, Array, Array]:
+    def interpolate(self, interval: Index, part: Array) -> tuple[Array, Array, Array]:
         """Return positions and derivatives by s at fractions of intervals, shape (k, n) each."""
         c0, c1, c2, c3, c4, c5 = self._quintics[:, interval]
         h, t = self.steps[interval][:, None], part[:, None]
@@ -190,15 +190,15 @@ class JointPath:
 
     def motion(self, interval: Index, part: Array, v: Array, u: Array) -> tuple[Array, ...]:
         """Return positions, velocities and accelerations at fractions of intervals, (k, n) each."""
-        q, first, second = self.between(interval, part)
+        q, first, second = self.interpolate(interval, part)
         return q, first * v[:, None], first * u[:, None] + second * (v**2)[:, None]
 
-    def slowed(self, interval: Index, part: Array) -> Array:
+    def find_speed_factor(self, interval: Index, part: Array) -> Array:
         """Return the factor of the reference point's speed in its limit, shape (k,)."""
         left = self.left[interval]
         return (1.0 - part) * self.slower[left] + part * self.slower[left + 1]
 
-    def refined(self, parts: Index) -> JointPath:
+    def refine(self, parts: Index) -> JointPath:
         """Return the path with each interval divided into ``parts`` parts.
 
         :param parts: shape (intervals,).

@@ -69,7 +69,7 @@ class Run:
     way: Array
 
     @classmethod
-    def of(cls, part: JointPath, x: Array) -> Run:
+    def from_profile(cls, part: JointPath, x: Array) -> Run:
         """Return the run by x = v^2 at the intervals' ends, linear in between, shape (i + 1,)."""
         v = np.sqrt(x)
         knots = np.concatenate([[0.0], np.cumsum(2.0 * part.steps / (v[:-1] + v[1:]))])
@@ -171,7 +171,7 @@ class TimedPath:
             clock = change.rest
             if change.stretch >= 0:
                 run = self.runs[change.stretch]
-                passed = float(run.ends[run.part.first_of(change.piece)])
+                passed = float(run.ends[run.part.find_first_interval(change.piece)])
                 clock = self.begins[change.stretch] + passed + change.rest
             result.append(clock)
         return np.array(result)
@@ -219,7 +219,7 @@ class TimedPath:
                 for change, switch in zip(self.carried[1:], self.switches, strict=True):
                     if change.stretch == k and not change.rest:
                         # Keep times on their side of the payload change despite rounding.
-                        end = float(run.ends[run.part.first_of(change.piece)])
+                        end = float(run.ends[run.part.find_first_interval(change.piece)])
                         before = np.minimum(local, np.nextafter(end, 0.0))
                         local = np.where(t[mine] >= switch, np.maximum(local, end), before)
                 own = sample_run(run, local, moves)
@@ -409,7 +409,7 @@ def sample_run(run: Run, time: Array, moves: Mask | bool = True, tool: bool = Tr
     q, qd, qdd = run.part.motion(interval, part, v, u)
     robot = run.part.curve.robot
     speed = np.linalg.norm(reference_velocity(robot, q, qd), axis=1) if tool else np.zeros(len(q))
-    return RunSamples(q, qd, qdd, speed, speed * run.part.slowed(interval, part), interval)
+    return RunSamples(q, qd, qdd, speed, speed * run.part.find_speed_factor(interval, part), interval)
 
 
 Moments = tuple[Array | None, Array, Array, Array]

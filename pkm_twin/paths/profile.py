@@ -39,7 +39,7 @@ class IntervalPrograms:
     most: Numbers
 
     @classmethod
-    def of(cls, p: Array, q: Array, least: Array, greatest: Array, most: Array) -> IntervalPrograms:
+    def from_rows(cls, p: Array, q: Array, least: Array, greatest: Array, most: Array) -> IntervalPrograms:
         """Convert rows least <= p x + q x' <= greatest, (i, r); ``most`` at the ends, (i + 1,)."""
         # A smaller coefficient is rounding: the row does not bound x'.
         level = np.abs(q) <= 1e-12 * np.abs(p)
@@ -104,7 +104,7 @@ def _find_largest_start(low: Numbers, high: Numbers, slopes: Numbers, x: float, 
 def interval_rows(
     rows: Rows, left: Index, steps: Array, x: Array | None, part: Array
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Return limits at both ends of the intervals, as :meth:`IntervalPrograms.of` takes them.
+    """Return limits at both ends of the intervals, as :meth:`IntervalPrograms.from_rows` takes them.
 
     Viscous friction is linearised in x about a profile.
 
@@ -156,7 +156,7 @@ def fastest_profile(rows: Rows, left: Index, steps: Array, part: Array, about: A
     x = about if viscous else None
     # With viscous friction until the speeds change by less than 3e-4.
     for _ in range(8 if viscous else 1):
-        before, x = x, IntervalPrograms.of(*interval_rows(rows, left, steps, x, part)).solve()
+        before, x = x, IntervalPrograms.from_rows(*interval_rows(rows, left, steps, x, part)).solve()
         if before is not None and np.abs(np.sqrt(x) - np.sqrt(before)).max() <= 3e-4 * np.sqrt(x.max()):
             break
     assert x is not None  # noqa: S101  one solution at least

@@ -61,7 +61,7 @@ class Phase:
         slope = np.where(inside == time, self._phase_curve(inside, 1), 0.0)
         return self._total_phase(inside) + rate * (time - inside), rate, slope
 
-    def earlier(self, time: Array, phase: float) -> tuple[Array, Array, Array]:
+    def find_earlier_times(self, time: Array, phase: float) -> tuple[Array, Array, Array]:
         """Return times at which the phase was ``phase`` less, and their two derivatives."""
         now, rate, slope = self.at(time)
         found = time - phase / rate
@@ -101,7 +101,7 @@ class ShapedPath(TimedPath):
         assert self.phase is not None  # noqa: S101  shaped() gives it
         plain = np.concatenate([begin + run.times for begin, run in zip(self.begins, self.runs, strict=True)])
         # The accelerations of each delayed copy jump at delayed times.
-        late = [self.phase.earlier(plain, -k * np.pi)[0] for k in range(len(self.amplitudes))]
+        late = [self.phase.find_earlier_times(plain, -k * np.pi)[0] for k in range(len(self.amplitudes))]
         even = np.linspace(0.0, self.duration, POSES_PER_STRETCH)
         times = np.unique(np.clip(np.concatenate([even, *late]), 0.0, self.duration))
         times = times[np.diff(times, prepend=-1.0) > MIN_TIME_STEP]
@@ -119,7 +119,7 @@ class ShapedPath(TimedPath):
         pose, rate, change = (np.zeros((len(t), len(robot.pose_names))) for _ in range(3))
         for k, amplitude in enumerate(self.amplitudes):
             assert self.phase is not None  # noqa: S101  shaped() gives it
-            when, first, second = self.phase.earlier(t, k * np.pi)
+            when, first, second = self.phase.find_earlier_times(t, k * np.pi)
             own = super().sample(when)
             jacobian = robot.jacobian(own.q)
             own_rate = (jacobian @ own.qd[..., None])[..., 0]
@@ -195,7 +195,7 @@ def shaped(
             rests, end = [plain.rests[0]], 0.0
             for run, rest in zip(plain.runs, plain.rests[1:], strict=True):
                 end += rests[-1] + run.duration
-                arrived = phase.earlier(np.array([end]), -HALF_PERIODS[shaper] * np.pi)[0]
+                arrived = phase.find_earlier_times(np.array([end]), -HALF_PERIODS[shaper] * np.pi)[0]
                 rests.append(float(arrived[0]) - end + rest)
             base = replace(plain, rests=tuple(rests))
             tails = np.array(base.rests[1:]) - plain.rests[1:]

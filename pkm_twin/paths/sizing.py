@@ -70,7 +70,7 @@ class Duty:
         return self.work - self.returned
 
     @classmethod
-    def of(cls, time: Array, effort: Array, rate: Array, net: Array) -> Duty:
+    def from_samples(cls, time: Array, effort: Array, rate: Array, net: Array) -> Duty:
         """Integrate a motion's samples (k,) by the trapezoidal rule.
 
         :param net: energy delivered minus regenerated in each interval, shape (k - 1,), J. Where an
@@ -231,7 +231,7 @@ class Gear:
         """The ratio or the lead."""
         return (self.ratio if self.lead is None else self.lead) or 0.0
 
-    def sized(self, key: str, size: float) -> Gear:
+    def with_size(self, key: str, size: float) -> Gear:
         """Return the gear with another ratio or lead."""
         return replace(self, ratio=size) if key == "ratio" else replace(self, lead=size)
 
@@ -253,7 +253,7 @@ class Gears:
     span: bool = False
 
     @classmethod
-    def of(cls, key: str, text: str, efficiency: float = 1.0) -> Gears:
+    def parse(cls, key: str, text: str, efficiency: float = 1.0) -> Gears:
         """Parse ``LOW:HIGH`` or numbers with commas; ``key``: ratio or lead.
 
         :raises ParameterError: another form, or numbers that no gear has.
@@ -270,14 +270,14 @@ class Gears:
             raise ParameterError(f"--{key}s", text, bound)
         steps = np.geomspace(values[0], values[1], GEARS_PER_ROUND).tolist() if span else values
         own = Gear(efficiency=efficiency)
-        return cls(tuple(own.sized(key, value) for value in steps), span)
+        return cls(tuple(own.with_size(key, value) for value in steps), span)
 
     def near(self, k: int) -> Gears:
         """Return the gears around one of a span."""
         low, high = self.gears[max(0, k - 1)], self.gears[min(k + 1, len(self.gears) - 1)]
         steps = np.geomspace(low.size, high.size, GEARS_PER_ROUND).tolist()
         key = "ratio" if low.lead is None else "lead"
-        return replace(self, gears=tuple(low.sized(key, size) for size in steps))
+        return replace(self, gears=tuple(low.with_size(key, size) for size in steps))
 
 
 def read_motors(path: Path, names: Sequence[str] = ()) -> dict[str, Motor]:
@@ -464,7 +464,7 @@ def size_drives(
         rotor = robot.graph.joints[joint].rotor_inertia
         load = masses[:, i] - rotor
         span = (float(load.min()), float(load.max()))
-        duty = DriveDuty(joint, slides, Duty.of(time, effort[:, i], qd[:, i], net[:, i]), span)
+        duty = DriveDuty(joint, slides, Duty.from_samples(time, effort[:, i], qd[:, i], net[:, i]), span)
         axis = _Axis(time, qd[:, i], qdd[:, i], effort[:, i] - rotor * qdd[:, i], span[1])
         drive = own
         if given:
@@ -487,7 +487,7 @@ def size_drives(
             duty = replace(
                 duty,
                 drive=drive,
-                at_motor=Duty.of(time, torques, speeds, own_net),
+                at_motor=Duty.from_samples(time, torques, speeds, own_net),
                 inertia_ratio=ratio,
                 torques=torques,
                 speeds=speeds,

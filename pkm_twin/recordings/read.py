@@ -57,13 +57,13 @@ MIN_STEP: Final = 1e-9
 """Smallest step between two times, s: the resolution of a bag's stamps."""
 MAX_DURATION: Final = 1e6
 """Longest recording, s, as for trajectories."""
-DEFAULT: Final = ReadOptions()
+DEFAULT_READ_OPTIONS: Final = ReadOptions()
 
 
 def read(
     path: str | Path,
     robot: str | Robot | None = None,
-    how: ReadOptions = DEFAULT,
+    how: ReadOptions = DEFAULT_READ_OPTIONS,
     progress: Callable[[int], None] | None = None,
 ) -> Recording:
     """Read a recording of a robot; without one, of the robot that the file names.

@@ -17,14 +17,14 @@ from pkm_twin.errors import BagError, MessageError, ParameterError, PkmTwinError
 from pkm_twin.recordings.origin import EffortModel
 from pkm_twin.recordings.payload import Load
 from pkm_twin.recordings.tables import DEFAULT_DIALECT, Dialect
-from pkm_twin.recordings.topics import COLUMNS, Topics
+from pkm_twin.recordings.topics import TABLE_SOURCE, Topics
 from pkm_twin.robot.derivatives import nearest_motion
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.differentiator import Differentiator
 from pkm_twin.streams.noise import SIGMAS, estimate_noise
-from pkm_twin.streams.rates import MAX_ACCELERATION_ERROR, MAX_RATE, STANDSTILL_FRACTION, rate_faults
+from pkm_twin.streams.rates import MAX_ACCELERATION_ERROR, MAX_MOVE_DIFFERENCE, STANDSTILL_FRACTION, rate_faults
 from pkm_twin.streams.rest import gradient_gain, velocity_error_bound
-from pkm_twin.streams.steps import MAX_GAP_PERIODS, Steps, find_play, find_repeats, find_steps
+from pkm_twin.streams.steps import MAX_GAP_PERIODS, Steps, find_backlash, find_repeats, find_steps
 from pkm_twin.streams.wrench import WrenchSettings
 
 MODEL_VALUES_NOTE: Final = "tables use the model's joint values; joint_map applies to messages and bags only"
@@ -101,7 +101,7 @@ class Recording:
     """Efforts that a model computed according to the file, shape (samples, n)."""
     effort_model: EffortModel | None = None
     """The robot model from which the efforts were computed, if the file states it."""
-    doubt: str = ""
+    effort_warning: str = ""
     """Sentence on efforts of the file that the robot's model does not give; empty without such efforts."""
     late: float = 0.0
     """Delay of the efforts behind the positions, s, which was removed."""
@@ -113,7 +113,7 @@ class Recording:
     """Stamp of the first sample, ns."""
     bag: Bag | None = None
     """The bag; None for a table."""
-    topics: Topics = Topics(COLUMNS)
+    topics: Topics = Topics(TABLE_SOURCE)
     rejected: Counter[str] = field(default_factory=Counter)
     """Refused messages by reason."""
     first_reject: str = ""
@@ -134,9 +134,9 @@ class Recording:
         """The file's name, in one line."""
         return one_line(Path(self.source).name, 100)
 
-    def qualify(self, answer: str) -> str:
-        """Return an answer for this motion, followed by the doubt about its efforts, if any."""
-        return f"{answer}; {self.doubt}" if self.doubt else answer
+    def with_effort_warning(self, answer: str) -> str:
+        """Return an answer for this motion, followed by the effort_warning about its efforts, if any."""
+        return f"{answer}; {self.effort_warning}" if self.effort_warning else answer
 
     @property
     def stamps(self) -> np.ndarray[Any, np.dtype[np.int64]]:
@@ -176,14 +176,14 @@ class Recording:
         return f"{len(found)} jumps: {', '.join(texts)}{more}" if found else ""
 
     @cached_property
-    def play_fault(self) -> str:
+    def backlash_description(self) -> str:
         """Description of positions that cross a play; empty without any, or if publishers are interleaved."""
         if self.steps.publishers:
             return ""
         names, units = self.robot.joint_names, self.robot.joint_units
         texts = [
             f"the position of {name} steps by {size:.3g} {unit} {count} times, up and down in turn"
-            for name, unit, size, count in zip(names, units, *find_play(self.q), strict=True)
+            for name, unit, size, count in zip(names, units, *find_backlash(self.q), strict=True)
             if count
         ]
         return f"{'; '.join(texts)}: play between the joint and its encoder?" if texts else ""
@@ -284,7 +284,7 @@ class Recording:
         :raises PkmTwinError: by more than `check` allows, with the factor between both if there is one.
         """
         judged = (
-            ("velocities", self.q, self.qd, MAX_RATE, ("position", "velocity")),
+            ("velocities", self.q, self.qd, MAX_MOVE_DIFFERENCE, ("position", "velocity")),
             ("accelerations", self.qd, self.qdd, MAX_ACCELERATION_ERROR, ("velocity", "acceleration")),
         )
         for what, values, rates, most, names in judged:

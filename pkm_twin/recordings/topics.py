@@ -17,7 +17,7 @@ JOINT_STATE: Final = "sensor_msgs/msg/JointState"
 TRANSFORM: Final = "geometry_msgs/msg/TransformStamped"
 WRENCH: Final = "geometry_msgs/msg/WrenchStamped"
 TRAJECTORY: Final = "trajectory_msgs/msg/JointTrajectory"
-COLUMNS: Final = "columns of the table"
+TABLE_SOURCE: Final = "columns of the table"
 """Text in place of topics for a table."""
 
 _FIELDS: Final = {
@@ -76,8 +76,8 @@ class Topics:
     """True if this frame rotates with the platform."""
 
     def __str__(self) -> str:
-        if self.joint_states == COLUMNS:
-            return COLUMNS
+        if self.joint_states == TABLE_SOURCE:
+            return TABLE_SOURCE
         text = f"joint states {self.joint_states}, wrench {self.wrench or 'none'}"
         text += f" (frame {self.frame})" if self.frame else ""
         text += f", deflection {self.deflection}" if self.deflection else ""
@@ -105,11 +105,11 @@ def choose_topics(bag: Bag, robot: Robot, wanted: Sequence[str] = (), deflected:
         if info is None or normalise_type(info) not in kinds:
             fit = [n for n, i in bag.report.topics.items() if normalise_type(i) in kinds]
             is_a = "is not in the bag" if info is None else f"is a {info.type}"
-            raise _make_choice_error(bag, f"topic {name} {is_a}; topics that fit: {', '.join(fit)}")
+            raise _make_topic_error(bag, f"topic {name} {is_a}; topics that fit: {', '.join(fit)}")
         kinds[normalise_type(info)].append(name)
     for kind, names in kinds.items():
         if len(set(names)) > 1:
-            raise _make_choice_error(bag, f"{' and '.join(names)} are both {kind}; choose one with --topic")
+            raise _make_topic_error(bag, f"{' and '.join(names)} are both {kind}; choose one with --topic")
     left_out: dict[str, str] = {}
     named = _find_candidates(bag, JOINT_STATE, kinds[JOINT_STATE], left_out)
     filled = [name for name in named if bag.report.topics[name].count]
@@ -122,7 +122,7 @@ def choose_topics(bag: Bag, robot: Robot, wanted: Sequence[str] = (), deflected:
                 f": {plans[0]} is a planned trajectory, which `pkm-twin torques` and `size` take; "
                 "record /joint_states while `pkm-twin play` sends it to the machine"
             )
-        raise _make_choice_error(bag, text, "no joint states")
+        raise _make_topic_error(bag, text, "no joint states")
     for name in filled:
         require_definition(bag, name)
     # The names in messages are the controller's names of the joints.
@@ -135,7 +135,7 @@ def choose_topics(bag: Bag, robot: Robot, wanted: Sequence[str] = (), deflected:
     if not fit:
         name = filled[0]
         missing = next(joint for joint in own if joint not in seen[name])
-        raise _make_choice_error(
+        raise _make_topic_error(
             bag,
             f"no topic has all joints of {robot.name}: on {name} joint {missing!r} is missing, "
             f"it has {', '.join(sorted(seen[name])) or 'none'}",
@@ -154,10 +154,10 @@ def choose_topics(bag: Bag, robot: Robot, wanted: Sequence[str] = (), deflected:
         deflection = _pick_usual(bag, "deflections", fit, "measured_deflection", left_out)
         if deflection is None:
             text = f"no deflection in the bag: a topic of {TRANSFORM} from the platform to the deflected platform"
-            raise _make_choice_error(bag, text, "no deflection")
+            raise _make_topic_error(bag, text, "no deflection")
         if wrench is None:
             text = "no wrench in the bag; compliance needs the applied wrench"
-            raise _make_choice_error(bag, text, "no wrench")
+            raise _make_topic_error(bag, text, "no wrench")
     for name in filter(None, (joints, wrench, deflection)):
         require_definition(bag, name)
     return Topics(joints, wrench, deflection, left_out)
@@ -213,7 +213,7 @@ def _pick_usual(bag: Bag, what: str, fit: list[str], usual: str, left_out: dict[
         return None
     preferred = [name for name in fit if name.split("/")[-1] == usual]
     if len(fit) > 1 and len(preferred) != 1:
-        raise _make_choice_error(bag, f"{what} on {', '.join(fit)}; choose one with --topic")
+        raise _make_topic_error(bag, f"{what} on {', '.join(fit)}; choose one with --topic")
     chosen = preferred[0] if preferred else fit[0]
     left_out.update({name: f"{chosen} is used" for name in fit if name != chosen})
     return chosen
@@ -249,7 +249,7 @@ def require_definition(bag: Bag, topic: str) -> None:
     try:
         recorded = parse_definition(info.type, info.definition)
     except BagError as error:
-        raise _make_choice_error(bag, f"topic {topic}: {error}", error.reason) from None
+        raise _make_topic_error(bag, f"topic {topic}: {error}", error.reason) from None
     for held, fields in parse_definition(info.type, DEFINITIONS[info.type]).items():
         found = recorded.get(held, ())
         if found == fields:
@@ -264,5 +264,5 @@ def require_definition(bag: Bag, topic: str) -> None:
         )
 
 
-def _make_choice_error(bag: Bag, text: str, reason: str = "topic") -> BagError:
+def _make_topic_error(bag: Bag, text: str, reason: str = "topic") -> BagError:
     return BagError(text, path=bag.report.path, reason=reason)

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from pkm_twin.ros.node import TwinNode
 
 JOINT_STATE: Final = "sensor_msgs/msg/JointState"
-NUMBERS: Final = "std_msgs/msg/Float64MultiArray"
+NUMBER_ARRAY: Final = "std_msgs/msg/Float64MultiArray"
 FIELDS: Final = ("position", "velocity", "effort")
 
 
@@ -51,7 +51,7 @@ def make_wrench_message(stamp: int, frame: str, wrench: Array) -> WrenchStamped:
     return WrenchStamped(header=header(stamp, frame), wrench=Wrench(force=force, torque=torque))
 
 
-def named(
+def make_joint_state(
     header: Header,
     names: Sequence[str],
     values: Sequence[float],
@@ -117,7 +117,7 @@ class EffortPublisher:
         self._stamped = JointPublisher(node, robot, stamped, expiry=expiry)
         self._plain = node.create_guarded_publisher(plain, expiry) if with_plain else None
         message = {"data": [0.0] * robot.joints_count}
-        self._template = DoublesTemplate(NUMBERS, message_definition(NUMBERS), message, stamped=False)
+        self._template = DoublesTemplate(NUMBER_ARRAY, message_definition(NUMBER_ARRAY), message, stamped=False)
 
     @property
     def controllers(self) -> int:

@@ -120,7 +120,7 @@ class GuardedNode(ParameterNode):
         self.health.caught(where, error)
         self.stream_broken(where)
 
-    def failed(self, where: str, error: Exception) -> None:
+    def report_failure(self, where: str, error: Exception) -> None:
         """Report an exception of a callback; a rejected message is not a fault of the node."""
         if isinstance(error, MessageError):
             self.log_throttled(error.reason, f"{where}: rejected, {error.labelled}")
@@ -321,7 +321,7 @@ class GuardedSubscription:
                     raise
             self._callback(message)
         except Exception as error:
-            node.failed(self._topic, error)
+            node.report_failure(self._topic, error)
         statistics.handled(time.perf_counter() - began)
 
     def _relax_reliability(self, what: Incompatibility) -> None:
@@ -350,7 +350,7 @@ class TwinNode(GuardedNode):
     def __init__(self, name: str) -> None:
         """Declare the parameters that all nodes have."""
         super().__init__(name)
-        self._tasks = Tasks(self.failed)
+        self._tasks = Tasks(self.report_failure)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", output_qos())
         self._cached = threading.Event()
         threading.Thread(target=self._report_start, daemon=True).start()

@@ -31,7 +31,7 @@ from pkm_twin.machine import rotations
 from pkm_twin.messages.fast_decoder import JointStateView
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.robot_urdf import joint_names, robot_urdf
-from pkm_twin.ros.joints import header, named, xyz
+from pkm_twin.ros.joints import header, make_joint_state, xyz
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.run import run
 from pkm_twin.ros.wrench import declare_mounts, declare_vector
@@ -239,7 +239,7 @@ class MachineStateNode(TwinNode):
         own = header(state.stamp, self.core.settings.base_frame)
         quaternion = rotations.to_quaternion(state.rotation)
         rates = () if state.rates is None else state.rates
-        self._joints.publish(named(header(state.stamp), self._names, state.joints, rates))
+        self._joints.publish(make_joint_state(header(state.stamp), self._names, state.joints, rates))
         place = Pose(position=xyz(Point, state.position), orientation=xyz(Quaternion, quaternion))
         self._pose.publish(PoseStamped(header=own, pose=place))
         if state.twist is not None:

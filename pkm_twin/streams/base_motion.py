@@ -15,7 +15,7 @@ from pkm_twin.messages.reading import read_imu
 from pkm_twin.messages.stamps import SECOND, StampRules
 from pkm_twin.settings import AGE_BOUNDS, setting
 from pkm_twin.streams.differentiator import Differentiator
-from pkm_twin.streams.monitor import Core, StreamMonitor, counting
+from pkm_twin.streams.monitor import Core, StreamMonitor, make_counter
 from pkm_twin.streams.wrench import ZERO, Mount, TimeCache, Triple, check_mount, check_order
 
 AVERAGING_TIME: Final = 1.0
@@ -52,7 +52,7 @@ class BaseImu(Core):
 
     settings: ImuSettings = field(default_factory=ImuSettings)
     rules: StampRules = field(default_factory=StampRules)
-    stream: StreamMonitor = field(default_factory=counting)
+    stream: StreamMonitor = field(default_factory=make_counter)
 
     def __post_init__(self) -> None:
         self._mount = Mount.of(self.settings.xyz, self.settings.rpy)

@@ -22,7 +22,7 @@ from pkm_twin.errors import MessageError
 from pkm_twin.messages.reading import JointSample, WrenchSample
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.streams.differentiator import fit_weights
-from pkm_twin.streams.monitor import Core, StreamMonitor, counting
+from pkm_twin.streams.monitor import Core, StreamMonitor, make_counter
 from pkm_twin.streams.wrench import Mount, TimeCache, WrenchReader
 
 MissingWrench = Literal["ignore", "stop"]
@@ -79,7 +79,7 @@ class WrenchWindow(Core):
     window: int = 25
     without: int = 0
     """Number of joint states without a recent wrench."""
-    stream: StreamMonitor = field(default_factory=counting)
+    stream: StreamMonitor = field(default_factory=make_counter)
 
     def __post_init__(self) -> None:
         self._recent: TimeCache[tuple[WrenchSample, Mount]] = TimeCache()

@@ -111,7 +111,7 @@ def finished(steps: Generator[None, None, V]) -> V:
             return cast(V, end.value)
 
 
-def counting() -> StreamMonitor:
+def make_counter() -> StreamMonitor:
     """Return a monitor of independent messages, which only counts and never stops."""
     return StreamMonitor(trip_count=2**62, recovery_count=1)
 

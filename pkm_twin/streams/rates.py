@@ -25,14 +25,14 @@ MIN_STEPS: Final = 5
 """Fewest steps between samples in a block."""
 STANDSTILL_FRACTION: Final = 0.03
 """A quantity stands still if its change is below this fraction of the other's, of position and integrated velocity."""
-MAX_RATE: Final = 0.15
+MAX_MOVE_DIFFERENCE: Final = 0.15
 """Largest relative RMS difference of the moves of a whole recording."""
 MAX_ACCELERATION_ERROR: Final = 0.6
 """Largest relative RMS difference of changes of the velocities. A step of the acceleration between two samples
 is up to 0.2 of a block of five steps, and filters delay accelerations; wrong signs, units and zeros leave 1 or more."""
 SCALE_TOLERANCE: Final = 0.1
 """Largest relative difference that a factor between both may leave to be named as the cause."""
-MAX_SHORT_SCALE: Final = 2.0
+MAX_SHORT_RECORDING_SCALE: Final = 2.0
 """Largest factor between both, up or down, of a recording without two blocks. Sampling alone explains a factor of
 x / tan(x), x half the phase between two samples: 0.6 to 1 where a move over two steps is not below that over one."""
 
@@ -136,7 +136,7 @@ def rate_faults(
     q: Array,
     qd: Array,
     jumps: Mask | None = None,
-    most: float = MAX_RATE,
+    most: float = MAX_MOVE_DIFFERENCE,
     names: tuple[str, str] = ("position", "velocity"),
 ) -> tuple[Array, list[str]]:
     """Compare the velocities of a recording with its positions, or its accelerations with its velocities.
@@ -165,7 +165,7 @@ def rate_faults(
         scale = float(np.sum(theirs * ours) / max(np.sum(ours**2), 1e-300))
         twice = ours[1:] + ours[:-1]
         if (
-            not (scale > MAX_SHORT_SCALE or 0.0 < scale < 1.0 / MAX_SHORT_SCALE)
+            not (scale > MAX_SHORT_RECORDING_SCALE or 0.0 < scale < 1.0 / MAX_SHORT_RECORDING_SCALE)
             or np.sum((theirs - scale * ours) ** 2) > SCALE_TOLERANCE**2 * np.sum(theirs**2)
             or np.mean(twice**2) < np.mean(ours**2)
         ):

@@ -158,7 +158,7 @@ def find_repeats(time: Array, q: Array) -> Mask:
     return found
 
 
-def find_play(q: Array) -> tuple[Array, NDArray[np.int64]]:
+def find_backlash(q: Array) -> tuple[Array, NDArray[np.int64]]:
     """Return the play that a joint crosses in its positions, and how often, shape (n,) each.
 
     Where the load of a joint turns, play between it and its encoder is a step from one sample to

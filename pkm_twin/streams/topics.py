@@ -62,7 +62,7 @@ def table(*rows: Topic) -> dict[str, Topic]:
 
 JOINTS: Final = "sensor_msgs/JointState"
 TRAJECTORY: Final = "trajectory_msgs/JointTrajectory"
-NUMBERS: Final = "std_msgs/Float64MultiArray"
+NUMBER_ARRAY: Final = "std_msgs/Float64MultiArray"
 WRENCH: Final = "geometry_msgs/WrenchStamped"
 STATUSES: Final = "diagnostic_msgs/DiagnosticArray"
 TEXT: Final = "std_msgs/String"

@@ -18,7 +18,7 @@ from pkm_twin.messages.reading import JointReader, WrenchSample, read_wrench
 from pkm_twin.messages.stamps import SECOND, StampRules
 from pkm_twin.robot.robot import Robot
 from pkm_twin.settings import DURATION_BOUNDS, FUTURE_TOLERANCE_TEXT, ZERO_STAMP_TEXT, setting
-from pkm_twin.streams.monitor import Core, counting
+from pkm_twin.streams.monitor import Core, make_counter
 
 Triple = tuple[float, float, float]
 V = TypeVar("V")
@@ -235,8 +235,8 @@ class TimeSynchronizer(Core):
     mounts: Mounts | None = None
 
     def __post_init__(self) -> None:
-        self.states = counting()
-        self.wrenches = counting()
+        self.states = make_counter()
+        self.wrenches = make_counter()
         self._reader = JointReader(self.robot)
         self.change_settings(self.settings)
 

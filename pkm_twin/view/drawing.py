@@ -12,7 +12,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.report.plots import pyplot
 from pkm_twin.robot.outline import base_line
 from pkm_twin.robot.robot import Robot
-from pkm_twin.view.scene import ANCHORS, GROUND, PLATFORM, Scene, choose_anchors
+from pkm_twin.view.scene import ANCHORS, GROUND_COLOUR, PLATFORM_COLOUR, Scene, choose_anchors
 from pkm_twin.view.stage import MAX_LETTER_PIXELS, VIEW_DIRECTION
 
 PICTURE_SUFFIXES: Final = (".png", ".svg")
@@ -139,11 +139,11 @@ def draw(robot: Robot, marked: bool = False) -> Any:
     for at, radius, colour in zip(shapes.ball_at, shapes.ball_sizes[:, 0], shapes.ball_colours, strict=True):
         camera.draw_ball(at, float(radius), colour)
     if len(scene.platform):
-        camera.draw_plate(scene.platform + shapes.platform_at, PLATFORM)
+        camera.draw_plate(scene.platform + shapes.platform_at, PLATFORM_COLOUR)
     if len(scene.base):
-        camera.draw_plate(scene.base, GROUND, opacity=0.35)
+        camera.draw_plate(scene.base, GROUND_COLOUR, opacity=0.35)
     elif len(ground := base_line(robot.graph)):
-        camera.draw_cylinder(ground, 0.015 * scene.size, GROUND)
+        camera.draw_cylinder(ground, 0.015 * scene.size, GROUND_COLOUR)
     figure = pyplot().figure(figsize=(WIDTH / DPI, HEIGHT / DPI), dpi=DPI)
     ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     extent = (camera.low[0], camera.high[0], camera.low[1], camera.high[1])

@@ -23,7 +23,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError, one_line
 from pkm_twin.view import texts
 from pkm_twin.view.model import Model, Range, State
-from pkm_twin.view.scene import DRIVE, Scene
+from pkm_twin.view.scene import DRIVE_COLOUR, Scene
 from pkm_twin.view.stage import Stage
 
 ADDRESS: Final = "127.0.0.1"
@@ -84,7 +84,9 @@ class Page:
         self._dragged = False
         self._wake = threading.Event()
         self._tops = np.array([r.high for r in model.wrench_ranges])
-        server.gui.configure_theme(control_width="medium", show_logo=False, show_share_button=False, brand_color=DRIVE)
+        server.gui.configure_theme(
+            control_width="medium", show_logo=False, show_share_button=False, brand_color=DRIVE_COLOUR
+        )
         # On a narrow screen the browser shows it as a sheet at the bottom instead.
         server.gui.main_panel.dock_right()
         server.gui.set_panel_label(f"pkm-twin view {model.robot.name}")

@@ -29,13 +29,13 @@ from pkm_twin.robot.robot import Robot
 Colour = tuple[int, int, int]
 
 
-BODY: Final = (128, 136, 146)
-ROD: Final = (86, 180, 233)
-PLATFORM: Final = (213, 94, 0)
-DRIVE: Final = (0, 114, 178)
-GROUND: Final = (70, 74, 80)
-JOINT: Final = (98, 104, 112)
-"""Colours of parts, 0 to 255; ROD, PLATFORM and DRIVE are distinct for colour-blind readers (Okabe and Ito 2008)."""
+BODY_COLOUR: Final = (128, 136, 146)
+ROD_COLOUR: Final = (86, 180, 233)
+PLATFORM_COLOUR: Final = (213, 94, 0)
+DRIVE_COLOUR: Final = (0, 114, 178)
+GROUND_COLOUR: Final = (70, 74, 80)
+JOINT_COLOUR: Final = (98, 104, 112)
+"""Colours of parts, 0 to 255; rods, platform and drives are distinct for colour-blind readers (Okabe and Ito 2008)."""
 ENERGY_COLOURS: Final = np.array([[198, 206, 214], [240, 228, 66], [213, 94, 0]], np.float64)
 """Colours from no share of the strain energy to the greatest: grey, yellow, vermilion (Okabe and Ito 2008)."""
 
@@ -216,8 +216,8 @@ class Scene:
         motors = [compute_bar_points(bar, 1, "") for bar in self._drives.values()]
         ends = np.concatenate([np.stack([a[:-1], a[1:]], axis=1) for a in (*lines, *motors)])
         thick = np.array([bar.radius for bar in self.bars])
-        parts = dict.fromkeys(graph.rods, ROD) | {BASE: GROUND, graph.platform: PLATFORM}
-        bar_colours = np.array([colours.get(bar.element, parts.get(bar.part, BODY)) for bar in self.bars])
+        parts = dict.fromkeys(graph.rods, ROD_COLOUR) | {BASE: GROUND_COLOUR, graph.platform: PLATFORM_COLOUR}
+        bar_colours = np.array([colours.get(bar.element, parts.get(bar.part, BODY_COLOUR)) for bar in self.bars])
         radii = np.array([*np.repeat(thick, self.pieces), *(bar.radius for bar in self._drives.values())])
         along = ends[:, 1] - ends[:, 0]
         length = np.linalg.norm(along, axis=1)
@@ -234,10 +234,10 @@ class Scene:
         # Balls at the ends close the gaps between bars of one body.
         tips = np.concatenate(lines)
         tip_radii = np.repeat(thick, self.pieces + 1)
-        ball_colours = [colours.get(name, JOINT) for name, _ in self._balls]
+        ball_colours = [colours.get(name, JOINT_COLOUR) for name, _ in self._balls]
         whole = Rotation.from_matrix(posture.rotations[graph.platform])
         labels = [graph.joints[name].label or name for name in self._drives]
-        drive_colours = [colours.get(label, DRIVE) for label in labels]
+        drive_colours = [colours.get(label, DRIVE_COLOUR) for label in labels]
         drives = [a.mean(0) for a in motors]
         places = (
             dict(zip(labels, drives, strict=True))

@@ -16,9 +16,9 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine.graph import BASE
 from pkm_twin.view.meshes import read_body_meshes
 from pkm_twin.view.scene import (
-    BODY,
-    GROUND,
-    PLATFORM,
+    BODY_COLOUR,
+    GROUND_COLOUR,
+    PLATFORM_COLOUR,
     RIGID,
     Deflection,
     Scene,
@@ -95,14 +95,19 @@ class Stage:
         (round_, faces), _ = make_round_meshes()
         for name, radius, length in (("flange", 0.05, 0.03), ("tool", 0.012, 0.2)):
             shape = size * (round_ * [radius, radius, length] + [0.0, 0.0, away * length / 2])
-            draw.add_mesh_simple(f"/platform/{name}", shape, faces, color=BODY)
+            draw.add_mesh_simple(f"/platform/{name}", shape, faces, color=BODY_COLOUR)
         self._rest = draw.add_frame("/at_rest", show_axes=False, visible=False)
         self._rest_bars = draw.add_line_segments(
-            "/bars_at_rest", np.zeros((1, 2, 3)), colors=GROUND, thickness=1.5, thickness_units="screen", visible=False
+            "/bars_at_rest",
+            np.zeros((1, 2, 3)),
+            colors=GROUND_COLOUR,
+            thickness=1.5,
+            thickness_units="screen",
+            visible=False,
         )
         if len(scene.platform):
             moving = make_plate(scene.platform, 0.016 * size)
-            draw.add_mesh_simple("/platform/plate", *moving, color=PLATFORM, flat_shading=True)
+            draw.add_mesh_simple("/platform/plate", *moving, color=PLATFORM_COLOUR, flat_shading=True)
             still = make_plate(scene.platform, 0.01 * size)
             draw.add_mesh_simple("/at_rest/plate", *still, color=(110, 110, 110), opacity=0.35)
         (cylinder, cylinder_faces), (ball, ball_faces) = make_round_meshes()
@@ -131,7 +136,7 @@ class Stage:
         self.meshes = {}
         for k, (body, mesh) in enumerate(read_body_meshes(scene.robot).items()):
             self.meshes[body] = draw.add_frame(f"/meshes/{k}", show_axes=False)
-            colour = {BASE: GROUND, scene.robot.graph.platform: PLATFORM}.get(body, BODY)
+            colour = {BASE: GROUND_COLOUR, scene.robot.graph.platform: PLATFORM_COLOUR}.get(body, BODY_COLOUR)
             draw.add_mesh_simple(f"/meshes/{k}/mesh", *mesh, color=colour, opacity=0.6)
         self._passed: list[Array] = []
         rotates = any(unit == "rad" for unit in scene.robot.pose_units)

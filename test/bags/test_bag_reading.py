@@ -302,7 +302,7 @@ def test_order_by_log_time_is_stable_and_counted(tmp_path: Path) -> None:
 
 
 def test_order_holds_without_chunks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pkm_twin.bags.strict._RUN_BYTES", 100)
+    monkeypatch.setattr("pkm_twin.bags.strict._MAX_SEGMENT_BYTES", 100)
     times = [9, 1, 5, 5, 2, 8, 3, 3, 7]
     path = foreign_bag(tmp_path / "f.mcap", times, use_chunking=False)
     assert [m.log_time for m in read_messages(path)] == sorted(times)

@@ -21,7 +21,7 @@ from pkm_twin.paths import cycle, timed
 from pkm_twin.recordings import Recording
 from pkm_twin.recordings.topics import JOINT_STATE
 from pkm_twin.robot.derivatives import nearest_motion
-from pkm_twin.streams.steps import find_play
+from pkm_twin.streams.steps import find_backlash
 from test.bags.folders import make_folder, write_split
 from test.commands.conftest import (
     COLLISION,
@@ -299,12 +299,12 @@ class TestPrintedBounds:
         turning = r.effort - np.median(r.effort, 0)
         q = q + noise * r.robot.size * rng.normal(size=q.shape)
         seen = q + 0.5 * play * np.sign(turning)
-        sizes, counts = find_play(seen)
+        sizes, counts = find_backlash(seen)
         crossings = np.count_nonzero(np.diff(np.sign(turning), axis=0), axis=0)
         assert (crossings >= 4).any()
         np.testing.assert_allclose(sizes[counts > 0], play, rtol=0.05)
         assert (counts > 0).tolist() == (crossings >= 4).tolist()
-        assert not find_play(q)[1].any()
+        assert not find_backlash(q)[1].any()
         found = check(replace(r, q=seen, qd=None, qdd=None))
         assert found.answer == "bad" and "play" in found.causes[0]
 
@@ -317,7 +317,7 @@ class TestPrintedBounds:
             for tick in (0.0, 1e-5, 1e-3):
                 coarse = q if tick == 0.0 else tick * np.round(q / tick)
                 for noise in (0.0, 1e-5):
-                    assert not find_play(coarse + noise * rng.normal(size=q.shape))[1].any()
+                    assert not find_backlash(coarse + noise * rng.normal(size=q.shape))[1].any()
 
 
 class TestPayload:

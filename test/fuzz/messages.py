@@ -283,10 +283,10 @@ class Messages(Kind):
         return self.joint_state(self.decode(data))
 
     def raw_trajectory(self, data: bytes) -> bool:
-        raw = RawTrajectory.of(data)
+        raw = RawTrajectory.decode(data)
         efforts = self.feedforward.trajectory(raw.fields, self.now)
         assert np.isfinite(efforts).all()
-        again = RawTrajectory.of(raw.with_effort(efforts))
+        again = RawTrajectory.decode(raw.with_effort(efforts))
         assert again.fields.names == raw.fields.names
         return True
 

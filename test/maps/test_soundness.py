@@ -9,7 +9,7 @@ pytest.importorskip("h5py")
 
 import h5py
 
-from pkm_twin.maps.store import CHECKSUM_ATTRIBUTE, MapError, open_map, seal
+from pkm_twin.maps.store import CHECKSUM_ATTRIBUTE, MapError, append_checksum, open_map
 from test.support.robots import partly_long
 
 NAMES = partly_long(["modes prru", "workspace delta_cu", "isotropy delta_cu"], "workspace delta_cu")
@@ -38,7 +38,7 @@ def copy(tmp_path, small_maps):
             change(file)
         if sealed:
             with path.open("r+b") as file:
-                seal(file)
+                append_checksum(file)
         return path
 
     return make

@@ -73,8 +73,8 @@ def test_joint_states_come_as_the_middleware_gives_them(messages):
 @settings(max_examples=60, deadline=None)
 @given(trajectories())
 def test_trajectories_come_as_the_middleware_gives_them(message):
-    raw = RawTrajectory.of(bytes(serialize_message(message)))
-    expected = TrajectoryFields.of(message)
+    raw = RawTrajectory.decode(bytes(serialize_message(message)))
+    expected = TrajectoryFields.from_message(message)
     assert raw.fields.names == expected.names
     assert (raw.fields.times == expected.times.reshape(2, -1)).all()
     for what in COLUMNS:
@@ -90,7 +90,7 @@ def test_trajectories_come_as_the_middleware_gives_them(message):
 def test_efforts_are_put_in_and_nothing_else_is_changed(message, seed):
     points = len(message.points)
     efforts = np.random.default_rng(seed).normal(size=(points, len(message.joint_names) or 1))
-    raw = RawTrajectory.of(bytes(serialize_message(message)))
+    raw = RawTrajectory.decode(bytes(serialize_message(message)))
     if not points:
         return
     answer = deserialize_message(raw.with_effort(efforts), JointTrajectory)
@@ -105,7 +105,7 @@ def test_points_of_several_lengths_are_named():
         message = MAKE.trajectory("abc", range(5), rows, rows, rows)
         setattr(message.points[3], what, [1.0])
         with pytest.raises(MessageError, match=f"point 3: 1 {what}, the first point has 3"):
-            RawTrajectory.of(bytes(serialize_message(message)))
+            RawTrajectory.decode(bytes(serialize_message(message)))
 
 
 @pytest.mark.parametrize("number", [10**6, 2**32 - 1])
@@ -114,14 +114,14 @@ def test_a_count_that_no_message_holds_costs_nothing(number):
     at = raw.index(struct.pack("<I", 1), 30)
     raw[at : at + 4] = struct.pack("<I", number)
     with pytest.raises(MessageError):
-        RawTrajectory.of(bytes(raw))
+        RawTrajectory.decode(bytes(raw))
 
 
 def test_masses_of_names_are_refused_unread():
     names = ["x"] * 10**6
     for read, message, bound in (
         (JointStateDecoder(JOINT_STATE), MAKE.joint_state(names, []), "bytes, at most"),
-        (RawTrajectory.of, MAKE.trajectory(names, [1], [()]), "joint names, at most 1000"),
+        (RawTrajectory.decode, MAKE.trajectory(names, [1], [()]), "joint names, at most 1000"),
     ):
         with pytest.raises(MessageError, match=bound):
             read(bytes(serialize_message(message)))

@@ -25,7 +25,7 @@ from pkm_twin.messages.reading import JointReader
 from pkm_twin.messages.stamps import StampRules
 from pkm_twin.robot.effort_limits import EffortLimits, effort_limits
 from pkm_twin.state.state import STATE_TOPICS, MachineState
-from pkm_twin.streams.topics import JOINTS, NUMBERS, TRAJECTORY
+from pkm_twin.streams.topics import JOINTS, NUMBER_ARRAY, TRAJECTORY
 from pkm_twin.streams.wrench import WrenchSettings
 from pkm_twin.view.live import Live
 from stiffness_monitor.monitor import Monitor
@@ -320,7 +320,7 @@ def test_what_a_wrench_does(name):
     close(answers[1].energy.deflection, answers[0].energy.deflection)
 
 
-LEAVES = (JOINTS, TRAJECTORY, NUMBERS)
+LEAVES = (JOINTS, TRAJECTORY, NUMBER_ARRAY)
 """Messages that can carry joint numbers."""
 OTHERS = {
     ("delta_dynamics/nodes/twin.py", "~/joint_trajectory_ff"): "filled with ControllerNumbers",

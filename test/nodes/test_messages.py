@@ -381,10 +381,10 @@ class TestTrajectory:
     def test_fields_are_read_as_their_message(self, make, reader):
         for kind, changes, word in wrong_lengths():
             if kind == "trajectory":
-                fields = TrajectoryFields.of(trajectory(make, **changes))
+                fields = TrajectoryFields.from_message(trajectory(make, **changes))
                 reason, text = reject(reader.trajectory, fields, NOW)
                 assert reason == "length" and word in text
-        fields = TrajectoryFields.of(trajectory(make))
+        fields = TrajectoryFields.from_message(trajectory(make))
         assert reader.trajectory(fields, NOW).q.tolist() == [list(Q)] * 3
         narrow = replace(fields, columns=fields.columns | {"positions": np.zeros((3, 2))})
         assert "point 0: 2 positions for 3" in reject(reader.trajectory, narrow, NOW)[1]

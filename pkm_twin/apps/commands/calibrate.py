@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 WIDTH: Final = 100
 """Characters of a printed line."""
-MAX_SHOWN: Final = 10
+MAX_PRINTED_OUTLIERS: Final = 10
 """Largest number of outliers that are printed."""
 
 
@@ -117,7 +117,7 @@ class Calibrate(RobotArgument, TableOptions, BeyondLimitsOption, AcceptOption, O
         super().check_options()
 
     @property
-    def free(self) -> dict[str, Any]:
+    def fit_options(self) -> dict[str, Any]:
         """Options of the fit: what is fitted in addition to the file's numbers, and the prior."""
         return {
             "offsets": not self.no_offsets,
@@ -155,7 +155,7 @@ def calibrate(given: Calibrate) -> Report:
             count=given.count,
             accuracy=given.accuracy,
             noise=known_noise,
-            **given.free,
+            **given.fit_options,
         )
         replace_file(given.plan, chosen.table(machine).encode())
         return report_plan(machine, chosen, given.accuracy, given.plan)
@@ -170,7 +170,7 @@ def calibrate(given: Calibrate) -> Report:
             done += count
             update(done)
 
-        result = calibrated(machine, measured, paths, accept=given.accept, progress=add_steps, **given.free)
+        result = calibrated(machine, measured, paths, accept=given.accept, progress=add_steps, **given.fit_options)
     source = f"calibrated with {one_line(given.poses.name, 100)}"
     marks = [*(f"accepted anyway: {fault}" for fault in result.faults), *notes]
     head = [f"{machine.name}, {source}: {len(measured.joints)} poses."]
@@ -259,9 +259,9 @@ def report_calibration(
         sums = p.before + one.sign * other.before, p.value + one.sign * other.value
         pairs[name] = [*sums, one.deviation, p.unit]
     lines = [] if scale is None else [fill(str(scale), WIDTH)]
-    lines += [f"outlier, with a small weight: {one}" for one in result.outliers[:MAX_SHOWN]]
-    if len(result.outliers) > MAX_SHOWN:
-        lines.append(f"{len(result.outliers) - MAX_SHOWN} more outliers: see --json")
+    lines += [f"outlier, with a small weight: {one}" for one in result.outliers[:MAX_PRINTED_OUTLIERS]]
+    if len(result.outliers) > MAX_PRINTED_OUTLIERS:
+        lines.append(f"{len(result.outliers) - MAX_PRINTED_OUTLIERS} more outliers: see --json")
     return Report(
         f"{machine.name}, {source}: held-out {first.name} error {after} RMS "
         f"({before} before); {found} of {len(rows)} numbers determined",

@@ -119,8 +119,8 @@ def read_path(given: Design, path: Path, *, efforts: bool = True) -> tuple[Robot
             bound = "one that is held throughout; --payload gives one"
             raise ParameterError(f"{path}: payload", str(motion.load), bound)
         robot = motion.load.apply_to(robot)
-    if efforts and motion.doubt:
-        warn_of_file(path, motion.doubt)
+    if efforts and motion.effort_warning:
+        warn_of_file(path, motion.effort_warning)
     q, qd, qdd, load = motion.motion
     load = load + np.asarray(given.wrench or np.zeros(6))
     return robot, PosePath.of_joints(robot, motion.time, q, qd, qdd, load)

@@ -264,7 +264,7 @@ def printer(given: ToPrinter) -> Report:
     return given.write(write_configuration(convert_to_printer(given.machine()), given.firmware))
 
 
-OWN: Final = {
+EXPORT_COMMANDS: Final = {
     "c": c,
     "python": python,
     "ros2-control": ros2_control,
@@ -279,6 +279,6 @@ OWN: Final = {
 export = Group(
     "export",
     "Export a robot to other software.",
-    Extensible("pkm_twin.exports", click.Command, OWN, OWN.__getitem__),
+    Extensible("pkm_twin.exports", click.Command, EXPORT_COMMANDS, EXPORT_COMMANDS.__getitem__),
     "Design and export",
 )

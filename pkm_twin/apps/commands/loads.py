@@ -69,7 +69,7 @@ def loads(given: Loads) -> Report:
     open_ = any(one["undetermined"] for one in joints.values())
     idle = [n for n, j in joints.items() if j.get("life") and math.isnan(j["life"]["L10_hours"])]
     return Report(
-        motion.qualify(answer),
+        motion.with_effort_warning(answer),
         [
             Fact("robot", robot.name),
             Fact("samples", len(motion.time), text="samples"),

@@ -147,8 +147,8 @@ def compute(given: MapOptions) -> Report:
             raise ParameterError("out", str(given.out), "a name that ends in .csv")
         motion = read(path, machine, ReadOptions(planned=True, load=given.load))
         if given.payload is None and (motion.computed is not None or (motion.effort is not None and len(motion.q) > 2)):
-            doubt = check_efforts(zero_resting_motion(motion.with_rates())).doubt
-            motion = replace(motion, doubt=doubt)
+            effort_warning = check_efforts(zero_resting_motion(motion.with_rates())).effort_warning
+            motion = replace(motion, effort_warning=effort_warning)
         else:
             motion.check_rates()
         found = along(
@@ -174,7 +174,7 @@ def compute(given: MapOptions) -> Report:
             reason = alone if low == beyond else f"{alone}; others are beyond limits or limbs interfere"
             notes.append(f"{beyond} of {len(found.time)} samples would not count, but are included: {reason}")
         return Report(
-            motion.qualify(first),
+            motion.with_effort_warning(first),
             [
                 Fact("robot", machine.name),
                 Fact("kind", kind.name),
@@ -227,10 +227,10 @@ def report_stored_map(file: Path, drawing: Path | None, html: bool, overwrite: b
     """
     from pkm_twin.maps import figures
     from pkm_twin.maps.page import write_page
-    from pkm_twin.maps.store import open_map, reading
+    from pkm_twin.maps.store import convert_read_errors, open_map
 
     with open_map(file) as data:
-        with reading(file):
+        with convert_read_errors(file):
             first, *rest = figures.write_lines(data)
             facts = [
                 Fact("robot", data.attrs["robot"]),

@@ -137,8 +137,8 @@ def size(given: Size) -> Report:
         Fact("mean_power_W", net / duration, "W", "mean power"),
     ]
     title = answer
-    if doubt := motion.doubt or taken.mismatch_warning:
-        answer += f"; {doubt}"
+    if effort_warning := motion.effort_warning or taken.mismatch_warning:
+        answer += f"; {effort_warning}"
         answer += "; --efforts model uses the model's" if taken.mismatch_warning else ""
     if motors:
         none = f"none of {len(duties[0].fits)}"
@@ -178,9 +178,9 @@ def read_gear_options(given: Size, robot: Robot) -> tuple[list[Gear], list[Gears
     one, choices = [], []
     for key, value, values in (("ratio", given.ratio, given.ratios), ("lead", given.lead, given.leads)):
         if value is not None:
-            one.append(Gear(efficiency=share).sized(key, value))
+            one.append(Gear(efficiency=share).with_size(key, value))
         if values is not None:
-            choices.append(Gears.of(key, values, share))
+            choices.append(Gears.parse(key, values, share))
     if not (one or choices) and given.drives is not None:
         listed = read_gears(given.drives)
         for slides in (False, True):

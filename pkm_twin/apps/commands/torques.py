@@ -135,7 +135,7 @@ def torques(given: Torques) -> Report:
         bounds = (f"{one.joint} {abs(one.value):.4g} of {one.high:g} {one.unit}" for one in over)
         answer += f"; beyond the file's limits: {', '.join(bounds)}"
     return Report(
-        motion.qualify(answer),
+        motion.with_effort_warning(answer),
         [
             Fact("robot", robot.name),
             Fact("samples", len(time)),

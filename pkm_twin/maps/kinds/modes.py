@@ -113,7 +113,7 @@ class Modes(Frequency):
     def page(cls, data: Dataset) -> Any:
         """Return a figure of the frame at rest and in a mode, with menu and animation."""
         graph = import_extra("plotly.graph_objects", "maps")
-        from pkm_twin.maps.page import BAR, CAMERA, MARGIN, MENU, make_button
+        from pkm_twin.maps.page import CAMERA, COLOUR_BAR, MARGIN, MENU, make_button
 
         # All lines as one path, with -1 between lines that do not meet.
         rest, nodes = data.position.values, list[int]()
@@ -159,7 +159,7 @@ class Modes(Frequency):
         figure.data[2].update({name: values[0] for name, values in first.items()})
         title = {"text": "displacement over the mode's largest", "side": "right"}
         figure.update_layout(
-            coloraxis={"colorscale": "Viridis", "cmin": 0.0, "cmax": 1.0, "colorbar": {**BAR, "title": title}},
+            coloraxis={"colorscale": "Viridis", "cmin": 0.0, "cmax": 1.0, "colorbar": {**COLOUR_BAR, "title": title}},
             scene={
                 "aspectmode": "manual",
                 "aspectratio": dict(zip("xyz", (1.3 * (high - low) / (high - low).max()).tolist(), strict=True)),

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from xarray import Dataset
 
-PANELS: Final = 3
+MAX_PANELS: Final = 3
 """Number of elements in a picture."""
 SLICES: Final = 5
 """Number of heights in a picture."""
@@ -84,9 +84,9 @@ class StrainEnergy(Compliance):
             mean, order = _rank(data, case)
             ranked = [int(n) for n in order if mean[n] >= 0.005]
             named = {f"{before}energy": _draw_slices(data, case, [])}
-            for k in range(0, len(ranked), PANELS):
-                part = ranked[k : k + PANELS]
-                name = f"{before}elements_{k // PANELS + 1}"
+            for k in range(0, len(ranked), MAX_PANELS):
+                part = ranked[k : k + MAX_PANELS]
+                name = f"{before}elements_{k // MAX_PANELS + 1}"
                 named[name] = _draw_slices(data, case, part) | _draw_planes(data, case, part)
             pictures |= {f"{name}_{end}": one for name, ends in named.items() for end, one in ends.items()}
         return pictures
@@ -190,7 +190,7 @@ def _draw_planes(data: Dataset, case: str, elements: list[int]) -> dict[str, Fig
     table = data.plane_factor.isel(plane=plane, case=k).values[..., elements]
     high = float(np.nanmax(table))
     figure: Figure
-    figure, columns = plots.make_subplots(len(elements), 1, plots.WIDTH / PANELS + 0.9)
+    figure, columns = plots.make_subplots(len(elements), 1, plots.WIDTH / MAX_PANELS + 0.9)
     mesh: Any = None
     for column, (ax,), n in zip(np.moveaxis(table, -1, 0), columns, elements, strict=True):
         drawn = one | {"values": column, "star": None}
