@@ -241,7 +241,7 @@ class _BoxSearch:
         return self._best[2], False
 
     def _margins(self, z: Array) -> tuple[Array, Array]:
-        """Return margins, positive if s bounds the aim and constraints hold, and their slopes."""
+        """Return the constraints of SLSQP and their derivatives: bound s minus aim, and minus excesses; z = (y, s)."""
         y, s = np.clip(z[:-1], 0.0, 1.0), z[-1]
         key = y.tobytes()
         if key not in self._known:

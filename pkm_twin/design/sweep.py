@@ -71,7 +71,7 @@ class Box:
 
     @cached_property
     def problem(self) -> Problem:
-        """Machines on the path."""
+        """Evaluation of the box's machines on the path; each process creates its own."""
         return Problem(self.robot, Variables.of(self.robot, self.vary), self.path)
 
     def evaluate(self, points: Array) -> dict[str, Array]:

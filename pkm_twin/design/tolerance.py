@@ -117,7 +117,7 @@ class Tolerances:
         return np.reshape(found, (*shape, 2))
 
     def part(self, path: str) -> Array:
-        """Return the effect of one standard deviation of an error, shape (..., 6)."""
+        """Return the platform's displacement by one standard deviation of the error at a path, shape (..., 6)."""
         return self.sigma[path] * self.sensitivity[path]
 
     @cached_property

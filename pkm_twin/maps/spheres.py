@@ -100,7 +100,7 @@ def find_spheres(space: Space, energy: float) -> dict[str, Variable]:
 
 
 def list_index_labels(data: Dataset) -> dict[str, tuple[str, str]]:
-    """Return the question and the scale's label of each index."""
+    """Return the question that eta_KE and F_max each answer, and the label of its colour scale."""
     energy = json.loads(data.attrs["settings"])["options"]["energy"]
     unit = str(data.sphere_force.attrs["units"])
     what = "force" if unit == "N" else "torque"

@@ -167,7 +167,7 @@ class Forces:
         """Return efforts at speeds v and accelerations u along the path, (p,) each: (p, n)."""
         moving = (v > 0.0)[:, None]
         v, u = v[:, None], u[:, None]
-        # Dry friction acts from the first moment of a start.
+        # Dry friction also acts at rest if the joint accelerates.
         moving |= u != 0.0
         return self.a * u + self.b * v**2 + self.w * v + self.g + np.where(moving, self.k, 0.0)
 

@@ -157,7 +157,7 @@ def smooth_run(part: JointPath, x: Array) -> Run | None:
         rises = (u[:-1] < 0.0) & (u[1:] > 0.0)
         dip = np.where(rises, -0.5 * u[:-1] ** 2 * np.diff(knots) / np.where(rises, np.diff(u), 1.0), 0.0)
         below = -np.minimum(np.minimum(v[:-1], v[1:]), v[:-1] + dip)
-        # Two neighbouring intervals share the point between their middles.
+        # Raise the profile's point between the middles where the speed is negative.
         low = np.flatnonzero(below > 1e-12 * v.max())
         if not len(low):
             jerk = np.diff(u) / np.diff(knots)

@@ -194,7 +194,7 @@ class JointPath:
         return q, first * v[:, None], first * u[:, None] + second * (v**2)[:, None]
 
     def find_speed_factor(self, interval: Index, part: Array) -> Array:
-        """Return the factor of the reference point's speed in its limit, shape (k,)."""
+        """Return the factors that scale the reference point's speed for its limit, shape (k,)."""
         left = self.left[interval]
         return (1.0 - part) * self.slower[left] + part * self.slower[left + 1]
 

@@ -254,7 +254,7 @@ class Gears:
 
     @classmethod
     def parse(cls, key: str, text: str, efficiency: float = 1.0) -> Gears:
-        """Parse ``LOW:HIGH`` or numbers with commas; ``key``: ratio or lead.
+        """Parse ``LOW:HIGH`` or numbers separated by commas; ``key``: ratio or lead.
 
         :raises ParameterError: another form, or numbers that no gear has.
         """
@@ -271,13 +271,6 @@ class Gears:
         steps = np.geomspace(values[0], values[1], GEARS_PER_ROUND).tolist() if span else values
         own = Gear(efficiency=efficiency)
         return cls(tuple(own.with_size(key, value) for value in steps), span)
-
-    def near(self, k: int) -> Gears:
-        """Return the gears around one of a span."""
-        low, high = self.gears[max(0, k - 1)], self.gears[min(k + 1, len(self.gears) - 1)]
-        steps = np.geomspace(low.size, high.size, GEARS_PER_ROUND).tolist()
-        key = "ratio" if low.lead is None else "lead"
-        return replace(self, gears=tuple(low.with_size(key, size) for size in steps))
 
 
 def read_motors(path: Path, names: Sequence[str] = ()) -> dict[str, Motor]:
@@ -575,13 +568,17 @@ class _Axis:
 
 def _fit_best_gear(axes: Sequence[_Axis], name: str, motor: Motor, choice: Gears) -> list[Fit]:
     """Choose one gear for several joints: it minimises the largest used fraction of all joints."""
-    # Each round of a range is between the neighbours of the best gear. Beyond its curve a motor has
-    # no torque; then the other fractions decide.
+    # Refine a range between the neighbours of the best gear. A motor beyond its curve has no torque,
+    # so that its used fraction is infinite; then heat and speed decide.
     for _ in range(4 if choice.span else 1):
         rows = [[axis.fit(name, motor, gear) for axis in axes] for gear in choice.gears]
         ranks = [(max(f.used for f in fits), max(max(f.thermal, f.speed) for f in fits)) for fits in rows]
         k = ranks.index(min(ranks))
-        choice = choice.near(k) if choice.span else choice
+        if choice.span:
+            low, high = choice.gears[max(0, k - 1)], choice.gears[min(k + 1, len(choice.gears) - 1)]
+            key = "ratio" if low.lead is None else "lead"
+            steps = np.geomspace(low.size, high.size, GEARS_PER_ROUND).tolist()
+            choice = replace(choice, gears=tuple(low.with_size(key, size) for size in steps))
     return rows[k]
 
 

@@ -117,7 +117,7 @@ def _read_table_recording(path: Path, name: str | Robot | None, how: ReadOptions
     def stack_columns(word: str) -> Array | None:
         values = table.stack_if([f"{joint}.{word}" for joint in joints])
         if values is not None and word in EFFORTS[:2] and "effort" in how.dialect.units:
-            # In per cent of the motors' rated torques, N m.
+            # The column is in per cent of the motors' rated torques: convert it to N m.
             if how.side != "motor":
                 raise ParameterError("--units", "percent", "--side motor: it is the motor's rated torque")
             rated = [drive.rated_torque for drive in _require_drives(robot)]

@@ -135,7 +135,7 @@ class Recording:
         return one_line(Path(self.source).name, 100)
 
     def with_effort_warning(self, answer: str) -> str:
-        """Return an answer for this motion, followed by the effort_warning about its efforts, if any."""
+        """Return an answer for this motion, with the warning about its efforts if there is one."""
         return f"{answer}; {self.effort_warning}" if self.effort_warning else answer
 
     @property
@@ -150,7 +150,7 @@ class Recording:
 
     @cached_property
     def steps(self) -> Steps:
-        """The steps by the measured velocities, or by the positions alone if these do not jump."""
+        """Jumps of the positions and interleaved publishers, found with the measured velocities if they are sound."""
         limit = self.robot.limits.velocity
         steps = find_steps(self.time, self.q, self.qd, limit)
         if self.qd is None or not steps.jumps.any():
@@ -177,7 +177,7 @@ class Recording:
 
     @cached_property
     def backlash_description(self) -> str:
-        """Description of positions that cross a play; empty without any, or if publishers are interleaved."""
+        """Description of positions that step by a backlash; empty without any, or if publishers are interleaved."""
         if self.steps.publishers:
             return ""
         names, units = self.robot.joint_names, self.robot.joint_units

@@ -18,7 +18,7 @@ TRANSFORM: Final = "geometry_msgs/msg/TransformStamped"
 WRENCH: Final = "geometry_msgs/msg/WrenchStamped"
 TRAJECTORY: Final = "trajectory_msgs/msg/JointTrajectory"
 TABLE_SOURCE: Final = "columns of the table"
-"""Text in place of topics for a table."""
+"""Source of the joint states that a report names for a table, where a bag has a topic."""
 
 _FIELDS: Final = {
     "std_msgs/Header": ("builtin_interfaces/Time stamp", "string frame_id"),

@@ -72,7 +72,7 @@ def _layout_judged(facts: Sequence[Fact]) -> Iterator[str]:
 
 
 def table_lines(table: Table) -> list[str]:
-    """Return a table's title, headings and rows; numeric columns are right-align_rows."""
+    """Return a table's title, headings and rows; numeric columns are aligned right."""
     head, *rows = table.cells
     shown = [k for k, column in enumerate(table.columns) if column.text is not None]
     words = [any(isinstance(row[k], str) for row in table.rows.values()) for k in shown]

@@ -24,17 +24,17 @@ MIN_BLOCK_TIME: Final = 0.05
 MIN_STEPS: Final = 5
 """Fewest steps between samples in a block."""
 STANDSTILL_FRACTION: Final = 0.03
-"""A quantity stands still if its change is below this fraction of the other's, of position and integrated velocity."""
+"""Moves below this fraction of the moves by the other signal (position or integrated velocity) count as standstill."""
 MAX_MOVE_DIFFERENCE: Final = 0.15
-"""Largest relative RMS difference of the moves of a whole recording."""
+"""Largest RMS difference of a recording's moves by positions and by integrated velocities, relative to the larger."""
 MAX_ACCELERATION_ERROR: Final = 0.6
 """Largest relative RMS difference of changes of the velocities. A step of the acceleration between two samples
 is up to 0.2 of a block of five steps, and filters delay accelerations; wrong signs, units and zeros leave 1 or more."""
 SCALE_TOLERANCE: Final = 0.1
-"""Largest relative difference that a factor between both may leave to be named as the cause."""
+"""Largest relative difference that remains after scaling if a wrong scale is named as the cause."""
 MAX_SHORT_RECORDING_SCALE: Final = 2.0
-"""Largest factor between both, up or down, of a recording without two blocks. Sampling alone explains a factor of
-x / tan(x), x half the phase between two samples: 0.6 to 1 where a move over two steps is not below that over one."""
+"""Largest ratio of both moves, or of its inverse, in a recording shorter than two blocks. Sampling alone explains
+x / tan(x), x half the phase between two samples: 0.6 to 1 if a move over two steps is not below that over one."""
 
 
 def rms(values: Array) -> Array:

@@ -118,7 +118,7 @@ class Calibrate(RobotArgument, TableOptions, BeyondLimitsOption, AcceptOption, O
 
     @property
     def fit_options(self) -> dict[str, Any]:
-        """Options of the fit: what is fitted in addition to the file's numbers, and the prior."""
+        """Keyword arguments of the fit: offsets and frames to fit, noise, and prior."""
         return {
             "offsets": not self.no_offsets,
             "frame": self.frame,

@@ -102,7 +102,7 @@ def judge(topic: str, arrivals: Arrivals, offer: Offer) -> Report:
 
 @command("Recordings")
 def monitor_torques(given: MonitorTorques) -> Report:
-    """Subscribe for a while, or until the first signal.
+    """Judge the torques that arrive in a time span, or until the first signal.
 
     :raises PkmTwinError: no ROS, or a topic of another type.
     """

@@ -59,7 +59,7 @@ class Motion(PayloadOption, TableOptions, SingularityOption, OutputOption, Pictu
     The table that it writes has the columns time, JOINT.position, JOINT.velocity,
     JOINT.acceleration, JOINT.effort, the pose's coordinates with their velocity and acceleration,
     and what the efforts rest on: the payload (payload.mass, and payload.x, .y, .z where given),
-    gravity, and a number of all the robot's numbers (computed_with.ROBOT). `pkm-twin torques`,
+    gravity, and a checksum of the robot's numbers (computed_with.ROBOT). `pkm-twin torques`,
     `size`, `loads` and `design` read it, and reject efforts that the robot does not compute.
     """
 

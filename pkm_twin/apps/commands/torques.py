@@ -48,7 +48,7 @@ class Torques(TimedPayloadOptions, MotionOptions, PoseOption, OutputOption, Pict
     or N), the terms that sum to it (JOINT.effort_gravity, _inertia, _velocity, _payload, _friction,
     _external, _preload), a recording's measured effort (JOINT.measured), and force and moment in
     every joint. A reaction that rigid-body equations do not determine is empty. The last columns
-    are what the efforts rest on: wrench, payload, gravity, and a number of all the robot's numbers
+    are the inputs of the efforts: wrench, payload, gravity, and a checksum of the robot's numbers
     (computed_with.ROBOT).
     With --beyond-limits, the column beyond_limits is 1 where a joint is outside its limits.
     """
