@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
+from operator import attrgetter
 from typing import Any, Final
 
 import numpy as np
@@ -15,7 +16,7 @@ from pkm_twin.identification.deflections import ElasticFit
 from pkm_twin.identification.drives import DriveFriction, Law
 from pkm_twin.identification.fit import Fit, Judged, Result
 from pkm_twin.identification.hypotheses import Explanation
-from pkm_twin.identification.parameters import Group, Number
+from pkm_twin.identification.parameters import Number
 from pkm_twin.report import Column, Fact, Report, Table, plots
 
 COMBINED_TEXT: Final = "known only in combination with others"
@@ -29,7 +30,7 @@ def report_fit(result: Result, marks: Sequence[str] = ()) -> tuple[Report, list[
     :param marks: notes that come first.
     """
     verdict, e, elastic = result.verdict, result.estimate, isinstance(result, ElasticFit)
-    label = _element_name if elastic else _parameter_name
+    label = _element_name if elastic else attrgetter("name")
     units = dict(zip(result.channels, result.units, strict=True))
     own = tuple(units[channel.name] for channel in verdict.channels)
     shown = [n for n in result.numbers if n.status != "not excited"]
@@ -58,7 +59,14 @@ def report_fit(result: Result, marks: Sequence[str] = ()) -> tuple[Report, list[
     elif isinstance(result, ElasticFit):
         names = tuple(map(_element_name, result.numbers))
         facts = _report_elastic(result)
-        more = list(map(_describe_group, result.groups))
+        more = []
+        for group in result.groups:
+            sums = []
+            for one in group.known:
+                terms = " + ".join(f"{w:.2f} x {name}" for name, w in one.weights.items())
+                sums.append(f"{terms.replace('+ -', '- ')} = {one.value:.4g} +- {one.deviation:.2g}")
+            combinations = "; ".join(sums) or "nothing"
+            more.append(f"Loads do not distinguish {' and '.join(group.elements)}; they identify {combinations}")
     notes = [*marks, *verdict.list_sentences(own), *more]
     if idle:
         notes.append(f"not excited, the file's value stays: {', '.join(idle)}")
@@ -111,8 +119,10 @@ def report_fit(result: Result, marks: Sequence[str] = ()) -> tuple[Report, list[
         for c, unit in zip(result.verdict.channels, own, strict=True)
     }
     explained = result.explained if isinstance(result, Fit) else ()
+    worst, (before, after, peak, unit) = max(held.items(), key=lambda row: row[1][1] / max(row[1][2], 1e-300))
     return Report(
-        _write_answer(result, held),
+        f"{result.robot.name}: {verdict}; the worst held-out residual is {after:.3g} {unit} ({worst}), "
+        f"{100 * after / peak:.2g} % of the peak ({before:.3g} {unit} with the file's values)",
         [
             Fact("robot", result.robot.name),
             Fact("verdict", verdict.as_json(own)),
@@ -147,22 +157,8 @@ def tabulate_causes(explained: Sequence[Explanation], names: Sequence[str]) -> l
     return [Table("considered", [column], rows, "considered as the cause of deviations", "cause")] * bool(rows)
 
 
-def _parameter_name(number: Number) -> str:
-    return number.name
-
-
 def _element_name(number: Number) -> str:
     return str(number.key[-1])
-
-
-def _write_answer(result: Result, held: Mapping[str, tuple[float, float, float, str]]) -> str:
-    """Describe whether the model explains the recordings, and the worst held-out channel."""
-    name, (before, after, peak, unit) = max(held.items(), key=lambda row: row[1][1] / max(row[1][2], 1e-300))
-    return (
-        f"{result.robot.name}: {result.verdict}; the worst held-out residual is "
-        f"{after:.3g} {unit} ({name}), {100 * after / peak:.2g} % of the peak ({before:.3g} {unit} "
-        "with the file's values)"
-    )
 
 
 def _report_efforts(result: Fit) -> list[Fact]:
@@ -222,15 +218,6 @@ def _report_elastic(result: ElasticFit) -> list[Fact]:
     ]
     noise = np.where(result.measured.any(0), result.estimate.noise, np.nan)
     return [Fact("not_told_apart", groups), Fact(f"deflection_noise_{DEFLECTION_UNITS}", noise), Fact("held_out", held)]
-
-
-def _describe_group(group: Group) -> str:
-    sums = []
-    for one in group.known:
-        terms = " + ".join(f"{w:.2f} x {name}" for name, w in one.weights.items())
-        sums.append(f"{terms.replace('+ -', '- ')} = {one.value:.4g} +- {one.deviation:.2g}")
-    combinations = "; ".join(sums) or "nothing"
-    return f"Loads do not distinguish {' and '.join(group.elements)}; they identify {combinations}"
 
 
 def _draw_residuals(judged: Judged, units: Mapping[str, str]) -> Any:

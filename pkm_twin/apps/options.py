@@ -20,7 +20,7 @@ from pkm_twin.settings import setting
 if TYPE_CHECKING:
     from pkm_twin.codegen.arrays import Array
     from pkm_twin.paths.along import EffortComparison
-    from pkm_twin.recordings import Dialect, Load, ReadOptions, Recording
+    from pkm_twin.recordings import Dialect, Load, Recording
     from pkm_twin.robot.limits import Beyond
     from pkm_twin.robot.robot import Robot
     from stiffness_monitor.chatter import Milling
@@ -176,19 +176,13 @@ class RecordingOptions(TableOptions):
     ) -> Recording:
         """Read a recording; ``more``: other fields of ``ReadOptions``."""
         from pkm_twin.bags.storage import is_bag
-        from pkm_twin.recordings import read
+        from pkm_twin.recordings import ReadOptions, read
 
         if self.topic and not is_bag(path):
             raise click.UsageError(f"--topic is for bags; {path} is read as a table")
-        return read(path, robot, self.build_read_options(**more), progress)
-
-    def build_read_options(self, **more: Any) -> ReadOptions:
-        """Return the options for reading a recording; ``more``: other fields of ``ReadOptions``."""
-        from pkm_twin.recordings import ReadOptions
-
         names = ("load", "follow", "dialect", "side", "wrench_frame", "base_frame")
         own: dict[str, Any] = {name: getattr(self, name, None) for name in names}
-        return ReadOptions(self.topic, **own, **more)
+        return read(path, robot, ReadOptions(self.topic, **own, **more), progress)
 
 
 @dataclass(frozen=True, kw_only=True)

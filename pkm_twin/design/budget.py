@@ -105,12 +105,6 @@ class ErrorBudget:
         shift, turn = self.deviations
         return ErrorSizes(rms_length(shift), largest_length(shift), rms_length(turn), largest_length(turn))
 
-    @property
-    def rms_deflection(self) -> float | None:
-        """RMS displacement under the wrench without errors, m; None without wrench or elasticity."""
-        bent = self.errors.deflection
-        return None if bent is None else rms_length(bent[..., :3])
-
     @cached_property
     def bounds(self) -> tuple[float, float]:
         """Largest displacement (m) and rotation (rad) by all bounds, over all states."""

@@ -172,7 +172,7 @@ class PathMotion:
             by_qdd = by_qdd + changes
         held = self._add_constant_poses(by_q, (by_qd, by_qdd))
         rows = np.concatenate([of_geometry + held, of_masses], -1)
-        return np.asarray(rows[0] @ self.machines.rigid_jacobian)
+        return np.asarray(rows[0] @ self.machines.functions.rigid.slopes_at(self.machines.values[:1])[0])
 
     def singularity_derivatives(self) -> Array:
         """Return the derivatives of each sample's index, shape (t, d)."""

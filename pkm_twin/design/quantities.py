@@ -48,10 +48,6 @@ class Quantity:
         found = self.evaluate(followed)
         return found.reshape(len(found), -1)
 
-    def component_count(self, robot: Robot) -> int:
-        """Return the number of components per sample."""
-        return robot.joints_count if self.name == "peak-effort" else 1
-
     def worst(self, components: Array) -> Array:
         """Return the quantity from components (k, p), shape (k,)."""
         return np.asarray(components.min(-1) if self.least else components.max(-1), np.float64)

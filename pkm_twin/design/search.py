@@ -280,7 +280,8 @@ def _evaluate_components(
     problem: Problem, quantity: Quantity, chosen: Index, one: Variants, y: Array
 ) -> tuple[Array, Array]:
     """Return chosen components of one machine at y, and their derivatives, shape (components, d)."""
-    width = quantity.component_count(problem.robot) if quantity.sampled else 0
+    # Components per sample: peak efforts have one per joint.
+    width = (problem.robot.joints_count if quantity.name == "peak-effort" else 1) if quantity.sampled else 0
     path = problem.path.at(chosen // width) if width else problem.path
     places = chosen % width if width else chosen
 

@@ -252,11 +252,6 @@ class Variants:
         return np.asarray(self.functions.geometry.slopes_at(self.values[:1])[0])
 
     @cached_property
-    def rigid_jacobian(self) -> Array:
-        """Derivatives of its geometry and masses with respect to the numbers, shape (entries, paths)."""
-        return np.asarray(self.functions.rigid.slopes_at(self.values[:1])[0])
-
-    @cached_property
     def elasticity(self) -> Array:
         """Inputs of the elastic model's programs that follow the geometry, shape (k, size)."""
         return self.functions.elastic_inputs(self.values)

@@ -44,11 +44,6 @@ class Along:
     loaded: bool
 
     @property
-    def excluded_count(self) -> int:
-        """Number of samples that a map would exclude."""
-        return int((~self.counted).sum())
-
-    @property
     def worst(self) -> list[dict[str, Any]]:
         """Worst sample of each case as plain data, as for a stored map, with its time."""
         answers, axes = [], self.kind.axes(self.robot)

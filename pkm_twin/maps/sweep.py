@@ -272,23 +272,21 @@ class Map(Space):
             poses[..., k] = values
         return poses.reshape(-1, len(self.bounds))
 
-    def _evaluate_states(self, chunk: Chunk) -> tuple[Array, Array, Mask]:
-        """Return joint positions, poses, and which are known, of a chunk."""
+    def evaluate(self, chunk: Chunk) -> Values:
+        """Evaluate the cases on a chunk; for the grid also worst poses and counts."""
+        # Joint positions, poses, and which of them are known.
         rows = slice(chunk.start, chunk.stop)
         if chunk.plane is not None:
             case = chunk.case or 0
             first, *rest = self.plane_ticks(chunk.plane, case)
-            return self.evaluate_poses(self._plane_poses(chunk.plane, case, [first[rows], *rest]))
-        if self.ticks:
+            states = self.evaluate_poses(self._plane_poses(chunk.plane, case, [first[rows], *rest]))
+        elif self.ticks:
             grid = np.meshgrid(self.ticks[0][rows], *self.ticks[1:], indexing="ij")
-            return self.evaluate_poses(np.stack(grid, -1).reshape(-1, len(self.bounds)))
-        rng = np.random.default_rng(chunk.start)
-        low, high = self.box.T
-        return self.evaluate_point(rng.uniform(low, high, (chunk.stop - chunk.start, len(low))))
-
-    def evaluate(self, chunk: Chunk) -> Values:
-        """Evaluate the cases on a chunk; for the grid also worst poses and counts."""
-        states = self._evaluate_states(chunk)
+            states = self.evaluate_poses(np.stack(grid, -1).reshape(-1, len(self.bounds)))
+        else:
+            low, high = self.box.T
+            size = (chunk.stop - chunk.start, len(low))
+            states = self.evaluate_point(np.random.default_rng(chunk.start).uniform(low, high, size))
         parts = 1 + len(states[0]) // self.kind.chunk
         cases = self.cases if chunk.case is None else (self.cases[chunk.case],)
         batches = zip(*(np.array_split(array, parts) for array in states), strict=True)

@@ -16,7 +16,7 @@ from pkm_twin.report import Column, Fact, Report, Table, Verdict
 from pkm_twin.settings import setting
 
 if TYPE_CHECKING:
-    from pkm_twin.certify.certificate import Item
+    pass
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,8 +80,8 @@ def certify(given: Certify) -> Report:
             f"{found.skipped} of {found.drawn} states drawn were skipped: pkm_twin meets a "
             "singularity on the way from home",
         )
-    # Report the comparison with the largest ratio of difference to bound.
-    worst = max(found.items, key=_relative_to_bound, default=None)
+    # Report the comparison with the largest ratio of difference to bound, infinite for a bound of 0.
+    worst = max(found.items, key=lambda i: i.worst / i.bound if i.bound else math.inf if i.worst else 0.0, default=None)
     most = (
         ""
         if worst is None
@@ -98,8 +98,3 @@ def certify(given: Certify) -> Report:
         notes=notes,
         verdict=Verdict.GOOD if found.good else Verdict.BAD,
     )
-
-
-def _relative_to_bound(item: Item) -> float:
-    """Return the largest difference over its bound; infinite for a difference with a bound of 0."""
-    return item.worst / item.bound if item.bound else math.inf if item.worst else 0.0

@@ -360,7 +360,7 @@ def report_budget(given: Design) -> Report:
     """
     from pkm_twin.design import tolerances
     from pkm_twin.design.budget import ErrorBudget, draw_machines
-    from pkm_twin.design.tolerance import workspace_states
+    from pkm_twin.design.tolerance import rms_length, workspace_states
     from pkm_twin.design.variables import parse_tolerances
     from pkm_twin.identification.calibration import calibrated_errors
 
@@ -405,7 +405,10 @@ def report_budget(given: Design) -> Report:
     ]
     sizes = summary.sizes
     turning, (shift, bound) = found.only_turns, summary.bounds
-    at, bound_at = (f" at {_format_pose(robot, pose)}" for pose in (summary.worst_pose, summary.bound_pose))
+    at, bound_at = (
+        f" at {', '.join(f'{n} {value:.4g}' for n, value in zip(robot.pose_names, pose, strict=True))}"
+        for pose in (summary.worst_pose, summary.bound_pose)
+    )
     case = "worst case of all bounds" if found.is_exact else "upper bound of the worst case"
     facts = [
         Fact("robot", robot.name),
@@ -441,9 +444,9 @@ def report_budget(given: Design) -> Report:
         )
         label = f"{given.monte_carlo} random machines, assembled exactly"
         facts.append(Fact("monte_carlo", asdict(exact), text=label, shown=words))
-    if (bent := summary.rms_deflection) is not None:
+    if (bent := found.deflection) is not None:
         label = "deflection under the wrench, not in the table: RMS"
-        facts.append(_report_length("rms_deflection_m", bent, label))
+        facts.append(_report_length("rms_deflection_m", rms_length(bent[..., :3]), label))
     what = f"rotation {1e3 * sizes.rms_angle:.4g} mrad" if turning else f"position {1e3 * sizes.rms_position:.4g} mm"
     held = f"{', '.join(robot.graph.leads)}" if robot.redundant else "actuated joints"
     return Report(
@@ -451,10 +454,6 @@ def report_budget(given: Design) -> Report:
         facts,
         [Table("contributions", columns, rows, head="error")],
     )
-
-
-def _format_pose(robot: Robot, pose: Any) -> str:
-    return ", ".join(f"{n} {value:.4g}" for n, value in zip(robot.pose_names, pose, strict=True))
 
 
 def _report_length(name: str, value: float, text: str | None = None, more: str = "") -> Fact:

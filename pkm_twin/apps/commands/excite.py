@@ -17,7 +17,7 @@ from pkm_twin.report import Fact, Report
 from pkm_twin.settings import setting
 
 if TYPE_CHECKING:
-    from pkm_twin.robot.robot import Robot
+    pass
 
 MAX_CONDITION_NUMBER: Final = 1e3
 """Condition number above which a fit determines some parameters poorly."""
@@ -111,11 +111,16 @@ def excite(given: Excite) -> Report:
         if given.friction
         else [Fact("frequencies_Hz", best.harmonics / best.duration)]
     )
-    size = f"{len(time)} points in {best.duration:.4g} s"
+    if given.friction:
+        # Rotary and sliding joints have speeds of different units.
+        units = np.array(machine.joint_units)
+        rows = {unit: best.speeds[units == unit] for unit in machine.joint_units}
+        ranges = " and ".join(f"{one.min():.2g} to {one.max():.2g} {unit}/s" for unit, one in rows.items())
+        answer = f"every joint alone moves up and down at {ranges}"
+    else:
+        answer = f"condition number {best.condition:.4g} over {len(judge.columns)} base parameters"
     return Report(
-        f"{machine.name}: every joint alone moves up and down at {_format_speed_ranges(machine, best.speeds)}, {size}"
-        if given.friction
-        else f"{machine.name}: condition number {best.condition:.4g} over {len(judge.columns)} base parameters, {size}",
+        f"{machine.name}: {answer}, {len(time)} points in {best.duration:.4g} s",
         facts=[
             Fact("robot", machine.name),
             Fact("condition", best.condition),
@@ -128,10 +133,3 @@ def excite(given: Excite) -> Report:
         notes=notes,
         files=given.files,
     )
-
-
-def _format_speed_ranges(machine: Robot, speeds: Any) -> str:
-    """Format the range of the speeds (n, speeds), of rotary and of sliding joints apart."""
-    units = np.array(machine.joint_units)
-    rows = {unit: speeds[units == unit] for unit in machine.joint_units}
-    return " and ".join(f"{one.min():.2g} to {one.max():.2g} {u}/s" for u, one in rows.items())

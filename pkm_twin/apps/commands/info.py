@@ -154,26 +154,23 @@ def group_reactions(names: Sequence[str]) -> list[str]:
             others.append(name)
     alike: dict[str, list[str]] = {}
     for joint, kinds in joints.items():
-        words = [f"{kind} {_describe_directions(directions)}".strip() for kind, directions in kinds.items()]
+        words = []
+        for kind, directions in kinds.items():
+            if len(directions) == 3:
+                words.append(f"{kind} in all directions")
+                continue
+            known = ["along the axis" if n == "axis" else f"along {n}" for n in directions if "across" not in n]
+            if {"across 1", "across 2"} <= set(directions):
+                known.append("across the axis")
+            elif any("across" in n for n in directions):
+                known.append("in one direction across the axis")
+            words.append(f"{kind} {' and '.join(known)}".strip())
         alike.setdefault(" and ".join(words), []).append(joint)
     lines = []
     for what, joined in alike.items():
         more = f" and {len(joined) - MAX_NAMES} more" if len(joined) > MAX_NAMES else ""
         lines.append(f"{', '.join(joined[:MAX_NAMES])}{more}: not determined: {what}")
     return lines + others
-
-
-def _describe_directions(names: list[str]) -> str:
-    """Describe the directions of one joint's forces or moments."""
-    if len(names) == 3:
-        return "in all directions"
-    both = {"across 1", "across 2"} <= set(names)
-    words = ["along the axis" if n == "axis" else f"along {n}" for n in names if "across" not in n]
-    if both:
-        words.append("across the axis")
-    elif any("across" in n for n in names):
-        words.append("in one direction across the axis")
-    return " and ".join(words)
 
 
 def _report_parameters(name: str, value: Any, unit: Any) -> Iterator[Fact]:

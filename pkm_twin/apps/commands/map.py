@@ -133,7 +133,13 @@ def compute(given: MapOptions) -> Report:
     from pkm_twin.maps.store import write_arrays
     from pkm_twin.maps.sweep import plan_map
 
-    kind, machine = make_kind(given), given.machine()
+    kind: Kind
+    if isinstance(given, MillingOptions) and isinstance(given, ToolOptions):
+        kind = CuttingDepth(given.milling, given.damping, given.tool)
+    else:
+        fields = dataclasses.fields(KINDS[given.kind])
+        kind = KINDS[given.kind](**{field.name: getattr(given, field.name) for field in fields})
+    machine = given.machine()
     cases = given.cases(kind, machine)
     if given.along is not None:
         # Evaluate the kind along a path; report the worst of each case.
@@ -164,7 +170,7 @@ def compute(given: MapOptions) -> Report:
         )
         if given.out is not None:
             replace_file(given.out, found.table().encode())
-        beyond, least, low = found.excluded_count, found.least, found.near_singular
+        beyond, least, low = int((~found.counted).sum()), found.least, found.near_singular
         first, *rest = found.sentences
         bound = f", singularity index {least:g} or more" if least > 0.0 else ""
         under = ["under the wrench of the path"] if found.loaded else []
@@ -256,14 +262,6 @@ def report_stored_map(file: Path, drawing: Path | None, html: bool, overwrite: b
             write_page(data, page)
         pictures = {name: lambda one=one: one for name, one in drawn.items()}
         return Report(first, facts, figures=pictures, notes=rest, files={"file": file, "page": page})
-
-
-def make_kind(given: MapOptions) -> Kind:
-    """Return the kind with its own options."""
-    if isinstance(given, MillingOptions) and isinstance(given, ToolOptions):
-        return CuttingDepth(given.milling, given.damping, given.tool)
-    kind = KINDS[given.kind]
-    return kind(**{field.name: getattr(given, field.name) for field in dataclasses.fields(kind)})
 
 
 def make_kind_command(kind: type[Kind]) -> Command:

@@ -4,21 +4,17 @@
 from __future__ import annotations
 
 import pkgutil
-from collections.abc import Iterator
 from importlib import import_module
 from typing import Final
 
 from pkm_twin.extensions import Extensible
 from pkm_twin.maps.kind import Kind
 
-
-def _list_builtin_kinds() -> Iterator[type[Kind]]:
-    for module in pkgutil.iter_modules(__path__):
-        for one in vars(import_module(f"{__name__}.{module.name}")).values():
-            if isinstance(one, type) and issubclass(one, Kind) and "name" in vars(one):
-                yield one
-
-
-BUILTIN_KINDS: Final = {kind.name: kind for kind in _list_builtin_kinds()}
+BUILTIN_KINDS: Final[dict[str, type[Kind]]] = {
+    one.name: one
+    for module in pkgutil.iter_modules(__path__)
+    for one in vars(import_module(f"{__name__}.{module.name}")).values()
+    if isinstance(one, type) and issubclass(one, Kind) and "name" in vars(one)
+}
 """This package's kinds of maps, by name."""
 KINDS: Final[Extensible[type[Kind]]] = Extensible("pkm_twin.maps", Kind, BUILTIN_KINDS, BUILTIN_KINDS.__getitem__)

@@ -96,7 +96,13 @@ class Workspace(Kind):
         if space.ticks and robot.grid().kind == "cylinder":
             low, high = space.ticks[robot.pose_names.index(robot.grid().height)][[0, -1]]
             heights = np.linspace(low, high, LAYERS)
-            result |= make_regular_variables(robot, heights, space.least, space.least_clearance)
+            radius = find_circle_radii(robot, heights, least=space.least, least_clearance=space.least_clearance)
+            best, unit = largest_cylinder(heights, radius), workspace_radius_unit(robot)
+            result |= make_circle_variables(robot, heights, radius) | {
+                "cylinder_low": scalar(best.low, "largest cylinder, low", "m"),
+                "cylinder_high": scalar(best.high, "largest cylinder, high", "m"),
+                "cylinder_radius": scalar(best.radius, "largest cylinder, radius", unit),
+            }
         return result
 
     @classmethod
@@ -151,17 +157,6 @@ class Workspace(Kind):
         for style, (x, y) in (("-", (sides, heights)), ("--", outline)):
             ax.plot(*((x, y) if names[1] == height else (y, x)), style, color="white", lw=1.2)
         return OVERLAY_CAPTION
-
-
-def make_regular_variables(robot: Robot, heights: Array, least: float, least_clearance: float) -> dict[str, Variable]:
-    """Return the largest circles about the axis at heights (n,), and the cylinder, for a file."""
-    radius = find_circle_radii(robot, heights, least=least, least_clearance=least_clearance)
-    best, unit = largest_cylinder(heights, radius), workspace_radius_unit(robot)
-    return make_circle_variables(robot, heights, radius) | {
-        "cylinder_low": scalar(best.low, "largest cylinder, low", "m"),
-        "cylinder_high": scalar(best.high, "largest cylinder, high", "m"),
-        "cylinder_radius": scalar(best.radius, "largest cylinder, radius", unit),
-    }
 
 
 def make_circle_variables(robot: Robot, heights: Array, radius: Array) -> dict[str, Variable]:
