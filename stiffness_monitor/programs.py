@@ -104,7 +104,7 @@ class Elastic:
         known = self._kernels.get(name)
         if known is None:
             numbers = np.array(list_numbers(self.structure), np.float64)
-            known = self._kernels[name] = self.robot.engine.kernel_with(
+            known = self._kernels[name] = self.robot.engine.kernel_with_inputs(
                 numbers, name, partial(self._write_program, write), self._key, free=free
             )
         return known

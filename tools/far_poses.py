@@ -25,7 +25,7 @@ ROOT: Final = Path(__file__).resolve().parents[1]
 VARIANTS: Final = 220
 POSES: Final = 30_000, 8_000
 """Numbers of poses for a file and for a random machine."""
-SAME_POSE: Final = 1e-6
+MAX_POSE_ROUNDING: Final = 1e-6
 """Largest difference of two poses that are one, lengths over the size."""
 
 
@@ -54,7 +54,7 @@ def judge_poses(robot: Robot, count: int, rng: np.random.Generator) -> Array:
     turns = np.array([unit == "rad" for unit in robot.pose_units])
     apart[:, turns] = 2.0 * np.sin(apart[:, turns] / 2.0)
     apart[:, ~turns] /= engine.tree.size
-    other = good & (np.abs(apart).max(1) > SAME_POSE)
+    other = good & (np.abs(apart).max(1) > MAX_POSE_ROUNDING)
     return np.array([count, accepted.sum(), other.sum(), (~good).sum()])
 
 

@@ -29,7 +29,7 @@ from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics import programs
 from pkm_twin.kinematics.motion import BaseMotion
 from pkm_twin.kinematics.posed import PlatformFirstScheme
-from pkm_twin.kinematics.programs import certify_assembly, follow_pose, pose_factors, solve_pose
+from pkm_twin.kinematics.programs import certify_assembly, iterate_pose, pose_factors, solve_pose
 from pkm_twin.kinematics.traced import Traced
 from pkm_twin.machine.inertia import ROTORS_PART, Layout, list_loaded_joints, make_frame_change
 from pkm_twin.robot.rejection import make_pivot_error
@@ -142,7 +142,7 @@ def evaluate_at_pose(robot: Robot, kernel: PoseKernel, p: Array, *given: ArrayLi
                 raise ValueError("an input in addition to the pose is not finite, or too large")
             index = tuple(int(k) for k in np.argwhere(left)[lost[0]])
             q = robot.inverse(rows[0][index])[robot.graph.leading]
-            raise make_pivot_error("pose", index, robot.engine.reach(q)[2])
+            raise make_pivot_error("pose", index, robot.engine.follow_line(q)[2])
         for values, new in zip(found, again, strict=True):
             values[left] = new
     return found
@@ -205,7 +205,7 @@ class _PoseDrivenMachine:
     def program(self, outputs: dict[str, Numbers], **inputs: int) -> Program:
         """Return the program; ``inputs``: sizes of those besides the pose."""
         t, posed = self.t, self.posed
-        branch = t.limit_growth(self.lead, t.drive_scales, t.pose_scales)
+        branch = t.pivot_margins(self.lead, t.drive_scales, t.pose_scales)
         certain = certify_assembly(t, self.scheme, posed, self.q) if self.certified else []
         return Program(
             {"pose": len(posed.q)} | inputs,
@@ -292,7 +292,7 @@ class _IteratedMachine:
 
     def __init__(self, t: Traced) -> None:
         self.t = t
-        self.equations, self.q = follow_pose(t, rates=True)
+        self.equations, self.q = iterate_pose(t, rates=True)
         self.layout = Layout(t.tree)
         self.parts = self.layout.split(t.tape.inputs(PARAMETERS, self.layout.size))
         self.lead = pose_factors(t)
@@ -328,14 +328,14 @@ def _write_pose_torques(t: Traced, scheme: PlatformFirstScheme | None, *, certif
         qd, drift = own.drift(rate)
         qdd = own.lead.solve(acceleration - drift)
         efforts, _ = efforts_of_motion(t, own.parts, qd, qdd)
-        return own.program(own.motion(qd, qdd) | {"tau": t.drives.shared(efforts, preload=True)}, **sizes)
+        return own.program(own.motion(qd, qdd) | {"tau": t.drives.distribute(efforts, preload=True)}, **sizes)
     made = _PoseDrivenMachine(t, scheme, certified=certified)
     # F_d = -J^-T (J_M' Q_M + sum of J_Hij' Q_Hij) - Q_S with J = dq/dX (equations 24 and 41); needed forces
     # are minus Q.
     f_d = made.lead.solve_transposed(made.forces(rate, acceleration))
     rates, changes = (made.joint(values) for values in (made.posed.u, made.posed.du))
     leads = add_friction_and_rotors(t, made.parts, f_d, made.q, rates, changes)[0]
-    tau = t.drives.shared(leads, preload=True)
+    tau = t.drives.distribute(leads, preload=True)
     return made.program({"q": made.q, "qd": rates, "qdd": changes, "tau": tau}, **sizes)
 
 
@@ -351,7 +351,7 @@ def _write_pose_masses(t: Traced, scheme: PlatformFirstScheme | None, *, certifi
         on_pose = made.masses()
         half = np.array([made.lead.solve_transposed(row) for row in on_pose], dtype=object).T
         mass = _complete_symmetric([made.lead.solve_transposed(row) for row in half])
-    return own.program({"matrix": t.drives.shared_on_both(mass), "on pose": np.ravel(on_pose)})
+    return own.program({"matrix": t.drives.distribute_matrix(mass), "on pose": np.ravel(on_pose)})
 
 
 def _write_pose_accelerations(t: Traced, scheme: PlatformFirstScheme | None, *, certified: bool) -> Program:

@@ -440,8 +440,8 @@ def _write_positions_and_wrenches(t: Traced) -> Program:
     t.solve()
     layout = Layout(t.tree)
     bodies, rods, gravity, *_, passive = layout.split(t.tape.inputs(PARAMETERS, layout.size))
-    t.set_rates(t.drives.given("qd"))
-    t.set_accelerations(t.drives.given("qdd"), BaseMotion.at_rest(gravity))
+    t.set_rates(t.drives.leading_inputs("qd"))
+    t.set_accelerations(t.drives.leading_inputs("qdd"), BaseMotion.at_rest(gravity))
     motion, graph = t.motion, t.graph
     forces = Forces(motion)
     # Rods are separate bodies here, so add only the other bodies.

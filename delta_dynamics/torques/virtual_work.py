@@ -416,8 +416,8 @@ def torque_program(t: Traced, *, on_bodies: bool = False, base: int = 0) -> Prog
     """
     layout, parts = solve_and_split(t)
     moving = t.tape.inputs("base", base) if base else None
-    leads, own = efforts_of_motion(t, parts, t.drives.given("qd"), t.drives.given("qdd"), moving)
-    efforts = t.drives.shared(leads, preload=True)
+    leads, own = efforts_of_motion(t, parts, t.drives.leading_inputs("qd"), t.drives.leading_inputs("qdd"), moving)
+    efforts = t.drives.distribute(leads, preload=True)
     if on_bodies:
         efforts = [effort - part for effort, part in zip(efforts, own, strict=True)]
     sizes = t.inputs("q", "qd", "qdd", wrench=6, **({"base": base} if base else {}))
@@ -426,7 +426,7 @@ def torque_program(t: Traced, *, on_bodies: bool = False, base: int = 0) -> Prog
 
 def _write_accelerations(t: Traced) -> Program:
     layout, parts = solve_and_split(t)
-    leads = solve_leading_accelerations(t, parts, t.drives.given("qd"), t.tape.inputs("tau", t.drives.count))
+    leads = solve_leading_accelerations(t, parts, t.drives.leading_inputs("qd"), t.tape.inputs("tau", t.drives.count))
     outputs = {"accelerations": t.lift(t.drives.drive_accelerations(leads, t.du))}
     sizes = t.inputs("q", "qd", "tau", wrench=6)
     return Program(sizes, layout.size, outputs, t.equations())
@@ -507,7 +507,7 @@ def mass_entries(t: Traced, parts: list[Objects], visit: Callable[[Forces], None
 def _write_mass_matrix(t: Traced) -> Program:
     layout, parts = solve_and_split(t)
     mass = np.reshape(mass_entries(t, parts), (t.joints, t.joints))
-    outputs = {"matrix": t.lift(t.drives.shared_on_both(mass))}
+    outputs = {"matrix": t.lift(t.drives.distribute_matrix(mass))}
     return Program(t.inputs("q"), layout.size, outputs, t.equations())
 
 
@@ -525,7 +525,7 @@ def potential(t: Traced, bodies: Objects, rods: Objects, gravity: Objects) -> An
 
 def _write_energy(t: Traced) -> Program:
     layout, (bodies, rods, gravity, *_, rotors, passive) = solve_and_split(t)
-    qd = t.drives.given("qd")
+    qd = t.drives.leading_inputs("qd")
     u = t.set_rates(qd)
     forces = Forces(t.motion)
     forces.momenta(bodies, rods)

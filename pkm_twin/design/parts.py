@@ -35,9 +35,9 @@ from pkm_twin.kinematics.constraints import (
     Equation,
     Placement,
     constraint_equations,
+    distance_equation,
     drive_equation,
-    keep_distance,
-    keep_pair,
+    rod_pair_equation,
     rotate,
 )
 from pkm_twin.kinematics.iterations import newton
@@ -252,7 +252,7 @@ class Assembly:
     def __init__(self, robot: Robot, q: Array) -> None:
         self.robot, self.graph, self.q = robot, robot.graph, q
         home = Placement.at_home(robot.graph, q.shape[:-1])
-        rotations, shifts = [home.turn(BASE)], [home.shift[..., 0, :]]
+        rotations, shifts = [home.body_rotation(BASE)], [home.shift[..., 0, :]]
         turned, origins = robot.placements(q)
         for name, rotation in turned.items():
             rotations.append(rotation)
@@ -283,7 +283,7 @@ class Assembly:
             if joint.virtual or (only is not None and joint.name not in only):
                 continue
             points = find_points(joint, ("inner", "outer"), (joint.at, joint.at))
-            inner, outer = placed.turn(joint.inner), placed.turn(joint.outer)
+            inner, outer = placed.body_rotation(joint.inner), placed.body_rotation(joint.outer)
             if ("tilt", joint.name) in errors:
                 inner = inner @ rotation_about(errors["tilt", joint.name])
             turns = partial(rotate, inner), partial(rotate, outer)
@@ -302,11 +302,11 @@ class Assembly:
             )
             length = errors.get(("length", rod.name), np.zeros(1))[..., 0]
             length = length + np.linalg.norm(rod.ends[1] - rod.ends[0])
-            found.append(keep_distance(rod.name, bodies, points, length**2, size))
+            found.append(distance_equation(rod.name, bodies, points, length**2, size))
             if rod.pair is not None:
-                first, second = (rotate(placed.turn(body), np.asarray(rod.pair)) for body in bodies)
+                first, second = (rotate(placed.body_rotation(body), np.asarray(rod.pair)) for body in bodies)
                 apart = np.linalg.norm(points[1] - points[0], axis=-1, keepdims=True)
-                found.append(keep_pair(rod.name, bodies, points, (first, second), apart))
+                found.append(rod_pair_equation(rod.name, bodies, points, (first, second), apart))
         return found
 
     # First-order effects of the errors.
@@ -322,7 +322,7 @@ class Assembly:
 
         :raises SingularityError: the rows do not determine the bodies.
         """
-        q, r = np.linalg.qr(self.placed.matrix(self._equations))
+        q, r = np.linalg.qr(self.placed.jacobian(self._equations))
         sizes = np.abs(np.diagonal(r, axis1=-2, axis2=-1))
         measure = sizes.min(-1) / sizes.max(-1)
         if not (measure > SINGULARITY_BOUND).all():
@@ -369,7 +369,7 @@ class Assembly:
         moved = moved + np.cross(turn, arm[..., None], axis=-2)
         for column, part in enumerate(parts):
             if ("origin", name) in part.effects:
-                moved[..., column] += placed.turn(name) @ part.effects["origin", name]
+                moved[..., column] += placed.body_rotation(name) @ part.effects["origin", name]
         return np.concatenate([moved, turn], -2), np.asarray(open_fraction, np.float64)
 
     # Effects of errors of any size.
@@ -412,7 +412,7 @@ class Assembly:
         if closed:
             name, origin = self.graph.platform, self.graph.origin
             there = placed.point(name, origin + errors.get(("origin", name), 0.0))
-            turn = placed.turn(name) @ start.turn(name).swapaxes(-1, -2)
+            turn = placed.body_rotation(name) @ start.body_rotation(name).swapaxes(-1, -2)
             moved = there - start.point(name, self.robot.graph.origin)
             return np.concatenate([moved, rotation_vector(turn)], -1)
         worst = int(np.abs(residuals(placed)[0]).max(-1).max(0).argmax())

@@ -30,7 +30,7 @@ from pkm_twin.codegen.program import (
 )
 from pkm_twin.export.c99 import Routine, Substitution
 from pkm_twin.export.c_package import Package
-from pkm_twin.kinematics.programs import SAME_POSE
+from pkm_twin.kinematics.programs import MAX_POSE_ROUNDING
 from pkm_twin.robot.robot import Robot
 
 FUNCTION_NAMES: Final = ("forward", "inverse", "jacobian", "torques", "joint_to_actuator", "actuator_to_joint", "gains")
@@ -143,7 +143,7 @@ def _call(inputs, equations, results, sizes):
     }}
     rounding = float(xp.finfo(zero.dtype).eps)
     # Rounding of two solutions of one state may be larger than the margins in double precision.
-    margin = min(0.0, {SAME_POSE!r} - 1e2 * rounding)
+    margin = min(0.0, {MAX_POSE_ROUNDING!r} - 1e2 * rounding)
     closed, residual = max({MAX_LAST_CORRECTION!r}, rounding**0.5) ** 2, max({MAX_RESIDUAL!r}, 1e3 * rounding) ** 2
     for target, goal, unknowns, home, origin, start, onward, correct, certain in equations:
         if goal is not None:

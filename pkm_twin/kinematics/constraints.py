@@ -21,10 +21,10 @@ from pkm_twin.machine.graph import BASE, Graph, Joint
 from pkm_twin.machine.joints import UNITS, Constraint, perpendicular_axes
 from pkm_twin.machine.rotations import rotation_about
 
-NONE: Final = np.zeros(3)
+ZERO_VECTOR: Final = np.zeros(3)
 Pair = tuple[Any, Any]
 """Something of the inner body, and the same of the outer body."""
-Turns = tuple[Callable[[Array], Any], Callable[[Array], Any]]
+Rotations = tuple[Callable[[Array], Any], Callable[[Array], Any]]
 """Functions from a vector fixed in the inner and in the outer body at home to the present one."""
 
 
@@ -51,7 +51,7 @@ class Equation(NamedTuple):
     @property
     def is_angular(self) -> bool:
         """True for an equation that constrains the orientation only."""
-        return self.force is NONE
+        return self.force is ZERO_VECTOR
 
 
 def dot(a: Any, b: Any) -> Any:
@@ -59,26 +59,26 @@ def dot(a: Any, b: Any) -> Any:
     return a @ b if a.ndim == b.ndim == 1 else (a * b).sum(-1)
 
 
-def keep_angle(part: str, bodies: tuple[str, str], points: Pair, vectors: Pair, known: Any) -> Equation:
+def angle_equation(part: str, bodies: tuple[str, str], points: Pair, vectors: Pair, known: Any) -> Equation:
     """Return the equation of a constant angle between a vector of each body.
 
     :param known: scalar product of the vectors.
     """
     inner, outer = vectors
-    return Equation(part, bodies, dot(inner, outer) - known, points, NONE, cross(outer, inner), 1.0)
+    return Equation(part, bodies, dot(inner, outer) - known, points, ZERO_VECTOR, cross(outer, inner), 1.0)
 
 
-def keep_distance(part: str, bodies: tuple[str, str], points: Pair, square: Any, size: Any) -> Equation:
+def distance_equation(part: str, bodies: tuple[str, str], points: Pair, square: Any, size: Any) -> Equation:
     """Return the equation of a rod (Delta-CU paper, equations 1 and 2).
 
     :param square: of the rod's length, m2. ``size``: of the machine, m.
     """
     apart = points[1] - points[0]
     value = 0.5 * (dot(apart, apart) - square)
-    return Equation(part, bodies, value, points, apart, NONE, 1.0 / (size * sqrt(square)))
+    return Equation(part, bodies, value, points, apart, ZERO_VECTOR, 1.0 / (size * sqrt(square)))
 
 
-def keep_pair(part: str, bodies: tuple[str, str], points: Pair, vectors: Pair, length: Any) -> Equation:
+def rod_pair_equation(part: str, bodies: tuple[str, str], points: Pair, vectors: Pair, length: Any) -> Equation:
     """Return the equation of two parallel rods of equal length.
 
     Their middle line is perpendicular to the difference of ``vectors``, the directions from rod to
@@ -86,11 +86,11 @@ def keep_pair(part: str, bodies: tuple[str, str], points: Pair, vectors: Pair, l
     """
     along = (points[1] - points[0]) * (1.0 / length)
     value = dot(along, vectors[1] - vectors[0])
-    return Equation(part, bodies, value, points, NONE, cross(vectors[1], along), 1.0)
+    return Equation(part, bodies, value, points, ZERO_VECTOR, cross(vectors[1], along), 1.0)
 
 
 def constraint_equations(
-    part: str, bodies: tuple[str, str], constraint: Constraint, points: Pair, turns: Turns, size: Any
+    part: str, bodies: tuple[str, str], constraint: Constraint, points: Pair, turns: Rotations, size: Any
 ) -> list[Equation]:
     """Return the equations of one constraint of a joint.
 
@@ -99,15 +99,17 @@ def constraint_equations(
     apart, scale = points[1] - points[0], 1.0 / size
     if constraint.kind == "point":
         # [()] makes an array of one expression that expression.
-        return [Equation(part, bodies, apart[..., i][()], points, unit, NONE, scale) for i, unit in enumerate(UNITS)]
+        return [
+            Equation(part, bodies, apart[..., i][()], points, unit, ZERO_VECTOR, scale) for i, unit in enumerate(UNITS)
+        ]
     inner = turns[0](constraint.inner)
     if constraint.kind == "angle":
         vectors = inner, turns[1](constraint.outer)
-        return [keep_angle(part, bodies, points, vectors, snapped(constraint.inner @ constraint.outer))]
+        return [angle_equation(part, bodies, points, vectors, snapped(constraint.inner @ constraint.outer))]
     # The inner body bears the force where the outer body's point is.
     there, along = (points[1], points[1]), dot(inner, apart)
     if constraint.kind == "plane":
-        return [Equation(part, bodies, along, there, inner, NONE, scale)]
+        return [Equation(part, bodies, along, there, inner, ZERO_VECTOR, scale)]
     mark = turns[1](constraint.outer)
     sine, cosine = dot(inner, cross(turns[0](constraint.outer), mark)), dot(turns[0](constraint.outer), mark)
     angle = np.arctan2(sine, cosine)
@@ -117,7 +119,7 @@ def constraint_equations(
     return [Equation(part, bodies, value, there, inner, -constraint.slide * inner, scale)]
 
 
-def drive_equation(joint: Joint, goal: Any, points: Pair, turns: Turns, size: Any) -> Equation:
+def drive_equation(joint: Joint, goal: Any, points: Pair, turns: Rotations, size: Any) -> Equation:
     """Return the equation of a joint of one freedom that is constraint.
 
     :param goal: its motion from home, rad or m, shape (...).
@@ -127,14 +129,14 @@ def drive_equation(joint: Joint, goal: Any, points: Pair, turns: Turns, size: An
         first, second = perpendicular_axes(joint.axes[0])
         goal = np.asarray(goal)[..., None]
         inner = turns[0](np.cos(goal) * second - np.sin(goal) * first)
-        return keep_angle(joint.name, bodies, points, (inner, turns[1](first)), 0.0)
+        return angle_equation(joint.name, bodies, points, (inner, turns[1](first)), 0.0)
     along = turns[0](joint.axes[0])
     value = dot(along, points[1] - points[0]) - goal
-    return Equation(joint.name, bodies, value, (points[1], points[1]), along, NONE, 1.0 / size)
+    return Equation(joint.name, bodies, value, (points[1], points[1]), along, ZERO_VECTOR, 1.0 / size)
 
 
 def rotate(rotation: Array, vectors: Array) -> Array:
-    """Return vectors, (3,) or (..., 3), rotated by matrices, (..., 3, 3)."""
+    """Return vectors, (3,) or (..., 3), rotated by closure_jacobians, (..., 3, 3)."""
     return np.asarray((rotation @ vectors[..., None])[..., 0], np.float64)
 
 
@@ -171,7 +173,7 @@ class Placement:
         k = self.index[body]
         return np.asarray(rotate(self.rotation[..., k, :, :], at) + self.shift[..., k, :], np.float64)
 
-    def turn(self, body: str) -> Array:
+    def body_rotation(self, body: str) -> Array:
         """Return a body's rotation from home, shape (..., 3, 3)."""
         return self.rotation[..., self.index[body], :, :]
 
@@ -189,7 +191,7 @@ class Placement:
         found = [np.broadcast_to(one.scale * one.value, shape) for one in equations]
         return np.stack(found, -1) if found else np.zeros((*shape, 0))
 
-    def matrix(self, equations: Sequence[Equation]) -> Array:
+    def jacobian(self, equations: Sequence[Equation]) -> Array:
         """Return their derivatives by the coordinates, shape (..., rows, 6 bodies)."""
         shape, rows = self.shift.shape[:-2], np.arange(len(equations))
         table = np.zeros((*shape, len(equations), len(self.index), 6))

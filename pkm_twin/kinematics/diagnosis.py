@@ -18,10 +18,10 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MobilityError, ParameterError
 from pkm_twin.kinematics.linkage import Linkage
 from pkm_twin.kinematics.rounding import repair_few
-from pkm_twin.kinematics.spins import MIN_MOTION, idle_bodies, null
+from pkm_twin.kinematics.spins import MIN_MOTION, find_idle_bodies, null_space
 from pkm_twin.machine.graph import Graph
 
-EXACT: Final = 1e-11
+MAX_COMPUTER_ROUNDING: Final = 1e-11
 """Deviations below this are the computer's rounding, rad or parts of the machine's size."""
 EVERYWHERE: Final = "where all loops close in every position"
 MAX_CAUSES: Final = 5
@@ -48,7 +48,7 @@ def mobility_error(linkage: Linkage, causes: Sequence[Deviation] = ()) -> Mobili
     """
     # Deviations take freedoms away; a machine with too many has lost none.
     lost = linkage.mobility.freedoms < linkage.joints
-    causes = causes or (near_conditions(linkage.graph) if lost else [])
+    causes = causes or (find_small_deviations(linkage.graph) if lost else [])
     texts = [c.text for c in causes[:MAX_CAUSES]]
     if len(causes) > MAX_CAUSES:
         texts.append(f"and {len(causes) - MAX_CAUSES} deviations more")
@@ -57,18 +57,18 @@ def mobility_error(linkage: Linkage, causes: Sequence[Deviation] = ()) -> Mobili
     graph = linkage.graph
     # What moves although the actuated joints are held: bodies that turn alone, and the rest.
     motion, ju = linkage.regular_state()
-    free = null(ju, MIN_MOTION)
+    free = null_space(ju, MIN_MOTION)
     if free.shape[1]:
-        spinning = [s for s in idle_bodies(graph, motion, free) if graph.platform not in s[0]]
+        spinning = [s for s in find_idle_bodies(graph, motion, free) if graph.platform not in s[0]]
         for bodies, _, _ in spinning:
             at = [j.name for j in graph.joints.values() if (j.inner in bodies) != (j.outer in bodies)]
             texts.append(f"{' with '.join(bodies)} can turn alone, at {' and '.join(at)}")
         ways = np.array([way for _, _, way in spinning]).reshape(-1, free.shape[1])
-        if names := _owners(linkage, free @ null(ways, MIN_MOTION)):
+        if names := _owners(linkage, free @ null_space(ways, MIN_MOTION)):
             texts.append(f"with the actuated joints held, {', '.join(names)} can move")
     # Actuated joints that cannot move, or only together.
     ju, jq = linkage.scaled_at_home()
-    moves = null(np.hstack([ju, jq]), MIN_MOTION)[ju.shape[1] :]
+    moves = null_space(np.hstack([ju, jq]), MIN_MOTION)[ju.shape[1] :]
     rank = int(np.linalg.matrix_rank(moves, MIN_MOTION)) if moves.size else 0
     if rank < linkage.joints:
         sizes = np.linalg.norm(moves, axis=1) if moves.size else np.zeros(linkage.joints)
@@ -79,11 +79,11 @@ def mobility_error(linkage: Linkage, causes: Sequence[Deviation] = ()) -> Mobili
     return MobilityError(linkage.joints, linkage.mobility.freedoms, texts)
 
 
-def singular_home(linkage: Linkage, rank: int, beside: int) -> ParameterError:
+def singular_home_error(linkage: Linkage, rank: int, beside: int) -> ParameterError:
     """Return the error of a singular home, with the joints that can move in it alone."""
     ju = linkage.regular_state()[1]
-    here = null(linkage.scaled_at_home()[0], MIN_MOTION)
-    there = null(ju, MIN_MOTION)
+    here = null_space(linkage.scaled_at_home()[0], MIN_MOTION)
+    there = null_space(ju, MIN_MOTION)
     # What is free at home and not beside it.
     extra = here - there @ (there.T @ here)
     names = _owners(linkage, extra) if here.shape[1] > there.shape[1] else list(linkage.graph.leads)
@@ -95,7 +95,7 @@ def singular_home(linkage: Linkage, rank: int, beside: int) -> ParameterError:
     )
 
 
-def near_conditions(graph: Graph, freedoms: int = 0) -> list[Deviation]:
+def find_small_deviations(graph: Graph, freedoms: int = 0) -> list[Deviation]:
     """Find deviations without which the machine has the mobility that the actuated joints need.
 
     :param freedoms: required degrees of freedom; 0: one for each actuated joint, which then
@@ -103,7 +103,7 @@ def near_conditions(graph: Graph, freedoms: int = 0) -> list[Deviation]:
     :returns: the fewest that are found, the largest first; empty if there are none.
     """
     repaired = repair_few(graph, freedoms or len(graph.leads))
-    if repaired is None or not is_right(repaired.graph, freedoms):
+    if repaired is None or not is_determined(repaired.graph, freedoms):
         return []
     found: list[Deviation] = []
     new = repaired.graph
@@ -114,7 +114,9 @@ def near_conditions(graph: Graph, freedoms: int = 0) -> list[Deviation]:
         for k, axis in enumerate(joint.axes):
             angle = float(np.linalg.norm(np.cross(axis, graph.joints[name].axes[k])))
             which = f"{name}'s axis" + (f" {k + 1}" if len(joint.axes) > 1 else "")
-            parallel = [o.name for o in others if float(np.linalg.norm(np.cross(axis, o.axes[0]))) < EXACT][:1]
+            parallel = [
+                o.name for o in others if float(np.linalg.norm(np.cross(axis, o.axes[0]))) < MAX_COMPUTER_ROUNDING
+            ][:1]
             goal = f"parallel to {parallel[0]}'s axis" if parallel else EVERYWHERE
             found.append(Deviation(f"{which} is {angle:.2g} rad from {goal}", (name, *parallel), angle, angle))
     points = [(f"{n}", n, new.joints[n].at - j.at) for n, j in graph.joints.items()]
@@ -127,11 +129,11 @@ def near_conditions(graph: Graph, freedoms: int = 0) -> list[Deviation]:
         gap = float(np.linalg.norm(change))
         text = f"{which} is {1e3 * gap:.3g} mm from {EVERYWHERE}"
         found.append(Deviation(text, (name,), gap, gap / graph.size))
-    found = [one for one in found if one.size > EXACT]
+    found = [one for one in found if one.size > MAX_COMPUTER_ROUNDING]
     return sorted(found, key=lambda one: -one.size)
 
 
-def is_right(graph: Graph | None, freedoms: int = 0) -> bool:
+def is_determined(graph: Graph | None, freedoms: int = 0) -> bool:
     """Return whether at home the actuated joints determine the machine and can all move.
 
     :param freedoms: if given, return whether the machine has as many degrees of freedom instead.
@@ -142,7 +144,7 @@ def is_right(graph: Graph | None, freedoms: int = 0) -> bool:
     if freedoms:
         return linkage.mobility.freedoms >= freedoms
     ju, _ = linkage.scaled_at_home()
-    return null(ju, MIN_MOTION).shape[1] == 0 and linkage.mobility.freedoms == linkage.joints
+    return null_space(ju, MIN_MOTION).shape[1] == 0 and linkage.mobility.freedoms == linkage.joints
 
 
 def _owners(linkage: Linkage, motions: Array) -> list[str]:

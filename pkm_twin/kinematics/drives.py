@@ -22,7 +22,7 @@ from pkm_twin.codegen.operations import absolute, cos, sin, sqrt
 
 LEADS: Final = "leads"
 """Name of the input of the leading drives, where ``q`` has those of all drives."""
-TIME: Final = 0.01
+TOLERANCE_TIME: Final = 0.01
 """Time that converts the tolerance of positions to that of rates, s."""
 
 
@@ -37,13 +37,13 @@ class Drives:
         self.count = len(self.graph.actuated)
         self.leading = self.graph.leading
         self.others = [k for k in range(self.count) if k not in self.leading]
-        self._given: dict[str, tuple[Objects, Objects]] = {}
+        self._inputs: dict[str, tuple[Objects, Objects]] = {}
         self._margins: list[Any] = []
 
-    def given(self, name: str) -> Objects:
+    def leading_inputs(self, name: str) -> Objects:
         """Return the inputs of the leading drives, shape (m,); those of the others are checked."""
         values = self.t.tape.inputs(name, self.count)
-        _, leads = self._given.setdefault(name, (values, values[self.leading]))
+        _, leads = self._inputs.setdefault(name, (values, values[self.leading]))
         return leads
 
     def variables(self, name: str) -> list[Any]:
@@ -53,9 +53,9 @@ class Drives:
             values[k] = lead if name == "q" else values[k]
         return values
 
-    def judge(self, name: str, leads: Numbers, rest: Numbers, time: float) -> None:
+    def check_dependent(self, name: str, leads: Numbers, rest: Numbers, time: float) -> None:
         """Check that the other drives' rates or accelerations follow from the leading ones'."""
-        values, own = self._given.get(name, ((), ()))
+        values, own = self._inputs.get(name, ((), ()))
         if own is leads:
             for k in self.others:
                 apart = rest[self.t.tree.drives[k].rate] - values[k]
@@ -109,7 +109,7 @@ class Drives:
         return [1.0 / (limit * limit) for limit in limits]
 
     @cached_property
-    def _root(self) -> SparseCholesky:
+    def _null_factors(self) -> SparseCholesky:
         """Factors of N W N'."""
         rows, lower = self.null_rows, {}
         for i, a in enumerate(rows):
@@ -118,7 +118,7 @@ class Drives:
                 lower[i, j] = sum((x * w * y for x, w, y in parts), 0.0)
         return SparseCholesky(lower, [lower[i, i] for i in range(len(rows))])
 
-    def shared(self, leads: Sequence[Any], *, preload: bool = False) -> list[Any]:
+    def distribute(self, leads: Sequence[Any], *, preload: bool = False) -> list[Any]:
         """Return efforts of all drives equivalent to ``leads`` of the leading ones, shape (n,).
 
         Relative to their limits they are the nearest to the preload, or the smallest.
@@ -132,15 +132,15 @@ class Drives:
         apart = [(a - p) * w for a, p, w in zip(efforts, wanted, self._weights, strict=True)]
         rows = self.null_rows
         sums = [sum((a * b for a, b in zip(row, apart, strict=True)), 0.0) for row in rows]
-        for amount, row in zip(self._root.solve(sums), rows, strict=True):
+        for amount, row in zip(self._null_factors.solve(sums), rows, strict=True):
             efforts = [effort - amount * value for effort, value in zip(efforts, row, strict=True)]
         return efforts
 
-    def shared_on_both(self, matrix: Objects) -> list[Any]:
+    def distribute_matrix(self, matrix: Objects) -> list[Any]:
         """Return the matrix from accelerations to efforts of all drives, (n n,) by row."""
         rows: Any = matrix.tolist()
         for _ in range(2):
-            rows = [self.shared(row) for row in zip(*rows, strict=True)]
+            rows = [self.distribute(row) for row in zip(*rows, strict=True)]
         return [value for row in rows for value in row]
 
     def leading_efforts(self, efforts: Sequence[Any]) -> list[Any]:
@@ -168,5 +168,7 @@ class Drives:
         """Return N with orthonormal rows, for efforts over their limits."""
         if not self.others:
             return []
-        columns = [self._root.forward(list(column)) for column in zip(*self.null_rows, strict=True)]
-        return [[column[i] * sqrt(inverse) for column in columns] for i, inverse in enumerate(self._root.inverses)]
+        columns = [self._null_factors.forward(list(column)) for column in zip(*self.null_rows, strict=True)]
+        return [
+            [column[i] * sqrt(inverse) for column in columns] for i, inverse in enumerate(self._null_factors.inverses)
+        ]

@@ -22,28 +22,28 @@ from pkm_twin.codegen.key import EMPTY, ProgramKey
 from pkm_twin.codegen.program import Program
 from pkm_twin.errors import ParameterError, SingularityError
 from pkm_twin.kinematics.iterations import newton, solve_damped
-from pkm_twin.kinematics.linkage import hold
+from pkm_twin.kinematics.linkage import keep_linkage
 from pkm_twin.kinematics.pose import Coordinate
 from pkm_twin.kinematics.posed import PlatformFirstScheme
 from pkm_twin.kinematics.programs import (
     POSE_WEIGHT,
     acceleration_program,
-    ahead_forward_program,
     body_jacobian_program,
     forward_program,
     inverse_program,
     jacobian_program,
+    newton_step_program,
     placement_program,
     quick_inverse_program,
-    walk_program,
+    reduced_forward_program,
 )
-from pkm_twin.kinematics.scheme import Scheme, Start
+from pkm_twin.kinematics.scheme import ClosedFormStart, Scheme
 from pkm_twin.kinematics.traced import NO_NUMBERS, Traced
 from pkm_twin.machine.graph import Graph
 
 MAX_GAP: Final = 1e-9
 """Largest residual of a closure that counts as satisfied, relative to the machine's size."""
-TO_THE_END: Final[Mapping[str, float]] = {"gain": math.inf, "tolerance": 0.0}
+WITHOUT_STOPPING: Final[Mapping[str, float]] = {"gain": math.inf, "tolerance": 0.0}
 """Options with which Newton's method takes all its steps, towards the least-squares residual."""
 
 
@@ -54,23 +54,23 @@ class Engine(Scheme):
     def _kernels(self) -> dict[str, Kernel]:
         return {}
 
-    def _walk(self, pose: Array, state: Array, step: Array) -> list[Array]:
+    def _newton_step(self, pose: Array, state: Array, step: Array) -> list[Array]:
         """Return residuals of closures and pose equations, their Jacobian, the state after a step."""
-        return self.kernel("walk", walk_program)(NO_NUMBERS, state, pose, step)[0]
+        return self.kernel("walk", newton_step_program)(NO_NUMBERS, state, pose, step)[0]
 
     def _evaluate_closures(self, q: Array, x: Array) -> tuple[Array, Array]:
         """Return the closures' dimensionless residuals and their Jacobian by the unknowns."""
         still = np.zeros(self.tree.unknown_rates + self.joints)
-        values, table, _ = self._walk(self.home_pose, np.concatenate([x, q]), still)
+        values, table, _ = self._newton_step(self.home_pose, np.concatenate([x, q]), still)
         k = len(self.parts)
         return values[:k], table.reshape(len(values), -1)[:k, : self.tree.unknown_rates]
 
     def _retract(self, q: Array, x: Array, step: Array) -> Array:
         """Return the unknowns after a step along their rates."""
         steps = np.concatenate([step, np.zeros(self.joints)])
-        return self._walk(self.home_pose, np.concatenate([x, q]), steps)[2][: len(x)]
+        return self._newton_step(self.home_pose, np.concatenate([x, q]), steps)[2][: len(x)]
 
-    def reach(self, q: Array, limit: float = 1.0, precision: float = 1e-4) -> tuple[float, Array, float]:
+    def follow_line(self, q: Array, limit: float = 1.0, precision: float = 1e-4) -> tuple[float, Array, float]:
         """Follow the straight line from home to q up to a singularity.
 
         :param limit: fraction of the line at which to stop.
@@ -93,16 +93,16 @@ class Engine(Scheme):
             x, done, least = new, way, min(least, measure)
         return done, x, least
 
-    def ending(self, q: Array, reached: float) -> tuple[str, float, float | None]:
+    def explain_end(self, q: Array, reached: float) -> tuple[str, float, float | None]:
         """Explain why no assembly is found beyond a fraction of the straight line from home to q.
 
         :returns: the joint or rod whose closure has the largest gap at q, the gap (m), and None;
             or, where an assembly exists behind a singularity, the closures' smallest reciprocal
             condition number on the line in place of None.
         """
-        _, x, least = self.reach(q, max(reached, 1e-12) + 1 / 8)
+        _, x, least = self.follow_line(q, max(reached, 1e-12) + 1 / 8)
         evaluate_closures = partial(self._evaluate_closures, q)
-        x, _ = newton(x, evaluate_closures, partial(self._retract, q), solve_damped, iterations=20, **TO_THE_END)
+        x, _ = newton(x, evaluate_closures, partial(self._retract, q), solve_damped, iterations=20, **WITHOUT_STOPPING)
         values = evaluate_closures(x)[0]
         if not np.isfinite(values).all():
             return self.parts[0], math.inf, None
@@ -117,7 +117,7 @@ class Engine(Scheme):
         s = np.linalg.svd(matrix, compute_uv=False)
         return float(np.linalg.slogdet(matrix)[0]), float(s[-1] / s[0]) if s.size and s[0] > 0.0 else 0.0
 
-    def shortest_pose(self, pose: Array) -> tuple[str, float, bool]:
+    def find_pose_gap(self, pose: Array) -> tuple[str, float, bool]:
         """Return the closure with the largest gap while the platform is fixed in a pose.
 
         :returns: its joint or rod, its gap, m, and whether all closures are satisfied in the pose:
@@ -129,14 +129,14 @@ class Engine(Scheme):
         still = np.zeros(self.tree.unknown_rates + self.joints)
 
         def evaluate_closures(state: Array) -> tuple[Array, Array]:
-            values, table, _ = self._walk(pose, state, still)
+            values, table, _ = self._newton_step(pose, state, still)
             return values, table.reshape(len(values), -1)
 
         def move(state: Array, step: Array) -> Array:
-            return self._walk(pose, state, step)[2]
+            return self._newton_step(pose, state, step)[2]
 
         home = np.array([*self.tree.home, *self.graph.lead_home], float)
-        state, _ = newton(home, evaluate_closures, move, solve_damped, iterations=40, **TO_THE_END)
+        state, _ = newton(home, evaluate_closures, move, solve_damped, iterations=40, **WITHOUT_STOPPING)
         values = evaluate_closures(state)[0]
         if not np.isfinite(values).all():
             return self.graph.platform, math.inf, False
@@ -157,11 +157,11 @@ class Engine(Scheme):
         """
         known = self._kernels.get(name)
         if known is None:
-            known = self.kernel_with(NO_NUMBERS, name, write, extra, free=free)
+            known = self.kernel_with_inputs(NO_NUMBERS, name, write, extra, free=free)
             self._kernels[name] = known
         return known
 
-    def kernel_with(
+    def kernel_with_inputs(
         self,
         more: Array,
         name: str,
@@ -177,17 +177,17 @@ class Engine(Scheme):
         """
         key = self.structure.also(f"{name} {extra}", write, Traced)
         numbers = np.concatenate([self.geometry, more])
-        made = Kernel(_code(key, self, write, more, free=free), numbers)
+        made = Kernel(_find_code(key, self, write, more, free=free), numbers)
         if not made.holds:
             # One of its constants has another value here: write a program for these values.
             exact = key.also(f"{self.graph.key} {more.tolist()}")
-            made = Kernel(_code(exact, self, write, more), numbers)
+            made = Kernel(_find_code(exact, self, write, more), numbers)
         return made
 
     @property
     def forward(self) -> Kernel:
         """Joint positions q to pose (m), position (3) and rotation (9) of the platform."""
-        return self.kernel("forward", ahead_forward_program, self._ahead_key)
+        return self.kernel("forward", reduced_forward_program, self._reduced_key)
 
     @property
     def jacobian(self) -> Kernel:
@@ -210,7 +210,7 @@ class Engine(Scheme):
         return scheme if all(n in scheme.tree.steps for n in self.graph.actuated) else None
 
     @cached_property
-    def ahead(self) -> PlatformFirstScheme | None:
+    def reduced(self) -> PlatformFirstScheme | None:
         """The machine with its platform placed first, if all limbs then have closed forms.
 
         Newton's method then has only the platform's coordinates as unknowns, and one or two scalar
@@ -219,15 +219,15 @@ class Engine(Scheme):
         a singularity of the pose coordinates these cannot be found from a pose, and only the
         machine's own tree detects that.
         """
-        if self.start is not None or not self.solved[1]:
+        if self.start is not None or not self.newton_unknowns[1]:
             return None
         if any(joint.virtual for joint in self.graph.joints.values()):
             return None
         try:
             scheme = PlatformFirstScheme(self, by_pose=False)
-            if any(c.place is None and not c.constrained for c in scheme.chain.carriers):
+            if any(c.pose_index is None and not c.constrained for c in scheme.chain.virtual_joints):
                 return None
-            fewer = len(scheme.solved[1]) < self.tree.unknown_rates
+            fewer = len(scheme.newton_unknowns[1]) < self.tree.unknown_rates
             return scheme if fewer and scheme.has_closed_limbs else None
         except (ParameterError, SingularityError):
             # A drive that alone connects the platform to the base cannot be placed after it.
@@ -243,12 +243,12 @@ class Engine(Scheme):
             key = f"{self.inverse_pivots}"
         else:
             key = f"{scheme.structure.text} {scheme.drive_pivots} {scheme.chain}"
-        key += self._ahead_key
+        key += self._reduced_key
         return self.kernel(name, partial(write, scheme=scheme), key)
 
     @property
-    def _ahead_key(self) -> str:
-        return self.ahead.structure.text if self.ahead is not None else ""
+    def _reduced_key(self) -> str:
+        return self.reduced.structure.text if self.reduced is not None else ""
 
     @property
     def inverse(self) -> Kernel:
@@ -298,17 +298,17 @@ _codes: Final[WeakValueDictionary[ProgramKey, Code]] = WeakValueDictionary()
 """Programs that are still referenced; machines of one structure share them."""
 
 
-def engine_of(graph: Graph, coordinates: Sequence[Coordinate], start: Start | None = None) -> Engine:
+def find_engine(graph: Graph, coordinates: Sequence[Coordinate], start: ClosedFormStart | None = None) -> Engine:
     """Return the engine of a geometry; machines that differ in inertia or limits alone share it."""
     key = EMPTY.also(f"{graph.key} {coordinates!r} {start!r}")
     engine = _engines.get(key)
     if engine is None:
         engine = _engines.setdefault(key, Engine(graph, coordinates, start=start))
-        hold(engine)
+        keep_linkage(engine)
     return engine
 
 
-def _code(
+def _find_code(
     key: ProgramKey,
     engine: Engine,
     write: Callable[[Traced], Program],

@@ -47,7 +47,7 @@ def pose_motion_gradient(engine: Engine) -> Kernel:
 
     def write(t: Traced) -> Program:
         t.solve()
-        qd, qdd = t.drives.given("qd"), t.drives.given("qdd")
+        qd, qdd = t.drives.leading_inputs("qd"), t.drives.leading_inputs("qdd")
         t.set_rates(qd)
         t.set_accelerations(qdd)
         motion, coordinates = t.motion, t.scheme.coordinates

@@ -15,7 +15,7 @@ from pkm_twin.codegen.arrays import Array
 
 S = TypeVar("S")
 
-RANK: Final = 1e-9
+RELATIVE_RANK_TOLERANCE: Final = 1e-9
 """Part of a matrix's largest singular value below which one counts as zero."""
 MAX_ITERATIONS: Final = 12
 MAX_STEP: Final = 0.2
@@ -26,7 +26,7 @@ MAX_VALUE: Final = 1e-9
 
 def solve_least_norm(table: Array, values: Array) -> Array:
     """Return the smallest step that cancels the values as far as their derivatives allow."""
-    return np.asarray(np.linalg.lstsq(table, -values, rcond=RANK)[0], np.float64)
+    return np.asarray(np.linalg.lstsq(table, -values, rcond=RELATIVE_RANK_TOLERANCE)[0], np.float64)
 
 
 def solve_damped(table: Array, values: Array) -> Array:

@@ -18,7 +18,7 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import Numbers, Objects, snapped, snapped_all
 from pkm_twin.codegen.operations import absolute, maximum, sqrt
-from pkm_twin.kinematics.motion import Columns, Motion, Row, difference
+from pkm_twin.kinematics.motion import Columns, Motion, Row, subtract_columns
 from pkm_twin.machine.graph import BASE
 from pkm_twin.machine.joints import UNITS
 from pkm_twin.machine.tree import Link, Step, Tree
@@ -82,9 +82,9 @@ class LimbPose:
             rod = graph.rods[limb.part]
             at, end = rod.ends if rod.inner == limb.tip else rod.ends[::-1]
             target = motion.point(limb.beyond, end)
-            self._reach(tree.links[limb.reach], at, target, end, square_of(end - at))
+            self._place_at_distance(tree.links[limb.reach], at, target, end, square_of(end - at))
             motion.place(limb.bodies, x, q)
-            self._keep_ends(limb, at, limb.beyond, target)
+            self._store_distance_ends(limb, at, limb.beyond, target)
             return
         at = graph.joints[limb.part].at
         top, last = tree.links[limb.turns[0]], tree.links[limb.turns[-1]]
@@ -96,16 +96,16 @@ class LimbPose:
         lever = home = snapped_all(last.axes.T @ (at - last.at))
         if limb.kind == "reach, turns":
             target = motion.point(limb.beyond, at)
-            square = self._square_between(limb, steps, lever, top.at, target)
-            self._reach(tree.links[limb.reach], top.at, target, at, square)
+            square = self._required_square(limb, steps, lever, top.at, target)
+            self._place_at_distance(tree.links[limb.reach], top.at, target, at, square)
             motion.place(before, x, q)
-            self._keep_ends(limb, top.at, limb.beyond, target)
+            self._store_distance_ends(limb, top.at, limb.beyond, target)
         elif limb.kind == "across":
             centre = motion.point(top.parent, top.at)
-            square = self._square_between(limb, steps, lever, at, centre)
-            self._reach(tree.links[limb.reach], at, centre, top.at, square)
+            square = self._required_square(limb, steps, lever, at, centre)
+            self._place_at_distance(tree.links[limb.reach], at, centre, top.at, square)
             motion.place(before, x, q)
-            self._keep_ends(limb, at, top.parent, centre)
+            self._store_distance_ends(limb, at, top.parent, centre)
             self.ends = self.ends[::-1]
             target = motion.point(limb.tip, at)
         else:
@@ -122,14 +122,14 @@ class LimbPose:
             square = square_of(apart)
             if len(steps) == 1:
                 square = square_of([*towards[:2], lever[2]])
-            self._solve_reach(link, at, local, top.at, square)
+            self._solve_distance(link, at, local, top.at, square)
             self.ends = (limb.beyond, target), (top.parent, centre)
         if limb.kind in ("turns", "turns, reach"):
             lever = Motion(tree, x, q, after, last.body).point(limb.tip, at)
         if len(steps) == 2:
-            self._turn_twice(steps, towards, lever, home)
+            self._rotate_lever_twice(steps, towards, lever, home)
         else:
-            self._turn(steps[0], towards, lever)
+            self._rotate_lever(steps[0], towards, lever)
         if len(steps) == 1:
             self.normal = parent @ steps[0].before[:, 2]
         for slide in (step for step in every if not step.turns):
@@ -137,15 +137,15 @@ class LimbPose:
             x[slide.position] = slide.sign * (towards[2] - lever[2]) / slide.slide
         if limb.spin:
             motion.place(beyond[:-1], x, q)
-            self._spin(limb)
+            self._solve_spin(limb)
         motion.place(beyond[-1:] if limb.spin else beyond, x, q)
         ends = (top.parent, limb.beyond), (apart, target)
         if limb.leaves and limb.kind == "turns":
-            self.rows.append(self._distance(limb, *ends, square_of(lever[: 2 if len(steps) == 1 else 3])))
+            self.rows.append(self._distance_row(limb, *ends, square_of(lever[: 2 if len(steps) == 1 else 3])))
         if limb.leaves > len(self.rows):
-            self.rows.append(self._plane(limb, *ends, lever[2]))
+            self.rows.append(self._plane_row(limb, *ends, lever[2]))
 
-    def _keep_ends(self, limb: Limb, moved: Array, body: str, target: Objects) -> None:
+    def _store_distance_ends(self, limb: Limb, moved: Array, body: str, target: Objects) -> None:
         """Keep the ends of the distance that the reach sets: carried by its parent, and given."""
         place = self.motion.point(limb.reach, moved)
         self.ends = (body, target), (self.tree.links[limb.reach].parent, place)
@@ -155,21 +155,21 @@ class LimbPose:
     def reach_rates(self) -> Columns:
         """Return the rate of the reach by the rates of the bodies at the limb's ends.
 
-        The distance is set by the reach: slope rate = distance vector . difference of velocities. In
+        The distance is set by the reach: slope rate = distance vector . subtract_columns of velocities. In
         the plane of a turn, both are velocities at one place, relative to the carrier of the plane.
         """
         (body, target), (carrier, place) = self.ends
         vector = target - place
         if self.normal is not None:
-            vector, place = _across(vector, self.normal), target
+            vector, place = _remove_component(vector, self.normal), target
         vector = vector / self.slope
         moving = (
             self.motion.linear_jacobian(body, target),
             self.motion.linear_jacobian(carrier, place),
         )
-        return {key: column @ vector for key, column in difference(*moving).items()}
+        return {key: column @ vector for key, column in subtract_columns(*moving).items()}
 
-    def _square_between(self, limb: Limb, steps: Sequence[Step], lever: Numbers, moved: Array, target: Numbers) -> Any:
+    def _required_square(self, limb: Limb, steps: Sequence[Step], lever: Numbers, moved: Array, target: Numbers) -> Any:
         """Return the square of the distance that the reach has to set.
 
         A single turn keeps out of its plane what is there.
@@ -184,13 +184,13 @@ class LimbPose:
         gap = normal @ (np.asarray(target) - motion.origin[link.parent] - turned @ own)
         return square_of([*lever[:2], gap])
 
-    def _reach(self, link: Link, point: Array, target: Numbers, goal: Array, square: Any) -> None:
+    def _place_at_distance(self, link: Link, point: Array, target: Numbers, goal: Array, square: Any) -> None:
         """Bring a body's point to a distance from a target; ``goal`` is the target at home."""
         turned, origin = self.motion.rotation[link.parent], self.motion.origin[link.parent]
         local = turned.T @ (np.asarray(target) - origin) - link.arm
-        self._solve_reach(link, point, local, goal, square)
+        self._solve_distance(link, point, local, goal, square)
 
-    def _solve_reach(self, link: Link, point: Array, local: Numbers, goal: Array, square: Any) -> None:
+    def _solve_distance(self, link: Link, point: Array, local: Numbers, goal: Array, square: Any) -> None:
         """Find the one step of a body by |point - target|^2 = square.
 
         :param local: the target from the joint, in axes of the parent. ``goal``: it at home.
@@ -203,7 +203,7 @@ class LimbPose:
             a, c = v[0] * w[0] + v[1] * w[1], v[0] * w[1] - v[1] * w[0]
             c_home = v[0] * w_home[1] - v[1] * w_home[0]
             d = 0.5 * (square_of(v[:2]) + square_of(w[:2]) + (v[2] - w[2]) ** 2 - square)
-            root, side = self._turn_to(step, a, c, d, c_home, square)
+            root, side = self._solve_angle(step, a, c, d, c_home, square)
             scale = sqrt(square_of(v[:2]) * square_of(w_home[:2]))
             self.slope = step.sign * side
         else:
@@ -214,7 +214,7 @@ class LimbPose:
             length, h = square_of(e), e @ d
             free = h * h - (square_of(d) - square) * length
             if self.closest and not free > 0.0:
-                self._fall_short(sqrt(square - free / length) - sqrt(square))
+                self._record_miss(sqrt(square - free / length) - sqrt(square))
                 free = 0.0
             root = sqrt(free)
             self.slope = sign_of(e @ d_home) * root
@@ -222,20 +222,20 @@ class LimbPose:
             scale = sqrt(square_of(d_home) * length)
         self.slopes.append((root, scale))
 
-    def _turn_to(self, step: Step, a: Any, b: Any, d: Any, b_home: Any, square: Any) -> tuple[Any, Any]:
+    def _solve_angle(self, step: Step, a: Any, b: Any, d: Any, b_home: Any, square: Any) -> tuple[Any, Any]:
         """Turn a step from home until a cos + b sin = d, on the side where home is.
 
-        :param b_home: b at home, where the turn is none. ``square``: as of :meth:`_limit_turn`.
+        :param b_home: b at home, where the turn is none. ``square``: as of :meth:`_clamp_to_range`.
         :returns: the root sqrt(a^2 + b^2 - d^2), and a sin - b cos: the root with its sign.
         """
         n = a * a + b * b
-        d, root = self._limit_turn(d, n, square)
+        d, root = self._clamp_to_range(d, n, square)
         side = -sign_of(b_home) * root
         self.x[step.position] = (a * d - b * side) / n
         self.x[step.position + 1] = step.sign * ((b * d + a * side) / n)
         return root, side
 
-    def _limit_turn(self, d: Any, n: Any, square: Any) -> tuple[Any, Any]:
+    def _clamp_to_range(self, d: Any, n: Any, square: Any) -> tuple[Any, Any]:
         """Limit d to the range of a cos + c sin; return it and sqrt(n - d^2).
 
         :param n: a^2 + c^2. ``square``: squared distance, which decreases by 2 d; 0: d is a
@@ -244,21 +244,21 @@ class LimbPose:
         if self.closest and not n > d * d:
             nearest = sqrt(n) * sign_of(d)
             most = sqrt(maximum(square + 2.0 * (d - nearest), 0.0)) - sqrt(square)
-            self._fall_short(absolute(most if square else d - nearest))
+            self._record_miss(absolute(most if square else d - nearest))
             return nearest, 0.0
         return d, sqrt(n - d * d)
 
-    def _fall_short(self, miss: Any) -> None:
+    def _record_miss(self, miss: Any) -> None:
         self.miss = max(self.miss, float(miss))
 
-    def _turn(self, step: Step, towards: Numbers, lever: Numbers) -> None:
+    def _rotate_lever(self, step: Step, towards: Numbers, lever: Numbers) -> None:
         """Turn a lever about an axis z into the direction of a vector."""
         x, y, n = lever[0], lever[1], square_of(lever[:2])
         self.levers.append((sqrt(n), self.tree.size))
         self.x[step.position] = (x * towards[0] + y * towards[1]) / n
         self.x[step.position + 1] = step.sign * ((x * towards[1] - y * towards[0]) / n)
 
-    def _turn_twice(self, steps: Sequence[Step], towards: Numbers, lever: Numbers, home: Numbers) -> None:
+    def _rotate_lever_twice(self, steps: Sequence[Step], towards: Numbers, lever: Numbers, home: Numbers) -> None:
         """Turn a lever about two axes that cross to a vector of its length.
 
         :param towards: the vector in axes of the first turn. ``home``: the lever at home.
@@ -268,14 +268,14 @@ class LimbPose:
         m = second.before[2]
         a, b = m[0] * x + m[1] * y, m[1] * x - m[0] * y
         c = towards[2] - m[2] * z
-        root, _ = self._turn_to(second, a, b, c, m[1] * home[0] - m[0] * home[1], 0.0)
+        root, _ = self._solve_angle(second, a, b, c, m[1] * home[0] - m[0] * home[1], 0.0)
         cosine = self.x[second.position]
         sine = second.sign * self.x[second.position + 1]
         turned = [cosine * x - sine * y, sine * x + cosine * y, z]
-        self._turn(first, towards, second.before @ np.array(turned, dtype=object))
+        self._rotate_lever(first, towards, second.before @ np.array(turned, dtype=object))
         self.slopes.append((root, sqrt(square_of(lever))))
 
-    def _spin(self, limb: Limb) -> None:
+    def _solve_spin(self, limb: Limb) -> None:
         """Turn a body about its line to the closing joint, whose axes keep their angle."""
         link, joint = self.tree.links[limb.spin], self.motion.graph.joints[limb.part]
         (step,), (constraint,) = link.steps, (c for c in joint.constraints if c.kind == "angle")
@@ -287,10 +287,10 @@ class LimbPose:
         home = snapped_all(step.before.T @ (self.tree.axes[link.parent].T @ other))
         a, b = v[0] * u[0] + v[1] * u[1], v[0] * u[1] - v[1] * u[0]
         d = snapped(mine @ other) - v[2] * u[2]
-        root, _ = self._turn_to(step, a, b, d, v[0] * home[1] - v[1] * home[0], 0.0)
+        root, _ = self._solve_angle(step, a, b, d, v[0] * home[1] - v[1] * home[0], 0.0)
         self.slopes.append((root, 1.0))
 
-    def _distance(self, limb: Limb, bodies: tuple[str, str], ends: tuple[Objects, Objects], square: Any) -> Row:
+    def _distance_row(self, limb: Limb, bodies: tuple[str, str], ends: tuple[Objects, Objects], square: Any) -> Row:
         """Return the closure by which a point keeps its distance from the turns' centre.
 
         Of a single turn, in its plane.
@@ -298,20 +298,20 @@ class LimbPose:
         :param bodies: the turns' parent, and the point's. ``ends``: the point from the centre, and
             from the origin. ``square``: of the distance.
         """
-        apart = ends[0] if self.normal is None else _across(ends[0], self.normal)
+        apart = ends[0] if self.normal is None else _remove_component(ends[0], self.normal)
         scale = 1.0 / (self.tree.size * sqrt(square))
         value = 0.5 * (apart @ apart - square)
-        return self._row(limb, bodies, ends[1], apart, value, scale)
+        return self._point_row(limb, bodies, ends[1], apart, value, scale)
 
-    def _plane(self, limb: Limb, bodies: tuple[str, str], ends: tuple[Objects, Objects], height: Any) -> Row:
+    def _plane_row(self, limb: Limb, bodies: tuple[str, str], ends: tuple[Objects, Objects], height: Any) -> Row:
         """Return the closure by which a point stays in the plane of a turn; see above.
 
         :param height: of the plane above the centre.
         """
         value = self.normal @ ends[0] - height
-        return self._row(limb, bodies, ends[1], self.normal, value, 1.0 / self.tree.size)
+        return self._point_row(limb, bodies, ends[1], self.normal, value, 1.0 / self.tree.size)
 
-    def _row(
+    def _point_row(
         self,
         limb: Limb,
         bodies: tuple[str, str],
@@ -323,7 +323,7 @@ class LimbPose:
         """Return a closure along a vector fixed in the turns' parent, at a point's place."""
         inner, outer = bodies
         moving = (self.motion.linear_jacobian(body, place) for body in (outer, inner))
-        columns = {k: column @ along for k, column in difference(*moving).items()}
+        columns = {k: column @ along for k, column in subtract_columns(*moving).items()}
         return Row(limb.part, value, columns, scale)
 
 
@@ -332,7 +332,7 @@ def square_of(vector: Numbers) -> Any:
     return sum((value * value for value in vector), 0.0)
 
 
-def _across(vector: Objects, normal: Objects) -> Objects:
+def _remove_component(vector: Objects, normal: Objects) -> Objects:
     """Return the part of a vector across a unit vector."""
     part: Objects = vector - normal * (normal @ vector)
     return part

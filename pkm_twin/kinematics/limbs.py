@@ -21,10 +21,10 @@ from pkm_twin.machine.tree import Link, Step, Tree
 MIN_LEVER: Final = 1e-2
 """Least lever of a limb's turns and least slope of its reach at home, of unit one: at a lever of 0
 the limb is singular, and nearby the closed form loses digits."""
-MIN_SLOPE: Final = 1e-4
+MIN_REMAINING_SINGULAR_VALUE: Final = 1e-4
 """Least singular value, of unit one, of the equations that closed limbs leave to Newton's method:
 a limb about one point leaves a distance that nothing changes."""
-SAME_STATE: Final = 1e-9
+MAX_CLOSED_FORM_ERROR: Final = 1e-9
 """Largest difference of a sampled state and its closed form: rounding, amplified near a
 singularity of the limb. Another solution differs by much more."""
 
@@ -60,7 +60,7 @@ class Closures(Protocol):
     def at(self, x: Numbers, q: Numbers) -> tuple[Motion, list[Row]]:
         """Return motion and closures in a state."""
 
-    def scaled(self, rows: Sequence[Row]) -> tuple[Array, Array]:
+    def scaled_jacobians(self, rows: Sequence[Row]) -> tuple[Array, Array]:
         """Return derivatives of closures by u and by qd, of unit one."""
 
 
@@ -90,7 +90,7 @@ def find_hanging_limbs(scheme: Closures) -> tuple[Limb, ...]:
             driven = all(step.actuated for b in bodies if b != root for step in tree.links[b].steps)
             limb = Limb("turns", name, tip, beyond, bodies, "", (root,), rows, 1)
             apart = graph.platform not in inside and beyond not in inside
-            if alone and driven and apart and _is_regular(scheme, limb):
+            if alone and driven and apart and _is_regular_at_home(scheme, limb):
                 found.append(limb)
                 break
     return tuple(found)
@@ -109,7 +109,7 @@ def _find_root(tree: Tree, tip: str) -> str | None:
     return None
 
 
-def _is_regular(scheme: Closures, limb: Limb) -> bool:
+def _is_regular_at_home(scheme: Closures, limb: Limb) -> bool:
     """Return whether home is far from where the limb is singular."""
     x, q = scheme.samples[0]
     pose = _solve_sample(scheme, limb, x, q)
@@ -132,7 +132,7 @@ def _solve_sample(scheme: Closures, limb: Limb, x: Numbers, q: Numbers) -> LimbP
         return LimbPose(motion, limb, given, q)
 
 
-def order_closed(scheme: Closures) -> tuple[str | Limb, ...]:
+def order_bodies(scheme: Closures) -> tuple[str | Limb, ...]:
     """Return a tree's bodies in an order of placing, with limbs in closed form where possible.
 
     Of the others first come bodies on the way to the platform; those that no actuated joint places
@@ -142,16 +142,16 @@ def order_closed(scheme: Closures) -> tuple[str | Limb, ...]:
     barred: set[Limb] = set()
     links = scheme.tree.links
     while True:
-        order, varying = _order_once(scheme, barred)
+        order, varying = _order_bodies_without(scheme, barred)
         limbs = [entry for entry in order if isinstance(entry, Limb)]
-        rates = _rates_of_newton(scheme, order)
+        rates = _newton_rates(scheme, order)
         faulty = {
             limb
             for limb in limbs
             if varying & set(limb.bodies)
             and rates.intersection(step.rate for body in limb.bodies for step in links[body].steps if not step.actuated)
         }
-        if not faulty and not _is_regular_for_newton(scheme, order):
+        if not faulty and not _is_newton_regular(scheme, order):
             # What these limbs leave to other joints does not determine them.
             faulty = {limb for limb in limbs if limb.leaves}
         if not faulty:
@@ -159,32 +159,32 @@ def order_closed(scheme: Closures) -> tuple[str | Limb, ...]:
         barred |= faulty
 
 
-def _is_regular_for_newton(scheme: Closures, order: Sequence[str | Limb]) -> bool:
+def _is_newton_regular(scheme: Closures, order: Sequence[str | Limb]) -> bool:
     """Return whether the equations of Newton's method determine its unknowns at home."""
     x, q = scheme.samples[0]
     limbs = [entry for entry in order if isinstance(entry, Limb)]
-    rows, links = _rows_of_newton(scheme, order, x, q), scheme.tree.links
+    rows, links = _newton_rows(scheme, order, x, q), scheme.tree.links
     found = {step.rate for limb in limbs for body in limb.bodies for step in links[body].steps if not step.actuated}
     rates = [rate for rate in scheme.varying if rate not in found]
-    table = scheme.scaled(rows)[0][:, rates]
+    table = scheme.scaled_jacobians(rows)[0][:, rates]
     sizes = np.linalg.svd(table, compute_uv=False)
-    return len(rows) == len(rates) and (not rates or bool(sizes[-1] > MIN_SLOPE))
+    return len(rows) == len(rates) and (not rates or bool(sizes[-1] > MIN_REMAINING_SINGULAR_VALUE))
 
 
-def _rates_of_newton(scheme: Closures, order: Sequence[str | Limb]) -> set[int]:
+def _newton_rates(scheme: Closures, order: Sequence[str | Limb]) -> set[int]:
     """Return the unknown rates that the equations of Newton's method depend on near home."""
     found: set[int] = set()
     for x, q in scheme.samples:
-        for row in _rows_of_newton(scheme, order, x, q):
+        for row in _newton_rows(scheme, order, x, q):
             found |= {
                 rate
                 for (kind, rate), value in row.columns.items()
-                if kind == "u" and abs(value) * row.scale > SAME_STATE * scheme.tree.scales[rate]
+                if kind == "u" and abs(value) * row.scale > MAX_CLOSED_FORM_ERROR * scheme.tree.scales[rate]
             }
     return found
 
 
-def _rows_of_newton(scheme: Closures, order: Sequence[str | Limb], x: Numbers, q: Numbers) -> list[Row]:
+def _newton_rows(scheme: Closures, order: Sequence[str | Limb], x: Numbers, q: Numbers) -> list[Row]:
     """Return the closures that no limb solves, and those that limbs leave, in a state."""
     solved = {k for entry in order if isinstance(entry, Limb) for k in entry.rows}
     motion, poses = place_in_order(scheme.tree, order, np.array(x, dtype=object), q)
@@ -193,7 +193,7 @@ def _rows_of_newton(scheme: Closures, order: Sequence[str | Limb], x: Numbers, q
     return rows + [row for pose in poses for row in pose.rows]
 
 
-def _order_once(scheme: Closures, barred: Collection[Limb]) -> tuple[tuple[str | Limb, ...], set[str]]:
+def _order_bodies_without(scheme: Closures, barred: Collection[Limb]) -> tuple[tuple[str | Limb, ...], set[str]]:
     """Return an order of placing without some limbs, and the bodies that vary with x."""
     tree = scheme.tree
     order: list[str | Limb] = []
@@ -203,7 +203,9 @@ def _order_once(scheme: Closures, barred: Collection[Limb]) -> tuple[tuple[str |
     while len(placed) <= len(tree.links):
         ready = [b for b in wanted if b not in placed and tree.links[b].parent in placed]
         driven = [b for b in ready if not any(scheme.varies(step) for step in tree.links[b].steps)]
-        found = (limb for limb in _find_candidates(scheme, placed) if limb not in barred and _is_closed(scheme, limb))
+        found = (
+            limb for limb in _find_candidates(scheme, placed) if limb not in barred and _closed_form_holds(scheme, limb)
+        )
         limb = None if driven else next(found, None)
         if limb is None:
             body = (driven or ready)[0]
@@ -237,14 +239,14 @@ def _find_candidates(scheme: Closures, placed: Collection[str]) -> Iterator[Limb
             if any(scheme.is_constrained(step) for link in links for step in link.steps):
                 continue
             bodies = tuple(body for body in tree.links if body in (*low, *high))
-            steps, tops = ([s for b in ends for s in _main_steps(tree.links[b])] for ends in (low, high))
+            steps, tops = ([s for b in ends for s in _independent_steps(tree.links[b])] for ends in (low, high))
             passive = [step for link in links for step in link.steps if not step.actuated]
             left = len(rows) - len(passive)
             if not bodies or not all(s.circle or (s.slide and not s.turns) for s in steps + tops):
                 continue
             drives = any(step.actuated for link in links for step in link.steps)
             owner = {id(step): link.body for link in links for step in link.steps}
-            for kind, reach, turns, spins in _split(steps, tops, rod=rod):
+            for kind, reach, turns, spins in _classify_limb(steps, tops, rod=rod):
                 spins_alone = len(links[len(low) - 1].steps) == 1 and not rod and cut.kind == "universal"
                 if reach is not None and len(tree.links[owner[id(reach)]].steps) > 1:
                     continue
@@ -272,14 +274,14 @@ def _find_candidates(scheme: Closures, placed: Collection[str]) -> Iterator[Limb
                     )
 
 
-def _main_steps(link: Link) -> Sequence[Step]:
+def _independent_steps(link: Link) -> Sequence[Step]:
     """Return a link's passive steps; of a cylindrical joint the turn, which its slide follows."""
     turns = [step for step in link.steps if step.turns]
     main = turns if len(turns) == 1 and len(link.steps) == 2 else link.steps
     return [step for step in main if not step.actuated]
 
 
-def _split(
+def _classify_limb(
     steps: Sequence[Step], tops: Sequence[Step], *, rod: bool
 ) -> Iterator[tuple[str, Step | None, Sequence[Step], bool]]:
     """Yield the kinds that a limb may have, its reach, its turns, and whether its tip spins.
@@ -308,17 +310,17 @@ def _split(
         yield "turns, reach", steps[-1], steps[:-1], False
 
 
-def _is_closed(scheme: Closures, limb: Limb) -> bool:
+def _closed_form_holds(scheme: Closures, limb: Limb) -> bool:
     """Return whether the closed form gives the sampled states, far from singular at home."""
     tree = scheme.tree
     steps = [step for body in limb.bodies for step in tree.links[body].steps]
-    if not _is_regular(scheme, limb):
+    if not _is_regular_at_home(scheme, limb):
         return False
     for x, q in scheme.samples:
         pose = _solve_sample(scheme, limb, x, q)
         difference = numbers(pose.x) - np.array(x, float)
         difference[[step.position for step in steps if not step.turns]] /= tree.size
         rest = [row.scale * float(row.value) for row in pose.rows]
-        if not (np.abs([*difference, *rest]) < SAME_STATE).all():
+        if not (np.abs([*difference, *rest]) < MAX_CLOSED_FORM_ERROR).all():
             return False
     return True

@@ -14,14 +14,14 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import Numbers
-from pkm_twin.kinematics.iterations import RANK, newton
-from pkm_twin.kinematics.motion import Motion, Row, matrices, numbers
+from pkm_twin.kinematics.iterations import RELATIVE_RANK_TOLERANCE, newton
+from pkm_twin.kinematics.motion import Motion, Row, closure_jacobians, numbers
 from pkm_twin.machine.graph import Graph
 from pkm_twin.machine.tree import Tree
 
 SAMPLES: Final = 6
 """States around home, besides home, in which pivots must not be small."""
-REACH: Final = 0.6
+SAMPLE_RADIUS: Final = 0.6
 """Largest distance of samples from home, rad or half the size: far enough to show small pivots."""
 
 
@@ -57,9 +57,9 @@ class Linkage:
         motion = Motion(self.tree, x, q)
         return motion, motion.closures()
 
-    def scaled(self, rows: Sequence[Row]) -> tuple[Array, Array]:
+    def scaled_jacobians(self, rows: Sequence[Row]) -> tuple[Array, Array]:
         """Return the dimensionless derivatives of closures by u and by qd."""
-        ju, jq = (numbers(m) for m in matrices(self.tree, rows))
+        ju, jq = (numbers(m) for m in closure_jacobians(self.tree, rows))
         left = np.array([row.scale for row in rows]).reshape(-1, 1)
         drives = np.array([self.drive_scale(name) for name in self.graph.leads])
         return left * ju / np.array(self.tree.scales), left * jq / drives
@@ -75,10 +75,10 @@ class Linkage:
         def evaluate_closures(x: Numbers) -> tuple[Array, Array]:
             _, rows = self.at(x, q)
             values = np.array([row.scale * float(row.value) for row in rows])
-            return values, self.scaled(rows)[0]
+            return values, self.scaled_jacobians(rows)[0]
 
         def move(x: Numbers, step: Array) -> Array:
-            return np.array(Motion(self.tree, x, q).retracted(x, step / scales), float)
+            return np.array(Motion(self.tree, x, q).retract(x, step / scales), float)
 
         x = np.array(self.tree.home if start is None else start, float)
         if not self.at(x, q)[1]:
@@ -94,11 +94,11 @@ class Linkage:
         if first is not self:
             return first.samples
         # Loading a machine builds two linkages, before and after the choice of pose coordinates.
-        hold(self)
+        keep_linkage(self)
         states = [(np.array(self.tree.home, float), home)]
         random = np.random.default_rng(0)
         slides = np.array([graph.joints[name].slides for name in graph.leads])
-        reach = np.where(slides, self.tree.size / 2, 1.0) * REACH
+        reach = np.where(slides, self.tree.size / 2, 1.0) * SAMPLE_RADIUS
         for _ in range(4 * SAMPLES):
             if len(states) > SAMPLES:
                 break
@@ -115,7 +115,7 @@ class Linkage:
     @cached_property
     def _sampled_jacobians(self) -> tuple[Array, Array]:
         """Dimensionless derivatives of closures by u and qd at the samples, (k, rows, ...)."""
-        pairs = [self.scaled(self.at(x, q)[1]) for x, q in self.samples]
+        pairs = [self.scaled_jacobians(self.at(x, q)[1]) for x, q in self.samples]
         return np.array([a for a, _ in pairs]), np.array([b for _, b in pairs])
 
     @cached_property
@@ -125,19 +125,19 @@ class Linkage:
 
     def scaled_at_home(self) -> tuple[Array, Array]:
         """Return the scaled derivatives of the closures at home by u and by qd."""
-        return self.scaled(self.at(self.tree.home, self.graph.lead_home)[1])
+        return self.scaled_jacobians(self.at(self.tree.home, self.graph.lead_home)[1])
 
     def regular_state(self) -> tuple[Motion, Array]:
         """Return a sampled state of the highest rank, and the scaled derivatives by u there."""
-        k = int(np.argmax([rank_of(ju) for ju in self._sampled_jacobians[0]]))
+        k = int(np.argmax([count_rank(ju) for ju in self._sampled_jacobians[0]]))
         return self.at(*self.samples[k])[0], np.asarray(self._sampled_jacobians[0][k], np.float64)
 
     @cached_property
     def mobility(self) -> Mobility:
         """Freedoms, rank and redundancy at home."""
         _, rows = self.at(self.tree.home, self.graph.lead_home)
-        both = np.hstack(self.scaled(rows))
-        rank = rank_of(both)
+        both = np.hstack(self.scaled_jacobians(rows))
+        rank = count_rank(both)
         parts: tuple[str, ...] = ()
         if rank < len(rows):
             left = np.linalg.svd(both)[0][:, rank:]
@@ -147,12 +147,12 @@ class Linkage:
         return Mobility(unknowns + self.joints - rank, len(rows), rank, len(rows) - rank, parts, unknowns)
 
 
-def rank_of(matrix: Array) -> int:
-    """Return the number of singular values above :data:`RANK`."""
+def count_rank(matrix: Array) -> int:
+    """Return the number of singular values above :data:`RELATIVE_RANK_TOLERANCE`."""
     if not matrix.size:
         return 0
     s = np.linalg.svd(matrix, compute_uv=False)
-    return int((s > RANK * max(1.0, float(s[0]))).sum())
+    return int((s > RELATIVE_RANK_TOLERANCE * max(1.0, float(s[0]))).sum())
 
 
 _firsts: Final[WeakValueDictionary[str, Linkage]] = WeakValueDictionary()
@@ -161,7 +161,7 @@ _recent: Final[deque[Linkage]] = deque(maxlen=16)
 """Kept so that a file that is loaded again uses the same engine."""
 
 
-def hold(linkage: Linkage) -> None:
+def keep_linkage(linkage: Linkage) -> None:
     """Keep a linkage until 16 others are kept."""
     if linkage not in _recent:
         _recent.append(linkage)

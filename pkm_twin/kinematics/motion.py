@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import Numbers, Objects, cross, snapped_all
 from pkm_twin.codegen.operations import cos, sin, sqrt
-from pkm_twin.kinematics.constraints import Equation, constraint_equations, keep_distance
+from pkm_twin.kinematics.constraints import Equation, constraint_equations, distance_equation
 from pkm_twin.machine.graph import BASE, Direction, Joint, Rod
 from pkm_twin.machine.joints import UNITS, Constraint
 from pkm_twin.machine.tree import Step, Tree
@@ -55,7 +55,7 @@ def numbers(values: Any) -> Array:
     return np.asarray(np.array(values, dtype=float), np.float64)
 
 
-def difference(b: Columns, a: Columns) -> Columns:
+def subtract_columns(b: Columns, a: Columns) -> Columns:
     """Subtract the columns of a from those of b, by rate."""
     keys = dict.fromkeys([*b, *a])
     return {k: (b[k] - a[k] if k in a else b[k]) if k in b else -a[k] for k in keys}
@@ -230,23 +230,26 @@ class Motion:
                 found = constraint_equations(
                     joint.name, (joint.inner, joint.outer), constraint, points, turns, self.tree.size
                 )
-                columns = self._differences(found[0])
-                rows += [self._row(one, columns, partial(self._bias, joint, constraint, one)) for one in found]
-        return rows + [self._rod(rod) for rod in self.graph.rods.values()]
+                columns = self._relative_columns(found[0])
+                rows += [
+                    self._make_row(one, columns, partial(self._second_derivative, joint, constraint, one))
+                    for one in found
+                ]
+        return rows + [self._rod_row(rod) for rod in self.graph.rods.values()]
 
-    def _differences(self, one: Equation) -> Columns:
+    def _relative_columns(self, one: Equation) -> Columns:
         """Return the outer body's velocity less the inner one's per rate, linear or angular."""
         if one.is_angular:
-            return difference(*(self.angular_jacobian(body) for body in one.bodies[::-1]))
-        return difference(*map(self.linear_jacobian, one.bodies[::-1], one.points[::-1]))
+            return subtract_columns(*(self.angular_jacobian(body) for body in one.bodies[::-1]))
+        return subtract_columns(*map(self.linear_jacobian, one.bodies[::-1], one.points[::-1]))
 
-    def _row(self, one: Equation, columns: Columns, bias: Callable[[], Any] = _no_bias) -> Row:
+    def _make_row(self, one: Equation, columns: Columns, bias: Callable[[], Any] = _no_bias) -> Row:
         """Return an equation with its derivatives by the rates."""
         load = one.moment if one.is_angular else one.force
         by_rates = {k: c @ load for k, c in columns.items()}
         return Row(one.part, one.value, by_rates, one.scale, one.is_angular, bias)
 
-    def _bias(self, joint: Joint, constraint: Constraint, one: Equation) -> Any:
+    def _second_derivative(self, joint: Joint, constraint: Constraint, one: Equation) -> Any:
         """Return an equation's second derivative from velocities and given accelerations."""
         a, b, at = joint.inner, joint.outer, joint.at
         wa, wb = self.omega[a], self.omega[b]
@@ -265,19 +268,19 @@ class Motion:
             + (cross(self.alpha[a], ea) + cross(wa, va)) @ (self.point(b, at) - self.point(a, at))
         )
 
-    def _rod(self, rod: Rod) -> Row:
+    def _rod_row(self, rod: Rod) -> Row:
         """Return the equation of a rod: the ends keep their distance."""
         a, b, (start, end) = rod.inner, rod.outer, rod.ends
         points = self.point(a, start), self.point(b, end)
         square = (end - start) @ (end - start)
-        one = keep_distance(rod.name, (a, b), points, square, self.tree.size)
+        one = distance_equation(rod.name, (a, b), points, square, self.tree.size)
 
         def bias() -> Any:
             speed = self.velocity(b, end) - self.velocity(a, start)
             change = self.acceleration(b, end) - self.acceleration(a, start)
             return one.force @ change + speed @ speed
 
-        return self._row(one, self._differences(one), bias)
+        return self._make_row(one, self._relative_columns(one), bias)
 
     # Velocities and accelerations.
 
@@ -358,7 +361,7 @@ class Motion:
         """Return [alpha]x + [omega]x [omega]x of a body, shape (3, 3)."""
         return self._spin[body]
 
-    def retracted(self, x: Numbers, du: Numbers) -> list[Any]:
+    def retract(self, x: Numbers, du: Numbers) -> list[Any]:
         """Return the unknowns after a small step du; rotations stay on their manifold."""
         new = list(x)
         for link in self.tree.links.values():
@@ -395,7 +398,7 @@ def reaction_directions(joint: Joint) -> tuple[Direction, ...]:
     return tuple(Direction(n, joint.inner, v) for n, v in zip(names, vectors, strict=True))
 
 
-def matrices(tree: Tree, rows: Sequence[Row]) -> tuple[Objects, Objects]:
+def closure_jacobians(tree: Tree, rows: Sequence[Row]) -> tuple[Objects, Objects]:
     """Return the derivatives of closures by u, shape (rows, unknown rates), and qd, (rows, n)."""
     n = len(tree.graph.leads)
 

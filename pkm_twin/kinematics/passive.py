@@ -54,7 +54,7 @@ def passive_program(t: Traced) -> Program:
 def passive_rates_program(t: Traced) -> Program:
     """Write the program from q and qd to the rates of all passive numbers."""
     t.solve()
-    qd = t.drives.given("qd")
+    qd = t.drives.leading_inputs("qd")
     rates = t.lift(_rates(t, qd, t.set_rates(qd)))
     return Program(t.inputs("q", "qd"), 0, {"rates": rates}, t.equations())
 
@@ -68,7 +68,7 @@ def state_program(t: Traced) -> Program:
 def moving_state_program(t: Traced) -> Program:
     """Write the program of q and qd: the state, rates of passive numbers, platform's twist (6)."""
     t.solve()
-    qd = t.drives.given("qd")
+    qd = t.drives.leading_inputs("qd")
     u, motion, graph = t.set_rates(qd), t.motion, t.graph
     twist = [*motion.velocity(graph.platform, graph.origin), *motion.omega[graph.platform]]
     outputs = {**_state(t), "rates": t.lift(_rates(t, qd, u)), "twist": t.lift(twist)}

@@ -49,7 +49,7 @@ COORDINATES: Final = {
 """The pose coordinates that every machine may have."""
 
 
-TURNS: Final = {
+ANGLE_AXES: Final = {
     "zyx": tuple(COORDINATES[name] for name in ("yaw", "pitch", "roll")),
     "xyz": (
         Coordinate("", entries=((1, 2, -1.0), (2, 2, 1.0))),
@@ -70,7 +70,7 @@ def name_angles(angles: Any) -> tuple[Coordinate, ...]:
     if not isinstance(angles, Mapping):
         raise ParameterError("angles", angles, "a mapping of names to axes")
     axes = "".join(map(str, angles.values()))
-    for sequence, turns in TURNS.items():
+    for sequence, turns in ANGLE_AXES.items():
         if len(axes) > 1 and sequence.startswith(axes):
             return tuple(replace(turn, name=str(name)) for name, turn in zip(angles, turns, strict=False))
     raise ParameterError("angles", dict(angles), "two or three names, about x, y, z or about z, y, x in this order")
@@ -79,7 +79,7 @@ def name_angles(angles: Any) -> tuple[Coordinate, ...]:
 def describe_angles(coordinates: Sequence[Coordinate]) -> dict[str, str]:
     """Return the argument of :func:`name_angles` that gives coordinates of a rotation."""
     names = {c.entries: c.name for c in coordinates if c.entries}
-    for sequence, turns in TURNS.items():
+    for sequence, turns in ANGLE_AXES.items():
         if set(names) <= {turn.entries for turn in turns}:
             last = max(k for k, turn in enumerate(turns) if turn.entries in names)
             own = zip(sequence, turns[: max(last + 1, 2)], strict=False)
@@ -115,7 +115,7 @@ def values(coordinates: Sequence[Coordinate], position: Any, rotation: Any) -> l
     return result
 
 
-def _columns_turned(rotation: Any, by: Any) -> list[list[Any]]:
+def _cross_columns(rotation: Any, by: Any) -> list[list[Any]]:
     """Return the vector product of ``by`` and each column of a matrix."""
     turned = [cross(by, [rotation[i][k] for i in range(3)]) for k in range(3)]
     return [[turned[k][i] for k in range(3)] for i in range(3)]
@@ -123,7 +123,7 @@ def _columns_turned(rotation: Any, by: Any) -> list[list[Any]]:
 
 def rates(coordinates: Sequence[Coordinate], rotation: Any, velocity: Any, omega: Any) -> list[Any]:
     """Return pose rates from the platform's velocity and angular velocity."""
-    turned = _columns_turned(rotation, omega)
+    turned = _cross_columns(rotation, omega)
     result = []
     for c in coordinates:
         if c.axis is not None:
@@ -145,9 +145,9 @@ def accelerations(
     alpha: Any,
 ) -> list[Any]:
     """Return second derivatives of the pose in time."""
-    once = _columns_turned(rotation, omega)
-    again = _columns_turned(once, omega)
-    bent = _columns_turned(rotation, alpha)
+    once = _cross_columns(rotation, omega)
+    again = _cross_columns(once, omega)
+    bent = _cross_columns(rotation, alpha)
     twice = [[again[i][k] + bent[i][k] for k in range(3)] for i in range(3)]
     result = []
     for c in coordinates:

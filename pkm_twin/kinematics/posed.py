@@ -26,9 +26,9 @@ from pkm_twin.kinematics import pose as poses
 from pkm_twin.kinematics.diagnosis import mobility_error
 from pkm_twin.kinematics.iterations import newton
 from pkm_twin.kinematics.limb_pose import Limb, LimbPose, place_in_order, sign_of
-from pkm_twin.kinematics.limbs import SAME_STATE, order_closed
-from pkm_twin.kinematics.linkage import REACH
-from pkm_twin.kinematics.motion import Motion, matrices, numbers
+from pkm_twin.kinematics.limbs import MAX_CLOSED_FORM_ERROR, order_bodies
+from pkm_twin.kinematics.linkage import SAMPLE_RADIUS
+from pkm_twin.kinematics.motion import Motion, closure_jacobians, numbers
 from pkm_twin.kinematics.pose import Coordinate
 from pkm_twin.kinematics.scheme import Scheme
 from pkm_twin.machine.graph import BASE, Body, Graph, Joint, array
@@ -42,10 +42,10 @@ MAX_ROUNDING_CHANGE: Final = 1e-8
 
 
 @dataclass(frozen=True)
-class Carrier:
+class VirtualJoint:
     """One joint of the chain, along or about a base axis at home.
 
-    ``place``: index of its pose coordinate; None if it is another coordinate of the platform.
+    ``pose_index``: index of its pose coordinate; None if it is another coordinate of the platform.
     ``constrained``: whether the closures keep it at its home value. ``joint``: the machine's joint
     that it replaces, whose point is on its axis; empty: it replaces none, and its axis goes through
     the reference point. ``end``: the body that it moves; empty: a massless one.
@@ -54,7 +54,7 @@ class Carrier:
     name: str
     coordinate: Coordinate
     axis: int
-    place: int | None
+    pose_index: int | None
     constrained: bool = False
     joint: str = ""
     end: str = ""
@@ -69,12 +69,12 @@ class Carrier:
 class PoseChain:
     """Prismatic and revolute joints from the base to the platform."""
 
-    carriers: tuple[Carrier, ...]
+    virtual_joints: tuple[VirtualJoint, ...]
 
     @property
     def joints(self) -> tuple[str, ...]:
         """Names of the joints of the chain."""
-        return tuple(f"pose {carrier.name}" for carrier in self.carriers)
+        return tuple(f"pose {virtual.name}" for virtual in self.virtual_joints)
 
     def attach(self, graph: Graph, *, by_pose: bool) -> Graph:
         """Return the graph with the chain added; rotations as in the 3-PRRU paper, equation 1.
@@ -83,25 +83,25 @@ class PoseChain:
         """
         chain: list[tuple[int, Joint]] = []
         massless: dict[str, Body] = {}
-        end, replaced = BASE, {carrier.joint for carrier in self.carriers}
-        for carrier, name in zip(self.carriers, self.joints, strict=True):
-            start, end = end, carrier.end or f"carrier of {carrier.name}"
-            if not carrier.end:
+        end, replaced = BASE, {virtual.joint for virtual in self.virtual_joints}
+        for virtual, name in zip(self.virtual_joints, self.joints, strict=True):
+            start, end = end, virtual.end or f"carrier of {virtual.name}"
+            if not virtual.end:
                 massless[end] = Body(end)
-            given = by_pose and carrier.place is not None
-            home = graph.origin[carrier.axis] if given and not carrier.turns else 0.0
-            at = graph.joints[carrier.joint].at if carrier.joint else graph.origin
+            given = by_pose and virtual.pose_index is not None
+            home = graph.origin[virtual.axis] if given and not virtual.turns else 0.0
+            at = graph.joints[virtual.joint].at if virtual.joint else graph.origin
             joint = Joint(
                 name,
-                "revolute" if carrier.turns else "prismatic",
+                "revolute" if virtual.turns else "prismatic",
                 start,
                 end,
                 at,
-                array(UNITS[carrier.axis : carrier.axis + 1]),
+                array(UNITS[virtual.axis : virtual.axis + 1]),
                 actuated=given,
                 home=home,
             )
-            chain.append((len(self.carriers) if carrier.place is None else carrier.place, joint))
+            chain.append((len(self.virtual_joints) if virtual.pose_index is None else virtual.pose_index, joint))
         # Actuated joints have the order of the pose.
         joints = {joint.name: joint for _, joint in sorted(chain, key=lambda pair: pair[0])}
         for name, joint in graph.joints.items():
@@ -129,31 +129,33 @@ def find_pose_chain(scheme: Scheme) -> PoseChain:
     """
     graph, given = scheme.graph, scheme.coordinates
     entries = {c.entries for c in given if c.entries}
-    sequence = next(t for t in poses.TURNS.values() if entries <= {c.entries for c in t})
+    sequence = next(t for t in poses.ANGLE_AXES.values() if entries <= {c.entries for c in t})
     every = [*(poses.COORDINATES[name] for name in "xyz"), *sequence]
-    closed = _vary(scheme, every, scheme.samples)
+    closed = _find_varying(scheme, every, scheme.samples)
     # Coordinates that the tree's joints keep constant, as in a planar machine, need no joint.
-    opened = _vary(scheme, every, _open_states(scheme))
-    carriers = []
+    opened = _find_varying(scheme, every, _sample_open_states(scheme))
+    virtual_joints = []
     for c, varies, moves in zip(every, closed, opened, strict=True):
         place = next(
             (i for i, own in enumerate(given) if (own.axis, own.entries) == (c.axis, c.entries)),
             None,
         )
         if place is not None:
-            carriers.append(Carrier(given[place].name, c, _axis_of(c), place))
+            virtual_joints.append(VirtualJoint(given[place].name, c, _axis_of(c), place))
         elif moves:
             kind = "slide" if c.axis is not None else "turn"
             name = f"{'xyz'[_axis_of(c)]} {kind}"
-            carriers.append(Carrier(name, c, _axis_of(c), None, constrained=not varies))
-    own = [carrier for carrier in carriers if carrier.place is not None]
+            virtual_joints.append(VirtualJoint(name, c, _axis_of(c), None, constrained=not varies))
+    own = [virtual for virtual in virtual_joints if virtual.pose_index is not None]
     joints = _replace_joints(scheme, own)
     if joints:
         return PoseChain(joints)
-    return PoseChain((*carriers[:-1], replace(carriers[-1], end=graph.platform)))
+    return PoseChain((*virtual_joints[:-1], replace(virtual_joints[-1], end=graph.platform)))
 
 
-def _vary(scheme: Scheme, coordinates: Sequence[Coordinate], states: Sequence[tuple[Array, Array]]) -> list[bool]:
+def _find_varying(
+    scheme: Scheme, coordinates: Sequence[Coordinate], states: Sequence[tuple[Array, Array]]
+) -> list[bool]:
     """Return which coordinates of the platform vary over states (x, q) of a machine."""
     placed = [tuple(numbers(part) for part in scheme.at(x, q)[0].platform()) for x, q in states]
     table = np.array([poses.values(coordinates, *state) for state in placed], float)
@@ -161,16 +163,16 @@ def _vary(scheme: Scheme, coordinates: Sequence[Coordinate], states: Sequence[tu
     return [len(states) == 1 or bool(change > MAX_ROUNDING_CHANGE) for change in np.ptp(table, axis=0) / scales]
 
 
-def _open_states(scheme: Scheme) -> list[tuple[Array, Array]]:
+def _sample_open_states(scheme: Scheme) -> list[tuple[Array, Array]]:
     """Return states of a machine's tree at random, whose loops are open."""
     random, tree, home = np.random.default_rng(0), scheme.tree, scheme.graph.lead_home
     motion = Motion(tree, tree.home, home)
     states = []
     for _ in range(OPEN_STATES):
-        move = random.uniform(-REACH, REACH, tree.unknown_rates) / np.array(tree.scales)
+        move = random.uniform(-SAMPLE_RADIUS, SAMPLE_RADIUS, tree.unknown_rates) / np.array(tree.scales)
         drives = [scheme.drive_scale(name) for name in scheme.graph.leads]
-        q = home + random.uniform(-REACH, REACH, len(home)) / np.array(drives)
-        states.append((np.array(motion.retracted(tree.home, move), float), q))
+        q = home + random.uniform(-SAMPLE_RADIUS, SAMPLE_RADIUS, len(home)) / np.array(drives)
+        states.append((np.array(motion.retract(tree.home, move), float), q))
     return states
 
 
@@ -180,7 +182,7 @@ def _axis_of(coordinate: Coordinate) -> int:
         return coordinate.axis
     return next(
         abs(first - k)
-        for first, turns in ((2, poses.TURNS["zyx"]), (0, poses.TURNS["xyz"]))
+        for first, turns in ((2, poses.ANGLE_AXES["zyx"]), (0, poses.ANGLE_AXES["xyz"]))
         for k, turn in enumerate(turns)
         if turn.entries == coordinate.entries
     )
@@ -188,29 +190,29 @@ def _axis_of(coordinate: Coordinate) -> int:
 
 def _replace_joints(
     scheme: Scheme,
-    carriers: Sequence[Carrier],
+    virtual_joints: Sequence[VirtualJoint],
     body: str = BASE,
     passed: frozenset[str] = frozenset(),
-) -> tuple[Carrier, ...]:
-    """Return carriers that replace a chain of joints from a body to the platform.
+) -> tuple[VirtualJoint, ...]:
+    """Return virtual joints that replace a chain of joints from a body to the platform.
 
     The joints' coordinates are the pose coordinates; empty if there is no such chain. Rotation axes
     need not meet in one point, but if there are slides too, they go through the reference point.
     """
     graph = scheme.graph
-    if not carriers:
+    if not virtual_joints:
         return ()
     for joint in graph.joints.values():
         if joint.name in passed or body not in (joint.inner, joint.outer):
             continue
         end = joint.outer if body == joint.inner else joint.inner
         freedoms = joint.freedoms if body == joint.inner else joint.freedoms[::-1]
-        mine, rest = carriers[: len(freedoms)], carriers[len(freedoms) :]
+        mine, rest = virtual_joints[: len(freedoms)], virtual_joints[len(freedoms) :]
         if not freedoms or len(mine) < len(freedoms) or joint.actuated or bool(rest) == (end == graph.platform):
             continue
         if not all(_is_along(f, c) for f, c in zip(freedoms, mine, strict=True)):
             continue
-        slides = any(not c.turns for c in carriers)
+        slides = any(not c.turns for c in virtual_joints)
         if slides and any(c.turns for c in mine) and np.abs(joint.at - graph.origin).max() > 0.0:
             continue
         own = [replace(c, joint=joint.name) for c in mine]
@@ -221,11 +223,11 @@ def _replace_joints(
     return ()
 
 
-def _is_along(freedom: Freedom, carrier: Carrier) -> bool:
-    """Return whether a joint's freedom is a slide or turn along the carrier's base axis."""
-    if carrier.turns != freedom.turns or (freedom.turns and freedom.slide):
+def _is_along(freedom: Freedom, virtual: VirtualJoint) -> bool:
+    """Return whether a joint's freedom is a slide or turn along the virtual joint's base axis."""
+    if virtual.turns != freedom.turns or (freedom.turns and freedom.slide):
         return False
-    return bool(abs(abs(freedom.axis[carrier.axis]) - 1.0) < SNAP)
+    return bool(abs(abs(freedom.axis[virtual.axis]) - 1.0) < SNAP)
 
 
 class PlatformFirstScheme(Scheme):
@@ -242,7 +244,7 @@ class PlatformFirstScheme(Scheme):
         """
         self.machine, self.by_pose = machine, by_pose
         self.chain = find_pose_chain(machine)
-        varying = [c for c in self.chain.carriers if not c.constrained]
+        varying = [c for c in self.chain.virtual_joints if not c.constrained]
         self._free = not by_pose and sum(c.turns for c in varying) == 3
         first = (machine.graph.platform,) if self._free else self.chain.joints
         super().__init__(self.attach_chain(machine.graph), machine.coordinates, first=first)
@@ -254,8 +256,8 @@ class PlatformFirstScheme(Scheme):
     @cached_property
     def constrained_rates(self) -> list[int]:
         """Indices of the unknown rates of platform coordinates that the closures keep at home."""
-        carriers = zip(self.chain.joints, self.chain.carriers, strict=True)
-        names = () if self._free else [name for name, carrier in carriers if carrier.constrained]
+        virtual_joints = zip(self.chain.joints, self.chain.virtual_joints, strict=True)
+        names = () if self._free else [name for name, virtual in virtual_joints if virtual.constrained]
         return [self.tree.steps[name].rate for name in names]
 
     @cached_property
@@ -295,8 +297,8 @@ class PlatformFirstScheme(Scheme):
         motion, _ = self.machine.at(x, q)
         position, rotation = (numbers(part) for part in motion.platform())
         x = np.array(self.tree.home, float)
-        carriers = zip(self.chain.joints, self.chain.carriers, strict=True)
-        free = {n: c.coordinate for n, c in carriers if not (self.by_pose and c.place is not None)}
+        virtual_joints = zip(self.chain.joints, self.chain.virtual_joints, strict=True)
+        free = {n: c.coordinate for n, c in virtual_joints if not (self.by_pose and c.pose_index is not None)}
         if self.by_pose:
             q = np.array(poses.values(self.coordinates, position, rotation), float)
         for link in self.tree.links.values():
@@ -315,7 +317,7 @@ class PlatformFirstScheme(Scheme):
     @cached_property
     def order(self) -> tuple[str | Limb, ...]:
         """Bodies in the order in which they are placed, limbs in closed form among them."""
-        return order_closed(self)
+        return order_bodies(self)
 
     @cached_property
     def platform_pivots(self) -> Order | None:
@@ -324,7 +326,7 @@ class PlatformFirstScheme(Scheme):
         It applies if closed limbs leave to Newton's method only slides and at most one turn of the
         platform, and if it reproduces the sampled states.
         """
-        places, rates = self.solved
+        places, rates = self.newton_unknowns
         steps = [self.tree.steps[name] for name in self.chain.joints] if self.by_pose else []
         left = [step for step in steps if not step.actuated and step.rate in rates]
         slides = [step.rate for step in left if not step.circle]
@@ -341,7 +343,7 @@ class PlatformFirstScheme(Scheme):
                 numbers(self.close_platform(self.tree, q, pivots)[0]) - np.array(x, float)[places]
                 for x, q in self.samples
             ]
-        return pivots if (np.abs(apart) < SAME_STATE).all() else None
+        return pivots if (np.abs(apart) < MAX_CLOSED_FORM_ERROR).all() else None
 
     def _affine_rows(self, tree: Tree, q: Numbers) -> tuple[Objects, Objects, Objects]:
         """Return the platform's remaining equations: d + G slides + h cos + k sin = 0.
@@ -356,8 +358,8 @@ class PlatformFirstScheme(Scheme):
                 if not step.actuated and step.circle:
                     x[step.position : step.position + 2] = cosine, 1.0 - cosine
             motion, limbs = self.place(tree, x, q)
-            rows = self.solved_rows(motion.closures(), limbs)
-            found += [np.array([row.value for row in rows], object), matrices(tree, rows)[0]]
+            rows = self.newton_rows(motion.closures(), limbs)
+            found += [np.array([row.value for row in rows], object), closure_jacobians(tree, rows)[0]]
         return found[0], found[1], found[3]
 
     def close_platform(self, tree: Tree, q: Numbers, pivots: Order) -> tuple[list[Any], Any]:
@@ -371,7 +373,7 @@ class PlatformFirstScheme(Scheme):
         """
         steps = {step.rate: step for step in tree.steps.values() if not step.actuated}
         order, slides = [row for row, _ in pivots], [column for _, column in pivots]
-        turn = next((steps[rate] for rate in self.solved[1] if rate not in slides), None)
+        turn = next((steps[rate] for rate in self.newton_unknowns[1] if rate not in slides), None)
 
         def eliminate(q: Numbers) -> tuple[Objects, SparseLU, Objects, Objects, list[Any]]:
             values, table, quarter = self._affine_rows(tree, q)
@@ -397,7 +399,7 @@ class PlatformFirstScheme(Scheme):
             values = values + h * (cosine - 1.0) + k * sine
         for rate, value in zip(slides, lu.solve(-values[order]), strict=True):
             x[steps[rate].position] = value
-        return list(x[self.solved[0]]), growth
+        return list(x[self.newton_unknowns[0]]), growth
 
     @property
     def has_closed_limbs(self) -> bool:
@@ -408,7 +410,7 @@ class PlatformFirstScheme(Scheme):
         return set(passive) <= set(stem)
 
     @property
-    def judged(self) -> list[int]:
+    def checked_closures(self) -> list[int]:
         """Indices of the closures that no limb's closed form satisfies by construction."""
         solved = {k for limb in self.limbs for k in limb.rows}
         return [k for k in range(len(self.parts)) if k not in solved]
@@ -419,7 +421,7 @@ class PlatformFirstScheme(Scheme):
         For a machine driven by its pose. None: not known, because a limb has no closed form.
         The gap is 0 if all closures are satisfied.
         """
-        rates = self.solved[1]
+        rates = self.newton_unknowns[1]
         inner = {
             step.rate
             for body in self.tree.chain_to_base(self.graph.platform)
@@ -433,14 +435,14 @@ class PlatformFirstScheme(Scheme):
         def evaluate_closures(x: Array) -> tuple[Array, Array]:
             """Return the dimensionless residuals of Newton's equations at x, and their Jacobian."""
             motion, limbs[:] = place_in_order(self.tree, self.order, np.array(x, dtype=object), pose, closest=True)
-            rows = self.solved_rows(motion.closures(), limbs)
+            rows = self.newton_rows(motion.closures(), limbs)
             values = [row.scale * float(row.value) for row in rows]
-            return np.array(values), self.scaled(rows)[0][:, rates]
+            return np.array(values), self.scaled_jacobians(rows)[0][:, rates]
 
         def move(x: Array, step: Array) -> Array:
             change = np.zeros(self.tree.unknown_rates)
             change[rates] = step / np.array(self.tree.scales)[rates]
-            return np.array(Motion(self.tree, x, pose).retracted(x, change), float)
+            return np.array(Motion(self.tree, x, pose).retract(x, change), float)
 
         with np.errstate(all="ignore"):
             if not newton(np.array(self.tree.home, float), evaluate_closures, move)[1]:
@@ -498,7 +500,7 @@ def _compute_joint_coordinates(tree: Tree, link: Link, motion: Motion, x: Array)
         elif step.slide:
             x[step.position] = step.sign * angle
     elif len(turns) == 2:
-        # Turns about a, then b: the first angle follows from b's direction, the second from a's.
+        # Rotations about a, then b: the first angle follows from b's direction, the second from a's.
         first, second = turns
         a, b = first.axis, second.axis
         angles = _angle(a, b, relative @ b), -_angle(b, a, relative.T @ a)

@@ -21,26 +21,26 @@ from pkm_twin.codegen.program import (
     previous_input_name,
 )
 from pkm_twin.kinematics import pose as poses
-from pkm_twin.kinematics.motion import Motion, Row, matrices
+from pkm_twin.kinematics.motion import Motion, Row, closure_jacobians
 from pkm_twin.kinematics.posed import PlatformFirstScheme
 from pkm_twin.kinematics.traced import POSED, Traced
 
 POSE_WEIGHT: Final = 100.0
 """What the pose weighs against closures where not all can be met: so a closure falls short."""
-CERTAIN: Final = 0.5
+MAX_LINEAR_POSE_ERROR: Final = 0.5
 """Largest distance from a pose, of unit one, of the poses that derivatives at both ends give for it."""
-CERTAIN_MARGIN: Final = 1.0
+MIN_DETERMINANT_PER_ERROR: Final = 1.0
 """Smallest ratio of the closures' determinant to that distance, from far poses of many machines: it
 is less than 0.5 where ``forward`` of the joints is not the pose."""
-CERTAIN_REGULAR: Final = 1e-5
+MIN_CERTAIN_DETERMINANT: Final = 1e-5
 """Smallest closures' determinant of the assembly of a closed start: ``forward`` computes its own from
 other pivots, and refuses it below 1e-8. The two agree to fewer digits the nearer a singularity is."""
-SAME_POSE: Final = 1e-7
+MAX_POSE_ROUNDING: Final = 1e-7
 """Largest difference of two poses that are one: rounding of the two solutions, of unit one. Another
 assembly is farther away unless a singularity is nearer than that."""
 
 
-def walk_program(t: Traced) -> Program:
+def newton_step_program(t: Traced) -> Program:
     """Write the program of one step of Newton's method for a pose, with q among the unknowns."""
     scheme, tree, tape = t.scheme, t.tree, t.tape
     size, free = len(tree.home), tree.unknown_rates
@@ -49,7 +49,7 @@ def walk_program(t: Traced) -> Program:
     motion = Motion(tree, everything[:size], everything[size:])
     rows = motion.closures()
     equations = poses.rows(scheme.coordinates, motion, goal)
-    table = np.vstack([np.hstack(matrices(tree, rows)), scheme.pose_rows(motion, goal)])
+    table = np.vstack([np.hstack(closure_jacobians(tree, rows)), scheme.pose_rows(motion, goal)])
     scales = [row.scale for row in rows] + [POSE_WEIGHT * scale for scale in t.pose_scales]
     columns = [*tree.scales, *t.drive_scales]
     entries = [
@@ -59,7 +59,7 @@ def walk_program(t: Traced) -> Program:
     ]
     values = [row.value for row in rows] + [value for value, _ in equations]
     move = tape.inputs("move", free + t.joints) / np.array(columns)
-    moved = [*motion.retracted(everything[:size], move[:free]), *(everything[size:] + move[free:])]
+    moved = [*motion.retract(everything[:size], move[:free]), *(everything[size:] + move[free:])]
     outputs = {
         "values": t.lift([s * v for s, v in zip(scales, values, strict=True)]),
         "table": t.lift(entries),
@@ -90,8 +90,8 @@ def jacobian_program(t: Traced) -> Program:
     rates = [poses.rates(t.scheme.coordinates, rotation, v, w) for v, w in twists]
     by_pose, by_twist = (zip(*r, strict=True) for r in (rates, [[*v, *w] for v, w in twists]))
     outputs = {
-        "rates": t.lift([value for row in by_pose for value in t.drives.shared(row)]),
-        "twist": t.lift([value for row in by_twist for value in t.drives.shared(row)]),
+        "rates": t.lift([value for row in by_pose for value in t.drives.distribute(row)]),
+        "twist": t.lift([value for row in by_twist for value in t.drives.distribute(row)]),
     }
     return Program(t.inputs("q"), 0, outputs, t.equations())
 
@@ -111,14 +111,14 @@ def body_jacobian_program(t: Traced) -> Program:
     columns, values = t.rate_columns(), []
     for body in t.graph.bodies:
         twists = [[*v, *w] for v, w in t.twists(body, t.motion.origin[body], columns)]
-        values += [value for row in zip(*twists, strict=True) for value in t.drives.shared(row)]
+        values += [value for row in zip(*twists, strict=True) for value in t.drives.distribute(row)]
     return Program(t.inputs("q"), 0, {"twists": t.lift(values)}, t.equations())
 
 
 def acceleration_program(t: Traced) -> Program:
     """Write the program of :attr:`.engine.Engine.acceleration`."""
     t.solve()
-    qd, qdd = t.drives.given("qd"), t.drives.given("qdd")
+    qd, qdd = t.drives.leading_inputs("qd"), t.drives.leading_inputs("qdd")
     t.set_rates(qd)
     t.set_accelerations(qdd)
     second = pose_accelerations(t)
@@ -139,9 +139,9 @@ def projection_program(t: Traced) -> Program:
     return Program(t.inputs("q", "qd", "qdd"), 0, outputs, t.equations(goal=t.lift(q)))
 
 
-def ahead_forward_program(t: Traced) -> Program:
+def reduced_forward_program(t: Traced) -> Program:
     """Write :func:`forward_program` on the tree with the fewest unknowns."""
-    return forward_program(t.ahead)
+    return forward_program(t.reduced)
 
 
 def inverse_program(t: Traced, scheme: PlatformFirstScheme | None) -> Program:
@@ -153,11 +153,11 @@ def inverse_program(t: Traced, scheme: PlatformFirstScheme | None) -> Program:
     """
     pose = t.tape.inputs("pose", len(t.scheme.coordinates))
     if scheme is None:
-        equations, leads = follow_pose(t)
+        equations, leads = iterate_pose(t)
         q = t.tree.drive_positions(leads, t.x)
     else:
         posed, q = solve_pose(t, scheme)
-        t = t.ahead
+        t = t.reduced
         equations = posed.equations() + confirm_pose(t, [q[k] for k in t.drives.leading])
     return Program({"pose": len(pose)}, 0, {"q": t.lift(q)}, equations)
 
@@ -179,9 +179,9 @@ def confirm_pose(t: Traced, leads: Numbers, *, rates: bool = False) -> tuple[Equ
             # A full turn makes no difference.
             same.append(cos(apart))
             apart = sin(apart)
-        same.append(SAME_POSE - absolute(apart) * scale)
+        same.append(MAX_POSE_ROUNDING - absolute(apart) * scale)
     if rates:
-        same += t.limit_growth(pose_factors(t), t.pose_scales, t.drive_scales)
+        same += t.pivot_margins(pose_factors(t), t.pose_scales, t.drive_scales)
     return t.equations(branch=t.lift(same), goal=t.lift(leads), stage=1)
 
 
@@ -213,7 +213,7 @@ def transmission_program(t: Traced, scheme: PlatformFirstScheme | None, *, certi
     m = len(t.scheme.coordinates)
     rate = t.tape.inputs("rate", m) if curved else None
     if scheme is None:
-        equations, leads = follow_pose(t, rates=True)
+        equations, leads = iterate_pose(t, rates=True)
         q = t.tree.drive_positions(leads, t.x)
         lu = pose_factors(t)
         follow = np.array(t.rate_columns(), dtype=object).T
@@ -248,7 +248,7 @@ def actuator_program(t: Traced) -> Program:
     position, rotation = t.motion.platform()
     twists = t.twists(t.graph.platform, position, t.rate_columns())
     rows = zip(*[poses.rates(t.scheme.coordinates, rotation, v, w) for v, w in twists], strict=True)
-    velocity = [np.array(t.drives.shared(row), dtype=object) @ qd for row in rows]
+    velocity = [np.array(t.drives.distribute(row), dtype=object) @ qd for row in rows]
     factors = pose_factors(t)
     effort = factors.solve_transposed(t.drives.leading_efforts([*tau]))
     outputs = {
@@ -256,7 +256,7 @@ def actuator_program(t: Traced) -> Program:
         "velocity": t.lift(velocity),
         "effort": t.lift(effort),
     }
-    sound = t.limit_growth(factors, t.pose_scales, t.drive_scales)
+    sound = t.pivot_margins(factors, t.pose_scales, t.drive_scales)
     return Program(t.inputs("q", "qd", "tau"), 0, outputs, t.equations(branch=sound))
 
 
@@ -296,19 +296,19 @@ def certify_assembly(t: Traced, scheme: PlatformFirstScheme, posed: Traced, q: S
     drives = at_home.inverse_determinant / here.inverse_determinant
     closures = drives * posed.determinant
     if t.scheme.start is not None:
-        return [closures - CERTAIN_REGULAR, *t.scheme.start.find_conditions(posed.motion)]
+        return [closures - MIN_CERTAIN_DETERMINANT, *t.scheme.start.find_conditions(posed.motion)]
     move = posed.q - posed.graph.lead_home
     way = np.array([q[k] for k in t.drives.leading], dtype=object) - t.graph.lead_home
     ends = ((lu.solve(way) - move) * np.array(t.pose_scales, dtype=object) for lu in (at_home, here))
     distance = 0.5 * sum(apart @ apart for apart in ends)
     return [
         drives - LEAST,
-        CERTAIN * CERTAIN - distance,
-        closures * closures - CERTAIN_MARGIN * CERTAIN_MARGIN * distance,
+        MAX_LINEAR_POSE_ERROR * MAX_LINEAR_POSE_ERROR - distance,
+        closures * closures - MIN_DETERMINANT_PER_ERROR * MIN_DETERMINANT_PER_ERROR * distance,
     ]
 
 
-def follow_pose(t: Traced, *, rates: bool = False) -> tuple[tuple[Equations, ...], Objects]:
+def iterate_pose(t: Traced, *, rates: bool = False) -> tuple[tuple[Equations, ...], Objects]:
     """Solve the machine's own tree for a pose, and return the equations and the leading joints.
 
     Newton's method finds all unknowns and joints; :func:`confirm_pose` judges them.
@@ -326,7 +326,7 @@ def follow_pose(t: Traced, *, rates: bool = False) -> tuple[tuple[Equations, ...
         """Return motion, closures, pose equations, and the factors of their derivatives."""
         motion = Motion(tree, state[:size], state[size:])
         rows = motion.closures()
-        table = np.hstack(matrices(tree, rows))[scheme.independent]
+        table = np.hstack(closure_jacobians(tree, rows))[scheme.independent]
         matrix = np.vstack([table, scheme.pose_rows(motion, pose)])
         equations = [value for value, _ in poses.rows(scheme.coordinates, motion, pose)]
         return motion, rows, equations, SparseLU(matrix, scheme.inverse_pivots)
@@ -336,7 +336,7 @@ def follow_pose(t: Traced, *, rates: bool = False) -> tuple[tuple[Equations, ...
 
     def retract(state: Objects, step: Objects) -> list[Expression]:
         """Return the state after a step; rotations stay on their manifold."""
-        retracted = motion.retracted(state[:size], step[:split])
+        retracted = motion.retract(state[:size], step[:split])
         return t.lift([*retracted, *(state[size:] + step[split:])])
 
     onward = tape.inputs(STATE, len(AT))[AT.onward]

@@ -27,42 +27,42 @@ from pkm_twin.kinematics.constraints import (
     Placement,
     constraint_equations,
     differentiate_by_frame,
-    keep_distance,
+    distance_equation,
     rotate,
 )
 from pkm_twin.kinematics.iterations import newton
 from pkm_twin.machine.graph import Graph, Joint, array
 from pkm_twin.machine.joints import CONSTRAINTS
 
-CHAIN: Final = 20.0
+MAX_ERROR_GROWTH: Final = 20.0
 """How far rounding may move a body or open a loop, rounding errors: a loop is a chain of places."""
 MAX_ROUNDING: Final = 1e-4
 """Deviation of axes and points that no file's rounding exceeds, rad or parts of the size."""
-POSITIONS: Final = (8, 24, 72)
+POSITION_COUNTS: Final = (8, 24, 72)
 """Positions in which the loops are closed: more conditions than a machine has numbers."""
-CHECKED: Final = 3
+CHECK_COUNT: Final = 3
 """Other positions in which the loops must then close too."""
-REACH: Final = 0.4
+POSITION_RADIUS: Final = 0.4
 """How far from home the positions are: the largest motion of a body, rad or parts of the size."""
 STEPS: Final = 4
 """Steps on the way to a position."""
-CORRECTIONS: Final = 6
+MAX_CORRECTIONS: Final = 6
 """Most corrections of a step."""
-ROUNDS: Final = 12
+MAX_ROUNDS: Final = 12
 """Most rounds of moving numbers."""
-CLOSED: Final = 1e-13
+MAX_OPENING: Final = 1e-13
 """Loops that are open by less are closed, rad or parts of the size."""
-EXACT: Final = 1e-10
+MAX_ZERO_SINGULAR_VALUE: Final = 1e-10
 """Singular values below this are zero but for the computer's own rounding."""
-NOISE: Final = 100.0
+NOISE_FACTOR: Final = 100.0
 """Part of the largest effect of numbers on the loops below which one comes from rounding: this many
 times the largest singular value that should be zero."""
-MAX_NOISE: Final = 1e-2
-"""Most of that part: NOISE times MAX_ROUNDING."""
+MAX_RELATIVE_NOISE: Final = 1e-2
+"""Most of that part: NOISE_FACTOR times MAX_ROUNDING."""
 MAX_DEVIATION: Final = 3e-2
 """Largest deviation of an axis or point that is taken for an error and not for the design, rad or
 parts of the machine's size."""
-MOST_MOVED: Final = 6
+MAX_CHOSEN_VECTORS: Final = 6
 """Most vectors that are chosen one by one."""
 
 Slot = tuple[str, str, int]
@@ -112,7 +112,7 @@ def repair_rounded(graph: Graph, rounding: float, least: float = 0.0) -> Repair 
     :param least: deviation that counts as rounding in any file, rad or parts of the size.
     :returns: None where no change within the file's precision gives the freedoms.
     """
-    precision = min(MAX_ROUNDING, max(least, CHAIN * rounding / min(1.0, graph.size)))
+    precision = min(MAX_ROUNDING, max(least, MAX_ERROR_GROWTH * rounding / min(1.0, graph.size)))
     found = repair(graph, precision)
     return found if found is not None and found.largest <= precision else None
 
@@ -129,21 +129,21 @@ def repair(graph: Graph, precision: float) -> Repair | None:
     sizes = np.linalg.svd(loops.equations(Placement.at_home(graph, (1,)))[1][0], compute_uv=False)
     rank = int((sizes > precision).sum())
     # Rounding may become visible at home or only away from it.
-    if loops.are_exact(rank, loops.walk(rank, 2, 1)) and not (sizes[rank:] > EXACT).any():
+    if loops.are_exact(rank, loops.sample_positions(rank, 2, 1)) and not (sizes[rank:] > MAX_ZERO_SINGULAR_VALUE).any():
         return Repair(graph, {})
     # In a planar linkage least changes alone would make axes that meet in a distant point.
     loops.graph = align_axes(graph, precision)
-    if loops.are_exact(rank, loops.walk(rank, CHECKED, STEPS, seed=1)):
+    if loops.are_exact(rank, loops.sample_positions(rank, CHECK_COUNT, STEPS, seed=1)):
         return loops.repair()
-    for count in POSITIONS:
+    for count in POSITION_COUNTS:
         loops = _Loops(graph)
-        positions = loops.walk(rank, count, STEPS)
-        if (loops.sizes(positions) > precision).sum(1).max() > rank:
+        positions = loops.sample_positions(rank, count, STEPS)
+        if (loops.singular_values(positions) > precision).sum(1).max() > rank:
             return None
         if not loops.close(rank, positions):
             return None
         # Dimensions fitted to few positions may close the loops only there: check further ones.
-        if loops.are_exact(rank, loops.walk(rank, CHECKED, STEPS, seed=1)):
+        if loops.are_exact(rank, loops.sample_positions(rank, CHECK_COUNT, STEPS, seed=1)):
             return loops.repair()
     return None
 
@@ -187,7 +187,7 @@ def repair_few(graph: Graph, freedoms: int) -> Repair | None:
     """Move as few axes and points as possible, so that a machine that lost freedoms has them.
 
     Vectors are chosen one by one, each the one whose change leaves the loops least open: orthogonal
-    matching pursuit (Pati, Rezaiifar and Krishnaprasad 1993). Where MOST_MOVED do not close the
+    matching pursuit (Pati, Rezaiifar and Krishnaprasad 1993). Where MAX_CHOSEN_VECTORS do not close the
     loops, all are moved as by :func:`repair`.
 
     :param freedoms: degrees of freedom that the machine should have.
@@ -198,11 +198,11 @@ def repair_few(graph: Graph, freedoms: int) -> Repair | None:
     sizes = np.linalg.svd(loops.equations(Placement.at_home(graph, (1,)))[1][0], compute_uv=False)
     if not 0 < rank < len(sizes) or sizes[rank] > MAX_DEVIATION:
         return None
-    positions = loops.walk(rank, POSITIONS[1], STEPS)
-    gap, effect, noise = loops.openings(rank, positions)
+    positions = loops.sample_positions(rank, POSITION_COUNTS[1], STEPS)
+    gap, effect, noise = loops.measure_openings(rank, positions)
     chosen: list[Slot] = []
     basis = np.zeros((len(gap), 0))
-    for _ in range(MOST_MOVED):
+    for _ in range(MAX_CHOSEN_VECTORS):
         best, least = None, float(np.linalg.norm(gap)) * (1.0 - 1e-6)
         for slot, columns in effect.items():
             apart = columns - basis @ (basis.T @ columns)
@@ -217,7 +217,9 @@ def repair_few(graph: Graph, freedoms: int) -> Repair | None:
         chosen.append(best)
         gap, basis = remaining, np.hstack([basis, added])
         trial = _Loops(graph)
-        if trial.close(rank, positions, chosen) and trial.are_exact(rank, trial.walk(rank, CHECKED, STEPS, seed=1)):
+        if trial.close(rank, positions, chosen) and trial.are_exact(
+            rank, trial.sample_positions(rank, CHECK_COUNT, STEPS, seed=1)
+        ):
             found = trial.repair()
             return found if found.largest < MAX_DEVIATION else None
     all_moved = repair(graph, 2.0 * float(sizes[rank]))
@@ -248,11 +250,11 @@ class _Loops:
             found += [("axis", joint.name, k) for k in range(len(joint.axes))]
         return found + [("end", name, k) for name in graph.rods for k in range(2)]
 
-    def walk(self, rank: int, count: int, steps: int, seed: int = 0) -> Placement:
+    def sample_positions(self, rank: int, count: int, steps: int, seed: int = 0) -> Placement:
         """Return positions that the machine can move to from home.
 
         :param rank: of the equations; smaller singular values are no constraints. ``count``: of
-            positions. ``steps``: towards each, of REACH in STEPS.
+            positions. ``steps``: towards each, of POSITION_RADIUS in STEPS.
         """
         placed = Placement.at_home(self.graph, (count,))
         way: Array = np.random.default_rng(seed).normal(size=(count, 6 * self.bodies))
@@ -260,12 +262,14 @@ class _Loops:
             free = np.linalg.svd(self.equations(placed)[1])[2][:, rank:]
             way = np.einsum("kfi,kfj,kj->ki", free, free, way)
             way /= np.abs(way).max(axis=1, keepdims=True, initial=1e-300)
-            placed = placed.moved(REACH / STEPS * way)
+            placed = placed.moved(POSITION_RADIUS / STEPS * way)
             solve = partial(_solve_truncated, rank)
-            placed, _ = newton(placed, self.equations, Placement.moved, solve, iterations=CORRECTIONS, tolerance=CLOSED)
+            placed, _ = newton(
+                placed, self.equations, Placement.moved, solve, iterations=MAX_CORRECTIONS, tolerance=MAX_OPENING
+            )
         return placed
 
-    def sizes(self, positions: Placement) -> Array:
+    def singular_values(self, positions: Placement) -> Array:
         """Return the singular values of the equations by the bodies' motions, shape (k, n)."""
         table = self.equations(positions)[1]
         return np.asarray(np.linalg.svd(table, compute_uv=False), np.float64)
@@ -273,9 +277,9 @@ class _Loops:
     def are_exact(self, rank: int, positions: Placement) -> bool:
         """Return whether all loops are closed, and the equations have that rank."""
         miss = np.abs(self.equations(positions)[0]).max(initial=0.0)
-        return bool(miss < CLOSED and (self.sizes(positions)[:, rank:] < EXACT).all())
+        return bool(miss < MAX_OPENING and (self.singular_values(positions)[:, rank:] < MAX_ZERO_SINGULAR_VALUE).all())
 
-    def openings(self, rank: int, positions: Placement) -> tuple[Array, dict[Slot, Array], float]:
+    def measure_openings(self, rank: int, positions: Placement) -> tuple[Array, dict[Slot, Array], float]:
         """Return the gaps that no motion of bodies closes, and their derivatives by the vectors.
 
         :returns: gaps, shape (k,); derivatives by each vector, (k, 3); the bound below which
@@ -284,9 +288,11 @@ class _Loops:
         value, table = self.equations(positions)
         left, sizes, _ = np.linalg.svd(table)
         left = left[:, :, rank:].transpose(0, 2, 1)
-        effect = (left @ self.by_vectors(positions)).reshape(-1, 3 * len(self.slots))
+        effect = (left @ self.vector_derivatives(positions)).reshape(-1, 3 * len(self.slots))
         gap = np.einsum("kfi,ki->kf", left, value).ravel()
-        noise = min(MAX_NOISE, NOISE * max(EXACT, float(sizes[:, rank:].max(initial=0.0))))
+        noise = min(
+            MAX_RELATIVE_NOISE, NOISE_FACTOR * max(MAX_ZERO_SINGULAR_VALUE, float(sizes[:, rank:].max(initial=0.0)))
+        )
         return gap, {s: effect[:, 3 * k : 3 * k + 3] for k, s in enumerate(self.slots)}, noise
 
     def close(self, rank: int, positions: Placement, slots: Sequence[Slot] | None = None) -> bool:
@@ -295,22 +301,22 @@ class _Loops:
         :param slots: the vectors that may move; by default all.
         """
         placed, last = positions, np.inf
-        for _ in range(ROUNDS):
+        for _ in range(MAX_ROUNDS):
             value, table = self.equations(placed)
             miss = float(np.abs(value).max(initial=0.0))
-            if miss < 0.1 * CLOSED or miss > 0.5 * last:
+            if miss < 0.1 * MAX_OPENING or miss > 0.5 * last:
                 break
-            by_vectors = self.by_vectors(placed)
-            gap, effect, noise = self.openings(rank, placed)
+            vector_derivatives = self.vector_derivatives(placed)
+            gap, effect, noise = self.measure_openings(rank, placed)
             allowed = [effect[s] * (slots is None or s in slots) for s in effect]
             step = np.linalg.lstsq(np.hstack(allowed), gap, rcond=noise)[0]
             change = np.asarray(-step, np.float64)
-            self.change(change)
-            placed = placed.moved(_solve_truncated(rank, table, value + by_vectors @ change))
+            self.move_vectors(change)
+            placed = placed.moved(_solve_truncated(rank, table, value + vector_derivatives @ change))
             last = miss
-        return miss < CLOSED
+        return miss < MAX_OPENING
 
-    def change(self, change: Array) -> None:
+    def move_vectors(self, change: Array) -> None:
         """Move all vectors of the graph, (3 vectors,); axes stay of length one."""
         parts = dict(zip(self.slots, change.reshape(-1, 3), strict=True))
         graph = self.graph
@@ -344,7 +350,7 @@ class _Loops:
     def equations(self, placed: Placement) -> tuple[Array, Array]:
         """Return the values of all equations, (k, rows), and derivatives by the coordinates."""
         found = [one for _, one in self._equations(placed)]
-        return placed.values(found), placed.matrix(found)
+        return placed.values(found), placed.jacobian(found)
 
     def _equations(self, placed: Placement) -> list[tuple[list[_Frame], Equation]]:
         """Return the equations in parts of the size, each with its frames on both bodies."""
@@ -353,7 +359,7 @@ class _Loops:
         for joint in self.graph.joints.values():
             a, b, name = joint.inner, joint.outer, joint.name
             points = placed.point(a, joint.at), placed.point(b, joint.at)
-            turns = partial(rotate, placed.turn(a)), partial(rotate, placed.turn(b))
+            turns = partial(rotate, placed.body_rotation(a)), partial(rotate, placed.body_rotation(b))
             for key in joint.type.holds:
                 for constraint in CONSTRAINTS[key](joint.axes, joint.pitch):
                     frames = [_Frame(("at", name, 0), joint.at)] * 2
@@ -371,11 +377,11 @@ class _Loops:
             points = placed.point(rod.inner, start), placed.point(rod.outer, end)
             square = float((end - start) @ (end - start))
             frames = [_Frame(("end", rod.name, k), point) for k, point in enumerate(rod.ends)]
-            one = keep_distance(rod.name, (rod.inner, rod.outer), points, square, size)
+            one = distance_equation(rod.name, (rod.inner, rod.outer), points, square, size)
             found.append((frames, one))
         return found
 
-    def by_vectors(self, placed: Placement) -> Array:
+    def vector_derivatives(self, placed: Placement) -> Array:
         """Return derivatives of the equations' values by the vectors, (k, rows, 3 vectors).
 
         A vector moves the part's frames on both bodies. At home it changes nothing, as equations
@@ -389,7 +395,7 @@ class _Loops:
             for i, (frames, one) in enumerate(found):
                 for side, frame in enumerate(frames):
                     turn, point = (
-                        where.turn(one.bodies[side]),
+                        where.body_rotation(one.bodies[side]),
                         where.point(one.bodies[side], frame.point),
                     )
                     shift, tilt = differentiate_by_frame(one, side, point, turn)

@@ -17,32 +17,32 @@ from pkm_twin.codegen.key import EMPTY, ProgramKey
 from pkm_twin.codegen.lu import Order, independent_rows, pivot_order
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics import pose as poses
-from pkm_twin.kinematics.diagnosis import mobility_error, near_conditions, singular_home
-from pkm_twin.kinematics.iterations import RANK
+from pkm_twin.kinematics.diagnosis import find_small_deviations, mobility_error, singular_home_error
+from pkm_twin.kinematics.iterations import RELATIVE_RANK_TOLERANCE
 from pkm_twin.kinematics.limb_pose import Limb, LimbPose, place_in_order
 from pkm_twin.kinematics.limbs import find_hanging_limbs
-from pkm_twin.kinematics.linkage import Linkage, rank_of
-from pkm_twin.kinematics.motion import Motion, Row, matrices, numbers
+from pkm_twin.kinematics.linkage import Linkage, count_rank
+from pkm_twin.kinematics.motion import Motion, Row, closure_jacobians, numbers
 from pkm_twin.kinematics.pose import Coordinate
-from pkm_twin.kinematics.spins import null
+from pkm_twin.kinematics.spins import null_space
 from pkm_twin.kinematics.three_rods import find_three_rods
 from pkm_twin.machine.geometry import describe_pattern, list_geometry
 from pkm_twin.machine.graph import BASE, Graph
 from pkm_twin.machine.tree import Step, Tree
 
-MOVES: Final = 1e-6
+MIN_DRIVE_MOTION: Final = 1e-6
 """Least motion of a drive at home, of unit one, and least determinant of a choice of drives, as part
 of the best one's: below, rounding decides."""
 
-POSE_MOVES: Final = (1e-3, 1e-6)
+MIN_POSE_MOTIONS: Final = (1e-3, 1e-6)
 """Least motion of the platform along a pose coordinate, of unit one: more than any file's rounding,
 or, where that leaves too few coordinates, more than the computer's."""
 
 
-class Start(Protocol):
+class ClosedFormStart(Protocol):
     """A closed form of the forward kinematics, that Newton's method starts from."""
 
-    def place(self, tree: Tree, q: Numbers) -> list[Any]:
+    def solve_unknowns(self, tree: Tree, q: Numbers) -> list[Any]:
         """Return the tree's unknowns at q, on numbers and expressions alike."""
 
     def find_conditions(self, motion: Motion) -> list[Any]:
@@ -61,7 +61,7 @@ class Scheme(Linkage):
         graph: Graph,
         coordinates: Sequence[Coordinate],
         first: tuple[str, ...] = (),
-        start: Start | None = None,
+        start: ClosedFormStart | None = None,
     ) -> None:
         super().__init__(graph, first)
         self._start = start
@@ -85,7 +85,7 @@ class Scheme(Linkage):
                     self.independent,
                     self.pivots,
                     self.order,
-                    self.solved_pivots,
+                    self.newton_pivots,
                     self.platform_pivots,
                 )
             ),
@@ -93,7 +93,7 @@ class Scheme(Linkage):
         )
 
     @cached_property
-    def start(self) -> Start | None:
+    def start(self) -> ClosedFormStart | None:
         """The closed form of all unknowns, None where there is none."""
         return self._start or find_three_rods(self)
 
@@ -164,17 +164,17 @@ class Scheme(Linkage):
         return [entry for entry in self.order if isinstance(entry, Limb)]
 
     @property
-    def ahead(self) -> Any:
+    def reduced(self) -> Any:
         """The machine with the platform placed before its limbs; None if that saves no unknowns."""
         return None
 
     @property
-    def judged(self) -> list[int]:
+    def checked_closures(self) -> list[int]:
         """Closures whose residual decides whether a state is accepted."""
         return list(range(len(self.parts)))
 
     @cached_property
-    def solved(self) -> tuple[list[int], list[int]]:
+    def newton_unknowns(self) -> tuple[list[int], list[int]]:
         """Indices of Newton's unknowns and their rates: all but those of closed-form limbs."""
         inner = {body for limb in self.limbs for body in limb.bodies}
         places, rates = list(range(len(self.tree.home))), list(range(self.tree.unknown_rates))
@@ -193,21 +193,21 @@ class Scheme(Linkage):
         """
         return place_in_order(tree, self.order, x, q)
 
-    def solved_rows(self, rows: Sequence[Row], poses: Sequence[LimbPose]) -> list[Row]:
+    def newton_rows(self, rows: Sequence[Row], poses: Sequence[LimbPose]) -> list[Row]:
         """Return Newton's equations: closures outside limbs, and those that limbs leave open."""
         limbs = {k for limb in self.limbs for k in limb.rows}
         return [rows[k] for k in self.independent if k not in limbs] + [row for pose in poses for row in pose.rows]
 
     @cached_property
-    def solved_pivots(self) -> Order:
+    def newton_pivots(self) -> Order:
         """Elimination order of Newton's equations, well conditioned near home."""
         if not self.limbs:
             return self.pivots
         samples = []
         for x, q in self.samples:
             motion, poses = self.place(self.tree, np.array(x, dtype=object), q)
-            table, _ = self.scaled(self.solved_rows(motion.closures(), poses))
-            samples.append(table[:, self.solved[1]])
+            table, _ = self.scaled_jacobians(self.newton_rows(motion.closures(), poses))
+            samples.append(table[:, self.newton_unknowns[1]])
         return pivot_order(np.array(samples))
 
     @cached_property
@@ -227,7 +227,7 @@ class Scheme(Linkage):
         n, tables = len(self.varying), []
         for x, q in self.samples:
             motion, rows = self.at(x, q)
-            ju, jq = self.scaled(rows)
+            ju, jq = self.scaled_jacobians(rows)
             follow = -np.linalg.solve(ju[self.independent], jq[self.independent])
             position, rotation = (numbers(part) for part in motion.platform())
             here = [float(v) for v in poses.values(self.coordinates, position, rotation)]
@@ -242,9 +242,9 @@ class Scheme(Linkage):
 
         :raises ParameterError: by the field.
         """
-        near = [rank_of(np.hstack([a, b])) for a, b in zip(*self._sampled_jacobians, strict=True)]
+        near = [count_rank(np.hstack([a, b])) for a, b in zip(*self._sampled_jacobians, strict=True)]
         if len(near) > 1 and near[0] < min(near[1:]):
-            raise singular_home(self, near[0], min(near[1:]))
+            raise singular_home_error(self, near[0], min(near[1:]))
         if self.mobility.freedoms != self.joints:
             raise mobility_error(self)
         _ = self.independent
@@ -257,7 +257,7 @@ class Scheme(Linkage):
             raise ParameterError("pose", [c.name for c in self.coordinates], bound)
         motion, rows = self.at(*self.samples[0])
         matrix = self._inverse_matrix(motion, rows, self.home_pose.tolist())
-        if rank_of(matrix) < len(matrix):
+        if count_rank(matrix) < len(matrix):
             raise ParameterError(
                 "pose",
                 [c.name for c in self.coordinates],
@@ -273,7 +273,7 @@ class Scheme(Linkage):
 
     def _inverse_matrix(self, motion: Motion, rows: Sequence[Row], pose: Numbers) -> Array:
         """Return the dimensionless Jacobian of closures and pose equations by u and qd."""
-        ju, jq = self.scaled(rows)
+        ju, jq = self.scaled_jacobians(rows)
         extra = self.pose_rows(motion, pose)
         table = np.array(self._pose_scales)[:, None] * numbers(extra)
         n = self.tree.unknown_rates
@@ -309,9 +309,9 @@ def choose_leads(graph: Graph, wanted: Sequence[str] = (), pose: int = 0) -> tup
             raise ParameterError("redundancy.leads", list(wanted), f"{', '.join(names)}: all lead")
         return names
     ju, jq = linkage.scaled_at_home()
-    rates = null(np.hstack([ju, jq]), RANK)[ju.shape[1] :]
-    causes = near_conditions(graph, freedoms + 1)
-    if causes or (np.abs(rates).max(1) < MOVES).any():
+    rates = null_space(np.hstack([ju, jq]), RELATIVE_RANK_TOLERANCE)[ju.shape[1] :]
+    causes = find_small_deviations(graph, freedoms + 1)
+    if causes or (np.abs(rates).max(1) < MIN_DRIVE_MOTION).any():
         raise mobility_error(linkage, causes)
     sizes = {
         chosen: abs(float(np.linalg.det(rates[list(chosen)]))) for chosen in combinations(range(len(names)), freedoms)
@@ -319,7 +319,7 @@ def choose_leads(graph: Graph, wanted: Sequence[str] = (), pose: int = 0) -> tup
     best = max(sizes.values())
     if wanted:
         places = tuple(sorted(names.index(name) for name in wanted if name in names))
-        if len(places) != len(wanted) or not sizes.get(places, 0.0) > MOVES * best:
+        if len(places) != len(wanted) or not sizes.get(places, 0.0) > MIN_DRIVE_MOTION * best:
             raise ParameterError(
                 "redundancy.leads",
                 list(wanted),
@@ -339,7 +339,7 @@ def choose_coordinates(graph: Graph) -> tuple[str, ...]:
     :raises ParameterError: something is free to move while the actuated joints are locked.
     """
     rates = _pose_rates(graph)
-    for least in POSE_MOVES:
+    for least in MIN_POSE_MOTIONS:
         chosen = _pick_independent(rates, list(rates), least)
         turns = sorted(
             (name for name in rates if poses.COORDINATES[name].entries),
@@ -358,7 +358,9 @@ def list_coordinates(graph: Graph) -> list[tuple[str, ...]]:
     rates = _pose_rates(graph)
     count = len(graph.leads)
     return [
-        names for names in combinations(rates, count) if len(_pick_independent(rates, names, POSE_MOVES[0])) == count
+        names
+        for names in combinations(rates, count)
+        if len(_pick_independent(rates, names, MIN_POSE_MOTIONS[0])) == count
     ]
 
 
@@ -379,7 +381,7 @@ def _pose_rates(graph: Graph) -> dict[str, Array]:
     """
     scheme = Scheme(graph, tuple(poses.COORDINATES.values()))
     motion, closed = scheme.at(scheme.tree.home, graph.lead_home)
-    ju, jq = (numbers(m) for m in matrices(scheme.tree, closed))
+    ju, jq = (numbers(m) for m in closure_jacobians(scheme.tree, closed))
     independent = scheme.independent
     rates = np.vstack([-np.linalg.solve(ju[independent], jq[independent]), np.eye(scheme.joints)])
     rows = numbers(scheme.pose_rows(motion, [0.0] * len(scheme.coordinates)))
@@ -394,7 +396,7 @@ def check_masses(scheme: Scheme, graph: Graph) -> None:
     :raises ParameterError: names a massless body that can move alone.
     """
     motion, rows = scheme.at(scheme.tree.home, graph.lead_home)
-    ju, jq = (numbers(m) for m in matrices(scheme.tree, rows))
+    ju, jq = (numbers(m) for m in closure_jacobians(scheme.tree, rows))
     moved = -np.linalg.solve(ju[scheme.independent], jq[scheme.independent])
     n = scheme.joints
     table = []

@@ -15,7 +15,7 @@ An error of one needs motion of at least a half on each side of it, hence the bo
 where anything moves although the actuators are locked: where they lose the platform, and in every
 constraint singularity, of platform, limbs or bodies between. Here closures are all that holds in
 truth: of a parallelogram also the couple that a pair of rods passes. Which joints are closures
-follows from the structure, see :func:`find_carriers`.
+follows from the structure, see :func:`find_tree_joints`.
 
 **Moved**: the platform's twist per joint rate T, shape (6, n), of each body's motion D:
 
@@ -41,7 +41,7 @@ from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.operations import maximum, minimum, sqrt
 from pkm_twin.codegen.program import Program
 from pkm_twin.errors import SingularityError
-from pkm_twin.kinematics.constraints import keep_pair
+from pkm_twin.kinematics.constraints import rod_pair_equation
 from pkm_twin.kinematics.engine import Engine
 from pkm_twin.kinematics.gradients import gradient_program
 from pkm_twin.kinematics.linkage import Linkage
@@ -49,7 +49,7 @@ from pkm_twin.kinematics.motion import (
     Columns,
     Motion,
     Row,
-    matrices,
+    closure_jacobians,
     numbers,
 )
 from pkm_twin.kinematics.traced import Traced
@@ -72,7 +72,7 @@ def compile_singularity_gradient(engine: Engine) -> Kernel:
     return engine.kernel("singularity gradient", write, free=True)
 
 
-def find_carriers(graph: Graph) -> frozenset[str]:
+def find_tree_joints(graph: Graph) -> frozenset[str]:
     """Return the joints of the spanning tree with which the actuated joints are locked.
 
     Bodies joined by locked, fixed and screw joints are one part. A part's tree joint is the one
@@ -112,7 +112,7 @@ class KinematicCopy(Motion):
         # All drives are locked, redundant ones too.
         true = {n: replace(j, follows=False) for n, j in graph.joints.items() if not j.virtual}
         self.graph: Graph = replace(graph, joints=true)
-        self.tree = Tree(self.graph, find_carriers(self.graph))
+        self.tree = Tree(self.graph, find_tree_joints(self.graph))
         # Errors of closures are in metres.
         self.tree.size = 1.0
         self._found = motion
@@ -144,8 +144,8 @@ class KinematicCopy(Motion):
                 bodies, (start, end), pair = (rod.inner, rod.outer), rod.ends, np.asarray(rod.pair)
                 points = self.point(rod.inner, start), self.point(rod.outer, end)
                 vectors = self.direction(rod.inner, pair), self.direction(rod.outer, pair)
-                one = keep_pair(rod.name, bodies, points, vectors, norm(plain(end - start)))
-                rows.append(self._row(one, self._differences(one)))
+                one = rod_pair_equation(rod.name, bodies, points, vectors, norm(plain(end - start)))
+                rows.append(self._make_row(one, self._relative_columns(one)))
         return rows
 
 
@@ -166,10 +166,10 @@ def singularity_at_home(graph: Graph) -> float:
 
     :raises SingularityError: something moves although the actuated joints are locked.
     """
-    return singularity_on_numbers(Linkage(graph), graph.lead_home)
+    return numeric_singularity(Linkage(graph), graph.lead_home)
 
 
-def singularity_on_numbers(linkage: Linkage, q: Array, *, point: bool = False) -> float:
+def numeric_singularity(linkage: Linkage, q: Array, *, point: bool = False) -> float:
     """Return the singularity measure at joint positions near home numerically.
 
     :param q: of the actuated joints that lead, shape (m,); ``point``: the pose has no angle.
@@ -188,7 +188,7 @@ class _NumericTraced:
         if x is None:
             raise SingularityError("q", (), 0.0, 1e-9)
         self.motion, rows = linkage.at(x, q)
-        ju, jq = (numbers(m) for m in matrices(linkage.tree, rows))
+        ju, jq = (numbers(m) for m in closure_jacobians(linkage.tree, rows))
         if ju.size and np.linalg.matrix_rank(ju, 1e-9) < ju.shape[1]:
             raise SingularityError("home", (), 0.0, 1e-9)
         self._rates = -np.linalg.lstsq(ju, jq, rcond=1e-9)[0]
@@ -244,7 +244,7 @@ def _motion_singularity(t: Traced | _NumericTraced, point: bool) -> Any:
 
 
 class _TwistMatrices:
-    """Compute the bodies' twist matrices D = S U.
+    """Compute the bodies' twist closure_jacobians D = S U.
 
     S: a body's twist per rate of the tree's joints between it and the base. U: these rates per rate
     of the leading joints.

@@ -19,15 +19,15 @@ from pkm_twin.kinematics.motion import Motion
 from pkm_twin.machine.graph import BASE, Graph, Joint, array, map_welded_bodies
 from pkm_twin.machine.joints import perpendicular_axes, unit
 
-SPIN: Final = 0.05
+MAX_SPIN_RADIUS: Final = 0.05
 """A part whose centre of mass moves less than this share of the machine a radian only spins."""
-RANK: Final = 1e-8
+RELATIVE_RANK_TOLERANCE: Final = 1e-8
 """Part of the greatest singular value below which one counts as zero."""
 MIN_MOTION: Final = 1e-6
 """Least motion of unit one; below, a joint or body stands still."""
 
 
-def without_spins(graph: Graph) -> tuple[Graph, dict[str, float]]:
+def lock_spins(graph: Graph) -> tuple[Graph, dict[str, float]]:
     """Hold every spin of a part; return the graph and the joints that hold them.
 
     Of each joint the greatest mass times distance of its centre from the spin's axis, kg m: where
@@ -47,14 +47,14 @@ def without_spins(graph: Graph) -> tuple[Graph, dict[str, float]]:
     ends = [(graph.joints[name].inner, graph.joints[name].outer) for name in tree.cut]
     ends += [(rod.inner, rod.outer) for rod in graph.rods.values()]
     looped = set().union(*(ways[a] ^ ways[b] for a, b in ends))
-    spins = null(ju, RANK)
-    spins = spins @ null(spins[[owner not in looped for owner in owners]], RANK, absolute=True)
+    spins = null_space(ju, RELATIVE_RANK_TOLERANCE)
+    spins = spins @ null_space(spins[[owner not in looped for owner in owners]], RELATIVE_RANK_TOLERANCE, absolute=True)
     heavy = [body for body in graph.bodies.values() if body.mass > 0.0]
     for body, point, rows, most in (
-        (graph.platform, graph.origin, slice(6), RANK),
-        *((body.name, body.com, slice(3), SPIN * graph.size) for body in heavy),
+        (graph.platform, graph.origin, slice(6), RELATIVE_RANK_TOLERANCE),
+        *((body.name, body.com, slice(3), MAX_SPIN_RADIUS * graph.size) for body in heavy),
     ):
-        spins = spins @ null(twist(motion, body, point)[rows] @ spins, most, absolute=True)
+        spins = spins @ null_space(twist(motion, body, point)[rows] @ spins, most, absolute=True)
     joints, held = dict(graph.joints), dict[str, float]()
     while spins.shape[1]:
         # The hinge with the largest part in a spin; of parts that are equal but for rounding the first.
@@ -67,7 +67,7 @@ def without_spins(graph: Graph) -> tuple[Graph, dict[str, float]]:
         if not shares[k] > MIN_MOTION:
             balls = (
                 (joint.name, np.array(perpendicular_axes(axis)), spins @ way, way)
-                for bodies, axis, way in idle_bodies(graph, motion, spins)
+                for bodies, axis, way in find_idle_bodies(graph, motion, spins)
                 for joint in graph.joints.values()
                 if joint.kind == "spherical" and {joint.inner, joint.outer} & set(bodies)
             )
@@ -75,7 +75,7 @@ def without_spins(graph: Graph) -> tuple[Graph, dict[str, float]]:
             if found is None:
                 break
             name, axes, way, lost = found
-        spins = spins @ null(lost[None], RANK)
+        spins = spins @ null_space(lost[None], RELATIVE_RANK_TOLERANCE)
         joints[name] = _lock_joint(joints[name], axes)
         held[name] = 0.0
         for one in graph.bodies.values():
@@ -86,7 +86,7 @@ def without_spins(graph: Graph) -> tuple[Graph, dict[str, float]]:
     return replace(graph, joints=joints), held
 
 
-def hold(graph: Graph, hinges: Sequence[str]) -> Graph:
+def lock_hinges(graph: Graph, hinges: Sequence[str]) -> Graph:
     """Fix some hinges of a graph."""
     fixed = {name: _lock_joint(graph.joints[name], np.zeros((0, 3))) for name in hinges}
     return replace(graph, joints={**graph.joints, **fixed})
@@ -105,7 +105,7 @@ def _lock_joint(joint: Joint, axes: Array) -> Joint:
     )
 
 
-def idle_bodies(graph: Graph, motion: Motion, free: Array) -> list[tuple[list[str], Array, Array]]:
+def find_idle_bodies(graph: Graph, motion: Motion, free: Array) -> list[tuple[list[str], Array, Array]]:
     """Find bodies that can move alone, those united by fixed joints as one, and their motion.
 
     :param free: motions with the actuated joints at rest, shape (unknown rates, count).
@@ -119,7 +119,7 @@ def idle_bodies(graph: Graph, motion: Motion, free: Array) -> list[tuple[list[st
     for names in groups.values():
         others = [rows for body, rows in moved.items() if body not in names]
         own = [body for body in names if body in moved]
-        alone = null(np.vstack(others), MIN_MOTION, absolute=True) if others else np.eye(free.shape[1])
+        alone = null_space(np.vstack(others), MIN_MOTION, absolute=True) if others else np.eye(free.shape[1])
         for way in alone.T if own else ():
             turning = moved[own[0]][3:] @ way
             if float(np.linalg.norm(turning)) > MIN_MOTION:
@@ -143,7 +143,7 @@ def twist(motion: Motion, body: str, point: Array) -> Array:
     return table
 
 
-def null(matrix: Array, bound: float, absolute: bool = False) -> Array:
+def null_space(matrix: Array, bound: float, absolute: bool = False) -> Array:
     """Return an orthonormal basis of the null space, shape (columns, free)."""
     if not matrix.size:
         return np.eye(matrix.shape[1])

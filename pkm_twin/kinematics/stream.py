@@ -17,9 +17,9 @@ from pkm_twin.kinematics.engine import Engine
 from pkm_twin.kinematics.singularity import singularity_measure
 from pkm_twin.kinematics.traced import Traced
 
-REACH: Final = 0.02
+MAX_MOVE: Final = 0.02
 """How far joints go, unit one, before the closures are solved from home again."""
-LONGEST: Final = 0.02
+MAX_EXTRAPOLATION_TIME: Final = 0.02
 """Most time between samples, s, over which motion is foreseen."""
 
 
@@ -35,10 +35,10 @@ def stream_kernel(engine: Engine) -> Kernel:
     the change of the rates tells, and is taken off. So is half of what is predicted, for where the
     rates turn between two samples.
     """
-    return engine.kernel("stream", _stream)
+    return engine.kernel("stream", _write_stream_program)
 
 
-def _stream(t: Traced) -> Program:
+def _write_stream_program(t: Traced) -> Program:
     n, m = t.drives.count, len(t.scheme.coordinates)
     scales = t.tape.inputs(PARAMETERS, m)
     before = t.tape.inputs("before", n + m + m * m + m + 1)
@@ -51,9 +51,9 @@ def _stream(t: Traced) -> Program:
     last = before[n + m : n + m + m * m].reshape(m, m)
     move = t.q - before[t.drives.leading]
     predicted = 0.5 * ((rates + last) @ move)
-    bend = _sizes(rates - last) @ _sizes(move)
-    error = _sizes(pose - before[n : n + m] - predicted)
-    beyond = error - 0.5 * _sizes(predicted) - bend
+    bend = _absolute_values(rates - last) @ _absolute_values(move)
+    error = _absolute_values(pose - before[n : n + m] - predicted)
+    beyond = error - 0.5 * _absolute_values(predicted) - bend
     row = t.lift([*t.drives.variables("q"), *pose, *rates.ravel(), *beyond, singularity_measure(t)])
     return Program(t.inputs("q", before=len(before)), m, {"sample": row}, t.equations())
 
@@ -66,7 +66,7 @@ def start_from_last(t: Traced, program: Program) -> Program:
     the unknowns moved on by these. Results are those of ``program``.
     """
     (q,) = program.equations
-    n, (places, rates) = t.joints, t.scheme.solved
+    n, (places, rates) = t.joints, t.scheme.newton_unknowns
     if not q.guessed or not places:
         last, more = t.tape.inputs(LAST, 1), [1.0]
         return replace(
@@ -78,14 +78,14 @@ def start_from_last(t: Traced, program: Program) -> Program:
     sizes = (1, n, n, n, len(places), k, k, k)
     last = t.tape.inputs(LAST, sum(sizes))
     (holds,), anchor, before, speed, x, u, du, change = np.split(last, np.cumsum(sizes)[:-1])
-    qd, scales = t.drives.given("qd"), np.array(t.drive_scales, dtype=object)
+    qd, scales = t.drives.leading_inputs("qd"), np.array(t.drive_scales, dtype=object)
     away, move = (t.q - anchor) * scales, (t.q - before) * scales
     mean = (0.5 * (qd + speed)) * scales
-    near = both(less(0.0, holds), less(away @ away, REACH * REACH))
+    near = both(less(0.0, holds), less(away @ away, MAX_MOVE * MAX_MOVE))
     # With the mean of both speeds the error grows with the third power of the time.
     time = (move @ mean) / maximum(mean @ mean, 1e-300)
-    time = minimum(maximum(time, 0.0), LONGEST)
-    foreseen = t.retracted(x, time * (u + (0.5 * time) * (du + change * (1.0 / 3.0))))
+    time = minimum(maximum(time, 0.0), MAX_EXTRAPOLATION_TIME)
+    foreseen = t.retract(x, time * (u + (0.5 * time) * (du + change * (1.0 / 3.0))))
     solved = (select(near, a, b) for a, b in zip(anchor, t.q, strict=True))
     changed = (select(near, a - b, 0.0) for a, b in zip(t.du[rates], du, strict=True))
     kept = [1.0, *solved, *t.q, *qd, *t.unknowns, *t.u[rates], *t.du[rates], *changed]
@@ -98,5 +98,5 @@ def start_from_last(t: Traced, program: Program) -> Program:
     )
 
 
-def _sizes(values: Any) -> Any:
+def _absolute_values(values: Any) -> Any:
     return np.array([absolute(value) for value in values.ravel()], object).reshape(values.shape)

@@ -71,7 +71,7 @@ class ThreeRods:
         n = cross(c2 - c1, c3 - c1)
         return snapped_all(n * sign_of(-(c1 @ n)))
 
-    def place(self, tree: Tree, q: Numbers) -> list[Any]:
+    def solve_unknowns(self, tree: Tree, q: Numbers) -> list[Any]:
         """Return the unknowns of the joint that carries the body, in closed form."""
         point, _, _ = meet_spheres(*self._spheres(tree, q), self._find_up(tree.graph))
         # Steps of the joint are along the base axes.

@@ -23,9 +23,9 @@ from pkm_twin.codegen.expressions import (
 )
 from pkm_twin.codegen.lu import SparseLU
 from pkm_twin.codegen.program import AT, LEAST, MAX_GROWTH, STATE, UNKNOWNS, Equations, previous_input_name
-from pkm_twin.kinematics.drives import LEADS, TIME, Drives
+from pkm_twin.kinematics.drives import LEADS, TOLERANCE_TIME, Drives
 from pkm_twin.kinematics.limb_pose import LimbPose
-from pkm_twin.kinematics.motion import FIXED, BaseMotion, Columns, Motion, Row, matrices
+from pkm_twin.kinematics.motion import FIXED, BaseMotion, Columns, Motion, Row, closure_jacobians
 from pkm_twin.kinematics.scheme import Scheme
 from pkm_twin.machine.geometry import build_sized_graph
 from pkm_twin.machine.graph import Graph
@@ -66,7 +66,7 @@ class Traced:
         self.geometry = given[:end]
         self.graph: Graph = build_sized_graph(scheme.graph, self.geometry)
         self.more = given[end:]
-        """Numbers beside the geometry's, see :meth:`.engine.Engine.kernel_with`."""
+        """Numbers beside the geometry's, see :meth:`.engine.Engine.kernel_with_inputs`."""
         self._span()
 
     def _span(self) -> None:
@@ -90,15 +90,15 @@ class Traced:
         return other
 
     @property
-    def ahead(self) -> Traced:
+    def reduced(self) -> Traced:
         """The symbolic machine whose forward kinematics have the fewest unknowns."""
-        return self if self.scheme.ahead is None else self.platform_first(self.scheme.ahead)
+        return self if self.scheme.reduced is None else self.platform_first(self.scheme.reduced)
 
     def _place(self, unknowns: Numbers) -> tuple[Motion, list[LimbPose], Objects]:
         """Return the motion, the limbs and all unknowns for given unknowns of Newton's method."""
         # Constrained coordinates keep their home values.
         x = np.array(self.tree.home, dtype=object)
-        x[self.scheme.solved[0]] = unknowns
+        x[self.scheme.newton_unknowns[0]] = unknowns
         motion, limbs = self.scheme.place(self.tree, x, self.q)
         return motion, limbs, x
 
@@ -106,22 +106,22 @@ class Traced:
         """Place the machine by its unknowns, and factor its closures."""
         scheme, tree = self.scheme, self.tree
         self.margins: list[Expression] = []
-        self.unknowns: Numbers = self.tape.inputs(self.unknowns_name, len(scheme.solved[0]))
+        self.unknowns: Numbers = self.tape.inputs(self.unknowns_name, len(scheme.newton_unknowns[0]))
         if scheme.platform_pivots is not None:
             self.unknowns, growth = scheme.close_platform(tree, self.q, scheme.platform_pivots)
             self.margins = self.lift([MAX_GROWTH - growth])
         self.motion, self.limbs, self.x = self._place(self.unknowns)
         self.rows = self.motion.closures()
-        self.ju, self.jq = matrices(tree, self.rows)
+        self.ju, self.jq = closure_jacobians(tree, self.rows)
         self.lu = SparseLU(self.ju[scheme.independent][:, scheme.varying], scheme.pivots)
-        self.solved = scheme.solved_rows(self.rows, self.limbs)
+        self.solved = scheme.newton_rows(self.rows, self.limbs)
         self.newton = self.lu
         if self.limbs:
-            self.newton = SparseLU(self._table(self.solved), scheme.solved_pivots)
+            self.newton = SparseLU(self._newton_jacobian(self.solved), scheme.newton_pivots)
 
-    def _table(self, solved: Sequence[Row]) -> Objects:
+    def _newton_jacobian(self, solved: Sequence[Row]) -> Objects:
         """Return the Jacobian of Newton's equations by the rates of its unknowns."""
-        return matrices(self.tree, solved)[0][:, self.scheme.solved[1]]
+        return closure_jacobians(self.tree, solved)[0][:, self.scheme.newton_unknowns[1]]
 
     @property
     def drive_scales(self) -> list[Any]:
@@ -145,40 +145,40 @@ class Traced:
         :param more: further fields of the equations.
         """
         if self.drives.others and "goal" not in more:
-            more["goal"] = self.lift(self.drives.given("q"))
+            more["goal"] = self.lift(self.drives.leading_inputs("q"))
             more["branch"] = [*more.pop("branch", ()), *self.lift(self.drives.tolerance_margins())]
         scheme, tree = self.scheme, self.tree
         branch = list(self.margins)
         systems = [(self.lu, [self.rows[k] for k in scheme.independent], scheme.varying)]
         if self.limbs:
-            systems.append((self.newton, self.solved, scheme.solved[1]))
+            systems.append((self.newton, self.solved, scheme.newton_unknowns[1]))
         for lu, own, columns in systems:
             # Results depend on factors that are used before, not corrections alone.
             if lu.used:
-                branch += self.limit_growth(lu, [row.scale for row in own], [tree.scales[k] for k in columns])
+                branch += self.pivot_margins(lu, [row.scale for row in own], [tree.scales[k] for k in columns])
         determinant = self.determinant
-        places, rates = scheme.solved if scheme.platform_pivots is None else ([], [])
+        places, rates = scheme.newton_unknowns if scheme.platform_pivots is None else ([], [])
         step: Numbers = -self.newton.solve([row.value for row in self.solved]) if places else []
         rows: list[Any] = [0.0] * tree.unknown_rates
         for k, value in zip(rates, step, strict=True):
             rows[k] = value
-        moved = self.motion.retracted(self.x, rows)
+        moved = self.motion.retract(self.x, rows)
         before = self.tape.inputs(previous_input_name(self.unknowns_name), len(places))
         state = self.tape.inputs(STATE, len(AT))
         onward = [x + state[AT.onward] * (x - last) for x, last in zip(self.unknowns, before, strict=False)]
         if not places:
             # Nothing is corrected: only the result is checked.
             branch, determinant = [*branch, *self.lift([determinant - LEAST])], 1.0
-        judged = [self.rows[k] for k in scheme.judged]
+        judged = [self.rows[k] for k in scheme.checked_closures]
         start: Sequence[Any] = []
         if places:
-            start = self._guess() if scheme.start is None else scheme.start.place(tree, self.q)
+            start = self._guess() if scheme.start is None else scheme.start.solve_unknowns(tree, self.q)
         solved = Equations(
             self.target,
             self.lift([tree.home[k] for k in places]),
             self.lift(self.graph.lead_home),
             self.lift(start),
-            self.retracted(onward) if places else [],
+            self.retract(onward) if places else [],
             self.lift([moved[k] for k in places]),
             self.square(step, [tree.scales[k] for k in rates]),
             self.tape.lift(determinant),
@@ -190,7 +190,7 @@ class Traced:
         )
         return (solved,)
 
-    def limit_growth(self, lu: SparseLU, rows: Numbers, columns: Numbers) -> list[Expression]:
+    def pivot_margins(self, lu: SparseLU, rows: Numbers, columns: Numbers) -> list[Expression]:
         """Return a margin that is positive where no pivot of ``lu`` vanishes.
 
         :param rows: factors that make rows and ``columns`` of the matrix dimensionless.
@@ -198,14 +198,14 @@ class Traced:
         growth = lu.find_growth(rows, columns)
         return self.lift([MAX_GROWTH - growth]) if isinstance(growth, Expression) else []
 
-    def retracted(self, values: Numbers, rates: Numbers = ()) -> list[Expression]:
+    def retract(self, values: Numbers, rates: Numbers = ()) -> list[Expression]:
         """Return Newton's unknowns after a step of small rates; turns are normalised."""
-        places, kept = self.scheme.solved
+        places, kept = self.scheme.newton_unknowns
         x, du = np.array(self.tree.home, object), np.zeros(self.tree.unknown_rates, object)
         x[places] = values
         if len(rates):
             du[kept] = rates
-        moved = self.home.retracted(x, du)
+        moved = self.home.retract(x, du)
         return self.lift([moved[k] for k in places])
 
     @property
@@ -218,7 +218,9 @@ class Traced:
                 result = result * (slope / at_home)
         if self.scheme.constrained_rates:
             constraining = self._factor_constraining(self.ju, self.lu)
-            at_home = self._factor_constraining(snapped_all(matrices(self.tree, self.home.closures())[0]), home.lu)
+            at_home = self._factor_constraining(
+                snapped_all(closure_jacobians(self.tree, self.home.closures())[0]), home.lu
+            )
             result = result * (at_home.inverse_determinant / constraining.inverse_determinant)
         return result
 
@@ -242,11 +244,11 @@ class Traced:
         x = np.array(self.tree.home, dtype=object)
         _, limbs = scheme.place(self.tree, x, self.graph.lead_home)
         closures = self.home.closures()
-        ju, jq = (snapped_all(m[scheme.independent]) for m in matrices(self.tree, closures))
+        ju, jq = (snapped_all(m[scheme.independent]) for m in closure_jacobians(self.tree, closures))
         lu = newton = SparseLU(ju[:, scheme.varying], scheme.pivots)
-        solved = scheme.solved_rows(closures, limbs)
+        solved = scheme.newton_rows(closures, limbs)
         if limbs:
-            newton = SparseLU(snapped_all(self._table(solved)), scheme.solved_pivots)
+            newton = SparseLU(snapped_all(self._newton_jacobian(solved)), scheme.newton_pivots)
         return Factors(limbs, jq, lu, solved, newton)
 
     @property
@@ -268,7 +270,7 @@ class Traced:
 
         :param home: at home.
         """
-        at, kept = self._at_home if home else self._here, self.scheme.solved[1]
+        at, kept = self._at_home if home else self._here, self.scheme.newton_unknowns[1]
         reaches = {limb.reach: pose for limb, pose in zip(self.scheme.limbs, at.limbs, strict=True)}
         bodies = {step.joint: link.body for link in self.tree.links.values() for step in link.steps}
         rows = []
@@ -282,7 +284,7 @@ class Traced:
             by_q: Any = np.array([columns.get(("q", k), 0.0) for k in range(self.joints)], object)
             if kept:
                 by_u = [columns.get(("u", k), 0.0) for k in kept]
-                table = matrices(self.tree, at.solved)[1]
+                table = closure_jacobians(self.tree, at.solved)[1]
                 by_q = by_q - table.T @ at.newton.solve_transposed(by_u)
             rows.append(by_q)
         return np.array(rows, dtype=object)
@@ -296,12 +298,12 @@ class Traced:
         _, jq, lu, _, newton = self._at_home
         away = self.q - self.graph.lead_home
         # Columns per joint are constants at home: an evaluation only multiplies by them.
-        columns = snapped_all([self._unknown(-lu.solve(jq[:, j])) for j in range(self.joints)])
-        moved = self.home.retracted(home, columns.T @ away)
-        tangent = [moved[k] for k in scheme.solved[0]]
+        columns = snapped_all([self._all_rates(-lu.solve(jq[:, j])) for j in range(self.joints)])
+        moved = self.home.retract(home, columns.T @ away)
+        tangent = [moved[k] for k in scheme.newton_unknowns[0]]
         motion, limbs, _ = self._place(tangent)
-        solved = scheme.solved_rows(motion.closures(), limbs)
-        return self.retracted(tangent, -newton.solve([row.value for row in solved]))
+        solved = scheme.newton_rows(motion.closures(), limbs)
+        return self.retract(tangent, -newton.solve([row.value for row in solved]))
 
     def lift(self, values: Numbers) -> list[Expression]:
         """Return results as expressions."""
@@ -324,17 +326,17 @@ class Traced:
         found = adjoints(sums, [*by, *self.unknowns])
         direct = found[: len(by)]
         by_x: list[Any] = [0.0] * len(self.x)
-        places, rates = self.scheme.solved
+        places, rates = self.scheme.newton_unknowns
         for k, value in zip(places, found[len(by) :], strict=True):
             by_x[k] = value
-        by_rates = self._by_rates(by_x)
+        by_rates = self._convert_to_rates(by_x)
         multipliers = self.newton.solve_transposed([by_rates[k] for k in rates])
         values = [row.value for row in self.solved]
         through = adjoints(list(zip(values, multipliers, strict=True)), by)
         return [a - b for a, b in zip(direct, through, strict=True)]
 
-    def _by_rates(self, by_x: Sequence[Any]) -> list[Any]:
-        """Convert derivatives by the unknowns to those by their rates: see ``Motion.retracted``."""
+    def _convert_to_rates(self, by_x: Sequence[Any]) -> list[Any]:
+        """Convert derivatives by the unknowns to those by their rates: see ``Motion.retract``."""
         result: list[Any] = [0.0] * self.tree.unknown_rates
         for link in self.tree.links.values():
             for step in link.steps:
@@ -357,10 +359,10 @@ class Traced:
     def set_rates(self, qd: Numbers) -> Objects:
         """Compute all rates from qd; return those of the unknowns."""
         kept = self.scheme.independent
-        self.u = self._unknown(self.lu.solve(-(self.jq[kept] @ np.asarray(qd, dtype=object))))
+        self.u = self._all_rates(self.lu.solve(-(self.jq[kept] @ np.asarray(qd, dtype=object))))
         self.qd = qd
         self.motion.set_rates(self.u, qd)
-        self.drives.judge("qd", qd, self.u, TIME)
+        self.drives.check_dependent("qd", qd, self.u, TOLERANCE_TIME)
         return self.u
 
     def set_accelerations(self, qdd: Numbers, base: BaseMotion = FIXED) -> None:
@@ -371,17 +373,17 @@ class Traced:
         kept = self.scheme.independent
         self.motion.set_accelerations(np.zeros(self.tree.unknown_rates), qdd)
         bias = [self.rows[k].bias() for k in kept]
-        self.du = self._unknown(-self.lu.solve(bias))
-        self.drives.judge("qdd", qdd, self.du, TIME * TIME)
+        self.du = self._all_rates(-self.lu.solve(bias))
+        self.drives.check_dependent("qdd", qdd, self.du, TOLERANCE_TIME * TOLERANCE_TIME)
         self.motion.set_rates(self.u, self.qd, base)
         self.motion.set_accelerations(self.du, qdd)
 
     def rate_columns(self) -> list[Objects]:
         """Return rates of the unknowns per joint rate."""
         kept = self.scheme.independent
-        return [self._unknown(self.lu.solve(-self.jq[kept][:, j])) for j in range(self.joints)]
+        return [self._all_rates(self.lu.solve(-self.jq[kept][:, j])) for j in range(self.joints)]
 
-    def _unknown(self, varying: Numbers) -> Objects:
+    def _all_rates(self, varying: Numbers) -> Objects:
         """Return all unknown rates from the solved ones; constrained rates are zero."""
         rates = np.zeros(self.tree.unknown_rates, dtype=object)
         rates[self.scheme.varying] = varying

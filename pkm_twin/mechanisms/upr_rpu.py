@@ -37,7 +37,7 @@ from pkm_twin.codegen.operations import absolute, atan2, cos, maximum, minimum, 
 from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.motion import Motion
 from pkm_twin.kinematics.pose import COORDINATES, Coordinate, name_angles
-from pkm_twin.kinematics.scheme import Start
+from pkm_twin.kinematics.scheme import ClosedFormStart
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph import BASE, MIN_LENGTH, PLATFORM, Body, Direction, Graph, Joint, array
 from pkm_twin.machine.members import Beam, Parts, Section, axial, compliances, disc, modulus
@@ -156,13 +156,13 @@ class Limits:
 
 
 @dataclass(frozen=True)
-class LargestRoot(Start):
+class LargestRoot(ClosedFormStart):
     """The home assembly: rho, beta and gamma by the largest root of a cubic.
 
     The guess about home is too far from most states: limbs triple their length.
     """
 
-    def place(self, tree: Tree, q: Numbers) -> list[Any]:
+    def solve_unknowns(self, tree: Tree, q: Numbers) -> list[Any]:
         """Return cosine and sine of the turns of the passive joints from home.
 
         With c = cos(gamma) = (P + K) / (2 a b), P = rho^2 and 4 a rho sin(gamma) = L1^2 - L2^2 = D,

@@ -19,7 +19,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import reference
 from pkm_twin.errors import ParameterError, UnknownNameError, unknown_number_error
 from pkm_twin.kinematics.pose import Coordinate
-from pkm_twin.kinematics.scheme import Start
+from pkm_twin.kinematics.scheme import ClosedFormStart
 from pkm_twin.machine import schema
 from pkm_twin.machine.formulas import Book
 from pkm_twin.machine.friction import find_law_names, select_compiled_laws
@@ -109,7 +109,7 @@ class Mechanism(Common):
     """The poses of a workspace map about the machine's axis; None: along the pose coordinates."""
     limit_key: ClassVar[str] = "limits.position"
     """Path of the actuated joints' limits in the file."""
-    start: ClassVar[Start | None] = None
+    start: ClassVar[ClosedFormStart | None] = None
     """A closed form of the forward kinematics that does not follow from the graph."""
     changeable: ClassVar[tuple[str, ...]] = (
         "payload",

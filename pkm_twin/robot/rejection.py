@@ -13,7 +13,7 @@ from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.codegen.code import NOT_FINITE
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.errors import ParameterError, SingularityError, UnreachableError
-from pkm_twin.kinematics.drives import TIME
+from pkm_twin.kinematics.drives import TOLERANCE_TIME
 from pkm_twin.kinematics.engine import Engine
 from pkm_twin.kinematics.programs import projection_program
 from pkm_twin.robot.mechanism import Mechanism
@@ -45,7 +45,7 @@ def reject_poses(
     one = np.broadcast_to(poses, (*status.shape[:-1], poses.shape[-1]))[index]
     if code == NOT_FINITE or not np.isfinite(one).all():
         raise _make_finite_error("pose", index)
-    part, miss, met = engine.shortest_pose(one)
+    part, miss, met = engine.find_pose_gap(one)
     question = _ask_for_unit(robot, one, engine.home_pose)
     if met and reached < 1.0:
         raise SingularityError("pose", index, 0.0, SINGULARITY_BOUND, reached, question=question)
@@ -108,11 +108,11 @@ def reject_joints(
     if gap is not None:
         raise UnreachableError("joint state", robot.name_limb(gap[0]), index, gap[1])
     if reached == 1.0 and try_program(engine.forward, given["q"])[1]:
-        raise make_pivot_error("joint state", index, engine.reach(sample)[2])
+        raise make_pivot_error("joint state", index, engine.follow_line(sample)[2])
     drive, change = _find_correction(robot, engine, sample)
     if change < np.inf and robot.graph.joints[drive].slides:
         raise UnreachableError("joint state", robot.name_limb(drive), index, change)
-    part, miss, measure = engine.ending(sample, reached)
+    part, miss, measure = engine.explain_end(sample, reached)
     if measure is not None:
         raise SingularityError("joint state", index, measure, SINGULARITY_BOUND, reached, question=question)
     limb = robot.name_limb(drive if change < np.inf else part)
@@ -167,7 +167,7 @@ def _reject_contradiction(robot: Mechanism, engine: Engine, given: Mapping[str, 
     for k, (own, follows, (has, whence, per)) in enumerate(zip(state, found, words, strict=True)):
         apart = np.abs(own - follows)
         worst = int(np.argmax(apart / scales))
-        bound = float(graph.sharing[0] * scales[worst]) / TIME**k
+        bound = float(graph.sharing[0] * scales[worst]) / TOLERANCE_TIME**k
         if not apart[worst] > bound:
             continue
         unit = robot.joint_units[worst] + per

@@ -15,7 +15,7 @@ from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.codegen.code import REJECTED, VALID
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.errors import ParameterError
-from pkm_twin.kinematics.engine import Engine, engine_of
+from pkm_twin.kinematics.engine import Engine, find_engine
 from pkm_twin.kinematics.passive import passive_names, passive_program, passive_rates_program
 from pkm_twin.kinematics.programs import projection_program
 from pkm_twin.kinematics.singularity import singularity_kernel
@@ -57,7 +57,7 @@ class Robot(Mechanism):
         return self._make_engine(self.graph)
 
     def _make_engine(self, graph: Graph) -> Engine:
-        return engine_of(graph, self.coordinates, self.start)
+        return find_engine(graph, self.coordinates, self.start)
 
     @cached_property
     def _massive_engine(self) -> Engine:

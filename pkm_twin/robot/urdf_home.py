@@ -21,14 +21,14 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.codegen.expressions import cross
 from pkm_twin.errors import ParameterError, SingularityError
-from pkm_twin.kinematics.constraints import Equation, constraint_equations, keep_angle
+from pkm_twin.kinematics.constraints import Equation, angle_equation, constraint_equations
 from pkm_twin.kinematics.iterations import newton
 from pkm_twin.kinematics.linkage import Linkage
 from pkm_twin.kinematics.motion import Motion, numbers
-from pkm_twin.kinematics.rounding import CHAIN, EXACT, MAX_ROUNDING, Repair, repair_rounded
+from pkm_twin.kinematics.rounding import MAX_ERROR_GROWTH, MAX_ROUNDING, MAX_ZERO_SINGULAR_VALUE, Repair, repair_rounded
 from pkm_twin.kinematics.scheme import choose_leads
 from pkm_twin.kinematics.singularity import singularity_at_home
-from pkm_twin.kinematics.spins import RANK, hold, null, without_spins
+from pkm_twin.kinematics.spins import RELATIVE_RANK_TOLERANCE, lock_hinges, lock_spins, null_space
 from pkm_twin.machine import graph as graphs
 from pkm_twin.machine.graph import BASE, Graph
 from pkm_twin.machine.joints import CONSTRAINTS, Constraint
@@ -58,7 +58,7 @@ class Assembly:
 
     def __init__(self, tree: LoopTree) -> None:
         self.tree = tree
-        self.rounding = min(MAX_ROUNDING, CHAIN * tree.rounding)
+        self.rounding = min(MAX_ROUNDING, MAX_ERROR_GROWTH * tree.rounding)
         """A loop that misses by less is drawn closed: the file has no more digits, m or rad."""
         self.closed = max(1e-5, self.rounding)
         """A loop that misses by more is open, m or rad."""
@@ -133,7 +133,7 @@ class Assembly:
         for held, apart in self._constraints[name]:
             if closure.type.count == 2 and held.kind == "angle":
                 axes = inner @ held.inner, outer @ held.outer
-                found.append(keep_angle(name, bodies, points, axes, closure.cosine))
+                found.append(angle_equation(name, bodies, points, axes, closure.cosine))
             else:
                 turns = inner.__matmul__, (outer @ apart).__matmul__
                 found += constraint_equations(name, bodies, held, points, turns, 1.0)
@@ -498,15 +498,15 @@ class HomeSearch:
         """
         # Numbers with fewer digits than most take freedoms, so that motors seem redundant.
         own, found = self.assembly.tree.rounding, None
-        for rounding in (max(own, miss), *([MAX_ROUNDING] if own > EXACT else [])):
+        for rounding in (max(own, miss), *([MAX_ROUNDING] if own > MAX_ZERO_SINGULAR_VALUE else [])):
             repaired = repair_rounded(graph, rounding, MIN_ROUNDING)
             if repaired is None:
                 continue
             held = self._hinges or {}
-            sound = hold(repaired.graph, list(held))
+            sound = lock_hinges(repaired.graph, list(held))
             driven = self._hinges is not None and _count_driven(sound)
             if not driven:
-                sound, held = without_spins(repaired.graph)
+                sound, held = lock_spins(repaired.graph)
                 driven = _count_driven(sound)
                 if driven and all(sound.joints[name].kind == "fixed" for name in held):
                     self._hinges = held
@@ -520,6 +520,6 @@ class HomeSearch:
 def _count_driven(graph: Graph) -> int:
     """Count the freedoms at home if the actuated joints determine the machine, perhaps redundantly; else zero."""
     linkage = Linkage(graph)
-    locked = null(linkage.scaled_at_home()[0], RANK, absolute=True)
+    locked = null_space(linkage.scaled_at_home()[0], RELATIVE_RANK_TOLERANCE, absolute=True)
     freedoms = linkage.mobility.freedoms
     return freedoms if not locked.shape[1] and 0 < freedoms <= linkage.joints else 0

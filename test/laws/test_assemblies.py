@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pkm_twin.kinematics.motion import Motion, numbers
-from pkm_twin.kinematics.programs import walk_program
+from pkm_twin.kinematics.programs import newton_step_program
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from test.laws.test_limbs import hexapod
 from test.machine.random_machines import FILES, GALLERY, variant
@@ -64,7 +64,7 @@ def led(engine, q, steps):
     home; below zero it is past a singularity.
     """
     home, kept, free = engine.graph.home, engine.independent, engine.tree.unknown_rates
-    walk, count = engine.kernel("walk", walk_program), len(engine.parts)
+    walk, count = engine.kernel("walk", newton_step_program), len(engine.parts)
     slides = np.array([engine.graph.joints[name].slides for name in engine.graph.actuated])
     step = (q - home) / steps
     drive = np.where(slides, step / engine.tree.size, step)[..., None]

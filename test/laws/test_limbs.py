@@ -18,7 +18,7 @@ from delta_dynamics import (
 )
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.kinematics.iterations import newton
-from pkm_twin.kinematics.motion import Motion, matrices, numbers
+from pkm_twin.kinematics.motion import Motion, closure_jacobians, numbers
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from test.machine.random_machines import NAMES as MACHINES
 from test.machine.random_machines import variant
@@ -64,7 +64,7 @@ def test_the_platform_is_that_of_all_closures(seed):
     robot = hexapod(seed)
     engine = robot.engine
     assert len(engine.limbs) == 5
-    assert len(engine.ahead.limbs) == 6
+    assert len(engine.reduced.limbs) == 6
     rng = np.random.default_rng(seed)
     q = engine.graph.home + rng.uniform(-0.15, 0.15, (400, 6)) * engine.tree.size
     pose, known = robot.try_forward(q)
@@ -84,10 +84,10 @@ def test_limbs_and_their_determinant_are_those_of_all_closures(seed):
         motion, limbs = engine.place(engine.tree, found, q)
         np.testing.assert_allclose(found.astype(float), x, atol=1e-10)
         rows = motion.closures()
-        solved = numbers(matrices(engine.tree, engine.solved_rows(rows, limbs))[0])
-        whole = numbers(matrices(engine.tree, rows)[0])[engine.independent]
+        solved = numbers(closure_jacobians(engine.tree, engine.newton_rows(rows, limbs))[0])
+        whole = numbers(closure_jacobians(engine.tree, rows)[0])[engine.independent]
         turns = np.prod([float(slope) for limb in limbs for slope, _ in limb.slopes])
-        part = np.linalg.det(solved[:, engine.solved[1]]) * turns
+        part = np.linalg.det(solved[:, engine.newton_unknowns[1]]) * turns
         ratios.append(np.linalg.det(whole) / part)
     assert len(ratios) > 3
     np.testing.assert_allclose(ratios, ratios[0], rtol=1e-9)
@@ -193,7 +193,7 @@ def test_slides_and_a_turn_of_the_platform_are_those_of_all_closures(name, rng):
     for x, q in posed.samples:
         at = q + rng.uniform(-0.05, 0.05, len(q))
         found = np.array(x, dtype=object)
-        found[posed.solved[0]] = posed.close_platform(posed.tree, at, posed.platform_pivots)[0]
+        found[posed.newton_unknowns[0]] = posed.close_platform(posed.tree, at, posed.platform_pivots)[0]
         motion, _ = posed.place(posed.tree, found, at)
         assert max(abs(row.value * row.scale) for row in motion.closures()) < 1e-12
 

@@ -83,14 +83,14 @@ def test_a_free_swing_keeps_its_energy_and_friction_takes_some(name):
 def test_a_swing_is_that_of_an_independent_engine(name):
     pytest.importorskip("pinocchio")
     from tools.certificate.machines import build
-    from tools.certificate.swing import engine_of, starts
+    from tools.certificate.swing import find_engine, starts
 
     (start,) = (s for s in starts() if s.title == name)
     robot = build(start.data)
     plant = Plant(robot, start.q)
     plant.qd = start.qd.copy()
     effort = inverse_dynamics(robot, start.rest, 0.0 * start.rest, 0.0 * start.rest)
-    engine = engine_of(start.data)
+    engine = find_engine(start.data)
     state = engine.state(start.q, start.qd, np.zeros(3))
     q, v = state.q, state.v
     for _ in range(150):

@@ -17,7 +17,7 @@ from pkm_twin.certify.maximal import Maximal
 from pkm_twin.certify.rows import stack_rows
 from pkm_twin.errors import SingularityError
 from pkm_twin.kinematics.linkage import Linkage
-from pkm_twin.kinematics.singularity import KinematicCopy, singularity_on_numbers
+from pkm_twin.kinematics.singularity import KinematicCopy, numeric_singularity
 from pkm_twin.machine.graph import weld
 from pkm_twin.machine.graph_description import graph_description
 from pkm_twin.mechanisms.catalogue import robot_of_data
@@ -173,7 +173,7 @@ class TestOneMachineOneMeasure:
         """By joint positions by name, of the joints that lead."""
         linkage = Linkage(graph)
         rows = ([state[name] for name in graph.leads] for state in states)
-        return [singularity_on_numbers(linkage, np.array(row), point=point) for row in rows]
+        return [numeric_singularity(linkage, np.array(row), point=point) for row in rows]
 
     @pytest.mark.parametrize("machine", list(law_machines()), ids=lambda m: Path(m).stem)
     def test_measure(self, machine):
@@ -210,7 +210,7 @@ class TestOneMachineOneMeasure:
         robot = load(name) if name in robot_names() else load(GALLERY / f"{name}.yaml")
         q = random_joints(robot, np.random.default_rng(1), 4)
         linkage = Linkage(robot.graph)
-        found = [singularity_on_numbers(linkage, here) for here in q]
+        found = [numeric_singularity(linkage, here) for here in q]
         assert robot.singularity(q) == pytest.approx(found, rel=1e-9)
 
 

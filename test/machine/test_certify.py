@@ -163,7 +163,7 @@ def test_drawn_machines_share_their_programs(name, monkeypatch):
         np.testing.assert_allclose(found, 0.0, atol=1e-9)
         mass_matrix(robot, q), robot.platform_jacobian(q)
         own = robot.engine
-        order = repr((own.pivots, own.order, own.solved_pivots, own.platform_pivots))
+        order = repr((own.pivots, own.order, own.newton_pivots, own.platform_pivots))
         assert not made or order not in orders
         orders.add(order)
         robots.append(robot)

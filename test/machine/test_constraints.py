@@ -11,9 +11,9 @@ from pkm_twin.kinematics.constraints import (
     Placement,
     constraint_equations,
     differentiate_by_frame,
+    distance_equation,
     drive_equation,
-    keep_distance,
-    keep_pair,
+    rod_pair_equation,
     rotate,
 )
 from pkm_twin.machine.graph import BASE, Body, Graph, Joint
@@ -31,15 +31,15 @@ def unit(rng):
 
 def equations(kind, placed, at, axes, shifts=(0.0, 0.0), tilts=(None, None)):
     """The equations of a part between two bodies, whose frames are displaced on them."""
-    turns = [placed.turn(n) for n in BODIES]
+    turns = [placed.body_rotation(n) for n in BODIES]
     turns = [r if t is None else r @ rotation_about(t) for r, t in zip(turns, tilts, strict=True)]
     points = [placed.point(n, at + s) for n, s in zip(BODIES, shifts, strict=True)]
     functions = [partial(rotate, turn) for turn in turns]
     if kind == "rod":
-        return [keep_distance("part", BODIES, points, 0.3, placed.size)]
+        return [distance_equation("part", BODIES, points, 0.3, placed.size)]
     if kind == "pair":
         vectors = [function(axes[0]) for function in functions]
-        return [keep_pair("part", BODIES, points, vectors, 1.0)]
+        return [rod_pair_equation("part", BODIES, points, vectors, 1.0)]
     own = TYPES[kind]
     joint = Joint("part", kind, *BODIES, at, axes[: own.count], actuated=True, pitch=0.1)
     found = []
@@ -62,7 +62,7 @@ def place(rng, apart=0.02):
 @pytest.mark.parametrize("kind", [*TYPES, "rod"])
 def test_forces_and_moments_are_derivatives_by_the_bodies(kind, rng):
     placed, at, axes = place(rng), rng.normal(size=3), np.array([unit(rng), unit(rng)])
-    table = placed.matrix(equations(kind, placed, at, axes))
+    table = placed.jacobian(equations(kind, placed, at, axes))
     for k in range(12):
         step = np.zeros((3, 12))
         step[:, k] = STEP
@@ -80,7 +80,7 @@ def test_derivatives_by_a_frame_are_differences(kind, side, rng):
     placed, at, axes = place(rng), rng.normal(size=3), np.array([unit(rng), unit(rng)])
     name = BODIES[side]
     for k, one in enumerate(equations(kind, placed, at, axes)):
-        shift, tilt = differentiate_by_frame(one, side, placed.point(name, at), placed.turn(name))
+        shift, tilt = differentiate_by_frame(one, side, placed.point(name, at), placed.body_rotation(name))
         way, values = rng.normal(size=3), []
         for what, found in (("shifts", shift), ("tilts", tilt)):
             if kind == "rod" and what == "tilts":
@@ -97,11 +97,11 @@ def test_derivatives_by_a_frame_are_differences(kind, side, rng):
 def test_a_pair_of_rods_holds_the_turn_about_its_normal(rng):
     placed, at, axes = place(rng, 0.0), rng.normal(size=3), np.array([unit(rng), unit(rng)])
     points = [placed.point(n, at + k * axes[1]) for k, n in enumerate(BODIES)]
-    vectors = [rotate(placed.turn(n), axes[0]) for n in BODIES]
-    one = keep_pair("part", BODIES, points, vectors, 1.0)
+    vectors = [rotate(placed.body_rotation(n), axes[0]) for n in BODIES]
+    one = rod_pair_equation("part", BODIES, points, vectors, 1.0)
     normal = np.cross(vectors[1], points[1] - points[0])
     np.testing.assert_allclose(one.value, 0.0, atol=1e-14)
-    np.testing.assert_allclose(placed.matrix([one])[..., 0, 9:12], normal, atol=1e-12)
+    np.testing.assert_allclose(placed.jacobian([one])[..., 0, 9:12], normal, atol=1e-12)
 
 
 def test_rotation_vectors_are_undone(rng):

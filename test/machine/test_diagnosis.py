@@ -8,9 +8,9 @@ import pytest
 
 from pkm_twin.certify.description import expand
 from pkm_twin.errors import MobilityError, ParameterError
-from pkm_twin.kinematics.diagnosis import is_right, near_conditions
+from pkm_twin.kinematics.diagnosis import find_small_deviations, is_determined
 from pkm_twin.kinematics.rounding import repair
-from pkm_twin.kinematics.spins import without_spins
+from pkm_twin.kinematics.spins import lock_spins
 from pkm_twin.machine import schema
 from pkm_twin.machine.graph_file import KINDS, build_graph, expand_limbs
 from pkm_twin.mechanisms.machine import Machine, MachineFile
@@ -41,9 +41,9 @@ def test_an_axis_that_is_not_parallel_is_named(name, angle, rng):
     data = changed(name, rng)
     hinges = [n for n, j in data["joints"].items() if j["type"] == "revolute"]
     joint = str(rng.choice(hinges[-2:]))
-    assert is_right(graph_of(data))
+    assert is_determined(graph_of(data))
     data["joints"][joint]["axis"] = tilted(data["joints"][joint]["axis"], angle, rng)
-    causes = near_conditions(graph_of(data))
+    causes = find_small_deviations(graph_of(data))
     assert causes and all(joint in cause.parts for cause in causes)
     assert max(cause.deviation for cause in causes) == pytest.approx(angle, rel=1e-2)
     with pytest.raises(MobilityError) as error:
@@ -56,11 +56,11 @@ def test_an_axis_that_is_not_parallel_is_named(name, angle, rng):
 @pytest.mark.parametrize("shift", DEVIATIONS)
 def test_an_axis_that_misses_the_centre_is_named(shift, rng):
     data = changed("rrr3_spherical", rng)
-    assert is_right(graph_of(data))
+    assert is_determined(graph_of(data))
     joint = data["joints"]["crown_2"]
     across = np.cross(joint["axis"], rng.normal(size=3))
     joint["at"] = (np.array(joint["at"]) + shift * across / np.linalg.norm(across)).tolist()
-    causes = near_conditions(graph_of(data))
+    causes = find_small_deviations(graph_of(data))
     assert causes and all("crown_2" in cause.parts for cause in causes)
     assert causes[0].deviation == pytest.approx(shift, rel=1e-2)
 
@@ -75,12 +75,12 @@ def guided():
 @pytest.mark.parametrize("shift", DEVIATIONS)
 def test_a_rod_whose_end_is_elsewhere_is_named(shift, rng):
     data = guided()
-    assert is_right(graph_of(data))
+    assert is_determined(graph_of(data))
     rod = data["rods"]["left_1"]
     shifted = np.array(rod["ends"])
     shifted[1] += shift * np.array([0.0, 0.0, 1.0])
     rod["ends"] = shifted.tolist()
-    causes = near_conditions(graph_of(data))
+    causes = find_small_deviations(graph_of(data))
     assert causes and all({"left_1", "right_1"} & set(cause.parts) for cause in causes)
     assert causes[0].deviation == pytest.approx(shift, rel=1e-2)
 
@@ -90,13 +90,13 @@ def test_several_causes_are_all_named(rng):
     moved = {"elbow_1": 3e-6, "wrist_3": 1e-4}
     for name, angle in moved.items():
         data["joints"][name]["axis"] = tilted(data["joints"][name]["axis"], angle, rng)
-    causes = near_conditions(graph_of(data))
+    causes = find_small_deviations(graph_of(data))
     assert [next(iter(set(c.parts) & set(moved))) for c in causes] == ["wrist_3", "elbow_1"]
 
 
 def test_a_sound_machine_is_left_as_it_is(rng):
     graph = graph_of(changed("rrr3_planar", rng))
-    assert not near_conditions(graph) and not repair(graph, 1e-6).moves
+    assert not find_small_deviations(graph) and not repair(graph, 1e-6).moves
 
 
 @pytest.mark.parametrize("name", ["rrr3_planar", "rrr3_spherical", "bolted"])
@@ -107,9 +107,9 @@ def test_rounding_is_taken_off_by_no_more_than_it_is(name, rng):
             if key in joint:
                 joint[key] = (np.array(joint[key]) + rng.uniform(-1e-8, 1e-8, np.shape(joint[key]))).tolist()
     rounded = graph_of(data)
-    assert not is_right(rounded)
+    assert not is_determined(rounded)
     ideal = repair(rounded, 1e-6).graph
-    assert is_right(ideal)
+    assert is_determined(ideal)
     for joint in ideal.joints.values():
         np.testing.assert_allclose(joint.axes, rounded.joints[joint.name].axes, atol=1e-7)
         np.testing.assert_allclose(joint.at, rounded.joints[joint.name].at, atol=1e-7)
@@ -153,12 +153,12 @@ def test_parts_that_spin_are_named_and_can_be_held():
         Machine.from_data(data, "x")
     assert (error.value.actuated, error.value.freedoms) == (3, 6)
     assert all(any(f"forearm_{i}" in cause for cause in error.value.causes) for i in (1, 2, 3))
-    graph, held = without_spins(graph_of(data))
-    assert is_right(graph) and len(held) == 3
+    graph, held = lock_spins(graph_of(data))
+    assert is_determined(graph) and len(held) == 3
     assert [graph.joints[name].kind for name in held] == ["universal"] * 3
     # As with rods, which have no spin.
-    alone, none = without_spins(graph_of(plain("delta_translation")))
-    assert is_right(alone) and not none
+    alone, none = lock_spins(graph_of(plain("delta_translation")))
+    assert is_determined(alone) and not none
 
 
 def test_a_singular_home_says_what_moves_in_it():

@@ -14,7 +14,7 @@ from pkm_twin.certify.mujoco_tree import MujocoTree
 from pkm_twin.robot.robot_urdf import robot_description
 from tools.certificate.lagrange_machines import energies
 from tools.certificate.machines import Case, friction, random_case
-from tools.certificate.swing import engine_of
+from tools.certificate.swing import find_engine
 
 ROUTES = ("Pinocchio", "MuJoCo", "Lagrange")
 EFFORT_BOUND = 1e-9
@@ -69,7 +69,7 @@ def compare_case(case: Case, exact: int) -> Figures:
     reaching = got - drag - rotors * case.qdd
     figures.balances["efforts"] = [difference(one, other) for one, other in zip(joint.efforts, reaching, strict=True)]
 
-    engine, source = engine_of(data), energies(data)
+    engine, source = find_engine(data), energies(data)
     mechanics = MujocoTree(robot_description(robot))
     stored = energy(robot, case.q, case.qd).total
     for k in range(len(case.q)):

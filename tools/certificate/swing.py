@@ -86,7 +86,7 @@ def starts() -> list[Start]:
     return result
 
 
-def engine_of(data: dict[str, Any]) -> LoopEngine:
+def find_engine(data: dict[str, Any]) -> LoopEngine:
     """Return Pinocchio's engine of a parameter mapping."""
     return PrruEngine(data) if data["mechanism"] == "prru" else DeltaEngine(data)
 
@@ -115,7 +115,7 @@ def run(start: Start) -> list[Swing]:
     """Run one machine in three ways."""
     robot = build(start.data)
     effort = inverse_dynamics(robot, start.rest, STILL, STILL)
-    engine = engine_of(start.data)
+    engine = find_engine(start.data)
     tree = engine.state(start.q, start.qd, STILL)
     result = [_summary(start, "pkm_twin, DOP853", effort, *_twin(robot, start, effort))]
     for route, integrate in (("DOP853", _pinocchio), ("its own step", _pinocchio_steps)):

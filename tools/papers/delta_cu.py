@@ -310,7 +310,7 @@ def _find_equations() -> tuple[Row, ...]:
             "closure of a limb, and its derivative",
             (
                 "pkm_twin.mechanisms.delta.Delta.make_parts",
-                "pkm_twin.kinematics.constraints.keep_distance",
+                "pkm_twin.kinematics.constraints.distance_equation",
             ),
             same,
             "lost in the scan; equations 3 and 9 show what they are",
