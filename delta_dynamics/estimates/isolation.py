@@ -101,7 +101,7 @@ def _twist_kernel(robot: Robot) -> Kernel:
         for column, own in zip(columns, np.eye(t.joints), strict=True):
             t.motion.set_rates(column, own)
             for body in t.graph.bodies:
-                rows += [*t.motion.speed[body], *t.motion.omega[body]]
+                rows += [*t.motion.origin_velocity[body], *t.motion.omega[body]]
         return Program(t.inputs("q"), 0, {"bodies": t.lift(rows)}, t.equations())
 
     return robot.engine.kernel("twists of bodies", write)

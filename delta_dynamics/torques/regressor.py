@@ -208,13 +208,13 @@ def _write_regressor(t: Traced) -> Program:
     twists = []
     for j, column in enumerate(t.rate_columns()):
         motion.set_rates(column, np.eye(n)[j])
-        twists.append((motion.speed, motion.omega))
+        twists.append((motion.origin_velocity, motion.omega))
     t.set_rates(qd)
     t.set_accelerations(qdd, BaseMotion.at_rest(gravity))
     bodies: list[Any] = []
     for body in t.tree.links:
         own = motion.rotation_from_home(body).T
-        rows = [motion.change[body], motion.omega[body], motion.alpha[body]]
+        rows = [motion.origin_acceleration[body], motion.omega[body], motion.alpha[body]]
         rows += [speed[body] for speed, _ in twists] + [omega[body] for _, omega in twists]
         bodies += [entry for row in rows for entry in own @ row]
 

@@ -192,8 +192,8 @@ class Forces:
         """Add m (a - g) of the origin and the first moment h's parts: spin h, and h x (a - g)."""
         m, mass = self.motion, ten[0]
         h = m.rotation[name] @ ten[1:4]
-        self.force[name] = self.force[name] + m.change[name] * mass + m.spin(name) @ h
-        self.moment[name] = self.moment[name] + cross(h, m.change[name])
+        self.force[name] = self.force[name] + m.origin_acceleration[name] * mass + m.acceleration_matrix(name) @ h
+        self.moment[name] = self.moment[name] + cross(h, m.origin_acceleration[name])
 
     def _add_euler(self, name: str, inertia: Objects) -> None:
         """Add I alpha + omega x I omega, computed in the body's axes."""
@@ -230,7 +230,7 @@ class Forces:
         m = self.motion
         for name, ten in zip(m.tree.links, bodies, strict=True):
             first = m.rotation[name] @ ten[1:4]
-            w, v = m.omega[name], m.speed[name]
+            w, v = m.omega[name], m.origin_velocity[name]
             self.force[name] = self.force[name] + v * ten[0] + cross(w, first)
             self.moment[name] = self.moment[name] + cross(first, v)
         for name, matrix in self._couples(bodies):
@@ -268,9 +268,9 @@ class Forces:
         # Relative to the inner body's point that coincides with the joint.
         lever = m.point(b, joint.at) - m.origin[a]
         if accelerated:
-            carried = m.change[a] + m.spin(a) @ lever
+            carried = m.origin_acceleration[a] + m.acceleration_matrix(a) @ lever
             second = axis @ (m.acceleration(b, joint.at) - carried)
-        return axis @ (m.velocity(b, joint.at) - m.speed[a] - cross(m.omega[a], lever)), second
+        return axis @ (m.velocity(b, joint.at) - m.origin_velocity[a] - cross(m.omega[a], lever)), second
 
     def pair(self, joint: Joint, amount: Any) -> None:
         """Add an effort along a joint's freedom on its outer body, the reaction on the inner."""

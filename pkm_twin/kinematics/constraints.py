@@ -23,21 +23,21 @@ from pkm_twin.machine.rotations import rotation_about
 
 ZERO_VECTOR: Final = np.zeros(3)
 Pair = tuple[Any, Any]
-"""Something of the inner body, and the same of the outer body."""
+"""A quantity of the inner body, and the same quantity of the outer body."""
 Rotations = tuple[Callable[[Array], Any], Callable[[Array], Any]]
-"""Functions from a vector fixed in the inner and in the outer body at home to the present one."""
+"""Functions that rotate a vector fixed in the inner (outer) body from home to its present direction."""
 
 
 class Equation(NamedTuple):
-    """Describe one scalar equation between two bodies: ``value`` is zero where the parts fit.
+    """Describe one scalar constraint equation between two bodies: ``value`` is zero.
 
-    A unit of its multiplier is a force ``force`` at ``points[1]`` and a moment ``moment`` on the
+    A multiplier of one is the force ``force`` at ``points[1]`` and the moment ``moment`` on the
     outer body, and the opposite on the inner body with the force at ``points[0]``. By virtual work
     these are the derivatives of the value by the bodies' motions:
 
         d value = force (v_outer - v_inner) + moment (w_outer - w_inner)
 
-    ``bodies``: names of the inner and of the outer body. ``scale`` makes the value of unit one.
+    ``bodies``: names of the inner and of the outer body. ``scale`` makes the value dimensionless.
     """
 
     part: str
@@ -55,14 +55,14 @@ class Equation(NamedTuple):
 
 
 def dot(a: Any, b: Any) -> Any:
-    """Return the scalar product over the last axis; of expressions in one order of operations."""
+    """Return the scalar product over the last axis, always added up in the same order."""
     return a @ b if a.ndim == b.ndim == 1 else (a * b).sum(-1)
 
 
 def angle_equation(part: str, bodies: tuple[str, str], points: Pair, vectors: Pair, known: Any) -> Equation:
     """Return the equation of a constant angle between a vector of each body.
 
-    :param known: scalar product of the vectors.
+    :param known: the vectors' constant scalar product.
     """
     inner, outer = vectors
     return Equation(part, bodies, dot(inner, outer) - known, points, ZERO_VECTOR, cross(outer, inner), 1.0)
@@ -106,23 +106,23 @@ def constraint_equations(
     if constraint.kind == "angle":
         vectors = inner, turns[1](constraint.outer)
         return [angle_equation(part, bodies, points, vectors, snapped(constraint.inner @ constraint.outer))]
-    # The inner body bears the force where the outer body's point is.
+    # The force on the inner body, too, acts at the outer body's point.
     there, along = (points[1], points[1]), dot(inner, apart)
     if constraint.kind == "plane":
         return [Equation(part, bodies, along, there, inner, ZERO_VECTOR, scale)]
     mark = turns[1](constraint.outer)
     sine, cosine = dot(inner, cross(turns[0](constraint.outer), mark)), dot(turns[0](constraint.outer), mark)
     angle = np.arctan2(sine, cosine)
-    # The angle is known up to full revolutions.
+    # The angle is compared modulo a full revolution.
     angle = angle + 2.0 * np.pi * np.round((along / constraint.slide - angle) / (2.0 * np.pi))
     value = along - constraint.slide * angle
     return [Equation(part, bodies, value, there, inner, -constraint.slide * inner, scale)]
 
 
 def drive_equation(joint: Joint, goal: Any, points: Pair, turns: Rotations, size: Any) -> Equation:
-    """Return the equation of a joint of one freedom that is constraint.
+    """Return the equation that sets the position of a joint of one freedom.
 
-    :param goal: its motion from home, rad or m, shape (...).
+    :param goal: the position relative to home, rad or m, shape (...).
     """
     bodies, (freedom,) = (joint.inner, joint.outer), joint.freedoms
     if freedom.turns:
@@ -142,11 +142,11 @@ def rotate(rotation: Array, vectors: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """Hold where all bodies of a graph are, with six coordinates a body.
+    """Hold the positions of all bodies of a graph, described by six coordinates per body.
 
     A point of a body, given at home, is at ``rotation`` @ point + ``shift``; shapes (..., bodies +
-    1, 3, 3) and (..., bodies + 1, 3), m, the ground first. Coordinates are the displacement at
-    ``middle``, (3,) m, in parts of ``size``, m, and the rotation, of all bodies but the ground.
+    1, 3, 3) and (..., bodies + 1, 3), m, the ground first. The coordinates of each body except the
+    ground are its displacement at ``middle``, (3,) m, divided by ``size``, m, and its rotation.
     """
 
     index: Mapping[str, int]
@@ -157,7 +157,7 @@ class Placement:
 
     @classmethod
     def at_home(cls, graph: Graph, shape: tuple[int, ...] = ()) -> Placement:
-        """Return the bodies of a graph at home, in a batch of a shape."""
+        """Return the bodies of a graph at home, repeated over batch axes of a shape."""
         index = {name: k for k, name in enumerate((BASE, *graph.bodies))}
         shape = (*shape, len(index))
         return cls(
@@ -169,7 +169,7 @@ class Placement:
         )
 
     def point(self, body: str, at: Array) -> Array:
-        """Return where a point of a body is, shape (..., 3); given at home, (3,) or (..., 3), m."""
+        """Return the position, (..., 3), of a body's point given at home, (3,) or (..., 3), m."""
         k = self.index[body]
         return np.asarray(rotate(self.rotation[..., k, :, :], at) + self.shift[..., k, :], np.float64)
 
@@ -192,7 +192,7 @@ class Placement:
         return np.stack(found, -1) if found else np.zeros((*shape, 0))
 
     def jacobian(self, equations: Sequence[Equation]) -> Array:
-        """Return their derivatives by the coordinates, shape (..., rows, 6 bodies)."""
+        """Return the derivatives of the values by the coordinates, shape (..., rows, 6 bodies)."""
         shape, rows = self.shift.shape[:-2], np.arange(len(equations))
         table = np.zeros((*shape, len(equations), len(self.index), 6))
         whole = (*shape, len(equations), 6 * len(self.index))
@@ -213,7 +213,7 @@ class Placement:
 
 
 def differentiate_by_frame(one: Equation, side: int, point: Array, rotation: Array) -> tuple[Array, Array]:
-    """Return an equation's derivatives by an error of the part's frame on one of its bodies.
+    """Return an equation's derivatives by an error of the joint's or rod's frame on one body.
 
     :param side: 0: the frame on the inner body, 1: on the outer body. ``point``: its origin,
         (..., 3) m. ``rotation``: of that body from home, shape (..., 3, 3).

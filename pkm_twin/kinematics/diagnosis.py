@@ -22,17 +22,17 @@ from pkm_twin.kinematics.spins import MIN_MOTION, find_idle_bodies, null_space
 from pkm_twin.machine.graph import Graph
 
 MAX_COMPUTER_ROUNDING: Final = 1e-11
-"""Deviations below this are the computer's rounding, rad or parts of the machine's size."""
+"""Largest deviation that is floating-point rounding, rad or relative to the machine's size."""
 EVERYWHERE: Final = "where all loops close in every position"
 MAX_CAUSES: Final = 5
-"""Most causes that an error names."""
+"""Largest number of causes that an error names."""
 
 
 class Deviation(NamedTuple):
-    """A deviation of an axis or point that takes a freedom away.
+    """A deviation of an axis or point that removes a degree of freedom.
 
     ``text``: a sentence. ``parts``: the joint or rod, and the joint that it is compared with.
-    ``deviation``: rad or m; ``size``: rad or parts of the machine's size.
+    ``deviation``: rad or m; ``size``: rad or relative to the machine's size.
     """
 
     text: str
@@ -42,11 +42,11 @@ class Deviation(NamedTuple):
 
 
 def mobility_error(linkage: Linkage, causes: Sequence[Deviation] = ()) -> MobilityError:
-    """Return the error of a machine that its actuated joints do not determine, with the causes.
+    """Return the error, with causes, for a machine that its actuated joints do not determine.
 
-    :param causes: deviations that take freedoms away; empty: they are looked for.
+    :param causes: deviations that remove degrees of freedom; empty: search for them.
     """
-    # Deviations take freedoms away; a machine with too many has lost none.
+    # A deviation only removes freedoms, so it cannot explain too many.
     lost = linkage.mobility.freedoms < linkage.joints
     causes = causes or (find_small_deviations(linkage.graph) if lost else [])
     texts = [c.text for c in causes[:MAX_CAUSES]]
@@ -55,7 +55,7 @@ def mobility_error(linkage: Linkage, causes: Sequence[Deviation] = ()) -> Mobili
     if causes:
         return MobilityError(linkage.joints, linkage.mobility.freedoms, texts)
     graph = linkage.graph
-    # What moves although the actuated joints are held: bodies that turn alone, and the rest.
+    # List what can move while the actuated joints are locked: bodies that only spin, then the rest.
     motion, ju = linkage.regular_state()
     free = null_space(ju, MIN_MOTION)
     if free.shape[1]:
@@ -66,7 +66,7 @@ def mobility_error(linkage: Linkage, causes: Sequence[Deviation] = ()) -> Mobili
         ways = np.array([way for _, _, way in spinning]).reshape(-1, free.shape[1])
         if names := _owners(linkage, free @ null_space(ways, MIN_MOTION)):
             texts.append(f"with the actuated joints held, {', '.join(names)} can move")
-    # Actuated joints that cannot move, or only together.
+    # List actuated joints that cannot move, or only together.
     ju, jq = linkage.scaled_at_home()
     moves = null_space(np.hstack([ju, jq]), MIN_MOTION)[ju.shape[1] :]
     rank = int(np.linalg.matrix_rank(moves, MIN_MOTION)) if moves.size else 0
@@ -80,11 +80,11 @@ def mobility_error(linkage: Linkage, causes: Sequence[Deviation] = ()) -> Mobili
 
 
 def singular_home_error(linkage: Linkage, rank: int, beside: int) -> ParameterError:
-    """Return the error of a singular home, with the joints that can move in it alone."""
+    """Return the error of a singular home, which names the joints that can move only there."""
     ju = linkage.regular_state()[1]
     here = null_space(linkage.scaled_at_home()[0], MIN_MOTION)
     there = null_space(ju, MIN_MOTION)
-    # What is free at home and not beside it.
+    # Motions that are free at home but not near it.
     extra = here - there @ (there.T @ here)
     names = _owners(linkage, extra) if here.shape[1] > there.shape[1] else list(linkage.graph.leads)
     return ParameterError(
@@ -96,11 +96,10 @@ def singular_home_error(linkage: Linkage, rank: int, beside: int) -> ParameterEr
 
 
 def find_small_deviations(graph: Graph, freedoms: int = 0) -> list[Deviation]:
-    """Find deviations without which the machine has the mobility that the actuated joints need.
+    """Find the small deviations that keep a machine from having the required mobility.
 
-    :param freedoms: required degrees of freedom; 0: one for each actuated joint, which then
-        determine the machine.
-    :returns: the fewest that are found, the largest first; empty if there are none.
+    :param freedoms: required degrees of freedom; 0: one for each actuated joint.
+    :returns: as few deviations as possible, the largest first; empty if none explains it.
     """
     repaired = repair_few(graph, freedoms or len(graph.leads))
     if repaired is None or not is_determined(repaired.graph, freedoms):
@@ -108,7 +107,7 @@ def find_small_deviations(graph: Graph, freedoms: int = 0) -> list[Deviation]:
     found: list[Deviation] = []
     new = repaired.graph
     for name, joint in new.joints.items():
-        # Joints of one axis, those on the same bodies first.
+        # Compare with joints that have one axis, those on the same bodies first.
         others = [other for other in new.joints.values() if other is not joint and len(other.axes) == 1]
         others.sort(key=lambda other: not {joint.inner, joint.outer} & {other.inner, other.outer})
         for k, axis in enumerate(joint.axes):
@@ -148,7 +147,7 @@ def is_determined(graph: Graph | None, freedoms: int = 0) -> bool:
 
 
 def _owners(linkage: Linkage, motions: Array) -> list[str]:
-    """List the joints, and bodies that only rods hold, of motions (unknown rates, count)."""
+    """List the joints, and bodies held by rods alone, that move in motions (unknown rates, count)."""
     parts = np.abs(motions).max(1, initial=0.0) > MIN_MOTION
     owners: Sequence[str] = linkage.tree.owners
     found = dict.fromkeys(o for o, part in zip(owners, parts, strict=True) if part)

@@ -1,11 +1,11 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""All drives of a machine, of which there may be more than it has degrees of freedom.
+"""All drives of a machine, which may be more than its degrees of freedom.
 
-As many drives as there are degrees of freedom lead: the closures are solved for their m positions,
-from which those of the others follow. Rates of all n drives are B qd, with qd of the leading ones;
-B' tau are the efforts of the leading drives alone that are equivalent to tau of all. Rows of N are
-efforts that move nothing, N B = 0; along them the sum of (effort / limit)^2 is minimised. Where all
-drives lead, B is the identity and N has no rows.
+As many drives as there are degrees of freedom lead (are independent): the closures are solved at
+their m positions, and the positions of the other drives follow. With the rates qd of the leading
+drives, the rates of all n drives are B qd, and efforts tau of all drives are equivalent to efforts
+B' tau of the leading drives alone. Rows of N are efforts that cause no motion, N B = 0; along them
+the sum of (effort / limit)^2 is minimised. If all drives lead, B is the identity and N is empty.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from pkm_twin.codegen.expressions import Numbers, Objects
 from pkm_twin.codegen.operations import absolute, cos, sin, sqrt
 
 LEADS: Final = "leads"
-"""Name of the input of the leading drives, where ``q`` has those of all drives."""
+"""Name of the input with the leading drives' positions, in programs whose ``q`` is of all drives."""
 TOLERANCE_TIME: Final = 0.01
-"""Time that converts the tolerance of positions to that of rates, s."""
+"""Divisor that converts the tolerance of positions to a tolerance of velocities, s."""
 
 
 class Drives:
-    """The drives of a symbolic machine; only their inputs are known before its closures are solved.
+    """The drives of a symbolic machine; before its closures are solved, only inputs are available.
 
-    :param t: the machine, a :class:`~pkm_twin.kinematics.traced.Traced`, which imports this.
+    :param t: the machine, a :class:`~pkm_twin.kinematics.traced.Traced`.
     """
 
     def __init__(self, t: Any) -> None:
@@ -41,20 +41,20 @@ class Drives:
         self._margins: list[Any] = []
 
     def leading_inputs(self, name: str) -> Objects:
-        """Return the inputs of the leading drives, shape (m,); those of the others are checked."""
+        """Return the leading drives' inputs, shape (m,); the other drives' inputs are checked later."""
         values = self.t.tape.inputs(name, self.count)
         _, leads = self._inputs.setdefault(name, (values, values[self.leading]))
         return leads
 
     def variables(self, name: str) -> list[Any]:
-        """Return the inputs of all drives, by which results can be differentiated, shape (n,)."""
+        """Return the inputs of all drives as variables of differentiation, shape (n,)."""
         values = list(self.t.tape.inputs(name, self.count))
         for k, lead in zip(self.leading, self.t.q, strict=True):
             values[k] = lead if name == "q" else values[k]
         return values
 
     def check_dependent(self, name: str, leads: Numbers, rest: Numbers, time: float) -> None:
-        """Check that the other drives' rates or accelerations follow from the leading ones'."""
+        """Compare the other drives' inputs with the rates or accelerations that the leading cause."""
         values, own = self._inputs.get(name, ((), ()))
         if own is leads:
             for k in self.others:
@@ -62,7 +62,7 @@ class Drives:
                 self._margins.append(self._tolerance(k) / time - absolute(apart))
 
     def tolerance_margins(self) -> list[Any]:
-        """Return margins that are positive where no drive contradicts the leading ones."""
+        """Return margins that are all positive if no drive contradicts the leading drives."""
         q, found = self.t.tape.inputs("q", self.count), list(self._margins)
         for k in self.others:
             x, step = self.t.x, self.t.tree.drives[k]
@@ -85,7 +85,7 @@ class Drives:
 
     @cached_property
     def null_rows(self) -> list[list[Any]]:
-        """N: per redundant drive, the efforts that move nothing if its own effort is one."""
+        """N: for each redundant drive, efforts without motion in which its own effort is one."""
         t = self.t
         steps = [t.tree.drives[k] for k in self.others]
         kept = t.jq[t.scheme.independent] if steps else np.zeros((0, 0))
@@ -94,7 +94,7 @@ class Drives:
         return self.null_rows
 
     def set_null_rows(self, rates: Sequence[Objects]) -> None:
-        """Set N from the rate of each drive that does not lead per rate of the leading ones."""
+        """Set N from the rate of each redundant drive per rate of the leading drives."""
         self.null_rows = []
         for k, own in zip(self.others, rates, strict=True):
             row: list[Any] = [0.0] * self.count
@@ -119,9 +119,9 @@ class Drives:
         return SparseCholesky(lower, [lower[i, i] for i in range(len(rows))])
 
     def distribute(self, leads: Sequence[Any], *, preload: bool = False) -> list[Any]:
-        """Return efforts of all drives equivalent to ``leads`` of the leading ones, shape (n,).
+        """Return efforts of all drives equivalent to efforts ``leads`` of the leading, shape (n,).
 
-        Relative to their limits they are the nearest to the preload, or the smallest.
+        Of all such efforts, divided by their limits, these are nearest to the preload or to zero.
         """
         if not self.others:
             return list(leads)
@@ -137,7 +137,7 @@ class Drives:
         return efforts
 
     def distribute_matrix(self, matrix: Objects) -> list[Any]:
-        """Return the matrix from accelerations to efforts of all drives, (n n,) by row."""
+        """Distribute a mass matrix of the leading drives to all drives, (n n,) by row."""
         rows: Any = matrix.tolist()
         for _ in range(2):
             rows = [self.distribute(row) for row in zip(*rows, strict=True)]
@@ -153,7 +153,8 @@ class Drives:
     def drive_accelerations(self, leads: Sequence[Any], bias: Numbers) -> list[Any]:
         """Return the accelerations of all drives.
 
-        :param leads: of the leading drives; ``bias``: of the unknowns while ``leads`` are zero.
+        :param leads: accelerations of the leading drives. ``bias``: accelerations of the unknowns
+            while the leading drives have none.
         """
         result: list[Any] = [0.0] * self.count
         for k, value in zip(self.leading, leads, strict=True):
@@ -165,7 +166,7 @@ class Drives:
         return result
 
     def null_efforts(self) -> list[list[Any]]:
-        """Return N with orthonormal rows, for efforts over their limits."""
+        """Return N with rows that are orthonormal for efforts divided by their limits."""
         if not self.others:
             return []
         columns = [self._null_factors.forward(list(column)) for column in zip(*self.null_rows, strict=True)]

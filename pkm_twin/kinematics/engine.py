@@ -1,8 +1,8 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""One engine for every machine: the programs made of its graph, and why one finds no assembly.
+"""The kinematics engine of a machine: compiled programs from its graph, and reasons of rejection.
 
-Newton's method on independent closures from a known state, judged by all of them, and behind it
-whatever is asked: pose, Jacobians, torques.
+Every program solves the independent closures by Newton's method from a known state, accepts the
+solution if all closures are satisfied, and then computes the outputs: pose, Jacobians, torques.
 """
 
 from __future__ import annotations
@@ -44,18 +44,18 @@ from pkm_twin.machine.graph import Graph
 MAX_GAP: Final = 1e-9
 """Largest residual of a closure that counts as satisfied, relative to the machine's size."""
 WITHOUT_STOPPING: Final[Mapping[str, float]] = {"gain": math.inf, "tolerance": 0.0}
-"""Options with which Newton's method takes all its steps, towards the least-squares residual."""
+"""Options of :func:`newton` that take all iterations, towards the least-squares residual."""
 
 
 class Engine(Scheme):
-    """Kinematics of a graph, and the compiled programs of it, each made when it is first used."""
+    """Kinematics of a graph, with its programs, each compiled when it is first used."""
 
     @cached_property
     def _kernels(self) -> dict[str, Kernel]:
         return {}
 
     def _newton_step(self, pose: Array, state: Array, step: Array) -> list[Array]:
-        """Return residuals of closures and pose equations, their Jacobian, the state after a step."""
+        """Return residuals of closures and pose, their Jacobian, and the state after a given step."""
         return self.kernel("walk", newton_step_program)(NO_NUMBERS, state, pose, step)[0]
 
     def _evaluate_closures(self, q: Array, x: Array) -> tuple[Array, Array]:
@@ -85,7 +85,7 @@ class Engine(Scheme):
             way = min(1.0, done + step)
             there = home + way * (q - home)
             new, closed = newton(x, partial(self._evaluate_closures, there), partial(self._retract, there))
-            # Beyond a singularity is another assembly.
+            # Beyond a singularity Newton's method finds another assembly.
             sign, measure = self._regularity(new, there) if closed else (0.0, 0.0)
             if not closed or sign != side or way > limit:
                 step /= 8
@@ -96,9 +96,9 @@ class Engine(Scheme):
     def explain_end(self, q: Array, reached: float) -> tuple[str, float, float | None]:
         """Explain why no assembly is found beyond a fraction of the straight line from home to q.
 
-        :returns: the joint or rod whose closure has the largest gap at q, the gap (m), and None;
-            or, where an assembly exists behind a singularity, the closures' smallest reciprocal
-            condition number on the line in place of None.
+        :returns: the joint or rod whose closure has the largest gap at q, the gap, m, and None. If
+            an assembly exists at q beyond a singularity, the last is the closures' smallest
+            reciprocal condition number on the line.
         """
         _, x, least = self.follow_line(q, max(reached, 1e-12) + 1 / 8)
         evaluate_closures = partial(self._evaluate_closures, q)
@@ -108,20 +108,20 @@ class Engine(Scheme):
             return self.parts[0], math.inf, None
         worst = int(np.abs(values).argmax())
         miss = float(abs(values[worst])) * self.tree.size
-        # Without a gap there is an assembly at q, but the line from home does not lead to it.
+        # Without a gap an assembly exists at q, but the straight line does not lead to it.
         return self.parts[worst], miss, least if miss < MAX_GAP * self.tree.size else None
 
     def _regularity(self, x: Array, q: Array) -> tuple[float, float]:
-        """Return the closures' determinant's sign and their reciprocal condition number."""
+        """Return the sign of the closures' determinant and their reciprocal condition number."""
         matrix = self._evaluate_closures(q, x)[1][self.independent]
         s = np.linalg.svd(matrix, compute_uv=False)
         return float(np.linalg.slogdet(matrix)[0]), float(s[-1] / s[0]) if s.size and s[0] > 0.0 else 0.0
 
     def find_pose_gap(self, pose: Array) -> tuple[str, float, bool]:
-        """Return the closure with the largest gap while the platform is fixed in a pose.
+        """Find the closure with the largest gap while the platform is fixed in a pose.
 
-        :returns: its joint or rod, its gap, m, and whether all closures are satisfied in the pose:
-            then a singularity ends the path from home to it.
+        :returns: the joint or rod of that closure, the gap, m, and whether all closures are
+            satisfied: then a singularity prevents the pose.
         """
         short = self.posed.find_shortfall(pose) if self.posed is not None else None
         if short is not None:
@@ -142,17 +142,15 @@ class Engine(Scheme):
             return self.graph.platform, math.inf, False
         misses, names = np.abs(values), self.parts
         if not names:
-            # A serial chain has no closures: the platform itself does not reach the pose.
+            # A serial chain has no closures: the gap is that of the platform to the pose.
             return self.graph.platform, float(misses.max()) * self.tree.size / POSE_WEIGHT, False
         worst = int(misses[: len(names)].argmax())
         return names[worst], float(misses[worst]) * self.tree.size, float(misses.max()) < MAX_GAP
 
-    # Compiled programs.
-
     def kernel(self, name: str, write: Callable[[Traced], Program], extra: str = "", *, free: bool = False) -> Kernel:
-        """Return the compiled program of a name on this geometry, the same object every time.
+        """Return the named program for this geometry; compile it at the first call.
 
-        :param extra: text of what the program depends on beside the machine's structure.
+        :param extra: text that identifies what the program depends on in addition to the structure.
         :param free: treat no number of the geometry as a constant.
         """
         known = self._kernels.get(name)
@@ -170,28 +168,27 @@ class Engine(Scheme):
         *,
         free: bool = False,
     ) -> Kernel:
-        """Return a program that has further inputs beside the geometry: :attr:`Traced.more`.
+        """Return a program with constant inputs in addition to the geometry: :attr:`Traced.more`.
 
-        :param more: values of these inputs.
-        :param extra: as of :meth:`kernel`, and ``free``.
+        :param more: values of these inputs. ``extra``, ``free``: as in :meth:`kernel`.
         """
         key = self.structure.also(f"{name} {extra}", write, Traced)
         numbers = np.concatenate([self.geometry, more])
         made = Kernel(_find_code(key, self, write, more, free=free), numbers)
         if not made.holds:
-            # One of its constants has another value here: write a program for these values.
+            # A number that the program treats as a constant differs here: write another program.
             exact = key.also(f"{self.graph.key} {more.tolist()}")
             made = Kernel(_find_code(exact, self, write, more), numbers)
         return made
 
     @property
     def forward(self) -> Kernel:
-        """Joint positions q to pose (m), position (3) and rotation (9) of the platform."""
+        """Program from joint positions to pose (m), position (3) and rotation (9) of the platform."""
         return self.kernel("forward", reduced_forward_program, self._reduced_key)
 
     @property
     def jacobian(self) -> Kernel:
-        """Joint positions q to pose rates (m n) and platform twist (6 n) per joint rate, by row."""
+        """Program from joint positions to pose rates (m n) and twist (6 n) per joint rate, by row."""
         return self.kernel("jacobian", jacobian_program)
 
     @cached_property
@@ -211,13 +208,13 @@ class Engine(Scheme):
 
     @cached_property
     def reduced(self) -> PlatformFirstScheme | None:
-        """The machine with its platform placed first, if all limbs then have closed forms.
+        """The machine with its platform placed first; None if that saves no unknowns.
 
-        Newton's method then has only the platform's coordinates as unknowns, and one or two scalar
-        equations per limb. Machines with a closed form of all unknowns or with a virtual joint keep
-        their tree. So do those whose platform has coordinates that are no pose coordinates: beyond
-        a singularity of the pose coordinates these cannot be found from a pose, and only the
-        machine's own tree detects that.
+        If all limbs have closed forms, Newton's method solves for the platform's coordinates alone,
+        with one or two scalar equations per limb. Machines with a closed form of all unknowns or
+        with a virtual joint keep their own tree; so do machines whose platform has free coordinates
+        that are not pose coordinates: a pose beyond a singularity does not determine these, and
+        only the machine's own tree detects that.
         """
         if self.start is not None or not self.newton_unknowns[1]:
             return None
@@ -230,13 +227,13 @@ class Engine(Scheme):
             fewer = len(scheme.newton_unknowns[1]) < self.tree.unknown_rates
             return scheme if fewer and scheme.has_closed_limbs else None
         except (ParameterError, SingularityError):
-            # A drive that alone connects the platform to the base cannot be placed after it.
+            # A drive that alone connects platform and base cannot be placed after the platform.
             return None
 
     def posed_kernel(self, name: str, write: Callable[..., Program]) -> Kernel:
-        """Return the named compiled program, which solves the machine driven by its pose.
+        """Return the named program of the machine driven by its pose; compile it at the first call.
 
-        :param write: writes it from a :class:`Traced` and ``scheme``: :attr:`posed` or None.
+        :param write: writes the program from a :class:`Traced` and ``scheme``, :attr:`posed` or None.
         """
         scheme = self.posed
         if scheme is None:
@@ -252,14 +249,14 @@ class Engine(Scheme):
 
     @property
     def inverse(self) -> Kernel:
-        """Pose to q; ``forward`` confirms the result."""
+        """Program from a pose to joint positions, confirmed by the forward kinematics."""
         return self.posed_kernel("inverse", inverse_program)
 
     @property
     def generic_forward(self) -> Kernel:
         """Forward kinematics on the machine's own tree, without closed forms of limbs.
 
-        It is valid for changed dimensions too, for which the closed forms may not exist.
+        Valid also for changed dimensions, for which the closed forms may not exist.
         """
         return self.kernel("forward on own tree", forward_program)
 
@@ -271,24 +268,24 @@ class Engine(Scheme):
 
     @property
     def quick_inverse(self) -> Kernel:
-        """Pose to q where the assembly is certain; other poses are rejected."""
+        """Program from a pose to joint positions, only for poses whose assembly is certain."""
         if self.posed is None:
             return self.inverse
         return self.posed_kernel("quick inverse", quick_inverse_program)
 
     @property
     def placement(self) -> Kernel:
-        """Joint positions q to rotation (9) from home and origin (3) of every body, by body."""
+        """Program from joint positions to rotation (9) from home and origin (3) of each body."""
         return self.kernel("placement", placement_program)
 
     @property
     def body_jacobian(self) -> Kernel:
-        """Joint positions q to the twist (6 n) of every body's frame per joint rate, by body."""
+        """Program from joint positions to the twist (6 n) of each body's frame per joint rate."""
         return self.kernel("body jacobian", body_jacobian_program)
 
     @property
     def acceleration(self) -> Kernel:
-        """q, qd, qdd to the second derivative of the pose (m)."""
+        """Program from q, qd and qdd to the second derivative of the pose (m)."""
         return self.kernel("acceleration", acceleration_program)
 
 
@@ -299,7 +296,7 @@ _codes: Final[WeakValueDictionary[ProgramKey, Code]] = WeakValueDictionary()
 
 
 def find_engine(graph: Graph, coordinates: Sequence[Coordinate], start: ClosedFormStart | None = None) -> Engine:
-    """Return the engine of a geometry; machines that differ in inertia or limits alone share it."""
+    """Return the engine of a geometry, shared by machines that differ only in inertia or limits."""
     key = EMPTY.also(f"{graph.key} {coordinates!r} {start!r}")
     engine = _engines.get(key)
     if engine is None:
@@ -316,7 +313,7 @@ def _find_code(
     *,
     free: bool = False,
 ) -> Code:
-    """Return the program of a key; write it for an engine if it is not cached."""
+    """Return the program with a key, from memory or written for an engine."""
     code = _codes.get(key)
     if code is None:
         code = _codes.setdefault(key, Code(lambda: write(Traced(engine, more, free=free)), key))

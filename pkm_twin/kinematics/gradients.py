@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Gradients of programs as programs: by inputs, and by the machine's geometry."""
+"""Write programs of gradients: with respect to inputs, and to the machine's geometry."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from pkm_twin.kinematics.traced import Traced
 
 
 def gradient_program(t: Traced, program: Program, by: Mapping[str, Numbers]) -> Program:
-    """Return the gradient of the sum of a program's outputs times its input ``weights``.
+    """Write the gradient of the sum of a program's outputs times the new input ``weights``.
 
-    :param by: inputs by which, by name of the output.
+    :param by: for each output of the gradient, the inputs to differentiate by.
     """
     results = [e for row in program.outputs.values() for e in row]
     weights = t.tape.inputs("weights", len(results))
@@ -30,9 +30,9 @@ def gradient_program(t: Traced, program: Program, by: Mapping[str, Numbers]) -> 
 
 
 def platform_gradient(engine: Engine) -> Kernel:
-    """Compile the gradient by the geometry of sums of pose, position and rotation.
+    """Compile the gradient, by the geometry, of a weighted sum of pose, position and rotation.
 
-    Inputs: q and the weights (m + 12) of these.
+    Inputs: q, and weights (m + 12).
     """
     return engine.kernel(
         "platform gradient", lambda t: gradient_program(t, forward_program(t), {"geometry": t.geometry}), free=True
@@ -40,9 +40,9 @@ def platform_gradient(engine: Engine) -> Kernel:
 
 
 def pose_motion_gradient(engine: Engine) -> Kernel:
-    """Compile the gradient of sums of pose, rates and accelerations of the pose.
+    """Compile the gradient of a weighted sum of pose, pose rates and pose accelerations.
 
-    q, qd, qdd and weights (3 m) to derivatives by q (n), qd (n) and the geometry.
+    Inputs: q, qd, qdd and weights (3 m). Outputs: derivatives by q (n), qd (n) and the geometry.
     """
 
     def write(t: Traced) -> Program:
@@ -66,5 +66,5 @@ def pose_motion_gradient(engine: Engine) -> Kernel:
 
 
 def free_forward(engine: Engine) -> Kernel:
-    """Compile :attr:`Engine.forward` for machines of every structure."""
+    """Compile :attr:`Engine.forward` with every number of the geometry as an input."""
     return engine.kernel("free forward", lambda t: replace(forward_program(t), quick=True), free=True)

@@ -1,7 +1,7 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Newton's method on constraint equations that are not compiled whole.
+"""Newton's method in numpy, on constraint equations that are not compiled as a whole.
 
-Values, columns and steps are of unit one; states may be batches.
+Values, derivatives and steps are dimensionless; states may be batches.
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from pkm_twin.codegen.arrays import Array
 S = TypeVar("S")
 
 RELATIVE_RANK_TOLERANCE: Final = 1e-9
-"""Part of a matrix's largest singular value below which one counts as zero."""
+"""Singular values below this fraction of the largest count as zero."""
 MAX_ITERATIONS: Final = 12
 MAX_STEP: Final = 0.2
-"""Largest damped step, rad or parts of the machine's size: derivatives hold about that far."""
+"""Largest damped step, rad or relative to the machine's size: the linearisation holds about so far."""
 MAX_VALUE: Final = 1e-9
 """Largest residual of an equation that counts as satisfied."""
 
 
 def solve_least_norm(table: Array, values: Array) -> Array:
-    """Return the smallest step that cancels the values as far as their derivatives allow."""
+    """Return the shortest step that reduces the linearised values as far as possible."""
     return np.asarray(np.linalg.lstsq(table, -values, rcond=RELATIVE_RANK_TOLERANCE)[0], np.float64)
 
 
 def solve_damped(table: Array, values: Array) -> Array:
-    """Return a step of least squares with Levenberg's damping, at most MAX_STEP; NaN if too large."""
+    """Return the least-squares step with Levenberg's damping, at most MAX_STEP; NaN if too large."""
     with np.errstate(over="ignore"):
         square = table.T @ table
     if not np.isfinite(square).all():
@@ -52,14 +52,14 @@ def newton(
     tolerance: float = 1e-12,
     most: float = MAX_VALUE,
 ) -> tuple[S, bool]:
-    """Solve for the state where all values vanish; return the last state, and whether they do.
+    """Solve for a state in which all values vanish; return the last state, and whether they vanish.
 
     :param evaluate: returns the residuals in a state, and their derivatives for ``solve``.
     :param move: returns the state after a step of rates.
     :param solve: returns the step that cancels the residuals, from derivatives and residuals.
-    :param gain: each step must be below this part of the one before, else the method ends.
-    :param tolerance: size of the step that is the last one; ``most``: largest value that counts as
-        zero then.
+    :param gain: end if a step is longer than this fraction of the step before.
+    :param tolerance: end after a step shorter than this. ``most``: largest value that then counts
+        as zero.
     """
     last = np.inf
     for _ in range(iterations):

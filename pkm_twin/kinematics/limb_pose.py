@@ -26,15 +26,15 @@ from pkm_twin.machine.tree import Link, Step, Tree
 
 @dataclass(frozen=True)
 class Limb:
-    """A limb by the names of its parts.
+    """A limb with a closed form, described by the names of its parts.
 
     ``kind``: "rod", "reach, turns", "across", "turns, reach" or "turns", see :class:`LimbPose`.
-    ``part``: the cut joint or rod that closes it, from ``tip`` to ``beyond``. ``bodies``: all that
-    the limb places, in the tree's order. ``reach``: the body whose step sets the distance, empty
-    where the limb has only turns. ``turns``: the bodies that turn about one centre. ``rows``: its
-    closures among the independent ones, by index. ``leaves``: how many of them are left to other
-    joints. ``spin``: a body that turns about the line from the centre to the closing joint, whose
-    axes set its angle; empty: none.
+    ``part``: the cut joint or rod that closes the limb, between the bodies ``tip`` and ``beyond``.
+    ``bodies``: the bodies that the limb places, in the tree's order. ``reach``: the body whose joint
+    sets the distance; empty: none. ``turns``: the bodies that rotate about one centre. ``rows``: the
+    limb's closures among the independent ones, by index; ``leaves``: how many of these must be
+    satisfied by other joints. ``spin``: the body that rotates about the line from the centre to the
+    closing joint, whose axes determine the angle; empty: none.
     """
 
     kind: str
@@ -50,22 +50,23 @@ class Limb:
 
 
 class LimbPose:
-    """A limb solved for bodies at its ends that are placed, on numbers and expressions alike.
+    """Solve a limb whose end bodies are placed, numerically or symbolically.
 
-    Of a P-R-R-U limb these are equations 6 to 12 of the 3-PRRU paper: its points, the slider, the
-    limb's plane and its swing. The limb's unknowns are written into ``x``, and its bodies are
-    placed. C is the centre of the turns, J the point of the joint that closes the limb.
+    The limb's unknowns are written into ``x``, and its bodies are placed. For a P-R-R-U limb these
+    are equations 6 to 12 of the 3-PRRU paper: points, slider, plane and swing angle. C is the centre
+    of the limb's rotations (turns), J the point of the joint that closes it; J has a position given
+    by each of the two bodies there.
 
-    * "rod": the reach brings one end of a rod to its length from the other.
-    * "reach, turns": the reach brings C to its distance from J beyond; then the turns bring J.
-    * "across": the reach brings J to its distance from C beyond; then the turns there bring J.
-    * "turns, reach": the reach beyond the turns brings J to the distance that it has from C.
-    * "turns": joints between C and J are driven; their distance is left to other joints.
+    * "rod": the reach sets the distance of a rod's ends to its length.
+    * "reach, turns": the reach sets the distance of C from J on ``beyond``; the turns then move J.
+    * "across": the turns are on the side of ``beyond``; the reach moves J to its distance from C.
+    * "turns, reach": the reach, after the turns, sets the distance of J from C.
+    * "turns": the joints between C and J are driven; other joints must satisfy the distance.
 
-    ``slopes``: factors of the limb in the determinant of the closures, above zero as at home, and
-    what makes them of unit one. ``levers``: of turns, in the same way. ``rows``: the closures that
-    are left to other joints. ``miss``: by how much (m) a limb falls short that is brought as near
-    as it can be (``closest``, on numbers alone); otherwise such a limb is NaN.
+    ``slopes``: pairs of a factor of the limb in the determinant of the closures, positive in the
+    assembly of home, and its scale. ``levers``: pairs of a lever arm of the turns and its scale.
+    ``rows``: the closures that other joints must satisfy. ``miss``: with ``closest`` (numbers only)
+    the gap, m, of a limb that is too short, brought as near as it can be; otherwise it is NaN.
     """
 
     def __init__(self, motion: Motion, limb: Limb, x: Objects, q: Numbers, *, closest: bool = False) -> None:
@@ -133,7 +134,7 @@ class LimbPose:
         if len(steps) == 1:
             self.normal = parent @ steps[0].before[:, 2]
         for slide in (step for step in every if not step.turns):
-            # Along the axis of the turn, so that nothing is left to other joints.
+            # A slide along the rotation axis satisfies the closure in that direction.
             x[slide.position] = slide.sign * (towards[2] - lever[2]) / slide.slide
         if limb.spin:
             motion.place(beyond[:-1], x, q)
@@ -146,14 +147,14 @@ class LimbPose:
             self.rows.append(self._plane_row(limb, *ends, lever[2]))
 
     def _store_distance_ends(self, limb: Limb, moved: Array, body: str, target: Objects) -> None:
-        """Keep the ends of the distance that the reach sets: carried by its parent, and given."""
+        """Store the two points whose distance the reach sets, each with the body that carries it."""
         place = self.motion.point(limb.reach, moved)
         self.ends = (body, target), (self.tree.links[limb.reach].parent, place)
         # The vector between them goes from the target to the point that is moved.
         self.slope = -self.slope
 
     def reach_rates(self) -> Columns:
-        """Return the rate of the reach by the rates of the bodies at the limb's ends.
+        """Return the reach joint's rate per rate of the bodies at the limb's ends.
 
         The distance is set by the reach: slope rate = distance vector . subtract_columns of velocities. In
         the plane of a turn, both are velocities at one place, relative to the carrier of the plane.
@@ -172,7 +173,7 @@ class LimbPose:
     def _required_square(self, limb: Limb, steps: Sequence[Step], lever: Numbers, moved: Array, target: Numbers) -> Any:
         """Return the square of the distance that the reach has to set.
 
-        A single turn keeps out of its plane what is there.
+        A single rotation cannot change the offset along its axis, so the present offset is used.
         """
         if len(steps) == 2:
             return square_of(lever)
@@ -185,15 +186,19 @@ class LimbPose:
         return square_of([*lever[:2], gap])
 
     def _place_at_distance(self, link: Link, point: Array, target: Numbers, goal: Array, square: Any) -> None:
-        """Bring a body's point to a distance from a target; ``goal`` is the target at home."""
+        """Solve a body's joint so that its point has a distance from a target in base axes.
+
+        :param goal: the target at home. ``square``: of the distance.
+        """
         turned, origin = self.motion.rotation[link.parent], self.motion.origin[link.parent]
         local = turned.T @ (np.asarray(target) - origin) - link.arm
         self._solve_distance(link, point, local, goal, square)
 
     def _solve_distance(self, link: Link, point: Array, local: Numbers, goal: Array, square: Any) -> None:
-        """Find the one step of a body by |point - target|^2 = square.
+        """Solve |point - target|^2 = square for the single coordinate of a body's joint.
 
-        :param local: the target from the joint, in axes of the parent. ``goal``: it at home.
+        :param local: the target relative to the joint, in the parent's axes. ``goal``: the target at
+            home, in base axes.
         """
         (step,), parent = link.steps, self.tree.axes[link.parent]
         v = snapped_all(link.axes.T @ (point - link.at))
@@ -223,9 +228,10 @@ class LimbPose:
         self.slopes.append((root, scale))
 
     def _solve_angle(self, step: Step, a: Any, b: Any, d: Any, b_home: Any, square: Any) -> tuple[Any, Any]:
-        """Turn a step from home until a cos + b sin = d, on the side where home is.
+        """Solve a cos + b sin = d for a rotation from home, on the branch of home.
 
-        :param b_home: b at home, where the turn is none. ``square``: as of :meth:`_clamp_to_range`.
+        :param b_home: b at home, where the rotation is zero. ``square``: as in
+            :meth:`_clamp_to_range`.
         :returns: the root sqrt(a^2 + b^2 - d^2), and a sin - b cos: the root with its sign.
         """
         n = a * a + b * b
@@ -236,10 +242,10 @@ class LimbPose:
         return root, side
 
     def _clamp_to_range(self, d: Any, n: Any, square: Any) -> tuple[Any, Any]:
-        """Limit d to the range of a cos + c sin; return it and sqrt(n - d^2).
+        """Return d, with ``closest`` limited to the range of a cos + c sin, and sqrt(n - d^2).
 
-        :param n: a^2 + c^2. ``square``: squared distance, which decreases by 2 d; 0: d is a
-            length.
+        :param n: a^2 + c^2. ``square``: squared distance, which decreases by 2 d; 0 if d is a
+            length itself.
         """
         if self.closest and not n > d * d:
             nearest = sqrt(n) * sign_of(d)
@@ -252,16 +258,17 @@ class LimbPose:
         self.miss = max(self.miss, float(miss))
 
     def _rotate_lever(self, step: Step, towards: Numbers, lever: Numbers) -> None:
-        """Turn a lever about an axis z into the direction of a vector."""
+        """Solve the rotation about an axis z that aligns a lever with a vector, seen along z."""
         x, y, n = lever[0], lever[1], square_of(lever[:2])
         self.levers.append((sqrt(n), self.tree.size))
         self.x[step.position] = (x * towards[0] + y * towards[1]) / n
         self.x[step.position + 1] = step.sign * ((x * towards[1] - y * towards[0]) / n)
 
     def _rotate_lever_twice(self, steps: Sequence[Step], towards: Numbers, lever: Numbers, home: Numbers) -> None:
-        """Turn a lever about two axes that cross to a vector of its length.
+        """Solve the rotations about two intersecting axes that carry a lever onto a vector.
 
-        :param towards: the vector in axes of the first turn. ``home``: the lever at home.
+        :param towards: the vector, as long as the lever, in axes of the first rotation. ``home``:
+            the lever at home.
         """
         first, second = steps
         x, y, z = lever
@@ -276,7 +283,7 @@ class LimbPose:
         self.slopes.append((root, sqrt(square_of(lever))))
 
     def _solve_spin(self, limb: Limb) -> None:
-        """Turn a body about its line to the closing joint, whose axes keep their angle."""
+        """Solve the rotation of ``limb.spin`` from the constant angle of the closing joint's axes."""
         link, joint = self.tree.links[limb.spin], self.motion.graph.joints[limb.part]
         (step,), (constraint,) = link.steps, (c for c in joint.constraints if c.kind == "angle")
         mine, other = constraint.inner, constraint.outer
@@ -291,12 +298,12 @@ class LimbPose:
         self.slopes.append((root, 1.0))
 
     def _distance_row(self, limb: Limb, bodies: tuple[str, str], ends: tuple[Objects, Objects], square: Any) -> Row:
-        """Return the closure by which a point keeps its distance from the turns' centre.
+        """Return the equation of a point's constant distance from the centre of the turns.
 
-        Of a single turn, in its plane.
+        For a single turn, only the components in its plane count.
 
-        :param bodies: the turns' parent, and the point's. ``ends``: the point from the centre, and
-            from the origin. ``square``: of the distance.
+        :param bodies: the parent of the turns, and the body of the point. ``ends``: the point
+            relative to the centre, and to the origin. ``square``: of the distance.
         """
         apart = ends[0] if self.normal is None else _remove_component(ends[0], self.normal)
         scale = 1.0 / (self.tree.size * sqrt(square))
@@ -304,7 +311,7 @@ class LimbPose:
         return self._point_row(limb, bodies, ends[1], apart, value, scale)
 
     def _plane_row(self, limb: Limb, bodies: tuple[str, str], ends: tuple[Objects, Objects], height: Any) -> Row:
-        """Return the closure by which a point stays in the plane of a turn; see above.
+        """Return the equation of a point in the plane of a turn; parameters as :meth:`_distance_row`.
 
         :param height: of the plane above the centre.
         """
@@ -320,7 +327,7 @@ class LimbPose:
         value: Any,
         scale: Any,
     ) -> Row:
-        """Return a closure along a vector fixed in the turns' parent, at a point's place."""
+        """Return an equation whose derivatives are relative velocities at ``place`` along a vector."""
         inner, outer = bodies
         moving = (self.motion.linear_jacobian(body, place) for body in (outer, inner))
         columns = {k: column @ along for k, column in subtract_columns(*moving).items()}
@@ -328,18 +335,18 @@ class LimbPose:
 
 
 def square_of(vector: Numbers) -> Any:
-    """Return the sum of the squares of three numbers or fewer."""
+    """Return the sum of the squares of a vector's components."""
     return sum((value * value for value in vector), 0.0)
 
 
 def _remove_component(vector: Objects, normal: Objects) -> Objects:
-    """Return the part of a vector across a unit vector."""
+    """Return a vector without its component along a unit vector."""
     part: Objects = vector - normal * (normal @ vector)
     return part
 
 
 def sign_of(value: Any) -> Any:
-    """Return 1 or -1 as the sign of a number that is not 0."""
+    """Return the sign, 1 or -1, of a nonzero number."""
     return value / absolute(value)
 
 

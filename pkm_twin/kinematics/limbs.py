@@ -19,13 +19,13 @@ from pkm_twin.machine.graph import BASE, Graph
 from pkm_twin.machine.tree import Link, Step, Tree
 
 MIN_LEVER: Final = 1e-2
-"""Least lever of a limb's turns and least slope of its reach at home, of unit one: at a lever of 0
-the limb is singular, and nearby the closed form loses digits."""
+"""Smallest dimensionless lever arm and slope of a limb at home, see :class:`.LimbPose`: at 0 the limb
+is singular, and near it the closed form loses digits."""
 MIN_REMAINING_SINGULAR_VALUE: Final = 1e-4
-"""Least singular value, of unit one, of the equations that closed limbs leave to Newton's method:
-a limb about one point leaves a distance that nothing changes."""
+"""Smallest dimensionless singular value of the equations that limbs in closed form leave to Newton's
+method: a limb whose axes meet in one point can leave a distance that no unknown changes."""
 MAX_CLOSED_FORM_ERROR: Final = 1e-9
-"""Largest difference of a sampled state and its closed form: rounding, amplified near a
+"""Largest difference of a sampled state and its closed form from rounding, amplified near a
 singularity of the limb. Another solution differs by much more."""
 
 
@@ -45,7 +45,7 @@ class Closures(Protocol):
 
     @property
     def independent(self) -> list[int]:
-        """Closures that determine the unknowns."""
+        """Indices of closures that determine the unknowns."""
 
     @property
     def varying(self) -> list[int]:
@@ -57,7 +57,7 @@ class Closures(Protocol):
     def is_constrained(self, step: Step) -> bool:
         """Return whether the closures keep a passive step at its home value."""
 
-    def at(self, x: Numbers, q: Numbers) -> tuple[Motion, list[Row]]:
+    def evaluate_state(self, x: Numbers, q: Numbers) -> tuple[Motion, list[Row]]:
         """Return motion and closures in a state."""
 
     def scaled_jacobians(self, rows: Sequence[Row]) -> tuple[Array, Array]:
@@ -65,10 +65,10 @@ class Closures(Protocol):
 
 
 def find_hanging_limbs(scheme: Closures) -> tuple[Limb, ...]:
-    """Find limbs on a passive universal joint of the ground that are driven and end in a ball.
+    """Find driven limbs between a passive universal joint on the ground and a ball joint.
 
-    Their turns follow from the bodies at their ends; of each limb the distance of the two centres
-    is left for Newton's method.
+    Their rotations follow from the bodies at their ends; Newton's method must satisfy the distance
+    between the two joint centres.
     """
     tree, graph = scheme.tree, scheme.graph
     ends = [(rod.inner, rod.outer) for rod in graph.rods.values()]
@@ -97,9 +97,10 @@ def find_hanging_limbs(scheme: Closures) -> tuple[Limb, ...]:
 
 
 def _find_root(tree: Tree, tip: str) -> str | None:
-    """Find the first body from the tip on a passive joint, if that is a universal of the ground.
+    """Return the first body from the tip on a passive joint, if that is a universal on the ground.
 
-    Its centre rests: where drives carried it, Newton's method could step over a singularity.
+    On the ground the joint's centre is at rest: if drives moved it, Newton's method could step over
+    a singularity.
     """
     for body in tree.chain_to_base(tip):
         steps = tree.links[body].steps
@@ -110,7 +111,6 @@ def _find_root(tree: Tree, tip: str) -> str | None:
 
 
 def _is_regular_at_home(scheme: Closures, limb: Limb) -> bool:
-    """Return whether home is far from where the limb is singular."""
     x, q = scheme.samples[0]
     pose = _solve_sample(scheme, limb, x, q)
     sizes = [*pose.slopes, *pose.levers]
@@ -118,13 +118,13 @@ def _is_regular_at_home(scheme: Closures, limb: Limb) -> bool:
 
 
 def _solve_sample(scheme: Closures, limb: Limb, x: Numbers, q: Numbers) -> LimbPose:
-    """Solve a limb of a sampled state, whose other bodies are placed."""
+    """Solve a limb in a sampled state, with all other bodies placed."""
     tree, inner = scheme.tree, set(limb.bodies)
     others = [body for body in tree.links if not inner.intersection(tree.chain_to_base(body))]
     motion = Motion(tree, x, q, others)
     given = np.array(x, dtype=object)
     for step in (s for body in limb.bodies for s in tree.links[body].steps if not s.actuated):
-        # What the limb has to find is not given.
+        # The limb must find these unknowns itself: start from home.
         size = 2 if step.circle else 1
         given[step.position : step.position + size] = tree.home[step.position :][:size]
     # Without a real solution the results are NaN, which no check accepts.
@@ -133,11 +133,11 @@ def _solve_sample(scheme: Closures, limb: Limb, x: Numbers, q: Numbers) -> LimbP
 
 
 def order_bodies(scheme: Closures) -> tuple[str | Limb, ...]:
-    """Return a tree's bodies in an order of placing, with limbs in closed form where possible.
+    """Order a tree's bodies for placing, with limbs in closed form where possible.
 
-    Of the others first come bodies on the way to the platform; those that no actuated joint places
-    are left for Newton's method. Its equations may not depend on limbs that depend on its unknowns,
-    as their derivatives would be incomplete: such limbs are left for it, too.
+    Bodies between base and platform come first. Newton's method solves the joints that are neither
+    actuated nor in closed form. Its equations must not depend on limbs that depend on its unknowns,
+    because their derivatives would be incomplete: Newton's method solves such limbs, too.
     """
     barred: set[Limb] = set()
     links = scheme.tree.links
@@ -152,7 +152,7 @@ def order_bodies(scheme: Closures) -> tuple[str | Limb, ...]:
             and rates.intersection(step.rate for body in limb.bodies for step in links[body].steps if not step.actuated)
         }
         if not faulty and not _is_newton_regular(scheme, order):
-            # What these limbs leave to other joints does not determine them.
+            # The equations that these limbs leave do not determine the other joints.
             faulty = {limb for limb in limbs if limb.leaves}
         if not faulty:
             return order
@@ -172,7 +172,7 @@ def _is_newton_regular(scheme: Closures, order: Sequence[str | Limb]) -> bool:
 
 
 def _newton_rates(scheme: Closures, order: Sequence[str | Limb]) -> set[int]:
-    """Return the unknown rates that the equations of Newton's method depend on near home."""
+    """Return the indices of the unknown rates in the equations of Newton's method near home."""
     found: set[int] = set()
     for x, q in scheme.samples:
         for row in _newton_rows(scheme, order, x, q):
@@ -185,7 +185,7 @@ def _newton_rates(scheme: Closures, order: Sequence[str | Limb]) -> set[int]:
 
 
 def _newton_rows(scheme: Closures, order: Sequence[str | Limb], x: Numbers, q: Numbers) -> list[Row]:
-    """Return the closures that no limb solves, and those that limbs leave, in a state."""
+    """Return the equations of Newton's method in a state: what limbs in closed form leave."""
     solved = {k for entry in order if isinstance(entry, Limb) for k in entry.rows}
     motion, poses = place_in_order(scheme.tree, order, np.array(x, dtype=object), q)
     closures = motion.closures()
@@ -194,7 +194,7 @@ def _newton_rows(scheme: Closures, order: Sequence[str | Limb], x: Numbers, q: N
 
 
 def _order_bodies_without(scheme: Closures, barred: Collection[Limb]) -> tuple[tuple[str | Limb, ...], set[str]]:
-    """Return an order of placing without some limbs, and the bodies that vary with x."""
+    """Return an order without ``barred`` limbs, and the bodies that depend on Newton's unknowns."""
     tree = scheme.tree
     order: list[str | Limb] = []
     placed, varying = {BASE}, set()
@@ -223,7 +223,7 @@ def _order_bodies_without(scheme: Closures, barred: Collection[Limb]) -> tuple[t
 
 
 def _find_candidates(scheme: Closures, placed: Collection[str]) -> Iterator[Limb]:
-    """Yield limbs that have the steps of one, by each cut joint or rod."""
+    """Yield, for each cut joint or rod, the limbs whose joints may have a closed form."""
     tree, graph = scheme.tree, scheme.graph
     for part in dict.fromkeys(scheme.parts):
         rod = part in graph.rods
@@ -255,10 +255,10 @@ def _find_candidates(scheme: Closures, placed: Collection[str]) -> Iterator[Limb
                 ways = tuple(dict.fromkeys(owner[id(step)] for step in turns))
                 first = tuple(link.body for link in links[: len(ways)])
                 if drives and (kind != "turns" or first != ways):
-                    # Actuated joints may only follow the turns.
+                    # Actuated joints are possible only between the turns and the tip.
                     continue
-                # A single turn cannot close across its plane, a limb of fixed length not the
-                # distance: these equations are left to Newton's method.
+                # A single turn cannot satisfy the closure along its axis, and a limb without reach
+                # not the distance: Newton's method must satisfy these equations.
                 if 0 <= left <= (len(turns) == 1) + (reach is None):
                     yield Limb(
                         kind,
@@ -275,7 +275,7 @@ def _find_candidates(scheme: Closures, placed: Collection[str]) -> Iterator[Limb
 
 
 def _independent_steps(link: Link) -> Sequence[Step]:
-    """Return a link's passive steps; of a cylindrical joint the turn, which its slide follows."""
+    """Return a link's passive steps, without a cylindrical joint's slide: it follows the rotation."""
     turns = [step for step in link.steps if step.turns]
     main = turns if len(turns) == 1 and len(link.steps) == 2 else link.steps
     return [step for step in main if not step.actuated]
@@ -284,7 +284,7 @@ def _independent_steps(link: Link) -> Sequence[Step]:
 def _classify_limb(
     steps: Sequence[Step], tops: Sequence[Step], *, rod: bool
 ) -> Iterator[tuple[str, Step | None, Sequence[Step], bool]]:
-    """Yield the kinds that a limb may have, its reach, its turns, and whether its tip spins.
+    """Yield the kinds that a limb may have, each with reach, turns, and whether its tip spins.
 
     :param steps: from a placed body to the tip; ``tops``: from a placed body beyond it.
     """
@@ -311,7 +311,7 @@ def _classify_limb(
 
 
 def _closed_form_holds(scheme: Closures, limb: Limb) -> bool:
-    """Return whether the closed form gives the sampled states, far from singular at home."""
+    """Return whether the limb is regular at home and its closed form gives the sampled states."""
     tree = scheme.tree
     steps = [step for body in limb.bodies for step in tree.links[body].steps]
     if not _is_regular_at_home(scheme, limb):

@@ -20,17 +20,19 @@ from pkm_twin.machine.graph import Graph
 from pkm_twin.machine.tree import Tree
 
 SAMPLES: Final = 6
-"""States around home, besides home, in which pivots must not be small."""
+"""Number of states near home, in addition to home, in which pivots must not be small."""
 SAMPLE_RADIUS: Final = 0.6
-"""Largest distance of samples from home, rad or half the size: far enough to show small pivots."""
+"""Largest distance of samples from home, rad or halves of the machine's size, so that pivots that
+vanish near home are found."""
 
 
 @dataclass(frozen=True)
 class Mobility:
     """Degrees of freedom of a graph at home, and its closures.
 
-    ``freedoms``: of the whole machine. ``rank``: of all closures. ``redundant``: closures less
-    their rank. ``parts``: the cut joints and rods among which they are. ``unknowns``: of the tree.
+    ``freedoms``: of the whole machine. ``rank``: of all closures. ``redundant``: number of closures
+    minus their rank. ``parts``: cut joints and rods with dependent closures. ``unknowns``: number
+    of the tree's unknown rates.
     """
 
     freedoms: int
@@ -52,7 +54,7 @@ class Linkage:
         """Number of actuated joints that lead: all, unless drives are redundant."""
         return len(self.graph.leads)
 
-    def at(self, x: Numbers, q: Numbers) -> tuple[Motion, list[Row]]:
+    def evaluate_state(self, x: Numbers, q: Numbers) -> tuple[Motion, list[Row]]:
         """Return the motion and the closures in a state, evaluated numerically."""
         motion = Motion(self.tree, x, q)
         return motion, motion.closures()
@@ -73,7 +75,7 @@ class Linkage:
         scales = np.array(self.tree.scales)
 
         def evaluate_closures(x: Numbers) -> tuple[Array, Array]:
-            _, rows = self.at(x, q)
+            _, rows = self.evaluate_state(x, q)
             values = np.array([row.scale * float(row.value) for row in rows])
             return values, self.scaled_jacobians(rows)[0]
 
@@ -81,19 +83,19 @@ class Linkage:
             return np.array(Motion(self.tree, x, q).retract(x, step / scales), float)
 
         x = np.array(self.tree.home if start is None else start, float)
-        if not self.at(x, q)[1]:
+        if not self.evaluate_state(x, q)[1]:
             return x
         x, closed = newton(x, evaluate_closures, move)
         return x if closed else None
 
     @cached_property
     def samples(self) -> list[tuple[Array, Array]]:
-        """States (x, q) at home and near it, the same in every run and for all of one geometry."""
+        """States (x, q) at home and near it, the same for all machines of a geometry, in every run."""
         graph, home = self.graph, self.graph.lead_home
         first = _firsts.setdefault(graph.key, self)
         if first is not self:
             return first.samples
-        # Loading a machine builds two linkages, before and after the choice of pose coordinates.
+        # Loading a machine builds a second linkage after the choice of pose coordinates.
         keep_linkage(self)
         states = [(np.array(self.tree.home, float), home)]
         random = np.random.default_rng(0)
@@ -115,27 +117,27 @@ class Linkage:
     @cached_property
     def _sampled_jacobians(self) -> tuple[Array, Array]:
         """Dimensionless derivatives of closures by u and qd at the samples, (k, rows, ...)."""
-        pairs = [self.scaled_jacobians(self.at(x, q)[1]) for x, q in self.samples]
+        pairs = [self.scaled_jacobians(self.evaluate_state(x, q)[1]) for x, q in self.samples]
         return np.array([a for a, _ in pairs]), np.array([b for _, b in pairs])
 
     @cached_property
     def parts(self) -> list[str]:
         """The joint or rod of every closure."""
-        return [row.part for row in self.at(self.tree.home, self.graph.lead_home)[1]]
+        return [row.part for row in self.evaluate_state(self.tree.home, self.graph.lead_home)[1]]
 
     def scaled_at_home(self) -> tuple[Array, Array]:
         """Return the scaled derivatives of the closures at home by u and by qd."""
-        return self.scaled_jacobians(self.at(self.tree.home, self.graph.lead_home)[1])
+        return self.scaled_jacobians(self.evaluate_state(self.tree.home, self.graph.lead_home)[1])
 
     def regular_state(self) -> tuple[Motion, Array]:
-        """Return a sampled state of the highest rank, and the scaled derivatives by u there."""
+        """Return a sampled state of the highest rank, with the scaled derivatives by u."""
         k = int(np.argmax([count_rank(ju) for ju in self._sampled_jacobians[0]]))
-        return self.at(*self.samples[k])[0], np.asarray(self._sampled_jacobians[0][k], np.float64)
+        return self.evaluate_state(*self.samples[k])[0], np.asarray(self._sampled_jacobians[0][k], np.float64)
 
     @cached_property
     def mobility(self) -> Mobility:
         """Freedoms, rank and redundancy at home."""
-        _, rows = self.at(self.tree.home, self.graph.lead_home)
+        _, rows = self.evaluate_state(self.tree.home, self.graph.lead_home)
         both = np.hstack(self.scaled_jacobians(rows))
         rank = count_rank(both)
         parts: tuple[str, ...] = ()
@@ -158,10 +160,10 @@ def count_rank(matrix: Array) -> int:
 _firsts: Final[WeakValueDictionary[str, Linkage]] = WeakValueDictionary()
 """The first linkage of each graph that is still referenced."""
 _recent: Final[deque[Linkage]] = deque(maxlen=16)
-"""Kept so that a file that is loaded again uses the same engine."""
+"""Linkages kept alive, so that a file that is loaded again uses the same engine."""
 
 
 def keep_linkage(linkage: Linkage) -> None:
-    """Keep a linkage until 16 others are kept."""
+    """Keep a linkage alive until 16 others were used."""
     if linkage not in _recent:
         _recent.append(linkage)

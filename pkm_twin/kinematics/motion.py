@@ -31,13 +31,13 @@ Columns = dict[tuple[str, int], Any]
 class BaseMotion(NamedTuple):
     """The motion of the base in its own axes, shape (3,) each.
 
-    ``omega``: angular velocity, rad/s. ``alpha``: angular acceleration, rad/s2. ``change``:
-    acceleration of its origin less gravity, m/s2. Nothing depends on a uniform velocity.
+    ``omega``: angular velocity, rad/s. ``alpha``: angular acceleration, rad/s2. ``acceleration``:
+    of the origin, less gravity, m/s2. A constant velocity has no effect on forces.
     """
 
     omega: Any
     alpha: Any
-    change: Any
+    acceleration: Any
 
     @classmethod
     def at_rest(cls, gravity: Any) -> BaseMotion:
@@ -56,7 +56,7 @@ def numbers(values: Any) -> Array:
 
 
 def subtract_columns(b: Columns, a: Columns) -> Columns:
-    """Subtract the columns of a from those of b, by rate."""
+    """Subtract the columns of a from the columns of b with the same rate."""
     keys = dict.fromkeys([*b, *a])
     return {k: (b[k] - a[k] if k in a else b[k]) if k in b else -a[k] for k in keys}
 
@@ -147,19 +147,17 @@ class Motion:
         value = q[k] - (origin[k] - step.sign * offset) if step.actuated else x[k]
         return -value if step.sign < 0.0 else value
 
-    # Points and directions that are fixed in a body, given at home.
-
     def arm(self, body: str, point: Array) -> Any:
-        """Return the vector from a body's origin to a point of it."""
+        """Return the vector from a body's origin to a point of the body, given at home."""
         tree = self.tree
         return self.rotation[body] @ snapped_all(tree.axes[body].T @ (point - tree.at[body]))
 
     def point(self, body: str, point: Array) -> Any:
-        """Return the position of a point of a body."""
+        """Return the position of a point of a body, given at home."""
         return self.origin[body] + self.arm(body, point)
 
     def direction(self, body: str, vector: Array) -> Any:
-        """Return a vector that is fixed in a body, in base axes."""
+        """Return a vector fixed in a body, given at home, in base axes."""
         return self.rotation[body] @ snapped_all(self.tree.axes[body].T @ vector)
 
     def rotation_from_home(self, body: str) -> Any:
@@ -170,8 +168,6 @@ class Motion:
         """Return the reference point's position, and the platform's rotation relative to home."""
         graph = self.graph
         return self.point(graph.platform, graph.origin), self.rotation_from_home(graph.platform)
-
-    # Columns: velocity of a point of a body, and angular velocity, by rates.
 
     def linear_jacobian(self, body: str, at: Any) -> Columns:
         """Return the velocity, per rate, of the body's point that is at position ``at``.
@@ -196,7 +192,7 @@ class Motion:
                     column = column + step.slide * axis
                 out[key] = step.sign * column
             if absolute:
-                # The body's rotation is absolute: only the parents' translation is inherited.
+                # Rates of a ball are those of the absolute rotation: only the translation is inherited.
                 at = origin
         return out
 
@@ -217,8 +213,6 @@ class Motion:
                     return out
         return out
 
-    # Closures.
-
     def closures(self) -> list[Row]:
         """Return the equations of all cut joints and rods."""
         rows: list[Row] = []
@@ -238,19 +232,19 @@ class Motion:
         return rows + [self._rod_row(rod) for rod in self.graph.rods.values()]
 
     def _relative_columns(self, one: Equation) -> Columns:
-        """Return the outer body's velocity less the inner one's per rate, linear or angular."""
+        """Return the relative velocity, linear or angular, of the outer body per rate."""
         if one.is_angular:
             return subtract_columns(*(self.angular_jacobian(body) for body in one.bodies[::-1]))
         return subtract_columns(*map(self.linear_jacobian, one.bodies[::-1], one.points[::-1]))
 
     def _make_row(self, one: Equation, columns: Columns, bias: Callable[[], Any] = _no_bias) -> Row:
-        """Return an equation with its derivatives by the rates."""
+        """Return a constraint equation with its derivatives by the rates."""
         load = one.moment if one.is_angular else one.force
         by_rates = {k: c @ load for k, c in columns.items()}
         return Row(one.part, one.value, by_rates, one.scale, one.is_angular, bias)
 
     def _second_derivative(self, joint: Joint, constraint: Constraint, one: Equation) -> Any:
-        """Return an equation's second derivative from velocities and given accelerations."""
+        """Return an equation's second time derivative at the bodies' velocities and accelerations."""
         a, b, at = joint.inner, joint.outer, joint.at
         wa, wb = self.omega[a], self.omega[b]
         if constraint.kind == "point":
@@ -269,7 +263,7 @@ class Motion:
         )
 
     def _rod_row(self, rod: Rod) -> Row:
-        """Return the equation of a rod: the ends keep their distance."""
+        """Return the equation of the constant distance of a rod's ends."""
         a, b, (start, end) = rod.inner, rod.outer, rod.ends
         points = self.point(a, start), self.point(b, end)
         square = (end - start) @ (end - start)
@@ -282,8 +276,6 @@ class Motion:
 
         return self._make_row(one, self._relative_columns(one), bias)
 
-    # Velocities and accelerations.
-
     def set_rates(self, u: Numbers, qd: Numbers, base: BaseMotion = FIXED) -> None:
         """Compute the angular velocity, and the velocity of the origin, of every body.
 
@@ -292,12 +284,12 @@ class Motion:
         """
         self._base, self._u = base, u
         self.omega: dict[str, Any] = {BASE: base.omega}
-        self.speed: dict[str, Any] = {BASE: _ZERO}
+        self.origin_velocity: dict[str, Any] = {BASE: _ZERO}
         self._before: dict[int, Any] = {}
         self._rate: dict[int, Any] = {}
         for link in self.tree.links.values():
             w = self.omega[link.parent]
-            v = self.speed[link.parent] + cross(w, self.lever[link.body])
+            v = self.origin_velocity[link.parent] + cross(w, self.lever[link.body])
             for step in link.steps:
                 k = step.rate
                 if step.ball or step.free:
@@ -312,7 +304,7 @@ class Motion:
                 if step.turns:
                     self._before[id(step)] = w
                     w = w + axis * rate
-            self.omega[link.body], self.speed[link.body] = w, v
+            self.omega[link.body], self.origin_velocity[link.body] = w, v
 
     def set_accelerations(self, du: Numbers, qdd: Numbers) -> None:
         """Compute each body's angular acceleration, and its origin's acceleration less gravity.
@@ -322,17 +314,17 @@ class Motion:
         """
         base = self._base
         self.alpha: dict[str, Any] = {BASE: base.alpha}
-        self.change: dict[str, Any] = {BASE: base.change}
-        self._spin: dict[str, Any] = {BASE: _acceleration_matrix(base.omega, base.alpha)}
+        self.origin_acceleration: dict[str, Any] = {BASE: base.acceleration}
+        self._acceleration_matrix: dict[str, Any] = {BASE: _acceleration_matrix(base.omega, base.alpha)}
         for link in self.tree.links.values():
             parent = link.parent
             w = self.omega[parent]
             al = self.alpha[parent]
-            acc = self.change[parent] + self._spin[parent] @ self.lever[link.body]
+            acc = self.origin_acceleration[parent] + self._acceleration_matrix[parent] @ self.lever[link.body]
             for step in link.steps:
                 k = step.rate
                 if step.ball or step.free:
-                    # Their rates and accelerations are relative to the base, in its axes.
+                    # Rates and accelerations of a ball or free joint are relative to the base.
                     turning = np.array(du[k : k + 3], dtype=object)
                     al = base.alpha + cross(base.omega, self.omega[link.body]) + turning
                     if step.free:
@@ -346,23 +338,23 @@ class Motion:
                     acc = acc + axis * swell + 2.0 * slip * cross(w, axis)
                 if step.turns:
                     al = al + axis * second + cross(self._before[id(step)], axis) * rate
-            self.alpha[link.body], self.change[link.body] = al, acc
-            self._spin[link.body] = _acceleration_matrix(self.omega[link.body], al)
+            self.alpha[link.body], self.origin_acceleration[link.body] = al, acc
+            self._acceleration_matrix[link.body] = _acceleration_matrix(self.omega[link.body], al)
 
     def velocity(self, body: str, point: Array) -> Any:
         """Return the velocity of a point of a body, given at home (Delta-CU paper, equations 7, 8)."""
-        return self.speed[body] + cross(self.omega[body], self.arm(body, point))
+        return self.origin_velocity[body] + cross(self.omega[body], self.arm(body, point))
 
     def acceleration(self, body: str, point: Array) -> Any:
         """Return the acceleration, less gravity, of a point of a body (Delta-CU paper, equation 15)."""
-        return self.change[body] + self._spin[body] @ self.arm(body, point)
+        return self.origin_acceleration[body] + self._acceleration_matrix[body] @ self.arm(body, point)
 
-    def spin(self, body: str) -> Any:
+    def acceleration_matrix(self, body: str) -> Any:
         """Return [alpha]x + [omega]x [omega]x of a body, shape (3, 3)."""
-        return self._spin[body]
+        return self._acceleration_matrix[body]
 
     def retract(self, x: Numbers, du: Numbers) -> list[Any]:
-        """Return the unknowns after a small step du; rotations stay on their manifold."""
+        """Return the unknowns after a small step du; angles and quaternions stay of unit length."""
         new = list(x)
         for link in self.tree.links.values():
             for step in link.steps:
@@ -426,7 +418,7 @@ def _quaternion_matrix(parts: Numbers) -> Objects:
 
 
 def _acceleration_matrix(w: Any, al: Any) -> Objects:
-    """Return [al]x + [w]x [w]x, which maps a lever to the relative acceleration of its end."""
+    """Return [al]x + [w]x [w]x, which maps a lever arm to the acceleration of its end."""
     x, y, z = w
     xx, yy, zz, xy, xz, yz = x * x, y * y, z * z, x * y, x * z, y * z
     return np.array(

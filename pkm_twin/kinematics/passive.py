@@ -1,10 +1,10 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Values of the passive joints in a URDF's convention: one number a revolute or prismatic axis.
 
-A spherical joint and a free body's ball are three revolutes in a row (x, y and z at home), a
-universal joint is two, a cylindrical one a slide and a turn, a translation three slides, a screw a
-turn and the slide that its thread makes (``NAME_slide``, of an actuated one too). Rods are links on
-two revolutes, that turn them from their direction at home.
+A spherical joint and a free body's rotation are three revolutes in series (x, y and z at home), a
+universal joint is two, a cylindrical joint a prismatic and a revolute, a translation three
+prismatics, a screw a revolute and the prismatic that its thread couples (``NAME_slide``, also if
+actuated). A rod is a link on two revolutes, which rotate it from its direction at home.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from pkm_twin.machine.tree import Link
 
 
 def rod_axes(rod: Rod) -> tuple[Array, Array]:
-    """Return the two axes that a rod turns about at its inner end, at home."""
+    """Return the axes of the two revolutes at a rod's inner end, at home."""
     return perpendicular_axes(unit(rod.ends[1] - rod.ends[0]))
 
 
 def passive_names(engine: Engine) -> tuple[str, ...]:
-    """Name all passive numbers: of the tree from the ground outwards, then of the rods."""
+    """Name all passive joint values: of the tree from the ground outwards, then of the rods."""
     names: list[str] = []
     labels = joint_labels(engine.tree)
     for link in engine.tree.links.values():
@@ -46,45 +46,45 @@ def passive_names(engine: Engine) -> tuple[str, ...]:
 
 
 def passive_program(t: Traced) -> Program:
-    """Write the program from q to all passive numbers."""
+    """Write the program from q to all passive joint values."""
     t.solve()
-    return Program(t.inputs("q"), 0, {"passive": t.lift(_values(t))}, t.equations())
+    return Program(t.inputs("q"), 0, {"passive": t.lift(_passive_values(t))}, t.equations())
 
 
 def passive_rates_program(t: Traced) -> Program:
-    """Write the program from q and qd to the rates of all passive numbers."""
+    """Write the program from q and qd to the rates of all passive joint values."""
     t.solve()
     qd = t.drives.leading_inputs("qd")
-    rates = t.lift(_rates(t, qd, t.set_rates(qd)))
+    rates = t.lift(_passive_rates(t, qd, t.set_rates(qd)))
     return Program(t.inputs("q", "qd"), 0, {"rates": rates}, t.equations())
 
 
 def state_program(t: Traced) -> Program:
-    """Write the program from q to the platform's position (3), rotation (9) and passive numbers."""
+    """Write the program from q to the platform's position (3), rotation (9) and passive values."""
     t.solve()
-    return Program(t.inputs("q"), 0, _state(t), t.equations())
+    return Program(t.inputs("q"), 0, _state_outputs(t), t.equations())
 
 
 def moving_state_program(t: Traced) -> Program:
-    """Write the program of q and qd: the state, rates of passive numbers, platform's twist (6)."""
+    """Write :func:`state_program` with qd, rates of passive values and the platform's twist (6)."""
     t.solve()
     qd = t.drives.leading_inputs("qd")
     u, motion, graph = t.set_rates(qd), t.motion, t.graph
     twist = [*motion.velocity(graph.platform, graph.origin), *motion.omega[graph.platform]]
-    outputs = {**_state(t), "rates": t.lift(_rates(t, qd, u)), "twist": t.lift(twist)}
+    outputs = {**_state_outputs(t), "rates": t.lift(_passive_rates(t, qd, u)), "twist": t.lift(twist)}
     return Program(t.inputs("q", "qd"), 0, outputs, t.equations())
 
 
-def _state(t: Traced) -> dict[str, list[Expression]]:
+def _state_outputs(t: Traced) -> dict[str, list[Expression]]:
     position, rotation = t.motion.platform()
     return {
         "position": t.lift(position),
         "rotation": t.lift(np.ravel(rotation)),
-        "passive": t.lift(_values(t)),
+        "passive": t.lift(_passive_values(t)),
     }
 
 
-def _values(t: Traced) -> list[Any]:
+def _passive_values(t: Traced) -> list[Any]:
     motion, tree = t.motion, t.tree
     values: list[Any] = []
     for link in t.tree.links.values():
@@ -93,12 +93,12 @@ def _values(t: Traced) -> list[Any]:
             if steps[0].free:
                 k = steps[0].position
                 values += list(t.x[k + 4 : k + 7])
-            r = _relative(t, link)
+            r = _relative_rotation(t, link)
             # The angles a, b, c of Rx(a) Ry(b) Rz(c).
             root = sqrt(r[0][0] * r[0][0] + r[0][1] * r[0][1])
             values += [atan2(-r[1][2], r[2][2]), atan2(r[0][2], root), atan2(-r[0][1], r[0][0])]
             continue
-        # A joint of one freedom has its own value at home.
+        # The value at home is given in the file for a joint of one freedom, and zero for others.
         home = tree.graph.joints[steps[0].joint].home if len(steps) == 1 else 0.0
         for step in steps:
             value = t.q[step.position] - home if step.actuated else t.x[step.position]
@@ -107,13 +107,13 @@ def _values(t: Traced) -> list[Any]:
             values += [] if tree.graph.joints[step.joint].actuated else [value + home]
             values += [step.slide * value] if step.turns and step.slide else []
     for rod in t.graph.rods.values():
-        span = motion.rotation_from_home(rod.inner).T @ _across_ends(t, rod)
-        b, a, x = _rod_sides(rod, span)
+        span = motion.rotation_from_home(rod.inner).T @ _rod_vector(t, rod)
+        b, a, x = _resolve_along_rod(rod, span)
         values += [atan2(a, x), atan2(b, sqrt(x * x + a * a))]
     return values
 
 
-def _rates(t: Traced, qd: Numbers, u: Numbers) -> list[Any]:
+def _passive_rates(t: Traced, qd: Numbers, u: Numbers) -> list[Any]:
     motion = t.motion
     rates: list[Any] = []
     for link in t.tree.links.values():
@@ -122,10 +122,10 @@ def _rates(t: Traced, qd: Numbers, u: Numbers) -> list[Any]:
             k = steps[0].rate
             if steps[0].free:
                 rates += list(u[k + 3 : k + 6])
-            inner, r = motion.rotation_from_home(link.parent), _relative(t, link)
+            inner, r = motion.rotation_from_home(link.parent), _relative_rotation(t, link)
             omega = inner.T @ (motion.omega[link.body] - motion.omega[link.parent])
-            # omega = a' x + b' (0, cos a, sin a) + c' (sin b, -sin a cos b, cos a cos b): the rates
-            # are not finite where cos b is zero, as no three angles are everywhere.
+            # omega = a' x + b' (0, cos a, sin a) + c' (sin b, -sin a cos b, cos a cos b): rates are
+            # infinite at the angles' singularity, cos b = 0.
             root = sqrt(r[0][0] * r[0][0] + r[0][1] * r[0][1])
             sine, cosine = -r[1][2] / root, r[2][2] / root
             third = (cosine * omega[2] - sine * omega[1]) / root
@@ -136,11 +136,11 @@ def _rates(t: Traced, qd: Numbers, u: Numbers) -> list[Any]:
             rates += [] if t.graph.joints[step.joint].actuated else [rate]
             rates += [step.slide * rate] if step.turns and step.slide else []
     for rod in t.graph.rods.values():
-        inner, apart = motion.rotation_from_home(rod.inner), _across_ends(t, rod)
+        inner, apart = motion.rotation_from_home(rod.inner), _rod_vector(t, rod)
         ends = [motion.velocity(body, end) for body, end in zip((rod.inner, rod.outer), rod.ends, strict=True)]
-        # As the inner body sees it.
+        # Relative velocity of the ends in the inner body's axes.
         slip = inner.T @ (ends[1] - ends[0] - cross(motion.omega[rod.inner], apart))
-        (b, a, x), (vb, va, vx) = _rod_sides(rod, inner.T @ apart), _rod_sides(rod, slip)
+        (b, a, x), (vb, va, vx) = _resolve_along_rod(rod, inner.T @ apart), _resolve_along_rod(rod, slip)
         square = x * x + a * a
         level = sqrt(square)
         change = (x * vx + a * va) / level
@@ -148,22 +148,22 @@ def _rates(t: Traced, qd: Numbers, u: Numbers) -> list[Any]:
     return rates
 
 
-def _relative(t: Traced, link: Link) -> Objects:
-    """Return the rotation of a link relative to its parent."""
+def _relative_rotation(t: Traced, link: Link) -> Objects:
+    """Return the rotation of a link relative to its parent, the identity at home."""
     turned: Objects = t.motion.rotation_from_home(link.parent).T @ t.motion.rotation_from_home(link.body)
     return turned
 
 
-def _across_ends(t: Traced, rod: Rod) -> Any:
-    """Return the vector from a rod's inner end to its outer one, base axes."""
+def _rod_vector(t: Traced, rod: Rod) -> Any:
+    """Return the vector from a rod's inner end to its outer end, base axes."""
     start, end = rod.ends
     return t.motion.point(rod.outer, end) - t.motion.point(rod.inner, start)
 
 
-def _rod_sides(rod: Rod, vector: Any) -> tuple[Any, Any, Any]:
-    """Resolve a vector of the inner body along a rod's second axis, first axis and direction.
+def _resolve_along_rod(rod: Rod, vector: Any) -> tuple[Any, Any, Any]:
+    """Return a vector's components along second x along, first x along, and the rod (along).
 
-    Turned by b about the second axis, then by a about the first, along becomes
+    Rotated by b about the second axis, then by a about the first, the rod is at
     (cos b) (cos a along + sin a (first x along)) + sin b (second x along).
     """
     along = unit(rod.ends[1] - rod.ends[0])

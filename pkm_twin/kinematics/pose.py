@@ -1,8 +1,8 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Pose coordinates of a platform, of its position and rotation, and their rates.
+"""Pose coordinates of a platform from its position and rotation, with derivatives in time.
 
-A coordinate is a coordinate of the position, a turn atan2(a, b) or an elevation asin(s) of signed
-entries of the rotation matrix. Written on numbers and expressions alike.
+A coordinate is a component of the position, or an angle atan2(a, b) or asin(s) of signed entries of
+the rotation matrix. Numbers and expressions have the same formulas.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ Entry = tuple[int, int, float]
 
 @dataclass(frozen=True)
 class Coordinate:
-    """One pose coordinate: ``axis`` of the position, or entries of the rotation.
+    """One pose coordinate: component ``axis`` of the position, or an angle from rotation entries.
 
-    One entry is the sine of an elevation, two are those of a turn, atan2(first, second).
+    One entry is the angle's sine; of two entries the angle is atan2(first, second).
     """
 
     name: str
@@ -46,7 +46,7 @@ COORDINATES: Final = {
     "pitch": Coordinate("pitch", entries=((2, 0, -1.0),)),
     "yaw": Coordinate("yaw", entries=((1, 0, 1.0), (0, 0, 1.0))),
 }
-"""The pose coordinates that every machine may have."""
+"""Pose coordinates that are available for every machine, by name."""
 
 
 ANGLE_AXES: Final = {
@@ -61,7 +61,7 @@ ANGLE_AXES: Final = {
 
 
 def name_angles(angles: Any) -> tuple[Coordinate, ...]:
-    """Return coordinates of a rotation by their names, each about an axis, from the base on.
+    """Return the pose coordinates of a rotation sequence, given as axes by name from the base on.
 
     ``{"alpha": "x", "beta": "y"}`` is R = Rx(alpha) Ry(beta) Rz.
 
@@ -77,7 +77,7 @@ def name_angles(angles: Any) -> tuple[Coordinate, ...]:
 
 
 def describe_angles(coordinates: Sequence[Coordinate]) -> dict[str, str]:
-    """Return the argument of :func:`name_angles` that gives coordinates of a rotation."""
+    """Return the argument with which :func:`name_angles` returns these coordinates."""
     names = {c.entries: c.name for c in coordinates if c.entries}
     for sequence, turns in ANGLE_AXES.items():
         if set(names) <= {turn.entries for turn in turns}:
@@ -93,9 +93,9 @@ def _entry(matrix: Any, entry: Entry) -> Any:
 
 
 def _root(matrix: Any, entry: Entry) -> Any:
-    """Return the cosine of an elevation from the other entries of its column.
+    """Return the cosine of an angle whose sine is an entry, from the other entries of its column.
 
-    No square is subtracted from one, which would lose digits.
+    sqrt(1 - sine^2) would lose digits.
     """
     row, column, _ = entry
     a, b = (matrix[i][column] for i in range(3) if i != row)
@@ -170,7 +170,7 @@ def accelerations(
 
 
 def rows(coordinates: Sequence[Coordinate], motion: Motion, pose: Numbers) -> list[tuple[Any, Columns]]:
-    """Return the equations of a pose, zero where the platform has it, and their derivatives."""
+    """Return the equations of a given pose, zero if the platform has it, and their derivatives."""
     body = motion.graph.platform
     position, rotation = motion.platform()
     linear = motion.linear_jacobian(body, position)

@@ -43,12 +43,12 @@ MAX_ROUNDING_CHANGE: Final = 1e-8
 
 @dataclass(frozen=True)
 class VirtualJoint:
-    """One joint of the chain, along or about a base axis at home.
+    """A virtual joint of the chain, along or about a base axis at home.
 
-    ``pose_index``: index of its pose coordinate; None if it is another coordinate of the platform.
-    ``constrained``: whether the closures keep it at its home value. ``joint``: the machine's joint
-    that it replaces, whose point is on its axis; empty: it replaces none, and its axis goes through
-    the reference point. ``end``: the body that it moves; empty: a massless one.
+    ``pose_index``: index of its pose coordinate; None for another coordinate of the platform.
+    ``constrained``: the closures keep it at its home value. ``joint``: the machine's joint that it
+    replaces, with the same point; empty: none, and its axis passes through the reference point.
+    ``end``: the body that it moves; empty: a massless body.
     """
 
     name: str
@@ -79,7 +79,7 @@ class PoseChain:
     def attach(self, graph: Graph, *, by_pose: bool) -> Graph:
         """Return the graph with the chain added; rotations as in the 3-PRRU paper, equation 1.
 
-        :param by_pose: actuate the pose coordinates in place of the machine's joints.
+        :param by_pose: actuate the pose coordinates instead of the machine's joints.
         """
         chain: list[tuple[int, Joint]] = []
         massless: dict[str, Body] = {}
@@ -122,10 +122,10 @@ class PoseChain:
 
 
 def find_pose_chain(scheme: Scheme) -> PoseChain:
-    """Find the chain of a machine's pose.
+    """Find the chain of virtual joints whose coordinates are the machine's pose.
 
-    It replaces joints whose coordinates are the pose coordinates already, as a universal joint
-    between base and platform; else it is added beside the machine's joints.
+    It replaces joints whose coordinates already are pose coordinates, for example a universal joint
+    between base and platform; otherwise it is added to the machine's joints.
     """
     graph, given = scheme.graph, scheme.coordinates
     entries = {c.entries for c in given if c.entries}
@@ -157,14 +157,14 @@ def _find_varying(
     scheme: Scheme, coordinates: Sequence[Coordinate], states: Sequence[tuple[Array, Array]]
 ) -> list[bool]:
     """Return which coordinates of the platform vary over states (x, q) of a machine."""
-    placed = [tuple(numbers(part) for part in scheme.at(x, q)[0].platform()) for x, q in states]
+    placed = [tuple(numbers(part) for part in scheme.evaluate_state(x, q)[0].platform()) for x, q in states]
     table = np.array([poses.values(coordinates, *state) for state in placed], float)
     scales = [scheme.tree.size if c.axis is not None else 1.0 for c in coordinates]
     return [len(states) == 1 or bool(change > MAX_ROUNDING_CHANGE) for change in np.ptp(table, axis=0) / scales]
 
 
 def _sample_open_states(scheme: Scheme) -> list[tuple[Array, Array]]:
-    """Return states of a machine's tree at random, whose loops are open."""
+    """Draw random states of a machine's tree, whose loops may be open."""
     random, tree, home = np.random.default_rng(0), scheme.tree, scheme.graph.lead_home
     motion = Motion(tree, tree.home, home)
     states = []
@@ -262,12 +262,12 @@ class PlatformFirstScheme(Scheme):
 
     @cached_property
     def varying(self) -> list[int]:
-        """Indices of the other unknown rates."""
+        """Indices of the unknown rates that are solved: all but :attr:`constrained_rates`."""
         return [k for k in range(self.tree.unknown_rates) if k not in self.constrained_rates]
 
     @cached_property
     def _constraining(self) -> tuple[list[int], Order]:
-        """The closures that keep platform coordinates at home, and their elimination order."""
+        """:attr:`constraining_closures` and :attr:`constraining_pivots`."""
         ju, _ = self._sampled_jacobians
         first = ju[:, self.independent]
         follow = np.linalg.solve(first[:, :, self.varying], first[:, :, self.constrained_rates])
@@ -284,7 +284,7 @@ class PlatformFirstScheme(Scheme):
 
     @property
     def constraining_pivots(self) -> Order:
-        """Elimination order of these closures in the coordinates that they keep at home."""
+        """Elimination order of :attr:`constraining_closures` by :attr:`constrained_rates`."""
         return self._constraining[1]
 
     @cached_property
@@ -294,7 +294,7 @@ class PlatformFirstScheme(Scheme):
 
     def _convert_state(self, x: Array, q: Array) -> tuple[Array, Array]:
         """Convert a state (x, q) of the machine to this tree's coordinates."""
-        motion, _ = self.machine.at(x, q)
+        motion, _ = self.machine.evaluate_state(x, q)
         position, rotation = (numbers(part) for part in motion.platform())
         x = np.array(self.tree.home, float)
         virtual_joints = zip(self.chain.joints, self.chain.virtual_joints, strict=True)
@@ -323,8 +323,8 @@ class PlatformFirstScheme(Scheme):
     def platform_pivots(self) -> Order | None:
         """Elimination order (equation, slide) of :meth:`close_platform`; None: it does not apply.
 
-        It applies if closed limbs leave to Newton's method only slides and at most one turn of the
-        platform, and if it reproduces the sampled states.
+        It applies if the limbs in closed form leave only translations and at most one rotation of
+        the platform to Newton's method, and if it reproduces the sampled states.
         """
         places, rates = self.newton_unknowns
         steps = [self.tree.steps[name] for name in self.chain.joints] if self.by_pose else []
@@ -365,8 +365,8 @@ class PlatformFirstScheme(Scheme):
     def close_platform(self, tree: Tree, q: Numbers, pivots: Order) -> tuple[list[Any], Any]:
         """Find the platform's unknowns in closed form, numerically or symbolically.
 
-        Slides are eliminated; the last equation, a cos + b sin = c, has two solutions, of which the
-        one on home's side is taken (for a 3-RPS: Lee and Shah 1988).
+        Translations are eliminated; of the two solutions of the last equation, a cos + b sin = c,
+        the one on the branch of home is taken (for a 3-RPS: Lee and Shah 1988).
 
         :returns: the unknowns, and the squared growth of rounding errors, which is infinite where a
             pivot or the root vanishes: there any unknowns would satisfy the equations.
@@ -416,10 +416,10 @@ class PlatformFirstScheme(Scheme):
         return [k for k in range(len(self.parts)) if k not in solved]
 
     def find_shortfall(self, pose: Array) -> tuple[str, float] | None:
-        """Return the joint or rod that closes the first limb which is too short, and the gap, m.
+        """Return the joint or rod that closes the first limb that is too short, and the gap, m.
 
-        For a machine driven by its pose. None: not known, because a limb has no closed form.
-        The gap is 0 if all closures are satisfied.
+        For a machine driven by its pose. None: unknown, because a limb has no closed form. The gap
+        is 0 if all closures are satisfied.
         """
         rates = self.newton_unknowns[1]
         inner = {

@@ -26,22 +26,25 @@ from pkm_twin.kinematics.posed import PlatformFirstScheme
 from pkm_twin.kinematics.traced import POSED, Traced
 
 POSE_WEIGHT: Final = 100.0
-"""What the pose weighs against closures where not all can be met: so a closure falls short."""
+"""Weight of pose equations relative to closures in the search for a reason of rejection: if both
+cannot be satisfied, the pose is met and the gap is in a closure."""
 MAX_LINEAR_POSE_ERROR: Final = 0.5
-"""Largest distance from a pose, of unit one, of the poses that derivatives at both ends give for it."""
+"""Largest dimensionless error of a pose predicted linearly from home and to home, see
+:func:`certify_assembly`."""
 MIN_DETERMINANT_PER_ERROR: Final = 1.0
-"""Smallest ratio of the closures' determinant to that distance, from far poses of many machines: it
-is less than 0.5 where ``forward`` of the joints is not the pose."""
+"""Smallest ratio of the closures' determinant to that error: over far poses of many machines it is
+below 0.5 wherever ``forward`` of the joints is not the pose."""
 MIN_CERTAIN_DETERMINANT: Final = 1e-5
-"""Smallest closures' determinant of the assembly of a closed start: ``forward`` computes its own from
-other pivots, and refuses it below 1e-8. The two agree to fewer digits the nearer a singularity is."""
+"""Smallest determinant of the closures, relative to home, for machines with a closed-form start:
+``forward`` computes it from other pivots and rejects values below 1e-8; near a singularity the two
+agree to few digits."""
 MAX_POSE_ROUNDING: Final = 1e-7
-"""Largest difference of two poses that are one: rounding of the two solutions, of unit one. Another
-assembly is farther away unless a singularity is nearer than that."""
+"""Largest dimensionless difference of two solutions for the same pose, from rounding. The pose of
+another assembly differs by more, unless a singularity is nearer than that."""
 
 
 def newton_step_program(t: Traced) -> Program:
-    """Write the program of one step of Newton's method for a pose, with q among the unknowns."""
+    """Write the program of one Newton step towards a pose; the unknowns include q."""
     scheme, tree, tape = t.scheme, t.tree, t.tape
     size, free = len(tree.home), tree.unknown_rates
     everything = tape.inputs(UNKNOWNS, size + t.joints)
@@ -126,7 +129,7 @@ def acceleration_program(t: Traced) -> Program:
 
 
 def projection_program(t: Traced) -> Program:
-    """Write the program of all drives' positions, rates and accelerations by the leading ones."""
+    """Write the program from the leading drives' motion to the motion of all drives."""
     t.solve()
     q, qd, qdd = (t.tape.inputs(name, t.drives.count)[t.drives.leading] for name in ("q", "qd", "qdd"))
     t.set_rates(qd)
@@ -145,11 +148,9 @@ def reduced_forward_program(t: Traced) -> Program:
 
 
 def inverse_program(t: Traced, scheme: PlatformFirstScheme | None) -> Program:
-    """Write the program from a pose to the joints of which ``forward`` is the pose.
+    """Write the inverse kinematics, confirmed by the forward kinematics (:func:`confirm_pose`).
 
-    The joints of a pose may belong to another assembly too, so the closures are solved of them.
-
-    :param scheme: None: the joints are found with the machine's own tree.
+    :param scheme: the machine driven by its pose; None: iterate on the machine's own tree.
     """
     pose = t.tape.inputs("pose", len(t.scheme.coordinates))
     if scheme is None:
@@ -163,11 +164,11 @@ def inverse_program(t: Traced, scheme: PlatformFirstScheme | None) -> Program:
 
 
 def confirm_pose(t: Traced, leads: Numbers, *, rates: bool = False) -> tuple[Equations, ...]:
-    """Return the closures of the leading joints as ``forward`` solves them, with its pose as verdict.
+    """Return the equations of ``forward`` at the leading joints, valid only if it gives the pose.
 
-    The joints of a pose may belong to another assembly too; such a pose is rejected.
+    Joint positions found for a pose may belong to another assembly, whose ``forward`` differs.
 
-    :param rates: whether results depend on :func:`pose_factors` too.
+    :param rates: whether results also depend on :func:`pose_factors`.
     """
     t.solve()
     pose = t.tape.inputs("pose", len(t.scheme.coordinates))
@@ -176,7 +177,7 @@ def confirm_pose(t: Traced, leads: Numbers, *, rates: bool = False) -> tuple[Equ
     for c, scale, a, b in zip(t.scheme.coordinates, t.pose_scales, there, pose, strict=True):
         apart = a - b
         if c.axis is None:
-            # A full turn makes no difference.
+            # Angles are compared modulo a full turn.
             same.append(cos(apart))
             apart = sin(apart)
         same.append(MAX_POSE_ROUNDING - absolute(apart) * scale)
@@ -186,10 +187,10 @@ def confirm_pose(t: Traced, leads: Numbers, *, rates: bool = False) -> tuple[Equ
 
 
 def quick_inverse_program(t: Traced, scheme: PlatformFirstScheme) -> Program:
-    """Write the program from a pose to joints that are certainly those of :func:`inverse_program`.
+    """Write an inverse kinematics without confirmation, for poses whose assembly is certain.
 
-    A pose is accepted if the determinant of the drives has its sign at home, and if the start of
-    ``forward``, to second order about home, is near the pose; others are left to that program.
+    It rejects the poses that :func:`certify_assembly` does not cover; :func:`inverse_program` may
+    still solve them.
     """
     posed, q = solve_pose(t, scheme)
     equations = posed.equations(certain=t.lift(certify_assembly(t, scheme, posed, q)))
@@ -197,7 +198,7 @@ def quick_inverse_program(t: Traced, scheme: PlatformFirstScheme) -> Program:
 
 
 def solve_pose(t: Traced, scheme: PlatformFirstScheme) -> tuple[Traced, list[Any]]:
-    """Return the machine that is driven by its pose, solved, and all its drives' positions."""
+    """Return the solved machine that is driven by its pose, and the positions of all drives."""
     posed = t.platform_first(scheme)
     posed.solve()
     return posed, posed.tree.joint_positions(t.graph.actuated, posed.x)
@@ -206,9 +207,9 @@ def solve_pose(t: Traced, scheme: PlatformFirstScheme) -> tuple[Traced, list[Any
 def transmission_program(t: Traced, scheme: PlatformFirstScheme | None, *, certified: bool, curved: bool) -> Program:
     """Write the program from a pose to the drives' positions and their rates per pose rate.
 
-    :param certified: whether poses are accepted as by :func:`quick_inverse_program`; else all are.
-    :param curved: whether the pose's ``rate`` is an input, and the drives' second derivatives at a
-        constant rate an output.
+    :param certified: reject the poses that :func:`quick_inverse_program` rejects.
+    :param curved: add the input ``rate`` of the pose, and the output of the drives' second
+        derivatives at that constant rate.
     """
     m = len(t.scheme.coordinates)
     rate = t.tape.inputs("rate", m) if curved else None
@@ -261,10 +262,7 @@ def actuator_program(t: Traced) -> Program:
 
 
 def pose_factors(t: Traced) -> SparseLU:
-    """Return the factors of pose rates by rates of the leading drives, of the machine's own tree.
-
-    The closures' equations have been taken before.
-    """
+    """Factor the Jacobian from the leading drives' rates to the pose's rates, for a solved ``t``."""
     position, rotation = t.motion.platform()
     twists = t.twists(t.graph.platform, position, t.rate_columns())
     columns = [poses.rates(t.scheme.coordinates, rotation, v, w) for v, w in twists]
@@ -284,11 +282,11 @@ def pose_accelerations(t: Traced) -> list[Any]:
 
 
 def certify_assembly(t: Traced, scheme: PlatformFirstScheme, posed: Traced, q: Sequence[Any]) -> list[Any]:
-    """Return numbers that are above zero if ``forward`` of q is certainly the pose.
+    """Return margins that are all positive only if ``forward`` of q is certainly the pose.
 
-    With x the pose, A = dq/dx and home 0, the way from home is read from both ends: A0^-1 (q - q0)
-    and A^-1 (q - q0) lie near x - x0 where it is nearly straight. Of a closed start of ``forward``
-    the sides of its singularities tell its assembly.
+    With the pose x, A = dq/dx, and home x0, q0, A0: the linear predictions A0^-1 (q - q0) from home
+    and A^-1 (q - q0) from the pose must both be near x - x0, so that no singularity lies between.
+    For a machine with a closed-form start the signs at its singularities identify the assembly.
     """
     names, order = t.graph.leads, scheme.drive_pivots
     rates, rates_home = (posed.rates_of_reaches(names, home=home) for home in (False, True))
@@ -309,11 +307,11 @@ def certify_assembly(t: Traced, scheme: PlatformFirstScheme, posed: Traced, q: S
 
 
 def iterate_pose(t: Traced, *, rates: bool = False) -> tuple[tuple[Equations, ...], Objects]:
-    """Solve the machine's own tree for a pose, and return the equations and the leading joints.
+    """Solve the machine's own tree for a pose; return the equations and the leading joints.
 
-    Newton's method finds all unknowns and joints; :func:`confirm_pose` judges them.
+    Newton's method solves for all unknowns and joints; :func:`confirm_pose` checks the solution.
 
-    :param rates: as of :func:`confirm_pose`.
+    :param rates: as for :func:`confirm_pose`.
     """
     scheme, tree, tape = t.scheme, t.tree, t.tape
     goal = tape.inputs("pose", len(scheme.coordinates))
@@ -323,7 +321,7 @@ def iterate_pose(t: Traced, *, rates: bool = False) -> tuple[tuple[Equations, ..
     origin = [0.0 if c.axis is None else t.graph.origin[c.axis] for c in scheme.coordinates]
 
     def system(state: Numbers, pose: Numbers) -> tuple[Motion, list[Row], list[Any], SparseLU]:
-        """Return motion, closures, pose equations, and the factors of their derivatives."""
+        """Return motion, closures, pose equations, and the LU factors of their Jacobian."""
         motion = Motion(tree, state[:size], state[size:])
         rows = motion.closures()
         table = np.hstack(closure_jacobians(tree, rows))[scheme.independent]
@@ -335,7 +333,6 @@ def iterate_pose(t: Traced, *, rates: bool = False) -> tuple[tuple[Equations, ..
     step = -lu.solve([rows[k].value for k in scheme.independent] + equations)
 
     def retract(state: Objects, step: Objects) -> list[Expression]:
-        """Return the state after a step; rotations stay on their manifold."""
         retracted = motion.retract(state[:size], step[:split])
         return t.lift([*retracted, *(state[size:] + step[split:])])
 

@@ -1,15 +1,15 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Axes and points that a file's rounding has moved off a machine that closes its loops.
+"""Repair axes and points of overconstrained machines that a file's rounding has displaced.
 
-An overconstrained machine moves only while its axes and points fit each other exactly: axes that
-meet in one point, are parallel or lie in a plane, bars of one length. Rounded numbers break that,
-and the machine loses freedoms. Which relation it was need not be known: all loops must close, not
-only at home but in other positions too. The numbers are moved by least changes until they do
-(Gauss and Newton with the least norm), in positions that the machine reaches with the rank that it
-has where singular values below the file's precision count as zero.
+An overconstrained machine moves only if its axes and points satisfy exact relations: axes that meet
+in one point, are parallel or lie in a plane, bars of equal length. Rounded numbers violate them,
+and the machine loses degrees of freedom. The relations need not be known: the loops must close at
+home and in other positions. Gauss-Newton steps of least norm change the numbers until they do, in
+positions that the machine reaches with the rank that remains if singular values below the file's
+precision count as zero.
 
-Bodies move by six coordinates each; every joint and rod is equations between two of them. Lengths
-are parts of the machine's size, angles are in rad.
+Each body has six coordinates; joints and rods are equations between two bodies. Lengths are relative
+to the machine's size, angles in rad.
 """
 
 from __future__ import annotations
@@ -35,45 +35,47 @@ from pkm_twin.machine.graph import Graph, Joint, array
 from pkm_twin.machine.joints import CONSTRAINTS
 
 MAX_ERROR_GROWTH: Final = 20.0
-"""How far rounding may move a body or open a loop, rounding errors: a loop is a chain of places."""
+"""Largest displacement of a body, or gap of a loop, per rounding error of a number: the errors of a
+chain of joints add up."""
 MAX_ROUNDING: Final = 1e-4
-"""Deviation of axes and points that no file's rounding exceeds, rad or parts of the size."""
+"""Largest deviation of axes and points by rounding in any file, rad or relative to the size."""
 POSITION_COUNTS: Final = (8, 24, 72)
-"""Positions in which the loops are closed: more conditions than a machine has numbers."""
+"""Numbers of positions in which the loops are closed, tried in order, until the conditions outnumber
+the machine's parameters."""
 CHECK_COUNT: Final = 3
-"""Other positions in which the loops must then close too."""
+"""Number of further positions in which the repaired loops must close."""
 POSITION_RADIUS: Final = 0.4
-"""How far from home the positions are: the largest motion of a body, rad or parts of the size."""
+"""Distance of the positions from home: the largest motion of a body, rad or relative to the size."""
 STEPS: Final = 4
-"""Steps on the way to a position."""
+"""Number of steps from home to a position."""
 MAX_CORRECTIONS: Final = 6
-"""Most corrections of a step."""
+"""Largest number of Newton corrections per step."""
 MAX_ROUNDS: Final = 12
-"""Most rounds of moving numbers."""
+"""Largest number of Gauss-Newton iterations."""
 MAX_OPENING: Final = 1e-13
-"""Loops that are open by less are closed, rad or parts of the size."""
+"""Largest gap of a closed loop, rad or relative to the size."""
 MAX_ZERO_SINGULAR_VALUE: Final = 1e-10
-"""Singular values below this are zero but for the computer's own rounding."""
+"""Largest singular value that is zero up to floating-point rounding."""
 NOISE_FACTOR: Final = 100.0
-"""Part of the largest effect of numbers on the loops below which one comes from rounding: this many
-times the largest singular value that should be zero."""
+"""Effects of numbers on the loops are noise below this multiple of the largest singular value that
+should be zero, relative to the largest effect."""
 MAX_RELATIVE_NOISE: Final = 1e-2
-"""Most of that part: NOISE_FACTOR times MAX_ROUNDING."""
+"""Upper bound of that relative noise: NOISE_FACTOR times MAX_ROUNDING."""
 MAX_DEVIATION: Final = 3e-2
-"""Largest deviation of an axis or point that is taken for an error and not for the design, rad or
-parts of the machine's size."""
+"""Largest deviation of an axis or point that is an error and not the design, rad or relative to the
+machine's size."""
 MAX_CHOSEN_VECTORS: Final = 6
-"""Most vectors that are chosen one by one."""
+"""Largest number of vectors that are chosen one by one."""
 
 Slot = tuple[str, str, int]
-"""A vector of the graph: ``at`` or ``axis`` of a joint, or ``end`` of a rod, and which."""
+"""Key of a vector of the graph: ``at`` or ``axis`` of a joint, or ``end`` of a rod; name; index."""
 
 
 class _Frame(NamedTuple):
-    """Describe a part's frame on one of its bodies by the vectors that place it.
+    """Describe a joint's or rod's frame on one of its bodies by the vectors that define it.
 
-    ``point``: its origin at home, the vector ``slot``. ``tilt``: the axis that tilts it, if one
-    does, and ``axis`` its value.
+    ``point``: the origin at home, the vector with key ``slot``. ``axis``: the axis that the frame
+    is aligned with, if any, the vector with key ``tilt``.
     """
 
     slot: Slot
@@ -84,9 +86,9 @@ class _Frame(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Repair:
-    """A graph whose loops close in all positions; ``moves``: by joint or rod how far it was moved.
+    """A repaired graph whose loops close in all positions.
 
-    Moves are in rad or parts of the machine's size.
+    ``moves``: change of each joint or rod, rad or relative to the machine's size.
     """
 
     graph: Graph
@@ -94,7 +96,7 @@ class Repair:
 
     @property
     def largest(self) -> float:
-        """The largest move, rad or parts of the size."""
+        """The largest move, rad or relative to the size."""
         return max(self.moves.values(), default=0.0)
 
     @property
@@ -107,10 +109,10 @@ class Repair:
 
 
 def repair_rounded(graph: Graph, rounding: float, least: float = 0.0) -> Repair | None:
-    """Repair a graph whose file has rounding errors, rad or m, as :func:`repair` does.
+    """Repair a graph by :func:`repair` with a file's rounding errors, rad or m.
 
-    :param least: deviation that counts as rounding in any file, rad or parts of the size.
-    :returns: None where no change within the file's precision gives the freedoms.
+    :param least: smallest precision to assume, rad or relative to the size.
+    :returns: None if no change within the precision restores the degrees of freedom.
     """
     precision = min(MAX_ROUNDING, max(least, MAX_ERROR_GROWTH * rounding / min(1.0, graph.size)))
     found = repair(graph, precision)
@@ -118,12 +120,12 @@ def repair_rounded(graph: Graph, rounding: float, least: float = 0.0) -> Repair 
 
 
 def repair(graph: Graph, precision: float) -> Repair | None:
-    """Move axes and points by least changes, so that the machine has its freedoms exactly.
+    """Move axes and points as little as possible, so that the machine's loops close exactly.
 
-    :param precision: singular values of the closures below this come from the file's rounding, rad
-        or parts of the machine's size.
-    :returns: the graph and its moves, none where no singular value is that small but not zero; None
-        where no small change gives the freedoms, or home is a singularity.
+    :param precision: nonzero singular values of the closures below this come from the file's
+        rounding, rad or relative to the machine's size.
+    :returns: the graph and its moves, empty if no such singular value exists; None if no small
+        change restores the degrees of freedom, or home is a singularity.
     """
     loops = _Loops(graph)
     sizes = np.linalg.svd(loops.equations(Placement.at_home(graph, (1,)))[1][0], compute_uv=False)
@@ -131,7 +133,7 @@ def repair(graph: Graph, precision: float) -> Repair | None:
     # Rounding may become visible at home or only away from it.
     if loops.are_exact(rank, loops.sample_positions(rank, 2, 1)) and not (sizes[rank:] > MAX_ZERO_SINGULAR_VALUE).any():
         return Repair(graph, {})
-    # In a planar linkage least changes alone would make axes that meet in a distant point.
+    # First align axes: least changes would make a planar linkage's axes meet in a distant point.
     loops.graph = align_axes(graph, precision)
     if loops.are_exact(rank, loops.sample_positions(rank, CHECK_COUNT, STEPS, seed=1)):
         return loops.repair()
@@ -142,16 +144,16 @@ def repair(graph: Graph, precision: float) -> Repair | None:
             return None
         if not loops.close(rank, positions):
             return None
-        # Dimensions fitted to few positions may close the loops only there: check further ones.
+        # Numbers fitted to few positions may close the loops only there: check other positions.
         if loops.are_exact(rank, loops.sample_positions(rank, CHECK_COUNT, STEPS, seed=1)):
             return loops.repair()
     return None
 
 
 def align_axes(graph: Graph, precision: float) -> Graph:
-    """Return the graph with axes exactly parallel, and hinges in one line, that are so within a precision.
+    """Make axes exactly parallel, and hinges collinear, that are so within a precision.
 
-    :param precision: rad, or parts of the machine's size.
+    :param precision: rad, or relative to the machine's size.
     """
     means: list[Array] = []
     for axis in (axis for joint in graph.joints.values() for axis in joint.axes):
@@ -184,14 +186,14 @@ def align_axes(graph: Graph, precision: float) -> Graph:
 
 
 def repair_few(graph: Graph, freedoms: int) -> Repair | None:
-    """Move as few axes and points as possible, so that a machine that lost freedoms has them.
+    """Move as few axes and points as possible, so that a machine has the required freedoms.
 
-    Vectors are chosen one by one, each the one whose change leaves the loops least open: orthogonal
-    matching pursuit (Pati, Rezaiifar and Krishnaprasad 1993). Where MAX_CHOSEN_VECTORS do not close the
-    loops, all are moved as by :func:`repair`.
+    Vectors are chosen one by one; each choice reduces the loops' gaps most: orthogonal matching
+    pursuit (Pati, Rezaiifar and Krishnaprasad 1993). If MAX_CHOSEN_VECTORS do not close the loops,
+    all vectors are moved as in :func:`repair`.
 
     :param freedoms: degrees of freedom that the machine should have.
-    :returns: None if the machine has them, or if no change within MAX_DEVIATION gives them.
+    :returns: None if the machine has them already, or no change within MAX_DEVIATION restores them.
     """
     loops = _Loops(graph)
     rank = 6 * loops.bodies - freedoms
@@ -209,7 +211,7 @@ def repair_few(graph: Graph, freedoms: int) -> Repair | None:
             left, strength, _ = np.linalg.svd(apart, full_matrices=False)
             own = left[:, strength > noise]
             rest = gap - own @ (own.T @ gap)
-            # Of equivalent vectors the first is taken.
+            # Take the first of equivalent vectors.
             if float(np.linalg.norm(rest)) < least * (1.0 - 1e-6):
                 best, least, remaining, added = slot, float(np.linalg.norm(rest)), rest, own
         if best is None:
@@ -227,14 +229,14 @@ def repair_few(graph: Graph, freedoms: int) -> Repair | None:
 
 
 def _solve_truncated(rank: int, table: Array, value: Array) -> Array:
-    """Solve table x = -value in all positions with the largest ``rank`` singular values alone."""
+    """Solve table x = -value in each position, using only the largest ``rank`` singular values."""
     left, sizes, rows = np.linalg.svd(table, full_matrices=False)
     parts = np.einsum("kir,ki->kr", left[:, :, :rank], -value) / sizes[:, :rank]
     return np.asarray(np.einsum("krj,kr->kj", rows[:, :rank], parts), np.float64)
 
 
 class _Loops:
-    """A graph whose axes and points may move, with its joints' and rods' equations."""
+    """A graph whose axes and points may be moved, with the equations of its joints and rods."""
 
     def __init__(self, graph: Graph) -> None:
         self.first = self.graph = graph
@@ -242,7 +244,7 @@ class _Loops:
 
     @property
     def slots(self) -> list[Slot]:
-        """All points and directions of the graph that rounding may have changed."""
+        """Keys of all points and directions of the graph."""
         graph = self.graph
         found: list[Slot] = []
         for joint in graph.joints.values():
@@ -251,10 +253,10 @@ class _Loops:
         return found + [("end", name, k) for name in graph.rods for k in range(2)]
 
     def sample_positions(self, rank: int, count: int, steps: int, seed: int = 0) -> Placement:
-        """Return positions that the machine can move to from home.
+        """Draw positions that the machine can reach from home.
 
-        :param rank: of the equations; smaller singular values are no constraints. ``count``: of
-            positions. ``steps``: towards each, of POSITION_RADIUS in STEPS.
+        :param rank: of the equations; smaller singular values constrain nothing. ``count``: number
+            of positions. ``steps``: number of steps to each, of POSITION_RADIUS / STEPS.
         """
         placed = Placement.at_home(self.graph, (count,))
         way: Array = np.random.default_rng(seed).normal(size=(count, 6 * self.bodies))
@@ -270,20 +272,20 @@ class _Loops:
         return placed
 
     def singular_values(self, positions: Placement) -> Array:
-        """Return the singular values of the equations by the bodies' motions, shape (k, n)."""
+        """Return the singular values of the equations' Jacobian in each position, shape (k, n)."""
         table = self.equations(positions)[1]
         return np.asarray(np.linalg.svd(table, compute_uv=False), np.float64)
 
     def are_exact(self, rank: int, positions: Placement) -> bool:
-        """Return whether all loops are closed, and the equations have that rank."""
+        """Return whether all loops are closed, and the Jacobian has this rank, in all positions."""
         miss = np.abs(self.equations(positions)[0]).max(initial=0.0)
         return bool(miss < MAX_OPENING and (self.singular_values(positions)[:, rank:] < MAX_ZERO_SINGULAR_VALUE).all())
 
     def measure_openings(self, rank: int, positions: Placement) -> tuple[Array, dict[Slot, Array], float]:
-        """Return the gaps that no motion of bodies closes, and their derivatives by the vectors.
+        """Return the gaps that no motion of the bodies can close, with derivatives by the vectors.
 
-        :returns: gaps, shape (k,); derivatives by each vector, (k, 3); the bound below which
-            a singular value of these is noise.
+        :returns: gaps, shape (k,); derivatives by each vector, (k, 3); the relative bound below
+            which their singular values are noise.
         """
         value, table = self.equations(positions)
         left, sizes, _ = np.linalg.svd(table)
@@ -296,9 +298,9 @@ class _Loops:
         return gap, {s: effect[:, 3 * k : 3 * k + 3] for k, s in enumerate(self.slots)}, noise
 
     def close(self, rank: int, positions: Placement, slots: Sequence[Slot] | None = None) -> bool:
-        """Move vectors by least changes until all loops close in all positions, if they can.
+        """Move vectors as little as possible until all loops close; return whether they do.
 
-        :param slots: the vectors that may move; by default all.
+        :param slots: keys of the vectors that may move; by default all.
         """
         placed, last = positions, np.inf
         for _ in range(MAX_ROUNDS):
@@ -317,7 +319,7 @@ class _Loops:
         return miss < MAX_OPENING
 
     def move_vectors(self, change: Array) -> None:
-        """Move all vectors of the graph, (3 vectors,); axes stay of length one."""
+        """Add changes (3 vectors,) to the vectors of the graph; axes stay of length one."""
         parts = dict(zip(self.slots, change.reshape(-1, 3), strict=True))
         graph = self.graph
 
@@ -335,7 +337,7 @@ class _Loops:
         self.graph = replace(graph, joints=joints, rods=rods)
 
     def repair(self) -> Repair:
-        """Return the graph with its vectors as they are, and how far they were moved."""
+        """Return the present graph, and how far its vectors were moved."""
         first, size = self.first, self.first.size
         moves: dict[str, float] = {}
         for name, joint in self.graph.joints.items():
@@ -348,12 +350,12 @@ class _Loops:
         return Repair(self.graph, moves)
 
     def equations(self, placed: Placement) -> tuple[Array, Array]:
-        """Return the values of all equations, (k, rows), and derivatives by the coordinates."""
+        """Return the values of all equations, (k, rows), and their derivatives by the coordinates."""
         found = [one for _, one in self._equations(placed)]
         return placed.values(found), placed.jacobian(found)
 
     def _equations(self, placed: Placement) -> list[tuple[list[_Frame], Equation]]:
-        """Return the equations in parts of the size, each with its frames on both bodies."""
+        """Return the dimensionless equations, each with its frames on both bodies."""
         found: list[tuple[list[_Frame], Equation]] = []
         size = placed.size
         for joint in self.graph.joints.values():
@@ -384,8 +386,8 @@ class _Loops:
     def vector_derivatives(self, placed: Placement) -> Array:
         """Return derivatives of the equations' values by the vectors, (k, rows, 3 vectors).
 
-        A vector moves the part's frames on both bodies. At home it changes nothing, as equations
-        are relative to home: that much is subtracted.
+        A vector moves the frames on both bodies. The equations are satisfied at home with every
+        vector, so the derivative there is subtracted.
         """
         columns = {slot: 3 * k for k, slot in enumerate(self.slots)}
         home = Placement.at_home(self.graph, (1,))
@@ -402,7 +404,7 @@ class _Loops:
                     k = columns[frame.slot]
                     total[:, i, k : k + 3] += sign * where.size * shift
                     if frame.tilt is not None and frame.axis is not None:
-                        # An axis that is moved by d is tilted by axis x d.
+                        # A change d of an axis rotates the frame by axis x d.
                         k = columns[frame.tilt]
                         total[:, i, k : k + 3] += sign * np.cross(tilt, frame.axis)
         return total

@@ -31,25 +31,25 @@ from pkm_twin.machine.graph import BASE, Graph
 from pkm_twin.machine.tree import Step, Tree
 
 MIN_DRIVE_MOTION: Final = 1e-6
-"""Least motion of a drive at home, of unit one, and least determinant of a choice of drives, as part
-of the best one's: below, rounding decides."""
+"""Smallest dimensionless motion of a drive at home, and smallest determinant of a choice of leading
+drives relative to the best choice: below, rounding decides."""
 
 MIN_POSE_MOTIONS: Final = (1e-3, 1e-6)
-"""Least motion of the platform along a pose coordinate, of unit one: more than any file's rounding,
-or, where that leaves too few coordinates, more than the computer's."""
+"""Smallest dimensionless motions of the platform along a pose coordinate: above any file's rounding,
+and, if too few coordinates move so far, above floating-point rounding."""
 
 
 class ClosedFormStart(Protocol):
-    """A closed form of the forward kinematics, that Newton's method starts from."""
+    """A closed form of the forward kinematics, from which Newton's method starts."""
 
     def solve_unknowns(self, tree: Tree, q: Numbers) -> list[Any]:
-        """Return the tree's unknowns at q, on numbers and expressions alike."""
+        """Return the tree's unknowns at q, numerically or symbolically."""
 
     def find_conditions(self, motion: Motion) -> list[Any]:
-        """Return numbers that are all above zero where bodies that are placed are in its assembly."""
+        """Return margins that are all positive if placed bodies are in the closed form's assembly."""
 
     def find_gap(self, tree: Tree, q: Numbers) -> tuple[str, float] | None:
-        """Return the joint or rod that falls short at q, and by how much (m); None: not known."""
+        """Return the joint or rod that cannot close at q, and its gap, m; None: unknown."""
         return None
 
 
@@ -69,12 +69,12 @@ class Scheme(Linkage):
 
     @cached_property
     def geometry(self) -> Array:
-        """The geometry's numbers that programs take as inputs, shape (k,)."""
+        """Geometric parameters that programs take as inputs, shape (k,)."""
         return np.array(list_geometry(self.graph), np.float64)
 
     @cached_property
     def structure(self) -> ProgramKey:
-        """The key of everything that programs depend on; machines of one structure share programs."""
+        """Key of everything that programs depend on: machines of the same structure share programs."""
         return EMPTY.also(
             repr(
                 (
@@ -94,12 +94,12 @@ class Scheme(Linkage):
 
     @cached_property
     def start(self) -> ClosedFormStart | None:
-        """The closed form of all unknowns, None where there is none."""
+        """The closed form of all unknowns; None if there is none."""
         return self._start or find_three_rods(self)
 
     @cached_property
     def independent(self) -> list[int]:
-        """Indices of independent closures, which are solved; the others only check the result.
+        """Indices of independent closures, which are solved; the others only verify the result.
 
         :raises ParameterError: something can move while the actuated joints are locked.
         """
@@ -120,16 +120,16 @@ class Scheme(Linkage):
         return []
 
     def varies(self, step: Step) -> bool:
-        """Return whether a step is passive, and no closure keeps it at its home value."""
+        """Return whether a step is passive and not kept at its home value by closures."""
         return not step.actuated and step.rate not in self.constrained_rates
 
     def is_constrained(self, step: Step) -> bool:
-        """Return whether the closures keep a passive step at its home value."""
+        """Return whether a step is passive and kept at its home value by closures."""
         return not step.actuated and step.rate in self.constrained_rates
 
     @property
     def constraining_closures(self) -> list[int]:
-        """Indices of the closures that keep these coordinates at home."""
+        """Indices of the closures that keep the constrained coordinates at home."""
         return []
 
     @property
@@ -139,28 +139,28 @@ class Scheme(Linkage):
 
     @cached_property
     def pivots(self) -> Order:
-        """Elimination order of the independent closures in the unknowns, good near home."""
+        """Elimination order of the independent closures by the unknowns, well conditioned near home."""
         return pivot_order(self._sampled_jacobians[0][:, self.independent][:, :, self.varying])
 
     @cached_property
     def order(self) -> tuple[str | Limb, ...]:
-        """Bodies in the order in which they are placed, limbs in closed form among them."""
+        """Bodies, and limbs in closed form, in the order in which they are placed."""
         limbs = find_hanging_limbs(self)
         inner = {body for limb in limbs for body in limb.bodies}
         return (*(body for body in self.tree.links if body not in inner), *limbs)
 
     @property
     def platform_pivots(self) -> Order | None:
-        """Elimination order of the platform's closed form; None: it has none."""
+        """Elimination order of the platform's closed form; None if there is none."""
         return None
 
     def close_platform(self, tree: Tree, q: Numbers, pivots: Order) -> tuple[list[Any], Any]:
-        """Return the platform's unknowns in closed form, and the squared growth of rounding."""
+        """Return the platform's unknowns in closed form, and the squared growth of rounding errors."""
         raise NotImplementedError
 
     @property
     def limbs(self) -> list[Limb]:
-        """Limbs in closed form."""
+        """The limbs that are solved in closed form."""
         return [entry for entry in self.order if isinstance(entry, Limb)]
 
     @property
@@ -170,12 +170,12 @@ class Scheme(Linkage):
 
     @property
     def checked_closures(self) -> list[int]:
-        """Closures whose residual decides whether a state is accepted."""
+        """Indices of the closures whose residuals decide whether a state is accepted."""
         return list(range(len(self.parts)))
 
     @cached_property
     def newton_unknowns(self) -> tuple[list[int], list[int]]:
-        """Indices of Newton's unknowns and their rates: all but those of closed-form limbs."""
+        """Indices of the unknowns and rates that Newton's method solves: not those of limbs."""
         inner = {body for limb in self.limbs for body in limb.bodies}
         places, rates = list(range(len(self.tree.home))), list(range(self.tree.unknown_rates))
         for link in self.tree.links.values():
@@ -194,7 +194,7 @@ class Scheme(Linkage):
         return place_in_order(tree, self.order, x, q)
 
     def newton_rows(self, rows: Sequence[Row], poses: Sequence[LimbPose]) -> list[Row]:
-        """Return Newton's equations: closures outside limbs, and those that limbs leave open."""
+        """Return the equations of Newton's method: those that limbs in closed form leave."""
         limbs = {k for limb in self.limbs for k in limb.rows}
         return [rows[k] for k in self.independent if k not in limbs] + [row for pose in poses for row in pose.rows]
 
@@ -212,10 +212,10 @@ class Scheme(Linkage):
 
     @cached_property
     def inverse_pivots(self) -> Order:
-        """Elimination order of closures and pose equations by unknowns and q, good near home."""
+        """Elimination order of closures and pose equations by the unknowns and q."""
         samples = []
         for x, q in self.samples:
-            there, closed = self.at(x, q)
+            there, closed = self.evaluate_state(x, q)
             position, rotation = (numbers(part) for part in there.platform())
             here = [float(v) for v in poses.values(self.coordinates, position, rotation)]
             samples.append(self._inverse_matrix(there, closed, here))
@@ -223,10 +223,10 @@ class Scheme(Linkage):
 
     @cached_property
     def jacobian_pivots(self) -> Order:
-        """Elimination order of the pose Jacobian by the leading joints' rates, good near home."""
+        """Elimination order of the pose Jacobian by the leading joints' rates."""
         n, tables = len(self.varying), []
         for x, q in self.samples:
-            motion, rows = self.at(x, q)
+            motion, rows = self.evaluate_state(x, q)
             ju, jq = self.scaled_jacobians(rows)
             follow = -np.linalg.solve(ju[self.independent], jq[self.independent])
             position, rotation = (numbers(part) for part in motion.platform())
@@ -255,7 +255,7 @@ class Scheme(Linkage):
                 bound += f"; the platform moves in {', '.join(ways) or 'none'} alone: choose another "
                 bound += "base or platform, so that each actuated joint moves it"
             raise ParameterError("pose", [c.name for c in self.coordinates], bound)
-        motion, rows = self.at(*self.samples[0])
+        motion, rows = self.evaluate_state(*self.samples[0])
         matrix = self._inverse_matrix(motion, rows, self.home_pose.tolist())
         if count_rank(matrix) < len(matrix):
             raise ParameterError(
@@ -298,8 +298,9 @@ class Scheme(Linkage):
 def choose_leads(graph: Graph, wanted: Sequence[str] = (), pose: int = 0) -> tuple[str, ...]:
     """Choose the drives that lead: all, or the most independent ones of redundant drives.
 
-    :param wanted: names, in place of that choice. ``pose``: number of pose coordinates, 0: any.
-    :raises MobilityError: they are redundant only because of a small deviation, or one cannot move.
+    :param wanted: names of the leading drives; empty: choose. ``pose``: number of pose coordinates;
+        0: any.
+    :raises MobilityError: drives are redundant only because of a small deviation, or cannot move.
     :raises ParameterError: the wanted drives do not exist or do not determine the machine.
     """
     linkage, names = Linkage(graph), graph.actuated
@@ -333,8 +334,8 @@ def choose_leads(graph: Graph, wanted: Sequence[str] = (), pose: int = 0) -> tup
 def choose_coordinates(graph: Graph) -> tuple[str, ...]:
     """Choose the usual pose coordinates that determine the platform at home.
 
-    If rotations alone determine it, as of an ankle, these are those that move most; else the first
-    coordinates that do.
+    If rotations alone determine it, as for an ankle, the rotations that move most; otherwise the
+    first set of :func:`list_coordinates`.
 
     :raises ParameterError: something is free to move while the actuated joints are locked.
     """
@@ -365,7 +366,7 @@ def list_coordinates(graph: Graph) -> list[tuple[str, ...]]:
 
 
 def _pick_independent(rates: Mapping[str, Array], names: Sequence[str], least: float) -> list[str]:
-    """Pick the first independent coordinates: singular values of their rates exceed ``least``."""
+    """Pick coordinates in order, each independent of the others: singular values exceed ``least``."""
     chosen: list[str] = []
     for name in names:
         table = np.array([rates[own] for own in (*chosen, name)])
@@ -380,7 +381,7 @@ def _pose_rates(graph: Graph) -> dict[str, Array]:
     :raises ParameterError: something is free to move while the actuated joints are locked.
     """
     scheme = Scheme(graph, tuple(poses.COORDINATES.values()))
-    motion, closed = scheme.at(scheme.tree.home, graph.lead_home)
+    motion, closed = scheme.evaluate_state(scheme.tree.home, graph.lead_home)
     ju, jq = (numbers(m) for m in closure_jacobians(scheme.tree, closed))
     independent = scheme.independent
     rates = np.vstack([-np.linalg.solve(ju[independent], jq[independent]), np.eye(scheme.joints)])
@@ -392,10 +393,10 @@ def _pose_rates(graph: Graph) -> dict[str, Array]:
 def check_masses(scheme: Scheme, graph: Graph) -> None:
     """Reject actuated joints that can move no mass.
 
-    :param graph: has the masses; the scheme's own graph may have those of another machine.
+    :param graph: the graph with the masses; those of the scheme's graph may be another machine's.
     :raises ParameterError: names a massless body that can move alone.
     """
-    motion, rows = scheme.at(scheme.tree.home, graph.lead_home)
+    motion, rows = scheme.evaluate_state(scheme.tree.home, graph.lead_home)
     ju, jq = (numbers(m) for m in closure_jacobians(scheme.tree, rows))
     moved = -np.linalg.solve(ju[scheme.independent], jq[scheme.independent])
     n = scheme.joints

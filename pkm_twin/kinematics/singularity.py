@@ -1,29 +1,29 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""How far a machine is from a singularity of any kind: 0 in one, 1 at best.
+"""Measure the distance of a machine from all kinds of singularities: 0 at one, 1 at best.
 
-The lesser of two numbers. Bodies that fixed joints hold together are one. A body moves by
-(v, L omega): v of the centre of its joints, L the distance of the farthest of them from there, at
-least the platform's. Closures err in lengths, angles times the platform's L. Hence neither units,
-scale nor the reference point count.
+The measure is the smaller one of two numbers. Bodies united by fixed joints count as one. The motion
+of a body is (v, L omega): v of the centre of its joints, L the distance of the farthest joint from
+the centre, at least the platform's. Errors of closures are lengths, angles times the platform's L.
+Hence the measure does not depend on units, scale or the reference point.
 
-**Held**: the actuated joints are locked, and a closure errs by one. A = d(closures)/d(rates), k
-rates and r closures of which some may be redundant, B = d(bodies)/d(rates), all bodies':
+**Held**: with locked actuated joints, how far do the bodies move if a closure has an error of one?
+A = d(closures)/d(rates), k rates and r closures, possibly redundant, B = d(bodies)/d(rates):
 
     held = (k / 2 sqrt(r)) / |B A+|,   |.|^2 the sum of squares,   |B A+|^2 = tr((A'A)^-1 B'B)
 
-An error of one needs motion of at least a half on each side of it, hence the bound of 1. It is zero
-where anything moves although the actuators are locked: where they lose the platform, and in every
-constraint singularity, of platform, limbs or bodies between. Here closures are all that holds in
-truth: of a parallelogram also the couple that a pair of rods passes. Which joints are closures
-follows from the structure, see :func:`find_tree_joints`.
+An error of one needs a motion of at least one half on both sides, hence the bound of 1. The number
+is zero if anything can move while the actuators are locked: in direct-kinematic singularities, and
+in constraint singularities of platform, limbs or intermediate bodies. Closures here include all
+real constraints, for example the couple that a pair of rods transmits in a parallelogram. The
+structure determines which joints are closures, see :func:`find_tree_joints`.
 
-**Moved**: the platform's twist per joint rate T, shape (6, n), of each body's motion D:
+**Moved**: the platform's twist T per joint rate, shape (6, n), compared with each body's motion D:
 
     moved = min over bodies sqrt(n) / |D T+|,          |D T+|^2 = tr((T'T)^-1 D'D)
 
-The platform is one of the bodies, hence the bound of 1. It is zero where joints move and the
-platform does not: at the edge of reach. Where the pose has no angle, the platform is its reference
-point: T has the velocity alone, shape (3, n).
+The platform is one of the bodies, hence the bound of 1. The number is zero if joints can move while
+the platform rests: at the edge of the workspace. If the pose has no angle, the platform is a point:
+T is the velocity of the reference point, shape (3, n).
 """
 
 from __future__ import annotations
@@ -73,11 +73,11 @@ def compile_singularity_gradient(engine: Engine) -> Kernel:
 
 
 def find_tree_joints(graph: Graph) -> frozenset[str]:
-    """Return the joints of the spanning tree with which the actuated joints are locked.
+    """Return the tree joints of a spanning tree in which the actuated joints are locked.
 
-    Bodies joined by locked, fixed and screw joints are one part. A part's tree joint is the one
-    through which it is nearest to the base, counted in joints. A part with several such joints has
-    no tree joint: all of them are closures. So nothing depends on the order of entries.
+    Bodies connected by locked, fixed and screw joints are one part. A part's tree joint is the joint
+    on its shortest path to the base, counted in joints. If several joints are, all of them are
+    closures, so that the result does not depend on the order of entries.
     """
     rigid = [j for j in graph.joints.values() if j.actuated or not j.type.cost]
     parts = group_connected([BASE, *graph.bodies], [(j.inner, j.outer) for j in rigid])
@@ -102,18 +102,18 @@ def find_tree_joints(graph: Graph) -> frozenset[str]:
 
 
 class KinematicCopy(Motion):
-    """A second spanning tree of the same bodies, in the poses that another motion has found.
+    """A second spanning tree of the same bodies, in the state of another motion.
 
-    Virtual joints, which stand for other parts, are left out.
+    Virtual joints, which represent other parts, are left out.
     """
 
     def __init__(self, motion: Motion) -> None:
         graph = weld(motion.graph)
-        # All drives are locked, redundant ones too.
+        # Lock all drives, including redundant ones.
         true = {n: replace(j, follows=False) for n, j in graph.joints.items() if not j.virtual}
         self.graph: Graph = replace(graph, joints=true)
         self.tree = Tree(self.graph, find_tree_joints(self.graph))
-        # Errors of closures are in metres.
+        # Express errors of closures in metres.
         self.tree.size = 1.0
         self._found = motion
         self.origin: dict[str, Any] = {BASE: np.zeros(3)}
@@ -136,11 +136,11 @@ class KinematicCopy(Motion):
         return self._found.direction(body, vector)
 
     def closures(self) -> list[Row]:
-        """Return the equations of all cut joints and rods, and the couples of pairs of rods."""
+        """Return the equations of all cut joints and rods, and of the couples of rod pairs."""
         rows = super().closures()
         for rod in self.graph.rods.values():
             if rod.pair is not None:
-                # The pair's equal lengths: no turn about their plane's normal, t x w.
+                # The equal lengths of a rod pair prevent rotation about the normal t x w of their plane.
                 bodies, (start, end), pair = (rod.inner, rod.outer), rod.ends, np.asarray(rod.pair)
                 points = self.point(rod.inner, start), self.point(rod.outer, end)
                 vectors = self.direction(rod.inner, pair), self.direction(rod.outer, pair)
@@ -156,7 +156,7 @@ def _singularity(t: Traced) -> Program:
 
 
 def singularity_measure(t: Traced) -> Any:
-    """Return the singularity measure of a solved symbolic machine; its rates are overwritten."""
+    """Return the singularity measure of a solved symbolic machine, whose rates are overwritten."""
     point = all(c.axis is not None for c in t.scheme.coordinates)
     return minimum(_constraint_singularity(t), _motion_singularity(t, point))
 
@@ -187,7 +187,7 @@ class _NumericTraced:
         x = linkage.close(q)
         if x is None:
             raise SingularityError("q", (), 0.0, 1e-9)
-        self.motion, rows = linkage.at(x, q)
+        self.motion, rows = linkage.evaluate_state(x, q)
         ju, jq = (numbers(m) for m in closure_jacobians(linkage.tree, rows))
         if ju.size and np.linalg.matrix_rank(ju, 1e-9) < ju.shape[1]:
             raise SingularityError("home", (), 0.0, 1e-9)
@@ -199,7 +199,7 @@ class _NumericTraced:
 
 
 def _constraint_singularity(t: Traced | _NumericTraced) -> Any:
-    """Return the measure's first number, from the closures while the actuated joints are locked."""
+    """Return the number **Held**, from the closures while the actuated joints are locked."""
     placed = KinematicCopy(t.motion)
     unknown = placed.tree.unknown_rates
     if not unknown:
@@ -222,7 +222,7 @@ def _constraint_singularity(t: Traced | _NumericTraced) -> Any:
 
 
 def _motion_singularity(t: Traced | _NumericTraced, point: bool) -> Any:
-    """Return the measure's second number, from the bodies' motions per platform twist.
+    """Return the number **Moved**, from the bodies' motions per platform twist.
 
     :param point: the pose has no angle, so the platform counts as its reference point.
     """
@@ -232,7 +232,7 @@ def _motion_singularity(t: Traced | _NumericTraced, point: bool) -> Any:
     twist = rates.twist_matrix(graph.platform, tool)[: 3 if point else 6]
     table = _gram([{("u", j): v for j, v in enumerate(row)} for row in twist], n)
     lower = {(a, b): table[a, b] for a in range(n) for b in range(a + 1)}
-    # Pivots stay positive where the platform stands still while a joint moves.
+    # Keep pivots positive if the platform rests while a joint moves.
     size = t.motion.tree.size
     lengths = [1.0 if graph.joints[name].slides else size * size for name in graph.leads]
     root = SparseCholesky(lower, [table[k, k] + length for k, length in enumerate(lengths)])
@@ -246,8 +246,8 @@ def _motion_singularity(t: Traced | _NumericTraced, point: bool) -> Any:
 class _TwistMatrices:
     """Compute the bodies' twist closure_jacobians D = S U.
 
-    S: a body's twist per rate of the tree's joints between it and the base. U: these rates per rate
-    of the leading joints.
+    S: a body's twist per rate of the tree joints between base and body. U: these rates per rate of
+    the leading joints.
     """
 
     def __init__(self, t: Traced | _NumericTraced, graph: Graph) -> None:
@@ -286,7 +286,7 @@ class _TwistMatrices:
     def response(self, name: str, root: SparseCholesky) -> Any:
         """Return tr((T'T)^-1 D'D), with T'T = L E L'.
 
-        From D's rows, or from S'S and U (T'T)^-1 U', whichever takes fewer operations.
+        Computed from D, or from S'S and U (T'T)^-1 U', whichever takes fewer operations.
         """
         frame = self.graph.frame(name)
         columns = list(self.tree_columns(name, frame).items())
@@ -317,7 +317,7 @@ class _TwistMatrices:
 
 
 def _gram(rows: list[Columns], size: int) -> Objects:
-    """Return R'R of the rows' entries of unknown rates, shape (size, size)."""
+    """Return R'R of the rows R by unknown rates, shape (size, size)."""
     table = np.zeros((size, size), dtype=object)
     for row in rows:
         entries = [(k, value) for (kind, k), value in row.items() if kind == "u"]

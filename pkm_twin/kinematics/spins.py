@@ -1,8 +1,8 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Parts that can turn about themselves while nothing else moves, and what holds them.
+"""Find and lock passive spins: parts that can rotate while nothing else moves.
 
-A bar between two ball joints, a pin between two hinges of one axis, small spheres that a drawing
-program leaves in a closure: such a freedom moves neither the platform nor, to speak of, a mass.
+Examples: a bar between two ball joints, a pin between two collinear hinges, small spheres that a
+drawing program puts into a closure. Such a freedom moves neither the platform nor much mass.
 """
 
 from __future__ import annotations
@@ -20,27 +20,26 @@ from pkm_twin.machine.graph import BASE, Graph, Joint, array, map_welded_bodies
 from pkm_twin.machine.joints import perpendicular_axes, unit
 
 MAX_SPIN_RADIUS: Final = 0.05
-"""A part whose centre of mass moves less than this share of the machine a radian only spins."""
+"""Largest motion of a spinning part's centre of mass per radian, relative to the machine's size."""
 RELATIVE_RANK_TOLERANCE: Final = 1e-8
-"""Part of the greatest singular value below which one counts as zero."""
+"""Singular values below this fraction of the largest count as zero."""
 MIN_MOTION: Final = 1e-6
-"""Least motion of unit one; below, a joint or body stands still."""
+"""Smallest dimensionless motion of a joint or body that is not at rest."""
 
 
 def lock_spins(graph: Graph) -> tuple[Graph, dict[str, float]]:
-    """Hold every spin of a part; return the graph and the joints that hold them.
+    """Lock every spin; return the graph, and the locked joints with their largest imbalance, kg m.
 
-    Of each joint the greatest mass times distance of its centre from the spin's axis, kg m: where
-    it is not zero, efforts depend on the angle at which the part is held.
-
-    With the actuated joints at rest such a spin moves no platform and hardly a centre of mass. One
-    of its hinges becomes fixed, or one of its ball joints a universal joint across its axis: as
-    many freedoms as there are spins, so that no closure loses one that it needs.
+    With the actuated joints at rest a spin moves neither the platform nor, by more than
+    MAX_SPIN_RADIUS, a centre of mass. For each spin one hinge becomes fixed, or one ball joint
+    becomes a universal joint across the spin's axis, so that no other freedom is lost. The imbalance
+    is mass times distance of the centre of mass from the spin's axis: if it is not zero, efforts
+    depend on the angle at which the part is locked.
     """
     linkage = Linkage(graph)
     motion, ju = linkage.regular_state()
     tree, owners = linkage.tree, linkage.tree.owners
-    # A body in no loop moves freely; a later check reports it.
+    # A body in no loop moves freely, which a later check reports: do not lock it.
     ways: dict[str, set[str]] = {BASE: set()}
     for link in tree.links.values():
         ways[link.body] = ways[link.parent] | {link.joint or f"free body {link.body}"}
@@ -57,7 +56,7 @@ def lock_spins(graph: Graph) -> tuple[Graph, dict[str, float]]:
         spins = spins @ null_space(twist(motion, body, point)[rows] @ spins, most, absolute=True)
     joints, held = dict(graph.joints), dict[str, float]()
     while spins.shape[1]:
-        # The hinge with the largest part in a spin; of parts that are equal but for rounding the first.
+        # Choose the hinge with the largest share of a spin, the first of shares equal up to rounding.
         shares = [
             float(np.linalg.norm(row)) if owner in joints and graph.joints[owner].kind == "revolute" else 0.0
             for row, owner in zip(spins, owners, strict=True)
@@ -87,13 +86,13 @@ def lock_spins(graph: Graph) -> tuple[Graph, dict[str, float]]:
 
 
 def lock_hinges(graph: Graph, hinges: Sequence[str]) -> Graph:
-    """Fix some hinges of a graph."""
+    """Return the graph with some hinges made fixed joints."""
     fixed = {name: _lock_joint(graph.joints[name], np.zeros((0, 3))) for name in hinges}
     return replace(graph, joints={**graph.joints, **fixed})
 
 
 def _lock_joint(joint: Joint, axes: Array) -> Joint:
-    """Return a hinge made fixed, without axes, or a ball joint made universal, on two."""
+    """Return the joint as a fixed joint without axes, or as a universal joint with two axes."""
     return replace(
         joint,
         kind="universal" if len(axes) else "fixed",
@@ -106,10 +105,11 @@ def _lock_joint(joint: Joint, axes: Array) -> Joint:
 
 
 def find_idle_bodies(graph: Graph, motion: Motion, free: Array) -> list[tuple[list[str], Array, Array]]:
-    """Find bodies that can move alone, those united by fixed joints as one, and their motion.
+    """Find bodies, or groups welded by fixed joints, that can rotate while all others are at rest.
 
     :param free: motions with the actuated joints at rest, shape (unknown rates, count).
-    :returns: names of the bodies, the axis at home (unit vector), and the motion in ``free``.
+    :returns: the bodies' names, the rotation axis at home (unit vector), and the motion as
+        coefficients of the columns of ``free``.
     """
     groups: dict[str, list[str]] = {}
     for body, lead in map_welded_bodies(graph).items():

@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""One sample of a stream next to the last: programs that are given what the last one left."""
+"""Programs for streams of samples, which take the state that the last sample left."""
 
 from __future__ import annotations
 
@@ -18,22 +18,21 @@ from pkm_twin.kinematics.singularity import singularity_measure
 from pkm_twin.kinematics.traced import Traced
 
 MAX_MOVE: Final = 0.02
-"""How far joints go, unit one, before the closures are solved from home again."""
+"""Largest dimensionless motion of the joints until the closures are solved from home again."""
 MAX_EXTRAPOLATION_TIME: Final = 0.02
-"""Most time between samples, s, over which motion is foreseen."""
+"""Longest time between samples over which the unknowns are extrapolated, s."""
 
 
 def stream_kernel(engine: Engine) -> Kernel:
-    """Compile the program of a stream's sample: q (n) and the previous sample's row to its row.
+    """Compile the program from q (n) and the previous sample's row to the present sample's row.
 
-    A row begins with q (n), the pose (m) and its rates per rate of the drives that lead (m m, by
-    row). Then comes what shows a jump (m): how far the pose is from where the rates lead; and the
-    singularity measure. Parameters: what makes lengths of pose coordinates (m); poses and rates are
-    multiplied by it.
+    A row has q (n), the pose (m), the pose rates per rate of the leading drives (m m, by row), the
+    jump of each pose coordinate (m), and the singularity measure. The parameters are factors (m)
+    that make pose coordinates lengths; poses and rates are multiplied by them.
 
-    What the mean of both samples' rates predicts errs by the third power of the move; how much,
-    the change of the rates tells, and is taken off. So is half of what is predicted, for where the
-    rates turn between two samples.
+    A jump is the motion that the mean of both samples' rates does not predict. The prediction's error
+    is of third order in the motion; a bound from the change of the rates is subtracted from the jump,
+    and half of the prediction for rates that change their sign between the samples.
     """
     return engine.kernel("stream", _write_stream_program)
 
@@ -59,11 +58,11 @@ def _write_stream_program(t: Traced) -> Program:
 
 
 def start_from_last(t: Traced, program: Program) -> Program:
-    """Make a program of motion start from the sample before: input and output ``last``.
+    """Make a program start from the previous sample, with the input and output ``last``.
 
-    The row has 1 where the sample is valid, the joints that were solved from home last, q, qd, and
-    of the unknowns the values, rates, accelerations and their change. Newton's method starts from
-    the unknowns moved on by these. Results are those of ``program``.
+    ``last`` has 1 for a valid sample, the joint positions of the last solution from home, q, qd, and
+    values, rates, accelerations and change of acceleration of the unknowns. Newton's method starts
+    from the unknowns extrapolated by these. The results are those of ``program``.
     """
     (q,) = program.equations
     n, (places, rates) = t.joints, t.scheme.newton_unknowns
@@ -82,7 +81,7 @@ def start_from_last(t: Traced, program: Program) -> Program:
     away, move = (t.q - anchor) * scales, (t.q - before) * scales
     mean = (0.5 * (qd + speed)) * scales
     near = both(less(0.0, holds), less(away @ away, MAX_MOVE * MAX_MOVE))
-    # With the mean of both speeds the error grows with the third power of the time.
+    # With the mean of both velocities the error is of third order in the time.
     time = (move @ mean) / maximum(mean @ mean, 1e-300)
     time = minimum(maximum(time, 0.0), MAX_EXTRAPOLATION_TIME)
     foreseen = t.retract(x, time * (u + (0.5 * time) * (du + change * (1.0 / 3.0))))

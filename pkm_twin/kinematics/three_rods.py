@@ -1,9 +1,9 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """Forward kinematics in closed form: three rods on a platform that only translates.
 
-The platform, moved to one point, is where three spheres about the driven ends of the rods meet. Of
-the two places it is the one on the side of the centres' plane where the platform is at home; turned
-over, the plane leaves none.
+With the rods' platform ends shifted to one point, the platform is at an intersection of three
+spheres about the driven ends. Of the two intersections the one on home's side of the centres' plane
+is taken; if that plane has turned over, neither is valid.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from pkm_twin.machine.tree import Tree
 
 
 def meet_spheres(centres: Sequence[Any], squares: Sequence[Any], up: Numbers) -> tuple[Objects, Any, Any]:
-    """Return where three spheres meet.
+    """Return the intersection of three spheres.
 
-    :param centres: three points; ``squares``: of the radii. ``up``: a direction, shape (3,): the
-        point is on that side of the centres' plane.
-    :returns: the point, shape (3,), where the spheres do not meet the nearest one in the plane of
-        the centres; its distance from there, squared, below zero where they do not meet; and the
-        square of the distance of the first centre from the point in the plane.
+    :param centres: three points. ``squares``: squared radii. ``up``: direction, (3,), to the side of
+        the centres' plane on which the intersection is wanted.
+    :returns: the point, (3,), which is in the plane if the spheres do not meet; its squared distance
+        from the plane, negative if they do not meet; and the squared distance of the first centre
+        from the point's projection onto the plane.
     """
     u, v = centres[1] - centres[0], centres[2] - centres[0]
     n = cross(u, v)
@@ -48,25 +48,25 @@ def meet_spheres(centres: Sequence[Any], squares: Sequence[Any], up: Numbers) ->
 
 @dataclass(frozen=True)
 class ThreeRods:
-    """Three rods, by name, from driven bodies to a body that only translates."""
+    """Forward kinematics of three rods, by name, from driven bodies to a translating body."""
 
     rods: tuple[str, ...]
     body: str
 
     def _list_ends(self, graph: Graph) -> list[tuple[str, Array, Array]]:
-        """Return each rod's driven body, its end there and its end on the body, at home."""
+        """Return each rod's driven body, the rod's end there and its end on the platform, at home."""
         rods = [(rod, *rod.ends) for rod in map(graph.rods.__getitem__, self.rods)]
         return [(r.outer, b, a) if r.inner == self.body else (r.inner, a, b) for r, a, b in rods]
 
     def _spheres(self, tree: Tree, q: Numbers) -> tuple[list[Any], list[Any]]:
-        """Return centres and squared radii of the spheres of the body's displacement from home."""
+        """Return centres and squared radii of the spheres for the body's displacement from home."""
         others = [name for name in tree.links if name != self.body]
         motion = Motion(tree, np.array(tree.home, dtype=object), q, others)
         ends = self._list_ends(tree.graph)
         return [motion.point(near, end) - own for near, end, own in ends], [square_of(b - a) for _, a, b in ends]
 
     def _find_up(self, graph: Graph) -> Objects:
-        """Return a normal of the centres' plane at home, on the body's side."""
+        """Return a normal of the centres' plane at home that points to the body's side."""
         c1, c2, c3 = (end - own for _, end, own in self._list_ends(graph))
         n = cross(c2 - c1, c3 - c1)
         return snapped_all(n * sign_of(-(c1 @ n)))
@@ -82,16 +82,16 @@ class ThreeRods:
         return x
 
     def find_conditions(self, motion: Motion) -> list[Any]:
-        """Return a number above zero where the body is on the side of the centres' plane as at home."""
+        """Return a margin that is positive if the body is on home's side of the centres' plane."""
         ends = self._list_ends(motion.graph)
         c1, c2, c3 = (motion.point(near, end) - motion.point(self.body, own) for near, end, own in ends)
         n = cross(c2 - c1, c3 - c1)
         return [-(c1 @ n) * (n @ self._find_up(motion.graph))]
 
     def find_gap(self, tree: Tree, q: Numbers) -> tuple[str, float] | None:
-        """Return the rod farthest from the two nearest ones, and by how much (m) the spheres miss.
+        """Return the rod that does not reach the intersection of the other two spheres, and the gap, m.
 
-        None where they meet, or where their centres are on one line.
+        None if the spheres meet, or their centres are on one line.
         """
         centres, squares = self._spheres(tree, q)
         with np.errstate(all="ignore"):
@@ -103,7 +103,7 @@ class ThreeRods:
 
 
 def find_three_rods(scheme: Closures) -> ThreeRods | None:
-    """Find three rods that hold a body on three slides from the base, the only unknown ones."""
+    """Find three rods that hold a translating body, if its translation is the only unknown motion."""
     tree, rods = scheme.tree, [scheme.parts[k] for k in scheme.independent]
     loose = [link for link in tree.links.values() if not all(s.actuated for s in link.steps)]
     if len(loose) != 1 or len(set(rods)) != 3 or not set(rods) <= set(tree.graph.rods):

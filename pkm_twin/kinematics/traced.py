@@ -1,5 +1,5 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""A machine's motion on expressions, solved for its unknowns: what programs are written with."""
+"""The symbolic motion of a machine, solved for its unknowns, from which programs are written."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ if TYPE_CHECKING:
 
 NO_NUMBERS: Final = np.zeros(0)
 POSED: Final = "y"
-"""Name of the unknowns when the input is a pose."""
+"""Name of the unknowns in programs whose input is a pose."""
 
 
 class Factors(NamedTuple):
-    """Closures in one state, see :class:`Traced`.
+    """Limbs in closed form, and factors of the closures, in one state of :class:`Traced`.
 
-    ``limbs``: in closed form. ``jq``: derivatives of the independent closures by the drives;
-    ``lu``: by the unknowns. ``solved``: equations of Newton's method, and its factors ``newton``.
+    ``jq``: derivatives of the independent closures by the drives; ``lu``: factors of those by the
+    unknowns. ``solved``: equations of Newton's method; ``newton``: factors of their Jacobian.
     """
 
     limbs: Sequence[LimbPose]
@@ -54,7 +54,7 @@ class Factors(NamedTuple):
 
 
 class Traced:
-    """Symbolic motion of a machine in its geometry's numbers, from which programs are written."""
+    """Symbolic motion of a machine as functions of inputs and geometric parameters."""
 
     unknowns_name, drives_name = UNKNOWNS, "q"
 
@@ -66,7 +66,7 @@ class Traced:
         self.geometry = given[:end]
         self.graph: Graph = build_sized_graph(scheme.graph, self.geometry)
         self.more = given[end:]
-        """Numbers beside the geometry's, see :meth:`.engine.Engine.kernel_with_inputs`."""
+        """Constant inputs in addition to the geometry, see :meth:`.Engine.kernel_with_inputs`."""
         self._span()
 
     def _span(self) -> None:
@@ -80,7 +80,7 @@ class Traced:
     def platform_first(self, scheme: PlatformFirstScheme) -> Traced:
         """Return the symbolic machine whose tree places the platform first, then the limbs."""
         other = copy(self)
-        # Cached properties are those of this tree.
+        # Cached properties belong to this tree: do not copy them.
         vars(other).clear()
         vars(other).update(tape=self.tape, geometry=self.geometry, more=self.more)
         other.scheme, other.graph = scheme, scheme.attach_chain(self.graph)
@@ -95,8 +95,10 @@ class Traced:
         return self if self.scheme.reduced is None else self.platform_first(self.scheme.reduced)
 
     def _place(self, unknowns: Numbers) -> tuple[Motion, list[LimbPose], Objects]:
-        """Return the motion, the limbs and all unknowns for given unknowns of Newton's method."""
-        # Constrained coordinates keep their home values.
+        """Return motion, limbs and all unknowns; constrained coordinates have their home values.
+
+        :param unknowns: those that Newton's method solves.
+        """
         x = np.array(self.tree.home, dtype=object)
         x[self.scheme.newton_unknowns[0]] = unknowns
         motion, limbs = self.scheme.place(self.tree, x, self.q)
@@ -120,7 +122,7 @@ class Traced:
             self.newton = SparseLU(self._newton_jacobian(self.solved), scheme.newton_pivots)
 
     def _newton_jacobian(self, solved: Sequence[Row]) -> Objects:
-        """Return the Jacobian of Newton's equations by the rates of its unknowns."""
+        """Return the Jacobian of Newton's equations by the rates that Newton's method solves."""
         return closure_jacobians(self.tree, solved)[0][:, self.scheme.newton_unknowns[1]]
 
     @property
@@ -140,9 +142,9 @@ class Traced:
         return dict.fromkeys(names, self.drives.count) | more
 
     def equations(self, **more: Any) -> tuple[Equations, ...]:
-        """Return Newton's method for the unknowns at q, from a guess or a closed form.
+        """Return the equations that Newton's method solves at q, from a guess or a closed form.
 
-        :param more: further fields of the equations.
+        :param more: further fields of :class:`.Equations`.
         """
         if self.drives.others and "goal" not in more:
             more["goal"] = self.lift(self.drives.leading_inputs("q"))
@@ -153,7 +155,7 @@ class Traced:
         if self.limbs:
             systems.append((self.newton, self.solved, scheme.newton_unknowns[1]))
         for lu, own, columns in systems:
-            # Results depend on factors that are used before, not corrections alone.
+            # Factors used before this call are in the results: their pivots must not vanish.
             if lu.used:
                 branch += self.pivot_margins(lu, [row.scale for row in own], [tree.scales[k] for k in columns])
         determinant = self.determinant
@@ -167,7 +169,7 @@ class Traced:
         state = self.tape.inputs(STATE, len(AT))
         onward = [x + state[AT.onward] * (x - last) for x, last in zip(self.unknowns, before, strict=False)]
         if not places:
-            # Nothing is corrected: only the result is checked.
+            # Without unknowns there is no correction: check the result only.
             branch, determinant = [*branch, *self.lift([determinant - LEAST])], 1.0
         judged = [self.rows[k] for k in scheme.checked_closures]
         start: Sequence[Any] = []
@@ -191,7 +193,7 @@ class Traced:
         return (solved,)
 
     def pivot_margins(self, lu: SparseLU, rows: Numbers, columns: Numbers) -> list[Expression]:
-        """Return a margin that is positive where no pivot of ``lu`` vanishes.
+        """Return a margin that is positive if no pivot of ``lu`` vanishes; empty for a constant matrix.
 
         :param rows: factors that make rows and ``columns`` of the matrix dimensionless.
         """
@@ -199,7 +201,7 @@ class Traced:
         return self.lift([MAX_GROWTH - growth]) if isinstance(growth, Expression) else []
 
     def retract(self, values: Numbers, rates: Numbers = ()) -> list[Expression]:
-        """Return Newton's unknowns after a step of small rates; turns are normalised."""
+        """Return Newton's unknowns after a small step along ``rates``, with rotations normalised."""
         places, kept = self.scheme.newton_unknowns
         x, du = np.array(self.tree.home, object), np.zeros(self.tree.unknown_rates, object)
         x[places] = values
@@ -210,7 +212,7 @@ class Traced:
 
     @property
     def determinant(self) -> Any:
-        """Determinant of all closures, relative to home."""
+        """Determinant of all closures, divided by its value at home."""
         home = self._at_home
         result = home.newton.inverse_determinant / self.newton.inverse_determinant
         for here, there in zip(self.limbs, home.limbs, strict=True):
@@ -225,7 +227,7 @@ class Traced:
         return result
 
     def _factor_constraining(self, ju: Objects, lu: SparseLU) -> SparseLU:
-        """Factor the closures that keep platform coordinates at home, in these coordinates."""
+        """Factor the Jacobian of the constraining closures by the constrained rates."""
         scheme, table = self.scheme, ju[self.scheme.constraining_closures]
         constrained = ju[scheme.independent][:, scheme.constrained_rates]
         follow = np.array([lu.solve(column) for column in constrained.T], dtype=object).T
@@ -266,9 +268,9 @@ class Traced:
         return -(at.jq.T @ at.lu.solve_transposed(unit))
 
     def rates_of_reaches(self, names: Sequence[str], *, home: bool = False) -> Objects:
-        """Return :meth:`rates_of_joints`; joints that change a limb's length take few operations.
+        """Return :meth:`rates_of_joints`, with few operations for joints that set a limb's length.
 
-        :param home: at home.
+        :param home: return the rates at home instead of the present state.
         """
         at, kept = self._at_home if home else self._here, self.scheme.newton_unknowns[1]
         reaches = {limb.reach: pose for limb, pose in zip(self.scheme.limbs, at.limbs, strict=True)}
@@ -290,14 +292,14 @@ class Traced:
         return np.array(rows, dtype=object)
 
     def _guess(self) -> list[Expression]:
-        """Return a guess of the unknowns to second order: the tangent at home, corrected once.
+        """Return a guess of the unknowns, exact to second order: the tangent at home, corrected once.
 
-        This costs less than a Newton step with derivatives at the guess, and is nearer.
+        The correction uses the factors at home, so it costs less than a Newton step from the tangent.
         """
         scheme, home = self.scheme, self.tree.home
         _, jq, lu, _, newton = self._at_home
         away = self.q - self.graph.lead_home
-        # Columns per joint are constants at home: an evaluation only multiplies by them.
+        # The columns at home are constants: an evaluation only multiplies by them.
         columns = snapped_all([self._all_rates(-lu.solve(jq[:, j])) for j in range(self.joints)])
         moved = self.home.retract(home, columns.T @ away)
         tangent = [moved[k] for k in scheme.newton_unknowns[0]]
@@ -306,11 +308,11 @@ class Traced:
         return self.retract(tangent, -newton.solve([row.value for row in solved]))
 
     def lift(self, values: Numbers) -> list[Expression]:
-        """Return results as expressions."""
+        """Convert results, which may be numbers, to expressions."""
         return [self.tape.lift(value) for value in values]
 
     def square(self, values: Numbers, scales: Numbers) -> Expression:
-        """Return the sum of the squares of values times scales."""
+        """Return the sum of the squares of scaled values."""
         total: Any = 0.0
         for value, scale in zip(values, scales, strict=True):
             part = value * scale
@@ -318,7 +320,7 @@ class Traced:
         return self.tape.lift(total)
 
     def gradient(self, sums: Sequence[tuple[Any, Any]], by: Sequence[Expression]) -> list[Any]:
-        """Differentiate a sum of results times factors by inputs while the closures stay satisfied.
+        """Differentiate a sum of products of results and factors while the closures stay satisfied.
 
         The unknowns x follow from f(x, q, g) = 0: with J' m = ds/du, J = df/du, the derivative is
         ds - m df (adjoint of the implicit function theorem).
@@ -336,7 +338,7 @@ class Traced:
         return [a - b for a, b in zip(direct, through, strict=True)]
 
     def _convert_to_rates(self, by_x: Sequence[Any]) -> list[Any]:
-        """Convert derivatives by the unknowns to those by their rates: see ``Motion.retract``."""
+        """Convert derivatives by the unknowns to derivatives by their rates, see ``Motion.retract``."""
         result: list[Any] = [0.0] * self.tree.unknown_rates
         for link in self.tree.links.values():
             for step in link.steps:
@@ -366,9 +368,9 @@ class Traced:
         return self.u
 
     def set_accelerations(self, qdd: Numbers, base: BaseMotion = FIXED) -> None:
-        """Compute all accelerations from qdd, after the rates; then the base may move too.
+        """Compute all accelerations from qdd; call :meth:`set_rates` before.
 
-        Closures hold relative to the base: unknown rates and accelerations do not depend on it.
+        Closures are relative to the base, so the unknown accelerations do not depend on its motion.
         """
         kept = self.scheme.independent
         self.motion.set_accelerations(np.zeros(self.tree.unknown_rates), qdd)
@@ -384,13 +386,13 @@ class Traced:
         return [self._all_rates(self.lu.solve(-self.jq[kept][:, j])) for j in range(self.joints)]
 
     def _all_rates(self, varying: Numbers) -> Objects:
-        """Return all unknown rates from the solved ones; constrained rates are zero."""
+        """Return all unknown rates from those that are solved; constrained rates are zero."""
         rates = np.zeros(self.tree.unknown_rates, dtype=object)
         rates[self.scheme.varying] = varying
         return rates
 
     def twists(self, body: str, at: Any, columns: Sequence[Objects]) -> list[tuple[Any, Any]]:
-        """Return velocity of a body's point at a place and angular velocity, per joint rate.
+        """Return the velocity of a body's point at position ``at``, and the angular velocity, per joint.
 
         :param columns: :meth:`rate_columns`.
         """

@@ -76,7 +76,7 @@ def twists(judge, graph):
 
 def expected(robot, judge, q):
     """The measure by its definition, on numbers, from a matrix of all bodies' free motion."""
-    placed = KinematicCopy(robot.engine.at(robot.engine.tree.home, robot.graph.home)[0])
+    placed = KinematicCopy(robot.engine.evaluate_state(robot.engine.tree.home, robot.graph.home)[0])
     graph = weld(robot.graph)
     judge.assemble(q)
     bodies, radius = twists(judge, graph), frame(graph, graph.platform)[1]
