@@ -11,12 +11,14 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from delta_dynamics.holding import MeasuredPose, find_holding_effort
+from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MessageError
 from pkm_twin.messages.reading import JointReader
 from pkm_twin.messages.stamps import SECOND, StampRules
 from pkm_twin.robot.effort_limits import EffortLimits, LimitedEfforts
 from pkm_twin.robot.robot import Robot
 from pkm_twin.settings import AGE_BOUNDS, COUNT_BOUNDS, DURATION_BOUNDS, FUTURE_TOLERANCE_TEXT, setting
+from pkm_twin.streams.continuity import check_step
 from pkm_twin.streams.monitor import Core, StreamMonitor, make_counter
 from pkm_twin.streams.wrench import check_order
 
@@ -69,6 +71,7 @@ class Gate(Core):
         self._last_stamp = 0
         self._last_arrival = 0
         self._pose: MeasuredPose | None = None
+        self._last_state: tuple[int, Array] | None = None
 
     def change_robot(self, robot: Robot) -> None:
         """Take a robot with another payload, gravity or limits, between two messages."""
@@ -80,7 +83,7 @@ class Gate(Core):
         """Close the gate after a jump of the clock, and forget the last stamp and pose."""
         self.stream.stop("clock jump", "the clock jumped")
         self._last_stamp = 0
-        self._pose = None
+        self._pose = self._last_state = None
 
     def torques(self, message: Any, now: int, steady: int) -> LimitedEfforts | None:
         """Return the command for one message of stamped torques, shape (n,), or None while closed.
@@ -110,10 +113,13 @@ class Gate(Core):
     def joint_state(self, message: Any, now: int, steady: int) -> None:
         """Store the robot's measured pose, for the effort against gravity.
 
-        :raises MessageError: the message is rejected, and counted.
+        :raises MessageError: the message is rejected, and counted; also one that is older than the last,
+            or that a joint could not reach since then, such as one of a second publisher.
         """
         with self.taking(self.states):
             sample = self._reader.joint_state(message, now, self._rules)
+            check_step(self._reader, sample, self._last_state)
+        self._last_state = sample.stamp, sample.q
         self._pose = MeasuredPose.from_sample(sample.q, sample.stamp, now, steady)
 
     def close_if_silent(self, steady: int) -> None:

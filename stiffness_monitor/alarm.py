@@ -460,9 +460,7 @@ class StiffnessWatch(Core):
 
     def answer(self, answer: Answer) -> None:
         """Add the monitor's answer to a wrench."""
-        latest = self._answers.latest
-        if latest is None or answer.stamp >= latest[0]:
-            self._answers.push(answer.stamp, answer)
+        self._answers.push(answer.stamp, answer)
         self._use_waiting_deflections()
 
     def deflection(self, message: Any, now: int) -> None:

@@ -12,6 +12,7 @@ from pkm_twin.codegen.arrays import Array, Mask, common_batch, doubles, require_
 from pkm_twin.machine.rotations import skew
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
+from pkm_twin.streams.wrench import check_order
 
 
 @dataclass(frozen=True)
@@ -97,8 +98,14 @@ class SetpointStream:
     """Set points that a position limit bounded."""
     at_rate: int = 0
     """Set points whose offset the rate bounded."""
-    _last: tuple[int, Array] | None = field(default=None, init=False)
-    """Stamp of the last set point, ns, and its offset, shape (n,)."""
+    _stamp: int = field(default=0, init=False)
+    """Stamp of the last set point, ns; 0 before the first."""
+    _offset: Array | None = field(default=None, init=False)
+    """Offset of the last set point, shape (n,)."""
+
+    def reset(self) -> None:
+        """Forget the last stamp, as when the clock jumps; the offset goes on from its present value."""
+        self._stamp = 0
 
     def correct(self, stamp: int, setpoint: Array, offset: Array) -> Array:
         """Return the corrected set point, shape (n,), rad or m.
@@ -107,14 +114,15 @@ class SetpointStream:
         once where one reaches its limit.
 
         :param stamp: of the set point, ns. ``offset``: of the last wrench, shape (n,), rad or m.
+        :raises MessageError: the set point is older than the last one.
         """
-        if self._last is not None:
-            before, current = self._last
-            elapsed = min(max(stamp - before, 0) / SECOND, self.max_elapsed)
-            step = np.clip(offset - current, -self.rate * elapsed, self.rate * elapsed)
-            self.at_rate += bool((current + step != offset).any())
-            offset = current + step
-        self._last = stamp, offset
+        check_order(stamp, self._stamp)
+        if self._offset is not None:
+            elapsed = min((stamp - self._stamp) / SECOND, self.max_elapsed) if self._stamp else 0.0
+            limited = self._offset + np.clip(offset - self._offset, -self.rate * elapsed, self.rate * elapsed)
+            self.at_rate += bool((limited != offset).any())
+            offset = limited
+        self._stamp, self._offset = stamp, offset
         corrected = setpoint + offset
         limits = self.robot.limits.position
         if limits is not None:

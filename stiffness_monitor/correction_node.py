@@ -50,6 +50,8 @@ class SetpointCorrection(Core):
         self.bounded = 0
         self.setpoints = make_counter()
         """Counts of corrected and of rejected set points."""
+        self.torques = make_counter()
+        """Counts of torques to pair with set points."""
         wanted = node.declare(
             "correct_setpoint", False, "publish joint offsets that compensate the tool point's deflection"
         )
@@ -107,12 +109,13 @@ class SetpointCorrection(Core):
         if paired:
             both = ("position", "effort")
             self._both = JointPublisher(node, robot, "~/setpoint_with_torques", both)
-            node.create_guarded_subscription("torques", self._on_torques)
+            node.create_guarded_subscription("torques", self._on_torques, refuse=partial(self.refuse, self.torques))
 
     def reset(self) -> None:
         """Discard the last wrench, as when the clock jumps."""
         self._offset = None
         self._waiting.clear()
+        self._stream.reset()
 
     def change_rules(self, rules: StampRules) -> None:
         """Use new stamp rules from the next set point on.
@@ -150,6 +153,7 @@ class SetpointCorrection(Core):
         }
         if self._paired:
             values["set points and torques without a pair"] = self.unpaired
+            values |= self.torques.counts("torques")
         return values | self.setpoints.counts("set points", "corrected")
 
     def _on_setpoint(self, message: JointStateView) -> None:
@@ -169,8 +173,9 @@ class SetpointCorrection(Core):
                 self._publish_pair(sample.stamp, "position", corrected)
 
     def _on_torques(self, message: JointStateView) -> None:
-        sample = self._reader.efforts(message, self._node.now(), self._rules)
-        efforts, _ = self._limits.apply(sample.given, "reject")
+        with self.taking(self.torques):
+            sample = self._reader.efforts(message, self._node.now(), self._rules)
+            efforts, _ = self._limits.apply(sample.given, "reject")
         self._publish_pair(sample.stamp, "effort", efforts)
 
     def _publish_pair(self, stamp: int, what: str, numbers: Any) -> None:

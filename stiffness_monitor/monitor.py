@@ -10,10 +10,11 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MessageError
-from pkm_twin.messages.reading import as_message_error
+from pkm_twin.messages.reading import as_message_error, check_deflection
 from pkm_twin.messages.stamps import SECOND
+from pkm_twin.streams.continuity import check_step
 from pkm_twin.streams.monitor import Pace
-from pkm_twin.streams.wrench import TimeCache, TimeSynchronizer, WrenchSettings
+from pkm_twin.streams.wrench import TimeCache, TimeSynchronizer, WrenchSettings, check_order
 from stiffness_monitor.compliance import PlatformResponse, platform_response
 
 Settings = WrenchSettings
@@ -48,6 +49,8 @@ class Monitor(TimeSynchronizer):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._recent: TimeCache[Array] = TimeCache()
+        self._last_wrench = 0
+        """Stamp of the newest wrench, ns."""
         self.pace = Pace(0.0)
 
     @property
@@ -58,19 +61,22 @@ class Monitor(TimeSynchronizer):
     def reset(self) -> None:
         """Discard all joint states, as when the clock jumps."""
         self._recent.clear()
+        self._last_wrench = 0
         self.pace.reset()
 
     def joint_state(self, message: Any, now: int) -> None:
-        """Add a joint state's positions; drop and count one that is older than the last.
+        """Add a joint state's positions.
 
-        :raises MessageError: the message is rejected, and counted.
+        :raises MessageError: the message is rejected, and counted; also one that is older than the last,
+            or that a joint could not reach since then, such as one of a second publisher.
         """
         with self.taking(self.states):
             sample = self._reader.positions(message, now, self._rules)
+            check_step(self._reader, sample, self.latest)
             self._recent.push(sample.stamp, sample.q)
 
     def wrench(self, message: Any, now: int) -> Answer | None:
-        """Compute the response to a wrench; None if ``pace`` skips it.
+        """Compute the response to a wrench that is not older than the last; None if ``pace`` skips it.
 
         A wrench in the base frame has base axes; one in any other frame has the platform's, as a
         force-torque sensor mounted there measures it. It is moved from its measuring point, given
@@ -90,10 +96,13 @@ class Monitor(TimeSynchronizer):
             if age > allowed:
                 text = f"no pose: the nearest joint state is {age:.3f} s away, allowed {allowed:g} s"
                 raise MessageError("no pose", text)
+            check_order(sample.stamp, self._last_wrench)
+            self._last_wrench = sample.stamp
             pose, _, rotation = as_message_error(self.robot.placed, q)
             fixed = self._wrench_reader.at_reference(sample, mount, rotation)
             energy = as_message_error(platform_response, self.robot, q, fixed)
             if not (np.isfinite(energy.compliance).all() and np.isfinite(energy.deflection).all()):
                 raise MessageError("non-finite result", "the model gave a value that is not finite")
+            check_deflection(energy.deflection)
             self.pace.answered(sample.stamp)
             return Answer(sample.stamp, q, pose, fixed, energy, rotation)

@@ -522,9 +522,6 @@ def read_deflection(message: Any, now: int, rules: StampRules) -> DeflectionSamp
     labels = ("translation.x", "translation.y", "translation.z", *"xyzw")
     values = (move.x, move.y, move.z, turn.x, turn.y, turn.z, turn.w)
     _check_numbers(labels, values, math.inf)
-    far = max(abs(value) for value in values[:3])
-    if far > MAX_DEFLECTION_M:
-        raise MessageError("bounds", f"translation is {far:g} m, allowed up to {MAX_DEFLECTION_M:g}")
     length = math.hypot(*values[3:])
     if abs(length - 1.0) > 1e-3:
         raise MessageError("bounds", f"the rotation's length is {length:g}, not 1")
@@ -532,11 +529,21 @@ def read_deflection(message: Any, now: int, rules: StampRules) -> DeflectionSamp
     sign = math.copysign(1.0, turn.w)
     size = math.hypot(turn.x, turn.y, turn.z)
     angle = 2.0 * math.atan2(size, abs(turn.w))
-    if angle > MAX_DEFLECTION_RAD:
-        raise MessageError("bounds", f"rotation is {angle:g} rad, allowed up to {MAX_DEFLECTION_RAD:g}")
     scale = sign * (2.0 if size < 1e-9 else angle / size)
     rotation = (scale * turn.x, scale * turn.y, scale * turn.z)
-    return DeflectionSample(stamp, frame, np.array((*values[:3], *rotation), np.float64))
+    deflection = np.array((*values[:3], *rotation), np.float64)
+    check_deflection(deflection)
+    return DeflectionSample(stamp, frame, deflection)
+
+
+def check_deflection(values: Array) -> None:
+    """Reject a displacement and rotation, (6,), m and rad, that are too large for linear elasticity."""
+    for what, size, unit, bound in (
+        ("translation", float(np.abs(values[:3]).max()), "m", MAX_DEFLECTION_M),
+        ("rotation", float(np.linalg.norm(values[3:])), "rad", MAX_DEFLECTION_RAD),
+    ):
+        if not size <= bound:
+            raise MessageError("bounds", f"the platform's {what} is {size:g} {unit}, allowed up to {bound:g}")
 
 
 def rotate_to_base(values: Array, rotation: Array) -> Array:

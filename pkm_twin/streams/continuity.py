@@ -12,10 +12,41 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.errors import MessageError
 from pkm_twin.kinematics.stream import stream_kernel
+from pkm_twin.messages.reading import JointReader, JointSample
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import describe_singularity_bound
 from pkm_twin.streams.steps import farthest
+from pkm_twin.streams.wrench import check_order
+
+
+def check_jump(robot: Robot, moves: Sequence[float], velocity: Sequence[float], period: float) -> None:
+    """Reject joint positions that are farther from those before than a joint can move.
+
+    :param moves: differences of the positions, (n,), rad or m. ``velocity``: largest joint velocities, (n,).
+    :param period: time between the samples' stamps, s.
+    :raises MessageError: a joint jumped: the encoder is wrong, or another publisher sends on this topic.
+    """
+    for joint, (move, fastest) in enumerate(zip(moves, velocity, strict=True)):
+        bound = farthest(fastest, period)
+        if not abs(move) <= bound:
+            controller = robot.controller
+            unit = robot.joint_units[joint] if controller.is_identity else "of its units"
+            moved, _, most = controller.shown(joint, "velocity", move, -bound, bound)
+            text = f"moved by {moved:g} {unit} in {period:g} s, allowed {most:g}"
+            raise MessageError("jump", f"{controller.names[joint]} {text}")
+
+
+def check_step(reader: JointReader, sample: JointSample, last: tuple[int, Array] | None) -> None:
+    """Reject a joint state that is older than the last one, or that a joint could not reach since then.
+
+    :param last: stamp, ns, and joint positions, (n,), of the last accepted joint state.
+    :raises MessageError: by :func:`check_order` or :func:`check_jump`.
+    """
+    if last is not None:
+        check_order(sample.stamp, last[0])
+        moves, period = (sample.q - last[1]).tolist(), (sample.stamp - last[0]) / SECOND
+        check_jump(reader.robot, moves, reader.highest_velocity, period)
 
 
 @dataclass(slots=True)
@@ -75,16 +106,9 @@ class Continuity:
         state = _EvaluatedSample(stamp, result)
         *beyond, measure = result.tolist()[self._state_size :]
         if last is not None:
-            period = (stamp - last.stamp) / SECOND
-            joints = zip(result.tolist(), last.numbers.tolist(), self._velocity, strict=False)
-            for joint, (here, there, velocity) in enumerate(joints):
-                bound = farthest(velocity, period)
-                if not abs(here - there) <= bound:
-                    controller = self.robot.controller
-                    unit = self.robot.joint_units[joint] if controller.is_identity else "of its units"
-                    moved, _, most = controller.shown(joint, "velocity", here - there, -bound, bound)
-                    text = f"moved by {moved:g} {unit} in {period:g} s, allowed {most:g}"
-                    raise MessageError("jump", f"{controller.names[joint]} {text}")
+            joints = len(self._velocity)
+            moves = (result[:joints] - last.numbers[:joints]).tolist()
+            check_jump(self.robot, moves, self._velocity, (stamp - last.stamp) / SECOND)
             if not max(beyond) <= self._largest:
                 name = self.robot.pose_names[beyond.index(max(beyond))]
                 text = "jumped but the joints did not: the assembly mode changed"

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from pkm_twin import Robot
 from pkm_twin.bags.reader import read_messages
 from pkm_twin.codegen.arrays import Array
+from pkm_twin.errors import MessageError
 from pkm_twin.machine.rotations import skew
 from pkm_twin.recordings import read
 from stiffness_monitor import setpoint_correction, strain_energy
@@ -135,17 +136,23 @@ def test_what_cannot_be_corrected_is_refused(change: dict[str, object]) -> None:
 
 @given(st.integers(0, 2**32 - 1))
 def test_a_corrected_set_point_keeps_the_limits_and_moves_at_most_at_its_rate(seed: int) -> None:
-    """Set points at the limits too, offsets that turn around at once, pauses and equal stamps."""
+    """Set points at the limits too, offsets that turn around at once, pauses, stamps in any order, clock jumps."""
     rng = np.random.default_rng(seed)
     robot, rate, age = load("upr_rpu"), 0.01, 0.1
     low, high = robot.limits.position.T
     stream = SetpointStream(robot, rate, age)
     stamp, before = 10**9, None
     for _ in range(40):
-        elapsed = int(rng.choice([0, 10**6, 10**7, 10**10]))
-        stamp += elapsed
+        elapsed = int(rng.choice([0, 10**6, 10**7, 10**10, -(10**7), -(10**8)]))
         setpoint = np.clip(rng.uniform(low - 0.01, high + 0.01), low, high)
         offset = rng.uniform(-1e-3, 1e-3, 3)
+        if elapsed < 0:
+            if before is not None and rng.random() < 0.5:
+                with pytest.raises(MessageError, match="before the last"):
+                    stream.correct(stamp + elapsed, setpoint, offset)
+                continue
+            stream.reset()
+        stamp, elapsed = stamp + elapsed, max(elapsed, 0)
         corrected = stream.correct(stamp, setpoint, offset)
         assert ((corrected >= low) & (corrected <= high)).all()
         wanted = setpoint + offset

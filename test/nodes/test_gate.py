@@ -212,6 +212,20 @@ class TestGravity:
         self.state(core, make, STEP, position=(2.0, 1.3, 0.4))
         assert (core.stop_command(STEP) == 0.0).all()
 
+    def test_neither_an_older_state_nor_one_of_another_publisher_replaces_the_pose(self, make):
+        core = gate(on_stop="gravity")
+        self.state(core, make, 10 * STEP)
+        held = core.stop_command(10 * STEP)
+        for reason, changes in (
+            ("stamp order", {"position": (0.11, 0.2, 0.3), "stamp": NOW + 9 * STEP}),
+            ("jump", {"position": (0.4, 0.2, 0.3), "stamp": NOW + 10 * STEP}),
+        ):
+            assert reject(lambda changes=changes: self.state(core, make, 10 * STEP, **changes))[0] == reason
+            assert (core.stop_command(10 * STEP) == held).all()
+        # The machine was moved while no state came.
+        self.state(core, make, 2 * SECOND, position=(0.4, 0.2, 0.3))
+        assert (core.stop_command(2 * SECOND) != held).any()
+
     def test_a_refused_state_is_not_kept(self, make):
         core = gate(on_stop="gravity")
         with pytest.raises(MessageError):

@@ -1,12 +1,14 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
 """The stiffness core: a wrench and the pose beside it, to compliance and strain energy."""
 
+import contextlib
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from pkm_twin.errors import SingularityError
+from pkm_twin.errors import MessageError, SingularityError
+from pkm_twin.messages.reading import MAX_DEFLECTION_M
 from stiffness_monitor import compliance, monitor, platform_response
 from stiffness_monitor.monitor import Monitor, Settings
 from test.nodes.harness import SECOND, reject
@@ -88,7 +90,7 @@ class TestPairing:
             stamp = NOW + i * SECOND // 1000
             twin.joint_state(state(make, ROBOT.inverse(pose), stamp), stamp)
         arrival = NOW + SECOND // 2
-        for i in (399, 300, 250):
+        for i in (250, 300, 399):
             message = make.wrench(WRENCH, NOW + i * SECOND // 1000 + SECOND // 3000)
             assert np.allclose(twin.wrench(message, arrival).pose, poses[i], atol=1e-12)
 
@@ -98,6 +100,32 @@ class TestPairing:
         assert (reason, twin.dropped) == ("stamp order", 1)
         twin.joint_state(state(make, stamp=NOW), NOW)
         assert twin.states.accepted == 2
+
+    @pytest.mark.parametrize("name", ["delta_cu", "prru"])
+    def test_of_two_publishers_only_one_is_believed(self, make, name):
+        """In any interleaving and order of names; the other one is as soon as the first one ends."""
+        robot, rng, stamp = load(name), np.random.default_rng(1), NOW
+        names, q = robot.joint_names, robot.inverse(robot.home())
+        places = [q, q + 0.03 * robot.limits.velocity]
+        twin = Monitor(robot)
+        for k in range(150):
+            second = k >= 100 or (k > 0 and bool(rng.integers(2)))
+            stamp += int(rng.integers(10**4, 5 * 10**5)) if k < 100 else SECOND // 100
+            turn = -1 if second else 1
+            with contextlib.suppress(MessageError) if second and k < 120 else contextlib.nullcontext():
+                twin.joint_state(state(make, places[second][::turn], stamp, names[::turn]), stamp)
+            if k < 100 or k >= 120:
+                assert (twin.wrench(make.wrench(WRENCH, stamp), stamp).q == places[k >= 100]).all(), k
+        assert set(twin.states.rejected) == {"jump"}
+
+    def test_an_older_wrench_is_not_answered_after_a_newer_one(self, make):
+        twin = watching(make)
+        twin.wrench(make.wrench(WRENCH, NOW), NOW)
+        assert reject(twin.wrench, make.wrench(WRENCH, NOW - 1), NOW)[0] == "stamp order"
+        assert twin.wrench(make.wrench(WRENCH, NOW), NOW).stamp == NOW
+        twin.reset()
+        twin.joint_state(state(make, stamp=NOW - SECOND), NOW)
+        assert twin.wrench(make.wrench(WRENCH, NOW - SECOND), NOW).stamp == NOW - SECOND
 
     def test_after_a_reset_there_is_no_pose(self, make):
         twin = watching(make)
@@ -114,6 +142,24 @@ class TestPairing:
 
 
 class TestRejects:
+    @pytest.mark.parametrize("name", ["upr_rpu", "delta_cu", "prru"])
+    @pytest.mark.parametrize("force", [True, False])
+    def test_no_deflection_beyond_linear_elasticity_is_answered(self, make, name, force):
+        robot = load(name)
+        q = robot.inverse(robot.home())
+        load_ = np.where(np.arange(6) < 3, float(force), float(not force))
+        moved = platform_response(robot, q, load_).deflection
+        size = max(np.abs(moved[:3]).max(), np.linalg.norm(moved[3:]))
+        for share in (0.99, 1.01, 1e3):
+            twin = Monitor(robot, Settings(wrench_frame="base_link"))
+            twin.joint_state(state(make, q, names=robot.joint_names), NOW)
+            message = make.wrench(load_ * share * MAX_DEFLECTION_M / size, NOW, "base_link")
+            if share < 1.0:
+                assert np.abs(twin.wrench(message, NOW).energy.deflection).max() > 0.01
+            else:
+                assert reject(twin.wrench, message, NOW)[0] == "bounds"
+                assert twin.wrench(make.wrench(0.5 * load_, NOW, "base_link"), NOW) is not None
+
     @pytest.mark.parametrize("frame", ["", "tool0", "base_link"])
     def test_an_empty_or_other_frame(self, make, frame):
         twin = watching(make)
