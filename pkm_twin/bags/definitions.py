@@ -200,7 +200,15 @@ def _add_types(name: str, texts: Mapping[str, str], definition: Definition, hold
             raise BagError(f"definition of {name}: {brief(line)} is not a field", reason="schema")
         if match is None or match["rest"].startswith("="):
             continue
-        base = _resolve_base(match["base"], name.split("/", 1)[0], texts)
+        base = match["base"]
+        if base == "wstring":
+            raise BagError("wide strings (wstring) are not supported", reason="schema")
+        if "/" in base:
+            base = _short_name(base)
+        elif base not in CODES and base != "string":
+            # A bare Header is std_msgs/Header by the rules of .msg files.
+            local = f"{name.split('/', 1)[0]}/{base}"
+            base = "std_msgs/Header" if base == "Header" and local not in texts else local
         where = f"definition of {name}: field {match['name']}"
         size = None if match["array"] is None else _read_bound(match["size"], where)
         chars = _read_bound(match["chars"], where)
@@ -220,18 +228,6 @@ def _read_bound(digits: str | None, where: str) -> int:
         text = f"{where} has the bound {brief(digits)}; at most {MAX_BOUND}"
         raise BagError(text, reason="schema")
     return int(digits or 0)
-
-
-def _resolve_base(base: str, package: str, texts: Mapping[str, str]) -> str:
-    if base in CODES or base == "string":
-        return base
-    if base == "wstring":
-        raise BagError("wide strings (wstring) are not supported", reason="schema")
-    if "/" in base:
-        return _short_name(base)
-    local = f"{package}/{base}"
-    # A bare Header is std_msgs/Header by the rules of .msg files.
-    return "std_msgs/Header" if base == "Header" and local not in texts else local
 
 
 def live_type_name(message: object) -> str | None:

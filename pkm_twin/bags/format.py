@@ -349,15 +349,6 @@ def metadata_crc(title: str, entries: Mapping[str, str]) -> str:
     return f"{zlib.crc32(raw):08x}"
 
 
-def check_metadata(record: mcap.Metadata, offset: int) -> tuple[dict[str, str], bool]:
-    """Return a metadata record's entries, and whether a CRC of its own confirms them."""
-    entries = dict(record.metadata)
-    crc = entries.pop(METADATA_CRC, None)
-    if crc is not None and crc != metadata_crc(record.name, entries):
-        raise FormatError(f"metadata {record.name!r} does not match its CRC", offset, "crc")
-    return entries, crc is not None
-
-
 def unpack_chunk(chunk: mcap.Chunk, offset: int, budget: Budget) -> bytes:
     """Decompress a chunk after checking its size, and check its CRC if it has one."""
     compression, size, data = chunk.compression, chunk.uncompressed_size, chunk.data

@@ -26,13 +26,14 @@ from pkm_twin.bags.format import (
     FOOTER_BYTES,
     FRAME,
     MAX_RECORD_BYTES,
+    METADATA_CRC,
     OPCODE_NAMES,
     ZSTD_MAGIC,
     FormatError,
     RecordReader,
     Records,
-    check_metadata,
     iterate_records,
+    metadata_crc,
     opcode_name,
     pack_record,
     parse_record,
@@ -321,7 +322,11 @@ class Check:
             case mcap.MessageIndex():
                 self._check_message_index(at, record, record_bytes)
             case mcap.Metadata(name=title):
-                self.metadata.append((title, *check_metadata(record, at)))
+                entries = dict(record.metadata)
+                crc = entries.pop(METADATA_CRC, None)
+                if crc is not None and crc != metadata_crc(title, entries):
+                    raise FormatError(f"metadata {title!r} does not match its CRC", at, "crc")
+                self.metadata.append((title, entries, crc is not None))
                 self._expected_indexes.add(_hash_index(mcap.MetadataIndex(at, record_bytes, title)))
 
     def _count_messages(self, data: bytes, at: int) -> Span:

@@ -7,7 +7,7 @@ With v = ds/dt, x = v^2 and u = d2s/dt2 the efforts are exactly
 
 with a from the masses, b from the velocity terms, w from viscous and k from dry friction in the
 direction of the path, g from gravity, offsets and the wrench. Five calls of the inverse dynamics
-give the five.
+give these coefficients.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, check_limit
-from pkm_twin.paths.joint_path import Index, JointPath
+from pkm_twin.paths.joint_path import Index, JointPath, describe_place
 from pkm_twin.robot.robot import Robot
 
 MIN_RATE_FRACTION: Final = 1e-12
@@ -108,12 +108,20 @@ class Limits:
             )
 
 
+def needs_forces(part: JointPath, limits: Limits) -> bool:
+    """Return whether efforts bound the motion.
+
+    :raises ParameterError: they do, and the robot's file has no masses.
+    """
+    if not np.isfinite(limits.effort).any():
+        return False
+    part.curve.robot.massive()
+    return True
+
+
 @dataclass(frozen=True)
 class Forces:
-    """Hold the coefficients of the efforts a u + b v^2 + w v + g + k at points of a path, (p, n) each.
-
-    ``k``: dry friction of a moving joint; ``g``: effort at rest; ``w``: viscous friction.
-    """
+    """Hold the coefficients a, b, w, k and g of the efforts at points of a path, shape (p, n) each."""
 
     a: Array
     b: Array
@@ -188,17 +196,33 @@ class Rows:
     most: Array
 
     @classmethod
-    def from_limits(cls, part: JointPath, forces: Forces | None, limits: Limits) -> Rows:
-        """Return the finite limits of acceleration, effort (with ``forces``) and velocity as rows."""
+    def from_limits(cls, part: JointPath, limits: Limits, wrench: Array | None) -> Rows:
+        """Return the finite limits at the points of a stretch as rows.
+
+        :raises ParameterError: the drives cannot hold the machine at rest at a point.
+        """
         zero = np.zeros_like(part.first)
         tables = [(limits.acceleration, (part.first, part.second, zero, zero, zero))]
-        if forces is not None:
+        if needs_forces(part, limits):
+            points = np.arange(len(part.s))
+            forces = Forces.from_inverse_dynamics(part, points, part.q, part.first, part.second, wrench)
             tables.insert(0, (limits.effort, (forces.a, forces.b, forces.w, forces.g, forces.k)))
         columns = []
         for bound, values in tables:
             used = np.isfinite(bound)
             columns.append([value[:, used] * (1.0 / bound[used]) for value in values])
         a, b, w, g, k = (np.concatenate(rows, 1) for rows in zip(*columns, strict=True))
+        held = np.abs(g + k)
+        if held.size and not held.max() < 1.0:
+            robot = part.curve.robot
+            row, column = np.unravel_index(int(held.argmax()), held.shape)
+            where = describe_place(robot, part.q[row], part.curve.begin + float(part.s[row]))
+            name = robot.joint_names[np.flatnonzero(np.isfinite(limits.effort))[column]]
+            raise ParameterError(
+                f"path: effort of {name} at rest {where}",
+                f"{100 * float(held[row, column]):.4g} % of its limit",
+                "less than 100 %: the drive cannot hold the machine there",
+            )
         # Bounds by joint velocities and the tool's speed.
         rates = np.abs(part.first)
         least = MIN_RATE_FRACTION * max(float(rates.max()), 1e-300)

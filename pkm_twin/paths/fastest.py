@@ -16,11 +16,11 @@ from numpy.typing import ArrayLike
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.paths.carrying import split_at_payloads
-from pkm_twin.paths.constraints import Forces, Limits, Rows
+from pkm_twin.paths.constraints import Forces, Limits, Rows, needs_forces
 from pkm_twin.paths.geometry import MAX_LENGTH, Path, through
 from pkm_twin.paths.jerk import MAX_PROGRAMS, smooth_profile, smooth_run
-from pkm_twin.paths.joint_path import JointPath, Slowdown, describe_place, joint_paths
-from pkm_twin.paths.motion import Run, TimedPath, needs_forces, run_peaks, sample_run
+from pkm_twin.paths.joint_path import JointPath, Slowdown, joint_paths
+from pkm_twin.paths.motion import Run, TimedPath, find_run_usage, sample_run
 from pkm_twin.paths.profile import fastest_profile
 from pkm_twin.robot.robot import Robot
 
@@ -260,7 +260,7 @@ def _solve_stretch(part: JointPath, limits: Limits, wrench: Array | None) -> Run
     Intervals within which a limit is exceeded are divided, and finally use smaller limits.
     """
     share = np.ones(len(part.left))
-    rows = _limit_rows(part, limits, wrench)
+    rows = Rows.from_limits(part, limits.part(1.0 - LIMIT_RESERVE), wrench)
     x: Array | None = None
     for count in range(MAX_REFINEMENTS + MAX_TIGHTENINGS):
         x = fastest_profile(rows, part.left, part.steps, share, x)
@@ -274,7 +274,7 @@ def _solve_stretch(part: JointPath, limits: Limits, wrench: Array | None) -> Run
         if unbounded.any():
             way = part.curve.begin + float(part.s[part.left[int(unbounded.argmax())]])
             raise ParameterError("path", f"no limit bounds the motion at {way:.4g} m", "acceleration or effort limits")
-        used = run_peaks(run, limits, wrench)
+        used = find_run_usage(run, limits, wrench)
         over = used.max(1)
         bad = over > 1.0 + MAX_EXCESS
         if not bad.any():
@@ -290,17 +290,17 @@ def _solve_stretch(part: JointPath, limits: Limits, wrench: Array | None) -> Run
         share[tight] /= over[tight]
         if (parts > 1).any():
             ends, part, share = part.ends, part.refine(parts), np.repeat(share, parts)
-            rows = _limit_rows(part, limits, wrench)
+            rows = Rows.from_limits(part, limits.part(1.0 - LIMIT_RESERVE), wrench)
             x = np.interp(part.ends, ends, x)
     return slow_within_limits(run, limits, wrench, used.max(0))
 
 
 def _solve_with_jerk(part: JointPath, limits: Limits, wrench: Array | None) -> Run:
     """Find the fastest run within jerk limits: the best of several profiles, or a quintic."""
-    rows = _limit_rows(part, limits, wrench)
+    rows = Rows.from_limits(part, limits.part(1.0 - LIMIT_RESERVE), wrench)
     slow = run_by_law(part, QUINTIC, limits, wrench)
     best: Run = slow
-    least = slowdown_factor(run_peaks(slow, limits, wrench).max(0)) * slow.duration
+    least = slowdown_factor(find_run_usage(slow, limits, wrench).max(0)) * slow.duration
     x = slow.profile() * (1.0 - LIMIT_RESERVE)
     share, jerks = np.ones((2, len(part.left)))
     n = len(limits.jerk)
@@ -313,7 +313,7 @@ def _solve_with_jerk(part: JointPath, limits: Limits, wrench: Array | None) -> R
         run = smooth_run(part, x)
         if run is None:
             break
-        used = run_peaks(run, limits, wrench)
+        used = find_run_usage(run, limits, wrench)
         factor = slowdown_factor(used.max(0))
         if factor * run.duration < (1.0 - REFINEMENT_EXCESS) * least:
             improved = count
@@ -340,32 +340,9 @@ def _solve_with_jerk(part: JointPath, limits: Limits, wrench: Array | None) -> R
         programs = MAX_PROGRAMS if divided else 1
         if divided:
             ends, part = part.ends, part.refine(parts)
-            rows = _limit_rows(part, limits, wrench)
+            rows = Rows.from_limits(part, limits.part(1.0 - LIMIT_RESERVE), wrench)
             x = np.interp(part.ends, ends, x**0.75) ** (4 / 3)
     return slow_within_limits(best, limits, wrench)
-
-
-def _limit_rows(part: JointPath, limits: Limits, wrench: Array | None) -> Rows:
-    """Return the limits at the points of a stretch, reduced by :data:`LIMIT_RESERVE`.
-
-    :raises ParameterError: the drives cannot hold the machine at rest at a point.
-    """
-    forces, robot = None, part.curve.robot
-    if needs_forces(part, limits):
-        points = np.arange(len(part.s))
-        forces = Forces.from_inverse_dynamics(part, points, part.q, part.first, part.second, wrench)
-    rows = Rows.from_limits(part, forces, limits.part(1.0 - LIMIT_RESERVE))
-    held = np.abs(rows.fixed + rows.dry)
-    if held.size and not held.max() < 1.0:
-        row, column = np.unravel_index(int(held.argmax()), held.shape)
-        where = describe_place(robot, part.q[row], part.curve.begin + float(part.s[row]))
-        name = robot.joint_names[np.flatnonzero(np.isfinite(limits.effort))[column]]
-        raise ParameterError(
-            f"path: effort of {name} at rest {where}",
-            f"{100 * float(held[row, column]):.4g} % of its limit",
-            "less than 100 %: the drive cannot hold the machine there",
-        )
-    return rows
 
 
 def slowdown_factor(used: Array) -> float:
@@ -390,7 +367,7 @@ def slow_within_limits(run: Run, limits: Limits, wrench: Array | None, used: Arr
     for more in SLOWDOWN_RESERVE * 4.0 ** np.arange(MAX_SLOWDOWNS):
         slower = run if factor == 1.0 else run.slower(factor)
         if used is None:
-            used = run_peaks(slower, limits, wrench).max(0)
+            used = find_run_usage(slower, limits, wrench).max(0)
         if used.max() <= 1.0:
             return slower
         factor *= max(slowdown_factor(used), 1.0) + more

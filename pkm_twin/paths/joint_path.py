@@ -193,11 +193,6 @@ class JointPath:
         q, first, second = self.interpolate(interval, part)
         return q, first * v[:, None], first * u[:, None] + second * (v**2)[:, None]
 
-    def find_speed_factor(self, interval: Index, part: Array) -> Array:
-        """Return the factors that scale the reference point's speed for its limit, shape (k,)."""
-        left = self.left[interval]
-        return (1.0 - part) * self.slower[left] + part * self.slower[left + 1]
-
     def refine(self, parts: Index) -> JointPath:
         """Return the path with each interval divided into ``parts`` parts.
 

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import ParameterError
 from pkm_twin.paths.carrying import PayloadChange, compute_efforts
-from pkm_twin.paths.constraints import Limits, limit_names, limit_usage
+from pkm_twin.paths.constraints import Limits, limit_names, limit_usage, needs_forces
 from pkm_twin.paths.geometry import Path
 from pkm_twin.paths.joint_path import JointPath, reference_velocity
 from pkm_twin.recordings.payload import Load
@@ -320,7 +320,30 @@ class TimedPath:
             if now < 0 or not active[row, now]:
                 now = int(lasts[row].argmax()) if active[row].any() else -1
             result.append(now)
-        return merge_bounds(self.fine.time, result, limit_names(self.robot), self.used)
+        time, names = self.fine.time, limit_names(self.robot)
+        if len(time) < 2:
+            return []
+        edges = [0, *(i for i in range(1, len(result)) if result[i] != result[i - 1]), len(result) - 1]
+        spans: list[tuple[int, int, int]] = []
+        for b, e in pairwise(edges):
+            if e == b:
+                continue
+            # An interval shorter than a hundredth of the duration joins the one before it, unless that has no
+            # binding limit.
+            brief = float(time[e] - time[b]) < 0.01 * float(time[-1] - time[0]) and spans and spans[-1][2] >= 0
+            if spans and (brief or spans[-1][2] == result[b]):
+                spans[-1] = (spans[-1][0], e, spans[-1][2])
+            else:
+                spans.append((b, e, result[b]))
+        return [
+            Bound(
+                float(time[b]),
+                float(time[e]),
+                "" if column < 0 else names[column],
+                float(self.used[b : e + (e == len(time) - 1 or column >= 0)].max()),
+            )
+            for b, e, column in spans
+        ]
 
     def check_rests(self) -> None:
         """Reject payloads that the drives cannot hold while the machine rests.
@@ -349,7 +372,7 @@ class TimedPath:
     @cached_property
     def _peak_usage(self) -> Array:
         """Largest used fraction of each limit at all times, shape (4 n + 1,)."""
-        moved = [run_peaks(run, self.limits, self.wrench).max(0) for run in self.runs]
+        moved = [find_run_usage(run, self.limits, self.wrench).max(0) for run in self.runs]
         return np.asarray(np.concatenate([self._rest_usage[1], moved]).max(0), np.float64)
 
     @property
@@ -409,14 +432,16 @@ def sample_run(run: Run, time: Array, moves: Mask | bool = True, tool: bool = Tr
     q, qd, qdd = run.part.motion(interval, part, v, u)
     robot = run.part.curve.robot
     speed = np.linalg.norm(reference_velocity(robot, q, qd), axis=1) if tool else np.zeros(len(q))
-    return RunSamples(q, qd, qdd, speed, speed * run.part.find_speed_factor(interval, part), interval)
+    left, slower = run.part.left[interval], run.part.slower
+    factor = (1.0 - part) * slower[left] + part * slower[left + 1]
+    return RunSamples(q, qd, qdd, speed, speed * factor, interval)
 
 
 Moments = tuple[Array | None, Array, Array, Array]
 """Efforts, joint velocities and accelerations, (k, n), and the limited speed, (k,)."""
 
 
-def peaks(limits: Limits, times: Array, sample: Callable[[Array], Moments]) -> Array:
+def find_peak_usage(limits: Limits, times: Array, sample: Callable[[Array], Moments]) -> Array:
     """Return the largest used fraction of each limit between neighbouring times, (i, 4 n + 1).
 
     Each interval is sampled, and a parabola through three samples estimates the excess between
@@ -449,7 +474,7 @@ def peaks(limits: Limits, times: Array, sample: Callable[[Array], Moments]) -> A
     return result
 
 
-def run_peaks(run: Run, limits: Limits, wrench: Array | None) -> Array:
+def find_run_usage(run: Run, limits: Limits, wrench: Array | None) -> Array:
     """Return the largest used fraction of each limit between times of a run, (i, 4 n + 1)."""
     part = run.part
     needs = needs_forces(part, limits)
@@ -459,45 +484,4 @@ def run_peaks(run: Run, limits: Limits, wrench: Array | None) -> Array:
         effort = part.efforts(part.left[interval], q, qd, qdd, wrench) if needs else None
         return effort, qd, qdd, felt
 
-    return peaks(limits, run.times, sample)
-
-
-def merge_bounds(time: Array, columns: list[int], names: list[str], used: Array) -> list[Bound]:
-    """Join samples to intervals of one binding limit.
-
-    An interval shorter than a hundredth of the duration joins the one before it.
-    """
-    if len(time) < 2:
-        return []
-    brief = 0.01 * float(time[-1] - time[0])
-    changes = (i for i in range(1, len(columns)) if columns[i] != columns[i - 1])
-    edges = [0, *changes, len(columns) - 1]
-    spans = [(b, e, columns[b]) for b, e in pairwise(edges) if e > b]
-    result: list[tuple[int, int, int]] = []
-    for b, e, column in spans:
-        # A brief interval after one without a binding limit stays separate.
-        short = float(time[e] - time[b]) < brief and result and result[-1][2] >= 0
-        if result and (short or result[-1][2] == column):
-            result[-1] = (result[-1][0], e, result[-1][2])
-        else:
-            result.append((b, e, column))
-    return [
-        Bound(
-            float(time[b]),
-            float(time[e]),
-            "" if column < 0 else names[column],
-            float(used[b : e + (e == len(time) - 1 or column >= 0)].max()),
-        )
-        for b, e, column in result
-    ]
-
-
-def needs_forces(part: JointPath, limits: Limits) -> bool:
-    """Return whether efforts bound the motion.
-
-    :raises ParameterError: they do, and the robot's file has no masses.
-    """
-    if not np.isfinite(limits.effort).any():
-        return False
-    part.curve.robot.massive()
-    return True
+    return find_peak_usage(limits, run.times, sample)

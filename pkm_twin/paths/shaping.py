@@ -22,7 +22,7 @@ from delta_dynamics import inverse_dynamics_at_pose
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.paths.joint_path import check_positions, check_singularity, reference_velocity
-from pkm_twin.paths.motion import Moments, Samples, TimedPath, peaks
+from pkm_twin.paths.motion import Moments, Samples, TimedPath, find_peak_usage
 from pkm_twin.robot.derivatives import joint_rates
 from stiffness_monitor.modes import natural_frequencies
 from stiffness_monitor.vibration import damping_ratios
@@ -47,19 +47,18 @@ class Phase:
     rate: Array
 
     @cached_property
-    def _phase_curve(self) -> Any:
-        return scipy.interpolate.PchipInterpolator(self.times, self.rate)
-
-    @cached_property
-    def _total_phase(self) -> Any:
-        return self._phase_curve.antiderivative()
+    def _curves(self) -> tuple[Any, Any]:
+        """Interpolations of the rate and of the phase."""
+        rate = scipy.interpolate.PchipInterpolator(self.times, self.rate)
+        return rate, rate.antiderivative()
 
     def at(self, time: Array) -> tuple[Array, Array, Array]:
         """Return phase (rad), its rate and the rate's derivative at times (k,)."""
         inside = np.clip(time, self.times[0], self.times[-1])
-        rate = self._phase_curve(inside)
-        slope = np.where(inside == time, self._phase_curve(inside, 1), 0.0)
-        return self._total_phase(inside) + rate * (time - inside), rate, slope
+        rate_curve, phase_curve = self._curves
+        rate = rate_curve(inside)
+        slope = np.where(inside == time, rate_curve(inside, 1), 0.0)
+        return phase_curve(inside) + rate * (time - inside), rate, slope
 
     def find_earlier_times(self, time: Array, phase: float) -> tuple[Array, Array, Array]:
         """Return times at which the phase was ``phase`` less, and their two derivatives."""
@@ -110,7 +109,7 @@ class ShapedPath(TimedPath):
             s = self.sample(time)
             return s.effort, s.qd, s.qdd, s.felt
 
-        return np.asarray(peaks(self.limits, times, sample).max(0), np.float64)
+        return np.asarray(find_peak_usage(self.limits, times, sample).max(0), np.float64)
 
     def sample(self, times: ArrayLike) -> Samples:
         """Return the shaped motion at times (k,), s from its beginning."""

@@ -278,13 +278,24 @@ def write_motion(path: Path, r: Recording, facts: Mapping[str, Any], overwrite: 
     :param facts: metadata of the bag in addition to robot and payload.
     :raises BagError: the bag exists or cannot be written.
     """
+    q, qd, qdd, _ = r.motion
     if path.suffix != ".mcap":
-        write_table(_make_columns(r) | effort_model_columns(r.robot, r.load, r.wrench, r.time), path)
+        columns = {"time": r.time}
+        for i, joint in enumerate(r.robot.joint_names):
+            columns |= {f"{joint}.position": q[:, i], f"{joint}.velocity": qd[:, i], f"{joint}.acceleration": qdd[:, i]}
+            columns |= {} if r.effort is None else {f"{joint}.effort": r.effort[:, i]}
+        if r.pose is not None:
+            rate = (r.robot.jacobian(q) @ qd[..., None])[..., 0]
+            change = r.robot.pose_acceleration(q, qd, qdd)
+            for word, values in (("", r.pose), (".velocity", rate), (".acceleration", change)):
+                for i, name in enumerate(r.robot.pose_names):
+                    # A joint and a coordinate may have the same name: the column is the joint's.
+                    columns.setdefault(f"{name}{word}", values[:, i])
+        write_table(columns | effort_model_columns(r.robot, r.load, r.wrench, r.time), path)
         return
     if r.wrench is not None and r.wrench.any():
         raise ParameterError("out", str(path), "a table: a bag's trajectory has no wrench")
     own = r.robot.controller
-    q, qd, qdd, _ = r.motion
     empty: list[list[float]] = [[]] * len(r.time)
     efforts = empty if r.effort is None else own.controller_efforts(r.effort).tolist()
     rows = zip(
@@ -317,24 +328,6 @@ def write_motion(path: Path, r: Recording, facts: Mapping[str, Any], overwrite: 
     with write_whole_bag(path, overwrite, metadata) as bag:
         bag.add_topic(TOPIC, TRAJECTORY, definition=DEFINITIONS[TRAJECTORY])
         bag.write(TOPIC, message, 0)
-
-
-def _make_columns(r: Recording) -> dict[str, Array]:
-    """Return a table's columns: time, the joints' motion and efforts, the pose and its rates."""
-    q, qd, qdd, _ = r.motion
-    words = {"position": q, "velocity": qd, "acceleration": qdd}
-    words |= {} if r.effort is None else {"effort": r.effort}
-    columns = {"time": r.time}
-    for i, joint in enumerate(r.robot.joint_names):
-        columns |= {f"{joint}.{word}": values[:, i] for word, values in words.items()}
-    if r.pose is not None:
-        rate = (r.robot.jacobian(q) @ qd[..., None])[..., 0]
-        change = r.robot.pose_acceleration(q, qd, qdd)
-        for word, values in (("", r.pose), (".velocity", rate), (".acceleration", change)):
-            for i, name in enumerate(r.robot.pose_names):
-                # A joint and a coordinate may have the same name: the column is the joint's.
-                columns.setdefault(f"{name}{word}", values[:, i])
-    return columns
 
 
 def read_trajectory(bag: Bag, robot: Robot) -> Recording | None:

@@ -99,7 +99,15 @@ def play(
         _create_publishers(bag, targets, bool(clock)) as (publishers, clock_publisher),
     ):
         awaited = {**publishers, CLOCK_TOPIC: clock_publisher} if clock else publishers
-        _await_subscribers(awaited, wait_for_subscribers, stop)
+        give_up = time.monotonic() + wait_for_subscribers
+        missing = list(awaited) if wait_for_subscribers else []
+        while missing and not stop.asked:
+            missing = [name for name in missing if not awaited[name].get_subscription_count()]
+            if missing and time.monotonic() >= give_up:
+                silent = ", ".join(awaited[name].topic_name for name in missing)
+                print(f"no subscriber after {wait_for_subscribers:g} s: {silent}", file=sys.stderr)
+                break
+            stop.wait(0.02 if missing else 0.0)
         replay = _Replay(bag, publishers, rate, stop, pace, clock_publisher, clock or 0.0)
         with _progress_bar(bag, progress) as update:
             result = replay.run(loop=loop, update=update)
@@ -194,18 +202,6 @@ def _create_publishers(bag: Bag, targets: Mapping[str, str], with_clock: bool) -
             kind = message_class("rosgraph_msgs/msg/Clock")
             clock = node.create_publisher(kind, CLOCK_TOPIC, QoSProfile(depth=10))
         yield publishers, clock
-
-
-def _await_subscribers(publishers: Mapping[str, Any], seconds: float, stop: _StopFlag) -> None:
-    give_up = time.monotonic() + seconds
-    missing = list(publishers) if seconds else []
-    while missing and not stop.asked:
-        missing = [name for name in missing if not publishers[name].get_subscription_count()]
-        if missing and time.monotonic() >= give_up:
-            topics = ", ".join(publishers[name].topic_name for name in missing)
-            print(f"no subscriber after {seconds:g} s: {topics}", file=sys.stderr)
-            return
-        stop.wait(0.02 if missing else 0.0)
 
 
 def _await_acknowledged(publisher: Any, seconds: float) -> None:

@@ -4,12 +4,11 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from typing import Any, Final
 
 import numpy as np
-from builtin_interfaces.msg import Duration as DurationMessage
 from geometry_msgs.msg import (
     Point,
     Pose,
@@ -23,7 +22,7 @@ from geometry_msgs.msg import (
 )
 from numpy.typing import NDArray
 from rclpy.duration import Duration
-from std_msgs.msg import ColorRGBA, Header, String
+from std_msgs.msg import ColorRGBA, String
 from visualization_msgs.msg import Marker, MarkerArray
 
 from pkm_twin.errors import ParameterError, PkmTwinError
@@ -36,7 +35,7 @@ from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.run import run
 from pkm_twin.ros.wrench import declare_mounts, declare_vector
 from pkm_twin.settings import list_changeable, with_parameters
-from pkm_twin.state.scene import Scales, Scene, Shape, WrenchEffects
+from pkm_twin.state.scene import Scales, Scene, WrenchEffects
 from pkm_twin.state.state import (
     STATE_TOPICS,
     MachineState,
@@ -48,7 +47,7 @@ from pkm_twin.streams.monitor import Pace
 from pkm_twin.streams.wrench import PLATFORM, Mount, WrenchSettings
 from stiffness_monitor.compliance import kernels, member_deflections, platform_response
 
-KINDS: Final = {
+MARKER_TYPES: Final = {
     "cylinder": Marker.CYLINDER,
     "sphere": Marker.SPHERE,
     "arrow": Marker.ARROW,
@@ -61,23 +60,6 @@ def make_transform(stamp: int, frame: str, child: str, position: NDArray[Any], t
     """Make the message of a frame's transform to its child: position (3,), quaternion x y z w."""
     moved = Transform(translation=xyz(Vector3, position), rotation=xyz(Quaternion, turn))
     return TransformStamped(header=header(stamp, frame), child_frame_id=child, transform=moved)
-
-
-def make_markers(own: Header, shapes: Iterable[Shape], lifetime: DurationMessage) -> MarkerArray:
-    """Convert shapes to markers; those that are not lasting disappear after ``lifetime``."""
-    array_of = MarkerArray()
-    for shape in shapes:
-        marker = Marker(header=own, ns=shape.group, id=shape.number, type=KINDS[shape.kind])
-        marker.text = shape.text
-        marker.pose.position = xyz(Point, shape.position)
-        marker.pose.orientation = xyz(Quaternion, shape.quaternion)
-        marker.scale = xyz(Vector3, shape.size)
-        marker.points = [xyz(Point, point) for point in shape.points]
-        marker.color = ColorRGBA(**dict(zip("rgba", shape.colour, strict=True)))
-        if not shape.lasting:
-            marker.lifetime = lifetime
-        array_of.markers.append(marker)
-    return array_of
 
 
 class Transforms:
@@ -260,9 +242,21 @@ class MachineStateNode(TwinNode):
         if not self._markers.get_subscription_count():
             return
         self._drawn = state.stamp
-        shapes = self._scene.shapes(state, self._compute_wrench_effects(state))
         own = header(state.stamp, self.core.settings.base_frame)
-        self._markers.publish(make_markers(own, shapes, Duration(seconds=1.0).to_msg()))
+        lifetime = Duration(seconds=1.0).to_msg()
+        markers = MarkerArray()
+        for shape in self._scene.shapes(state, self._compute_wrench_effects(state)):
+            marker = Marker(header=own, ns=shape.group, id=shape.number, type=MARKER_TYPES[shape.kind])
+            marker.text = shape.text
+            marker.pose.position = xyz(Point, shape.position)
+            marker.pose.orientation = xyz(Quaternion, shape.quaternion)
+            marker.scale = xyz(Vector3, shape.size)
+            marker.points = [xyz(Point, point) for point in shape.points]
+            marker.color = ColorRGBA(**dict(zip("rgba", shape.colour, strict=True)))
+            if not shape.lasting:
+                marker.lifetime = lifetime
+            markers.markers.append(marker)
+        self._markers.publish(markers)
 
     def _compute_wrench_effects(self, state: State) -> WrenchEffects | None:
         """Compute the effects of the wrench on the machine; None if the wrench is unknown."""

@@ -124,7 +124,21 @@ class Scene:
         factors = {} if load is None else load.energy_fractions
         greatest = max(factors.values(), default=0.0)
         shares = {name: value / greatest for name, value in factors.items()} if greatest > 0.0 else {}
-        shapes = self._draw_bars(places, shares)
+        shapes = []
+        for k, (bar, (start, end)) in enumerate(zip(self.bars, places, strict=True)):
+            share = shares.get(bar.element)
+            colour = COLOURS["neutral"] if share is None else choose_heat_colour(share)
+            span, thickness = end - start, 2.0 * bar.radius
+            length = float(np.linalg.norm(span))
+            quaternion = (0.0, 0.0, 0.0, 1.0)
+            if length > 0.0:
+                z = span / length
+                x = perpendicular_axes(z)[0]
+                quaternion = _to_quaternion(np.column_stack((x, np.cross(z, x), z)))
+            cylinder, middle = (thickness, thickness, length), (start + end) / 2.0
+            shapes.append(
+                Shape("cylinder", "bars", k, colour, cylinder, middle, quaternion, text=bar.part, lasting=True)
+            )
         if load is None:
             return shapes
         # Elastic joints as spheres.
@@ -163,22 +177,6 @@ class Scene:
     def _find_points(self, q: Array, places: Sequence[Place]) -> Array:
         posture = Posture(self.robot, q)
         return np.array([posture.place(*place) for place in places]).reshape(-1, 3)
-
-    def _draw_bars(self, places: Array, shares: Mapping[str, float]) -> list[Shape]:
-        shapes = []
-        for k, (bar, (start, end)) in enumerate(zip(self.bars, places, strict=True)):
-            share = shares.get(bar.element)
-            colour = COLOURS["neutral"] if share is None else choose_heat_colour(share)
-            span, width = end - start, 2.0 * bar.radius
-            length = float(np.linalg.norm(span))
-            quaternion = (0.0, 0.0, 0.0, 1.0)
-            if length > 0.0:
-                z = span / length
-                x = perpendicular_axes(z)[0]
-                quaternion = _to_quaternion(np.column_stack((x, np.cross(z, x), z)))
-            size, middle = (width, width, length), (start + end) / 2.0
-            shapes.append(Shape("cylinder", "bars", k, colour, size, middle, quaternion, text=bar.part, lasting=True))
-        return shapes
 
     def _draw_arrows(self, state: State, load: WrenchEffects) -> list[Shape]:
         """Draw force and moment as arrows from the reference point."""

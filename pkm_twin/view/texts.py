@@ -114,27 +114,21 @@ def describe_state(model: Model, state: State, numbers: StateQuantities) -> str:
         if state.refusal
         else '<div id="refusal"></div>'
     )
-    return f'<div style="{_BLOCK_STYLE}">{_write_table(rows)}{said}{_write_joint_rows(model, state, numbers)}</div>'
-
-
-def _write_joint_rows(model: Model, state: State, numbers: StateQuantities) -> str:
     robot = model.robot
-    effort: Sequence[float | None] = [None] * len(state.q)
-    if numbers.effort is not None:
-        effort = numbers.effort.tolist()
-    rows = [_write_head("joint", "position", "effort at rest")]
+    effort: Sequence[float | None] = [None] * len(state.q) if numbers.effort is None else numbers.effort.tolist()
+    joints = [_write_head("joint", "position", "effort at rest")]
     units = zip(robot.joint_names, robot.joint_units, robot.effort_units, strict=True)
     for k, (name, unit, effort_unit) in enumerate(units):
         colour = GRADES["bad"] if name in numbers.beyond_effort else "inherit"
-        rows.append(
+        joints.append(
             _write_row(
                 escape(name),
                 _write_value(f"q_{k}", float(state.q[k]), unit),
                 _write_value(f"effort_{k}", effort[k], effort_unit, colour),
             )
         )
-    why = numbers.why.get("effort", "")
-    return _write_table(rows) + (f"<div>efforts: {escape(why)}</div>" if why else "")
+    why = f"<div>efforts: {escape(numbers.why['effort'])}</div>" if numbers.why.get("effort") else ""
+    return f'<div style="{_BLOCK_STYLE}">{_write_table(rows)}{said}{_write_table(joints)}{why}</div>'
 
 
 def describe_load(numbers: StateQuantities) -> str:

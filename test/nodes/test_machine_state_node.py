@@ -23,7 +23,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from visualization_msgs.msg import Marker, MarkerArray
 
-from pkm_twin.state.node import KINDS
+from pkm_twin.state.node import MARKER_TYPES
 
 MODULE = "pkm_twin.state.node"
 MAKE = Maker(Ros())
@@ -136,7 +136,7 @@ def test_markers_are_the_cores_shapes(answers, expected):
     assert len({(m.ns, m.id) for m in markers}) == len(markers)
     for marker, shape in zip(markers, shapes, strict=True):
         assert (marker.ns, marker.id, marker.text) == (shape.group, shape.number, shape.text)
-        assert (marker.type, marker.action) == (KINDS[shape.kind], Marker.ADD)
+        assert (marker.type, marker.action) == (MARKER_TYPES[shape.kind], Marker.ADD)
         assert marker.header.frame_id == "base_link"
         assert stamp_of(marker) in answers["stamps"]
         colour = marker.color
