@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import partial
 from operator import attrgetter
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -18,6 +18,10 @@ from pkm_twin.identification.fit import Fit, Judged, Result
 from pkm_twin.identification.hypotheses import Explanation
 from pkm_twin.identification.parameters import Number
 from pkm_twin.report import Column, Fact, Report, Table, plots
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 
 COMBINED_TEXT: Final = "known only in combination with others"
 DEFLECTION_UNITS: Final = "m_m_m_rad_rad_rad"
@@ -220,7 +224,7 @@ def _report_elastic(result: ElasticFit) -> list[Fact]:
     return [Fact("not_told_apart", groups), Fact(f"deflection_noise_{DEFLECTION_UNITS}", noise), Fact("held_out", held)]
 
 
-def _draw_residuals(judged: Judged, units: Mapping[str, str]) -> Any:
+def _draw_residuals(judged: Judged, units: Mapping[str, str]) -> Figure:
     """Draw residuals of each channel before and after the fit, with the model's standard deviation."""
     # At most 4,000 samples of a recording are drawn.
     step = max(1, len(judged.time) // 4000)
@@ -248,7 +252,7 @@ def _draw_residuals(judged: Judged, units: Mapping[str, str]) -> Any:
     return figure
 
 
-def _draw_changes(shown: Mapping[str, Number]) -> Any:
+def _draw_changes(shown: Mapping[str, Number]) -> Figure:
     """Draw the changes of numbers, in standard deviations where these are known."""
     known = all(np.isfinite(n.deviation) and n.deviation > 0.0 for n in shown.values())
     moved = {

@@ -8,7 +8,7 @@ import io
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,9 @@ from pkm_twin.maps.sweep import check
 from pkm_twin.report import plots
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import belong_to_workspace
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +96,7 @@ class Along:
         csv.writer(text).writerows([header, *zip(*columns, strict=True)])
         return text.getvalue()
 
-    def draw(self) -> Any:
+    def draw(self) -> Figure:
         """Draw the values of each case over time, coloured by the critical element."""
         indices = [one.element for one in self.found if one.element is not None and self.elements]
         # An element has one colour in all panels.

@@ -228,7 +228,6 @@ def planes(data: Dataset, case: int) -> Figure:
         spans = np.array([np.ptp(one["ticks"][0]) for one in drawn])
         widths = np.clip(spans / spans.max(), 0.5, 1.0).tolist()
     with plots.pyplot().rc_context({"font.size": 9}):
-        figure: Figure
         figure, columns = plots.make_subplots(count, 1, height, gridspec_kw={"width_ratios": widths})
         axes, over = [column[0] for column in columns], ""
         for one, ax in zip(drawn, axes, strict=True):

@@ -174,6 +174,7 @@ def draw_spheres(data: Dataset) -> dict[str, Figure]:
 
 def _draw_index(data: Dataset, index: str) -> Figure:
     from matplotlib.patches import Circle
+    from matplotlib.tri import Triangulation
 
     from pkm_twin.maps.figures import COLOUR_MAP
 
@@ -185,15 +186,12 @@ def _draw_index(data: Dataset, index: str) -> Figure:
     flat = np.stack([ways @ right, ways @ up], -1)
     corners = _triangles(ways)
     front = corners[(ways @ VIEW_DIRECTION)[corners].max(-1) > 0.0]
-    figure: Figure
     figure, ((ax,),) = plots.make_subplots(1, 1, 8.6)
     mesh: Any = None
     for a, t, centre in _sphere_centres(data):
         x, y = (centre + RADIUS * flat).T
         mesh = ax.tripcolor(
-            x,
-            y,
-            front,
+            Triangulation(x, y, front),
             values[a, t],
             shading="gouraud",
             cmap=COLOUR_MAP,

@@ -8,12 +8,17 @@ import re
 import textwrap
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pkm_twin.console import convert_write_errors
 from pkm_twin.files import replace_file
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 # Colours of Okabe and Ito (2008), which colour-blind readers can distinguish.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#F0E442", "#000000")
@@ -40,29 +45,31 @@ def pyplot() -> Any:
     return pyplot
 
 
-def make_subplots(columns: int, rows: int, height: float | None = None, **options: Any) -> tuple[Any, list[Any]]:
+def make_subplots(
+    columns: int, rows: int, height: float | None = None, **options: Any
+) -> tuple[Figure, list[list[Axes]]]:
     """Make a figure with ``columns`` columns of ``rows`` axes each; ``height`` in inches."""
     figure, axes = pyplot().subplots(
         rows, columns, figsize=(WIDTH, height or max(3 * rows, 4.2)), squeeze=False, layout="constrained", **options
     )
-    return figure, list(axes.T)
+    return figure, axes.T.tolist()
 
 
-def label(ax: Any, x: str, y: str, title: str = "", size: float | None = None) -> None:
+def label(ax: Axes, x: str, y: str, title: str = "", size: float | None = None) -> None:
     """Label the axes and draw a grid; ``size``: font size of the title, points."""
     ax.set_xlabel(x)
     ax.set_ylabel(y)
     if title:
-        ax.set_title(title, **({} if size is None else {"fontsize": size}))
+        ax.set_title(title, fontsize=size or STYLE["axes.titlesize"])
     ax.grid(alpha=0.3)
 
 
-def render(figure: Any, dpi: int, form: str = "png") -> bytes:
+def render(figure: Figure, dpi: int, form: str = "png") -> bytes:
     """Render a figure as an image and close it.
 
     Texts are not parsed as formulas: names of files and joints may contain a dollar sign.
     """
-    texts = [] if figure._suptitle is None else [figure._suptitle]
+    texts: list[Any] = [title for title in (vars(figure)["_suptitle"],) if title is not None]
     for ax in figure.axes:
         legend = ax.get_legend()
         texts += [ax.title, ax.xaxis.label, ax.yaxis.label, *ax.texts]
@@ -75,7 +82,7 @@ def render(figure: Any, dpi: int, form: str = "png") -> bytes:
     return data.getvalue()
 
 
-def write_title(figure: Any, text: str, size: float = STYLE["figure.titlesize"]) -> int:
+def write_title(figure: Figure, text: str, size: float = STYLE["figure.titlesize"]) -> int:
     """Write the figure's title, wrapped; return the number of lines."""
     # A no-break space keeps a value and its unit on one line.
     tied = re.sub(r"(?<=\d) (?=[^\W\d])|(?<=\bN) (?=m\b)", "\xa0", text)
@@ -84,7 +91,7 @@ def write_title(figure: Any, text: str, size: float = STYLE["figure.titlesize"])
     return len(rows)
 
 
-def legend(ax: Any, below: bool = False) -> None:
+def legend(ax: Axes, below: bool = False) -> None:
     """Place the legend to the right of the data, or below; none where no curve has a label."""
     if not ax.get_legend_handles_labels()[0]:
         return
@@ -94,7 +101,7 @@ def legend(ax: Any, below: bool = False) -> None:
         ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 
-def save(figure: Any, path: Path, dpi: int = DPI) -> Path:
+def save(figure: Figure, path: Path, dpi: int = DPI) -> Path:
     """Write a figure as PNG, SVG or PDF, to stdout as PNG, atomically, and close it.
 
     :raises PkmTwinError: the file cannot be written.
@@ -105,17 +112,19 @@ def save(figure: Any, path: Path, dpi: int = DPI) -> Path:
     return path
 
 
-def draw_torques(motion: Any, table: Mapping[str, Any], title: str) -> Any:
+def draw_torques(units: Mapping[str, str], table: Mapping[str, NDArray[np.float64]], title: str) -> Figure:
     """Draw efforts and their terms, one row per actuated joint; grey where beyond the limits.
 
     For a motion longer than MAX_SINGLE_COLUMN_TIME the terms are drawn in a second column, one
     second before and after the largest effort.
+
+    :param units: unit of the effort of each joint, by name.
     """
-    robot, time = motion.robot, np.asarray(table["time"])
+    time = np.asarray(table["time"])
     whole = time[-1] - time[0] <= MAX_SINGLE_COLUMN_TIME
-    figure, columns = make_subplots(1 if whole else 2, len(robot.joint_names), sharey="row")
-    efforts = np.array([table[f"{joint}.effort"] for joint in robot.joint_names])
-    for k, (joint, unit) in enumerate(zip(robot.joint_names, robot.effort_units, strict=True)):
+    figure, columns = make_subplots(1 if whole else 2, len(units), sharey="row")
+    efforts = np.array([table[f"{joint}.effort"] for joint in units])
+    for k, (joint, unit) in enumerate(units.items()):
         peak = int(np.abs(efforts[k]).argmax())
         for axes in columns:
             _draw_efforts(axes[k], joint, table, terms=axes is columns[-1])
@@ -128,7 +137,7 @@ def draw_torques(motion: Any, table: Mapping[str, Any], title: str) -> Any:
     return figure
 
 
-def _draw_efforts(ax: Any, joint: str, table: Mapping[str, Any], terms: bool) -> None:
+def _draw_efforts(ax: Axes, joint: str, table: Mapping[str, NDArray[np.float64]], terms: bool) -> None:
     time, effort = table["time"], table[f"{joint}.effort"]
     measured = table.get(f"{joint}.measured")
     if measured is not None:

@@ -8,7 +8,10 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 ROUNDING: Final = 1e-9
 """Numbers below this fraction of a column's largest number are shown as 0 (columns with a unit)."""
@@ -148,7 +151,7 @@ class Report:
     answer: str = ""
     facts: Sequence[Fact] = ()
     tables: Sequence[Table] = ()
-    figures: Mapping[str, Callable[[], Any]] = field(default_factory=dict)
+    figures: Mapping[str, Callable[[], Figure]] = field(default_factory=dict)
     notes: Sequence[str] = ()
     files: Mapping[str, Path | None] = field(default_factory=dict)
     verdict: Verdict | None = None

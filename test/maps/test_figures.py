@@ -6,7 +6,6 @@ from __future__ import annotations
 import html
 from dataclasses import replace
 from html.parser import HTMLParser
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -54,7 +53,7 @@ def test_a_picture_answers_and_the_star_has_its_cells_colour(stored):
     for name in map(str, stored.case.values):
         figure = drawn[name if len(stored.case) > 1 else ""]
         panels = [ax for ax in figure.axes if ax.get_xlabel()]
-        assert 1 <= len(panels) <= figures.PANELS
+        assert 1 <= len(panels) <= figures.MAX_PANELS
         assert all(ax.get_ylabel() for ax in panels)
         # At 900 pixels of width.
         texts = [t for ax in panels for t in (ax.title, ax.xaxis.label, *ax.get_xticklabels())]
@@ -111,7 +110,7 @@ def test_efforts_have_their_residual_and_a_long_motion_the_seconds_of_its_peak(s
         effort = np.exp(-((time - 0.7 * seconds) ** 2))
         table |= {f"{joint}.effort": effort, f"{joint}.measured": effort + 0.01}
         table |= {f"{joint}.effort_{term}": 0.0 * effort for term in plots.TERMS}
-    figure = plots.draw_torques(SimpleNamespace(robot=robot), table, "title")
+    figure = plots.draw_torques(dict(zip(robot.joint_names, robot.effort_units, strict=True)), table, "title")
     assert len(figure.axes) == panels
     for ax in figure.axes:
         (residual,) = [one for one in ax.lines if one.get_label() == "measured - sum"]

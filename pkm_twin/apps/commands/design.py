@@ -20,6 +20,8 @@ from pkm_twin.report import Column, Fact, Report, Table, make_judged_fact, plots
 from pkm_twin.settings import setting
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from pkm_twin.design import Design as Found
     from pkm_twin.design import PosePath
     from pkm_twin.robot.robot import Robot
@@ -269,7 +271,7 @@ def write_robot(robot: Robot, source: str, found: Found, path: Path, out: Path) 
     return write_edited(out, head, edit_robot_text(robot, source, values), robot)
 
 
-def draw_design(robot: Robot, found: Found, path: PosePath, answer: str) -> Any:
+def draw_design(robot: Robot, found: Found, path: PosePath, answer: str) -> Figure:
     """Draw the Pareto front, or the efforts before and after."""
     from pkm_twin.design import QUANTITIES
     from pkm_twin.design.pose_path import PathMotion

@@ -16,6 +16,8 @@ from pkm_twin.report import Fact, Report, plots
 from pkm_twin.settings import setting
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from pkm_twin.codegen.arrays import Array
     from pkm_twin.robot.robot import Robot
     from stiffness_monitor.vibration import ToolModes, ToolResponse
@@ -96,13 +98,14 @@ def report_modes(machine: Robot, pose: list[float], frequencies: Array, damping:
     ]
 
 
-def draw(found: ToolResponse, modes: ToolModes, title: str) -> Any:
+def draw(found: ToolResponse, modes: ToolModes, title: str) -> Figure:
     """Draw magnitude and phase of the response along each axis over the frequency."""
     figure, axes = plots.make_subplots(1, 2)
     size, phase = axes[0]
     grid = found.frequencies
     for k, name in enumerate("xyz"):
-        one, style = found.response[:, k, k], {"color": plots.COLOURS[k], "ls": plots.LINE_STYLES[k]}
+        one = found.response[:, k, k]
+        style: dict[str, Any] = {"color": plots.COLOURS[k], "ls": plots.LINE_STYLES[k]}
         size.semilogy(grid, 1e6 * np.abs(one), label=f"along {name}", **style)
         phase.plot(grid, np.degrees(np.angle(one)), **style)
     for frequency in modes.frequencies[modes.frequencies <= grid[-1]]:

@@ -21,6 +21,8 @@ from pkm_twin.report.report import ROUNDING
 from pkm_twin.settings import setting
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from pkm_twin.paths.joint_loads import Summary
     from pkm_twin.recordings import Recording
 
@@ -156,14 +158,14 @@ def _tabulate_bearing_loads(joints: dict[str, Any]) -> list[Table]:
     return tables
 
 
-def draw(motion: Recording, loads: Sequence[Summary], title: str) -> Any:
+def draw(motion: Recording, loads: Sequence[Summary], title: str) -> Figure:
     """Draw the largest joint forces over time, and their rainflow spectra."""
     told = [load for load in loads if load.determined[:3].any()]
     shown = sorted(told, key=lambda load: -load.peaks[2])
     figure, axes = plots.make_subplots(2, 1)
     (force,), (counted,) = axes
     for k, load in enumerate(shown[:6]):
-        style = {"color": plots.COLOURS[k], "ls": plots.LINE_STYLES[k % 3], "lw": 1.2}
+        style: dict[str, Any] = {"color": plots.COLOURS[k], "ls": plots.LINE_STYLES[k % 3], "lw": 1.2}
         label = f"{load.name}: {'' if load.known[2] else 'at least '}{load.peaks[2]:.4g} N"
         force.plot(motion.clock, np.concatenate(load.sizes), label=label, **style)
         own = [k for k in range(3) if load.determined[k]]

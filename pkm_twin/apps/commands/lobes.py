@@ -16,6 +16,8 @@ from pkm_twin.report import Fact, Report, plots
 from pkm_twin.settings import setting
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from stiffness_monitor.chatter import Lobes as Limits
     from stiffness_monitor.chatter import Milling
 
@@ -92,7 +94,7 @@ def _limit_data(speed: float, depth: float, is_open: bool) -> dict[str, Any]:
     return {"speed_rpm": float(speed), "depth_m": float(depth), "open": bool(is_open)}
 
 
-def draw(found: Limits, milling: Milling, title: str) -> Any:
+def draw(found: Limits, milling: Milling, title: str) -> Figure:
     """Draw the limit of the depth over the speed, with the best speed."""
     figure, axes = plots.make_subplots(1, 1)
     ax = axes[0][0]

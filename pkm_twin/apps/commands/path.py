@@ -27,6 +27,8 @@ from pkm_twin.report import Column, Fact, Report, Table, plots
 from pkm_twin.settings import setting
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from pkm_twin.paths import Path as Way
     from pkm_twin.paths import TimedPath
     from pkm_twin.paths.along import SoftCut
@@ -277,7 +279,7 @@ def _read_path(given: Motion, machine: Robot) -> tuple[Way, list[float] | None]:
     return made, None
 
 
-def draw_limits(motion: TimedPath, title: str) -> Any:
+def draw_limits(motion: TimedPath, title: str) -> Figure:
     """Draw the used fraction of each limit over time, coloured by the limit that binds."""
     from pkm_twin.paths.constraints import limit_names
     from pkm_twin.paths.joint_path import only_turns
@@ -334,7 +336,7 @@ def _report_milling(cut: SoftCut, motion: TimedPath) -> tuple[list[Fact], Any]:
         Fact("tolerance_m", tolerance, "m"),
     ]
 
-    def draw_feed(motion: TimedPath, title: str) -> Any:
+    def draw_feed(motion: TimedPath, title: str) -> Figure:
         figure, axes = plots.make_subplots(1, 2)
         curves = (
             (1e3 * s.speed, "feed (mm/s)", 1e3 * speed),

@@ -18,6 +18,8 @@ from pkm_twin.report import Column, Fact, Report, Table, plots
 from pkm_twin.settings import setting
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from pkm_twin.paths.along import EffortComparison
     from pkm_twin.paths.sizing import DriveDuty, Fit, Gear, Gears
     from pkm_twin.robot.robot import Robot
@@ -330,7 +332,7 @@ def select_motors(duty: DriveDuty) -> list[Fit]:
     return fits[max(first - 3, 0) : first + 1]
 
 
-def draw(taken: EffortComparison, duties: Sequence[DriveDuty], answer: str) -> Any:
+def draw(taken: EffortComparison, duties: Sequence[DriveDuty], answer: str) -> Figure:
     """Draw torque over speed, one axes per drive, with the curves of motors or the file's limits."""
     from pkm_twin.paths.sizing import RPM
 
@@ -346,8 +348,7 @@ def draw(taken: EffortComparison, duties: Sequence[DriveDuty], answer: str) -> A
             speeds, torques = m.motion[1][:, k], taken.effort[:, k]
             unit = m.robot.joint_units[k]
             labels = f"speed of the joint ({unit}/s)", f"effort ({m.robot.effort_units[k]})"
-            own, dashed = m.robot.limits, {"color": "0.5", "ls": "--", "lw": 1}
-            used = []
+            own, used = m.robot.limits, []
             for what, limits, draw, values in (
                 ("speed", own.velocity, ax.axvline, speeds),
                 ("effort", own.effort, ax.axhline, torques),
@@ -355,7 +356,7 @@ def draw(taken: EffortComparison, duties: Sequence[DriveDuty], answer: str) -> A
                 if limits is not None and np.isfinite(limits[k]):
                     used.append(f"{_format_percent(np.abs(values).max() / limits[k])} of {what}")
                     for sign in (1.0, -1.0):
-                        draw(sign * limits[k], **dashed)
+                        draw(sign * limits[k], color="0.5", ls="--", lw=1)
             words = f"uses {', '.join(used)} (dashed: limits of the file)" if used else "no limits"
         ax.plot(speeds, torques, color="black", lw=1.5, label="motion")
         most = float(np.abs(torques).max())

@@ -144,7 +144,7 @@ def torques(given: Torques) -> Report:
             Fact("beyond_limits", [str(item) for item in beyond]),
         ],
         [Table("efforts", shown, rows, head="joint")],
-        figures={"": lambda: plots.draw_torques(motion, columns, answer)} if given.at is None else {},
+        figures={} if given.at is not None else {"": lambda: plots.draw_torques(units, columns, answer)},
         notes=[
             *([f"table: {len(time)} rows, {len(columns)} columns"] if given.out else []),
             *motion.notes,

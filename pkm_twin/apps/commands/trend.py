@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from pkm_twin.apps.frame import command
 from pkm_twin.apps.options import PictureOptions
@@ -15,6 +15,8 @@ from pkm_twin.report import Fact, Report, Verdict
 from pkm_twin.settings import setting
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from pkm_twin.identification.history import Judged
 
 
@@ -67,7 +69,7 @@ def trend(given: Trend) -> Report:
     )
 
 
-def draw(results: Sequence[Judged], answer: str) -> Any:
+def draw(results: Sequence[Judged], answer: str) -> Figure:
     """Draw the series with their control limits, those that drift first."""
     import numpy as np
 

@@ -81,6 +81,7 @@ class Modes(Frequency):
         """Draw the shapes of the lowest modes, coloured by displacement."""
         from mpl_toolkits.mplot3d.art3d import Line3DCollection  # type: ignore[import-untyped]
 
+        ax: Any  # of three dimensions
         figure, columns = plots.make_subplots(3, 1, 4.6, subplot_kw={"projection": "3d"})
         axes = [column[0] for column in columns]
         rest, edges = data.position.values, data.line.values

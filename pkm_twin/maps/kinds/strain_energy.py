@@ -135,7 +135,7 @@ def _draw_slices(data: Dataset, case: str, elements: list[int]) -> dict[str, Fig
     extend = "max" if beyond else "neither"
     x, y = np.meshgrid(*(data[name].values for name in flat), indexing="ij")
     heights = data[upwards].values[chosen]
-    figure: Figure
+    ax: Any  # of three dimensions
     figure, columns = plots.make_subplots(len(tables), 1, 4.6 if elements else 6.0, subplot_kw={"projection": "3d"})
     drawn: Any = None
     for table, (ax,), n in zip(tables, columns, elements or [-1], strict=True):
@@ -189,7 +189,6 @@ def _draw_planes(data: Dataset, case: str, elements: list[int]) -> dict[str, Fig
         return {}
     table = data.plane_factor.isel(plane=plane, case=k).values[..., elements]
     high = float(np.nanmax(table))
-    figure: Figure
     figure, columns = plots.make_subplots(len(elements), 1, plots.WIDTH / MAX_PANELS + 0.9)
     mesh: Any = None
     for column, (ax,), n in zip(np.moveaxis(table, -1, 0), columns, elements, strict=True):
