@@ -2,9 +2,9 @@
 """Locate a contact: which body, and where along it, from the direction of external efforts.
 
 A force F at a point p of a body causes the joint efforts J(p)' F, with the Jacobian J of that
-point. CandidatePositions on all bodies are compared by their marginal likelihood: F is unknown, its prior
-normal, of any size. A body that explains efforts of every direction thus has less evidence than
-one that explains these alone.
+point. Candidate positions on all bodies are compared by their marginal likelihood, with a normal
+prior of F of any size. A body that can explain efforts of every direction therefore has less
+evidence than a body that explains only the observed direction.
 """
 
 from __future__ import annotations
@@ -112,12 +112,12 @@ class CandidatePositions:
 
     ``parts``: body or rod of each; ``limbs``: its limb, or ``platform``. ``thin``: whether it is
     on a thin bar. ``prior``: its probability, even along a limb's bars and over the platform's.
-    ``pairs``: numbers of two places that may clamp something, (pairs,) each: on different limbs, or
-    on a limb and the platform where no joint joins the two bodies. None with three joints or fewer.
+    ``pairs``: indices of two positions that may clamp something, (pairs,) each: on different limbs,
+    or on a limb and the platform if no joint connects the bodies. None with three joints or fewer.
 
-    ``classes``: platform and limbs; ``bodies``: all of ``parts``; ``couples``: two bodies each. Of
-    class and body 1 where a place is of it, (classes, P) and (bodies, P); ``couple_of``: the number
-    of each pair's couple.
+    ``classes``: platform and limbs; ``bodies``: all of ``parts``; ``couples``: pairs of bodies.
+    Class and body masks have 1 for the positions that belong to them, (classes, P) and (bodies, P).
+    ``couple_of``: index of each pair's couple.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -244,11 +244,11 @@ class ContactLocator:
         if not y.any():
             return
         self._positions, jacobians, along = self.places.evaluate(q)
-        # The axis of positions is last: jacobian (n, 3, P), way (3, P).
+        # The axis of positions is last: jacobian (n, 3, P), direction (3, P).
         jacobian, direction = jacobians.transpose(1, 2, 0), along.T
         if self._sums is None:
             self._start_contact(jacobian, weights, qd)
-        # The force is proportional to the efforts, in the units of the first sample.
+        # Scale by the effort's size, in the weights of the first sample: the force is proportional to it.
         weights = float(np.linalg.norm(external * self._first_weights)) * weights
         decay = math.exp(-step / DECAY_TIME)
         weight = min(1.0, step / CORRELATION_TIME)

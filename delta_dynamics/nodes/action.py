@@ -180,7 +180,7 @@ class EffortAction:
         return self._turns > 0
 
     def _check_goals(self) -> None:
-        self._send_filled()
+        self._send_ready_goals()
         for goal in list(self._goals.values()):
             if goal.filled is None or goal.sent:
                 continue
@@ -234,7 +234,7 @@ class EffortAction:
             goal.filled = time.monotonic()
             if goal.handle.is_cancel_requested:
                 self._finish(goal, GoalStatus.STATUS_CANCELED, Result())
-            self._send_filled()
+            self._send_ready_goals()
 
         def reject(error: MessageError) -> None:
             self._abort(goal, f"delta_dynamics rejected the trajectory, {error.labelled}")
@@ -244,7 +244,7 @@ class EffortAction:
         except MessageError as error:
             reject(error)
 
-    def _send_filled(self) -> None:
+    def _send_ready_goals(self) -> None:
         """Send the goals that have their efforts to the controller, in the order of arrival."""
         waiting = [g for g in self._goals.values() if g.filled is not None and not g.sent]
         if waiting and self._client.server_is_ready():

@@ -24,7 +24,7 @@ from pkm_twin.ros.run import run
 
 CHANGEABLE = ("effort_limits", "payload.mass", "payload.com")
 """Parameters that may change while the gate runs."""
-TORQUES = "delta_dynamics/joint_torques"
+TORQUES_TOPIC = "delta_dynamics/joint_torques"
 MAX_DEADLINE = 3600.0
 """Longest deadline that a node of the suite promises, s; the middleware's "none" is longer."""
 
@@ -45,7 +45,7 @@ class CommandGate(TwinNode):
         self._closed = True
         # With names and a stamp for recordings and plots.
         self._commands = EffortPublisher(self, robot, "~/commands_stamped", "~/commands")
-        # An inertia has no effort at rest, and a payload that is set to 0 kg may have none.
+        # Inertia has no effect at rest, and a payload must have none if its mass is set to 0 kg.
         robot = robot.changed(payload={"inertia": [0.0, 0.0, 0.0]})
         robot = change_robot(robot, declare_changes(self, robot, CHANGEABLE))
         if settings.on_stop == "gravity":
@@ -54,7 +54,7 @@ class CommandGate(TwinNode):
             inverse_dynamics(robot, robot.inverse(robot.home()), zeros, zeros)
         self.core = Gate(robot, settings)
         self.create_guarded_subscription(
-            TORQUES,
+            TORQUES_TOPIC,
             self._on_torques,
             refuse=self._reject_torques,
             expected=True,
@@ -126,7 +126,7 @@ class CommandGate(TwinNode):
     def _find_longer_deadline(self) -> str:
         """Name a node whose torques the middleware withholds, as it offers a longer deadline."""
         deadline = self.core.settings.deadline
-        for publisher in self.get_publishers_info_by_topic(self.resolve_topic_name(TORQUES)):
+        for publisher in self.get_publishers_info_by_topic(self.resolve_topic_name(TORQUES_TOPIC)):
             promised = publisher.qos_profile.deadline.nanoseconds / SECOND
             if promised > deadline:
                 name = health.endpoint_node_name(publisher)

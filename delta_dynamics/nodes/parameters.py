@@ -14,7 +14,7 @@ from pkm_twin.robot.plausibility import gravity_findings, payload_findings
 from pkm_twin.robot.robot import Robot
 from pkm_twin.ros.node import TwinNode
 
-CHANGES: Final = {
+CHANGEABLE_PARAMETERS: Final = {
     "payload.mass": ("payload", "mass", "kg", "mass of the payload"),
     "payload.com": ("payload", "com", "m", "centre of mass of the payload, from the platform's reference point"),
     "payload.inertia": ("payload", "inertia", "kg m2", "inertia of the payload about its com, 3 or 9 numbers"),
@@ -29,14 +29,14 @@ CHANGES: Final = {
         "largest effort of each joint; efforts beyond it are rejected, or as limit_policy says",
     ),
 }
-"""Their section, key, unit and meaning."""
+"""Section, key, unit and meaning of each parameter."""
 
 
-def declare_changes(node: TwinNode, robot: Robot, names: Collection[str] = CHANGES) -> dict[str, Any]:
-    """Declare these parameters; return the values that were given, by name."""
+def declare_changes(node: TwinNode, robot: Robot, names: Collection[str] = CHANGEABLE_PARAMETERS) -> dict[str, Any]:
+    """Declare parameters of :data:`CHANGEABLE_PARAMETERS`; return the values that were set, by name."""
     changes = {}
     for name in names:
-        section, key, unit, text = CHANGES[name]
+        section, key, unit, text = CHANGEABLE_PARAMETERS[name]
         value = getattr(robot, section)
         value = getattr(value, key) if key else value
         if value is None:
@@ -52,10 +52,10 @@ def declare_changes(node: TwinNode, robot: Robot, names: Collection[str] = CHANG
 
 
 def change_robot(robot: Robot, values: dict[str, Any]) -> Robot:
-    """Return the robot with new values of :data:`CHANGES`; an implausible one gives a warning."""
+    """Return the robot with new values of :data:`CHANGEABLE_PARAMETERS`; an implausible one gives a warning."""
     sections: dict[str, Any] = {}
     for name, value in values.items():
-        section, key, *_ = CHANGES[name]
+        section, key, *_ = CHANGEABLE_PARAMETERS[name]
         plain = list(value) if hasattr(value, "__len__") else value
         if name == "payload.inertia" and len(plain) == 9:
             plain = [plain[0:3], plain[3:6], plain[6:9]]

@@ -13,7 +13,7 @@ from geometry_msgs.msg import WrenchStamped
 
 from delta_dynamics.feedforward import Feedforward, Settings, Torques, warm_up
 from delta_dynamics.nodes.estimates import Estimates
-from delta_dynamics.nodes.parameters import CHANGES, change_robot, declare_changes
+from delta_dynamics.nodes.parameters import CHANGEABLE_PARAMETERS, change_robot, declare_changes
 from delta_dynamics.nodes.topics import TWIN
 from delta_dynamics.torques.reactions import reactions
 from pkm_twin.errors import MessageError, ParameterError
@@ -90,7 +90,7 @@ class DeltaDynamics(TwinNode):
             self.create_guarded_subscription(
                 "base_imu", lambda message: base.take(message, self.now()), expected=True, every=True
             )
-        self.follow([*CHANGES, *list_changeable(Settings)], self._prepare_changes, self._apply_changes)
+        self.follow([*CHANGEABLE_PARAMETERS, *list_changeable(Settings)], self._prepare_changes, self._apply_changes)
         self._reported_window = 0
         self._accepted: tuple[int, Any] | None = None
         """Arrival of the last accepted joint state by the steady clock, ns, and the message."""
@@ -379,7 +379,7 @@ class DeltaDynamics(TwinNode):
             self.core.stop(reason, text)
 
     def _prepare_changes(self, values: dict[str, Any]) -> tuple[Robot, Settings]:
-        core, own = self.core, {k: v for k, v in values.items() if k in CHANGES}
+        core, own = self.core, {k: v for k, v in values.items() if k in CHANGEABLE_PARAMETERS}
         robot = change_robot(core.robot, own) if own else core.robot
         return robot, with_parameters(core.settings, values)
 

@@ -23,7 +23,7 @@ from pkm_twin.machine.inertia import list_loaded_joints
 from pkm_twin.robot.robot import Robot
 
 States = NDArray[np.int8]
-"""By row: 0 a force that holds the row, 1 the greatest force, -1 the least one."""
+"""For each row 0 if its force is between its bounds, 1 at the upper and -1 at the lower bound."""
 
 TOLERANCE: Final = 1e-7
 """Tolerance of forces and motions, relative to the largest."""
@@ -34,15 +34,15 @@ def solve_resisting_forces(
 ) -> tuple[Array, States]:
     """Solve for forces that resist motions: a bounded linear complementarity problem.
 
-    What is left of the motion, w = motion - matrix force, is zero where the force is between its
-    bounds, positive or zero at the upper bound and negative or zero at the lower one: Coulomb's law
-    with -low = high = friction, a stop with one bound infinite. By block pivoting (Judice and
-    Pires 1994), which ends for every positive definite matrix.
+    The remaining motion, w = motion - matrix force, is zero for a force between its bounds, not
+    negative at the upper bound and not positive at the lower bound: Coulomb's law with -low = high =
+    friction, or a stop with one infinite bound. Solved by block pivoting (Judice and Pires 1994),
+    which ends for every positive definite matrix.
 
-    :param matrix: motions by forces, symmetric and not negative, shape (m, m).
-    :param motion: without these forces, shape (m,).
-    :param states: where the search begins, shape (m,).
-    :returns: the forces and their states; of dependent rows those that are least.
+    :param matrix: motion per force, symmetric positive semidefinite, shape (m, m).
+    :param motion: motion without these forces, shape (m,).
+    :param states: initial guess of the states, shape (m,).
+    :returns: the forces and their states; for dependent rows the smallest forces.
     :raises ValueError: a value that is not finite.
     """
     diagonal = matrix.diagonal()
@@ -78,10 +78,10 @@ def solve_resisting_forces(
 
 
 def find_independent_rows(rows: Array, inverse: Array) -> list[int]:
-    """Return the indices of the rows that do not depend on earlier ones, to a part of 1e-7.
+    """Return the indices of the rows that are independent of earlier rows, to a relative 1e-7.
 
     :param rows: shape (m, n).
-    :param inverse: of the mass matrix, in which they are compared, shape (n, n).
+    :param inverse: inverse mass matrix, which defines the rows' scalar product, shape (n, n).
     """
     kept: list[int] = []
     basis: list[Array] = []
@@ -96,12 +96,12 @@ def find_independent_rows(rows: Array, inverse: Array) -> list[int]:
 
 
 ZERO_VELOCITY: Final = 1e-12
-"""Velocity of a row that counts as zero, relative to the largest contribution of a joint to it."""
+"""Largest velocity of a row at rest, relative to the largest contribution of one joint."""
 
 
 @dataclass(slots=True)
 class Law:
-    """The rows that slide (m), their directions, and the rows that are held (h), until one changes."""
+    """The sliding rows (m) and the held rows (h), valid until a row starts or stops sliding."""
 
     dry_friction: Array
     """Constant dry friction of all rows, shape (n + k,)."""
@@ -111,21 +111,21 @@ class Law:
     signs: Array
     """Rows with dry friction that slide, and their directions, shape (m,)."""
     held: Indices = field(default_factory=lambda: np.zeros(0, np.intp))
-    """Rows that hold the others still, drives first, shape (h,)."""
+    """Independent rows that friction or stops hold at rest, drives first, shape (h,)."""
     low: Array = field(default_factory=lambda: np.zeros(0))
     high: Array = field(default_factory=lambda: np.zeros(0))
-    """Bounds of the forces that hold, shape (h,)."""
+    """Bounds of the holding forces, shape (h,)."""
     moves: Indices = field(default_factory=lambda: np.zeros(0, np.intp))
     """Actuated joints that are not held."""
     floor: Array = field(default_factory=lambda: np.zeros(0))
     ceiling: Array = field(default_factory=lambda: np.zeros(0))
-    """Bounds of their positions: the stops, or the position at the begin if it is beyond."""
+    """Bounds of the positions of ``moves``: the stops, or the initial position if it is beyond."""
 
-    given: Array = field(default_factory=lambda: np.zeros(0))
+    input_effort: Array = field(default_factory=lambda: np.zeros(0))
     effort: Array = field(default_factory=lambda: np.zeros(0))
     """Efforts of the drives without offset and dry friction, shape (n,)."""
     wrench: Array | None = None
-    first: Array = field(default_factory=lambda: np.zeros(0))
+    acceleration: Array = field(default_factory=lambda: np.zeros(0))
     """Accelerations at the start, shape (n,)."""
     force: Array = field(default_factory=lambda: np.zeros(0))
     """Holding forces at the start, shape (h,)."""
@@ -139,13 +139,13 @@ class Law:
 class Resistance:
     """Model friction and stops of a robot, and track which of its rows move.
 
-    ``forced_joints``: passive joints that efforts act on, by their places among those with friction. These
-    efforts come after the wrench's six numbers, and their rates after the platform's twist.
+    ``forced_joints``: passive joints on which efforts act, as indices among those with friction.
+    These efforts follow the wrench's six numbers, and their rates follow the platform's twist.
     ``memory``: state of the drives' presliding friction at the start of the present part of a step.
     """
 
     def __init__(self, robot: Robot, forced_joints: Sequence[int] = (), memory: Memory | None = None) -> None:
-        self._pushed = list(forced_joints)
+        self._forced_joints = list(forced_joints)
         n = robot.joints_count
         friction, passive = robot.friction, list_loaded_joints(robot.graph)
         self._offset = np.array(friction.offset, np.float64)
@@ -160,10 +160,10 @@ class Resistance:
         self._level = np.where(self._distance > 0.0, friction.coulomb, 0.0)
         self._dry[:n] -= self._level
         self.memory = memory
-        self._rubs = self._dry > 0.0
+        self._has_dry_friction = self._dry > 0.0
         if self._laws:
             _, dry, share = sum_laws(self._laws, self._numbers, robot.graph.home, np.zeros(n))
-            self._rubs[:n] |= (dry > 0.0) | (share > 0.0)
+            self._has_dry_friction[:n] |= (dry > 0.0) | (share > 0.0)
         limits = robot.limits.position
         limits = np.tile([-math.inf, math.inf], (n, 1)) if limits is None else limits
         self._low, self._high = limits[:, 0].copy(), limits[:, 1].copy()
@@ -174,14 +174,14 @@ class Resistance:
         """State of each row: direction of sliding, or state of the force at rest."""
         self._law: Law | None = None
 
-    def at(self, q: Array, qd: Array) -> Terms:
+    def evaluate_terms(self, q: Array, qd: Array) -> Terms:
         """Return the terms of a state, with position-dependent friction of the drives.
 
         Errors as of :meth:`Equations.at`.
         """
         here = self._equations.at(q, qd)
-        if self._pushed:
-            here = here._replace(twists=np.concatenate([here.twists, here.rows[self._pushed]]))
+        if self._forced_joints:
+            here = here._replace(twists=np.concatenate([here.twists, here.rows[self._forced_joints]]))
         if not self._laws:
             return here
         energy = np.sum(potential(self._laws, self._numbers, q))
@@ -207,7 +207,7 @@ class Resistance:
     def _bounds(self, here: Terms, given: Array) -> tuple[Array, Array]:
         """Return the smallest and largest dry friction of all rows at a state, shape (n + k,).
 
-        :param given: efforts of the drives, less their offset, shape (n,).
+        :param given: efforts of the drives, minus their offset, shape (n,).
         """
         low, high = -self._dry, self._dry.copy()
         if self._laws:
@@ -223,7 +223,7 @@ class Resistance:
 
     def apply_state(self, q: Array, qd: Array) -> Terms:
         """Return the terms of a new state, after the impact of joints that reach their stops."""
-        return self._apply_impact(self._classify_rows(self.at(q, qd)))
+        return self._apply_impact(self._classify_rows(self.evaluate_terms(q, qd)))
 
     def _classify_rows(self, here: Terms) -> Terms:
         """Determine which rows move, and in which direction."""
@@ -249,7 +249,7 @@ class Resistance:
         qd[j[states == 0]] = 0.0
         qd[up] = np.minimum(qd[up], 0.0)
         qd[down] = np.maximum(qd[down], 0.0)
-        return self._classify_rows(self.at(q, qd))
+        return self._classify_rows(self.evaluate_terms(q, qd))
 
     def find_law(self, here: Terms, effort: Array, wrench: Array | None) -> Law:
         """Return which rows slide and which are held under efforts (n,) and a wrench.
@@ -258,69 +258,70 @@ class Resistance:
         """
         law = self._law
         if law is not None:
-            self._set_load(law, here, effort, wrench)
+            self._set_efforts(law, here, effort, wrench)
             # Sticking rows that depend linearly on law.held keep their forces: check the bounds of law.held only.
             if not len(law.held) or ((law.low <= law.force) & (law.force <= law.high)).all():
                 return law
         n, still = len(here.q), self._still
-        slides = np.flatnonzero(self._rubs & ~still)
+        slides = np.flatnonzero(self._has_dry_friction & ~still)
         signs = self._states[slides].astype(np.float64)
         pull = np.zeros(len(self._dry))
         pull[slides] = self._dry[slides] * signs
         law = self._law = Law(pull, np.zeros(len(self._dry), bool), slides, signs)
-        self._set_load(law, here, effort, wrench)
+        self._set_efforts(law, here, effort, wrench)
         up = (here.q >= self._high) & (here.qd == 0.0)
         down = (here.q <= self._low) & (here.qd == 0.0)
-        resists = still & self._rubs
+        resists = still & self._has_dry_friction
         resists[:n] |= up | down
         if resists.any():
-            low, high = self._bounds(here, law.given)
+            low, high = self._bounds(here, law.input_effort)
             high[:n][up] = math.inf
             low[:n][down] = -math.inf
             # Solve for the forces that hold the resting rows z, while the others keep their friction.
-            z, inverse, motion = np.flatnonzero(resists), _inverse(here.mass), law.first
+            z, inverse, motion = np.flatnonzero(resists), _inverse(here.mass), law.acceleration
             rows = self.build_row_jacobian(here)[z]
             if self._passive:
                 motion = np.concatenate([motion, here.rows @ motion + here.drift])
             force, states = solve_resisting_forces(rows @ inverse @ rows.T, motion[z], low[z], high[z], self._states[z])
             self._states[z] = states
             stays = np.flatnonzero(states == 0)
-            # A row that depends on held rows is at rest by them: its own force is constant.
+            # A row that depends on held rows is at rest with them, so its own force stays constant.
             own = stays[find_independent_rows(rows[stays], inverse)]
             law.still[z[stays]] = True
             for i in np.flatnonzero(states):
                 law.still[z[i]] = len(find_independent_rows(rows[[*own, i]], inverse)) == len(own)
             force[own] = 0.0
             law.dry_friction[z] = force
-            begins = z[~law.still[z] & self._rubs[z]]
+            begins = z[~law.still[z] & self._has_dry_friction[z]]
             law.slides = np.concatenate([law.slides, begins])
             law.signs = np.concatenate([law.signs, self._states[begins]])
             law.held = z[own]
             law.low, law.high = low[law.held], high[law.held]
-            self._set_load(law, here, effort, wrench)
+            self._set_efforts(law, here, effort, wrench)
         law.moves = np.flatnonzero(~law.still[:n])
         law.floor = np.minimum(self._low, here.q)[law.moves]
         law.ceiling = np.maximum(self._high, here.q)[law.moves]
         return law
 
-    def _set_load(self, law: Law, here: Terms, effort: Array, wrench: Array | None) -> None:
-        law.given, law.wrench = effort - self._offset, wrench
-        law.effort = law.given - law.dry_friction[: len(effort)]
+    def _set_efforts(self, law: Law, here: Terms, effort: Array, wrench: Array | None) -> None:
+        """Store the efforts in a law, and compute accelerations, holding forces and their bounds."""
+        law.input_effort, law.wrench = effort - self._offset, wrench
+        law.effort = law.input_effort - law.dry_friction[: len(effort)]
         if self._laws and len(law.held):
-            # The load that friction can hold grows with the load on the joint.
-            low, high = (one[law.held] for one in self._bounds(here, law.given))
+            # Static friction grows with the load on the joint.
+            low, high = (one[law.held] for one in self._bounds(here, law.input_effort))
             law.low = np.where(np.isfinite(law.low), low, law.low)
             law.high = np.where(np.isfinite(law.high), high, law.high)
-        law.first, law.force = self.accelerate(law, here)
+        law.acceleration, law.force = self.accelerate(law, here)
 
     def accelerate(self, law: Law, here: Terms) -> tuple[Array, Array]:
         """Return accelerations at a state, shape (n,), and the holding forces, shape (h,)."""
         n, h, effort = len(law.effort), len(law.held), law.effort
         if self._laws:
-            low, high = self._bounds(here, law.given)
+            low, high = self._bounds(here, law.input_effort)
             pull = law.dry_friction.copy()
             pull[law.slides] = np.where(law.signs > 0.0, high[law.slides], low[law.slides])
-            effort = law.given - pull[:n]
+            effort = law.input_effort - pull[:n]
         rest = effort - here.bias
         if law.wrench is not None:
             rest = rest + law.wrench @ here.twists
@@ -353,7 +354,7 @@ class Resistance:
             return make_undamped_stepper(span)
         free = self._drives
         if len(law.held):
-            # Basis of the joint velocities at which held rows rest.
+            # Columns span the joint velocities with held rows at rest.
             free = np.linalg.svd(self.build_row_jacobian(here)[law.held])[2][len(law.held) :].T
             free[law.held[law.held < len(free)]] = 0.0
         root = np.linalg.inv(np.linalg.cholesky(free.T @ here.mass @ free))
@@ -374,13 +375,13 @@ class Resistance:
         """
         n = len(here.q)
         inverse = _inverse(here.mass + span * self._damping(here))
-        rest = law.given - here.bias + (0.0 if law.wrench is None else law.wrench @ here.twists)
+        rest = law.input_effort - here.bias + (0.0 if law.wrench is None else law.wrench @ here.twists)
         rates = inverse @ (here.mass @ here.qd + span * rest)
         up, down = here.q >= self._high, here.q <= self._low
-        low, high = (span * one for one in self._bounds(here, law.given))
+        low, high = (span * one for one in self._bounds(here, law.input_effort))
         high[:n][up] = math.inf
         low[:n][down] = -math.inf
-        resists = self._rubs.copy()
+        resists = self._has_dry_friction.copy()
         resists[:n] |= up | down
         z = np.flatnonzero(resists)
         rows = self.build_row_jacobian(here)[z]
@@ -394,13 +395,13 @@ class Resistance:
         self._still[z] = states == 0
         self._states[z] = states
         low, high = np.minimum(self._low, here.q), np.maximum(self._high, here.q)
-        return self._apply_impact(self.at(np.clip(here.q + span * rates, low, high), rates))
+        return self._apply_impact(self.evaluate_terms(np.clip(here.q + span * rates, low, high), rates))
 
     def find_lasting_fraction(self, here: Terms, end: Terms, law: Law) -> float:
         """Return the fraction of a span up to which the law holds, 1 for all of it.
 
         It holds while joints are within their stops, sliding rows keep their directions, and holding
-        forces are within their bounds. Each of these margins is interpolated linearly between both ends of the span.
+        forces are within their bounds. The margins are interpolated linearly over the span.
         """
         before, after = here.q[law.moves], end.q[law.moves]
         begins, ends = [law.ceiling - before, before - law.floor], [law.ceiling - after, after - law.floor]
@@ -431,7 +432,7 @@ class Resistance:
             drift = np.linalg.lstsq(rows @ across, rows @ end.qd, rcond=1e-12)[0]
             qd = end.qd - across @ drift
             qd[law.held[law.held < len(qd)]] = 0.0
-            end = end if (qd == end.qd).all() else self.at(end.q, qd)
+            end = end if (qd == end.qd).all() else self.evaluate_terms(end.q, qd)
         return self._apply_impact(end)
 
 

@@ -161,7 +161,7 @@ def error_growth(
     their way. The mass matrix is constant, and efforts are constant in a period.
 
     :param inertia: mass matrix of the drives that lead, shape (m, m).
-    :param follow: rates of all drives by these, shape (n, m); by default all lead.
+    :param follow: rates of all drives per rate of these, shape (n, m); by default all lead.
     :param stiffness: factor of the settings' stiffness, ``damping``: of their damping.
     """
     n, s = len(inertia), settings

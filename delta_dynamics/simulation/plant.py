@@ -22,9 +22,9 @@ from pkm_twin.machine.inertia import list_loaded_joints
 from pkm_twin.robot.robot import Robot
 
 MAX_EXPLICIT_PARTS: Final = 100
-"""Number of parts of a step after which implicit parts get longer, as changes accumulate."""
+"""Number of parts of a step after which implicit parts become longer, to limit their number."""
 MIN_RELATIVE_SPAN: Final = 0.5**12
-"""Shortest part of a step, relative to it: the one in which what sticks or slides changes."""
+"""Shortest part of a step, relative to the step: the part in which sticking or sliding changes."""
 MAX_ENERGY_GROWTH: Final = 1e-9
 """Energy that the method may add in a part, relative to the kinetic energy; it is removed
 afterwards."""
@@ -36,13 +36,14 @@ ENERGY_ROUNDING: Final = 1e-14
 class Plant:
     """Hold a robot's state, and integrate its motion.
 
-    Between changes a step is one of a Runge-Kutta method of order four that is exact in viscous
-    friction, however stiff; efforts and wrench are constant in it. Dry friction of all joints and
-    stops obey Coulomb's law: a joint sticks exactly and leaves only beyond its friction. A part
-    ends just before what sticks or slides changes, by linear interpolation; the change itself is
-    within 1/4096 of the step, which is integrated implicitly. Stops do not bounce: an impact
-    projects the rates, in the mass matrix, onto those that all stops allow. A part in which the
-    energy grows by more than the work of efforts and wrench is halved.
+    Efforts and wrench are constant in a step. While no joint starts or stops sliding, the integrator
+    is a Runge-Kutta method of order four that is exact in viscous friction, however stiff. Dry
+    friction of all joints, and stops, obey Coulomb's law: a joint sticks exactly until the force
+    exceeds its friction. A part of a step ends just before sticking or sliding changes, found by
+    linear interpolation; the change itself is integrated implicitly within 1/4096 of the step. Stops
+    do not bounce: an impact projects the rates, in the metric of the mass matrix, onto those that all
+    stops allow. A part in which the energy grows by more than the work of efforts and wrench is
+    halved.
     """
 
     robot: Robot
@@ -160,12 +161,12 @@ class Plant:
         resistance, powers = self._resistance, []
 
         def accelerations(q: Array, qd: Array) -> Array:
-            t = here if q is here.q else resistance.at(q, qd)
+            t = here if q is here.q else resistance.evaluate_terms(q, qd)
             if law.wrench is not None:
                 powers.append(float(law.wrench @ (t.twists @ qd)))
-            return law.first if t is here else resistance.accelerate(law, t)[0]
+            return law.acceleration if t is here else resistance.accelerate(law, t)[0]
 
-        end = resistance.at(*resistance.stepper(here, law, span).run(here.q, here.qd, accelerations))
+        end = resistance.evaluate_terms(*resistance.stepper(here, law, span).run(here.q, here.qd, accelerations))
         if not powers:
             return end, 0.0
         return end, span / 6.0 * (powers[0] + 2.0 * (powers[1] + powers[2]) + powers[3])
@@ -176,13 +177,13 @@ def _energy_growth(here: Terms, end: Terms, law: Law, work: float) -> float:
 
     :param work: of the wrench, J.
     """
-    done = work + float((law.given) @ (end.q - here.q))
+    done = work + float((law.input_effort) @ (end.q - here.q))
     return end.kinetic - here.kinetic + (end.potential - here.potential) - done
 
 
 def _energy_rounding(here: Terms, end: Terms, law: Law) -> float:
     """Bound the rounding error of the energy growth, J, including that of positions."""
-    forces = np.abs(law.given) + np.abs(here.bias)
+    forces = np.abs(law.input_effort) + np.abs(here.bias)
     size = here.kinetic + end.kinetic + abs(here.potential) + abs(end.potential)
     return ENERGY_ROUNDING * (size + float(forces @ np.abs(here.q)))
 

@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike
 from delta_dynamics.torques.virtual_work import (
     Forces,
     add_friction_and_rotors,
+    efforts_for_acceleration,
     efforts_of_motion,
     mass_entries,
-    remaining_efforts,
     solve_accelerations,
     solve_leading_accelerations,
 )
@@ -74,7 +74,7 @@ def inverse_dynamics_at_pose(
     """
     load = np.zeros(6) if wrench is None else wrench
     given = pose, rate, acceleration, load
-    q, qd, qdd, tau = evaluate_at_pose(robot, pose_torques, robot.inertial, *given)
+    q, qd, qdd, tau = evaluate_at_pose(robot, pose_torque_kernel, robot.inertial, *given)
     return PoseMotion(q, qd, qdd, tau, np.broadcast_to(acceleration, (*q.shape[:-1], len(robot.pose_names))))
 
 
@@ -113,21 +113,21 @@ def mass_matrix_at_pose(robot: Robot, pose: ArrayLike) -> Array:
 
 
 class PoseKernel(Protocol):
-    """Gives a robot's program of poses and other inputs."""
+    """A function that returns a robot's program whose first input is a pose."""
 
     def __call__(self, robot: Robot, *, certified: bool) -> Kernel:
         """Return the program.
 
-        :param certified: whether it accepts poses as the quick inverse kinematics does; else those
-            are given that the inverse kinematics has accepted.
+        :param certified: reject poses that the quick inverse kinematics rejects; otherwise the
+            caller must give poses that the inverse kinematics accepts.
         """
 
 
 def evaluate_at_pose(robot: Robot, kernel: PoseKernel, p: Array, *given: ArrayLike) -> list[Array]:
-    """Evaluate a program of poses and other inputs; reject the poses that inverse kinematics rejects.
+    """Evaluate a program of poses and other inputs, for poses that the inverse kinematics accepts.
 
     :param p: the program's parameters. ``given``: poses, shape (..., m), and the other inputs.
-    :raises UnreachableError: as the inverse kinematics, and SingularityError.
+    :raises UnreachableError: as the inverse kinematics; also SingularityError.
     :raises ValueError: an input that is not finite.
     """
     found, status = kernel(robot, certified=True)(p, *given)
@@ -149,7 +149,7 @@ def evaluate_at_pose(robot: Robot, kernel: PoseKernel, p: Array, *given: ArrayLi
 
 
 def _compile_at_pose(robot: Robot, name: str, write: Callable[..., Program], *, certified: bool) -> Kernel:
-    """Return the compiled program of a pose; without a closed form, one program for all poses.
+    """Return the compiled program; without a closed form ``certified`` makes no difference.
 
     :raises ParameterError: a robot whose file gives no masses.
     """
@@ -159,13 +159,13 @@ def _compile_at_pose(robot: Robot, name: str, write: Callable[..., Program], *, 
     return engine.posed_kernel(f"{name} at {place}", partial(write, certified=certified))
 
 
-def pose_torques(robot: Robot, *, certified: bool) -> Kernel:
+def pose_torque_kernel(robot: Robot, *, certified: bool) -> Kernel:
     """Return the program from pose, rate, acceleration and wrench to q, qd, qdd and efforts."""
     return _compile_at_pose(robot, "torques", _write_pose_torques, certified=certified)
 
 
-def iterated_pose_torques(robot: Robot) -> Kernel:
-    """Return :func:`pose_torques` by iteration on the machine's own tree, valid for other dimensions.
+def iterated_pose_torque_kernel(robot: Robot) -> Kernel:
+    """Return :func:`pose_torque_kernel` by iteration on the machine's own tree, valid for other dimensions.
 
     Poses are accepted as by :attr:`.engine.Engine.generic_inverse`.
     """
@@ -191,7 +191,11 @@ def pose_acceleration_kernel(robot: Robot, *, certified: bool) -> Kernel:
 
 
 class _PoseDrivenMachine:
-    """Write motion and forces of a machine whose tree is driven by the pose, as expressions."""
+    """Motion and forces as expressions, on a tree in which the pose coordinates are actuated.
+
+    ``q``: positions of all drives; ``drives``: their rates per pose rate; ``lead``: factors of the
+    leading drives' rows of these; ``parts``: the parts of the parameter vector.
+    """
 
     def __init__(self, t: Traced, scheme: PlatformFirstScheme, *, certified: bool) -> None:
         self.t, self.scheme, self.certified = t, scheme, certified
@@ -203,7 +207,7 @@ class _PoseDrivenMachine:
         t.drives.set_null_rows([self.lead.solve_transposed(self.drives[k]) for k in t.drives.others])
 
     def program(self, outputs: dict[str, Numbers], **inputs: int) -> Program:
-        """Return the program; ``inputs``: sizes of those besides the pose."""
+        """Return the program; ``inputs``: sizes of the inputs after the pose."""
         t, posed = self.t, self.posed
         branch = t.pivot_margins(self.lead, t.drive_scales, t.pose_scales)
         certain = certify_assembly(t, self.scheme, posed, self.q) if self.certified else []
@@ -217,7 +221,7 @@ class _PoseDrivenMachine:
 
     @cached_property
     def _bodies(self) -> Objects:
-        """The inertial parameters of all bodies in frames of the tree that the pose drives."""
+        """Inertial parameters of all bodies in the frames of the pose-driven tree."""
         t, layout, tree = self.t, self.layout, self.posed.tree
         p = t.tape.inputs(PARAMETERS, layout.size)
         rows: list[Any] = []
@@ -229,12 +233,12 @@ class _PoseDrivenMachine:
             rows.append(make_frame_change(link.axes, lever) @ p[layout.body(name)])
         return np.array(rows, dtype=object)
 
-    def joint(self, values: Objects) -> list[Any]:
+    def select_drives(self, values: Objects) -> list[Any]:
         """Select the rates or accelerations of all drives from those of all unknowns."""
         return [values[self.posed.tree.steps[name].rate] for name in self.t.graph.actuated]
 
     def add_inertia(self, add: Callable[[Forces, Objects, Objects], None]) -> Forces:
-        """Return the forces after ``add`` has added those of all bodies and rods."""
+        """Return the forces, or momenta, of all bodies and rods, by a method of :class:`Forces`."""
         forces = Forces(self.posed.motion)
         add(forces, self._bodies, self.parts[1])
         return forces
@@ -244,31 +248,31 @@ class _PoseDrivenMachine:
         t, posed, passive = self.t, self.posed, self.parts[-1]
         posed.set_rates(rate)
         posed.set_accelerations(acceleration, BaseMotion.at_rest(self.parts[2]))
-        forces = self.add_inertia(Forces.inertia)
+        forces = self.add_inertia(Forces.add_inertia)
         for k, joint in enumerate(list_loaded_joints(t.graph)):
-            forces.joint(joint, passive[3 * k : 3 * k + 3])
-        forces.wrench(t.tape.inputs("wrench", 6))
-        unknown, on_pose = forces.generalised()
+            forces.add_passive_joint(joint, passive[3 * k : 3 * k + 3])
+        forces.subtract_wrench(t.tape.inputs("wrench", 6))
+        unknown, on_pose = forces.generalised_forces()
         jq: Objects = posed.jq[self.scheme.independent]
         multipliers = posed.lu.solve_transposed(unknown[self.scheme.varying])
         return np.asarray(on_pose - jq.T @ multipliers, object)
 
-    def masses(self) -> Objects:
+    def pose_mass_matrix(self) -> Objects:
         """Return the mass matrix on the pose coordinates, rotors included.
 
-        With the mass matrix H of pose x and unknowns u as if the closures were open, and
-        u' = -Ju^-1 Jx x', it is Hxx - W Jx - (W Jx)' + Jx' Y Jx, W = Hxu Ju^-1, Y = Ju^-T Huu Ju^-1.
+        With the mass matrix H of the open tree by pose x and unknowns u, and u' = -Ju^-1 Jx x', it is
+        Hxx - W Jx - (W Jx)' + Jx' Y Jx with W = Hxu Ju^-1, Y = Ju^-T Huu Ju^-1.
         """
         t, posed, passive = self.t, self.posed, self.parts[-1]
         free, m = posed.tree.unknown_rates, len(posed.q)
         table = np.zeros((m + free, m + free), dtype=object)
         for k, unit in enumerate(np.eye(m + free)):
             posed.motion.set_rates(unit[m:], unit[:m])
-            forces = self.add_inertia(Forces.momenta)
+            forces = self.add_inertia(Forces.add_momenta)
             for j, joint in enumerate(list_loaded_joints(t.graph)):
-                forces.pair(joint, passive[3 * j + 2] * forces.relative(joint, accelerated=False)[0])
-            unknown, driven = forces.generalised()
-            # The column of the rate that is farther from the base moves fewer bodies.
+                forces.add_joint_effort(joint, passive[3 * j + 2] * forces.relative_motion(joint, accelerated=False)[0])
+            unknown, driven = forces.generalised_forces()
+            # Of both symmetric entries take that of the rate farther from the base: it moves fewer bodies.
             table[: k + 1, k] = table[k, : k + 1] = [*driven, *unknown][: k + 1]
         kept = [m + k for k in self.scheme.varying]
         jq, lu = posed.jq[self.scheme.independent], posed.lu
@@ -288,7 +292,10 @@ def _complete_symmetric(matrix: Any) -> Objects:
 
 
 class _IteratedMachine:
-    """Write a machine whose joints are iterated from the pose, on its own tree, as expressions."""
+    """Motion as expressions, with joints that Newton's method finds from the pose on the own tree.
+
+    ``q``: positions of the leading drives; ``lead``: factors of the pose rates by their rates.
+    """
 
     def __init__(self, t: Traced) -> None:
         self.t = t
@@ -298,19 +305,19 @@ class _IteratedMachine:
         self.lead = pose_factors(t)
 
     def program(self, outputs: dict[str, Numbers], **inputs: int) -> Program:
-        """Return the program; ``inputs``: sizes of those besides the pose."""
+        """Return the program; ``inputs``: sizes of the inputs after the pose."""
         made = {name: self.t.lift(values) for name, values in outputs.items()}
         return Program({"pose": self.t.joints} | inputs, self.layout.size, made, self.equations)
 
     def drift(self, rate: Numbers) -> tuple[Objects, Objects]:
-        """Return the leading drives' rates, and the pose's accelerations while they keep these rates."""
+        """Return the leading drives' rates, and the pose's accelerations at constant rates."""
         t, qd = self.t, self.lead.solve(rate)
         t.set_rates(qd)
         t.set_accelerations(np.zeros(t.joints))
         return qd, np.array(programs.pose_accelerations(t), dtype=object)
 
     def motion(self, qd: Numbers, qdd: Numbers) -> dict[str, Numbers]:
-        """Return positions, rates and accelerations of all drives, from the leading drives' ones."""
+        """Return positions, rates and accelerations of all drives from those of the leading drives."""
         t, tree = self.t, self.t.tree
         return {
             "q": tree.drive_positions(self.q, t.x),
@@ -333,7 +340,7 @@ def _write_pose_torques(t: Traced, scheme: PlatformFirstScheme | None, *, certif
     # F_d = -J^-T (J_M' Q_M + sum of J_Hij' Q_Hij) - Q_S with J = dq/dX (equations 24 and 41); needed forces
     # are minus Q.
     f_d = made.lead.solve_transposed(made.forces(rate, acceleration))
-    rates, changes = (made.joint(values) for values in (made.posed.u, made.posed.du))
+    rates, changes = (made.select_drives(values) for values in (made.posed.u, made.posed.du))
     leads = add_friction_and_rotors(t, made.parts, f_d, made.q, rates, changes)[0]
     tau = t.drives.distribute(leads, preload=True)
     return made.program({"q": made.q, "qd": rates, "qdd": changes, "tau": tau}, **sizes)
@@ -348,7 +355,7 @@ def _write_pose_masses(t: Traced, scheme: PlatformFirstScheme | None, *, certifi
         on_pose = rates @ mass @ rates.T
     else:
         own = made = _PoseDrivenMachine(t, scheme, certified=certified)
-        on_pose = made.masses()
+        on_pose = made.pose_mass_matrix()
         half = np.array([made.lead.solve_transposed(row) for row in on_pose], dtype=object).T
         mass = _complete_symmetric([made.lead.solve_transposed(row) for row in half])
     return own.program({"matrix": t.drives.distribute_matrix(mass), "on pose": np.ravel(on_pose)})
@@ -368,12 +375,12 @@ def _write_pose_accelerations(t: Traced, scheme: PlatformFirstScheme | None, *, 
         return own.program(own.motion(qd, leads) | found, **sizes)
     made = _PoseDrivenMachine(t, scheme, certified=certified)
     on_pose = made.forces(rate, np.zeros(m))
-    rates, drift = (made.joint(values) for values in (made.posed.u, made.posed.du))
+    rates, drift = (made.select_drives(values) for values in (made.posed.u, made.posed.du))
     # Only friction that grows with the load needs the drives' loads.
     by_load = bool(t.graph.laws) and not t.drives.others
     loads = made.lead.solve_transposed(on_pose) if by_load else np.zeros(m)
-    rest = remaining_efforts(t, made.parts, t.drives.leading_efforts([*tau]), loads, made.q, rates, drift)
+    rest = efforts_for_acceleration(t, made.parts, t.drives.leading_efforts([*tau]), loads, made.q, rates, drift)
     forces = made.drives[t.drives.leading].T @ rest - (0.0 if by_load else on_pose)
-    acceleration = np.array(solve_accelerations(made.masses(), forces), dtype=object)
+    acceleration = np.array(solve_accelerations(made.pose_mass_matrix(), forces), dtype=object)
     outputs = {"q": made.q, "qd": rates, "qdd": made.drives @ acceleration + drift, "acceleration": acceleration}
     return made.program(outputs, **sizes)

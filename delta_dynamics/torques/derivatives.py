@@ -78,7 +78,7 @@ def _derivatives(
     *,
     rows: bool,
 ) -> TorqueDerivatives:
-    inputs = _list_inputs(motion, wrench, weights, rows=rows)
+    inputs = _stack_inputs(motion, wrench, weights, rows=rows)
     by_q, by_qd, by_qdd = robot.evaluate(motion_gradient_kernel(robot), *inputs, p=robot.inertial)
     found: dict[str, Array] = {}
     if by:
@@ -90,13 +90,13 @@ def _derivatives(
 def torque_effects(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None) -> Array:
     """Return the change of efforts per standard deviation of each cause, (..., n, causes)."""
     causes = robot.cached(CauseSlopes, geometry_and_masses)
-    kernel = robot.cached(_effects_kernel)
-    inputs = _list_inputs((q, qd, qdd), wrench, np.eye(robot.joints_count), rows=True)
+    kernel = robot.cached(_cause_gradient_kernel)
+    inputs = _stack_inputs((q, qd, qdd), wrench, np.eye(robot.joints_count), rows=True)
     (table,) = robot.evaluate(kernel, *inputs, p=robot.inertial)
     return np.asarray(table @ causes.slopes, np.float64)
 
 
-def _effects_kernel(robot: Robot) -> Kernel:
+def _cause_gradient_kernel(robot: Robot) -> Kernel:
     chosen = robot.cached(CauseSlopes, geometry_and_masses).chosen
 
     def write_effort_gradient(t: Traced) -> Program:
@@ -108,11 +108,11 @@ def _effects_kernel(robot: Robot) -> Kernel:
     return robot.massive().kernel(f"torque gradient by {chosen}", write_effort_gradient, free=True)
 
 
-def _list_inputs(motion: Sequence[ArrayLike], wrench: ArrayLike | None, weights: Array, *, rows: bool) -> list[Array]:
+def _stack_inputs(motion: Sequence[ArrayLike], wrench: ArrayLike | None, weights: Array, *, rows: bool) -> list[Array]:
     load = np.zeros(6) if wrench is None else wrench
     inputs = [doubles(value) for value in (*motion, load)]
     if rows:
-        # Without the axis a single sample takes the fast path.
+        # Add an axis for the rows; single samples do without it and take the fast path.
         inputs = [array if array.ndim == 1 else array[..., None, :] for array in inputs]
     return [*inputs, weights]
 
@@ -130,7 +130,7 @@ def torques_by_numbers(
     :param robot: also one of :meth:`Robot.numbered`; with ``slopes`` of :func:`differentiate_numbers`.
         Others as of :func:`torque_derivatives`.
     """
-    inputs = _list_inputs((q, qd, qdd), wrench, np.eye(robot.joints_count), rows=True)
+    inputs = _stack_inputs((q, qd, qdd), wrench, np.eye(robot.joints_count), rows=True)
     return _evaluate_number_gradient(robot, inputs) @ slopes
 
 

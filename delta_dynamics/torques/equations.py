@@ -95,13 +95,13 @@ def _write_terms(t: Traced) -> Program:
     t.set_rates(qd)
     t.set_accelerations(np.zeros(n), BaseMotion.at_rest(gravity))
     forces = Forces(motion)
-    forces.inertia(bodies, rods)
+    forces.add_inertia(bodies, rods)
     drift = []
     for k, joint in enumerate(list_loaded_joints(graph)):
-        _, second = forces.relative(joint, accelerated=True)
-        forces.pair(joint, passive[3 * k + 2] * second)
+        _, second = forces.relative_motion(joint, accelerated=True)
+        forces.add_joint_effort(joint, passive[3 * k + 2] * second)
         drift.append(second)
-    unknown, driven = forces.generalised()
+    unknown, driven = forces.generalised_forces()
     bias = driven - t.jq[t.scheme.independent].T @ t.lu.solve_transposed(unknown)
     height = potential(t, bodies, rods, gravity)
     twists: list[Any] = []
@@ -109,7 +109,7 @@ def _write_terms(t: Traced) -> Program:
 
     def add_motion(forces: Forces) -> None:
         twists.append([*motion.velocity(graph.platform, graph.origin), *motion.omega[graph.platform]])
-        rows.append([forces.relative(j, accelerated=False)[0] for j in list_loaded_joints(graph)])
+        rows.append([forces.relative_motion(j, accelerated=False)[0] for j in list_loaded_joints(graph)])
 
     mass = mass_entries(t, parts, add_motion)
     # twists and rows have one entry per joint: transpose them below.

@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from delta_dynamics.torques.virtual_work import Forces, body_efforts
+from delta_dynamics.torques.virtual_work import Forces, body_effort_kernel
 from pkm_twin.codegen.arrays import Array, Mask, require_finite
 from pkm_twin.codegen.expressions import PARAMETERS, cross
 from pkm_twin.codegen.kernels import Kernel
@@ -81,7 +81,7 @@ def list_transmitters(graph: Graph, rods: Array, places: Array) -> list[Transmit
 def _make_joint_transmitter(joint: Joint, vectors: Array) -> Transmitter:
     """Return a joint's wrenches: forces across its slides, moments across its rotations.
 
-    A screw's force along its axis comes with the moment that its thread makes of it.
+    A screw transmits a force along its axis together with the moment of its thread.
     """
     name = joint.label or joint.name
     freedoms = joint.freedoms
@@ -205,13 +205,13 @@ def assemble_transmission(
 POINT_FRACTION: Final = 1e-6
 """Extent of all joints, relative to the machine's size, below which they count as one point."""
 SINGULAR_VALUE_BOUND: Final = SINGULARITY_BOUND
-"""Singular values of the balance below this part of the largest count as zero."""
+"""Singular values of the balance below this fraction of the largest count as zero."""
 MIN_FULL_RANK_CONDITION: Final = 1e-6
 """Reciprocal condition above which the rank is full without singular values."""
 DETERMINATE_BOUND: Final = 1e-6
-"""A component is determinate where no unit vector of the null space reaches beyond this."""
+"""Largest entry of a determinate component in the unit vectors of the null space."""
 BALANCE_BOUND: Final = 1e-6
-"""Largest part of the loads that may stay unbalanced before there is no equilibrium."""
+"""Largest imbalance, relative to the loads, of an equilibrium."""
 
 
 @dataclass(frozen=True)
@@ -364,10 +364,10 @@ def least_norm_reactions(
 def balance(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: ArrayLike | None = None) -> Balance:
     """Solve the balances of a motion; arguments and errors as :func:`reactions`."""
     load = np.zeros(6) if wrench is None else wrench
-    loads = robot.evaluate(loads_kernel(robot), q, qd, qdd, load, p=robot.inertial)
+    loads = robot.evaluate(needed_wrench_kernel(robot), q, qd, qdd, load, p=robot.inertial)
     found = solve_balances(robot, loads)
     if robot.redundant:
-        efforts = robot.evaluate(body_efforts(robot), q, qd, qdd, load, p=robot.inertial)[0]
+        efforts = robot.evaluate(body_effort_kernel(robot), q, qd, qdd, load, p=robot.inertial)[0]
         # Balances with the given efforts (..., n) of a redundant machine's drives.
         names = [joint.actuated for joint in found.joints if joint.actuated is not None]
         rows = [found.components.index(name) for name in names]
@@ -385,7 +385,7 @@ def balance(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench: A
 
 
 def solve_balances(robot: Robot, loads: Sequence[Array], *, strict: bool = True) -> Balance:
-    """Solve the balances of the loads of :func:`loads_kernel`, also of variants of the robot.
+    """Solve the balances of the loads of :func:`needed_wrench_kernel`, also of variants of the robot.
 
     :param strict: raise if a sample has no equilibrium; without it ``residual`` exceeds
         ``BALANCE_BOUND`` there.
@@ -422,8 +422,8 @@ def solve_balances(robot: Robot, loads: Sequence[Array], *, strict: bool = True)
     )
 
 
-def loads_kernel(robot: Robot) -> Kernel:
-    """Return the program from a motion and a wrench to the needed wrenches and the joints' places.
+def needed_wrench_kernel(robot: Robot) -> Kernel:
+    """Return the program from a motion and a wrench to the bodies' required wrenches and positions.
 
     :raises ParameterError: a robot without masses.
     """
@@ -445,10 +445,10 @@ def _write_positions_and_wrenches(t: Traced) -> Program:
     motion, graph = t.motion, t.graph
     forces = Forces(motion)
     # Rods are separate bodies here, so add only the other bodies.
-    for name, ten in zip(t.tree.links, bodies, strict=True):
-        forces.body(name, ten)
-    forces.passive(passive)
-    forces.wrench(t.tape.inputs("wrench", 6))
+    for name, inertial in zip(t.tree.links, bodies, strict=True):
+        forces.add_body(name, inertial)
+    forces.add_passive_joints(passive)
+    forces.subtract_wrench(t.tape.inputs("wrench", 6))
     body_rows: list[Any] = []
     for name in t.tree.links:
         body_rows += [*motion.origin[name], *forces.force[name], *forces.moment[name]]

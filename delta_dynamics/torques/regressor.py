@@ -42,7 +42,7 @@ The linear parameters of other friction laws follow after those of all drives.
 """
 PAYLOAD: Final = "payload"
 WRENCH: Final = "wrench"
-"""Name of the last column: the share of the given wrench, whose value is 1."""
+"""Name of the last column: efforts due to the external wrench; the value of its parameter is 1."""
 
 
 def parameter_names(robot: Robot) -> tuple[str, ...]:
@@ -232,10 +232,10 @@ def _write_regressor(t: Traced) -> Program:
     for joint in list_loaded_joints(graph):
         for three in np.eye(3):
             forces = Forces(motion)
-            forces.joint(joint, three)
+            forces.add_passive_joint(joint, three)
             add_powers(forces, joint.inner, joint.outer)
     forces = Forces(motion)
-    forces.wrench(wrench)
+    forces.subtract_wrench(wrench)
     add_powers(forces, graph.platform)
     others = [column[j] for j in range(n) for column in columns]
     sizes = {"q": n, "qd": n, "qdd": n, "wrench": 6}

@@ -41,7 +41,7 @@ def friction_reach(robot: Robot) -> Array:
         back = np.array([inverse_dynamics(robot, q, -row, still) for row in rows])
         return np.asarray(np.diag(ahead - back) / 2.0, np.float64)
 
-    # Viscous friction doubles with the rates. Below a part of 1e-9 the rest is rounding.
+    # Viscous friction doubles with the rates; a remainder below 1e-9 of the effort is rounding.
     reach = 2.0 * odd_part(SIGN_RATE) - odd_part(2.0 * SIGN_RATE)
     return np.where(reach > 1e-9 * (1.0 + size), reach, 0.0)
 

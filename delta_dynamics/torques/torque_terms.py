@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from delta_dynamics.torques.virtual_work import torques
+from delta_dynamics.torques.virtual_work import torque_kernel
 from pkm_twin.codegen.arrays import Array, Indices, common_batch, vectors
 from pkm_twin.machine.inertia import GRAVITY, Layout
 from pkm_twin.robot.robot import Robot
@@ -51,7 +51,7 @@ def efforts_without_friction(
     p = _zero_inputs(robot.inertial, layout.friction)
     if not weight:
         p = _zero_inputs(p, layout.part(GRAVITY))
-    return robot.evaluate(torques(robot), q, qd, qdd, np.zeros(6), p=p)[0]
+    return robot.evaluate(torque_kernel(robot), q, qd, qdd, np.zeros(6), p=p)[0]
 
 
 def _zero_inputs(p: Array, part: slice | Indices) -> Array:
@@ -72,7 +72,7 @@ def dynamics_terms(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wr
     :returns: the terms, each of the common batch shape; parameters and errors as of
         :func:`~delta_dynamics.inverse_dynamics`.
     """
-    kernel = torques(robot)
+    kernel = torque_kernel(robot)
     load = np.zeros(6) if wrench is None else vectors(wrench, 6, "the wrench")
     n = robot.joints_count
     given = (q, "joint positions"), (qd, "joint rates"), (qdd, "joint accelerations")

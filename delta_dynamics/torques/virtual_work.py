@@ -61,11 +61,11 @@ def inverse_dynamics(
     """
     load = _NO_WRENCH if wrench is None else wrench
     if base is not None:
-        return robot.function(moving_torques, robot.inertial)(q, qd, qdd, load, base)
-    return robot.function(torques, robot.inertial)(q, qd, qdd, load)
+        return robot.function(moving_base_torque_kernel, robot.inertial)(q, qd, qdd, load, base)
+    return robot.function(torque_kernel, robot.inertial)(q, qd, qdd, load)
 
 
-def torques(robot: Robot) -> Kernel:
+def torque_kernel(robot: Robot) -> Kernel:
     """Return the program of :func:`inverse_dynamics`: q, qd, qdd and wrench to efforts.
 
     :raises ParameterError: a robot whose file gives no masses.
@@ -73,7 +73,7 @@ def torques(robot: Robot) -> Kernel:
     return robot.massive().kernel("torques", torque_program)
 
 
-def moving_torques(robot: Robot) -> Kernel:
+def moving_base_torque_kernel(robot: Robot) -> Kernel:
     """Return the program of :func:`inverse_dynamics` with the motion of the base as last input.
 
     :raises ParameterError: a robot whose file gives no masses.
@@ -81,18 +81,18 @@ def moving_torques(robot: Robot) -> Kernel:
     return robot.massive().kernel("moving torques", partial(torque_program, base=9))
 
 
-def stream_torques(robot: Robot) -> Kernel:
-    """Return the program of a stream's efforts, see :mod:`pkm_twin.kinematics.stream`."""
+def stream_torque_kernel(robot: Robot) -> Kernel:
+    """Return the program of :func:`inverse_dynamics` that starts from a stream's last sample."""
     return robot.massive().kernel("stream torques", lambda t: start_from_last(t, torque_program(t)))
 
 
 def mass_matrix(robot: Robot, q: ArrayLike) -> Array:
     """Compute the mass matrix on the actuated joints, payload included, shape (..., n, n)."""
     # The cached function is fast for one sample: a simulation evaluates it several thousand times a second.
-    return _reshape_to_rows(robot, robot.function(masses_kernel, robot.inertial)(q))
+    return _reshape_to_rows(robot, robot.function(mass_matrix_kernel, robot.inertial)(q))
 
 
-def masses_kernel(robot: Robot) -> Kernel:
+def mass_matrix_kernel(robot: Robot) -> Kernel:
     """Return the program of :func:`mass_matrix`: q to its entries, row by row."""
     return robot.massive().kernel("mass matrix", _write_mass_matrix)
 
@@ -107,7 +107,7 @@ def body_mass_matrix(robot: Robot, q: ArrayLike, body: str) -> Array:
     """Return one body's part of the mass matrix, (..., n, n); the platform's with payload."""
     p, where = np.zeros_like(robot.inertial), Layout(robot.massive().tree).body(body)
     p[where] = robot.inertial[where]
-    return _reshape_to_rows(robot, robot.evaluate(masses_kernel(robot), q, p=p)[0])
+    return _reshape_to_rows(robot, robot.evaluate(mass_matrix_kernel(robot), q, p=p)[0])
 
 
 def forward_dynamics(
@@ -122,12 +122,12 @@ def forward_dynamics(
 
     def evaluate_checked(q: ArrayLike, qd: ArrayLike, tau: ArrayLike, load: ArrayLike) -> Array:
         efforts = vectors(tau, robot.joints_count, "efforts")
-        return robot.evaluate(accelerations(robot), q, qd, efforts, load, p=robot.inertial)[0]
+        return robot.evaluate(acceleration_kernel(robot), q, qd, efforts, load, p=robot.inertial)[0]
 
-    return robot.function(accelerations, robot.inertial, evaluate_checked)(q, qd, tau, load)
+    return robot.function(acceleration_kernel, robot.inertial, evaluate_checked)(q, qd, tau, load)
 
 
-def accelerations(robot: Robot) -> Kernel:
+def acceleration_kernel(robot: Robot) -> Kernel:
     """Return the program of :func:`forward_dynamics`: q, qd, efforts and wrench to qdd."""
     return robot.massive().kernel("accelerations", _write_accelerations)
 
@@ -155,7 +155,7 @@ def energy(robot: Robot, q: ArrayLike, qd: ArrayLike) -> Energy:
 class Forces:
     """The force and moment that each body needs at its origin, base axes: minus Q of the papers.
 
-    :meth:`generalised` sums up their virtual work (Delta-CU paper, step 4, equation 22).
+    :meth:`generalised_forces` sums up their virtual work (Delta-CU paper, step 4, equation 22).
     """
 
     def __init__(self, motion: Motion) -> None:
@@ -164,34 +164,34 @@ class Forces:
         self.force: dict[str, Any] = {name: np.zeros(3) for name in names}
         self.moment: dict[str, Any] = {name: np.zeros(3) for name in names}
 
-    def push(self, body: str, point: Array, force: Any) -> None:
+    def add_force(self, body: str, point: Array, force: Any) -> None:
         """Add a needed force at a point of a body, given at home."""
         self.force[body] = self.force[body] + force
         self.moment[body] = self.moment[body] + cross(self.motion.arm(body, point), force)
 
-    def inertia(self, bodies: Objects, rods: Objects) -> None:
+    def add_inertia(self, bodies: Objects, rods: Objects) -> None:
         """Add Newton's and Euler's laws, for the motion's accelerations (less gravity).
 
         These are minus the 3-PRRU paper's Q_M, Q_S and Q_Hij (equations 32 to 37). Couples of
         bodies that share a rotation act on the first of them: generalised efforts are the same.
-        For reactions take :meth:`body` of each.
+        For reactions take :meth:`add_body` of each.
         """
-        for name, ten in zip(self.motion.tree.links, bodies, strict=True):
-            self._add_newton(name, ten)
-        for name, matrix in self._couples(bodies):
+        for name, inertial in zip(self.motion.tree.links, bodies, strict=True):
+            self._add_newton(name, inertial)
+        for name, matrix in self._sum_inertias(bodies):
             self._add_euler(name, matrix)
         for mass, rod in zip(rods, self.motion.graph.rods.values(), strict=True):
             self.add_rod(rod, mass)
 
-    def body(self, name: str, ten: Objects) -> None:
-        """Add the force and moment that the acceleration of one body needs."""
-        self._add_newton(name, ten)
-        self._add_euler(name, _inertia_matrix(ten))
+    def add_body(self, name: str, inertial: Objects) -> None:
+        """Add the force and moment that one body's acceleration requires."""
+        self._add_newton(name, inertial)
+        self._add_euler(name, _inertia_matrix(inertial))
 
-    def _add_newton(self, name: str, ten: Objects) -> None:
-        """Add m (a - g) of the origin and the first moment h's parts: spin h, and h x (a - g)."""
-        m, mass = self.motion, ten[0]
-        h = m.rotation[name] @ ten[1:4]
+    def _add_newton(self, name: str, inertial: Objects) -> None:
+        """Add the force m (a - g) + alpha x h + omega x (omega x h) and the moment h x (a - g)."""
+        m, mass = self.motion, inertial[0]
+        h = m.rotation[name] @ inertial[1:4]
         self.force[name] = self.force[name] + m.origin_acceleration[name] * mass + m.acceleration_matrix(name) @ h
         self.moment[name] = self.moment[name] + cross(h, m.origin_acceleration[name])
 
@@ -201,13 +201,13 @@ class Forces:
         omega, alpha = turned.T @ m.omega[name], turned.T @ m.alpha[name]
         self.moment[name] = self.moment[name] + turned @ (inertia @ alpha + cross(omega, inertia @ omega))
 
-    def _couples(self, bodies: Objects) -> list[tuple[str, Objects]]:
+    def _sum_inertias(self, bodies: Objects) -> list[tuple[str, Objects]]:
         """Return inertia matrices about the origins, summed over bodies with the same rotation."""
         first: dict[int, str] = {}
         found: dict[str, Objects] = {}
-        for name, ten in zip(self.motion.tree.links, bodies, strict=True):
+        for name, inertial in zip(self.motion.tree.links, bodies, strict=True):
             lead = first.setdefault(id(self.motion.rotation[name]), name)
-            inertia = _inertia_matrix(ten)
+            inertia = _inertia_matrix(inertial)
             found[lead] = found[lead] + inertia if lead in found else inertia
         return list(found.items())
 
@@ -222,42 +222,42 @@ class Forces:
     def _share_ends(self, rod: Rod, mass: Any, motion: Callable[[str, Array], Any]) -> None:
         a, b = motion(rod.inner, rod.ends[0]), motion(rod.outer, rod.ends[1])
         sixth = mass * (1.0 / 6.0)
-        self.push(rod.inner, rod.ends[0], sixth * (2.0 * a + b))
-        self.push(rod.outer, rod.ends[1], sixth * (a + 2.0 * b))
+        self.add_force(rod.inner, rod.ends[0], sixth * (2.0 * a + b))
+        self.add_force(rod.outer, rod.ends[1], sixth * (a + 2.0 * b))
 
-    def momenta(self, bodies: Objects, rods: Objects) -> None:
+    def add_momenta(self, bodies: Objects, rods: Objects) -> None:
         """Add the momenta of the motion's velocities in place of forces."""
         m = self.motion
-        for name, ten in zip(m.tree.links, bodies, strict=True):
-            first = m.rotation[name] @ ten[1:4]
+        for name, inertial in zip(m.tree.links, bodies, strict=True):
+            first = m.rotation[name] @ inertial[1:4]
             w, v = m.omega[name], m.origin_velocity[name]
-            self.force[name] = self.force[name] + v * ten[0] + cross(w, first)
+            self.force[name] = self.force[name] + v * inertial[0] + cross(w, first)
             self.moment[name] = self.moment[name] + cross(first, v)
-        for name, matrix in self._couples(bodies):
+        for name, matrix in self._sum_inertias(bodies):
             turned = m.rotation[name]
             spin = turned @ (matrix @ (turned.T @ m.omega[name]))
             self.moment[name] = self.moment[name] + spin
         for mass, rod in zip(rods, m.graph.rods.values(), strict=True):
             self._share_ends(rod, mass, m.velocity)
 
-    def passive(self, values: Objects) -> None:
+    def add_passive_joints(self, values: Objects) -> None:
         """Add friction and rotor inertia of passive joints, three numbers per joint."""
         for k, joint in enumerate(list_loaded_joints(self.motion.graph)):
-            self.joint(joint, values[3 * k : 3 * k + 3])
+            self.add_passive_joint(joint, values[3 * k : 3 * k + 3])
 
-    def joint(self, joint: Joint, three: Numbers) -> None:
+    def add_passive_joint(self, joint: Joint, three: Numbers) -> None:
         """Add viscous friction, Coulomb friction and rotor inertia of one joint."""
         viscous, coulomb, rotor = three
-        rate, second = self.relative(joint, accelerated=True)
-        self.pair(joint, viscous * rate + coulomb * sign(rate) + rotor * second)
+        rate, second = self.relative_motion(joint, accelerated=True)
+        self.add_joint_effort(joint, viscous * rate + coulomb * sign(rate) + rotor * second)
 
-    def passive_momenta(self, values: Objects) -> None:
+    def add_passive_momenta(self, values: Objects) -> None:
         """Add the momenta of the passive joints' rotors."""
         for k, joint in enumerate(list_loaded_joints(self.motion.graph)):
-            self.pair(joint, values[3 * k + 2] * self.relative(joint, accelerated=False)[0])
+            self.add_joint_effort(joint, values[3 * k + 2] * self.relative_motion(joint, accelerated=False)[0])
 
-    def relative(self, joint: Joint, *, accelerated: bool) -> tuple[Any, Any]:
-        """Return rate and acceleration of a passive joint, of its outer body against its inner one."""
+    def relative_motion(self, joint: Joint, *, accelerated: bool) -> tuple[Any, Any]:
+        """Return the rate and acceleration of a passive joint of one freedom."""
         m, a, b = self.motion, joint.inner, joint.outer
         axis = m.direction(a, joint.axes[0])
         second: Any = 0.0
@@ -272,8 +272,8 @@ class Forces:
             second = axis @ (m.acceleration(b, joint.at) - carried)
         return axis @ (m.velocity(b, joint.at) - m.origin_velocity[a] - cross(m.omega[a], lever)), second
 
-    def pair(self, joint: Joint, amount: Any) -> None:
-        """Add an effort along a joint's freedom on its outer body, the reaction on the inner."""
+    def add_joint_effort(self, joint: Joint, amount: Any) -> None:
+        """Add an effort along a joint's freedom to its outer body, and the reaction to the inner."""
         m, a, b = self.motion, joint.inner, joint.outer
         load = m.direction(a, joint.axes[0]) * amount
         if not joint.slides:
@@ -285,17 +285,17 @@ class Forces:
             self.force[body] = self.force[body] + force
             self.moment[body] = self.moment[body] + cross(at - m.origin[body], force)
 
-    def wrench(self, six: Objects) -> None:
+    def subtract_wrench(self, six: Objects) -> None:
         """Subtract a wrench that acts on the platform at its reference point."""
         graph = self.motion.graph
-        self.push(graph.platform, graph.origin, -six[:3])
+        self.add_force(graph.platform, graph.origin, -six[:3])
         self.moment[graph.platform] = self.moment[graph.platform] - six[3:]
 
-    def generalised(self) -> tuple[Objects, Objects]:
-        """Return the generalised forces on the unknown rates and on the drives, down the tree.
+    def generalised_forces(self) -> tuple[Objects, Objects]:
+        """Return the generalised forces on the unknown rates and on the drives.
 
-        The power of all needed forces per rate, minus the sum of J_M' Q_M, J' Q_S and J_Hij' Q_Hij
-        (3-PRRU paper, equations 38 and 39; Delta-CU paper, equation 22).
+        They are the power of all required forces per rate: minus the sum of J_M' Q_M, J' Q_S and
+        J_Hij' Q_Hij (3-PRRU paper, equations 38 and 39; Delta-CU paper, equation 22).
         """
         m, tree = self.motion, self.motion.tree
         unknown = np.zeros(tree.unknown_rates, dtype=object)
@@ -325,13 +325,13 @@ class Forces:
         return unknown, driven
 
 
-def _inertia_matrix(ten: Objects) -> Objects:
-    xx, yy, zz, xy, xz, yz = ten[4:]
+def _inertia_matrix(inertial: Objects) -> Objects:
+    xx, yy, zz, xy, xz, yz = inertial[4:]
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]], dtype=object)
 
 
 def solve_and_split(t: Traced) -> tuple[Layout, list[Objects]]:
-    """Solve the closures; return the layout of the run-time inputs, and its parts."""
+    """Solve the closures; return the layout of the parameter vector, and its parts as inputs."""
     t.solve()
     layout = Layout(t.tree)
     return layout, layout.split(t.tape.inputs(PARAMETERS, layout.size))
@@ -340,10 +340,10 @@ def solve_and_split(t: Traced) -> tuple[Layout, list[Objects]]:
 def efforts_of_motion(
     t: Traced, parts: list[Objects], qd: Objects, qdd: Objects, base: Objects | None = None
 ) -> tuple[list[Any], list[Any]]:
-    """Write the efforts of a motion under the input ``wrench``, of the leading drives.
+    """Write the leading drives' efforts for a motion under the input ``wrench``.
 
     :param base: motion of the base, shape (9,); None: at rest.
-    :returns: efforts of the leading drives, and the part of friction and rotor of all, shape (n,).
+    :returns: efforts of the leading drives, and friction and rotor efforts of all drives, (n,).
     """
     f_d = driving_forces(t, parts, qd, qdd, base)
     rates, changes = t.tree.drive_rates(qd, t.u), t.tree.drive_rates(qdd, t.du)
@@ -353,10 +353,10 @@ def efforts_of_motion(
 def add_friction_and_rotors(
     t: Traced, parts: list[Objects], loads: Numbers, q: Numbers, rates: Numbers, changes: Numbers
 ) -> tuple[list[Any], list[Any]]:
-    """Add the drives' own friction and rotors to the loads of the leading drives.
+    """Add friction and rotor efforts of the drives to the loads of the leading drives.
 
-    :param q: positions of all drives, shape (n,), with ``rates`` and ``changes`` (accelerations).
-    :returns: efforts of the leading drives, and the part of friction and rotor of all, shape (n,).
+    :param q: positions of all drives, shape (n,), with ``rates`` and accelerations ``changes``.
+    :returns: efforts of the leading drives, and friction and rotor efforts of all drives, (n,).
     """
     rotors = [rotor * change for rotor, change in zip(parts[ROTORS_PART], changes, strict=True)]
     basic = _basic_friction(parts, rates)
@@ -370,19 +370,19 @@ def add_friction_and_rotors(
 
 
 def _basic_friction(parts: list[Objects], qd: Numbers) -> list[Any]:
-    """Return viscous and Coulomb friction and the constant effort of each drive."""
+    """Return each drive's viscous friction, Coulomb friction and constant effort, added up."""
     rows = zip(*parts[3:6], qd, strict=True)
     return [viscous * v + coulomb * sign(v) + offset for viscous, coulomb, offset, v in rows]
 
 
 def _friction_law_parameters(t: Traced, parts: list[Objects]) -> list[dict[str, Any]]:
-    """Return the parameters of each drive's friction laws beyond viscous and Coulomb; an empty list without."""
+    """Return the parameters of each drive's named friction laws; empty if there are no such laws."""
     laws = Layout(t.tree).laws(parts[LAWS_PART])
     return [{key: v[k] for key, v in laws.items()} for k in range(t.drives.count if laws else 0)]
 
 
 def driving_forces(t: Traced, parts: list[Objects], qd: Objects, qdd: Objects, base: Objects | None = None) -> Objects:
-    """Write F_d, the efforts without the drives' friction and rotors, shape (m,).
+    """Write F_d, the leading drives' efforts without friction and rotors of the drives, shape (m,).
 
     :param base: motion of the base, shape (9,); None: at rest.
     """
@@ -392,24 +392,24 @@ def driving_forces(t: Traced, parts: list[Objects], qd: Objects, qdd: Objects, b
     moving = BaseMotion.at_rest(gravity) if base is None else BaseMotion(*base.reshape(3, 3))
     t.set_accelerations(qdd, moving)
     forces = Forces(t.motion)
-    forces.inertia(bodies, rods)
-    forces.passive(passive)
-    forces.wrench(wrench)
+    forces.add_inertia(bodies, rods)
+    forces.add_passive_joints(passive)
+    forces.subtract_wrench(wrench)
     # Virtual work: F_d = -J^-T (J_M' Q_M + sum of J_Hij' Q_Hij) - Q_S (3-PRRU paper, equations 40 and 41;
     # equivalent to equation 23 of the Delta-CU paper). With constraints K u + J qd = 0 on the dependent
-    # rates u, the map -J^-T to joint efforts is J' K^-T. generalised() returns -Q, so the signs are reversed.
-    minus_q, minus_q_s = forces.generalised()
+    # rates u, the map -J^-T to joint efforts is J' K^-T. generalised_forces() returns -Q, so the signs are reversed.
+    minus_q, minus_q_s = forces.generalised_forces()
     f_d: Objects = minus_q_s - t.jq[t.scheme.independent].T @ t.lu.solve_transposed(minus_q)
     return f_d
 
 
-def body_efforts(robot: Robot) -> Kernel:
-    """Return the program of the efforts that act on the bodies, without friction and rotors."""
+def body_effort_kernel(robot: Robot) -> Kernel:
+    """Return the program of the drives' efforts on the bodies, without their friction and rotors."""
     return robot.massive().kernel("body efforts", partial(torque_program, on_bodies=True))
 
 
 def torque_program(t: Traced, *, on_bodies: bool = False, base: int = 0) -> Program:
-    """Write the program of :func:`torques`.
+    """Write the program of :func:`torque_kernel`.
 
     :param on_bodies: without friction and rotors of the drives.
     :param base: size of the input with the motion of the base.
@@ -433,25 +433,26 @@ def _write_accelerations(t: Traced) -> Program:
 
 
 def solve_leading_accelerations(t: Traced, parts: list[Objects], qd: Objects, tau: Objects) -> list[Any]:
-    """Solve for the accelerations of the leading (independent) drives under all drives' efforts and a wrench.
+    """Solve for the leading drives' accelerations under efforts of all drives and a wrench.
 
-    Afterwards the dependent coordinates of ``t`` have the accelerations that belong to zero
-    accelerations of the drives, not to the result.
+    Afterwards the dependent coordinates of ``t`` have the accelerations of drives at constant rates,
+    not those of the result.
     """
     driving, still = t.drives.leading_efforts([*tau]), np.zeros(t.joints)
     loads = driving_forces(t, parts, qd, still)
     q, rates, changes = t.drives.variables("q"), t.tree.drive_rates(qd, t.u), t.tree.drive_rates(still, t.du)
-    rest = remaining_efforts(t, parts, driving, loads, q, rates, changes)
+    rest = efforts_for_acceleration(t, parts, driving, loads, q, rates, changes)
     return solve_accelerations(np.reshape(mass_entries(t, parts), (t.joints, t.joints)), rest)
 
 
-def remaining_efforts(
+def efforts_for_acceleration(
     t: Traced, parts: list[Objects], driving: Numbers, loads: Numbers, q: Numbers, rates: Numbers, changes: Numbers
 ) -> Objects:
-    """Return the leading drives' efforts that remain for accelerations.
+    """Return the leading drives' efforts minus loads and friction, which accelerate the machine.
 
-    :param loads: efforts that bodies take at accelerations ``changes`` of all drives, (n,); ``q``
-        and ``rates``: positions and rates of all drives.
+    :param driving: applied efforts of the leading drives. ``loads``: efforts that the bodies require
+        at the accelerations ``changes`` of all drives, (n,).
+    :param q: positions of all drives, with ``rates``.
     """
     rest: Objects = np.array(driving) - add_friction_and_rotors(t, parts, loads, q, rates, changes)[0]
     laws = _friction_law_parameters(t, parts)
@@ -479,7 +480,7 @@ def solve_accelerations(mass: Objects, rest: Objects) -> list[Any]:
 def mass_entries(t: Traced, parts: list[Objects], visit: Callable[[Forces], None] | None = None) -> list[Any]:
     """Write the entries of the leading drives' mass matrix, row by row.
 
-    :param visit: called once a joint, while that joint alone moves, at rate one.
+    :param visit: called for each leading joint while this joint alone moves, at rate one.
     """
     bodies, rods, *_, rotors, passive = parts
     columns = t.rate_columns()
@@ -491,9 +492,9 @@ def mass_entries(t: Traced, parts: list[Objects], visit: Callable[[Forces], None
         forces = Forces(t.motion)
         if visit is not None:
             visit(forces)
-        forces.momenta(bodies, rods)
-        forces.passive_momenta(passive)
-        unknown, driven = forces.generalised()
+        forces.add_momenta(bodies, rods)
+        forces.add_passive_momenta(passive)
+        unknown, driven = forces.generalised_forces()
         for k in range(j + 1):
             value = driven[k] + columns[k] @ unknown
             if j == k:
@@ -515,8 +516,8 @@ def potential(t: Traced, bodies: Objects, rods: Objects, gravity: Objects) -> An
     """Write the potential energy, zero at the base's origin."""
     motion = t.motion
     weighted: Any = np.zeros(3)
-    for name, ten in zip(t.tree.links, bodies, strict=True):
-        weighted = weighted + motion.origin[name] * ten[0] + motion.rotation[name] @ ten[1:4]
+    for name, inertial in zip(t.tree.links, bodies, strict=True):
+        weighted = weighted + motion.origin[name] * inertial[0] + motion.rotation[name] @ inertial[1:4]
     for mass, rod in zip(rods, t.graph.rods.values(), strict=True):
         ends = motion.point(rod.inner, rod.ends[0]) + motion.point(rod.outer, rod.ends[1])
         weighted = weighted + ends * (mass * 0.5)
@@ -528,9 +529,9 @@ def _write_energy(t: Traced) -> Program:
     qd = t.drives.leading_inputs("qd")
     u = t.set_rates(qd)
     forces = Forces(t.motion)
-    forces.momenta(bodies, rods)
-    forces.passive_momenta(passive)
-    unknown, driven = forces.generalised()
+    forces.add_momenta(bodies, rods)
+    forces.add_passive_momenta(passive)
+    unknown, driven = forces.generalised_forces()
     rates = t.tree.drive_rates(qd, u)
     double = driven @ qd + u @ unknown
     double = double + sum((r * v * v for r, v in zip(rotors, rates, strict=True)), 0.0)
@@ -580,7 +581,7 @@ class TorqueLoop:
         """
         if samples < 1:
             raise ValueError(f"samples is {samples}; at least 1 is needed")
-        self._bound = BoundCall(torques(robot), robot.inertial, samples)
+        self._bound = BoundCall(torque_kernel(robot), robot.inertial, samples)
         self.q, self.qd, self.qdd, self.wrench = self._bound.inputs
         (self.tau,) = self._bound.outputs
         self.q[:] = robot.graph.home

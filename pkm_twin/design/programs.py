@@ -7,11 +7,10 @@ from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Final, Literal
 
-from delta_dynamics.torques.at_pose import iterated_pose_torques
+from delta_dynamics.torques.at_pose import iterated_pose_torque_kernel
 from delta_dynamics.torques.derivatives import motion_gradient_kernel, number_gradient_kernel
-from delta_dynamics.torques.reactions import loads_kernel
-from delta_dynamics.torques.virtual_work import masses_kernel
-from delta_dynamics.torques.virtual_work import torques as torques_kernel
+from delta_dynamics.torques.reactions import needed_wrench_kernel
+from delta_dynamics.torques.virtual_work import mass_matrix_kernel, torque_kernel
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.kinematics.gradients import free_forward, platform_gradient, pose_motion_gradient
 from pkm_twin.kinematics.singularity import compile_singularity_gradient
@@ -68,13 +67,13 @@ acceleration: Final = make_request(lambda robot: robot.engine.acceleration)
 """From q, qd, qdd to the pose's second derivative."""
 singularity: Final = make_request(lambda robot: robot.singularity_kernel())
 """From q to the singularity index."""
-torques: Final = make_request(torques_kernel, "masses", "geometry")
+torques: Final = make_request(torque_kernel, "masses", "geometry")
 """From q, qd, qdd and wrench to efforts."""
-torques_at_pose: Final = make_request(iterated_pose_torques, "masses", "geometry")
+torques_at_pose: Final = make_request(iterated_pose_torque_kernel, "masses", "geometry")
 """From pose, rate, acceleration and wrench to q, qd, qdd and efforts."""
-loads: Final = make_request(loads_kernel, "masses", "geometry")
+loads: Final = make_request(needed_wrench_kernel, "masses", "geometry")
 """From q, qd, qdd and wrench to the joints' loads and positions."""
-masses: Final = make_request(masses_kernel, "masses", "geometry")
+masses: Final = make_request(mass_matrix_kernel, "masses", "geometry")
 """From q to the mass matrix."""
 compliance: Final = make_request(lambda robot: robot.cached(Elastic).compliance, "geometry", "elasticity")
 """From q to the compliance and its frame's pivot ratio."""

@@ -12,16 +12,16 @@ from typing import Any
 
 import numpy as np
 
-from delta_dynamics.torques.at_pose import PoseKernel, pose_acceleration_kernel, pose_mass_kernel, pose_torques
+from delta_dynamics.torques.at_pose import PoseKernel, pose_acceleration_kernel, pose_mass_kernel, pose_torque_kernel
 from delta_dynamics.torques.equations import motion_kernel
 from delta_dynamics.torques.transmission import transmission_kernel
 from delta_dynamics.torques.virtual_work import (
-    accelerations,
-    masses_kernel,
-    moving_torques,
+    acceleration_kernel,
+    mass_matrix_kernel,
+    moving_base_torque_kernel,
     null_kernel,
-    stream_torques,
-    torques,
+    stream_torque_kernel,
+    torque_kernel,
 )
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import GEOMETRY, PARAMETERS, Expression, find_prepared
@@ -165,7 +165,7 @@ class Package:
                 "torques",
                 "Actuator efforts tau (N m or N) for a motion.",
                 rates | {"qdd": n} | wrench,
-                lambda: torques(robot),
+                lambda: torque_kernel(robot),
                 p,
                 tau="efforts",
             )
@@ -174,7 +174,7 @@ class Package:
                 "The efforts of _torques on a base that moves. base, in its own axes: angular "
                 "velocity, angular acceleration, and acceleration of its origin less gravity.",
                 rates | {"qdd": n} | wrench | {"base": 9},
-                lambda: moving_torques(robot),
+                lambda: moving_base_torque_kernel(robot),
                 p,
                 tau="efforts",
             )
@@ -182,7 +182,7 @@ class Package:
                 "torques_and_singularity",
                 "Both for the time of one: actuator efforts tau, and the singularity index.",
                 rates | {"qdd": n} | wrench,
-                [lambda: torques(robot), robot.singularity_kernel],
+                [lambda: torque_kernel(robot), robot.singularity_kernel],
                 p,
                 tau="efforts",
                 index="measure",
@@ -191,7 +191,7 @@ class Package:
                 "torques_next",
                 "The efforts of _torques",
                 rates | {"qdd": n} | wrench,
-                lambda: stream_torques(robot),
+                lambda: stream_torque_kernel(robot),
                 p,
                 "torques",
                 tau="efforts",
@@ -200,7 +200,7 @@ class Package:
                 "torques_and_singularity_next",
                 "The results of _torques_and_singularity",
                 rates | {"qdd": n} | wrench,
-                [lambda: stream_torques(robot), robot.singularity_kernel],
+                [lambda: stream_torque_kernel(robot), robot.singularity_kernel],
                 p,
                 "torques_and_singularity",
                 tau="efforts",
@@ -232,7 +232,7 @@ class Package:
                 "mass_matrix",
                 "Mass matrix of the actuated joints, row by row.",
                 q,
-                lambda: masses_kernel(robot),
+                lambda: mass_matrix_kernel(robot),
                 p,
                 m="matrix",
             )
@@ -240,7 +240,7 @@ class Package:
                 "accelerations",
                 "Joint accelerations that efforts tau cause.",
                 rates | {"tau": n} | wrench,
-                lambda: accelerations(robot),
+                lambda: acceleration_kernel(robot),
                 p,
                 "mass_matrix",
                 qdd="accelerations",
@@ -308,7 +308,7 @@ class Package:
                 "Joint motion q, qd, qdd and efforts tau for a motion of "
                 "the pose: its rate and acceleration are those of the pose's coordinates.",
                 motion | {"acceleration": self.m, "wrench": 6},
-                pose_torques,
+                pose_torque_kernel,
                 {name: name for name in ("q", "qd", "qdd", "tau")},
             ),
             (

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from delta_dynamics.torques.virtual_work import torques
+from delta_dynamics.torques.virtual_work import torque_kernel
 from pkm_twin import load, robot_names
 from pkm_twin.export.c_package import c_package
 from test.export.c_programs import Package
@@ -78,7 +78,7 @@ def built(package, n, compiler, *flags):
 def times(robot, package):
     """Nanoseconds of one torques call by build, and of the vector code's; in turns, medians."""
     q, qd, qdd, wrench = random_motion(robot, np.random.default_rng(0), SAMPLES)
-    kernel = torques(robot)
+    kernel = torque_kernel(robot)
     prepared, out = kernel.prepared(robot.inertial), np.zeros(8)
     words = [1, 1, 1, prepared.ctypes.data, 0]
     for array in (q, qd, qdd, wrench):

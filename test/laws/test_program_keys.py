@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from delta_dynamics.torques.reactions import loads_kernel
-from delta_dynamics.torques.virtual_work import torques
+from delta_dynamics.torques.reactions import needed_wrench_kernel
+from delta_dynamics.torques.virtual_work import torque_kernel
 from pkm_twin.codegen import key as keys
 from pkm_twin.codegen.key import EMPTY
 from stiffness_monitor.derivatives import compliance_gradient
@@ -24,8 +24,8 @@ def kernels(robot):
     found = {
         "forward": robot.engine.forward,
         "inverse": robot.engine.inverse,
-        "torques": torques(robot),
-        "loads": loads_kernel(robot),
+        "torques": torque_kernel(robot),
+        "loads": needed_wrench_kernel(robot),
     }
     if has(robot, "structure"):
         elastic = robot.cached(Elastic)

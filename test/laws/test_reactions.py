@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from delta_dynamics import inverse_dynamics, least_norm_reactions, reactions
-from delta_dynamics.torques.reactions import list_transmitters, loads_kernel
+from delta_dynamics.torques.reactions import list_transmitters, needed_wrench_kernel
 from pkm_twin.errors import SingularityError
 from test.support.bodies import bodies, rubs
 from test.support.robots import FREE, MASSIVE, load, loaded, massive, random_motion
@@ -144,7 +144,7 @@ def test_the_2upr_rpu_cannot_tell_how_its_three_limbs_share_a_twist():
 
 def balance(robot, motion):
     """What every component does to every body: shape (n, 6 bodies, components), base's origin."""
-    (_, rods, places), status = loads_kernel(robot)(robot.inertial, *motion)
+    (_, rods, places), status = needed_wrench_kernel(robot)(robot.inertial, *motion)
     assert status is None
     joints = list_transmitters(robot.graph, rods, places)
     names = list(dict.fromkeys(c for joint in joints for c in joint.components))
