@@ -90,7 +90,7 @@ def _write_terms(t: Traced) -> Program:
     """
     layout, parts = solve_and_split(t)
     bodies, rods, gravity, *_, passive = parts
-    n, graph, motion = t.joints, t.scheme.graph, t.motion
+    n, graph, motion = t.joints, t.graph, t.motion
     qd = t.tape.inputs("qd", n)
     t.set_rates(qd)
     t.set_accelerations(np.zeros(n), BaseMotion.at_rest(gravity))
