@@ -107,7 +107,7 @@ def test_planes_of_every_number_of_coordinates(name, tmp_path, monkeypatch):
         assert "circle" not in data
         assert data.sizes["plane"] == max(1, size * (size - 1) // 2)
         for figure in figures.draw(data).values():
-            assert 1 <= sum(bool(ax.get_xlabel()) for ax in figure.axes) <= figures.PANELS
+            assert 1 <= sum(bool(ax.get_xlabel()) for ax in figure.axes) <= figures.MAX_PANELS
             pyplot.close(figure)
         pytest.importorskip("plotly")
         assert "Plotly.newPlot" in write_page(data, tmp_path / "a.html").read_text()
