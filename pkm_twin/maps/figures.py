@@ -7,9 +7,11 @@ import math
 import re
 import textwrap
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import UnknownNameError
@@ -19,6 +21,7 @@ from pkm_twin.report import plots
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.collections import QuadMesh
     from matplotlib.figure import Figure
     from xarray import Dataset
 
@@ -171,32 +174,38 @@ def choose_colour_limits(values: Array, worst: float) -> tuple[float, float]:
     return low, high if high > low else low + (abs(low) or 1.0)
 
 
-def extract_plane(data: Dataset, case: int, plane: int) -> dict[str, Any]:
-    """Return a plane for drawing: names, units and ticks of its sides, and values.
+@dataclass(frozen=True, eq=False)
+class Plane:
+    """Hold a plane of a map for drawing: names, units and ticks of its sides, values and reach.
 
-    ``star``: position of the worst pose; None if it is not in the plane. ``held``: the other
-    coordinates.
+    ``star``: position of the worst pose; None if it is not in the plane. ``through``: a pose in the
+    plane, by coordinate; ``held``: its coordinates that are constant, in words.
     """
+
+    names: tuple[str, ...]
+    units: list[str]
+    ticks: list[Array]
+    values: Array
+    reach: NDArray[np.int8]
+    star: list[float] | None
+    through: dict[str, float]
+    held: str
+
+
+def extract_plane(data: Dataset, case: int, plane: int) -> Plane:
+    """Return a plane of a case for drawing."""
     part, units = data.isel(case=case, plane=plane), list_units(data)
     names = tuple(n for n in (str(part.row_name.values), str(part.column_name.values)) if n)
     sides = [part.row_value.values, part.column_value.values]
     pose, through = part.worst_pose.values, part.through.values
     every = [str(name) for name in data.coordinate.values]
-    at = {n: through[every.index(n)] for n in every}
+    at = {n: float(through[every.index(n)]) for n in every}
     held = [f"{n} = {_drop_noise(at[n]):.4g} {units[n]}" for n in every if n not in names]
     star = None
     if np.isfinite(pose).all() and np.allclose(pose, through, rtol=0.0, atol=1e-12):
         star = [at[n] for n in names]
-    return {
-        "names": names,
-        "units": [units[n] for n in names],
-        "ticks": sides[: len(names)],
-        "values": part.plane_value.values,
-        "reach": part.plane_reach.values,
-        "star": star,
-        "through": at,
-        "held": ", ".join(held),
-    }
+    values, reach = part.plane_value.values, part.plane_reach.values
+    return Plane(names, [units[n] for n in names], sides[: len(names)], values, reach, star, at, ", ".join(held))
 
 
 def full_planes(data: Dataset, case: int) -> list[int]:
@@ -210,9 +219,9 @@ def planes(data: Dataset, case: int) -> Figure:
     """Draw up to three planes of a case through its worst pose, with one colour scale."""
     kind, part = find_kind(data), data.isel(case=case)
     drawn = [extract_plane(data, case, k) for k in sorted(full_planes(data, case)[:MAX_PANELS])]
-    count, flat = len(drawn), len(drawn[0]["names"]) > 1
+    count, flat = len(drawn), len(drawn[0].names) > 1
     worst = float(part.worst_value)
-    values = np.concatenate([one["values"].ravel() for one in drawn])
+    values = np.concatenate([one.values.ravel() for one in drawn])
     low, high = choose_colour_limits(values, worst)
     beyond = bool((np.append(values, worst) > high).any())
     scale, unit = choose_prefix(max(abs(low), abs(high)), str(part.case_unit.values))
@@ -221,43 +230,43 @@ def planes(data: Dataset, case: int) -> Figure:
     height, widths = 0.5 * plots.WIDTH, [1.0] * count
     if count == MAX_PANELS:
         height = plots.WIDTH / MAX_PANELS + 0.9
-    elif count == 1 and flat and len(set(drawn[0]["units"])) == 1:
-        across, up = map(np.ptp, drawn[0]["ticks"])
+    elif count == 1 and flat and len(set(drawn[0].units)) == 1:
+        across, up = map(np.ptp, drawn[0].ticks)
         height = float(np.clip(0.8 * plots.WIDTH * up / across, 3.0, 0.7 * plots.WIDTH) + 0.6)
-    if count > 1 and len({unit for one in drawn for unit in one["units"]}) == 1:
-        spans = np.array([np.ptp(one["ticks"][0]) for one in drawn])
+    if count > 1 and len({unit for one in drawn for unit in one.units}) == 1:
+        spans = np.array([np.ptp(one.ticks[0]) for one in drawn])
         widths = np.clip(spans / spans.max(), 0.5, 1.0).tolist()
     with plots.pyplot().rc_context({"font.size": 9}):
         figure, columns = plots.make_subplots(count, 1, height, gridspec_kw={"width_ratios": widths})
         axes, over = [column[0] for column in columns], ""
         for one, ax in zip(drawn, axes, strict=True):
             if not flat:
-                ax.plot(one["ticks"][0], scale * one["values"][:, 0], color=plots.COLOURS[0])
-                plots.label(ax, f"{one['names'][0]} ({one['units'][0]})", label)
-                if one["star"]:
-                    k = int(np.abs(one["ticks"][0] - one["star"][0]).argmin())
-                    ax.plot(one["star"][0], scale * one["values"][k, 0], "*", color="red", ms=12)
+                ax.plot(one.ticks[0], scale * one.values[:, 0], color=plots.COLOURS[0])
+                plots.label(ax, f"{one.names[0]} ({one.units[0]})", label)
+                if one.star:
+                    k = int(np.abs(one.ticks[0] - one.star[0]).argmin())
+                    ax.plot(one.star[0], scale * one.values[k, 0], "*", color="red", ms=12)
                 continue
             # Contours at fewer quantiles in a full row of panels.
             quantiles = (0.25, 0.6, 0.9) if count < MAX_PANELS else (0.35, 0.85)
             mesh = draw_panel(one, ax, scale, scale * low, scale * high, quantiles)
-            over = kind.overlay(data, one["names"], one["through"], ax)
+            over = kind.overlay(data, one.names, one.through, ax)
         if flat:
             bar = figure.colorbar(mesh, ax=axes, aspect=25, pad=0.01, extend="max" if beyond else "neither")
             bar.set_label(label)
         rows = plots.write_title(figure, "\n".join(title(data, case)), 10)
         figure.set_figheight(height + 0.2 * rows)
-        star = "star: worst pose; " if any(one["star"] for one in drawn) else ""
+        star = "star: worst pose; " if any(one.star for one in drawn) else ""
         more = "; brightest: this or more" if beyond else ""
         caption = f"{star}outline: joint limits; white: does not count{more}{over}"
         figure.supxlabel(caption, fontsize=8.5, color="0.3")
     return figure
 
 
-def draw_panel(one: dict[str, Any], ax: Axes, scale: float, low: float, high: float, shares: Sequence[float]) -> Any:
+def draw_panel(one: Plane, ax: Axes, scale: float, low: float, high: float, shares: Sequence[float]) -> QuadMesh:
     """Draw a plane of :func:`extract_plane`, with contours at quantiles of its values."""
-    x, y = one["ticks"]
-    values = scale * one["values"].T
+    x, y = one.ticks
+    values = scale * one.values.T
     mesh = ax.pcolormesh(
         x,
         y,
@@ -268,23 +277,23 @@ def draw_panel(one: dict[str, Any], ax: Axes, scale: float, low: float, high: fl
         vmax=high,
         rasterized=True,
     )
-    if one["reach"].any() and not one["reach"].all():
-        ax.contour(x, y, one["reach"].T, [0.5], colors="0.2", linewidths=1.2)
+    if one.reach.any() and not one.reach.all():
+        ax.contour(x, y, one.reach.T, [0.5], colors="0.2", linewidths=1.2)
     known = values[np.isfinite(values)]
     if len(known) > values.size // 6 and np.ptp(known) > 0.02 * (high - low):
         levels = np.unique([float(f"{v:.2g}") for v in np.quantile(known, shares)])
         contours = ax.contour(x, y, values, levels, colors="white", linewidths=0.7)
         for text in ax.clabel(contours, fmt="%.3g", fontsize=8.5):
             text.set_bbox({"facecolor": "0.25", "edgecolor": "none", "alpha": 0.55, "pad": 0.6})
-    if one["star"]:
+    if one.star:
         # The star has the colour of the cell that it covers.
-        at = [int(np.abs(side - place).argmin()) for side, place in zip((x, y), one["star"], strict=True)]
+        at = [int(np.abs(side - place).argmin()) for side, place in zip((x, y), one.star, strict=True)]
         face = mesh.to_rgba(values[at[1], at[0]])
-        ax.plot(*one["star"], "*", color=face, mec="red", mew=1.2, ms=14, zorder=5)
-    ax.set_xlabel(f"{one['names'][0]} ({one['units'][0]})")
-    ax.set_ylabel(f"{one['names'][1]} ({one['units'][1]})")
-    if one["held"].count("=") == 1:
-        ax.set_title(one["held"], fontsize=9)
-    if one["units"][0] == one["units"][1]:
+        ax.plot(*one.star, "*", color=face, mec="red", mew=1.2, ms=14, zorder=5)
+    ax.set_xlabel(f"{one.names[0]} ({one.units[0]})")
+    ax.set_ylabel(f"{one.names[1]} ({one.units[1]})")
+    if one.held.count("=") == 1:
+        ax.set_title(one.held, fontsize=9)
+    if one.units[0] == one.units[1]:
         ax.set_aspect("equal")
     return mesh

@@ -181,9 +181,9 @@ def _draw_planes(data: Dataset) -> tuple[Any, list[dict[str, Any]]]:
     for k, p in every:
         scale, unit, layout = _case_layout(data, k, data.plane_value.isel(case=k).values)
         one = figures.extract_plane(data, k, p)
-        what, (x, *y) = str(data.case_what.values[k]), one["names"]
-        values, axes = scale * one["values"], [round_digits(ticks) for ticks in one["ticks"]]
-        named = [f"{n} ({u})" for n, u in zip(one["names"], one["units"], strict=True)]
+        what, (x, *y) = str(data.case_what.values[k]), one.names
+        values, axes = scale * one.values, [round_digits(ticks) for ticks in one.ticks]
+        named = [f"{n} ({u})" for n, u in zip(one.names, one.units, strict=True)]
         where = "".join(f"{n} %{{{a}:.4~f}}<br>" for n, a in zip(named, "xy", strict=False))
         said = f"{where}{what} %{{{'z' if y else 'y'}:.4~g}} {unit}<extra></extra>"
         if y:
@@ -197,7 +197,7 @@ def _draw_planes(data: Dataset) -> tuple[Any, list[dict[str, Any]]]:
             )
         else:
             figure.add_scatter(x=axes[0], y=round_digits(values[:, 0]), hovertemplate=said)
-        star = one["star"] if one["star"] and y else [None, None]
+        star = one.star if one.star and y else [None, None]
         worst = figures.format_value(float(data.worst_value[k]), str(data.case_unit.values[k]))
         figure.add_scatter(
             x=star[:1],

@@ -187,7 +187,6 @@ def _draw_index(data: Dataset, index: str) -> Figure:
     corners = _triangles(ways)
     front = corners[(ways @ VIEW_DIRECTION)[corners].max(-1) > 0.0]
     figure, ((ax,),) = plots.make_subplots(1, 1, 8.6)
-    mesh: Any = None
     for a, t, centre in _sphere_centres(data):
         x, y = (centre + RADIUS * flat).T
         mesh = ax.tripcolor(

@@ -10,7 +10,7 @@ before. It starts from a quintic.
 from __future__ import annotations
 
 from itertools import product
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
@@ -103,7 +103,7 @@ def smooth_profile(
     return unit * x
 
 
-def _sparse_matrix(rows: list[tuple[Any, Any, Any]], shape: tuple[int, int]) -> scipy.sparse.csr_matrix:
+def _sparse_matrix(rows: list[tuple[Array, Index, Index]], shape: tuple[int, int]) -> scipy.sparse.csr_matrix:
     """Return the sparse matrix of triplets (values, rows, columns)."""
     values, row, column = (np.concatenate([np.ravel(r[k]) for r in rows]) for k in range(3))
     return scipy.sparse.coo_matrix((values, (row, column)), shape=shape).tocsr()
@@ -132,7 +132,7 @@ def _jerk_rows(part: JointPath, jerk: Array, h: Array, x: Array, share: Array) -
     tangent = 0.5 * most / about**1.5
     top = 1.5 * most / np.sqrt(about)
     point = np.repeat(np.arange(count), width)
-    made: list[tuple[Any, Any, Any]] = []
+    made: list[tuple[Array, Index, Index]] = []
     at = 0
     for sign, side in product((1.0, -1.0), (third[:-1], third[1:])):
         number = at + np.arange(count * width)

@@ -7,9 +7,10 @@ from collections import Counter
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pkm_twin.bags.reader import Bag
 from pkm_twin.codegen.arrays import Array, Mask
@@ -139,7 +140,7 @@ class Recording:
         return f"{answer}; {self.effort_warning}" if self.effort_warning else answer
 
     @property
-    def stamps(self) -> np.ndarray[Any, np.dtype[np.int64]]:
+    def stamps(self) -> NDArray[np.int64]:
         """Times in ns, shape (samples,)."""
         return self.start + np.round(1e9 * self.time).astype(np.int64)
 
@@ -246,7 +247,7 @@ class Recording:
         wrench = np.zeros((len(self.time), 6)) if self.wrench is None else self.wrench
         return self.q, self.qd, self.qdd, wrench
 
-    def select(self, rows: Any) -> Recording:
+    def select(self, rows: slice | NDArray[np.generic]) -> Recording:
         """Return the recording of some samples only, by a slice, mask or indices; times are not shifted."""
         values = {
             name: getattr(self, name)
@@ -346,7 +347,9 @@ class Recording:
         text = f"no samples from {self.time[k]:.6g} to {self.time[k + 1]:.6g} s{others}, while joints move: "
         return replace(self, notes=(*self.notes, f"{text}RMS and energy are interpolated there"))
 
-    def _project_motion(self, qd: Array, qdd: Array, still: Mask | None, rows: Any) -> Recording:
+    def _project_motion(
+        self, qd: Array, qdd: Array, still: Mask | None, rows: slice | NDArray[np.generic]
+    ) -> Recording:
         """Return some samples with these velocities and accelerations; measured ones are kept.
 
         Differentiated velocities and accelerations are projected onto the motions that the mechanism

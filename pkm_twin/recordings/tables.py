@@ -17,10 +17,10 @@ import os
 import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO, Final, TextIO
+from typing import BinaryIO, Final, TextIO
 
 import numpy as np
 
@@ -226,7 +226,7 @@ def read_table(
     if path.suffix in NOT_READ:
         raise ParameterError(str(path), f"a {path.suffix} file", NOT_READ[path.suffix])
     try:
-        file: Any = nullcontext(sys.stdin.buffer)
+        file: AbstractContextManager[BinaryIO] = nullcontext(sys.stdin.buffer)
         if str(path) != STANDARD:
             file = open_regular(path)
             size = os.fstat(file.fileno()).st_size

@@ -9,9 +9,10 @@ difference.
 from __future__ import annotations
 
 from collections import deque
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.messages.stamps import SECOND
@@ -132,7 +133,7 @@ class RateAgreement:
 
 def rate_faults(
     robot: Robot,
-    stamps: np.ndarray[Any, np.dtype[np.int64]],
+    stamps: NDArray[np.int64],
     q: Array,
     qd: Array,
     jumps: Mask | None = None,
@@ -184,7 +185,7 @@ def rate_faults(
 
 
 def _block_moves(
-    stamps: np.ndarray[Any, np.dtype[np.int64]], q: Array, qd: Array, apart: Mask, steps: int, duration: int
+    stamps: NDArray[np.int64], q: Array, qd: Array, apart: Mask, steps: int, duration: int
 ) -> tuple[Array, Array]:
     """Return the moves of consecutive blocks by positions and by integrated velocities, (blocks, n) each.
 

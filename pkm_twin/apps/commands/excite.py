@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -66,7 +66,7 @@ def excite(given: Excite) -> Report:
 
     :raises PkmTwinError: no trajectory keeps to the limits.
     """
-    from pkm_twin.identification.excitation import Judge, TrajectoryLimits, design_sweeps
+    from pkm_twin.identification.excitation import Excitation, Judge, Sweeps, TrajectoryLimits, design_sweeps
     from pkm_twin.identification.excitation import optimize_excitation as design
     from pkm_twin.identification.parameters import file_parameters, parse_kinds
     from pkm_twin.recordings import Recording, read
@@ -81,7 +81,7 @@ def excite(given: Excite) -> Report:
         if other is None:
             raise BagError("too few joint states in a row", path=given.compare, reason="too short")
     bounds = TrajectoryLimits(given.share, given.acceleration, given.singularity, given.rate)
-    best: Any
+    best: Sweeps | Excitation
     if given.friction:
         best = design_sweeps(judge, given.duration, bounds)
     else:
@@ -106,18 +106,15 @@ def excite(given: Excite) -> Report:
             "longer --duration, more --harmonics or --trials, a smaller --singularity, wider "
             "limits in the robot file, or fewer kinds with --what"
         )
-    shape = (
-        [Fact("speeds", best.speeds), Fact("speed_units", machine.joint_units)]
-        if given.friction
-        else [Fact("frequencies_Hz", best.harmonics / best.duration)]
-    )
-    if given.friction:
+    if isinstance(best, Sweeps):
+        shape = [Fact("speeds", best.speeds), Fact("speed_units", machine.joint_units)]
         # Rotary and sliding joints have speeds of different units.
         units = np.array(machine.joint_units)
         rows = {unit: best.speeds[units == unit] for unit in machine.joint_units}
         ranges = " and ".join(f"{one.min():.2g} to {one.max():.2g} {unit}/s" for unit, one in rows.items())
         answer = f"every joint alone moves up and down at {ranges}"
     else:
+        shape = [Fact("frequencies_Hz", best.harmonics / best.duration)]
         answer = f"condition number {best.condition:.4g} over {len(judge.columns)} base parameters"
     return Report(
         f"{machine.name}: {answer}, {len(time)} points in {best.duration:.4g} s",

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -223,7 +224,7 @@ def path(given: Motion) -> Report:
         shaper = {"kind": motion.shaper, "added_s": motion.added, "lowest_hz": low, "highest_hz": high}
         words = f"{motion.shaper} for {low:.4g} to {high:.4g} Hz, adds {motion.added:.4g} s"
         facts.append(Fact("shaper", shaper, text="shaper", shown=words))
-    draw: Any = draw_limits
+    draw: Callable[[TimedPath, str], Figure] = draw_limits
     if cut is not None:
         more, draw = _report_milling(cut, motion)
         facts += more
@@ -318,7 +319,7 @@ def draw_limits(motion: TimedPath, title: str) -> Figure:
     return figure
 
 
-def _report_milling(cut: SoftCut, motion: TimedPath) -> tuple[list[Fact], Any]:
+def _report_milling(cut: SoftCut, motion: TimedPath) -> tuple[list[Fact], Callable[[TimedPath, str], Figure]]:
     """Report feed and deflection of a cut with their bounds, and draw them."""
     s, speed, tolerance = motion.fine, cut.feed, cut.tolerance
     deflection, constant_feed = cut.along(s)

@@ -185,17 +185,15 @@ def _draw_planes(data: Dataset, case: str, elements: list[int]) -> dict[str, Fig
     across = [p for p in full if upwards not in (str(data.row_name.values[p]), str(data.column_name.values[p]))]
     plane = (across or full)[0]
     one = extract_plane(data, k, plane)
-    if len(one["names"]) < 2:
+    if len(one.names) < 2:
         return {}
     table = data.plane_factor.isel(plane=plane, case=k).values[..., elements]
     high = float(np.nanmax(table))
     figure, columns = plots.make_subplots(len(elements), 1, plots.WIDTH / MAX_PANELS + 0.9)
-    mesh: Any = None
     for column, (ax,), n in zip(np.moveaxis(table, -1, 0), columns, elements, strict=True):
-        drawn = one | {"values": column, "star": None}
-        mesh = draw_panel(drawn, ax, 1.0, 0.0, high, (0.25, 0.6, 0.9))
+        mesh = draw_panel(replace(one, values=column, star=None), ax, 1.0, 0.0, high, (0.25, 0.6, 0.9))
         ax.set_title(str(data.element.values[n]), fontsize=10)
     bar = figure.colorbar(mesh, ax=figure.axes, aspect=25, pad=0.01)
     bar.set_label("share of the strain energy (dimensionless)")
-    plots.write_title(figure, _title(data, case, elements, f"{one['held']}"), 10)
+    plots.write_title(figure, _title(data, case, elements, one.held), 10)
     return {"plane": figure}
