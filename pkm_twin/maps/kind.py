@@ -177,11 +177,11 @@ class Kind:
         """The kind's own options, for a file."""
         return asdict(self)
 
-    def summaries(self, space: Space, counted: int, apart: int) -> dict[str, Variable]:
+    def summaries(self, space: Space, counted: int, separate: int) -> dict[str, Variable]:
         """Return results over the whole workspace.
 
         :param counted: number of grid poses that keep all bounds except that on the clearance;
-            ``apart``: number of these in which no limbs interfere.
+            ``separate``: number of these in which no limbs interfere.
         """
         return {}
 

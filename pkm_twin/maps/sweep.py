@@ -318,10 +318,10 @@ class Map(Space):
         reach = satisfies_limits(robot, q, pose, -math.inf, known)
         inside = reach & self.is_encircled(pose)
         inside[inside] = robot.try_singularity(q[inside])[0] >= self.least
-        apart = inside.copy()
+        separate = inside.copy()
         if has_clearance(robot):
             gap = joint_clearance(robot, q[inside], refuse=False)
-            apart[inside] = gap > self.least_clearance
+            separate[inside] = gap > self.least_clearance
         size, ways = len(self.elements), len(self.kind.axes(robot))
         values: Values = {
             "value": np.full((count, len(cases)), np.nan),
@@ -330,10 +330,10 @@ class Map(Space):
             "factor": np.full((count, len(cases), size), np.nan),
             "reach": np.repeat(reach[:, None], len(cases), 1).astype(np.int8),
             "pose": np.where(known[:, None], pose, np.nan),
-            "counts": np.array([[inside.sum(), apart.sum(), count]]),
+            "counts": np.array([[inside.sum(), separate.sum(), count]]),
             "starts": np.full((1, len(cases), STARTS_PER_CHUNK, pose.shape[-1]), np.nan),
         }
-        for interfering, kept in ((False, apart), (True, inside)):
+        for interfering, kept in ((False, separate), (True, inside)):
             own = [k for k, case in enumerate(cases) if case.interfering == interfering]
             if not own:
                 continue
@@ -370,8 +370,8 @@ class Map(Space):
 
     def summaries(self, grid: Iterable[Values]) -> dict[str, Variable]:
         """Return the worst of each case, the planes' axes, and the kind's summaries."""
-        counted, apart, every = np.sum([values["counts"] for values in grid], axis=0).tolist()
-        result = {"valid": scalar(apart / every, "part of the grid that counts", "", UNIT_INTERVAL)}
+        counted, separate, every = np.sum([values["counts"] for values in grid], axis=0).tolist()
+        result = {"valid": scalar(separate / every, "part of the grid that counts", "", UNIT_INTERVAL)}
         for k, dim in enumerate(("row", "column")):
             sides = [
                 [[*self.plane_ticks(p, c), np.zeros(1)][k] for p in range(len(self.planes))]
@@ -414,7 +414,7 @@ class Map(Space):
             result["worst_element"] = Variable(cases, blame, names)
         if self.circles is not None:
             result |= make_circle_variables(self.robot, *self.circles)
-        return result | self.kind.summaries(self, counted, apart)
+        return result | self.kind.summaries(self, counted, separate)
 
 
 def _store_values(values: Values, case: int, kept: Mask, found: Found) -> None:

@@ -162,20 +162,20 @@ class SoftCut:
         if only_turns(self.robot):
             raise ParameterError("slow-where-soft", self.robot.name, "a pose with x, y or z")
 
-    def deflection_per_feed(self, q: Array, way: Array) -> Array:
+    def deflection_per_feed(self, q: Array, direction: Array) -> Array:
         """Return the deflection of the reference point per feed, m per m/s, shape (p,).
 
-        :param q: joint positions (p, n); ``way``: directions of the motion (p, 3), base axes.
+        :param q: joint positions (p, n); ``direction``: directions of the motion (p, 3), base axes.
         :raises ParameterError: a robot without elastic members.
         """
         from stiffness_monitor import platform_response
 
         matrix = platform_response(self.robot, q, np.zeros(6)).compliance[..., :3, :3]
-        return np.asarray(self.force * np.linalg.norm(matrix @ way[..., None], axis=(-2, -1)))
+        return np.asarray(self.force * np.linalg.norm(matrix @ direction[..., None], axis=(-2, -1)))
 
-    def slowdown(self, q: Array, way: Array) -> Array:
+    def slowdown(self, q: Array, direction: Array) -> Array:
         """Return the divisor of the feed that keeps the deflection within the tolerance, (p,)."""
-        return np.maximum(1.0, self.feed / self.tolerance * self.deflection_per_feed(q, way))
+        return np.maximum(1.0, self.feed / self.tolerance * self.deflection_per_feed(q, direction))
 
     def along(self, samples: Samples) -> tuple[Array, float]:
         """Return the deflection along a motion, shape (k,), m, and the largest constant feed, m/s.

@@ -68,13 +68,13 @@ def split_at_payloads(
         k = 0
         if mark.stretch >= 0:
             # The piece that begins with the payload; one that the change lies within is split.
-            pieces, way = list(stretches[mark.stretch].pieces), mark.way
-            while k < len(pieces) and way >= pieces[k].length - MIN_DISTANCE and way > MIN_DISTANCE:
-                way -= pieces[k].length
+            pieces, distance = list(stretches[mark.stretch].pieces), mark.distance
+            while k < len(pieces) and distance >= pieces[k].length - MIN_DISTANCE and distance > MIN_DISTANCE:
+                distance -= pieces[k].length
                 k += 1
-            if k < len(pieces) and way > MIN_DISTANCE:
+            if k < len(pieces) and distance > MIN_DISTANCE:
                 whole = pieces[k]
-                pieces[k : k + 1] = SubPiece(whole, 0.0, way), SubPiece(whole, way, whole.length)
+                pieces[k : k + 1] = SubPiece(whole, 0.0, distance), SubPiece(whole, distance, whole.length)
                 stretches[mark.stretch] = replace(stretches[mark.stretch], pieces=tuple(pieces))
                 k += 1
         result.append(PayloadChange(robots[mass], mass, mark.stretch, k, mark.rest))

@@ -30,11 +30,11 @@ class Law:
     """A motion law: polynomials from 0 to 1 over the normalised time 0 to 1, as in :class:`Run`."""
 
     knots: Array
-    way: Array
+    coefficients: Array
 
     def make_run(self, part: JointPath, duration: float) -> Run:
         """Return the run of a stretch by this law, duration in s."""
-        return Run(part, self.knots, float(part.ends[-1]) * self.way).slower(duration)
+        return Run(part, self.knots, float(part.ends[-1]) * self.coefficients).slower(duration)
 
 
 QUINTIC: Final = Law(np.array([0.0, 1.0]), np.array([[0.0, 0.0, 0.0, 10.0, -15.0, 6.0]]).T)
@@ -172,8 +172,8 @@ def fastest(
         If a waypoint is repeated, its payload changes after the rests of the copies before it. A
         cycle has 4 waypoints, with the way back 7; a circle has its two ends.
     :returns: the motion: ``.times``, ``.q``, ``.qd``, ``.qdd``, ``.effort`` and ``.pose`` at its
-        points, the same of ``.uniform(rate)`` and ``.sample(times)``; ``.bounds``, which limit
-        binds when; ``.duration``, s.
+        points; ``.uniform(rate)`` and ``.sample(times)`` return these at other times; ``.bounds``, which
+        limit binds when; ``.duration``, s.
     :raises ParameterError: with the position: a pose out of reach, beyond a joint's limit or close
         to a singularity, or a drive that cannot hold the machine; or no limit bounds the speed.
     """
@@ -212,7 +212,7 @@ def timed(
 
     :param law: ``fastest``, ``quintic`` or ``s-curve``, each from stop to stop.
     :param duration: of the whole, rests included, s; all stretches are slowed down alike.
-    :param bounds: limits as those of :func:`fastest`; so are the other parameters and errors.
+    :param bounds: limits, parameters of :func:`fastest`; the other parameters and errors are those, too.
     :raises ParameterError: a duration too short for the limits.
     """
     if law not in ("fastest", *LAWS):
@@ -266,14 +266,16 @@ def _solve_stretch(part: JointPath, limits: Limits, wrench: Array | None) -> Run
         x = fastest_profile(rows, part.left, part.steps, share, x)
         stopped = (x[:-1] + x[1:]) <= 0.0
         if stopped.any():
-            way = part.curve.begin + float(part.s[part.left[int(stopped.argmax())]])
-            raise ParameterError("path", f"no motion after {way:.4g} m", "limits that let the machine pass")
+            distance = part.curve.begin + float(part.s[part.left[int(stopped.argmax())]])
+            raise ParameterError("path", f"no motion after {distance:.4g} m", "limits that let the machine pass")
         run = Run.from_profile(part, x)
         # Where the joints turn back and nothing bounds their acceleration, the path's speed has no bound.
         unbounded = np.diff(run.knots) <= np.finfo(float).eps * run.duration
         if unbounded.any():
-            way = part.curve.begin + float(part.s[part.left[int(unbounded.argmax())]])
-            raise ParameterError("path", f"no limit bounds the motion at {way:.4g} m", "acceleration or effort limits")
+            distance = part.curve.begin + float(part.s[part.left[int(unbounded.argmax())]])
+            raise ParameterError(
+                "path", f"no limit bounds the motion at {distance:.4g} m", "acceleration or effort limits"
+            )
         used = find_run_usage(run, limits, wrench)
         over = used.max(1)
         bad = over > 1.0 + MAX_EXCESS

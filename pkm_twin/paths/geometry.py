@@ -47,12 +47,12 @@ class Stretch:
 class Mark(NamedTuple):
     """Describe where a waypoint lies on a path.
 
-    ``stretch``: its index; -1 is the rest before the first. ``way``: length up to the waypoint on
+    ``stretch``: its index; -1 is the rest before the first. ``distance``: length up to the waypoint on
     the stretch, m. ``rest``: time that the machine has rested there, s.
     """
 
     stretch: int
-    way: float
+    distance: float
     rest: float = 0.0
 
 
@@ -178,9 +178,9 @@ def _join_waypoints(robot: Robot, space: Space, points: Array, blends: Array, dw
             arc = arc_through(*points[k : k + 3], places=places, where=f"waypoint {k + 1}")
             moves.append((arc, k + 2))
         else:
-            way = points[k + 1] - points[k]
-            length = float(np.linalg.norm(way * scales))
-            moves.append((Line(points[k], way / length, length), k + 1))
+            chord = points[k + 1] - points[k]
+            length = float(np.linalg.norm(chord * scales))
+            moves.append((Line(points[k], chord / length, length), k + 1))
         k = moves[-1][1]
     pieces: list[Piece] = []
     stretches: list[Stretch] = []

@@ -73,9 +73,9 @@ def smooth_profile(
         more, top = _jerk_rows(part, jerk, h, x, jerks)
         v = np.sqrt(np.maximum(x, 1e-12 * x.max()))
         weight = np.zeros(len(x))
-        way = h / (v[:-1] + v[1:]) ** 2
-        weight[:-1] += way / v[:-1]
-        weight[1:] += way / v[1:]
+        change = h / (v[:-1] + v[1:]) ** 2
+        weight[:-1] += change / v[:-1]
+        weight[1:] += change / v[1:]
         answer = scipy.optimize.linprog(
             -weight / weight[1:-1].max(),
             A_ub=scipy.sparse.vstack([own, -own, more]).tocsr(),
@@ -152,7 +152,7 @@ def smooth_run(part: JointPath, x: Array) -> Run | None:
     """
     x = x.copy()
     for count in range(20):
-        knots, way, v, u = _integrate_profile(part, x)
+        knots, length, v, u = _integrate_profile(part, x)
         # The acceleration may change its sign within an interval, where the speed has a minimum.
         rises = (u[:-1] < 0.0) & (u[1:] > 0.0)
         dip = np.where(rises, -0.5 * u[:-1] ** 2 * np.diff(knots) / np.where(rises, np.diff(u), 1.0), 0.0)
@@ -161,14 +161,14 @@ def smooth_run(part: JointPath, x: Array) -> Run | None:
         low = np.flatnonzero(below > 1e-12 * v.max())
         if not len(low):
             jerk = np.diff(u) / np.diff(knots)
-            return Run(part, knots, np.stack([way[:-1], v[:-1], u[:-1] / 2, jerk / 6]))
+            return Run(part, knots, np.stack([length[:-1], v[:-1], u[:-1] / 2, jerk / 6]))
         at = np.clip(low, 1, len(x) - 2)
         np.maximum.at(x, at, (np.sqrt(x[at]) + 1.5**count * below[low]) ** 2)
     return None
 
 
 def _integrate_profile(part: JointPath, x: Array) -> tuple[Array, Array, Array, Array]:
-    """Integrate a profile's mean accelerations, linear in time: times, way, v and u.
+    """Integrate a profile's mean accelerations, linear in time: times, length, v and u.
 
     Between points y = x^(3/4) is linear in s, as for constant jerk from rest. A smooth bump over
     the whole corrects the error of the final position and speed.
@@ -192,6 +192,6 @@ def _integrate_profile(part: JointPath, x: Array) -> tuple[Array, Array, Array, 
     u = u - bump * integrate_accelerations(u)[-1] / integrate_accelerations(bump)[-1]
     v = integrate_accelerations(u)
     jerk = np.diff(u) / step
-    way = np.cumsum(step * (v[:-1] + step * (u[:-1] / 2 + step * jerk / 6)))
-    scale = float(part.s[-1]) / way[-1]
-    return times, scale * np.append(0.0, way), scale * v, scale * u
+    length = np.cumsum(step * (v[:-1] + step * (u[:-1] / 2 + step * jerk / 6)))
+    scale = float(part.s[-1]) / length[-1]
+    return times, scale * np.append(0.0, length), scale * v, scale * u

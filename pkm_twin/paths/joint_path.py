@@ -32,7 +32,7 @@ Slowdown = Callable[[Array, Array], Array]
 class Curve:
     """Describe a stretch of a robot's path, at any points of which joints can be computed.
 
-    ``robots``: with the payload of each piece. ``begin``: way up to the stretch, m.
+    ``robots``: with the payload of each piece. ``begin``: length up to the stretch, m.
     ``singularity``: least singularity index on it, 0 to 1.
     """
 
@@ -112,8 +112,8 @@ class Curve:
         travel = np.linalg.norm(twist, axis=1)
         slower = np.ones(len(s))
         if self.slowdown is not None:
-            way = twist / np.maximum(travel, 1e-300)[:, None]
-            slower = np.asarray(self.slowdown(q, way), np.float64)
+            direction = twist / np.maximum(travel, 1e-300)[:, None]
+            slower = np.asarray(self.slowdown(q, direction), np.float64)
         ends = np.cumsum([len(own) for own in grid])
         left = np.delete(np.arange(len(s)), ends - 1)
         return JointPath(self, tuple(grid), s, q, first, second, travel * slower, slower, left)
@@ -223,17 +223,17 @@ def only_turns(robot: Robot) -> bool:
     return not {"x", "y", "z"} & set(robot.pose_names)
 
 
-def describe_place(robot: Robot, q: Array, way: float) -> str:
+def describe_place(robot: Robot, q: Array, distance: float) -> str:
     """Describe a position of a path by its joint positions (n,): length, m, and pose."""
-    return _format_place(robot, robot.forward(q), way)
+    return _format_place(robot, robot.forward(q), distance)
 
 
-def _format_place(robot: Robot, pose: Array, way: float) -> str:
+def _format_place(robot: Robot, pose: Array, distance: float) -> str:
     values = (np.round(pose, 12) + 0.0).tolist()
     entries = zip(robot.pose_names, values, robot.pose_units, strict=True)
     place = "at " + ", ".join(f"{name} {value:.4g} {unit}" for name, value, unit in entries)
     # The length of a path in angles is not in metres.
-    return f"{place}, {way:.4g} m after the start" if "m" in robot.pose_units else place
+    return f"{place}, {distance:.4g} m after the start" if "m" in robot.pose_units else place
 
 
 def check_positions(robot: Robot, s: Array, q: Array, begin: float) -> None:
@@ -255,10 +255,10 @@ def check_positions(robot: Robot, s: Array, q: Array, begin: float) -> None:
         )
 
 
-def check_singularity(robot: Robot, way: Array, q: Array, singularity: float) -> None:
+def check_singularity(robot: Robot, distance: Array, q: Array, singularity: float) -> None:
     """Check that a path keeps away from singularities.
 
-    :param way: from the start, shape (p,), m; ``q``: joint positions there, (p, n).
+    :param distance: from the start, shape (p,), m; ``q``: joint positions there, (p, n).
     :param singularity: least singularity index, 0 to 1.
     :raises ParameterError: with the least index on the path, and its place.
     """
@@ -269,7 +269,7 @@ def check_singularity(robot: Robot, way: Array, q: Array, singularity: float) ->
     if index[row] < singularity:
         least = float(index[row])
         raise ParameterError(
-            f"path: singularity index {describe_place(robot, q[row], float(way[row]))}",
+            f"path: singularity index {describe_place(robot, q[row], float(distance[row]))}",
             round(least, 6),
             f"{singularity:g} or more; {describe_singularity_bound(least)} passes",
         )
@@ -299,7 +299,7 @@ def joint_paths(
         except (UnreachableError, SingularityError) as error:
             raise ParameterError("path", error, "joints that can be assembled") from None
         begin += stretch.length
-    way = np.concatenate([part.curve.begin + part.s for part in result])
+    distance = np.concatenate([part.curve.begin + part.s for part in result])
     # After all stretches, so that the error names the path's least index.
-    check_singularity(robot, way, np.concatenate([part.q for part in result]), singularity)
+    check_singularity(robot, distance, np.concatenate([part.q for part in result]), singularity)
     return [replace(part, curve=replace(part.curve, singularity=singularity)) for part in result]

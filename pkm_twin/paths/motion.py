@@ -60,13 +60,13 @@ class Bound:
 class Run:
     """Describe one stretch in time: its path length as polynomials of the time since knots.
 
-    ``knots``: rising from 0, the last one the end, shape (k + 1,), s. ``way``: coefficients by
+    ``knots``: rising from 0, the last one the end, shape (k + 1,), s. ``coefficients``: of the path length, by
     rising powers, shape (powers, k), m, m/s, ...
     """
 
     part: JointPath
     knots: Array
-    way: Array
+    coefficients: Array
 
     @classmethod
     def from_profile(cls, part: JointPath, x: Array) -> Run:
@@ -82,16 +82,16 @@ class Run:
 
     def slower(self, factor: float) -> Run:
         """Return the run with ``factor`` times the duration."""
-        powers = np.arange(len(self.way))[:, None]
-        return Run(self.part, factor * self.knots, self.way / factor**powers)
+        powers = np.arange(len(self.coefficients))[:, None]
+        return Run(self.part, factor * self.knots, self.coefficients / factor**powers)
 
     def evaluate(self, k: Index, time: Array) -> tuple[Array, Array, Array]:
         """Return path length, v and u at times after knots k."""
         t = np.clip(time - self.knots[k], 0.0, self.knots[k + 1] - self.knots[k])
-        way, v, u = np.zeros((3, len(t)))
-        for row in self.way[::-1, k]:
-            way, v, u = way * t + row, v * t + way, u * t + 2.0 * v
-        return way, v, u
+        length, v, u = np.zeros((3, len(t)))
+        for row in self.coefficients[::-1, k]:
+            length, v, u = length * t + row, v * t + length, u * t + 2.0 * v
+        return length, v, u
 
     def _last_knot(self, time: Array) -> Index:
         """Return the index of the last knot before times (k,)."""
@@ -101,15 +101,15 @@ class Run:
     @cached_property
     def ends(self) -> Array:
         """Times of the intervals' ends, shape (i + 1,), s."""
-        way, begins = self.part.ends[1:-1], self.way[0]
-        k = np.clip(np.searchsorted(begins, way, side="right") - 1, 0, len(begins) - 1)
+        length, begins = self.part.ends[1:-1], self.coefficients[0]
+        k = np.clip(np.searchsorted(begins, length, side="right") - 1, 0, len(begins) - 1)
         low, high = self.knots[k], self.knots[k + 1]
         # Bisect until the interval has the size of rounding errors.
         for _ in range(60):
             middle = 0.5 * (low + high)
-            before = self.evaluate(k, middle)[0] < way
+            before = self.evaluate(k, middle)[0] < length
             low, high = np.where(before, middle, low), np.where(before, high, middle)
-        inner = np.where(begins[k] == way, self.knots[k], high)
+        inner = np.where(begins[k] == length, self.knots[k], high)
         return np.concatenate([self.knots[:1], inner, self.knots[-1:]])
 
     @cached_property
@@ -125,10 +125,10 @@ class Run:
 
     def at(self, time: Array) -> tuple[Index, Array, Array, Array]:
         """Return the interval at times (k,), the fraction of it, ds/dt (v) and d2s/dt2 (u)."""
-        way, v, u = self.evaluate(self._last_knot(time), time)
+        length, v, u = self.evaluate(self._last_knot(time), time)
         s = self.part.ends
-        j = np.clip(np.searchsorted(s, way, side="right") - 1, 0, len(s) - 2)
-        return j, np.clip((way - s[j]) / (s[j + 1] - s[j]), 0.0, 1.0), v, u
+        j = np.clip(np.searchsorted(s, length, side="right") - 1, 0, len(s) - 2)
+        return j, np.clip((length - s[j]) / (s[j + 1] - s[j]), 0.0, 1.0), v, u
 
 
 @dataclass(frozen=True)

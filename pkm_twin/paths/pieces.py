@@ -124,8 +124,8 @@ class Arc:
 
     def arc_length_at(self, point: Array) -> float:
         """Return the arc length s of a point of the arc."""
-        way = point - self.centre
-        return self.radius * float(np.arctan2(way @ self.along, way @ self.across) % (2 * np.pi))
+        arm = point - self.centre
+        return self.radius * float(np.arctan2(arm @ self.along, arm @ self.across) % (2 * np.pi))
 
     def at(self, s: Array) -> tuple[Array, Array, Array]:
         """Return coordinates and their first two derivatives by s, shape (k, m) each."""

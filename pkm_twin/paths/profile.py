@@ -84,11 +84,11 @@ def _find_largest_start(low: Numbers, high: Numbers, slopes: Numbers, x: float, 
     for _ in range(50):
         least, rise, most, fall = 0.0, 0.0, after, 0.0
         for c, e, d in zip(low, high, slopes, strict=True):
-            way = d * x
-            if c + way > least:
-                least, rise = c + way, d
-            if e + way < most:
-                most, fall = e + way, d
+            shift = d * x
+            if c + shift > least:
+                least, rise = c + shift, d
+            if e + shift < most:
+                most, fall = e + shift, d
         gap, closing = least - most, rise - fall
         if gap <= 0.0 or closing <= 0.0:
             return x

@@ -210,9 +210,9 @@ def shaped(
         over = max(result.worst.values(), default=0.0)
         if over <= 1.0 + 1e-9:
             fine = result.fine
-            way = np.cumsum(fine.speed * np.diff(fine.time, prepend=0.0))
-            check_positions(motion.robot, way, fine.q, 0.0)
-            check_singularity(motion.robot, way, fine.q, singularity)
+            distance = np.cumsum(fine.speed * np.diff(fine.time, prepend=0.0))
+            check_positions(motion.robot, distance, fine.q, 0.0)
+            check_singularity(motion.robot, distance, fine.q, singularity)
             return result
         plain = replace(plain, runs=tuple(run.slower(over) for run in plain.runs))
     raise ParameterError("motion", f"{shaper} passes its limits", "wider limits, or no shaper")

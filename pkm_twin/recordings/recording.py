@@ -282,7 +282,7 @@ class Recording:
     def check_rates(self) -> None:
         """Reject velocities that contradict the positions, and accelerations that contradict the velocities.
 
-        :raises PkmTwinError: by more than `check` allows, with the factor between both if there is one.
+        :raises PkmTwinError: the difference is larger than `check` allows; names a constant factor if there is one.
         """
         judged = (
             ("velocities", self.q, self.qd, MAX_MOVE_DIFFERENCE, ("position", "velocity")),

@@ -43,16 +43,16 @@ def rms(values: Array) -> Array:
     return np.asarray(np.sqrt(np.mean(values**2, 0)), np.float64)
 
 
-def find_likely_cause(moved: Array, told: Array, names: tuple[str, str] = ("position", "velocity")) -> str:
+def find_likely_cause(moved: Array, integrated: Array, names: tuple[str, str] = ("position", "velocity")) -> str:
     """Name the likely cause of a difference of both moves, (blocks,); may be empty.
 
     :param names: of the quantity that moves, and of its rate.
     """
-    by_q, by_qd = float(rms(moved)), float(rms(told))
-    scale = float(np.sum(told * moved) / max(np.sum(moved**2), 1e-300))
+    by_q, by_qd = float(rms(moved)), float(rms(integrated))
+    scale = float(np.sum(integrated * moved) / max(np.sum(moved**2), 1e-300))
     if abs(scale + 1.0) < SCALE_TOLERANCE:
         return " (wrong sign?)"
-    if rms(told - scale * moved) < SCALE_TOLERANCE * by_qd:
+    if rms(integrated - scale * moved) < SCALE_TOLERANCE * by_qd:
         return f" ({scale:.3g} times the rate of the {names[0]}: time stamps, ratio or unit?)"
     if by_qd < STANDSTILL_FRACTION * by_q:
         return f" (the {names[1]} is zero)"
@@ -116,16 +116,16 @@ class RateAgreement:
         self._sums, self._steps = [0.0] * len(q), 0
 
     def _judge(self) -> None:
-        moved, told = np.moveaxis(np.array(self._blocks), 1, 0)
-        size = np.maximum(rms(moved), rms(told))
+        moved, integrated = np.moveaxis(np.array(self._blocks), 1, 0)
+        size = np.maximum(rms(moved), rms(integrated))
         moves = size * np.sqrt(len(moved)) >= self._min_move
         if not moves.any():
             return
-        error = np.where(moves, rms(told - moved) / np.maximum(size, 1e-300), 0.0)
+        error = np.where(moves, rms(integrated - moved) / np.maximum(size, 1e-300), 0.0)
         j = int(np.argmax(error))
         self.fault = ""
         if error[j] > 0.4:
-            cause = find_likely_cause(moved[:, j], told[:, j])
+            cause = find_likely_cause(moved[:, j], integrated[:, j])
             self.fault = (
                 f"{self._names[j]}: velocities differ from the rate of the positions by {100 * error[j]:.2g} %{cause}"
             )
@@ -152,17 +152,17 @@ def rate_faults(
     span = np.diff(time)
     period = float(np.median(span)) if len(span) else 0.0
     gaps, units, step = span > MAX_GAP_PERIODS * period, np.array(robot.joint_units), MIN_STEPS
-    apart = gaps if jumps is None else gaps | jumps.any(1)
-    moved, told = _block_moves(stamps, q, qd, apart, step, round(SECOND * MIN_BLOCK_TIME))
+    breaks = gaps if jumps is None else gaps | jumps.any(1)
+    moved, integrated = _block_moves(stamps, q, qd, breaks, step, round(SECOND * MIN_BLOCK_TIME))
     short = len(moved) < 2
     if short:
         # All steps jump where the times are far too short.
         step = min(MIN_STEPS, max(1, len(span) // 4))
-        moved, told = _block_moves(stamps, q, qd, gaps, step, 0)
+        moved, integrated = _block_moves(stamps, q, qd, gaps, step, 0)
         if len(moved) < 2 or moved.size < 3:
             return np.zeros(0), []
         weights = np.where(units == "m", 1.0 / robot.size, 1.0)
-        ours, theirs = moved * weights, told * weights
+        ours, theirs = moved * weights, integrated * weights
         scale = float(np.sum(theirs * ours) / max(np.sum(ours**2), 1e-300))
         twice = ours[1:] + ours[:-1]
         if (
@@ -172,27 +172,27 @@ def rate_faults(
         ):
             return np.zeros(0), []
     # The moves of a joint that hardly moves are noise.
-    sizes = np.maximum(rms(moved), rms(told))
+    sizes = np.maximum(rms(moved), rms(integrated))
     floor = np.array([STANDSTILL_FRACTION * sizes[units == unit].max() for unit in units])
-    size, width = rms(told - moved), step if short else max(MIN_STEPS, MIN_BLOCK_TIME / period)
+    size, width = rms(integrated - moved), step if short else max(MIN_STEPS, MIN_BLOCK_TIME / period)
     noisy = 2.0 * estimate_noise(time, q) + np.sqrt(width) * period * estimate_noise(time, qd)
     part = size / np.maximum(np.maximum(sizes, floor), 1e-300)
     bad = (part > most) & (size > SIGMAS * noisy)
     return part, [
-        f"{robot.joint_names[j]} {100 * part[j]:.3g} %{find_likely_cause(moved[:, j], told[:, j], names)}"
+        f"{robot.joint_names[j]} {100 * part[j]:.3g} %{find_likely_cause(moved[:, j], integrated[:, j], names)}"
         for j in np.flatnonzero(bad)
     ]
 
 
 def _block_moves(
-    stamps: NDArray[np.int64], q: Array, qd: Array, apart: Mask, steps: int, duration: int
+    stamps: NDArray[np.int64], q: Array, qd: Array, breaks: Mask, steps: int, duration: int
 ) -> tuple[Array, Array]:
     """Return the moves of consecutive blocks by positions and by integrated velocities, (blocks, n) each.
 
-    :param apart: steps over which no block extends, shape (k - 1,).
+    :param breaks: steps over which no block extends, shape (k - 1,).
     :param steps: fewest steps of a block; ``duration``: shortest duration, ns.
     """
-    last = np.append(np.flatnonzero(apart), len(stamps) - 1)
+    last = np.append(np.flatnonzero(breaks), len(stamps) - 1)
     blocks, begin, after = list[tuple[int, int]](), 0, np.searchsorted(stamps, stamps + duration)
     for end in last.tolist():
         while (stop := max(begin + steps, int(after[begin]))) <= end:

@@ -120,10 +120,10 @@ def find_steps(time: Array, q: Array, qd: Array | None, limit: Sequence[float] |
     if np.mean(jumps.any(1)) > MIN_JUMPING_FRACTION:
         publishers = _count_publisher_samples(q, floor + LOOKBACK_SAMPLES * period * speed)
     if not publishers:
-        apart = _find_alternating_tracks(time, q)
-        rows = apart.any(1)
+        distance = _find_alternating_tracks(time, q)
+        rows = distance.any(1)
         if np.mean(rows) > 2.0 * MIN_PUBLISHER_FRACTION:
-            sizes = np.maximum(sizes, apart[1:])
+            sizes = np.maximum(sizes, distance[1:])
             jumps, publishers = sizes > 0.0, (k - k // 2, k // 2)
     return Steps(jumps, sizes, publishers)
 
@@ -138,17 +138,18 @@ def find_repeats(time: Array, q: Array) -> Mask:
     :param time: rising, shape (k,), s; q, shape (k, n).
     """
     found, move = np.zeros(len(q), np.bool_), np.diff(q, axis=0)
-    apart = np.concatenate([np.ones_like(q[:1], np.bool_), move != 0.0])
-    if apart.all():
+    changed = np.concatenate([np.ones_like(q[:1], np.bool_), move != 0.0])
+    if changed.all():
         return found
-    own = [estimate_noise(time[new], one[new, None])[0] for one, new in zip(q.T, apart.T, strict=True)]
+    own = [estimate_noise(time[new], one[new, None])[0] for one, new in zip(q.T, changed.T, strict=True)]
     floor = 2.0 * SIGMAS * np.array(own) + 2.0 * _find_resolution(np.abs(move))
     period = np.median(np.diff(time))
     for count in range(1, min(3, len(move) - 3) + 1):
         around = np.array([0, 1, count + 2, count + 3])
-        apart_from = np.prod(count + 1 - around) / (count + 1 - around)
-        weights = apart_from / [np.prod([x - y for y in around if y != x]) for x in around]
-        same = ~sliding_window_view(apart[2:-2], count, axis=0).any(-1) & apart[1 : -count - 2]
+        # Lagrange weights of the cubic at the first repeated sample.
+        products = np.prod(count + 1 - around) / (count + 1 - around)
+        weights = products / [np.prod([x - y for y in around if y != x]) for x in around]
+        same = ~sliding_window_view(changed[2:-2], count, axis=0).any(-1) & changed[1 : -count - 2]
         # The cubic assumes even times: skip samples next to a gap.
         span = time[count + 3 :] - time[: -count - 3]
         rows = np.flatnonzero(same.any(1) & (span < (count + MAX_GAP_PERIODS) * period))
@@ -159,14 +160,13 @@ def find_repeats(time: Array, q: Array) -> Mask:
 
 
 def find_backlash(q: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Return the play that a joint crosses in its positions, and how often, shape (n,) each.
+    """Return the backlash that shows in each joint's positions, and how often, shape (n,) each; zero without.
 
-    Where the load of a joint turns, play between it and its encoder is a step from one sample to
-    the next, up and down in turn, always by the same. A step b has third differences of b, and of
-    -b / 2 on both sides of it; a motion has none of both. Zero where there is no play: play has at
-    least four steps, three quarters of them opposite to the one before, of sizes within 15 %, above
-    8 standard deviations of the noise (beyond all of 1e9 normal numbers) and above 10 steps of the
-    encoder, whose rounding goes up and down in turn, too.
+    When the load of a joint reverses, backlash between joint and encoder makes the position step by the
+    same amount from one sample to the next, up and down in turn. A step b has third differences (halved)
+    of b, and -b / 2 on both sides; a motion has none. Backlash has at least four steps, three quarters
+    of them opposite to the one before, of sizes within 15 %, above 8 standard deviations of the noise
+    (beyond all of 1e9 normal numbers), and above 10 steps of the encoder, whose rounding also alternates.
 
     :param q: positions at even times, shape (k, n).
     """
@@ -233,8 +233,8 @@ def _find_alternating_tracks(time: Array, q: Array) -> Array:
     bent *= np.sign(bent.sum(1, keepdims=True))
     clear = bent > np.maximum(moved + SIGMAS * size, 2.0 * _find_resolution(twice))[:, None]
     # At least three quarters of a block alternate.
-    apart = np.where(clear.mean(1) > 0.75, bent.mean(1), 0.0)
-    found[1 : blocks * ALTERNATING_BLOCK + 1] = np.repeat(apart, ALTERNATING_BLOCK, 0)
+    distance = np.where(clear.mean(1) > 0.75, bent.mean(1), 0.0)
+    found[1 : blocks * ALTERNATING_BLOCK + 1] = np.repeat(distance, ALTERNATING_BLOCK, 0)
     return found
 
 

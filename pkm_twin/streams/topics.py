@@ -15,12 +15,12 @@ from typing import Any, Final, Literal
 class Topic:
     """A topic or service of a node.
 
-    ``way``: direction. ``name``: ``<joint>`` stands for a joint's name. ``kind``: package and type.
+    ``direction``: as seen by the node. ``name``: ``<joint>`` stands for a joint's name. ``kind``: package and type.
     ``when``: the setting that creates the topic. ``latched``: late subscribers get the last
     message. ``whole``: a newer message must not replace an older one in the queue.
     """
 
-    way: Literal["in", "out", "service"]
+    direction: Literal["in", "out", "service"]
     name: str
     kind: str
     text: str

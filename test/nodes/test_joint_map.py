@@ -343,7 +343,7 @@ def test_joint_numbers_leave_through_the_publishers_that_ask_for_converted_ones(
     found = set()
     for package, own in tables.items():
         rows = [row for table in own for row in table.values()]
-        topics = {row.name for row in rows if row.way == "out" and row.kind in LEAVES}
+        topics = {row.name for row in rows if row.direction == "out" and row.kind in LEAVES}
         paths = (REPOSITORY / package).rglob("*.py")
         for path in (p for p in paths if re.search(r"node.py$|dynamics/nodes/(?!topics)", str(p))):
             tree = ast.parse(path.read_text(encoding="utf-8"))

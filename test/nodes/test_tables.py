@@ -98,7 +98,7 @@ def test_topics_and_services(node, peer):
         what, how = GROUPS[way].split()
         found = names(node, asked[way](node, "/"))
         # With base_imu the estimates above are rejected, see test_base_imu.py.
-        rows = [row for row in table if row.way == way and row.name != "base_imu"]
+        rows = [row for row in table if row.direction == way and row.name != "base_imu"]
         own = {row.name.removeprefix("/"): row.kind for row in rows}
         # Transforms where tf2 is installed.
         own = {name: kind for name, kind in own.items() if TF or not name.startswith("tf")}

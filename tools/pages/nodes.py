@@ -69,7 +69,7 @@ def topic_row(row: Topic) -> str:
     """Write a topic's line."""
     when = f"only with {row.when}: " if row.when else ""
     kept = "; transient local" if row.latched else ""
-    return f"* {row.way} `{row.name}` ({row.kind}): {when}{row.text}{kept}\n"
+    return f"* {row.direction} `{row.name}` ({row.kind}): {when}{row.text}{kept}\n"
 
 
 def _value(value: Any) -> str:
@@ -113,7 +113,9 @@ def policy(text: str) -> str:
     """Return the security policy with the nodes' present topics and services."""
     for node in MODULES:
         found = class_of(node).topics.values()
-        allowed = "".join(_group(head, [row.name for row in found if row.way == way]) for way, head in GROUPS.items())
+        allowed = "".join(
+            _group(head, [row.name for row in found if row.direction == way]) for way, head in GROUPS.items()
+        )
         start = text.index("/>\n", text.index(f'node="{node}"')) + len("/>\n")
         text = text[:start] + allowed + text[text.index("        </profile>", start) :]
     return text

@@ -61,7 +61,7 @@ class Isotropy(Kind):
             return Found(ends.least, ends.directions[..., 0, :])
         return Found(*driving_force_peak(robot, pose, self.energy))
 
-    def summaries(self, space: Space, counted: int, apart: int) -> dict[str, Variable]:
+    def summaries(self, space: Space, counted: int, separate: int) -> dict[str, Variable]:
         """Return both indices in every direction of motion if ``spheres`` is set."""
         return spheres.find_spheres(space, self.energy) if self.spheres else {}
 

@@ -56,7 +56,7 @@ class Modes(Frequency):
             for k in numbers
         )
 
-    def summaries(self, space: Space, counted: int, apart: int) -> dict[str, Variable]:
+    def summaries(self, space: Space, counted: int, separate: int) -> dict[str, Variable]:
         """Return the mode shapes at the planes' pose, their energy shares, and lines to draw."""
         pose, node, part = space.planes_pose(0), ("mode", "node", "space"), ("mode", "element")
         found = modes(space.robot, pose, len(space.cases))

@@ -79,7 +79,7 @@ class Workspace(Kind):
             return Found(gaps.min(-1), element=gaps.argmin(-1))
         return Found(joint_angle_at(robot, robot.forward(q)))
 
-    def summaries(self, space: Space, counted: int, apart: int) -> dict[str, Variable]:
+    def summaries(self, space: Space, counted: int, separate: int) -> dict[str, Variable]:
         """Return volume, interference, and circles and cylinder of a workspace with an axis."""
         robot, result = space.robot, {}
         if len(space.ticks) == len(robot.pose_names):
@@ -88,9 +88,9 @@ class Workspace(Kind):
             counts = {unit: robot.pose_units.count(unit) for unit in sorted(set(robot.pose_units))}
             # As "m3", "m rad2".
             unit = " ".join(f"{unit}{power if power > 1 else ''}" for unit, power in counts.items())
-            result["volume"] = scalar(apart * cell, what, unit, NON_NEGATIVE)
+            result["volume"] = scalar(separate * cell, what, unit, NON_NEGATIVE)
         if has_clearance(robot):
-            share = (counted - apart) / counted if counted else math.nan
+            share = (counted - separate) / counted if counted else math.nan
             what = "share of otherwise reachable poses in which limbs interfere"
             result["interference"] = scalar(share, what, "", UNIT_INTERVAL)
         if space.ticks and robot.grid().kind == "cylinder":
