@@ -20,8 +20,8 @@ from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.noise import SIGMAS, estimate_noise
 from pkm_twin.streams.steps import MAX_GAP_PERIODS
 
-MIN_BLOCK_TIME: Final = 0.05
-"""Shortest time over which moves are compared, s."""
+MIN_BLOCK_NS: Final = SECOND // 20
+"""Shortest time over which moves are compared, ns."""
 MIN_STEPS: Final = 5
 """Fewest steps between samples in a block."""
 STANDSTILL_FRACTION: Final = 0.03
@@ -82,38 +82,20 @@ class RateAgreement:
     def reset(self) -> None:
         """Forget the stream."""
         self.fault = ""
-        self._blocks: deque[tuple[list[float], list[float]]] = deque(maxlen=self._count)
-        self._last, self._steps = 0, 0
-        self._rates: list[float] = []
-        self._sums: list[float] = []
-        self.skip()
-
-    def skip(self) -> None:
-        """Begin a new block at the next sample, as the motion until then is unknown."""
-        self._begin: tuple[int, list[float]] | None = None
+        self._blocks: deque[tuple[Array, Array]] = deque(maxlen=self._count)
+        self._samples: list[tuple[int, Array, Array]] = []
+        """Samples of the present block."""
 
     def push(self, stamp: int, q: Array, qd: Array) -> None:
         """Take a sample, shape (n,) each; its stamp, ns, is later than that of the last sample."""
-        rates = qd.tolist()
-        if self._begin is None:
-            self._start(stamp, q)
-        else:
-            half = 0.5 * (stamp - self._last) / SECOND
-            pairs = zip(self._sums, self._rates, rates, strict=True)
-            self._sums = [total + half * (a + b) for total, a, b in pairs]
-            self._steps += 1
-            first, before = self._begin
-            if self._steps >= MIN_STEPS and (stamp - first) / SECOND >= MIN_BLOCK_TIME:
-                moves = [now - then for now, then in zip(q.tolist(), before, strict=True)]
-                self._blocks.append((moves, self._sums))
-                if len(self._blocks) == self._count:
-                    self._judge()
-                self._start(stamp, q)
-        self._last, self._rates = stamp, rates
-
-    def _start(self, stamp: int, q: Array) -> None:
-        self._begin = stamp, q.tolist()
-        self._sums, self._steps = [0.0] * len(q), 0
+        self._samples.append((stamp, q, qd))
+        if len(self._samples) <= MIN_STEPS or stamp - self._samples[0][0] < MIN_BLOCK_NS:
+            return
+        stamps, positions, velocities = map(np.array, zip(*self._samples, strict=True))
+        self._blocks.extend(zip(*_block_moves(stamps, positions, velocities), strict=True))
+        self._samples = self._samples[-1:]
+        if len(self._blocks) == self._count:
+            self._judge()
 
     def _judge(self) -> None:
         moved, integrated = np.moveaxis(np.array(self._blocks), 1, 0)
@@ -153,7 +135,7 @@ def rate_faults(
     period = float(np.median(span)) if len(span) else 0.0
     gaps, units, step = span > MAX_GAP_PERIODS * period, np.array(robot.joint_units), MIN_STEPS
     breaks = gaps if jumps is None else gaps | jumps.any(1)
-    moved, integrated = _block_moves(stamps, q, qd, breaks, step, round(SECOND * MIN_BLOCK_TIME))
+    moved, integrated = _block_moves(stamps, q, qd, breaks)
     short = len(moved) < 2
     if short:
         # All steps jump where the times are far too short.
@@ -174,7 +156,7 @@ def rate_faults(
     # The moves of a joint that hardly moves are noise.
     sizes = np.maximum(rms(moved), rms(integrated))
     floor = np.array([STANDSTILL_FRACTION * sizes[units == unit].max() for unit in units])
-    size, width = rms(integrated - moved), step if short else max(MIN_STEPS, MIN_BLOCK_TIME / period)
+    size, width = rms(integrated - moved), step if short else max(MIN_STEPS, 1e-9 * MIN_BLOCK_NS / period)
     noisy = 2.0 * estimate_noise(time, q) + np.sqrt(width) * period * estimate_noise(time, qd)
     part = size / np.maximum(np.maximum(sizes, floor), 1e-300)
     bad = (part > most) & (size > SIGMAS * noisy)
@@ -185,14 +167,19 @@ def rate_faults(
 
 
 def _block_moves(
-    stamps: NDArray[np.int64], q: Array, qd: Array, breaks: Mask, steps: int, duration: int
+    stamps: NDArray[np.int64],
+    q: Array,
+    qd: Array,
+    breaks: Mask | None = None,
+    steps: int = MIN_STEPS,
+    duration: int = MIN_BLOCK_NS,
 ) -> tuple[Array, Array]:
     """Return the moves of consecutive blocks by positions and by integrated velocities, (blocks, n) each.
 
-    :param breaks: steps over which no block extends, shape (k - 1,).
+    :param breaks: steps over which no block extends, shape (k - 1,); None: none.
     :param steps: fewest steps of a block; ``duration``: shortest duration, ns.
     """
-    last = np.append(np.flatnonzero(breaks), len(stamps) - 1)
+    last = np.append([] if breaks is None else np.flatnonzero(breaks), len(stamps) - 1).astype(int)
     blocks, begin, after = list[tuple[int, int]](), 0, np.searchsorted(stamps, stamps + duration)
     for end in last.tolist():
         while (stop := max(begin + steps, int(after[begin]))) <= end:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from delta_dynamics.feedforward import Feedforward, Settings
 from pkm_twin.streams.monitor import Pace, StreamMonitor, TopicStatistics
-from pkm_twin.streams.rates import RateAgreement
+from pkm_twin.streams.rates import RateAgreement, _block_moves
 from test.nodes.harness import SECOND
 from test.support.robots import load
 
@@ -248,3 +248,17 @@ def test_the_stream_of_the_node_is_judged(make):
             core.joint_state(make.joint_state(robot.joint_names, q, qd, stamp=stamp), stamp)
         assert core.stream.rejected.total() == 0
         assert bool(core.rates.fault) == (factor != 1.0)
+
+
+def test_a_stream_and_its_recording_are_compared_alike(rng):
+    """The share of the difference of both, over stamps with jitter and losses, at rates about the least of a block."""
+    robot = load("delta_cu")
+    for rate in (60.0, 100.0, 101.0, 1000.0):
+        t = (np.arange(400) + rng.uniform(0.0, 0.5, 400))[rng.uniform(size=400) > 0.1] / rate
+        stamps = np.round(1e9 * t).astype(np.int64) + SECOND
+        q, qd = motion(rng, robot, t)
+        stream = RateAgreement(robot, blocks=10**6)
+        moved, told = _block_moves(stamps, q, 0.5 * qd)
+        for stamp, place, rates in zip(stamps.tolist(), q, 0.5 * qd, strict=True):
+            stream.push(stamp, place, rates)
+        assert np.array_equal(np.moveaxis(np.array(stream._blocks), 1, 0), [moved, told])
