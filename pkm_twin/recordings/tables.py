@@ -58,6 +58,15 @@ UNITS: Final = {
     "ms": ("time", 1e-3),
     "us": ("time", 1e-6),
     "ns": ("time", 1e-9),
+    "N": ("force", 1.0),
+    "kN": ("force", 1e3),
+    "Nm": ("moment", 1.0),
+    "Nmm": ("moment", 1e-3),
+    "kNm": ("moment", 1e3),
+    "kg": ("mass", 1.0),
+    "g": ("mass", 1e-3),
+    "A": ("current", 1.0),
+    "mA": ("current", 1e-3),
     "percent": ("effort", 1e-2),
 }
 """Units of a table: for each its quantity and its factor to SI."""
@@ -69,7 +78,11 @@ PAYLOAD: Final = ("payload.mass", "payload.x", "payload.y", "payload.z")
 """Columns of the mass (kg) and the centre of mass (m) of the payload on the platform."""
 COLUMN_ALIASES: Final = {"payload": PAYLOAD[0]}
 """Other names of columns."""
-_UNIT: Final = re.compile(r"(.*?)(?:\s*[\[(]\s*(\w+)(?:/s2?)?\s*[\])]|_(mm|cm|[uµ]m|deg|mrad|ms|us|ns))")
+UNIT_SPELLING: Final = str.maketrans({" ": "", "·": "", "*": "", "°": "deg"})
+SWAPPED_MARKS: Final = str.maketrans(",.", ".,")
+"""Turns a decimal comma into a point, and a point, which may separate thousands, into what is no number."""
+_UNIT: Final = re.compile(rf"(.*?)(?:\s*[\[(]\s*(.*?)(?:/s(?:\^?2|²)?)?\s*[\])]|_({'|'.join(UNITS)}))")
+"""A column's name with its unit, in brackets or after an underscore."""
 
 
 @dataclass(frozen=True)
@@ -125,7 +138,7 @@ class Dialect:
 
     def size(self, kind: str) -> float:
         """Return the factor to SI of a quantity's numbers in columns without a unit."""
-        return UNITS[self.units[kind]][1] if kind in self.units else 1.0
+        return math.prod(UNITS[self.units[word]][1] for word in kind.split() if word in self.units)
 
 
 DEFAULT_DIALECT: Final = Dialect()
@@ -184,7 +197,9 @@ class Table(dict[str, Array]):
 
 
 def column_quantities(robot: Robot, side: str = "joint") -> dict[str, str]:
-    """Return the quantity of each column of a motion table: angle, length, time, effort or other (empty).
+    """Return the quantity of each column of a motion table, of those of ``UNITS`` or other (empty).
+
+    An effort is a force or a moment, or a part of the motor's rated torque.
 
     :param side: where joint values are measured, one of ``VALUE_SIDES``; those of the motor are angles.
     """
@@ -195,11 +210,13 @@ def column_quantities(robot: Robot, side: str = "joint") -> dict[str, str]:
     units |= dict(zip(names, joints, strict=True))
     for name, unit in units.items():
         kinds |= dict.fromkeys((f"{name}.{what}" for what in RATES), UNITS[unit][0])
-        kinds |= dict.fromkeys((f"{name}.{what}" for what in EFFORTS[:2]), "effort")
-        kinds[f"{name}.{EFFORTS[2]}"] = ""
+        efforts = "effort force" if unit == "m" else "effort moment"
+        kinds |= dict.fromkeys((f"{name}.{what}" for what in EFFORTS[:2]), efforts)
+        kinds[f"{name}.{EFFORTS[2]}"] = "current"
     kinds |= dict.fromkeys((*DEFLECTION[:3], *PAYLOAD[1:], "blend"), "length")
     kinds |= dict.fromkeys(DEFLECTION[3:], "angle")
-    kinds |= dict.fromkeys((*WRENCH, PAYLOAD[0], "dwell", "arc"), "")
+    kinds |= dict.fromkeys(WRENCH[:3], "force") | dict.fromkeys(WRENCH[3:], "moment")
+    kinds |= {PAYLOAD[0]: "mass"} | dict.fromkeys(("dwell", "arc"), "")
     # If a joint and a pose coordinate have the same name, rates and efforts are the joint's.
     pose = zip(robot.pose_names, robot.pose_units, strict=True)
     return kinds | {name: UNITS[unit][0] for name, unit in pose}
@@ -268,10 +285,20 @@ def _read_csv(
         lines, above = _read_lines(text, path), 0
         while (first := next(lines, "")).startswith("#"):
             above += 1
-        rows = _split_rows(path, itertools.chain([first], lines), first, dialect)
+        separator = dialect.separator
+        if separator is None:
+            # Column names contain no separators, so a single kind of them in the header is certain.
+            there = [mark for mark in (";", "\t") if mark in first]
+            separator = there[0] if len(there) == 1 and "," not in first else ","
+            if separator != ",":
+                warn_of_file(
+                    path, f"columns are separated by {'tabs' if separator == SEPARATORS['tab'] else separator}"
+                )
+        rows = csv.reader(itertools.chain([first], lines), delimiter=separator)
         header = [name.strip() for name in next(rows, [])]
         cells, number, read = array.array("d"), above + 1, _find_needed(header, kinds, dialect)
-        for number, row in enumerate(rows, above + 2):
+        comma = None if dialect.decimal is None and separator != "," else dialect.decimal == ","
+        for number, row in enumerate(itertools.takewhile(bool, rows), above + 2):
             if len(row) != len(header):
                 raise ParameterError(f"{path}: line {number}", len(row), f"{len(header)} values")
             for name, cell, needed in zip(header, row, read, strict=True):
@@ -280,7 +307,12 @@ def _read_csv(
                     if not cell.strip():
                         value = math.nan
                     else:
-                        value = parse_decimal(cell)
+                        if comma is None and needed and ("," in cell or "." in cell):
+                            # The first mark decides: a file with both may have thousands separators.
+                            comma = "," in cell
+                            if comma:
+                                warn_of_file(path, "numbers have a decimal comma")
+                        value = parse_decimal(cell.translate(SWAPPED_MARKS) if comma else cell)
                         if not math.isfinite(value):
                             raise ValueError(f"{cell!r} is not finite")
                     cells.append(value)
@@ -289,7 +321,10 @@ def _read_csv(
                         cells.append(math.nan)
                         continue
                     where = f"{path}: line {number}, column {name}"
-                    raise ParameterError(where, cell, "a finite number") from None
+                    mark = " with a decimal comma" if comma else " with a decimal point" if "," in cell else ""
+                    raise ParameterError(where, cell, f"a finite number{mark}") from None
+        if any(rows):
+            raise ParameterError(f"{path}: line {number + 1}", "empty", f"{len(header)} values")
     if not cells:
         raise ParameterError(str(path), f"{number if header else 0} lines", "a header row and rows")
     table = np.frombuffer(cells, np.float64).reshape(-1, len(header))
@@ -340,38 +375,18 @@ def _read_lines(text: TextIO, path: Path) -> Iterator[str]:
         yield line
 
 
-def _split_rows(path: Path, lines: Iterator[str], first: str, dialect: Dialect) -> Iterator[list[str]]:
-    """Yield rows with decimal points; a separator or comma that is detected is reported."""
-    separator = dialect.separator
-    if separator is None:
-        # Column names contain no separators, so a single kind of them in the header is certain.
-        there = [mark for mark in (";", "\t") if mark in first]
-        separator = there[0] if len(there) == 1 and "," not in first else ","
-        if separator != ",":
-            name = "tabs" if separator == "\t" else separator
-            warn_of_file(path, f"columns are separated by {name}")
-    rows = csv.reader(lines, delimiter=separator)
-    yield next(rows, [])
-    comma = dialect.decimal == ","
-    for row in rows:
-        if dialect.decimal is None and separator != "," and not comma:
-            comma = any("," in cell for cell in row)
-            if comma:
-                warn_of_file(path, "numbers have a decimal comma")
-        yield [cell.replace(",", ".") for cell in row] if comma else row
-
-
 def _name_columns(header: Sequence[str], kinds: Mapping[str, str], dialect: Dialect) -> tuple[list[str], list[float]]:
     """Return the columns' names in this package, and their units in SI.
 
     :raises ParameterError: a unit of another kind.
-    :raises UnknownNameError: a name that no column has, or a header that is not there.
+    :raises UnknownNameError: a name that no column has, a header that is not there, or a column that differs
+        from a known one in upper and lower case alone.
     """
     ours = {cell: (COLUMN_ALIASES[cell], "") for cell in header if COLUMN_ALIASES.get(cell) in kinds}
     for cell in header:
         match = _UNIT.fullmatch(cell)
-        if match is not None and match[1] in kinds:
-            ours[cell] = match[1], match[2] or match[3]
+        if match is not None and match[1] in kinds and cell not in kinds:
+            ours[cell] = match[1], (match[2] or match[3]).translate(UNIT_SPELLING)
     for given, text in dialect.columns.items():
         name = COLUMN_ALIASES.get(given, given)
         match = _UNIT.fullmatch(text) if text not in header else None
@@ -387,11 +402,14 @@ def _name_columns(header: Sequence[str], kinds: Mapping[str, str], dialect: Dial
             ours[cell] = whole, unit
     names: list[str] = []
     sizes: list[float] = []
+    folded = {name.casefold(): name for name in kinds if name not in {ours.get(c, (c, ""))[0] for c in header}}
     for cell in header:
         name, unit = ours.get(cell, (cell, ""))
         kind = kinds.get(name, "")
-        if unit and UNITS.get(unit, ("",))[0] != kind:
-            fit = [word for word, (of, _) in UNITS.items() if of == kind]
+        if name not in kinds and name.casefold() in folded:
+            raise UnknownNameError("column", name, [folded[name.casefold()]])
+        if unit and (unit not in UNITS or UNITS[unit][0] not in kind.split()):
+            fit = [word for word, (of, _) in UNITS.items() if of in kind.split()]
             raise ParameterError(f"{cell}: unit", unit, f"one of {', '.join(fit) or 'none'}")
         names.append(name)
         sizes.append(UNITS[unit][1] if unit else dialect.size(kind))

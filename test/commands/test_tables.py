@@ -7,17 +7,21 @@ import os
 import re
 import subprocess
 import sys
+import tempfile
 import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from hypothesis import example, given
+from hypothesis import strategies as st
 from scipy.io import loadmat
 
 from pkm_twin.bags.reader import BagWriter
 from pkm_twin.errors import ParameterError
 from pkm_twin.recordings import Dialect, ReadOptions, read, write_table
+from pkm_twin.recordings.tables import UNITS, column_quantities, read_table
 from pkm_twin.recordings.topics import DEFINITIONS, JOINT_STATE
 from test.bags.folders import make_folder
 from test.support.robots import load, parameters_of
@@ -150,6 +154,56 @@ def test_an_ambiguous_table_is_refused(motion):
     Path("a.csv").write_text(written(header, [time, *q.T], ",", ","))
     with pytest.raises(ParameterError):
         read("a.csv", robot)
+
+
+@example(values=[1234], separator=";", marks=".,", end="\n", quote=False, other="")
+@given(
+    values=st.lists(st.integers(-(10**6), 10**6) | st.floats(-1e6, 1e6).map(lambda x: round(x, 3)), max_size=8),
+    separator=st.sampled_from([",", ";", "\t"]),
+    marks=st.sampled_from([".", ",", ".,", ",."]),
+    end=st.sampled_from(["\n", "\r\n", "\r"]),
+    quote=st.booleans(),
+    other=st.sampled_from(["", "a, b", "1.5"]),
+)
+def test_marks_of_numbers_are_read_as_meant_or_the_table_is_refused(values, separator, marks, end, quote, other):
+    """A decimal mark, and a second one between thousands; a fraction in the file tells one from the other."""
+    values = [*values, 0.5]
+
+    def told(value):
+        text = f"{value:,.12g}" if len(marks) == 2 else f"{value:.12g}"
+        text = text.translate(str.maketrans(".,", marks if len(marks) == 2 else marks + "'"))
+        return f'"{text}"' if quote or separator in text else text
+
+    word = f'"{other}"' if other else ""
+    rows = [separator.join((str(k), told(value), word)) for k, value in enumerate(values)]
+    with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        path = Path(folder) / "a.csv"
+        path.write_bytes((separator.join(("time", "x", "note")) + "\n" + end.join(rows) + 3 * end).encode())
+        try:
+            found = read_table(path, {"time": "time", "x": "length"})
+        except ParameterError:
+            assert len(marks) == 2 or (separator, marks) == (",", ",")  # A plain table is read.
+            return
+    assert found["x"].tolist() == values
+
+
+def test_units_of_headers_are_those_of_the_column_or_refused(tmp_path):
+    kinds = column_quantities(load("delta_cu"))
+    for kind, name in {kind: name for name, kind in kinds.items()}.items():
+        for unit, (quantity, size) in UNITS.items():
+            for header in (f"{name} [{unit}]", f"{name}_{unit}", f"{name} ({unit}/s^2)"):
+                path = tmp_path / "a.csv"
+                path.write_text(f"{header}\n2.0\n")
+                if quantity in kind.split():
+                    assert read_table(path, kinds)[name].tolist() == [2.0 * size]
+                else:
+                    with pytest.raises(ParameterError, match="unit"):
+                        read_table(path, kinds)
+        for header in (name.upper(), f"{name} [furlong]"):
+            path.write_text(f"{header}\n2.0\n")
+            with pytest.raises(ParameterError):
+                read_table(path, kinds)
 
 
 def test_options_of_a_command_are_the_dialect(motion, twin):
