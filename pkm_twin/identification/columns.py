@@ -1,29 +1,233 @@
 # Copyright 2026 pkm_twin maintainers. SPDX-License-Identifier: Apache-2.0
-"""Columns of the numbers of a robot's file and of usual errors, at the rows of a recording."""
+"""Columns of a recording's model: the numbers of the robot's file, and errors that may be present.
+
+Errors of the drives and the recording (a gain, a delay, an offset, an elastic drive, another
+friction law, another rate of time), and lengths and angles of the robot's file, which a fit takes
+for certain. The search for a recording's cause and the judgement of a fit have the same columns.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
+from delta_dynamics.torques.derivatives import differentiate_numbers, torques_by_numbers
 from pkm_twin.codegen.arrays import Array, Mask
+from pkm_twin.errors import ParameterError
 from pkm_twin.identification.evidence import Signals, Spectra
-from pkm_twin.identification.judge import ALL_JOINTS
-from pkm_twin.identification.rows import Rows
-from pkm_twin.identification.samples import Motion
-from pkm_twin.identification.suspects import DELAY_DEVIATION, GAIN, GAIN_DEVIATION, Lengths, list_errors
+from pkm_twin.identification.parameters import FileParameters
+from pkm_twin.identification.rows import BLOCK_ROWS, Rows
+from pkm_twin.identification.samples import MIN_RELATIVE_NOISE, Motion, evaluate_blocks
+from pkm_twin.identification.verdict import ALL_JOINTS, GEOMETRY, Suspect
 from pkm_twin.identification.words import USUAL_SCALE
 from pkm_twin.machine.friction import list_reversal_keys
+from pkm_twin.machine.places import join_path
+from pkm_twin.machine.uncertainty import match_numbers
+from pkm_twin.robot.robot import Robot
 
-MASS_ERROR: Final = 0.3
-"""Prior deviation of a mass or a rotor, as a part of it."""
-OFFSET_SHARE: Final = 0.1
-"""Prior deviation of a current sensor's offset, as a part of the joint's efforts."""
-ERROR_SHARE: Final = 0.03
-"""Prior deviation of an error without a usual size, as a part of the efforts."""
+GAIN: Final = "gain of the efforts"
+LATE: Final = "efforts late"
+LOAD: Final = "friction that grows with the load"
+SQUARE: Final = "friction that grows with the square of the speed"
+STATIC: Final = "static friction above Coulomb friction"
+OFFSET: Final = "sensor offset"
+ELASTIC: Final = "elastic drive"
+SPEED: Final = "time at another rate"
+DELAY: Final = "delay of all efforts"
+CURRENT_OFFSET: Final = "offset of the efforts"
+MASS: Final = "mass or rotor inertia"
+FRICTION: Final = "friction"
+OTHER: Final = "other errors"
+PRIOR_DEVIATIONS: Final = {
+    GAIN: 0.05,  # constants of drives and current sensors are known to some per cent
+    DELAY: 0.02,  # s: buffers of buses and controllers
+    LATE: 2e-3,  # s: one drive against the others
+    LOAD: 0.05,  # gears and screws
+    OFFSET: 0.01,  # rad or machine sizes: homing
+    GEOMETRY: 5e-3,  # rad or machine sizes: parts made to a drawing are within 1 %, two deviations
+    MASS: 0.3,  # as a fraction of itself
+    FRICTION: 0.3,  # as a fraction of a joint's efforts
+    CURRENT_OFFSET: 0.1,  # as a fraction of a joint's efforts
+    OTHER: 0.03,  # as a fraction of the efforts
+}
+"""Prior standard deviations of errors and of the file's numbers; ``docs/fit.md`` has the same."""
+DIFFERENCE_STEP: Final = 1e-4
+"""Step of difference quotients, rad or machine sizes."""
+_PLACES: Final = re.compile(r"geometry\.|origin\[|(joints|rods)\.[^.]+\.(at|ends)\[")
+
+
+@dataclass(frozen=True, eq=False)
+class Errors:
+    """Errors that a robot and a recording may have: s of them, at k rows of n joints.
+
+    ``columns``: derivatives of the measured efforts by the errors' sizes, (k, n, s). ``missed``:
+    what the differentiation of the positions misses, joint by joint, (k, n, n).
+    """
+
+    suspects: tuple[Suspect, ...]
+    columns: Array
+    missed: Array
+
+    @classmethod
+    def from_rows(cls, rows: Rows, values: Array) -> Errors:
+        """Differentiate the measured efforts at a recording's rows.
+
+        :param values: of all parameters of the file, at which the efforts are linearised.
+        """
+        robot, s = rows.model.robot, rows.signals
+        names, efforts, motion = robot.joint_names, robot.effort_units, s.motion
+        pairs = list(zip(robot.joint_units, efforts, strict=True))
+        # A radian for joints that turn, the machine's size for those that slide.
+        eye, lengths = np.eye(len(names)), np.array([robot.size if u == "m" else 1.0 for u in robot.joint_units])
+        # Dry friction is left out: it has no derivative where a rate changes sign.
+        own = [name.rpartition(".")[2] for name in rows.model.parameters.names]
+        smooth = np.where([word in list_reversal_keys() for word in own], 0.0, values)
+
+        def compute_efforts(q: Array | float = 0.0, qd: Array | float = 0.0, qdd: Array | float = 0.0) -> Array:
+            """Compute the efforts of a motion that differs by these amounts."""
+            q, qd, qdd = motion.q + q, motion.qd + qd, motion.qdd + qdd
+            return rows.model.efforts(replace(motion, q=q, qd=qd, qdd=qdd), smooth)
+
+        here, measured = compute_efforts(), s.effort
+        load, square, *static = np.moveaxis(s.own, -1, 0)
+        # A law that the robot has is fitted and no error.
+        share = None if "load-dependent" in robot.laws else PRIOR_DEVIATIONS[LOAD]
+        found: list[tuple[Suspect, Array]] = []
+        for kind, units, usual, column in (
+            (GAIN, [""] * len(names), PRIOR_DEVIATIONS[GAIN], measured),
+            (LATE, ["s"] * len(names), PRIOR_DEVIATIONS[LATE], -rows.change),
+            (LOAD, [""] * len(names), share, load),
+            (SQUARE, [f"{e} s2/{u}2" for u, e in pairs], None, square),
+            *((STATIC, efforts, None, law) for law in static),
+        ):
+            each = zip(names, units, eye, strict=True)
+            found += [(Suspect(kind, name, unit, usual), column * e) for name, unit, e in each]
+        for name, (unit, _), length, e in zip(names, pairs, lengths, eye, strict=True):
+            step = DIFFERENCE_STEP * length * e
+            slope = (compute_efforts(-step) - compute_efforts(step)) / (2.0 * DIFFERENCE_STEP * length)
+            found.append((Suspect(OFFSET, name, unit, PRIOR_DEVIATIONS[OFFSET] * float(length)), slope))
+        for j, (name, (u, effort)) in enumerate(zip(names, pairs, strict=True)):
+            # The load turns the drive's outer side back by so much.
+            size = DIFFERENCE_STEP * lengths[j] / max(float(np.abs(s.load[0][:, j]).max()), 1e-300)
+            back = (-size * one[:, [j]] * eye[j] for one in s.load)
+            unit = f"{u}/({effort})" if " " in effort else f"{u}/{effort}"
+            found.append((Suspect(ELASTIC, name, unit, positive=True), (compute_efforts(*back) - here) / size))
+        fast, slow = (
+            compute_efforts(0.0, h * motion.qd, (2.0 * h + h**2) * motion.qdd)
+            for h in (DIFFERENCE_STEP, -DIFFERENCE_STEP)
+        )
+        found += [
+            (Suspect(GAIN, ALL_JOINTS, usual=PRIOR_DEVIATIONS[GAIN]), measured),
+            (Suspect(LOAD, ALL_JOINTS, usual=share), load),
+            (Suspect(SPEED, ALL_JOINTS), (fast - slow) / (2.0 * DIFFERENCE_STEP)),
+        ]
+        geometry = Lengths.from_robot(robot)
+        return cls(
+            (*(one for one, _ in found), *geometry.suspects),
+            np.concatenate([np.stack([c for _, c in found], -1), geometry.columns(rows, values)], -1),
+            (compute_efforts(0.0, *s.missed) - here)[..., None] * eye,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Lengths:
+    """Lengths and angles of a file as suspects, by how much the file's numbers change with each.
+
+    ``paths``: of the numbers. ``mixing``: shape (paths, suspects).
+    """
+
+    suspects: tuple[Suspect, ...]
+    paths: tuple[str, ...]
+    mixing: Array
+
+    @classmethod
+    def from_robot(cls, robot: Robot) -> Lengths:
+        """List the file's lengths and angles; an entry of its ``uncertainty`` is one suspect."""
+        known = robot.file_numbers()
+        units = {p: unit for p, (_, unit) in known.items() if _PLACES.match(p)}
+        paths = tuple(path for path, unit in units.items() if unit in ("m", "rad"))
+        causes: list[tuple[Suspect, Mapping[str, float]]] = []
+        listed = set[str]()
+        for name, entry in robot.uncertainty.items():
+            below = {p: v for p, v in match_numbers(name, entry, known).items() if p in paths}
+            listed |= set(below)
+            if below and entry.deviation is None:
+                causes.append((Suspect(GEOMETRY, name, "", entry.relative, known=True), below))
+            elif below:
+                (path,) = below
+                causes.append((Suspect(GEOMETRY, path, units[path], entry.deviation, known=True), {path: 1.0}))
+        for path in paths:
+            if path not in listed:
+                usual = PRIOR_DEVIATIONS[GEOMETRY] * (robot.graph.size if units[path] == "m" else 1.0)
+                causes.append((Suspect(GEOMETRY, path, units[path], usual, known=True), {path: 1.0}))
+        mixing = np.zeros((len(paths), len(causes)))
+        for k, (_, weights) in enumerate(causes):
+            for path, weight in weights.items():
+                mixing[paths.index(path), k] = weight
+        return cls(tuple(one for one, _ in causes), paths, mixing)
+
+    def columns(self, rows: Rows, values: Array) -> Array:
+        """Differentiate the measured efforts at a recording's rows, shape (k, n, suspects).
+
+        :param values: of all parameters of the file.
+        """
+        model, motion = rows.model, rows.signals.motion
+        machine = _set_masses(model.robot, model.parameters, values, "inertia")
+        if model.carried is None:
+            machine = _set_masses(machine, model.parameters, values, "payload")
+        else:
+            machine = machine.numbered(_list_payload_numbers(model.carried))
+        bare = machine.numbered(dict.fromkeys(_list_payload_numbers(machine), 0.0))
+        held = motion.held[:, None, None]
+        away = bool((np.abs(held - 1.0) > MIN_RELATIVE_NOISE).any())
+        slopes, of_bare = (
+            differentiate_numbers(one, self.paths) @ self.mixing if needed else np.zeros(0)
+            for one, needed in ((machine, True), (bare, away))
+        )
+
+        def block(some: slice) -> Array:
+            part = motion.part(some)
+            whole = torques_by_numbers(machine, *part.joints, part.wrench, slopes)
+            if away:
+                less = torques_by_numbers(bare, *part.joints, part.wrench, of_bare)
+                whole = less + held[some] * (whole - less)
+            return whole
+
+        return evaluate_blocks(len(held), BLOCK_ROWS, block)
+
+
+def _set_masses(robot: Robot, parameters: FileParameters, values: Array, kind: str) -> Robot:
+    """Return the robot with fitted masses, or payload, its geometry as it is."""
+    numbers: dict[str, float] = {}
+    for where, group in zip(parameters.slices, parameters.groups, strict=True):
+        if group.kind == kind and (values[where] != group.values).any():
+            new = group.keys(values[where])
+            numbers |= {join_path(key): value for key, value in new.items()}
+            numbers |= {
+                join_path((*key[:-2], key[-1], key[-2])): value
+                for key, value in new.items()
+                if isinstance(key[-1], int) and isinstance(key[-2], int)
+            }
+    given: dict[str, float] = {}
+    for path, value in numbers.items():
+        # Numbers that the file derives from others follow them.
+        with suppress(ParameterError):
+            robot.number(path)
+            given[path] = value
+    return robot.numbered(given) if given else robot
+
+
+def _list_payload_numbers(robot: Robot) -> dict[str, float]:
+    load = robot.payload
+    numbers = {"payload.mass": float(load.mass)}
+    numbers |= {f"payload.com[{i}]": float(v) for i, v in enumerate(load.com)}
+    inertia = np.ndenumerate(np.asarray(load.inertia))
+    return numbers | {f"payload.inertia[{i}][{j}]": float(v) for (i, j), v in inertia}
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,32 +258,23 @@ class Columns:
     def from_rows(cls, rows: Rows) -> Columns:
         """Return the model of the recorded motion, with the usual errors."""
         numbers = _differentiate(rows, rows.table, rows.rest, rows.signals.motion)
+        errors, n = Errors.from_rows(rows, rows.model.parameters.values), rows.effort.shape[1]
         size = np.maximum(np.sqrt(np.mean(rows.effort**2, 0)), 1e-300)
-        values = rows.model.parameters.values
-        errors, _ = list_errors(rows, values)
-        lengths = Lengths.from_robot(rows.model.robot)
-        tables = [
-            -rows.change[..., None],
-            np.broadcast_to(np.eye(len(size)), (*rows.effort.shape, len(size))),
-        ]
-        deviation, kinds = [DELAY_DEVIATION, *(OFFSET_SHARE * size)], ["error", *["offset"] * len(size)]
-        gains = [(one, column) for one, column in errors if one.kind == GAIN]
-        errors = [(one, column) for one, column in errors if one.kind != GAIN]
-        for one, column in errors:
-            rms = np.sqrt(np.mean(column**2, 0))
-            j = int(rms.argmax())
-            if rms[j] > 0.0 and one.where != ALL_JOINTS:
-                tables.append(column[..., None])
-                deviation.append(one.usual or ERROR_SHARE * size[j] / rms[j])
-                kinds.append("error")
-        tables.append(lengths.columns(rows, values))
-        deviation += [float(one.usual or 0.0) for one in lengths.suspects]
-        tables.append(np.stack([column for _, column in gains], -1))
-        deviation += [GAIN_DEVIATION] * len(gains)
-        kinds += ["error"] * (len(lengths.suspects) + len(gains))
-        more = np.concatenate(tables, -1)
-        count = more.shape[-1]
-        scales = np.arange(count) >= count - len(gains)
+        rms = np.sqrt(np.mean(errors.columns**2, 0))
+        gains, others = list[int](), list[int]()
+        for k, one in enumerate(errors.suspects):
+            if one.kind == GAIN:
+                gains.append(k)
+            elif one.known or (one.where != ALL_JOINTS and rms[:, k].any()):
+                others.append(k)
+        deviation = [PRIOR_DEVIATIONS[DELAY], *(PRIOR_DEVIATIONS[CURRENT_OFFSET] * size)]
+        for k in (*others, *gains):
+            j, one = int(rms[:, k].argmax()), errors.suspects[k]
+            deviation.append(one.usual or (0.0 if one.known else PRIOR_DEVIATIONS[OTHER] * size[j] / rms[j, k]))
+        kinds = ["error", *["offset"] * n, *["error"] * (len(others) + len(gains))]
+        offsets = np.broadcast_to(np.eye(n), (*rows.effort.shape, n))
+        more = np.concatenate([-rows.change[..., None], offsets, errors.columns[..., [*others, *gains]]], -1)
+        scales = np.arange(len(kinds)) >= len(kinds) - len(gains)
         return replace(
             numbers,
             columns=np.concatenate([numbers.columns, more], -1),
@@ -88,7 +283,7 @@ class Columns:
             low=np.concatenate([numbers.low, np.where(scales, 1.0 - USUAL_SCALE, -np.inf)]),
             high=np.concatenate([numbers.high, np.where(scales, 1.0 - 1.0 / USUAL_SCALE, np.inf)]),
             kinds=(*numbers.kinds, *kinds),
-            turning=np.concatenate([numbers.turning, np.zeros(count, np.bool_)]),
+            turning=np.concatenate([numbers.turning, np.zeros(len(kinds), np.bool_)]),
             gains=len(gains),
         )
 
@@ -105,13 +300,8 @@ class Columns:
         own = self.rows.table[..., rubs] * turned[:, None]
         table[..., rubs] = own if order is None else own[:, list(order)]
         made = _differentiate(self.rows, table, rest, motion)
-        count = made.columns.shape[-1]
-        return replace(
-            self,
-            certain=made.certain,
-            fast_certain=made.fast_certain,
-            columns=np.concatenate([made.columns, self.columns[..., count:]], -1),
-        )
+        columns = np.concatenate([made.columns, self.columns[..., made.columns.shape[-1] :]], -1)
+        return replace(self, certain=made.certain, fast_certain=made.fast_certain, columns=columns)
 
     @property
     def payload(self) -> Mask:
@@ -128,16 +318,9 @@ class Columns:
         """Return the statistics of some rows, with other efforts, or time at another rate."""
         r, s, more = self.rows, self.rows.signals, rate**2 - 1.0
         joints = slice(None) if order is None else list(order)
-        return Spectra.from_signals(
-            Signals(
-                (self.certain + more * self.fast_certain)[inner],
-                (self.columns + more * self.fast)[inner],
-                (r.effort if effort is None else effort)[inner][:, joints],
-                r.counts[inner],
-                s.noise[joints],
-                s.band,
-            )
-        )
+        measured = (r.effort if effort is None else effort)[:, joints]
+        certain, columns = self.certain + more * self.fast_certain, self.columns + more * self.fast
+        return Spectra.from_signals(Signals(certain, columns, measured, r.counts, s.noise[joints], s.band), inner)
 
 
 def _differentiate(rows: Rows, table: Array, rest: Array, motion: Motion) -> Columns:
@@ -146,7 +329,7 @@ def _differentiate(rows: Rows, table: Array, rest: Array, motion: Motion) -> Col
     standing, rest_standing = rows.model.columns(replace(motion, qd=0 * motion.qd, qdd=0 * motion.qdd))
     rubs = np.array([g.kind == "friction" for g in p.groups for _ in g.names])
     quick = np.where(rubs, 0.0, table - standing)
-    told = np.maximum(np.sqrt(np.mean((rows.rest + rows.table @ p.values) ** 2, 0)), 1e-300)
+    effort = np.maximum(np.sqrt(np.mean((rows.rest + rows.table @ p.values) ** 2, 0)), 1e-300)
     columns, fast, deviation, low = [], [], list[float](), list[float]()
     kinds, turning = list[str](), list[bool]()
     for where, group in zip(p.slices, p.groups, strict=True):
@@ -157,7 +340,7 @@ def _differentiate(rows: Rows, table: Array, rest: Array, motion: Motion) -> Col
         if kind == "inertia":
             # All numbers of a body together: its mass.
             own, inertial = ((one @ values)[..., None] for one in (own, inertial))
-            count, kind, spread, least = 1, "masses", np.array([MASS_ERROR]), np.array([-1.0])
+            count, kind, spread, least = 1, "masses", np.array([PRIOR_DEVIATIONS[MASS]]), np.array([-1.0])
         elif kind == "payload":
             # A payload's centre is within 40 % of the machine's size.
             reach, most = 0.4 * robot.size, max(float(p.scales[where][0]), 1e-9)
@@ -165,12 +348,12 @@ def _differentiate(rows: Rows, table: Array, rest: Array, motion: Motion) -> Col
             least[0] = -values[0]
         elif kind == "rotor":
             kind, least = "masses", -values
-            spread = np.where(values > 0.0, MASS_ERROR * values, p.scales[where])
+            spread = np.where(values > 0.0, PRIOR_DEVIATIONS[MASS] * values, p.scales[where])
         else:
             shown = np.sqrt(np.mean(rows.table[..., where] ** 2, 0))
             j = int(shown.max(1).argmax())
-            share = OFFSET_SHARE if word.endswith("offset") else 0.3
-            spread = share * told[j] / np.maximum(shown[j], 1e-12 * told[j] + 1e-300)
+            share = PRIOR_DEVIATIONS[CURRENT_OFFSET if word.endswith("offset") else FRICTION]
+            spread = share * effort[j] / np.maximum(shown[j], 1e-12 * effort[j] + 1e-300)
             least = least if word.endswith("offset") else -values
         columns.append(own)
         fast.append(inertial)
@@ -178,12 +361,11 @@ def _differentiate(rows: Rows, table: Array, rest: Array, motion: Motion) -> Col
         low += least.tolist()
         kinds += [kind] * count
         turning += [kind == "friction" and word in {*list_reversal_keys(), "viscous"}] * count
-    quick_rest = (rest - rest_standing) + quick @ p.values
     return Columns(
         rows,
         rest + table @ p.values,
         np.concatenate(columns, -1),
-        quick_rest,
+        (rest - rest_standing) + quick @ p.values,
         np.concatenate(fast, -1),
         np.array(deviation),
         np.array(low),

@@ -19,7 +19,6 @@ from delta_dynamics.torques.virtual_work import inverse_dynamics, null_efforts
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.estimation import estimate
-from pkm_twin.identification.judge import MAX_NOISE_RATIO
 from pkm_twin.identification.rows import BLOCK_ROWS
 from pkm_twin.identification.samples import (
     Filtering,
@@ -31,6 +30,7 @@ from pkm_twin.identification.samples import (
     simulate_noise,
     tracks,
 )
+from pkm_twin.identification.verdict import MAX_NOISE_RATIO
 from pkm_twin.identification.words import MAX_DELAY, late_text
 from pkm_twin.machine.friction import Dahl
 from pkm_twin.recordings import Load, Recording, at_rest, split_by_load

@@ -23,9 +23,10 @@ from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.estimation import Estimate, estimate
 from pkm_twin.identification.fit import Judged, Result, refuse_faults
 from pkm_twin.identification.identifiable import make_nonnegative_cone
-from pkm_twin.identification.judge import Case, Suspect, Verdict, fit_and_judge
+from pkm_twin.identification.judge import Case, fit_and_judge
 from pkm_twin.identification.parameters import FITTED_RATIO, Group, Number, group_elements, make_number
 from pkm_twin.identification.rows import HELD_OUT
+from pkm_twin.identification.verdict import Suspect, Verdict
 from pkm_twin.messages.reading import rotate_to_base
 from pkm_twin.recordings import Recording
 from pkm_twin.robot.robot import Robot
@@ -404,20 +405,10 @@ def _judge_fit(robot: Robot, parts: Sequence[_Part], found: Estimate, factors: A
         own = np.where(counts, moved, 0.0)
         columns = np.concatenate([slopes, _make_zero_columns(i, len(parts), np.ones_like(own))], -1)
         target = np.where(counts, left + columns @ change, 0.0)
-        cases.append(
-            Case(
-                target[:, measured],
-                columns[:, measured],
-                np.zeros((*own[:, measured].shape, 0)),
-                np.zeros(0),
-                np.stack(errors, -1)[:, measured],
-                own[:, measured],
-                counts[:, measured].astype(np.float64),
-                _find_noise(left, own, columns.shape[-1])[measured],
-                1.0,
-                part.split,
-            )
-        )
+        noise = _find_noise(left, own, columns.shape[-1])[measured]
+        columns = np.concatenate([columns, np.stack(errors, -1)], -1)[:, measured]
+        certain, own, used = (one[:, measured] for one in (own - target, own, counts.astype(np.float64)))
+        cases.append(Case(certain, columns, own, used, noise, 1.0, np.zeros(0), part.split))
     names = [name for name, good in zip(AXES, measured.tolist(), strict=True) if good]
     verdict, _ = fit_and_judge(names, suspects, cases, found.prior)
     off = verdict.change - change

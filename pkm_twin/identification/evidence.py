@@ -74,12 +74,13 @@ class Spectra:
     power: Array
 
     @classmethod
-    def from_signals(cls, s: Signals) -> Spectra:
-        """Transform the signals of a recording."""
-        k, n = s.measured.shape
-        table = np.concatenate([s.certain[..., None], s.columns], -1) * s.counts[..., None]
+    def from_signals(cls, s: Signals, rows: slice = slice(None)) -> Spectra:
+        """Transform some rows of a recording's signals."""
+        certain, columns, measured, counts = (one[rows] for one in (s.certain, s.columns, s.measured, s.counts))
+        k, n = measured.shape
+        table = np.concatenate([certain[..., None], columns], -1) * counts[..., None]
         both = scipy.fft.dct(table, axis=0, norm="ortho")
-        seen = scipy.fft.dct(s.measured * s.counts, axis=0, norm="ortho")
+        seen = scipy.fft.dct(measured * counts, axis=0, norm="ortho")
         last = max(min(BANDS + 2, k), round(FLAT_BAND * s.band * k) if s.band < 1.0 else k)
         edges = np.unique(np.geomspace(1, last, BANDS + 1).astype(int))
         edges[0] = 0
@@ -93,8 +94,8 @@ class Spectra:
         p = np.array(power)
         wide = np.concatenate([p[:1], p, p[-1:]])
         p = np.maximum((wide[:-2] + 2.0 * wide[1:-1] + wide[2:]) / 4.0, 1e-6 * p.max(0))
-        rms = np.sqrt(np.mean(s.measured**2, 0))
-        used = np.maximum(s.counts.mean(0), 1.0 / k)
+        rms = np.sqrt(np.mean(measured**2, 0))
+        used = np.maximum(counts.mean(0), 1.0 / k)
         noise = np.maximum(np.maximum(s.noise, MIN_RELATIVE_NOISE * rms) ** 2 * used, 1e-300)
         return cls(np.stack(grams, 1), np.diff(edges).astype(float), noise[:, None], p.T)
 

@@ -18,7 +18,7 @@ from pkm_twin.identification.compare import MAX_DELAY_PASSES, MAX_RESIDUAL
 from pkm_twin.identification.estimation import Estimate, find_nearest, find_violations
 from pkm_twin.identification.hypotheses import Explanation, explain
 from pkm_twin.identification.identifiable import KINDS, Kind
-from pkm_twin.identification.judge import Verdict, make_basis
+from pkm_twin.identification.judge import judge_problem, make_basis
 from pkm_twin.identification.parameters import (
     Number,
     Status,
@@ -26,7 +26,7 @@ from pkm_twin.identification.parameters import (
 )
 from pkm_twin.identification.rows import Problem, Rows
 from pkm_twin.identification.samples import MIN_RELATIVE_NOISE, Filtering
-from pkm_twin.identification.suspects import judge_problem
+from pkm_twin.identification.verdict import Verdict
 from pkm_twin.identification.words import MAX_DELAY, late_text
 from pkm_twin.recordings import Recording
 from pkm_twin.robot.robot import Robot

@@ -23,11 +23,11 @@ from pkm_twin.identification.drives import FIT, fit_constants, parse_constants
 from pkm_twin.identification.fit import Fit, correct_delays, fit, refuse_faults, solve_and_judge
 from pkm_twin.identification.hypotheses import Explanation, describe_positions, explain_recording
 from pkm_twin.identification.identifiable import KINDS, PAYLOAD, Kind, list_drive_parameters
-from pkm_twin.identification.judge import SIGMAS, Verdict, make_basis
+from pkm_twin.identification.judge import SIGMAS, make_basis
 from pkm_twin.identification.parameters import Number, file_parameters
 from pkm_twin.identification.rows import Problem
 from pkm_twin.identification.samples import MIN_RELATIVE_NOISE, filtered
-from pkm_twin.identification.suspects import LINE
+from pkm_twin.identification.verdict import LINE, Verdict
 from pkm_twin.machine.friction import BASIC, KNOWN_FRACTION, LAWS, Dahl, select_compiled_laws
 from pkm_twin.recordings import Recording
 from pkm_twin.robot.robot import Robot

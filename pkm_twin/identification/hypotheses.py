@@ -21,14 +21,13 @@ import scipy  # type: ignore[import-untyped]  # its parts come when they are ask
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError, SingularityError, UnreachableError
-from pkm_twin.identification.columns import OFFSET_SHARE, Columns
+from pkm_twin.identification.columns import CURRENT_OFFSET, GAIN, PRIOR_DEVIATIONS, Columns
 from pkm_twin.identification.compare import cut_recording, find_idle
 from pkm_twin.identification.evidence import Model, Spectra
 from pkm_twin.identification.judge import ALTERNATIVE_LOG_ODDS, SIGMAS
 from pkm_twin.identification.parameters import file_parameters
 from pkm_twin.identification.rows import MAX_EFFORT, Rows, make_rows
 from pkm_twin.identification.samples import Motion, find_held_payload
-from pkm_twin.identification.suspects import GAIN_DEVIATION
 from pkm_twin.identification.words import (
     EFFORT_UNITS,
     MAX_DELAY,
@@ -233,7 +232,7 @@ class HypothesisSearch:
         """Weigh other signs, scales and orders of the efforts, no relation, and time."""
         n, eye, sp = len(self.joints), np.eye(len(self.joints)), self.spectra
         offset = np.array([kind == "offset" for kind in self.columns.kinds])
-        none = np.where(offset, 1.0 / OFFSET_SHARE, 0.0)
+        none = np.where(offset, 1.0 / PRIOR_DEVIATIONS[CURRENT_OFFSET], 0.0)
         yield self.weigh(NO_MACHINE, RARE_PRICE, sp, ("",), gains=np.zeros(n), factors=none)
         whole = [np.ones(n), *eye] if n > 1 else [np.ones(1)]
         signs = [1.0 - 2.0 * one for one in whole]
@@ -428,15 +427,15 @@ class HypothesisSearch:
         gains, deviations = self._find_gains()
         j, mean = int(np.abs(gains).argmax()), float(gains.mean())
         # A gain of 10 %, two usual deviations, is named.
-        if not sound.kinds and abs(gains[j]) > 2.0 * GAIN_DEVIATION + SIGMAS * deviations[j]:
+        if not sound.kinds and abs(gains[j]) > 2.0 * PRIOR_DEVIATIONS[GAIN] + SIGMAS * deviations[j]:
             if (np.abs(gains - mean) >= 0.5 * abs(mean)).any():
                 scale = 1.0 / (1.0 - float(gains[j]))
                 return Explanation(scale_text(self.joints[j], scale), not is_usual_scale(scale))
             # In slow motions payload and friction that the file lacks look like a gain.
-            beside, _ = self._find_gains(kinds="friction payload", usual=GAIN_DEVIATION)
+            beside, _ = self._find_gains(kinds="friction payload", usual=PRIOR_DEVIATIONS[GAIN])
             scale = 1.0 / (1.0 - mean)
             text, clear = self._tell_scale(scale)
-            if clear or abs(beside[j]) > 2.0 * GAIN_DEVIATION:
+            if clear or abs(beside[j]) > 2.0 * PRIOR_DEVIATIONS[GAIN]:
                 return Explanation(text, clear and not is_usual_scale(scale))
         if sound.kinds in ("payload", "heavy payload") and self.rows.recording.load is None:
             held = self._weigh_payload(self.spectra, 0.0)

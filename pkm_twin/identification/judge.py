@@ -14,24 +14,40 @@ recordings cannot show counts with its prior probability.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
-from typing import Any, Final, Literal
+from typing import Final
 
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array, Mask
+from pkm_twin.identification.columns import (
+    DELAY,
+    ELASTIC,
+    GAIN,
+    LATE,
+    OTHER,
+    PRIOR_DEVIATIONS,
+    SPEED,
+    Errors,
+)
 from pkm_twin.identification.evidence import Model, Posterior, Signals, Spectra
+from pkm_twin.identification.rows import Problem
 from pkm_twin.identification.samples import MIN_RELATIVE_NOISE
+from pkm_twin.identification.verdict import (
+    ALL_JOINTS,
+    GEOMETRY,
+    LINE,
+    MAX_NOISE_RATIO,
+    Answer,
+    Channel,
+    Finding,
+    Suspect,
+    Verdict,
+)
 
-Answer = Literal["explains", "explains partly", "does not explain"]
-Deviations = Literal["as estimated", "widened", "withheld"]
-SENTENCE: Final[dict[Answer, str]] = {
-    "explains": "explains",
-    "explains partly": "partly explains",
-    "does not explain": "does not explain",
-}
 SIGMAS: Final = 4.5
 """Standard deviations that a normal error exceeds in one of 150,000 cases."""
 PRESENT_PROBABILITY: Final = 0.2
@@ -40,214 +56,20 @@ FOUND_LOG_ODDS: Final = float(np.log(99.0))
 """Log odds from which an error is found: 99 %."""
 ALTERNATIVE_LOG_ODDS: Final = 3.0
 """Log evidence below the best error's up to which another one is named with it: one in 20."""
-MAX_NOISE_RATIO: Final = 1.5
-"""Largest ratio of residual to noise, in the band of the motion, that noise alone explains."""
 MAX_UNEXPLAINED: Final = 0.2
 """Largest fraction of a channel's measured variation that may stay unexplained."""
-ALL_JOINTS: Final = "all joints"
-"""Place of an error that all joints share."""
-UNKNOWN_ERROR: Final = "no known error"
-"""Name of a finding whose error explains the signal but has an impossible size."""
-GEOMETRY: Final = "geometry"
-
-
-@dataclass(frozen=True)
-class Suspect:
-    """An error that a machine or a recording may have.
-
-    ``kind``: in words; ``where``: a joint, a direction, or a number of the file; ``unit``: of its
-    size, empty for a ratio; ``usual``: its prior standard deviation, None where there is none;
-    ``known``: every machine has it, as no length is exact. ``positive``: no size below zero is
-    possible.
-    """
-
-    kind: str
-    where: str
-    unit: str = ""
-    usual: float | None = None
-    known: bool = False
-    positive: bool = False
-
-    def __str__(self) -> str:
-        return f"{self.kind} ({self.where})"
-
-
-@dataclass(frozen=True)
-class Finding:
-    """A suspect that the residual shows: its size, standard deviation, and how clearly.
-
-    ``sigmas``: of the residual; no more than of the size, which other findings make less sure.
-
-    ``others``: suspects that explain the residual nearly as well.
-    """
-
-    suspect: Suspect
-    size: float
-    deviation: float
-    sigmas: float
-    others: tuple[Suspect, ...] = ()
-
-    def __str__(self) -> str:
-        return (
-            f"{self.suspect} {_write_size(self.size, self.suspect.unit)} +- "
-            f"{_write_size(self.deviation, self.suspect.unit)}, {self.sigmas:.3g} sigma"
-            + "".join(f", or {other}" for other in self.others)
-        )
-
-
-@dataclass(frozen=True)
-class Channel:
-    """A joint's, or a direction's, residual in the band of the motion.
-
-    ``residual`` and ``noise``: rms, in the unit of the measurements; ``noise`` is what the signal
-    has above the band, scaled to it. ``left``: the part of the measured variation that neither the
-    fit nor a finding nor noise explains; ``left_ratio``: that residual over noise, less what chance
-    may do. ``held_out``: residual of what was held out over that of what was fitted, or over noise.
-    """
-
-    name: str
-    residual: float
-    noise: float
-    left: float
-    left_ratio: float
-    held_out: float
 
 
 @dataclass(frozen=True, eq=False)
-class Verdict:
-    """Whether a model explains its recordings, and the posterior of the fitted numbers.
+class Case(Signals):
+    """One recording, the first ``split`` rows of which are fitted.
 
-    ``hints``: errors that are as likely as not. ``change``: posterior mean of the numbers less the
-    prior's mean, (p,). ``plain``: their covariance by noise alone, with the errors that were found;
-    ``covariance``: with all errors that may be present, (p, p). ``own``: posterior mean of each
-    recording's own unknowns. ``slow``: the motion is too slow to show any inertia.
+    ``columns``: of the p numbers, of the s errors, and of the recording's own d unknowns, (k, n,
+    p + s + d). ``own_sizes``: prior standard deviations of the latter, (d,).
     """
 
-    answer: Answer
-    channels: tuple[Channel, ...]
-    findings: tuple[Finding, ...]
-    hints: tuple[Finding, ...]
-    change: Array
-    plain: Array
-    covariance: Array
-    own: tuple[Array, ...]
-    slow: bool = False
-
-    @property
-    def deviations(self) -> Deviations:
-        """Report of the standard deviations: as estimated, widened, or withheld."""
-        if self.answer == "does not explain":
-            return "withheld"
-        loud = any(channel.left_ratio > MAX_NOISE_RATIO for channel in self.channels)
-        return "widened" if self.findings or self.hints or loud else "as estimated"
-
-    def __str__(self) -> str:
-        return f"the model {SENTENCE[self.answer]} the recordings"
-
-    def list_sentences(self, units: tuple[str, ...]) -> list[str]:
-        """List the sentences that explain the answer: causes, residuals and what is not excluded.
-
-        :param units: units of the channels' measurements.
-        """
-        told = [f"likely cause: {one}" for one in self.findings]
-        if self.slow:
-            told.append(
-                "the motion is too slow to show inertia above the noise: inertia parameters are "
-                "undetermined, and a wrong time scale would not show"
-            )
-        for channel, unit in zip(self.channels, units, strict=True):
-            if channel.left_ratio > 1.0 or self.answer == "does not explain":
-                told.append(
-                    f"{channel.name}: residual {channel.residual:.3g} {unit} in the band of the "
-                    f"motion, noise {channel.noise:.3g} {unit}; {100 * channel.left:.2g} % of the "
-                    "variation has no known cause"
-                )
-        told += [f"not excluded: {one}" for one in self.hints]
-        if self.deviations != "as estimated":
-            told.append(f"standard deviations are {self.deviations}")
-        return told
-
-    def as_json(self, units: tuple[str, ...]) -> dict[str, Any]:
-        """Return plain data for JSON.
-
-        :param units: of the channels' measurements.
-        """
-        return {
-            "model": self.answer,
-            "standard_deviations": self.deviations,
-            "too_slow_for_inertia": self.slow,
-            "findings": [_as_json(one) for one in self.findings],
-            "not_excluded": [_as_json(one) for one in self.hints],
-            "channels": [
-                {
-                    "name": channel.name,
-                    "unit": unit,
-                    "residual_in_band": channel.residual,
-                    "noise_in_band": channel.noise,
-                    "unexplained_part": channel.left,
-                    "held_out_over_fitted": channel.held_out,
-                }
-                for channel, unit in zip(self.channels, units, strict=True)
-            ],
-        }
-
-
-def _write_size(size: float, unit: str) -> str:
-    return f"{size:.3g} {unit}" if unit else f"{100 * size:.2g} %"
-
-
-def _as_json(one: Finding) -> dict[str, Any]:
-    return {
-        "kind": one.suspect.kind,
-        "where": one.suspect.where,
-        "size": one.size,
-        "unit": one.suspect.unit,
-        "standard_deviation": one.deviation,
-        "sigmas": one.sigmas,
-        "or": [{"kind": other.kind, "where": other.where} for other in one.others],
-    }
-
-
-@dataclass(frozen=True, eq=False)
-class Case:
-    """One recording: k rows of n channels, the first ``split`` of which are fitted.
-
-    ``target``: measured signals less those of the prior's mean, (k, n). ``fitted``: columns of the
-    p numbers; ``own``: of the recording's own d unknowns, with their standard deviations
-    ``own_sizes``; ``errors``: of the s errors, (k, n, ...) each. ``counts``: 1 for what is used.
-    ``noise``: deviation of a row's noise as if rows were independent, (n,). ``band``: the part of
-    the rows' rate that the filter passes.
-    """
-
-    target: Array
-    fitted: Array
-    own: Array
     own_sizes: Array
-    errors: Array
-    measured: Array
-    counts: Array
-    noise: Array
-    band: float
     split: int
-
-    @property
-    def columns(self) -> Array:
-        """Columns of numbers, errors and own unknowns, shape (k, n, p + s + d)."""
-        return np.concatenate([self.fitted, self.errors, self.own], -1)
-
-    def spectra(self, count: int) -> Spectra:
-        """Return the statistics of the first rows."""
-        some = slice(0, count)
-        return Spectra.from_signals(
-            Signals(
-                (self.measured - self.target)[some],
-                self.columns[some],
-                self.measured[some],
-                self.counts[some],
-                self.noise,
-                self.band,
-            )
-        )
 
 
 @dataclass(frozen=True)
@@ -267,15 +89,16 @@ class Fitted:
 
     def __init__(self, errors: Sequence[Suspect], cases: Sequence[Case], sizes: Array) -> None:
         self.errors, self.cases, self.count = errors, cases, len(sizes)
-        # An error without a usual size makes up 3 % of the efforts.
+        some = slice(self.count, self.count + len(errors))
         rms, size = (
             np.sqrt(sum(np.mean(part**2, 0) for part in parts))
-            for parts in ([np.moveaxis(c.errors, -1, 1) for c in cases], [c.measured for c in cases])
+            for parts in ([np.moveaxis(c.columns[..., some], -1, 1) for c in cases], [c.measured for c in cases])
         )
         usual = list[float]()
         for one, own in zip(errors, rms, strict=True):
             j = int(np.argmax(own / np.maximum(size, 1e-300)))
-            usual.append(one.usual or (0.03 * float(size[j] / own[j]) if own[j] > 0.0 else 0.0))
+            other = PRIOR_DEVIATIONS[OTHER] * float(size[j] / own[j]) if own[j] > 0.0 else 0.0
+            usual.append(one.usual or other)
         first = self.count + len(errors)
         self.places, deviations = [], [sizes, np.array(usual, np.float64)]
         for case in cases:
@@ -285,9 +108,11 @@ class Fitted:
             first = last
         self.model, self.whole = (
             Model.from_spectra(
-                [c.spectra(k) for c, k in zip(cases, counts, strict=True)], self.places, np.concatenate(deviations)
+                [Spectra.from_signals(c, slice(0, k)) for c, k in zip(cases, counts, strict=True)],
+                self.places,
+                np.concatenate(deviations),
             )
-            for counts in ([c.split for c in cases], [len(c.target) for c in cases])
+            for counts in ([c.split for c in cases], [len(c.measured) for c in cases])
         )
         self.certain = np.ones(first, np.bool_)
         self.certain[self.count : self.count + len(errors)] = False
@@ -407,8 +232,8 @@ class Fitted:
         change = sizes * (told @ (told.T @ (mean / sizes)))
         return change, covariance + np.outer(mean - change, mean - change)
 
-    def name(self, places: Sequence[int]) -> Suspect:
-        """Return the error of some columns; that of several joints is of all."""
+    def find_suspect(self, places: Sequence[int]) -> Suspect:
+        """Return the error that a set of columns belongs to; columns of several joints: of all joints."""
         first = self.errors[places[0] - self.count]
         if len(places) == 1:
             return first
@@ -418,7 +243,7 @@ class Fitted:
 
     def describe(self, posterior: Posterior, one: Selected) -> Finding:
         """Return a selected error with its size, the root mean square of several columns'."""
-        own, rows = self.name(one.places), np.array(one.places)
+        own, rows = self.find_suspect(one.places), np.array(one.places)
         mean = posterior.mean[rows]
         size = float(mean[0])
         deviation = float(np.sqrt(posterior.covariance[rows[0], rows[0]]))
@@ -428,14 +253,14 @@ class Fitted:
             deviation = size / np.sqrt(2.0 * max(one.odds, 1e-9))
         if own.positive and (mean < 0.0).any():
             # The size is impossible, so the cause of the signal is another error.
-            own = replace(own, kind=UNKNOWN_ERROR)
-        others = tuple(dict.fromkeys(map(self.name, one.others)))
+            own = replace(own, kind="no known error")
+        others = tuple(dict.fromkeys(map(self.find_suspect, one.others)))
         return Finding(own, size, deviation, abs(size) / max(deviation, 1e-300), others)
 
     def residuals(self, posterior: Posterior) -> list[Array]:
         """Return what a posterior's mean leaves of the signals, (k, n) of each recording."""
         return [
-            case.counts * (case.target - case.columns @ posterior.mean[place])
+            case.counts * (case.measured - case.certain - case.columns @ posterior.mean[place])
             for case, place in zip(self.cases, self.places, strict=True)
         ]
 
@@ -533,3 +358,128 @@ def _judge_channel(name: str, j: int, cases: Sequence[Case], both: Sequence[Sequ
         float(np.sqrt(now / max(level * sure, 1e-300))),
         float(held / max(fitted, np.sqrt(level), 1e-300)),
     )
+
+
+def judge_problem(problem: Problem) -> Verdict:
+    """Fit the chosen numbers of a problem, and judge whether the model explains its recordings."""
+    robot, everything, chosen = problem.robot, problem.everything, problem.chosen
+    kinds = np.array([g.kind for g in everything.groups for _ in g.names])
+    cases, errors = list[Case](), list[Suspect]()
+    for rows in problem.whole:
+        found, s = Errors.from_rows(rows, problem.values), rows.signals
+        # Columns of numbers that are not fitted are those of a motion without noise; the sign of a
+        # velocity is filtered as the efforts are.
+        nominal, _ = rows.model.columns(s.motion)
+        others = np.where(kinds == "friction", rows.table, nominal)[..., ~chosen]
+        parts = [rows.table[..., chosen], found.columns, others, -rows.change[..., None], found.missed]
+        sizes = np.append(PRIOR_DEVIATIONS[DELAY], np.ones(found.missed.shape[-1]))
+        certain, columns = rows.rest + rows.table @ everything.values, np.concatenate(parts, -1)
+        cases.append(Case(certain, columns, rows.effort, rows.counts, s.noise, s.band, sizes, rows.held_from))
+        errors = [*found.suspects]
+    words = {"rotor": "rotor inertia", "inertia": "mass or inertia"}
+    for k in np.flatnonzero(~chosen).tolist():
+        kind = f"{words.get(kinds[k], kinds[k])} other than the file's"
+        errors.append(Suspect(kind, everything.names[k], everything.units[k]))
+    verdict, fitted = fit_and_judge(robot.joint_names, errors, cases, problem.both.prior[: chosen.sum()])
+    slow = bool((chosen & (kinds != "friction")).any()) and not _shows_inertia(fitted, kinds[chosen] == "friction")
+    verdict = replace(verdict, slow=slow)
+    if (chosen & (kinds == "inertia")).any() and not verdict.findings:
+        verdict = _compare_file_masses(verdict, fitted, kinds[chosen] == "inertia")
+    if not {one.suspect.kind for one in verdict.findings} & {ELASTIC, LATE}:
+        verdict = _compare_elastic_drives(verdict, fitted)
+    # Of each joint the clearest line: above the band, so that no number changes.
+    lines = sorted((one for rows in problem.whole for one in rows.signals.lines), key=lambda one: one.sigmas)
+    told = []
+    for j, line in sorted({one.joint: one for one in lines}.items()):
+        where = f"{robot.joint_names[j]}, {line.rms:.2g} {robot.effort_units[j]} rms"
+        told.append(Finding(Suspect(LINE, where, "Hz"), line.frequency, line.resolution, line.sigmas))
+    verdict = replace(verdict, findings=(*verdict.findings, *told))
+    if (slow or told) and verdict.answer == "explains":
+        verdict = replace(verdict, answer="explains partly")
+    return verdict
+
+
+def _compare_file_masses(verdict: Verdict, fitted: Fitted, masses: Mask) -> Verdict:
+    """Name one error beside the fitted masses where it explains as much with the file's masses.
+
+    Any scale of the efforts is one of them.
+    """
+    certain = fitted.certain.copy()
+    certain[: fitted.count][masses] = False
+    other = copy(fitted)
+    scale = [one.kind == GAIN and one.where == ALL_JOINTS for one in fitted.errors].index(True)
+    factors = np.ones(len(certain))
+    factors[fitted.count + scale] = 1.0 / PRIOR_DEVIATIONS[GAIN]
+    other.whole = fitted.whole.widened(factors)
+    selected, used = other.select(certain)
+    if len(selected) != 1 or selected[0].odds < FOUND_LOG_ODDS:
+        return verdict
+    log = other.whole.log_evidence(used) - FOUND_LOG_ODDS
+    if log < fitted.whole.log_evidence(fitted.used) - ALTERNATIVE_LOG_ODDS:
+        return verdict
+    found = fitted.describe(other.whole.posterior(used), selected[0])
+    alike = Suspect("the masses that were fitted", "all of them")
+    change = fitted.model.posterior(used).mean[: fitted.count] - verdict.change
+    return replace(
+        verdict,
+        answer="explains partly",
+        findings=(replace(found, others=(*found.others, alike)),),
+        covariance=verdict.covariance + np.outer(change, change),
+    )
+
+
+def _compare_elastic_drives(verdict: Verdict, fitted: Fitted) -> Verdict:
+    """Name elastic drives beside a delay of all efforts where they explain as much."""
+    delays = [place[fitted.count + len(fitted.errors)] for place in fitted.places]
+    elastic = [fitted.count + k for k, one in enumerate(fitted.errors) if one.kind == ELASTIC]
+    late = fitted.used
+    stiff = late.copy()
+    stiff[delays] = False
+    other = fitted.with_columns(stiff, elastic)
+    logs = [fitted.whole.log_evidence(one) for one in (late, other, stiff)]
+    if logs[1] < max(logs[0] - ALTERNATIVE_LOG_ODDS, logs[2]):
+        return verdict
+    one, two = (fitted.whole.posterior(used) for used in (late, other))
+    gives, errors = two.mean[elastic], np.sqrt(np.diag(two.covariance)[elastic])
+    if (gives < -2.0 * errors).any():
+        return verdict
+    sizes = ", ".join(
+        f"{fitted.errors[k - fitted.count].where} {give:.2g} {fitted.errors[k - fitted.count].unit}"
+        for k, give in zip(elastic, gives.tolist(), strict=True)
+        if give > 0.0
+    )
+    place = max(delays, key=lambda k: abs(one.mean[k]))
+    size, deviation = float(one.mean[place]), float(np.sqrt(one.covariance[place, place]))
+    hint = Finding(Suspect(LATE, ALL_JOINTS, "s"), size, deviation, abs(size) / deviation, (Suspect(ELASTIC, sizes),))
+    change = (two.mean - one.mean)[: fitted.count]
+    return replace(
+        verdict,
+        hints=(*verdict.hints, hint),
+        covariance=verdict.covariance + np.outer(change, change),
+    )
+
+
+def _shows_inertia(fitted: Fitted, friction: Mask) -> bool:
+    """Return whether the recordings show time at twice or half its rate, with any friction.
+
+    :param friction: which of the numbers are friction, (p,).
+    """
+    speed = fitted.count + [one.kind for one in fitted.errors].index(SPEED)
+    own = fitted.count + len(fitted.errors)
+    square, fraction, count = 0.0, 0.0, 0.0
+    for case in fitted.cases:
+        floor = np.maximum(case.noise, MIN_RELATIVE_NOISE * np.sqrt(np.mean(case.measured**2, 0)))
+        weight = case.counts[..., None] / np.maximum(floor, 1e-300)[:, None]
+        columns = [*np.flatnonzero(friction), *range(own, case.columns.shape[-1])]
+        table = case.columns[..., columns] * weight
+        basis = make_basis(table.reshape(-1, table.shape[-1]))
+        column = (case.columns[..., speed] * weight[..., 0]).ravel()
+        left = column - basis @ (basis.T @ column)
+        square += float(left @ left)
+        # The derivative by the rate is twice the efforts of inertia.
+        inertial = 0.5 * left.reshape(case.measured.shape) * floor
+        fraction += float(np.sum((inertial / np.maximum(np.std(case.measured, 0), 1e-300)) ** 2))
+        count += float(case.counts.sum())
+    # Twice the rate takes three quarters of the efforts of inertia, which are 3/8 of their derivative
+    # by the rate. Other masses and offsets take up what is below a tenth of the efforts.
+    return square > (8.0 / 3.0 * SIGMAS) ** 2 and fraction > 0.1**2 * count

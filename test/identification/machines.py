@@ -12,7 +12,7 @@ from delta_dynamics import inverse_dynamics
 from pkm_twin import Robot
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError
-from pkm_twin.identification.suspects import Lengths
+from pkm_twin.identification.columns import Lengths
 from pkm_twin.recordings import Recording
 from test.laws.recordings import smooth_motion
 

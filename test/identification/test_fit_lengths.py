@@ -13,11 +13,12 @@ from scipy.interpolate import CubicSpline
 from delta_dynamics import inverse_dynamics
 from pkm_twin import Robot
 from pkm_twin.codegen.arrays import Array
+from pkm_twin.identification.columns import PRIOR_DEVIATIONS, Lengths
 from pkm_twin.identification.fit import fit
 from pkm_twin.identification.parameters import file_parameters
 from pkm_twin.identification.rows import make_rows
 from pkm_twin.identification.samples import differentiate
-from pkm_twin.identification.suspects import DEFAULT_GEOMETRY_DEVIATION, Lengths
+from pkm_twin.identification.verdict import GEOMETRY
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.recordings import Load, Recording
 from test.identification.machines import machine, noisy, of_prior
@@ -112,11 +113,11 @@ def test_drawn_lengths_change_the_efforts_as_their_columns_say(name: str) -> Non
 def test_the_file_says_how_well_its_lengths_are_known() -> None:
     robot = load("delta_cu")
     usual = {one.where: one.usual for one in Lengths.from_robot(robot).suspects}
-    assert usual["geometry.arm_length"] == DEFAULT_GEOMETRY_DEVIATION * robot.graph.size
+    assert usual["geometry.arm_length"] == PRIOR_DEVIATIONS[GEOMETRY] * robot.graph.size
     own = unsure(robot, {"geometry.arm_length": {"deviation": 1e-4}, "inertia": {"relative": 0.1}})
     usual = {one.where: one.usual for one in Lengths.from_robot(own).suspects}
     assert usual["geometry.arm_length"] == 1e-4
-    assert usual["geometry.forearm_length"] == DEFAULT_GEOMETRY_DEVIATION * robot.graph.size
+    assert usual["geometry.forearm_length"] == PRIOR_DEVIATIONS[GEOMETRY] * robot.graph.size
     all_in_one = Lengths.from_robot(unsure(robot, {"geometry": {"relative": 1e-3}}))
     assert len(all_in_one.suspects) == 1
     assert all_in_one.mixing[all_in_one.paths.index("geometry.arm_length"), 0] == robot.number("geometry.arm_length")

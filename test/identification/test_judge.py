@@ -6,7 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pkm_twin.identification.judge import Case, Suspect, Verdict, fit_and_judge
+from pkm_twin.identification.judge import Case, fit_and_judge
+from pkm_twin.identification.verdict import Suspect, Verdict
 from test.support.robots import partly_long
 
 ROWS, CHANNELS, FITTED, ERRORS = 300, 2, 3, 12
@@ -18,18 +19,8 @@ def judged(
     """A fit with noise of deviation 1: its verdict, and least squares without the errors."""
     inverse = np.linalg.pinv(explained.reshape(-1, explained.shape[-1]))
     found, covariance = inverse @ measured.ravel(), inverse @ inverse.T
-    case = Case(
-        measured,
-        explained,
-        np.zeros((ROWS, CHANNELS, 0)),
-        np.zeros(0),
-        columns,
-        measured,
-        np.ones((ROWS, CHANNELS)),
-        np.ones(CHANNELS),
-        1.0,
-        ROWS,
-    )
+    both, ones = np.concatenate([explained, columns], -1), np.ones((ROWS, CHANNELS))
+    case = Case(0.0 * measured, both, measured, ones, np.ones(CHANNELS), 1.0, np.zeros(0), ROWS)
     suspects = [Suspect("length", str(k), "m", float(u), known=True) for k, u in enumerate(usual)]
     verdict, _ = fit_and_judge(["a", "b"], suspects, [case], np.full(explained.shape[-1], 1e3))
     return verdict, covariance, found
