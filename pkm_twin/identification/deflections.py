@@ -11,6 +11,7 @@ fit leaves is taken for noise.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
@@ -24,7 +25,7 @@ from pkm_twin.identification.estimation import Estimate, estimate
 from pkm_twin.identification.fit import Judged, Result, refuse_faults
 from pkm_twin.identification.identifiable import make_nonnegative_cone
 from pkm_twin.identification.judge import Case, fit_and_judge
-from pkm_twin.identification.parameters import FITTED_RATIO, Group, Number, group_elements, make_number
+from pkm_twin.identification.parameters import FITTED_RATIO, Group, group_elements, make_number
 from pkm_twin.identification.rows import HELD_OUT
 from pkm_twin.identification.verdict import Suspect, Verdict
 from pkm_twin.messages.reading import rotate_to_base
@@ -105,14 +106,8 @@ class _Part:
             raise PkmTwinError(f"{r.name}: no deflection, every one is the same")
         few = slice(None, None, -(-len(r.time) // 2000))
         q = r.q[few]
-        return cls(
-            r.name,
-            r.time[few],
-            q,
-            r.wrench[few],
-            r.deflection[few],
-            element_response(robot, robot.forward(q)),
-        )
+        response = element_response(robot, robot.forward(q))
+        return cls(r.name, r.time[few], q, r.wrench[few], r.deflection[few], response)
 
     @cached_property
     def measured(self) -> Mask:
@@ -129,27 +124,9 @@ class _Part:
     def split(self) -> int:
         return round((1.0 - HELD_OUT) * len(self.time))
 
-    def left(self) -> float:
-        """Return the fraction of the variation that compliances fitted to this recording leave."""
-        count = len(self.response.names)
-        try:
-            found, _ = _solve([self], count)
-        except (PkmTwinError, np.linalg.LinAlgError):
-            return np.inf
-        factors = np.maximum(found.values[:count], MIN_FACTOR)
-        return _find_unexplained_part(self, factors, found.values[count:])
-
     def moved(self, factors: Array) -> tuple[Array, Array]:
         """Return the model's deflections (k, 6) and their derivatives by the factors (k, 6, e)."""
         return self.response.deflection(self.wrench, factors)
-
-    def rows(self, factors: Array) -> tuple[Array, Array, Array]:
-        """Return derivatives (k, 6, e), target and weights, 1 or 0, (k, 6), of the fitted samples."""
-        moved, slopes = (one[: self.split] for one in self.moved(factors))
-        target = self.deflection[: self.split] - moved + slopes @ factors
-        counts = np.isfinite(target)
-        slopes = np.where(counts[..., None], slopes, 0.0)
-        return slopes, np.where(counts, target, 0.0), counts.astype(np.float64)
 
 
 def fit_elements(
@@ -173,15 +150,15 @@ def fit_elements(
         if progress is not None:
             progress(i + 1)
     _check_loads(parts, robot)
-    faults = _scale_faults(parts)
+    faults = _list_scale_faults(parts)
     refuse_faults(faults, accept)
-    names = parts[0].response.names
+    names, one = parts[0].response.names, np.ones(len(parts[0].response.names))
     try:
-        found, _ = _solve(parts, len(names))
+        found = _solve(parts, len(names))
     except PkmTwinError as error:
         cause, _ = _best_repair(robot, parts[0], np.inf)
         raise PkmTwinError(f"{error}" + (f" ({cause}?)" if cause else "")) from None
-    # A factor at its bound zero would be no valid compliance.
+    # A factor at its bound of zero is not a valid compliance.
     factors = np.maximum(found.values[: len(names)], MIN_FACTOR)
     zeros = found.values[len(names) :].reshape(len(parts), 6)
     verdict = _judge_fit(robot, parts, found, factors, zeros)
@@ -189,18 +166,27 @@ def fit_elements(
         odd = verdict.answer == "does not explain"
         faults = _list_unexplained(robot, parts, factors, zeros, odd)
         refuse_faults(faults, accept)
-    numbers = _make_numbers(robot, names, factors, found, verdict)
+    # An element is known by the noise alone; its deviation is the verdict's.
+    plain, own = (one[: len(names), : len(names)] for one in (found.covariance, verdict.covariance))
+    deviations = np.sqrt([np.diag(plain), np.diag(own) * (np.nan if verdict.deviations == "withheld" else 1.0)])
+    numbers = []
+    for name, factor, (narrow, wide) in zip(names, factors.tolist(), deviations.T.tolist(), strict=True):
+        before = float(robot.element_compliance.get(name, 1.0))
+        both, prior = (before * narrow, before * wide), COMPLIANCE_DEVIATION * before
+        numbers.append(make_number(("element_compliance", name), "", before, before * factor, both, prior))
     if all(number.status == "not excited" for number in numbers):
         raise PkmTwinError("no excitation: the loads identify no element's compliance")
-    plain = found.covariance[: len(names), : len(names)]
-    found = replace(found, covariance=verdict.covariance)
-    own = found.covariance[: len(names), : len(names)]
-    judged = tuple(_judge_held_out(part, factors, zero, own) for part, zero in zip(parts, zeros, strict=True))
+    judged = []
+    for part, zero in zip(parts, zeros, strict=True):
+        end, (before_fit, _), (after, slopes) = slice(part.split, None), part.moved(one), part.moved(factors)
+        spread = np.sqrt(np.sum((slopes @ own) * slopes, -1).clip(0.0))
+        measured = part.deflection[end] - zero
+        judged.append(Judged(part.name, part.time[end], measured, before_fit[end], after[end], spread[end]))
     return ElasticFit(
         robot=robot,
-        estimate=found,
-        numbers=numbers,
-        judged=judged,
+        estimate=replace(found, covariance=verdict.covariance),
+        numbers=tuple(numbers),
+        judged=tuple(judged),
         zeros=zeros,
         verdict=verdict,
         groups=group_elements(names, factors, plain, own),
@@ -209,22 +195,6 @@ def fit_elements(
         known_count=int(np.sum(np.linalg.eigvalsh(plain / COMPLIANCE_DEVIATION**2) < FITTED_RATIO**2)),
         accepted=tuple(faults),
     )
-
-
-def _make_numbers(
-    robot: Robot, names: Sequence[str], factors: Array, found: Estimate, verdict: Verdict
-) -> tuple[Number, ...]:
-    """Of the elements: known by the noise alone, their deviations by the verdict too."""
-    own, wide = (np.sqrt(np.diag(one)[: len(names)]) for one in (found.covariance, verdict.covariance))
-    wide = np.full_like(wide, np.nan) if verdict.deviations == "withheld" else wide
-    numbers = []
-    for name, factor, *deviations in zip(names, factors, own, wide, strict=True):
-        before = float(robot.element_compliance.get(name, 1.0))
-        plain, told = (float(before * one) for one in deviations)
-        key = "element_compliance", name
-        after = float(before * factor)
-        numbers.append(make_number(key, "", before, after, (plain, told), COMPLIANCE_DEVIATION * before))
-    return tuple(numbers)
 
 
 def _check_loads(parts: Sequence[_Part], robot: Robot) -> None:
@@ -249,10 +219,10 @@ def _check_loads(parts: Sequence[_Part], robot: Robot) -> None:
         )
 
 
-def _scale_faults(parts: Sequence[_Part]) -> list[str]:
-    """Deflections and the file's own, without the instrument's zero, over all directions at once.
+def _list_scale_faults(parts: Sequence[_Part]) -> list[str]:
+    """List recordings whose deflections are the file's but for a factor that no machine is off by.
 
-    :returns: recordings in which they are alike but for a factor that no machine is off by.
+    Without the instrument's zero, over all directions at once.
     """
     faults = []
     for part in parts:
@@ -325,66 +295,54 @@ def _list_unexplained(robot: Robot, parts: Sequence[_Part], factors: Array, zero
 
 def _best_repair(robot: Robot, part: _Part, most: float) -> tuple[str, float]:
     """Return the fault whose repair leaves the smallest residual, and that residual."""
-    cause, best = "", 0.8 * most
-    for text, other in _list_repairs(robot, part):
-        left = other.left()
-        if left < best:
-            cause, best = text, left
+    cause, best, count = "", 0.8 * most, len(part.response.names)
+    for text, what, values in _list_repairs(robot, part):
+        other = replace(part, wrench=values) if what == "wrench" else replace(part, deflection=values)
+        with suppress(PkmTwinError, np.linalg.LinAlgError):
+            found = _solve([other], count).values
+            left = _find_unexplained_part(other, np.maximum(found[:count], MIN_FACTOR), found[count:])
+            if left < best:
+                cause, best = text, left
     return cause, best
 
 
-def _solve(parts: Sequence[_Part], count: int) -> tuple[Estimate, Array]:
-    """Estimate factors and zeros by steps of linear least squares; return also their columns."""
+def _solve(parts: Sequence[_Part], count: int) -> Estimate:
+    """Estimate factors and zeros by steps of linear least squares."""
     factors = np.ones(count)
     scales = np.concatenate([np.full(count, COMPLIANCE_DEVIATION), *(np.maximum(part.size, 1e-12) for part in parts)])
     start = np.concatenate([factors, np.zeros(6 * len(parts))])
     cones = [(slice(k, k + 1), make_nonnegative_cone(0, 1)) for k in range(count)]
     for _ in range(20):
-        rows = [part.rows(factors) for part in parts]
-        tables = [
-            np.concatenate([slopes, _make_zero_columns(i, len(parts), counts)], -1)
-            for i, (slopes, _, counts) in enumerate(rows)
-        ]
-        target, judged = (np.concatenate([one[k] for one in rows]) for k in (1, 2))
-        table = np.concatenate(tables)
-        begin = _estimate_noise(table * scales, target - table @ start, judged)
-        found = estimate(table, target, start, scales, cones, judged, begin)
+        rows = []
+        for i, part in enumerate(parts):
+            moved, slopes = (one[: part.split] for one in part.moved(factors))
+            target = part.deflection[: part.split] - moved + slopes @ factors
+            used = np.isfinite(target)
+            slopes = np.where(used[..., None], slopes, 0.0)
+            columns = np.concatenate([slopes, _make_offset_columns(i, len(parts), used)], -1)
+            rows.append((columns, np.where(used, target, 0.0), used.astype(np.float64)))
+        table, target, counts = map(np.concatenate, zip(*rows, strict=True))
+        # The noise to begin with is what all factors and zeros together leave, by direction.
+        change = target - table @ start
+        size = np.sqrt(np.sum(change**2 * counts, 0) / np.maximum(np.sum(counts, 0), 1.0))
+        weights = counts / np.maximum(size, 1e-300)
+        scaled = (table * scales * weights[..., None]).reshape(-1, table.shape[-1])
+        equations, unknowns, noise = int(counts.sum()), int((np.abs(scaled).max(0) > 0.0).sum()), None
+        if equations >= 1.5 * unknowns:
+            free = (1.0 - unknowns / equations) * np.sum(counts, 0)
+            first = np.linalg.lstsq(scaled, (change * weights).ravel(), rcond=1e-9)[0]
+            left = (change - (table * scales) @ first) * counts
+            noise = np.asarray(np.sqrt(np.sum(left**2, 0) / np.maximum(free, 1.0)), np.float64)
+        found = estimate(table, target, start, scales, cones, counts, noise)
         new = np.maximum(found.values[:count], MIN_FACTOR)
-        moved = np.abs(new - factors) / np.sqrt(np.diag(found.covariance)[:count])
+        step = np.abs(new - factors) / np.sqrt(np.diag(found.covariance)[:count])
         factors = new
-        if moved.max() < 1e-2:
-            return found, table
+        if step.max() < 1e-2:
+            return found
     raise PkmTwinError(
         "the compliances do not converge in 20 steps: no compliance of this robot explains "
         "the deflections, or loads in more directions are needed"
     )
-
-
-def _estimate_noise(table: Array, change: Array, judged: Array) -> Array | None:
-    """Return what all factors and zeros together leave of a change, by direction (6,).
-
-    None where there are hardly more equations than those.
-    """
-    size = np.sqrt(np.sum(change**2 * judged, 0) / np.maximum(np.sum(judged, 0), 1.0))
-    weights = judged / np.maximum(size, 1e-300)
-    rows = (table * weights[..., None]).reshape(-1, table.shape[-1])
-    equations, unknowns = int(judged.sum()), int((np.abs(rows).max(0) > 0.0).sum())
-    if equations < 1.5 * unknowns:
-        return None
-    found = np.linalg.lstsq(rows, (change * weights).ravel(), rcond=1e-9)[0]
-    left = (change - table @ found) * judged
-    free = 1.0 - unknowns / equations
-    return np.asarray(np.sqrt(np.sum(left**2, 0) / np.maximum(free * np.sum(judged, 0), 1.0)), np.float64)
-
-
-def _judge_held_out(part: _Part, factors: Array, zero: Array, covariance: Array) -> Judged:
-    """Predict the held-out part, without the instrument's zero."""
-    end = slice(part.split, None)
-    before, _ = part.moved(np.ones(len(factors)))
-    after, slopes = part.moved(factors)
-    spread = np.sqrt(np.sum((slopes @ covariance) * slopes, -1).clip(0.0))
-    measured = part.deflection[end] - zero
-    return Judged(part.name, part.time[end], measured, before[end], after[end], spread[end])
 
 
 def _judge_fit(robot: Robot, parts: Sequence[_Part], found: Estimate, factors: Array, zeros: Array) -> Verdict:
@@ -403,7 +361,7 @@ def _judge_fit(robot: Robot, parts: Sequence[_Part], found: Estimate, factors: A
         counts = np.isfinite(left)
         suspects, errors = zip(*_list_errors(robot, part, factors), strict=True)
         own = np.where(counts, moved, 0.0)
-        columns = np.concatenate([slopes, _make_zero_columns(i, len(parts), np.ones_like(own))], -1)
+        columns = np.concatenate([slopes, _make_offset_columns(i, len(parts), np.ones_like(own))], -1)
         target = np.where(counts, left + columns @ change, 0.0)
         noise = _find_noise(left, own, columns.shape[-1])[measured]
         columns = np.concatenate([columns, np.stack(errors, -1)], -1)[:, measured]
@@ -415,8 +373,11 @@ def _judge_fit(robot: Robot, parts: Sequence[_Part], found: Estimate, factors: A
     return replace(verdict, covariance=verdict.covariance + np.outer(off, off))
 
 
-def _make_zero_columns(recording: int, count: int, values: Array) -> Array:
-    """Columns of the instruments' zeros of so many recordings, at one of them, (k, 6, 6 count)."""
+def _make_offset_columns(recording: int, count: int, values: Array) -> Array:
+    """Return the columns of the instruments' zeros, shape (k, 6, 6 count).
+
+    One block of six a recording, which is not zero in the rows of its own ``recording``.
+    """
     columns = np.zeros((*values.shape, 6 * count))
     columns[..., 6 * recording : 6 * recording + 6] = values[..., None] * np.eye(6)
     return columns
@@ -442,7 +403,7 @@ def _find_noise(left: Array, moved: Array, fitted: int) -> Array:
 
 
 def _list_errors(robot: Robot, part: _Part, factors: Array) -> Iterator[tuple[Suspect, Array]]:
-    """Errors of a machine or a recording, with the derivatives of the deflections, (k, 6)."""
+    """Yield errors of a machine or a recording, with the derivatives of the deflections, (k, 6)."""
     q, wrench = part.q, part.wrench
     moved, _ = part.moved(factors)
 
@@ -479,35 +440,29 @@ def _list_errors(robot: Robot, part: _Part, factors: Array) -> Iterator[tuple[Su
             yield pose, moved * here[:, None] * e
 
 
-def _list_repairs(robot: Robot, r: _Part) -> Iterator[tuple[str, _Part]]:
-    """Faults of a recording, and the recording without each."""
+def _list_repairs(robot: Robot, r: _Part) -> Iterator[tuple[str, str, Array]]:
+    """Yield faults that a recording may have, each with the wrenches or deflections without it."""
     rotation = robot.rotation(robot.forward(r.q))
     back = np.swapaxes(rotation, -1, -2)
     base, platform = "the base's axes", "the platform's"
 
-    def loaded(wrench: Array) -> _Part:
-        return replace(r, wrench=wrench)
-
-    def moved(deflection: Array) -> _Part:
-        return replace(r, deflection=deflection)
-
     own, other = (rotate_to_base(r.wrench, one) for one in (rotation, back))
-    yield f"the wrench is in {platform} axes, not in {base}", loaded(own)
-    yield f"the wrench is in {base}, not in {platform}", loaded(other)
+    yield f"the wrench is in {platform} axes, not in {base}", "wrench", own
+    yield f"the wrench is in {base}, not in {platform}", "wrench", other
     own = rotate_to_base(r.deflection, rotation)
-    yield f"the deflection is in {platform} axes, not in {base}", moved(own)
+    yield f"the deflection is in {platform} axes, not in {base}", "deflection", own
     for first, load, move in ((0, "forces", "shifts"), (3, "moments", "turns")):
         for i, j in combinations(range(3), 2):
             order = np.arange(6)
             order[[first + i, first + j]] = first + j, first + i
             pair = f"{'xyz'[i]} and {'xyz'[j]}"
-            yield f"{load} along {pair} are exchanged", loaded(r.wrench[:, order])
-            yield f"{move} along {pair} are exchanged", moved(r.deflection[:, order])
+            yield f"{load} along {pair} are exchanged", "wrench", r.wrench[:, order]
+            yield f"{move} along {pair} are exchanged", "deflection", r.deflection[:, order]
     for k, (load, move) in enumerate(zip(WRENCH, AXES, strict=True)):
         sign = np.where(np.arange(6) == k, -1.0, 1.0)
-        yield f"{load} has the wrong sign", loaded(r.wrench * sign)
-        yield f"{move} has the wrong sign", moved(r.deflection * sign)
+        yield f"{load} has the wrong sign", "wrench", r.wrench * sign
+        yield f"{move} has the wrong sign", "deflection", r.deflection * sign
     mixed = np.repeat([1.0, 1e-3], 3)
-    yield "moments are in N mm, forces in N", loaded(r.wrench * mixed)
-    yield "turns are in mrad, shifts in m", moved(r.deflection * mixed)
-    yield "shifts are in mm, turns in rad", moved(r.deflection * mixed[::-1])
+    yield "moments are in N mm, forces in N", "wrench", r.wrench * mixed
+    yield "turns are in mrad, shifts in m", "deflection", r.deflection * mixed
+    yield "shifts are in mm, turns in rad", "deflection", r.deflection * mixed[::-1]

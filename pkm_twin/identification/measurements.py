@@ -27,10 +27,10 @@ UNKNOWN_DEVIATION: Final = 10.0
 class Kind:
     """A quantity of a axes that people measure, by position and rotation in the instrument's frame.
 
-    ``name``: of its column. ``noise``: usual standard deviation, which counts for ``believed``
-    measurements. ``length``: whether it measures a length across the workspace. ``pair``: whether
-    it measures two poses, by the difference of their positions. ``own``: unit and standard
-    deviation before of numbers that are fitted with it.
+    ``name``: of its column. ``noise``: usual standard deviation, which counts as ``believed``
+    measurements against the residuals. ``length``: whether it measures a length across the
+    workspace. ``pair``: whether it measures two poses, by the difference of their positions.
+    ``own``: unit and standard deviation before of numbers that are fitted with it.
     """
 
     name: str
@@ -40,35 +40,34 @@ class Kind:
     length: bool = False
     pair: bool = False
     own: Mapping[str, tuple[str, float]] = field(default_factory=dict)
-    # Measurements that the usual noise of a kind counts for against the residuals.
     believed: float = 4.0
 
     def value(self, p: Array, r: Array, own: Mapping[str, float]) -> Array:
-        """At positions (m, 3) and rotations (m, 3, 3): (m, a); here coordinates of the position."""
+        """Compute the quantity at positions (m, 3) and rotations (m, 3, 3): here coordinates, (m, a)."""
         del r, own
         return p[:, self.axes]
 
     def slopes(self, p: Array, r: Array, own: Mapping[str, float]) -> Array:
-        """Its derivatives by the linear and the angular velocity, (m, a, 6)."""
+        """Differentiate the quantity by the linear and the angular velocity, (m, a, 6)."""
         del r, own
         return np.broadcast_to(np.eye(6)[list(self.axes)], (len(p), len(self.axes), 6))
 
     def by_own(self, p: Array, own: Mapping[str, float]) -> dict[str, Array]:
-        """Its derivatives by its own numbers, (m,) each."""
+        """Differentiate the quantity by its own numbers, (m,) each."""
         del p, own
         return {}
 
     def begin(self, p: Array, values: Array) -> dict[str, float]:
-        """Guess its own numbers from positions (m, 3) and values (m,)."""
+        """Guess the quantity's own numbers from positions (m, 3) and values (m,)."""
         del p, values
         return {}
 
     def likely(self, p: Array) -> Array:
-        """Values (m, 1) at positions (m, 3) that give its own numbers a likely place."""
+        """Return values (m, 1) at positions (m, 3) that give the quantity's own numbers a likely place."""
         return np.zeros((len(p), 1))
 
     def residual(self, values: Array, p: Array, r: Array, own: Mapping[str, float]) -> Array:
-        """Measured less computed, (m, a)."""
+        """Return measured minus computed values, (m, a)."""
         apart = values - self.value(p, r, own)
         turned = np.asarray((apart + np.pi) % (2.0 * np.pi) - np.pi)
         return turned if self.unit == "rad" else apart
@@ -103,21 +102,21 @@ class _Angle(Kind):
 class _Plane(Kind):
     """Distance from a plane of unknown height and slopes, along its normal; at contact 0."""
 
-    def _normal(self, own: Mapping[str, float]) -> Array:
-        return np.array([-own["plane.slope_x"], -own["plane.slope_y"], 1.0])
+    def _find_normal(self, own: Mapping[str, float]) -> tuple[Array, float]:
+        normal = np.array([-own["plane.slope_x"], -own["plane.slope_y"], 1.0])
+        return normal, float(np.linalg.norm(normal))
 
     def value(self, p: Array, r: Array, own: Mapping[str, float]) -> Array:
-        normal = self._normal(own)
-        return np.asarray((p @ normal - own["plane.z"]) / np.linalg.norm(normal))[:, None]
+        normal, size = self._find_normal(own)
+        return np.asarray((p @ normal - own["plane.z"]) / size)[:, None]
 
     def slopes(self, p: Array, r: Array, own: Mapping[str, float]) -> Array:
-        normal = self._normal(own)
-        row = np.concatenate([normal / np.linalg.norm(normal), np.zeros(3)])
-        return np.broadcast_to(row, (len(p), 1, 6))
+        normal, size = self._find_normal(own)
+        return np.broadcast_to(np.concatenate([normal / size, np.zeros(3)]), (len(p), 1, 6))
 
     def by_own(self, p: Array, own: Mapping[str, float]) -> dict[str, Array]:
-        size = np.linalg.norm(self._normal(own))
-        away = (p @ self._normal(own) - own["plane.z"]) / size**3
+        normal, size = self._find_normal(own)
+        away = (p @ normal - own["plane.z"]) / size**3
         found = {"plane.z": np.full(len(p), -1.0 / size)}
         for k, name in enumerate(("plane.slope_x", "plane.slope_y")):
             found[name] = -p[:, k] / size - away * own[name]
@@ -181,7 +180,7 @@ class _Range(_Ball):
         return super().by_own(p, own) | {"range.zero": np.ones(len(p))}
 
     def begin(self, p: Array, values: Array) -> dict[str, float]:
-        """Of places at many distances from the middle the one that fits best."""
+        """Guess the place: of several at many distances from the middle the one that fits best."""
         away = np.ptp(p, axis=0).max() * 2.0 ** np.arange(-1, 6)
         zeros = [0.0, *(values.mean() - away).tolist()]
         found = [_Ball.begin(self, p, values - z) | {"range.zero": z} for z in zeros]
@@ -239,8 +238,8 @@ def parse_kinds(texts: Sequence[str]) -> tuple[Kind, ...]:
     return tuple(KINDS[name] for name in dict.fromkeys(every))
 
 
-def named_numbers(option: str, text: str, right: str) -> dict[str, list[float]]:
-    """Of ``NAME=NUMBER[:NUMBER]``, several with commas between.
+def parse_named_numbers(option: str, text: str, right: str) -> dict[str, list[float]]:
+    """Parse ``NAME=NUMBER[:NUMBER]``, several separated by commas.
 
     :raises ParameterError: anything else than what is ``right``.
     """
@@ -257,12 +256,12 @@ def named_numbers(option: str, text: str, right: str) -> dict[str, list[float]]:
 
 
 def parse_noise(texts: Sequence[str]) -> dict[str, float]:
-    """Of ``KIND=VALUE`` separated by commas, m or rad.
+    """Parse ``KIND=VALUE`` separated by commas, m or rad.
 
     :raises ParameterError: no number above zero, or no such kind.
     """
     right = "KIND=VALUE, m or rad, as height=0.00002"
-    found = named_numbers("--noise", ",".join(texts), right)
+    found = parse_named_numbers("--noise", ",".join(texts), right)
     for name, values in found.items():
         if name not in KINDS:
             raise UnknownNameError("--noise", name, list(KINDS))
@@ -285,7 +284,7 @@ class Readings:
     lines: Indices
 
     def compute_poses(self, state: State) -> tuple[Array, Array]:
-        """Positions (m, 3), of pairs their differences, and rotations (m, 3, 3)."""
+        """Compute positions (m, 3), of pairs their differences, and rotations (m, 3, 3)."""
         position, rotation = state.instrument.compute_reading(*state.platform)
         p = position[self.first]
         return (p if self.second is None else p - position[self.second]), rotation[self.first]
@@ -314,7 +313,7 @@ class Weights:
     scales: tuple[Array, ...]
 
     def over(self, parts: Sequence[Array]) -> Array:
-        """Rows (m, a, ...) of each kind over the noise, one below the other."""
+        """Divide the rows (m, a, ...) of each kind by the noise, one below the other."""
         rows = [
             (part * scale.reshape(-1, *[1] * (part.ndim - 1))).reshape(-1, *part.shape[2:])
             for part, scale in zip(parts, self.scales, strict=True)
@@ -339,7 +338,7 @@ class Measured:
         return {name: number for one in self.readings for name, number in one.kind.own.items()}
 
     def parts(self, state: State) -> list[Array]:
-        """Measured less computed, (m, a) a kind."""
+        """Return measured minus computed values, (m, a) a kind."""
         return [one.kind.residual(one.values, *one.compute_poses(state), one.own(state)) for one in self.readings]
 
     def slopes(self, robot: Robot, state: State, names: Sequence[str]) -> list[Array]:
@@ -348,7 +347,7 @@ class Measured:
         return [one.slopes(state, columns, names) for one in self.readings]
 
     def weighed(self, parts: list[Array], slopes: list[Array], prior: Array) -> Weights:
-        """Noise by what a fit leaves over and by what is usual; robust weights.
+        """Estimate the noise of each kind from residuals and from what is usual; return robust weights.
 
         Of few measurements a fit leaves little: each counts for the part that it does not decide.
         """
@@ -376,7 +375,7 @@ class Measured:
 
 
 def find_redundancy(slopes: Sequence[Array], noise: Sequence[float], prior: Array) -> list[Array]:
-    """Part of each measurement that the others and the priors decide, 0 to 1, (m,) a kind."""
+    """Find the fraction of each measurement that the others and the priors decide, (m,) a kind."""
     rows = [(table * prior / s).reshape(-1, len(prior)) for table, s in zip(slopes, noise, strict=True)]
     whole = np.concatenate(rows)
     both = np.vstack([whole, np.eye(len(prior))])
@@ -402,7 +401,7 @@ def make_measured(
     lines: Indices,
     noise: Mapping[str, float],
 ) -> Measured:
-    """Measurements of a table: a value that is NaN was not measured.
+    """Return the measurements of a table; a value that is NaN was not measured.
 
     :param joints: of the rows, (k, n); ``second``: of a pair's other pose, (k, n), NaN where none.
     :param values: (k,) by kind.
@@ -444,7 +443,7 @@ _MEASURED: Final = re.compile(r"meas\w*_|actual_|mocap_")
 
 
 def read_poses(path: Path, robot: Robot, dialect: Dialect = DEFAULT_DIALECT) -> Poses:
-    """Measured poses.
+    """Read measured poses.
 
     Columns, in any order: ``JOINT.position`` of every joint, in the controller's names and numbers;
     ``x y z``; and, where measured, ``roll pitch yaw`` or ``qx qy qz qw``, of the platform relative
@@ -458,7 +457,7 @@ def read_poses(path: Path, robot: Robot, dialect: Dialect = DEFAULT_DIALECT) -> 
     """
     joints = [f"{name}.position" for name in robot.controller.names]
     table = _read(path, joints, QUATERNION, dialect)
-    _find(table, joints, dialect)
+    _find_columns(table, joints, dialect)
     q, position = table.stack(joints), table.stack(POSITIONS)
     # No instrument stands farther from what it measures, m.
     for names, bound, its in ((POSITIONS, 1e4, "m"), (ANGLES, 2.0 * np.pi, "rad")):
@@ -484,7 +483,7 @@ def read_measured(
     noise: Mapping[str, float],
     dialect: Dialect = DEFAULT_DIALECT,
 ) -> Measured:
-    """Measurements of some quantities; cells may be empty.
+    """Read measurements of some quantities; cells may be empty.
 
     Columns: ``JOINT.position`` of every joint, and one by the name of each kind. ``z`` stands for a
     missing ``height``, ``height`` for a missing ``plane``, which is contact without both. Of a
@@ -496,7 +495,7 @@ def read_measured(
     joints = [f"{name}.position" for name in robot.controller.names]
     others = [f"{name}_2" for name in joints]
     table = _read(path, joints, (*others, "to"), dialect, blank=True)
-    _find(table, joints, dialect)
+    _find_columns(table, joints, dialect)
     q = table.stack(joints)
     if "z" in table:
         table.setdefault("height", table["z"])
@@ -525,7 +524,7 @@ def _read(
     *,
     blank: bool = False,
 ) -> Table:
-    """Columns by name in SI units; joints in the controller's.
+    """Read columns by name in SI units; joints in the controller's.
 
     :raises ParameterError: a joint that the robot has not.
     """
@@ -538,11 +537,11 @@ def _read(
     return table
 
 
-def _find(table: Table, joints: Sequence[str], dialect: Dialect) -> None:
+def _find_columns(table: Table, joints: Sequence[str], dialect: Dialect) -> None:
     """Add columns that are missing by what such columns are usually called."""
     if not any(name in table for name in POSITIONS):
         size = dialect.size("length")
-        places, turns = _set(table, _PLACE, "xyz", ""), _set(table, _TURN, "xyzw", "q")
+        places, turns = _find_column_set(table, _PLACE, "xyz", ""), _find_column_set(table, _TURN, "xyzw", "q")
         turned = any(name in table for name in (*ANGLES, *QUATERNION))
         table |= {name: size * table[header] for name, header in places.items()}
         table |= {} if turned else {name: table[header] for name, header in turns.items()}
@@ -562,8 +561,10 @@ def _find(table: Table, joints: Sequence[str], dialect: Dialect) -> None:
             table |= {joint: table[header] for joint, header in zip(joints, whole[0], strict=True)}
 
 
-def _set(columns: Mapping[str, Array], pattern: re.Pattern[str], letters: str, prefix: str) -> dict[str, str]:
-    """Columns by letter of the only whole set, of several the only measured one."""
+def _find_column_set(
+    columns: Mapping[str, Array], pattern: re.Pattern[str], letters: str, prefix: str
+) -> dict[str, str]:
+    """Return the columns of the one complete set, by letter; among several, of the only measured one."""
     sets: dict[str, dict[str, str]] = {}
     for name in columns:
         match = pattern.fullmatch(name)

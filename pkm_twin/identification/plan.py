@@ -12,14 +12,8 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.identification.calibration import Estimate, Free, list_geometric_paths, list_parameters, make_start
-from pkm_twin.identification.calibration_state import differentiate_lines, differentiate_poses
-from pkm_twin.identification.measurements import (
-    KINDS,
-    Kind,
-    Measured,
-    Readings,
-    named_numbers,
-)
+from pkm_twin.identification.calibration_state import State, differentiate_lines, differentiate_poses
+from pkm_twin.identification.measurements import KINDS, Kind, Measured, Readings, parse_named_numbers
 from pkm_twin.machine.rotations import skew
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import within_limits
@@ -30,12 +24,12 @@ MAX_MEASUREMENTS: Final = 150
 
 
 def parse_within(text: str | None) -> dict[str, tuple[float, float]]:
-    """Of ``x=-0.1:0.1, z=0``: least and greatest values, m or rad.
+    """Parse ``x=-0.1:0.1, z=0``: least and greatest values, m or rad.
 
     :raises ParameterError: anything else.
     """
     right = "COORDINATE=LEAST:GREATEST, as x=-0.1:0.1"
-    found = named_numbers("--within", text or "", right)
+    found = parse_named_numbers("--within", text or "", right)
     for name, ends in found.items():
         if len(ends) > 2 or ends[0] > ends[-1]:
             raise ParameterError("--within", f"{name}={':'.join(map(str, ends))}", right)
@@ -119,14 +113,19 @@ def plan(
     fitted = [name for name in names if name in paths]
     state = make_start(robot, all_poses, fitted)
     covariance: Array = np.eye(len(names))
+
+    def scale_slopes(one: Measured, at: State) -> list[Array]:
+        """Return derivatives (m, p) of each kind over its noise, in units of the priors."""
+        sizes = [one.noise.get(r.kind.name, r.kind.noise) for r in one.readings]
+        return [part[:, 0] * prior / size for part, size in zip(one.slopes(robot, at, names), sizes, strict=True)]
+
     if measured is not None:
         there = make_start(robot, measured, fitted)
         state.instrument.own |= {k: v for k, v in there.instrument.own.items() if k in names}
-        known = [measured.noise.get(one.kind.name, one.kind.noise) for one in measured.readings]
-        table = np.concatenate(_over(measured.slopes(robot, there, names), prior, known))
+        table = np.concatenate(scale_slopes(measured, there))
         covariance = np.asarray(np.linalg.inv(covariance + table.T @ table), np.float64)
     usual = [noise.get(kind.name, kind.noise) for kind in kinds]
-    rows = np.stack(_over(all_poses.slopes(robot, state, names), prior, usual), 1)
+    rows = np.stack(scale_slopes(all_poses, state), 1)
     places = differentiate_poses(robot, state, names)[:, :3] * prior
     # A rigid motion of the workspace is the instrument's pose, not an error of the machine.
     rigid = np.concatenate([np.broadcast_to(np.eye(3), (len(q), 3, 3)), -skew(state.platform[0])], -1).reshape(-1, 6)
@@ -165,11 +164,6 @@ def plan(
     )
 
 
-def _over(parts: Sequence[Array], prior: Array, noise: Sequence[float]) -> list[Array]:
-    """Divide derivatives (m, p) of each kind by its noise, in units of the priors."""
-    return [part[:, 0] * prior / size for part, size in zip(parts, noise, strict=True)]
-
-
 def _candidates(
     robot: Robot,
     measured: Measured | None,
@@ -200,11 +194,8 @@ def _candidates(
         box[names.index(name)] = ends
     if not np.isfinite(box).all():
         missing = names[int(np.flatnonzero(~np.isfinite(box).all(1))[0])]
-        raise ParameterError(
-            "--within",
-            None,
-            f"the range of {missing}, as {missing}=-0.1:0.1: the file has no joint limits",
-        )
+        right = f"the range of {missing}, as {missing}=-0.1:0.1: the file has no joint limits"
+        raise ParameterError("--within", None, right)
     poses = rng.uniform(box[:, 0], box[:, 1], (20 * MAX_CANDIDATES, len(box)))
     q, good = robot.try_inverse(poses)
     good &= within_limits(robot, q)

@@ -133,22 +133,15 @@ class _Numbers:
         rod = self.graph.rods[name]
         return (rod.inner, rod.outer)[end], name
 
-    def limbs(self) -> list[list[tuple[str, int]]]:
-        """Points by the limb they are on: what hangs together without base and platform."""
-        found = [
-            [point for point in self.points if set(self.bodies(point)) & set(limb)] for limb in list_limbs(self.graph)
-        ]
-        return [one for one in found if one]
-
     def point(self, point: tuple[str, int]) -> Array:
         """Return a point's position at home, (3,)."""
         name, end = point
         joints, rods = self.graph.joints, self.graph.rods
         return joints[name].at if name in joints else np.asarray(rods[name].ends[end], np.float64)
 
-    def side(self, body: str) -> list[tuple[str, int]]:
-        """List the points on a body."""
-        return [point for point in self.points if body in self.bodies(point)]
+    def list_points(self, *bodies: str) -> list[tuple[str, int]]:
+        """List the points on bodies."""
+        return [point for point in self.points if set(self.bodies(point)) & set(bodies)]
 
 
 def _list_changes(n: _Numbers) -> Iterator[Change]:
@@ -165,12 +158,14 @@ def _list_changes(n: _Numbers) -> Iterator[Change]:
             if point is not None:
                 along = n.vector([(point, joint.axes[number])])
                 yield Change("{items} moved along their own axes", name, along)
-    for limb in n.limbs():
-        label = " with ".join(dict.fromkeys(name for name, _ in limb))
-        for k, axis in enumerate(AXES):
-            moved = n.vector([(n.points[point], np.eye(3)[k]) for point in limb])
+    for limb in list_limbs(n.graph):
+        # What hangs together without base and platform.
+        points = n.list_points(*limb)
+        label = " with ".join(dict.fromkeys(name for name, _ in points))
+        for k, axis in enumerate(AXES if points else ""):
+            moved = n.vector([(n.points[point], np.eye(3)[k]) for point in points])
             yield Change("limbs moved as a whole along {axes}: {items}", label, moved, axis)
-    base, platform = n.side("base"), n.side(n.graph.platform)
+    base, platform = n.list_points("base"), n.list_points(n.graph.platform)
     of_base, of_platform = "the base's joints", "the platform's joints"
     reference = "the reference point"
     groups = [
@@ -215,13 +210,9 @@ def undetermined(graph: Graph, names: Sequence[str], scales: Array, directions: 
     found: dict[tuple[str, str], list[str]] = {}
     for change in _list_changes(n):
         size = float(np.linalg.norm(change.vector))
-        if not left.shape[1] or size == 0.0:
-            continue
-        unit = change.vector / size
-        if np.sum((directions.T @ unit) ** 2) < 0.8:
-            continue
+        unit = change.vector / max(size, 1e-300)
         inner = left.T @ unit
-        if inner @ inner < 0.1:
+        if np.sum((directions.T @ unit) ** 2) < 0.8 or inner @ inner < 0.1:
             continue
         found.setdefault((change.kind, change.axis), []).append(change.item)
         # Keep the part of the remaining space that is orthogonal to the change.
@@ -234,30 +225,16 @@ def undetermined(graph: Graph, names: Sequence[str], scales: Array, directions: 
         kind.format(items=_write_list(names_of), axes=_join_words(sorted(set(axes))))
         for (kind, names_of), axes in merged.items()
     ]
-    rest = list(_combinations(names, left))
+    # Combinations that no named change explains.
+    count, mostly = left.shape[1], _write_list(_find_greatest(names, np.sqrt(np.sum(left**2, 1))))
+    each = [_find_greatest(names, np.abs(vector)) for vector in left.T]
+    rest = [f"{_join_words(sorted(shown, key=names.index))} changed together" for shown in each]
+    if any(len(shown) > 4 for shown in each):
+        rest = [f"{count} further combination{'s' * (count > 1)}, mostly of {mostly}"]
     if len(told) + len(rest) > MAX_SENTENCES:
-        shown = told[: MAX_SENTENCES - 1]
-        more = left.shape[1] + sum(len(found[k]) for k in list(found)[MAX_SENTENCES - 1 :] if k in found)
-        weights = np.sqrt(np.sum(left**2, 1))
-        return [
-            *shown,
-            f"{more} further combinations, mostly of {_write_list(_find_greatest(names, weights))}",
-        ]
+        more = count + sum(len(found[k]) for k in list(found)[MAX_SENTENCES - 1 :])
+        return [*told[: MAX_SENTENCES - 1], f"{more} further combinations, mostly of {mostly}"]
     return [*told, *rest]
-
-
-def _combinations(names: Sequence[str], left: Array) -> Iterator[str]:
-    """Describe combinations of numbers that no named change explains."""
-    for vector in left.T:
-        shown = _find_greatest(names, np.abs(vector))
-        if len(shown) > 4:
-            weights = np.sqrt(np.sum(left**2, 1))
-            many = "further combinations" if left.shape[1] > 1 else "further combination"
-            yield f"{left.shape[1]} {many}, mostly of {_write_list(_find_greatest(names, weights))}"
-            return
-    for vector in left.T:
-        shown = sorted(_find_greatest(names, np.abs(vector)), key=names.index)
-        yield f"{_join_words(shown)} changed together"
 
 
 def _find_greatest(names: Sequence[str], weights: Array) -> list[str]:
