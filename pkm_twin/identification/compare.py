@@ -6,7 +6,7 @@ Nothing is fitted but how late the efforts are against the positions, as in a fi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, Final
@@ -86,10 +86,6 @@ class Compared:
     how: Filtering
     bound: float
 
-    def filtered(self, columns: Sequence[Array]) -> Array:
-        """Signals of the tracks, (samples, m) each, filtered as the efforts are, shape (k, m)."""
-        return filtered([{"": column} for column in columns], self.period, self.how)[""]
-
     @property
     def edge(self) -> float:
         """Time over which the filter spreads a step, s."""
@@ -116,19 +112,14 @@ class Compared:
 
     @property
     def limit(self) -> Array:
-        """Largest good residual, RMS, shape (n,): a part of the peak, and not below the noise.
-
-        What is as large as the noise in the band explains the recording, as the verdict of a fit
-        has it.
-        """
+        """Largest good residual, RMS, shape (n,): a fraction of the peak, and not below the noise."""
         return np.maximum(self.bound * self.peak, MAX_NOISE_RATIO * self.noise)
 
     def local(self) -> tuple[Array, Array]:
         """Return the largest RMS over a short time and the time of its middle, s, (n,) each."""
         n = self.residual.shape[1]
         worst, at = np.zeros(n), np.full(n, self.time[0])
-        # A collision is shorter than a recording: a residual is judged over a quarter of a second
-        # by itself.
+        # A collision is shorter than a recording: each quarter of a second is judged by itself.
         width = max(1, round(0.25 / self.period))
         for begin, end in zip(self.starts, (*self.starts[1:], len(self.time)), strict=True):
             some = min(width, end - begin)
@@ -156,12 +147,12 @@ class Compared:
 
     @property
     def good(self) -> Mask:
-        """Which joints' efforts agree with the model, shape (n,)."""
+        """Mask of the joints whose efforts agree with the model, shape (n,)."""
         return np.asarray((self.rms <= self.limit) & (self.local()[0] <= MAX_LOCAL_RATIO * self.limit))
 
     @property
     def delayed(self) -> str:
-        """Efforts that are later than a recording's may be, in words; or empty."""
+        """Words for efforts that are later than a recording's may be; empty if they are not."""
         return late_text("all joints", self.late) if abs(self.late) > MAX_DELAY else ""
 
 
@@ -171,22 +162,17 @@ def evaluate_loaded(r: Recording, function: Callable[..., Array], time: Array, *
     return np.concatenate([function(robot, *(v[rows] for v in motion)) for robot, rows in parts])
 
 
-def make_motion_projection(robot: Robot, q: Array) -> Array:
+def _project_motion(robot: Robot, q: Array) -> Array:
     """Return the projection of efforts on the smallest ones with the same motion, (k, n, n).
 
-    Least over their limits. Drives that share may do so otherwise than the model says: what they
-    give against each other moves nothing. One where no drives share.
+    Smallest over their limits. Drives that share may do so otherwise than the model says: what they
+    give against each other moves nothing. The identity where no drives share.
     """
     one = np.eye(robot.joints_count)
     if not robot.redundant:
         return np.broadcast_to(one, (len(q), *one.shape))
     rows = null_efforts(robot, q)
     return one - rows.swapaxes(-1, -2) @ (rows / robot.effort_scale**2)
-
-
-def _multiply_each(matrices: Array, rows: Array) -> Array:
-    """Multiply each matrix (k, n, n) with its vector (k, n)."""
-    return np.asarray(np.einsum("kij,kj->ki", matrices, rows), np.float64)
 
 
 def compare(r: Recording, bound: float = MAX_RESIDUAL) -> Compared | None:
@@ -216,62 +202,62 @@ def _compare_recording(r: Recording, bound: float) -> Compared | None:
     if not pieces:
         return None
 
-    def efforts(track: Track, alike: Array) -> Array:
+    def compute_efforts(track: Track) -> Array:
+        """Compute the model's efforts, the smallest ones with the same motion."""
         qd = zero_resting_rates(track.qd, ~track.moves(how), reach)
-        made = evaluate_loaded(r, inverse_dynamics, track.time, track.q, qd, track.qdd, track.wrench)
-        made = made + Dahl.remembered(robot.friction, track.q, qd)[0]
-        return _multiply_each(alike, made)
-
-    def moved(track: Track) -> Array:
-        return efforts(track, make_motion_projection(robot, track.q))
+        efforts = evaluate_loaded(r, inverse_dynamics, track.time, track.q, qd, track.qdd, track.wrench)
+        efforts = efforts + Dahl.remembered(robot.friction, track.q, qd)[0]
+        return np.asarray(np.einsum("kij,kj->ki", _project_motion(robot, track.q), efforts), np.float64)
 
     period, every, how = pieces[0].period, how.keep_every, replace(how, keep_every=1)
     sharp: list[dict[str, Array]] = []
     for track in pieces:
-        alike = make_motion_projection(robot, track.q)
-        expected = efforts(track, alike)
+        expected, projection = compute_efforts(track), _project_motion(robot, track.q)
         _, doubt = Dahl.remembered(robot.friction, track.q, track.sure(how))
-        slack = _multiply_each(np.abs(alike), np.where(track.moves(how), doubt, reach))
-        left = beyond_friction(_multiply_each(alike, track.effort) - expected, slack > 0.0, slack)
+        slack = np.einsum("kij,kj->ki", np.abs(projection), np.where(track.moves(how), doubt, reach))
+        measured = np.einsum("kij,kj->ki", projection, track.effort)
+        left = beyond_friction(measured - expected, slack > 0.0, slack)
         change = np.gradient(expected, period, axis=0)
         qd = zero_resting_rates(track.qd, ~track.moves(how), reach)
-        rubs = np.concatenate([alike * part[:, None] for part in (qd, np.sign(qd))], -1)
+        rubs = np.concatenate([projection * part[:, None] for part in (qd, np.sign(qd))], -1)
         sharp.append({"expected": expected, "left": left, "change": change, "rubs": rubs})
     smooth = filtered(sharp, period, how)
     expected, left, change, rubs = smooth.values()
     inside = [kept_rows(len(track.time), period, how) for track in pieces]
     starts = np.cumsum([0, *(rows.stop - rows.start for rows in inside[:-1])]).tolist()
     time = np.concatenate([one.time[rows] for one, rows in zip(pieces, inside, strict=True)])
-    cut = {
-        name: np.concatenate([one[name][rows] for one, rows in zip(sharp, inside, strict=True)])
+    cut_left, cut_change = (
+        np.concatenate([one[name][rows] for one, rows in zip(sharp, inside, strict=True)])
         for name in ("left", "change")
-    }
-    late = _estimate_delay(*(one[::every] for one in (left, change, rubs)))
+    )
+    # The delay, beside other friction of the drives; one at the bound is the effect of another error.
+    some, rubs = left[::every], rubs[::every]
+    table = np.concatenate([-change[::every, ..., None], rubs], -1)
+    scales = max(float(rms(some).max()), 1e-12) / np.maximum(np.sqrt(np.mean(rubs**2, (0, 1))), 1e-12)
+    found = estimate(table, some, np.zeros(table.shape[-1]), np.array([MAX_DELAY, *scales]))
+    late, sure = float(found.values[0]), 3.0 * np.sqrt(found.covariance[0, 0])
+    late = late if sure < abs(late) < MAX_DELAY else 0.0
     longest = max(pieces, key=lambda track: len(track.time))
     raw = [one["left"] for one in sharp]
     long = [one for one in raw if len(one) >= 256] or [max(raw, key=len)]
-    shaken = np.zeros_like(r.q) if rates is not None else simulate_noise(r, longest, how, moved)
-    density = estimate_noise_density(long, shaken, period, how)
-    size = np.abs(expected).max(0)
-    units = np.array(robot.effort_units)
-
-    def greatest(sizes: Array) -> Array:
-        return np.array([sizes[units == unit].max() for unit in units])
-
-    residual = left + late * change
-    noise = density * np.sqrt(find_passed_band(how, 1.0 / period) / period)
+    shaken = np.zeros_like(r.q) if rates is not None else simulate_noise(r, longest, how, compute_efforts)
+    noise = estimate_noise_density(long, shaken, period, how) * np.sqrt(find_passed_band(how, 1.0 / period) / period)
+    residual, size, units = left + late * change, np.abs(expected).max(0), np.array(robot.effort_units)
     # A joint with next to no effort is judged as if it had a twentieth of the greatest of its unit.
     # Noise as large as half of the efforts hides efforts that are twice the model's.
+    greatest, greatest_rms = (
+        np.array([sizes[units == unit].max() for unit in units]) for sizes in (size, rms(expected + residual))
+    )
     return Compared(
         time,
         expected + residual,
         expected,
         change,
         residual,
-        cut["left"] + late * cut["change"],
+        cut_left + late * cut_change,
         noise,
-        np.maximum(size, 0.05 * greatest(size)),
-        MAX_NOISE_RATIO * noise > 0.5 * greatest(rms(expected + residual)),
+        np.maximum(size, 0.05 * greatest),
+        MAX_NOISE_RATIO * noise > 0.5 * greatest_rms,
         r.late + late,
         period,
         tuple(starts),
@@ -280,20 +266,6 @@ def _compare_recording(r: Recording, bound: float) -> Compared | None:
         how,
         bound,
     )
-
-
-def _estimate_delay(left: Array, change: Array, rubs: Array) -> float:
-    """Estimate the efforts' delay, s; 0 where other friction of the drives explains it as well.
-
-    :param left: residuals, ``change``: the efforts', (k, n) each; ``rubs``: of friction, (k, n, f).
-    """
-    table = np.concatenate([-change[..., None], rubs], -1)
-    sizes = np.sqrt(np.mean(rubs**2, (0, 1)))
-    scales = max(float(rms(left).max()), 1e-12) / np.maximum(sizes, 1e-12)
-    found = estimate(table, left, np.zeros(table.shape[-1]), np.array([MAX_DELAY, *scales]))
-    late, sure = float(found.values[0]), 3.0 * np.sqrt(found.covariance[0, 0])
-    # A delay at the bound is the effect of another error.
-    return late if sure < abs(late) < MAX_DELAY else 0.0
 
 
 def describe_delay(late: float, period: float) -> str:

@@ -16,7 +16,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from pkm_twin.codegen.arrays import Array
+from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import PkmTwinError, write_install_command
 from pkm_twin.identification.samples import huber
 from pkm_twin.streams.noise import estimate_deviation
@@ -32,10 +32,9 @@ class Estimate:
     """Parameters of a fit, shape (k,), and what is known of them.
 
     ``covariance``: shape (k, k), of data and prior together. ``prior``: deviations before, (k,).
-    ``noise``: deviation of the efforts' residual by joint, (n,). ``directions``: how many
-    combinations the data told. ``condition``: of the weighted regressor over those, columns
-    scaled by the prior. ``weights``: of the samples, shape (samples, n). ``bound``: columns of
-    the parameters that each physical bound holds.
+    ``noise``: deviation of the efforts' residual by joint, (n,). ``directions``: number of
+    combinations that the data determine. ``condition``: of the weighted regressor over those,
+    columns scaled by the prior. ``bound``: columns of the parameters that each physical bound holds.
     """
 
     values: Array
@@ -44,7 +43,6 @@ class Estimate:
     noise: Array
     directions: int
     condition: float
-    weights: Array
     bound: Bound
 
 
@@ -57,7 +55,7 @@ def estimate(
     judged: Array | None = None,
     begin: Array | None = None,
 ) -> Estimate:
-    """Fit target = table parameters.
+    """Fit target = table @ parameters by robust least squares with a Gaussian prior.
 
     :param table: regressor, shape (samples, n, k), samples in the order of time.
     :param target: efforts, shape (samples, n).
@@ -65,8 +63,8 @@ def estimate(
     :param scales: its deviations, shape (k,), above zero.
     :param cones: matrices that have to stay positive semidefinite.
     :param judged: 1 or 0 for what counts, shape (samples, n).
-    :param begin: the noise to begin with, (n,); default what the prior's values leave, from which
-        a few samples do not find their way.
+    :param begin: initial noise of each joint, (n,); default: the residual of the prior's values,
+        from which few samples may not converge.
     """
     samples, n, k = table.shape
     counts = np.ones((samples, n)) if judged is None else judged
@@ -79,8 +77,7 @@ def estimate(
     guess = np.sqrt(_average(change**2, counts)) if begin is None else begin
     noise = np.maximum(guess, floor)
     weights = counts.copy()
-    told: Any = None
-    z = np.zeros(k)
+    z, values, vectors, kept = np.zeros(k), np.zeros(k), np.eye(k), np.zeros(k, np.bool_)
     for _ in range(MAX_ITERATIONS):
         root = np.sqrt(weights) / noise
         rows = (scaled * root[..., None]).reshape(-1, k)
@@ -88,8 +85,10 @@ def estimate(
         # A direction whose effect is below 1e-5 of the efforts is not identifiable.
         least = 1e-5**2 * samples * float(np.sum((size / noise) ** 2))
         # Directions that the data determine five times better than the prior are fitted.
-        told = _solve_directions(gram, side, max(5.0**2, least))
-        before, z = z, told[0]
+        values, vectors = np.linalg.eigh(gram)
+        kept = values > max(5.0**2, least, 1e-13 * float(values.max(initial=0.0)))
+        inverse = np.where(kept, 1.0 / np.where(kept, values, 1.0), 0.0)
+        before, z = z, vectors @ (inverse * (vectors.T @ side))
         residual = change - scaled @ z
         parts = [residual[used[:, j], j] for j in range(n)]
         new = np.array([float(estimate_deviation(r - np.median(r))) if len(r) else 0.0 for r in parts])
@@ -98,7 +97,6 @@ def estimate(
         weights = counts * huber(np.abs(residual) / noise)
         if settled:
             break
-    z, values, vectors, kept = told
     noise = np.sqrt(np.sum(weights * residual**2, 0) / np.maximum(np.sum(weights, 0) - k / n, 1.0))
     noise = np.maximum(noise, floor)
     factor = _factor_covariance(scaled, residual * weights, counts, noise, values, vectors, kept)
@@ -111,29 +109,12 @@ def estimate(
         moved = (fitted - start) / scales - z
         spread = spread + np.outer(moved, moved)
     condition = float(np.sqrt(values[kept].max() / values[kept].min())) if kept.any() else np.inf
-    return Estimate(
-        fitted,
-        scales[:, None] * spread * scales,
-        scales,
-        noise,
-        int(kept.sum()),
-        condition,
-        weights,
-        bound,
-    )
+    return Estimate(fitted, scales[:, None] * spread * scales, scales, noise, int(kept.sum()), condition, bound)
 
 
 def _average(values: Array, counts: Array) -> Array:
     """Return the mean over the samples that count, (n,)."""
     return np.asarray(np.sum(values * counts, 0) / np.maximum(np.sum(counts, 0), 1.0), np.float64)
-
-
-def _solve_directions(gram: Array, side: Array, least: float) -> tuple[Array, Array, Array, Any]:
-    """Solve in the directions whose information exceeds ``least``; return also the eigenpairs."""
-    values, vectors = np.linalg.eigh(gram)
-    kept = values > max(least, 1e-13 * float(values.max(initial=0.0)))
-    inverse = np.where(kept, 1.0 / np.where(kept, values, 1.0), 0.0)
-    return vectors @ (inverse * (vectors.T @ side)), values, vectors, kept
 
 
 def _factor_covariance(
@@ -143,7 +124,7 @@ def _factor_covariance(
     noise: Array,
     values: Array,
     vectors: Array,
-    kept: Any,
+    kept: Mask,
 ) -> Array:
     """Return the factor F of the scaled parameters' covariance F F^T, shape (k, k).
 
@@ -192,20 +173,22 @@ def find_violations(values: Array, cones: Cones) -> Bound:
     return tuple(found)
 
 
-def is_possible(values: Array, cones: Cones) -> bool:
-    """Return whether every cone's matrix is positive semidefinite, up to rounding."""
-    return not find_violations(values, cones)
-
-
 def find_nearest(z: Array, factor: Array, start: Array, scales: Array, cones: Cones) -> Array:
     """Return the possible parameters nearest to a solution, in its standard deviations.
 
     :param factor: of the scaled parameters' covariance, shape (k, k).
     """
     if all(len(cone) == 1 and np.count_nonzero(cone) == 1 for _, cone in cones):
-        sizes = np.linalg.norm(factor, axis=0)
+        from scipy.optimize import lsq_linear  # type: ignore[import-untyped]
+
+        sizes, low = np.linalg.norm(factor, axis=0), np.full(len(start), -np.inf)
         root = np.linalg.inv(factor / sizes) / sizes[:, None]
-        return _solve_bounded(root, root @ z, start, scales, cones)
+        for where, cone in cones:
+            k = where.start + int(np.flatnonzero(cone[0, 0])[0])
+            low[k] = -start[k] / scales[k]
+        found = lsq_linear(root, root @ z, (np.minimum(low, -1e-15), np.inf), method="bvls")
+        least = np.where(np.isfinite(low), 0.0, -np.inf)
+        return np.asarray(np.maximum(start + scales * found.x, least), np.float64)
     try:
         cvxpy: Any = importlib.import_module("cvxpy")
     except ImportError:
@@ -219,7 +202,9 @@ def find_nearest(z: Array, factor: Array, start: Array, scales: Array, cones: Co
     physical = start + scales * z + moved @ unknown
     limits = []
     for where, cone in cones:
-        basis = _scale_basis(cone, scales[where])
+        # Scaled to the rows that the cone's matrices use.
+        reach = np.concatenate([np.abs(cone[..., k] * s) for k, s in enumerate(scales[where])], 1).max(1)
+        basis = np.diag(1.0 / np.sqrt(np.where(reach > 0.0, reach, 1.0)))[:, reach > 0.0]
         if basis.shape[1] == 1:
             row = np.einsum("ia,ijk,jb->k", basis, cone, basis)
             limits.append(row @ physical[where] >= 0.0)
@@ -235,33 +220,9 @@ def find_nearest(z: Array, factor: Array, start: Array, scales: Array, cones: Co
         raise PkmTwinError(f"no possible masses and inertias near the data: {problem.status}")
     result = start + scales * z + moved @ np.asarray(unknown.value, np.float64)
     result[np.abs(result) < 1e-9 * scales] = 0.0
-    return _move_inside(result, start, cones)
-
-
-def _scale_basis(cone: Array, scales: Array) -> Array:
-    """Return a scaled basis of the rows that the cone's matrices use, (d, r)."""
-    reach = np.concatenate([np.abs(cone[..., k] * scales[k]) for k in range(cone.shape[-1])], 1)
-    used = reach.max(1) > 0.0
-    basis = np.diag(1.0 / np.sqrt(np.where(used, reach.max(1), 1.0)))[:, used]
-    return np.asarray(basis, np.float64)
-
-
-def _solve_bounded(root: Array, aim: Array, start: Array, scales: Array, cones: Cones) -> Array:
-    from scipy.optimize import lsq_linear  # type: ignore[import-untyped]
-
-    low = np.full(len(start), -np.inf)
-    for where, cone in cones:
-        k = int(np.flatnonzero(cone[0, 0])[0])
-        low[where.start + k] = -start[where.start + k] / scales[where.start + k]
-    found = lsq_linear(root, aim, (np.minimum(low, -1e-15), np.inf), method="bvls")
-    least = np.where(np.isfinite(low), 0.0, -np.inf)
-    return np.asarray(np.maximum(start + scales * found.x, least), np.float64)
-
-
-def _move_inside(values: Array, start: Array, cones: Cones) -> Array:
-    """Move a solver's result inwards by its excess, towards the file's values."""
-    for share in (0.0, 1e-9, 1e-8, 1e-7, 1e-6, 1e-5, 1e-4, 1e-3):
-        moved = values + share * (start - values)
-        if is_possible(moved, cones):
-            return moved
-    return values
+    # A solver's result is just outside the bounds: it moves towards the file's values.
+    for share in (0.0, *np.geomspace(1e-9, 1e-3, 7)):
+        moved_inside = result + share * (start - result)
+        if not find_violations(moved_inside, cones):
+            return np.asarray(moved_inside, np.float64)
+    return result

@@ -7,7 +7,7 @@ import math
 import os
 import sqlite3
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -25,7 +25,7 @@ from pkm_twin.robot.plausibility import why_no_torques
 
 MAX_NUMBER: Final = 1e9
 """Largest size of a number: N, N m, kg, Hz or a factor."""
-APPLICATION: Final = 0x706B6D74
+APPLICATION_ID: Final = 0x706B6D74
 """SQLite's application_id of a history: "pkmt"."""
 MIN_RECORDINGS: Final = 6
 """Smallest number of recordings of a series that is judged."""
@@ -86,87 +86,67 @@ QUANTITY_NAMES: Final = {
 
 
 def measure(recording: Recording) -> list[Measured]:
-    """Residual, friction and payload by the efforts; stiffness and frequency by deflections.
+    """Measure residual, friction and payload by the efforts, stiffness and frequency by deflections.
 
     Friction and payload are those that `fit` finds, with its standard deviations. What the
     recording or the robot's file lacks, or the motion does not excite, is left out.
     """
-    return [*_measure_efforts(recording), *_measure_elasticity(recording)]
-
-
-def _measure_efforts(r: Recording) -> list[Measured]:
-    if r.effort is None or why_no_torques(r.robot):
-        return []
-    idle = find_idle(r)
-    compared = compare_part(r, idle)
-    if compared is None:
-        return []
-    names, units = r.robot.joint_names, r.robot.effort_units
-    residuals = zip(names, compared.rms.tolist(), units, strict=True)
-    found = [Measured("residual", name, rms, np.nan, unit) for name, rms, unit in residuals]
-    known = 0.0 if r.load is None else r.load.mass
-    try:
-        result, *_ = fit_recordings(r.robot, [r], ("friction", "payload"), (), accept=True)
-    except (PkmTwinError, ValueError, np.linalg.LinAlgError):
-        return found
-    owners = {key: g.names[0] for g in result.problem.parameters.groups for key in g.keys(g.values)}
-    for one in result.list_numbers("fitted"):
-        part, _, law = owners[one.key].rpartition(".")
-        if part in names and law in ("viscous", "coulomb"):
-            found.append(Measured(f"friction {law}", part, one.after, one.deviation, one.unit))
-        elif one.key == ("payload", "mass"):
-            beyond = one.after - known
-            found.append(Measured(UNKNOWN_PAYLOAD, "platform", beyond, one.deviation, one.unit))
-    return found
-
-
-def _measure_elasticity(r: Recording) -> list[Measured]:
     from pkm_twin.identification.deflections import fit_elements
     from stiffness_monitor.modes import has_modes, natural_frequencies
 
+    r, found, compared = recording, list[Measured](), None
+    if r.effort is not None and not why_no_torques(r.robot):
+        compared = compare_part(r, find_idle(r))
+    if compared is not None:
+        residuals = zip(r.robot.joint_names, compared.rms.tolist(), r.robot.effort_units, strict=True)
+        found = [Measured("residual", name, rms, np.nan, unit) for name, rms, unit in residuals]
+        known = 0.0 if r.load is None else r.load.mass
+        with suppress(PkmTwinError, ValueError, np.linalg.LinAlgError):
+            result, *_ = fit_recordings(r.robot, [r], ("friction", "payload"), (), accept=True)
+            owners = {key: g.names[0] for g in result.problem.parameters.groups for key in g.keys(g.values)}
+            for one in result.list_numbers("fitted"):
+                part, _, law = owners[one.key].rpartition(".")
+                if part in r.robot.joint_names and law in ("viscous", "coulomb"):
+                    found.append(Measured(f"friction {law}", part, one.after, one.deviation, one.unit))
+                elif one.key == ("payload", "mass"):
+                    beyond = one.after - known
+                    found.append(Measured(UNKNOWN_PAYLOAD, "platform", beyond, one.deviation, one.unit))
     if r.bag is None:
-        return []
+        return found
     try:
-        deflected = read(r.source, r.robot, ReadOptions(deflected=True))
-        fit = fit_elements(r.robot, [deflected])
+        elastic = fit_elements(r.robot, [read(r.source, r.robot, ReadOptions(deflected=True))])
     except PkmTwinError:
-        return []
-    known = fit.list_numbers("fitted")
-    found = [Measured("compliance factor", str(n.key[-1]), n.after, n.deviation, "1") for n in known]
-    if known and has_modes(r.robot):
-        softer = {str(n.key[-1]): n.after for n in fit.numbers}
-        changed = r.robot.changed(element_compliance=softer)
+        return found
+    factors = elastic.list_numbers("fitted")
+    found += [Measured("compliance factor", str(n.key[-1]), n.after, n.deviation, "1") for n in factors]
+    if factors and has_modes(r.robot):
+        changed = r.robot.changed(element_compliance={str(n.key[-1]): n.after for n in elastic.numbers})
         first = float(natural_frequencies(changed, changed.home(), 1)[0])
         found.append(Measured("frequency at home", "first mode", first, np.nan, "Hz"))
     return found
 
 
-def recorded_at(recording: Recording, path: Path) -> float:
-    """When a recording began, s since 1970: by its stamps, else by the file's age."""
-    first = float(recording.stamps[0])
-    # Smaller stamps, ns, are since a start, not since 1970.
-    return first / 1e9 if first > 1e17 else path.stat().st_mtime
-
-
 @contextmanager
 def _open_database(path: Path) -> Iterator[sqlite3.Connection]:
     try:
-        with closing(sqlite3.connect(path, timeout=60.0, isolation_level=None)) as base:
-            yield base
+        with closing(sqlite3.connect(path, timeout=60.0, isolation_level=None)) as database:
+            yield database
     except sqlite3.Error as error:
         raise FileError(path, error, HISTORY) from None
 
 
-def _check_base(path: Path, base: sqlite3.Connection, new: bool) -> None:
-    """Reject a database that is no history; one without application_id has its two tables alone.
+def _check_schema(path: Path, database: sqlite3.Connection, new: bool) -> None:
+    """Reject a database that is not a history.
+
+    The application id, or without one exactly the two tables, must match.
 
     :param new: whether an empty database is good, too.
     :raises ParameterError: by its tables.
     """
-    own = base.execute("PRAGMA application_id").fetchone()[0]
-    rows = base.execute("SELECT name FROM sqlite_master WHERE type IN ('table', 'view')").fetchall()
+    own = database.execute("PRAGMA application_id").fetchone()[0]
+    rows = database.execute("SELECT name FROM sqlite_master WHERE type IN ('table', 'view')").fetchall()
     tables = {str(name) for (name,) in rows}
-    if own == APPLICATION or (own == 0 and tables in [{"checks", "numbers"}, *([set()] * new)]):
+    if own == APPLICATION_ID or (own == 0 and tables in [{"checks", "numbers"}, *([set()] * new)]):
         return
     found = f"a database with {len(tables)} tables: {', '.join(sorted(tables))}"
     raise ParameterError(str(path), one_line(found, 100), HISTORY)
@@ -178,8 +158,8 @@ def check_file(path: Path) -> None:
     :raises ParameterError: by the file.
     """
     if path.exists():
-        with _open_database(path) as base:
-            _check_base(path, base, new=True)
+        with _open_database(path) as database:
+            _check_schema(path, database, new=True)
 
 
 def _check_row(where: str, time: Any, value: Any, deviation: Any) -> None:
@@ -219,23 +199,23 @@ def append(
     row = recorded, when, machine, robot, os.fspath(file), int(good)
     for one in numbers:
         _check_row(f"{one.quantity} of {one.part}", recorded, one.value, one.deviation)
-    with _open_database(path) as base:
-        base.execute("PRAGMA foreign_keys = ON")
-        base.execute("BEGIN IMMEDIATE")
-        _check_base(path, base, new=True)
-        base.execute(f"PRAGMA application_id = {APPLICATION}")
+    with _open_database(path) as database:
+        database.execute("PRAGMA foreign_keys = ON")
+        database.execute("BEGIN IMMEDIATE")
+        _check_schema(path, database, new=True)
+        database.execute(f"PRAGMA application_id = {APPLICATION_ID}")
         for statement in _TABLES.split(";")[:-1]:
-            base.execute(statement)
-        key = base.execute(
+            database.execute(statement)
+        key = database.execute(
             "INSERT OR REPLACE INTO checks (recorded, judged, machine, robot, file, good) VALUES (?, ?, ?, ?, ?, ?)",
             row,
         ).lastrowid
         # SQLite stores NaN as NULL.
-        base.executemany(
+        database.executemany(
             "INSERT INTO numbers VALUES (?, ?, ?, ?, ?, ?)",
             [(key, n.quantity, n.part, n.value, n.deviation, n.unit) for n in numbers],
         )
-        base.execute("COMMIT")
+        database.execute("COMMIT")
 
 
 def append_recording(path: Path, recording: Recording, file: Path, good: bool, machine: str | None = None) -> None:
@@ -243,7 +223,9 @@ def append_recording(path: Path, recording: Recording, file: Path, good: bool, m
 
     :param machine: its name in the history; default: the robot's.
     """
-    robot, began = recording.robot.name, recorded_at(recording, file)
+    robot, first = recording.robot.name, float(recording.stamps[0])
+    # By the stamps, ns since 1970; smaller ones are since a start, and the file's age stands for them.
+    began = first / 1e9 if first > 1e17 else file.stat().st_mtime
     append(path, machine or robot, robot, file, began, good, measure(recording))
 
 
@@ -254,9 +236,9 @@ def read_history(path: Path, machine: str | None = None) -> list[Series]:
     """
     if not path.is_file():
         raise FileError(path, FileNotFoundError(), HISTORY)
-    with _open_database(path) as base:
-        _check_base(path, base, new=False)
-        rows = base.execute(
+    with _open_database(path) as database:
+        _check_schema(path, database, new=False)
+        rows = database.execute(
             "SELECT machine, quantity, part, unit, recorded, value, deviation FROM numbers "
             "JOIN checks ON checks.id = check_id ORDER BY machine, quantity, part, unit, recorded"
         ).fetchall()
@@ -358,7 +340,7 @@ def judge_history(path: Path, machine: str | None, baseline: int, false_alarm: f
 
 
 def judge_series(series: Series, baseline: int, alarm: float) -> Judged:
-    """Control limits and a change of the mean of one series.
+    """Find the control limits and a change of the mean of one series.
 
     Limits: where a single further recording lies but for the chance ``alarm``, by mean and standard
     deviation of the first ``baseline`` recordings (Student's t). The change: of all splits with two

@@ -245,16 +245,29 @@ def make_rows(robot: Robot, parameters: FileParameters, recording: Recording, wi
     # With the friction laws on trial, as the robot has them.
     carried = None if r.loaded_robot is None else replace(robot, payload=r.loaded_robot.payload)
     model = Model(robot, parameters, carried)
+    parts = list[_Piece]()
     try:
-        parts = [_Piece.from_track(model, track, how) for track in pieces]
+        for track in pieces:
+            memory, moves = model.memory(track, how), track.moves(how)
+            table, rest = model.columns(track, memory)
+            if memory is not None:
+                moves = np.where(robot.friction.presliding > 0.0, memory.unknown < KNOWN_FRACTION, moves)
+            parts.append(_Piece(track, table, track.effort - rest, rest, moves.astype(np.float64)))
     except (UnreachableError, SingularityError) as error:
         raise PkmTwinError(f"{r.name}: {position_text(error)}") from None
     if all(not part.moves.any() for part in parts):
         raise PkmTwinError(f"{r.name}: no excitation, the joints stand still")
     first, outliers = _drop_outliers(parts, parameters, how.keep_every)
-    told = [part.apply_first_fit(model, first) for part in parts]
-    both = zip(parts, told, strict=True)
-    f = filtered([part.columns(one) for part, one in both], pieces[0].period, how)
+    rubs, told, columns = model.of_drives, list[_FirstFit](), list[dict[str, Array]]()
+    for part in parts:
+        efforts = part.rest + part.table @ first
+        load = efforts - part.table[..., rubs] @ first[rubs]
+        told.append(_FirstFit(part.track, efforts, load, part.target - part.table @ first, part.moves))
+        columns.append({name: getattr(part, name) for name in ("table", "target", "rest", "moves")})
+        columns[-1]["time"] = part.track.time
+        columns[-1]["doubt"] = (1.0 - part.moves) * np.abs(efforts - load)
+        columns[-1]["change"] = np.gradient(efforts, part.track.period, axis=0)
+    f = filtered(columns, pieces[0].period, how)
     # Where standing still is in the filter's reach, friction's sign is not known.
     moves, left = f["moves"] > 0.8, f["target"] - f["table"] @ first
     usual = [
@@ -318,33 +331,6 @@ class _Piece:
     moves: Array
     """1 where the direction of friction is known, shape (k, n)."""
 
-    @classmethod
-    def from_track(cls, model: Model, track: Track, how: Filtering) -> _Piece:
-        """Evaluate the model along a track."""
-        memory, moves = model.memory(track, how), track.moves(how)
-        table, rest = model.columns(track, memory)
-        if memory is not None:
-            moves = np.where(model.robot.friction.presliding > 0.0, memory.unknown < KNOWN_FRACTION, moves)
-        return cls(track, table, track.effort - rest, rest, moves.astype(np.float64))
-
-    def columns(self, told: _FirstFit) -> dict[str, Array]:
-        """Return what rows are made of, by name, (samples, ...) each."""
-        return {
-            "time": self.track.time,
-            "table": self.table,
-            "target": self.target,
-            "rest": self.rest,
-            "moves": self.moves,
-            "doubt": (1.0 - self.moves) * np.abs(told.efforts - told.load),
-            "change": np.gradient(told.efforts, self.track.period, axis=0),
-        }
-
-    def apply_first_fit(self, model: Model, first: Array) -> _FirstFit:
-        """Return this piece's efforts and residuals by the parameters of the first robust fit."""
-        told, rubs = self.rest + self.table @ first, model.of_drives
-        load = told - self.table[..., rubs] @ first[rubs]
-        return _FirstFit(self.track, told, load, self.target - self.table @ first, self.moves)
-
 
 @dataclass(frozen=True, eq=False)
 class _FirstFit:
@@ -393,10 +379,10 @@ def _drop_outliers(parts: list[_Piece], parameters: FileParameters, every: int) 
 
     :returns: that fit's parameters, and how many efforts.
     """
-    table = np.concatenate([part.table[::every] for part in parts])
-    target = np.concatenate([part.target[::every] for part in parts])
-    rest = np.concatenate([part.rest[::every] for part in parts])
-    moves = np.concatenate([part.moves[::every] for part in parts])
+    table, target, rest, moves = (
+        np.concatenate([getattr(part, name)[::every] for part in parts])
+        for name in ("table", "target", "rest", "moves")
+    )
     scales = prior_scales(parameters, table, target + rest)
     first = estimate(table, target, parameters.values, scales, judged=moves).values
     count = 0

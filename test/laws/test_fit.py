@@ -14,7 +14,7 @@ import pytest
 from delta_dynamics import inverse_dynamics
 from pkm_twin import Robot
 from pkm_twin.errors import ParameterError, PkmTwinError
-from pkm_twin.identification.estimation import estimate, is_possible
+from pkm_twin.identification.estimation import estimate, find_violations
 from pkm_twin.identification.fit import Fit, fit
 from pkm_twin.identification.identifiable import make_inertia_cone
 from pkm_twin.identification.parameters import file_parameters, fitted_yaml
@@ -174,8 +174,8 @@ def test_the_nearest_possible_body_takes_an_impossible_one_s_place():
     start = standard_parameters(1.0, np.zeros(3), 0.01 * np.eye(3))
     alone = estimate(table, target, start, np.ones(10))
     held = estimate(table, target, start, np.ones(10), cone)
-    assert not is_possible(alone.values, cone)
-    assert held.bound and is_possible(held.values, cone)
+    assert find_violations(alone.values, cone)
+    assert held.bound and not find_violations(held.values, cone)
     # The nearest: not farther from the truth, which is possible.
     measure = np.linalg.inv(alone.covariance)
     apart = [v - true for v in (alone.values, held.values)]

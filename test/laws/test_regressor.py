@@ -16,7 +16,7 @@ from delta_dynamics import (
 )
 from delta_dynamics.torques.regressor import random_states
 from pkm_twin import Robot
-from pkm_twin.identification.estimation import is_possible
+from pkm_twin.identification.estimation import find_violations
 from pkm_twin.identification.parameters import file_parameters
 from pkm_twin.machine.places import join_path
 from pkm_twin.mechanisms.catalogue import robot_of_data
@@ -50,12 +50,12 @@ def test_numbers_of_a_file_are_linear_parameters(name):
     robot, rng = complete(name), np.random.default_rng(2)
     parameters = file_parameters(robot)
     assert len(set(parameters.names)) == len(parameters.names) == len(parameters.values)
-    assert is_possible(parameters.values, parameters.cones)
+    assert not find_violations(parameters.values, parameters.cones)
     values, numbers = parameters.values.copy(), {}
     for where, group in zip(parameters.slices, parameters.groups, strict=True):
         step = 0.3 * np.nan_to_num(group.scales) * rng.normal(size=len(group.names))
         new = 1.2 * group.values + step
-        while not is_possible(new, [(slice(None), cone) for cone in group.cones]):
+        while find_violations(new, [(slice(None), cone) for cone in group.cones]):
             step *= 0.5
             new = 1.2 * group.values + step
         if group.kind in ("payload", "inertia"):
