@@ -6,7 +6,7 @@ Efforts are compared by the derivative, filter and noise of `fit`, so that both 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
@@ -91,7 +91,7 @@ class Checked:
 
     @property
     def planned(self) -> bool:
-        """Whether every effort is the model's, as in the table of a plan."""
+        """True if every effort is the model's, as in the table of a plan."""
         r, c = self.recording, self.compared
         if c is None or r.qd is None or r.qdd is None:
             return False
@@ -100,7 +100,7 @@ class Checked:
 
     @property
     def agreement(self) -> str:
-        """Sentence on how well efforts and model agree."""
+        """Sentence about how well efforts and model agree."""
         r, c = self.recording, self.compared
         assert c is not None  # noqa: S101  without efforts no recording is good
         if self.planned:
@@ -143,7 +143,7 @@ def compare_with_model(r: Recording, residual: float) -> Checked:
 
     :param residual: largest good one, RMS, part of the peak effort.
     """
-    items = [*_judge_file(r), *_judge_motion(r), *_judge_limits(r), _judge_singularity(r)]
+    items = [*_judge_file(r), *_judge_motion(r), *_judge_limits(r)]
     left_out = np.zeros(len(r.time), np.bool_)
     bound = f"RMS below {100 * residual:g} % of peak"
     reason = why_no_torques(r.robot)
@@ -152,7 +152,7 @@ def compare_with_model(r: Recording, residual: float) -> Checked:
         reason = "the table has no columns JOINT.effort" if r.bag is None else reason
         reason = COMPUTED if r.efforts == "model" else reason
     fault = r.backlash_description or r.jump_description
-    # Single jumps are left out of what is compared.
+    # Efforts are compared apart from single jumps.
     if reason or r.steps.publishers or r.backlash_description:
         items.append(make_judged_fact(RESIDUAL, fault or reason, bound, None))
         return Checked(r, items, unjudged=reason, causes=(fault,) if fault else ())
@@ -203,19 +203,12 @@ def _judge_motion(r: Recording) -> list[Fact]:
     median, longest = float(np.median(periods)), float(periods.max())
     gap = f"{1e3 * longest:.3f} ms at {r.time[int(periods.argmax())]:.3f} s"
     within, rate = 5.0 * median, f"{1 / median:.1f} Hz over {r.time[-1]:.3f} s"
+    most = f"at most {1e3 * within:.3f} ms"
     fault = r.backlash_description or r.jump_description
     items = [
         make_judged_fact("rate", rate, "", True, number=1 / median, unit="Hz"),
         missing_samples(r.time),
-        make_judged_fact(
-            "longest gap",
-            gap,
-            f"at most {1e3 * within:.3f} ms",
-            longest <= within,
-            number=longest,
-            limit=within,
-            unit="s",
-        ),
+        make_judged_fact("longest gap", gap, most, longest <= within, number=longest, limit=within, unit="s"),
         make_judged_fact(POSITION_STEPS, fault or "no jumps", "within rates and limits", not fault),
     ]
     return items if r.qd is None or r.steps.publishers else items + _judge_velocities(r, r.qd)
@@ -259,18 +252,14 @@ def _judge_velocities(r: Recording, qd: Array) -> list[Fact]:
         return []
     worst = int(np.argmax(part))
     value = ", ".join(faults) or f"{100 * part[worst]:.2g} %, {names[worst]}"
-    number = float(part[worst])
-    text, good = (
-        f"RMS difference {value}",
-        False if faults else True if number <= MAX_MOVE_DIFFERENCE else None,
-    )
-    if good is None:
-        text += ", no more than noise"
+    number, text = float(part[worst]), f"RMS difference {value}"
+    good = False if faults else True if number <= MAX_MOVE_DIFFERENCE else None
+    text += ", no more than noise" * (good is None)
     return [make_judged_fact(VELOCITIES, text, bound, good, number=number, limit=MAX_MOVE_DIFFERENCE)]
 
 
 def _judge_limits(r: Recording) -> list[Fact]:
-    """Effort limits; position and velocity limits are already a node's reason to reject."""
+    """Judge margins of the limits, and the distance to singularities."""
     recorded = {"position": r.q, "velocity": r.qd, "effort": r.effort}
     items = []
     for what, low, high, units in list_limits(r.robot):
@@ -285,24 +274,19 @@ def _judge_limits(r: Recording) -> list[Fact]:
         text, only = f"least margin {margins}", [(0.0 - most, unit) for unit, most in worst.items()]
         least = {"number": only[0][0], "limit": 0.0, "unit": only[0][1]} if len(only) == 1 else {}
         items.append(make_judged_fact(f"{what} limits", text, "0 or more", good, **least))
-    return items
-
-
-def _judge_singularity(r: Recording) -> Fact:
-    what = "singularity index"
-    bound = f"{MIN_SINGULARITY:g} or more"
+    index, bound = "singularity index", f"{MIN_SINGULARITY:g} or more"
     try:
         measure = r.robot.singularity(r.q)
     except (UnreachableError, SingularityError) as error:
-        return make_judged_fact(what, str(error), bound, False)
-    worst = int(measure.argmin())
-    value = f"{measure[worst]:.4f} at {r.time[worst]:.3f} s"
-    least = float(measure[worst])
-    return make_judged_fact(what, value, bound, least >= MIN_SINGULARITY, number=least, limit=MIN_SINGULARITY)
+        return [*items, make_judged_fact(index, str(error), bound, False)]
+    k = int(measure.argmin())
+    smallest, text = float(measure[k]), f"{measure[k]:.4f} at {r.time[k]:.3f} s"
+    good = smallest >= MIN_SINGULARITY
+    return [*items, make_judged_fact(index, text, bound, good, number=smallest, limit=MIN_SINGULARITY)]
 
 
 def _judge_shares(r: Recording, idle: Mask, compared: Compared | None) -> tuple[list[Fact], str]:
-    """Return the samples that are left out, and the reason where too few remain for a verdict."""
+    """Judge the fraction of samples that are compared; return also why too few are left for a verdict."""
     items, total = [], max(float(r.time[-1]), 1e-9)
     used = 0 if compared is None else sum(len(track.time) for track in compared.tracks)
     share = used / len(r.time)
@@ -333,7 +317,7 @@ def _judge_shares(r: Recording, idle: Mask, compared: Compared | None) -> tuple[
 
 
 def _stuck_efforts(r: Recording, c: Compared) -> str:
-    """Efforts that were not measured, or not all the time; saturated ones are no such; or empty."""
+    """Describe efforts that were not measured, or not all the time, other than saturated ones; or empty."""
     assert r.effort is not None  # noqa: S101
     if r.robot.redundant:
         # One of the drives that share may stay as it is.
@@ -395,7 +379,7 @@ def _judge_residuals(r: Recording, c: Compared, bands: Mapping[str, Mapping[str,
 
 
 def _compare_uncertainty(r: Recording, c: Compared) -> dict[str, dict[str, Any]]:
-    """By joint, where the robot's file has an ``uncertainty``."""
+    """Compare residuals with the deviations by the file's ``uncertainty``, by joint; empty without one."""
     if not r.robot.uncertainty:
         return {}
     parts = []
@@ -444,9 +428,7 @@ def check(r: Recording, residual: float = MAX_RESIDUAL, thorough: bool = True) -
         return replace(found, causes=(one.text,))
     if MEASURED in bad:
         return found
-    causes = _find_saturated(r, c) or tuple(
-        text for text, after in _find_contact(r, c) if _agrees(r, found.left_out | after, c.bound)
-    )
+    causes = _find_saturated(r, c) or _find_contact(r, c, found.left_out)
     findings: tuple[str, ...] = ()
     if thorough and not causes:
         causes, findings = _explain_by_fit(found, c.bound)
@@ -482,21 +464,23 @@ def _agrees(r: Recording, without: Mask, bound: float) -> bool:
     return compared is not None and bool(compared.good.all()) and not compared.delayed
 
 
-def _find_contact(r: Recording, c: Compared) -> Iterator[tuple[str, Mask]]:
-    """Find when something else begins to act on the machine; yield text and samples from then."""
+def _find_contact(r: Recording, c: Compared, left_out: Mask) -> tuple[str, ...]:
+    """Find when something else begins to act on the machine, if all efforts before agree."""
     begins = c.begins()
     if begins is None:
-        return
+        return ()
     before = c.time < begins
-    # Before the motion is under way every machine agrees.
+    # Before the motion is under way every machine agrees: a fifth of the recording has to, which
+    # shows half of the peak efforts.
     seen = np.abs(c.expected[before]).max(0, initial=0.0) > 0.5 * np.abs(c.expected).max(0)
-    # What agrees before is a fifth of the recording, and shows half of the peak efforts.
-    if before.mean() > 0.2 and seen.all():
-        text = (
-            f"before {begins:.3f} s the efforts agree with the model, from then on something else "
-            "acts on the machine (contact, collision or another load?)"
-        )
-        yield text, r.time >= begins - 2.0 * c.edge
+    if not (before.mean() > 0.2 and seen.all()):
+        return ()
+    if not _agrees(r, left_out | (r.time >= begins - 2.0 * c.edge), c.bound):
+        return ()
+    return (
+        f"before {begins:.3f} s the efforts agree with the model, from then on something else "
+        "acts on the machine (contact, collision or another load?)",
+    )
 
 
 def _find_saturated(r: Recording, c: Compared) -> tuple[str, ...]:
@@ -532,12 +516,17 @@ def _find_saturated(r: Recording, c: Compared) -> tuple[str, ...]:
 def _explain_by_fit(found: Checked, bound: float) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return causes if other friction or all fitted numbers explain the efforts, else findings."""
     r = found.recording
+
+    def describe(what: str, made: Fit) -> str:
+        late = describe_delay(made.delays[0], made.problem.whole[0].period)
+        return f"{what} the efforts" + (f", which are {late}" if late else "") + ": `pkm-twin fit`"
+
     try:
         part = [cut_recording(r, found.left_out)]
         first = fit(r.robot, part, ("friction",), accept=True, explained=[Explanation("")])
         rubbing = r.robot.with_file_values({one.name: one.after for one in first.numbers})
         if not first.accepted and _agrees(replace(r, robot=rubbing), found.left_out, bound):
-            return (_describe_fit("friction other than the file's explains", first),), ()
+            return (describe("friction other than the file's explains", first),), ()
         last, *_ = fit_recordings(r.robot, [r], accept=True)
         verdict = last.verdict
         if last.accepted:
@@ -545,12 +534,5 @@ def _explain_by_fit(found: Checked, bound: float) -> tuple[tuple[str, ...], tupl
     except (PkmTwinError, ValueError, np.linalg.LinAlgError):
         return (), ()
     if verdict.answer == "explains":
-        text = "friction, masses or payload other than the file's explain"
-        return (_describe_fit(text, last),), ()
+        return (describe("friction, masses or payload other than the file's explain", last),), ()
     return (), tuple(map(str, verdict.findings[:2]))
-
-
-def _describe_fit(what: str, made: Fit) -> str:
-    """Write what explains the efforts, and their delay."""
-    late = describe_delay(made.delays[0], made.problem.whole[0].period)
-    return f"{what} the efforts" + (f", which are {late}" if late else "") + ": `pkm-twin fit`"

@@ -116,8 +116,9 @@ def _fit_constants(
         inverse = np.linalg.pinv(table / scale, rcond=1e-9) / scale[:, None]
         sizes = inverse @ current
         left = current - table @ sizes
-        # Neighbouring rows are not independent, so the variance is estimated by blocks.
-        blocks = np.array([inverse[0, part] @ left[part] for part in _split_blocks(len(left))])
+        # Neighbouring rows are not independent, so the variance is estimated by 30 blocks.
+        ends = np.linspace(0, len(left), 31).astype(int).tolist()
+        blocks = np.array([inverse[0, a:b] @ left[a:b] for a, b in pairwise(ends)])
         deviation = float(np.sqrt(np.sum(blocks**2)))
         if not deviation < 0.1 * abs(sizes[0]):
             raise PkmTwinError(
@@ -127,12 +128,6 @@ def _fit_constants(
             )
         found[:, j] = 1.0 / sizes[0], deviation / sizes[0] ** 2
     return found[0], found[1], used
-
-
-def _split_blocks(count: int) -> list[slice]:
-    """Split ``count`` samples into 30 contiguous blocks of nearly equal length."""
-    ends = np.linspace(0, count, 31).astype(int)
-    return [slice(int(a), int(b)) for a, b in pairwise(ends)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +171,7 @@ Runs = tuple[Array, Array, Array, Array | None, Array | None]
 
 
 def list_runs(table: Table, lever: float | None = None) -> Runs:
-    """Torques, currents up and down, speeds and drives of a table, for :func:`drive_friction`.
+    """List torques, currents up and down, speeds and drives of a table, for :func:`drive_friction`.
 
     :param lever: travel per radian of the motor, m, for masses.
     :raises ParameterError: a column or the lever is missing.
@@ -199,7 +194,7 @@ def drive_friction(
     speed: ArrayLike | None = None,
     drive: ArrayLike | None = None,
 ) -> DriveFriction:
-    """Torque constant and friction law of a drive, or of several alike.
+    """Estimate the torque constant and the friction law of a drive, or common ones of identical drives.
 
     :param torque: of the weights at the motor, N m, shape (k,), at least two different ones.
     :param up: mean current while they are lifted, A; ``down``: while they are lowered. Signs as

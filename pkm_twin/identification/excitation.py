@@ -171,8 +171,16 @@ def optimize_excitation(
     centre, reach = position_range(robot)
     reach *= keep.share
     harmonics = _choose_harmonics(robot, duration, terms, reach, keep)
-    whole = _TimeGrid.from_harmonics(duration, harmonics)
-    basis = _make_resting_basis(harmonics)
+    whole = _TimeGrid(duration, harmonics)
+    # Sines and cosines without velocity and acceleration at the ends, (2 h, 2 h - 2).
+    h = len(harmonics)
+    rows = np.zeros((2, 2 * h))
+    rows[0, :h], rows[1, h:] = harmonics, harmonics**2
+    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+    # High harmonics start small, because velocity limits restrict them first.
+    damped = np.concatenate([1.0 / harmonics, 1.0 / harmonics])
+    basis = damped[:, None] * np.linalg.svd(rows)[2][2:].T
+    basis = np.asarray(basis - rows.T @ (rows @ basis), np.float64)
     rng = np.random.default_rng(seed)
     shape = (len(centre), basis.shape[1])
     coarse = np.linspace(0.0, duration, 120, endpoint=False)
@@ -211,7 +219,7 @@ def optimize_excitation(
 
 
 def _choose_harmonics(robot: Robot, duration: float, terms: int, reach: Array, keep: TrajectoryLimits) -> Array:
-    """Different multiples of 1 / duration, up to where velocity and position limits meet."""
+    """Choose multiples of 1 / duration, up to the frequency where velocity and position limits meet."""
     # Ten points or more in a period of the highest harmonic.
     highest = keep.rate / 10.0
     if terms / duration > highest:
@@ -220,7 +228,7 @@ def _choose_harmonics(robot: Robot, duration: float, terms: int, reach: Array, k
             f"points per second allow {highest:.3g} Hz: use fewer --harmonics, a longer --duration "
             "or a higher --rate"
         )
-    # Without velocity limits 1 Hz, and never above 5 Hz.
+    # Highest frequency: 1 Hz without velocity limits, never above 5 Hz.
     top = min(1.0, highest)
     if robot.limits.velocity is not None:
         velocity = np.where(np.isfinite(robot.limits.velocity), robot.limits.velocity, np.inf)
@@ -232,19 +240,6 @@ def _choose_harmonics(robot: Robot, duration: float, terms: int, reach: Array, k
     return np.unique(np.round(np.linspace(least, most, terms))).astype(np.float64)
 
 
-def _make_resting_basis(harmonics: Array) -> Array:
-    """Basis of sines and cosines of no velocity and acceleration at the ends, (2 h, 2 h - 2)."""
-    h = len(harmonics)
-    rows = np.zeros((2, 2 * h))
-    rows[0, :h], rows[1, h:] = harmonics, harmonics**2
-    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
-    # High harmonics start small, because velocity limits restrict them first.
-    damped = np.concatenate([1.0 / harmonics, 1.0 / harmonics])
-    basis = damped[:, None] * np.linalg.svd(rows)[2][2:].T
-    return np.asarray(basis - rows.T @ (rows @ basis), np.float64)
-
-
-@dataclass(frozen=True, eq=False)
 class _TimeGrid:
     """Time grid dense enough that limits kept at its points hold between them too.
 
@@ -252,19 +247,13 @@ class _TimeGrid:
     it reaches between them (Ehlich, Zeller, 1964, doi:10.1007/BF01111276).
     """
 
-    time: Array
-    margin: float
-    bases: tuple[Array, Array, Array]
-    """Of positions, rates and accelerations, (states, 2 h) each."""
-
-    @classmethod
-    def from_harmonics(cls, duration: float, harmonics: Array) -> _TimeGrid:
-        """Return a time grid that resolves the highest harmonic."""
+    def __init__(self, duration: float, harmonics: Array) -> None:
         count = max(1200, 20 * round(float(harmonics[-1])))
-        time = np.asarray(np.arange(count) * (duration / count), np.float64)
-        eye = np.eye(2 * len(harmonics)).reshape(-1, 2, len(harmonics))
-        q, qd, qdd = _evaluate_series(time, duration, harmonics, np.zeros(len(eye)), np.moveaxis(eye, 1, 0))
-        return cls(time, float(np.cos(np.pi * harmonics[-1] / count)), (q, qd, qdd))
+        self.time = np.asarray(np.arange(count) * (duration / count), np.float64)
+        self.margin = float(np.cos(np.pi * harmonics[-1] / count))
+        eye = np.moveaxis(np.eye(2 * len(harmonics)).reshape(-1, 2, len(harmonics)), 1, 0)
+        # Of positions, rates and accelerations, (states, 2 h) each.
+        self.bases = _evaluate_series(self.time, duration, harmonics, np.zeros(eye.shape[1]), eye)
 
     def scaled(self, robot: Robot, keep: TrajectoryLimits, reach: Array, pair: Array) -> Array:
         """Scale the series (2, n, h) to the limits of position, rate and acceleration."""
@@ -363,9 +352,8 @@ class Sweeps:
         for way, (k, j) in product((1.0, -1.0), np.ndindex(self.speeds.T.shape)):
             length = float(self.lengths[j, k])
             inside = (time >= start) & (time <= start + length)
-            place, rate, change = way * _evaluate_sweep(
-                time[inside] - start, float(self.reach[j]), float(self.speeds[j, k])
-            )
+            sweep = _evaluate_sweep(time[inside] - start, float(self.reach[j]), float(self.speeds[j, k]))
+            place, rate, change = way * sweep
             q[inside, j] = self.centre[j] + place
             qd[inside, j], qdd[inside, j] = rate, change
             start += length
@@ -405,7 +393,7 @@ def design_sweeps(judge: Judge, duration: float, bounds: TrajectoryLimits | None
     lengths = SWEEP_DURATION * np.sum(1.0 / ratios) * n / duration
 
     def speeds(j: int) -> Array:
-        """By the duration, and the limits of the fastest sweep."""
+        """Choose the speeds by the duration, and the limits of the fastest sweep."""
         fastest = most[j]
         if keep.acceleration is not None:
             # A ramp of half a cosine has pi / 2 of its mean acceleration.

@@ -87,20 +87,17 @@ class FileParameters:
         return tuple((where, cone) for where, group in pairs for cone in group.cones)
 
 
-def _scale_rotor(group: Identifiable, robot: Robot) -> Identifiable:
-    """Set a rotor inertia's scale to the mass matrix's largest diagonal entry at home."""
-    if group.kind != "rotor":
-        return group
-    moved = float(np.diag(mass_matrix(robot, robot.graph.home)).max())
-    return replace(group, scales=np.array([max(moved, float(group.values[0]))]))
-
-
 def file_parameters(robot: Robot, what: Sequence[Kind] = KINDS) -> FileParameters:
     """List the parameters of some kinds.
 
     :raises ParameterError: the robot's file gives no masses.
     """
-    kept = [_scale_rotor(g, robot) for g in robot.cached(identifiable) if g.kind in what]
+    kept = [g for g in robot.cached(identifiable) if g.kind in what]
+    for k, group in enumerate(kept):
+        if group.kind == "rotor":
+            # A rotor inertia may be all that the mass matrix has at home.
+            moved = float(np.diag(mass_matrix(robot, robot.graph.home)).max())
+            kept[k] = replace(group, scales=np.array([max(moved, float(group.values[0]))]))
     place = {name: k for k, name in enumerate(parameter_names(robot))}
     tree = robot.engine.tree
     mixing = np.zeros((len(place), sum(len(group.names) for group in kept)))

@@ -101,18 +101,14 @@ def plan(
         raise ParameterError("--measure", "distance", "distance alone, or other kinds, in a plan")
     q = _candidates(robot, measured, dict(within or {}), kinds)
     paths = list_geometric_paths(robot, q, (free := Free(**options)).only)
-    joints = np.asarray(robot.controller.controller_positions(q))
-    first = np.arange(len(q))
+    joints, position = np.asarray(robot.controller.controller_positions(q)), robot.platform(q)[0]
+    first, noise = np.arange(len(q)), dict(noise or {})
     second = np.roll(first, len(q) // 2) if pair == {True} else None
-    noise = dict(noise or {})
-    position = robot.platform(q)[0]
     all_poses = Measured(joints, tuple(Readings(k, first, second, k.likely(position), first) for k in kinds), noise)
     parameters = list_parameters(robot, all_poses, paths, free)
-    names = [p.name for p in parameters]
-    prior = np.array([p.prior for p in parameters])
+    names, prior = [p.name for p in parameters], np.array([p.prior for p in parameters])
     fitted = [name for name in names if name in paths]
-    state = make_start(robot, all_poses, fitted)
-    covariance: Array = np.eye(len(names))
+    state, covariance = make_start(robot, all_poses, fitted), np.asarray(np.eye(len(names)), np.float64)
 
     def scale_slopes(one: Measured, at: State) -> list[Array]:
         """Return derivatives (m, p) of each kind over its noise, in units of the priors."""
@@ -147,9 +143,8 @@ def plan(
         best = int(np.argmax(gain))
         order.append(best)
         covariance = covariance - moved[best].T @ np.linalg.solve(inner[best], moved[best])
-    axis, distance, angle, seen_all = zip(*told, strict=True)
-    told_by = zip(kinds, usual, np.array(seen_all).T, strict=True)
-    quantity = {kind.name: size * deviations for kind, size, deviations in told_by}
+    axis, distance, angle, each = zip(*told, strict=True)
+    quantity = {k.name: size * seen for k, size, seen in zip(kinds, usual, np.array(each).T, strict=True)}
     deviations = prior * np.sqrt(np.maximum(np.diag(covariance), 0.0))
     numbers = tuple(replace(p, value=p.before, deviation=float(d)) for p, d in zip(parameters, deviations, strict=True))
     return Plan(

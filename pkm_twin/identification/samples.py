@@ -125,10 +125,10 @@ def local_fit(values: Array, window: int, degree: int, order: int, period: float
 
 
 def fit_spline(values: Array, period: float, cutoff: float | None) -> list[Array]:
-    """Signals (samples, n) below a frequency, Hz, with their first and second derivative.
+    """Fit signals (samples, n) below a frequency, Hz; return also the first and second derivative.
 
-    A least-squares spline with two knots a period: unlike a filter's, its ends take nothing for
-    granted of what is beyond them, so that derivatives hold there too. None: as they are.
+    A least-squares spline with two knots a period: unlike a filter it assumes nothing about the
+    signal beyond its ends, so that derivatives hold there too. None: the signals as they are.
     """
     if cutoff is None:
         return [values, *(differentiate(values, order, period) for order in (1, 2))]
@@ -195,7 +195,7 @@ def tracks(
     if not pieces:
         return [], Filtering(0, (), None, 1)
     positions = [own[0] for _, own in pieces]
-    # Each piece by its length.
+    # The noise of each piece counts by its number of samples.
     noise = np.average([estimate_noise(t, own[0]) for t, own in pieces], 0, [len(t) for t, _ in pieces])
     width = window or choose_window(positions, period, noise)
     result = []
@@ -236,7 +236,7 @@ def low_pass(values: Array, period: float, how: Filtering) -> Array:
 
 
 def filtered(pieces: Sequence[Mapping[str, Array]], period: float, how: Filtering) -> dict[str, Array]:
-    """Signals of pieces by name, (samples, ...) each, filtered alike, one piece after the other."""
+    """Filter signals of pieces by name, (samples, ...) each, alike; join the pieces one after the other."""
     shapes = {name: values.shape[1:] for name, values in pieces[0].items()}
     ends = np.cumsum([int(np.prod(shape)) for shape in shapes.values()])[:-1]
     smooth = [low_pass(np.concatenate([v.reshape(len(v), -1) for v in one.values()], 1), period, how) for one in pieces]
@@ -283,9 +283,9 @@ def find_passed_band(how: Filtering, rate: float) -> float:
 
 
 def select_motion(values: Sequence[Array], moves: Sequence[Array | Mask]) -> list[Array]:
-    """Noise of pieces, (samples, n) each, where the direction of friction is known; else zero.
+    """Return noise (samples, n) of pieces where the direction of friction is known, else zero.
 
-    Larger in turn, so that its power is that of a joint that moves all the time.
+    It is scaled so that its power is that of a joint that moves all the time.
 
     :param moves: where it is known, of the same shapes.
     """
@@ -309,7 +309,7 @@ class Line:
 
 
 def estimate_noise_density(residual: Sequence[Array], shaken: Array, period: float, how: Filtering) -> Array:
-    """Density of the efforts' noise in the band of the motion, N m or N per root hertz, (n,).
+    """Estimate the density of the efforts' noise in the motion's band, N m or N per root hertz, (n,).
 
     Above the band nothing but noise is left: the loudest octave there counts. The positions' noise
     comes through the differentiation with another spectrum; what it does is taken off above the
@@ -385,7 +385,7 @@ def find_lines(
 
 
 def _spectrum(pieces: Sequence[Array], rate: float, segment: int) -> tuple[Array, Array]:
-    """Frequencies, and two-sided spectral densities by channel (Welch), (frequencies, n).
+    """Estimate two-sided spectral densities by channel (Welch), (frequencies, n); return also frequencies.
 
     Of the pieces that are as long as a segment, each by its length.
     """
