@@ -36,7 +36,7 @@ from pkm_twin.streams.base_motion import BaseImu
 from pkm_twin.streams.continuity import Continuity
 from pkm_twin.streams.differentiator import Differentiator
 from pkm_twin.streams.matched import WrenchWindow
-from pkm_twin.streams.monitor import Core, StreamMonitor, finished, make_counter
+from pkm_twin.streams.monitor import Core, StreamMonitor, make_counter, run_to_end
 from pkm_twin.streams.rates import RateAgreement
 from pkm_twin.streams.rest import VelocityErrorEstimator, gradient_gain, velocity_error_bound
 from pkm_twin.streams.wrench import STAMP_ORDER, check_order
@@ -262,7 +262,7 @@ class Feedforward(Core):
 
         :raises MessageError: the message is rejected, and counted.
         """
-        return finished(self.trajectory_steps(message, now))
+        return run_to_end(self.trajectory_steps(message, now))
 
     def trajectory_steps(
         self, message: Any, now: int, *, holding: bool = False

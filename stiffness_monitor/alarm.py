@@ -27,7 +27,7 @@ from pkm_twin.messages.reading import DeflectionSample, quote_name, read_deflect
 from pkm_twin.messages.stamps import SECOND, StampRules
 from pkm_twin.robot.robot import Robot
 from pkm_twin.settings import setting
-from pkm_twin.streams.monitor import Core, finished, make_counter
+from pkm_twin.streams.monitor import Core, make_counter, run_to_end
 from pkm_twin.streams.noise import estimate_deviation
 from pkm_twin.streams.wrench import TimeCache, check_order
 from stiffness_monitor.compliance import strain_energy
@@ -240,7 +240,7 @@ class StiffnessAlarm:
 
     def judge(self) -> tuple[Departure, ...] | None:
         """Return the elements with an alarm, the most certain first; None without enough load."""
-        return finished(self.judging())
+        return run_to_end(self.judging())
 
     def judging(self) -> Generator[None, None, tuple[Departure, ...] | None]:
         """Evaluate as :meth:`judge` in slices, with the samples of the first slice."""

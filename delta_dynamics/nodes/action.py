@@ -27,7 +27,7 @@ from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.effort_limits import LimitedEfforts
 from pkm_twin.ros.node import TwinNode
 from pkm_twin.ros.turns import Task
-from pkm_twin.streams.monitor import finished
+from pkm_twin.streams.monitor import run_to_end
 
 Efforts = Callable[[Any], Generator[None, None, LimitedEfforts]]
 ReadPositions = Callable[[], "Mapping[str, float] | None"]
@@ -349,7 +349,7 @@ class EffortAction:
             zeros = [0.0] * len(names)
             point = JointTrajectoryPoint(positions=positions, velocities=zeros, accelerations=zeros)
             trajectory = JointTrajectory(joint_names=names, points=[point])
-            point.effort = finished(self._hold_efforts(trajectory))[0].tolist()
+            point.effort = run_to_end(self._hold_efforts(trajectory))[0].tolist()
         except KeyError as error:
             self._node.log_throttled("hold", f"{ACTION_NAME}: no hold point: {error} was not measured")
             return False

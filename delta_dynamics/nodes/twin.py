@@ -30,7 +30,7 @@ from pkm_twin.settings import DURATION_BOUNDS, list_changeable, with_parameters
 from pkm_twin.streams.base_motion import BaseImu, ImuSettings
 from pkm_twin.streams.matched import WrenchWindow
 from pkm_twin.streams.monitor import Pace
-from pkm_twin.streams.topics import topic_tokens
+from pkm_twin.streams.topics import make_topic_tokens
 from pkm_twin.streams.wrench import WrenchReader, WrenchSettings
 
 
@@ -291,7 +291,7 @@ class DeltaDynamics(TwinNode):
         names = reactions(robot, robot.inverse(robot.home()), *rest).names
         return {
             name: self.create_guarded_publisher("~/reactions/<joint>", joint=token)
-            for name, token in topic_tokens(names).items()
+            for name, token in make_topic_tokens(names).items()
         }
 
     def _reacting_to_stop(self) -> AbstractContextManager[None]:

@@ -40,7 +40,7 @@ from pkm_twin.robot.limits import list_limits
 from pkm_twin.robot.plausibility import why_no_torques
 from pkm_twin.streams.drives import CONSTANT_SAMPLES, MAX_RELATIVE_CHANGE
 from pkm_twin.streams.noise import estimate_deviation
-from pkm_twin.streams.rates import MAX_MOVE_DIFFERENCE, STANDSTILL_FRACTION, rate_faults, rms
+from pkm_twin.streams.rates import MAX_MOVE_DIFFERENCE, STANDSTILL_FRACTION, compare_rates, rms
 
 REJECTED: Final = "messages that a node rejects"
 POSITION_STEPS: Final = "position steps"
@@ -247,7 +247,7 @@ def _judge_velocities(r: Recording, qd: Array) -> list[Fact]:
             text = f"the position of {names[j]} stands still from {begin:.3f} s to {end:.3f} s"
             text += " while its velocity does not (encoder?)"
             return [make_judged_fact(VELOCITIES, text, bound, False)]
-    part, faults = rate_faults(r.robot, r.stamps, r.q, qd, r.steps.jumps)
+    part, faults = compare_rates(r.robot, r.stamps, r.q, qd, r.steps.jumps)
     if not len(part):
         return []
     worst = int(np.argmax(part))

@@ -33,10 +33,10 @@ from pkm_twin.identification.samples import (
 from pkm_twin.identification.verdict import MAX_NOISE_RATIO
 from pkm_twin.identification.words import MAX_DELAY, late_text
 from pkm_twin.machine.friction import Dahl
-from pkm_twin.recordings import Load, Recording, at_rest, split_by_load
+from pkm_twin.recordings import Load, Recording, find_resting_joints, split_by_load
 from pkm_twin.report import Fact, make_judged_fact
 from pkm_twin.robot.robot import Robot
-from pkm_twin.streams.drives import idle_samples
+from pkm_twin.streams.drives import find_idle_samples
 from pkm_twin.streams.noise import estimate_deviation
 from pkm_twin.streams.rates import rms
 from pkm_twin.streams.steps import Steps, find_sampling
@@ -345,4 +345,4 @@ def find_idle(r: Recording) -> Mask:
     rates = r.qd
     if rates is None:
         rates = np.gradient(r.q, r.time, axis=0) if len(r.time) > 1 else still
-    return idle_samples(r.time, at_rest(r, rates), r.effort, needed)
+    return find_idle_samples(r.time, find_resting_joints(r, rates), r.effort, needed)

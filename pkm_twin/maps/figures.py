@@ -208,7 +208,7 @@ def extract_plane(data: Dataset, case: int, plane: int) -> Plane:
     return Plane(names, [units[n] for n in names], sides[: len(names)], values, reach, star, at, ", ".join(held))
 
 
-def full_planes(data: Dataset, case: int) -> list[int]:
+def list_full_planes(data: Dataset, case: int) -> list[int]:
     """Return the planes of a case that have more than one counted pose, fullest first."""
     known = np.isfinite(data.plane_value.isel(case=case).values).sum((1, 2))
     order = np.argsort(-known, kind="stable")
@@ -218,7 +218,7 @@ def full_planes(data: Dataset, case: int) -> list[int]:
 def planes(data: Dataset, case: int) -> Figure:
     """Draw up to three planes of a case through its worst pose, with one colour scale."""
     kind, part = find_kind(data), data.isel(case=case)
-    drawn = [extract_plane(data, case, k) for k in sorted(full_planes(data, case)[:MAX_PANELS])]
+    drawn = [extract_plane(data, case, k) for k in sorted(list_full_planes(data, case)[:MAX_PANELS])]
     count, flat = len(drawn), len(drawn[0].names) > 1
     worst = float(part.worst_value)
     values = np.concatenate([one.values.ravel() for one in drawn])

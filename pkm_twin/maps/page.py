@@ -177,7 +177,7 @@ def _draw_layers(data: Dataset) -> tuple[Any, list[dict[str, Any]]]:
 def _draw_planes(data: Dataset) -> tuple[Any, list[dict[str, Any]]]:
     graph = import_extra("plotly.graph_objects", "maps")
     figure, buttons = graph.Figure(), []
-    every = [(k, p) for k in range(len(data.case)) for p in figures.full_planes(data, k)]
+    every = [(k, p) for k in range(len(data.case)) for p in figures.list_full_planes(data, k)]
     for k, p in every:
         scale, unit, layout = _case_layout(data, k, data.plane_value.isel(case=k).values)
         one = figures.extract_plane(data, k, p)

@@ -17,7 +17,7 @@ from pkm_twin.machine.friction import Dahl
 from pkm_twin.paths.joint_path import only_turns, reference_velocity
 from pkm_twin.paths.motion import Samples
 from pkm_twin.paths.sizing import rms
-from pkm_twin.recordings.origin import effort_model_columns
+from pkm_twin.recordings.origin import make_effort_model_columns
 from pkm_twin.recordings.payload import split_by_load
 from pkm_twin.recordings.recording import Recording
 from pkm_twin.recordings.tables import WRENCH
@@ -111,13 +111,13 @@ def compare_efforts(motion: Recording) -> EffortComparison:
 
     :raises ParameterError: a robot without masses.
     """
-    model = model_efforts(motion)
+    model = compute_model_efforts(motion)
     if motion.effort is None:
         return EffortComparison(motion, model, "the model's", model)
     return EffortComparison(motion, motion.effort, "the file's", model)
 
 
-def model_efforts(m: Recording) -> Array:
+def compute_model_efforts(m: Recording) -> Array:
     """Return the model's efforts along a motion with velocities, shape (samples, n).
 
     Dry friction has no direction at standstill, and the model adds none there.
@@ -199,7 +199,7 @@ class EffortPeak:
 
 
 def find_peaks(robot: Robot, columns: dict[str, Array]) -> dict[str, EffortPeak]:
-    """Return the effort's peak of each joint in a table of :func:`torque_table`."""
+    """Return the effort's peak of each joint in a table of :func:`tabulate_torques`."""
     time, found = columns["time"], {}
     for joint in robot.joint_names:
         effort = columns[f"{joint}.effort"]
@@ -210,7 +210,7 @@ def find_peaks(robot: Robot, columns: dict[str, Array]) -> dict[str, EffortPeak]
     return found
 
 
-def torque_table(m: Recording, progress: Callable[[int], None] | None = None) -> dict[str, Array]:
+def tabulate_torques(m: Recording, progress: Callable[[int], None] | None = None) -> dict[str, Array]:
     """Return named columns: time, motion, efforts, their terms, and all joints' reactions.
 
     The terms ``NAME.effort_gravity``, ``NAME.effort_inertia`` ... sum to ``NAME.effort``. A
@@ -275,4 +275,4 @@ def torque_table(m: Recording, progress: Callable[[int], None] | None = None) ->
         if np.abs(m.effort - model).max() <= EFFORT_TOLERANCE * np.abs(model).max():
             # The file is a plan of this machine, not a measurement.
             table = {name: v for name, v in table.items() if not name.endswith(".measured")}
-    return table | effort_model_columns(m.robot, m.load, m.wrench, m.time)
+    return table | make_effort_model_columns(m.robot, m.load, m.wrench, m.time)

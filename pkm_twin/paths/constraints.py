@@ -241,13 +241,15 @@ class Rows:
 
 
 def limit_names(robot: Robot) -> list[str]:
-    """Return the names of all limits, in the order of :func:`limit_usage`."""
+    """Return the names of all limits, in the order of :func:`compute_limit_usage`."""
     joints = robot.joint_names
     words = ("effort", "velocity", "acceleration", "jerk")
     return [f"{word} {joint}" for word in words for joint in joints] + ["speed"]
 
 
-def limit_usage(limits: Limits, effort: Array | None, qd: Array, qdd: Array, qddd: Array, speed: Array) -> Array:
+def compute_limit_usage(
+    limits: Limits, effort: Array | None, qd: Array, qdd: Array, qddd: Array, speed: Array
+) -> Array:
     """Return the signed used fraction of each limit, (k, 4 n + 1), 1 at the limit, 0 without."""
     parts = (
         (np.zeros_like(qd) if effort is None else effort) / limits.effort,

@@ -19,9 +19,9 @@ from pkm_twin.paths.carrying import split_at_payloads
 from pkm_twin.paths.constraints import Forces, Limits, Rows, needs_forces
 from pkm_twin.paths.geometry import MAX_LENGTH, Path, through
 from pkm_twin.paths.jerk import MAX_PROGRAMS, smooth_profile, smooth_run
-from pkm_twin.paths.joint_path import JointPath, Slowdown, joint_paths
+from pkm_twin.paths.joint_path import JointPath, Slowdown, make_joint_paths
 from pkm_twin.paths.motion import Run, TimedPath, find_run_usage, sample_run
-from pkm_twin.paths.profile import fastest_profile
+from pkm_twin.paths.profile import find_fastest_profile
 from pkm_twin.robot.robot import Robot
 
 
@@ -234,7 +234,7 @@ def timed(
         runs = (run_by_law(part, one, limits, load) for one in LAWS[law])
         return slow_within_limits(min(runs, key=lambda run: run.duration), limits, load)
 
-    parts = joint_paths(made, carried, points, singularity, slowdown)
+    parts = make_joint_paths(made, carried, points, singularity, slowdown)
     rests = (made.wait, *(stretch.dwell for stretch in made.stretches))
     result = TimedPath(robot, made, limits, tuple(map(plan, parts)), rests, law, carried, load)
     result.check_rests()
@@ -263,7 +263,7 @@ def _solve_stretch(part: JointPath, limits: Limits, wrench: Array | None) -> Run
     rows = Rows.from_limits(part, limits.part(1.0 - LIMIT_RESERVE), wrench)
     x: Array | None = None
     for count in range(MAX_REFINEMENTS + MAX_TIGHTENINGS):
-        x = fastest_profile(rows, part.left, part.steps, share, x)
+        x = find_fastest_profile(rows, part.left, part.steps, share, x)
         stopped = (x[:-1] + x[1:]) <= 0.0
         if stopped.any():
             distance = part.curve.begin + float(part.s[part.left[int(stopped.argmax())]])
@@ -302,7 +302,7 @@ def _solve_with_jerk(part: JointPath, limits: Limits, wrench: Array | None) -> R
     rows = Rows.from_limits(part, limits.part(1.0 - LIMIT_RESERVE), wrench)
     slow = run_by_law(part, QUINTIC, limits, wrench)
     best: Run = slow
-    least = slowdown_factor(find_run_usage(slow, limits, wrench).max(0)) * slow.duration
+    least = estimate_slowdown_factor(find_run_usage(slow, limits, wrench).max(0)) * slow.duration
     x = slow.profile() * (1.0 - LIMIT_RESERVE)
     share, jerks = np.ones((2, len(part.left)))
     n = len(limits.jerk)
@@ -316,7 +316,7 @@ def _solve_with_jerk(part: JointPath, limits: Limits, wrench: Array | None) -> R
         if run is None:
             break
         used = find_run_usage(run, limits, wrench)
-        factor = slowdown_factor(used.max(0))
+        factor = estimate_slowdown_factor(used.max(0))
         if factor * run.duration < (1.0 - REFINEMENT_EXCESS) * least:
             improved = count
         if factor * run.duration < least:
@@ -347,7 +347,7 @@ def _solve_with_jerk(part: JointPath, limits: Limits, wrench: Array | None) -> R
     return slow_within_limits(best, limits, wrench)
 
 
-def slowdown_factor(used: Array) -> float:
+def estimate_slowdown_factor(used: Array) -> float:
     """Estimate the factor of the duration that a motion needs, from used fractions (4 n + 1,).
 
     Velocities scale with the speed, accelerations with its square, jerks with its cube. The moving
@@ -372,6 +372,6 @@ def slow_within_limits(run: Run, limits: Limits, wrench: Array | None, used: Arr
             used = find_run_usage(slower, limits, wrench).max(0)
         if used.max() <= 1.0:
             return slower
-        factor *= max(slowdown_factor(used), 1.0) + more
+        factor *= max(estimate_slowdown_factor(used), 1.0) + more
         used = None
     raise ParameterError("path", "any speed", "limits that a slow motion meets")

@@ -20,7 +20,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.paths.constraints import Limits, Rows
 from pkm_twin.paths.joint_path import JointPath
 from pkm_twin.paths.motion import Run
-from pkm_twin.paths.profile import interval_rows
+from pkm_twin.paths.profile import make_interval_rows
 
 Index = NDArray[np.int64]
 
@@ -66,7 +66,7 @@ def smooth_profile(
         by_rest[k] = min(by_rest[k], 0.25 * least ** (2 / 3) * (6.0 * step) ** (4 / 3))
     count = slower = 0
     while count < programs:
-        p, q, low, high, most = interval_rows(rows, part.left, h, x, share)
+        p, q, low, high, most = make_interval_rows(rows, part.left, h, x, share)
         number, column = np.arange(p.size), np.repeat(np.arange(len(p)), p.shape[1])
         # low <= p x + q x' <= high
         own = _sparse_matrix([(p, number, column), (q, number, column + 1)], (p.size, len(x)))

@@ -78,7 +78,7 @@ class Reversals:
         return np.concatenate([*self._parts, self._tail])
 
 
-def rainflow(values: ArrayLike) -> Cycles:
+def count_rainflow_cycles(values: ArrayLike) -> Cycles:
     """Count cycles by the rainflow method, ASTM E1049-85 (2017), section 5.4.4.
 
     :param values: a load over time, shape (samples,).
@@ -120,7 +120,7 @@ class Life:
     hours: float
 
 
-def bearing_life(
+def compute_bearing_life(
     load: ArrayLike,
     moved: ArrayLike,
     duration: float,
@@ -187,7 +187,7 @@ class JointLoad:
     travelled: Array
 
 
-def joint_loads(motion: Recording) -> Iterator[list[JointLoad]]:
+def compute_joint_loads(motion: Recording) -> Iterator[list[JointLoad]]:
     """Yield the loads of all joints along a motion in blocks that overlap by one sample.
 
     Errors as of ``reactions``.
@@ -285,13 +285,13 @@ class Summary:
 
     def cycles(self, axis: int) -> Cycles:
         """Return the rainflow cycles of one component."""
-        return rainflow(self.reversals[axis].values)
+        return count_rainflow_cycles(self.reversals[axis].values)
 
     def life(self, duration: float) -> Life:
         """Return the L10 life of the joint's bearing; the load is linear between samples."""
         assert self.spec is not None  # noqa: S101  asked for joints with a bearing
         load, moved = (np.concatenate(column) for column in zip(*self.bearing, strict=True))
-        return bearing_life(load, moved, duration, self.spec.C, self.spec.p, self.slides)
+        return compute_bearing_life(load, moved, duration, self.spec.C, self.spec.p, self.slides)
 
 
 def _multiply(matrices: Array, vectors: Array) -> Array:
@@ -398,7 +398,7 @@ def summarise_loads(
             hidden = files.enter_context(write_atomically(out))
             text = files.enter_context(hidden.open("w", newline="", encoding="utf-8"))
             writer = csv.writer(text)
-        for block in joint_loads(motion):
+        for block in compute_joint_loads(motion):
             if not result:
                 names = tuple(load.name for load in block)
                 fitted = {} if bearings is None else read_bearings(bearings, names, motion.robot)

@@ -275,7 +275,7 @@ def check_singularity(robot: Robot, distance: Array, q: Array, singularity: floa
         )
 
 
-def joint_paths(
+def make_joint_paths(
     path: Path,
     carried: Sequence[PayloadChange],
     points: int,

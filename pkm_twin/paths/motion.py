@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import ParameterError
 from pkm_twin.paths.carrying import PayloadChange, compute_efforts
-from pkm_twin.paths.constraints import Limits, limit_names, limit_usage, needs_forces
+from pkm_twin.paths.constraints import Limits, compute_limit_usage, limit_names, needs_forces
 from pkm_twin.paths.geometry import Path
 from pkm_twin.paths.joint_path import JointPath, reference_velocity
 from pkm_twin.recordings.payload import Load
@@ -302,7 +302,7 @@ class TimedPath:
         jerk = np.zeros_like(s.q)
         if np.isfinite(self.limits.jerk).any() and len(s.time) > 2:
             jerk = np.gradient(s.qdd, s.time, axis=0)
-        return np.abs(limit_usage(self.limits, s.effort, s.qd, s.qdd, jerk, s.felt))
+        return np.abs(compute_limit_usage(self.limits, s.effort, s.qd, s.qdd, jerk, s.felt))
 
     @cached_property
     def bounds(self) -> list[Bound]:
@@ -366,7 +366,7 @@ class TimedPath:
         rests = self.sample(times)
         zero = np.zeros_like(rests.q)
         resting = np.abs(rests.qd).max(1) == 0.0
-        used = np.abs(limit_usage(self.limits, rests.effort, zero, zero, zero, rests.felt))
+        used = np.abs(compute_limit_usage(self.limits, rests.effort, zero, zero, zero, rests.felt))
         return times[resting], used[resting]
 
     @cached_property
@@ -463,7 +463,7 @@ def find_peak_usage(limits: Limits, times: Array, sample: Callable[[Array], Mome
             own = qdd.reshape(len(todo), cells + 1, n)
             changes = np.gradient(own, parts, axis=1, edge_order=2)
             jerk = (changes / spans[todo, None, None]).reshape(jerk.shape)
-        used = limit_usage(limits, effort, qd, qdd, jerk, felt).reshape(len(todo), cells + 1, -1)
+        used = compute_limit_usage(limits, effort, qd, qdd, jerk, felt).reshape(len(todo), cells + 1, -1)
         more = np.abs(np.diff(used, 2, axis=1)).max(1) / 8.0
         top = np.abs(used).max(1)
         result[todo] = top + np.minimum(more, PEAK_TOLERANCE)

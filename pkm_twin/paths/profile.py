@@ -101,7 +101,7 @@ def _find_largest_start(low: Numbers, high: Numbers, slopes: Numbers, x: float, 
     return x
 
 
-def interval_rows(
+def make_interval_rows(
     rows: Rows, left: Index, steps: Array, x: Array | None, part: Array
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Return limits at both ends of the intervals, as :meth:`IntervalPrograms.from_rows` takes them.
@@ -146,7 +146,7 @@ def interval_rows(
     )
 
 
-def fastest_profile(rows: Rows, left: Index, steps: Array, part: Array, about: Array | None = None) -> Array:
+def find_fastest_profile(rows: Rows, left: Index, steps: Array, part: Array, about: Array | None = None) -> Array:
     """Find the largest x = v^2 at the intervals' ends, (i + 1,), at rest at both ends.
 
     :param part: of each interval's limits that is used, shape (i,).
@@ -156,7 +156,7 @@ def fastest_profile(rows: Rows, left: Index, steps: Array, part: Array, about: A
     x = about if viscous else None
     # With viscous friction until the speeds change by less than 3e-4.
     for _ in range(8 if viscous else 1):
-        before, x = x, IntervalPrograms.from_rows(*interval_rows(rows, left, steps, x, part)).solve()
+        before, x = x, IntervalPrograms.from_rows(*make_interval_rows(rows, left, steps, x, part)).solve()
         if before is not None and np.abs(np.sqrt(x) - np.sqrt(before)).max() <= 3e-4 * np.sqrt(x.max()):
             break
     assert x is not None  # noqa: S101  one solution at least

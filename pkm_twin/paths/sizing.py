@@ -111,7 +111,7 @@ class Duty:
         }
 
 
-def net_energy(duties: Sequence[Duty]) -> float:
+def compute_net_energy(duties: Sequence[Duty]) -> float:
     """Return the energy that drives take, J: 0 for a closed cycle, which gives back all of it."""
     net = sum(duty.energy for duty in duties)
     return net if abs(net) > CLOSED_CYCLE * sum(duty.returned for duty in duties) else 0.0

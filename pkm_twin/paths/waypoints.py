@@ -21,7 +21,7 @@ from pkm_twin.recordings.tables import (
     PAYLOAD,
     WRENCH,
     Dialect,
-    column_quantities,
+    map_column_quantities,
     read_table,
 )
 from pkm_twin.robot.robot import Robot
@@ -44,7 +44,7 @@ def read_waypoints(
         robot file's centre of mass.
     :raises ParameterError: a column is missing, unknown, or a number is out of range.
     """
-    kinds = column_quantities(robot)
+    kinds = map_column_quantities(robot)
     table = read_table(file, kinds, dialect)
     joints = [f"{name}.position" for name in robot.joint_names]
     space: Space = "pose" if any(name in table for name in robot.pose_names) else "joint"

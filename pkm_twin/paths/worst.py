@@ -45,7 +45,7 @@ class Worst:
     poses: int
 
 
-def workspace_poses(
+def sample_workspace_poses(
     robot: Robot,
     rays: int = DEFAULT_RAYS,
     singularity: float = MIN_SINGULARITY_INDEX,
@@ -160,10 +160,10 @@ def worst_over_workspace(
     :param speed: of the tool point, m/s; ``acceleration``: m/s2. Of a machine that only turns, of
         the platform's rotation, rad/s and rad/s2.
     :param singularity: least singularity index of a pose that counts, 0 to 1.
-    :param lever: as of :func:`workspace_poses`.
+    :param lever: as of :func:`sample_workspace_poses`.
     :raises ParameterError: a workspace without bounds.
     """
-    poses = workspace_poses(robot, rays, singularity, lever)
+    poses = sample_workspace_poses(robot, rays, singularity, lever)
     q = robot.inverse(poses)
     back = _joint_rates(robot, q)
     k, n = q.shape

@@ -3,8 +3,8 @@
 
 from pkm_twin.recordings.payload import Load, split_by_load
 from pkm_twin.recordings.read import read
-from pkm_twin.recordings.recording import ReadOptions, Recording, at_rest
-from pkm_twin.recordings.tables import Dialect, Table, column_quantities, read_table, write_table
+from pkm_twin.recordings.recording import ReadOptions, Recording, find_resting_joints
+from pkm_twin.recordings.tables import Dialect, Table, map_column_quantities, read_table, write_table
 
 __all__ = [
     "Dialect",
@@ -12,8 +12,8 @@ __all__ = [
     "ReadOptions",
     "Recording",
     "Table",
-    "at_rest",
-    "column_quantities",
+    "find_resting_joints",
+    "map_column_quantities",
     "read",
     "read_table",
     "split_by_load",

@@ -28,8 +28,8 @@ from pkm_twin.messages.reading import (
     rotate_to_base,
 )
 from pkm_twin.messages.stamps import SECOND, StampRules
-from pkm_twin.recordings.origin import EffortModel, effort_model_columns, effort_model_facts
-from pkm_twin.recordings.payload import metadata_error, read_load
+from pkm_twin.recordings.origin import EffortModel, make_effort_model_columns, make_effort_model_facts
+from pkm_twin.recordings.payload import make_metadata_error, read_load
 from pkm_twin.recordings.recording import MODEL_VALUES_NOTE, ReadOptions, Recording
 from pkm_twin.recordings.tables import write_table
 from pkm_twin.recordings.topics import DEFINITIONS, JOINT_STATE, TRAJECTORY, Topics, choose_topics
@@ -67,7 +67,7 @@ def read_bag(
             raise BagError("the bag names no robot; use --robot", path=bag.report.path, reason="no robot")
         # A bag names a shipped robot only, so that it cannot choose which files are opened.
         if recorded not in robot_names():
-            raise metadata_error(bag, "robot", recorded, f"one of {', '.join(robot_names())}; or give --robot")
+            raise make_metadata_error(bag, "robot", recorded, f"one of {', '.join(robot_names())}; or give --robot")
         machine = load(recorded)
     held = how.load or read_load(bag)
     kinds = {topic.type for topic in bag.report.topics.values()}
@@ -291,7 +291,7 @@ def write_motion(path: Path, r: Recording, facts: Mapping[str, Any], overwrite: 
                 for i, name in enumerate(r.robot.pose_names):
                     # A joint and a coordinate may have the same name: the column is the joint's.
                     columns.setdefault(f"{name}{word}", values[:, i])
-        write_table(columns | effort_model_columns(r.robot, r.load, r.wrench, r.time), path)
+        write_table(columns | make_effort_model_columns(r.robot, r.load, r.wrench, r.time), path)
         return
     if r.wrench is not None and r.wrench.any():
         raise ParameterError("out", str(path), "a table: a bag's trajectory has no wrench")
@@ -323,7 +323,7 @@ def write_motion(path: Path, r: Recording, facts: Mapping[str, Any], overwrite: 
         "joint_names": list(own.names),
         "points": points,
     }
-    told = {**facts, **effort_model_facts(r.robot, r.load)}
+    told = {**facts, **make_effort_model_facts(r.robot, r.load)}
     metadata = {"pkm_twin": {key: str(value) for key, value in told.items()}}
     with write_whole_bag(path, overwrite, metadata) as bag:
         bag.add_topic(TOPIC, TRAJECTORY, definition=DEFINITIONS[TRAJECTORY])

@@ -19,7 +19,7 @@ from pkm_twin.bags.reader import Bag
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.files import parse_numbers
-from pkm_twin.recordings.payload import CENTRE, MASS, PICKED, RELEASED, Load, metadata_error, payload_columns
+from pkm_twin.recordings.payload import CENTRE, MASS, PICKED, RELEASED, Load, make_metadata_error, make_payload_columns
 from pkm_twin.recordings.tables import WRENCH, Table
 from pkm_twin.robot.robot import Robot
 
@@ -75,9 +75,9 @@ class EffortModel:
             return None
         gravity = parse_numbers(facts.get("gravity", "").replace(" ", ","))
         if not digest.isdecimal():
-            raise metadata_error(bag, COMPUTED_WITH, digest, "a whole number")
+            raise make_metadata_error(bag, COMPUTED_WITH, digest, "a whole number")
         if len(gravity) != len(GRAVITY):
-            raise metadata_error(bag, "gravity", facts.get("gravity"), "x y z")
+            raise make_metadata_error(bag, "gravity", facts.get("gravity"), "x y z")
         return cls(facts.get("robot", ""), int(digest), tuple(gravity))
 
     def differs_from(self, robot: Robot) -> str:
@@ -96,19 +96,19 @@ def is_effort_model_column(name: str) -> bool:
     return name in GRAVITY or name.startswith(MARK)
 
 
-def effort_model_columns(robot: Robot, load: Load | None, wrench: Array | None, time: Array) -> dict[str, Array]:
+def make_effort_model_columns(robot: Robot, load: Load | None, wrench: Array | None, time: Array) -> dict[str, Array]:
     """Return a table's columns of robot, gravity, wrench and payload, shape (samples,) each.
 
     :param wrench: shape (samples, 6); ``time``: (samples,), s.
     """
     own, one = EffortModel.from_robot(robot), np.ones(len(time))
     columns = {} if wrench is None else dict(zip(WRENCH, wrench.T, strict=True))
-    columns |= payload_columns(robot, load, time)
+    columns |= make_payload_columns(robot, load, time)
     columns |= {MARK + own.robot: own.digest * one}
     return columns | {name: v * one for name, v in zip(GRAVITY, own.gravity, strict=True)}
 
 
-def effort_model_facts(robot: Robot, load: Load | None) -> dict[str, Any]:
+def make_effort_model_facts(robot: Robot, load: Load | None) -> dict[str, Any]:
     """Return a bag's metadata of robot, gravity and payload."""
     own = EffortModel.from_robot(robot)
     facts = {"robot": own.robot, COMPUTED_WITH: own.digest, "gravity": " ".join(map(repr, own.gravity))}

@@ -118,7 +118,7 @@ class Load:
         return f"{self.mass:g} kg{at}, {', '.join(words) or 'throughout'}, {told}"
 
 
-def payload_columns(robot: Robot, carried: Load | None, time: Array) -> dict[str, Array]:
+def make_payload_columns(robot: Robot, carried: Load | None, time: Array) -> dict[str, Array]:
     """Return a table's payload columns, which have the robot file's payload outside the intervals."""
     if carried is None:
         return {}
@@ -172,20 +172,20 @@ def read_load(bag: Bag) -> Load | None:
         return None
     masses, picked, released = (_read_numbers(bag, facts, name) for name in (MASS, PICKED, RELEASED))
     if min(masses) < 0.0:
-        raise metadata_error(bag, MASS, facts[MASS], "0 or more")
+        raise make_metadata_error(bag, MASS, facts[MASS], "0 or more")
     before = -math.inf
     for begin, end in zip(picked, released, strict=False):
         if not before <= begin <= end:
-            raise metadata_error(bag, RELEASED, facts[RELEASED], f"{PICKED}, {begin:g}, or later")
+            raise make_metadata_error(bag, RELEASED, facts[RELEASED], f"{PICKED}, {begin:g}, or later")
         before = end
     if not len(picked) == len(released) or len(masses) not in (1, len(picked)):
-        raise metadata_error(bag, RELEASED, facts[RELEASED], f"a time for each of {PICKED}")
+        raise make_metadata_error(bag, RELEASED, facts[RELEASED], f"a time for each of {PICKED}")
     com = None
     if CENTRE in facts:
         try:
             com = parse_payload(",".join(["0", *facts[CENTRE].split()]))[1]
         except ParameterError:
-            raise metadata_error(bag, CENTRE, facts[CENTRE], "x y z") from None
+            raise make_metadata_error(bag, CENTRE, facts[CENTRE], "x y z") from None
     each = masses * len(picked) if len(masses) == 1 else masses
     return Load.from_intervals(list(zip(picked, released, each, strict=True)), "bag", com)
 
@@ -197,13 +197,13 @@ def _read_numbers(bag: Bag, facts: Mapping[str, str], name: str) -> list[float]:
     except (KeyError, ValueError):
         values = []
     if not values or not all(map(math.isfinite, values[: -1 if name == RELEASED else None])):
-        raise metadata_error(bag, name, facts.get(name), "a finite number")
+        raise make_metadata_error(bag, name, facts.get(name), "a finite number")
     if math.isnan(values[-1]) or values[-1] == -math.inf:
-        raise metadata_error(bag, name, facts.get(name), "a finite number")
+        raise make_metadata_error(bag, name, facts.get(name), "a finite number")
     return values
 
 
-def metadata_error(bag: Bag, name: str, value: str | None, expected: str) -> BagError:
+def make_metadata_error(bag: Bag, name: str, value: str | None, expected: str) -> BagError:
     """Return the error for a wrong value in the bag's own metadata."""
     return BagError(
         f"metadata 'pkm_twin': {name} is {value!r}; expected {expected}", path=bag.report.path, reason="metadata"

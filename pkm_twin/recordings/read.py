@@ -30,7 +30,7 @@ from pkm_twin.recordings.tables import (
     WRENCH,
     Dialect,
     Table,
-    column_quantities,
+    map_column_quantities,
     read_table,
 )
 from pkm_twin.robot.derivatives import joint_rates
@@ -110,7 +110,7 @@ def _read_table_recording(path: Path, name: str | Robot | None, how: ReadOptions
             raise ParameterError(str(path), f"columns {one_line(', '.join(columns), 80)}", RECORDING)
         raise ParameterError("--robot", None, "a robot, because a table does not name its robot")
     robot = name if isinstance(name, Robot) else load(name)
-    table, side = (read_table(path, column_quantities(robot, how.side), how.dialect), _find_map(robot, how.side))
+    table, side = (read_table(path, map_column_quantities(robot, how.side), how.dialect), _find_map(robot, how.side))
     joints = robot.joint_names if side is None else side.names
     _reject_misspelt_columns(table, robot, joints, how)
 

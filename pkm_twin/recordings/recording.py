@@ -23,7 +23,7 @@ from pkm_twin.robot.derivatives import nearest_motion
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.differentiator import Differentiator
 from pkm_twin.streams.noise import SIGMAS, estimate_noise
-from pkm_twin.streams.rates import MAX_ACCELERATION_ERROR, MAX_MOVE_DIFFERENCE, STANDSTILL_FRACTION, rate_faults
+from pkm_twin.streams.rates import MAX_ACCELERATION_ERROR, MAX_MOVE_DIFFERENCE, STANDSTILL_FRACTION, compare_rates
 from pkm_twin.streams.rest import gradient_gain, velocity_error_bound
 from pkm_twin.streams.steps import MAX_GAP_PERIODS, Steps, find_backlash, find_repeats, find_steps
 from pkm_twin.streams.wrench import WrenchSettings
@@ -293,7 +293,7 @@ class Recording:
                 return
             # An overflow gives numbers that are not finite, which the model rejects.
             with np.errstate(all="ignore"):
-                _, faults = rate_faults(self.robot, self.stamps, values, rates, self.steps.jumps, most, names)
+                _, faults = compare_rates(self.robot, self.stamps, values, rates, self.steps.jumps, most, names)
             if faults:
                 plural = "positions" if values is self.q else "velocities"
                 raise PkmTwinError(
@@ -320,7 +320,7 @@ class Recording:
             qd, qdd, used = differentiate_motion(self)
             if not used.any():
                 raise PkmTwinError(f"{self.source}: too few joint states in a row to differentiate: {len(self.time)}")
-            return self._project_motion(qd, qdd, at_rest(self, qd), used)
+            return self._project_motion(qd, qdd, find_resting_joints(self, qd), used)
         if len(self.time) < 3:
             raise PkmTwinError(f"{self.source}: {len(self.time)} rows; 3 or more to differentiate")
         qd = _differentiate(self.q, self.time) if self.qd is None else self.qd
@@ -367,7 +367,7 @@ def _differentiate(values: Array, time: Array) -> Array:
         return np.gradient(values, time, axis=0, edge_order=2)
 
 
-def at_rest(r: Recording, qd: Array) -> Mask:
+def find_resting_joints(r: Recording, qd: Array) -> Mask:
     """Return which joints are at rest within the error of rates ``qd``, (samples, n)."""
     if r.qd is not None:
         return np.asarray(np.abs(qd) <= SIGMAS * estimate_noise(r.time, r.qd))

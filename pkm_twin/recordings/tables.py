@@ -196,7 +196,7 @@ class Table(dict[str, Array]):
         return np.stack([self.get(n, np.full(self.rows, missing)) for n in names], -1)
 
 
-def column_quantities(robot: Robot, side: str = "joint") -> dict[str, str]:
+def map_column_quantities(robot: Robot, side: str = "joint") -> dict[str, str]:
     """Return the quantity of each column of a motion table, of those of ``UNITS`` or other (empty).
 
     An effort is a force or a moment, or a part of the motor's rated torque.

@@ -16,7 +16,7 @@ from pkm_twin.messages.reading import JointReader, JointSample
 from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import describe_singularity_bound
-from pkm_twin.streams.steps import farthest
+from pkm_twin.streams.steps import find_max_move
 from pkm_twin.streams.wrench import check_order
 
 
@@ -28,7 +28,7 @@ def check_jump(robot: Robot, moves: Sequence[float], velocity: Sequence[float], 
     :raises MessageError: a joint jumped: the encoder is wrong, or another publisher sends on this topic.
     """
     for joint, (move, fastest) in enumerate(zip(moves, velocity, strict=True)):
-        bound = farthest(fastest, period)
+        bound = find_max_move(fastest, period)
         if not abs(move) <= bound:
             controller = robot.controller
             unit = robot.joint_units[joint] if controller.is_identity else "of its units"

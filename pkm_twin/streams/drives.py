@@ -85,7 +85,7 @@ class DriveWatch:
         return self.idle
 
 
-def idle_samples(time: Array, still: Mask, effort: Array, expected: Array) -> Mask:
+def find_idle_samples(time: Array, still: Mask, effort: Array, expected: Array) -> Mask:
     """Find the samples of a recording whose efforts do not carry the machine.
 
     :class:`DriveWatch` runs over the recording forwards and backwards in time.

@@ -102,7 +102,7 @@ class StreamMonitor:
                 react()
 
 
-def finished(steps: Generator[None, None, V]) -> V:
+def run_to_end(steps: Generator[None, None, V]) -> V:
     """Run a generator to its end and return its result."""
     while True:
         try:

@@ -113,7 +113,7 @@ class RateAgreement:
             )
 
 
-def rate_faults(
+def compare_rates(
     robot: Robot,
     stamps: NDArray[np.int64],
     q: Array,

@@ -44,7 +44,7 @@ GAP_TOLERANCE: Final = 0.25
 Numbers = TypeVar("Numbers", float, Array)
 
 
-def farthest(velocity: Numbers, period: Numbers) -> Numbers:
+def find_max_move(velocity: Numbers, period: Numbers) -> Numbers:
     """Return the farthest that a joint may move between two samples, rad or m.
 
     :param velocity: the joint's velocity limit.
@@ -113,7 +113,7 @@ def find_steps(time: Array, q: Array, qd: Array | None, limit: Sequence[float] |
         slack = slack + SIGMAS * np.quantile(sizes[near], 0.95, axis=0)
     sizes = np.where(near[:, None] & (sizes > slack), sizes, 0.0)
     if limit is not None:
-        bound = farthest(np.asarray(limit, np.float64), span)
+        bound = find_max_move(np.asarray(limit, np.float64), span)
         sizes = np.where(steps > bound, np.maximum(sizes, steps), sizes)
     jumps = sizes > 0.0
     publishers: tuple[int, ...] = ()

@@ -35,7 +35,7 @@ class Topic:
         return getattr(import_module(f"{package}.msg"), kind)
 
 
-def topic_tokens(names: Sequence[str]) -> dict[str, str]:
+def make_topic_tokens(names: Sequence[str]) -> dict[str, str]:
     """Return for each name a different token of a ROS topic name.
 
     ROS allows ASCII letters, digits and single underscores, and no leading digit. Accents are

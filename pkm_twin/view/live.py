@@ -42,7 +42,7 @@ class LiveValues:
 
     ``q`` (n,); ``traces``: by name, times (k,) s before the latest, and values (k, n), N m or N;
     ``shares``: of the strain energy by element; ``deflection``: in platform axes, (6,), m and rad.
-    ``counts``: accepted messages by name; ``refused``: number of rejected messages; ``reason``: of
+    ``counts``: accepted messages by name; ``rejected``: number of rejected messages; ``reason``: of
     the last rejection.
     """
 
@@ -52,7 +52,7 @@ class LiveValues:
     shares: dict[str, float]
     deflection: Array | None
     counts: dict[str, int]
-    refused: int
+    rejected: int
     reason: str
 
 
@@ -64,7 +64,7 @@ class Live:
         self._reader = JointReader(robot, limited=False)
         self._lock = threading.Lock()
         self._counts: Counter[str] = Counter()
-        self._refused, self._reason = 0, ""
+        self._rejected, self._reason = 0, ""
         self._q: Array | None = None
         self._traces: dict[str, deque[tuple[int, Array]]] = {name: deque() for name in TRACES}
         self._dominant, self._shares = "", dict[str, float]()
@@ -78,13 +78,13 @@ class Live:
         }
 
     def take(self, name: str, message: Any) -> None:
-        """Store a message of the topic ``name`` in TOPICS; count it as refused if it is invalid."""
+        """Store a message of the topic ``name`` in TOPICS; count it as rejected if it is invalid."""
         with self._lock:
             try:
                 self._take[name](message)
                 self._counts[name] += 1
             except MessageError as error:
-                self._refused += 1
+                self._rejected += 1
                 self._reason = one_line(f"{TOPICS[name][1]}: {error}")
 
     def _take_joint_state(self, message: Any) -> None:
@@ -147,7 +147,7 @@ class Live:
                 dict(self._shares),
                 self._deflection,
                 dict(self._counts),
-                self._refused,
+                self._rejected,
                 self._reason,
             )
 

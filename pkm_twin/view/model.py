@@ -48,13 +48,13 @@ class Range:
 class State:
     """The shown state: q (n,), pose (m,), wrench (6,) on the platform, base axes, N and N m.
 
-    ``refusal``: why the last request was rejected; empty if it was not.
+    ``rejection``: why the last request was rejected; empty if it was not.
     """
 
     q: Array
     pose: Array
     wrench: Array = field(default_factory=lambda: np.zeros(6))
-    refusal: str = ""
+    rejection: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,11 +168,11 @@ class Model:
         return Range("deflection enlarged", "times", 0.0, top, _choose_step(top))
 
     def to_joints(self, state: State, q: ArrayLike) -> State:
-        """Return the state at joint positions, (n,), or the old state with a refusal."""
+        """Return the state at joint positions, (n,), or the old state with a rejection."""
         return self._try_move(state, np.asarray(q, np.float64), None)
 
     def to_pose(self, state: State, pose: ArrayLike) -> State:
-        """Return the state at a pose, shape (m,), or the old state with a refusal."""
+        """Return the state at a pose, shape (m,), or the old state with a rejection."""
         asked = np.asarray(pose, np.float64)
         try:
             q = self.robot.inverse(asked)
@@ -218,7 +218,7 @@ class Model:
                 return _reject(state, "the pose is in another assembly mode than home")
             pose = asked
         beyond = self._describe_beyond_passive(q, pose)
-        return _reject(state, beyond) if beyond else replace(state, q=q, pose=pose, refusal="")
+        return _reject(state, beyond) if beyond else replace(state, q=q, pose=pose, rejection="")
 
     def _describe_beyond_passive(self, q: Array, pose: Array) -> str:
         """Describe which passive joint is beyond its limits; empty if none is."""
@@ -239,11 +239,11 @@ class Model:
         return ""
 
     def apply_wrench(self, state: State, wrench: ArrayLike) -> State:
-        """Return the state under a wrench, (6,), N and N m; the old state with a refusal if it is not finite."""
+        """Return the state under a wrench, (6,), N and N m; the old state with a rejection if it is not finite."""
         values = np.array(wrench, np.float64)
         if not np.isfinite(values).all():
             return _reject(state, "the wrench is not finite")
-        return replace(state, wrench=values, refusal="")
+        return replace(state, wrench=values, rejection="")
 
     def write_url(self, state: State) -> str:
         """Write robot, pose and wrench as the query of a URL."""
@@ -253,7 +253,7 @@ class Model:
         return f"?{urlencode(parts, safe=',')}"
 
     def read_url(self, state: State, link: str) -> State:
-        """Return the state that a page's URL (of :meth:`write_url`) encodes, or the old state with a refusal."""
+        """Return the state that a page's URL (of :meth:`write_url`) encodes, or the old state with a rejection."""
         parts = {name: given[-1] for name, given in parse_qs(link.rpartition("?")[2]).items()}
         if parts.get("robot") != self.robot.name:
             return _reject(state, f"the link is not of the robot {self.robot.name}")
@@ -267,7 +267,7 @@ class Model:
                 return _reject(state, f"the link's {name} has not {count} numbers")
             rows.append(row)
         moved = self.to_pose(state, rows[0])
-        return moved if moved.refusal else self.apply_wrench(moved, rows[1])
+        return moved if moved.rejection else self.apply_wrench(moved, rows[1])
 
     def find_softest_pose(self, wrench: Array, tell: Callable[[float], object] = abs) -> tuple[Array, str]:
         """Find the joint positions of the softest pose, or of the one that a wrench (6,) moves most.
@@ -339,7 +339,7 @@ def _write_numbers(values: Array) -> str:
 
 
 def _reject(state: State, reason: str) -> State:
-    return replace(state, refusal=one_line(reason))
+    return replace(state, rejection=one_line(reason))
 
 
 def _grade(value: float, bad: float, warn: float) -> Grade:

@@ -168,7 +168,7 @@ class Page:
                 logging.getLogger("pkm_twin").warning("view: a change was rejected: %s", reason)
 
     def show_state(self, state: State) -> None:
-        """Show another state; with a refusal the sliders stay as the visitor set them."""
+        """Show another state; after a rejection the sliders stay as the visitor set them."""
         self.state = state
         self._update()
 
@@ -214,7 +214,7 @@ class Page:
         state, numbers = self.state, self.model.compute_numbers(self.state)
         energy = numbers.energy
         with self.server.atomic():
-            if not state.refusal:
+            if not state.rejection:
                 _set_sliders(self._joints, state.q)
                 _set_sliders(self._pose, state.pose)
                 _set_sliders(self._wrench, state.wrench)

@@ -214,7 +214,7 @@ class LivePanel:
     def step(self) -> None:
         """Show the latest messages."""
         page, heard = self._page, self._live.read_latest()
-        counts = (heard.counts, heard.refused)
+        counts = (heard.counts, heard.rejected)
         if counts == self._seen:
             return
         self._seen = counts

@@ -110,8 +110,8 @@ def describe_state(model: Model, state: State, numbers: StateQuantities) -> str:
     ]
     said = (
         f'<div id="refusal" style="color:#fff;background:{GRADES["bad"]};border-radius:4px;'
-        f'padding:0.2em 0.6em;margin:0.3em 0">{escape(state.refusal)}</div>'
-        if state.refusal
+        f'padding:0.2em 0.6em;margin:0.3em 0">{escape(state.rejection)}</div>'
+        if state.rejection
         else '<div id="refusal"></div>'
     )
     robot = model.robot
@@ -204,9 +204,9 @@ def describe_live_values(robot: Robot, live: LiveValues, waiting: str) -> str:
     text = ""
     if waiting:
         text += f'<div id="waiting">waiting for {escape(waiting)}</div>'
-    if live.refused:
+    if live.rejected:
         text += (
-            f'<div style="color:{GRADES["bad"]}">{live.refused} messages rejected, the last: '
+            f'<div style="color:{GRADES["bad"]}">{live.rejected} messages rejected, the last: '
             f"{escape(live.reason)}</div>"
         )
     if live.dominant:

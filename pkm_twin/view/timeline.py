@@ -10,7 +10,7 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError
-from pkm_twin.paths.along import model_efforts
+from pkm_twin.paths.along import compute_model_efforts
 from pkm_twin.recordings import Recording
 from pkm_twin.robot.plausibility import why_no_torques
 
@@ -72,7 +72,7 @@ class Timeline:
             motion, why = None, str(error)
         if motion is not None:
             twin = np.full_like(recording.q, np.nan)
-            twin[np.isin(recording.time, motion.time)] = model_efforts(motion)
+            twin[np.isin(recording.time, motion.time)] = compute_model_efforts(motion)
         return cls(recording.time, recording.q, twin, recording.effort, recording.wrench, why)
 
     @property

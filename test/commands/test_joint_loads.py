@@ -14,11 +14,11 @@ from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.paths.joint_loads import (
     Reversals,
     Summary,
-    bearing_life,
+    compute_bearing_life,
+    compute_joint_loads,
+    count_rainflow_cycles,
     find_reversals,
-    joint_loads,
     joints_by_label,
-    rainflow,
     read_bearings,
 )
 from pkm_twin.recordings import ReadOptions, Recording, read
@@ -34,7 +34,7 @@ ASTM = [-2, 1, -3, 5, -1, 3, -4, 4, -2]
 
 def test_rainflow_is_the_standards_example():
     """ASTM E1049-85, 5.4.4: half cycles of 3, 4, 8, 9, 8, 6 and a whole one of 4."""
-    found = rainflow(ASTM)
+    found = count_rainflow_cycles(ASTM)
     counted = sorted(zip(found.ranges.tolist(), found.counts.tolist(), strict=True))
     expected = [(3, 0.5), (4, 0.5), (4, 1.0), (6, 0.5), (8, 0.5), (8, 0.5), (9, 0.5)]
     assert counted == expected
@@ -42,7 +42,7 @@ def test_rainflow_is_the_standards_example():
     assert whole.tolist() == [1.0]
     # More samples between the reversals, and rests, change nothing.
     fine = np.interp(np.linspace(0, 8, 801), np.arange(9), ASTM)
-    again = rainflow(np.repeat(fine, 2))
+    again = count_rainflow_cycles(np.repeat(fine, 2))
     assert again.ranges.tolist() == pytest.approx(found.ranges.tolist())
     assert again.counts.tolist() == found.counts.tolist()
 
@@ -51,7 +51,7 @@ def test_cycles_hold_all_reversals(rng):
     for _ in range(50):
         load_ = rng.normal(size=60)
         points = find_reversals(load_)
-        found = rainflow(load_)
+        found = count_rainflow_cycles(load_)
         # Each reversal to the next is half a cycle.
         assert found.counts.sum() == pytest.approx((len(points) - 1) / 2)
         assert found.ranges.max() == pytest.approx(np.ptp(load_))
@@ -59,7 +59,7 @@ def test_cycles_hold_all_reversals(rng):
         assert counts.sum() == pytest.approx(found.counts.sum())
         assert ends[-1] == pytest.approx(np.ptp(load_))
     for flat in ([], [1.0], [2.0, 2.0, 2.0]):
-        assert rainflow(flat).equivalent_range(5.0) == 0.0
+        assert count_rainflow_cycles(flat).equivalent_range(5.0) == 0.0
 
 
 def test_reversals_of_blocks_are_those_of_the_whole(rng):
@@ -102,14 +102,14 @@ def test_loads_in_blocks_are_those_of_the_whole(twin, tmp_path, monkeypatch):
 def test_life_of_a_bearing_by_hand():
     """Half the turning at 1 kN, half at 2 kN; C = 10 kN, balls; 100 turns a minute."""
     load_, turned = np.repeat([1000.0, 2000.0], 50), np.full(100, 2 * np.pi)
-    life = bearing_life(load_, turned, 60.0, 10_000.0)
+    life = compute_bearing_life(load_, turned, 60.0, 10_000.0)
     mean = ((1000.0**3 + 2000.0**3) / 2) ** (1 / 3)
     assert life.load == pytest.approx(mean)
     assert life.life == pytest.approx(1e6 * (10_000.0 / mean) ** 3)
     assert life.hours == pytest.approx(life.life / 100 / 60)
     # What bears a load and does not move has no life that follows from motion.
-    assert np.isnan(bearing_life(load_, 0 * turned, 60.0, 10_000.0).hours)
-    assert bearing_life(0 * load_, turned, 60.0, 10_000.0).hours == np.inf
+    assert np.isnan(compute_bearing_life(load_, 0 * turned, 60.0, 10_000.0).hours)
+    assert compute_bearing_life(0 * load_, turned, 60.0, 10_000.0).hours == np.inf
 
 
 @pytest.mark.parametrize("name", ["linear_delta", "prru", "upr_rpu"])
@@ -122,7 +122,7 @@ def test_life_of_a_sliding_joint_is_that_of_its_travel(name, twin, tmp_path):
     given.write_text(f"bearings: {{'{label}': {{C: 8000}}}}")
     told = twin.told("loads", name, source, "--bearings", given)["joints"][label]
     motion = read(source, robot, ReadOptions(planned=True)).with_rates()
-    load_ = next(one for one in next(joint_loads(motion)) if one.name == label)
+    load_ = next(one for one in next(compute_joint_loads(motion)) if one.name == label)
     steps = np.abs(np.diff(joined(read_columns(source), robot, "position")[:, 0]))
     across = np.linalg.norm(np.cross(load_.own[:, :3], joint.axes[0]), axis=1)
     mean = np.average(((across[1:] + across[:-1]) / 2) ** 3, weights=steps) ** (1 / 3)
@@ -225,7 +225,7 @@ def test_turning_of_a_hinge_and_of_a_rod(rng):
     time = np.linspace(0.0, 1.0, 50)
     q = robot.graph.home + 0.1 * np.outer(np.sin(7 * time), [1.0, -0.6])
     zero = np.zeros_like(q)
-    found = {j.name: j for j in next(joint_loads(Recording(robot, time, q, zero, zero)))}
+    found = {j.name: j for j in next(compute_joint_loads(Recording(robot, time, q, zero, zero)))}
     borne = Summary(robot, "left", None)
     borne.add(found["left"])
     # The drive alone bears the moment about its axis.
@@ -238,7 +238,7 @@ def test_turning_of_a_hinge_and_of_a_rod(rng):
     robot = load("linear_delta")
     q = 0.3 + 0.03 * np.outer(np.sin(7 * time), [1.0, -0.6, 0.3])
     zero = np.zeros_like(q)
-    loads = next(joint_loads(Recording(robot, time, q, zero, zero)))
+    loads = next(compute_joint_loads(Recording(robot, time, q, zero, zero)))
     rod = robot.graph.rods["left_1"]
     way = rod.ends[1] - rod.ends[0] + robot.platform(q)[0] - robot.graph.origin
     way = way - np.outer(q[:, 0] - 0.3, [0, 0, 1])
@@ -251,7 +251,7 @@ def test_turning_of_a_hinge_and_of_a_rod(rng):
 def test_a_slide_that_closes_a_loop_travels_by_the_screw_s_lead():
     q = np.linspace(0.0, 6.0 * np.pi, 7)[:, None]
     motion = Recording(slide(0.02), np.arange(7.0), q, 0 * q, 0 * q)
-    rail = {load.name: load for load in next(joint_loads(motion))}["rail"]
+    rail = {load.name: load for load in next(compute_joint_loads(motion))}["rail"]
     np.testing.assert_allclose(rail.travelled, 0.01, atol=1e-12)
 
 

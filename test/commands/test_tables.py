@@ -21,7 +21,7 @@ from scipy.io import loadmat
 from pkm_twin.bags.reader import BagWriter
 from pkm_twin.errors import ParameterError
 from pkm_twin.recordings import Dialect, ReadOptions, read, write_table
-from pkm_twin.recordings.tables import UNITS, column_quantities, read_table
+from pkm_twin.recordings.tables import UNITS, map_column_quantities, read_table
 from pkm_twin.recordings.topics import DEFINITIONS, JOINT_STATE
 from test.bags.folders import make_folder
 from test.support.robots import load, parameters_of
@@ -189,7 +189,7 @@ def test_marks_of_numbers_are_read_as_meant_or_the_table_is_refused(values, sepa
 
 
 def test_units_of_headers_are_those_of_the_column_or_refused(tmp_path):
-    kinds = column_quantities(load("delta_cu"))
+    kinds = map_column_quantities(load("delta_cu"))
     for kind, name in {kind: name for name, kind in kinds.items()}.items():
         for unit, (quantity, size) in UNITS.items():
             for header in (f"{name} [{unit}]", f"{name}_{unit}", f"{name} ({unit}/s^2)"):

@@ -19,7 +19,7 @@ from delta_dynamics import inverse_dynamics
 from pkm_twin import load, robot_names
 from pkm_twin.bags.reader import inspect
 from pkm_twin.mechanisms.catalogue import config_folder, robot_of_data
-from pkm_twin.paths.along import torque_table
+from pkm_twin.paths.along import tabulate_torques
 from pkm_twin.recordings import ReadOptions, read
 from pkm_twin.robot.limits import beyond_limits
 from pkm_twin.robot.robot import Robot
@@ -301,7 +301,7 @@ class Csv(Kind):
         def compute() -> None:
             motion = read(path, self.load(name), ReadOptions(planned=True)).with_rates()
             beyond_limits(motion.robot, motion.q, motion.qd)
-            columns = torque_table(motion)
+            columns = tabulate_torques(motion)
             assert {len(values) for values in columns.values()} == {len(motion.time)}
             # What rigid bodies leave open of a reaction is not a number in the table.
             for column in (f"{joint}.effort" for joint in motion.robot.joint_names):

@@ -306,7 +306,7 @@ def start(folder, program=PROGRAM):
     )
 
 
-def finished(process):
+def run_to_end(process):
     out, error = process.communicate()
     assert process.returncode == 0, error
     return out, error.splitlines()
@@ -351,12 +351,12 @@ def test_processes_that_start_cold_compile_each_program_once(tmp_path):
     folder, blocked = tmp_path / "cache", tmp_path / "file"
     blocked.write_text("no folder")
     counted = COUNTED + PROGRAM
-    ended = [finished(p) for p in [start(folder, counted) for _ in range(4)]]
+    ended = [run_to_end(p) for p in [start(folder, counted) for _ in range(4)]]
     assert not any(warnings for _, warnings in ended)
     outputs = [out.splitlines() for out, _ in ended]
     # Two programs and two names of what their sources emit; no lock.
     assert sum(int(lines[-1]) for lines in outputs) == len(list(folder.iterdir())) // 2 == 2
-    out, (line,) = finished(start(blocked))
+    out, (line,) = run_to_end(start(blocked))
     assert {tuple(lines[:-1]) for lines in outputs} == {tuple(out.splitlines())}
     assert "compiled programs are not kept" in line
 

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.streams.drives import DriveWatch, idle_samples
+from pkm_twin.streams.drives import DriveWatch, find_idle_samples
 
 Flags = NDArray[np.bool_]
 
@@ -50,7 +50,7 @@ def test_efforts_that_are_zero_or_constant_at_standstill(braked: Array) -> None:
     begin = 0.05 if not braked.any() else 0.13
     assert found[during][round(begin / PERIOD) :].all()
     assert not found[after][round(0.05 / PERIOD) :].any()
-    whole = idle_samples(time, still, effort, np.broadcast_to(HELD, effort.shape))
+    whole = find_idle_samples(time, still, effort, np.broadcast_to(HELD, effort.shape))
     assert whole[during].all()
     assert whole[before].mean() < 0.05 > whole[after].mean()
 
@@ -65,7 +65,7 @@ def test_a_drive_that_is_on_is_on() -> None:
     ):
         time, still, effort, _ = phases(part)
         assert not followed(time, still, effort).any()
-        assert not idle_samples(time, still, effort, np.broadcast_to(HELD, effort.shape)).any()
+        assert not find_idle_samples(time, still, effort, np.broadcast_to(HELD, effort.shape)).any()
 
 
 def test_noise_that_moves_a_joint_now_and_then_is_no_motion() -> None:
@@ -87,7 +87,7 @@ def test_a_brake_that_opens_or_closes_bears_a_part() -> None:
     inner = slice(5, -10)
     found = followed(time, still, effort)
     assert found[opening][inner].all()
-    whole = idle_samples(time, still, effort, np.broadcast_to(HELD, effort.shape))
+    whole = find_idle_samples(time, still, effort, np.broadcast_to(HELD, effort.shape))
     assert whole[opening][inner].all()
     assert whole[closing][10:-5].all()
 

@@ -9,7 +9,7 @@ import pytest
 
 from pkm_twin.errors import ParameterError
 from pkm_twin.recordings import Load, Recording, split_by_load
-from pkm_twin.recordings.payload import payload_columns, read_table_load
+from pkm_twin.recordings.payload import make_payload_columns, read_table_load
 from pkm_twin.recordings.tables import Table
 from test.support.robots import load as robot_of
 
@@ -53,6 +53,6 @@ def test_several_payloads_follow_each_other_without_a_sample_of_both():
     np.testing.assert_allclose(masses, np.where(np.isnan(expected), 0.1, expected), atol=1e-15)
     loaded = {machine.payload.mass for machine, _ in split_by_load(robot, load, TIME, 8)}
     assert loaded == {0.0, 0.1, 0.2, 0.5}
-    table = Table(Path("x.csv"), payload_columns(robot, load, TIME))
+    table = Table(Path("x.csv"), make_payload_columns(robot, load, TIME))
     again = read_table_load(robot, table, TIME)
     np.testing.assert_array_equal(again.mass_at(TIME), expected)

@@ -13,7 +13,7 @@ from pkm_twin.paths import circle, cycle, fastest, lines, through, timed
 from pkm_twin.paths.carrying import PayloadChange
 from pkm_twin.paths.fastest import LAWS
 from pkm_twin.paths.jerk import smooth_run
-from pkm_twin.paths.joint_path import joint_paths
+from pkm_twin.paths.joint_path import make_joint_paths
 from pkm_twin.paths.motion import BINDING_USE
 from pkm_twin.paths.pieces import Arc, Corner, arc_through
 from test.support.robots import load, parameters_of, partly_long
@@ -275,7 +275,7 @@ def test_rates_with_limits_of_jerk_are_those_of_the_positions():
 def test_a_motion_never_goes_back_along_its_path():
     """Of any profile, with places where the machine nearly stops."""
     rng, robot = np.random.default_rng(2), load("five_bar")
-    [part] = joint_paths(through(robot, points_of(robot)), [PayloadChange(robot)], 120, 1e-6)
+    [part] = make_joint_paths(through(robot, points_of(robot)), [PayloadChange(robot)], 120, 1e-6)
     s = part.ends / part.ends[-1]
     for dip in 10.0 ** rng.uniform(-9.0, 0.0, 20):
         x = np.sin(np.pi * s) ** (4 / 3) * (1.0 - (1.0 - dip) * (rng.random(len(s)) < 0.05))

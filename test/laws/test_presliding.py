@@ -16,7 +16,7 @@ from pkm_twin.export.c_package import c_package
 from pkm_twin.identification.compare import compare
 from pkm_twin.identification.friction_laws import fit_with_laws
 from pkm_twin.machine.friction import Dahl, Memory
-from pkm_twin.paths.along import torque_table
+from pkm_twin.paths.along import tabulate_torques
 from pkm_twin.recordings import Recording
 from test.nodes.feedforward_core import NOW, core
 from test.nodes.harness import SECOND, Maker, Plain, reject
@@ -242,7 +242,7 @@ def test_without_reversals_or_a_memory_no_distance_is_found(how):
 def test_tables_along_a_motion_have_memory_and_what_has_no_state_says_so(rng):
     time = np.linspace(0.0, 3.0, 601)
     q, qd, qdd = Swings(rng, 3, HOME).at(time)
-    columns = torque_table(Recording(ROBOT, time, q, qd, qdd))
+    columns = tabulate_torques(Recording(ROBOT, time, q, qd, qdd))
     change = COULOMB * (Dahl.states(q, qd, PRESLIDING).z - np.sign(qd)) * (PRESLIDING > 0.0)
     effort = inverse_dynamics(ROBOT, q, qd, qdd) + change
     static = inverse_dynamics(ROBOT.changed(friction={"presliding": [0.0] * 3}), q, qd, qdd)

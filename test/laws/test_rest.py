@@ -16,7 +16,7 @@ from delta_dynamics.torques.stiction import beyond_friction, friction_reach, zer
 from pkm_twin import Robot
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError
-from pkm_twin.paths.along import torque_table
+from pkm_twin.paths.along import tabulate_torques
 from pkm_twin.recordings import ReadOptions, Recording, read
 from pkm_twin.streams.differentiator import Differentiator
 from pkm_twin.streams.noise import NoiseEstimator, estimate_noise
@@ -177,7 +177,7 @@ def test_a_table_of_positions_rubs_in_no_wrong_direction(tmp_path: Path, name: s
         writer = csv.writer(file)
         writer.writerow(["time", *(f"{joint}.position" for joint in robot.joint_names)])
         writer.writerows(np.column_stack([time, q]).tolist())
-    found = torque_table(read(path, name, ReadOptions(planned=True)).with_rates())
+    found = tabulate_torques(read(path, name, ReadOptions(planned=True)).with_rates())
     way, coulomb = np.sign(true[-1] - true[0]), robot.friction.coulomb
     for k, joint in enumerate(robot.joint_names):
         rubs = found[f"{joint}.effort_friction"]

@@ -18,7 +18,7 @@ from pkm_twin.errors import (
     MessageError,
     UnreachableError,
 )
-from pkm_twin.paths.along import model_efforts, torque_table
+from pkm_twin.paths.along import compute_model_efforts, tabulate_torques
 from pkm_twin.recordings import Recording
 from pkm_twin.robot.derivatives import joint_rates
 from test.nodes.harness import SECOND, Maker, Plain
@@ -41,11 +41,11 @@ def test_a_table_of_encoders_that_differ_has_efforts(planar, rng):
     moved = Recording(planar, t, seen).with_rates()
     right = inverse_dynamics(planar, q, qd, qdd)
     # Dry friction turns over within the noise.
-    apart = (model_efforts(moved) - right)[(np.abs(qd) > 0.2).all(1)]
+    apart = (compute_model_efforts(moved) - right)[(np.abs(qd) > 0.2).all(1)]
     assert np.sqrt(np.mean(apart**2)) < 0.2 * np.abs(right).max()
     seen[300, 3] += 5e-3
     with pytest.raises(UnreachableError, match=r"sample 300.*motor_4 .*redundancy\.tolerance"):
-        torque_table(Recording(planar, t, seen).with_rates())
+        tabulate_torques(Recording(planar, t, seen).with_rates())
 
 
 def test_a_plant_under_computed_efforts_follows_the_path(planar):

@@ -8,7 +8,7 @@ import pytest
 
 from pkm_twin.errors import ParameterError
 from pkm_twin.maps import figures
-from pkm_twin.maps.kinds.workspace import Workspace, find_circle_radii, largest_cylinder
+from pkm_twin.maps.kinds.workspace import Workspace, find_circle_radii, find_largest_cylinder
 from pkm_twin.maps.run import run
 from pkm_twin.maps.search import find_workspace_box
 from pkm_twin.maps.store import open_map
@@ -119,7 +119,7 @@ def test_the_largest_cylinder_is_better_than_all_others(reach_map):
 def test_no_cylinder_where_nothing_is_reachable():
     far = find_circle_radii(load("delta"), [-5.0, -4.0])
     assert (far == 0.0).all()
-    assert largest_cylinder(np.array([-5.0, -4.0]), far).radius == 0.0
+    assert find_largest_cylinder(np.array([-5.0, -4.0]), far).radius == 0.0
     assert singularity_of_pose(load("delta"), [[0.0, 0.0, -5.0]]) == [0.0]
 
 

@@ -21,7 +21,7 @@ from pkm_twin.messages.stamps import SECOND
 from pkm_twin.robot.effort_limits import EffortLimits
 from pkm_twin.streams.base_motion import BaseImu, ImuSettings
 from pkm_twin.streams.matched import WrenchWindow
-from pkm_twin.streams.monitor import finished
+from pkm_twin.streams.monitor import run_to_end
 from pkm_twin.streams.wrench import WrenchReader, WrenchSettings
 from test.nodes.efforts import HEAVY, LIMITS, PLACES, ROBOT, Judge
 from test.nodes.feedforward_core import NAMES, NOW, STEP, UNREACHABLE, WINDOW, sample, trajectory
@@ -308,7 +308,7 @@ def points(holding):
         message = MAKE.trajectory(NAMES, [0, SECOND, 2 * SECOND], rows, zero, zero)
         with suppress(MessageError), chain.twin.stream.reacting(chain.stop):
             policy = "zeros" if holding else chain.twin.settings.limit_policy
-            for effort in finished(chain.twin.trajectory_steps(message, chain.ros, holding=holding)):
+            for effort in run_to_end(chain.twin.trajectory_steps(message, chain.ros, holding=holding)):
                 chain.law.judge(effort, chain.steady / SECOND, STALE, policy)
 
     return send
@@ -378,7 +378,7 @@ def test_points_that_stop_the_machine_are_zeros_beyond_the_limits(policy):
     twin = Feedforward(HEAVY, Settings(window=WINDOW, limit_policy=policy))
     rest = {"rates": True, "accelerations": True}
     message = trajectory(MAKE, count=3, **rest)
-    efforts = finished(twin.trajectory_steps(message, NOW, holding=True))
+    efforts = run_to_end(twin.trajectory_steps(message, NOW, holding=True))
     assert efforts.shape == (3, 3) and not efforts.any()
 
 

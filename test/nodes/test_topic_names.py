@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from delta_dynamics import reactions
 from pkm_twin import robot_names
 from pkm_twin.errors import MessageError
-from pkm_twin.streams.topics import topic_tokens
+from pkm_twin.streams.topics import make_topic_tokens
 from test.support.robots import load
 
 
@@ -16,7 +16,7 @@ from test.support.robots import load
 @given(names=st.lists(st.text(max_size=8), max_size=12, unique=True))
 def test_every_name_has_a_legal_token_of_its_own(names):
     validate = pytest.importorskip("rclpy.validate_full_topic_name", exc_type=ImportError)
-    tokens = topic_tokens(names)
+    tokens = make_topic_tokens(names)
     assert list(tokens) == names
     assert len(set(tokens.values())) == len(names)
     for token in tokens.values():
@@ -26,7 +26,7 @@ def test_every_name_has_a_legal_token_of_its_own(names):
 
 def test_names_that_are_legal_but_for_spaces_stay():
     names = ["arm_1", "base joint I", "U joint 1"]
-    assert list(topic_tokens(names).values()) == ["arm_1", "base_joint_I", "U_joint_1"]
+    assert list(make_topic_tokens(names).values()) == ["arm_1", "base_joint_I", "U_joint_1"]
 
 
 @pytest.mark.parametrize("name", robot_names())
@@ -44,7 +44,7 @@ def test_a_node_publishes_the_reactions_of_every_robot(name, peer, launch):
         "publish_reactions:=true",
         arguments=["-r", f"__node:=of_{name}"],
     )
-    tokens = topic_tokens(names).values()
+    tokens = make_topic_tokens(names).values()
 
     def published():
         assert process.alive(), process.output

@@ -320,11 +320,11 @@ def test_the_mouse_drags_the_platform_along_one_axis_within_limits_and_chooses_a
         def drag(ends=ends):
             browser.drag(*project_points(ends, camera())[0].tolist(), pause=look)
 
-        wait_until(lambda p=pose: (page.state.pose != p).any() or page.state.refusal, drag, 60.0, "")
+        wait_until(lambda p=pose: (page.state.pose != p).any() or page.state.rejection, drag, 60.0, "")
         wait_until(lambda: not page._dragged, look, 60.0, "")
         moved = page.state.pose - pose
-        assert moved[axis] * way > 0.0 or page.state.refusal
-        assert bool(page.state.refusal) == (way == -0.6)
+        assert moved[axis] * way > 0.0 or page.state.rejection
+        assert bool(page.state.rejection) == (way == -0.6)
         np.testing.assert_allclose(np.delete(moved, axis), 0.0, atol=1e-6)
         assert not beyond_limits(page.model.robot, page.state.q)[0]
     pressed(browser, "[role=tab]", "e.innerText === 'Load'")

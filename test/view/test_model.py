@@ -46,7 +46,7 @@ def states(model, count, rng):
     low, high = (np.array([getattr(r, end) for r in model.joint_ranges]) for end in ("low", "high"))
     tried = low + (high - low) * rng.random((count, len(low)))
     moved = [model.to_joints(model.start, q) for q in tried]
-    good = [state for state in moved if not state.refusal]
+    good = [state for state in moved if not state.rejection]
     assert len(good) >= count / 5, model.robot.name
     return good
 
@@ -78,7 +78,7 @@ def test_joints_and_pose_lead_to_the_same_state(name, rng):
     for state in states(model, 10, rng):
         np.testing.assert_array_equal(state.pose, robot.forward(state.q))
         back = model.to_pose(model.start, state.pose)
-        assert back.refusal == ""
+        assert back.rejection == ""
         np.testing.assert_array_equal(back.pose, state.pose)
         if name == URDF.name:  # drives that turn all the way reach a pose with either elbow
             np.testing.assert_allclose(robot.forward(back.q), state.pose, rtol=0, atol=1e-7)
@@ -88,28 +88,28 @@ def test_joints_and_pose_lead_to_the_same_state(name, rng):
 
 @every_model
 def test_no_slider_leads_to_an_exception(name, rng):
-    """Whatever is asked for inside the sliders is shown, or refused in words and left alone."""
+    """Whatever is asked for inside the sliders is shown, or rejected in words and left alone."""
     model = model_of(name)
     low, high = (np.array([getattr(r, end) for r in model.pose_ranges]) for end in ("low", "high"))
-    refused, count = 0, 15
+    rejected, count = 0, 15
     tried = low + (high - low) * rng.random((count, len(low)))
     # All over their ranges hardly any six numbers are a pose; near the start all are.
     tried[10:] = model.start.pose + 0.1 * (tried[10:] - model.start.pose)
     for pose in tried:
         state = model.to_pose(model.start, pose)
-        if state.refusal:
-            refused += 1
-            assert "\n" not in state.refusal
+        if state.rejection:
+            rejected += 1
+            assert "\n" not in state.rejection
             np.testing.assert_array_equal(state.q, model.start.q)
             np.testing.assert_array_equal(state.pose, model.start.pose)
         else:
             np.testing.assert_allclose(model.robot.forward(state.q), pose, rtol=0, atol=1e-6)
         assert np.isfinite(model.compute_numbers(state).singularity)
     far = model.to_pose(model.start, np.full(len(low), 50.0))
-    assert far.refusal
-    assert model.to_joints(model.start, np.full(len(model.start.q), np.nan)).refusal
-    assert model.apply_wrench(model.start, np.full(6, np.inf)).refusal
-    assert 0 < refused <= 10
+    assert far.rejection
+    assert model.to_joints(model.start, np.full(len(model.start.q), np.nan)).rejection
+    assert model.apply_wrench(model.start, np.full(6, np.inf)).rejection
+    assert 0 < rejected <= 10
 
 
 @every_model
@@ -119,7 +119,7 @@ def test_a_link_carries_pose_and_load(name, rng):
     state = model.apply_wrench(model.to_pose(model.start, states(model, 8, rng)[0].pose), wrench)
     for given in (state, model.apply_wrench(state, np.zeros(6))):
         opened = model.read_url(model.start, f"http://127.0.0.1:8080/{model.write_url(given)}")
-        assert opened.refusal == ""
+        assert opened.rejection == ""
         np.testing.assert_allclose(opened.pose, given.pose, rtol=1e-8, atol=1e-12)
         np.testing.assert_array_equal(opened.wrench, given.wrench)
         assert model.write_url(opened) == model.write_url(given)
@@ -131,10 +131,10 @@ def test_a_dragged_platform_goes_where_it_can(name, rng):
     model = model_of(name)
     for state in states(model, 8, rng)[:3]:
         near = model.to_joints(state, 0.9 * state.q + 0.1 * model.start.q)
-        if near.refusal:
+        if near.rejection:
             continue
         moved = model.to_platform(state, *model.robot.platform(near.q))
-        assert moved.refusal == ""
+        assert moved.rejection == ""
         for got, asked in zip(model.robot.platform(moved.q), model.robot.platform(near.q), strict=True):
             np.testing.assert_allclose(got, asked, atol=1e-6)
         position, rotation = model.robot.platform(state.q)
@@ -168,7 +168,7 @@ def test_a_link_that_says_something_else_changes_nothing():
         "?robot=five_bar&pose=9,9",
     ):
         state = model.read_url(model.start, link)
-        assert state.refusal, link
+        assert state.rejection, link
         assert state.q is model.start.q
         assert not state.wrench.any()
 
@@ -189,7 +189,7 @@ def test_the_softest_pose_is_softer_than_all_others(rng):
         q, told = model.find_softest_pose(wrench, parts.append)
         assert parts == sorted(parts)
         found = model.to_joints(model.start, q)
-        assert found.refusal == ""
+        assert found.rejection == ""
         number, told_unit = told.split(" along ")[0].split()[-2:]
         assert told_unit == unit
         assert float(number) == pytest.approx(1e6 * moves(found), rel=1e-3)
@@ -203,7 +203,7 @@ def test_beyond_a_limit_is_told_with_joint_value_and_range(name):
         pytest.skip("this machine has no limits")
     q = model.start.q.copy()
     q[0] = model.joint_ranges[0].high + 0.25
-    told = model.to_joints(model.start, q).refusal
+    told = model.to_joints(model.start, q).rejection
     joint, unit = model.robot.joint_names[0], model.robot.joint_units[0]
     assert told.startswith(f"{joint}.position is {q[0]:.6g} {unit}, limits ")
     assert "--" not in told
@@ -215,7 +215,7 @@ def test_beyond_a_passive_limit_names_the_joint():
     graph = model.robot.graph
     beta = model.start.pose.copy()
     beta[2] = model.pose_ranges[2].high
-    told = model.to_pose(model.start, beta).refusal
+    told = model.to_pose(model.start, beta).rejection
     name, value = told.split(" rad, limit ")[0].split(" is at ")
     assert name == "R joint 1"
     posture = Posture(model.robot, model.robot.inverse(beta))

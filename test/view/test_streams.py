@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from pkm_twin.paths.along import model_efforts
+from pkm_twin.paths.along import compute_model_efforts
 from pkm_twin.recordings import read
 from pkm_twin.view import texts
 from pkm_twin.view.live import TRACE_SECONDS, Live
@@ -35,7 +35,7 @@ def test_the_time_line_has_a_node_s_residual(recording):
     motion = recording.with_rates()
     used = np.isin(recording.time, motion.time)
     residual = np.full_like(recording.q, np.nan)
-    residual[used] = motion.effort - model_efforts(motion)
+    residual[used] = motion.effort - compute_model_efforts(motion)
     assert line.end == recording.time[-1]
     for k in np.flatnonzero(used)[:: len(used) // 7]:
         at = line.sample_at(line.time[k] + 1e-5)
@@ -124,7 +124,7 @@ def test_a_message_that_makes_no_sense_leaves_nothing_behind():
     ):
         live.take(name, message)
     after = live.read_latest()
-    assert after.refused == 7
+    assert after.rejected == 7
     assert after.reason.startswith("stiffness_monitor/deflection: ")
     np.testing.assert_array_equal(after.q, before.q)
     assert after.traces == {}

@@ -83,7 +83,7 @@ class Size(TimedPayloadOptions, MotionOptions, SingularityOption, PictureOptions
 def size(given: Size) -> Report:
     """Compute the duty of each drive, and the motors that suffice."""
     from pkm_twin.paths.along import EFFORT_TOLERANCE
-    from pkm_twin.paths.sizing import find_smallest, net_energy, read_motors, size_drives
+    from pkm_twin.paths.sizing import compute_net_energy, find_smallest, read_motors, size_drives
 
     if (given.motion is None) == (given.over_workspace is None):
         raise click.UsageError("give a recording or path, or --over-workspace")
@@ -114,7 +114,7 @@ def size(given: Size) -> Report:
     duration = float(motion.time[-1] - motion.time[0])
     energy = sum(d.at_joint.energy for d in duties)
     returned = sum(d.at_joint.returned for d in duties)
-    net = net_energy([d.at_joint for d in duties])
+    net = compute_net_energy([d.at_joint for d in duties])
     worst = max(duties, key=lambda d: (d.slides == duties[0].slides, d.at_joint.peak))
     unit = "N" if worst.slides else "N m"
     answer = (
@@ -122,7 +122,7 @@ def size(given: Size) -> Report:
         f"RMS {worst.at_joint.rms:.4g} {unit}; net energy of all drives {net:.4g} J"
     )
     at_motors = [d.at_motor for d in duties if d.at_motor is not None]
-    motors_energy = net_energy(at_motors) if len(at_motors) == len(duties) else None
+    motors_energy = compute_net_energy(at_motors) if len(at_motors) == len(duties) else None
     if motors_energy is not None:
         answer += f" at the joints, {motors_energy:.4g} J at the motors"
     facts = [
@@ -193,7 +193,7 @@ def read_gear_options(given: Size, robot: Robot) -> tuple[list[Gear], list[Gears
 
 def _tabulate_drive_duties(duties: Sequence[DriveDuty]) -> list[Table]:
     """Return the duties of rotary and sliding joints and of motors, and the use of each motor."""
-    from pkm_twin.paths.sizing import net_energy
+    from pkm_twin.paths.sizing import compute_net_energy
 
     tables = []
     sides = [("joint", True), ("joint", False), ("motor", False)]
@@ -211,7 +211,7 @@ def _tabulate_drive_duties(duties: Sequence[DriveDuty]) -> list[Table]:
                 duty.mean_speed,
                 duty.power,
                 duty.braking,
-                net_energy([duty]),
+                compute_net_energy([duty]),
                 duty.returned,
                 span if side == "joint" else d.inertia_ratio or "",
             ]

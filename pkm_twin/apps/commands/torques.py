@@ -82,7 +82,7 @@ class Torques(TimedPayloadOptions, MotionOptions, PoseOption, OutputOption, Pict
 @command("Torques, paths and drives")
 def torques(given: Torques) -> Report:
     """Report peak and RMS effort of each joint, and write the table."""
-    from pkm_twin.paths.along import find_peaks, torque_table
+    from pkm_twin.paths.along import find_peaks, tabulate_torques
     from pkm_twin.robot.limits import beyond_limits
 
     if given.out is not None:
@@ -99,7 +99,7 @@ def torques(given: Torques) -> Report:
         motion = given.read_motion(given.motion, given.machine())
     beyond = given.list_beyond_limits(motion.robot, motion.q, motion.qd)
     with draw_progress("torques", len(motion.time)) as update:
-        columns = torque_table(motion, update)
+        columns = tabulate_torques(motion, update)
     if given.out is not None:
         with convert_write_errors(given.out):
             write_table(columns, given.out)

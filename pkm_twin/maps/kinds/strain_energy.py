@@ -177,11 +177,11 @@ def _draw_slices(data: Dataset, case: str, elements: list[int]) -> dict[str, Fig
 
 def _draw_planes(data: Dataset, case: str, elements: list[int]) -> dict[str, Figure]:
     """Draw elements' shares in the plane across the height, or in the fullest plane."""
-    from pkm_twin.maps.figures import draw_panel, extract_plane, full_planes
+    from pkm_twin.maps.figures import draw_panel, extract_plane, list_full_planes
 
     k = [str(name) for name in data.case.values].index(case)
     upwards = data.attrs["height"]
-    full = full_planes(data, k)
+    full = list_full_planes(data, k)
     across = [p for p in full if upwards not in (str(data.row_name.values[p]), str(data.column_name.values[p]))]
     plane = (across or full)[0]
     one = extract_plane(data, k, plane)

@@ -97,7 +97,7 @@ class Workspace(Kind):
             low, high = space.ticks[robot.pose_names.index(robot.grid().height)][[0, -1]]
             heights = np.linspace(low, high, LAYERS)
             radius = find_circle_radii(robot, heights, least=space.least, least_clearance=space.least_clearance)
-            best, unit = largest_cylinder(heights, radius), workspace_radius_unit(robot)
+            best, unit = find_largest_cylinder(heights, radius), workspace_radius_unit(robot)
             result |= make_circle_variables(robot, heights, radius) | {
                 "cylinder_low": scalar(best.low, "largest cylinder, low", "m"),
                 "cylinder_high": scalar(best.high, "largest cylinder, high", "m"),
@@ -204,7 +204,7 @@ class Cylinder:
     radius: float
 
 
-def largest_cylinder(heights: Array, radius: Array) -> Cylinder:
+def find_largest_cylinder(heights: Array, radius: Array) -> Cylinder:
     """Return the cylinder of largest radius squared times height between two heights (n,)."""
     best, volume = Cylinder(math.nan, math.nan, 0.0), 0.0
     for i in range(len(heights)):
