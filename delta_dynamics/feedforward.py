@@ -474,7 +474,7 @@ class Feedforward(Core):
             return None, 0.0
         before = self._memory or Memory.begun(q)
         memory = before.after(q[None], np.sign(rates), friction.presliding).last
-        return memory, Dahl.beyond(friction, memory.z, rates)
+        return memory, Dahl.memory_effort(friction, memory.z, rates)
 
     def _resolve_motion(
         self, sample: JointSample, rates: tuple[Array, Array], rate_error: Array | None

@@ -243,7 +243,7 @@ class StiffnessAlarm:
         return run_to_end(self.judging())
 
     def judging(self) -> Generator[None, None, tuple[Departure, ...] | None]:
-        """Evaluate as :meth:`judge` in slices, with the samples of the first slice."""
+        """Evaluate :meth:`judge` in slices, yielding between them, with the samples at the start."""
         if not self._samples:
             return None
         sizes = np.array([np.linalg.norm(sample.predicted[:3]) for sample in self._samples])

@@ -133,9 +133,9 @@ class SetpointStream:
 
 
 def _solve_least_norm(matrix: Array, target: Array, target_change: Array) -> tuple[Array, Array]:
-    """Return the least-norm solution within reach, and the projector on the other directions.
+    """Return the least-norm solution in well-conditioned directions, and the projector on the others.
 
-    :param target_change: matrix whose largest singular value is the reference for reach.
+    :param target_change: matrix whose largest singular value is the reference for the condition.
     """
     u, values, vt = np.linalg.svd(matrix, full_matrices=False)
     greatest = np.linalg.svd(target_change, compute_uv=False)[..., :1]

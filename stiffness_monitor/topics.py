@@ -8,7 +8,7 @@ from typing import Final
 from pkm_twin.streams.topics import JOINTS, NUMBER_ARRAY, STATUSES, TEXT, TRIGGER, WRENCH, Topic, table
 
 _TRANSFORM: Final = "geometry_msgs/TransformStamped"
-_CORRECTED: Final = "`correct_setpoint`"
+_IF_CORRECTING: Final = "`correct_setpoint`"
 
 STIFFNESS: Final = table(
     Topic(
@@ -40,13 +40,13 @@ STIFFNESS: Final = table(
         "platform to deflected platform, in platform axes; frames `platform_frame` and this name "
         "with `_deflected` added",
     ),
-    Topic("in", "setpoint", JOINTS, "commanded positions", _CORRECTED),
+    Topic("in", "setpoint", JOINTS, "commanded positions", _IF_CORRECTING),
     Topic(
         "out",
         "~/setpoint_offset",
         JOINTS,
         "offsets for the joints' setpoints that keep the tool point in place",
-        _CORRECTED,
+        _IF_CORRECTING,
     ),
     Topic(
         "out",
@@ -54,7 +54,7 @@ STIFFNESS: Final = table(
         JOINTS,
         "`setpoint` with the last offset, which moves at most at `correction_rate`, bounded at "
         "the joints' position limits",
-        _CORRECTED,
+        _IF_CORRECTING,
     ),
     Topic("in", "torques", JOINTS, "efforts, as `~/joint_torques` of `delta_dynamics`", "`pair_torques`"),
     Topic(

@@ -172,7 +172,7 @@ def test_a_command_and_a_node_start_without_what_they_may_never_need():
     assert not modules & loaded_by("import pkm_twin.apps.cli")
     assert not {"numpy", "rich"} & loaded_by("import pkm_twin.apps.cli")
     # Masked arrays are a tenth of a short command's time.
-    code = "from pkm_twin.mechanisms import catalogue; catalogue.findings(catalogue.load('delta'))"
+    code = "from pkm_twin.mechanisms import catalogue; catalogue.find_implausible_numbers(catalogue.load('delta'))"
     assert "numpy.ma" not in loaded_by(code)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from pkm_twin.errors import warn_of_file
 from pkm_twin.machine.sections import MAX_MASS
-from pkm_twin.robot.plausibility import gravity_findings, payload_findings
+from pkm_twin.robot.plausibility import check_gravity, check_payload_mass
 from pkm_twin.robot.robot import Robot
 from pkm_twin.ros.node import TwinNode
 
@@ -64,6 +64,6 @@ def change_robot(robot: Robot, values: dict[str, Any]) -> Robot:
         else:
             sections[section] = plain
     made = robot.changed(**sections)
-    for finding in (*gravity_findings(made), *payload_findings(made)):
+    for finding in (*check_gravity(made), *check_payload_mass(made)):
         warn_of_file(f"parameters of {robot.name}", finding.text)
     return made

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from pkm_twin.codegen.arrays import Array
     from pkm_twin.paths.along import EffortComparison
     from pkm_twin.recordings import Dialect, Load, Recording
-    from pkm_twin.robot.limits import Beyond
+    from pkm_twin.robot.limits import LimitViolation
     from pkm_twin.robot.robot import Robot
     from stiffness_monitor.chatter import Milling
 
@@ -223,7 +223,9 @@ class BeyondLimitsOption:
 
     beyond_limits: bool = setting(False, "also compute outside the joint limits, marked")
 
-    def list_beyond_limits(self, machine: Robot, q: Array, qd: Array | None = None, where: str = "") -> list[Beyond]:
+    def list_beyond_limits(
+        self, machine: Robot, q: Array, qd: Array | None = None, where: str = ""
+    ) -> list[LimitViolation]:
         """Return the joints that joint states (..., n) take beyond their limits.
 
         :param where: name of the recording, for the error, if there are several.

@@ -196,8 +196,8 @@ class Code:
 
             header, code = self._load_or_compile(llvm, native)
             prepare, address = native.load_object(code)
-            prepare = native.LOCKED(prepare)
-            return header, prepare, native.PROTOTYPE(address), native.LOCKED(address)
+            prepare = native.LOCK_KEEPING_PROTOTYPE(prepare)
+            return header, prepare, native.LOCK_RELEASING_PROTOTYPE(address), native.LOCK_KEEPING_PROTOTYPE(address)
 
     def _load_or_compile(self, llvm: ModuleType, native: ModuleType) -> tuple[dict[str, Any], bytes]:
         """Return sizes and object code from the cache, or compile them.
@@ -470,20 +470,20 @@ def _is_valid_header(header: dict[str, Any]) -> bool:
     return False
 
 
-THREADS: Final = "PKM_TWIN_THREADS"
+THREADS_VARIABLE: Final = "PKM_TWIN_THREADS"
 """Environment variable: threads for a large batch; 1 unless set, 0 for all cores."""
 MIN_SAMPLES_PER_THREAD: Final = 4096
 """Smallest number of samples per thread for which starting it saves time."""
 
 
-def threads() -> int:
+def read_thread_count() -> int:
     """Read the number of threads from the environment, at every large batch.
 
     :raises ParameterError: the variable is not a number of threads.
     """
-    text = os.environ.get(THREADS, "").strip() or "1"
+    text = os.environ.get(THREADS_VARIABLE, "").strip() or "1"
     if not text.isascii() or not text.isdigit() or int(text) > 1024:
-        raise ParameterError(THREADS, text, "a number of threads, 0 for all cores")
+        raise ParameterError(THREADS_VARIABLE, text, "a number of threads, 0 for all cores")
     return int(text) or len(os.sched_getaffinity(0))
 
 
@@ -494,7 +494,7 @@ def run_in_threads(part: Callable[[int, int], bool], size: int, samples: int) ->
     """
     count = min(size, samples // MIN_SAMPLES_PER_THREAD)
     if count > 1:
-        count = min(count, threads())
+        count = min(count, read_thread_count())
     if count <= 1:
         return part(0, size)
     ends = [size * k // count for k in range(count + 1)]

@@ -35,7 +35,7 @@ class ProgramKey:
     text: str = ""
     writers: frozenset[str] = frozenset()
 
-    def also(self, text: str, *writers: Callable[..., Any]) -> ProgramKey:
+    def extend(self, text: str, *writers: Callable[..., Any]) -> ProgramKey:
         """Return the key of a program made from this one with further content and writers."""
         modules = (module for writer in writers for module in _writer_modules(writer))
         return ProgramKey(f"{self.text} {text}", self.writers.union(modules))

@@ -36,13 +36,13 @@ from pkm_twin.codegen.expressions import GEOMETRY, PARAMETERS, Expression, count
 from pkm_twin.codegen.native import CPU, FEATURES, OPTIMISATION, PREPARE, QUICK, SYMBOL
 from pkm_twin.codegen.operations import fused, sub
 from pkm_twin.codegen.program import (
-    AT,
     MAX_ITERATIONS,
     MAX_SUM,
     STATE,
+    STATE_INDEX,
     Equations,
     Program,
-    holding,
+    flag_solved,
     previous_input_name,
 )
 
@@ -269,11 +269,11 @@ class _Writer:
         for q in program.equations:
             values[q.unknowns] = self._solve(q, values, state)
         if state:
-            good, reached = self._is_positive(b.load(state[AT.alive])), b.load(state[AT.reached])
+            good, reached = self._is_positive(b.load(state[STATE_INDEX.alive])), b.load(state[STATE_INDEX.reached])
         out = self.emitter()
         names = list(program.outputs)
         rows = {name: out.run(list(program.outputs[name]), values) for name in names}
-        for value in out.run(holding(program.equations), values):
+        for value in out.run(flag_solved(program.equations), values):
             good = b.and_(good, self._is_positive(value))
         total = out.number(0.0)
         for row in rows.values():
@@ -302,16 +302,16 @@ class _Writer:
             share = b.fdiv(b.sitofp(b.add(k, integer_constant(more)), DOUBLE), b.sitofp(self.steps, DOUBLE))
             left = b.fsub(real_constant(1.0), share)
             parts.append(b.fsub(real_constant(1.0), b.fmul(b.fmul(left, left), left)))
-        b.store(b.splat(parts[2], LANES), n[AT.part])
+        b.store(b.splat(parts[2], LANES), n[STATE_INDEX.part])
         onward = b.fdiv(b.fsub(parts[2], parts[1]), b.fsub(parts[1], parts[0]))
-        b.store(b.splat(onward, LANES), n[AT.onward])
+        b.store(b.splat(onward, LANES), n[STATE_INDEX.onward])
 
     def _solve(self, q: Equations, values: dict[str, list[Value]], n: list[Value]) -> list[Value]:
         """Write Newton's method in steps, with the state n; return the unknowns."""
         b, number = self.function, self.emitter().number
         first = not n
         x, last, aim = ([b.alloca(VECTOR) for _ in row] for row in (q.home, q.home, q.origin))
-        n += [b.alloca(VECTOR) for _ in (AT if first else ())]
+        n += [b.alloca(VECTOR) for _ in (STATE_INDEX if first else ())]
         size = b.alloca(VECTOR)
         if q.goal:
             values[q.target] = self.emitter().run(q.goal, values)
@@ -334,17 +334,17 @@ class _Writer:
 
         once = b.icmp("eq", self.steps, ONE)
         if first:
-            b.store(b.select(once, number(1.0), number(0.0)), n[AT.once])
-            b.store(number(1.0), n[AT.alive])
-            b.store(number(0.0), n[AT.reached])
+            b.store(b.select(once, number(1.0), number(0.0)), n[STATE_INDEX.once])
+            b.store(number(1.0), n[STATE_INDEX.alive])
+            b.store(number(0.0), n[STATE_INDEX.reached])
         # Use branches instead of selects for conditions that are equal in all lanes: they are predictable.
-        masks = {q.state[AT.once].number: once}
+        masks = {q.state[STATE_INDEX.once].number: once}
         compute(q.home, last)
         steps = _CountingLoop(b, "step", self.steps)
         k = steps.begin()
         masks[q.is_underway.number] = b.icmp("slt", b.add(k, ONE), self.steps)
         self._store_continuation_fraction(k, n)
-        b.store(b.load(n[AT.alive]), n[AT.moving])
+        b.store(b.load(n[STATE_INDEX.alive]), n[STATE_INDEX.moving])
         compute(q.step_target, aim)
         begin, onward, joined = (b.block(name) for name in ("begin", "onward", "turns"))
         b.cbranch(b.icmp("eq", k, ZERO), begin, onward)
@@ -358,14 +358,14 @@ class _Writer:
             b.store(value, place)
         b.branch(joined)
         b.go_to(joined)
-        b.store(b.load(size), n[AT.size])
+        b.store(b.load(size), n[STATE_INDEX.size])
         corrections = _CountingLoop(b, "turn", integer_constant(MAX_ITERATIONS))
         corrections.begin()
-        kept = [*x, *n[AT.size : AT.reached]]
-        compute(q.correct, kept, {q.unknowns: x, q.target: aim}, q.results)
-        corrections.close(self._any_lane(self._is_positive(b.load(n[AT.moving]))))
-        compute(q.flags_after_step, n[AT.alive : AT.reached + 1])
-        steps.close(self._any_lane(self._is_positive(b.load(n[AT.alive]))))
+        kept = [*x, *n[STATE_INDEX.size : STATE_INDEX.reached]]
+        compute(q.corrected_state, kept, {q.unknowns: x, q.target: aim}, q.results)
+        corrections.close(self._any_lane(self._is_positive(b.load(n[STATE_INDEX.moving]))))
+        compute(q.flags_after_step, n[STATE_INDEX.alive : STATE_INDEX.reached + 1])
+        steps.close(self._any_lane(self._is_positive(b.load(n[STATE_INDEX.alive]))))
         return [b.load(place) for place in x]
 
 

@@ -23,9 +23,9 @@ def _initialise() -> None:
         binding.initialize()
     binding.initialize_native_target()
     binding.initialize_native_asmprinter()
-    # The scheduler compares each load with each store of a region, and ours are long: half of the
-    # compile time. Split sooner, the code has the same size and speed. Releases that are not
-    # known may end the process for an option that they lack.
+    # Scheduling compares each load with each store of a region: for long regions half of the compile
+    # time. Shorter regions give code of the same size and speed. Set the option only for releases
+    # that are known to have it, because LLVM ends the process for an unknown option.
     if (14,) <= binding.llvm_version_info < (23,):
         binding.set_option("", "-dag-maps-huge-region=200")
         binding.set_option("", "-dag-maps-reduction-size=100")
@@ -74,9 +74,9 @@ def _make_target_machine(level: int = OPTIMISATION) -> Any:
     return target.create_target_machine(cpu=CPU, features=FEATURES, opt=level, jit=True, reloc="pic")
 
 
-PROTOTYPE: Final = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_void_p)
+LOCK_RELEASING_PROTOTYPE: Final = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_void_p)
 """Function type for batches: releases the interpreter lock during the call."""
 
 
-LOCKED: Final = ctypes.PYFUNCTYPE(ctypes.c_int64, ctypes.c_void_p)
+LOCK_KEEPING_PROTOTYPE: Final = ctypes.PYFUNCTYPE(ctypes.c_int64, ctypes.c_void_p)
 """Function type for one sample: keeps the lock, as releasing it costs more than the sample."""

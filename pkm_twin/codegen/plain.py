@@ -18,14 +18,14 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import GEOMETRY, PARAMETERS, Expression, count_uses, list_dependencies
 from pkm_twin.codegen.operations import OPERATIONS
 from pkm_twin.codegen.program import (
-    AT,
     MAX_ITERATIONS,
     MAX_SUM,
     SOLUTION_PARTS,
     STATE,
+    STATE_INDEX,
     Equations,
     Program,
-    holding,
+    flag_solved,
     previous_input_name,
     progress,
 )
@@ -97,7 +97,7 @@ class PlainCode:
         self.program = program
         names = {**program.inputs, PARAMETERS: len(program.prepared)}
         results = [e for row in program.outputs.values() for e in row]
-        results += holding(program.equations)
+        results += flag_solved(program.equations)
         parts: dict[Any, Sequence[Expression]] = {"results": results}
         for q in program.equations:
             names |= q.inputs
@@ -122,15 +122,15 @@ class PlainCode:
         columns = [list(value.T) if many else value.ravel().tolist() for value in inputs]
         named: dict[str, Any] = dict(zip(self.program.inputs, columns, strict=True))
         named[PARAMETERS] = p.tolist()
-        n: list[Any] = [0.0] * len(AT)
-        n[AT.once], n[AT.alive], n[AT.reached] = float(steps == 1), 1.0, 0.0
+        n: list[Any] = [0.0] * len(STATE_INDEX)
+        n[STATE_INDEX.once], n[STATE_INDEX.alive], n[STATE_INDEX.reached] = float(steps == 1), 1.0, 0.0
         if not self.program.equations:
-            n[AT.reached] = 1.0
+            n[STATE_INDEX.reached] = 1.0
         with np.errstate(all="ignore"):
             for q in self.program.equations:
                 self._solve(q, named, n, steps, many=many)
             values = self._evaluate("results", named, many=many)
-            good: Any = n[AT.alive] * (values.pop() if self.program.equations else 1.0)
+            good: Any = n[STATE_INDEX.alive] * (values.pop() if self.program.equations else 1.0)
             total = sum(map(abs, [*values, *(x for column in columns for x in column)]))
             own = _ARRAY_FUNCTIONS if many else _SCALAR_FUNCTIONS
             finite = own["select"](own["less"](total, MAX_SUM), 0.0, 2.0)
@@ -139,7 +139,7 @@ class PlainCode:
         for k, value in enumerate(values):
             table[:, k] = value
         status = np.empty((count, 2))
-        status[:, 0], status[:, 1] = code, n[AT.reached]
+        status[:, 0], status[:, 1] = code, n[STATE_INDEX.reached]
         table[status[:, 0] != 0.0] = np.nan
         ends = itertools.accumulate(map(len, self.program.outputs.values()), initial=0)
         return [table[:, a:b].copy() for a, b in itertools.pairwise(ends)], status
@@ -159,7 +159,10 @@ class PlainCode:
             named[q.target] = evaluate("goal")
         before = x = evaluate("home")
         for k in range(1, steps + 1):
-            n[AT.part], n[AT.onward], n[AT.moving] = *progress(k, steps), n[AT.alive]
+            n[STATE_INDEX.part], n[STATE_INDEX.onward], n[STATE_INDEX.moving] = (
+                *progress(k, steps),
+                n[STATE_INDEX.alive],
+            )
             guesses = {q.unknowns: x, previous_input_name(q.unknowns): before}
             step_inputs = named | guesses | {q.target: evaluate("step_target")}
             before = x
@@ -167,14 +170,14 @@ class PlainCode:
                 *x, size = evaluate("begin", step_inputs)
             else:
                 x = evaluate("onward", step_inputs)
-            n[AT.size], step_inputs[q.unknowns] = size, x
+            n[STATE_INDEX.size], step_inputs[q.unknowns] = size, x
             for _ in range(MAX_ITERATIONS):
-                after = evaluate("correct", step_inputs)
-                x, n[AT.size : AT.reached] = after[: len(q.home)], after[len(q.home) :]
+                after = evaluate("corrected_state", step_inputs)
+                x, n[STATE_INDEX.size : STATE_INDEX.reached] = after[: len(q.home)], after[len(q.home) :]
                 step_inputs[q.unknowns] = x
-                if not any_of(n[AT.moving]):
+                if not any_of(n[STATE_INDEX.moving]):
                     break
-            n[AT.alive], n[AT.reached] = evaluate("flags_after_step")
-            if not any_of(n[AT.alive]):
+            n[STATE_INDEX.alive], n[STATE_INDEX.reached] = evaluate("flags_after_step")
+            if not any_of(n[STATE_INDEX.alive]):
                 break
         named[q.unknowns] = x

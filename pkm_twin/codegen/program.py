@@ -23,21 +23,21 @@ UNKNOWNS: Final = "x"
 """Name of the input that holds the unknowns of Newton's method."""
 
 MAX_LAST_CORRECTION: Final = 1e-8
-"""Largest last correction of Newton's method, of unit one. Convergence is quadratic, so the error
-left is its square: half a unit of rounding."""
+"""Largest dimensionless last correction of Newton's method. Convergence is quadratic, so the
+remaining error is its square: half a unit of rounding."""
 MAX_ITERATIONS: Final = 12
-"""Most corrections of a step."""
+"""Largest number of Newton corrections per step."""
 MAX_CONTRACTION: Final = 0.25
-"""Largest ratio of a correction to the one before."""
+"""Largest ratio of a correction to the previous correction."""
 MAX_FIRST_CORRECTION: Final = 0.3
-"""Largest first correction from a guess, of unit one; a longer one may lead to another root."""
+"""Largest dimensionless first correction from a guess; a longer one may lead to another root."""
 MAX_EXTRAPOLATED_CORRECTION: Final = 0.1
-"""Largest first correction of a step that starts at an extrapolated point, of unit one."""
+"""Largest dimensionless first correction of a step that starts at an extrapolated point."""
 MAX_STREAM_CORRECTION: Final = 0.01
-"""Largest first correction of a stream's sample, which starts from the sample before, of unit one."""
-LEAST: Final = 1e-8
+"""Largest dimensionless first correction of a stream's sample, which starts from the last sample."""
+MIN_RELATIVE_DETERMINANT: Final = 1e-8
 """Smallest determinant, relative to the determinant at home."""
-MAX_GROWTH: Final = LEAST**-2
+MAX_GROWTH: Final = MIN_RELATIVE_DETERMINANT**-2
 """Largest :meth:`.SparseLU.find_growth`: results keep half of their digits."""
 MIN_DETERMINANT_RATIO: Final = 5.0
 """Smallest ratio of determinant to correction from a guess in a single step. A longer correction may
@@ -76,7 +76,7 @@ class StateIndices(NamedTuple):
     reached: int
 
 
-AT: Final = StateIndices(*range(7))
+STATE_INDEX: Final = StateIndices(*range(7))
 
 
 def progress(k: int, steps: int) -> tuple[float, float]:
@@ -93,7 +93,7 @@ def previous_input_name(unknowns: str) -> str:
     return f"{unknowns}_before"
 
 
-SOLUTION_PARTS: Final = ("home", "goal", "step_target", "begin", "onward", "correct", "flags_after_step")
+SOLUTION_PARTS: Final = ("home", "goal", "step_target", "begin", "onward", "corrected_state", "flags_after_step")
 """Attributes of :class:`Equations` that are computed while the equations are solved."""
 
 
@@ -124,7 +124,7 @@ class Equations:
     corrected: Sequence[Expression]
     """Unknowns after one correction."""
     size: Expression
-    """Square of the correction, of unit one."""
+    """Square of the dimensionless correction."""
     determinant: Expression
     """Determinant of the equations, relative to that at home."""
     residual: Expression
@@ -152,7 +152,7 @@ class Equations:
         """Sizes of the inputs that exist while the equations are solved, by name."""
         n = len(self.home)
         own = {self.unknowns: n, previous_input_name(self.unknowns): n}
-        return own | {self.target: len(self.origin), STATE: len(AT)}
+        return own | {self.target: len(self.origin), STATE: len(STATE_INDEX)}
 
     @property
     def results(self) -> list[Expression]:
@@ -162,9 +162,9 @@ class Equations:
     @cached_property
     def state(self) -> list[Any]:
         """The state of Newton's method as expressions."""
-        state = list(self.size.tape.inputs(STATE, len(AT)))
+        state = list(self.size.tape.inputs(STATE, len(STATE_INDEX)))
         if self.lone:
-            state[AT.moving] = state[AT.alive] = self.size.tape.constant(1.0)
+            state[STATE_INDEX.moving] = state[STATE_INDEX.alive] = self.size.tape.constant(1.0)
         return state
 
     def _lift_all(self, *values: Any) -> list[Expression]:
@@ -173,7 +173,7 @@ class Equations:
     @cached_property
     def begin(self) -> list[Expression]:
         """Initial unknowns, and the squared size that the first correction is compared with."""
-        once, closed_form = self.state[AT.once], self.start is not None and not self.guessed
+        once, closed_form = self.state[STATE_INDEX.once], self.start is not None and not self.guessed
         first: Sequence[Any] = self.start or self.home
         if closed_form:
             first = [select(once, a, b) for a, b in zip(first, self.home, strict=True)]
@@ -188,41 +188,43 @@ class Equations:
     @cached_property
     def is_underway(self) -> Expression:
         """Expression: 1 in a step that ends before the target, else 0."""
-        return self._lift_all(less(self.state[AT.part], 1.0))[0]
+        return self._lift_all(less(self.state[STATE_INDEX.part], 1.0))[0]
 
     @cached_property
     def step_target(self) -> list[Expression]:
         """Input values, for example joint positions, that the present step solves for."""
-        part, underway = self.state[AT.part], self.is_underway
+        part, underway = self.state[STATE_INDEX.part], self.is_underway
         goal = self.size.tape.inputs(self.target, len(self.origin))
         pairs = zip(self.origin, goal, strict=True)
         return self._lift_all(*(select(underway, a + part * (b - a), b) for a, b in pairs))
 
     @cached_property
-    def correct(self) -> list[Expression]:
-        """Unknowns after a correction, then the state from ``size`` to ``alive``.
+    def corrected_state(self) -> list[Expression]:
+        """Unknowns after a correction, followed by the entries ``size`` to ``alive`` of the state.
 
         A sample is rejected if a correction does not contract or the determinant is too small. A
         start in closed form is in the right assembly; a guess may lead to another.
         """
         state, size, determinant = self.state, self.size, self.determinant
-        once, moving = state[AT.once], state[AT.moving]
+        once, moving = state[STATE_INDEX.once], state[STATE_INDEX.moving]
         closed_form = self.start is not None and not self.guessed
         x = self.size.tape.inputs(self.unknowns, len(self.home))
         new = (select(moving, a, b) for a, b in zip(self.corrected, x, strict=True))
-        converges = both(less(size, MAX_CONTRACTION**2 * state[AT.size]), less(LEAST, determinant))
+        converges = both(
+            less(size, MAX_CONTRACTION**2 * state[STATE_INDEX.size]), less(MIN_RELATIVE_DETERMINANT, determinant)
+        )
         if not closed_form:
             min_determinant = select(once, MIN_DETERMINANT_RATIO**2 * size, 0.0)
             converges = both(converges, less(min_determinant, determinant * determinant))
         continues = both(moving, both(converges, less(MAX_LAST_CORRECTION**2, size)))
-        return self._lift_all(*new, size, continues, select(moving, converges, state[AT.alive]))
+        return self._lift_all(*new, size, continues, select(moving, converges, state[STATE_INDEX.alive]))
 
     @cached_property
     def flags_after_step(self) -> list[Expression]:
         """``alive`` and ``reached`` after a step; a sample whose corrections have not converged is rejected."""
         n = self.state
-        alive = select(n[AT.moving], 0.0, n[AT.alive])
-        return self._lift_all(alive, select(alive, n[AT.part] + float(self.stage), n[AT.reached]))
+        alive = select(n[STATE_INDEX.moving], 0.0, n[STATE_INDEX.alive])
+        return self._lift_all(alive, select(alive, n[STATE_INDEX.part] + float(self.stage), n[STATE_INDEX.reached]))
 
     @cached_property
     def is_solved(self) -> Expression:
@@ -233,17 +235,17 @@ class Equations:
         return self._lift_all(solved)[0]
 
 
-def holding(equations: Iterable[Equations], *, certain: bool = True) -> list[Expression]:
+def flag_solved(equations: Iterable[Equations], *, certain: bool = True) -> list[Expression]:
     """Return a list of one expression, 1 where all equations hold; an empty list without equations.
 
-    :param certain: also require :func:`certainty`.
+    :param certain: also require :func:`flag_certain`.
     """
     equations = list(equations)
-    flags = [q.is_solved for q in equations] + (certainty(equations) if certain else [])
+    flags = [q.is_solved for q in equations] + (flag_certain(equations) if certain else [])
     return [reduce(both, flags)] if flags else []
 
 
-def certainty(equations: Iterable[Equations]) -> list[Expression]:
+def flag_certain(equations: Iterable[Equations]) -> list[Expression]:
     """Return a list of one expression, 1 where the assembly is certain; empty if it always is."""
     flags = [q.size.tape.lift(less(0.0, value)) for q in equations for value in q.certain]
     return [reduce(both, flags)] if flags else []
@@ -287,7 +289,7 @@ class Program:
         rows = [e for row in self.outputs.values() for e in row]
         for q in self.equations:
             rows += [e for name in SOLUTION_PARTS for e in getattr(q, name)]
-        return rows + holding(self.equations)
+        return rows + flag_solved(self.equations)
 
     @cached_property
     def prepared(self) -> list[Expression]:

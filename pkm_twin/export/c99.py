@@ -28,19 +28,19 @@ from pkm_twin.codegen.operations import (
     sub,
 )
 from pkm_twin.codegen.program import (
-    AT,
     LAST,
     MAX_ITERATIONS,
     MAX_SUM,
     STATE,
+    STATE_INDEX,
     UNKNOWNS,
     Equations,
-    certainty,
-    holding,
+    flag_certain,
+    flag_solved,
     previous_input_name,
 )
 from pkm_twin.export.c_functions import C_FUNCTIONS
-from pkm_twin.export.schedule import DEFAULT_LATENCY, LATENCIES, TURN_LATENCY, Work, order_work
+from pkm_twin.export.schedule import DEFAULT_LATENCY, LATENCY_BY_OPERATION, SINE_COSINE_LATENCY, Work, order_work
 
 STEPS_PER_ATTEMPT: Final = (1, *STEPS)
 """Number of continuation steps of each attempt; Newton's method solves each step."""
@@ -117,7 +117,7 @@ class StraightLineCode:
         self.needed.add(sin)
         lines = [f"    double a{k}[{size}], s{k}[{size}], c{k}[{size}];"]
         self.doubles += 3 * size
-        work = Work.join([self._work[angle] for angle in angles if angle in self._work], TURN_LATENCY)
+        work = Work.join([self._work[angle] for angle in angles if angle in self._work], SINE_COSINE_LATENCY)
         for i, (angle, turn) in enumerate(angles.items()):
             lines.append(f"    a{k}[{i}] = {strip_brackets(self._text[angle])};")
             for e in turn:
@@ -150,7 +150,9 @@ class StraightLineCode:
         if parts is not None:
             first, product, rest = parts
             values = [*product.args, rest]
-        work = Work.join([self._work.get(v.number, Work()) for v in values], LATENCIES.get(op, DEFAULT_LATENCY))
+        work = Work.join(
+            [self._work.get(v.number, Work()) for v in values], LATENCY_BY_OPERATION.get(op, DEFAULT_LATENCY)
+        )
         x, *others = (self._text[v.number] for v in values)
         if parts is None:
             self.needed.add(op)
@@ -174,9 +176,10 @@ def _group_angles(results: Sequence[Expression], known: Mapping[int, str]) -> li
     return [groups[k] for k in sorted(groups)]
 
 
-ROW_FIELDS: Final = ("home", "origin", "start", "onward", "corrected", "branch", "certain", "goal", "foreseen")
+SEQUENCE_FIELDS: Final = ("home", "origin", "start", "onward", "corrected", "branch", "certain", "goal", "foreseen")
+"""Fields of :class:`Equations` that hold sequences of expressions."""
 SCALAR_FIELDS: Final = ("size", "determinant", "residual", "near")
-"""Fields of :class:`Equations` that hold sequences of expressions, and single expressions."""
+"""Fields of :class:`Equations` that hold single expressions."""
 
 
 class Substitution:
@@ -201,7 +204,7 @@ class Substitution:
 
     def equations(self, q: Equations, given: Mapping[str, Sequence[Any]]) -> Equations:
         """Substitute inputs in equations, whose known state then is constant."""
-        rows = {name: getattr(q, name) for name in ROW_FIELDS}
+        rows = {name: getattr(q, name) for name in SEQUENCE_FIELDS}
         folded: dict[str, Any] = {name: row and self(row, given) for name, row in rows.items()}
         for name in SCALAR_FIELDS:
             value = getattr(q, name)
@@ -211,7 +214,7 @@ class Substitution:
 
 @dataclass(frozen=True)
 class Routine:
-    """One public function.
+    """One public function of the exported C.
 
     ``outputs``: expressions by argument. ``equations``: solved one after the other. ``state``: values
     for its next call, which reads them as the input ``last``. ``upon``: a function whose body it
@@ -241,7 +244,7 @@ class Routine:
     @property
     def body(self) -> list[Expression]:
         """Results, then flags (1 or 0): closures are satisfied; the assembly mode is certain."""
-        return [*self.results, *holding(self.equations, certain=False), *certainty(self.equations)]
+        return [*self.results, *flag_solved(self.equations, certain=False), *flag_certain(self.equations)]
 
     @property
     def max_operations(self) -> tuple[int, int]:
@@ -250,7 +253,9 @@ class Routine:
         A stream's sample has a further attempt, from the sample before.
         """
         solved = [q for q in self.equations if q.home]
-        step = sum(MAX_ITERATIONS * count(q.correct) + count([*q.begin, *q.onward, *q.step_target]) for q in solved)
+        step = sum(
+            MAX_ITERATIONS * count(q.corrected_state) + count([*q.begin, *q.onward, *q.step_target]) for q in solved
+        )
         rest = count([*self.body, *(e for q in self.equations for e in q.goal)])
         more = len(self.state) > 1
         steps, attempts = (sum(STEPS_PER_ATTEMPT), len(STEPS_PER_ATTEMPT)) if solved else (1, 1)
@@ -397,14 +402,14 @@ static const int @_steps[{len(STEPS_PER_ATTEMPT)}] = {{{steps}}};
 
         :returns: the function's name, and indices into its table ``h`` by the expression's number.
         """
-        work = [*q.begin, *q.onward, *q.correct, *q.step_target]
+        work = [*q.begin, *q.onward, *q.corrected_state, *q.step_target]
         key = tuple(e.number for e in work)
         if key not in self._solvers:
             name = "reach" if q.unknowns != UNKNOWNS else "assembly" if q.near is None else "beside"
             others = sum(known.startswith(name) for known, _ in self._solvers.values())
             name += str(others + 1) if others else ""
             # Compute values that are constant in a step once per step; results reuse those of the last step.
-            step_constants = _find_independent_values((q.unknowns, STATE), q.correct)
+            step_constants = _find_independent_values((q.unknowns, STATE), q.corrected_state)
             self._solvers[key] = name, {e.number: k for k, e in enumerate(step_constants)}
             self._write_solver(name, q, step_constants)
         return self._solvers[key]
@@ -416,7 +421,7 @@ static const int @_steps[{len(STEPS_PER_ATTEMPT)}] = {{{steps}}};
         prepare = self.write_function(f"{name}_ahead", ahead, {}, aim) % "h" if ahead else "(void)h"
         begin = self.write_function(f"{name}_begin", q.begin, known, aim) % "next"
         onward = self.write_function(f"{name}_onward", q.onward, {}) % "next"
-        correct = self.write_function(f"{name}_correct", q.correct, known, aim) % "next"
+        correct = self.write_function(f"{name}_correct", q.corrected_state, known, aim) % "next"
         target = self.write_function(f"{name}_aim", q.step_target, {}) % "aim"
         more = "" if q.near is None else "const double *qd, const double *last, "
         x, x_before = q.unknowns, previous_input_name(q.unknowns)
@@ -425,20 +430,20 @@ static const int @_steps[{len(STEPS_PER_ATTEMPT)}] = {{{steps}}};
 /* Newton's method from the known assembly in so many steps; 0 where it does not get there. */
 static int @_{name}({more}const double *{q.target}, int steps, double *h, double *{x})
 {{
-    double {STATE}[{AT.moving}], aim[{m}], {x_before}[{n}] = {{0.0}}, next[{n + 3}], first = 0.0;
+    double {STATE}[{STATE_INDEX.moving}], aim[{m}], {x_before}[{n}] = {{0.0}}, next[{n + 3}], first = 0.0;
     double part = 0.0, way = 1.0;
     int i, k;
-    {STATE}[{AT.once}] = (steps == 1) ? 1.0 : 0.0;
+    {STATE}[{STATE_INDEX.once}] = (steps == 1) ? 1.0 : 0.0;
     for (i = 0; i < {n}; i++) {{
         {x}[i] = @_{name}_home[i];
     }}
     for (k = 1; k <= steps; k++) {{
         const double left = 1.0 - ((double)k / (double)steps);
         int turn, moving = 1;
-        {STATE}[{AT.part}] = 1.0 - ((left * left) * left);
-        {STATE}[{AT.onward}] = ({STATE}[{AT.part}] - part) / way;
-        way = {STATE}[{AT.part}] - part;
-        part = {STATE}[{AT.part}];
+        {STATE}[{STATE_INDEX.part}] = 1.0 - ((left * left) * left);
+        {STATE}[{STATE_INDEX.onward}] = ({STATE}[{STATE_INDEX.part}] - part) / way;
+        way = {STATE}[{STATE_INDEX.part}] - part;
+        part = {STATE}[{STATE_INDEX.part}];
         {target};
         {prepare};
         if (k == 1) {{
@@ -451,13 +456,13 @@ static int @_{name}({more}const double *{q.target}, int steps, double *h, double
             {x_before}[i] = {x}[i];
             {x}[i] = next[i];
         }}
-        {STATE}[{AT.size}] = first;
+        {STATE}[{STATE_INDEX.size}] = first;
         for (turn = 0; (turn < {MAX_ITERATIONS}) && (moving != 0); turn++) {{
             {correct};
             for (i = 0; i < {n}; i++) {{
                 {q.unknowns}[i] = next[i];
             }}
-            {STATE}[{AT.size}] = next[{n}];
+            {STATE}[{STATE_INDEX.size}] = next[{n}];
             moving = (next[{n + 1}] > 0.0) ? 1 : 0;
             if (!(next[{n + 2}] > 0.0)) {{
                 return 0;

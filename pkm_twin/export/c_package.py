@@ -109,8 +109,6 @@ class Package:
         self.unit = CSource(self.prefix, self.parameters, self.routines)
         self._write_functions()
 
-    # Routines from compiled programs.
-
     def _substitute_numbers(
         self, kernel: Kernel, own: Sequence[Any] | Array = (), **more: Sequence[float]
     ) -> tuple[dict[str, list[Expression]], list[Equations]]:
@@ -429,8 +427,6 @@ class Package:
         """Mass, centre of mass and inertia of the robot's payload."""
         load = self.robot.payload
         return [float(load.mass), *map(float, load.com), *np.ravel(load.inertia).tolist()]
-
-    # The source.
 
     def _write_functions(self) -> None:
         unit = self.unit

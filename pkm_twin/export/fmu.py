@@ -76,8 +76,6 @@ class Fmu:
         self.variables = self._list_variables()
         self.files = self._write_files()
 
-    # Variables.
-
     def _list_variables(self) -> list[Variable]:
         robot, n = self.robot, self.n
         found: list[Variable] = []
@@ -189,8 +187,6 @@ class Fmu:
             text = "entry of the inertia matrix about the centre of mass"
             rows.append(Variable(name, "p", "kg.m2", text, value))
         return rows
-
-    # Files.
 
     def _write_files(self) -> dict[str, str]:
         prefix = self.identifier

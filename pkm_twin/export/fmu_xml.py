@@ -23,7 +23,7 @@ UNITS: Final[dict[str, dict[str, int]]] = {
     "N": {"kg": 1, "m": 1, "s": -2},
     "N.m": {"kg": 1, "m": 2, "s": -2},
 }
-"""Units by the exponents of their base units."""
+"""Exponents of SI base units for each unit."""
 PLAIN_NAME: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 
 

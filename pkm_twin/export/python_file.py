@@ -16,16 +16,16 @@ from pkm_twin.codegen.expressions import PARAMETERS, Expression
 from pkm_twin.codegen.operations import OPERATIONS
 from pkm_twin.codegen.plain import write_function
 from pkm_twin.codegen.program import (
-    AT,
-    LEAST,
     MAX_CONTRACTION,
     MAX_EXTRAPOLATED_CORRECTION,
     MAX_FIRST_CORRECTION,
     MAX_LAST_CORRECTION,
     MAX_RESIDUAL,
     MIN_DETERMINANT_RATIO,
+    MIN_RELATIVE_DETERMINANT,
     STATE,
-    certainty,
+    STATE_INDEX,
+    flag_certain,
     previous_input_name,
 )
 from pkm_twin.export.c99 import Routine, Substitution
@@ -96,7 +96,9 @@ def jit(function):
 def _repeat(step, state):
     return jax.lax.scan(lambda s, _: (step(s), None), state, None, length=CORRECTIONS)[0]
 """
-ONWARD_STATE: Final = f"({', '.join('ahead' if k == AT.onward else '0.0' for k in range(len(AT)))})"
+EXTRAPOLATION_STATE: Final = (
+    f"({', '.join('ahead' if k == STATE_INDEX.onward else '0.0' for k in range(len(STATE_INDEX)))})"
+)
 RUNTIME_CODE: Final = f"""
 
 def _like(value, x):
@@ -169,7 +171,7 @@ def _call(inputs, equations, results, sizes):
                 def step(state):
                     x, size, moving, valid = state
                     *new, now, determinant = correct(**aim, **{{unknowns: x}})
-                    sound = (now < {MAX_CONTRACTION**2!r} * size) & (determinant > {LEAST!r})
+                    sound = (now < {MAX_CONTRACTION**2!r} * size) & (determinant > {MIN_RELATIVE_DETERMINANT!r})
                     if steps == 1 and not certain:
                         sound = sound & ({MIN_DETERMINANT_RATIO**2!r} * now < determinant * determinant)
                     valid = valid & (sound | ~moving)
@@ -177,7 +179,7 @@ def _call(inputs, equations, results, sizes):
                     return x, xp.where(moving, now, size), moving & sound & (now > closed), valid
 
                 if k > 1:
-                    x, before = onward(x, before, {ONWARD_STATE}), x
+                    x, before = onward(x, before, {EXTRAPOLATION_STATE}), x
                 elif start is not None and (steps == 1 or not certain):
                     x = start(**aim)
                 x = tuple(value + zero for value in x)
@@ -272,7 +274,7 @@ def _write_routine(routine: Routine, payload: Mapping[str, Sequence[Any]], prefi
             known[q.unknowns] = len(q.home)
             correct = write_part(f"correct_{k}", q.results)
             # The unknowns of a step and of the one before, and the state of Newton's method.
-            size = {q.unknowns: len(q.home), previous_input_name(q.unknowns): len(q.home), STATE: len(AT)}
+            size = {q.unknowns: len(q.home), previous_input_name(q.unknowns): len(q.home), STATE: len(STATE_INDEX)}
             onward = write_part(f"onward_{k}", q.onward, size)
         home, origin = (tuple(e.value for e in row) for row in (q.home, q.origin))
         certain = q.start is not None and not q.guessed
@@ -281,7 +283,7 @@ def _write_routine(routine: Routine, payload: Mapping[str, Sequence[Any]], prefi
         )
         judged.append(q.residual)
         branches += q.branch
-    own = list(routine.outputs.values()) + ([] if routine.judge is None else [certainty(routine.equations)])
+    own = list(routine.outputs.values()) + ([] if routine.judge is None else [flag_certain(routine.equations)])
     outputs = [e for row in own for e in fold(row, payload)]
     results = write_part("results", [*outputs, *judged, *branches])
     sizes = [len(row) for row in own]

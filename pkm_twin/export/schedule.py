@@ -13,18 +13,19 @@ from typing import Final
 from pkm_twin.codegen.operations import Operation, atan2, inv, sqrt
 
 DEFAULT_LATENCY: Final = 4
-LATENCIES: Final[Mapping[Operation, int]] = {inv: 13, sqrt: 18, atan2: 75}
-TURN_LATENCY: Final = 60
-"""Cycles until a result is available: by default (products, sums), by operation, of sines.
-For x86-64 processors of 2017 to 2023 (Fog, Instruction tables); functions as measured."""
-PER_CYCLE: Final = 2.0
-"""Operations that begin in a cycle, with loads and stores beside them: as measured."""
+"""Cycles until the result of a product or sum is available, on x86-64 processors of 2017 to 2023
+(Fog, Instruction tables)."""
+LATENCY_BY_OPERATION: Final[Mapping[Operation, int]] = {inv: 13, sqrt: 18, atan2: 75}
+SINE_COSINE_LATENCY: Final = 60
+"""Cycles until cosine and sine of an angle are available, as measured."""
+OPERATIONS_PER_CYCLE: Final = 2.0
+"""Operations that begin per cycle, in addition to loads and stores, as measured."""
 
-WINDOW: Final = 120
-"""Statements among which the next one is chosen: with more, intermediate results no longer fit into
-registers, and programs of a thousand statements take longer than unordered ones."""
-PATIENCE: Final = 16
-"""Cycles before its arguments are there that a statement may begin: processors look ahead so far."""
+SCHEDULING_WINDOW: Final = 120
+"""Number of statements among which the next one is chosen: with more, intermediate results no longer
+fit into registers, and programs of a thousand statements take longer than in their first order."""
+LOOK_AHEAD_CYCLES: Final = 16
+"""Cycles by which a statement may begin before its arguments are available, as processors look ahead."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ class Work:
 
 
 def order_work(statements: Sequence[Work]) -> list[int]:
-    """Return the order in which statements begin on a processor that sees ``WINDOW`` of them.
+    """Return the order in which statements begin on a processor that sees ``SCHEDULING_WINDOW`` of them.
 
     The one begins after which the fewest results are kept, so that they stay in registers; or, while
     the longest chain takes longer than all operations that are left, the one of that chain (Goodman
@@ -77,17 +78,17 @@ def order_work(statements: Sequence[Work]) -> list[int]:
     while len(order) < count:
         while first < count and done[first]:
             first += 1
-        ready.update(k for k in range(seen, min(first + WINDOW, count)) if not missing[k])
-        seen = max(seen, min(first + WINDOW, count))
-        hurry = max(chain[k] for k in ready) * PER_CYCLE > left
-        now = max(now, min(since[k] for k in ready) - (0 if hurry else PATIENCE))
-        able = [k for k in ready if since[k] <= now + (0 if hurry else PATIENCE)]
+        ready.update(k for k in range(seen, min(first + SCHEDULING_WINDOW, count)) if not missing[k])
+        seen = max(seen, min(first + SCHEDULING_WINDOW, count))
+        hurry = max(chain[k] for k in ready) * OPERATIONS_PER_CYCLE > left
+        now = max(now, min(since[k] for k in ready) - (0 if hurry else LOOK_AHEAD_CYCLES))
+        able = [k for k in ready if since[k] <= now + (0 if hurry else LOOK_AHEAD_CYCLES)]
         best = max(able, key=lambda k: (0 if hurry else count_freed(k), chain[k], -k))
         order.append(best)
         ready.remove(best)
         done[best] = True
         work = statements[best]
-        begun, busy = max(now, since[best]), work.operations / PER_CYCLE
+        begun, busy = max(now, since[best]), work.operations / OPERATIONS_PER_CYCLE
         now += busy
         left -= work.operations
         for read in work.reads:

@@ -206,14 +206,14 @@ def _compare_recording(r: Recording, bound: float) -> Compared | None:
         """Compute the model's efforts, the smallest ones with the same motion."""
         qd = zero_resting_rates(track.qd, ~track.moves(how), reach)
         efforts = evaluate_loaded(r, inverse_dynamics, track.time, track.q, qd, track.qdd, track.wrench)
-        efforts = efforts + Dahl.remembered(robot.friction, track.q, qd)[0]
+        efforts = efforts + Dahl.bounded_memory_effort(robot.friction, track.q, qd)[0]
         return np.asarray(np.einsum("kij,kj->ki", _project_motion(robot, track.q), efforts), np.float64)
 
     period, every, how = pieces[0].period, how.keep_every, replace(how, keep_every=1)
     sharp: list[dict[str, Array]] = []
     for track in pieces:
         expected, projection = compute_efforts(track), _project_motion(robot, track.q)
-        _, doubt = Dahl.remembered(robot.friction, track.q, track.sure(how))
+        _, doubt = Dahl.bounded_memory_effort(robot.friction, track.q, track.sure(how))
         slack = np.einsum("kij,kj->ki", np.abs(projection), np.where(track.moves(how), doubt, reach))
         measured = np.einsum("kij,kj->ki", projection, track.effort)
         left = beyond_friction(measured - expected, slack > 0.0, slack)

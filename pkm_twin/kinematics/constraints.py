@@ -18,7 +18,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import cross, snapped
 from pkm_twin.codegen.operations import sqrt
 from pkm_twin.machine.graph import BASE, Graph, Joint
-from pkm_twin.machine.joints import UNITS, Constraint, perpendicular_axes
+from pkm_twin.machine.joints import UNIT_VECTORS, Constraint, perpendicular_axes
 from pkm_twin.machine.rotations import rotation_about
 
 ZERO_VECTOR: Final = np.zeros(3)
@@ -100,7 +100,8 @@ def constraint_equations(
     if constraint.kind == "point":
         # [()] makes an array of one expression that expression.
         return [
-            Equation(part, bodies, apart[..., i][()], points, unit, ZERO_VECTOR, scale) for i, unit in enumerate(UNITS)
+            Equation(part, bodies, apart[..., i][()], points, unit, ZERO_VECTOR, scale)
+            for i, unit in enumerate(UNIT_VECTORS)
         ]
     inner = turns[0](constraint.inner)
     if constraint.kind == "angle":

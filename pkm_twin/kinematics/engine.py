@@ -172,12 +172,12 @@ class Engine(Scheme):
 
         :param more: values of these inputs. ``extra``, ``free``: as in :meth:`kernel`.
         """
-        key = self.structure.also(f"{name} {extra}", write, Traced)
+        key = self.structure.extend(f"{name} {extra}", write, Traced)
         numbers = np.concatenate([self.geometry, more])
         made = Kernel(_find_code(key, self, write, more, free=free), numbers)
         if not made.holds:
             # A number that the program treats as a constant differs here: write another program.
-            exact = key.also(f"{self.graph.key} {more.tolist()}")
+            exact = key.extend(f"{self.graph.key} {more.tolist()}")
             made = Kernel(_find_code(exact, self, write, more), numbers)
         return made
 
@@ -297,7 +297,7 @@ _codes: Final[WeakValueDictionary[ProgramKey, Code]] = WeakValueDictionary()
 
 def find_engine(graph: Graph, coordinates: Sequence[Coordinate], start: ClosedFormStart | None = None) -> Engine:
     """Return the engine of a geometry, shared by machines that differ only in inertia or limits."""
-    key = EMPTY.also(f"{graph.key} {coordinates!r} {start!r}")
+    key = EMPTY.extend(f"{graph.key} {coordinates!r} {start!r}")
     engine = _engines.get(key)
     if engine is None:
         engine = _engines.setdefault(key, Engine(graph, coordinates, start=start))

@@ -20,7 +20,7 @@ from pkm_twin.codegen.expressions import Numbers, Objects, snapped, snapped_all
 from pkm_twin.codegen.operations import absolute, maximum, sqrt
 from pkm_twin.kinematics.motion import Columns, Motion, Row, subtract_columns
 from pkm_twin.machine.graph import BASE
-from pkm_twin.machine.joints import UNITS
+from pkm_twin.machine.joints import UNIT_VECTORS
 from pkm_twin.machine.tree import Link, Step, Tree
 
 
@@ -78,7 +78,7 @@ class LimbPose:
         self.closest, self.miss = closest, 0.0
         self.normal: Any = None
         self.slope: Any = None
-        self.ends: tuple[tuple[str, Any], tuple[str, Any]] = (BASE, UNITS[0]), (BASE, UNITS[0])
+        self.ends: tuple[tuple[str, Any], tuple[str, Any]] = (BASE, UNIT_VECTORS[0]), (BASE, UNIT_VECTORS[0])
         if limb.kind == "rod":
             rod = graph.rods[limb.part]
             at, end = rod.ends if rod.inner == limb.tip else rod.ends[::-1]

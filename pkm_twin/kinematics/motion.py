@@ -21,7 +21,7 @@ from pkm_twin.codegen.expressions import Numbers, Objects, cross, snapped_all
 from pkm_twin.codegen.operations import cos, sin, sqrt
 from pkm_twin.kinematics.constraints import Equation, constraint_equations, distance_equation
 from pkm_twin.machine.graph import BASE, Direction, Joint, Rod
-from pkm_twin.machine.joints import UNITS, Constraint
+from pkm_twin.machine.joints import UNIT_VECTORS, Constraint
 from pkm_twin.machine.tree import Step, Tree
 
 Columns = dict[tuple[str, int], Any]
@@ -100,7 +100,7 @@ class Motion:
         start: str = BASE,
     ) -> None:
         self.tree, self.graph = tree, tree.graph
-        self.rotation: dict[str, Any] = {start: UNITS}
+        self.rotation: dict[str, Any] = {start: UNIT_VECTORS}
         self.origin: dict[str, Any] = {start: np.zeros(3)}
         self.lever: dict[str, Any] = {}
         self.axis: dict[int, Any] = {}
@@ -120,7 +120,7 @@ class Motion:
                         lever = link.at + np.array(x[k + 4 : k + 7], dtype=object)
                     continue
                 if step.turns:
-                    own = turned if (step.before == UNITS).all() else turned @ step.before
+                    own = turned if (step.before == UNIT_VECTORS).all() else turned @ step.before
                     self.axis[id(step)] = own[:, 2]
                     if step.circle:
                         c, s = x[step.position], step.sign * x[step.position + 1]
@@ -182,9 +182,9 @@ class Motion:
                 if step.ball or step.free:
                     absolute = True
                     for i in range(3):
-                        out["u", step.rate + i] = cross(UNITS[i], at - origin)
+                        out["u", step.rate + i] = cross(UNIT_VECTORS[i], at - origin)
                         if step.free:
-                            out["u", step.rate + 3 + i] = UNITS[i]
+                            out["u", step.rate + 3 + i] = UNIT_VECTORS[i]
                     continue
                 axis = self.axis[id(step)]
                 column: Any = cross(axis, at - origin) if step.turns else 0.0
@@ -209,7 +209,7 @@ class Motion:
                     out[key] = step.sign * self.axis[id(step)]
                 elif step.ball or step.free:
                     for i in range(3):
-                        out["u", step.rate + i] = UNITS[i]
+                        out["u", step.rate + i] = UNIT_VECTORS[i]
                     return out
         return out
 

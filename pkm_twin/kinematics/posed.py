@@ -32,7 +32,7 @@ from pkm_twin.kinematics.motion import Motion, closure_jacobians, numbers
 from pkm_twin.kinematics.pose import Coordinate
 from pkm_twin.kinematics.scheme import Scheme
 from pkm_twin.machine.graph import BASE, Body, Graph, Joint, array
-from pkm_twin.machine.joints import UNITS, Freedom
+from pkm_twin.machine.joints import UNIT_VECTORS, Freedom
 from pkm_twin.machine.tree import Link, Tree
 
 OPEN_STATES: Final = 4
@@ -97,7 +97,7 @@ class PoseChain:
                 start,
                 end,
                 at,
-                array(UNITS[virtual.axis : virtual.axis + 1]),
+                array(UNIT_VECTORS[virtual.axis : virtual.axis + 1]),
                 actuated=given,
                 home=home,
             )

@@ -12,9 +12,9 @@ from pkm_twin.codegen.expressions import Expression, Numbers, Objects
 from pkm_twin.codegen.lu import SparseLU
 from pkm_twin.codegen.operations import absolute, cos, sin
 from pkm_twin.codegen.program import (
-    AT,
-    LEAST,
+    MIN_RELATIVE_DETERMINANT,
     STATE,
+    STATE_INDEX,
     UNKNOWNS,
     Equations,
     Program,
@@ -300,7 +300,7 @@ def certify_assembly(t: Traced, scheme: PlatformFirstScheme, posed: Traced, q: S
     ends = ((lu.solve(way) - move) * np.array(t.pose_scales, dtype=object) for lu in (at_home, here))
     distance = 0.5 * sum(apart @ apart for apart in ends)
     return [
-        drives - LEAST,
+        drives - MIN_RELATIVE_DETERMINANT,
         MAX_LINEAR_POSE_ERROR * MAX_LINEAR_POSE_ERROR - distance,
         closures * closures - MIN_DETERMINANT_PER_ERROR * MIN_DETERMINANT_PER_ERROR * distance,
     ]
@@ -336,7 +336,7 @@ def iterate_pose(t: Traced, *, rates: bool = False) -> tuple[tuple[Equations, ..
         retracted = motion.retract(state[:size], step[:split])
         return t.lift([*retracted, *(state[size:] + step[split:])])
 
-    onward = tape.inputs(STATE, len(AT))[AT.onward]
+    onward = tape.inputs(STATE, len(STATE_INDEX))[STATE_INDEX.onward]
     way = onward * (everything - tape.inputs(previous_input_name(POSED), len(home)))
     solved = Equations(
         "pose",

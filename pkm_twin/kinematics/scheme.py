@@ -75,7 +75,7 @@ class Scheme(Linkage):
     @cached_property
     def structure(self) -> ProgramKey:
         """Key of everything that programs depend on: machines of the same structure share programs."""
-        return EMPTY.also(
+        return EMPTY.extend(
             repr(
                 (
                     self.graph.topology,

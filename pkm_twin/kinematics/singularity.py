@@ -120,7 +120,7 @@ class KinematicCopy(Motion):
         self.axis: dict[int, Any] = {}
         for link in self.tree.links.values():
             free = link.joint is None
-            at = graph.frame(link.body)[0] if free else self.tree.at[link.body]
+            at = graph.body_scale(link.body)[0] if free else self.tree.at[link.body]
             self.origin[link.body] = motion.point(link.body, at)
             for step in link.steps:
                 if not (step.ball or step.free):
@@ -204,7 +204,7 @@ def _constraint_singularity(t: Traced | _NumericTraced) -> Any:
     unknown = placed.tree.unknown_rates
     if not unknown:
         return 1.0
-    _, radius = placed.graph.frame(placed.graph.platform)
+    _, radius = placed.graph.body_scale(placed.graph.platform)
     errors = [
         {key: v * (radius if row.is_angular else row.scale) for key, v in row.columns.items()}
         for row in placed.closures()
@@ -212,7 +212,7 @@ def _constraint_singularity(t: Traced | _NumericTraced) -> Any:
     ]
     bodies = []
     for name in placed.graph.bodies:
-        centre, reach = placed.graph.frame(name)
+        centre, reach = placed.graph.body_scale(name)
         linear = placed.linear_jacobian(name, placed.point(name, centre))
         turning = placed.angular_jacobian(name)
         bodies += [{k: v[i] for k, v in linear.items()} for i in range(3)]
@@ -228,7 +228,7 @@ def _motion_singularity(t: Traced | _NumericTraced, point: bool) -> Any:
     """
     n, graph = t.joints, weld(t.graph)
     rates = _TwistMatrices(t, graph)
-    tool = (graph.origin, 0.0) if point else graph.frame(graph.platform)
+    tool = (graph.origin, 0.0) if point else graph.body_scale(graph.platform)
     twist = rates.twist_matrix(graph.platform, tool)[: 3 if point else 6]
     table = _gram([{("u", j): v for j, v in enumerate(row)} for row in twist], n)
     lower = {(a, b): table[a, b] for a in range(n) for b in range(a + 1)}
@@ -288,7 +288,7 @@ class _TwistMatrices:
 
         Computed from D, or from S'S and U (T'T)^-1 U', whichever takes fewer operations.
         """
-        frame = self.graph.frame(name)
+        frame = self.graph.body_scale(name)
         columns = list(self.tree_columns(name, frame).items())
         total: Any = 0.0
         if len(columns) > self.n:

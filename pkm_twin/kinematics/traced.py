@@ -22,7 +22,15 @@ from pkm_twin.codegen.expressions import (
     snapped_all,
 )
 from pkm_twin.codegen.lu import SparseLU
-from pkm_twin.codegen.program import AT, LEAST, MAX_GROWTH, STATE, UNKNOWNS, Equations, previous_input_name
+from pkm_twin.codegen.program import (
+    MAX_GROWTH,
+    MIN_RELATIVE_DETERMINANT,
+    STATE,
+    STATE_INDEX,
+    UNKNOWNS,
+    Equations,
+    previous_input_name,
+)
 from pkm_twin.kinematics.drives import LEADS, TOLERANCE_TIME, Drives
 from pkm_twin.kinematics.limb_pose import LimbPose
 from pkm_twin.kinematics.motion import FIXED, BaseMotion, Columns, Motion, Row, closure_jacobians
@@ -166,11 +174,11 @@ class Traced:
             rows[k] = value
         moved = self.motion.retract(self.x, rows)
         before = self.tape.inputs(previous_input_name(self.unknowns_name), len(places))
-        state = self.tape.inputs(STATE, len(AT))
-        onward = [x + state[AT.onward] * (x - last) for x, last in zip(self.unknowns, before, strict=False)]
+        state = self.tape.inputs(STATE, len(STATE_INDEX))
+        onward = [x + state[STATE_INDEX.onward] * (x - last) for x, last in zip(self.unknowns, before, strict=False)]
         if not places:
             # Without unknowns there is no correction: check the result only.
-            branch, determinant = [*branch, *self.lift([determinant - LEAST])], 1.0
+            branch, determinant = [*branch, *self.lift([determinant - MIN_RELATIVE_DETERMINANT])], 1.0
         judged = [self.rows[k] for k in scheme.checked_closures]
         start: Sequence[Any] = []
         if places:

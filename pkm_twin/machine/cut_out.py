@@ -34,8 +34,8 @@ class CutOut:
     carried: tuple[Link, ...]
 
 
-def find_circles(pairs: Mapping[str, tuple[str, str]], base: str, platform: str) -> dict[str, tuple[str, str]]:
-    """Find the joints that are on a circle through the base and the platform, in their order.
+def find_loop_joints(pairs: Mapping[str, tuple[str, str]], base: str, platform: str) -> dict[str, tuple[str, str]]:
+    """Find the joints that are on a path or loop through base and platform, in their order.
 
     :param pairs: bodies of each joint and closure; no joint has the same body at both ends.
     """
@@ -74,7 +74,7 @@ def cut_out(tree: LoopTree, base: str, platform: str, *, carry: bool = False) ->
         raise ParameterError(
             "base", base, f"a link that joints connect to platform {platform!r}, as {', '.join(near[:MAX_NAMES])}"
         )
-    circles = find_circles(pairs, ground, tool)
+    circles = find_loop_joints(pairs, ground, tool)
     kept = {body for pair in circles.values() for body in pair}
     links = {name: link for name, link in tree.links.items() if bodies[name] in kept}
     spanned = {

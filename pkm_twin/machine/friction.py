@@ -24,7 +24,7 @@ Values = Mapping[str, Any]
 """Parameters of a law by key, each a number, an expression or an array."""
 
 MIN_DIVISOR: Final = 1e-9
-"""Smallest divisor, in place of a parameter that is not given, whose law has zero effort then."""
+"""Smallest divisor in a friction law, instead of a missing parameter: the law then has no effort."""
 KNOWN_FRACTION: Final = 0.01
 """A state counts as known when this fraction of the unknown initial state is left: after five
 presliding distances."""
@@ -246,19 +246,19 @@ class Dahl(FrictionLaw):
         return np.asarray(values["coulomb"] * z, np.float64)
 
     @staticmethod
-    def beyond(friction: Any, z: Array, rates: Array) -> Array:
+    def memory_effort(friction: Any, z: Array, rates: Array) -> Array:
         """Return coulomb (z - sign(rate)), the effect of memory on efforts, N m or N, in z's shape."""
         change = friction.coulomb * (z - np.sign(rates))
         return np.where(friction.presliding > 0.0, change, 0.0)
 
     @classmethod
-    def remembered(cls, friction: Any, q: Array, rates: Array) -> tuple[Array, Array]:
-        """Return :meth:`beyond` from an unknown state, and its error bound, shape (k, n) each."""
+    def bounded_memory_effort(cls, friction: Any, q: Array, rates: Array) -> tuple[Array, Array]:
+        """Return :meth:`memory_effort` from an unknown state, and its error bound, shape (k, n) each."""
         if not friction.presliding.any():
             return np.zeros_like(q), np.zeros_like(q)
         memory = cls.states(q, rates, friction.presliding)
         doubt = np.where(friction.presliding > 0.0, friction.coulomb * memory.unknown, 0.0)
-        return cls.beyond(friction, memory.z, rates), doubt
+        return cls.memory_effort(friction, memory.z, rates), doubt
 
 
 LAWS: Final[Mapping[str, type[FrictionLaw]]] = {

@@ -36,15 +36,15 @@ class SizedGraph(Graph):
         """The given rim, m."""
         return self.given[1]
 
-    def frame(self, body: str) -> tuple[Array, Any]:
-        """Return the point, shape (3,), and the length, m, that scale a body; see :class:`Graph`."""
+    def body_scale(self, body: str) -> tuple[Array, Any]:
+        """Return the point, (3,), and length, m, that scale a body's motion, see :class:`Graph`."""
         k = 2 + 4 * self.names.index(body)
         return plain(self.given[k : k + 3]), self.given[k + 3]
 
 
 def list_scale_lengths(graph: Graph) -> list[float]:
     """List the lengths that only scale equations: size, rim, and every body's frame."""
-    frames = [graph.frame(body) for body in graph.bodies]
+    frames = [graph.body_scale(body) for body in graph.bodies]
     return [graph.size, graph.rim, *(v for middle, reach in frames for v in (*middle, reach))]
 
 

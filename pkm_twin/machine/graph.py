@@ -211,7 +211,7 @@ class Graph:
         far = reduce(maximum, [norm(plain(p - self.origin)) for p in points], 0.0)
         return far if reference(far) > 1e-6 * reference(self.size) else 0.1 * self.size
 
-    def frame(self, body: str) -> tuple[Array, float]:
+    def body_scale(self, body: str) -> tuple[Array, float]:
         """Return the point of a body at home and the length, m, that scale its velocity and rotation.
 
         The point, m, is the middle of the body's joints; the length is the distance of the farthest

@@ -273,7 +273,7 @@ class Source:
 
 KINDS: Final[Mapping[str, type]] = {"bodies": BodySpec, "joints": JointSpec, "rods": RodSpec}
 """The three mappings of a graph, and the schemas of their entries."""
-PER_COPY: Final = (["rotor_inertia"], *(["friction", key] for key in list_friction_keys()))
+PER_COPY_KEYS: Final = (["rotor_inertia"], *(["friction", key] for key in list_friction_keys()))
 """Keys of a limb's numbers that may be lists, one number per copy."""
 
 
@@ -365,7 +365,7 @@ def _copy_entry(entry: Any, count: int, path: str) -> list[Any]:
     result = [entry] * count
     if not isinstance(entry, Mapping):
         return result
-    for keys in PER_COPY:
+    for keys in PER_COPY_KEYS:
         value: Any = entry
         for key in keys:
             value = value.get(key) if isinstance(value, Mapping) else None

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import cross, norm, plain, reference, references
 
-UNITS: Final = np.eye(3)
+UNIT_VECTORS: Final = np.eye(3)
 
 
 def unit(vector: ArrayLike) -> Array:
@@ -72,8 +72,8 @@ class Constraint:
     """
 
     kind: str
-    inner: Array = field(default_factory=lambda: UNITS[0])
-    outer: Array = field(default_factory=lambda: UNITS[0])
+    inner: Array = field(default_factory=lambda: UNIT_VECTORS[0])
+    outer: Array = field(default_factory=lambda: UNIT_VECTORS[0])
     axes: tuple[int, int] = (0, 0)
     slide: float = 0.0
 
@@ -108,7 +108,7 @@ class JointType:
         :param axes: unit vectors, shape (count, 3).
         :param pitch: of a screw, m/rad.
         """
-        along = {0: UNITS, 1: np.repeat(axes, len(cls.steps), axis=0)}.get(cls.count, axes)
+        along = {0: UNIT_VECTORS, 1: np.repeat(axes, len(cls.steps), axis=0)}.get(cls.count, axes)
         slides = {"turn": 0.0, "slide": 1.0, "screw": pitch}
         return tuple(
             Freedom(axis, step != "slide", slides[step], cls.count == 2 and k == 1)
@@ -119,7 +119,7 @@ class JointType:
     def directions(cls, axes: Array) -> Array:
         """Return the unit vectors along which loads and compliances are given, shape (3, 3)."""
         if not cls.count:
-            return UNITS
+            return UNIT_VECTORS
         first, other = axes[0], axes[-1]
         if cls.count == 1:
             return np.array([first, *perpendicular_axes(first)])
@@ -134,7 +134,7 @@ class JointType:
 
 CONSTRAINTS: Final[dict[str, Callable[[Array, float], Sequence[Constraint]]]] = {
     "point": lambda _, __: [Constraint("point")],
-    "turns": lambda _, __: [Constraint("angle", UNITS[i], UNITS[(i + 1) % 3]) for i in range(3)],
+    "turns": lambda _, __: [Constraint("angle", UNIT_VECTORS[i], UNIT_VECTORS[(i + 1) % 3]) for i in range(3)],
     "line": lambda axes, _: [Constraint("plane", e) for e in perpendicular_axes(axes[0])],
     "flat": lambda axes, _: [Constraint("plane", axes[0])],
     "direction": lambda axes, _: [Constraint("angle", e, axes[0]) for e in perpendicular_axes(axes[0])],
@@ -221,8 +221,8 @@ class Free(JointType):
     @classmethod
     def freedoms(cls, axes: Array, pitch: float) -> tuple[Freedom, ...]:
         """Return three slides, then three rotations."""
-        slides = (Freedom(axis, turns=False, slide=1.0) for axis in UNITS)
-        return (*slides, *(Freedom(axis) for axis in UNITS))
+        slides = (Freedom(axis, turns=False, slide=1.0) for axis in UNIT_VECTORS)
+        return (*slides, *(Freedom(axis) for axis in UNIT_VECTORS))
 
 
 TYPES: Final = {

@@ -28,7 +28,7 @@ KINDS: Final[Mapping[str, type[JointType]]] = {**TYPES, Free.name: Free}
 """Joint types of description files, with that of a body that only closures hold."""
 WORLD: Final = "world"
 """Name of the root of a tree read from MJCF, SDF or USD."""
-SINGLE: Final = tuple(name for name, kind in TYPES.items() if len(kind.steps) == 1)
+SINGLE_FREEDOM_TYPES: Final = tuple(name for name, kind in TYPES.items() if len(kind.steps) == 1)
 """Joint types of one degree of freedom."""
 
 

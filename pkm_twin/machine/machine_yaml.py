@@ -12,7 +12,7 @@ import yaml
 from pkm_twin.errors import ParameterError, one_line
 
 Path = tuple[str | int, ...]
-WIDTH: Final = 100
+MAX_LINE_WIDTH: Final = 100
 """Longest entry on one line, characters; a longer one has one line per key."""
 HEAD: Final = """\
 # A machine as bodies, joints and rods at its home pose: every vector in base axes at home.
@@ -71,7 +71,7 @@ def describe_machine_yaml(data: Mapping[str, Any], parameters: Sequence[str] = (
                 lines += ["  - ", "".join(entries)[4:]] if listed else entries
         else:
             line, note = f"{key}: {_write_flow(data[key])}", NOTES.get(key, "")
-            if len(line) + len(note) > WIDTH and note:
+            if len(line) + len(note) > MAX_LINE_WIDTH and note:
                 line, note = f"# {note}\n{line}", ""
             lines.append(f"{line}  # {note}\n" if note else f"{line}\n")
     if "pose" not in data:
@@ -83,7 +83,7 @@ def describe_machine_yaml(data: Mapping[str, Any], parameters: Sequence[str] = (
 def _write_entry(name: object, value: Any, indent: str) -> str:
     """Write an entry in one line if it fits, else one line per key."""
     line = f"{indent}{_write_flow(name)}: {_write_flow(value)}"
-    if not isinstance(value, Mapping) or len(line) <= WIDTH:
+    if not isinstance(value, Mapping) or len(line) <= MAX_LINE_WIDTH:
         return line + "\n"
     inner = "".join(_write_entry(key, item, indent + "  ") for key, item in value.items())
     return f"{indent}{_write_flow(name)}:\n{inner}"

@@ -6,12 +6,12 @@ from __future__ import annotations
 import re
 from typing import Final
 
-from pkm_twin.machine.joints import UNITS, Free, Freedom, name_single_freedoms
+from pkm_twin.machine.joints import UNIT_VECTORS, Free, Freedom, name_single_freedoms
 from pkm_twin.machine.tree import Tree
 
-FREE_BODY: Final = Free.freedoms(UNITS, 0.0)
+FREE_BODY: Final = Free.freedoms(UNIT_VECTORS, 0.0)
 """Freedoms of a body that only closures hold."""
-FREE_ROD: Final = (Freedom(UNITS[0]), Freedom(UNITS[1]))
+FREE_ROD: Final = (Freedom(UNIT_VECTORS[0]), Freedom(UNIT_VECTORS[1]))
 """Freedoms of a rod about its inner end, if it lies along z."""
 
 

@@ -31,7 +31,7 @@ class Pose:
         return Pose(self.rotation.T, -self.rotation.T @ self.position)
 
 
-def about(axis: Array, angle: ArrayLike) -> Array:
+def axis_rotation(axis: Array, angle: ArrayLike) -> Array:
     """Return rotations by angles (...,), rad, about a unit vector (3,), shape (..., 3, 3)."""
     across = skew(np.asarray(axis, np.float64))
     sine, rest = np.sin(angle)[..., None, None], 1.0 - np.cos(angle)[..., None, None]
@@ -68,7 +68,7 @@ def from_rpy(angles: Array) -> Array:
     """Return the rotation of roll, pitch and yaw (3,), rad."""
     roll, pitch, yaw = angles
     x, y, z = np.eye(3)
-    rotation: Array = about(z, yaw) @ about(y, pitch) @ about(x, roll)
+    rotation: Array = axis_rotation(z, yaw) @ axis_rotation(y, pitch) @ axis_rotation(x, roll)
     return rotation
 
 

@@ -195,7 +195,7 @@ class Tree:
         graph = self.graph
         if name is None:
             # A point of the geometry, which programs have at run time; a centre of mass is none.
-            at = graph.origin if body == graph.platform else graph.frame(body)[0]
+            at = graph.origin if body == graph.platform else graph.body_scale(body)[0]
             backwards, actuated = False, False
             freedoms: tuple[Freedom, ...] = ()
             start: tuple[float, ...] = FREE

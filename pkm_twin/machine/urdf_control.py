@@ -25,7 +25,7 @@ from pkm_twin.machine.urdf_xml import UNLIMITED
 
 MODEL: Final = "_model"
 """Suffix of a joint of the tree whose own name is the controller's name of a drive."""
-MARKS: Final = ("ros2_control", "transmission", "independent", "plugin")
+ACTUATION_MARKS: Final = ("ros2_control", "transmission", "independent", "plugin")
 """What marks actuated joints after a YAML file's name_mot: the first that names any counts."""
 ACTUATED_OPTION: Final = "`actuated=[...]` or --actuated"
 """Words of errors for the ways to name the actuated joints."""
@@ -52,7 +52,7 @@ def read_companion_yaml(path: Path) -> dict[str, Any]:
 
 
 def list_marked_joints(top: ET.Element, mark: str) -> list[str]:
-    """List the joints that are actuated by one of :data:`MARKS`, in the order of the file."""
+    """List the joints that are actuated by one of :data:`ACTUATION_MARKS`, in the order of the file."""
     if mark == "plugin":
         moving = re.compile(r"(ApplyJointForce|Joint(Position|Trajectory|Force)?Controller)$")
         plugins = [plugin for plugin in top.iter("plugin") if moving.search(plugin.get("name") or "")]
@@ -88,7 +88,7 @@ def find_marked(
     ways += "" if others is None else "; or by an <effort> in its <limit>"
     if names := [str(name) for name in beside.get("name_mot", [])]:
         return names, "name_mot", ways
-    for mark in MARKS:
+    for mark in ACTUATION_MARKS:
         if names := list_marked_joints(top, mark):
             return names, mark, ways
     return others or (), "limit.effort", ways
@@ -186,7 +186,7 @@ class Control:
     offset: float
 
     @property
-    def same(self) -> bool:
+    def matches_model(self) -> bool:
         """True if the controller has the same name and numbers as the model."""
         return self == Control(self.joint, self.joint, factor=1.0, offset=0.0)
 
@@ -212,7 +212,7 @@ class Control:
 def tree_names(joints: Iterable[str], controls: Iterable[Control]) -> dict[str, str]:
     """Return the names that joints of the tree have in a URDF with these drives."""
     names = list(joints)
-    drives = {control.name for control in controls if not control.same}
+    drives = {control.name for control in controls if not control.matches_model}
     taken = drives.union(names)
     return {name: urdf_xml.free_name(name + MODEL, taken, MODEL) if name in drives else name for name in names}
 

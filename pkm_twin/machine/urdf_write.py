@@ -27,13 +27,15 @@ from pkm_twin.machine.urdf_xml import UNLIMITED
 
 GROUND: Final = "base_link"
 """The root link's name."""
-MOCK: Final = "mock_components/GenericSystem"
-"""The hardware of ros2_control that needs none."""
+MOCK_HARDWARE: Final = "mock_components/GenericSystem"
+"""The ros2_control plugin that simulates ideal hardware."""
 PLATFORM: Final = "platform"
 """The link that stands on the platform's reference point."""
 
 
-def write_urdf(tree: LoopTree, hardware: str = MOCK, prefix: str = "", controls: Iterable[Control] = ()) -> str:
+def write_urdf(
+    tree: LoopTree, hardware: str = MOCK_HARDWARE, prefix: str = "", controls: Iterable[Control] = ()
+) -> str:
     """Write the URDF of a tree.
 
     The root is ``base_link``; ``platform`` is a link without mass on the reference point, fixed
@@ -64,7 +66,7 @@ def write_urdf(tree: LoopTree, hardware: str = MOCK, prefix: str = "", controls:
     for closure in tree.closures:
         _write_closure(robot, closure, places)
     for part in parts:
-        if part.name not in drives or drives[part.name].same:
+        if part.name not in drives or drives[part.name].matches_model:
             continue
         # The controller's joint, with a link without mass; the tree's joint follows it.
         control = drives[part.name]
@@ -153,7 +155,7 @@ def _write_joint(robot: ET.Element, part: Single, places: Mapping[str, Array]) -
     if part.kind == "prismatic":
         xyz = xyz - part.axis * part.home
     elif part.kind == "revolute":
-        rpy = rotations.to_rpy(rotations.about(part.axis, -part.home))
+        rpy = rotations.to_rpy(rotations.axis_rotation(part.axis, -part.home))
     ET.SubElement(element, "origin", xyz=number_text(xyz), rpy=number_text(rpy))
     ET.SubElement(element, "parent", link=part.parent)
     ET.SubElement(element, "child", link=part.child)

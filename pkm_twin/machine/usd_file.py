@@ -20,7 +20,7 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, warn_of_file, write_install_command
 from pkm_twin.machine.loop_tree import WORLD, Fault, Joint, Link, LoopTree, hold_in_world, order_from_root, span_tree
-from pkm_twin.machine.rotations import Pose, about, from_quaternion
+from pkm_twin.machine.rotations import Pose, axis_rotation, from_quaternion
 from pkm_twin.machine.urdf_control import UNCOUPLED_JOINTS, list_actuated_joints
 
 SUFFIXES: Final = (".usd", ".usda", ".usdc")
@@ -289,7 +289,7 @@ class _Reader:
             else:
                 along = first.rotation.T @ own
                 value = _value_between(joint.kind, along, first, second)
-                apart = Pose(about(along, value)) if joint.kind == "revolute" else Pose(position=value * along)
+                apart = Pose(axis_rotation(along, value)) if joint.kind == "revolute" else Pose(position=value * along)
             target = first @ apart
             miss = np.linalg.norm(target.position - second.position)
             turned = np.abs(target.rotation - second.rotation).max()

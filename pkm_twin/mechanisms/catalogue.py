@@ -12,7 +12,7 @@ from typing import Any, Final
 from pkm_twin.errors import ParameterError, UnknownNameError, one_line, warn_of_file
 from pkm_twin.machine import usd_file
 from pkm_twin.machine.strict_yaml import read_yaml
-from pkm_twin.robot.plausibility import findings
+from pkm_twin.robot.plausibility import find_implausible_numbers
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.urdf_read import UrdfSelection, read_tree
 
@@ -116,7 +116,7 @@ def load(
 def _warn_of_implausible(path: Path, robot: Robot) -> Robot:
     """Return the robot, after a warning of each implausible number in a user's file."""
     if path.parent != config_folder():
-        for finding in findings(robot):
+        for finding in find_implausible_numbers(robot):
             warn_of_file(path, finding.text)
     return robot
 

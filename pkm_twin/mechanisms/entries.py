@@ -78,11 +78,11 @@ def edit_robot_text(robot: Robot, source: str, values: Mapping[str, Fitted | Cho
 
 
 def write_edited(path: Path, head: Sequence[str], text: str, before: Robot) -> list[str]:
-    """Write a robot's file under a comment, atomically; return the expressions that are lost.
+    """Write a robot's file with a head comment, atomically; return the lost expressions.
 
     :param before: the robot of the file that was edited.
-    :returns: what the text has lost of its expressions, in lines, which the head has too.
-    :raises PkmTwinError: not writable, or numbers that no robot may have.
+    :returns: lines that describe the expressions lost by the edit; the comment has them, too.
+    :raises PkmTwinError: the file is not writable, or its numbers are not a valid robot.
     """
     try:
         after = robot_of_data(parse_yaml(text, str(path)), path.stem)

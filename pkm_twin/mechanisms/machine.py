@@ -31,7 +31,7 @@ from pkm_twin.machine.friction import list_unshareable_laws
 from pkm_twin.machine.graph import Graph
 from pkm_twin.machine.graph_file import (
     KINDS,
-    PER_COPY,
+    PER_COPY_KEYS,
     BodySpec,
     JointSpec,
     Limb,
@@ -68,10 +68,10 @@ from pkm_twin.robot.robot_urdf import robot_description
 M = TypeVar("M", bound="Machine")
 
 MAX_JOINTS: Final = 12
-"""Most actuated joints."""
-_ELASTIC: Final = (("bodies", "member"), ("joints", "compliance"), ("rods", "section"), ("rods", "radius"))
+"""Largest number of actuated joints of a machine."""
+_ELASTIC_KEYS: Final = (("bodies", "member"), ("joints", "compliance"), ("rods", "section"), ("rods", "radius"))
 """Elastic keys, which a graph does not have, by the kind of their entry."""
-_GEOMETRY: Final = ("at", "axis", "axes", "ends", "azimuths")
+_GEOMETRY_KEYS: Final = ("at", "axis", "axes", "ends", "azimuths")
 """Keys of places and directions."""
 
 
@@ -306,7 +306,7 @@ class Machine(TwinRobot):
                 yield kind, name, ("azimuth",), source.azimuth
             if keys[:own] == list(source.path):
                 where = keys[own:]
-                listed = where[:-1] in PER_COPY
+                listed = where[:-1] in PER_COPY_KEYS
                 if listed and where.pop() != source.copy:
                     continue
                 yield kind, name, tuple(where), source.azimuth
@@ -415,13 +415,13 @@ class Machine(TwinRobot):
 
     @cached_property
     def passive_limits(self) -> tuple[PassiveLimit, ...]:
-        """Positions and swivels of joints that are not actuated, and of rods at both ends."""
+        """Limits of positions and swivels of passive joints, and of swivels at both ends of rods."""
         return find_passive_limits(self.graph, self.specs)
 
     def elastic_entries(self) -> dict[str, dict[str, dict[str, Any]]]:
         """Return members of bodies, sections and radii of rods, compliances of joints, for a file."""
         told: dict[str, dict[str, dict[str, Any]]] = {kind: {} for kind in KINDS}
-        for kind, word in _ELASTIC:
+        for kind, word in _ELASTIC_KEYS:
             for name, spec in self.specs[kind].items():
                 value = drop_missing(schema.plain(getattr(spec, word)))
                 if value is not None:
@@ -491,7 +491,7 @@ def _remove_rounding(
         """Yield the numbers of points and directions in a file's data, as text."""
         if isinstance(part, Mapping):
             for key, one in part.items():
-                yield from list_numbers(one, inside or key in _GEOMETRY)
+                yield from list_numbers(one, inside or key in _GEOMETRY_KEYS)
         elif isinstance(part, (list, tuple)):
             for one in part:
                 yield from list_numbers(one, inside)

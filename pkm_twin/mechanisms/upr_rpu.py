@@ -62,7 +62,7 @@ FREE_AXES: Final = {
     "rpu_revolute": (3,),
 }
 """Entries of each joint's compliance that are free axes."""
-_ENTRIES: Final = ("along u", "along v", "along w", "about u", "about v", "about w")
+_COMPLIANCE_DIRECTIONS: Final = ("along u", "along v", "along w", "about u", "about v", "about w")
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,9 +113,9 @@ class JointsCompliance:
             for i, value in enumerate(getattr(self, joint).tolist()):
                 field = f"{path}.{joint}[{i}]"
                 if i in free and value != math.inf:
-                    raise ParameterError(field, value, f".inf: the joint turns {_ENTRIES[i]}")
+                    raise ParameterError(field, value, f".inf: the joint turns {_COMPLIANCE_DIRECTIONS[i]}")
                 if i not in free and not value <= 1.0:
-                    raise ParameterError(field, value, f"0 to 1: the joint carries load {_ENTRIES[i]}")
+                    raise ParameterError(field, value, f"0 to 1: the joint carries load {_COMPLIANCE_DIRECTIONS[i]}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,9 +262,9 @@ class UprRpu(TwinRobot):
         return self.geometry.platform_radius, self.geometry.base_radius
 
     def chosen_home(self) -> float:
-        """Length of the limbs at home, m: the middle of their limits, if the platform hangs then.
+        """Length of the limbs at home, m: the middle of their limits, if the platform is below the base.
 
-        Else that at 1.5 times the greater radius below the base.
+        Otherwise the length with the platform 1.5 times the larger radius below the base.
         """
         a, b = self._radii
         aside, middle = abs(a - b), shared_middle(self.limits.position)

@@ -125,7 +125,7 @@ def compute_model_efforts(m: Recording) -> Array:
     (q, _, qdd, wrench), rates, made = m.motion, _zero_resting_rates(m), np.empty_like(m.q)
     for robot, part in split_by_load(m.robot, m.load, m.time, SAMPLES_PER_BLOCK):
         made[part] = inverse_dynamics(robot, q[part], rates[part], qdd[part], wrench[part])
-    return made + Dahl.remembered(m.robot.friction, q, rates)[0]
+    return made + Dahl.bounded_memory_effort(m.robot.friction, q, rates)[0]
 
 
 def zero_resting_motion(m: Recording) -> Recording:
@@ -231,7 +231,7 @@ def tabulate_torques(m: Recording, progress: Callable[[int], None] | None = None
     told = m.efforts == "measured" or (m.efforts == "effort" and m.bag is None)
     outside, _ = beyond_limits(m.robot, q, qd)
     rates = _zero_resting_rates(m)
-    memory = Dahl.remembered(m.robot.friction, q, rates)[0]
+    memory = Dahl.bounded_memory_effort(m.robot.friction, q, rates)[0]
     for robot, part in split_by_load(m.robot, m.load, m.time, SAMPLES_PER_BLOCK):
         begin = part.start
         state = (robot, q[part], rates[part], qdd[part], wrench[part])

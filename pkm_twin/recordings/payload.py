@@ -17,7 +17,7 @@ from pkm_twin.errors import BagError, ParameterError
 from pkm_twin.files import parse_numbers
 from pkm_twin.machine.sections import of_mass
 from pkm_twin.recordings.tables import PAYLOAD, Table
-from pkm_twin.robot.plausibility import payload_findings
+from pkm_twin.robot.plausibility import check_payload_mass
 from pkm_twin.robot.robot import Robot
 
 SOURCES = {"bag": "recording", "table": "table, as sampled", "path": "path's waypoints"}
@@ -94,7 +94,7 @@ class Load:
             of all moving parts.
         """
         loaded = robot.changed(payload=of_mass(self.mass if mass is None else mass, self.com))
-        for finding in payload_findings(loaded):
+        for finding in check_payload_mass(loaded):
             raise ParameterError(finding.field, finding.value, f"{finding.bound:.4g} kg or less: {finding.likely}")
         return loaded
 

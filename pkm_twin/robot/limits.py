@@ -20,7 +20,7 @@ ROUNDING: Final = 1e-9
 
 
 @dataclass(frozen=True)
-class Beyond:
+class LimitViolation:
     """The position, velocity or effort of a joint that is farthest outside its range in a motion.
 
     ``index``: its sample; None for a single joint state.
@@ -55,7 +55,7 @@ def list_limits(robot: Robot) -> Iterator[tuple[str, Array, Array, list[str]]]:
 
 def beyond_limits(
     robot: Robot, q: ArrayLike, qd: ArrayLike | None = None, effort: ArrayLike | None = None
-) -> tuple[NDArray[np.bool_], list[Beyond]]:
+) -> tuple[NDArray[np.bool_], list[LimitViolation]]:
     """Return which joint states are outside the limits, shape (...), and the farthest of each joint.
 
     q, qd, effort: shape (..., n), rad or m, per s, N m or N; at most one leading axis.
@@ -79,11 +79,11 @@ def beyond_limits(
                 value = float(values[quantity].reshape(rows.shape)[worst, i])
                 at = None if single else worst
                 bounds = float(low[i]), float(high[i])
-                found.append(Beyond(name, quantity, value, *bounds, units[i], at))
+                found.append(LimitViolation(name, quantity, value, *bounds, units[i], at))
     return outside, found
 
 
-def find_first_beyond(robot: Robot, q: Array, *, actuated: bool = True) -> Beyond | None:
+def find_first_beyond(robot: Robot, q: Array, *, actuated: bool = True) -> LimitViolation | None:
     """Find the first of positions (p, n) where a joint, passive or not, is beyond its limit.
 
     Errors as ``robot.forward``.
@@ -97,7 +97,7 @@ def find_first_beyond(robot: Robot, q: Array, *, actuated: bool = True) -> Beyon
             row = int(bad.any(1).argmax())
             k = int(excess[row].argmax())
             low, high = bounds[k].tolist()
-            return Beyond(names[k], "position", float(values[row, k]), low, high, units[k], row)
+            return LimitViolation(names[k], "position", float(values[row, k]), low, high, units[k], row)
     return None
 
 
@@ -117,7 +117,7 @@ def _list_bounded(
         yield [one.joint for one in passive], passive_values(robot, q), bounds, units
 
 
-def reject_beyond_limits(found: list[Beyond], where: str = "") -> None:
+def reject_beyond_limits(found: list[LimitViolation], where: str = "") -> None:
     """Reject a motion if :func:`beyond_limits` found a joint outside its limits.
 
     :param where: name of the recording, if there are several.

@@ -26,16 +26,16 @@ class FileNumbers:
     """A function from numbers of a robot's file to results.
 
     :param paths: dotted paths of the numbers, as in :meth:`Robot.numbered`.
-    :param of: returns the results of a robot, numbers or expressions.
+    :param compute: returns the results of a robot, numbers or expressions.
     :raises ParameterError: an unknown path.
     """
 
-    def __init__(self, robot: Robot, paths: Sequence[str], of: Callable[[Robot], Sequence[Any]]) -> None:
+    def __init__(self, robot: Robot, paths: Sequence[str], compute: Callable[[Robot], Sequence[Any]]) -> None:
         tape = Tape([robot.number(path) for path in paths])
         given = tape.inputs(GEOMETRY, len(paths))
         made = robot.numbered(dict(zip(paths, given, strict=True)))
         self._given = list(given)
-        self._results: list[Expression] = [tape.lift(value) for value in of(made)]
+        self._results: list[Expression] = [tape.lift(value) for value in compute(made)]
         _, self._run = compile_functions(self._results, {GEOMETRY: len(paths)})
 
     @cached_property
@@ -81,14 +81,14 @@ class CauseSlopes:
 
     ``chosen``: indices of the results that change; ``slopes``: shape (chosen, causes).
 
-    :param of: as in :class:`FileNumbers`.
+    :param compute: as in :class:`FileNumbers`.
     """
 
-    def __init__(self, robot: Robot, of: Callable[[Robot], Sequence[Any]]) -> None:
+    def __init__(self, robot: Robot, compute: Callable[[Robot], Sequence[Any]]) -> None:
         causes = robot.causes.values()
         paths = tuple(dict.fromkeys(path for cause in causes for path in cause))
         steps = np.array([[cause.get(path, 0.0) for cause in causes] for path in paths])
-        table = FileNumbers(robot, paths, of).slopes @ steps.reshape(len(paths), len(causes))
+        table = FileNumbers(robot, paths, compute).slopes @ steps.reshape(len(paths), len(causes))
         chosen = np.flatnonzero(table.any(1))
         self.chosen: tuple[int, ...] = tuple(chosen.tolist())
         self.slopes: Array = table[chosen]

@@ -165,7 +165,7 @@ def _half_hull(flat: Array, order: NDArray[np.int64]) -> list[int]:
 
 
 def base_face(graph: Graph) -> Array:
-    """Return the corners of the plate under the base's joints, without slides, which have rails."""
+    """Return the corners of the plate under the base's joints; slides, drawn as rails, are left out."""
     return find_plate_corners(list(_iterate_fixed_points(graph, BASE)))
 
 

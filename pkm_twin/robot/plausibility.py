@@ -20,7 +20,7 @@ from pkm_twin.machine.graph import BASE, Graph, Joint, map_welded_bodies
 from pkm_twin.machine.members import RigidError
 from pkm_twin.robot.robot import Robot
 
-EXTENTS: Final = (2e-3, 20.0)
+EXTENT_BOUNDS: Final = (2e-3, 20.0)
 """Bounds of a machine's extent, m; outside them its lengths were probably meant in another unit."""
 
 
@@ -47,7 +47,7 @@ class Finding:
         return f"{self.field}: {self.quantity} {numbers}, {side} {bound}: {self.likely}"
 
 
-def findings(robot: Robot) -> tuple[Finding, ...]:
+def find_implausible_numbers(robot: Robot) -> tuple[Finding, ...]:
     """Return the implausible numbers of a robot."""
     graph = robot.graph
     found = [
@@ -55,7 +55,7 @@ def findings(robot: Robot) -> tuple[Finding, ...]:
         *_check_masses(robot, graph),
         *_check_bodies(robot, graph),
         *_check_drives(robot, graph),
-        *gravity_findings(robot),
+        *check_gravity(robot),
         *_check_members(robot, graph),
         *_check_home(graph),
     ]
@@ -91,7 +91,7 @@ def _check_size(graph: Graph) -> Iterator[Finding]:
         "geometry",
         "extent of the machine",
         _extent(graph),
-        EXTENTS,
+        EXTENT_BOUNDS,
         "m",
         ("lengths in another unit than metres?", "lengths in millimetres?"),
     )
@@ -104,7 +104,7 @@ def _check_masses(robot: Robot, graph: Graph) -> Iterator[Finding]:
     # All masses over the cube of the extent: at most between solid aluminium and steel. Grams or tonnes
     # change it a thousandfold. Lengths in another unit are reported alone.
     extent = _extent(graph)
-    density = total / extent**3 if EXTENTS[0] <= extent <= EXTENTS[1] else 0.0
+    density = total / extent**3 if EXTENT_BOUNDS[0] <= extent <= EXTENT_BOUNDS[1] else 0.0
     whole = f"{total:.4g} kg in all; masses in"
     yield from _check_bounds(
         "masses",
@@ -125,10 +125,10 @@ def _check_masses(robot: Robot, graph: Graph) -> Iterator[Finding]:
             "kg",
             "left out? then torques lack its weight and inertia",
         )
-    yield from payload_findings(robot)
+    yield from check_payload_mass(robot)
 
 
-def payload_findings(robot: Robot) -> Iterator[Finding]:
+def check_payload_mass(robot: Robot) -> Iterator[Finding]:
     """Yield a finding if the payload is too heavy for the machine."""
     total, mass = _sum_mass(robot.graph), robot.payload.mass
     if total > 0.0:
@@ -197,7 +197,7 @@ def _check_drives(robot: Robot, graph: Graph) -> Iterator[Finding]:
             yield from _check_maximum(f"{name}: rotor_inertia", what, weight, 100.0 * total, "kg", likely)
 
 
-def gravity_findings(robot: Robot) -> Iterator[Finding]:
+def check_gravity(robot: Robot) -> Iterator[Finding]:
     """Return an implausible gravity."""
     size = float(np.linalg.norm(robot.gravity))
     times = f"{size / 9.81:.4g} times the Earth's; in mm/s2 or cm/s2?"

@@ -20,7 +20,7 @@ from pkm_twin.errors import ParameterError
 from pkm_twin.files import parse_decimal
 from pkm_twin.robot.robot import Robot
 
-ANGLES: Final = np.array([210.0, 330.0, 90.0])
+TOWER_ANGLES: Final = np.array([210.0, 330.0, 90.0])
 """Nominal angles of the towers, degrees."""
 G33_ANGLES: Final = {"x": 210, "y": 330, "z": 90, "yz": 30, "zx": 150, "xy": 270}
 """Angles of the points that G33 reports, degrees; c is the centre."""
@@ -99,7 +99,7 @@ def convert_to_printer(robot: Robot) -> Printer:
     if not (own.factors == 1.0).all():
         raise ParameterError("joint_map", own.factors.tolist(), "ratios and signs of 1")
     angles = np.degrees(g.angles)
-    angles = (angles - angles[2] + ANGLES[2]) % 360.0
+    angles = (angles - angles[2] + TOWER_ANGLES[2]) % 360.0
     none = np.zeros((0, 4))
     return Printer(1e3 * g.radius, angles, 1e3 * g.arm_lengths, -1e3 * own.offsets, none, none)
 
@@ -119,7 +119,7 @@ def write_configuration(printer: Printer, firmware: Firmware) -> str:
                 f"position_endstop: {above[k]:.6f}",
             ]
         return "\n".join([*lines, ""])
-    trims = (printer.angles - ANGLES + 180.0) % 360.0 - 180.0
+    trims = (printer.angles - TOWER_ANGLES + 180.0) % 360.0 - 180.0
     turned = " ".join(f"{axis}{trim:.4f}" for axis, trim in zip("XYZ", trims, strict=True))
     if firmware is Firmware.REPRAPFIRMWARE:
         height = float(above.mean())
@@ -158,7 +158,7 @@ def read_printer(text: str, firmware: Firmware | None, probe_radius: float | Non
             raise ParameterError(f"M665 {word}", None, f"M665 with {word}, the {what}, in the log")
     arms, radius = np.resize(m665["L"], 3), m665["R"][0]
     trims = np.array([m666.get(axis, [0.0])[0] for axis in "XYZ"])
-    angles, height = ANGLES.copy(), m665.get("H", [0.0])[0]
+    angles, height = TOWER_ANGLES.copy(), m665.get("H", [0.0])[0]
     if firmware is Firmware.SMOOTHIEWARE:
         height = m665.get("Z", [0.0])[0]
     else:
@@ -290,7 +290,7 @@ def _read_klipper(text: str) -> Printer:
     radius = _read_number(sections["printer"]["delta_radius"], "delta_radius")
     arms = np.array([read_stepper_value(k, "arm_length") for k in range(3)])
     angles = np.array(
-        [_read_number(s["angle"], "angle") if "angle" in s else a for s, a in zip(steppers, ANGLES, strict=True)]
+        [_read_number(s["angle"], "angle") if "angle" in s else a for s, a in zip(steppers, TOWER_ANGLES, strict=True)]
     )
     ends = np.array([read_stepper_value(k, "position_endstop") for k in range(3)])
     ends = ends + _find_carriage_heights(arms, radius, "arm_length")

@@ -51,7 +51,7 @@ def reject_poses(
         raise SingularityError("pose", index, 0.0, SINGULARITY_BOUND, reached, question=question)
     if met:
         raise SingularityError("pose", index, 0.0, SINGULARITY_BOUND, None, True, question)
-    # How much of the straight line from home is reached: three refinements by 64.
+    # Find the reached fraction of the straight line from home, in three refinements by 64.
     home, low, high = engine.home_pose, 0.0, 1.0
     for _ in range(3):
         fractions = np.linspace(low, high, 65)

@@ -60,7 +60,7 @@ class Robot(Mechanism):
         return find_engine(graph, self.coordinates, self.start)
 
     @cached_property
-    def _massive_engine(self) -> Engine:
+    def _engine_with_friction_laws(self) -> Engine:
         return self._make_engine(self.with_friction_laws(self.graph)) if self.laws else self.engine
 
     @cached_property
@@ -119,7 +119,7 @@ class Robot(Mechanism):
 
     @property
     def _layout(self) -> Layout:
-        return Layout(self._massive_engine.tree)
+        return Layout(self._engine_with_friction_laws.tree)
 
     def massive(self) -> Engine:
         """Return the engine of a robot with masses, whose programs include the friction laws.
@@ -128,7 +128,7 @@ class Robot(Mechanism):
         """
         if getattr(self, "inertia", True) is None:
             raise ParameterError("inertia", None, "a section with the masses and inertias")
-        return self._massive_engine
+        return self._engine_with_friction_laws
 
     @property
     def has_masses(self) -> bool:

@@ -23,7 +23,7 @@ from pkm_twin.machine.places import has_entry, join_path
 from pkm_twin.machine.rotations import Pose
 from pkm_twin.machine.sdf_write import write_sdf
 from pkm_twin.machine.urdf_control import Control, tree_names
-from pkm_twin.machine.urdf_write import GROUND, MOCK, PLATFORM, write_urdf
+from pkm_twin.machine.urdf_write import GROUND, MOCK_HARDWARE, PLATFORM, write_urdf
 from pkm_twin.robot.mechanism import FREE_FALL
 from pkm_twin.robot.outline import list_bars
 from pkm_twin.robot.robot import Robot
@@ -32,7 +32,7 @@ PAYLOAD: Final = "payload"
 """The link of a payload, apart from the platform's."""
 
 
-def robot_urdf(robot: Robot, hardware: str = MOCK, prefix: str = "") -> str:
+def robot_urdf(robot: Robot, hardware: str = MOCK_HARDWARE, prefix: str = "") -> str:
     """Write the robot as a URDF that parsers of trees read, see docs/urdf.md.
 
     Its joints are ``robot.joint_names`` and ``robot.passive_joints``; with their values the link

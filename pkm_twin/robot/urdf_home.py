@@ -37,7 +37,7 @@ from pkm_twin.machine.rotations import Pose, rotation_about, rotation_vector
 from pkm_twin.machine.tree import Tree
 
 MAX_ITERATIONS: Final = 100
-"""Most corrections of one closing, and most steps towards the zeros."""
+"""Largest number of corrections to close the loops, and of steps towards the joints' zeros."""
 RANK_BOUNDS: Final = (1e-4, 1e-6, 1e-8)
 """Singular values below this part of the largest count as zero; the next one if loops stay open."""
 MAX_LOOP_GAP: Final = 1e-9
@@ -234,10 +234,10 @@ class Assembly:
                 values, miss = other, less
         self.place(values)
         if miss > self.closed:
-            raise self.open_loop()
+            raise self.open_loop_error()
         return values, miss
 
-    def open_loop(self) -> ParameterError:
+    def open_loop_error(self) -> ParameterError:
         """Return the error of the loop that is open farthest at the placed values."""
         closure = max(self.tree.closures, key=lambda one: max(abs(float(e.value)) for e in self._write_equations(one)))
         a, b = (self.frame(closure, end) for end in (0, 1))
@@ -411,7 +411,7 @@ class HomeSearch:
             # A drawing that is open by the rounding of some numbers is not meant to be another assembly.
             if drawn is None and self._drawn_gap <= MAX_DRAWN_GAP:
                 self.assembly.place(self.wanted)
-                raise self.assembly.open_loop()
+                raise self.assembly.open_loop_error()
             return chosen
         # Try growing distances from the wanted values; take the best conditioned assembly of the first that has one.
         rng = np.random.default_rng(1)
@@ -477,7 +477,7 @@ class HomeSearch:
     def _make_home(self, values: Array, miss: float, how: str) -> Home:
         self.assembly.place(values)
         try:
-            settled = self._settle(self.graph(), miss)
+            settled = self._repair_and_lock(self.graph(), miss)
             index = 0.0
             if settled is not None:
                 # Redundant drives follow those that lead.
@@ -485,18 +485,18 @@ class HomeSearch:
                 led = {n: replace(j, follows=j.actuated and n not in leads) for n, j in joints.items()}
                 index = singularity_at_home(replace(settled[0], joints=led))
         except (ParameterError, SingularityError, np.linalg.LinAlgError):
-            # The machine is checked again when it becomes a robot.
+            # Creating the robot raises this error again, with its text.
             settled, index = None, 0.0
         sound, held, repaired = settled or (None, {}, None)
         return Home(values, miss, how, self.place, sound, held, repaired, index)
 
-    def _settle(self, graph: Graph, miss: float) -> tuple[Graph, dict[str, float], Repair] | None:
+    def _repair_and_lock(self, graph: Graph, miss: float) -> tuple[Graph, dict[str, float], Repair] | None:
         """Remove a file's rounding and hold spins.
 
         :returns: the graph, the joints that hold spins, and the repair; None if the actuated joints
             do not determine the machine.
         """
-        # Numbers with fewer digits than most take freedoms, so that motors seem redundant.
+        # Numbers with fewer digits than most remove freedoms, so that motors seem redundant.
         own, found = self.assembly.tree.rounding, None
         for rounding in (max(own, miss), *([MAX_ROUNDING] if own > MAX_ZERO_SINGULAR_VALUE else [])):
             repaired = repair_rounded(graph, rounding, MIN_ROUNDING)

@@ -16,10 +16,10 @@ from pkm_twin.kinematics.linkage import Linkage
 from pkm_twin.kinematics.rounding import repair_rounded
 from pkm_twin.machine import graph as graphs
 from pkm_twin.machine import mjcf_file, sdf_file, urdf_file, urdf_xml, usd_file
-from pkm_twin.machine.cut_out import cut_out, find_circles
+from pkm_twin.machine.cut_out import cut_out, find_loop_joints
 from pkm_twin.machine.graph import BASE, Graph
 from pkm_twin.machine.graph_description import graph_description
-from pkm_twin.machine.loop_tree import SINGLE, Joint, Link, LoopTree
+from pkm_twin.machine.loop_tree import SINGLE_FREEDOM_TYPES, Joint, Link, LoopTree
 from pkm_twin.machine.rotations import Pose
 from pkm_twin.machine.urdf_control import convert_drives
 from pkm_twin.machine.urdf_file import Visual, read_visuals
@@ -170,7 +170,7 @@ def read_tree(path: str | Path, part: UrdfSelection = UrdfSelection()) -> UrdfRe
         f"{key} {value:g} of {one.name}"
         for one in (*tree.joints.values(), *tree.closures)
         for key, value in (("damping", one.viscous), ("friction", one.coulomb), ("rotor inertia", one.rotor_inertia))
-        if value and one.kind not in (*SINGLE, "fixed")
+        if value and one.kind not in (*SINGLE_FREEDOM_TYPES, "fixed")
     ]
     if ignored:
         notes.append(f"ignored, because the joint has several degrees of freedom: {', '.join(ignored)}")
@@ -260,7 +260,7 @@ def _require_moving(tree: LoopTree, bodies: dict[str, str], tool: str) -> None:
     joints += tree.closures
     pairs = {joint.name: (bodies[joint.inner], bodies[joint.outer]) for joint in joints}
     pairs = {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
-    moving, target = find_circles(pairs, BASE, bodies[tool]), {BASE, bodies[tool]}
+    moving, target = find_loop_joints(pairs, BASE, bodies[tool]), {BASE, bodies[tool]}
     apart = [name for name in tree.actuated if name not in moving]
     if not apart:
         return
@@ -290,7 +290,7 @@ def _describe_graph(assembly: Assembly, graph: Graph, ground: str) -> dict[str, 
         data["gravity"] = _round_vector(gravity).tolist()
     for name, entry in data["joints"].items():
         ends = tree.joints[name].limits.get("position") if name in tree.joints else None
-        if ends is not None and np.isfinite(ends).any() and entry["type"] in SINGLE:
+        if ends is not None and np.isfinite(ends).any() and entry["type"] in SINGLE_FREEDOM_TYPES:
             entry["limits"] = {"position": ends}
     for name in tree.actuated:
         joint, entry = tree.joints[name], data["joints"][name]
@@ -315,7 +315,7 @@ def _build_graph(assembly: Assembly, bodies: dict[str, str], tool: str, ground: 
         axes = [e.rotation @ axis for e, axis in zip(ends, joint.axes, strict=False)]
         axes = axes[: joint.type.count]
         own = {}
-        if joint.kind in SINGLE:
+        if joint.kind in SINGLE_FREEDOM_TYPES:
             value = round(home.get(joint.name, 0.0) + joint.drawn, 14) + 0.0
             own = {key: getattr(joint, key) for key in ("viscous", "coulomb", "rotor_inertia")}
             own |= {"home": value, "pitch": joint.pitch}

@@ -51,11 +51,11 @@ RAYS_PER_CIRCLE: Final = 360
 STEPS_PER_BLOCK: Final = 16
 """Steps along a ray that are tried at a time."""
 MIN_WORKSPACE_INDEX: Final = 0.01
-"""Singularity index (0 singular, 1 best) above which regular workspaces stay."""
+"""Smallest singularity index (0 singular, 1 best) in a regular workspace."""
 MIN_TILT_RADIUS: Final = math.radians(10.0)
 """Radius, rad, below which a circle of tilts is left out (2UPR-RPU paper, section 4)."""
 MIN_SAMPLED_INDEX: Final = 0.05
-"""Singularity index above which random joint positions stay."""
+"""Smallest singularity index of random joint positions."""
 
 
 def try_inverse(robot: Robot, pose: ArrayLike) -> tuple[Array, Mask]:
@@ -140,7 +140,7 @@ def satisfies_limits(
     inside = np.array(within_limits(robot, q) & known)
     bound = getattr(robot.limits, "joint_angle", None)
     if bound is not None and has_passive_joint_limits(robot):
-        # NaN is not below.
+        # A pose out of reach has NaN, which is outside by the comparison.
         inside &= joint_angle_at(robot, pose) <= bound
     if robot.passive_limits:
         values = passive_values(robot, q[inside])

@@ -255,7 +255,7 @@ def _make_fit_kernel(degree: int, joints: int, *, solved: bool) -> Kernel:
     middle and half length of the window, and the stamp to evaluate at, ns. Output: the new sums;
     with ``solved`` first and second derivative by seconds at that stamp, and the pivots of V V'.
     """
-    key = EMPTY.also(f"polynomial fit {degree} {joints} {solved}", _write_fit_program)
+    key = EMPTY.extend(f"polynomial fit {degree} {joints} {solved}", _write_fit_program)
     return Kernel(Code(lambda: _write_fit_program(degree, joints, solved), key))
 
 

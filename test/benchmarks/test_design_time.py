@@ -24,7 +24,7 @@ def test_an_optimiser_that_compiles_each_machine_finds_no_better_one(benchmark, 
     found = design(robot, BOX, path, "peak-effort", ["singularity>=0.1"], starts=16)
     took = process_time() - began
     structure = Engine.structure.func
-    monkeypatch.setattr(Engine, "structure", property(lambda e: structure(e).also(e.graph.key)))
+    monkeypatch.setattr(Engine, "structure", property(lambda e: structure(e).extend(e.graph.key)))
     counted = 0
 
     def asked(x):

@@ -52,11 +52,11 @@ def test_inverse_dynamics(benchmark, name, count):
 @pytest.mark.parametrize("threads", ["1", "0"], ids=["one", "all"])
 def test_variants(benchmark, monkeypatch, threads):
     """10,000 machines on 200 samples, on one core and on all."""
-    monkeypatch.setenv(codes.THREADS, threads)
+    monkeypatch.setenv(codes.THREADS_VARIABLE, threads)
     robot = load("delta")
     lengths = np.random.default_rng(3).uniform(0.18, 0.22, 10_000)
     machines = variants(robot, {"geometry.arm_length": lengths})
-    what = f"variants(delta), {codes.threads()} threads"
+    what = f"variants(delta), {codes.read_thread_count()} threads"
     benchmark.extra_info.update(what=what, samples=200 * len(machines))
     run(benchmark, 200 * len(machines), machines.inverse_dynamics, *motion(robot, 200))
 

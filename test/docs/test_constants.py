@@ -25,7 +25,7 @@ def test_newtons_judgement():
     ]
     assert word("at most a **{}** of the one before it") == program.MAX_CONTRACTION
     pattern = r"stays above (\S+); without a closed form, .*? above (\S+) times each correction"
-    assert numbers(ENGINE, pattern) == [program.LEAST, program.MIN_DETERMINANT_RATIO]
+    assert numbers(ENGINE, pattern) == [program.MIN_RELATIVE_DETERMINANT, program.MIN_DETERMINANT_RATIO]
     assert numbers(ENGINE, r"redundant ones too, is at most (\S+) \(") == [program.MAX_RESIDUAL]
     pattern = r"tried again in (\d+), (\d+), (\d+), (\d+), (\d+) and (\d+) \*\*steps"
     assert numbers(ENGINE, pattern) == list(STEPS)

@@ -5,12 +5,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from pkm_twin.export.schedule import WINDOW, Work, order_work
+from pkm_twin.export.schedule import SCHEDULING_WINDOW, Work, order_work
 
 
 def test_every_statement_follows_what_it_reads_and_stays_near_its_place(rng):
     """Over random graphs: an order of all statements, in which none overtakes a whole window."""
-    for count in (1, 2, 50, 3 * WINDOW):
+    for count in (1, 2, 50, 3 * SCHEDULING_WINDOW):
         statements = [
             Work(
                 frozenset(rng.integers(0, k, rng.integers(0, 3)).tolist() if k else ()),
@@ -22,7 +22,7 @@ def test_every_statement_follows_what_it_reads_and_stays_near_its_place(rng):
         place = np.argsort(order_work(statements))
         assert sorted(place) == list(range(count))
         assert all(place[read] < place[k] for k, work in enumerate(statements) for read in work.reads)
-        assert (np.arange(count) - place < WINDOW).all()
+        assert (np.arange(count) - place < SCHEDULING_WINDOW).all()
 
 
 def test_chains_that_are_independent_begin_side_by_side():

@@ -371,7 +371,7 @@ def test_a_payload_is_looked_for_with_the_memory_of_friction() -> None:
     friction = {"coulomb": [3.9, 3.8], "viscous": [0.01, 0.01]}
     file = robot.changed(friction=friction, payload={"mass": 0.0})
     truth = file.changed(friction={"presliding": [0.02, 0.02]}, payload={"mass": 1.0})
-    effort = inverse_dynamics(truth, *motion) + Dahl.remembered(truth.friction, *motion[:2])[0]
+    effort = inverse_dynamics(truth, *motion) + Dahl.bounded_memory_effort(truth.friction, *motion[:2])[0]
     made = noisy(Recording(file, time, q, effort=effort), rng, 0.005, 1e6)
     found, *_ = fit_recordings(file, [made], ("friction", "payload"), ("dahl",))
     (start,) = (rows.recording.load for rows in found.problem.whole)

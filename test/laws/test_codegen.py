@@ -236,15 +236,15 @@ def test_a_call_keeps_its_arguments_while_other_threads_allocate(monkeypatch):
 
 
 def test_a_number_of_threads_is_a_number(monkeypatch):
-    monkeypatch.delenv(codes.THREADS, raising=False)
-    assert codes.threads() == 1
+    monkeypatch.delenv(codes.THREADS_VARIABLE, raising=False)
+    assert codes.read_thread_count() == 1
     for text, number in (("", 1), ("3", 3), ("0", len(os.sched_getaffinity(0)))):
-        monkeypatch.setenv(codes.THREADS, text)
-        assert codes.threads() == number
+        monkeypatch.setenv(codes.THREADS_VARIABLE, text)
+        assert codes.read_thread_count() == number
     for text in ("two", "-1", "1.5", "²"):
-        monkeypatch.setenv(codes.THREADS, text)
+        monkeypatch.setenv(codes.THREADS_VARIABLE, text)
         with pytest.raises(ParameterError):
-            codes.threads()
+            codes.read_thread_count()
 
 
 @pytest.mark.parametrize("size", [1, 2, 5, 12])

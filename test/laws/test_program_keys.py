@@ -104,14 +104,14 @@ def test_keys_follow_the_content_and_the_writers():
     def one(*_):
         """A writer of this module."""
 
-    plain = EMPTY.also("a", one)
-    assert plain == EMPTY.also("a", one)
-    assert plain.digest() == EMPTY.also("a", one).digest()
+    plain = EMPTY.extend("a", one)
+    assert plain == EMPTY.extend("a", one)
+    assert plain.digest() == EMPTY.extend("a", one).digest()
     others = [
-        EMPTY.also("b", one),
-        EMPTY.also("a", load),
-        EMPTY.also("a", partial(one, load)),
-        plain.also("a"),
+        EMPTY.extend("b", one),
+        EMPTY.extend("a", load),
+        EMPTY.extend("a", partial(one, load)),
+        plain.extend("a"),
     ]
     assert len({key.digest() for key in (plain, *others)}) == len({plain, *others}) == 5
     assert plain.digest("x") != plain.digest()
@@ -121,9 +121,9 @@ def test_a_writer_without_a_file_is_another_one_in_every_process(monkeypatch):
     def one(*_):
         """A writer of no module."""
 
-    saved = EMPTY.also("a").digest()
+    saved = EMPTY.extend("a").digest()
     one.__module__ = "of_no_file"
-    first = EMPTY.also("a", one).digest()
-    assert first == EMPTY.also("a", one).digest() != saved
+    first = EMPTY.extend("a", one).digest()
+    assert first == EMPTY.extend("a", one).digest() != saved
     monkeypatch.setattr(keys, "_UNSAVED", "another process")
-    assert EMPTY.also("a", one).digest() != first
+    assert EMPTY.extend("a", one).digest() != first

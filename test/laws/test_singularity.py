@@ -45,7 +45,7 @@ def with_both_rods(robot):
     for name, rod in graph.rods.items():
         whole = data["rods"].pop(name)
         for side, sign in (("left", 0.5), ("right", -0.5)):
-            ends = (rod.ends + sign * graph.frame(graph.platform)[1] * rod.pair).tolist()
+            ends = (rod.ends + sign * graph.body_scale(graph.platform)[1] * rod.pair).tolist()
             data["rods"][f"{name} {side}"] = {**whole, "ends": ends, "mass": whole["mass"] / 2}
     return data
 

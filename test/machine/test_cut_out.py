@@ -13,7 +13,7 @@ import pytest
 from delta_dynamics import inverse_dynamics
 from pkm_twin import load, transmission
 from pkm_twin.errors import MobilityError, ParameterError, UnknownNameError
-from pkm_twin.machine.cut_out import find_circles
+from pkm_twin.machine.cut_out import find_loop_joints
 from pkm_twin.machine.strict_yaml import read_yaml
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from test.support.mujoco_judge import Judge, mujoco
@@ -120,7 +120,7 @@ def test_joints_on_circles_are_those_of_all_ways_from_base_to_platform():
         count = int(rng.integers(4, 11))
         pairs = {f"j{k}": tuple(rng.choice(list("abcdefg"), 2, replace=False).tolist()) for k in range(count)}
         expected = {name for way in ways(pairs, "a", "b") for name in way}
-        assert set(find_circles(pairs, "a", "b")) == expected
+        assert set(find_loop_joints(pairs, "a", "b")) == expected
 
 
 def test_a_urdf_with_meshes_and_an_arm_is_cut_too(tmp_path):

@@ -10,7 +10,7 @@ from pkm_twin.certify.certificate import certify_robot
 from pkm_twin.machine.strict_yaml import read_yaml
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from pkm_twin.robot.outline import base_face, platform_face
-from pkm_twin.robot.plausibility import findings
+from pkm_twin.robot.plausibility import find_implausible_numbers
 from stiffness_monitor import compliance
 from test.docs.test_docs import DOCS
 from test.support.robots import partly_long
@@ -28,7 +28,7 @@ TEMPLATES = [name for name in NAMES if f"`{name.removesuffix('.yaml')}`" in TABL
 @pytest.mark.parametrize("name", NAMES)
 def test_its_numbers_are_plausible_and_its_page_complete(name):
     robot = load(MACHINES / name)
-    assert findings(robot) == ()
+    assert find_implausible_numbers(robot) == ()
     assert bool(robot.book.values) == (name in TEMPLATES)
     if MACHINES / name in PICTURED:
         picture = f"robot_{robot.name}.png"

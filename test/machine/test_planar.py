@@ -6,7 +6,7 @@ import pytest
 
 from delta_dynamics import inverse_dynamics, mass_matrix
 from pkm_twin.errors import ParameterError
-from pkm_twin.machine.joints import UNITS, Freedom, name_single_freedoms
+from pkm_twin.machine.joints import UNIT_VECTORS, Freedom, name_single_freedoms
 from pkm_twin.mechanisms.catalogue import load, robot_of_data
 from pkm_twin.robot.robot_urdf import robot_urdf
 
@@ -75,4 +75,4 @@ def test_a_tree_of_planar_joints_has_three_freedoms_each():
 
 @pytest.mark.parametrize("count", range(7))
 def test_a_type_of_joint_may_have_any_number_of_freedoms(count):
-    assert len(set(name_single_freedoms("touch", [Freedom(UNITS[0])] * count))) == count
+    assert len(set(name_single_freedoms("touch", [Freedom(UNIT_VECTORS[0])] * count))) == count

@@ -14,7 +14,7 @@ import pkm_twin
 from pkm_twin.certify.description import expand
 from pkm_twin.errors import ParameterError, RobotWarning
 from pkm_twin.mechanisms.machine import Machine
-from pkm_twin.robot.plausibility import find_members_fault, findings
+from pkm_twin.robot.plausibility import find_implausible_numbers, find_members_fault
 from test.laws.conftest import changed as edited
 from test.support.robots import SHIPPED, partly_long
 
@@ -30,18 +30,18 @@ def machine(data):
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_no_shipped_robot_has_an_implausible_number(name):
-    assert findings(SHIPPED[name]) == ()
+    assert find_implausible_numbers(SHIPPED[name]) == ()
 
 
 def test_joints_of_a_platform_may_be_anywhere_on_it():
     folder = Path(__file__).parents[2] / "examples" / "machines"
-    assert findings(pkm_twin.load(folder / "tricept.yaml")) == ()
+    assert find_implausible_numbers(pkm_twin.load(folder / "tricept.yaml")) == ()
 
 
 @pytest.mark.parametrize("name", partly_long(NAMES, *NAMES[::4]))
 def test_no_sound_machine_has_an_implausible_number(name, rng):
-    assert findings(machine(plain(name))) == ()
-    assert [f.text for f in findings(machine(variant(name, rng)))] == []
+    assert find_implausible_numbers(machine(plain(name))) == ()
+    assert [f.text for f in find_implausible_numbers(machine(variant(name, rng)))] == []
 
 
 @pytest.mark.parametrize("name", partly_long(SKETCHES, "four_bar"))
@@ -152,15 +152,15 @@ def data(rng):
 
 def test_what_each_kind_changes_is_sound(data):
     """Also with a bar whose end is a millimetre aside."""
-    assert findings(machine(copy.deepcopy(data))) == ()
+    assert find_implausible_numbers(machine(copy.deepcopy(data))) == ()
     barred(1e-3)(data)
-    assert findings(machine(data)) == ()
+    assert find_implausible_numbers(machine(data)) == ()
 
 
 @pytest.mark.parametrize("name", KINDS)
 def test_each_kind_is_found_by_its_field_and_number(name, data):
     _, field, unit, value = KINDS[name]
-    found = findings(machine(with_change(data, name)))
+    found = find_implausible_numbers(machine(with_change(data, name)))
     assert (found[0].field, found[0].unit) == (field, unit)
     if value is not None:
         assert found[0].value == pytest.approx(value, rel=2e-2, abs=1e-12)
@@ -193,13 +193,13 @@ def legs(data, **more):
 
 def test_a_leg_without_home_is_asked_for_it():
     stewart = expand(plain("stewart"))
-    (found,) = findings(machine(legs(stewart)))
+    (found,) = find_implausible_numbers(machine(legs(stewart)))
     assert found.field.startswith("leg_a_1: home") and found.unit == "m"
     # The bound is the leg's own length at home.
     ends = [stewart["joints"][name]["at"] for name in ("foot_a_1", "ball_a_1")]
     assert found.bound == pytest.approx(np.linalg.norm(np.subtract(*ends)), rel=1e-6)
     # A leg that counts from home says so.
-    assert findings(machine(legs(stewart, home=0.0))) == ()
+    assert find_implausible_numbers(machine(legs(stewart, home=0.0))) == ()
 
 
 def test_a_small_index_at_home_is_told(rng):
@@ -207,7 +207,7 @@ def test_a_small_index_at_home_is_told(rng):
     data = plain("four_bar")
     for k, name in enumerate(("motor", "crank_pin", "rocker_pin", "rocker_foot")):
         data["joints"][name]["at"] = [0.1 * k, 3e-4 * (k % 2), 0.0]
-    fields = [f.field for f in findings(machine(data))]
+    fields = [f.field for f in find_implausible_numbers(machine(data))]
     assert fields == ["home"]
 
 
@@ -223,7 +223,7 @@ def test_a_users_file_is_warned_of_once_and_without_a_line_of_the_program(data, 
     with pytest.warns(RobotWarning) as told:
         robot = pkm_twin.load(path)
     (one,) = told
-    assert str(one.message) == findings(robot)[0].text
+    assert str(one.message) == find_implausible_numbers(robot)[0].text
     assert (one.filename, one.lineno) == (str(path), 0)
     shown = twin("info", path)
     assert shown.err == f"warning: {path}: {one.message}\n"

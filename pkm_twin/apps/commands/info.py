@@ -19,7 +19,7 @@ from pkm_twin.kinematics.scheme import list_coordinates
 from pkm_twin.machine.formulas import PARAMETERS
 from pkm_twin.report import Fact, Report, format_number
 from pkm_twin.robot.clearance import clearance, has_clearance
-from pkm_twin.robot.plausibility import find_members_fault, findings, why_no_torques
+from pkm_twin.robot.plausibility import find_implausible_numbers, find_members_fault, why_no_torques
 
 MAX_NAMES: Final = 6
 """Largest number of names in a printed line."""
@@ -50,7 +50,7 @@ def info(given: Info) -> Report:
     assumed = [joint.name for joint in robot.graph.joints.values() if joint.virtual]
     undetermined = list_undetermined(robot)
     gap = float(clearance(robot, home)) if has_clearance(robot) else None
-    implausible, fault = findings(robot), find_members_fault(robot)
+    implausible, fault = find_implausible_numbers(robot), find_members_fault(robot)
     equations = f"{engine.closures} loop equations, {engine.rank} independent"
     if engine.redundant and assumed and not undetermined:
         # A joint that replaces equal constraints of several limbs repeats those of one limb.
