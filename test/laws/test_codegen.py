@@ -210,7 +210,7 @@ def test_large_batches_in_threads_have_the_same_bits(rng, monkeypatch):
         return inverse_dynamics(robot, *motion), many.inverse_dynamics(*few)
 
     alone, used = answers(), []
-    monkeypatch.setattr(codes, "threads", lambda: used.append(3) or 3)
+    monkeypatch.setattr(codes, "read_thread_count", lambda: used.append(3) or 3)
     for one, other in zip(alone, answers(), strict=True):
         np.testing.assert_array_equal(one, other)
     assert len(used) >= 3
