@@ -124,11 +124,11 @@ class StiffnessMonitor(TwinNode):
         self._alarm.reset()
         self._published_stamp = 0
 
-    def judge(self) -> tuple[bytes, str]:
+    def worst_status(self) -> tuple[bytes, str]:
         """Return level and message of the node's diagnostic status."""
         if self._alarm.departures:
             return health.WARN, self._alarm.warning()
-        return super().judge()
+        return super().worst_status()
 
     def values(self) -> dict[str, object]:
         """Return the values of the node's diagnostic status."""

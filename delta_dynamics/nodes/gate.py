@@ -104,12 +104,12 @@ class CommandGate(TwinNode):
         """Open without waiting for good torques; return the description of the stop."""
         return self.core.stream.resume()
 
-    def judge(self) -> tuple[bytes, str]:
+    def worst_status(self) -> tuple[bytes, str]:
         """Return level and message of the node's diagnostic status."""
         stream = self.core.stream
         if stream.stopped:
             return health.ERROR, f"closed: {self._find_longer_deadline() or stream.status}"
-        level, message = super().judge()
+        level, message = super().worst_status()
         return level, "open" if level == health.OK else message
 
     def values(self) -> dict[str, object]:

@@ -140,7 +140,7 @@ class MachineSim(TwinNode):
         self.core.restart()
         return text or "the machine is at its start"
 
-    def judge(self) -> tuple[bytes, str]:
+    def worst_status(self) -> tuple[bytes, str]:
         """Return level and message of the node's diagnostic status."""
         sim = self.core
         if sim.failure:

@@ -143,7 +143,7 @@ class DeltaDynamics(TwinNode):
         """End a stop without waiting for good samples; return its description."""
         return self.core.stream.resume()
 
-    def judge(self) -> tuple[bytes, str]:
+    def worst_status(self) -> tuple[bytes, str]:
         """Return level and message of the node's diagnostic status: those of the worst problem."""
         core, estimates = self.core, self._estimates
         if core.rates.fault:
@@ -154,7 +154,7 @@ class DeltaDynamics(TwinNode):
             measure = core.singularity()
             index = "" if measure is None else f": index {measure:.3g}"
             return health.WARN, f"close to a singularity or the edge of the workspace{index}"
-        level, message = super().judge()
+        level, message = super().worst_status()
         if core.rates.fault:
             return health.WARN, core.rates.fault
         if level != health.OK:

@@ -407,7 +407,7 @@ class TwinNode(GuardedNode):
         joints = ", ".join(robot.joint_names)
         return f"robot {robot.name} ({robot.mechanism}), joints {joints}{self.details()}"
 
-    def judge(self) -> tuple[bytes, str]:
+    def worst_status(self) -> tuple[bytes, str]:
         """Return level and message of the node's diagnostic status."""
         rejected = self.core.last_reject
         return (WARN, f"last reject: {rejected}") if rejected else (OK, "running")
@@ -418,7 +418,7 @@ class TwinNode(GuardedNode):
 
     def diagnose(self) -> tuple[bytes, str, dict[str, object]]:
         """Return level, message and values of the node's diagnostic status."""
-        return (*self.judge(), {"robot": self.core.robot.name, **self.values()})
+        return (*self.worst_status(), {"robot": self.core.robot.name, **self.values()})
 
     def time_jumped_backward(self) -> None:
         """Discard everything that depends on time: the ROS clock went back or changed."""
