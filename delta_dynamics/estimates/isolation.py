@@ -20,7 +20,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics.traced import Traced
-from pkm_twin.machine.graph import BASE, Graph, list_limbs
+from pkm_twin.machine.graph import BASE, list_limbs
 from pkm_twin.robot.outline import body_points, robot_bars
 from pkm_twin.robot.robot import Robot
 
@@ -85,11 +85,6 @@ def map_limbs(robot: Robot) -> dict[str, str]:
     return {name: names.get(root, root) for name, root in limb.items()} | {graph.platform: PLATFORM}
 
 
-def list_joined_bodies(graph: Graph) -> list[tuple[str, str]]:
-    """List the pairs of bodies and rods that a joint connects, in both orders."""
-    return [*graph.links, *((b, a) for a, b in graph.links)]
-
-
 def _twist_kernel(robot: Robot) -> Kernel:
     """Return the program of rotation (9), origin (3), and velocity and angular velocity per joint rate, by body."""
 
@@ -132,7 +127,9 @@ class CandidatePositions:
             if body in limb_of and body not in drawn:
                 end = (body, points[0] if points else graph.bodies[body].com)
                 bars.append((body, end, end))
-        blocks = _find_thick_bodies(graph)
+        # The platform, and sliders on the base, are no thin bars.
+        sliders = (j.outer for j in graph.joints.values() if j.kind == "prismatic" and j.inner == BASE)
+        thick = {graph.platform, *sliders}
         self.parts: list[str] = []
         ends, mix, lengths = [], [], []
         for k, (part, start, end) in enumerate(bars):
@@ -154,11 +151,11 @@ class CandidatePositions:
             self._mix[2 * k : 2 * k + 2, i] = 1.0 - s, s
         self.limbs = [limb_of[part] for part in self.parts]
         size = np.maximum(lengths, 1e-3 * graph.size)
-        self.thin = np.array([part not in blocks for part in self.parts]) & (np.array(lengths) > 0)
+        self.thin = np.array([part not in thick for part in self.parts]) & (np.array(lengths) > 0)
         self.names = tuple(dict.fromkeys(name for name in self.limbs if name != PLATFORM))
         owners = np.array(self.limbs)
         one, other = np.triu_indices(len(owners), 1)
-        joined = {*list_joined_bodies(graph)}
+        joined = {*graph.links, *((b, a) for a, b in graph.links)}
         # With three drives or fewer, a force on the platform explains every effort, so clamping cannot be told.
         eligible = (owners[one] != owners[other]) & (robot.joints_count > 3)
         eligible &= [(self.parts[a], self.parts[b]) not in joined for a, b in zip(one, other, strict=True)]
@@ -200,13 +197,6 @@ class CandidatePositions:
         direction = np.divide(direction, length, out=np.zeros_like(direction), where=length > 0.0)[self._bar]
         # The axis of positions is last in memory, because it is the longest.
         return found[0].T, found[1:].transpose(2, 0, 1), direction
-
-
-def _find_thick_bodies(graph: Graph) -> set[str]:
-    """Find the bodies that are not thin bars: the platform, and sliders on the base."""
-    return {graph.platform} | {
-        joint.outer for joint in graph.joints.values() if joint.kind == "prismatic" and joint.inner == BASE
-    }
 
 
 class ContactLocator:

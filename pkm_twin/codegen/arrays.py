@@ -41,7 +41,9 @@ def doubles(values: ArrayLike, what: str = "values") -> Array:
         array = np.asarray(values)
     except ValueError:
         raise ValueError(f"{what} are not an array: rows of different lengths") from None
-    if array.dtype.kind == "O" and all(map(_is_real, array.flat)):
+    if array.dtype.kind == "O" and all(
+        isinstance(value, (Real, Decimal)) and not isinstance(value, (bool, np.bool_)) for value in array.flat
+    ):
         # Fractions, decimals, integers beyond 64 bits; an overflow becomes infinity.
         array = np.array([_convert_to_double(value) for value in array.flat]).reshape(array.shape)
     if array.dtype.kind not in "fiu":
@@ -49,10 +51,6 @@ def doubles(values: ArrayLike, what: str = "values") -> Array:
         raise ValueError(f"{what} have to be real numbers, not {kind}")
     with np.errstate(over="ignore"):
         return array.astype(_F8, copy=False)
-
-
-def _is_real(value: Any) -> bool:
-    return isinstance(value, (Real, Decimal)) and not isinstance(value, (bool, np.bool_))
 
 
 def _convert_to_double(value: Any) -> float:

@@ -74,10 +74,6 @@ def slowness() -> str:
     )
 
 
-def _count_axes(array: Array) -> int:
-    return array.ndim
-
-
 class KernelBuffers:
     """Preallocated inputs, outputs and status of a kernel, with their addresses for compiled code.
 
@@ -268,7 +264,7 @@ class Code:
         :raises ValueError: an input is not real numbers, its last axis has another size, or batches differ.
         """
         arrays = self.checked(inputs)
-        shape = max(arrays, key=_count_axes, default=_NO_INPUT).shape[:-1]
+        shape = max(arrays, key=lambda array: array.ndim, default=_NO_INPUT).shape[:-1]
         if shape and not all([a.ndim == 1 or a.shape[:-1] == shape for a in arrays]):
             shape = common_batch(*(a.shape[:-1] for a in arrays))
             arrays = [

@@ -84,7 +84,12 @@ def moveit_package(robot: Robot, kinematics: str = "") -> dict[str, str]:
     ET.SubElement(root, "virtual_joint", name="ground", type="fixed", parent_frame="world", child_link=GROUND)
     for joint in robot.passive_joints:
         ET.SubElement(root, "passive_joint", name=joint)
-    touching = dict.fromkeys(_find_touching_links(tree), "Default")
+    touching: dict[tuple[str, str], str] = {}
+    # Shapes intersect at home where bars meet in a point.
+    for one, other in combinations(tree.capsules, 2):
+        gap = distance(one.start, one.end - one.start, other.start, other.end - other.start)
+        if one.link != other.link and not gap > one.radius + other.radius:
+            touching[min(one.link, other.link), max(one.link, other.link)] = "Default"
     touching |= dict.fromkeys(_list_joined_links(tree, parts), "Adjacent")
     for (first, second), reason in touching.items():
         ET.SubElement(root, "disable_collisions", link1=first, link2=second, reason=reason)
@@ -198,16 +203,6 @@ def _list_joined_links(tree: LoopTree, parts: Sequence[Single]) -> list[tuple[st
         near = {name for pair in pairs if own in pair for name in pair} - {own}
         pairs += combinations(sorted(near), 2)
     return list(dict.fromkeys((min(pair), max(pair)) for pair in pairs))
-
-
-def _find_touching_links(tree: LoopTree) -> list[tuple[str, str]]:
-    """Find pairs of links whose shapes intersect at home, as bars do that meet in a point."""
-    pairs = []
-    for one, other in combinations(tree.capsules, 2):
-        gap = distance(one.start, one.end - one.start, other.start, other.end - other.start)
-        if one.link != other.link and not gap > one.radius + other.radius:
-            pairs.append((min(one.link, other.link), max(one.link, other.link)))
-    return list(dict.fromkeys(pairs))
 
 
 def _write_joint_limits(robot: Robot, home_accelerations: Sequence[float]) -> dict[str, Any]:

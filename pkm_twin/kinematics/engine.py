@@ -35,7 +35,6 @@ from pkm_twin.kinematics.programs import (
     newton_step_program,
     placement_program,
     quick_inverse_program,
-    reduced_forward_program,
 )
 from pkm_twin.kinematics.scheme import ClosedFormStart, Scheme
 from pkm_twin.kinematics.traced import NO_NUMBERS, Traced
@@ -184,7 +183,7 @@ class Engine(Scheme):
     @property
     def forward(self) -> Kernel:
         """Program from joint positions to pose (m), position (3) and rotation (9) of the platform."""
-        return self.kernel("forward", reduced_forward_program, self._reduced_key)
+        return self.kernel("forward", lambda t: forward_program(t.reduced), self._reduced_key)
 
     @property
     def jacobian(self) -> Kernel:

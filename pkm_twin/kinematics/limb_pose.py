@@ -140,11 +140,17 @@ class LimbPose:
             motion.place(beyond[:-1], x, q)
             self._solve_spin(limb)
         motion.place(beyond[-1:] if limb.spin else beyond, x, q)
-        ends = (top.parent, limb.beyond), (apart, target)
+        bodies = (top.parent, limb.beyond)
         if limb.leaves and limb.kind == "turns":
-            self.rows.append(self._distance_row(limb, *ends, square_of(lever[: 2 if len(steps) == 1 else 3])))
+            # J keeps its distance from C; of a single turn, in the plane of the turn.
+            square = square_of(lever[: 2 if len(steps) == 1 else 3])
+            across = apart if self.normal is None else _remove_component(apart, self.normal)
+            scale = 1.0 / (tree.size * sqrt(square))
+            self.rows.append(self._point_row(limb, bodies, target, across, 0.5 * (across @ across - square), scale))
         if limb.leaves > len(self.rows):
-            self.rows.append(self._plane_row(limb, *ends, lever[2]))
+            # J stays in the plane of the single turn.
+            height = self.normal @ apart - lever[2]
+            self.rows.append(self._point_row(limb, bodies, target, self.normal, height, 1.0 / tree.size))
 
     def _store_distance_ends(self, limb: Limb, moved: Array, body: str, target: Objects) -> None:
         """Store the two points whose distance the reach sets, each with the body that carries it."""
@@ -230,29 +236,24 @@ class LimbPose:
     def _solve_angle(self, step: Step, a: Any, b: Any, d: Any, b_home: Any, square: Any) -> tuple[Any, Any]:
         """Solve a cos + b sin = d for a rotation from home, on the branch of home.
 
-        :param b_home: b at home, where the rotation is zero. ``square``: as in
-            :meth:`_clamp_to_range`.
+        With ``closest``, d is limited to the range of the left side.
+
+        :param b_home: b at home, where the rotation is zero. ``square``: squared distance, which
+            decreases by 2 d; 0 if d is a length itself.
         :returns: the root sqrt(a^2 + b^2 - d^2), and a sin - b cos: the root with its sign.
         """
         n = a * a + b * b
-        d, root = self._clamp_to_range(d, n, square)
-        side = -sign_of(b_home) * root
-        self.x[step.position] = (a * d - b * side) / n
-        self.x[step.position + 1] = step.sign * ((b * d + a * side) / n)
-        return root, side
-
-    def _clamp_to_range(self, d: Any, n: Any, square: Any) -> tuple[Any, Any]:
-        """Return d, with ``closest`` limited to the range of a cos + c sin, and sqrt(n - d^2).
-
-        :param n: a^2 + c^2. ``square``: squared distance, which decreases by 2 d; 0 if d is a
-            length itself.
-        """
         if self.closest and not n > d * d:
             nearest = sqrt(n) * sign_of(d)
             most = sqrt(maximum(square + 2.0 * (d - nearest), 0.0)) - sqrt(square)
             self._record_miss(absolute(most if square else d - nearest))
-            return nearest, 0.0
-        return d, sqrt(n - d * d)
+            d, root = nearest, 0.0
+        else:
+            root = sqrt(n - d * d)
+        side = -sign_of(b_home) * root
+        self.x[step.position] = (a * d - b * side) / n
+        self.x[step.position + 1] = step.sign * ((b * d + a * side) / n)
+        return root, side
 
     def _record_miss(self, miss: Any) -> None:
         self.miss = max(self.miss, float(miss))
@@ -296,27 +297,6 @@ class LimbPose:
         d = snapped(mine @ other) - v[2] * u[2]
         root, _ = self._solve_angle(step, a, b, d, v[0] * home[1] - v[1] * home[0], 0.0)
         self.slopes.append((root, 1.0))
-
-    def _distance_row(self, limb: Limb, bodies: tuple[str, str], ends: tuple[Objects, Objects], square: Any) -> Row:
-        """Return the equation of a point's constant distance from the centre of the turns.
-
-        For a single turn, only the components in its plane count.
-
-        :param bodies: the parent of the turns, and the body of the point. ``ends``: the point
-            relative to the centre, and to the origin. ``square``: of the distance.
-        """
-        apart = ends[0] if self.normal is None else _remove_component(ends[0], self.normal)
-        scale = 1.0 / (self.tree.size * sqrt(square))
-        value = 0.5 * (apart @ apart - square)
-        return self._point_row(limb, bodies, ends[1], apart, value, scale)
-
-    def _plane_row(self, limb: Limb, bodies: tuple[str, str], ends: tuple[Objects, Objects], height: Any) -> Row:
-        """Return the equation of a point in the plane of a turn; parameters as :meth:`_distance_row`.
-
-        :param height: of the plane above the centre.
-        """
-        value = self.normal @ ends[0] - height
-        return self._point_row(limb, bodies, ends[1], self.normal, value, 1.0 / self.tree.size)
 
     def _point_row(
         self,

@@ -32,7 +32,7 @@ from pkm_twin.kinematics.motion import Motion, closure_jacobians, numbers
 from pkm_twin.kinematics.pose import Coordinate
 from pkm_twin.kinematics.scheme import Scheme
 from pkm_twin.machine.graph import BASE, Body, Graph, Joint, array
-from pkm_twin.machine.joints import UNIT_VECTORS, Freedom
+from pkm_twin.machine.joints import UNIT_VECTORS
 from pkm_twin.machine.tree import Link, Tree
 
 OPEN_STATES: Final = 4
@@ -210,7 +210,11 @@ def _replace_joints(
         mine, rest = virtual_joints[: len(freedoms)], virtual_joints[len(freedoms) :]
         if not freedoms or len(mine) < len(freedoms) or joint.actuated or bool(rest) == (end == graph.platform):
             continue
-        if not all(_is_along(f, c) for f, c in zip(freedoms, mine, strict=True)):
+        # Each freedom must be a slide or a rotation along the base axis of its virtual joint.
+        if not all(
+            c.turns == f.turns and not (f.turns and f.slide) and abs(abs(f.axis[c.axis]) - 1.0) < SNAP
+            for f, c in zip(freedoms, mine, strict=True)
+        ):
             continue
         slides = any(not c.turns for c in virtual_joints)
         if slides and any(c.turns for c in mine) and np.abs(joint.at - graph.origin).max() > 0.0:
@@ -221,13 +225,6 @@ def _replace_joints(
         if more or not rest:
             return (*own, *more)
     return ()
-
-
-def _is_along(freedom: Freedom, virtual: VirtualJoint) -> bool:
-    """Return whether a joint's freedom is a slide or turn along the virtual joint's base axis."""
-    if virtual.turns != freedom.turns or (freedom.turns and freedom.slide):
-        return False
-    return bool(abs(abs(freedom.axis[virtual.axis]) - 1.0) < SNAP)
 
 
 class PlatformFirstScheme(Scheme):

@@ -142,11 +142,6 @@ def projection_program(t: Traced) -> Program:
     return Program(t.inputs("q", "qd", "qdd"), 0, outputs, t.equations(goal=t.lift(q)))
 
 
-def reduced_forward_program(t: Traced) -> Program:
-    """Write :func:`forward_program` on the tree with the fewest unknowns."""
-    return forward_program(t.reduced)
-
-
 def inverse_program(t: Traced, scheme: PlatformFirstScheme | None) -> Program:
     """Write the inverse kinematics, confirmed by the forward kinematics (:func:`confirm_pose`).
 

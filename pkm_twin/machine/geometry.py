@@ -42,15 +42,10 @@ class SizedGraph(Graph):
         return plain(self.given[k : k + 3]), self.given[k + 3]
 
 
-def list_scale_lengths(graph: Graph) -> list[float]:
-    """List the lengths that only scale equations: size, rim, and every body's frame."""
-    frames = [graph.body_scale(body) for body in graph.bodies]
-    return [graph.size, graph.rim, *(v for middle, reach in frames for v in (*middle, reach))]
-
-
 def list_geometry(graph: Graph) -> Array:
-    """Return all numbers of a graph's geometry, shape (k,), the scale lengths last."""
-    return array([*graph.numbers, *list_scale_lengths(graph)])
+    """Return all numbers of a graph's geometry, shape (k,); last those that only scale equations."""
+    scales = [graph.body_scale(body) for body in graph.bodies]
+    return array([*graph.numbers, graph.size, graph.rim, *(v for point, length in scales for v in (*point, length))])
 
 
 def build_sized_graph(graph: Graph, numbers: Numbers) -> SizedGraph:

@@ -118,9 +118,13 @@ def edit_yaml(text: str, values: Mapping[Path, Any], notes: Mapping[Path, str]) 
     lines = text.splitlines(keepends=True)
     above: dict[int, list[str]] = {}
     for path, note in notes.items():
-        node = _find_node(_parse_root(text), path)
+        node = _parse_root(text)
+        for key in path:
+            node = _find_child(node, key)
+            if node is None:
+                raise ParameterError(".".join(map(str, path)), None, "a key of the file")
         number = node.start_mark.line
-        # Never inside the list that a number belongs to.
+        # A comment cannot stand inside the list that a number belongs to.
         while number and lines[number].lstrip().startswith(("[", "]", ",")):
             number -= 1
         above.setdefault(number, []).append(note)
@@ -145,14 +149,6 @@ def _find_child(node: Any, key: str | int) -> Any:
             if name.value == key:
                 return value
     return None
-
-
-def _find_node(node: Any, path: Path) -> Any:
-    for key in path:
-        node = _find_child(node, key)
-        if node is None:
-            raise ParameterError(".".join(map(str, path)), None, "a key of the file")
-    return node
 
 
 def _set_value(text: str, path: Path, value: Any) -> str:

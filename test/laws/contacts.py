@@ -9,7 +9,7 @@ from functools import lru_cache
 import numpy as np
 
 from delta_dynamics import ContactMonitor, inverse_dynamics
-from delta_dynamics.estimates.isolation import CLAMPING, PLATFORM, list_joined_bodies, map_limbs
+from delta_dynamics.estimates.isolation import CLAMPING, PLATFORM, map_limbs
 from delta_dynamics.torques.regressor import PAYLOAD, parameter_names, parameter_values, regressor
 from pkm_twin import Robot
 from pkm_twin.codegen.arrays import Array
@@ -238,7 +238,7 @@ def strike(robot: Robot, rng: np.random.Generator, motion: tuple[Array, ...], ki
     bodies: tuple[str, ...] = (body,)
     if kind == CLAMPING:
         apart = [
-            p for p, name in limbs.items() if name != limbs[body] and (p, body) not in list_joined_bodies(robot.graph)
+            p for p, name in limbs.items() if name != limbs[body] and not {(p, body), (body, p)} & {*robot.graph.links}
         ]
         if not apart:
             return None
