@@ -311,7 +311,7 @@ def stability_lobes(
 
     :param pose: shape (m,), the mechanism's pose coordinates, m and rad.
     :param speeds: spindle speeds, shape (k,), rpm.
-    :param damping, tool: as of :func:`~stiffness_monitor.vibration.tool_modes`; so are errors.
+    :param damping, tool: as in :func:`~stiffness_monitor.vibration.tool_modes`; so are errors.
     :param deepest: depth up to which to look, m; default :data:`DEFAULT_DEPTH_RATIO` times the
         depth that is stable at every speed.
     :raises ParameterError: a speed with more than :data:`MAX_WAVES_PER_TOOTH` vibrations from tooth to tooth.

@@ -25,7 +25,7 @@ from pkm_twin.robot.robot import Robot
 States = NDArray[np.int8]
 """For each row 0 if its force is between its bounds, 1 at the upper and -1 at the lower bound."""
 
-TOLERANCE: Final = 1e-7
+RELATIVE_TOLERANCE: Final = 1e-7
 """Tolerance of forces and motions, relative to the largest."""
 
 
@@ -50,7 +50,7 @@ def solve_resisting_forces(
     size = float(np.abs(motion).max() + (diagonal * np.abs(widths)).max())
     if not np.isfinite(size):
         raise ValueError("the motion is not finite")
-    wrong_motion = TOLERANCE * size
+    wrong_motion = RELATIVE_TOLERANCE * size
     wrong_force = wrong_motion / np.maximum(diagonal, 1e-300)
     # Dependent rows share their force, by a regularisation far below the tolerance.
     regular = matrix + np.eye(len(motion)) * (1e-11 * diagonal.max())
@@ -177,7 +177,7 @@ class Resistance:
     def evaluate_terms(self, q: Array, qd: Array) -> Terms:
         """Return the terms of a state, with position-dependent friction of the drives.
 
-        Errors as of :meth:`Equations.at`.
+        Errors as in :meth:`Equations.at`.
         """
         here = self._equations.at(q, qd)
         if self._forced_joints:

@@ -185,7 +185,7 @@ def pose_mass_kernel(robot: Robot, *, certified: bool) -> Kernel:
 def pose_acceleration_kernel(robot: Robot, *, certified: bool) -> Kernel:
     """Build the kernel that computes q, qd, qdd and the pose's second derivative.
 
-    Inputs: pose, pose rate, efforts and wrench. ``certified``: as of :func:`pose_mass_kernel`.
+    Inputs: pose, pose rate, efforts and wrench. ``certified``: as for :func:`pose_mass_kernel`.
     """
     return _compile_at_pose(robot, "accelerations", _write_pose_accelerations, certified=certified)
 
@@ -202,7 +202,7 @@ class _PoseDrivenMachine:
         self.posed, self.q = solve_pose(t, scheme)
         self.layout = Layout(t.tree)
         self.parts = self.layout.split(t.tape.inputs(PARAMETERS, self.layout.size))
-        self.drives = self.posed.rates_of_reaches(t.graph.actuated)
+        self.drives = self.posed.fast_rates_of_joints(t.graph.actuated)
         self.lead = SparseLU(self.drives[t.drives.leading], scheme.drive_pivots)
         t.drives.set_null_rows([self.lead.solve_transposed(self.drives[k]) for k in t.drives.others])
 

@@ -44,7 +44,7 @@ def torque_derivatives(
     friction counts with its direction held: its jump at rest has no derivative.
 
     :param q: joint positions, shape (..., n), with rates ``qd`` and accelerations ``qdd``.
-    :param wrench: as of :func:`delta_dynamics.inverse_dynamics`.
+    :param wrench: as in :func:`delta_dynamics.inverse_dynamics`.
     :param by: dotted paths of numbers of the file, as :func:`pkm_twin.variants` takes them.
     :raises ParameterError: an unknown path. Other errors as of ``inverse_dynamics``.
     """
@@ -62,7 +62,7 @@ def torque_gradient(
 ) -> TorqueDerivatives:
     """Compute the derivatives of the sum of weights times efforts, in reverse mode.
 
-    :param weights: shape (..., n). Others and errors as of :func:`torque_derivatives`.
+    :param weights: shape (..., n). Others and errors as in :func:`torque_derivatives`.
     :returns: ``q``, ``qd``, ``qdd`` of shape (..., n), and ``by`` of shape (...).
     """
     chosen = vectors(weights, robot.joints_count, "weights")
@@ -128,7 +128,7 @@ def torques_by_numbers(
     """Compute the derivatives of the efforts with respect to numbers of the file, (..., n, paths).
 
     :param robot: also one of :meth:`Robot.numbered`; with ``slopes`` of :func:`differentiate_numbers`.
-        Others as of :func:`torque_derivatives`.
+        Others as in :func:`torque_derivatives`.
     """
     inputs = _stack_inputs((q, qd, qdd), wrench, np.eye(robot.joints_count), rows=True)
     return _evaluate_number_gradient(robot, inputs) @ slopes

@@ -300,7 +300,7 @@ def driving_force_peak(
 ) -> tuple[Array, Array, NDArray[np.int64]]:
     """Find the greatest F_max over all directions, its direction (..., m), and its actuator's index.
 
-    Arguments as of :func:`max_driving_force_range`; any number of pose coordinates.
+    Arguments as in :func:`max_driving_force_range`; any number of pose coordinates.
     """
     back, forms = _driving_forms(robot, pose, energy, acceleration)
     greatest, y, joint = _find_largest_form(forms)

@@ -275,7 +275,7 @@ def reactions(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wrench:
     The rank of the balance decides which components the mechanism's statics determines; the others
     are NaN, see ``Reactions.determinate`` and ``Reactions.indeterminate``.
 
-    Parameters and errors as of :func:`~delta_dynamics.inverse_dynamics`.
+    Parameters and errors as in :func:`~delta_dynamics.inverse_dynamics`.
 
     :raises SingularityError: also where the joints cannot hold the loads (a constraint
         singularity).

@@ -544,7 +544,7 @@ def null_efforts(robot: Robot, q: ArrayLike) -> Array:
 
     They are the machine's internal forces: added to any efforts, they change no motion. Rows are
     of unit length and at right angles in efforts over their limits (``limits.effort``; without
-    limits, in efforts). Errors as of :meth:`Robot.forward`.
+    limits, in efforts). Errors as in :meth:`Robot.forward`.
     """
     if not robot.redundant:
         batch = vectors(robot.forward(q), len(robot.pose_names), "pose").shape[:-1]

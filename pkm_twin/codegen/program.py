@@ -128,7 +128,7 @@ class Equations:
     determinant: Expression
     """Determinant of the equations, relative to that at home."""
     residual: Expression
-    """Square of the residual of all equations, of unit one."""
+    """Square of the dimensionless residual of all equations."""
     guessed: bool = False
     """Whether ``start`` is a guess, which may be nearer to another root."""
     branch: Sequence[Expression] = ()

@@ -21,7 +21,7 @@ from pkm_twin.kinematics.rounding import repair_few
 from pkm_twin.kinematics.spins import MIN_MOTION, find_idle_bodies, null_space
 from pkm_twin.machine.graph import Graph
 
-MAX_COMPUTER_ROUNDING: Final = 1e-11
+MAX_FLOAT_ROUNDING: Final = 1e-11
 """Largest deviation that is floating-point rounding, rad or relative to the machine's size."""
 EVERYWHERE: Final = "where all loops close in every position"
 MAX_CAUSES: Final = 5
@@ -114,7 +114,7 @@ def find_small_deviations(graph: Graph, freedoms: int = 0) -> list[Deviation]:
             angle = float(np.linalg.norm(np.cross(axis, graph.joints[name].axes[k])))
             which = f"{name}'s axis" + (f" {k + 1}" if len(joint.axes) > 1 else "")
             parallel = [
-                o.name for o in others if float(np.linalg.norm(np.cross(axis, o.axes[0]))) < MAX_COMPUTER_ROUNDING
+                o.name for o in others if float(np.linalg.norm(np.cross(axis, o.axes[0]))) < MAX_FLOAT_ROUNDING
             ][:1]
             goal = f"parallel to {parallel[0]}'s axis" if parallel else EVERYWHERE
             found.append(Deviation(f"{which} is {angle:.2g} rad from {goal}", (name, *parallel), angle, angle))
@@ -128,7 +128,7 @@ def find_small_deviations(graph: Graph, freedoms: int = 0) -> list[Deviation]:
         gap = float(np.linalg.norm(change))
         text = f"{which} is {1e3 * gap:.3g} mm from {EVERYWHERE}"
         found.append(Deviation(text, (name,), gap, gap / graph.size))
-    found = [one for one in found if one.size > MAX_COMPUTER_ROUNDING]
+    found = [one for one in found if one.size > MAX_FLOAT_ROUNDING]
     return sorted(found, key=lambda one: -one.size)
 
 

@@ -61,7 +61,7 @@ class Closures(Protocol):
         """Return motion and closures in a state."""
 
     def scaled_jacobians(self, rows: Sequence[Row]) -> tuple[Array, Array]:
-        """Return derivatives of closures by u and by qd, of unit one."""
+        """Return the dimensionless derivatives of closures by u and by qd."""
 
 
 def find_hanging_limbs(scheme: Closures) -> tuple[Limb, ...]:

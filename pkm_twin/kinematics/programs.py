@@ -284,7 +284,7 @@ def certify_assembly(t: Traced, scheme: PlatformFirstScheme, posed: Traced, q: S
     For a machine with a closed-form start the signs at its singularities identify the assembly.
     """
     names, order = t.graph.leads, scheme.drive_pivots
-    rates, rates_home = (posed.rates_of_reaches(names, home=home) for home in (False, True))
+    rates, rates_home = (posed.fast_rates_of_joints(names, home=home) for home in (False, True))
     here, at_home = SparseLU(rates, order), SparseLU(rates_home, order)
     drives = at_home.inverse_determinant / here.inverse_determinant
     closures = drives * posed.determinant

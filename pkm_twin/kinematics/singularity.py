@@ -59,7 +59,7 @@ from pkm_twin.machine.tree import Tree
 
 def singularity_kernel(engine: Engine) -> Kernel:
     """Compile the program that returns the singularity measure (1) at q."""
-    return engine.kernel("singularity", _singularity)
+    return engine.kernel("singularity", _write_singularity_program)
 
 
 def compile_singularity_gradient(engine: Engine) -> Kernel:
@@ -67,7 +67,7 @@ def compile_singularity_gradient(engine: Engine) -> Kernel:
 
     def write(t: Traced) -> Program:
         by: dict[str, Numbers] = {"q": t.drives.variables("q"), "geometry": t.geometry}
-        return gradient_program(t, _singularity(t), by)
+        return gradient_program(t, _write_singularity_program(t), by)
 
     return engine.kernel("singularity gradient", write, free=True)
 
@@ -149,7 +149,7 @@ class KinematicCopy(Motion):
         return rows
 
 
-def _singularity(t: Traced) -> Program:
+def _write_singularity_program(t: Traced) -> Program:
     t.solve()
     outputs = {"measure": [t.tape.lift(singularity_measure(t))]}
     return Program(t.inputs("q"), 0, outputs, t.equations())

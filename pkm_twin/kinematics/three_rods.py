@@ -65,7 +65,7 @@ class ThreeRods:
         ends = self._list_ends(tree.graph)
         return [motion.point(near, end) - own for near, end, own in ends], [square_of(b - a) for _, a, b in ends]
 
-    def _find_up(self, graph: Graph) -> Objects:
+    def _find_plane_normal(self, graph: Graph) -> Objects:
         """Return a normal of the centres' plane at home that points to the body's side."""
         c1, c2, c3 = (end - own for _, end, own in self._list_ends(graph))
         n = cross(c2 - c1, c3 - c1)
@@ -73,7 +73,7 @@ class ThreeRods:
 
     def solve_unknowns(self, tree: Tree, q: Numbers) -> list[Any]:
         """Return the unknowns of the joint that carries the body, in closed form."""
-        point, _, _ = meet_spheres(*self._spheres(tree, q), self._find_up(tree.graph))
+        point, _, _ = meet_spheres(*self._spheres(tree, q), self._find_plane_normal(tree.graph))
         # Steps of the joint are along the base axes.
         steps = tree.links[self.body].steps
         x: list[Any] = [0.0] * len(steps)
@@ -86,7 +86,7 @@ class ThreeRods:
         ends = self._list_ends(motion.graph)
         c1, c2, c3 = (motion.point(near, end) - motion.point(self.body, own) for near, end, own in ends)
         n = cross(c2 - c1, c3 - c1)
-        return [-(c1 @ n) * (n @ self._find_up(motion.graph))]
+        return [-(c1 @ n) * (n @ self._find_plane_normal(motion.graph))]
 
     def find_gap(self, tree: Tree, q: Numbers) -> tuple[str, float] | None:
         """Return the rod that does not reach the intersection of the other two spheres, and the gap, m.

@@ -275,7 +275,7 @@ class Traced:
         unit = np.eye(at.lu.size)[self.scheme.varying.index(self.tree.steps[name].rate)]
         return -(at.jq.T @ at.lu.solve_transposed(unit))
 
-    def rates_of_reaches(self, names: Sequence[str], *, home: bool = False) -> Objects:
+    def fast_rates_of_joints(self, names: Sequence[str], *, home: bool = False) -> Objects:
         """Return :meth:`rates_of_joints`, with few operations for joints that set a limb's length.
 
         :param home: return the rates at home instead of the present state.

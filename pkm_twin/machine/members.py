@@ -205,7 +205,7 @@ class Structure:
 class Parts:
     """What a robot file describes: the graph, its beams, and the compliance of joints by name.
 
-    ``order``: as of :class:`Structure`. ``rigid``: path and text of what makes parts elastic, for
+    ``order``: as in :class:`Structure`. ``rigid``: path and text of what makes parts elastic, for
     the error where nothing is. ``missing``: path of a section that a bar must have and has not.
     """
 

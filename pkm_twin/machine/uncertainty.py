@@ -81,7 +81,7 @@ def list_causes(
 
 
 def match_numbers(name: str, entry: UncertaintyEntry, numbers: Mapping[str, tuple[float, str]]) -> dict[str, float]:
-    """Return the numbers that an entry's path covers; errors as of :func:`list_causes`."""
+    """Return the numbers that an entry's path covers; errors as in :func:`list_causes`."""
     parts = (f"{name}.", f"{name}[")
     below = {path: v for path, (v, _) in numbers.items() if path == name or path.startswith(parts)}
     field = f"uncertainty.{name}"

@@ -34,7 +34,7 @@ def write_pivots(t, scheme=None):
     else:
         t, _ = solve_pose(t, scheme)
         leads = scheme.machine.graph.leads
-        drives = SparseLU(t.rates_of_reaches(leads), scheme.drive_pivots)
+        drives = SparseLU(t.fast_rates_of_joints(leads), scheme.drive_pivots)
         found, equations, inputs = [t.lu, t.newton, drives], t.equations(), {"pose": len(t.q)}
     pivots = [1.0 / pivot for lu in found for pivot in lu.inverse_pivots.values()]
     return Program(inputs, 0, {"pivots": t.lift(pivots)}, equations)
