@@ -125,10 +125,6 @@ class Machine:
         """Values of the actuated joints at home, shape (n,), rad or m."""
         return np.array([joint.home for joint in self.actuated])
 
-    def pose_coordinates(self, rotation: Array, position: Array) -> Array:
-        """Return the pose coordinates of a rotation and a position, shape (m,), m and rad."""
-        return self.select_pose_rows(position, Rotation.from_matrix(rotation).as_euler(self.sequence))
-
     @property
     def sequence(self) -> str:
         """Axes of the three angles in scipy's notation of intrinsic rotations."""

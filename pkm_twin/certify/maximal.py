@@ -190,7 +190,8 @@ class Maximal(Engine):
     def pose(self, q: Array) -> Array:
         """Compute the pose coordinates, shape (m,), m and rad."""
         position, rotation = self.platform(q)
-        return self.machine.pose_coordinates(rotation, position)
+        angles = Rotation.from_matrix(rotation).as_euler(self.machine.sequence)
+        return self.machine.select_pose_rows(position, angles)
 
     def energy(self, q: Array, qd: Array) -> tuple[float, float]:
         """Compute kinetic and potential energy, J; the latter is zero at the base's origin."""

@@ -144,7 +144,14 @@ def order_bodies(scheme: Closures) -> tuple[str | Limb, ...]:
     while True:
         order, varying = _order_bodies_without(scheme, barred)
         limbs = [entry for entry in order if isinstance(entry, Limb)]
-        rates = _newton_rates(scheme, order)
+        # Unknown rates in the equations of Newton's method, at home or near it.
+        rates = {
+            rate
+            for x, q in scheme.samples
+            for row in _newton_rows(scheme, order, x, q)
+            for (kind, rate), value in row.columns.items()
+            if kind == "u" and abs(value) * row.scale > MAX_CLOSED_FORM_ERROR * scheme.tree.scales[rate]
+        }
         faulty = {
             limb
             for limb in limbs
@@ -169,19 +176,6 @@ def _is_newton_regular(scheme: Closures, order: Sequence[str | Limb]) -> bool:
     table = scheme.scaled_jacobians(rows)[0][:, rates]
     sizes = np.linalg.svd(table, compute_uv=False)
     return len(rows) == len(rates) and (not rates or bool(sizes[-1] > MIN_REMAINING_SINGULAR_VALUE))
-
-
-def _newton_rates(scheme: Closures, order: Sequence[str | Limb]) -> set[int]:
-    """Return the indices of the unknown rates in the equations of Newton's method near home."""
-    found: set[int] = set()
-    for x, q in scheme.samples:
-        for row in _newton_rows(scheme, order, x, q):
-            found |= {
-                rate
-                for (kind, rate), value in row.columns.items()
-                if kind == "u" and abs(value) * row.scale > MAX_CLOSED_FORM_ERROR * scheme.tree.scales[rate]
-            }
-    return found
 
 
 def _newton_rows(scheme: Closures, order: Sequence[str | Limb], x: Numbers, q: Numbers) -> list[Row]:
