@@ -16,28 +16,24 @@ from typing import Any, Final
 
 import numpy as np
 
-from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import BagError, ParameterError, PkmTwinError, UnknownNameError
 from pkm_twin.identification.compare import cut_recording, missing_samples
 from pkm_twin.identification.drives import FIT, fit_constants, parse_constants
 from pkm_twin.identification.fit import Fit, correct_delays, fit, refuse_faults, solve_and_judge
+from pkm_twin.identification.friction_search import LawSearch, Searched
 from pkm_twin.identification.hypotheses import Explanation, describe_positions, explain_recording
 from pkm_twin.identification.identifiable import KINDS, PAYLOAD, Kind, list_drive_parameters
-from pkm_twin.identification.judge import SIGMAS, make_basis
+from pkm_twin.identification.judge import SIGMAS
 from pkm_twin.identification.parameters import Number, file_parameters
 from pkm_twin.identification.rows import Problem
-from pkm_twin.identification.samples import MIN_RELATIVE_NOISE, filtered
+from pkm_twin.identification.samples import MIN_RELATIVE_NOISE
 from pkm_twin.identification.verdict import LINE, Verdict
-from pkm_twin.machine.friction import BASIC, KNOWN_FRACTION, LAWS, Dahl, select_compiled_laws
+from pkm_twin.machine.friction import BASIC, LAWS, Dahl, select_compiled_laws
 from pkm_twin.recordings import Recording
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.steps import find_sampling
 
 AUTO: Final = "auto"
-STRIBECK_SPEEDS: Final = np.geomspace(0.01, 1.0, 17)
-"""Candidate Stribeck speeds, as multiples of the RMS speed."""
-PRESLIDING_DISTANCES: Final = np.geomspace(1e-4, 0.1, 24)
-"""Candidate presliding distances, as fractions of the travel."""
 MAX_RESIDUAL_RATIO: Final = 1.02
 """Largest ratio of a joint's held-out residual with a law to that without at which it is taken."""
 
@@ -67,19 +63,6 @@ class Choice:
         if self.taken:
             return f"friction law {self.law} taken, the law without it is rejected: {evidence}"
         return f"friction law {self.law} not taken: {evidence}"
-
-
-@dataclass(frozen=True)
-class Searched:
-    """A nonlinear parameter of a friction law, with its standard deviation, (n,) each.
-
-    ``others``: the standard deviations that it causes in the law's other parameters, by key, (n,).
-    The phase of a cogging, for example, follows its period at the far end of the travel.
-    """
-
-    value: Array
-    deviation: Array
-    others: dict[str, Array]
 
 
 def parse_laws(words: str) -> tuple[str, ...] | None:
@@ -301,10 +284,10 @@ def _add_hysteresis(robot: Robot, recordings: Sequence[Recording], what: Sequenc
     """
     static = correct_delays(Problem.from_recordings(robot, recordings, what))
     recordings = [rows.recording for rows in static.whole]
-    rough = _set_values(robot, _Search(static, Dahl.name).found())
+    rough = _set_values(robot, LawSearch(static, Dahl.name).find())
     # Without hysteresis efforts near reversals count as outliers and noise, so search again with it.
     again = Problem.from_recordings(rough, recordings, static.what)
-    found = _set_values(robot, _Search(again, Dahl.name).found(judged=True))
+    found = _set_values(robot, LawSearch(again, Dahl.name).find(judged=True))
     return replace(found, open_laws=(*robot.open_laws, Dahl.name))
 
 
@@ -319,7 +302,7 @@ def _add_law(before: Problem, name: str) -> tuple[dict[str, Searched], Robot]:
     :raises PkmTwinError: the motion does not show it.
     """
     robot = before.robot
-    found = _Search(before, name).found()
+    found = LawSearch(before, name).find()
     robot = _set_values(robot, found) if found else robot
     return found, replace(robot, open_laws=(*robot.open_laws, name))
 
@@ -352,124 +335,3 @@ def _find_joint(robot: Robot, key: tuple[str | int, ...]) -> int:
             joint = group.names[0].rpartition(".")[0]
             return robot.joint_names.index(joint)
     raise KeyError(key)
-
-
-class _Search:
-    """Search of a law's nonlinear parameters in the residual of a fit without the law."""
-
-    def __init__(self, before: Problem, name: str) -> None:
-        self.robot, self.law = before.robot, LAWS[name]
-        self._rows = before.rows
-        parts = [rows.fitted for rows in self._rows]
-        pieces = [t for rows in self._rows for t in rows.tracks]
-        q, qd = (np.concatenate([getattr(t, word) for t in pieces]) for word in ("q", "qd"))
-        self._speed, self._travel = np.sqrt(np.mean(qd**2, 0)), np.ptp(q, axis=0)
-        counts = np.concatenate([some.counts for some in parts])
-        if self.law.memory:
-            # Hysteresis shows after reversals; samples whose friction state is unknown are left out.
-            most = PRESLIDING_DISTANCES[-1] * self._travel
-            unknown = self._filtered(lambda q, rates: Dahl.states(q, rates, most).unknown)
-            counts = (unknown < KNOWN_FRACTION).astype(np.float64)
-        noise = [np.broadcast_to(some.signals.noise, some.target.shape) for some in parts]
-        self._weight = counts / np.maximum(np.concatenate(noise), 1e-300)
-        self._left = np.concatenate([some.target for some in parts]) * self._weight
-        self._basic = []
-        for j, joint in enumerate(self.robot.joint_names):
-            # The parameters fitted before may have absorbed a part of the law's efforts.
-            own = before.columns[:, j] * self._weight[:, j, None]
-            if self.law.memory:
-                own = np.delete(own, before.parameters.names.index(f"{joint}.coulomb"), -1)
-            self._basic.append(make_basis(own))
-        cutoffs = [rows.how.cutoff for rows in self._rows if rows.how.cutoff is not None]
-        fastest = self._travel * min(cutoffs, default=np.inf) / np.maximum(self._speed, 1e-300)
-        self._waves = np.minimum(200.0, fastest)
-
-    def _filtered(self, columns: Callable[[Array, Array], Array]) -> Array:
-        """Evaluate columns, (samples, n, c), along the tracks and filter them to the fitted rows."""
-        made = []
-        for rows in self._rows:
-            parts = [{"": columns(t.q, t.sure(rows.how))} for t in rows.tracks]
-            made.append(filtered(parts, rows.period, rows.how)[""][: rows.held_from])
-        return np.concatenate(made)
-
-    def found(self, *, judged: bool = False) -> dict[str, Searched]:
-        """Return the nonlinear parameters by key; none if the law is linear.
-
-        :param judged: whether a memory has to be clear, joint by joint.
-        :raises PkmTwinError: the residual shows no value.
-        """
-        keys = [key for key, one in self.law.parameters.items() if not one.linear]
-        if not keys:
-            return {}
-        (key,) = keys
-        if self.law.memory:
-            grid = PRESLIDING_DISTANCES[:, None] * np.maximum(self._travel, 1e-12)
-        elif self.law.parameters[key].unit.endswith("/s"):
-            grid = STRIBECK_SPEEDS[:, None] * np.maximum(self._speed, 1e-12)
-        else:
-            waves = np.linspace(1.0, max(float(self._waves.max()), 2.0), 800)
-            grid = np.maximum(self._travel, 1e-12) / waves[:, None]
-        gains = np.concatenate([self._compute_gains(key, grid[a : a + 24])[0] for a in range(0, len(grid), 24)])
-        best = gains.argmax(0)
-        joints = np.arange(gains.shape[1])
-        seen = gains[best, joints] > 0.0
-        if judged:
-            # Coulomb friction without one is the other hypothesis.
-            without = self._compute_gains(key, np.zeros((1, len(joints))))[0][0]
-            seen = gains[best, joints] - without > SIGMAS**2
-        if not seen.any():
-            where = " at reversals: slow ones show it" if judged else ""
-            raise PkmTwinError(f"no sign of {self.law.name} friction{where}")
-        low = np.log(grid[np.maximum(best - 1, 0), joints])
-        high = np.log(grid[np.minimum(best + 1, len(grid) - 1), joints])
-        low, high = np.minimum(low, high), np.maximum(low, high)
-        part = (np.sqrt(5.0) - 1.0) / 2.0
-        for _ in range(14):
-            pair = np.stack([high - part * (high - low), low + part * (high - low)])
-            left, right = self._compute_gains(key, np.exp(pair))[0]
-            high = np.where(left > right, pair[1], high)
-            low = np.where(left > right, low, pair[0])
-        middle = 0.5 * (low + high)
-        step = np.full(len(middle), 0.02)
-        if not self.law.turns:
-            # A phase change of at most 15 % of a period at the far end of the travel.
-            step = np.minimum(step, 0.15 * np.exp(middle) / np.maximum(self._travel, 1e-12))
-        gains, sizes = self._compute_gains(key, np.exp(middle + step * np.array([[0.0], [1.0], [-1.0]])))
-        here, up, down = gains
-        bend = np.maximum(2.0 * here - up - down, 1e-300) / step**2
-        value = np.exp(middle)
-        if judged:
-            value = np.where(seen, value, getattr(self.robot.friction, key))
-        relative = np.minimum(np.sqrt(2.0 / bend), 10.0)
-        slopes = np.abs(sizes[1] - sizes[2]) * (relative / (2.0 * step))[:, None]
-        words = [word for word, one in self.law.parameters.items() if one.linear]
-        return {key: Searched(value, value * relative, dict(zip(words, slopes.T, strict=True)))}
-
-    def _compute_gains(self, key: str, grid: Array) -> tuple[Array, Array]:
-        """Return how far each value of a nonlinear parameter, (g, n), reduces chi square, (g, n).
-
-        Also the law's linear parameters fitted with each value, (g, n, others).
-        """
-        n, linear = self.robot.joints_count, [(word, one) for word, one in self.law.parameters.items() if one.linear]
-
-        def columns(q: Array, rates: Array) -> Array:
-            made = []
-            for values in grid:
-                for word, _ in linear:
-                    given = {key: values} | {k: np.full(n, float(k == word)) for k, _ in linear}
-                    made.append(self.law.along(given, q, rates))
-            return np.stack(made, -1)
-
-        table = self._filtered(columns) * self._weight[..., None]
-        table = table.reshape(*table.shape[:2], len(grid), len(linear))
-        gains, sizes = np.zeros((len(grid), n)), np.zeros((len(grid), n, len(linear)))
-        for j in range(n):
-            basis, left = self._basic[j], self._left[:, j]
-            left = left - basis @ (basis.T @ left)
-            for g in range(len(grid)):
-                own = table[:, j, g] - basis @ (basis.T @ table[:, j, g])
-                size, *_ = np.linalg.lstsq(own, left, rcond=1e-9)
-                good = all(one.low is None or s >= 0.0 for s, (_, one) in zip(size, linear, strict=True))
-                sizes[g, j] = size
-                gains[g, j] = float(left @ (own @ size)) if good else 0.0
-        return gains, sizes
