@@ -9,7 +9,7 @@ for certain. The search for a recording's cause and the judgement of a fit have 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Final
@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 
 from delta_dynamics.torques.derivatives import differentiate_numbers, torques_by_numbers
-from pkm_twin.codegen.arrays import Array, Mask
+from pkm_twin.codegen.arrays import Array, Indices, Mask
 from pkm_twin.errors import ParameterError
 from pkm_twin.identification.evidence import Signals, Spectra
 from pkm_twin.identification.parameters import FileParameters
@@ -287,7 +287,7 @@ class Columns:
             gains=len(gains),
         )
 
-    def with_motion(self, motion: Motion, turned: Array, order: Sequence[int] | None) -> Columns:
+    def with_motion(self, motion: Motion, turned: Array, order: Indices | None) -> Columns:
         """Return the model of another motion with the same errors.
 
         :param turned: 1 or -1 where the joint's velocity has the other sign, (n,). ``order``: the
@@ -298,10 +298,31 @@ class Columns:
         rubs = np.array([g.kind == "friction" for g in self.rows.model.parameters.groups for _ in g.names])
         # The sign of a velocity is filtered as the efforts are.
         own = self.rows.table[..., rubs] * turned[:, None]
-        table[..., rubs] = own if order is None else own[:, list(order)]
+        table[..., rubs] = own if order is None else own[:, order]
         made = _differentiate(self.rows, table, rest, motion)
         columns = np.concatenate([made.columns, self.columns[..., made.columns.shape[-1] :]], -1)
         return replace(self, certain=made.certain, fast_certain=made.fast_certain, columns=columns)
+
+    def with_friction(self, units: Array) -> Columns:
+        """Return the model with more friction of each drive, of its usual size.
+
+        :param units: efforts by a unit of each parameter, (k, n, parameters).
+        """
+        k, n, count = units.shape
+        place = [len(self.kinds) - self.gains] * (n * count)
+        told = np.sqrt(np.mean(self.certain**2, 0))[:, None]
+        shown = np.maximum(np.sqrt(np.mean(units**2, 0)), 1e-300)
+        table = np.einsum("knl,nm->knml", units, np.eye(n)).reshape(k, n, -1)
+        return replace(
+            self,
+            columns=np.insert(self.columns, place, table, -1),
+            fast=np.insert(self.fast, place, 0.0, -1),
+            deviation=np.insert(self.deviation, place, (PRIOR_DEVIATIONS[FRICTION] * told / shown).ravel()),
+            low=np.insert(self.low, place, -np.inf),
+            high=np.insert(self.high, place, np.inf),
+            kinds=(*self.kinds[: place[0]], *["error"] * len(place), *self.kinds[place[0] :]),
+            turning=np.insert(self.turning, place, False),
+        )
 
     @property
     def payload(self) -> Mask:
@@ -313,11 +334,11 @@ class Columns:
         effort: Array | None = None,
         inner: slice = slice(None),
         rate: float = 1.0,
-        order: Sequence[int] | None = None,
+        order: Indices | None = None,
     ) -> Spectra:
         """Return the statistics of some rows, with other efforts, or time at another rate."""
         r, s, more = self.rows, self.rows.signals, rate**2 - 1.0
-        joints = slice(None) if order is None else list(order)
+        joints = slice(None) if order is None else order
         measured = (r.effort if effort is None else effort)[:, joints]
         certain, columns = self.certain + more * self.fast_certain, self.columns + more * self.fast
         return Spectra.from_signals(Signals(certain, columns, measured, r.counts, s.noise[joints], s.band), inner)

@@ -11,22 +11,25 @@ wide enough for a heavy payload would prefer a wrong scale to a sound recording 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import combinations
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
 
-from pkm_twin.codegen.arrays import Array
+from pkm_twin.codegen.arrays import Array, Indices
 from pkm_twin.errors import PkmTwinError, SingularityError, UnreachableError
 from pkm_twin.identification.columns import CURRENT_OFFSET, GAIN, PRIOR_DEVIATIONS, Columns
 from pkm_twin.identification.compare import cut_recording, find_idle
 from pkm_twin.identification.evidence import Model, Spectra
+from pkm_twin.identification.friction_search import LawSearch
+from pkm_twin.identification.identifiable import KINDS
 from pkm_twin.identification.judge import ALTERNATIVE_LOG_ODDS, SIGMAS
 from pkm_twin.identification.parameters import file_parameters
-from pkm_twin.identification.rows import MAX_EFFORT, Rows, make_rows
+from pkm_twin.identification.rows import MAX_EFFORT, Problem, Rows, make_rows
 from pkm_twin.identification.samples import Motion, find_held_payload
 from pkm_twin.identification.words import (
     EFFORT_UNITS,
@@ -37,12 +40,15 @@ from pkm_twin.identification.words import (
     position_text,
     scale_text,
 )
+from pkm_twin.machine.friction import LAWS, select_compiled_laws
 from pkm_twin.messages.reading import rotate_to_base
 from pkm_twin.recordings import Load, Recording
 from pkm_twin.robot.robot import Robot
 
 HEAVY_PAYLOAD_RATIO: Final = 30.0
 """Prior deviation of a heavy payload, as a multiple of that of a usual one."""
+HEAVY_FRICTION_RATIO: Final = 3.0
+"""Prior deviation of heavy friction, which may be all of the efforts, as a multiple of that of usual friction."""
 CLASSES: Final = {
     "": 0.0,
     "payload": 2.0,
@@ -50,6 +56,7 @@ CLASSES: Final = {
     "friction masses payload": 3.0,
     "heavy payload": 4.0,
     "friction heavy payload": 5.0,
+    "heavy friction": 4.0,
 }
 """Kinds of numbers that differ from the file, and the log prior odds against it."""
 MAX_LISTED_CAUSES: Final = 6
@@ -60,6 +67,10 @@ UNIT_PRICE: Final = 5.0
 """Log prior odds against another unit, scale or rate: one recording in 150."""
 RARE_PRICE: Final = 8.0
 """Log prior odds against any other cause: one in 3,000."""
+MAX_NAMED_DISCREPANCY: Final = 0.12
+"""Largest ratio of the model error to the measured efforts with which a cause is named."""
+MAX_SOUND_DISCREPANCY: Final = 0.3
+"""Largest ratio of the model error to the measured efforts of a machine that may be the file's."""
 MIN_PROBABILITY: Final = 0.99
 """Smallest probability of a cause that is named."""
 MIN_LOG_ODDS: Final = float(np.log(MIN_PROBABILITY / (1.0 - MIN_PROBABILITY)))
@@ -81,6 +92,7 @@ class Hypothesis:
 
     No words: the recording is sound. ``classes``: probability of each. ``load``: the payload that
     explains the efforts. ``late``: the delay of the efforts of all joints, s; ``scale``: theirs.
+    ``law``: of friction, that the file lacks.
     """
 
     text: str
@@ -91,6 +103,7 @@ class Hypothesis:
     late: float = 0.0
     classes: tuple[float, ...] = ()
     scale: float = 1.0
+    law: str = ""
 
 
 @dataclass(frozen=True)
@@ -182,7 +195,10 @@ class HypothesisSearch:
         kinds = np.array(self.columns.kinds)
         free = ~np.isin(kinds, ("friction", "masses", "payload")) | np.isin(kinds, name.split())
         # Numbers that agree with the file do so within a tenth of the prior deviations.
-        return np.where((kinds == "payload") & ("heavy" in name), HEAVY_PAYLOAD_RATIO, np.where(free, 1.0, 0.1))
+        widths = np.where(free, 1.0, 0.1)
+        for kind, ratio in (("payload", HEAVY_PAYLOAD_RATIO), ("friction", HEAVY_FRICTION_RATIO)):
+            widths = np.where((kinds == kind) & (f"heavy {kind}" in name), ratio, widths)
+        return widths
 
     def _find_logs(self, model: Model, name: str, bounded: bool) -> Array:
         """Return a class's log evidence at each share, less what possible numbers cost."""
@@ -226,6 +242,9 @@ class HypothesisSearch:
         )
         if pushed or not clearly_sound:
             found += self._weigh_positions()
+        best = max(found, key=lambda one: one.log)
+        if best.text or best.discrepancy_ratio > MAX_NAMED_DISCREPANCY:
+            found += self._weigh_friction_laws()
         return sorted(found, key=lambda one: -one.log)
 
     def _weigh_efforts(self) -> Iterator[Hypothesis]:
@@ -252,10 +271,9 @@ class HypothesisSearch:
         for order, (i, k) in zip(orders, combinations(range(n), 2), strict=True):
             order[[i, k]] = k, i
             text = f"efforts of {self.joints[i]} and {self.joints[k]} are exchanged"
-            yield self.weigh(text, RARE_PRICE, self.columns.spectra(order=order.tolist()))
+            yield self._weigh_order(text, self.columns, order, order)
         for order in [np.roll(range(n), 1), np.roll(range(n), -1)] if n > 2 else []:
-            text = "columns of the efforts are in another order"
-            yield self.weigh(text, RARE_PRICE, self.columns.spectra(order=order.tolist()))
+            yield self._weigh_order("columns of the efforts are in another order", self.columns, order, order)
         back = np.where(self.columns.turning, -1.0, 1.0)
         p = self.rows.model.parameters
         rubs = np.array([g.kind == "friction" for g in p.groups for _ in g.names])
@@ -266,6 +284,20 @@ class HypothesisSearch:
             text = f"the motion was {rate:.3g} times as fast as its time stamps are ("
             text += "ms for s?)" if rate >= 1e3 or rate <= 1e-3 else "time steps?)"
             yield self.weigh(text, UNIT_PRICE, self.columns.spectra(rate=rate))
+
+    def _weigh_order(self, text: str, columns: Columns, order: Indices, efforts: Indices | None = None) -> Hypothesis:
+        """Weigh another order of joints, by the samples at which the friction of both orders is known.
+
+        :param order: of the joints whose motion or efforts are exchanged; ``efforts``: of the efforts.
+        """
+        counts = self.rows.counts * self.rows.counts[:, order]
+        common = replace(self.rows, counts=counts)
+        alike = bool((counts == self.rows.counts).all())
+        one = self.weigh(text, RARE_PRICE, replace(columns, rows=common).spectra(order=efforts), screened=alike)
+        if alike:
+            return one
+        before = self.weigh("", 0.0, replace(self.columns, rows=common).spectra(), screened=False)
+        return replace(one, log=self.sound.log + one.log - before.log)
 
     def _weigh_scales(self, names: str, which: Array, way: float) -> Iterator[Hypothesis]:
         """Weigh the most probable scale of some drives' efforts."""
@@ -295,7 +327,7 @@ class HypothesisSearch:
                 *((u, UNIT_PRICE - 2.0) for u in units),
             ):
                 one = self.weigh("", price, self.spectra, gains=gains(size))
-                if one.kinds in ("", "friction") and size == scale:
+                if one.kinds in ("", "friction", "heavy friction") and size == scale:
                     own = float(np.mean(self._find_gains(gains(size), one.kinds)[0][which > 0.0]))
                     size /= 1.0 - size * own
                 yield replace(one, text=scale_text(names, size), scale=size if which.all() else 1.0)
@@ -383,6 +415,26 @@ class HypothesisSearch:
             part = replace(c, columns=np.where(payload, held[:, None, None], 1.0) * c.columns)
             yield self._weigh_payload(part.spectra(), UNIT_PRICE + 3.0 * len(spans), tuple(spans))
 
+    def _weigh_friction_laws(self) -> Iterator[Hypothesis]:
+        """Weigh friction laws that the file lacks, with the nonlinear parameter that explains most."""
+        r, c, model = self.rows, self.columns, self.rows.model
+        problem = Problem.from_recordings(model.robot, [r.recording], KINDS, known=[r])
+        n = len(self.joints)
+        for name in select_compiled_laws(tuple(LAWS)):
+            search = LawSearch(problem, name)
+            if name in model.robot.laws or not search.key:
+                continue
+            try:
+                (found,) = search.find().values()
+            except PkmTwinError:
+                continue
+            other, units = copy(self), search.columns(found.value)
+            other.columns = c.with_friction(units)
+            text = f"{name} friction of the drives, which the file lacks, explains the efforts: --friction {name}"
+            price = UNIT_PRICE + n * float(np.log(len(search.list_candidates())))
+            one = other.weigh(text, price, other.columns.spectra(), screened=False)
+            yield replace(one, law=name)
+
     def _weigh_payload(self, spectra: Spectra, price: float, spans: tuple[tuple[float, float], ...] = ()) -> Hypothesis:
         """Weigh a payload, with the mass that it has at the file's centre."""
         one, robot = self.weigh("", price, spectra), self.rows.model.robot
@@ -408,7 +460,7 @@ class HypothesisSearch:
         scaled = next((one for one in self.all if one.scale > 0.0 and one.scale != 1.0), best)
         if (
             scaled.scale != 1.0
-            and scaled.discrepancy_ratio <= 0.12
+            and scaled.discrepancy_ratio <= MAX_NAMED_DISCREPANCY
             and abs(scaled.log - sound.log) <= MIN_LOG_ODDS >= best.log - scaled.log
         ):
             text, _ = self._tell_scale(scaled.scale, scaled.kinds)
@@ -416,13 +468,13 @@ class HypothesisSearch:
                 return Explanation(text, not is_usual_scale(scaled.scale))
             best = next(one for one in self.all if one is not scaled)
         if best.text and best.log - sound.log > MIN_LOG_ODDS:
-            if best.text == NO_MACHINE or best.discrepancy_ratio > 0.12:
+            if best.text == NO_MACHINE or best.discrepancy_ratio > MAX_NAMED_DISCREPANCY:
                 return Explanation(unknown, fault=True)
             if 0.0 < abs(best.late) < MAX_DELAY and not self.rows.recording.late:
                 r = self.rows.recording.compensate_effort_delay(best.late)
                 return explain(make_rows(self.rows.model.robot, self.rows.model.parameters, r))
-            return Explanation(best.text, fault=True, load=best.load)
-        if sound.discrepancy_ratio > 0.3:
+            return Explanation(best.text, fault=not best.law, load=best.load)
+        if sound.discrepancy_ratio > MAX_SOUND_DISCREPANCY:
             return Explanation(unknown, fault=True)
         gains, deviations = self._find_gains()
         j, mean = int(np.abs(gains).argmax()), float(gains.mean())
@@ -504,10 +556,10 @@ class HypothesisSearch:
             order[[i, k]] = k, i
             other = replace(motion, q=q[:, order], qd=motion.qd[:, order], qdd=motion.qdd[:, order])
             text = f"{names[i]} and {names[k]} are exchanged"
-            yield from self._weigh_motion(f"positions of {text}", other, ones, text, order.tolist())
+            yield from self._weigh_motion(f"positions of {text}", other, ones, text, order)
 
     def _weigh_motion(
-        self, text: str, motion: Motion, turned: Array, both: str = "", order: Any = None
+        self, text: str, motion: Motion, turned: Array, both: str = "", order: Indices | None = None
     ) -> Iterator[Hypothesis]:
         """Weigh another motion; and with the efforts turned or exchanged alike, ``both``."""
         # The error of a motion that the machine cannot make takes as long as weighing it.
@@ -519,12 +571,14 @@ class HypothesisSearch:
             return
         if not np.isfinite(made.columns).all() or not np.abs(made.certain).max() < MAX_EFFORT:
             return
+        if order is not None:
+            yield self._weigh_order(text, made, order)
+            yield self._weigh_order(both, made, order, order)
+            return
         spectra = made.spectra()
         yield self.weigh(text, RARE_PRICE, spectra)
-        if both and order is None:
+        if both:
             yield self.weigh(both, RARE_PRICE, spectra, gains=turned)
-        elif both:
-            yield self.weigh(both, RARE_PRICE, made.spectra(order=order))
 
 
 SEARCH_CLASSES: Final = ("", "friction masses payload")

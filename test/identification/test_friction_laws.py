@@ -12,6 +12,7 @@ from pkm_twin.identification.drives import fit_constants, parse_constants
 from pkm_twin.identification.excitation import Judge, TrajectoryLimits, design_sweeps
 from pkm_twin.identification.fit import fit
 from pkm_twin.identification.friction_laws import fit_with_laws, parse_laws
+from pkm_twin.identification.hypotheses import explain_recording
 from pkm_twin.identification.parameters import file_parameters
 from pkm_twin.identification.samples import Filtering, find_lines
 from pkm_twin.recordings import Recording
@@ -67,6 +68,16 @@ def test_the_law_of_a_drive_is_found_by_what_was_held_out(case):
     for key, rows in found.items():
         value, deviation = np.array(rows).T
         assert (np.abs(value - values[key]) < 4.0 * deviation + 0.05 * np.abs(values[key])).all()
+
+
+def test_a_large_cogging_torque_is_a_cause_and_no_fault():
+    rng = np.random.default_rng(8)
+    m = machine(load("five_bar"), rng, 8.0)
+    truth, _ = rubbing(m, "periodic")
+    effort = inverse_dynamics(truth, m.q, m.qd, m.qdd)
+    found = explain_recording(m.robot, noisy(m.recorded(effort=effort), rng, 0.005))
+    assert "--friction periodic" in found.text and not found.fault
+    assert found.considered[0][1] > 0.99
 
 
 def test_laws_are_tried_with_a_known_payload():
