@@ -25,7 +25,7 @@ from delta_dynamics.simulation.machine import (
     WrenchSignal,
     tune_position_control,
 )
-from pkm_twin.bags.definitions import message_definition
+from pkm_twin.bags.definitions import WRENCH, message_definition
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MessageError, ParameterError, shorten_value
 from pkm_twin.messages.fast_decoder import DoublesTemplate, RawTrajectory
@@ -44,7 +44,6 @@ MAX_TICK_TIME: Final = 5e-3
 """Longest time that one tick of the clock may simulate, s: messages are taken between ticks."""
 CHECK_PERIOD: Final = 0.05
 """In lockstep: period of the checks for a silent commander, s."""
-WRENCH: Final = "geometry_msgs/msg/WrenchStamped"
 SIM_TIME_EXPECTED: Final = "false, because machine_sim has its own clock"
 
 

@@ -8,9 +8,15 @@ import importlib.util
 import os
 import re
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Final
 
 from pkm_twin.errors import BagError, shorten_value
+
+JOINT_STATE: Final = "sensor_msgs/msg/JointState"
+TRAJECTORY: Final = "trajectory_msgs/msg/JointTrajectory"
+WRENCH: Final = "geometry_msgs/msg/WrenchStamped"
+TRANSFORM: Final = "geometry_msgs/msg/TransformStamped"
+"""Types of messages that nodes and recordings share."""
 
 SEPARATOR = "=" * 80
 """The line between the parts of a concatenated message definition."""

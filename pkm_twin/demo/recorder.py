@@ -33,9 +33,6 @@ joint state and its wrench, which arrive independently."""
 QUEUE_DEPTH = 20_000
 """Depth of the recorder's queues: more messages than a stage publishes before they are taken."""
 
-JOINT_STATE_TYPE = "sensor_msgs/msg/JointState"
-TRAJECTORY_TYPE = "trajectory_msgs/msg/JointTrajectory"
-
 
 class Recorder:
     """Writes the raw messages of topics into a bag, with a prefix for each stage."""

@@ -23,13 +23,12 @@ from rclpy.executors import SingleThreadedExecutor
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
+from pkm_twin.bags.definitions import JOINT_STATE, TRAJECTORY, TRANSFORM
 from pkm_twin.bags.reader import BagMessage, BagWriter, inspect
 from pkm_twin.demo import tracking
 from pkm_twin.demo.recorder import (
-    JOINT_STATE_TYPE,
     MAX_WAIT,
     QUEUE_DEPTH,
-    TRAJECTORY_TYPE,
     Lockstep,
     Recorder,
     receive_remaining,
@@ -74,9 +73,9 @@ STALE_PARAMETER = f"stale_after:={MAX_WAIT}"
 QUEUE_WAIT_PARAMETER = f"max_wait:={MAX_WAIT}"
 JOINT_STATES = "/joint_states"
 DYNAMICS_OUTPUTS = {
-    "/delta_dynamics/joint_torques": JOINT_STATE_TYPE,
-    "/delta_dynamics/torque_residual": JOINT_STATE_TYPE,
-    "/delta_dynamics/joint_trajectory_ff": TRAJECTORY_TYPE,
+    "/delta_dynamics/joint_torques": JOINT_STATE,
+    "/delta_dynamics/torque_residual": JOINT_STATE,
+    "/delta_dynamics/joint_trajectory_ff": TRAJECTORY,
 }
 STAGES = (
     Stage(
@@ -106,7 +105,7 @@ STAGES = (
             "/stiffness_monitor/compliance": "std_msgs/msg/Float64MultiArray",
             "/stiffness_monitor/strain_energy": "diagnostic_msgs/msg/DiagnosticArray",
             "/stiffness_monitor/dominant_element": "std_msgs/msg/String",
-            "/stiffness_monitor/deflection": "geometry_msgs/msg/TransformStamped",
+            "/stiffness_monitor/deflection": TRANSFORM,
         },
         "/wrench",
         "/stiffness_monitor/deflection",

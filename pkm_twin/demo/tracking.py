@@ -22,12 +22,11 @@ from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from pkm_twin import load
+from pkm_twin.bags.definitions import JOINT_STATE, TRAJECTORY
 from pkm_twin.bags.reader import read_messages
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.demo.recorder import (
-    JOINT_STATE_TYPE,
     QUEUE_DEPTH,
-    TRAJECTORY_TYPE,
     Recorder,
     receive_remaining,
     run_process,
@@ -37,6 +36,7 @@ from pkm_twin.demo.report import Panel, judge_share, unjudged_fact
 from pkm_twin.errors import BagError
 from pkm_twin.messages.reading import JointReader
 from pkm_twin.messages.stamps import SECOND, stamp_of
+from pkm_twin.recordings.bags import TOPIC
 from pkm_twin.report import Fact, make_judged_fact, plots
 from pkm_twin.streams.path import JointPath
 
@@ -54,7 +54,6 @@ TRAJECTORY_POINTS: Final = 81
 """Number of points of the tracked trajectory."""
 INPUT_TOPIC: Final = "/machine_sim/joint_trajectory"
 QUEUE_PARAMETER: Final = "qos_overrides./joint_states.publisher.depth"
-TWIN_TOPIC: Final = "/delta_dynamics/joint_trajectory"
 
 
 class _MachineWatch:
@@ -83,13 +82,13 @@ class _MachineWatch:
 def run(spread: float, recorder: Recorder, executor: SingleThreadedExecutor, console: Console) -> None:
     """Record a run without and a run with feedforward on a machine with this perturbation."""
     node = executor.get_nodes()[0]
-    recorder.start_recording(topic_prefix(spread), {"/joint_states": JOINT_STATE_TYPE, INPUT_TOPIC: TRAJECTORY_TYPE})
+    recorder.start_recording(topic_prefix(spread), {"/joint_states": JOINT_STATE, INPUT_TOPIC: TRAJECTORY})
     watch = _MachineWatch()
     states = node.create_subscription(JointState, "/joint_states", watch.update, QUEUE_DEPTH)
     answers: list[JointTrajectory] = []
-    twin_answers = node.create_subscription(JointTrajectory, f"{TWIN_TOPIC}_ff", answers.append, 10)
+    twin_answers = node.create_subscription(JointTrajectory, f"{TOPIC}_ff", answers.append, 10)
     depth = QoSProfile(depth=1)
-    twin, machine = (node.create_publisher(JointTrajectory, t, depth) for t in (TWIN_TOPIC, INPUT_TOPIC))
+    twin, machine = (node.create_publisher(JointTrajectory, t, depth) for t in (TOPIC, INPUT_TOPIC))
     reset = node.create_client(Trigger, "/machine_sim/reset")
     module = [sys.executable, "-m"]
     # The twin answers trajectories alone, so give it an empty topic of joint states.

@@ -19,15 +19,13 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from pkm_twin.codegen.arrays import Array
+from pkm_twin.codegen.arrays import Array, Indices
 from pkm_twin.design import programs
 from pkm_twin.design.variants import Variants
 from pkm_twin.errors import ParameterError
 from pkm_twin.robot.robot import Robot
-
-Index = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +73,7 @@ class PosePath:
             np.array(np.broadcast_to(load, (len(times), 6))),
         )
 
-    def at(self, rows: Index) -> PosePath:
+    def at(self, rows: Indices) -> PosePath:
         """Return some samples of the path, in any order."""
         parts = (self.time, self.pose, self.rate, self.acceleration, self.wrench)
         return PosePath(*(part[rows] for part in parts))

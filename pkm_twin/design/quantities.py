@@ -14,15 +14,12 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pkm_twin.codegen.arrays import Array
+from pkm_twin.codegen.arrays import Array, Indices
 from pkm_twin.design.pose_path import PathMotion
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.robot.numbers import FileNumbers
 from pkm_twin.robot.robot import Robot
-
-Index = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
@@ -39,7 +36,7 @@ class Quantity:
     name: str
     meaning: str
     evaluate: Callable[[PathMotion], Array]
-    differentiate: Callable[[PathMotion, Index], Array]
+    differentiate: Callable[[PathMotion, Indices], Array]
     sampled: bool = False
     least: bool = False
 
@@ -116,7 +113,7 @@ def effort_scales(robot: Robot) -> Array:
     return 1.0 / np.asarray(limit, np.float64)
 
 
-def _peak_derivatives(f: PathMotion, joints: Index) -> Array:
+def _peak_derivatives(f: PathMotion, joints: Indices) -> Array:
     """Return the derivatives of peak efforts; ``joints``: the joint with the peak at each sample."""
     rows = np.arange(len(joints))
     weights = np.zeros(f.efforts.shape[1:])
@@ -137,7 +134,7 @@ def _rms_gradient(f: PathMotion, values: Array, place: int) -> Array:
     return np.asarray(f.path.weights * values[0, :, place] / max(root, 1e-300), np.float64)
 
 
-def _rms_derivatives(f: PathMotion, places: Index) -> Array:
+def _rms_derivatives(f: PathMotion, places: Indices) -> Array:
     scales, rows = effort_scales(f.machines.robot), []
     for place in places:
         weights = np.zeros(f.efforts.shape[1:])
@@ -169,7 +166,7 @@ def _motor_torques(f: PathMotion) -> tuple[Array, Array, Array, Array, Array]:
     return inertia * turns * f.qdd + transmitted * losses / turns, losses, turns, inertia, efficiency
 
 
-def _motor_derivatives(f: PathMotion, places: Index) -> Array:
+def _motor_derivatives(f: PathMotion, places: Indices) -> Array:
     torques, losses, *numbers = _motor_torques(f)
     loss, tau, qdd = losses[0], f.efforts[0], f.qdd[0]
     turns, inertia, efficiency = (values[0] for values in numbers)
@@ -196,7 +193,7 @@ def _energy(f: PathMotion) -> Array:
     return np.asarray((f.path.weights[:, None] * power).sum((1, 2))[:, None], np.float64)
 
 
-def _energy_derivatives(f: PathMotion, places: Index) -> Array:
+def _energy_derivatives(f: PathMotion, places: Indices) -> Array:
     given = (f.efforts * f.qd > 0.0)[0] * f.path.weights[:, None]
     rows = f.effort_derivatives(given * f.qd[0], given * f.efforts[0])
     return np.repeat(rows.sum(0)[None], len(places), 0)
@@ -206,7 +203,7 @@ def _deflection(f: PathMotion) -> Array:
     return np.asarray(np.linalg.norm(f.deflection[..., :3], axis=-1)[..., None], np.float64)
 
 
-def _deflection_derivatives(f: PathMotion, places: Index) -> Array:
+def _deflection_derivatives(f: PathMotion, places: Indices) -> Array:
     del places
     moved = f.deflection[0, :, :3]
     size = np.linalg.norm(moved, axis=-1, keepdims=True)

@@ -16,17 +16,14 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pkm_twin.codegen.arrays import Array
+from pkm_twin.codegen.arrays import Array, Indices
 from pkm_twin.design.pose_path import PathMotion, PosePath
 from pkm_twin.design.quantities import QUANTITIES, Constraint, Quantity, find_quantity
 from pkm_twin.design.variables import Variables
 from pkm_twin.design.variants import Variants
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.robot.robot import Robot
-
-Index = NDArray[np.intp]
 
 MISS_TOLERANCE: Final = 1e-6
 """Largest excess of a bound, relative to it, at which the bound counts as kept."""
@@ -171,7 +168,7 @@ class Search:
                 break
         return best, aim, miss
 
-    def _components_near_worst(self, k: int, components: Array) -> Index:
+    def _components_near_worst(self, k: int, components: Array) -> Indices:
         """Return components that may become the largest: peaks in time near the worst."""
         quantity = self._all[k]
         if not quantity.sampled:
@@ -201,7 +198,7 @@ class _BoxSearch:
     def __init__(
         self,
         search: Search,
-        chosen: Sequence[Index],
+        chosen: Sequence[Indices],
         scale: float,
         centre: Array,
         aim: float,
@@ -277,7 +274,7 @@ class _BoxSearch:
 
 
 def _evaluate_components(
-    problem: Problem, quantity: Quantity, chosen: Index, one: Variants, y: Array
+    problem: Problem, quantity: Quantity, chosen: Indices, one: Variants, y: Array
 ) -> tuple[Array, Array]:
     """Return chosen components of one machine at y, and their derivatives, shape (components, d)."""
     # Components per sample: peak efforts have one per joint.

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from delta_dynamics.torques.reactions import BALANCE_BOUND, Reactions, hide_indeterminate, solve_balances
-from pkm_twin.codegen.arrays import Array, common_batch, doubles
+from pkm_twin.codegen.arrays import Array, Mask, common_batch, doubles
 from pkm_twin.codegen.code import Code
 from pkm_twin.codegen.kernels import MAX_GEOMETRY_MISMATCH
 from pkm_twin.design import programs
@@ -33,8 +33,6 @@ from pkm_twin.robot.derivatives import make_twist_rows
 from pkm_twin.robot.robot import Robot
 from stiffness_monitor.compliance import MIN_PIVOT_RATIO
 from stiffness_monitor.programs import Elastic
-
-Mask = NDArray[np.bool_]
 
 SAMPLES_PER_BALANCE: Final = 2048
 """Samples whose joint loads are solved at a time: each has large tables."""

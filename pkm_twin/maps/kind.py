@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pkm_twin.codegen.arrays import Array
+from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import belong_to_workspace
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from xarray import Dataset
 
-Mask = NDArray[np.bool_]
 FORMAT_VERSION: Final = "2"
 """Version of the file format; files of another version are rejected."""
 NON_NEGATIVE: Final = {"valid_min": 0.0}

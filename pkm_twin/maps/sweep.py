@@ -21,7 +21,7 @@ from typing import Any, Final
 import numpy as np
 
 import pkm_twin
-from pkm_twin.codegen.arrays import Array
+from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import ParameterError
 from pkm_twin.maps.kind import (
     FLAG_BOUNDS,
@@ -32,7 +32,6 @@ from pkm_twin.maps.kind import (
     Field,
     Found,
     Kind,
-    Mask,
     Space,
     Values,
     Variable,

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pkm_twin.bags.cdr import MessageCodec
+from pkm_twin.bags.definitions import JOINT_STATE
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import BagError, MessageError
 from pkm_twin.machine.joint_map import ControllerNumbers
@@ -77,7 +78,7 @@ class JointStateDecoder:
     """
 
     def __init__(self, definition: str) -> None:
-        self._codec = MessageCodec("sensor_msgs/msg/JointState", definition)
+        self._codec = MessageCodec(JOINT_STATE, definition)
         self._layout: _Layout | None = None
 
     def __call__(self, data: bytes) -> JointStateView:

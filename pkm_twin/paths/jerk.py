@@ -14,15 +14,12 @@ from typing import Final
 
 import numpy as np
 import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
-from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.paths.constraints import Limits, Rows
-from pkm_twin.paths.joint_path import JointPath
+from pkm_twin.paths.joint_path import Index, JointPath
 from pkm_twin.paths.motion import Run
 from pkm_twin.paths.profile import make_interval_rows
-
-Index = NDArray[np.int64]
 
 MAX_PROGRAMS: Final = 20
 """Largest number of linear programs."""

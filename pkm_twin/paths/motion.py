@@ -10,18 +10,16 @@ from itertools import pairwise
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import ParameterError
 from pkm_twin.paths.carrying import PayloadChange, compute_efforts
 from pkm_twin.paths.constraints import Limits, compute_limit_usage, limit_names, needs_forces
 from pkm_twin.paths.geometry import Path
-from pkm_twin.paths.joint_path import JointPath, reference_velocity
+from pkm_twin.paths.joint_path import Index, JointPath, reference_velocity
 from pkm_twin.recordings.payload import Load
 from pkm_twin.robot.robot import Robot
-
-Index = NDArray[np.int64]
 
 BINDING_USE: Final = 0.98
 """Used fraction of a limit from which on it binds."""

@@ -15,13 +15,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.paths.constraints import Rows
-
-Index = NDArray[np.int64]
-
+from pkm_twin.paths.joint_path import Index
 
 Numbers = list[float]
 

@@ -12,6 +12,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pkm_twin.bags.definitions import JOINT_STATE, TRAJECTORY
 from pkm_twin.bags.reader import Bag, open_bag
 from pkm_twin.bags.storage import METADATA_FILE
 from pkm_twin.bags.writer import write_whole_bag
@@ -32,7 +33,7 @@ from pkm_twin.recordings.origin import EffortModel, make_effort_model_columns, m
 from pkm_twin.recordings.payload import make_metadata_error, read_load
 from pkm_twin.recordings.recording import MODEL_VALUES_NOTE, ReadOptions, Recording
 from pkm_twin.recordings.tables import write_table
-from pkm_twin.recordings.topics import DEFINITIONS, JOINT_STATE, TRAJECTORY, Topics, choose_topics
+from pkm_twin.recordings.topics import DEFINITIONS, Topics, choose_topics
 from pkm_twin.robot.robot import Robot
 from pkm_twin.streams.wrench import PLATFORM
 

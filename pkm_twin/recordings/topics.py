@@ -8,15 +8,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
-from pkm_twin.bags.definitions import SEPARATOR, parse_definition
+from pkm_twin.bags.definitions import JOINT_STATE, SEPARATOR, TRAJECTORY, TRANSFORM, WRENCH, parse_definition
 from pkm_twin.bags.reader import Bag, TopicInfo
 from pkm_twin.errors import BagError, one_line
 from pkm_twin.robot.robot import Robot
 
-JOINT_STATE: Final = "sensor_msgs/msg/JointState"
-TRANSFORM: Final = "geometry_msgs/msg/TransformStamped"
-WRENCH: Final = "geometry_msgs/msg/WrenchStamped"
-TRAJECTORY: Final = "trajectory_msgs/msg/JointTrajectory"
 TABLE_SOURCE: Final = "columns of the table"
 """Source of the joint states that a report names for a table, where a bag has a topic."""
 

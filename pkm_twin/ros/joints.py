@@ -19,7 +19,7 @@ from rclpy.time import Time
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 
-from pkm_twin.bags.definitions import message_definition
+from pkm_twin.bags.definitions import JOINT_STATE, message_definition
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine.joint_map import ControllerNumbers
 from pkm_twin.messages.fast_decoder import DoublesTemplate
@@ -30,7 +30,6 @@ from pkm_twin.robot.robot import Robot
 if TYPE_CHECKING:
     from pkm_twin.ros.node import TwinNode
 
-JOINT_STATE: Final = "sensor_msgs/msg/JointState"
 NUMBER_ARRAY: Final = "std_msgs/msg/Float64MultiArray"
 FIELDS: Final = ("position", "velocity", "effort")
 

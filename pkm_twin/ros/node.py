@@ -30,7 +30,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rosgraph_msgs.msg import Clock as ClockMessage
 from std_srvs.srv import Trigger
 
-from pkm_twin.bags.definitions import message_definition
+from pkm_twin.bags.definitions import JOINT_STATE, message_definition
 from pkm_twin.codegen.code import slowness
 from pkm_twin.errors import MessageError, ParameterError, PkmTwinError
 from pkm_twin.messages.fast_decoder import JointStateDecoder
@@ -255,7 +255,7 @@ class GuardedSubscription:
         self._node, self._kind, self._topic, self._callback = node, row.message, topic, callback
         self._refuse, self._decode = refuse, None
         if row.kind == JOINTS:
-            self._decode = JointStateDecoder(message_definition("sensor_msgs/msg/JointState"))
+            self._decode = JointStateDecoder(message_definition(JOINT_STATE))
         self._raw, self._best_effort = raw or self._decode is not None, not row.whole
         self._expires, self._expiry = expires, expiry
         self._statistics = node.health.statistics[topic] = TopicStatistics()

@@ -16,6 +16,7 @@ from typing import Any, Final
 import numpy as np
 from scipy.spatial.transform import Rotation  # type: ignore[import-untyped]
 
+from pkm_twin.bags.definitions import JOINT_STATE, TRANSFORM
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MessageError, one_line
 from pkm_twin.messages.reading import JointReader
@@ -25,11 +26,11 @@ from pkm_twin.robot.robot import Robot
 TRACE_SECONDS: Final = 20.0
 """Length of the drawn traces, s."""
 TOPICS: Final = {
-    "state": ("sensor_msgs/msg/JointState", "joint_states"),
-    "torque": ("sensor_msgs/msg/JointState", "delta_dynamics/joint_torques"),
-    "residual": ("sensor_msgs/msg/JointState", "delta_dynamics/torque_residual"),
+    "state": (JOINT_STATE, "joint_states"),
+    "torque": (JOINT_STATE, "delta_dynamics/joint_torques"),
+    "residual": (JOINT_STATE, "delta_dynamics/torque_residual"),
     "energy": ("diagnostic_msgs/msg/DiagnosticArray", "stiffness_monitor/strain_energy"),
-    "deflection": ("geometry_msgs/msg/TransformStamped", "stiffness_monitor/deflection"),
+    "deflection": (TRANSFORM, "stiffness_monitor/deflection"),
 }
 """Subscriptions by name: type, and topic in the robot's namespace."""
 TRACES: Final = ("torque", "residual")

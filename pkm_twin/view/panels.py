@@ -11,6 +11,7 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError, one_line
+from pkm_twin.report import plots
 from pkm_twin.view import texts
 from pkm_twin.view.live import TOPICS, TRACE_SECONDS, TRACES, Live
 from pkm_twin.view.model import MAX_SHOWN_DEFLECTION, State
@@ -19,8 +20,6 @@ from pkm_twin.view.scene import Deflection
 from pkm_twin.view.timeline import Timeline
 from stiffness_monitor.modes import Modes, modes
 
-COLOURS: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
-"""Colours of the joints' curves (Okabe and Ito 2008)."""
 MODE_COUNT: Final = 6
 """Number of natural modes to choose from."""
 _MEASURED: Final = "measured"
@@ -46,7 +45,7 @@ class BagPanel:
             if len(self._times) > 1:
                 self._joint = gui.add_dropdown("joint", names, initial_value=names[0])
                 page.call_on(self._joint.on_update, "joint", self._draw_joint)
-                efforts = {_MEASURED: "#999999", "model": COLOURS[1]}
+                efforts = {_MEASURED: "#999999", "model": plots.COLOURS[1]}
                 if self._measured is None:
                     del efforts[_MEASURED]
                 self._add_chart("effort of the joint", self._select_efforts(), efforts)
@@ -234,7 +233,7 @@ class LivePanel:
 
 
 def _assign_colours(names: Sequence[str]) -> dict[str, str]:
-    return {name: COLOURS[k % len(COLOURS)] for k, name in enumerate(names)}
+    return {name: plots.COLOURS[k % 6] for k, name in enumerate(names)}
 
 
 def _create_chart(

@@ -12,6 +12,7 @@ pytest.importorskip("mcap")
 from mcap.writer import Writer
 
 from delta_dynamics import inverse_dynamics, null_efforts
+from pkm_twin.bags.definitions import JOINT_STATE
 from pkm_twin.bags.reader import inspect, read_messages
 from pkm_twin.identification.check import MEASURED, check
 from pkm_twin.identification.hypotheses import explain
@@ -19,7 +20,6 @@ from pkm_twin.identification.parameters import file_parameters
 from pkm_twin.identification.rows import make_rows
 from pkm_twin.paths import cycle, timed
 from pkm_twin.recordings import Recording
-from pkm_twin.recordings.topics import JOINT_STATE
 from pkm_twin.robot.derivatives import nearest_motion
 from pkm_twin.streams.steps import find_backlash
 from test.bags.folders import make_folder, write_split

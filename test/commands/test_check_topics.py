@@ -8,11 +8,11 @@ import yaml
 pytest.importorskip("mcap")
 from mcap.writer import Writer
 
+from pkm_twin.bags.definitions import JOINT_STATE, WRENCH
 from pkm_twin.bags.reader import BagWriter, open_bag
 from pkm_twin.errors import BagError
 from pkm_twin.recordings import ReadOptions, read, read_table
 from pkm_twin.recordings.origin import is_effort_model_column
-from pkm_twin.recordings.topics import JOINT_STATE, WRENCH
 from test.commands.conftest import COLLISION, DELTA, JOINTS, MILLING, checked, items_of, rewrite
 from test.support.mapped import sides
 

@@ -18,11 +18,12 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from scipy.io import loadmat
 
+from pkm_twin.bags.definitions import JOINT_STATE
 from pkm_twin.bags.reader import BagWriter
 from pkm_twin.errors import ParameterError
 from pkm_twin.recordings import Dialect, ReadOptions, read, write_table
 from pkm_twin.recordings.tables import UNITS, map_column_quantities, read_table
-from pkm_twin.recordings.topics import DEFINITIONS, JOINT_STATE
+from pkm_twin.recordings.topics import DEFINITIONS
 from test.bags.folders import make_folder
 from test.support.robots import load, parameters_of
 from test.support.tables import read_columns

@@ -45,7 +45,7 @@ def test_a_running_nodes_torques_and_residuals_are_heard(domain, peer, launch, m
     np.testing.assert_array_equal(heard.q, q)
     np.testing.assert_allclose(heard.traces["torque"][1][-1], expected, atol=1e-9)
     np.testing.assert_allclose(heard.traces["residual"][1][-1], 0.25, atol=1e-9)
-    assert heard.refused == 0
+    assert heard.rejected == 0
     assert node.stop() == 0
 
 

@@ -6,9 +6,10 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 from pkm_twin.apps.frame import command
+from pkm_twin.bags.definitions import JOINT_STATE
 from pkm_twin.errors import MessageError, PkmTwinError
 from pkm_twin.messages.stamps import SECOND, stamp_of
 from pkm_twin.report import Fact, Report, Verdict, make_judged_fact
@@ -16,8 +17,6 @@ from pkm_twin.ros.context import listening_node
 from pkm_twin.ros.signals import first_signal
 from pkm_twin.settings import setting
 from pkm_twin.streams.arrivals import Arrivals
-
-TORQUES_TYPE: Final = "sensor_msgs/msg/JointState"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,10 +168,10 @@ def _subscribe(node: Any, topic: str, take: Any) -> bool:
     infos = node.get_publishers_info_by_topic(topic)
     if not infos:
         return False
-    other = {info.topic_type for info in infos} - {TORQUES_TYPE}
+    other = {info.topic_type for info in infos} - {JOINT_STATE}
     if other:
         raise PkmTwinError(
-            f"{topic} carries {', '.join(sorted(other))}; expected a topic of {TORQUES_TYPE}, which has "
+            f"{topic} carries {', '.join(sorted(other))}; expected a topic of {JOINT_STATE}, which has "
             "time stamps, for example delta_dynamics/joint_torques"
         )
     reliable, best_effort = ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT
