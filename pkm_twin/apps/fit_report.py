@@ -132,7 +132,7 @@ def report_fit(result: Result, marks: Sequence[str] = ()) -> tuple[Report, list[
             Fact("verdict", verdict.as_json(own)),
             Fact("accepted", result.accepted),
             Fact("condition", e.condition, text="condition number"),
-            Fact("combinations_determined", result.identifiable_count, text="combinations identified"),
+            Fact("combinations_determined", result.estimate.directions, text="combinations identified"),
             Fact("held_by_a_physical_bound", bool(e.bound)),
             Fact("samples_fitted", result.samples),
             Fact("parameters", parameters),

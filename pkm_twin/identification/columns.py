@@ -134,6 +134,16 @@ class Errors:
         )
 
 
+def find_deviation(error: Suspect, rms: Array, size: Array) -> float:
+    """Return the prior deviation of an error; one without a usual size makes up 3 % of the efforts.
+
+    :param rms: of the error's column, (n,); ``size``: RMS of the measured efforts, (n,).
+    """
+    j = int(np.argmax(rms / np.maximum(size, 1e-300)))
+    other = PRIOR_DEVIATIONS[OTHER] * float(size[j] / rms[j]) if rms[j] > 0.0 else 0.0
+    return error.usual or other
+
+
 @dataclass(frozen=True, eq=False)
 class Lengths:
     """Lengths and angles of a file as suspects, by how much the file's numbers change with each.
@@ -268,9 +278,7 @@ class Columns:
             elif one.known or (one.where != ALL_JOINTS and rms[:, k].any()):
                 others.append(k)
         deviation = [PRIOR_DEVIATIONS[DELAY], *(PRIOR_DEVIATIONS[CURRENT_OFFSET] * size)]
-        for k in (*others, *gains):
-            j, one = int(rms[:, k].argmax()), errors.suspects[k]
-            deviation.append(one.usual or (0.0 if one.known else PRIOR_DEVIATIONS[OTHER] * size[j] / rms[j, k]))
+        deviation += [find_deviation(errors.suspects[k], rms[:, k], size) for k in (*others, *gains)]
         kinds = ["error", *["offset"] * n, *["error"] * (len(others) + len(gains))]
         offsets = np.broadcast_to(np.eye(n), (*rows.effort.shape, n))
         more = np.concatenate([-rows.change[..., None], offsets, errors.columns[..., [*others, *gains]]], -1)

@@ -59,7 +59,6 @@ class ElasticFit(Result):
     groups: tuple[Group, ...]
     zeros: Array
     measured: Mask
-    known_count: int
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -70,11 +69,6 @@ class ElasticFit(Result):
     def units(self) -> tuple[str, ...]:
         """Units of the directions."""
         return UNITS
-
-    @property
-    def identifiable_count(self) -> int:
-        """Number of combinations of the compliance factors that the data determine."""
-        return self.known_count
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,9 +176,10 @@ def fit_elements(
         spread = np.sqrt(np.sum((slopes @ own) * slopes, -1).clip(0.0))
         measured = part.deflection[end] - zero
         judged.append(Judged(part.name, part.time[end], measured, before_fit[end], after[end], spread[end]))
+    known = int(np.sum(np.linalg.eigvalsh(plain / COMPLIANCE_DEVIATION**2) < FITTED_RATIO**2))
     return ElasticFit(
         robot=robot,
-        estimate=replace(found, covariance=verdict.covariance),
+        estimate=replace(found, covariance=verdict.covariance, directions=known),
         numbers=tuple(numbers),
         judged=tuple(judged),
         zeros=zeros,
@@ -192,7 +187,6 @@ def fit_elements(
         groups=group_elements(names, factors, plain, own),
         measured=np.array([part.measured for part in parts]),
         samples=sum(part.split for part in parts),
-        known_count=int(np.sum(np.linalg.eigvalsh(plain / COMPLIANCE_DEVIATION**2) < FITTED_RATIO**2)),
         accepted=tuple(faults),
     )
 

@@ -80,11 +80,6 @@ class Result:
         """Units of the channels."""
         return self.robot.effort_units
 
-    @property
-    def identifiable_count(self) -> int:
-        """Number of combinations of the parameters that the data determine."""
-        return self.estimate.directions
-
     def list_numbers(self, status: Status) -> tuple[Number, ...]:
         """List the numbers of a status."""
         return tuple(number for number in self.numbers if number.status == status)
@@ -108,7 +103,7 @@ class Fit(Result):
     @property
     def delays(self) -> tuple[float, ...]:
         """How late the efforts are against the positions, s, by recording."""
-        return delays(self.problem)
+        return self.problem.total_delays
 
     @property
     def outliers(self) -> int:
@@ -145,7 +140,7 @@ def fit(
         problem = correct_delays(problem)
         faults = [
             f"{made.recording.name}: {late_text('all joints', late)}"
-            for made, late in zip(problem.whole, delays(problem), strict=True)
+            for made, late in zip(problem.whole, problem.total_delays, strict=True)
             # A delay that was not corrected for is too uncertain to be a fault.
             if abs(late) > MAX_DELAY and made.recording.late
         ]
@@ -154,12 +149,6 @@ def fit(
     faults = faults or _list_worse(problem)
     refuse_faults(faults, accept)
     return solve_and_judge(problem, tuple(faults))
-
-
-def delays(problem: Problem) -> tuple[float, ...]:
-    """How late the efforts of each recording are against the positions, s."""
-    pairs = zip(problem.whole, problem.delays, strict=True)
-    return tuple(made.recording.late + late for made, late in pairs)
 
 
 def correct_delays(problem: Problem) -> Problem:

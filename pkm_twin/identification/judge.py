@@ -28,10 +28,10 @@ from pkm_twin.identification.columns import (
     ELASTIC,
     GAIN,
     LATE,
-    OTHER,
     PRIOR_DEVIATIONS,
     SPEED,
     Errors,
+    find_deviation,
 )
 from pkm_twin.identification.evidence import Model, Posterior, Signals, Spectra
 from pkm_twin.identification.rows import Problem
@@ -94,11 +94,7 @@ class Fitted:
             np.sqrt(sum(np.mean(part**2, 0) for part in parts))
             for parts in ([np.moveaxis(c.columns[..., some], -1, 1) for c in cases], [c.measured for c in cases])
         )
-        usual = list[float]()
-        for one, own in zip(errors, rms, strict=True):
-            j = int(np.argmax(own / np.maximum(size, 1e-300)))
-            other = PRIOR_DEVIATIONS[OTHER] * float(size[j] / own[j]) if own[j] > 0.0 else 0.0
-            usual.append(one.usual or other)
+        usual = [find_deviation(one, own, size) for one, own in zip(errors, rms, strict=True)]
         first = self.count + len(errors)
         self.places, deviations = [], [sizes, np.array(usual, np.float64)]
         for case in cases:
@@ -120,9 +116,7 @@ class Fitted:
         self.known = [self.count + k for k, one in enumerate(errors) if one.known]
         self.kinds: dict[tuple[str, bool], list[int]] = {}
         for k, one in enumerate(errors):
-            if one.usual and not one.known:
-                own = self.kinds.setdefault((one.kind, one.where == ALL_JOINTS), [])
-                own.append(self.count + k)
+            self.kinds.setdefault((one.kind, one.where == ALL_JOINTS), []).append(self.count + k)
 
     def with_columns(self, used: Mask, places: Sequence[int]) -> Mask:
         """Return a mask of columns with some more of them."""
@@ -136,19 +130,14 @@ class Fitted:
 
         Any joint is as likely as another, and twice as likely as all. Lengths are one error.
         """
-        alike = dict[tuple[str, bool], list[int]]()
-        for k, one in enumerate(self.errors):
-            alike.setdefault((one.kind, one.where == ALL_JOINTS), []).append(self.count + k)
         odds = float(np.log(PRESENT_PROBABILITY / (1.0 - PRESENT_PROBABILITY)))
-        found = [
-            ([k], odds - float(np.log(len(own)))) for (kind, _), own in alike.items() for k in own if kind != GEOMETRY
-        ]
-        found += [
-            (own, odds - (0.0 if kind == GEOMETRY else float(np.log(2.0 * len(own)))))
-            for (kind, _), own in alike.items()
-            if len(own) > 1
-        ]
-        return found
+        single, whole = list[tuple[list[int], float]](), list[tuple[list[int], float]]()
+        for (kind, _), own in self.kinds.items():
+            if kind != GEOMETRY:
+                single += [([k], odds - float(np.log(len(own)))) for k in own]
+            if len(own) > 1:
+                whole.append((own, odds - (0.0 if kind == GEOMETRY else float(np.log(2.0 * len(own))))))
+        return single + whole
 
     def select(self, certain: Mask) -> tuple[list[Selected], Mask]:
         """Select errors one by one, the most probable first, by what they add to the evidence.
@@ -201,7 +190,9 @@ class Fitted:
 
         :param used: columns of the found errors: their shares of the discrepancy are taken.
         """
-        kinds: list[list[int]] = list(self.kinds.values())
+        # Errors that have a usual size; all of a kind have one or none.
+        firsts = [(self.errors[own[0] - self.count], own) for own in self.kinds.values()]
+        kinds = [own for first, own in firsts if first.usual and not first.known]
         always = self.with_columns(self.certain, [*self.known, *(k for one in chosen for k in one.places)])
         usual = {*self.known, *(k for own in kinds for k in own)}
         others = [[k for other in one.others for k in other if k not in usual] for one in chosen]
@@ -216,15 +207,14 @@ class Fitted:
         weights = np.exp(np.array(logs) - max(logs))
         weights[weights < 1e-3] = 0.0
         weights /= weights.sum()
-        some = slice(0, self.count)
-        mean = self.model.posterior(used).mean[some]
+        some, best = slice(0, self.count), self.model.posterior(used)
+        mean, plain = best.mean[some], best.covariance[some, some]
         covariance = np.zeros((self.count, self.count))
         for k in np.flatnonzero(weights):
             one = self.model.posterior(masks[k], shares)
             away = one.mean[some] - mean
             covariance += weights[k] * (one.covariance[some, some] + np.outer(away, away))
         # Combinations that the recordings hardly determine keep the file's values.
-        plain = self.model.posterior(used).covariance[some, some]
         sizes = self.model.deviation[some]
         values, vectors = np.linalg.eigh(plain / np.outer(sizes, sizes))
         # A combination is determined if its deviation is a fifth of the prior's.
@@ -293,19 +283,8 @@ def fit_and_judge(
         answer = "does not explain"
     elif sure or any(max(channel.left_ratio, channel.held_out) > MAX_NOISE_RATIO for channel in told):
         answer = "explains partly"
-    own = tuple(last.mean[place[fitted.count + len(errors) :]] for place in fitted.places)
-    some = slice(0, fitted.count)
-    fitted.used = used
-    return Verdict(
-        answer,
-        told,
-        tuple(found[:sure]),
-        tuple(found[sure:]),
-        mean,
-        last.covariance[some, some],
-        covariance,
-        own,
-    ), fitted
+    plain, fitted.used = last.covariance[: fitted.count, : fitted.count], used
+    return Verdict(answer, told, tuple(found[:sure]), tuple(found[sure:]), mean, plain, covariance), fitted
 
 
 def make_basis(table: Array) -> Array:

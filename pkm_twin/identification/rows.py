@@ -517,8 +517,13 @@ class Problem:
 
     @property
     def delays(self) -> tuple[float, ...]:
-        """Delay of each recording's efforts, s."""
+        """Delay of each recording's efforts, s, beside what was compensated."""
         return tuple(self.both.values[-len(self.rows) :].tolist())
+
+    @property
+    def total_delays(self) -> tuple[float, ...]:
+        """How late the efforts of each recording were against the positions, s."""
+        return tuple(made.recording.late + late for made, late in zip(self.whole, self.delays, strict=True))
 
     @property
     def held_out(self) -> list[Rows]:

@@ -56,11 +56,22 @@ class Finding:
     others: tuple[Suspect, ...] = ()
 
     def __str__(self) -> str:
-        return (
-            f"{self.suspect} {_write_size(self.size, self.suspect.unit)} +- "
-            f"{_write_size(self.deviation, self.suspect.unit)}, {self.sigmas:.3g} sigma"
-            + "".join(f", or {other}" for other in self.others)
-        )
+        unit, both = self.suspect.unit, (self.size, self.deviation)
+        size, deviation = (f"{one:.3g} {unit}" if unit else f"{100 * one:.2g} %" for one in both)
+        others = "".join(f", or {other}" for other in self.others)
+        return f"{self.suspect} {size} +- {deviation}, {self.sigmas:.3g} sigma{others}"
+
+    def as_json(self) -> dict[str, Any]:
+        """Return plain data for JSON."""
+        return {
+            "kind": self.suspect.kind,
+            "where": self.suspect.where,
+            "size": self.size,
+            "unit": self.suspect.unit,
+            "standard_deviation": self.deviation,
+            "sigmas": self.sigmas,
+            "or": [{"kind": other.kind, "where": other.where} for other in self.others],
+        }
 
 
 @dataclass(frozen=True)
@@ -87,8 +98,8 @@ class Verdict:
 
     ``hints``: errors that are as likely as not. ``change``: posterior mean of the numbers less the
     prior's mean, (p,). ``plain``: their covariance by noise alone, with the errors that were found;
-    ``covariance``: with all errors that may be present, (p, p). ``own``: posterior mean of each
-    recording's own unknowns. ``slow``: the motion is too slow to show any inertia.
+    ``covariance``: with all errors that may be present, (p, p). ``slow``: the motion is too slow to
+    show any inertia.
     """
 
     answer: Answer
@@ -98,7 +109,6 @@ class Verdict:
     change: Array
     plain: Array
     covariance: Array
-    own: tuple[Array, ...]
     slow: bool = False
 
     @property
@@ -145,8 +155,8 @@ class Verdict:
             "model": self.answer,
             "standard_deviations": self.deviations,
             "too_slow_for_inertia": self.slow,
-            "findings": [_as_json(one) for one in self.findings],
-            "not_excluded": [_as_json(one) for one in self.hints],
+            "findings": [one.as_json() for one in self.findings],
+            "not_excluded": [one.as_json() for one in self.hints],
             "channels": [
                 {
                     "name": channel.name,
@@ -159,19 +169,3 @@ class Verdict:
                 for channel, unit in zip(self.channels, units, strict=True)
             ],
         }
-
-
-def _write_size(size: float, unit: str) -> str:
-    return f"{size:.3g} {unit}" if unit else f"{100 * size:.2g} %"
-
-
-def _as_json(one: Finding) -> dict[str, Any]:
-    return {
-        "kind": one.suspect.kind,
-        "where": one.suspect.where,
-        "size": one.size,
-        "unit": one.suspect.unit,
-        "standard_deviation": one.deviation,
-        "sigmas": one.sigmas,
-        "or": [{"kind": other.kind, "where": other.where} for other in one.others],
-    }
