@@ -299,7 +299,7 @@ def test_the_page_that_listens(both):
     live.take("torque", torques(both, effort))
     live.take("residual", torques(both, 0.1 * effort, NOW))
     heard = live.read_latest()
-    assert heard.refused == 0
+    assert heard.rejected == 0
     close(heard.q, q)
     close(heard.traces["torque"][1][-1], effort)
     close(heard.traces["residual"][1][-1], 0.1 * effort)
