@@ -44,6 +44,9 @@ MAX_LOOP_GAP: Final = 1e-9
 """Largest gap of a closed loop, m or rad."""
 MAX_DRAWN_GAP: Final = 1e-3
 """Largest gap of loops that are drawn closed but for the rounding of some numbers, of three digits: m or rad."""
+MAX_DRAWN_MOVE: Final = 0.5
+"""Largest move of a passive joint from the drawing, rad or part of the size, up to which the drawing tells
+which assembly is meant: a mirrored assembly of usual linkages is farther away."""
 MIN_HOME_INDEX: Final = 1e-4
 """Smallest singularity index of a home."""
 MIN_ROUNDING: Final = 1e-6
@@ -106,6 +109,11 @@ class Assembly:
         """Return the positions of the links, shape (links, 3), m."""
         at, links = self._motion.point, self.tree.links
         return numbers([at(body, links[n].frame.position) for n, body in self._bodies.items()])
+
+    def points(self) -> Array:
+        """Return the positions of the links and of the loops' joints, which tell assemblies apart, (points, 3), m."""
+        closed = [self.frame(closure, 0).position for closure in self.tree.closures]
+        return np.concatenate([self.places(), np.reshape(closed, (-1, 3))])
 
     def frame(self, joint: Joint, end: int) -> Pose:
         """Return a joint's frame on one of its links."""
@@ -308,7 +316,8 @@ class Home:
     ``how``: "drawn", "wanted" or "near"; ``place``: the wanted values of the actuated joints, in words.
     ``graph``: idealised, with spins held by the joints ``held`` (each with the largest mass times
     offset of the held parts, kg m); None if its mobility is wrong. ``repair``: of the file's rounding.
-    ``index``: the singularity index.
+    ``index``: the singularity index. ``others``: number of other assemblies that
+    were found, if the passive joints are too far from the drawing for it to tell which is meant.
     """
 
     values: Array
@@ -319,6 +328,7 @@ class Home:
     held: Mapping[str, float]
     repair: Repair | None
     index: float
+    others: int = 0
 
     @property
     def text(self) -> str:
@@ -360,7 +370,7 @@ class HomeSearch:
             self.place = "zero or amid their limits"
 
         self._known: list[Array] = []
-        """Positions of the links in the known assemblies, shape (links, 3), m."""
+        """Positions of links and loops in the known assemblies, shape (points, 3), m."""
         self._hinges: dict[str, float] | None = None
         """The joints that hold the spins of one assembly, and of the others too."""
 
@@ -383,7 +393,7 @@ class HomeSearch:
             values, miss = self.assembly.close(values, self.held | zero)
         if miss > max(home.miss, MAX_LOOP_GAP):
             return home
-        turned = self._make_home(self._wrap_turns(values), miss, home.how)
+        turned = replace(self._make_home(self._wrap_turns(values), miss, home.how), others=home.others)
         return turned if turned.index >= MIN_HOME_INDEX else home
 
     def _find_best(self) -> Home:
@@ -406,13 +416,15 @@ class HomeSearch:
             # one nearest to the zero of all joints.
             best = max(home.index for home in inside)
             good = [home for home in inside if home.index * 1.05 >= best]
-            chosen = min(good, key=lambda home: float(np.linalg.norm(home.values / self.units)))
+            chosen = min(good, key=lambda home: round(float(np.linalg.norm(home.values / self.units)), 6))
         if chosen is not None and chosen.index >= MIN_HOME_INDEX:
             # A drawing that is open by the rounding of some numbers is not meant to be another assembly.
             if drawn is None and self._drawn_gap <= MAX_DRAWN_GAP:
                 self.assembly.place(self.wanted)
                 raise self.assembly.open_loop_error()
-            return chosen
+            far = float((np.abs(chosen.values) / self.units)[~self.held].max(initial=0.0))
+            count = sum(home.index >= MIN_HOME_INDEX for home in inside) - 1
+            return replace(chosen, others=count if far > MAX_DRAWN_MOVE else 0)
         # Try growing distances from the wanted values; take the best conditioned assembly of the first that has one.
         rng = np.random.default_rng(1)
         tried: list[Home] = []
@@ -450,7 +462,7 @@ class HomeSearch:
         self._drawn_gap = miss if far <= 0.1 else math.inf
         if miss > self.assembly.closed:
             return None
-        self._known.append(self.assembly.places())
+        self._known.append(self.assembly.points())
         return self._make_home(values, miss, "drawn" if far <= 0.1 else "wanted")
 
     def _close_from(self, start: Array, how: str) -> Home | None:
@@ -458,7 +470,7 @@ class HomeSearch:
         values, miss = self.assembly.close(start, self.held)
         if miss > self.assembly.closed and how == "near":
             values, miss = self.assembly.close(values)
-        places, apart = self.assembly.places(), 1e-4 * self.assembly.size
+        places, apart = self.assembly.points(), 1e-4 * self.assembly.size
         known = any(float(np.abs(places - other).max()) <= apart for other in self._known)
         if miss > self.assembly.closed or known:
             return None

@@ -176,6 +176,11 @@ def read_tree(path: str | Path, part: UrdfSelection = UrdfSelection()) -> UrdfRe
         notes.append(f"ignored, because the joint has several degrees of freedom: {', '.join(ignored)}")
     if home.miss > MAX_LOOP_GAP:
         notes.append(f"the loops close within {home.miss:.1g} only (m or rad)")
+    if home.others:
+        notes.append(
+            f"home is not as drawn: of {home.others + 1} assemblies the best conditioned one, passive joints up to "
+            f"{np.abs(home.values).max():.3g} rad or m from zero"
+        )
     if home.repair and home.repair.moves:
         notes.append(home.repair.text)
     if home.held:

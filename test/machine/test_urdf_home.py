@@ -13,7 +13,7 @@ from pkm_twin.errors import ParameterError
 from pkm_twin.kinematics.singularity import singularity_at_home
 from pkm_twin.mechanisms.machine import Machine
 from pkm_twin.robot.urdf_home import Assembly
-from pkm_twin.robot.urdf_read import read_tree
+from pkm_twin.robot.urdf_read import UrdfSelection, read_tree
 from test.support.robots import partly_long, random_joints
 
 pytest.importorskip("pinocchio")
@@ -312,3 +312,26 @@ def test_a_part_that_only_spins_is_held_at_zero_and_its_imbalance_is_said(start,
     assert any("c (0.03 kg m)" in note for note in reading.notes)
     path.write_text(SPUN.format(offset=0.0, start=start))
     assert not any("kg m" in note for note in read_tree(path).notes)
+
+
+def test_a_drawing_that_does_not_tell_the_assembly_is_told(tmp_path):
+    """A four bar linkage drawn as a line: the loop closes on either side of it."""
+    path, fields = tmp_path / "robot.urdf", 'ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01"'
+    mass = f'<inertial><origin xyz="0.1 0 0"/><mass value="1"/><inertia {fields}/></inertial>'
+    links = "".join(f'<link name="{name}">{mass}</link>' for name in ("world", "crank", "rod", "tool"))
+    joints = "".join(
+        f'<joint name="{name}" type="revolute"><parent link="{inner}"/><child link="{outer}"/>'
+        f'<origin xyz="{x} 0 0"/><axis xyz="0 0 1"/></joint>'
+        for name, inner, outer, x in (
+            ("motor", "world", "crank", 0.0),
+            ("elbow", "crank", "rod", 0.3),
+            ("pivot", "world", "tool", 0.4),
+        )
+    )
+    ends = '<predecessor link="rod"><origin xyz="0.35 0 0"/></predecessor><successor link="tool"><origin xyz="{} 0 0"/>'
+    for length, told in ((0.25, False), (0.3, True)):
+        end = ends.format(length)
+        loop = f'<loop name="tip" type="revolute">{end}</successor><axis xyz="0 0 1"/></loop>'
+        path.write_text(f'<robot name="four_bar">{links}{joints}{loop}</robot>')
+        notes = read_tree(path, UrdfSelection(platform="tool", actuated=("motor",))).notes
+        assert any("of 2 assemblies" in note for note in notes) is told
