@@ -472,8 +472,8 @@ class Feedforward(Core):
         friction = self.robot.friction
         if not friction.presliding.any():
             return None, 0.0
-        before = self._memory or Memory.begun(q)
-        memory = before.after(q[None], np.sign(rates), friction.presliding).last
+        before = self._memory or Memory.unknown_at(q)
+        memory = before.advance_to(q[None], np.sign(rates), friction.presliding).last
         return memory, Dahl.memory_effort(friction, memory.z, rates)
 
     def _resolve_motion(

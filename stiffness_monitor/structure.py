@@ -191,8 +191,8 @@ def structural_model(robot: Robot, q: ArrayLike) -> StructuralModel:
     structure, posture = robot.elastic, Posture(robot, q)
     model = evaluate_plan(
         plan_structure(robot.graph, structure),
-        posture.place,
-        posture.turn,
+        posture.locate_point,
+        posture.rotate_vector,
         structure.sections.__getitem__,
         lambda joint, k: float(structure.compliances[joint][k]),
     )
@@ -202,7 +202,13 @@ def structural_model(robot: Robot, q: ArrayLike) -> StructuralModel:
     lumps = [(name, b.mass, b.com, b.inertia, name) for name, b in graph.bodies.items() if name not in beams]
     lumps.append(("payload", load.mass, graph.origin + load.com, load.inertia, graph.platform))
     bodies = (
-        RigidBody(name, mass, posture.place(on, com), posture.turn(on, posture.turn(on, inertia).T), on)
+        RigidBody(
+            name,
+            mass,
+            posture.locate_point(on, com),
+            posture.rotate_vector(on, posture.rotate_vector(on, inertia).T),
+            on,
+        )
         for name, mass, com, inertia, on in lumps
         if mass > 0.0
     )

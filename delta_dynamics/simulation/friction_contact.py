@@ -191,8 +191,8 @@ class Resistance:
 
     def _move_memory(self, q: Array) -> Memory:
         """Return the friction memory after a straight motion to a position."""
-        before = self.memory = self.memory or Memory.begun(q)
-        return before.after(q[None], np.sign(q - before.q), self._distance).last
+        before = self.memory = self.memory or Memory.unknown_at(q)
+        return before.advance_to(q[None], np.sign(q - before.q), self._distance).last
 
     def store_memory(self, here: Terms) -> None:
         """Store the friction memory at the end of a part of the step."""

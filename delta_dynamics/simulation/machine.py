@@ -19,7 +19,7 @@ from delta_dynamics.simulation.plant import Plant
 from delta_dynamics.torques.virtual_work import mass_matrix
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import MessageError, ParameterError, PkmTwinError, UnreachableError
-from pkm_twin.machine.sections import of_mass
+from pkm_twin.machine.sections import make_payload
 from pkm_twin.messages.reading import MAX_VELOCITY, JointReader, as_message_error, read_wrench
 from pkm_twin.messages.stamps import SECOND, StampRules
 from pkm_twin.robot.robot import Robot
@@ -50,7 +50,7 @@ class PayloadEvent:
     @property
     def load(self) -> dict[str, Any]:
         """Payload as in a robot's file."""
-        return of_mass(self.mass, self.com)
+        return make_payload(self.mass, self.com)
 
 
 @dataclass(frozen=True)

@@ -62,7 +62,7 @@ def energy_forms(robot: Robot, q: ArrayLike, found: Balance) -> dict[str, Array]
     for beam in structure.beams:
         if beam.parts[0] in robot.graph.rods or beam.parts[0] == robot.graph.platform:
             continue
-        ends = [posture.place(*place) for place in (beam.inner, beam.outer)]
+        ends = [posture.locate_point(*place) for place in (beam.inner, beam.outer)]
         matrix = _beam_energy(robot, beam, structure.sections[beam.name], ends, found)
         result[beam.element] = result.get(beam.element, 0.0) + matrix
     for k, joint in enumerate(found.joints):
@@ -82,7 +82,7 @@ def energy_forms(robot: Robot, q: ArrayLike, found: Balance) -> dict[str, Array]
             order = np.abs(np.array([d.vector for d in directions]) @ columns).argmax(0)
             weights = np.concatenate([weights[order], weights[3 + order]])
             weights[3:5] = 0.0
-        world = np.stack([posture.turn(*one) for one in axes], -1)
+        world = np.stack([posture.rotate_vector(*one) for one in axes], -1)
         if len(axes) == 2:
             normal = np.cross(world[..., 0], world[..., 1])
             normal /= np.linalg.norm(normal, axis=-1, keepdims=True)

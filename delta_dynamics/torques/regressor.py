@@ -30,7 +30,7 @@ from pkm_twin.machine.inertia import (
     make_frame_change,
     standard_parameters,
 )
-from pkm_twin.machine.schema import frozen
+from pkm_twin.machine.schema import make_read_only
 from pkm_twin.robot.mechanism import EFFORT_SHARING_NOTE
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import random_joints
@@ -295,7 +295,9 @@ def base_parameters(robot: Robot, *, seed: int = 0) -> BaseParameters:
     matrix = matrix * units / units[list(columns)][:, None]
     led = [combination_name(row, k, names) for k, row in zip(columns, matrix, strict=True)]
     unseen = [name for k, name in enumerate(names[:-1]) if not matrix[:, k].any()]
-    return BaseParameters(tuple(led), names, columns, frozen(matrix), frozen(matrix @ pi), tuple(unseen))
+    return BaseParameters(
+        tuple(led), names, columns, make_read_only(matrix), make_read_only(matrix @ pi), tuple(unseen)
+    )
 
 
 def random_states(robot: Robot, count: int, seed: int) -> tuple[Array, Array, Array]:

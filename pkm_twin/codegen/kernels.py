@@ -38,12 +38,12 @@ class Kernel:
         return self.code.sizes
 
     @property
-    def holds(self) -> bool:
+    def matches_geometry(self) -> bool:
         """True if the geometry agrees with the constants that the program assumes."""
         p = np.zeros(self.code.parameters - len(self.geometry))
         return bool(self.code.prepare(np.concatenate([p, self.geometry]))[-1] <= MAX_GEOMETRY_MISMATCH)
 
-    def prepared(self, p: Array) -> Array:
+    def prepare(self, p: Array) -> Array:
         """Compute the expressions of parameters and geometry alone, for all samples to use."""
         return self.code.prepare(np.concatenate([p, self.geometry]))
 
@@ -59,7 +59,7 @@ class Kernel:
         """
         last, call = self._last
         if last is not p:
-            prepared = self.prepared(p)
+            prepared = self.prepare(p)
             run = partial(self.code.run, prepared)
             call = self.code.bound(prepared, run, len(self.sizes[1]))
             self._last = p, call
@@ -73,7 +73,7 @@ class Kernel:
         :param otherwise: function for all but good single samples; default: the program, without
             a check of its status.
         """
-        return self.code.bound(self.prepared(p), otherwise or (lambda *inputs: self(p, *inputs)[0][0]))
+        return self.code.bound(self.prepare(p), otherwise or (lambda *inputs: self(p, *inputs)[0][0]))
 
 
 class BoundCall:
@@ -85,7 +85,7 @@ class BoundCall:
     def __init__(self, kernel: Kernel, p: Array, samples: int = 1) -> None:
         self._kernel, self._p = kernel, p
         self._space = space = KernelBuffers(*kernel.sizes, samples)
-        space.point_at(kernel.prepared(p))
+        space.point_at(kernel.prepare(p))
         self.inputs, self.outputs, self._address = space.inputs, space.outputs, space.address
         # Release the interpreter lock for batches only: for one sample that takes longer than the sample.
         code = kernel.code.functions

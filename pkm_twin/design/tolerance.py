@@ -234,7 +234,7 @@ def tolerances(
         most = {"m": MAX_DEVIATION * robot.graph.size, "rad": MAX_DEVIATION}.get(units[path])
         number = schema.number(low=0.0, high=most, unit=units[path])
         value_size = value.size if isinstance(value, Tolerance) else value
-        size = schema.checked(number, f"tolerance {path}", value_size)
+        size = schema.check_field(number, f"tolerance {path}", value_size)
         one = value if isinstance(value, Tolerance) else Tolerance(deviation=size)
         # A part is at most half the play from the middle.
         sizes[path] = Tolerance(bound=size / 2.0) if is_play(path) else one
@@ -266,7 +266,7 @@ def tolerances(
         {path: "number of the file" if part is None else part.text for path, part in parts.items()},
         units,
         None if wrench is None else _deflection(robot, states, wrench),
-        {path: size.most for path, size in sizes.items()},
+        {path: size.max_error for path, size in sizes.items()},
     )
 
 

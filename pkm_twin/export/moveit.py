@@ -31,7 +31,7 @@ from pkm_twin.export.ros2_control import (
     write_cpp_string,
 )
 from pkm_twin.kinematics.pose import Coordinate, Entry
-from pkm_twin.machine.loop_tree import LoopTree, Single
+from pkm_twin.machine.loop_tree import LoopTree, SingleAxisJoint
 from pkm_twin.machine.urdf_write import GROUND, PLATFORM, list_single_joints
 from pkm_twin.robot.clearance import distance
 from pkm_twin.robot.robot import Robot
@@ -190,7 +190,7 @@ def home_accelerations(robot: Robot) -> list[float]:
         return list(0.5 * np.maximum(limits - weight, 0.0) / inertia)
 
 
-def _list_joined_links(tree: LoopTree, parts: Sequence[Single]) -> list[tuple[str, str]]:
+def _list_joined_links(tree: LoopTree, parts: Sequence[SingleAxisJoint]) -> list[tuple[str, str]]:
     """Return pairs of links that a joint, or a cut loop, connects.
 
     A link without mass and shape is between the axes of one joint, which then connects its neighbours.

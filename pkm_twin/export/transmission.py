@@ -26,7 +26,7 @@ def transmission_package(robot: Robot) -> dict[str, str]:
     :raises ParameterError: a ratio of ``joint_map`` that changes with travel.
     """
     controller, package = robot.controller, package_name(robot, "transmission")
-    controller.check_even()
+    controller.check_constant_ratios()
     code, shown = Package(robot, ("inverse", "joint_to_actuator", "actuator_to_joint", "gains")), printable_name(robot)
     drives = [
         f"  {{{write_cpp_string(name)}, {write_cpp_number(factor)}, {write_cpp_number(offset)}}},"

@@ -174,7 +174,7 @@ class Engine(Scheme):
         key = self.structure.extend(f"{name} {extra}", write, Traced)
         numbers = np.concatenate([self.geometry, more])
         made = Kernel(_find_code(key, self, write, more, free=free), numbers)
-        if not made.holds:
+        if not made.matches_geometry:
             # A number that the program treats as a constant differs here: write another program.
             exact = key.extend(f"{self.graph.key} {more.tolist()}")
             made = Kernel(_find_code(exact, self, write, more), numbers)

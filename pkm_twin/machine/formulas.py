@@ -244,14 +244,14 @@ def _has_no_unit(node: ast.expr) -> bool:
     return all(map(_has_no_unit, _child_nodes(node)))
 
 
-class Written(str):
+class ExpressionText(str):
     """A text in a machine file that may be an expression in place of a number."""
 
     book: Book
     place: str
 
     @classmethod
-    def of(cls, text: str, book: Book, place: str = "") -> Written:
+    def of(cls, text: str, book: Book, place: str = "") -> ExpressionText:
         """Make the text of a file with these parameters; ``place``: suffix of the number's path."""
         made = cls(text)
         made.book, made.place = book, place
@@ -317,12 +317,12 @@ class Book:
         return cls(dict.fromkeys(order, 0.0), own, {}, data)._replace_numbers(numbers)
 
     def mark_expressions(self, data: Any) -> Any:
-        """Convert all texts of data to :class:`Written`, so that they may be expressions."""
+        """Convert all texts of data to :class:`ExpressionText`, so that they may be expressions."""
         if isinstance(data, Mapping):
             return {name: self.mark_expressions(value) for name, value in data.items()}
         if isinstance(data, list):
             return [self.mark_expressions(value) for value in data]
-        return Written.of(data, self) if isinstance(data, str) else data
+        return ExpressionText.of(data, self) if isinstance(data, str) else data
 
     def _replace_numbers(self, numbers: Mapping[str, Any]) -> Book:
         """Return the book with numbers in place of some parameters."""

@@ -83,7 +83,7 @@ class FrictionLaw:
         return 0.0
 
     @staticmethod
-    def share(values: Values, q: Any, speed: Any) -> Any:
+    def load_fraction(values: Values, q: Any, speed: Any) -> Any:
         """Return the effort against the motion as a fraction of the load's magnitude, below one."""
         return 0.0
 
@@ -130,7 +130,7 @@ class LoadDependent(FrictionLaw):
     parameters: ClassVar = {"load_dependent": Parameter("1", high=0.9)}
 
     @staticmethod
-    def share(values: Values, q: Any, speed: Any) -> Any:
+    def load_fraction(values: Values, q: Any, speed: Any) -> Any:
         """Return the friction coefficient, below one: self-locking drives are not modelled."""
         return values["load_dependent"]
 
@@ -180,11 +180,11 @@ class Memory(NamedTuple):
     slope: Array
 
     @classmethod
-    def begun(cls, q: Array) -> Memory:
-        """Return the initial state at positions q, of which nothing is known."""
+    def unknown_at(cls, q: Array) -> Memory:
+        """Return an unknown initial state at positions q."""
         return cls(np.zeros_like(q), q, np.zeros_like(q), np.ones_like(q), np.zeros_like(q))
 
-    def after(self, q: Array, way: Array, distance: Array) -> Memory:
+    def advance_to(self, q: Array, way: Array, distance: Array) -> Memory:
         """Return the states after positions (k, n) of a motion in one direction.
 
         The solution is exact for any step. Moves against the direction count as noise.
@@ -225,7 +225,7 @@ class Dahl(FrictionLaw):
 
         :param rates: zero if their sign is unknown; a reversal is at the farthest position there.
         """
-        way, parts, here = np.sign(rates), [], Memory.begun(q[0])
+        way, parts, here = np.sign(rates), [], Memory.unknown_at(q[0])
         for own, place in zip(way.T, q.T, strict=True):
             sure = np.flatnonzero(own)
             for k in np.flatnonzero(np.diff(own[sure])):
@@ -235,7 +235,7 @@ class Dahl(FrictionLaw):
         way = np.take_along_axis(way, latest, 0)
         turns = np.flatnonzero((way[1:] != way[:-1]).any(1)) + 1
         for a, b in pairwise([0, *turns.tolist(), len(q)]):
-            parts.append(here.after(q[a:b], way[a], distance))
+            parts.append(here.advance_to(q[a:b], way[a], distance))
             here = parts[-1].last
         return Memory(*(np.concatenate(each) for each in zip(*parts, strict=True)))
 
@@ -289,7 +289,7 @@ def select_compiled_laws(names: Sequence[str]) -> tuple[str, ...]:
 def list_unshareable_laws(names: Sequence[str]) -> list[str]:
     """Select the laws that depend on load or past motion, which redundant drives cannot have."""
     laws = {name: LAWS[name] for name in names}
-    return [n for n, law in laws.items() if law.memory or law.share is not FrictionLaw.share]
+    return [n for n, law in laws.items() if law.memory or law.load_fraction is not FrictionLaw.load_fraction]
 
 
 def list_parameters(names: Sequence[str]) -> dict[str, Parameter]:
@@ -343,7 +343,7 @@ def sum_laws(names: Sequence[str], values: Values, q: Any, speed: Any) -> tuple[
     laws = [LAWS[name] for name in names]
     at_place: Any = sum((law.by_position(values, q) for law in laws), 0.0)
     dry: Any = sum((law.dry(values, q, speed) for law in laws), 0.0)
-    share: Any = sum((law.share(values, q, speed) for law in laws), 0.0)
+    share: Any = sum((law.load_fraction(values, q, speed) for law in laws), 0.0)
     return at_place, dry, share
 
 

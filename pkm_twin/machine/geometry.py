@@ -32,7 +32,7 @@ class SizedGraph(Graph):
         return self.given[0]
 
     @property
-    def rim(self) -> Any:
+    def platform_radius(self) -> Any:
         """The given rim, m."""
         return self.given[1]
 
@@ -45,7 +45,9 @@ class SizedGraph(Graph):
 def list_geometry(graph: Graph) -> Array:
     """Return all numbers of a graph's geometry, shape (k,); last those that only scale equations."""
     scales = [graph.body_scale(body) for body in graph.bodies]
-    return array([*graph.numbers, graph.size, graph.rim, *(v for point, length in scales for v in (*point, length))])
+    return array(
+        [*graph.numbers, graph.size, graph.platform_radius, *(v for point, length in scales for v in (*point, length))]
+    )
 
 
 def build_sized_graph(graph: Graph, numbers: Numbers) -> SizedGraph:

@@ -205,7 +205,7 @@ class Graph:
         return extent if reference(extent) >= MIN_LENGTH else 1.0
 
     @property
-    def rim(self) -> float:
+    def platform_radius(self) -> float:
         """Largest distance of a joint on the platform from the reference point, m."""
         points = self.joint_points(self.platform)
         far = reduce(maximum, [norm(plain(p - self.origin)) for p in points], 0.0)

@@ -17,21 +17,21 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import references
 from pkm_twin.errors import ParameterError, UnknownNameError
 from pkm_twin.machine import schema
-from pkm_twin.machine.formulas import Written
+from pkm_twin.machine.formulas import ExpressionText
 from pkm_twin.machine.friction import check_laws, list_friction_keys
 from pkm_twin.machine.graph import Body, Graph, Joint, Rod, array, rotation_about_z
 from pkm_twin.machine.joints import TURN, TYPES, Freedom, unit
 from pkm_twin.machine.members import Tube, compliances
-from pkm_twin.machine.places import Keys, join_path, number_in, replace_numbers
+from pkm_twin.machine.places import Keys, find_number, join_path, replace_numbers
 from pkm_twin.machine.sections import (
     MAX_PLACE,
     DriveSpec,
     Redundancy,
     check_angles,
     friction_fields,
-    friction_of,
     length,
-    limits_of,
+    make_friction_schema,
+    make_limits_schema,
     mass,
     place,
 )
@@ -226,7 +226,7 @@ class JointSpec:
         rub = self.friction or FrictionSpec()
         rotor = self.rotor_inertia
         if self.drive is not None:
-            rotor = self.drive.reflected(self.slides, f"{path}.drive")
+            rotor = self.drive.reflect_inertia(self.slides, f"{path}.drive")
         inner, outer = self.between
         at = np.zeros(3) if self.at is None else self.at
         return Joint(
@@ -375,7 +375,7 @@ def _copy_entry(entry: Any, count: int, path: str) -> list[Any]:
             raise ParameterError(f"{path}.{'.'.join(keys)}", value, f"one number, or {count}, one per copy")
         for k in range(count):
             one = value[k]
-            one = Written.of(one, one.book, f"[{k}]") if isinstance(one, Written) else one
+            one = ExpressionText.of(one, one.book, f"[{k}]") if isinstance(one, ExpressionText) else one
             inner = {keys[-1]: one}
             whole = inner if len(keys) == 1 else {keys[0]: {**result[k][keys[0]], **inner}}
             result[k] = {**result[k], **whole}
@@ -433,7 +433,7 @@ def find_entry_number(entry: Any, keys: tuple[str | int, ...], azimuth: float, p
         return azimuth
     if azimuth:
         entry = _rotate_entry(entry, -azimuth, set(), 0)
-    return number_in(schema.plain(_add_implied_zeros(entry, [keys])), keys, path)
+    return find_number(schema.plain(_add_implied_zeros(entry, [keys])), keys, path)
 
 
 def _add_implied_zeros(entry: T, places: Iterable[Keys]) -> T:
@@ -510,8 +510,10 @@ def collect_drives(graph: Graph, joints: Mapping[str, JointSpec]) -> dict[str, A
     rubs = [joints[j].friction or FrictionSpec() for j in drives]
     n = len(drives)
     return {
-        "friction": friction_of(n)(**{key: array([getattr(rub, key) for rub in rubs]) for key in list_friction_keys()}),
-        "limits": limits_of(n)(
+        "friction": make_friction_schema(n)(
+            **{key: array([getattr(rub, key) for rub in rubs]) for key in list_friction_keys()}
+        ),
+        "limits": make_limits_schema(n)(
             position=_join_values([v.position for v in limits], [-math.inf, math.inf]),
             velocity=_join_values([v.velocity for v in limits], math.inf),
             effort=_join_values([v.effort for v in limits], math.inf),

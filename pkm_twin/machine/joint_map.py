@@ -90,19 +90,19 @@ class JointMap:
     @property
     def is_identity(self) -> bool:
         """True if the joint map changes neither positions nor efforts."""
-        return bool((self.factors == 1.0).all() and (self.offsets == 0.0).all() and self.even)
+        return bool((self.factors == 1.0).all() and (self.offsets == 0.0).all() and self.has_constant_ratios)
 
     @property
-    def even(self) -> bool:
+    def has_constant_ratios(self) -> bool:
         """True if no ratio depends on the position."""
         return bool((self.changes == 0.0).all())
 
-    def check_even(self) -> None:
+    def check_constant_ratios(self) -> None:
         """Reject a map whose velocities and efforts depend on the position.
 
         :raises ParameterError: a ratio changes with travel.
         """
-        if not self.even:
+        if not self.has_constant_ratios:
             worst = int(np.abs(self.changes).argmax())
             raise ParameterError(
                 f"joint_map.{self.names[worst]}.ratio_change",
@@ -130,7 +130,7 @@ class JointMap:
         NaN beyond the position where a changing ratio falls to zero.
         """
         model = np.asarray((controller - self.offsets) / self.factors, np.float64)
-        if self.even:
+        if self.has_constant_ratios:
             return model
         away = model - self.centres
         with np.errstate(invalid="ignore"):
@@ -143,12 +143,12 @@ class JointMap:
 
     def rates(self, controller: Array) -> Array:
         """Convert the controller's velocities or accelerations to the model's, shape (..., n)."""
-        self.check_even()
+        self.check_constant_ratios()
         return np.asarray(controller / self.factors, np.float64)
 
     def efforts(self, controller: Array) -> Array:
         """Convert the controller's efforts to the model's, shape (..., n)."""
-        self.check_even()
+        self.check_constant_ratios()
         return np.asarray(controller * self.factors, np.float64)
 
     def controller_positions(self, model: Array) -> ControllerNumbers:
@@ -158,10 +158,10 @@ class JointMap:
 
     def controller_rates(self, model: Array) -> ControllerNumbers:
         """Convert rates or position differences to the controller's, shape (..., n)."""
-        self.check_even()
+        self.check_constant_ratios()
         return ControllerNumbers(self.factors * model)
 
     def controller_efforts(self, model: Array) -> ControllerNumbers:
         """Convert the model's efforts to the controller's, shape (..., n)."""
-        self.check_even()
+        self.check_constant_ratios()
         return ControllerNumbers(model / self.factors)

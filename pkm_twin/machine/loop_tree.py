@@ -121,7 +121,7 @@ class Joint:
             return found
         return tuple(replace(one, axis=-one.axis) for one in found[::-1])
 
-    def closing(self) -> Joint:
+    def make_loop_closing(self) -> Joint:
         """Convert the joint to one that closes a loop.
 
         :raises ParameterError: the joint is a screw.
@@ -190,7 +190,7 @@ class TreeJoint(NamedTuple):
     child: str
 
 
-class Single(NamedTuple):
+class SingleAxisJoint(NamedTuple):
     """A joint of one axis or, fixed, of none, between two links."""
 
     name: str
@@ -233,14 +233,14 @@ def order_from_root(root: str, joints: Iterable[Joint]) -> list[TreeJoint]:
     return order
 
 
-def split_freedoms(joint: Joint, parent: str, child: str, taken: set[str]) -> list[Single]:
+def split_freedoms(joint: Joint, parent: str, child: str, taken: set[str]) -> list[SingleAxisJoint]:
     """Replace a joint by joints of one freedom in series, with named links between them.
 
     :param taken: names of links, to which those of the links between are added.
     """
     freedoms = joint.freedoms(parent)
     if not freedoms:
-        return [Single(joint.name, "fixed", np.zeros(3), parent, child, joint)]
+        return [SingleAxisJoint(joint.name, "fixed", np.zeros(3), parent, child, joint)]
     parts = []
     for one in freedoms:
         kinds = ["revolute"] * one.turns + ["prismatic"] * bool(one.slide)
@@ -249,12 +249,12 @@ def split_freedoms(joint: Joint, parent: str, child: str, taken: set[str]) -> li
     inside = [free_name(f"{plain_name(name)}_link", taken, "_body") for name in names[:-1]]
     ends = [parent, *inside, child]
     return [
-        Single(name, kind, axis, ends[k], ends[k + 1], joint)
+        SingleAxisJoint(name, kind, axis, ends[k], ends[k + 1], joint)
         for k, (name, (kind, axis)) in enumerate(zip(names, parts, strict=True))
     ]
 
 
-def list_screws(parts: Sequence[Single]) -> list[tuple[str, str, float, float]]:
+def list_screws(parts: Sequence[SingleAxisJoint]) -> list[tuple[str, str, float, float]]:
     """Return slide, turn, factor and offset of each screw: slide = offset + factor turn."""
     return [
         (slide.name, turn.name, turn.joint.pitch, -turn.joint.pitch * turn.home)

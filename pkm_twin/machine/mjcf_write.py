@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array
-from pkm_twin.machine.loop_tree import Link, LoopTree, Single, TreeJoint, list_screws, split_freedoms
+from pkm_twin.machine.loop_tree import Link, LoopTree, SingleAxisJoint, TreeJoint, list_screws, split_freedoms
 from pkm_twin.machine.urdf_write import GROUND, PLATFORM, number_text
 
 
@@ -40,7 +40,7 @@ def write_mjcf(tree: LoopTree, gravity: Array, efforts: Sequence[float] | None =
     elements = {GROUND: ET.SubElement(top, "worldbody")}
     places = {GROUND: np.zeros(3)}
     home: list[float] = []
-    parts: list[Single] = []
+    parts: list[SingleAxisJoint] = []
     for parent, child, row in list_bodies(tree):
         link = tree.links[child]
         place = row[0].joint.at if row else link.frame.position
@@ -84,7 +84,7 @@ def write_mjcf(tree: LoopTree, gravity: Array, efforts: Sequence[float] | None =
     return ET.tostring(top, encoding="unicode") + "\n"
 
 
-def list_bodies(tree: LoopTree) -> list[tuple[str, str, list[Single]]]:
+def list_bodies(tree: LoopTree) -> list[tuple[str, str, list[SingleAxisJoint]]]:
     """List bodies depth first, as MuJoCo numbers joints: parent, child, single joints between.
 
     A link without mass is left out where one joint alone goes on from it: its joints then belong to
@@ -94,8 +94,8 @@ def list_bodies(tree: LoopTree) -> list[tuple[str, str, list[Single]]]:
     for one in tree.tree_joints:
         after.setdefault(one.parent, []).append(one)
     held = {end for one in tree.closures for end in (one.inner, one.outer)} | {tree.platform}
-    found: list[tuple[str, str, list[Single]]] = []
-    todo = [(GROUND, one, list[Single]()) for one in after.get(GROUND, [])[::-1]]
+    found: list[tuple[str, str, list[SingleAxisJoint]]] = []
+    todo = [(GROUND, one, list[SingleAxisJoint]()) for one in after.get(GROUND, [])[::-1]]
     while todo:
         start, (joint, parent, child), row = todo.pop()
         row = row + [one for one in split_freedoms(joint, parent, child, set()) if one.kind != "fixed"]
@@ -155,7 +155,7 @@ def _write_body(parent: ET.Element, link: Link, place: Array, before: Array) -> 
     return element
 
 
-def _write_joint(part: Single, place: Array) -> dict[str, str]:
+def _write_joint(part: SingleAxisJoint, place: Array) -> dict[str, str]:
     joint, limits = part.joint, part.joint.limits if part.whole else {}
     found = {
         "name": part.name,

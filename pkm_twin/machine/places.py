@@ -145,7 +145,7 @@ def merge_data(data: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str,
     return result
 
 
-def number_in(data: Any, keys: Iterable[Key], path: str) -> float:
+def find_number(data: Any, keys: Iterable[Key], path: str) -> float:
     """Return a number of plain data.
 
     :raises ParameterError: there is no number at this location.

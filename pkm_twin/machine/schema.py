@@ -19,7 +19,7 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.operations import absolute, maximum, minimum
 from pkm_twin.errors import ParameterError, UnknownNameError
-from pkm_twin.machine.formulas import MAX_SIZE, Written
+from pkm_twin.machine.formulas import MAX_SIZE, ExpressionText
 from pkm_twin.settings import Setting, map_parameters
 
 MAX_INERTIA: Final = 1e12
@@ -85,7 +85,7 @@ def _make_numbers_field(
         if spread and _is_number(value):
             value = [value] * shape[0]
         found = _check_nested(field, value, shape, bounds, least)
-        return frozen(found) if shape else found
+        return make_read_only(found) if shape else found
 
     bound = words + bounds.bounds_text + ("; one stands for all" if spread else "")
     return key(check, bound, default, **more)
@@ -130,7 +130,7 @@ def mapping(entry: Any, *, default: Any = MISSING, **more: Any) -> Any:
         paths = {name: _join_path(field, name) for name in value}
         if section:
             return {name: build(entry, item, paths[name]) for name, item in value.items()}
-        return {name: checked(entry, paths[name], item) for name, item in value.items()}
+        return {name: check_field(entry, paths[name], item) for name, item in value.items()}
 
     bound = f"a mapping of names to {what}"
     if not section:
@@ -169,7 +169,7 @@ def words(*allowed: str, size: int = 0, distinct: bool = True, default: Any = MI
     return key(check, bound, default, **more)
 
 
-def checked(field: Any, path: str, value: Any) -> Any:
+def check_field(field: Any, path: str, value: Any) -> Any:
     """Check a value like a field of a schema; return the field's value."""
     return field.metadata["setting"].check(path, value)
 
@@ -189,8 +189,8 @@ def interval(*, count: int = 0, default: Any = MISSING, **more: Any) -> Any:
     def check(field: str, value: Any) -> Array:
         if count and isinstance(value, list) and any(isinstance(v, list) for v in value):
             items = _check_list(field, value, count)
-            return frozen([pair(f"{field}[{i}]", v) for i, v in enumerate(items)])
-        return frozen([pair(field, value)] * count if count else pair(field, value))
+            return make_read_only([pair(f"{field}[{i}]", v) for i, v in enumerate(items)])
+        return make_read_only([pair(field, value)] * count if count else pair(field, value))
 
     bound = "[min, max]" + bounds.bounds_text
     return key(check, f"{bound}, or {count} of them" if count else bound, default, **more)
@@ -219,7 +219,7 @@ def inertia(*, positive: bool, default: Any = MISSING, **more: Any) -> Any:
             raise ParameterError(field, value, f"principal moments {bound}; the least is {a:.6g}")
         if not triangle >= 0.0:
             raise ParameterError(field, value, f"triangle rule: {c:.6g} at most {a:.6g} + {b:.6g} (principal)")
-        return frozen((matrix + matrix.T) / 2)
+        return make_read_only((matrix + matrix.T) / 2)
 
     bound = "3 numbers or 3x3" + (", moments above zero" if positive else "")
     return key(check, bound, default, unit="kg m2", **more)
@@ -338,7 +338,7 @@ def units(kind: type, data: Mapping[str, Any], words: Mapping[str, str]) -> dict
     return result
 
 
-def frozen(values: object) -> Array:
+def make_read_only(values: object) -> Array:
     """Make a read-only float array."""
     array = np.array(values, dtype=np.float64)
     array.setflags(write=False)
@@ -346,7 +346,7 @@ def frozen(values: object) -> Array:
 
 
 def _is_number(value: Any) -> bool:
-    kinds = int, float, np.integer, np.floating, Written
+    kinds = int, float, np.integer, np.floating, ExpressionText
     return isinstance(value, kinds) and not isinstance(value, bool)
 
 
@@ -361,14 +361,14 @@ def _check_nested(field: str, value: Any, shape: Sequence[int], bounds: Key, lea
     if not _is_number(value):
         raise ParameterError(field, value, bound)
     try:
-        result = value.number(field) if isinstance(value, Written) else float(value)
+        result = value.number(field) if isinstance(value, ExpressionText) else float(value)
     except OverflowError:
         raise ParameterError(field, "an integer too large for a float", bound) from None
     if math.isfinite(result) and abs(result) > MAX_SIZE:
         bound += f", at most {MAX_SIZE:g} in size"
     endless = result == math.inf and bounds.high == math.inf
     if not (abs(result) <= MAX_SIZE or endless) or not bounds.is_within_bounds(result):
-        told = f"{value} = {result:g}" if isinstance(value, Written) else value
+        told = f"{value} = {result:g}" if isinstance(value, ExpressionText) else value
         raise ParameterError(field, told, bound)
     return result
 

@@ -102,7 +102,7 @@ def read(path: Path, top: ET.Element, actuated: Sequence[str] | None = None) -> 
         WORLD,
         links,
         tree,
-        tuple(joint.closing() for joint in closures),
+        tuple(joint.make_loop_closing() for joint in closures),
         motors,
         foreign.read_gravity(path, weight, links, WORLD, joints.values(), gravity),
         rounding=rounding_error(word for part in positions for word in (part.text or "").split()),

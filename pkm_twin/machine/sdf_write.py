@@ -15,7 +15,7 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine import urdf_xml
-from pkm_twin.machine.loop_tree import Capsule, Link, LoopTree, Single, split_freedoms
+from pkm_twin.machine.loop_tree import Capsule, Link, LoopTree, SingleAxisJoint, split_freedoms
 from pkm_twin.machine.rotations import Pose
 from pkm_twin.machine.urdf_write import GROUND, PLATFORM, number_text, rpy_along
 
@@ -42,7 +42,7 @@ def write_sdf(tree: LoopTree) -> str:
     model = ET.SubElement(top, "model", name=tree.name)
     links, joints = dict(tree.links), [*tree.joints.values(), *tree.closures]
     ends = {one.joint.name: one[1:] for one in tree.tree_joints}
-    rows: list[tuple[str, str, str, str, Array, Sequence[Single]]] = []
+    rows: list[tuple[str, str, str, str, Array, Sequence[SingleAxisJoint]]] = []
     for joint in joints:
         parent, child = ends.get(joint.name, (joint.inner, joint.outer))
         row = split_freedoms(joint, parent, child, {PLATFORM, *links})

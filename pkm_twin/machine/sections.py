@@ -82,7 +82,7 @@ class Payload:
             )
 
 
-def of_mass(mass: float, com: Any = None) -> dict[str, Any]:
+def make_payload(mass: float, com: Any = None) -> dict[str, Any]:
     """Return the entries of a payload of another mass (kg) and centre (m); without mass it has no inertia."""
     entries: dict[str, Any] = {"mass": mass} if com is None else {"mass": mass, "com": list(com)}
     return entries if mass else entries | {"inertia": [0.0, 0.0, 0.0]}
@@ -143,7 +143,7 @@ class DriveSpec:
         turns: Any = self.ratio if self.lead is None else 2 * math.pi / self.lead
         return turns  # type: ignore[no-any-return]
 
-    def reflected(self, slides: bool, path: str) -> float:
+    def reflect_inertia(self, slides: bool, path: str) -> float:
         """Return the inertia reflected to the joint: kg m2 if rotary, kg if prismatic."""
         if slides != (self.lead is not None):
             what = "lead, m per turn" if slides else "ratio, turns per turn"
@@ -172,7 +172,7 @@ class Redundancy:
 
 
 @remembered
-def friction_of(joints: int) -> Any:
+def make_friction_schema(joints: int) -> Any:
     """Make the schema of friction at this number of actuated joints.
 
     Its fields are the parameters of all laws of :mod:`~pkm_twin.machine.friction`.
@@ -190,7 +190,7 @@ def friction_fields(kind: Any, *size: int, **options: Any) -> list[tuple[str, An
 
 
 @remembered
-def limits_of(joints: int) -> Any:
+def make_limits_schema(joints: int) -> Any:
     """Make the schema of limits for this number of joints: None if absent; one value sets all."""
     above: dict[str, Any] = {"above": 0.0, "high": math.inf, "spread": True, "default": None}
     entries = [
@@ -211,7 +211,7 @@ def _make_section(name: str, entries: list[tuple[str, Any, Any]], joints: int, m
 
 
 def _rebuild_section(name: str, joints: int, values: list[Any]) -> Any:
-    schema_of = friction_of if name == "Friction" else limits_of
+    schema_of = make_friction_schema if name == "Friction" else make_limits_schema
     return schema_of(joints)(*values)
 
 

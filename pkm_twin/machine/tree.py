@@ -208,7 +208,7 @@ class Tree:
         sign, frame = -1.0 if backwards else 1.0, self.axes[parent]
         steps: list[Step] = []
         if start:
-            position, rate = self._claim(start, name or f"free body {body}", len(start) - 1)
+            position, rate = self._add_unknowns(start, name or f"free body {body}", len(start) - 1)
             self.scales += [1.0] * 3 + [1.0 / graph.size] * (len(start) - 4)
             none = np.zeros(3)
             steps.append(
@@ -249,7 +249,7 @@ class Tree:
             if actuated:
                 position = rate = graph.leads.index(str(name))
             else:
-                position, rate = self._claim((1.0, 0.0) if circle else (0.0,), str(name), 1)
+                position, rate = self._add_unknowns((1.0, 0.0) if circle else (0.0,), str(name), 1)
                 self.scales.append(1.0 if freedom.turns else 1.0 / graph.size)
             steps.append(
                 Step(
@@ -272,7 +272,7 @@ class Tree:
         arm = snapped_all(self.axes[parent].T @ (at - self.at[parent]))
         self.links[body] = Link(body, parent, name, tuple(steps), at, frame, arm)
 
-    def _claim(self, start: Sequence[float], owner: str, rates: int) -> tuple[int, int]:
+    def _add_unknowns(self, start: Sequence[float], owner: str, rates: int) -> tuple[int, int]:
         """Add the unknowns and rates of a step; return their first indices."""
         position, rate = len(self.home), len(self.owners)
         self.home += start

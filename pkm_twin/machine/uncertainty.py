@@ -56,7 +56,7 @@ class Tolerance:
         return self.size if self.bound is None else self.size / math.sqrt(3.0)
 
     @property
-    def most(self) -> float:
+    def max_error(self) -> float:
         """The bound; for a normal distribution three standard deviations."""
         return 3.0 * self.size if self.bound is None else self.size
 

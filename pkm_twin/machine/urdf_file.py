@@ -177,7 +177,7 @@ def _read_gazebo(path: Path, robot: ET.Element, frames: Mapping[str, Pose], take
         place = frames[start] @ sdf_file.pose(stated, f"{where}.pose")
         found.append(sdf_file.read_joint_element(element, name, (first, second), place, turn))
     found += sdf_file.read_welds(path, robot, robot.get("name", ""), frames, taken)
-    return {joint.name: joint.closing() for joint in found}
+    return {joint.name: joint.make_loop_closing() for joint in found}
 
 
 def _find_unread(element: ET.Element) -> Iterator[str]:

@@ -20,7 +20,7 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.machine import rotations, urdf_xml
-from pkm_twin.machine.loop_tree import Joint, Link, LoopTree, Single, list_screws, split_freedoms
+from pkm_twin.machine.loop_tree import Joint, Link, LoopTree, SingleAxisJoint, list_screws, split_freedoms
 from pkm_twin.machine.rotations import Pose
 from pkm_twin.machine.urdf_control import Control, tree_names
 from pkm_twin.machine.urdf_xml import UNLIMITED
@@ -77,7 +77,7 @@ def write_urdf(
         # A motor rotates; only a controller that counts the metres of a slide has a slide.
         slides = part.kind == "prismatic" and abs(control.factor) == 1.0
         kind = "prismatic" if slides else "revolute"
-        _write_joint(robot, Single(control.name, kind, part.axis, part.parent, name, joint), places)
+        _write_joint(robot, SingleAxisJoint(control.name, kind, part.axis, part.parent, name, joint), places)
         ET.SubElement(robot, "link", name=name)
         back = control.inverse()
         _write_mimic(elements[part.name], control.name, back.factor, back.offset)
@@ -94,7 +94,7 @@ def write_urdf(
     return '<?xml version="1.0"?>\n' + ET.tostring(robot, encoding="unicode") + "\n"
 
 
-def list_single_joints(tree: LoopTree) -> list[Single]:
+def list_single_joints(tree: LoopTree) -> list[SingleAxisJoint]:
     """List the joints of the URDF, from the ground outwards; the last leads to ``platform``."""
     place, taken = Pose(position=tree.origin), {PLATFORM, *tree.links}
     tool = Joint(f"{PLATFORM}_frame", "fixed", tree.platform, PLATFORM, (place, place))
@@ -103,7 +103,7 @@ def list_single_joints(tree: LoopTree) -> list[Single]:
 
 
 def _write_inertial(link: ET.Element, body: Link, place: Array) -> None:
-    # Written for massless links too: some simulators assume 1 kg for a missing inertia.
+    # ExpressionText for massless links too: some simulators assume 1 kg for a missing inertia.
     inertial = ET.SubElement(link, "inertial")
     ET.SubElement(inertial, "origin", xyz=number_text(body.com - place), rpy="0 0 0")
     ET.SubElement(inertial, "mass", value=f"{body.mass:.15g}")
@@ -148,7 +148,7 @@ def rpy_along(direction: Array) -> str:
     return number_text([0.0, math.atan2(math.hypot(x, y), z), math.atan2(y, x)])
 
 
-def _write_joint(robot: ET.Element, part: Single, places: Mapping[str, Array]) -> ET.Element:
+def _write_joint(robot: ET.Element, part: SingleAxisJoint, places: Mapping[str, Array]) -> ET.Element:
     element = ET.SubElement(robot, "joint", name=part.name, type=part.kind)
     xyz, rpy = part.joint.at - places[part.parent], np.zeros(3)
     # The joint's frame is where the child stands at the value zero.

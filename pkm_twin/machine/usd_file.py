@@ -309,7 +309,7 @@ class _Reader:
         first, second = (self.moves[end] for end in (joint.inner, joint.outer))
         axes = [m.rotation @ a for m, a in zip((first, second), joint.axes, strict=False)]
         frames = first @ joint.frames[0], second @ joint.frames[1]
-        return replace(joint, frames=frames, axes=np.reshape(axes, (-1, 3))).closing()
+        return replace(joint, frames=frames, axes=np.reshape(axes, (-1, 3))).make_loop_closing()
 
 
 def _to_rotation(quaternion: Any) -> Array:

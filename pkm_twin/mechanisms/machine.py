@@ -51,10 +51,10 @@ from pkm_twin.machine.places import (
     Keys,
     check_number,
     drop_missing,
+    find_number,
     full_keys,
     has_entry,
     join_path,
-    number_in,
     replace_numbers,
     split_path,
 )
@@ -278,9 +278,9 @@ class Machine(TwinRobot):
         path = self.canonical_path(path)
         keys = full_keys(path)
         if keys[0] == PARAMETERS:
-            return number_in(dict(self.book.values), keys[1:], path)
+            return find_number(dict(self.book.values), keys[1:], path)
         if keys[0] == "origin":
-            return number_in(self.described.origin.tolist(), keys[1:], path)
+            return find_number(self.described.origin.tolist(), keys[1:], path)
         for kind, name, where, azimuth in self.named(keys):
             return find_entry_number(self.specs[kind][name], where, azimuth, path)
         return super().number(path)
@@ -451,7 +451,7 @@ class Machine(TwinRobot):
                 joint.pop(key, None)
             if spec.drive is not None:
                 slides = self.graph.joints[name].slides
-                joint["rotor_inertia"] = spec.drive.reflected(slides, f"joints.{name}.drive")
+                joint["rotor_inertia"] = spec.drive.reflect_inertia(slides, f"joints.{name}.drive")
             # A nonzero friction, since rates are computed only for joints with friction.
             viscous = max(float(self.friction.viscous[k]), 1e-12)
             joint["friction"] = {"viscous": viscous, "coulomb": float(self.friction.coulomb[k])}

@@ -133,8 +133,8 @@ class Prru(TwinRobot):
     def make_parts(self) -> Parts:
         """Make sliders, links and platform, level; limbs are bars between slider and platform.
 
-        The upper link turns about the limb (equation 4), by what the platform-fixed tangential axis
-        of its universal joint asks for (equations 13 to 17): the graph's closures find the angle.
+        The upper link turns about the limb (equation 4) by the angle that its universal joint's
+        tangential axis, fixed to the platform, requires (equations 13 to 17): the closures find it.
         """
         g, members = self.geometry, self.members
         m: Any = self.with_default_inertia.inertia

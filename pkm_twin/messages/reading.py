@@ -162,7 +162,7 @@ class JointReader:
         position = limits.position if self.limited else None
         velocity = limits.velocity if self.limited else None
         reach = [100.0 if unit == "m" else 2000.0 * math.pi for unit in self.robot.joint_units]
-        self.robot.controller.check_even()
+        self.robot.controller.check_constant_ratios()
         self._map = None if self.robot.controller.is_identity else self.robot.controller
         self._names = self.robot.controller.names
         self._limited = {"position": position is not None, "velocity": velocity is not None}

@@ -15,7 +15,7 @@ from pkm_twin.bags.reader import Bag
 from pkm_twin.codegen.arrays import Array, Mask
 from pkm_twin.errors import BagError, ParameterError
 from pkm_twin.files import parse_numbers
-from pkm_twin.machine.sections import of_mass
+from pkm_twin.machine.sections import make_payload
 from pkm_twin.recordings.tables import PAYLOAD, Table
 from pkm_twin.robot.plausibility import check_payload_mass
 from pkm_twin.robot.robot import Robot
@@ -93,7 +93,7 @@ class Load:
         :raises ParameterError: the robot cannot carry this payload, or its mass is many times that
             of all moving parts.
         """
-        loaded = robot.changed(payload=of_mass(self.mass if mass is None else mass, self.com))
+        loaded = robot.changed(payload=make_payload(self.mass if mass is None else mass, self.com))
         for finding in check_payload_mass(loaded):
             raise ParameterError(finding.field, finding.value, f"{finding.bound:.4g} kg or less: {finding.likely}")
         return loaded

@@ -32,15 +32,15 @@ from pkm_twin.machine.places import (
     Keys,
     check_number,
     drop_missing,
+    find_number,
     full_keys,
     list_file_numbers,
     merge_data,
-    number_in,
     replace_numbers,
 )
 from pkm_twin.machine.pose_grid import PoseGrid
 from pkm_twin.machine.reach import PassiveLimit, position_box
-from pkm_twin.machine.sections import DriveSpec, JointLimits, Payload, friction_of, limits_of
+from pkm_twin.machine.sections import DriveSpec, JointLimits, Payload, make_friction_schema, make_limits_schema
 from pkm_twin.machine.uncertainty import Tolerance, UncertaintyEntry, list_causes
 from pkm_twin.machine.urdf_file import Visual
 from pkm_twin.settings import map_parameters
@@ -89,9 +89,9 @@ class Mechanism(Common):
     """How the home was chosen, if the file leaves it open."""
     visuals: tuple[Visual, ...] = ()
     """Meshes of a URDF's links."""
-    friction: Coefficients = schema.section(friction_of(3), default={})
+    friction: Coefficients = schema.section(make_friction_schema(3), default={})
     limits: JointLimits = schema.section(
-        limits_of(3), text="nodes and commands reject values beyond, or warn", default={}
+        make_limits_schema(3), text="nodes and commands reject values beyond, or warn", default={}
     )
     drive: DriveSpec | None = schema.section(
         DriveSpec, text="of every actuated joint, in place of `inertia.rotor_inertia`", default=None
@@ -149,7 +149,7 @@ class Mechanism(Common):
 
         It converts angles to lengths.
         """
-        return float(self.graph.rim)
+        return float(self.graph.platform_radius)
 
     @property
     def limb_names(self) -> tuple[str, ...]:
@@ -293,7 +293,7 @@ class Mechanism(Common):
         if given:
             bound = "no value, fixed or varied, because the section drive has the rotor: drive.inertia"
             raise ParameterError("inertia.rotor_inertia", reference(given), bound)
-        return self.drive.reflected(slides, "drive")
+        return self.drive.reflect_inertia(slides, "drive")
 
     @cached_property
     def laws(self) -> tuple[str, ...]:
@@ -476,7 +476,7 @@ class Mechanism(Common):
         keys = full_keys(path)
         if not keys or keys[0] not in map_parameters(type(self)):
             raise unknown_number_error(path, self.file_numbers())
-        return number_in(schema.plain(getattr(self, str(keys[0]))), keys[1:], path)
+        return find_number(schema.plain(getattr(self, str(keys[0]))), keys[1:], path)
 
     def with_file_values(self: R, values: Mapping[str, Any]) -> R:
         """Return the robot of the same file with other numbers at dotted paths.

@@ -52,11 +52,11 @@ class Posture:
             name: origins[name] - rotations[name] @ at[name] for name in rotations
         }
 
-    def place(self, body: str, point: Array) -> Array:
+    def locate_point(self, body: str, point: Array) -> Array:
         """Return the position of a point of a body, given at home, (3,), m; shape (..., 3)."""
         return np.asarray(self.rotations[body] @ point + self._shifts[body], np.float64)
 
-    def turn(self, body: str, vector: Array) -> Array:
+    def rotate_vector(self, body: str, vector: Array) -> Array:
         """Return the direction of a vector of a body, given at home, (3,); shape (..., 3)."""
         return np.asarray(self.rotations[body] @ vector, np.float64)
 

@@ -110,12 +110,12 @@ class Robot(Mechanism):
     def inertial(self) -> Array:
         """Parameter vector of the dynamics with the payload, see ``machine.inertia``."""
         load = self.payload
-        return schema.frozen(self.own_inertial + self._layout.payload(load.mass, load.com, load.inertia))
+        return schema.make_read_only(self.own_inertial + self._layout.payload(load.mass, load.com, load.inertia))
 
     @cached_property
     def own_inertial(self) -> Array:
         """Parameter vector of the dynamics without the payload."""
-        return schema.frozen(self._layout.pack(self.graph, self.gravity, self.friction))
+        return schema.make_read_only(self._layout.pack(self.graph, self.gravity, self.friction))
 
     @property
     def _layout(self) -> Layout:

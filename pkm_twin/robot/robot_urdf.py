@@ -49,7 +49,7 @@ def robot_urdf(robot: Robot, hardware: str = MOCK_HARDWARE, prefix: str = "") ->
     """
     _warn_of_losses(robot, "URDF")
     if hardware:
-        robot.controller.check_even()
+        robot.controller.check_constant_ratios()
     return write_urdf(robot_tree(robot), hardware, prefix, _list_controls(robot))
 
 

@@ -24,7 +24,7 @@ def passive_values(robot: Robot, q: ArrayLike) -> Array:
     :param q: joint positions, shape (..., n); errors as ``robot.forward``.
     """
     posture, values = Posture(robot, q), []
-    turned, placed = posture.turn, posture.place
+    turned, placed = posture.rotate_vector, posture.locate_point
     for limit in robot.passive_limits:
         axis = turned(limit.inner, limit.axis)
         if limit.kind == "slide":

@@ -176,7 +176,7 @@ class Scene:
 
     def _find_points(self, q: Array, places: Sequence[Place]) -> Array:
         posture = Posture(self.robot, q)
-        return np.array([posture.place(*place) for place in places]).reshape(-1, 3)
+        return np.array([posture.locate_point(*place) for place in places]).reshape(-1, 3)
 
     def _draw_arrows(self, state: State, load: WrenchEffects) -> list[Shape]:
         """Draw force and moment as arrows from the reference point."""

@@ -187,11 +187,11 @@ class Scene:
         """
         posture, graph = Posture(self.robot, q), self.robot.graph
         colours = colour_by_share(shares or {})
-        origin = posture.place(graph.platform, graph.origin)
+        origin = posture.locate_point(graph.platform, graph.origin)
         shift, turn = moved.platform[:3], Rotation.from_rotvec(moved.platform[3:])
 
         def move_point(spot: Place) -> Array:
-            point = posture.place(*spot)
+            point = posture.locate_point(*spot)
             if moved is RIGID:
                 return point
             if self._on_platform(spot):
@@ -205,7 +205,7 @@ class Scene:
             shares = np.linspace(0.0, 1.0, pieces + 1)[:, None]
             if (member := moved.members.get(name)) is None:
                 return np.asarray(first + shares * (last - first), np.float64)
-            start, end = posture.place(*bar.start), posture.place(*bar.end)
+            start, end = posture.locate_point(*bar.start), posture.locate_point(*bar.end)
             displaced = _interpolate_along(*member, start + shares * (end - start))
             bow = displaced - displaced[0] - shares * (displaced[-1] - displaced[0])
             return np.asarray(first + shares * (last - first) + bow, np.float64)
@@ -266,9 +266,9 @@ class Scene:
         posture, graph = Posture(self.robot, q), self.robot.graph
         result = {}
         for body, rotation in posture.rotations.items():
-            at, turn = posture.place(body, np.zeros(3)), Rotation.from_matrix(rotation)
+            at, turn = posture.locate_point(body, np.zeros(3)), Rotation.from_matrix(rotation)
             if body == graph.platform:
-                origin, more = posture.place(body, graph.origin), moved.platform[3:]
+                origin, more = posture.locate_point(body, graph.origin), moved.platform[3:]
                 about = Rotation.from_rotvec(more)
                 at = origin + moved.platform[:3] + about.apply(at - origin)
                 turn = about * turn

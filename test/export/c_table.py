@@ -79,7 +79,7 @@ def times(robot, package):
     """Nanoseconds of one torques call by build, and of the vector code's; in turns, medians."""
     q, qd, qdd, wrench = random_motion(robot, np.random.default_rng(0), SAMPLES)
     kernel = torque_kernel(robot)
-    prepared, out = kernel.prepared(robot.inertial), np.zeros(8)
+    prepared, out = kernel.prepare(robot.inertial), np.zeros(8)
     words = [1, 1, 1, prepared.ctypes.data, 0]
     for array in (q, qd, qdd, wrench):
         words += [array.ctypes.data, 0, 0]

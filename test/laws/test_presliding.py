@@ -77,10 +77,10 @@ def test_states_are_those_of_the_differential_equation_and_no_step_matters(rng):
     # Nor where it turns round too slowly for its direction to be seen.
     slow = Dahl.states(q, np.where(np.abs(qd) < 0.05 * np.abs(qd).max(0), 0.0, qd), distance)
     assert (np.abs(slow.z - found.z) < 1e-3 + slow.unknown).all() and slow.unknown[-1].max() < 0.01
-    halved = Memory.begun(q[0])
+    halved = Memory.unknown_at(q[0])
     for (a, b), rates in zip(pairwise(q[:200]), qd[1:200], strict=True):
         for place in (0.5 * (a + b), b):
-            halved = halved.after(place[None], np.sign(rates), distance).last
+            halved = halved.advance_to(place[None], np.sign(rates), distance).last
     assert np.abs(halved.z - found.z[199]).max() < 1e-12
 
 

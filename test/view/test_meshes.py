@@ -50,7 +50,7 @@ def test_a_mesh_moves_with_its_link(tmp_path, filename, rng):
         now = Rotation.from_quat(np.roll(turn, -1)).apply(corners) + at
         posture = Posture(robot, q)
         for name, corner in (("motor_left", 0), ("elbow_left", 1)):
-            joint = posture.place("upper_left", graph.joints[name].at)
+            joint = posture.locate_point("upper_left", graph.joints[name].at)
             assert np.linalg.norm(now - joint, axis=1).argmin() == corner
             assert now[corner] == pytest.approx(joint, abs=1e-7)
 

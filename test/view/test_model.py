@@ -220,8 +220,8 @@ def test_beyond_a_passive_limit_names_the_joint():
     assert name == "R joint 1"
     posture = Posture(model.robot, model.robot.inverse(beta))
     foot, tip = (graph.joints[joint] for joint in ("U joint 1", name))
-    leg = foot.at - posture.place(tip.outer, tip.at)
-    normal = posture.turn(graph.platform, np.array([0.0, 0.0, 1.0]))
+    leg = foot.at - posture.locate_point(tip.outer, tip.at)
+    normal = posture.rotate_vector(graph.platform, np.array([0.0, 0.0, 1.0]))
     angle = np.arccos(leg @ normal / np.linalg.norm(leg))
     assert float(value) == pytest.approx(angle, abs=1e-5)
 

@@ -15,7 +15,7 @@ from pkm_twin.machine.graph_file import BodySpec, FrictionSpec, JointSpec, LimbF
 from pkm_twin.machine.joint_map import JointMapEntry
 from pkm_twin.machine.members import Tube
 from pkm_twin.machine.schema import plain
-from pkm_twin.machine.sections import DriveSpec, friction_of
+from pkm_twin.machine.sections import DriveSpec, make_friction_schema
 from pkm_twin.machine.uncertainty import UncertaintyEntry
 from pkm_twin.mechanisms import delta, linear_delta, machine, prru, upr_rpu
 from pkm_twin.robot.mechanism import Common, Mechanism
@@ -53,7 +53,7 @@ TITLES = {
     Tube: "tube",
     DriveSpec: "drive",
     FrictionSpec: "friction",
-    friction_of(3): "friction",
+    make_friction_schema(3): "friction",
     JointMapEntry: "joint_map.JOINT",
     UncertaintyEntry: "uncertainty.PATH",
 }
