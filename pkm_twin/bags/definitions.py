@@ -115,9 +115,23 @@ def message_definition(type_name: str) -> str:
             continue
         package, short = name.split("/")
         cls = message_class(f"{package}/msg/{short}")
-        fields = [_parse_class_field(*item) for item in cls.get_fields_and_field_types().items()]
-        sections[name] = "\n".join(_write_field(field) for field in fields)
-        waiting += [field.base for field in fields if "/" in field.base]
+        lines = []
+        # Message classes print types such as ``sequence<double, 3>``.
+        for field, spec in cls.get_fields_and_field_types().items():
+            sequence = re.fullmatch(r"sequence<(?P<item>.+?)(?:,\s*(?P<bound>\d+))?>", spec)
+            match = _TYPE_PATTERN.fullmatch(sequence["item"] if sequence else spec)
+            if match is None:
+                raise BagError(f"field {field} has the unknown type {spec!r}", reason="type")
+            base = {"double": "float64", "float": "float32", "boolean": "bool", "octet": "byte"}.get(
+                match["base"], match["base"]
+            )
+            chars = f"<={match['chars']}" if match["chars"] else ""
+            size = f"[{match['size']}]" if match["size"] else ""
+            if sequence:
+                size = f"[<={sequence['bound']}]" if sequence["bound"] else "[]"
+            lines.append(f"{base}{chars}{size} {field}")
+            waiting += [base] if "/" in base else []
+        sections[name] = "\n".join(lines)
     (main, *others) = sections.items()
     parts = [main[1], *(f"MSG: {name}\n{text}" for name, text in others)]
     return f"\n{SEPARATOR}\n".join(parts) + "\n"
@@ -134,27 +148,6 @@ def _check_type_name(type_name: str) -> str:
         text = f"{brief(type_name)} is not a type name; expected package/msg/Type"
         raise BagError(text, reason="schema")
     return _short_name(type_name)
-
-
-def _parse_class_field(name: str, spec: str) -> Field:
-    """Parse a field's type as message classes print it, such as ``sequence<double, 3>``."""
-    sequence = re.fullmatch(r"sequence<(?P<item>.+?)(?:,\s*(?P<bound>\d+))?>", spec)
-    match = _TYPE_PATTERN.fullmatch(sequence["item"] if sequence else spec)
-    if match is None:
-        raise BagError(f"field {name} has the unknown type {spec!r}", reason="type")
-    base = {"double": "float64", "float": "float32", "boolean": "bool", "octet": "byte"}.get(
-        match["base"], match["base"]
-    )
-    size: int | None = int(match["size"]) if match["size"] else None
-    if sequence:
-        size = int(sequence["bound"] or 0)
-    return Field(name, base, size, bool(sequence and sequence["bound"]), int(match["chars"] or 0))
-
-
-def _write_field(field: Field) -> str:
-    chars = f"<={field.chars}" if field.chars else ""
-    brackets = "" if field.size is None else f"[{'<=' * field.upto}{field.size or ''}]"
-    return f"{field.base}{chars}{brackets} {field.name}"
 
 
 def parse_definition(type_name: str, text: str) -> Definition:

@@ -159,25 +159,6 @@ def choose_topics(bag: Bag, robot: Robot, wanted: Sequence[str] = (), deflected:
     return Topics(joints, wrench, deflection, left_out)
 
 
-def is_output(topic: str) -> bool:
-    """Return whether the name is one of the twin's own topics."""
-    last = topic.split("/")[-2:]
-    return last == ["stiffness_monitor", "deflection"] or any(
-        part
-        in (
-            "joint_torques",
-            "torque_residual",
-            "reactions",
-            "machine_state",
-            "commands_stamped",
-            "compliance_stamped",
-            "strain_energy_stamped",
-            "natural_frequencies_stamped",
-        )
-        for part in last
-    )
-
-
 def normalise_type(info: TopicInfo) -> str:
     """Return a topic's type as ROS 2 writes it; some libraries leave the ``msg`` out."""
     package, _, name = info.type.partition("/")
@@ -186,17 +167,20 @@ def normalise_type(info: TopicInfo) -> str:
 
 def _find_candidates(bag: Bag, kind: str, wanted: list[str], left_out: dict[str, str]) -> list[str]:
     """Find topics of a type: the wanted, else all but the twin's and a simulation's own."""
+    outputs = {"joint_torques", "torque_residual", "reactions", "machine_state", "commands_stamped"}
+    outputs |= {"compliance_stamped", "strain_energy_stamped", "natural_frequencies_stamped"}
     fit = []
     for name, info in bag.report.topics.items():
         if normalise_type(info) != kind:
             continue
+        last = name.split("/")[-2:]
         if info.encoding != "cdr":
             left_out[name] = f"its encoding is {info.encoding}; expected cdr"
         elif wanted and name not in wanted:
             left_out[name] = "not chosen"
         elif not wanted and any(part in ("ground_truth", "groundtruth") for part in name.split("/")):
             left_out[name] = "no sensor's; --topic uses it"
-        elif not wanted and is_output(name):
+        elif not wanted and (last == ["stiffness_monitor", "deflection"] or outputs & {*last}):
             left_out[name] = "published by pkm_twin"
         else:
             fit.append(name)

@@ -126,40 +126,30 @@ def draw_torques(units: Mapping[str, str], table: Mapping[str, NDArray[np.float6
     efforts = np.array([table[f"{joint}.effort"] for joint in units])
     for k, (joint, unit) in enumerate(units.items()):
         peak = int(np.abs(efforts[k]).argmax())
-        for axes in columns:
-            _draw_efforts(axes[k], joint, table, terms=axes is columns[-1])
-            label(axes[k], "time (s)", f"effort ({unit})")
-        axes[k].set_title(f"{joint}: {efforts[k, peak]:.4g} {unit} at {time[peak]:.4g} s")
+        for column in columns:
+            ax, effort, measured = column[k], efforts[k], table.get(f"{joint}.measured")
+            if measured is not None:
+                ax.plot(time, measured, color="0.7", lw=3, label="measured")
+                ax.plot(time, measured - effort, color="#882255", lw=1, label="measured - sum")
+            ax.plot(time, effort, color="black", lw=1, label="sum")
+            if f"{joint}.effort_deviation" in table:
+                band = 2.0 * table[f"{joint}.effort_deviation"]
+                ax.fill_between(
+                    time, effort - band, effort + band, label="two deviations", color="0.3", alpha=0.25, lw=0
+                )
+            for colour, term in zip(COLOURS, TERMS, strict=False):
+                values = table[f"{joint}.effort_{term}"]
+                if column is columns[-1] and np.any(values != 0.0):
+                    ax.plot(time, values, color=colour, lw=0.8, label=term)
+            if "beyond_limits" in table:
+                beyond, whole_height = np.asarray(table["beyond_limits"]) > 0, ax.get_xaxis_transform()
+                ax.fill_between(
+                    time, 0, 1, where=beyond, color="0.85", zorder=0, transform=whole_height, label="beyond limits"
+                )
+            label(ax, "time (s)", f"effort ({unit})")
+        ax.set_title(f"{joint}: {efforts[k, peak]:.4g} {unit} at {time[peak]:.4g} s")
         if not whole:
-            axes[k].set_xlim(time[peak] - 1.0, time[peak] + 1.0)
-        legend(axes[k])
+            ax.set_xlim(time[peak] - 1.0, time[peak] + 1.0)
+        legend(ax)
     write_title(figure, title)
     return figure
-
-
-def _draw_efforts(ax: Axes, joint: str, table: Mapping[str, NDArray[np.float64]], terms: bool) -> None:
-    time, effort = table["time"], table[f"{joint}.effort"]
-    measured = table.get(f"{joint}.measured")
-    if measured is not None:
-        ax.plot(time, measured, color="0.7", lw=3, label="measured")
-        ax.plot(time, measured - effort, color="#882255", lw=1, label="measured - sum")
-    ax.plot(time, effort, color="black", lw=1, label="sum")
-    if f"{joint}.effort_deviation" in table:
-        band = 2.0 * table[f"{joint}.effort_deviation"]
-        style: dict[str, Any] = {"color": "0.3", "alpha": 0.25, "lw": 0}
-        ax.fill_between(time, effort - band, effort + band, label="two deviations", **style)
-    for colour, term in zip(COLOURS, TERMS, strict=False):
-        values = table[f"{joint}.effort_{term}"]
-        if terms and np.any(values != 0.0):
-            ax.plot(time, values, color=colour, lw=0.8, label=term)
-    if "beyond_limits" in table:
-        ax.fill_between(
-            time,
-            0,
-            1,
-            where=np.asarray(table["beyond_limits"]) > 0,
-            color="0.85",
-            zorder=0,
-            transform=ax.get_xaxis_transform(),
-            label="beyond limits",
-        )

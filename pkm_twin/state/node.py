@@ -39,7 +39,6 @@ from pkm_twin.state.scene import Scales, Scene, WrenchEffects
 from pkm_twin.state.state import (
     STATE_TOPICS,
     MachineState,
-    State,
     make_state_program,
     make_state_program_with_velocities,
 )
@@ -245,7 +244,22 @@ class MachineStateNode(TwinNode):
         own = header(state.stamp, self.core.settings.base_frame)
         lifetime = Duration(seconds=1.0).to_msg()
         markers = MarkerArray()
-        for shape in self._scene.shapes(state, self._compute_wrench_effects(state)):
+        robot, effects = self.core.robot, None
+        wrench = self.core.find_wrench(state) if self._elastic else None
+        if wrench is not None:
+            try:
+                found = platform_response(robot, state.q, wrench)
+                effects = WrenchEffects(
+                    wrench,
+                    found.compliance,
+                    found.deflection,
+                    dict(zip(found.elements, found.factors.tolist(), strict=True)),
+                    str(found.dominant),
+                    member_deflections(robot, state.q, wrench),
+                )
+            except (PkmTwinError, ValueError) as error:
+                self.log_throttled("load", f"~/markers: without the load: {error}")
+        for shape in self._scene.shapes(state, effects):
             marker = Marker(header=own, ns=shape.group, id=shape.number, type=MARKER_TYPES[shape.kind])
             marker.text = shape.text
             marker.pose.position = xyz(Point, shape.position)
@@ -257,26 +271,6 @@ class MachineStateNode(TwinNode):
                 marker.lifetime = lifetime
             markers.markers.append(marker)
         self._markers.publish(markers)
-
-    def _compute_wrench_effects(self, state: State) -> WrenchEffects | None:
-        """Compute the effects of the wrench on the machine; None if the wrench is unknown."""
-        wrench = self.core.find_wrench(state) if self._elastic else None
-        if wrench is None:
-            return None
-        robot = self.core.robot
-        try:
-            found = platform_response(robot, state.q, wrench)
-            return WrenchEffects(
-                wrench,
-                found.compliance,
-                found.deflection,
-                dict(zip(found.elements, found.factors.tolist(), strict=True)),
-                str(found.dominant),
-                member_deflections(robot, state.q, wrench),
-            )
-        except (PkmTwinError, ValueError) as error:
-            self.log_throttled("load", f"~/markers: without the load: {error}")
-            return None
 
 
 def _warm_up(robot: Robot) -> bool:

@@ -141,13 +141,6 @@ class Differentiator:
         derivative = 1 if self._carries_velocity else 2
         return derivative, back, fit_weights(back, self.degree, derivative, 0.0)
 
-    def _is_gap(self, stamp: int) -> bool:
-        """Return whether the stream was silent for too long to fit one polynomial."""
-        if self._count < MIN_SAMPLES:
-            return False
-        newest = self._stamps.item((self._count - 1) % self._places)
-        return stamp - self._begin - newest > max(self._span, self.time * SECOND)
-
     def _fit_samples(self, window: int) -> None:
         if window == self.window:
             return
@@ -168,8 +161,11 @@ class Differentiator:
         carries = qd is not None
         values = q if qd is None else qd
         n = len(values)
-        if self._is_gap(stamp):
-            self.reset()
+        if self._count >= MIN_SAMPLES:
+            newest = self._stamps.item((self._count - 1) % self._places)
+            # A longer silence is too long to fit one polynomial.
+            if stamp - self._begin - newest > max(self._span, self.time * SECOND):
+                self.reset()
         if self._fit is None or carries is not self._carries_velocity or n != self._fit.joints:
             self.reset()
             self._carries_velocity = carries
