@@ -22,16 +22,18 @@ from delta_dynamics.torques.virtual_work import (
 )
 from pkm_twin.codegen.arrays import Array, vectors
 from pkm_twin.codegen.code import REJECTED, VALID
-from pkm_twin.codegen.expressions import PARAMETERS, Numbers, Objects, snapped_all
+from pkm_twin.codegen.expressions import PARAMETERS, Numbers, Objects, cross, snapped_all
 from pkm_twin.codegen.kernels import Kernel
 from pkm_twin.codegen.lu import SparseLU
 from pkm_twin.codegen.program import Program
 from pkm_twin.kinematics import programs
-from pkm_twin.kinematics.motion import BaseMotion
+from pkm_twin.kinematics.motion import BaseMotion, Motion
 from pkm_twin.kinematics.posed import PlatformFirstScheme
 from pkm_twin.kinematics.programs import certify_assembly, iterate_pose, pose_factors, solve_pose
 from pkm_twin.kinematics.traced import Traced
-from pkm_twin.machine.inertia import ROTORS_PART, Layout, list_loaded_joints, make_frame_change
+from pkm_twin.machine.graph import BASE
+from pkm_twin.machine.inertia import ROTORS_PART, Layout, list_loaded_joints, lump_inertia, make_frame_change
+from pkm_twin.machine.joints import UNIT_VECTORS
 from pkm_twin.robot.rejection import make_pivot_error
 from pkm_twin.robot.robot import Robot
 
@@ -190,6 +192,41 @@ def pose_acceleration_kernel(robot: Robot, *, certified: bool) -> Kernel:
     return _compile_at_pose(robot, "accelerations", _write_pose_accelerations, certified=certified)
 
 
+class _RecursiveForces(Forces):
+    """Forces whose couples follow from the bodies' turning in their own axes, and go down the tree there.
+
+    This takes fewer operations than base axes where most joints turn.
+    """
+
+    def __init__(self, motion: Motion, *, accelerated: bool) -> None:
+        """Find angular velocities and, after accelerations are set, angular accelerations of all bodies."""
+        super().__init__(motion)
+        self._turning: dict[str, tuple[Any, Any]] = {}
+        self._turning[BASE] = motion.omega[BASE], motion.alpha[BASE] if accelerated else np.zeros(3)
+        for link in motion.tree.links.values():
+            w, al = self._turning[link.parent]
+            for step in link.steps:
+                if step.ball or step.free:
+                    own = motion.rotation[link.body].T
+                    w, al = own @ motion.omega[link.body], own @ motion.alpha[link.body] if accelerated else al
+                elif step.turns:
+                    turn, rate = motion.turn(step).T, motion.rate[id(step)]
+                    w = turn @ w
+                    if accelerated:
+                        al = turn @ al + UNIT_VECTORS[2] * motion.second[id(step)] + cross(w, UNIT_VECTORS[2]) * rate
+                    w = w + UNIT_VECTORS[2] * rate
+            self._turning[link.body] = w, al
+
+    def omega(self, name: str) -> Any:
+        return self._turning[name][0]
+
+    def alpha(self, name: str) -> Any:
+        return self._turning[name][1]
+
+    def add_couple(self, name: str, couple: Objects) -> None:
+        self.couple[name] = self.couple[name] + couple
+
+
 class _PoseDrivenMachine:
     """Motion and forces as expressions, on a tree in which the pose coordinates are actuated.
 
@@ -237,10 +274,10 @@ class _PoseDrivenMachine:
         """Select the rates or accelerations of all drives from those of all unknowns."""
         return [values[self.posed.tree.steps[name].rate] for name in self.t.graph.actuated]
 
-    def add_inertia(self, add: Callable[[Forces, Objects, Objects], None]) -> Forces:
+    def add_inertia(self, add: Callable[[Forces, Objects, Objects], None], *, accelerated: bool) -> Forces:
         """Return the forces, or momenta, of all bodies and rods, by a method of :class:`Forces`."""
-        forces = Forces(self.posed.motion)
-        add(forces, self._bodies, self.parts[1])
+        forces = _RecursiveForces(self.posed.motion, accelerated=accelerated)
+        add(forces, lump_inertia(self.posed.tree, self._bodies), self.parts[1])
         return forces
 
     def forces(self, rate: Numbers, acceleration: Numbers) -> Objects:
@@ -248,7 +285,7 @@ class _PoseDrivenMachine:
         t, posed, passive = self.t, self.posed, self.parts[-1]
         posed.set_rates(rate)
         posed.set_accelerations(acceleration, BaseMotion.at_rest(self.parts[2]))
-        forces = self.add_inertia(Forces.add_inertia)
+        forces = self.add_inertia(Forces.add_inertia, accelerated=True)
         for k, joint in enumerate(list_loaded_joints(t.graph)):
             forces.add_passive_joint(joint, passive[3 * k : 3 * k + 3])
         forces.subtract_wrench(t.tape.inputs("wrench", 6))
@@ -268,7 +305,7 @@ class _PoseDrivenMachine:
         table = np.zeros((m + free, m + free), dtype=object)
         for k, unit in enumerate(np.eye(m + free)):
             posed.motion.set_rates(unit[m:], unit[:m])
-            forces = self.add_inertia(Forces.add_momenta)
+            forces = self.add_inertia(Forces.add_momenta, accelerated=False)
             for j, joint in enumerate(list_loaded_joints(t.graph)):
                 forces.add_joint_effort(joint, passive[3 * j + 2] * forces.relative_motion(joint, accelerated=False)[0])
             unknown, driven = forces.generalised_forces()

@@ -99,8 +99,7 @@ def mass_matrix_kernel(robot: Robot) -> Kernel:
 
 def _reshape_to_rows(robot: Robot, flat: Array) -> Array:
     """Reshape the last axis to (n, size / n): one row per joint."""
-    n = robot.joints_count
-    return flat.reshape(*flat.shape[:-1], n, flat.shape[-1] // n)
+    return flat.reshape(*flat.shape[:-1], robot.joints_count, flat.shape[-1] // robot.joints_count)
 
 
 def body_mass_matrix(robot: Robot, q: ArrayLike, body: str) -> Array:
@@ -155,14 +154,14 @@ def energy(robot: Robot, q: ArrayLike, qd: ArrayLike) -> Energy:
 class Forces:
     """The force and moment that each body needs at its origin, base axes: minus Q of the papers.
 
-    :meth:`generalised_forces` sums up their virtual work (Delta-CU paper, step 4, equation 22).
+    :meth:`generalised_forces` sums up their virtual work (Delta-CU paper, step 4, equation 22), and
+    that of ``couple``: a further moment, in the body's axes.
     """
 
     def __init__(self, motion: Motion) -> None:
         self.motion = motion
-        names = [BASE, *motion.tree.links]
-        self.force: dict[str, Any] = {name: np.zeros(3) for name in names}
-        self.moment: dict[str, Any] = {name: np.zeros(3) for name in names}
+        none: dict[str, Any] = dict.fromkeys((BASE, *motion.tree.links), np.zeros(3))
+        self.force, self.moment, self.couple = none.copy(), none.copy(), none.copy()
 
     def add_force(self, body: str, point: Array, force: Any) -> None:
         """Add a needed force at a point of a body, given at home."""
@@ -197,9 +196,20 @@ class Forces:
 
     def _add_euler(self, name: str, inertia: Objects) -> None:
         """Add I alpha + omega x I omega, computed in the body's axes."""
-        m, turned = self.motion, self.motion.rotation[name]
-        omega, alpha = turned.T @ m.omega[name], turned.T @ m.alpha[name]
-        self.moment[name] = self.moment[name] + turned @ (inertia @ alpha + cross(omega, inertia @ omega))
+        omega = self.omega(name)
+        self.add_couple(name, inertia @ self.alpha(name) + cross(omega, inertia @ omega))
+
+    def omega(self, name: str) -> Any:
+        """Return a body's angular velocity in its axes."""
+        return self.motion.rotation[name].T @ self.motion.omega[name]
+
+    def alpha(self, name: str) -> Any:
+        """Return a body's angular acceleration in its axes."""
+        return self.motion.rotation[name].T @ self.motion.alpha[name]
+
+    def add_couple(self, name: str, couple: Objects) -> None:
+        """Add a moment that is given in a body's axes."""
+        self.moment[name] = self.moment[name] + self.motion.rotation[name] @ couple
 
     def _sum_inertias(self, bodies: Objects) -> list[tuple[str, Objects]]:
         """Return inertia matrices about the origins, summed over bodies with the same rotation."""
@@ -234,9 +244,7 @@ class Forces:
             self.force[name] = self.force[name] + v * inertial[0] + cross(w, first)
             self.moment[name] = self.moment[name] + cross(first, v)
         for name, matrix in self._sum_inertias(bodies):
-            turned = m.rotation[name]
-            spin = turned @ (matrix @ (turned.T @ m.omega[name]))
-            self.moment[name] = self.moment[name] + spin
+            self.add_couple(name, matrix @ self.omega(name))
         for mass, rod in zip(rods, m.graph.rods.values(), strict=True):
             self._share_ends(rod, mass, m.velocity)
 
@@ -292,27 +300,26 @@ class Forces:
         self.moment[graph.platform] = self.moment[graph.platform] - six[3:]
 
     def generalised_forces(self) -> tuple[Objects, Objects]:
-        """Return the generalised forces on the unknown rates and on the drives.
+        """Return the power of all required forces per unknown rate and per drive's rate.
 
-        They are the power of all required forces per rate: minus the sum of J_M' Q_M, J' Q_S and
-        J_Hij' Q_Hij (3-PRRU paper, equations 38 and 39; Delta-CU paper, equation 22).
+        Minus the sum of J_M' Q_M, J' Q_S, J_Hij' Q_Hij (3-PRRU paper, equations 38 and 39; Delta-CU paper, 22).
         """
         m, tree = self.motion, self.motion.tree
-        unknown = np.zeros(tree.unknown_rates, dtype=object)
-        driven = np.zeros(len(tree.graph.leads), dtype=object)
+        unknown, driven = (np.zeros(k, dtype=object) for k in (tree.unknown_rates, len(tree.graph.leads)))
         for link in reversed(list(tree.links.values())):
-            force, moment = self.force[link.body], self.moment[link.body]
+            force, moment, couple = self.force[link.body], self.moment[link.body], self.couple[link.body]
             absolute = free = False
-            for step in link.steps:
+            for step in reversed(link.steps):
                 if not (step.ball or step.free):
                     axis = m.axis[id(step)]
-                    along: Any = axis @ moment if step.turns else 0.0
+                    along: Any = axis @ moment + couple[2] if step.turns else 0.0
+                    couple = m.turn(step) @ couple if step.turns else couple
                     if step.slide:
                         along = along + step.slide * (axis @ force)
                     (driven if step.actuated else unknown)[step.rate] = step.sign * along
                     continue
                 absolute, free = True, step.free
-                unknown[step.rate : step.rate + 3] = moment
+                unknown[step.rate : step.rate + 3] = moment + m.rotation[link.body] @ couple
                 if free:
                     unknown[step.rate + 3 : step.rate + 6] = force
             if free:
@@ -322,6 +329,7 @@ class Forces:
             self.moment[parent] = self.moment[parent] + cross(m.lever[link.body], force)
             if not absolute:
                 self.moment[parent] = self.moment[parent] + moment
+                self.couple[parent] = self.couple[parent] + couple
         return unknown, driven
 
 

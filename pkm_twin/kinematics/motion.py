@@ -104,6 +104,7 @@ class Motion:
         self.origin: dict[str, Any] = {start: np.zeros(3)}
         self.lever: dict[str, Any] = {}
         self.axis: dict[int, Any] = {}
+        self._circle: dict[int, tuple[Any, Any]] = {}
         self.place(tree.links if bodies is None else bodies, x, q)
 
     def place(self, bodies: Iterable[str], x: Numbers, q: Numbers) -> None:
@@ -127,6 +128,7 @@ class Motion:
                     else:
                         angle = self._step_displacement(step, x, q, origin, step.offset)
                         s, c = sin(angle), cos(angle)
+                    self._circle[id(step)] = c, s
                     turned = np.array(
                         [own[:, 0] * c + own[:, 1] * s, own[:, 1] * c - own[:, 0] * s, own[:, 2]],
                         dtype=object,
@@ -146,6 +148,11 @@ class Motion:
         k = step.position
         value = q[k] - (origin[k] - step.sign * offset) if step.actuated else x[k]
         return -value if step.sign < 0.0 else value
+
+    def turn(self, step: Step) -> Any:
+        """Return the rotation from the axes beyond a turn to those before it, shape (3, 3)."""
+        (c, s), (first, second, third) = self._circle[id(step)], step.before.T
+        return np.array([first * c + second * s, second * c - first * s, third], dtype=object).T
 
     def arm(self, body: str, point: Array) -> Any:
         """Return the vector from a body's origin to a point of the body, given at home."""
@@ -286,7 +293,7 @@ class Motion:
         self.omega: dict[str, Any] = {BASE: base.omega}
         self.origin_velocity: dict[str, Any] = {BASE: _ZERO}
         self._before: dict[int, Any] = {}
-        self._rate: dict[int, Any] = {}
+        self.rate: dict[int, Any] = {}
         for link in self.tree.links.values():
             w = self.omega[link.parent]
             v = self.origin_velocity[link.parent] + cross(w, self.lever[link.body])
@@ -297,7 +304,7 @@ class Motion:
                     if step.free:
                         v = v + np.array(u[k + 3 : k + 6], dtype=object)
                     continue
-                rate = self._rate[id(step)] = step.sign * (qd[k] if step.actuated else u[k])
+                rate = self.rate[id(step)] = step.sign * (qd[k] if step.actuated else u[k])
                 axis = self.axis[id(step)]
                 if step.slide:
                     v = v + axis * (step.slide * rate)
@@ -314,6 +321,7 @@ class Motion:
         """
         base = self._base
         self.alpha: dict[str, Any] = {BASE: base.alpha}
+        self.second: dict[int, Any] = {}
         self.origin_acceleration: dict[str, Any] = {BASE: base.acceleration}
         self._acceleration_matrix: dict[str, Any] = {BASE: _acceleration_matrix(base.omega, base.alpha)}
         for link in self.tree.links.values():
@@ -331,8 +339,8 @@ class Motion:
                         slip = cross(base.omega, self._u[k + 3 : k + 6])
                         acc = acc + 2.0 * slip + np.array(du[k + 3 : k + 6], dtype=object)
                     continue
-                second = step.sign * (qdd[k] if step.actuated else du[k])
-                axis, rate = self.axis[id(step)], self._rate[id(step)]
+                second = self.second[id(step)] = step.sign * (qdd[k] if step.actuated else du[k])
+                axis, rate = self.axis[id(step)], self.rate[id(step)]
                 if step.slide:
                     slip, swell = step.slide * rate, step.slide * second
                     acc = acc + axis * swell + 2.0 * slip * cross(w, axis)

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from pkm_twin.codegen.arrays import Array, Indices
 from pkm_twin.codegen.expressions import plain
+from pkm_twin.codegen.lu import is_zero
 from pkm_twin.machine.friction import list_friction_keys, list_parameters
-from pkm_twin.machine.graph import Graph, Joint
+from pkm_twin.machine.graph import BASE, Graph, Joint
 from pkm_twin.machine.tree import Tree
 
 Objects = NDArray[Any]
@@ -61,6 +62,34 @@ def make_frame_change(axes: Array, lever: Array) -> Array:
     turned = axes.T @ about @ axes
     moved = [mass, (first + mass * lever) @ axes, turned[:, *np.transpose(_MATRIX_ENTRIES)]]
     return plain(np.concatenate(moved, 1).T)
+
+
+def lump_inertia(tree: Tree, bodies: Objects) -> Objects:
+    """Move masses on rotary joints to the bodies that carry them; drop what the ground carries.
+
+    A mass at a joint moves as a point of both bodies, so that no generalised force changes and fewer
+    parameters are left: base parameters (Gautier and Khalil 1990). About a fixed axis z the first
+    moment mz and an inertia iyy about x and y need no effort of the joint either.
+
+    :param bodies: standard inertial parameters in the links' axes, shape (bodies, 10).
+    """
+    found = dict(zip(tree.links, np.array(bodies, dtype=object), strict=True))
+    for link in reversed(list(tree.links.values())):
+        ten, fixed = found[link.body], link.parent == BASE
+        if not link.steps or any(step.slide or step.free for step in link.steps):
+            continue
+        if not fixed and all(is_zero(value) for value in found[link.parent]):
+            # The acceleration of a massless body is not needed otherwise.
+            continue
+        moved = np.zeros(10, dtype=object)
+        moved[0] = ten[0]
+        if fixed and len(link.steps) == 1 and not link.steps[0].ball:
+            moved[3:6] = ten[3], ten[5], ten[5]
+        found[link.body] = ten - moved
+        if not fixed:
+            own = link.steps[0].before.T
+            found[link.parent] = found[link.parent] + make_frame_change(own, own @ link.arm) @ moved
+    return np.array(list(found.values()), dtype=object)
 
 
 def inertia_matrix(ten: Array) -> Array:
