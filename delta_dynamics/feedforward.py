@@ -329,7 +329,7 @@ class Feedforward(Core):
 
         :raises MessageError: the message is rejected, and counted.
         """
-        with self.refusing(self.trajectories):
+        with self.count_rejections(self.trajectories):
             self._reader.check_shape(message)
 
     def joint_state(self, message: Any, now: int, steady: int | None = None) -> Torques | None:
@@ -338,19 +338,19 @@ class Feedforward(Core):
         :param now: the ROS clock, ns. ``steady``: the steady clock, ns; by default the same.
         :raises MessageError: the message is rejected, and counted.
         """
-        with self.refusing(self.stream):
+        with self.count_rejections(self.stream):
             torques = self._compute_efforts(message, now, now if steady is None else steady)
         if torques is None or not self.stream.accept():
             return None
         self.saturations += torques.saturated
         return torques
 
-    def refuse(self, counts: StreamMonitor, error: MessageError) -> None:
+    def count_rejection(self, counts: StreamMonitor, error: MessageError) -> None:
         """Count a message that is rejected; several joint states in a row stop the stream.
 
         A trajectory stops it if the model gives no finite result for finite input.
         """
-        super().refuse(counts, error)
+        super().count_rejection(counts, error)
         if error.reason in (STOP_REASONS if counts is self.stream else (NON_FINITE,)):
             self.stream.stop(error.reason, str(error))
 
@@ -361,7 +361,7 @@ class Feedforward(Core):
         """
         age = now - torques.stamp
         if age > self.settings.stale_after * SECOND:
-            with self.refusing(self.stream):
+            with self.count_rejections(self.stream):
                 raise MessageError(
                     "late answer",
                     f"the answer is ready {age / SECOND:.3f} s after the state's stamp, allowed "

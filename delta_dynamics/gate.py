@@ -96,7 +96,7 @@ class Gate(Core):
         :raises MessageError: the message is rejected, and counted.
         """
         self.close_if_silent(steady)
-        with self.refusing(self.stream):
+        with self.count_rejections(self.stream):
             sample = self._reader.efforts(message, now, self._rules)
             try:
                 check_order(sample.stamp, self._last_stamp + 1)

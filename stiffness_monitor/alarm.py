@@ -468,7 +468,7 @@ class StiffnessWatch(Core):
 
         :raises MessageError: the message is rejected, and counted.
         """
-        with self.refusing(self.taken):
+        with self.count_rejections(self.taken):
             sample = read_deflection(message, now, self.rules)
             if sample.frame not in self.frames:
                 expected = " or ".join(map(repr, dict.fromkeys(self.frames)))
@@ -479,7 +479,7 @@ class StiffnessWatch(Core):
         if len(self._waiting) > MAX_WAITING:
             self._waiting.pop()
             text = f"{MAX_WAITING} deflections are already waiting for the wrench after them"
-            self.refuse(self.taken, MessageError("no wrench", text))
+            self.count_rejection(self.taken, MessageError("no wrench", text))
 
     def judgement(self) -> Generator[None, None, bool] | None:
         """Start an evaluation in slices; None if one is running or less than 1 s of stamps has passed.
@@ -512,7 +512,7 @@ class StiffnessWatch(Core):
             try:
                 self._push_pair(sample)
             except MessageError as error:
-                self.refuse(self.taken, error)
+                self.count_rejection(self.taken, error)
                 continue
             self._last = sample.stamp
             self.taken.accept()

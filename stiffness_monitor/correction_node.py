@@ -105,11 +105,15 @@ class SetpointCorrection(Core):
         fields = ("position",)
         self._offsets = JointPublisher(node, robot, "~/setpoint_offset", fields)
         self._corrected = JointPublisher(node, robot, "~/corrected_setpoint", fields)
-        node.create_guarded_subscription("setpoint", self._on_setpoint, refuse=partial(self.refuse, self.setpoints))
+        node.create_guarded_subscription(
+            "setpoint", self._on_setpoint, on_reject=partial(self.count_rejection, self.setpoints)
+        )
         if paired:
             both = ("position", "effort")
             self._both = JointPublisher(node, robot, "~/setpoint_with_torques", both)
-            node.create_guarded_subscription("torques", self._on_torques, refuse=partial(self.refuse, self.torques))
+            node.create_guarded_subscription(
+                "torques", self._on_torques, on_reject=partial(self.count_rejection, self.torques)
+            )
 
     def reset(self) -> None:
         """Discard the last wrench, as when the clock jumps."""

@@ -104,7 +104,7 @@ class StiffnessMonitor(TwinNode):
         self.create_guarded_subscription(
             "joint_states",
             lambda message: self.core.joint_state(message, self.now()),
-            refuse=partial(self.core.refuse, self.core.states),
+            on_reject=partial(self.core.count_rejection, self.core.states),
             expected=True,
         )
         self.create_guarded_subscription("wrench", self._on_wrench)

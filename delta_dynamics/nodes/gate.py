@@ -56,7 +56,7 @@ class CommandGate(TwinNode):
         self.create_guarded_subscription(
             TORQUES_TOPIC,
             self._on_torques,
-            refuse=self._reject_torques,
+            on_reject=self._reject_torques,
             expected=True,
             expires=lambda: settings.deadline,
             expiry=settings.deadline,
@@ -65,7 +65,7 @@ class CommandGate(TwinNode):
             self.create_guarded_subscription(
                 "joint_states",
                 lambda m: self.core.joint_state(m, self.now(), time.monotonic_ns()),
-                refuse=partial(self.core.refuse, self.core.states),
+                on_reject=partial(self.core.count_rejection, self.core.states),
                 expected=True,
             )
         self.follow(CHANGEABLE, lambda values: change_robot(self.core.robot, values), self.core.change_robot)
@@ -140,7 +140,7 @@ class CommandGate(TwinNode):
 
     def _reject_torques(self, error: MessageError) -> None:
         with self.core.stream.reacting(self._repeat_stop_command):
-            self.core.refuse(self.core.stream, error)
+            self.core.count_rejection(self.core.stream, error)
 
     def _on_torques(self, message: JointStateView) -> None:
         # A closed gate sends its command at once.

@@ -273,7 +273,7 @@ class MachineSim(TwinNode):
                 self._advance()
 
     def _on_trajectory(self, data: bytes) -> None:
-        with self.core.refusing(self.core.trajectories):
+        with self.core.count_rejections(self.core.trajectories):
             raw = RawTrajectory.decode(data)
         self.core.trajectory(raw.fields)
 

@@ -73,7 +73,7 @@ class DeltaDynamics(TwinNode):
         self.create_guarded_subscription(
             "joint_states",
             self._on_joint_state,
-            refuse=self._reject_joint_state,
+            on_reject=self._reject_joint_state,
             expected=True,
             expires=lambda: self.core.settings.stale_after,
             every=True,
@@ -307,12 +307,12 @@ class DeltaDynamics(TwinNode):
         return core.stream.reacting(send_stop)
 
     def _on_trajectory(self, data: bytes) -> None:
-        with self.core.refusing(self.core.trajectories):
+        with self.core.count_rejections(self.core.trajectories):
             self.defer("~/joint_trajectory", self._answer_trajectory(data))
 
     def _answer_trajectory(self, data: bytes) -> Task:
         """Answer a trajectory in steps, so that the stream is answered meanwhile."""
-        with self.core.refusing(self.core.trajectories):
+        with self.core.count_rejections(self.core.trajectories):
             raw = RawTrajectory.decode(data)
         steps = self.core.trajectory_steps(raw.fields, self.now())
         while True:
@@ -330,7 +330,7 @@ class DeltaDynamics(TwinNode):
 
     def _reject_joint_state(self, error: MessageError) -> None:
         with self._reacting_to_stop():
-            self.core.refuse(self.core.stream, error)
+            self.core.count_rejection(self.core.stream, error)
 
     def _on_joint_state(self, message: JointStateView) -> None:
         core, came = self.core, time.monotonic_ns()

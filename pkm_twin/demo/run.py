@@ -64,13 +64,12 @@ class Stage:
         """Arguments of the node, with queues that do not overflow on a busy computer."""
         queues = [f"qos_overrides.{t}.subscription.reliability:=reliable" for t in self.inputs]
         queues += [f"qos_overrides.{t}.publisher.depth:={QUEUE_DEPTH}" for t in self.outputs]
-        given = ("use_sim_time:=true", "future_tolerance:=1.0", QUEUE_WAIT_PARAMETER, *self.parameters, *queues)
+        given = ("use_sim_time:=true", "future_tolerance:=1.0", f"max_wait:={MAX_WAIT}", *self.parameters, *queues)
         return ["--ros-args", *(word for parameter in given for word in ("-p", parameter))]
 
 
 # Accept late torques, because they are only recorded.
 STALE_PARAMETER = f"stale_after:={MAX_WAIT}"
-QUEUE_WAIT_PARAMETER = f"max_wait:={MAX_WAIT}"
 JOINT_STATES = "/joint_states"
 DYNAMICS_OUTPUTS = {
     "/delta_dynamics/joint_torques": JOINT_STATE,

@@ -53,7 +53,6 @@ DURATION: Final = 0.8
 TRAJECTORY_POINTS: Final = 81
 """Number of points of the tracked trajectory."""
 INPUT_TOPIC: Final = "/machine_sim/joint_trajectory"
-QUEUE_PARAMETER: Final = "qos_overrides./joint_states.publisher.depth"
 
 
 class _MachineWatch:
@@ -97,7 +96,8 @@ def run(spread: float, recorder: Recorder, executor: SingleThreadedExecutor, con
     machine_command = [*module, "delta_dynamics.nodes.simulation", "--ros-args", "-p", f"mechanism:={ROBOT}"]
     machine_command += ["-p", "clock:=simulated", "-p", f"period:={PERIOD}"]
     # Use deep queues, because a busy computer catches up in bursts.
-    machine_command += ["-p", f"spread:={spread}", "-p", f"{QUEUE_PARAMETER}:={QUEUE_DEPTH}"]
+    queue = f"qos_overrides./joint_states.publisher.depth:={QUEUE_DEPTH}"
+    machine_command += ["-p", f"spread:={spread}", "-p", queue]
     console.print(f"machine_sim at {100 * spread:g} % spread: PD, then with feedforward")
     # Make a trajectory from home and back, at rest at both ends, that starts on receipt.
     robot = load(ROBOT)

@@ -27,7 +27,6 @@ from pkm_twin.robot.robot import Robot
 SAMPLES_PER_BLOCK: Final = 256
 """Samples computed at a time, so that the balances of a block of :func:`~delta_dynamics.reactions` stay in a
 processor's cache: half the time of 4096."""
-BEYOND_LIMITS: Final = "beyond_limits"
 EFFORT_TOLERANCE: Final = 1e-6
 """Largest relative difference of two computations of the same efforts."""
 MAX_EFFORT_DIFFERENCE: Final = 0.05
@@ -215,7 +214,7 @@ def tabulate_torques(m: Recording, progress: Callable[[int], None] | None = None
 
     The terms ``NAME.effort_gravity``, ``NAME.effort_inertia`` ... sum to ``NAME.effort``. A
     reaction that rigid bodies do not determine is left empty (NaN) in the table. Where a sample is
-    beyond the limits, there is a column :data:`BEYOND_LIMITS`, 1 for such samples, 0 for others.
+    beyond the limits, there is a column ``beyond_limits``, 1 for such samples, 0 for others.
     If the robot's file has an ``uncertainty``, ``NAME.effort_deviation`` is its effect.
 
     :raises UnreachableError: by the sample's index in the motion.
@@ -252,7 +251,7 @@ def tabulate_torques(m: Recording, progress: Callable[[int], None] | None = None
             raise PkmTwinError(f"between {seconds}: {e}") from None
         append_column("time", m.clock[part])
         if outside.any():
-            append_column(BEYOND_LIMITS, outside[part].astype(np.float64))
+            append_column("beyond_limits", outside[part].astype(np.float64))
         for i, joint in enumerate(m.robot.joint_names):
             append_column(f"{joint}.position", q[part][:, i])
             append_column(f"{joint}.velocity", rates[part][:, i])

@@ -39,11 +39,6 @@ from pkm_twin.streams.wrench import PLATFORM
 
 Stamps = NDArray[np.int64]
 
-NO_STAMPS: Final = (
-    "expected joint states with the time of each sample in header.stamp; without them, record a "
-    "table with a column time"
-)
-"""Error for a bag without stamps: log times cannot replace them, because they are the times of writing."""
 MAX_DEFLECTION_OFFSET: Final = 0.02
 """Largest time between a deflection and its wrench or joint state, s."""
 
@@ -225,7 +220,11 @@ def _read_messages(
         except MessageError as error:
             text = f"{message.topic}: {error}"
             if error.reason == "zero stamp":
-                text = f"{message.topic}: the stamp is zero; {NO_STAMPS}"
+                # Log times cannot replace stamps, because they are the times of writing.
+                text = (
+                    f"{message.topic}: the stamp is zero; expected joint states with the time of each sample in "
+                    "header.stamp; without them, record a table with a column time"
+                )
             if how.deflected and error.reason == "frame" and message.topic == topics.wrench:
                 # Wrenches of different frames cannot be interpolated.
                 raise BagError(text, path=bag.report.path, reason="frames") from None

@@ -41,8 +41,6 @@ RECORDING: Final = "an MCAP file, a rosbag2 folder, or a table with columns time
 COORDINATES: Final = ("joints", "pose")
 VALUE_SIDES: Final = ("joint", "controller", "motor")
 """Where joint values are measured: at the joint, in the controller's units and offsets, or at the motor shaft."""
-GRAVITY_COLUMN_SUFFIX: Final = "effort_gravity"
-"""Suffix of the gravity column, which every table of the command `torques` has."""
 SAMPLES_PER_BLOCK: Final = 4096
 """Samples computed at a time, so that memory stays flat."""
 MAX_COLUMN_VALUES: Final = dict(
@@ -154,7 +152,7 @@ def _read_table_recording(path: Path, name: str | Robot | None, how: ReadOptions
     time, notes, effort, word = read_times(path, times), [], None, how.efforts[0]
     effort_model = EffortModel.from_table(table)
     # A table with the terms of the model has computed efforts.
-    computed = any(f"{joint}.{GRAVITY_COLUMN_SUFFIX}" in table for joint in robot.joint_names)
+    computed = any(f"{joint}.effort_gravity" in table for joint in robot.joint_names)
     if computed:
         # Reject computed efforts without the wrench or payload that they were computed with.
         own = how.load is not None or robot.payload.mass > 0.0

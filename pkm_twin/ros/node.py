@@ -226,7 +226,7 @@ class GuardedSubscription:
     publishers of both reliabilities match. A ``whole`` topic, for long messages, is reliable until
     a best-effort publisher appears. Joint states are decoded from their bytes.
 
-    :param refuse: called with the error of bytes that are not a joint state.
+    :param on_reject: called with the error of bytes that are not a joint state.
     :param raw: the callback takes the message's bytes.
     :param expected: the diagnostics warn until the first message.
     :param expires: how long a message may wait for the node, s, if less than ``max_wait``.
@@ -241,7 +241,7 @@ class GuardedSubscription:
         topic: str,
         callback: Callable[[Any], None],
         *,
-        refuse: Callable[[MessageError], None] | None = None,
+        on_reject: Callable[[MessageError], None] | None = None,
         raw: bool = False,
         expected: bool = False,
         expires: Callable[[], float] = lambda: math.inf,
@@ -253,7 +253,7 @@ class GuardedSubscription:
         if expected:
             node.health.expected.append(topic)
         self._node, self._kind, self._topic, self._callback = node, row.message, topic, callback
-        self._refuse, self._decode = refuse, None
+        self._on_reject, self._decode = on_reject, None
         if row.kind == JOINTS:
             self._decode = JointStateDecoder(message_definition(JOINT_STATE))
         self._raw, self._best_effort = raw or self._decode is not None, not row.whole
@@ -316,8 +316,8 @@ class GuardedSubscription:
                 try:
                     message = self._decode(message)
                 except MessageError as error:
-                    if self._refuse is not None:
-                        self._refuse(error)
+                    if self._on_reject is not None:
+                        self._on_reject(error)
                     raise
             self._callback(message)
         except Exception as error:

@@ -147,7 +147,10 @@ class MachineStateNode(TwinNode):
             self._markers = self.create_guarded_publisher("~/markers")
             self.create_guarded_timer(1.0 / rate, self._publish_markers)
         self.create_guarded_subscription(
-            "joint_states", self._on_joint_state, refuse=partial(self.core.refuse, self.core.states), expected=True
+            "joint_states",
+            self._on_joint_state,
+            on_reject=partial(self.core.count_rejection, self.core.states),
+            expected=True,
         )
         self.create_guarded_subscription("wrench", lambda m: self.core.store_wrench(m, self.now()))
         self.follow(

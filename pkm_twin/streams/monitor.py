@@ -124,24 +124,24 @@ class Core:
 
     last_reject = ""
 
-    def refuse(self, counts: StreamMonitor, error: MessageError) -> None:
+    def count_rejection(self, counts: StreamMonitor, error: MessageError) -> None:
         """Count a rejected message."""
         counts.reject(error.reason, str(error))
         self.last_reject = str(error)
 
     @contextmanager
-    def refusing(self, counts: StreamMonitor) -> Iterator[None]:
+    def count_rejections(self, counts: StreamMonitor) -> Iterator[None]:
         """Count a message that is rejected in this block."""
         try:
             yield
         except MessageError as error:
-            self.refuse(counts, error)
+            self.count_rejection(counts, error)
             raise
 
     @contextmanager
     def taking(self, counts: StreamMonitor) -> Iterator[None]:
         """Count the message that is read in this block, as accepted or as rejected."""
-        with self.refusing(counts):
+        with self.count_rejections(counts):
             yield
         counts.accept()
 

@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -25,8 +25,6 @@ if TYPE_CHECKING:
 
     from pkm_twin.paths.joint_loads import Summary
     from pkm_twin.recordings import Recording
-
-STATIC_BEARING_TEXT: Final = "no life, because the bearing bears a load and does not move"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,7 +90,7 @@ def loads(given: Loads) -> Report:
                 if open_
                 else []
             ),
-            *([f"{STATIC_BEARING_TEXT}: {', '.join(idle)}"] if idle else []),
+            *([f"no life, because the bearing bears a load and does not move: {', '.join(idle)}"] if idle else []),
         ],
         files={"out": given.out, "spectrum": given.spectrum},
     )
