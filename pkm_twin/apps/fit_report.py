@@ -187,7 +187,7 @@ def _report_efforts(result: Fit) -> list[Fact]:
             "kept_every": how.keep_every,
             "position_noise": how.position_noise,
         }
-        for how in result.filtering
+        for how in (made.how for made in result.problem.whole)
     ]
     return [
         Fact("outliers_replaced", result.outliers),

@@ -50,12 +50,7 @@ from pkm_twin.identification.calibration_state import (
     make_state,
     place_frame,
 )
-from pkm_twin.identification.measurements import (
-    POSITION_KIND,
-    Measured,
-    find_redundancy,
-    select_poses,
-)
+from pkm_twin.identification.measurements import POSITION_KIND, Measured, find_redundancy, select_poses
 from pkm_twin.identification.parameters import OBSERVED_RATIO, list_weights
 from pkm_twin.identification.undetermined import Pair, find_determined_pairs, undetermined
 from pkm_twin.machine.formulas import PARAMETERS
@@ -89,14 +84,6 @@ class Free:
     prior: float = 0.01
     transmission: Transmission = Transmission.AUTO
     only: tuple[str, ...] = ()
-
-    def list_map_parameters(self, robot: Robot, q: Array) -> list[Parameter]:
-        """Numbers of the joint map that are fitted to joint states (k, n)."""
-        angle = self.prior / robot.size
-        found = list_map_parameters(robot, q, self.transmission, self.offsets, self.prior, angle)
-        if not self.only or self.transmission not in (Transmission.AUTO, Transmission.FILE):
-            return found
-        return [one for one in found if one.name.startswith(tuple(self.only))]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -270,8 +257,8 @@ def left_by_calibration(robot: Robot, errors: Callable[[Array], Array], states: 
     """
     paths = list_geometric_paths(robot, states)
 
-    def slopes(rows: Array) -> Array:
-        """By the numbers that it fits, and by the zeros of the joints."""
+    def differentiate(rows: Array) -> Array:
+        """Differentiate the platform's pose by the joints' zeros and the numbers that a calibration fits."""
         zeros = robot.platform_jacobian(rows) @ robot.drive_jacobian(rows)
         if not paths:
             return zeros
@@ -279,9 +266,9 @@ def left_by_calibration(robot: Robot, errors: Callable[[Array], Array], states: 
         return np.concatenate([zeros, many.differentiate_platform(rows)], -1)
 
     scale = np.repeat([1.0, robot.size], 3)[:, None]
-    table, wanted = ((scale * of(states)).reshape(6 * len(states), -1) for of in (slopes, errors))
+    table, wanted = ((scale * of(states)).reshape(6 * len(states), -1) for of in (differentiate, errors))
     found = np.linalg.lstsq(table, wanted, rcond=1e-8)[0]
-    return np.asarray(errors(q) - slopes(q) @ found, np.float64)
+    return np.asarray(errors(q) - differentiate(q) @ found, np.float64)
 
 
 MEASURED_STATES: Final = 100
@@ -319,7 +306,10 @@ def list_parameters(robot: Robot, measured: Measured, paths: Sequence[str], free
     robot.check_independent("calibrations", "a pose does not give the others' zeros")
     known, prior = robot.file_numbers(), free.prior
     angle = prior / robot.size
-    mapped = free.list_map_parameters(robot, robot.controller.positions(measured.joints))
+    q = robot.controller.positions(measured.joints)
+    mapped = list_map_parameters(robot, q, free.transmission, free.offsets, prior, angle)
+    if free.only and free.transmission in (Transmission.AUTO, Transmission.FILE):
+        mapped = [one for one in mapped if one.name.startswith(tuple(free.only))]
     # A joint's value at home and its sensor's offset are one number.
     own = {one.name for one in mapped}
     homes = {f"joints.{j}.home" for j in robot.joint_names if f"joint_map.{j}.offset" in own}

@@ -14,14 +14,7 @@ import numpy as np
 
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, PkmTwinError, one_line
-from pkm_twin.identification.calibration_state import (
-    FRAME,
-    TARGET,
-    Instrument,
-    Parameter,
-    State,
-    update_state,
-)
+from pkm_twin.identification.calibration_state import FRAME, TARGET, Instrument, Parameter, State, update_state
 from pkm_twin.identification.measurements import Measured, Readings, Weights
 from pkm_twin.identification.samples import MIN_OUTLIER_DISTANCE
 from pkm_twin.robot.robot import Robot
@@ -61,11 +54,7 @@ class Fitted(NamedTuple):
 
 
 def fit(
-    robot: Robot,
-    start: State,
-    measured: Measured,
-    parameters: Sequence[Parameter],
-    progress: Callable[[int], None],
+    robot: Robot, start: State, measured: Measured, parameters: Sequence[Parameter], progress: Callable[[int], None]
 ) -> Fitted:
     """Fit all parameters by robust least squares, and estimate the noise with them.
 

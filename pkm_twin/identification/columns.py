@@ -303,7 +303,7 @@ class Columns:
         :raises PkmTwinError: a motion that the machine cannot make.
         """
         table, rest = self.rows.model.columns(motion)
-        rubs = np.array([g.kind == "friction" for g in self.rows.model.parameters.groups for _ in g.names])
+        rubs = self.rows.model.parameters.kinds == "friction"
         # The sign of a velocity is filtered as the efforts are.
         own = self.rows.table[..., rubs] * turned[:, None]
         table[..., rubs] = own if order is None else own[:, order]
@@ -338,11 +338,7 @@ class Columns:
         return np.array([kind == "payload" for kind in self.kinds])
 
     def spectra(
-        self,
-        effort: Array | None = None,
-        inner: slice = slice(None),
-        rate: float = 1.0,
-        order: Indices | None = None,
+        self, effort: Array | None = None, inner: slice = slice(None), rate: float = 1.0, order: Indices | None = None
     ) -> Spectra:
         """Return the statistics of some rows, with other efforts, or time at another rate."""
         r, s, more = self.rows, self.rows.signals, rate**2 - 1.0
@@ -356,8 +352,7 @@ def _differentiate(rows: Rows, table: Array, rest: Array, motion: Motion) -> Col
     """Return the columns of the file's numbers, of a motion."""
     p, robot = rows.model.parameters, rows.model.robot
     standing, rest_standing = rows.model.columns(replace(motion, qd=0 * motion.qd, qdd=0 * motion.qdd))
-    rubs = np.array([g.kind == "friction" for g in p.groups for _ in g.names])
-    quick = np.where(rubs, 0.0, table - standing)
+    quick = np.where(p.kinds == "friction", 0.0, table - standing)
     effort = np.maximum(np.sqrt(np.mean((rows.rest + rows.table @ p.values) ** 2, 0)), 1e-300)
     columns, fast, deviation, low = [], [], list[float](), list[float]()
     kinds, turning = list[str](), list[bool]()

@@ -188,11 +188,7 @@ def list_runs(table: Table, lever: float | None = None) -> Runs:
 
 
 def drive_friction(
-    torque: ArrayLike,
-    up: ArrayLike,
-    down: ArrayLike,
-    speed: ArrayLike | None = None,
-    drive: ArrayLike | None = None,
+    torque: ArrayLike, up: ArrayLike, down: ArrayLike, speed: ArrayLike | None = None, drive: ArrayLike | None = None
 ) -> DriveFriction:
     """Estimate the torque constant and the friction law of a drive, or common ones of identical drives.
 

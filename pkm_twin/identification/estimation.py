@@ -118,13 +118,7 @@ def _average(values: Array, counts: Array) -> Array:
 
 
 def _factor_covariance(
-    scaled: Array,
-    residual: Array,
-    counts: Array,
-    noise: Array,
-    values: Array,
-    vectors: Array,
-    kept: Mask,
+    scaled: Array, residual: Array, counts: Array, noise: Array, values: Array, vectors: Array, kept: Mask
 ) -> Array:
     """Return the factor F of the scaled parameters' covariance F F^T, shape (k, k).
 

@@ -237,10 +237,7 @@ class Model:
         own = np.tensordot(each, inverses, 1) + away.T @ away
         covariance[np.ix_(used, used)] = own * np.outer(d, d)
         return Posterior(
-            float(np.logaddexp.reduce(logs)),
-            float(self.ratios[int(np.argmax(weights))]),
-            full,
-            covariance,
+            float(np.logaddexp.reduce(logs)), float(self.ratios[int(np.argmax(weights))]), full, covariance
         )
 
     def gains(self, used: Mask, more: Mask) -> tuple[Array, Array]:

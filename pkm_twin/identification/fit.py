@@ -19,13 +19,9 @@ from pkm_twin.identification.estimation import Estimate, find_nearest, find_viol
 from pkm_twin.identification.hypotheses import Explanation, explain
 from pkm_twin.identification.identifiable import KINDS, Kind
 from pkm_twin.identification.judge import judge_problem, make_basis
-from pkm_twin.identification.parameters import (
-    Number,
-    Status,
-    make_group_numbers,
-)
+from pkm_twin.identification.parameters import Number, Status, make_group_numbers
 from pkm_twin.identification.rows import Problem, Rows
-from pkm_twin.identification.samples import MIN_RELATIVE_NOISE, Filtering
+from pkm_twin.identification.samples import MIN_RELATIVE_NOISE
 from pkm_twin.identification.verdict import Verdict
 from pkm_twin.identification.words import MAX_DELAY, late_text
 from pkm_twin.recordings import Recording
@@ -96,11 +92,6 @@ class Fit(Result):
     explained: tuple[Explanation, ...] = ()
 
     @property
-    def filtering(self) -> tuple[Filtering, ...]:
-        """Filtering of each recording."""
-        return tuple(made.how for made in self.problem.whole)
-
-    @property
     def delays(self) -> tuple[float, ...]:
         """How late the efforts are against the positions, s, by recording."""
         return self.problem.total_delays
@@ -154,11 +145,24 @@ def fit(
 def correct_delays(problem: Problem) -> Problem:
     """Correct the efforts' delays, if that reduces the residual.
 
-    Its delays are to the first order, good for a sample or so.
+    A problem's own delays are to the first order, good for a sample or so.
     """
-    found = [
-        _search_delay(made, late, problem.both.noise) for made, late in zip(problem.rows, problem.delays, strict=True)
-    ]
+    found = list[float]()
+    for rows, late in zip(problem.rows, problem.delays, strict=True):
+        # The first-order estimate, or the delay of the least residual where that is farther.
+        period, count = rows.period * rows.how.keep_every, len(rows.time)
+        most = min(int(2.0 * MAX_DELAY / period), count // 4)
+        inner = slice(most, count - most)
+        weight = rows.counts[inner] / problem.both.noise
+        table = rows.table[inner] * weight[..., None]
+        basis = make_basis(table.reshape(-1, table.shape[-1]))
+        left = []
+        for step in range(2 * most + 1):
+            target = rows.effort[step : count - 2 * most + step] - rows.rest[inner]
+            seen = (target * weight).ravel()
+            left.append(float(seen @ seen - np.sum((basis.T @ seen) ** 2)))
+        far = period * (int(np.argmin(left)) - most)
+        found.append(far if abs(far - late) > period else late)
     for _ in range(MAX_DELAY_PASSES):
         moved = [
             made.recording.compensate_effort_delay(late) if abs(late) > made.period else made.recording
@@ -177,26 +181,6 @@ def correct_delays(problem: Problem) -> Problem:
             break
         problem, found = other, list(other.delays)
     return problem
-
-
-def _search_delay(rows: Rows, late: float, noise: Array) -> float:
-    """Return the delay of efforts, s: the first-order estimate, or that of the least residual.
-
-    :param noise: of the efforts, (n,).
-    """
-    period, count = rows.period * rows.how.keep_every, len(rows.time)
-    most = min(int(2.0 * MAX_DELAY / period), count // 4)
-    inner = slice(most, count - most)
-    weight = rows.counts[inner] / noise
-    table = rows.table[inner] * weight[..., None]
-    basis = make_basis(table.reshape(-1, table.shape[-1]))
-    left = []
-    for step in range(2 * most + 1):
-        target = rows.effort[step : count - 2 * most + step] - rows.rest[inner]
-        seen = (target * weight).ravel()
-        left.append(float(seen @ seen - np.sum((basis.T @ seen) ** 2)))
-    far = period * (int(np.argmin(left)) - most)
-    return far if abs(far - late) > period else late
 
 
 def solve_and_judge(problem: Problem, accepted: tuple[str, ...] = ()) -> Fit:

@@ -16,18 +16,19 @@ from typing import Any, Final
 
 import numpy as np
 
-from pkm_twin.errors import BagError, ParameterError, PkmTwinError, UnknownNameError
-from pkm_twin.identification.compare import cut_recording, missing_samples
+from pkm_twin.errors import BagError, ParameterError, PkmTwinError, SingularityError, UnknownNameError, UnreachableError
+from pkm_twin.identification.compare import cut_recording, find_idle, missing_samples
 from pkm_twin.identification.drives import FIT, fit_constants, parse_constants
 from pkm_twin.identification.fit import Fit, correct_delays, fit, refuse_faults, solve_and_judge
 from pkm_twin.identification.friction_search import LawSearch, Searched
-from pkm_twin.identification.hypotheses import Explanation, describe_positions, explain_recording
+from pkm_twin.identification.hypotheses import Explanation, explain_recording
 from pkm_twin.identification.identifiable import KINDS, PAYLOAD, Kind, list_drive_parameters
 from pkm_twin.identification.judge import SIGMAS
 from pkm_twin.identification.parameters import Number, file_parameters
 from pkm_twin.identification.rows import Problem
 from pkm_twin.identification.samples import MIN_RELATIVE_NOISE
 from pkm_twin.identification.verdict import LINE, Verdict
+from pkm_twin.identification.words import position_text
 from pkm_twin.machine.friction import BASIC, LAWS, Dahl, select_compiled_laws
 from pkm_twin.recordings import Recording
 from pkm_twin.robot.robot import Robot
@@ -105,12 +106,14 @@ def fit_with_laws(
     else:
         best = fit(robot, recordings, what, **options)
     recordings = [made.recording for made in best.problem.whole]
-    while asked if laws is not None else _is_unexplained(best):
+    while asked if laws is not None else _may_lack_law(best):
         names = asked[:1] or [one for one in select_compiled_laws(tuple(LAWS)) if one not in best.robot.laws]
         tried = []
         for name in names:
             try:
-                found, opened = _add_law(best.problem, name)
+                found = LawSearch(best.problem, name).find()
+                opened = _set_values(best.robot, found) if found else best.robot
+                opened = replace(opened, open_laws=(*best.robot.open_laws, name))
                 one = Problem.from_recordings(opened, recordings, what, passes=1)
                 one.check_count()
             except PkmTwinError:
@@ -168,13 +171,10 @@ def fit_recordings(
     """
     for r in recordings:
         if r.measured is not None and r.topics.wrench is not None and r.wrench is None:
-            raise BagError(
-                f"no wrench on {r.topics.wrench} is accepted: {r.first_reject}",
-                path=Path(r.source),
-                reason="frames",
-            )
+            text = f"no wrench on {r.topics.wrench} is accepted: {r.first_reject}"
+            raise BagError(text, path=Path(r.source), reason="frames")
     file = robot
-    faults = [f"{r.name}: {describe_positions(r)}" for r in recordings if r.jump_description]
+    faults = [f"{r.name}: {_describe_positions(r)}" for r in recordings if r.jump_description]
     refuse_faults(faults, accept)
     notes = [f"accepted by --accept: {fault}" for fault in faults]
     for r in recordings:
@@ -216,11 +216,8 @@ def fit_recordings(
         if constant != FIT:
             constants = parse_constants(robot, constant)
         elif {"payload", "inertia"} & set(what):
-            raise ParameterError(
-                "--torque-constant",
-                FIT,
-                "--what friction,rotor: the masses of the file are its scale",
-            )
+            right = "--what friction,rotor: the masses of the file are its scale"
+            raise ParameterError("--torque-constant", FIT, right)
         else:
             constants = fit_constants(robot, made)
         made, notes = [constants.convert(r) for r in made], constants.lines(robot) + notes
@@ -228,6 +225,16 @@ def fit_recordings(
     result, choices = fit_with_laws(robot, made, what, laws, **options)
     result = replace(result, explained=tuple(found))
     return result if robot is file else _compare_with_file(file, result), choices, notes
+
+
+def _describe_positions(r: Recording) -> str:
+    """Say why positions that step are no motion of the machine: it cannot take them, or they jump."""
+    if not r.backlash_description and not r.steps.publishers and r.effort is not None:
+        try:
+            find_idle(r)
+        except (UnreachableError, SingularityError) as error:
+            return position_text(error)
+    return f"position steps that are no motion: {r.backlash_description or r.jump_description}"
 
 
 def _compare_with_file(file: Robot, result: Fit) -> Fit:
@@ -247,13 +254,11 @@ def _compare_with_file(file: Robot, result: Fit) -> Fit:
     return replace(result, numbers=tuple(numbers), judged=judged)
 
 
-def _is_unexplained(result: Fit) -> bool:
+def _may_lack_law(result: Fit) -> bool:
     """Return whether another friction law may explain the rest; False after accepted faults."""
-    if result.accepted:
-        return False
-    verdict = result.verdict
-    kinds = {one.suspect.kind for one in verdict.findings}
-    return bool(kinds - {LINE}) or any(channel.left_ratio > 1.0 for channel in verdict.channels)
+    v = result.verdict
+    left = {one.suspect.kind for one in v.findings} - {LINE} or any(one.left_ratio > 1.0 for one in v.channels)
+    return bool(left) and not result.accepted
 
 
 def _compare_fits(name: str, verdict: Verdict, before: Problem, after: Problem) -> Choice:
@@ -294,17 +299,6 @@ def _add_hysteresis(robot: Robot, recordings: Sequence[Recording], what: Sequenc
 def _set_values(robot: Robot, found: dict[str, Searched]) -> Robot:
     """Return the robot with the values found."""
     return robot.changed(friction={key: one.value.tolist() for key, one in found.items()})
-
-
-def _add_law(before: Problem, name: str) -> tuple[dict[str, Searched], Robot]:
-    """Add one law to the robot, with its nonlinear parameters as found.
-
-    :raises PkmTwinError: the motion does not show it.
-    """
-    robot = before.robot
-    found = LawSearch(before, name).find()
-    robot = _set_values(robot, found) if found else robot
-    return found, replace(robot, open_laws=(*robot.open_laws, name))
 
 
 def _list_numbers(robot: Robot, result: Fit, name: str, found: dict[str, Searched]) -> list[Number]:

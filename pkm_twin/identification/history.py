@@ -180,13 +180,7 @@ def _check_row(where: str, time: Any, value: Any, deviation: Any) -> None:
 
 
 def append(
-    path: Path,
-    machine: str,
-    robot: str,
-    file: Path,
-    recorded: float,
-    good: bool,
-    numbers: Sequence[Measured],
+    path: Path, machine: str, robot: str, file: Path, recorded: float, good: bool, numbers: Sequence[Measured]
 ) -> None:
     """Add one check to a history; a check of the same recording takes the place of the older one.
 

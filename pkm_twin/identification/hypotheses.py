@@ -21,34 +21,24 @@ import numpy as np
 import scipy  # type: ignore[import-untyped]  # its parts come when they are asked for
 
 from pkm_twin.codegen.arrays import Array, Indices
-from pkm_twin.errors import PkmTwinError, SingularityError, UnreachableError
+from pkm_twin.errors import PkmTwinError
 from pkm_twin.identification.columns import CURRENT_OFFSET, GAIN, PRIOR_DEVIATIONS, Columns
-from pkm_twin.identification.compare import cut_recording, find_idle
+from pkm_twin.identification.compare import cut_recording
 from pkm_twin.identification.evidence import Model, Spectra
 from pkm_twin.identification.friction_search import LawSearch
 from pkm_twin.identification.identifiable import KINDS
-from pkm_twin.identification.judge import ALTERNATIVE_LOG_ODDS, SIGMAS
+from pkm_twin.identification.judge import ALTERNATIVE_LOG_ODDS, FOUND_LOG_ODDS, SIGMAS
 from pkm_twin.identification.parameters import file_parameters
 from pkm_twin.identification.rows import MAX_EFFORT, Problem, Rows, make_rows
 from pkm_twin.identification.samples import Motion, find_held_payload
-from pkm_twin.identification.words import (
-    EFFORT_UNITS,
-    MAX_DELAY,
-    is_usual_scale,
-    late_text,
-    list_joints,
-    position_text,
-    scale_text,
-)
+from pkm_twin.identification.words import EFFORT_UNITS, MAX_DELAY, is_usual_scale, late_text, list_joints, scale_text
 from pkm_twin.machine.friction import LAWS, select_compiled_laws
 from pkm_twin.messages.reading import rotate_to_base
 from pkm_twin.recordings import Load, Recording
 from pkm_twin.robot.robot import Robot
 
-HEAVY_PAYLOAD_RATIO: Final = 30.0
-"""Prior deviation of a heavy payload, as a multiple of that of a usual one."""
-HEAVY_FRICTION_RATIO: Final = 3.0
-"""Prior deviation of heavy friction, which may be all of the efforts, as a multiple of that of usual friction."""
+HEAVY_RATIOS: Final = {"payload": 30.0, "friction": 3.0}
+"""Prior deviations of heavy ones, over those of usual ones; heavy friction may be all of the efforts."""
 CLASSES: Final = {
     "": 0.0,
     "payload": 2.0,
@@ -66,15 +56,11 @@ DISCREPANCY_RATIOS: Final = np.geomspace(0.01, 1.0, 7)
 UNIT_PRICE: Final = 5.0
 """Log prior odds against another unit, scale or rate: one recording in 150."""
 RARE_PRICE: Final = 8.0
-"""Log prior odds against any other cause: one in 3,000."""
+"""Log prior odds against any other cause: one recording in 3,000."""
 MAX_NAMED_DISCREPANCY: Final = 0.12
 """Largest ratio of the model error to the measured efforts with which a cause is named."""
 MAX_SOUND_DISCREPANCY: Final = 0.3
 """Largest ratio of the model error to the measured efforts of a machine that may be the file's."""
-MIN_PROBABILITY: Final = 0.99
-"""Smallest probability of a cause that is named."""
-MIN_LOG_ODDS: Final = float(np.log(MIN_PROBABILITY / (1.0 - MIN_PROBABILITY)))
-"""Log odds of MIN_PROBABILITY."""
 MAX_SEARCHED_DELAY: Final = 1.5
 """Longest delay of efforts that is searched for, s."""
 TIME_RATES: Final = (2.0, 0.5, 3.0, 1 / 3, 4.0, 0.25, 5.0, 0.2, 10.0, 0.1, 1e3, 1e-3)
@@ -190,19 +176,15 @@ class HypothesisSearch:
         odds = tuple(np.exp(np.array(logs) - log).tolist())
         return Hypothesis(text, log - price, found[best], classes[best], classes=odds)
 
-    def _find_widths(self, name: str) -> Array:
-        """Return factors on the prior's deviations in a class, (c,)."""
+    def _find_logs(self, model: Model, name: str, bounded: bool) -> Array:
+        """Return a class's log evidence at each ratio of the discrepancy, less what possible numbers cost."""
         kinds = np.array(self.columns.kinds)
         free = ~np.isin(kinds, ("friction", "masses", "payload")) | np.isin(kinds, name.split())
         # Numbers that agree with the file do so within a tenth of the prior deviations.
         widths = np.where(free, 1.0, 0.1)
-        for kind, ratio in (("payload", HEAVY_PAYLOAD_RATIO), ("friction", HEAVY_FRICTION_RATIO)):
+        for kind, ratio in HEAVY_RATIOS.items():
             widths = np.where((kinds == kind) & (f"heavy {kind}" in name), ratio, widths)
-        return widths
-
-    def _find_logs(self, model: Model, name: str, bounded: bool) -> Array:
-        """Return a class's log evidence at each share, less what possible numbers cost."""
-        model = model.widened(self._find_widths(name))
+        model = model.widened(widths)
         used = np.ones(len(model.deviation), np.bool_)
         logs = model.logs(used)
         low, high = self.columns.low, self.columns.high
@@ -211,7 +193,7 @@ class HypothesisSearch:
             return logs
         free = np.ones(len(logs), np.bool_)
         # A bound may reduce the best ratio's evidence so that other ratios count, with their bounds.
-        while (near := free & (logs > logs.max() - 2.0 * MIN_LOG_ODDS)).any():
+        while (near := free & (logs > logs.max() - 2.0 * FOUND_LOG_ODDS)).any():
             k = int(np.argmax(np.where(near, logs, -np.inf)))
             free[k] = False
             mean, inner = model.posterior_at(k, used)
@@ -238,7 +220,7 @@ class HypothesisSearch:
         clearly_sound = (
             best is self.sound
             and best.discrepancy_ratio <= DISCREPANCY_RATIOS[0]
-            and others[0].log < best.log - MIN_LOG_ODDS
+            and others[0].log < best.log - FOUND_LOG_ODDS
         )
         if pushed or not clearly_sound:
             found += self._weigh_positions()
@@ -267,16 +249,15 @@ class HypothesisSearch:
             names = list_joints([self.joints[j] for j in np.flatnonzero(which)], n)
             for way in (1.0, -1.0):
                 yield from self._weigh_scales(names, which, way)
-        orders = [np.arange(n) for _ in combinations(range(n), 2)]
-        for order, (i, k) in zip(orders, combinations(range(n), 2), strict=True):
+        for i, k in combinations(range(n), 2):
+            order = np.arange(n)
             order[[i, k]] = k, i
             text = f"efforts of {self.joints[i]} and {self.joints[k]} are exchanged"
             yield self._weigh_order(text, self.columns, order, order)
         for order in [np.roll(range(n), 1), np.roll(range(n), -1)] if n > 2 else []:
             yield self._weigh_order("columns of the efforts are in another order", self.columns, order, order)
         back = np.where(self.columns.turning, -1.0, 1.0)
-        p = self.rows.model.parameters
-        rubs = np.array([g.kind == "friction" for g in p.groups for _ in g.names])
+        p, rubs = self.rows.model.parameters, self.rows.model.parameters.kinds == "friction"
         certain = self.columns.certain - 2.0 * (self.rows.table[..., rubs] @ p.values[rubs])
         backwards = replace(self.columns, columns=self.columns.columns * back, certain=certain)
         yield self.weigh("time runs backwards", RARE_PRICE, backwards.spectra())
@@ -371,17 +352,14 @@ class HypothesisSearch:
         left /= np.maximum(np.var(r.effort, 0), 1e-300)
         choices: list[tuple[list[int], int]] = [([*range(n)], int(left.sum(1).argmin()))]
         choices += [([j], int(left[:, j].argmin())) for j in range(n)] if n > 1 else []
-        before: Hypothesis | None = None
+        choices = [(which, place) for which, place in choices if abs(place - most) * period >= 0.03]
+        before = self.weigh("", 0.0, c.spectra(inner=inner), screened=False) if choices else self.sound
         for which, place in choices:
-            step = place - most
-            if abs(step) * period < 0.03:
-                continue
-            before = before or self.weigh("", 0.0, c.spectra(inner=inner), screened=False)
             effort = r.effort.copy()
             effort[inner, which] = r.effort[place : k - 2 * most + place, which]
             spectra = c.spectra(effort, inner)
             one = self.weigh("", 0.0, spectra, screened=False)
-            late = float(step * period) + self._find_mean(spectra, one.kinds)[self.late]
+            late = float((place - most) * period) + self._find_mean(spectra, one.kinds)[self.late]
             text = late_text(list_joints([self.joints[j] for j in which], n), late)
             one = replace(one, text=text, late=late if len(which) == n else 0.0)
             # Scale the evidence of the compared rows to all rows.
@@ -399,7 +377,7 @@ class HypothesisSearch:
         if kinds is not None:
             used = np.isin(c.kinds, ["offset", *kinds.split()])
             used[[self.late, more or self.late]] = True
-        deviation = c.deviation * np.where(c.payload, HEAVY_PAYLOAD_RATIO, 1.0)
+        deviation = c.deviation * np.where(c.payload, HEAVY_RATIOS["payload"], 1.0)
         return Model.from_spectra([spectra], [np.arange(len(used))], deviation, DISCREPANCY_RATIOS).posterior(used).mean
 
     def _weigh_loads(self) -> Iterator[Hypothesis]:
@@ -461,13 +439,13 @@ class HypothesisSearch:
         if (
             scaled.scale != 1.0
             and scaled.discrepancy_ratio <= MAX_NAMED_DISCREPANCY
-            and abs(scaled.log - sound.log) <= MIN_LOG_ODDS >= best.log - scaled.log
+            and abs(scaled.log - sound.log) <= FOUND_LOG_ODDS >= best.log - scaled.log
         ):
             text, _ = self._tell_scale(scaled.scale, scaled.kinds)
             if text:
                 return Explanation(text, not is_usual_scale(scaled.scale))
             best = next(one for one in self.all if one is not scaled)
-        if best.text and best.log - sound.log > MIN_LOG_ODDS:
+        if best.text and best.log - sound.log > FOUND_LOG_ODDS:
             if best.text == NO_MACHINE or best.discrepancy_ratio > MAX_NAMED_DISCREPANCY:
                 return Explanation(unknown, fault=True)
             if 0.0 < abs(best.late) < MAX_DELAY and not self.rows.recording.late:
@@ -507,14 +485,11 @@ class HypothesisSearch:
     def _tell_scale(self, scale: float, kinds: str = "") -> tuple[str, bool]:
         """Say that all efforts are scaled, nothing where heavier masses explain them better, and whether it is clear.
 
-        A heavier machine has the friction of its file, efforts of another scale have not. Friction
-        may be less than the other hypotheses' discrepancy of 1 %. Where it is not the file's both are
-        as likely.
-
-        :param kinds: numbers that differ from the file.
+        A heavier machine has the friction of its file, efforts of another scale have not. Where friction
+        is not the file's (``kinds``: numbers that differ from it), both are as likely.
         """
         c, p, rows = self.columns, self.rows.model.parameters, self.rows
-        rubs = np.array([g.kind == "friction" for g in p.groups for _ in g.names])
+        rubs = p.kinds == "friction"
         smooth = c.certain - rows.table[..., rubs] @ p.values[rubs]
         beside = np.flatnonzero([kind == "offset" or k == self.late for k, kind in enumerate(c.kinds)])
         table = np.concatenate([c.columns[..., beside], c.certain[..., None], smooth[..., None]], -1)
@@ -536,8 +511,17 @@ class HypothesisSearch:
         r, robot, motion = self.rows, self.rows.model.robot, self.rows.signals.motion
         n, names, eye = len(self.joints), self.joints, np.eye(len(self.joints))
         ones, q = np.ones(n), motion.q
-        for text, wrench in wrenches(r.recording, motion):
-            yield from self._weigh_motion(text, replace(motion, wrench=wrench), ones)
+        if r.recording.wrench is not None and r.recording.wrench.any():
+            rotation, axes = robot.rotation(robot.forward(q)), "platform"
+            if r.recording.topics.turns:
+                rotation, axes = rotation.swapaxes(-1, -2), "base"
+            opposite = "the wrench has the opposite sign: it is what the platform applies to its surroundings"
+            for text, wrench in {
+                f"the wrench has {axes} axes": rotate_to_base(motion.wrench, rotation),
+                opposite: -motion.wrench,
+                "without the wrench the efforts agree: it does not act on the platform": 0.0 * motion.wrench,
+            }.items():
+                yield from self._weigh_motion(text, replace(motion, wrench=wrench), ones)
         for text, scale in POSITION_FACTORS.items():
             other = replace(motion, q=scale * q, qd=scale * motion.qd, qdd=scale * motion.qdd)
             yield from self._weigh_motion(text, other, ones)
@@ -613,27 +597,3 @@ def explain_recording(robot: Robot, r: Recording) -> Explanation:
         loaded = explain(make_rows(robot, rows.model.parameters, replace(rows.recording, load=found.load)))
         found = loaded if loaded.fault else found
     return replace(found, steps="" if r.jump_description else r.backlash_description, rows=rows)
-
-
-def describe_positions(r: Recording) -> str:
-    """Say why positions that step are no motion of the machine: it cannot take them, or they jump."""
-    if not r.backlash_description and not r.steps.publishers and r.effort is not None:
-        try:
-            find_idle(r)
-        except (UnreachableError, SingularityError) as error:
-            return position_text(error)
-    return f"position steps that are no motion: {r.backlash_description or r.jump_description}"
-
-
-def wrenches(r: Recording, motion: Motion) -> Iterator[tuple[str, Array]]:
-    """Yield possible faults of the wrenches, each with the corrected wrenches."""
-    if r.wrench is None or not r.wrench.any():
-        return
-    rotation, axes = r.robot.rotation(r.robot.forward(motion.q)), "platform"
-    if r.topics.turns:
-        rotation, axes = rotation.swapaxes(-1, -2), "base"
-    yield f"the wrench has {axes} axes", rotate_to_base(motion.wrench, rotation)
-    text = "the wrench has the opposite sign: it is what the platform applies to its surroundings"
-    yield text, -motion.wrench
-    text = "without the wrench the efforts agree: it does not act on the platform"
-    yield text, 0.0 * motion.wrench

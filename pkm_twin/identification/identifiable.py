@@ -74,7 +74,7 @@ def make_inertia_cone() -> Array:
 
 
 def identifiable(robot: Robot) -> tuple[Identifiable, ...]:
-    """All that a fit of the robot's file may change: drives, payload, bodies and rods.
+    """List all that a fit of the robot's file may change: drives, payload, bodies and rods.
 
     :raises ParameterError: the robot's file gives no masses.
     """
@@ -130,20 +130,20 @@ def list_drive_parameters(robot: Robot) -> tuple[Identifiable, ...]:
     return tuple(found)
 
 
-def _tens(robot: Robot) -> list[Any]:
-    """List ten inertial parameters of each body and the payload about the origin, and rod masses."""
-    graph, load = robot.graph, robot.payload
-    tens = [standard_parameters(body.mass, body.com, body.inertia) for body in graph.bodies.values()]
-    tens.append(standard_parameters(load.mass, graph.origin + load.com, load.inertia))
-    return [*(value for ten in tens for value in ten), *(rod.mass for rod in graph.rods.values())]
-
-
 def list_mass_parameters(robot: Robot) -> Iterator[Identifiable]:
-    """Masses, centres and inertias of payload, bodies and rods, by what they move together.
+    """Yield masses, centres and inertias of payload, bodies and rods, by what they move together.
 
     :param robot: of a file that gives all of them.
     """
     graph, load = robot.graph, robot.payload
+
+    def list_inertial(robot: Robot) -> list[Any]:
+        """List ten inertial parameters of each body and the payload about the origin, and rod masses."""
+        graph, load = robot.graph, robot.payload
+        tens = [standard_parameters(body.mass, body.com, body.inertia) for body in graph.bodies.values()]
+        tens.append(standard_parameters(load.mass, graph.origin + load.com, load.inertia))
+        return [*(value for ten in tens for value in ten), *(rod.mass for rod in graph.rods.values())]
+
     every: list[Keys] = [(PAYLOAD, "mass"), *((PAYLOAD, "com", i) for i in range(3))]
     every += [*((PAYLOAD, "inertia", *ij) for ij in np.ndindex(3, 3)), *robot.mass_keys()]
     # Of an inertia matrix the upper half, for both.
@@ -157,7 +157,7 @@ def list_mass_parameters(robot: Robot) -> Iterator[Identifiable]:
     reference = values.copy()
     for k in _find_places(keys, "mass", "density"):
         reference[k] = max(values[k], heavy if keys[k][0] == PAYLOAD or not values[k] else 0.0)
-    made = FileNumbers(robot, [join_path(key) for pair in both for key in pair], _tens)
+    made = FileNumbers(robot, [join_path(key) for pair in both for key in pair], list_inertial)
     slopes = made.slopes_at((tie @ reference)[None])[0] @ tie
     names = [*graph.bodies, PAYLOAD]
     tens = slopes[: 10 * len(names)].reshape(len(names), 10, -1)
@@ -174,6 +174,7 @@ def list_mass_parameters(robot: Robot) -> Iterator[Identifiable]:
         far = max((float(np.linalg.norm(p - body.com)) for p in graph.joint_points(name)), default=0.0)
         extents.append(far if far > 1e-3 * graph.size else 0.1 * graph.size)
     extents.append(0.3 * graph.size)
+    units = {"mass": "kg", "density": "kg/m3", "inertia": "kg m2"}
     for chosen in dict.fromkeys(tuple(np.flatnonzero(row).tolist()) for row in linked):
         part = list(chosen)
         inside = [b for b in range(len(names)) if own[b][:, part].any()]
@@ -184,7 +185,7 @@ def list_mass_parameters(robot: Robot) -> Iterator[Identifiable]:
         yield Identifiable(
             "payload" if payload else "inertia",
             tuple(map(join_path, group.keys)),
-            tuple(_find_unit(key) for key in group.keys),
+            tuple(units.get(_find_word(k), "m" if isinstance(k[-1], int) else "") for k in group.keys),
             group.begin,
             group.scales([extents[b] for b in inside]),
             group.numbers,
@@ -288,14 +289,9 @@ def _mirror_key(key: Keys) -> Keys:
 
 
 def _find_word(key: Keys) -> str:
-    """``mass``, ``density``, ``com`` or ``inertia``."""
+    """Return which of ``mass``, ``density``, ``com`` or ``inertia`` a key has."""
     return [str(k) for k in key if not isinstance(k, int)][-1].rpartition("_")[2]
 
 
 def _find_places(keys: Sequence[Keys], *words: str) -> Indices:
     return np.flatnonzero([_find_word(key) in words for key in keys])
-
-
-def _find_unit(key: Keys) -> str:
-    units = {"mass": "kg", "density": "kg/m3", "inertia": "kg m2"}
-    return units.get(_find_word(key), "m" if isinstance(key[-1], int) else "")

@@ -23,16 +23,7 @@ from typing import Final
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array, Mask
-from pkm_twin.identification.columns import (
-    DELAY,
-    ELASTIC,
-    GAIN,
-    LATE,
-    PRIOR_DEVIATIONS,
-    SPEED,
-    Errors,
-    find_deviation,
-)
+from pkm_twin.identification.columns import DELAY, ELASTIC, GAIN, LATE, PRIOR_DEVIATIONS, SPEED, Errors, find_deviation
 from pkm_twin.identification.evidence import Model, Posterior, Signals, Spectra
 from pkm_twin.identification.rows import Problem
 from pkm_twin.identification.samples import MIN_RELATIVE_NOISE
@@ -342,7 +333,7 @@ def _judge_channel(name: str, j: int, cases: Sequence[Case], both: Sequence[Sequ
 def judge_problem(problem: Problem) -> Verdict:
     """Fit the chosen numbers of a problem, and judge whether the model explains its recordings."""
     robot, everything, chosen = problem.robot, problem.everything, problem.chosen
-    kinds = np.array([g.kind for g in everything.groups for _ in g.names])
+    kinds = everything.kinds
     cases, errors = list[Case](), list[Suspect]()
     for rows in problem.whole:
         found, s = Errors.from_rows(rows, problem.values), rows.signals
@@ -431,11 +422,7 @@ def _compare_elastic_drives(verdict: Verdict, fitted: Fitted) -> Verdict:
     size, deviation = float(one.mean[place]), float(np.sqrt(one.covariance[place, place]))
     hint = Finding(Suspect(LATE, ALL_JOINTS, "s"), size, deviation, abs(size) / deviation, (Suspect(ELASTIC, sizes),))
     change = (two.mean - one.mean)[: fitted.count]
-    return replace(
-        verdict,
-        hints=(*verdict.hints, hint),
-        covariance=verdict.covariance + np.outer(change, change),
-    )
+    return replace(verdict, hints=(*verdict.hints, hint), covariance=verdict.covariance + np.outer(change, change))
 
 
 def _shows_inertia(fitted: Fitted, friction: Mask) -> bool:

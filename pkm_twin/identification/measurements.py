@@ -205,13 +205,7 @@ KINDS: Final = {
                 for name, unit in (("z", "m"), ("slope_x", "rad"), ("slope_y", "rad"))
             },
         ),
-        _Ball(
-            "radius",
-            "m",
-            1e-5,
-            length=True,
-            own={f"ball.{axis}": ("m", UNKNOWN_DEVIATION) for axis in "xyz"},
-        ),
+        _Ball("radius", "m", 1e-5, length=True, own={f"ball.{axis}": ("m", UNKNOWN_DEVIATION) for axis in "xyz"}),
         _Range(
             "range",
             "m",
@@ -395,11 +389,7 @@ def select_poses(poses: Poses, rows: Indices) -> Measured:
 
 
 def make_measured(
-    joints: Array,
-    second: Array | None,
-    values: Mapping[str, Array],
-    lines: Indices,
-    noise: Mapping[str, float],
+    joints: Array, second: Array | None, values: Mapping[str, Array], lines: Indices, noise: Mapping[str, float]
 ) -> Measured:
     """Return the measurements of a table; a value that is NaN was not measured.
 
@@ -423,11 +413,7 @@ def make_measured(
     place = np.cumsum(used) - 1
     readings = (
         Readings(
-            kind,
-            place[first],
-            None if other is None else place[other],
-            values[kind.name][first, None],
-            lines[first],
+            kind, place[first], None if other is None else place[other], values[kind.name][first, None], lines[first]
         )
         for kind, first, other in found
     )
@@ -477,11 +463,7 @@ def read_poses(path: Path, robot: Robot, dialect: Dialect = DEFAULT_DIALECT) -> 
 
 
 def read_measured(
-    path: Path,
-    robot: Robot,
-    kinds: Sequence[Kind],
-    noise: Mapping[str, float],
-    dialect: Dialect = DEFAULT_DIALECT,
+    path: Path, robot: Robot, kinds: Sequence[Kind], noise: Mapping[str, float], dialect: Dialect = DEFAULT_DIALECT
 ) -> Measured:
     """Read measurements of some quantities; cells may be empty.
 
@@ -516,14 +498,7 @@ def read_measured(
     return make_measured(q, second, values, np.arange(len(q)) + 2, noise)
 
 
-def _read(
-    path: Path,
-    joints: Sequence[str],
-    others: Sequence[str],
-    dialect: Dialect,
-    *,
-    blank: bool = False,
-) -> Table:
+def _read(path: Path, joints: Sequence[str], others: Sequence[str], dialect: Dialect, *, blank: bool = False) -> Table:
     """Read columns by name in SI units; joints in the controller's.
 
     :raises ParameterError: a joint that the robot has not.

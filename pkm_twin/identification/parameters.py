@@ -10,18 +10,13 @@ from itertools import combinations, pairwise
 from typing import Any, Final, Literal, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from delta_dynamics.torques.regressor import parameter_names
 from delta_dynamics.torques.virtual_work import mass_matrix
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import UnknownNameError
-from pkm_twin.identification.identifiable import (
-    KINDS,
-    Identifiable,
-    Kind,
-    find_possible_inertia,
-    identifiable,
-)
+from pkm_twin.identification.identifiable import KINDS, Identifiable, Kind, find_possible_inertia, identifiable
 from pkm_twin.machine.graph import group_connected
 from pkm_twin.machine.inertia import STANDARD_PARAMETERS, make_frame_change
 from pkm_twin.machine.machine_yaml import edit_yaml
@@ -58,6 +53,11 @@ class FileParameters:
     def names(self) -> tuple[str, ...]:
         """Names, shape (k,)."""
         return tuple(name for group in self.groups for name in group.names)
+
+    @cached_property
+    def kinds(self) -> NDArray[np.str_]:
+        """Kinds, shape (k,)."""
+        return np.array([group.kind for group in self.groups for _ in group.names])
 
     @cached_property
     def units(self) -> tuple[str, ...]:

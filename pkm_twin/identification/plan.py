@@ -160,10 +160,7 @@ def plan(
 
 
 def _candidates(
-    robot: Robot,
-    measured: Measured | None,
-    within: dict[str, tuple[float, float]],
-    kinds: Sequence[Kind],
+    robot: Robot, measured: Measured | None, within: dict[str, tuple[float, float]], kinds: Sequence[Kind]
 ) -> Array:
     """Draw the joint states (k, n) from which poses are chosen.
 

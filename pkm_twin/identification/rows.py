@@ -474,8 +474,7 @@ class Problem:
     @cached_property
     def chosen(self) -> Mask:
         """Mask of the fitted ones among all parameters."""
-        groups = self.everything.groups
-        return np.array([group.kind in self.what for group in groups for _ in group.names])
+        return np.isin(self.everything.kinds, self.what)
 
     @cached_property
     def rows(self) -> tuple[Rows, ...]:

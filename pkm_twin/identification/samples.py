@@ -146,29 +146,6 @@ def differentiate(values: Array, order: int, period: float) -> Array:
     return np.concatenate([ends[:3], inner[3:-3], ends[-3:]])
 
 
-def split_even_pieces(
-    time: Array, columns: list[Array], least: int = MIN_SAMPLES // 2
-) -> list[tuple[Array, list[Array]]]:
-    """Split a recording at gaps into pieces, resampled evenly by cubic splines where needed.
-
-    :param least: samples that a piece needs.
-    """
-    period = float(np.median(np.diff(time)))
-    edges = [0, *(np.flatnonzero(np.diff(time) > 5.0 * period) + 1).tolist(), len(time)]
-    pieces = []
-    for begin, end in pairwise(edges):
-        if end - begin < least:
-            continue
-        t = time[begin:end]
-        own = [c[begin:end] for c in columns]
-        if np.abs(np.diff(t) - period).max() > 0.02 * period:
-            even = np.arange(t[0], t[-1], period)
-            own = [np.asarray(scipy.interpolate.CubicSpline(t, c)(even), np.float64) for c in own]
-            t = even
-        pieces.append((t, own))
-    return pieces
-
-
 def tracks(
     time: Array,
     q: Array,
@@ -190,8 +167,17 @@ def tracks(
     held = np.ones(len(time)) if held is None else held
     if len(time) < 2:
         return [], Filtering(0, (), None, 1)
-    period = float(np.median(np.diff(time)))
-    pieces = split_even_pieces(time, [q, effort, wrench, held, *(rates or ())], least)
+    # Pieces without a gap, resampled evenly by cubic splines where needed.
+    period, pieces = float(np.median(np.diff(time))), list[tuple[Array, list[Array]]]()
+    edges = [0, *(np.flatnonzero(np.diff(time) > 5.0 * period) + 1).tolist(), len(time)]
+    for begin, end in pairwise(edges):
+        if end - begin >= least:
+            t, own = time[begin:end], [c[begin:end] for c in (q, effort, wrench, held, *(rates or ()))]
+            if np.abs(np.diff(t) - period).max() > 0.02 * period:
+                even = np.arange(t[0], t[-1], period)
+                own = [np.asarray(scipy.interpolate.CubicSpline(t, c)(even), np.float64) for c in own]
+                t = even
+            pieces.append((t, own))
     if not pieces:
         return [], Filtering(0, (), None, 1)
     positions = [own[0] for _, own in pieces]
@@ -339,11 +325,7 @@ def estimate_noise_density(residual: Sequence[Array], shaken: Array, period: flo
 
 
 def find_lines(
-    residual: Sequence[Array],
-    period: float,
-    how: Filtering,
-    size: Array,
-    wrench: Array | None = None,
+    residual: Sequence[Array], period: float, how: Filtering, size: Array, wrench: Array | None = None
 ) -> tuple[Line, ...]:
     """Find the strongest line above the motion's band in each joint's residual, if there is one.
 
@@ -408,11 +390,7 @@ def simulate_noise(r: Recording, track: Track, how: Filtering, efforts: Callable
     told = []
     for shake in (np.zeros_like(q), noise * rng.normal(size=q.shape)):
         pieces, _ = tracks(
-            time,
-            q + shake,
-            np.zeros_like(q),
-            window=how.window,
-            least=min(MIN_SAMPLES // 2, len(track.time)),
+            time, q + shake, np.zeros_like(q), window=how.window, least=min(MIN_SAMPLES // 2, len(track.time))
         )
         told.append(np.concatenate([efforts(t) for t in pieces]))
     change = told[1] - told[0]
