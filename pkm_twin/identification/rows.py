@@ -418,6 +418,10 @@ def prior_scales(parameters: FileParameters, table: Array, effort: Array) -> Arr
     return scales
 
 
+MAX_PASSES: Final = 6
+"""Largest number of repetitions of a fit whose columns depend on its values."""
+SETTLED_CHANGE: Final = 0.1
+"""Change between two repetitions, in standard deviations, that does not count."""
 MIN_VALUES_PER_NUMBER: Final = 5.0
 """Smallest number of independent measured values for each fitted number."""
 
@@ -441,14 +445,14 @@ class Problem:
         robot: Robot,
         recordings: Sequence[Recording],
         what: Sequence[Kind],
-        passes: int = 2,
+        passes: int = MAX_PASSES,
         progress: Callable[[int], None] | None = None,
         known: Sequence[Rows] = (),
     ) -> Problem:
         """Filter recordings and build their regressors.
 
-        :param passes: number of repetitions in which load-dependent friction and hysteresis use
-            the values of the previous fit instead of the file's.
+        :param passes: largest number of repetitions in which load-dependent friction and hysteresis
+            use the values of the previous fit instead of the file's, until these stay.
         :param progress: called with the number of recordings processed so far.
         :param known: rows of the same robot that are used again instead of being recomputed.
         """
@@ -461,9 +465,13 @@ class Problem:
         problem = cls(robot, tuple(what), everything, tuple(whole))
         laws = (*select_compiled_laws(robot.laws), *robot.open_laws)
         for _ in range(passes if list_unshareable_laws(laws) else 0):
+            before = problem.estimate
             opened = replace(everything, loads=problem.values)
             whole = [made.again(opened, made.how.window) for made in problem.whole]
             problem = replace(problem, everything=opened, whole=tuple(whole))
+            deviations = np.sqrt(np.diag(before.covariance))
+            if (np.abs(problem.estimate.values - before.values) <= SETTLED_CHANGE * deviations).all():
+                break
         return problem
 
     @cached_property
