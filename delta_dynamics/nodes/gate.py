@@ -117,7 +117,7 @@ class CommandGate(TwinNode):
         stream = self.core.stream
         return {
             "open": not stream.stopped,
-            "controllers": self._commands.controllers,
+            "controllers": self._commands.controller_count,
             **stream.counts("torques", "forwarded"),
             **self.core.states.counts("joint states"),
             **{f"closed: {k}": v for k, v in stream.stops.items()},

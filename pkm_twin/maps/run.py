@@ -26,7 +26,7 @@ from typing import Any, Final, Protocol
 import pkm_twin
 from pkm_twin.errors import ParameterError, PkmTwinError, import_extra
 from pkm_twin.maps.kind import Values
-from pkm_twin.maps.store import MapError, Parts, convert_write_errors, join, save_part
+from pkm_twin.maps.store import MapError, Parts, convert_write_errors, save_part, write_map_file
 from pkm_twin.maps.sweep import Chunk, Map
 from pkm_twin.threads import one_blas_thread_for_children
 
@@ -95,7 +95,7 @@ def run(
                 parts.drop()
                 raise
             _compute_pending(sweep, parts, True, workers, scheduler, tell)
-            join(sweep, parts, out)
+            write_map_file(sweep, parts, out)
             parts.drop()
         finally:
             parts.close()

@@ -273,7 +273,7 @@ class _Sink(io.RawIOBase):
         return size or 0
 
 
-def join(sweep: Map, parts: Parts, out: Path) -> None:
+def write_map_file(sweep: Map, parts: Parts, out: Path) -> None:
     """Write the NetCDF file of a finished sweep, chunk by chunk.
 
     :raises MapError: a damaged chunk.

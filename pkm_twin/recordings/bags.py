@@ -161,7 +161,9 @@ def is_collection(path: Path) -> bool:
     return bool(list_bags(path)) and not any(path.glob("*.db3"))
 
 
-class _Found(NamedTuple):
+class _BagMessages(NamedTuple):
+    """The accepted messages of a bag's chosen topics; ``others``: joint states without the robot's joints."""
+
     samples: list[JointSample]
     wrenches: list[WrenchSample]
     deflections: list[DeflectionSample]
@@ -172,7 +174,7 @@ class _Found(NamedTuple):
 
 def _read_messages(
     bag: Bag, robot: Robot, topics: Topics, how: ReadOptions, progress: Callable[[int], None] | None
-) -> _Found:
+) -> _BagMessages:
     """Read the accepted messages of the chosen topics, joint states in the order of their stamps.
 
     :raises BagError: no joint state is accepted.
@@ -197,7 +199,7 @@ def _read_messages(
                 "--base-frame one with base axes",
             ) from None
 
-    found, first = _Found([], [], [], Counter(), ""), ""
+    found, first = _BagMessages([], [], [], Counter(), ""), ""
     names = [topics.joint_states, topics.wrench, topics.deflection]
     own, others = set(robot.controller.names), 0
     for i, message in enumerate(bag.messages([name for name in names if name is not None])):

@@ -119,7 +119,7 @@ class EffortPublisher:
         self._template = DoublesTemplate(NUMBER_ARRAY, message_definition(NUMBER_ARRAY), message, stamped=False)
 
     @property
-    def controllers(self) -> int:
+    def controller_count(self) -> int:
         """Number of subscribers of the plain numbers."""
         return 0 if self._plain is None else self._plain.get_subscription_count()
 

@@ -301,7 +301,7 @@ class GuardedSubscription:
         try:
             number, sent = info["publication_sequence_number"], info["source_timestamp"]
             # Several publishers have independent sequence numbers.
-            if statistics.received(number, sent) and node.count_publishers(self._name) == 1:
+            if statistics.record_message(number, sent) and node.count_publishers(self._name) == 1:
                 statistics.count_missed()
             # 0 if the middleware does not report the time of reception.
             came = info["received_timestamp"]
@@ -309,7 +309,7 @@ class GuardedSubscription:
                 return
             if self._droppable and came:
                 waited = (time.time_ns() - came) / SECOND
-                if self._backlog.drop(waited, min(node.max_wait, self._expires()), began):
+                if self._backlog.should_drop(waited, min(node.max_wait, self._expires()), began):
                     return
             node.health.seen["messages"] += 1
             if self._decode is not None:
@@ -322,7 +322,7 @@ class GuardedSubscription:
             self._callback(message)
         except Exception as error:
             node.report_failure(self._topic, error)
-        statistics.handled(time.perf_counter() - began)
+        statistics.record_duration(time.perf_counter() - began)
 
     def _relax_reliability(self, what: Incompatibility) -> None:
         """Accept best-effort publishers from now on, unless a parameter says otherwise."""

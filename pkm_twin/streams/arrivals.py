@@ -37,7 +37,7 @@ class Arrivals:
     _last_stamp: int = 0
     _names: frozenset[str] = frozenset()
 
-    def arrived(
+    def count_message(
         self,
         names: Sequence[str],
         efforts: Sequence[float],
@@ -63,7 +63,7 @@ class Arrivals:
         self.ages += age
         self.oldest = max(self.oldest, age)
         self.late += age > self.deadline * SECOND
-        if self.topic.received(number, sent):
+        if self.topic.record_message(number, sent):
             self.topic.count_missed()
         found = []
         if stamp == 0:
@@ -83,7 +83,7 @@ class Arrivals:
             self.faults[fault] += 1
         self._last_stamp = max(self._last_stamp, stamp)
 
-    def ended(self, steady: int) -> None:
+    def end_count(self, steady: int) -> None:
         """End the count; the silence until ``steady``, ns, counts, too."""
         if self.count:
             self._count_silence(steady - self.last)

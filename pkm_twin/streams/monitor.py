@@ -164,7 +164,7 @@ class TopicStatistics:
     _periods: int = 0
     _missing: int = 0
 
-    def received(self, number: int | None, sent: int) -> bool:
+    def record_message(self, number: int | None, sent: int) -> bool:
         """Take a message's sequence number (None without one) and its time of sending, ns.
 
         :returns: whether messages are missing before this one. The caller counts them with
@@ -187,7 +187,7 @@ class TopicStatistics:
         """Count the messages that are missing before the newest one."""
         self.missed += self._missing
 
-    def handled(self, took: float) -> None:
+    def record_duration(self, took: float) -> None:
         """Record the time that the newest message took, s."""
         self.longest = max(self.longest, took)
         self.overruns += 0.0 < self._period < took
@@ -216,7 +216,7 @@ class Backlog:
     _behind: bool = False
     _last_drop: float = 0.0
 
-    def drop(self, waited: float, max_wait: float, now: float) -> bool:
+    def should_drop(self, waited: float, max_wait: float, now: float) -> bool:
         """Return whether a message is dropped.
 
         :param waited: since the middleware received it, s; ``max_wait``: longest wait of a message

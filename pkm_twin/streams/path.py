@@ -13,7 +13,7 @@ from pkm_twin.messages.reading import Trajectory
 
 
 @dataclass(frozen=True)
-class Wanted:
+class Setpoint:
     """The setpoint at one time, shape (n,) each; effort zero if the trajectory has none."""
 
     q: Array
@@ -59,7 +59,7 @@ class JointPath:
             )
         )
 
-    def at(self, time: float) -> Wanted:
+    def at(self, time: float) -> Setpoint:
         """Return the setpoint at ``time`` after the start, s."""
         p = self.points
         end = len(p.times) - 1
@@ -67,14 +67,14 @@ class JointPath:
         if after in (0, end + 1):
             k = min(after, end)
             effort = np.zeros_like(p.q[k]) if p.effort is None else p.effort[k]
-            return Wanted(p.q[k], np.zeros_like(p.q[k]), effort)
+            return Setpoint(p.q[k], np.zeros_like(p.q[k]), effort)
         before = after - 1
         span = float(p.times[after] - p.times[before])
         t = (time - float(p.times[before])) / span
         q, qd = _interpolate(p, before, after, span, t)
         if p.effort is None:
-            return Wanted(q, qd, np.zeros_like(q))
-        return Wanted(q, qd, (1.0 - t) * p.effort[before] + t * p.effort[after])
+            return Setpoint(q, qd, np.zeros_like(q))
+        return Setpoint(q, qd, (1.0 - t) * p.effort[before] + t * p.effort[after])
 
 
 def _interpolate(p: Trajectory, a: int, b: int, span: float, t: float) -> tuple[Array, Array]:

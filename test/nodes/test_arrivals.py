@@ -24,7 +24,7 @@ def send(arrivals, index, age=STEP, names=NAMES, effort=EFFORT, number=None, sta
     """A message of a stream at 1 kHz that is so old when it comes."""
     now = NOW + index * STEP
     stamp = now - age if stamp is None else stamp
-    arrivals.arrived(names, effort, stamp, now, index * STEP, number, now - age)
+    arrivals.count_message(names, effort, stamp, now, index * STEP, number, now - age)
 
 
 def stream(count=10, **changes):
@@ -52,12 +52,12 @@ def test_a_sound_stream_is_good():
 def test_every_silence_beyond_the_deadline_counts_the_last_one_too(silences):
     arrivals = Arrivals(0.1)
     time = 0
-    arrivals.arrived(NAMES, EFFORT, NOW, NOW, time)
+    arrivals.count_message(NAMES, EFFORT, NOW, NOW, time)
     for i, silence in enumerate(silences, 1):
         time += silence
         if i < len(silences):
-            arrivals.arrived(NAMES, EFFORT, NOW + i, NOW + i, time)
-    arrivals.ended(time)
+            arrivals.count_message(NAMES, EFFORT, NOW + i, NOW + i, time)
+    arrivals.end_count(time)
     assert arrivals.silences == sum(silence > DEADLINE for silence in silences)
     assert arrivals.longest_silence == max(silences)
 

@@ -20,7 +20,7 @@ def work_through(backlog, arrivals, service, drop_cost=2e-5):
     now, answered, before = 0.0, [], 0
     for arrival in arrivals:
         now = max(now, arrival)
-        if backlog.drop(now - arrival, MAX_WAIT, now):
+        if backlog.should_drop(now - arrival, MAX_WAIT, now):
             now += drop_cost
             continue
         answered.append(now - arrival)
@@ -56,10 +56,10 @@ def test_no_answer_is_of_a_message_that_waited_too_long_and_all_are_counted(peri
 
 def test_after_an_overload_a_node_takes_every_message_again():
     backlog = Backlog()
-    assert backlog.drop(1.0, MAX_WAIT, 100.0)
-    assert backlog.drop(0.9 * MAX_WAIT, MAX_WAIT, 100.1)
-    assert not backlog.drop(0.0, MAX_WAIT, 100.2 + RELIEF_TIME)
-    assert not backlog.drop(0.9 * MAX_WAIT, MAX_WAIT, 100.3 + RELIEF_TIME)
+    assert backlog.should_drop(1.0, MAX_WAIT, 100.0)
+    assert backlog.should_drop(0.9 * MAX_WAIT, MAX_WAIT, 100.1)
+    assert not backlog.should_drop(0.0, MAX_WAIT, 100.2 + RELIEF_TIME)
+    assert not backlog.should_drop(0.9 * MAX_WAIT, MAX_WAIT, 100.3 + RELIEF_TIME)
     assert (backlog.dropped, backlog.take_longest(), backlog.take_longest()) == (2, 1.0, 0.0)
 
 

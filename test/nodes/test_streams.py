@@ -119,7 +119,7 @@ MILLISECOND = 10**6
 def test_what_is_missing_between_two_messages_is_counted(come):
     topic = TopicStatistics()
     for number, here in enumerate(come, 1):
-        if here and topic.received(number, number * MILLISECOND):
+        if here and topic.record_message(number, number * MILLISECOND):
             topic.count_missed()
     first, last = (come.index(True), len(come) - come[::-1].index(True)) if any(come) else (0, 0)
     assert topic.missed == come[first:last].count(False)
@@ -129,12 +129,12 @@ def test_a_publisher_that_begins_anew_or_gives_no_numbers_has_lost_nothing():
     for numbers in ([100, 101, 1, 2, 3], [None, None, None], [7, None, 9]):
         topic = TopicStatistics()
         for sent, number in enumerate(numbers, 1):
-            assert not topic.received(number, sent * MILLISECOND)
+            assert not topic.record_message(number, sent * MILLISECOND)
 
 
 def test_unconfirmed_gaps_are_not_counted():
     topic = TopicStatistics()
-    assert [topic.received(number, number) for number in (1, 900, 2)] == [False, True, False]
+    assert [topic.record_message(number, number) for number in (1, 900, 2)] == [False, True, False]
     assert topic.missed == 0
 
 
@@ -142,8 +142,8 @@ def test_unconfirmed_gaps_are_not_counted():
 def test_an_answer_that_takes_longer_than_the_period_is_an_overrun(took, overruns):
     topic = TopicStatistics()
     for i in range(21):
-        topic.received(i, i * MILLISECOND)
-        topic.handled(took)
+        topic.record_message(i, i * MILLISECOND)
+        topic.record_duration(took)
     # The first message has no period yet; stamp zero is none.
     assert topic.overruns == pytest.approx(overruns, abs=1)
     assert topic.longest == took
@@ -155,22 +155,22 @@ def test_the_period_is_a_mean():
     sent = 0
     for i in range(100):
         sent += MILLISECOND * (4 if i % 2 else 8)
-        topic.received(i, sent)
-        topic.handled(5e-3)
+        topic.record_message(i, sent)
+        topic.record_duration(5e-3)
     assert topic.overruns <= 1
 
 
 @pytest.mark.parametrize("regular", [1, 4, 20])
 def test_a_silence_counts_as_two_periods(regular):
     topic = TopicStatistics()
-    topic.received(0, MILLISECOND)
-    topic.handled(1.0)
+    topic.record_message(0, MILLISECOND)
+    topic.record_duration(1.0)
     for i in range(1, regular + 1):
-        topic.received(i, (i + 1) * MILLISECOND)
-    topic.received(regular + 1, 100 * SECOND)
+        topic.record_message(i, (i + 1) * MILLISECOND)
+    topic.record_message(regular + 1, 100 * SECOND)
     period = 1e-3 * (1.0 + max(0.1, 1.0 / (regular + 1)))
     for took, overruns in ((0.999 * period, 0), (1.001 * period, 1)):
-        topic.handled(took)
+        topic.record_duration(took)
         assert topic.overruns == overruns
 
 
@@ -179,8 +179,8 @@ def test_a_slower_stream_is_learned():
     sent = 0
     for i in range(300):
         sent += MILLISECOND * (1 if i < 100 else 20)
-        topic.received(i, sent)
-        topic.handled(5e-3)
+        topic.record_message(i, sent)
+        topic.record_duration(5e-3)
     assert 98 <= topic.overruns <= 140
 
 

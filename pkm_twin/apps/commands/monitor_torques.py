@@ -115,7 +115,7 @@ def monitor_torques(given: MonitorTorques) -> Report:
                 stamp = stamp_of(message.header)
             except MessageError:
                 stamp = 0
-            arrivals.arrived(
+            arrivals.count_message(
                 message.name,
                 message.effort,
                 stamp,
@@ -153,7 +153,7 @@ def monitor_torques(given: MonitorTorques) -> Report:
                         break
         except KeyboardInterrupt:
             pass  # Report the messages received so far.
-        arrivals.ended(time.monotonic_ns())
+        arrivals.end_count(time.monotonic_ns())
     return judge(name, arrivals, offer)
 
 
