@@ -282,6 +282,19 @@ int main()
       if (is_common(name)) { own[k][name] = value; }
     }
   }
+  // Names of the robot in another order, or one twice, would drive the wrong motors.
+  for (const bool twice : {false, true}) {
+    auto wrong = joints;
+    std::swap(wrong[0], wrong[JOINTS - 1]);
+    wrong[0] = twice ? wrong[JOINTS - 1] : wrong[0];
+    Node node;
+    node.values.emplace("joints", rclcpp::Parameter("joints", wrong));
+    try {
+      declare_parameters(node, Role::FOLLOWS);
+      return 5;
+    } catch (const std::invalid_argument &) {
+    }
+  }
   const auto carried = Carried::find("/cell", joints);
   if (carried != Carried::find("/cell", joints) || carried == Carried::find("/other", joints)) {
     return 9;

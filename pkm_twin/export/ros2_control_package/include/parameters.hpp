@@ -110,6 +110,16 @@ inline std::vector<std::string> declare_parameters(Node & node, Role role)
   if (joints.size() != JOINTS) {
     throw std::invalid_argument("joints: expected " + std::to_string(JOINTS) + " names");
   }
+  for (std::size_t i = 0; i < JOINTS; ++i) {
+    for (std::size_t k = 0; k < JOINTS; ++k) {
+      // The robot's names in another order would drive each other's motors.
+      if (k != i && (joints[i] == joints[k] || joints[i] == own[k])) {
+        throw std::invalid_argument(
+                "joints: " + joints[i] + " in place " + std::to_string(i + 1) +
+                ", expected different names in the robot's order, the first for " + own[0]);
+      }
+    }
+  }
   const bool follows = role == Role::FOLLOWS;
   for (std::size_t i = 0; i < JOINTS; ++i) {
     const std::string gains = "gains." + joints[i], limits = "limits." + joints[i];
