@@ -307,8 +307,10 @@ class Recording:
         If the recording has both, they stay. In a table the missing ones are second-order
         differences; in a bag, a node's differentiator gives them in the middle of its window.
 
-        :raises PkmTwinError: too few samples in a row, or as :meth:`check_rates`.
+        :raises PkmTwinError: too few samples in a row, two interleaved publishers, or as :meth:`check_rates`.
         """
+        if len(self.time) > 2 and self.steps.publishers:
+            raise PkmTwinError(f"{self.source}: {self.jump_description}; expected the samples of one")
         self.check_rates()
         if self.qd is not None and len(self.time) > 2 and self.jump_description:
             self = replace(self, notes=(*self.notes, f"positions jump: {self.jump_description}"))

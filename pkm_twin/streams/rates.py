@@ -157,9 +157,15 @@ def compare_rates(
     sizes = np.maximum(rms(moved), rms(integrated))
     floor = np.array([STANDSTILL_FRACTION * sizes[units == unit].max() for unit in units])
     size, width = rms(integrated - moved), step if short else max(MIN_STEPS, 1e-9 * MIN_BLOCK_NS / period)
-    noisy = 2.0 * estimate_noise(time, q) + np.sqrt(width) * period * estimate_noise(time, qd)
+    q_noise = 2.0 * estimate_noise(time, q)
+    noisy = q_noise + np.sqrt(width) * period * estimate_noise(time, qd)
     part = size / np.maximum(np.maximum(sizes, floor), 1e-300)
     bad = (part > most) & (size > SIGMAS * noisy)
+    # Velocities of other joints or of several sources look like noise, but noise averages out over the blocks:
+    # the factor between both is then 1 within its standard deviation.
+    length = np.sqrt(np.sum(moved**2, 0))
+    excess = np.abs(np.sum((integrated - moved) * moved, 0)) / np.maximum(length, 1e-300)
+    bad |= (excess > np.maximum(most * length, SIGMAS * noisy)) & (rms(moved) > np.maximum(floor, SIGMAS * q_noise))
     return part, [
         f"{robot.joint_names[j]} {100 * part[j]:.3g} %{find_likely_cause(moved[:, j], integrated[:, j], names)}"
         for j in np.flatnonzero(bad)

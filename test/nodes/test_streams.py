@@ -9,8 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from delta_dynamics.feedforward import Feedforward, Settings
+from pkm_twin.errors import PkmTwinError
+from pkm_twin.recordings.recording import Recording
 from pkm_twin.streams.monitor import Pace, StreamMonitor, TopicStatistics
-from pkm_twin.streams.rates import RateAgreement, _block_moves
+from pkm_twin.streams.rates import RateAgreement, _block_moves, compare_rates
 from test.nodes.harness import SECOND
 from test.support.robots import load
 
@@ -262,3 +264,30 @@ def test_a_stream_and_its_recording_are_compared_alike(rng):
         for stamp, place, rates in zip(stamps.tolist(), q, 0.5 * qd, strict=True):
             stream.push(stamp, place, rates)
         assert np.array_equal(np.moveaxis(np.array(stream._blocks), 1, 0), [moved, told])
+
+
+@pytest.mark.parametrize("noise", [0.01, 0.3, 3.0])
+def test_noise_is_no_fault_and_velocities_of_two_joints_in_turn_are_one(rng, noise):
+    robot = load("delta_cu")
+    t = np.arange(0.0, 4.0, 0.002)
+    stamps = np.round(1e9 * t).astype(np.int64) + SECOND
+    for _ in range(10):
+        q, qd = motion(rng, robot, t)
+        size = noise * np.abs(qd).max()
+        honest = qd + size * rng.normal(size=qd.shape)
+        assert not compare_rates(robot, stamps, q, honest)[1]
+        if noise < 3.0:
+            turned = np.where(np.arange(len(t))[:, None] % 2, honest, honest[:, ::-1])
+            faults = compare_rates(robot, stamps, q, turned)[1]
+            assert {text.split()[0] for text in faults} == {robot.joint_names[0], robot.joint_names[-1]}
+
+
+def test_positions_of_two_publishers_in_turn_are_no_motion(rng):
+    robot = load("delta_cu")
+    t = np.arange(0.0, 4.0, 0.002)
+    q, qd = motion(rng, robot, t)
+    for second in (q[::-1], q + 0.3):
+        both = np.where(np.arange(len(t))[:, None] % 2, q, second)
+        with pytest.raises(PkmTwinError, match="two publishers"):
+            Recording(robot, t, both, qd).with_rates()
+    Recording(robot, t, q, qd).with_rates()
