@@ -12,7 +12,7 @@ from scipy.optimize import least_squares
 
 from pkm_twin import Robot, load
 from pkm_twin.apps.fit_report import report_drive
-from pkm_twin.identification.calibration import HELD_OUT, Calibration, Errors, calibrate, list_geometric_paths
+from pkm_twin.identification.calibration import HELD_OUT_INTERVAL, Calibration, Errors, calibrate, list_geometric_paths
 from pkm_twin.identification.calibration_state import Poses, rotations
 from pkm_twin.identification.drives import GRAVITY, drive_friction
 from pkm_twin.identification.measurements import read_poses
@@ -103,10 +103,10 @@ def section() -> str:
     count = len(poses.joints)
     paths = list_geometric_paths(robot, robot.controller.positions(poses.joints))
     rows: dict[str, list[list[Errors]]] = {"the file": [], "`calibrate`": [], ALONE: []}
-    for k in range(HELD_OUT):
+    for k in range(HELD_OUT_INTERVAL):
         # `calibrate` holds out the last of every four poses.
-        part = _rolled(poses, HELD_OUT - 1 - k)
-        last = np.arange(count) % HELD_OUT == HELD_OUT - 1
+        part = _rolled(poses, HELD_OUT_INTERVAL - 1 - k)
+        last = np.arange(count) % HELD_OUT_INTERVAL == HELD_OUT_INTERVAL - 1
         away = leg_poses(fit_a_leg(robot, part.part(~last)), part.part(last))
         found = calibrate(robot, part, paths)
         held = [[a.held_out[k] for a in found.agreements] for k in range(2)]

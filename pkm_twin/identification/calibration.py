@@ -60,7 +60,7 @@ from pkm_twin.robot.derivatives import list_geometry_numbers
 from pkm_twin.robot.numbers import FileNumbers
 from pkm_twin.robot.robot import Robot
 
-HELD_OUT: Final = 4
+HELD_OUT_INTERVAL: Final = 4
 """One whole pose in so many is held out to judge the fit."""
 NOT_GEOMETRY: Final = ("limits.", "gravity", "payload.", "joint_map.")
 TIGHT_PRIOR_RATIO: Final = 0.1
@@ -361,7 +361,7 @@ def calibrate(
     if isinstance(poses, Measured):
         learnt = poses
     else:
-        held = np.arange(len(poses.joints)) % HELD_OUT == HELD_OUT - 1
+        held = np.arange(len(poses.joints)) % HELD_OUT_INTERVAL == HELD_OUT_INTERVAL - 1
         learnt, apart = (select_poses(poses, np.flatnonzero(rows)) for rows in (~held, held))
     fit_of = partial(_calibrated, robot, learnt, apart, paths, progress)
 

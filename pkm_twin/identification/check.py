@@ -19,7 +19,7 @@ from pkm_twin.identification.compare import (
     MAX_RESIDUAL,
     MIN_PIECE_SAMPLES,
     MIN_REST_TIME,
-    Compared,
+    EffortComparison,
     compare_part,
     cut_recording,
     describe_delay,
@@ -33,7 +33,7 @@ from pkm_twin.identification.fit import Fit, fit
 from pkm_twin.identification.friction_laws import fit_recordings
 from pkm_twin.identification.hypotheses import NO_MACHINE, Explanation, explain_recording
 from pkm_twin.identification.verdict import MAX_NOISE_RATIO
-from pkm_twin.identification.words import MAX_DELAY, list_joints, position_text, scale_text
+from pkm_twin.identification.words import MAX_DELAY, join_names, write_scale, write_unreachable
 from pkm_twin.recordings import Recording
 from pkm_twin.report import Fact, Verdict, make_judged_fact
 from pkm_twin.robot.limits import list_limits
@@ -71,7 +71,7 @@ class Checked:
     items: list[Fact]
     bands: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     unjudged: str = ""
-    compared: Compared | None = None
+    compared: EffortComparison | None = None
     left_out: Mask = field(default_factory=lambda: np.zeros(0, np.bool_))
     causes: tuple[str, ...] = ()
     """Causes with which contradicting efforts agree with the model, or why none were compared."""
@@ -164,7 +164,7 @@ def compare_with_model(r: Recording, residual: float) -> Checked:
     # ValueError: numbers within bounds whose result is not finite.
     except (UnreachableError, SingularityError, ValueError) as error:
         text = one_line(str(error))
-        causes = (position_text(error),) if isinstance(error, (UnreachableError, SingularityError)) else ()
+        causes = (write_unreachable(error),) if isinstance(error, (UnreachableError, SingularityError)) else ()
         return Checked(r, [*items, make_judged_fact(RESIDUAL, text, bound, False)], causes=causes)
     shares, unjudged = _judge_shares(r, idle, compared)
     items += shares
@@ -285,7 +285,7 @@ def _judge_limits(r: Recording) -> list[Fact]:
     return [*items, make_judged_fact(index, text, bound, good, number=smallest, limit=MIN_SINGULARITY)]
 
 
-def _judge_shares(r: Recording, idle: Mask, compared: Compared | None) -> tuple[list[Fact], str]:
+def _judge_shares(r: Recording, idle: Mask, compared: EffortComparison | None) -> tuple[list[Fact], str]:
     """Judge the fraction of samples that are compared; return also why too few are left for a verdict."""
     items, total = [], max(float(r.time[-1]), 1e-9)
     used = 0 if compared is None else sum(len(track.time) for track in compared.tracks)
@@ -316,7 +316,7 @@ def _judge_shares(r: Recording, idle: Mask, compared: Compared | None) -> tuple[
     return items, f"{told}; {100 * part:.3g} % {why}"
 
 
-def _stuck_efforts(r: Recording, c: Compared) -> str:
+def _stuck_efforts(r: Recording, c: EffortComparison) -> str:
     """Describe efforts that were not measured, or not all the time, other than saturated ones; or empty."""
     assert r.effort is not None  # noqa: S101
     if r.robot.redundant:
@@ -346,7 +346,9 @@ def _stuck_efforts(r: Recording, c: Compared) -> str:
     return "; ".join(texts)
 
 
-def _judge_residuals(r: Recording, c: Compared, bands: Mapping[str, Mapping[str, Any]], bound: str) -> list[Fact]:
+def _judge_residuals(
+    r: Recording, c: EffortComparison, bands: Mapping[str, Mapping[str, Any]], bound: str
+) -> list[Fact]:
     good, begins, (worst, at) = c.good, c.begins(), c.local()
     items = []
     for i, (name, unit) in enumerate(zip(r.robot.joint_names, r.robot.effort_units, strict=True)):
@@ -378,7 +380,7 @@ def _judge_residuals(r: Recording, c: Compared, bands: Mapping[str, Mapping[str,
     return items
 
 
-def _compare_uncertainty(r: Recording, c: Compared) -> dict[str, dict[str, Any]]:
+def _compare_uncertainty(r: Recording, c: EffortComparison) -> dict[str, dict[str, Any]]:
     """Compare residuals with the deviations by the file's ``uncertainty``, by joint; empty without one."""
     if not r.robot.uncertainty:
         return {}
@@ -442,9 +444,9 @@ def _explain(found: Checked) -> Explanation | None:
         # Of drives that share: the signs of some, or the scale of all.
         opposed = ~c.good & (np.sum(c.measured * c.expected, 0) < 0.0)
         scale = float(np.sum(c.measured * c.expected) / max(float(np.sum(c.expected**2)), 1e-300))
-        names = list_joints(np.array(r.robot.joint_names)[opposed].tolist(), len(opposed))
+        names = join_names(np.array(r.robot.joint_names)[opposed].tolist(), len(opposed))
         tried = [(f"efforts of {names} have the wrong sign", np.where(opposed, -1.0, 1.0))] * bool(opposed.any())
-        for text, factors in (*tried, (scale_text("all joints", scale), np.full(len(opposed), 1.0 / scale))):
+        for text, factors in (*tried, (write_scale("all joints", scale), np.full(len(opposed), 1.0 / scale))):
             if _agrees(replace(r, effort=factors * r.measured), found.left_out, c.bound):
                 return Explanation(text, fault=True)
     if r.robot.redundant:
@@ -464,7 +466,7 @@ def _agrees(r: Recording, without: Mask, bound: float) -> bool:
     return compared is not None and bool(compared.good.all()) and not compared.delayed
 
 
-def _find_contact(r: Recording, c: Compared, left_out: Mask) -> tuple[str, ...]:
+def _find_contact(r: Recording, c: EffortComparison, left_out: Mask) -> tuple[str, ...]:
     """Find when something else begins to act on the machine, if all efforts before agree."""
     begins = c.begins()
     if begins is None:
@@ -483,7 +485,7 @@ def _find_contact(r: Recording, c: Compared, left_out: Mask) -> tuple[str, ...]:
     )
 
 
-def _find_saturated(r: Recording, c: Compared) -> tuple[str, ...]:
+def _find_saturated(r: Recording, c: EffortComparison) -> tuple[str, ...]:
     """Find joints whose effort saturates while the model needs more and otherwise agrees."""
     assert r.effort is not None  # noqa: S101
     if r.robot.redundant:

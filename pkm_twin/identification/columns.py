@@ -31,7 +31,7 @@ from pkm_twin.machine.uncertainty import match_numbers
 from pkm_twin.robot.robot import Robot
 
 GAIN: Final = "gain of the efforts"
-LATE: Final = "efforts late"
+DELAYED_EFFORTS: Final = "efforts late"
 LOAD: Final = "friction that grows with the load"
 SQUARE: Final = "friction that grows with the square of the speed"
 STATIC: Final = "static friction above Coulomb friction"
@@ -46,7 +46,7 @@ OTHER: Final = "other errors"
 PRIOR_DEVIATIONS: Final = {
     GAIN: 0.05,  # constants of drives and current sensors are known to some per cent
     DELAY: 0.02,  # s: buffers of buses and controllers
-    LATE: 2e-3,  # s: one drive against the others
+    DELAYED_EFFORTS: 2e-3,  # s: one drive against the others
     LOAD: 0.05,  # gears and screws
     OFFSET: 0.01,  # rad or machine sizes: homing
     GEOMETRY: 5e-3,  # rad or machine sizes: parts made to a drawing are within 1 %, two deviations
@@ -100,7 +100,7 @@ class Errors:
         found: list[tuple[Suspect, Array]] = []
         for kind, units, usual, column in (
             (GAIN, [""] * len(names), PRIOR_DEVIATIONS[GAIN], measured),
-            (LATE, ["s"] * len(names), PRIOR_DEVIATIONS[LATE], -rows.change),
+            (DELAYED_EFFORTS, ["s"] * len(names), PRIOR_DEVIATIONS[DELAYED_EFFORTS], -rows.change),
             (LOAD, [""] * len(names), share, load),
             (SQUARE, [f"{e} s2/{u}2" for u, e in pairs], None, square),
             *((STATIC, efforts, None, law) for law in static),

@@ -31,7 +31,7 @@ from pkm_twin.identification.samples import (
     tracks,
 )
 from pkm_twin.identification.verdict import MAX_NOISE_RATIO
-from pkm_twin.identification.words import MAX_DELAY, late_text
+from pkm_twin.identification.words import MAX_DELAY, write_late
 from pkm_twin.machine.friction import Dahl
 from pkm_twin.recordings import Load, Recording, find_resting_joints, split_by_load
 from pkm_twin.report import Fact, make_judged_fact
@@ -58,7 +58,7 @@ MAX_DELAY_PASSES: Final = 4
 
 
 @dataclass(frozen=True, eq=False)
-class Compared:
+class EffortComparison:
     """Efforts of a recording in the band of its motion, k rows, n joints.
 
     ``time``: (k,), s; ``measured``, ``expected``, ``residual``: (k, n), N m or N; ``change``: of
@@ -153,7 +153,7 @@ class Compared:
     @property
     def delayed(self) -> str:
         """Words for efforts that are later than a recording's may be; empty if they are not."""
-        return late_text("all joints", self.late) if abs(self.late) > MAX_DELAY else ""
+        return write_late("all joints", self.late) if abs(self.late) > MAX_DELAY else ""
 
 
 def evaluate_loaded(r: Recording, function: Callable[..., Array], time: Array, *motion: Array) -> Array:
@@ -175,7 +175,7 @@ def _project_motion(robot: Robot, q: Array) -> Array:
     return one - rows.swapaxes(-1, -2) @ (rows / robot.effort_scale**2)
 
 
-def compare(r: Recording, bound: float = MAX_RESIDUAL) -> Compared | None:
+def compare(r: Recording, bound: float = MAX_RESIDUAL) -> EffortComparison | None:
     """Compare a recording with the model; None where no piece of it is long enough.
 
     Velocities and accelerations of a recording that has both are used as they are. Of drives that
@@ -194,7 +194,7 @@ def compare(r: Recording, bound: float = MAX_RESIDUAL) -> Compared | None:
     return first if c is None or not c.good.all() else c
 
 
-def _compare_recording(r: Recording, bound: float) -> Compared | None:
+def _compare_recording(r: Recording, bound: float) -> EffortComparison | None:
     """Compare measured and modelled efforts; the delay is estimated and removed to first order."""
     robot, reach = r.robot, friction_reach(r.robot)
     rates = None if r.qd is None or r.qdd is None else (r.qd, r.qdd)
@@ -248,7 +248,7 @@ def _compare_recording(r: Recording, bound: float) -> Compared | None:
     greatest, greatest_rms = (
         np.array([sizes[units == unit].max() for unit in units]) for sizes in (size, rms(expected + residual))
     )
-    return Compared(
+    return EffortComparison(
         time,
         expected + residual,
         expected,
@@ -330,7 +330,7 @@ def near_change(r: Recording, load: Load | None = None) -> tuple[Mask, float]:
     return load.near_change(r.time, within), within
 
 
-def compare_part(r: Recording, idle: Mask, bound: float = MAX_RESIDUAL) -> Compared | None:
+def compare_part(r: Recording, idle: Mask, bound: float = MAX_RESIDUAL) -> EffortComparison | None:
     """Filter efforts to the band of the motion, without samples whose drives are idle."""
     part = cut_recording(r, idle)
     return None if len(part.time) < 3 else compare(part, bound)

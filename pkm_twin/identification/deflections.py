@@ -26,7 +26,7 @@ from pkm_twin.identification.fit import Judged, Result, refuse_faults
 from pkm_twin.identification.identifiable import make_nonnegative_cone
 from pkm_twin.identification.judge import Case, fit_and_judge
 from pkm_twin.identification.parameters import FITTED_RATIO, Group, group_elements, make_number
-from pkm_twin.identification.rows import HELD_OUT
+from pkm_twin.identification.rows import HELD_OUT_FRACTION
 from pkm_twin.identification.verdict import Suspect, Verdict
 from pkm_twin.messages.reading import rotate_to_base
 from pkm_twin.recordings import Recording
@@ -116,7 +116,7 @@ class _Part:
 
     @property
     def split(self) -> int:
-        return round((1.0 - HELD_OUT) * len(self.time))
+        return round((1.0 - HELD_OUT_FRACTION) * len(self.time))
 
     def moved(self, factors: Array) -> tuple[Array, Array]:
         """Return the model's deflections (k, 6) and their derivatives by the factors (k, 6, e)."""

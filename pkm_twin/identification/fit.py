@@ -23,7 +23,7 @@ from pkm_twin.identification.parameters import Number, Status, make_group_number
 from pkm_twin.identification.rows import Problem, Rows
 from pkm_twin.identification.samples import MIN_RELATIVE_NOISE
 from pkm_twin.identification.verdict import Verdict
-from pkm_twin.identification.words import MAX_DELAY, late_text
+from pkm_twin.identification.words import MAX_DELAY, write_late
 from pkm_twin.recordings import Recording
 from pkm_twin.robot.robot import Robot
 
@@ -130,7 +130,7 @@ def fit(
         # The delay of another machine's recording has no meaning.
         problem = correct_delays(problem)
         faults = [
-            f"{made.recording.name}: {late_text('all joints', late)}"
+            f"{made.recording.name}: {write_late('all joints', late)}"
             for made, late in zip(problem.whole, problem.total_delays, strict=True)
             # A delay that was not corrected for is too uncertain to be a fault.
             if abs(late) > MAX_DELAY and made.recording.late

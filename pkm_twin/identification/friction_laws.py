@@ -28,7 +28,7 @@ from pkm_twin.identification.parameters import Number, file_parameters
 from pkm_twin.identification.rows import Problem
 from pkm_twin.identification.samples import MIN_RELATIVE_NOISE
 from pkm_twin.identification.verdict import LINE, Verdict
-from pkm_twin.identification.words import position_text
+from pkm_twin.identification.words import write_unreachable
 from pkm_twin.machine.friction import BASIC, LAWS, Dahl, select_compiled_laws
 from pkm_twin.recordings import Recording
 from pkm_twin.robot.robot import Robot
@@ -233,7 +233,7 @@ def _describe_positions(r: Recording) -> str:
         try:
             find_idle(r)
         except (UnreachableError, SingularityError) as error:
-            return position_text(error)
+            return write_unreachable(error)
     return f"position steps that are no motion: {r.backlash_description or r.jump_description}"
 
 

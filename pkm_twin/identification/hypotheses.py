@@ -31,7 +31,7 @@ from pkm_twin.identification.judge import ALTERNATIVE_LOG_ODDS, FOUND_LOG_ODDS, 
 from pkm_twin.identification.parameters import file_parameters
 from pkm_twin.identification.rows import MAX_EFFORT, Problem, Rows, make_rows
 from pkm_twin.identification.samples import Motion, find_held_payload
-from pkm_twin.identification.words import EFFORT_UNITS, MAX_DELAY, is_usual_scale, late_text, list_joints, scale_text
+from pkm_twin.identification.words import EFFORT_UNITS, MAX_DELAY, is_usual_scale, join_names, write_late, write_scale
 from pkm_twin.machine.friction import LAWS, select_compiled_laws
 from pkm_twin.messages.reading import rotate_to_base
 from pkm_twin.recordings import Load, Recording
@@ -53,9 +53,9 @@ MAX_LISTED_CAUSES: Final = 6
 """Largest number of causes that are listed with their probabilities."""
 DISCREPANCY_RATIOS: Final = np.geomspace(0.01, 1.0, 7)
 """Candidate ratios of the model error to the measured efforts, both RMS; no model is better than 1 %."""
-UNIT_PRICE: Final = 5.0
+UNIT_LOG_ODDS: Final = 5.0
 """Log prior odds against another unit, scale or rate: one recording in 150."""
-RARE_PRICE: Final = 8.0
+OTHER_LOG_ODDS: Final = 8.0
 """Log prior odds against any other cause: one recording in 3,000."""
 MAX_NAMED_DISCREPANCY: Final = 0.12
 """Largest ratio of the model error to the measured efforts with which a cause is named."""
@@ -124,9 +124,9 @@ class HypothesisSearch:
     def __init__(self, rows: Rows) -> None:
         self.rows, self.columns = rows, Columns.from_rows(rows)
         self.joints = rows.model.robot.joint_names
-        self.late = self.columns.kinds.index("error")
+        self.delay_column = self.columns.kinds.index("error")
         self.spectra = self.columns.spectra()
-        self.first: float | None = None
+        self.first_log: float | None = None
         self.sound = self.weigh("", 0.0, self.spectra)
 
     def weigh(
@@ -162,8 +162,8 @@ class HypothesisSearch:
             # Improbable hypotheses are discarded by two classes and one ratio of the discrepancy.
             few = Model.from_spectra([spectra], places, base, DISCREPANCY_RATIOS[1:2], gains, order)
             log = max(self._find_logs(few, name, False)[0] for name in SEARCH_CLASSES)
-            self.first = log if self.first is None else self.first
-            if log < self.first - 40.0:
+            self.first_log = log if self.first_log is None else self.first_log
+            if log < self.first_log - 40.0:
                 return Hypothesis(text, log - price, 1.0)
         model = Model.from_spectra([spectra], places, base, ratios, gains, order)
         logs, found = [], []
@@ -234,7 +234,7 @@ class HypothesisSearch:
         n, eye, sp = len(self.joints), np.eye(len(self.joints)), self.spectra
         offset = np.array([kind == "offset" for kind in self.columns.kinds])
         none = np.where(offset, 1.0 / PRIOR_DEVIATIONS[CURRENT_OFFSET], 0.0)
-        yield self.weigh(NO_MACHINE, RARE_PRICE, sp, ("",), gains=np.zeros(n), factors=none)
+        yield self.weigh(NO_MACHINE, OTHER_LOG_ODDS, sp, ("",), gains=np.zeros(n), factors=none)
         whole = [np.ones(n), *eye] if n > 1 else [np.ones(1)]
         signs = [1.0 - 2.0 * one for one in whole]
         if n > 2:
@@ -242,11 +242,11 @@ class HypothesisSearch:
             signs += [1.0 - 2.0 * (eye[np.argsort(each)[-k:]].sum(0)) for k in range(2, n)]
         for sign in signs:
             turned = [self.joints[j] for j in np.flatnonzero(sign < 0.0)]
-            text = f"efforts of {list_joints(turned, n)} have the wrong sign"
-            price = RARE_PRICE + 2.0 * (len(turned) - 1 if len(turned) < n else 0)
+            text = f"efforts of {join_names(turned, n)} have the wrong sign"
+            price = OTHER_LOG_ODDS + 2.0 * (len(turned) - 1 if len(turned) < n else 0)
             yield self.weigh(text, price, sp, gains=sign)
         for which in whole:
-            names = list_joints([self.joints[j] for j in np.flatnonzero(which)], n)
+            names = join_names([self.joints[j] for j in np.flatnonzero(which)], n)
             for way in (1.0, -1.0):
                 yield from self._weigh_scales(names, which, way)
         for i, k in combinations(range(n), 2):
@@ -260,11 +260,11 @@ class HypothesisSearch:
         p, rubs = self.rows.model.parameters, self.rows.model.parameters.kinds == "friction"
         certain = self.columns.certain - 2.0 * (self.rows.table[..., rubs] @ p.values[rubs])
         backwards = replace(self.columns, columns=self.columns.columns * back, certain=certain)
-        yield self.weigh("time runs backwards", RARE_PRICE, backwards.spectra())
+        yield self.weigh("time runs backwards", OTHER_LOG_ODDS, backwards.spectra())
         for rate in TIME_RATES:
             text = f"the motion was {rate:.3g} times as fast as its time stamps are ("
             text += "ms for s?)" if rate >= 1e3 or rate <= 1e-3 else "time steps?)"
-            yield self.weigh(text, UNIT_PRICE, self.columns.spectra(rate=rate))
+            yield self.weigh(text, UNIT_LOG_ODDS, self.columns.spectra(rate=rate))
 
     def _weigh_order(self, text: str, columns: Columns, order: Indices, efforts: Indices | None = None) -> Hypothesis:
         """Weigh another order of joints, by the samples at which the friction of both orders is known.
@@ -274,7 +274,7 @@ class HypothesisSearch:
         counts = self.rows.counts * self.rows.counts[:, order]
         common = replace(self.rows, counts=counts)
         alike = bool((counts == self.rows.counts).all())
-        one = self.weigh(text, RARE_PRICE, replace(columns, rows=common).spectra(order=efforts), screened=alike)
+        one = self.weigh(text, OTHER_LOG_ODDS, replace(columns, rows=common).spectra(order=efforts), screened=alike)
         if alike:
             return one
         before = self.weigh("", 0.0, replace(self.columns, rows=common).spectra(), screened=False)
@@ -304,14 +304,14 @@ class HypothesisSearch:
             # A scale that is that of a known unit has better prior odds.
             units = [u for u in EFFORT_UNITS.values() if way > 0.0 and 0.5 < u / scale < 2.0]
             for size, price in (
-                (scale, UNIT_PRICE + (RARE_PRICE if way < 0.0 else 0.0)),
-                *((u, UNIT_PRICE - 2.0) for u in units),
+                (scale, UNIT_LOG_ODDS + (OTHER_LOG_ODDS if way < 0.0 else 0.0)),
+                *((u, UNIT_LOG_ODDS - 2.0) for u in units),
             ):
                 one = self.weigh("", price, self.spectra, gains=gains(size))
                 if one.kinds in ("", "friction", "heavy friction") and size == scale:
                     own = float(np.mean(self._find_gains(gains(size), one.kinds)[0][which > 0.0]))
                     size /= 1.0 - size * own
-                yield replace(one, text=scale_text(names, size), scale=size if which.all() else 1.0)
+                yield replace(one, text=write_scale(names, size), scale=size if which.all() else 1.0)
 
     def _find_gains(self, gains: Array | None = None, kinds: str = "", usual: float = 1.0) -> tuple[Array, Array]:
         """Return each joint's gain, a part of its efforts, beside a delay; its deviation.
@@ -323,7 +323,7 @@ class HypothesisSearch:
         used = np.arange(len(c.kinds)) >= len(c.kinds) - c.gains
         deviation = np.where(used, usual, c.deviation)
         used |= np.isin(c.kinds, kinds.split())
-        used[self.late] = True
+        used[self.delay_column] = True
         model = Model.from_spectra([self.spectra], [np.arange(len(used))], deviation, DISCREPANCY_RATIOS, gains)
         found = model.posterior(used)
         some = slice(len(used) - c.gains, None)
@@ -359,12 +359,12 @@ class HypothesisSearch:
             effort[inner, which] = r.effort[place : k - 2 * most + place, which]
             spectra = c.spectra(effort, inner)
             one = self.weigh("", 0.0, spectra, screened=False)
-            late = float((place - most) * period) + self._find_mean(spectra, one.kinds)[self.late]
-            text = late_text(list_joints([self.joints[j] for j in which], n), late)
+            late = float((place - most) * period) + self._find_mean(spectra, one.kinds)[self.delay_column]
+            text = write_late(join_names([self.joints[j] for j in which], n), late)
             one = replace(one, text=text, late=late if len(which) == n else 0.0)
             # Scale the evidence of the compared rows to all rows.
             gain = (one.log - before.log) * k / (k - 2 * most)
-            yield replace(one, log=self.sound.log + gain - RARE_PRICE)
+            yield replace(one, log=self.sound.log + gain - OTHER_LOG_ODDS)
 
     def _find_mean(self, spectra: Spectra, kinds: str | None = None, more: int = 0) -> Array:
         """Return the posterior mean of the columns, (c,).
@@ -376,7 +376,7 @@ class HypothesisSearch:
         used = np.ones(len(c.kinds), np.bool_)
         if kinds is not None:
             used = np.isin(c.kinds, ["offset", *kinds.split()])
-            used[[self.late, more or self.late]] = True
+            used[[self.delay_column, more or self.delay_column]] = True
         deviation = c.deviation * np.where(c.payload, HEAVY_RATIOS["payload"], 1.0)
         return Model.from_spectra([spectra], [np.arange(len(used))], deviation, DISCREPANCY_RATIOS).posterior(used).mean
 
@@ -391,7 +391,7 @@ class HypothesisSearch:
         _, spans, held = find_held_payload(r.time, kilogram, left, weight)
         if spans and not held.all():
             part = replace(c, columns=np.where(payload, held[:, None, None], 1.0) * c.columns)
-            yield self._weigh_payload(part.spectra(), UNIT_PRICE + 3.0 * len(spans), tuple(spans))
+            yield self._weigh_payload(part.spectra(), UNIT_LOG_ODDS + 3.0 * len(spans), tuple(spans))
 
     def _weigh_friction_laws(self) -> Iterator[Hypothesis]:
         """Weigh friction laws that the file lacks, with the nonlinear parameter that explains most."""
@@ -409,7 +409,7 @@ class HypothesisSearch:
             other, units = copy(self), search.columns(found.value)
             other.columns = c.with_friction(units)
             text = f"{name} friction of the drives, which the file lacks, explains the efforts: --friction {name}"
-            price = UNIT_PRICE + n * float(np.log(len(search.list_candidates())))
+            price = UNIT_LOG_ODDS + n * float(np.log(len(search.list_candidates())))
             one = other.weigh(text, price, other.columns.spectra(), screened=False)
             yield replace(one, law=name)
 
@@ -460,7 +460,7 @@ class HypothesisSearch:
         if not sound.kinds and abs(gains[j]) > 2.0 * PRIOR_DEVIATIONS[GAIN] + SIGMAS * deviations[j]:
             if (np.abs(gains - mean) >= 0.5 * abs(mean)).any():
                 scale = 1.0 / (1.0 - float(gains[j]))
-                return Explanation(scale_text(self.joints[j], scale), not is_usual_scale(scale))
+                return Explanation(write_scale(self.joints[j], scale), not is_usual_scale(scale))
             # In slow motions payload and friction that the file lacks look like a gain.
             beside, _ = self._find_gains(kinds="friction payload", usual=PRIOR_DEVIATIONS[GAIN])
             scale = 1.0 / (1.0 - mean)
@@ -491,7 +491,7 @@ class HypothesisSearch:
         c, p, rows = self.columns, self.rows.model.parameters, self.rows
         rubs = p.kinds == "friction"
         smooth = c.certain - rows.table[..., rubs] @ p.values[rubs]
-        beside = np.flatnonzero([kind == "offset" or k == self.late for k, kind in enumerate(c.kinds)])
+        beside = np.flatnonzero([kind == "offset" or k == self.delay_column for k, kind in enumerate(c.kinds)])
         table = np.concatenate([c.columns[..., beside], c.certain[..., None], smooth[..., None]], -1)
         spectra = replace(c, columns=table, fast=0.0 * table).spectra()
         places, deviation = np.arange(len(beside) + 2), np.append(c.deviation[beside], [1.0, 1.0])
@@ -503,8 +503,8 @@ class HypothesisSearch:
         left = model.posterior(places != len(beside) + 1).discrepancy_ratio
         clear = "friction" not in kinds and efforts > masses + ALTERNATIVE_LOG_ODDS and left <= DISCREPANCY_RATIOS[0]
         others = [] if clear else [f"all masses are {scale:.3g} times the file's"]
-        names = list_joints([*self.joints], len(self.joints))
-        return scale_text(names, scale, *others), clear
+        names = join_names([*self.joints], len(self.joints))
+        return write_scale(names, scale, *others), clear
 
     def _weigh_positions(self) -> Iterator[Hypothesis]:
         """Weigh other positions, with the efforts as they are or turned alike, and wrenches."""
@@ -560,9 +560,9 @@ class HypothesisSearch:
             yield self._weigh_order(both, made, order, order)
             return
         spectra = made.spectra()
-        yield self.weigh(text, RARE_PRICE, spectra)
+        yield self.weigh(text, OTHER_LOG_ODDS, spectra)
         if both:
-            yield self.weigh(both, RARE_PRICE, spectra, gains=turned)
+            yield self.weigh(both, OTHER_LOG_ODDS, spectra, gains=turned)
 
 
 SEARCH_CLASSES: Final = ("", "friction masses payload")

@@ -23,7 +23,16 @@ from typing import Final
 import numpy as np
 
 from pkm_twin.codegen.arrays import Array, Mask
-from pkm_twin.identification.columns import DELAY, ELASTIC, GAIN, LATE, PRIOR_DEVIATIONS, SPEED, Errors, find_deviation
+from pkm_twin.identification.columns import (
+    DELAY,
+    DELAYED_EFFORTS,
+    ELASTIC,
+    GAIN,
+    PRIOR_DEVIATIONS,
+    SPEED,
+    Errors,
+    find_deviation,
+)
 from pkm_twin.identification.evidence import Model, Posterior, Signals, Spectra
 from pkm_twin.identification.rows import Problem
 from pkm_twin.identification.samples import MIN_RELATIVE_NOISE
@@ -355,7 +364,7 @@ def judge_problem(problem: Problem) -> Verdict:
     verdict = replace(verdict, slow=slow)
     if (chosen & (kinds == "inertia")).any() and not verdict.findings:
         verdict = _compare_file_masses(verdict, fitted, kinds[chosen] == "inertia")
-    if not {one.suspect.kind for one in verdict.findings} & {ELASTIC, LATE}:
+    if not {one.suspect.kind for one in verdict.findings} & {ELASTIC, DELAYED_EFFORTS}:
         verdict = _compare_elastic_drives(verdict, fitted)
     # Of each joint the clearest line: above the band, so that no number changes.
     lines = sorted((one for rows in problem.whole for one in rows.signals.lines), key=lambda one: one.sigmas)
@@ -402,14 +411,14 @@ def _compare_elastic_drives(verdict: Verdict, fitted: Fitted) -> Verdict:
     """Name elastic drives beside a delay of all efforts where they explain as much."""
     delays = [place[fitted.count + len(fitted.errors)] for place in fitted.places]
     elastic = [fitted.count + k for k, one in enumerate(fitted.errors) if one.kind == ELASTIC]
-    late = fitted.used
-    stiff = late.copy()
+    delayed = fitted.used
+    stiff = delayed.copy()
     stiff[delays] = False
     other = fitted.with_columns(stiff, elastic)
-    logs = [fitted.whole.log_evidence(one) for one in (late, other, stiff)]
+    logs = [fitted.whole.log_evidence(one) for one in (delayed, other, stiff)]
     if logs[1] < max(logs[0] - ALTERNATIVE_LOG_ODDS, logs[2]):
         return verdict
-    one, two = (fitted.whole.posterior(used) for used in (late, other))
+    one, two = (fitted.whole.posterior(used) for used in (delayed, other))
     gives, errors = two.mean[elastic], np.sqrt(np.diag(two.covariance)[elastic])
     if (gives < -2.0 * errors).any():
         return verdict
@@ -420,7 +429,8 @@ def _compare_elastic_drives(verdict: Verdict, fitted: Fitted) -> Verdict:
     )
     place = max(delays, key=lambda k: abs(one.mean[k]))
     size, deviation = float(one.mean[place]), float(np.sqrt(one.covariance[place, place]))
-    hint = Finding(Suspect(LATE, ALL_JOINTS, "s"), size, deviation, abs(size) / deviation, (Suspect(ELASTIC, sizes),))
+    late, others = Suspect(DELAYED_EFFORTS, ALL_JOINTS, "s"), (Suspect(ELASTIC, sizes),)
+    hint = Finding(late, size, deviation, abs(size) / deviation, others)
     change = (two.mean - one.mean)[: fitted.count]
     return replace(verdict, hints=(*verdict.hints, hint), covariance=verdict.covariance + np.outer(change, change))
 

@@ -190,7 +190,7 @@ class _Range(_Ball):
 POSITION_KIND: Final = Kind("position", "m", MIN_NOISE, (0, 1, 2), length=True, believed=0.0)
 ROTATION_KIND: Final = _Rotation("rotation", "rad", MIN_NOISE, (3, 4, 5), believed=0.0)
 """Of whole poses."""
-KINDS: Final = {
+MEASUREMENT_KINDS: Final = {
     kind.name: kind
     for kind in (
         *(Kind(name, "m", 5e-5, (k,), length=k < 2) for k, name in enumerate(COORDINATES[:3])),
@@ -227,9 +227,9 @@ def parse_kinds(texts: Sequence[str]) -> tuple[Kind, ...]:
     names = [name.strip() for text in texts for name in text.split(",")]
     every = [one for name in names for one in GROUPS.get(name, (name,))]
     for name in every:
-        if name not in KINDS:
-            raise UnknownNameError("--measure", name, [*KINDS, *GROUPS])
-    return tuple(KINDS[name] for name in dict.fromkeys(every))
+        if name not in MEASUREMENT_KINDS:
+            raise UnknownNameError("--measure", name, [*MEASUREMENT_KINDS, *GROUPS])
+    return tuple(MEASUREMENT_KINDS[name] for name in dict.fromkeys(every))
 
 
 def parse_named_numbers(option: str, text: str, right: str) -> dict[str, list[float]]:
@@ -257,8 +257,8 @@ def parse_noise(texts: Sequence[str]) -> dict[str, float]:
     right = "KIND=VALUE, m or rad, as height=0.00002"
     found = parse_named_numbers("--noise", ",".join(texts), right)
     for name, values in found.items():
-        if name not in KINDS:
-            raise UnknownNameError("--noise", name, list(KINDS))
+        if name not in MEASUREMENT_KINDS:
+            raise UnknownNameError("--noise", name, list(MEASUREMENT_KINDS))
         if len(values) > 1 or not 0.0 < values[0] < 1.0:
             raise ParameterError("--noise", f"{name}={':'.join(map(str, values))}", right)
     return {name: values[0] for name, values in found.items()}
@@ -404,12 +404,12 @@ def make_measured(
         rows = np.flatnonzero(np.isfinite(column))
         if not len(rows):
             raise ParameterError(name, "no value", "a measured value in at least one row")
-        pair = KINDS[name].pair
+        pair = MEASUREMENT_KINDS[name].pair
         if pair and (second is None or not np.isfinite(second[rows]).all()):
             raise ParameterError(name, "one pose", "two in each row: JOINT.position and JOINT.position_2 columns")
         used[rows] = True
         used[rows + count * pair] = True
-        found.append((KINDS[name], rows, rows + count if pair else None))
+        found.append((MEASUREMENT_KINDS[name], rows, rows + count if pair else None))
     place = np.cumsum(used) - 1
     readings = (
         Readings(
@@ -504,7 +504,7 @@ def _read(path: Path, joints: Sequence[str], others: Sequence[str], dialect: Dia
     :raises ParameterError: a joint that the robot has not.
     """
     kinds = dict.fromkeys((*joints, *others), "")
-    kinds |= {name: "length" if kind.unit == "m" else "angle" for name, kind in KINDS.items()}
+    kinds |= {name: "length" if kind.unit == "m" else "angle" for name, kind in MEASUREMENT_KINDS.items()}
     table = read_table(path, kinds, dialect, blank=blank)
     for name in table:
         if name.endswith(".position") and name not in kinds:

@@ -193,7 +193,7 @@ def make_group_numbers(
     moments: dict[Keys, list[int]] = {}
     for k, one in enumerate(numbers):
         if isinstance(one.key[-1], int) and isinstance(one.key[-2], int):
-            moments.setdefault(_find_base(one.key), []).append(k)
+            moments.setdefault(_find_entry_key(one.key), []).append(k)
     for places in moments.values():
         inertia = np.array([numbers[k].after for k in places])
         off = np.abs(find_possible_inertia(inertia) - inertia).max()
@@ -269,7 +269,7 @@ def fitted_yaml(text: str, fitted: Sequence[Number], recordings: Sequence[str]) 
     """
     groups: dict[Keys, list[Number]] = {}
     for number in fitted:
-        groups.setdefault(_find_base(number.key), []).append(number)
+        groups.setdefault(_find_entry_key(number.key), []).append(number)
     values: dict[Keys, Any] = {}
     notes: dict[Keys, str] = {}
     source = ", ".join(recordings)
@@ -290,7 +290,7 @@ def fitted_yaml(text: str, fitted: Sequence[Number], recordings: Sequence[str]) 
     return edit_yaml(text, values, notes)
 
 
-def _find_base(key: Keys) -> Keys:
+def _find_entry_key(key: Keys) -> Keys:
     """Return the key of the number, vector or matrix that a number belongs to."""
     base: Keys = tuple(k for k in key if not isinstance(k, int))
     # A section of a list is no place in a vector.

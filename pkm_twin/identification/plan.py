@@ -13,7 +13,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
 from pkm_twin.identification.calibration import Estimate, Free, list_geometric_paths, list_parameters, make_start
 from pkm_twin.identification.calibration_state import State, differentiate_lines, differentiate_poses
-from pkm_twin.identification.measurements import KINDS, Kind, Measured, Readings, parse_named_numbers
+from pkm_twin.identification.measurements import MEASUREMENT_KINDS, Kind, Measured, Readings, parse_named_numbers
 from pkm_twin.machine.rotations import skew
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import within_limits
@@ -178,7 +178,7 @@ def _candidates(
         if good.any():
             box = np.stack([poses[good].min(0), poses[good].max(0)], -1)
     names = list(robot.pose_names)
-    if KINDS["plane"] in kinds and measured is None and "z" in names:
+    if MEASUREMENT_KINDS["plane"] in kinds and measured is None and "z" in names:
         box[names.index("z")] = robot.home()[names.index("z")]
     for name, ends in within.items():
         if name not in names:

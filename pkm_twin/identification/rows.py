@@ -37,7 +37,7 @@ from pkm_twin.identification.samples import (
     simulate_noise,
     tracks,
 )
-from pkm_twin.identification.words import position_text
+from pkm_twin.identification.words import write_unreachable
 from pkm_twin.machine.friction import (
     KNOWN_FRACTION,
     Dahl,
@@ -53,7 +53,7 @@ from pkm_twin.streams.noise import estimate_deviation
 BLOCK_ROWS: Final = 2048
 MAX_EFFORT: Final = 1e9
 """Largest effort that a drive can have, N m or N."""
-HELD_OUT: Final = 1 / 3
+HELD_OUT_FRACTION: Final = 1 / 3
 """Fraction of each recording, at its end, that is predicted and not fitted."""
 
 
@@ -196,7 +196,7 @@ class Rows:
     @property
     def held_from(self) -> int:
         """Index of the first held-out row."""
-        return round((1.0 - HELD_OUT) * len(self.time))
+        return round((1.0 - HELD_OUT_FRACTION) * len(self.time))
 
     @property
     def fitted(self) -> Rows:
@@ -254,7 +254,7 @@ def make_rows(robot: Robot, parameters: FileParameters, recording: Recording, wi
                 moves = np.where(robot.friction.presliding > 0.0, memory.unknown < KNOWN_FRACTION, moves)
             parts.append(_Piece(track, table, track.effort - rest, rest, moves.astype(np.float64)))
     except (UnreachableError, SingularityError) as error:
-        raise PkmTwinError(f"{r.name}: {position_text(error)}") from None
+        raise PkmTwinError(f"{r.name}: {write_unreachable(error)}") from None
     if all(not part.moves.any() for part in parts):
         raise PkmTwinError(f"{r.name}: no excitation, the joints stand still")
     first, outliers = _drop_outliers(parts, parameters, how.keep_every)

@@ -21,18 +21,18 @@ def is_usual_scale(scale: float) -> bool:
     return 1.0 / USUAL_SCALE < scale < USUAL_SCALE
 
 
-def position_text(error: Exception) -> str:
-    """Return words for positions that the machine cannot take, by its error."""
+def write_unreachable(error: Exception) -> str:
+    """Describe positions that the machine cannot take, by its error."""
     return one_line(f"{error} (positions of this machine, in rad and m?)")
 
 
-def late_text(names: str, late: float) -> str:
-    """Return words for efforts that belong to another time."""
+def write_late(names: str, late: float) -> str:
+    """Describe efforts that are late or early against the positions."""
     return f"efforts of {names} are {abs(late):.2g} s {'late' if late > 0 else 'early'}"
 
 
-def scale_text(names: str, scale: float, *others: str) -> str:
-    """Return words for efforts of another scale, or what else explains them as well."""
+def write_scale(names: str, scale: float, *others: str) -> str:
+    """Describe efforts that are a constant factor off, and the other causes that would explain it."""
     sign = " and of the wrong sign" if scale < 0.0 else ""
     alike = "".join(f"; or {other}" for other in others)
     alike += ", the recording cannot tell" if others else ""
@@ -43,6 +43,6 @@ def scale_text(names: str, scale: float, *others: str) -> str:
     )
 
 
-def list_joints(names: Sequence[str], count: int) -> str:
-    """Return the names of joints, of so many, in words."""
+def join_names(names: Sequence[str], count: int) -> str:
+    """Return joint names as text: "all joints" if they are all ``count`` of them."""
     return "all joints" if len(names) == count > 1 else " and ".join(names)

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from pkm_twin import Robot
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError
-from pkm_twin.identification.calibration import HELD_OUT, calibrate, list_geometric_paths
+from pkm_twin.identification.calibration import HELD_OUT_INTERVAL, calibrate, list_geometric_paths
 from pkm_twin.identification.calibration_state import Poses, Transmission
 from pkm_twin.identification.measurements import read_poses
 from pkm_twin.machine.joint_map import JointMap, JointMapEntry
@@ -93,7 +93,7 @@ def test_a_measured_hexapod_is_predicted_as_well_as_by_a_fit_of_each_leg(
     position, rotation = real.platform(q)
     position = position + 2.5e-4 * rng.normal(size=position.shape)
     rotation = (Rotation.from_rotvec(5e-4 * rng.normal(size=(count, 3))) * Rotation.from_matrix(rotation)).as_matrix()
-    learnt = np.arange(count) % HELD_OUT != HELD_OUT - 1
+    learnt = np.arange(count) % HELD_OUT_INTERVAL != HELD_OUT_INTERVAL - 1
     position[rng.choice(np.flatnonzero(learnt), wrong, replace=False)] += 0.02
     motors = q * factors + robot.controller.offsets + 0.2 * rng.normal(size=6)
     poses = Poses(motors, position, rotation)

@@ -19,7 +19,7 @@ from pkm_twin.identification.calibration import (
     make_start,
 )
 from pkm_twin.identification.calibration_state import FRAME, update_state
-from pkm_twin.identification.measurements import KINDS, Measured, make_measured, parse_kinds
+from pkm_twin.identification.measurements import MEASUREMENT_KINDS, Measured, make_measured, parse_kinds
 from pkm_twin.identification.plan import plan
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from test.identification.partial_cases import Towers, case, published
@@ -42,7 +42,7 @@ def printer() -> Robot:
 def test_derivatives_are_those_of_what_is_computed(name: str) -> None:
     """By central differences, of every kind and every number that may be fitted."""
     robot = load(name)
-    kinds = [k for k in KINDS if robot.coordinates[-1].axis is None or k not in ("roll", "pitch", "yaw")]
+    kinds = [k for k in MEASUREMENT_KINDS if robot.coordinates[-1].axis is None or k not in ("roll", "pitch", "yaw")]
     drawn = case(robot, kinds, 5, 1)
     paths = drawn.paths[:3]
     parameters = list_parameters(robot, drawn.measured, paths, Free(frame=True, target=True))

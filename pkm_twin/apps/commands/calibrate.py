@@ -20,7 +20,7 @@ from pkm_twin.identification.calibration import calibrate as calibrated
 from pkm_twin.identification.calibration_fit import MAX_STEPS
 from pkm_twin.identification.calibration_state import Transmission
 from pkm_twin.identification.measurements import (
-    KINDS,
+    MEASUREMENT_KINDS,
     Kind,
     Measured,
     parse_kinds,
@@ -315,7 +315,7 @@ def report_plan(robot: Robot, plan: Plan, accuracy: float | None, out: Path) -> 
         Column("", text="position*, worst axis", scale=1e3, shown="mm"),
         Column("", text="distances", scale=100.0, shown="mm per 100 mm"),
         Column("", text="angles between", scale=1e3, shown="mrad"),
-        *(Column("", text=n, scale=1e3, shown=f"m{KINDS[n].unit}") for n in plan.quantity),
+        *(Column("", text=n, scale=1e3, shown=f"m{MEASUREMENT_KINDS[n].unit}") for n in plan.quantity),
     ]
     each = [
         plan.position.tolist(),
