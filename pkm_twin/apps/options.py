@@ -19,7 +19,6 @@ from pkm_twin.settings import setting
 
 if TYPE_CHECKING:
     from pkm_twin.codegen.arrays import Array
-    from pkm_twin.paths.along import EffortComparison
     from pkm_twin.recordings import Dialect, Load, Recording
     from pkm_twin.robot.limits import LimitViolation
     from pkm_twin.robot.robot import Robot
@@ -205,16 +204,6 @@ class MotionOptions(RecordingOptions):
 
         motion = zero_resting_motion(self.read(path, robot, planned=True).with_rates())
         return motion if getattr(self, "payload", None) is not None else check_efforts(motion)
-
-    def read_efforts(self, path: Path, robot: Robot) -> EffortComparison:
-        """Return a recorded or planned motion with its efforts and the model's.
-
-        :raises ParameterError: as :meth:`read_motion`, or a robot without masses.
-        """
-        from pkm_twin.paths.along import compare_efforts, zero_resting_motion
-
-        compared = compare_efforts(zero_resting_motion(self.read(path, robot, planned=True).with_rates()))
-        return compared if getattr(self, "payload", None) is not None else compared.check_source()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,6 +19,7 @@ from pkm_twin.messages.stamps import stamp_of
 from pkm_twin.recordings import ReadOptions, Recording, read
 from pkm_twin.recordings.recording import differentiate_motion
 from pkm_twin.report import Fact, make_judged_fact, plots
+from pkm_twin.streams.rates import rms
 
 MIN_ANSWERED = 0.95
 """Smallest fraction of the samples that must be answered."""
@@ -57,9 +58,9 @@ def report_dynamics(bag: Path, recording: Path, prefix: str) -> tuple[list[Fact]
     )
     measured = np.zeros_like(predicted) if r.effort is None else r.effort[answered]
     window = _select_window(time, 2.0, time)
-    rms = f", residual RMS {_rms(residual[window])[0]:.2g} {unit}" if window.any() else ""
+    size = f", residual RMS {rms(residual[window])[0]:.2g} {unit}" if window.any() else ""
     panel = Panel(
-        f"{prefix}:\neffort of {robot.joint_names[0]}{rms}",
+        f"{prefix}:\neffort of {robot.joint_names[0]}{size}",
         f"effort ({unit})",
         [
             (time[window], measured[window, 0], {"color": "0.6", "lw": 2.5, "label": "recorded"}),
@@ -76,7 +77,7 @@ def report_dynamics(bag: Path, recording: Path, prefix: str) -> tuple[list[Fact]
         return findings, panel
 
     def judge_residual(what: str, rows: Mask, bound: float) -> Fact:
-        part = _rms(residual[rows]) / np.abs(measured).max(0)
+        part = rms(residual[rows]) / np.abs(measured).max(0)
         return make_judged_fact(
             f"{prefix}: residual RMS {what}",
             _format_list(100 * part, "% of peak"),
@@ -103,7 +104,7 @@ def report_dynamics(bag: Path, recording: Path, prefix: str) -> tuple[list[Fact]
     free = free[answered]
     findings += [
         unjudged_fact(prefix, "peak effort", _format_list(np.abs(predicted).max(0), unit)),
-        unjudged_fact(prefix, "RMS effort", _format_list(_rms(predicted), unit)),
+        unjudged_fact(prefix, "RMS effort", _format_list(rms(predicted), unit)),
         judge_residual("without load", free, 0.05),
     ]
     if r.wrench is not None:
@@ -115,10 +116,6 @@ def report_dynamics(bag: Path, recording: Path, prefix: str) -> tuple[list[Fact]
         held = (time > begin + 0.5) & (time < end - 0.5)
         findings += _judge_payload(prefix, r, residual, free, np.array(answered), held)
     return findings, panel
-
-
-def _rms(values: Array) -> Array:
-    return np.asarray(np.sqrt(np.mean(values**2, 0)), np.float64)
 
 
 def _judge_payload(prefix: str, r: Recording, residual: Array, free: Mask, answered: Indices, held: Mask) -> list[Fact]:

@@ -51,10 +51,6 @@ class EffortComparison:
         """RMS difference between efforts and model over the model's RMS, shape (n,)."""
         return relative_difference(self.effort, self.model)
 
-    def with_model(self) -> EffortComparison:
-        """Return the motion with the model's efforts."""
-        return replace(self, effort=self.model, source="the model's")
-
     def check_source(self) -> EffortComparison:
         """Check that efforts which this robot computed for the file equal the model's.
 

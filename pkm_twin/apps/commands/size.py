@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -82,7 +82,7 @@ class Size(TimedPayloadOptions, MotionOptions, SingularityOption, PictureOptions
 @command("Torques, paths and drives")
 def size(given: Size) -> Report:
     """Compute the duty of each drive, and the motors that suffice."""
-    from pkm_twin.paths.along import EFFORT_TOLERANCE
+    from pkm_twin.paths.along import EFFORT_TOLERANCE, compare_efforts, zero_resting_motion
     from pkm_twin.paths.sizing import compute_net_energy, find_smallest, read_motors, size_drives
 
     if (given.motion is None) == (given.over_workspace is None):
@@ -98,18 +98,19 @@ def size(given: Size) -> Report:
     if given.motion is None:
         return report_workspace(given)
     motors = {} if given.drives is None else read_motors(given.drives, given.motor)
-    taken = given.read_efforts(given.motion, given.machine())
+    motion = zero_resting_motion(given.read(given.motion, given.machine(), planned=True).with_rates())
+    taken = compare_efforts(motion)
+    if given.payload is None:
+        taken = taken.check_source()
     motion, notes = taken.motion, list(taken.motion.notes)
-    doubted = taken.mismatch_warning or motion.efforts != "measured"
-    if given.efforts == "model":
-        taken = taken.with_model()
-    elif given.payload is not None and given.efforts is None and doubted:
-        if taken.difference.max() > EFFORT_TOLERANCE:
-            notes.append(
-                f"the file's efforts are not those of {motion.load}: the model's are used; "
-                "--efforts file uses the file's"
-            )
-        taken = taken.with_model()
+    replaced = given.efforts is None and given.payload is not None
+    replaced = replaced and (bool(taken.mismatch_warning) or motion.efforts != "measured")
+    if replaced and taken.difference.max() > EFFORT_TOLERANCE:
+        notes.append(
+            f"the file's efforts are not those of {motion.load}: the model's are used; --efforts file uses the file's"
+        )
+    if replaced or given.efforts == "model":
+        taken = replace(taken, effort=taken.model, source="the model's")
     duties = size_drives(motion, taken.effort, motors, *read_gear_options(given, motion.robot))
     duration = float(motion.time[-1] - motion.time[0])
     energy = sum(d.at_joint.energy for d in duties)
