@@ -90,8 +90,8 @@ class Dialect:
     """The format of a table: separator, decimal mark, column names and units.
 
     ``separator``, ``decimal``: found from the header row if None. ``columns``: from our name of a
-    column to the table's; ``*`` in both stands for the same text. ``units``: from angle, length or
-    time to the unit of columns whose header has none; rates are always per second.
+    column to the table's; ``*`` in both stands for the same text. ``units``: from a quantity of ``UNITS``
+    to the unit of columns whose header has none; rates are always per second.
     """
 
     separator: str | None = None
