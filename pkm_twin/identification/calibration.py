@@ -94,19 +94,17 @@ class Estimate:
     parameters: tuple[Parameter, ...]
     covariance: Array
 
-    @property
-    def _unknown(self) -> Array:
-        """Orthonormal directions, in units of the priors, that the poses do not determine, (p, u)."""
+    def _find_unknown(self) -> tuple[list[str], Array, Array]:
+        """Return names, priors, and orthonormal directions in their units that the poses do not determine, (p, u)."""
         prior = np.array([p.prior for p in self.parameters])
         values, vectors = np.linalg.eigh(self.covariance / np.outer(prior, prior))
-        return np.asarray(vectors[:, values > OBSERVED_RATIO**2], np.float64)
+        unknown = np.asarray(vectors[:, values > OBSERVED_RATIO**2], np.float64)
+        return [p.name for p in self.parameters], prior, unknown
 
     @property
     def undetermined(self) -> list[str]:
         """Sentences, at most ten, on what the poses do not determine: there the file's values stay."""
-        names = [p.name for p in self.parameters]
-        prior = np.array([p.prior for p in self.parameters])
-        return undetermined(self.robot.graph, names, prior, self._unknown)
+        return undetermined(self.robot.graph, *self._find_unknown())
 
     @property
     def unobserved(self) -> tuple[dict[str, float], ...]:
@@ -115,8 +113,8 @@ class Estimate:
         What the file says stays along them; a number that is not observed may be in one whose
         other combinations are.
         """
-        names = [p.name for p in self.parameters]
-        return tuple(list_weights(names, column) for column in self._unknown.T)
+        names, _, unknown = self._find_unknown()
+        return tuple(list_weights(names, column) for column in unknown.T)
 
 
 class Errors(NamedTuple):

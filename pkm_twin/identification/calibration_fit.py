@@ -211,12 +211,8 @@ def list_faults(
             what = f"RMS residual {noise:.3g} {unit} per axis after the fit"
             faults.append(Fault(what, f"expected at most {most:.3g} {unit} for {right}"))
     if len(outliers) > MAX_OUTLIERS * count:
-        faults.append(
-            Fault(
-                f"{len(outliers)} of {count} do not fit the others ({outliers[0]})",
-                f"at most {100 * MAX_OUTLIERS:.0f} % may be outliers",
-            )
-        )
+        what = f"{len(outliers)} of {count} do not fit the others ({outliers[0]})"
+        faults.append(Fault(what, f"at most {100 * MAX_OUTLIERS:.0f} % may be outliers"))
     if changes:
         worst = max(changes, key=lambda p: abs(p.value - p.before) / p.prior)
         change = worst.value - worst.before

@@ -32,8 +32,7 @@ from pkm_twin.identification.compare import (
 from pkm_twin.identification.fit import Fit, fit
 from pkm_twin.identification.friction_laws import fit_recordings
 from pkm_twin.identification.hypotheses import NO_MACHINE, Explanation, explain_recording
-from pkm_twin.identification.verdict import MAX_NOISE_RATIO
-from pkm_twin.identification.words import MAX_DELAY, join_names, write_scale, write_unreachable
+from pkm_twin.identification.verdict import MAX_DELAY, MAX_NOISE_RATIO, join_names, write_scale, write_unreachable
 from pkm_twin.recordings import Recording
 from pkm_twin.report import Fact, Verdict, make_judged_fact
 from pkm_twin.robot.limits import list_limits

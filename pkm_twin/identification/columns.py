@@ -23,8 +23,7 @@ from pkm_twin.identification.evidence import Signals, Spectra
 from pkm_twin.identification.parameters import FileParameters
 from pkm_twin.identification.rows import BLOCK_ROWS, Rows
 from pkm_twin.identification.samples import MIN_RELATIVE_NOISE, Motion, evaluate_blocks
-from pkm_twin.identification.verdict import ALL_JOINTS, GEOMETRY, Suspect
-from pkm_twin.identification.words import USUAL_SCALE
+from pkm_twin.identification.verdict import ALL_JOINTS, GEOMETRY, USUAL_SCALE, Suspect
 from pkm_twin.machine.friction import list_reversal_keys
 from pkm_twin.machine.places import join_path
 from pkm_twin.machine.uncertainty import match_numbers

@@ -30,8 +30,7 @@ from pkm_twin.identification.samples import (
     simulate_noise,
     tracks,
 )
-from pkm_twin.identification.verdict import MAX_NOISE_RATIO
-from pkm_twin.identification.words import MAX_DELAY, write_late
+from pkm_twin.identification.verdict import MAX_DELAY, MAX_NOISE_RATIO, write_late
 from pkm_twin.machine.friction import Dahl
 from pkm_twin.recordings import Load, Recording, find_resting_joints, split_by_load
 from pkm_twin.report import Fact, make_judged_fact

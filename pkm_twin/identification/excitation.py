@@ -352,30 +352,25 @@ class Sweeps:
         for way, (k, j) in product((1.0, -1.0), np.ndindex(self.speeds.T.shape)):
             length = float(self.lengths[j, k])
             inside = (time >= start) & (time <= start + length)
-            sweep = _evaluate_sweep(time[inside] - start, float(self.reach[j]), float(self.speeds[j, k]))
-            place, rate, change = way * sweep
-            q[inside, j] = self.centre[j] + place
-            qd[inside, j], qdd[inside, j] = rate, change
+            own, reach, speed = time[inside] - start, float(self.reach[j]), float(self.speeds[j, k])
+            ramp = RAMP_FRACTION * 2.0 * reach / speed
+            whole, wave = reach / speed + ramp, np.pi / ramp
+            sweep = np.zeros((3, len(own)))
+            # From the centre to one end and back, at rest in between.
+            for begin, place, sign in ((0.0, 0.0, 1.0), (whole, reach, -1.0)):
+                t = np.clip(own - begin, 0.0, whole)
+                up, down = np.minimum(t, ramp), np.maximum(t - (whole - ramp), 0.0)
+                x = t - up + (0.5 * (up - np.sin(wave * up) / wave))
+                x -= 0.5 * (down - np.sin(wave * down) / wave)
+                v = 0.5 * (1.0 - np.cos(wave * up)) - 0.5 * (1.0 - np.cos(wave * down))
+                a = 0.5 * wave * (np.sin(wave * up) - np.sin(wave * down))
+                now = (own >= begin) & (own <= begin + whole)
+                sweep[:, now] = (sign * speed * np.stack([x, v, a]))[:, now]
+                sweep[0, now] += place
+            position, qd[inside, j], qdd[inside, j] = way * sweep
+            q[inside, j] = self.centre[j] + position
             start += length
         return q, qd, qdd
-
-
-def _evaluate_sweep(time: Array, reach: float, speed: float) -> Array:
-    """Position, rate and acceleration, (3, k), from the centre up and back, at rest in between."""
-    ramp = RAMP_FRACTION * 2.0 * reach / speed
-    whole, wave = reach / speed + ramp, np.pi / ramp
-    result = np.zeros((3, len(time)))
-    for begin, place, way in ((0.0, 0.0, 1.0), (whole, reach, -1.0)):
-        t = np.clip(time - begin, 0.0, whole)
-        up, down = np.minimum(t, ramp), np.maximum(t - (whole - ramp), 0.0)
-        x = t - up + (0.5 * (up - np.sin(wave * up) / wave))
-        x -= 0.5 * (down - np.sin(wave * down) / wave)
-        v = 0.5 * (1.0 - np.cos(wave * up)) - 0.5 * (1.0 - np.cos(wave * down))
-        a = 0.5 * wave * (np.sin(wave * up) - np.sin(wave * down))
-        now = (time >= begin) & (time <= begin + whole)
-        result[:, now] = (way * speed * np.stack([x, v, a]))[:, now]
-        result[0, now] += place
-    return result
 
 
 def design_sweeps(judge: Judge, duration: float, bounds: TrajectoryLimits | None = None) -> Sweeps:

@@ -22,8 +22,7 @@ from pkm_twin.identification.judge import judge_problem, make_basis
 from pkm_twin.identification.parameters import Number, Status, make_group_numbers
 from pkm_twin.identification.rows import Problem, Rows
 from pkm_twin.identification.samples import MIN_RELATIVE_NOISE
-from pkm_twin.identification.verdict import Verdict
-from pkm_twin.identification.words import MAX_DELAY, write_late
+from pkm_twin.identification.verdict import MAX_DELAY, Verdict, write_late
 from pkm_twin.recordings import Recording
 from pkm_twin.robot.robot import Robot
 

@@ -27,8 +27,7 @@ from pkm_twin.identification.judge import SIGMAS
 from pkm_twin.identification.parameters import Number, file_parameters
 from pkm_twin.identification.rows import Problem
 from pkm_twin.identification.samples import MIN_RELATIVE_NOISE
-from pkm_twin.identification.verdict import LINE, Verdict
-from pkm_twin.identification.words import write_unreachable
+from pkm_twin.identification.verdict import LINE, Verdict, write_unreachable
 from pkm_twin.machine.friction import BASIC, LAWS, Dahl, select_compiled_laws
 from pkm_twin.recordings import Recording
 from pkm_twin.robot.robot import Robot

@@ -31,7 +31,7 @@ from pkm_twin.identification.judge import ALTERNATIVE_LOG_ODDS, FOUND_LOG_ODDS, 
 from pkm_twin.identification.parameters import file_parameters
 from pkm_twin.identification.rows import MAX_EFFORT, Problem, Rows, make_rows
 from pkm_twin.identification.samples import Motion, find_held_payload
-from pkm_twin.identification.words import EFFORT_UNITS, MAX_DELAY, is_usual_scale, join_names, write_late, write_scale
+from pkm_twin.identification.verdict import EFFORT_UNITS, MAX_DELAY, is_usual_scale, join_names, write_late, write_scale
 from pkm_twin.machine.friction import LAWS, select_compiled_laws
 from pkm_twin.messages.reading import rotate_to_base
 from pkm_twin.recordings import Load, Recording

@@ -37,7 +37,7 @@ from pkm_twin.identification.samples import (
     simulate_noise,
     tracks,
 )
-from pkm_twin.identification.words import write_unreachable
+from pkm_twin.identification.verdict import write_unreachable
 from pkm_twin.machine.friction import (
     KNOWN_FRACTION,
     Dahl,
