@@ -28,12 +28,12 @@ from pkm_twin.kinematics.traced import POSED, Traced
 POSE_WEIGHT: Final = 100.0
 """Weight of pose equations relative to closures in the search for a reason of rejection: if both
 cannot be satisfied, the pose is met and the gap is in a closure."""
-MAX_LINEAR_POSE_ERROR: Final = 0.5
-"""Largest dimensionless error of a pose predicted linearly from home and to home, see
+MAX_PREDICTED_POSE_ERROR: Final = 0.125
+"""Largest dimensionless error of a pose that the derivatives at home and there predict, see
 :func:`certify_assembly`."""
-MIN_DETERMINANT_PER_ERROR: Final = 1.0
-"""Smallest ratio of the closures' determinant to that error: over far poses of many machines it is
-below 0.5 wherever ``forward`` of the joints is not the pose."""
+MIN_DETERMINANT_PER_ERROR: Final = 1.5
+"""Smallest ratio of the closures' determinant to that error. Of 2.1 million far poses of many
+machines none within twice the error and half the ratio has another pose as ``forward``."""
 MIN_CERTAIN_DETERMINANT: Final = 1e-5
 """Smallest determinant of the closures, relative to home, for machines with a closed-form start:
 ``forward`` computes it from other pivots and rejects values below 1e-8; near a singularity the two
@@ -279,8 +279,8 @@ def pose_accelerations(t: Traced) -> list[Any]:
 def certify_assembly(t: Traced, scheme: PlatformFirstScheme, posed: Traced, q: Sequence[Any]) -> list[Any]:
     """Return margins that are all positive only if ``forward`` of q is certainly the pose.
 
-    With the pose x, A = dq/dx, and home x0, q0, A0: the linear predictions A0^-1 (q - q0) from home
-    and A^-1 (q - q0) from the pose must both be near x - x0, so that no singularity lies between.
+    With the pose x, A = dq/dx, and home x0, q0, A0: the mean of the linear predictions A0^-1 (q - q0)
+    and A^-1 (q - q0) must be near x - x0, by the determinant there, so that no singularity lies between.
     For a machine with a closed-form start the signs at its singularities identify the assembly.
     """
     names, order = t.graph.leads, scheme.drive_pivots
@@ -292,11 +292,11 @@ def certify_assembly(t: Traced, scheme: PlatformFirstScheme, posed: Traced, q: S
         return [closures - MIN_CERTAIN_DETERMINANT, *t.scheme.start.find_conditions(posed.motion)]
     move = posed.q - posed.graph.lead_home
     way = np.array([q[k] for k in t.drives.leading], dtype=object) - t.graph.lead_home
-    ends = ((lu.solve(way) - move) * np.array(t.pose_scales, dtype=object) for lu in (at_home, here))
-    distance = 0.5 * sum(apart @ apart for apart in ends)
+    apart = (0.5 * (at_home.solve(way) + here.solve(way)) - move) * np.array(t.pose_scales, dtype=object)
+    distance = apart @ apart
     return [
         drives - MIN_RELATIVE_DETERMINANT,
-        MAX_LINEAR_POSE_ERROR * MAX_LINEAR_POSE_ERROR - distance,
+        MAX_PREDICTED_POSE_ERROR * MAX_PREDICTED_POSE_ERROR - distance,
         closures * closures - MIN_DETERMINANT_PER_ERROR * MIN_DETERMINANT_PER_ERROR * distance,
     ]
 
