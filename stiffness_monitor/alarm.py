@@ -400,7 +400,7 @@ def _file_deviations(robot: Robot, pose: Array, count: int) -> Array:
 
     The elements' energies under six unit loads are compared at one pose.
     """
-    if not robot.causes:
+    if not robot.uncertainty_changes:
         return np.zeros(count)
     loads = np.diag(np.repeat([1.0, 1.0 / robot.size], 3))
     own = strain_energy(robot, pose, loads).energies.sum(0)

@@ -47,7 +47,7 @@ def compliance_derivatives(robot: Robot, pose: ArrayLike, by: Sequence[str] = ()
 
 def compliance_effects(robot: Robot, pose: ArrayLike) -> Array:
     """Return the change of C per standard deviation of each cause, (..., 6, 6, causes)."""
-    if not robot.causes:
+    if not robot.uncertainty_changes:
         return np.zeros((*compliance(robot, pose).shape, 0))
     return _unravel_square(_cause_effects(robot, pose, _write_compliance))
 

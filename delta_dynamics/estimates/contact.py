@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from delta_dynamics.estimates.isolation import ContactLocator, ContactPlace
-from delta_dynamics.torques.stiction import LoadShare, friction_reach, zero_resting_rates
+from delta_dynamics.torques.stiction import LoadFrictionCompensation, friction_reach, zero_resting_rates
 from delta_dynamics.torques.uncertainty import NOISE_AVERAGING_TIME, Noise, effort_parts, torque_deviation, usual_effort
 from delta_dynamics.torques.virtual_work import inverse_dynamics, mass_matrix
 from pkm_twin.codegen.arrays import Array, check_later, common_batch, one_vector, require_finite, vectors
@@ -236,8 +236,8 @@ class ContactMonitor:
 
     def change_robot(self, robot: Robot) -> None:
         """Use a robot with another payload, gravity or friction."""
-        self._share = LoadShare(robot)
-        self.robot = self.observer.robot = robot = self._share.robot
+        self._load_friction = LoadFrictionCompensation(robot)
+        self.robot = self.observer.robot = robot = self._load_friction.robot
         q, ones = robot.inverse(robot.home()), np.ones(robot.joints_count)
         self.stated = bool(robot.uncertainty) and bool(torque_deviation(robot, q, ones, ones).any())
         """True if the robot's file has uncertainties that efforts depend on."""
@@ -269,8 +269,8 @@ class ContactMonitor:
         if rate_error is None:
             rate_error = self._velocity_error.push(round(time * SECOND), q, qd, qd)
         still = np.abs(qd) <= rate_error
-        rates_used = zero_resting_rates(qd, still, self._friction_reach + self._share.share)
-        effort, load_friction = self._share.remove(q, rates_used, effort)
+        rates_used = zero_resting_rates(qd, still, self._friction_reach + self._load_friction.fraction)
+        effort, load_friction = self._load_friction.remove(q, rates_used, effort)
         parts = effort_parts(self.robot, q, rates_used, qdd, wrench, mass)
         self._last = time
         self._greatest = np.maximum(self._greatest, np.abs(parts.whole))

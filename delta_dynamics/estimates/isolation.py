@@ -43,7 +43,8 @@ CORRELATION_TIME: Final = 0.02
 DECAY_TIME: Final = 0.1
 """Time after which a sample's weight has decayed to 1/e, s."""
 FORCE_RATIOS: Final = np.array([0.1, 0.3, 1.0, 3.0, 10.0])
-"""Forces that are compared, relative to that of a typical position."""
+"""Standard deviations of a contact force over which its likelihood is averaged, relative to the force
+that noise hides at a typical position."""
 
 
 @dataclass(frozen=True)

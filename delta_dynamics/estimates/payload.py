@@ -11,7 +11,12 @@ from typing import Final
 import numpy as np
 
 from delta_dynamics.torques.regressor import PAYLOAD, parameter_names, regressor
-from delta_dynamics.torques.stiction import LoadShare, beyond_friction, friction_reach, zero_resting_rates
+from delta_dynamics.torques.stiction import (
+    LoadFrictionCompensation,
+    beyond_friction,
+    friction_reach,
+    zero_resting_rates,
+)
 from delta_dynamics.torques.uncertainty import Noise
 from delta_dynamics.torques.virtual_work import inverse_dynamics
 from pkm_twin.codegen.arrays import Array, check_later, one_vector
@@ -69,8 +74,8 @@ class PayloadEstimator:
         :param reach: standard deviation of its centre of mass, m.
         """
         robot.check_independent("payloads of measured efforts", EFFORT_SHARING_NOTE)
-        self._share = LoadShare(robot)
-        self.robot = robot = self._share.robot
+        self._load_friction = LoadFrictionCompensation(robot)
+        self.robot = robot = self._load_friction.robot
         names = parameter_names(robot)
         self._columns = [names.index(f"{PAYLOAD}.{what}") for what in ESTIMATED_PARAMETERS]
         load = robot.payload
@@ -148,8 +153,8 @@ class PayloadEstimator:
         if not self.drives.repeated:
             self._save_estimate()
         step = time - last
-        rates_used = zero_resting_rates(qd, still, self._friction_reach + self._share.share)
-        effort, load_friction = self._share.remove(q, rates_used, effort)
+        rates_used = zero_resting_rates(qd, still, self._friction_reach + self._load_friction.fraction)
+        effort, load_friction = self._load_friction.remove(q, rates_used, effort)
         reach = self._friction_reach + load_friction
         columns = regressor(self.robot, q, rates_used, qdd)[:, self._columns]
         computed = inverse_dynamics(self.robot, q, rates_used, qdd, wrench)

@@ -277,7 +277,7 @@ class Simulation(Core):
 
     @cached_property
     def stable_fraction(self) -> float:
-        """Stable fraction of this machine's bandwidth, as :func:`stable_fraction`."""
+        """Largest stable fraction, at most 1, of the control bandwidth that the settings ask for."""
         return stable_fraction(self.robot, self.settings)
 
     def control_fault(self) -> str:

@@ -181,7 +181,7 @@ def pose_mass_kernel(robot: Robot, *, certified: bool) -> Kernel:
 
     :param certified: see :meth:`PoseKernel.__call__`.
     """
-    return _compile_at_pose(robot, "mass matrix", _write_pose_masses, certified=certified)
+    return _compile_at_pose(robot, "mass matrix", _write_pose_mass_matrix, certified=certified)
 
 
 def pose_acceleration_kernel(robot: Robot, *, certified: bool) -> Kernel:
@@ -383,7 +383,8 @@ def _write_pose_torques(t: Traced, scheme: PlatformFirstScheme | None, *, certif
     return made.program({"q": made.q, "qd": rates, "qdd": changes, "tau": tau}, **sizes)
 
 
-def _write_pose_masses(t: Traced, scheme: PlatformFirstScheme | None, *, certified: bool) -> Program:
+def _write_pose_mass_matrix(t: Traced, scheme: PlatformFirstScheme | None, *, certified: bool) -> Program:
+    """Write the program of the mass matrices by drive rates and by pose rates."""
     m = len(t.scheme.coordinates)
     if scheme is None:
         own: _IteratedMachine | _PoseDrivenMachine = _IteratedMachine(t)

@@ -48,7 +48,7 @@ def torque_derivatives(
     :param by: dotted paths of numbers of the file, as :func:`pkm_twin.variants` takes them.
     :raises ParameterError: an unknown path. Other errors as of ``inverse_dynamics``.
     """
-    return _derivatives(robot, (q, qd, qdd), wrench, np.eye(robot.joints_count), by, rows=True)
+    return _compute_derivatives(robot, (q, qd, qdd), wrench, np.eye(robot.joints_count), by, rows=True)
 
 
 def torque_gradient(
@@ -66,10 +66,10 @@ def torque_gradient(
     :returns: ``q``, ``qd``, ``qdd`` of shape (..., n), and ``by`` of shape (...).
     """
     chosen = vectors(weights, robot.joints_count, "weights")
-    return _derivatives(robot, (q, qd, qdd), wrench, chosen, by, rows=False)
+    return _compute_derivatives(robot, (q, qd, qdd), wrench, chosen, by, rows=False)
 
 
-def _derivatives(
+def _compute_derivatives(
     robot: Robot,
     motion: Sequence[ArrayLike],
     wrench: ArrayLike | None,
@@ -78,6 +78,10 @@ def _derivatives(
     *,
     rows: bool,
 ) -> TorqueDerivatives:
+    """Differentiate the sum of weights times efforts.
+
+    :param rows: differentiate one such sum for each row of ``weights``, on a further axis.
+    """
     inputs = _stack_inputs(motion, wrench, weights, rows=rows)
     by_q, by_qd, by_qdd = robot.evaluate(motion_gradient_kernel(robot), *inputs, p=robot.inertial)
     found: dict[str, Array] = {}

@@ -46,20 +46,20 @@ def friction_reach(robot: Robot) -> Array:
     return np.where(reach > 1e-9 * (1.0 + size), reach, 0.0)
 
 
-class LoadShare:
-    """Removes the friction that grows with the load from measured efforts.
+class LoadFrictionCompensation:
+    """Remove the friction that grows with the load from measured efforts.
 
     An unknown payload or contact also increases this friction, so it cannot be computed from the
     known load. ``robot``: the robot without that friction law, for the remaining efforts.
-    ``share``: friction as a fraction of the load, shape (n,).
+    ``fraction``: friction as a fraction of the load, shape (n,).
     """
 
     def __init__(self, robot: Robot) -> None:
         self._full = self.robot = robot
-        self.share = np.zeros(robot.joints_count)
+        self.fraction = np.zeros(robot.joints_count)
         if LoadDependent.name in robot.laws:
-            self.share = read_friction_values(robot.laws, robot.friction)["load_dependent"]
-            self.robot = robot.changed(friction={"load_dependent": (0.0 * self.share).tolist()})
+            self.fraction = read_friction_values(robot.laws, robot.friction)["load_dependent"]
+            self.robot = robot.changed(friction={"load_dependent": (0.0 * self.fraction).tolist()})
 
     def remove(self, q: Array, rates: Array, effort: Array) -> tuple[Array, Array]:
         """Return efforts without this friction, and its bound for joints at rest, (n,) each.
@@ -67,7 +67,7 @@ class LoadShare:
         :param rates: zero at rest.
         """
         if self.robot is self._full:
-            return effort, self.share
+            return effort, self.fraction
         laws, own = self._full.laws, self._full.friction
         directions = np.sign(rates)
         position_friction, dry, share = sum_laws(laws, read_friction_values(laws, own), q, np.abs(rates))

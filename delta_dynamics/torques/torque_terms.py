@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from delta_dynamics.torques.virtual_work import torque_kernel
 from pkm_twin.codegen.arrays import Array, Indices, common_batch, vectors
-from pkm_twin.machine.inertia import GRAVITY, Layout
+from pkm_twin.machine.inertia import GRAVITY_PART, Layout
 from pkm_twin.robot.robot import Robot
 
 
@@ -50,7 +50,7 @@ def efforts_without_friction(
     layout = Layout(robot.massive().tree)
     p = _zero_inputs(robot.inertial, layout.friction)
     if not weight:
-        p = _zero_inputs(p, layout.part(GRAVITY))
+        p = _zero_inputs(p, layout.part(GRAVITY_PART))
     return robot.evaluate(torque_kernel(robot), q, qd, qdd, np.zeros(6), p=p)[0]
 
 
@@ -89,8 +89,8 @@ def dynamics_terms(robot: Robot, q: ArrayLike, qd: ArrayLike, qdd: ArrayLike, wr
     layout = Layout(robot.massive().tree)
     without_friction = _zero_inputs(robot.inertial, layout.friction)
     own_without_friction = _zero_inputs(robot.own_inertial, layout.friction)
-    weightless = _zero_inputs(own_without_friction, layout.part(GRAVITY))
-    own_without_gravity = _zero_inputs(robot.own_inertial, layout.part(GRAVITY))
+    weightless = _zero_inputs(own_without_friction, layout.part(GRAVITY_PART))
+    own_without_gravity = _zero_inputs(robot.own_inertial, layout.part(GRAVITY_PART))
     preload = np.zeros((*shape, n))
     if robot.redundant:
         # The effort that remains at rest without gravity, friction and wrench.

@@ -111,8 +111,8 @@ class KernelBuffers:
 
 
 @remembered
-def make_fast_call(inputs: int, outputs: int) -> Callable[..., Any]:
-    """Return a maker of fast calls for this number of inputs, written without a loop over the inputs.
+def make_fast_call_factory(inputs: int, outputs: int) -> Callable[..., Any]:
+    """Return a function that makes fast calls for this number of inputs, without a loop over the inputs.
 
     A call returns the first output; with ``outputs`` above zero a list of all outputs, and None for
     the status. Each call takes a free buffer, so that threads do not share one.
@@ -361,7 +361,7 @@ class Code:
             copies = (view.copy for view in space.outputs[: outputs or 1])
             return (*space.input_views(), *copies, space.address, space)
 
-        make = make_fast_call(len(sizes[0]), outputs)
+        make = make_fast_call_factory(len(sizes[0]), outputs)
         call: Callable[..., Any] = make(code, make_buffers, np.ndarray, otherwise)
         return call
 

@@ -20,9 +20,11 @@ if TYPE_CHECKING:
     from pkm_twin.codegen.assembly import Lanes, Value
 
 CONSTANT_LEVEL: Final = 0
+"""Level of an expression that depends on no input."""
 PARAMETER_LEVEL: Final = 1
+"""Level of an expression that depends on parameters only."""
 SAMPLE_LEVEL: Final = 2
-"""Levels of an expression: it is constant, depends on parameters only, or depends on the sample."""
+"""Level of an expression that depends on the sample."""
 
 MAX_ANGLE: Final = 1e6
 """Largest angle of sine and cosine, rad; beyond it the reduction by quarter turns loses digits."""

@@ -92,7 +92,7 @@ class Engine(Scheme):
             x, done, least = new, way, min(least, measure)
         return done, x, least
 
-    def explain_end(self, q: Array, reached: float) -> tuple[str, float, float | None]:
+    def explain_missing_assembly(self, q: Array, reached: float) -> tuple[str, float, float | None]:
         """Explain why no assembly is found beyond a fraction of the straight line from home to q.
 
         :returns: the joint or rod whose closure has the largest gap at q, the gap, m, and None. If

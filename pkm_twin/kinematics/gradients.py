@@ -54,7 +54,7 @@ def pose_motion_gradient(engine: Engine) -> Kernel:
         position, rotation = motion.platform()
         velocity = motion.velocity(t.graph.platform, t.graph.origin)
         outputs = {
-            "pose": t.lift(poses.values(coordinates, position, rotation)),
+            "pose": t.lift(poses.evaluate_coordinates(coordinates, position, rotation)),
             "rates": t.lift(poses.rates(coordinates, rotation, velocity, motion.omega[t.graph.platform])),
             "accelerations": t.lift(pose_accelerations(t)),
         }

@@ -14,7 +14,7 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import Numbers, reference
 from pkm_twin.kinematics.limb_pose import Limb, LimbPose, place_in_order
-from pkm_twin.kinematics.motion import Motion, Row, numbers
+from pkm_twin.kinematics.motion import Motion, Row, to_floats
 from pkm_twin.machine.graph import BASE, Graph
 from pkm_twin.machine.tree import Link, Step, Tree
 
@@ -29,8 +29,8 @@ MAX_CLOSED_FORM_ERROR: Final = 1e-9
 singularity of the limb. Another solution differs by much more."""
 
 
-class Closures(Protocol):
-    """A linkage whose closures are solved, see :class:`pkm_twin.kinematics.scheme.Scheme`."""
+class SolvableLinkage(Protocol):
+    """The linkage as the solver of limbs needs it, see :class:`pkm_twin.kinematics.scheme.Scheme`."""
 
     tree: Tree
     graph: Graph
@@ -64,7 +64,7 @@ class Closures(Protocol):
         """Return the dimensionless derivatives of closures by u and by qd."""
 
 
-def find_hanging_limbs(scheme: Closures) -> tuple[Limb, ...]:
+def find_hanging_limbs(scheme: SolvableLinkage) -> tuple[Limb, ...]:
     """Find driven limbs between a passive universal joint on the ground and a ball joint.
 
     Their rotations follow from the bodies at their ends; Newton's method must satisfy the distance
@@ -110,14 +110,14 @@ def _find_root(tree: Tree, tip: str) -> str | None:
     return None
 
 
-def _is_regular_at_home(scheme: Closures, limb: Limb) -> bool:
+def _is_regular_at_home(scheme: SolvableLinkage, limb: Limb) -> bool:
     x, q = scheme.samples[0]
     pose = _solve_sample(scheme, limb, x, q)
     sizes = [*pose.slopes, *pose.levers]
     return all(reference(size) > MIN_LEVER * reference(scale) for size, scale in sizes)
 
 
-def _solve_sample(scheme: Closures, limb: Limb, x: Numbers, q: Numbers) -> LimbPose:
+def _solve_sample(scheme: SolvableLinkage, limb: Limb, x: Numbers, q: Numbers) -> LimbPose:
     """Solve a limb in a sampled state, with all other bodies placed."""
     tree, inner = scheme.tree, set(limb.bodies)
     others = [body for body in tree.links if not inner.intersection(tree.chain_to_base(body))]
@@ -132,7 +132,7 @@ def _solve_sample(scheme: Closures, limb: Limb, x: Numbers, q: Numbers) -> LimbP
         return LimbPose(motion, limb, given, q)
 
 
-def order_bodies(scheme: Closures) -> tuple[str | Limb, ...]:
+def order_bodies(scheme: SolvableLinkage) -> tuple[str | Limb, ...]:
     """Order a tree's bodies for placing, with limbs in closed form where possible.
 
     Bodies between base and platform come first. Newton's method solves the joints that are neither
@@ -166,7 +166,7 @@ def order_bodies(scheme: Closures) -> tuple[str | Limb, ...]:
         barred |= faulty
 
 
-def _is_newton_regular(scheme: Closures, order: Sequence[str | Limb]) -> bool:
+def _is_newton_regular(scheme: SolvableLinkage, order: Sequence[str | Limb]) -> bool:
     """Return whether the equations of Newton's method determine its unknowns at home."""
     x, q = scheme.samples[0]
     limbs = [entry for entry in order if isinstance(entry, Limb)]
@@ -178,7 +178,7 @@ def _is_newton_regular(scheme: Closures, order: Sequence[str | Limb]) -> bool:
     return len(rows) == len(rates) and (not rates or bool(sizes[-1] > MIN_REMAINING_SINGULAR_VALUE))
 
 
-def _newton_rows(scheme: Closures, order: Sequence[str | Limb], x: Numbers, q: Numbers) -> list[Row]:
+def _newton_rows(scheme: SolvableLinkage, order: Sequence[str | Limb], x: Numbers, q: Numbers) -> list[Row]:
     """Return the equations of Newton's method in a state: what limbs in closed form leave."""
     solved = {k for entry in order if isinstance(entry, Limb) for k in entry.rows}
     motion, poses = place_in_order(scheme.tree, order, np.array(x, dtype=object), q)
@@ -187,7 +187,7 @@ def _newton_rows(scheme: Closures, order: Sequence[str | Limb], x: Numbers, q: N
     return rows + [row for pose in poses for row in pose.rows]
 
 
-def _order_bodies_without(scheme: Closures, barred: Collection[Limb]) -> tuple[tuple[str | Limb, ...], set[str]]:
+def _order_bodies_without(scheme: SolvableLinkage, barred: Collection[Limb]) -> tuple[tuple[str | Limb, ...], set[str]]:
     """Return an order without ``barred`` limbs, and the bodies that depend on Newton's unknowns."""
     tree = scheme.tree
     order: list[str | Limb] = []
@@ -216,7 +216,7 @@ def _order_bodies_without(scheme: Closures, barred: Collection[Limb]) -> tuple[t
     return tuple(order), varying
 
 
-def _find_candidates(scheme: Closures, placed: Collection[str]) -> Iterator[Limb]:
+def _find_candidates(scheme: SolvableLinkage, placed: Collection[str]) -> Iterator[Limb]:
     """Yield, for each cut joint or rod, the limbs whose joints may have a closed form."""
     tree, graph = scheme.tree, scheme.graph
     for part in dict.fromkeys(scheme.parts):
@@ -304,7 +304,7 @@ def _classify_limb(
         yield "turns, reach", steps[-1], steps[:-1], False
 
 
-def _closed_form_holds(scheme: Closures, limb: Limb) -> bool:
+def _closed_form_holds(scheme: SolvableLinkage, limb: Limb) -> bool:
     """Return whether the limb is regular at home and its closed form gives the sampled states."""
     tree = scheme.tree
     steps = [step for body in limb.bodies for step in tree.links[body].steps]
@@ -312,7 +312,7 @@ def _closed_form_holds(scheme: Closures, limb: Limb) -> bool:
         return False
     for x, q in scheme.samples:
         pose = _solve_sample(scheme, limb, x, q)
-        difference = numbers(pose.x) - np.array(x, float)
+        difference = to_floats(pose.x) - np.array(x, float)
         difference[[step.position for step in steps if not step.turns]] /= tree.size
         rest = [row.scale * float(row.value) for row in pose.rows]
         if not (np.abs([*difference, *rest]) < MAX_CLOSED_FORM_ERROR).all():

@@ -15,7 +15,7 @@ import numpy as np
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import Numbers
 from pkm_twin.kinematics.iterations import RELATIVE_RANK_TOLERANCE, newton
-from pkm_twin.kinematics.motion import Motion, Row, closure_jacobians, numbers
+from pkm_twin.kinematics.motion import Motion, Row, closure_jacobians, to_floats
 from pkm_twin.machine.graph import Graph
 from pkm_twin.machine.tree import Tree
 
@@ -61,7 +61,7 @@ class Linkage:
 
     def scaled_jacobians(self, rows: Sequence[Row]) -> tuple[Array, Array]:
         """Return the dimensionless derivatives of closures by u and by qd."""
-        ju, jq = (numbers(m) for m in closure_jacobians(self.tree, rows))
+        ju, jq = (to_floats(m) for m in closure_jacobians(self.tree, rows))
         left = np.array([row.scale for row in rows]).reshape(-1, 1)
         drives = np.array([self.drive_scale(name) for name in self.graph.leads])
         return left * ju / np.array(self.tree.scales), left * jq / drives

@@ -50,7 +50,7 @@ FIXED: Final = BaseMotion(_ZERO, _ZERO, _ZERO)
 """A base at rest, without gravity: the motion of all parts is relative to it."""
 
 
-def numbers(values: Any) -> Array:
+def to_floats(values: Any) -> Array:
     """Convert an object array of numbers to an array of floats."""
     return np.asarray(np.array(values, dtype=float), np.float64)
 

@@ -102,7 +102,7 @@ def _root(matrix: Any, entry: Entry) -> Any:
     return sqrt(a * a + b * b)
 
 
-def values(coordinates: Sequence[Coordinate], position: Any, rotation: Any) -> list[Any]:
+def evaluate_coordinates(coordinates: Sequence[Coordinate], position: Any, rotation: Any) -> list[Any]:
     """Return the pose coordinates of a platform."""
     result = []
     for c in coordinates:

@@ -28,7 +28,7 @@ from pkm_twin.kinematics.iterations import newton
 from pkm_twin.kinematics.limb_pose import Limb, LimbPose, place_in_order, sign_of
 from pkm_twin.kinematics.limbs import MAX_CLOSED_FORM_ERROR, order_bodies
 from pkm_twin.kinematics.linkage import SAMPLE_RADIUS
-from pkm_twin.kinematics.motion import Motion, closure_jacobians, numbers
+from pkm_twin.kinematics.motion import Motion, closure_jacobians, to_floats
 from pkm_twin.kinematics.pose import Coordinate
 from pkm_twin.kinematics.scheme import Scheme
 from pkm_twin.machine.graph import BASE, Body, Graph, Joint, array
@@ -157,8 +157,8 @@ def _find_varying(
     scheme: Scheme, coordinates: Sequence[Coordinate], states: Sequence[tuple[Array, Array]]
 ) -> list[bool]:
     """Return which coordinates of the platform vary over states (x, q) of a machine."""
-    placed = [tuple(numbers(part) for part in scheme.evaluate_state(x, q)[0].platform()) for x, q in states]
-    table = np.array([poses.values(coordinates, *state) for state in placed], float)
+    placed = [tuple(to_floats(part) for part in scheme.evaluate_state(x, q)[0].platform()) for x, q in states]
+    table = np.array([poses.evaluate_coordinates(coordinates, *state) for state in placed], float)
     scales = [scheme.tree.size if c.axis is not None else 1.0 for c in coordinates]
     return [len(states) == 1 or bool(change > MAX_ROUNDING_CHANGE) for change in np.ptp(table, axis=0) / scales]
 
@@ -292,16 +292,16 @@ class PlatformFirstScheme(Scheme):
     def _convert_state(self, x: Array, q: Array) -> tuple[Array, Array]:
         """Convert a state (x, q) of the machine to this tree's coordinates."""
         motion, _ = self.machine.evaluate_state(x, q)
-        position, rotation = (numbers(part) for part in motion.platform())
+        position, rotation = (to_floats(part) for part in motion.platform())
         x = np.array(self.tree.home, float)
         virtual_joints = zip(self.chain.joints, self.chain.virtual_joints, strict=True)
         free = {n: c.coordinate for n, c in virtual_joints if not (self.by_pose and c.pose_index is not None)}
         if self.by_pose:
-            q = np.array(poses.values(self.coordinates, position, rotation), float)
+            q = np.array(poses.evaluate_coordinates(self.coordinates, position, rotation), float)
         for link in self.tree.links.values():
             if link.joint in free:
                 c = free[link.joint]
-                (value,) = poses.values([c], position, rotation)
+                (value,) = poses.evaluate_coordinates([c], position, rotation)
                 (step,) = link.steps
                 if step.turns:
                     x[step.position : step.position + 2] = math.cos(value), math.sin(value)
@@ -329,7 +329,7 @@ class PlatformFirstScheme(Scheme):
         slides = [step.rate for step in left if not step.circle]
         if not left or len(left) != len(rates) or len(slides) < len(left) - 1:
             return None
-        tables = np.array([numbers(self._affine_rows(self.tree, q)[1])[:, slides] for _, q in self.samples])
+        tables = np.array([to_floats(self._affine_rows(self.tree, q)[1])[:, slides] for _, q in self.samples])
         kept = independent_rows(tables) if slides else []
         if len(kept) < len(slides):
             return None
@@ -337,7 +337,7 @@ class PlatformFirstScheme(Scheme):
         pivots = tuple((kept[row], slides[column]) for row, column in order)
         with np.errstate(all="ignore"):
             apart = [
-                numbers(self.close_platform(self.tree, q, pivots)[0]) - np.array(x, float)[places]
+                to_floats(self.close_platform(self.tree, q, pivots)[0]) - np.array(x, float)[places]
                 for x, q in self.samples
             ]
         return pivots if (np.abs(apart) < MAX_CLOSED_FORM_ERROR).all() else None
@@ -464,7 +464,7 @@ def _compute_joint_coordinates(tree: Tree, link: Link, motion: Motion, x: Array)
     """Write a joint's passive coordinates, from its bodies' poses in ``motion``, into x."""
 
     def rotation(body: str) -> Array:
-        return np.eye(3) if body == BASE else numbers(motion.rotation_from_home(body))
+        return np.eye(3) if body == BASE else to_floats(motion.rotation_from_home(body))
 
     inner, outer = rotation(link.parent), rotation(link.body)
     relative = inner.T @ outer
@@ -480,12 +480,12 @@ def _compute_joint_coordinates(tree: Tree, link: Link, motion: Motion, x: Array)
                 (outer[1, 0] - outer[0, 1]) / (4 * w),
             ]
             if step.free:
-                x[k + 4 : k + 7] = numbers(motion.point(link.body, link.at)) - link.at
+                x[k + 4 : k + 7] = to_floats(motion.point(link.body, link.at)) - link.at
     turns = [step for step in steps if step.turns]
     for step in steps:
         if step.slide and not step.turns:
-            apart = numbers(motion.point(link.body, link.at))
-            apart = apart - (numbers(motion.point(link.parent, link.at)) if link.parent != BASE else link.at)
+            apart = to_floats(motion.point(link.body, link.at))
+            apart = apart - (to_floats(motion.point(link.parent, link.at)) if link.parent != BASE else link.at)
             x[step.position] = step.sign * ((inner.T @ apart) @ step.axis) / step.slide
     if len(turns) == 1:
         (step,) = turns

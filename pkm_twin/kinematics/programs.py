@@ -76,7 +76,7 @@ def forward_program(t: Traced) -> Program:
     """Write the program of :attr:`.engine.Engine.forward`."""
     t.solve()
     position, rotation = t.motion.platform()
-    values = poses.values(t.scheme.coordinates, position, rotation)
+    values = poses.evaluate_coordinates(t.scheme.coordinates, position, rotation)
     outputs = {
         "pose": t.lift(values),
         "position": t.lift(position),
@@ -167,7 +167,7 @@ def confirm_pose(t: Traced, leads: Numbers, *, rates: bool = False) -> tuple[Equ
     """
     t.solve()
     pose = t.tape.inputs("pose", len(t.scheme.coordinates))
-    there = poses.values(t.scheme.coordinates, *t.motion.platform())
+    there = poses.evaluate_coordinates(t.scheme.coordinates, *t.motion.platform())
     same: list[Any] = []
     for c, scale, a, b in zip(t.scheme.coordinates, t.pose_scales, there, pose, strict=True):
         apart = a - b
@@ -248,7 +248,7 @@ def actuator_program(t: Traced) -> Program:
     factors = pose_factors(t)
     effort = factors.solve_transposed(t.drives.leading_efforts([*tau]))
     outputs = {
-        "pose": t.lift(poses.values(t.scheme.coordinates, position, rotation)),
+        "pose": t.lift(poses.evaluate_coordinates(t.scheme.coordinates, position, rotation)),
         "velocity": t.lift(velocity),
         "effort": t.lift(effort),
     }

@@ -22,7 +22,7 @@ from pkm_twin.kinematics.iterations import RELATIVE_RANK_TOLERANCE
 from pkm_twin.kinematics.limb_pose import Limb, LimbPose, place_in_order
 from pkm_twin.kinematics.limbs import find_hanging_limbs
 from pkm_twin.kinematics.linkage import Linkage, count_rank
-from pkm_twin.kinematics.motion import Motion, Row, closure_jacobians, numbers
+from pkm_twin.kinematics.motion import Motion, Row, closure_jacobians, to_floats
 from pkm_twin.kinematics.pose import Coordinate
 from pkm_twin.kinematics.spins import null_space
 from pkm_twin.kinematics.three_rods import find_three_rods
@@ -216,8 +216,8 @@ class Scheme(Linkage):
         samples = []
         for x, q in self.samples:
             there, closed = self.evaluate_state(x, q)
-            position, rotation = (numbers(part) for part in there.platform())
-            here = [float(v) for v in poses.values(self.coordinates, position, rotation)]
+            position, rotation = (to_floats(part) for part in there.platform())
+            here = [float(v) for v in poses.evaluate_coordinates(self.coordinates, position, rotation)]
             samples.append(self._inverse_matrix(there, closed, here))
         return pivot_order(np.array(samples))
 
@@ -229,9 +229,9 @@ class Scheme(Linkage):
             motion, rows = self.evaluate_state(x, q)
             ju, jq = self.scaled_jacobians(rows)
             follow = -np.linalg.solve(ju[self.independent], jq[self.independent])
-            position, rotation = (numbers(part) for part in motion.platform())
-            here = [float(v) for v in poses.values(self.coordinates, position, rotation)]
-            table = numbers(self.pose_rows(motion, here))
+            position, rotation = (to_floats(part) for part in motion.platform())
+            here = [float(v) for v in poses.evaluate_coordinates(self.coordinates, position, rotation)]
+            table = to_floats(self.pose_rows(motion, here))
             drives = np.array([self.drive_scale(name) for name in self.graph.leads])
             own = table[:, n:] / drives + (table[:, :n] / np.array(self.tree.scales)) @ follow
             tables.append(np.array(self._pose_scales)[:, None] * own)
@@ -275,7 +275,7 @@ class Scheme(Linkage):
         """Return the dimensionless Jacobian of closures and pose equations by u and qd."""
         ju, jq = self.scaled_jacobians(rows)
         extra = self.pose_rows(motion, pose)
-        table = np.array(self._pose_scales)[:, None] * numbers(extra)
+        table = np.array(self._pose_scales)[:, None] * to_floats(extra)
         n = self.tree.unknown_rates
         drives = np.array([self.drive_scale(name) for name in self.graph.leads])
         lower = np.hstack([table[:, :n] / np.array(self.tree.scales), table[:, n:] / drives])
@@ -382,10 +382,10 @@ def _pose_rates(graph: Graph) -> dict[str, Array]:
     """
     scheme = Scheme(graph, tuple(poses.COORDINATES.values()))
     motion, closed = scheme.evaluate_state(scheme.tree.home, graph.lead_home)
-    ju, jq = (numbers(m) for m in closure_jacobians(scheme.tree, closed))
+    ju, jq = (to_floats(m) for m in closure_jacobians(scheme.tree, closed))
     independent = scheme.independent
     rates = np.vstack([-np.linalg.solve(ju[independent], jq[independent]), np.eye(scheme.joints)])
-    rows = numbers(scheme.pose_rows(motion, [0.0] * len(scheme.coordinates)))
+    rows = to_floats(scheme.pose_rows(motion, [0.0] * len(scheme.coordinates)))
     scales = np.array(scheme._pose_scales)[:, None]
     return dict(zip(poses.COORDINATES, scales * rows @ rates, strict=True))
 
@@ -397,7 +397,7 @@ def check_masses(scheme: Scheme, graph: Graph) -> None:
     :raises ParameterError: names a massless body that can move alone.
     """
     motion, rows = scheme.evaluate_state(scheme.tree.home, graph.lead_home)
-    ju, jq = (numbers(m) for m in closure_jacobians(scheme.tree, rows))
+    ju, jq = (to_floats(m) for m in closure_jacobians(scheme.tree, rows))
     moved = -np.linalg.solve(ju[scheme.independent], jq[scheme.independent])
     n = scheme.joints
     table = []
@@ -411,12 +411,12 @@ def check_masses(scheme: Scheme, graph: Graph) -> None:
             # A square root R of the inertia: R' R = inertia.
             moments, axes = np.linalg.eigh(body.inertia)
             root = np.sqrt(np.maximum(moments, 0.0))[:, None] * axes.T
-            column += [*(math.sqrt(body.mass) * numbers(motion.velocity(body.name, body.com)))]
-            column += [*(root @ numbers(motion.omega[body.name]))]
+            column += [*(math.sqrt(body.mass) * to_floats(motion.velocity(body.name, body.com)))]
+            column += [*(root @ to_floats(motion.omega[body.name]))]
         for rod in graph.rods.values():
             ends = zip((rod.inner, rod.outer), rod.ends, strict=True)
             for body_name, end in ends:
-                column += [*(math.sqrt(rod.mass) * numbers(motion.velocity(body_name, end)))]
+                column += [*(math.sqrt(rod.mass) * to_floats(motion.velocity(body_name, end)))]
         table.append(column)
     values = np.array(table, float)
     size = np.linalg.norm(values, axis=1, keepdims=True)

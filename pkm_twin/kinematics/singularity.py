@@ -50,7 +50,7 @@ from pkm_twin.kinematics.motion import (
     Motion,
     Row,
     closure_jacobians,
-    numbers,
+    to_floats,
 )
 from pkm_twin.kinematics.traced import Traced
 from pkm_twin.machine.graph import BASE, Graph, group_connected, weld
@@ -188,7 +188,7 @@ class _NumericTraced:
         if x is None:
             raise SingularityError("q", (), 0.0, 1e-9)
         self.motion, rows = linkage.evaluate_state(x, q)
-        ju, jq = (numbers(m) for m in closure_jacobians(linkage.tree, rows))
+        ju, jq = (to_floats(m) for m in closure_jacobians(linkage.tree, rows))
         if ju.size and np.linalg.matrix_rank(ju, 1e-9) < ju.shape[1]:
             raise SingularityError("home", (), 0.0, 1e-9)
         self._rates = -np.linalg.lstsq(ju, jq, rcond=1e-9)[0]
@@ -227,9 +227,9 @@ def _motion_singularity(t: Traced | _NumericTraced, point: bool) -> Any:
     :param point: the pose has no angle, so the platform counts as its reference point.
     """
     n, graph = t.joints, weld(t.graph)
-    rates = _TwistMatrices(t, graph)
+    rates = _TwistJacobians(t, graph)
     tool = (graph.origin, 0.0) if point else graph.body_scale(graph.platform)
-    twist = rates.twist_matrix(graph.platform, tool)[: 3 if point else 6]
+    twist = rates.twist_jacobian(graph.platform, tool)[: 3 if point else 6]
     table = _gram([{("u", j): v for j, v in enumerate(row)} for row in twist], n)
     lower = {(a, b): table[a, b] for a in range(n) for b in range(a + 1)}
     # Keep pivots positive if the platform rests while a joint moves.
@@ -243,8 +243,8 @@ def _motion_singularity(t: Traced | _NumericTraced, point: bool) -> Any:
     return sqrt(n / farthest)
 
 
-class _TwistMatrices:
-    """Compute the bodies' twist closure_jacobians D = S U.
+class _TwistJacobians:
+    """Compute the bodies' twist Jacobians D = S U.
 
     S: a body's twist per rate of the tree joints between base and body. U: these rates per rate of
     the leading joints.
@@ -260,10 +260,11 @@ class _TwistMatrices:
         self._halves: dict[tuple[str, int], list[Any]] = {}
         self._products: dict[tuple[tuple[str, int], tuple[str, int]], Any] = {}
 
-    def tree_columns(self, name: str, frame: tuple[Any, Any]) -> dict[tuple[str, int], list[Any]]:
-        """Return S: per tree rate, the centre's velocity and the angular velocity times radius.
+    def tree_jacobian(self, name: str, frame: tuple[Any, Any]) -> dict[tuple[str, int], list[Any]]:
+        """Return S: the body's scaled twist (6 entries) per rate of each tree joint, by joint.
 
-        :param frame: centre and radius.
+        :param frame: the point of the body whose velocity is taken, and the length that multiplies
+            the angular velocity.
         """
         centre, reach = frame
         linear = self.motion.linear_jacobian(name, self.motion.point(name, centre))
@@ -274,10 +275,10 @@ class _TwistMatrices:
             for k in dict.fromkeys([*linear, *turning])
         }
 
-    def twist_matrix(self, name: str, frame: tuple[Any, Any]) -> list[list[Any]]:
+    def twist_jacobian(self, name: str, frame: tuple[Any, Any]) -> list[list[Any]]:
         """Return D: the body's scaled twist (6 rows) per rate of each leading joint (columns)."""
         rows: list[list[Any]] = [[0.0] * self.n for _ in range(6)]
-        for key, six in self.tree_columns(name, frame).items():
+        for key, six in self.tree_jacobian(name, frame).items():
             for row, value in zip(rows, six, strict=True):
                 for j, rate in enumerate(self._by_joints[key]):
                     row[j] = row[j] + value * rate
@@ -289,10 +290,10 @@ class _TwistMatrices:
         Computed from D, or from S'S and U (T'T)^-1 U', whichever takes fewer operations.
         """
         frame = self.graph.body_scale(name)
-        columns = list(self.tree_columns(name, frame).items())
+        columns = list(self.tree_jacobian(name, frame).items())
         total: Any = 0.0
         if len(columns) > self.n:
-            for row in self.twist_matrix(name, frame):
+            for row in self.twist_jacobian(name, frame):
                 half = root.forward(row)
                 total = total + sum((v * v * e for v, e in zip(half, root.inverses, strict=True)), 0.0)
             return total

@@ -43,7 +43,7 @@ def _write_stream_program(t: Traced) -> Program:
     before = t.tape.inputs("before", n + m + m * m + m + 1)
     t.solve()
     position, rotation = t.motion.platform()
-    pose = scales * np.array(poses.values(t.scheme.coordinates, position, rotation), dtype=object)
+    pose = scales * np.array(poses.evaluate_coordinates(t.scheme.coordinates, position, rotation), dtype=object)
     twists = t.twists(t.graph.platform, position, t.rate_columns())
     columns = [poses.rates(t.scheme.coordinates, rotation, v, w) for v, w in twists]
     rates = scales[:, None] * np.array(columns, dtype=object).T

@@ -18,7 +18,7 @@ from pkm_twin.codegen.arrays import Array
 from pkm_twin.codegen.expressions import Numbers, Objects, cross, snapped, snapped_all
 from pkm_twin.codegen.operations import absolute, maximum, sqrt
 from pkm_twin.kinematics.limb_pose import sign_of, square_of
-from pkm_twin.kinematics.limbs import Closures
+from pkm_twin.kinematics.limbs import SolvableLinkage
 from pkm_twin.kinematics.motion import Motion
 from pkm_twin.machine.graph import UP, Graph
 from pkm_twin.machine.tree import Tree
@@ -102,7 +102,7 @@ class ThreeRods:
         return (far, miss) if left < 0.0 and np.isfinite(miss) else None
 
 
-def find_three_rods(scheme: Closures) -> ThreeRods | None:
+def find_three_rods(scheme: SolvableLinkage) -> ThreeRods | None:
     """Find three rods that hold a translating body, if its translation is the only unknown motion."""
     tree, rods = scheme.tree, [scheme.parts[k] for k in scheme.independent]
     loose = [link for link in tree.links.values() if not all(s.actuated for s in link.steps)]

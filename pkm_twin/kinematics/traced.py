@@ -262,14 +262,14 @@ class Traced:
         return Factors(limbs, jq, lu, solved, newton)
 
     @property
-    def _here(self) -> Factors:
+    def _current_factors(self) -> Factors:
         """Limbs and factors in the current state."""
         jq = self.jq[self.scheme.independent]
         return Factors(self.limbs, jq, self.lu, self.solved, self.newton)
 
     def rates_of_joints(self, names: Sequence[str]) -> Objects:
         """Return rates of passive joints per rate of each drive, shape (names, n)."""
-        return np.array([self._rates_by_closures(name, self._here) for name in names], object)
+        return np.array([self._rates_by_closures(name, self._current_factors) for name in names], object)
 
     def _rates_by_closures(self, name: str, at: Factors) -> Objects:
         unit = np.eye(at.lu.size)[self.scheme.varying.index(self.tree.steps[name].rate)]
@@ -280,7 +280,7 @@ class Traced:
 
         :param home: return the rates at home instead of the present state.
         """
-        at, kept = self._at_home if home else self._here, self.scheme.newton_unknowns[1]
+        at, kept = self._at_home if home else self._current_factors, self.scheme.newton_unknowns[1]
         reaches = {limb.reach: pose for limb, pose in zip(self.scheme.limbs, at.limbs, strict=True)}
         bodies = {step.joint: link.body for link in self.tree.links.values() for step in link.steps}
         rows = []

@@ -20,7 +20,7 @@ from pkm_twin.machine.tree import Tree
 
 @dataclass(frozen=True, eq=False)
 class SizedGraph(Graph):
-    """A graph whose scale lengths (size, rim and frames) are given instead of computed."""
+    """A graph whose scale lengths (size, platform radius and frames of bodies) are given instead of computed."""
 
     given: Sequence[Any] = field(default=())
     names: tuple[str, ...] = ()
@@ -33,7 +33,7 @@ class SizedGraph(Graph):
 
     @property
     def platform_radius(self) -> Any:
-        """The given rim, m."""
+        """The given radius of the platform, m."""
         return self.given[1]
 
     def body_scale(self, body: str) -> tuple[Array, Any]:

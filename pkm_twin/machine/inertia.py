@@ -28,10 +28,10 @@ _MATRIX_ENTRIES: Final = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 STANDARD_UNITS: Final = ("kg", *["kg m"] * 3, *["kg m2"] * 6)
 PARTS: Final = ("bodies", "rods", "gravity", "viscous", "coulomb", "offset", "laws", "rotors", "passive")
 """Parts of the parameter vector, in order."""
-GRAVITY: Final = 2
+GRAVITY_PART: Final = 2
 LAWS_PART: Final = 6
 ROTORS_PART: Final = 7
-"""Indices of parts, see :meth:`Layout.part`."""
+"""Indices in :data:`PARTS` of gravity, of the drives' friction laws and of their rotor inertias."""
 
 
 def standard_parameters(mass: float, com: Array, inertia: Array) -> Array:
@@ -166,10 +166,10 @@ class Layout:
         """Indices of all friction parameters that efforts are linear in, also of passive joints."""
         starts, keys = self.starts, list_parameters(self.tree.graph.laws).values()
         passive = np.arange(starts[8], starts[9])
-        rubs = passive[np.arange(len(passive)) % 3 < 2]
+        friction_entries = passive[np.arange(len(passive)) % 3 < 2]
         linear = np.repeat([one.linear for one in keys], len(self.tree.graph.actuated))
         laws = np.arange(starts[6], starts[7])[linear.astype(bool)]
-        return np.concatenate([np.arange(starts[3], starts[6]), laws, rubs]).astype(np.intp)
+        return np.concatenate([np.arange(starts[3], starts[6]), laws, friction_entries]).astype(np.intp)
 
     def laws(self, part: Objects) -> dict[str, Objects]:
         """Split part ``laws`` into the friction laws' parameters by key, shape (n,) each."""

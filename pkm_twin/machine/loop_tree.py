@@ -202,14 +202,14 @@ class SingleAxisJoint(NamedTuple):
     """The joint of which this is one freedom."""
 
     @property
-    def whole(self) -> bool:
+    def is_only_freedom(self) -> bool:
         """True if the joint has this freedom alone, so that its limits and friction belong here."""
         return self.name == self.joint.name
 
     @property
     def home(self) -> float:
         """The value as drawn."""
-        return self.joint.drawn if self.whole else 0.0
+        return self.joint.drawn if self.is_only_freedom else 0.0
 
 
 def order_from_root(root: str, joints: Iterable[Joint]) -> list[TreeJoint]:
@@ -259,7 +259,7 @@ def list_screws(parts: Sequence[SingleAxisJoint]) -> list[tuple[str, str, float,
     return [
         (slide.name, turn.name, turn.joint.pitch, -turn.joint.pitch * turn.home)
         for turn, slide in pairwise(parts)
-        if slide.joint.type.threaded() and not slide.whole
+        if slide.joint.type.threaded() and not slide.is_only_freedom
     ]
 
 

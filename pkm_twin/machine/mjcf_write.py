@@ -156,7 +156,7 @@ def _write_body(parent: ET.Element, link: Link, place: Array, before: Array) -> 
 
 
 def _write_joint(part: SingleAxisJoint, place: Array) -> dict[str, str]:
-    joint, limits = part.joint, part.joint.limits if part.whole else {}
+    joint, limits = part.joint, part.joint.limits if part.is_only_freedom else {}
     found = {
         "name": part.name,
         "type": {"revolute": "hinge", "prismatic": "slide"}[part.kind],
@@ -171,6 +171,6 @@ def _write_joint(part: SingleAxisJoint, place: Array) -> dict[str, str]:
     if "effort" in limits:
         found["actuatorfrcrange"] = number_text([-limits["effort"], limits["effort"]])
     for key, value in (("damping", joint.viscous), ("frictionloss", joint.coulomb), ("armature", joint.rotor_inertia)):
-        if value and part.whole:
+        if value and part.is_only_freedom:
             found[key] = number_text([value])
     return found

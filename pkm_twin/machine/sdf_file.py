@@ -194,7 +194,7 @@ class Model:
 
         :raises ParameterError: the frame is unknown, or depends on itself.
         """
-        return self._express_outside(self.local(name, where), None)
+        return self._express_outside(self.resolve_frame(name, where), None)
 
     def _express_outside(self, frame: Pose, end: Model | None) -> Pose:
         """Return a frame of this model in an outer model, by default in the world."""
@@ -207,10 +207,10 @@ class Model:
         """Return the model's frame in the outer model."""
         found = self._read_frame(self.element, MODEL, self.outer)
         placed = self.element.get("placement_frame")
-        return found @ self.local(placed, "placement_frame").inverse() if placed else found
+        return found @ self.resolve_frame(placed, "placement_frame").inverse() if placed else found
 
-    def local(self, name: str, where: str) -> Pose:
-        """Return a frame in this model."""
+    def resolve_frame(self, name: str, where: str) -> Pose:
+        """Return the pose of a named frame in this model."""
         if name in self._known:
             found = self._known[name]
             if found is None:
@@ -220,9 +220,9 @@ class Model:
         model, own = self._find_nested(name, where)
         part = None if own in (MODEL, WORLD) else model.parts[own]
         if model is not self:
-            found = model._express_outside(model.local(own, where), self)
+            found = model._express_outside(model.resolve_frame(own, where), self)
         elif part is None and name == WORLD and self.outer is not None:
-            found = self.pose().inverse() @ self.outer.local(WORLD, where)
+            found = self.pose().inverse() @ self.outer.resolve_frame(WORLD, where)
         elif part is None:
             found = Pose()
         elif part.tag == "model":
@@ -240,7 +240,7 @@ class Model:
         name = default
         if stated is not None:
             name = stated.get("relative_to") or stated.get("frame") or default
-        return (Pose() if scope is None else scope.local(name, where)) @ pose(stated, where)
+        return (Pose() if scope is None else scope.resolve_frame(name, where)) @ pose(stated, where)
 
     def link(self, name: str, where: str = "attached_to") -> str:
         """Find the link that a frame is attached to.

@@ -71,7 +71,8 @@ def write_sdf(tree: LoopTree) -> str:
         ET.SubElement(element, "child").text = names[child]
         count = 0 if kind in ("fixed", "ball") else 1 if kind == "screw" else len(parts)
         for tag, part in zip(("axis", "axis2"), parts[:count], strict=False):
-            axis, joint, limits = ET.SubElement(element, tag), part.joint, part.joint.limits if part.whole else {}
+            axis, joint = ET.SubElement(element, tag), part.joint
+            limits = joint.limits if part.is_only_freedom else {}
             ET.SubElement(axis, "xyz").text = number_text(part.axis)
             limit = ET.SubElement(axis, "limit")
             # SDF's number for no limit; positions count from home.
@@ -82,7 +83,7 @@ def write_sdf(tree: LoopTree) -> str:
             for key in ("effort", "velocity"):
                 if key in limits:
                     ET.SubElement(limit, key).text = number_text([limits[key]])
-            if part.whole and (joint.viscous or joint.coulomb):
+            if part.is_only_freedom and (joint.viscous or joint.coulomb):
                 dynamics = ET.SubElement(axis, "dynamics")
                 ET.SubElement(dynamics, "damping").text = number_text([joint.viscous])
                 ET.SubElement(dynamics, "friction").text = number_text([joint.coulomb])

@@ -194,7 +194,7 @@ class Tree:
     def _attach_body(self, parent: str, body: str, name: str | None) -> None:
         graph = self.graph
         if name is None:
-            # A point of the geometry, which programs have at run time; a centre of mass is none.
+            # Use a point that is an input of compiled programs; a centre of mass is not one.
             at = graph.origin if body == graph.platform else graph.body_scale(body)[0]
             backwards, actuated = False, False
             freedoms: tuple[Freedom, ...] = ()

@@ -162,13 +162,13 @@ def _write_joint(robot: ET.Element, part: SingleAxisJoint, places: Mapping[str, 
     if part.kind == "fixed":
         return element
     ET.SubElement(element, "axis", xyz=number_text(part.axis))
-    limits = part.joint.limits if part.whole else {}
+    limits = part.joint.limits if part.is_only_freedom else {}
     free = UNLIMITED[part.kind]
     low, high = limits.get("position", (-free, free))
     bounds = {"lower": low, "upper": high}
     bounds |= {key: limits.get(key, UNLIMITED[key]) for key in ("velocity", "effort")}
     ET.SubElement(element, "limit", {key: number_text([v]) for key, v in bounds.items()})
-    if part.whole:
+    if part.is_only_freedom:
         _write_dynamics(element, part.joint)
     return element
 

@@ -169,7 +169,7 @@ class Machine(TwinRobot):
         robot.engine.check()
         check_masses(robot.engine, robot.graph)
         _ = robot.passive_limits
-        _ = robot.causes
+        _ = robot.uncertainty_changes
         robot.check_stiffness_factors()
         return robot
 

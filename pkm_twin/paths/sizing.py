@@ -472,10 +472,10 @@ def size_drives(
         if drive is not None:
             torques = axis.torques(drive.inertia, drive)
             speeds = drive.turns * axis.qd
-            losses = 0.5 * (axis.losses(drive)[:-1] + axis.losses(drive)[1:])
+            factors = 0.5 * (axis.efficiency_factor(drive)[:-1] + axis.efficiency_factor(drive)[1:])
             turning = (change * mean * step)[:, i]
             own_net = drive.inertia * drive.turns**2 * turning
-            own_net = own_net + (net[:, i] - rotor * turning) * losses
+            own_net = own_net + (net[:, i] - rotor * turning) * factors
             ratio = span[1] / drive.turns**2 / drive.inertia if drive.inertia > 0.0 else None
             duty = replace(
                 duty,
@@ -533,9 +533,9 @@ class _Axis:
     def torques(self, inertia: float, drive: DriveSpec) -> Array:
         """Return the motor's torques (module equation), (k,), N m; ``inertia``: at the motor."""
         turns = drive.turns
-        return np.asarray(inertia * turns * self.qdd + self.through * self.losses(drive) / turns)
+        return np.asarray(inertia * turns * self.qdd + self.through * self.efficiency_factor(drive) / turns)
 
-    def losses(self, drive: DriveSpec) -> Array:
+    def efficiency_factor(self, drive: DriveSpec) -> Array:
         """Return the factor by which the gear's efficiency changes the load, shape (k,)."""
         back = self.through * self.qd < 0.0
         return np.where(back, drive.efficiency, 1.0 / drive.efficiency)

@@ -20,13 +20,13 @@ from pkm_twin.robot.workspace import belong_to_workspace, describe_causes, try_i
 DEFAULT_RAYS: Final = 1000
 """Rays from home on which poses of the workspace are taken."""
 COARSE_DIRECTIONS: Final = 32
-"""Directions of the tool point's speed at all poses."""
+"""Number of directions of the tool point's velocity that are tried at every pose."""
 FINE_DIRECTIONS: Final = 2000
-"""Directions at each drive's worst poses."""
+"""Number of directions that are tried at each drive's worst poses."""
 MIN_SINGULARITY_INDEX: Final = 0.05
-"""Default smallest singularity index of a pose that counts."""
-MIN_LEVER: Final = 0.3
-"""Default smallest lever of a drive at a pose that counts, over its largest."""
+"""Default: poses with a smaller singularity index are left out."""
+MIN_LEVER_RATIO: Final = 0.3
+"""Default: poses at which the lever of a drive is below this fraction of its largest lever are left out."""
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ def worst_over_workspace(
     acceleration: float,
     *,
     singularity: float = MIN_SINGULARITY_INDEX,
-    lever: float = MIN_LEVER,
+    lever: float = MIN_LEVER_RATIO,
     rays: int = DEFAULT_RAYS,
 ) -> Worst:
     """Find the drives' largest efforts and speeds, for the worst directions of the tool point.

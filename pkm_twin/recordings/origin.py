@@ -24,7 +24,8 @@ from pkm_twin.recordings.tables import WRENCH, Table
 from pkm_twin.robot.robot import Robot
 
 COMPUTED_WITH: Final = "computed_with"
-"""Key of the digest; in a table, the column's name is this key, a dot and the robot's name."""
+"""Metadata key of the hash of the robot file from which efforts were computed; in a table, the
+column's name is this key, a dot and the robot's name."""
 MARK: Final = f"{COMPUTED_WITH}."
 GRAVITY: Final = ("gravity.x", "gravity.y", "gravity.z")
 

@@ -20,7 +20,8 @@ from pkm_twin.recordings.tables import PAYLOAD, Table
 from pkm_twin.robot.plausibility import check_payload_mass
 from pkm_twin.robot.robot import Robot
 
-SOURCES = {"bag": "recording", "table": "table, as sampled", "path": "path's waypoints"}
+SOURCE_NAMES = {"bag": "recording", "table": "table, as sampled", "path": "path's waypoints"}
+"""How reports name the source of a payload, by :attr:`Load.source`."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,7 @@ class Load:
 
     def __str__(self) -> str:
         at = "" if self.com is None else " at " + ", ".join(f"{v:g}" for v in self.com) + " m"
-        told = "from --payload" if self.source == "option" else f"from the {SOURCES[self.source]}"
+        told = "from --payload" if self.source == "option" else f"from the {SOURCE_NAMES[self.source]}"
         words = [f"{b:g} s on" if e == math.inf else f"{b:g} to {e:g} s" for b, e in self.times]
         if self.masses:
             masses = zip(self.masses, words, strict=True)

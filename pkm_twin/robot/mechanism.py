@@ -47,7 +47,7 @@ from pkm_twin.settings import map_parameters
 
 EFFORT_SHARING_NOTE: Final = "a controller may share efforts in any way"
 """Why measured efforts of a redundantly actuated machine have no unique cause: internal loads may be superposed."""
-FREE_FALL: Final = (0.0, 0.0, -9.81)
+DEFAULT_GRAVITY: Final = (0.0, 0.0, -9.81)
 """Gravity of files without one, base axes, m/s2."""
 R = TypeVar("R", bound="Mechanism")
 
@@ -58,7 +58,7 @@ class Common:
 
     mechanism: str
     payload: Payload = schema.section(Payload, default={})
-    gravity: Array = schema.vector(3, unit="m/s2", text="free fall, base axes", default=list(FREE_FALL))
+    gravity: Array = schema.vector(3, unit="m/s2", text="free fall, base axes", default=list(DEFAULT_GRAVITY))
     joint_map: Mapping[str, JointMapEntry] = schema.mapping(JointMapEntry, default={})
     uncertainty: Mapping[str, UncertaintyEntry] = schema.mapping(UncertaintyEntry, default={})
     tolerances: Mapping[str, Tolerance] = schema.mapping(Tolerance, default={})
@@ -129,7 +129,7 @@ class Mechanism(Common):
         robot = schema.build(cls, data)
         robot = dataclasses.replace(robot, name=name, home_joint=robot.chosen_home())
         _ = robot.controller
-        _ = robot.causes
+        _ = robot.uncertainty_changes
         robot.check_stiffness_factors()
         return robot
 
@@ -306,8 +306,8 @@ class Mechanism(Common):
         return dataclasses.replace(graph, laws=laws) if laws else graph
 
     @cached_property
-    def causes(self) -> Mapping[str, Mapping[str, float]]:
-        """The changes of numbers, by path, for one standard deviation of each uncertainty."""
+    def uncertainty_changes(self) -> Mapping[str, Mapping[str, float]]:
+        """By uncertainty, the changes of the file's numbers, by path, for one standard deviation of it."""
         return list_causes(self.uncertainty, self.file_numbers())
 
     def __getstate__(self) -> dict[str, Any]:

@@ -85,7 +85,7 @@ class CauseSlopes:
     """
 
     def __init__(self, robot: Robot, compute: Callable[[Robot], Sequence[Any]]) -> None:
-        causes = robot.causes.values()
+        causes = robot.uncertainty_changes.values()
         paths = tuple(dict.fromkeys(path for cause in causes for path in cause))
         steps = np.array([[cause.get(path, 0.0) for cause in causes] for path in paths])
         table = FileNumbers(robot, paths, compute).slopes @ steps.reshape(len(paths), len(causes))

@@ -112,7 +112,7 @@ def reject_joints(
     drive, change = _find_correction(robot, engine, sample)
     if change < np.inf and robot.graph.joints[drive].slides:
         raise UnreachableError("joint state", robot.name_limb(drive), index, change)
-    part, miss, measure = engine.explain_end(sample, reached)
+    part, miss, measure = engine.explain_missing_assembly(sample, reached)
     if measure is not None:
         raise SingularityError("joint state", index, measure, SINGULARITY_BOUND, reached, question=question)
     limb = robot.name_limb(drive if change < np.inf else part)

@@ -41,7 +41,10 @@ class ControlLoop(Protocol):
     tau: Array
 
     def __call__(self) -> int:
-        """Return 0 if all samples are good, 1 if one has no assembly, 2 if one is not finite."""
+        """Evaluate the inputs and fill ``tau``.
+
+        :returns: 0 if all samples are good, 1 if one has no assembly, 2 if one is not finite.
+        """
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

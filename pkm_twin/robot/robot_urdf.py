@@ -24,7 +24,7 @@ from pkm_twin.machine.rotations import Pose
 from pkm_twin.machine.sdf_write import write_sdf
 from pkm_twin.machine.urdf_control import Control, tree_names
 from pkm_twin.machine.urdf_write import GROUND, MOCK_HARDWARE, PLATFORM, write_urdf
-from pkm_twin.robot.mechanism import FREE_FALL
+from pkm_twin.robot.mechanism import DEFAULT_GRAVITY
 from pkm_twin.robot.outline import list_bars
 from pkm_twin.robot.robot import Robot
 
@@ -91,8 +91,8 @@ def _warn_of_losses(robot: Robot, where: str) -> None:
             for joint in robot.graph.joints.values()
             if joint.rotor_inertia and not (where == "URDF" and joint.actuated)
         ]
-        if tuple(robot.gravity) != FREE_FALL:
-            lost.append(f"gravity {robot.gravity.tolist()}: it becomes {list(FREE_FALL)}")
+        if tuple(robot.gravity) != DEFAULT_GRAVITY:
+            lost.append(f"gravity {robot.gravity.tolist()}: it becomes {list(DEFAULT_GRAVITY)}")
     if where != "URDF":
         constant = zip(robot.joint_names, robot.friction.offset, strict=True)
         lost += [f"the constant friction of {name}" for name, offset in constant if offset]

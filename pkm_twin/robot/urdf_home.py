@@ -24,7 +24,7 @@ from pkm_twin.errors import ParameterError, SingularityError
 from pkm_twin.kinematics.constraints import Equation, angle_equation, constraint_equations
 from pkm_twin.kinematics.iterations import newton
 from pkm_twin.kinematics.linkage import Linkage
-from pkm_twin.kinematics.motion import Motion, numbers
+from pkm_twin.kinematics.motion import Motion, to_floats
 from pkm_twin.kinematics.rounding import MAX_ERROR_GROWTH, MAX_ROUNDING, MAX_ZERO_SINGULAR_VALUE, Repair, repair_rounded
 from pkm_twin.kinematics.scheme import choose_leads
 from pkm_twin.kinematics.singularity import singularity_at_home
@@ -100,15 +100,15 @@ class Assembly:
     def move(self, link: str) -> Pose:
         """Return how a link has moved since it was drawn, in the root's axes."""
         if link not in self._moves:
-            turn = numbers(self._motion.rotation_from_home(self._bodies[link]))
-            at = numbers(self._motion.point(self._bodies[link], np.zeros(3)))
+            turn = to_floats(self._motion.rotation_from_home(self._bodies[link]))
+            at = to_floats(self._motion.point(self._bodies[link], np.zeros(3)))
             self._moves[link] = Pose(turn, at)
         return self._moves[link]
 
     def places(self) -> Array:
         """Return the positions of the links, shape (links, 3), m."""
         at, links = self._motion.point, self.tree.links
-        return numbers([at(body, links[n].frame.position) for n, body in self._bodies.items()])
+        return to_floats([at(body, links[n].frame.position) for n, body in self._bodies.items()])
 
     def points(self) -> Array:
         """Return the positions of the links and of the loops' joints, which tell assemblies apart, (points, 3), m."""

@@ -15,7 +15,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from pkm_twin.export.moveit import MAX_POSITION_ERROR, MAX_ROTATION_ERROR, moveit_package
-from pkm_twin.kinematics.pose import values
+from pkm_twin.kinematics.pose import evaluate_coordinates
 from test.support.robots import load, partly_long, random_joints
 
 from .c_programs import COMPILERS, STRICT, compile_in
@@ -184,7 +184,7 @@ def test_a_goal_is_what_the_machine_has_in_all_directions(plugin, states):
     turned = Rotation.from_rotvec(MAX_ROTATION_ERROR * shift[:, 3:]) * Rotation.from_quat(goals[:, 3:])
     goals[:, 3:] = turned.as_quat()
     placed = zip(goals[:, :3], turned.as_matrix(), strict=True)
-    q, good = robot.try_inverse([values(robot.coordinates, p, r) for p, r in placed])
+    q, good = robot.try_inverse([evaluate_coordinates(robot.coordinates, p, r) for p, r in placed])
     near = good.copy()
     near[good] = np.linalg.norm(goals[good, :3] - robot.platform(q[good])[0], axis=1) <= MAX_POSITION_ERROR
     relative = Rotation.from_matrix(robot.platform(q[good])[1]).inv() * turned[good]

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pkm_twin.kinematics.motion import Motion, numbers
+from pkm_twin.kinematics.motion import Motion, to_floats
 from pkm_twin.kinematics.programs import newton_step_program
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from test.laws.test_limbs import hexapod
@@ -116,5 +116,5 @@ def test_far_states_are_those_that_small_steps_lead_to(name, rng):
     for k in np.flatnonzero(known)[::4]:
         position, turn = robot.platform(q[k])
         place, rotation = Motion(engine.tree, x[k], q[k]).platform()
-        np.testing.assert_allclose(position, numbers(place), atol=1e-6)
-        np.testing.assert_allclose(turn, numbers(rotation), atol=1e-5)
+        np.testing.assert_allclose(position, to_floats(place), atol=1e-6)
+        np.testing.assert_allclose(turn, to_floats(rotation), atol=1e-5)

@@ -18,7 +18,7 @@ from delta_dynamics import (
 )
 from pkm_twin.errors import PkmTwinError
 from pkm_twin.kinematics.iterations import newton
-from pkm_twin.kinematics.motion import Motion, closure_jacobians, numbers
+from pkm_twin.kinematics.motion import Motion, closure_jacobians, to_floats
 from pkm_twin.mechanisms.catalogue import robot_of_data
 from test.machine.random_machines import NAMES as MACHINES
 from test.machine.random_machines import variant
@@ -72,7 +72,7 @@ def test_the_platform_is_that_of_all_closures(seed):
     for k in np.flatnonzero(known)[:20]:
         x = followed(engine, q[k])
         position, _ = Motion(engine.tree, x, q[k]).platform()
-        np.testing.assert_allclose(pose[k, :3], numbers(position), atol=1e-10)
+        np.testing.assert_allclose(pose[k, :3], to_floats(position), atol=1e-10)
 
 
 @pytest.mark.parametrize("seed", [1, 2])
@@ -84,8 +84,8 @@ def test_limbs_and_their_determinant_are_those_of_all_closures(seed):
         motion, limbs = engine.place(engine.tree, found, q)
         np.testing.assert_allclose(found.astype(float), x, atol=1e-10)
         rows = motion.closures()
-        solved = numbers(closure_jacobians(engine.tree, engine.newton_rows(rows, limbs))[0])
-        whole = numbers(closure_jacobians(engine.tree, rows)[0])[engine.independent]
+        solved = to_floats(closure_jacobians(engine.tree, engine.newton_rows(rows, limbs))[0])
+        whole = to_floats(closure_jacobians(engine.tree, rows)[0])[engine.independent]
         turns = np.prod([float(slope) for limb in limbs for slope, _ in limb.slopes])
         part = np.linalg.det(solved[:, engine.newton_unknowns[1]]) * turns
         ratios.append(np.linalg.det(whole) / part)

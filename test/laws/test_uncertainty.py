@@ -99,7 +99,7 @@ def test_effects_are_differences_of_machines_with_other_numbers() -> None:
         (compliance_effects(robot, pose), lambda r: compliance(r, pose)),
         (energy_effects(robot, pose, loads), lambda r: strain_energy(r, pose, loads).energies),
     ):
-        expected = np.stack([effect(cause, call) for cause in robot.causes.values()], -1)
+        expected = np.stack([effect(cause, call) for cause in robot.uncertainty_changes.values()], -1)
         assert expected.any()
         np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
 

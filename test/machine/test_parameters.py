@@ -124,7 +124,7 @@ def test_a_parameter_of_tolerances_and_doubt():
     step = 1e-6
     places = [robot.with_file_values({path: 0.2 + s}).platform(Q)[0] for s in (-step, step)]
     assert moved[:3] == pytest.approx((places[1] - places[0]) / (2 * step), abs=1e-7)
-    assert robot.causes[path] == {path: 1e-4}
+    assert robot.uncertainty_changes[path] == {path: 1e-4}
 
 
 def test_units_follow_from_where_a_parameter_stands():

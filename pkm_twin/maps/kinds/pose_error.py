@@ -31,7 +31,7 @@ class PoseError(Kind):
 
     def elements(self, robot: Robot) -> tuple[str, ...]:
         """Return the numbers of the geometry whose errors move the platform."""
-        return tuple(list(robot.causes)[k] for k in _moving_causes(robot))
+        return tuple(list(robot.uncertainty_changes)[k] for k in _moving_causes(robot))
 
     def found(self, robot: Robot, q: Array, case: Case) -> Found:
         """Return the standard deviation in the worst direction, joints at their set points.
@@ -50,7 +50,7 @@ def _moving_causes(robot: Robot) -> NDArray[np.intp]:
     :raises ParameterError: a file without standard deviations of the geometry, or with those of
     points or axes at home: all parts that meet there move along, and home still closes.
     """
-    for name, steps in robot.causes.items() if robot.mechanism == "machine" else ():
+    for name, steps in robot.uncertainty_changes.items() if robot.mechanism == "machine" else ():
         places = {"at", "axis", "axes", "ends"}
         shared = [path for path, step in steps.items() if step and places & {*split_path(path)[2:3]}]
         if shared:
