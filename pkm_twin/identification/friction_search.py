@@ -18,6 +18,8 @@ from pkm_twin.machine.friction import KNOWN_FRACTION, LAWS, Dahl
 
 STRIBECK_SPEEDS: Final = np.geomspace(0.01, 1.0, 17)
 """Candidate Stribeck speeds, as multiples of the RMS speed."""
+MIN_PERIODS: Final = 3.0
+"""Smallest number of periods within the travel: a slower effort may be another gravity or load."""
 PRESLIDING_DISTANCES: Final = np.geomspace(1e-4, 0.1, 24)
 """Candidate presliding distances, as fractions of the travel."""
 
@@ -99,7 +101,10 @@ class LawSearch:
 
     def list_candidates(self) -> Array:
         """List values of the nonlinear parameter that are compared, shape (candidates, n)."""
-        factors, scale = 1.0 / np.linspace(1.0, max(float(self._waves.max()), 2.0), 800), self._travel
+        factors, scale = (
+            1.0 / np.linspace(MIN_PERIODS, max(float(self._waves.max()), 2.0 * MIN_PERIODS), 800),
+            self._travel,
+        )
         if self.law.memory:
             factors = PRESLIDING_DISTANCES
         elif self.law.parameters[self.key].unit.endswith("/s"):
