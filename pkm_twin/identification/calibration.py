@@ -465,7 +465,7 @@ def _calibrated(
         steps=steps,
         faults=tuple(faults),
         cost=sum(((p.value - p.before) / p.prior) ** 2 for p in changes),
-        placed=apart is not None and not free.frame and _looks_placed(robot, learnt, found, told),
+        placed=apart is not None and not free.frame and _needs_instrument_frame(robot, learnt, found, told),
         instrument=found.state.instrument,
     )
 
@@ -509,7 +509,7 @@ def _compare_measurements(
     return tuple(agreements), outliers
 
 
-def _looks_placed(robot: Robot, measured: Measured, found: Fitted, told: Sequence[Parameter]) -> bool:
+def _needs_instrument_frame(robot: Robot, measured: Measured, found: Fitted, told: Sequence[Parameter]) -> bool:
     """Return whether a free frame of the instrument would reduce the residual by more than 20 %."""
     over, asked = found.weights.over, [(p.before - p.value) / p.prior for p in told]
     target = np.append(over(measured.parts(found.state)), asked)
@@ -525,7 +525,7 @@ def _judge_scale(
 ) -> tuple[Scale | None, list[Parameter], Array | None]:
     """Return how well the scale is known, and the parameters, marked where the scale limits them.
 
-    And the scale's derivatives, where it is not determined.
+    The last is the derivatives of the scale, None where it is determined.
     """
     # Joint states on lines between measured ones.
     rng, joints = np.random.default_rng(0), measured.joints

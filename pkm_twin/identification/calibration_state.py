@@ -156,7 +156,7 @@ def differentiate_poses(robot: Robot, state: State, names: Sequence[str]) -> Arr
     tool, machine, own = state.instrument, state.machine, state.instrument.map
     position, rotation = state.platform
     by_joints = machine.platform_jacobian(state.q[None])[0]
-    # By the joint map's numbers, at fixed positions of the controller.
+    # Differentiate joint positions by the joint map's numbers; the controller's positions are constant.
     away, slope = state.q - own.centres, own.slopes(state.q)
     wound = state.q + 0.5 * own.changes * away**2
     rates = {

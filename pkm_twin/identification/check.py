@@ -46,7 +46,7 @@ POSITION_STEPS: Final = "position steps"
 VELOCITIES: Final = "velocities"
 RESIDUAL: Final = "torque residual"
 MEASURED: Final = "measured efforts"
-COMPARED: Final = "compared efforts"
+COMPARED_EFFORTS: Final = "compared efforts"
 IDLE: Final = "drives off or braked"
 COMPUTED: Final = "the efforts of this table are the model's; expected columns JOINT.measured"
 DEVIATIONS: Final = (1, 2, 3)
@@ -128,7 +128,7 @@ class Checked:
         if why and self.compared is None:
             what = f"{why} ({what})"
         # The answer "not judged" already says why efforts are not judged.
-        said = (COMPARED, IDLE, RESIDUAL) if self.answer == "not judged" else ()
+        said = (COMPARED_EFFORTS, IDLE, RESIDUAL) if self.answer == "not judged" else ()
         unknown = [item for item in self.named(Verdict.UNKNOWN) if item not in said]
         return f"{self.answer}: {what}" + (f"; not judged: {', '.join(unknown)}" if unknown else "")
 
@@ -297,7 +297,7 @@ def _judge_shares(r: Recording, idle: Mask, compared: EffortComparison | None) -
         items.append(make_judged_fact(IDLE, text, some, enough or None, number=seconds, unit="s"))
     text = f"{100 * share:.3g} % of {len(r.time)} samples"
     bound = f"at least {100 * MIN_COMPARED:g} %"
-    items.append(make_judged_fact(COMPARED, text, bound, enough or None, number=share, limit=MIN_COMPARED))
+    items.append(make_judged_fact(COMPARED_EFFORTS, text, bound, enough or None, number=share, limit=MIN_COMPARED))
     if enough:
         return items, ""
     near, within = near_change(r)
@@ -348,7 +348,7 @@ def _stuck_efforts(r: Recording, c: EffortComparison) -> str:
 def _judge_residuals(
     r: Recording, c: EffortComparison, bands: Mapping[str, Mapping[str, Any]], bound: str
 ) -> list[Fact]:
-    good, begins, (worst, at) = c.good, c.begins(), c.local()
+    good, begins, (worst, at) = c.good, c.begins(), c.find_largest_local_rms()
     items = []
     for i, (name, unit) in enumerate(zip(r.robot.joint_names, r.robot.effort_units, strict=True)):
         share = 100 * c.rms[i] / max(c.peak[i], 1e-12)

@@ -192,7 +192,7 @@ class Lengths:
         else:
             machine = machine.numbered(_list_payload_numbers(model.carried))
         bare = machine.numbered(dict.fromkeys(_list_payload_numbers(machine), 0.0))
-        held = motion.held[:, None, None]
+        held = motion.payload_fraction[:, None, None]
         away = bool((np.abs(held - 1.0) > MIN_RELATIVE_NOISE).any())
         slopes, of_bare = (
             differentiate_numbers(one, self.paths) @ self.mixing if needed else np.zeros(0)

@@ -27,8 +27,8 @@ from pkm_twin.identification.samples import (
     filtered,
     find_passed_band,
     kept_rows,
+    resample_recording,
     simulate_noise,
-    tracks,
 )
 from pkm_twin.identification.verdict import MAX_DELAY, MAX_NOISE_RATIO, write_late
 from pkm_twin.machine.friction import Dahl
@@ -114,8 +114,8 @@ class EffortComparison:
         """Largest good residual, RMS, shape (n,): a fraction of the peak, and not below the noise."""
         return np.maximum(self.bound * self.peak, MAX_NOISE_RATIO * self.noise)
 
-    def local(self) -> tuple[Array, Array]:
-        """Return the largest RMS over a short time and the time of its middle, s, (n,) each."""
+    def find_largest_local_rms(self) -> tuple[Array, Array]:
+        """Return the residual's largest RMS within 0.25 s, and the time of that window's middle, s, (n,) each."""
         n = self.residual.shape[1]
         worst, at = np.zeros(n), np.full(n, self.time[0])
         # A collision is shorter than a recording: each quarter of a second is judged by itself.
@@ -147,7 +147,7 @@ class EffortComparison:
     @property
     def good(self) -> Mask:
         """Mask of the joints whose efforts agree with the model, shape (n,)."""
-        return np.asarray((self.rms <= self.limit) & (self.local()[0] <= MAX_LOCAL_RATIO * self.limit))
+        return np.asarray((self.rms <= self.limit) & (self.find_largest_local_rms()[0] <= MAX_LOCAL_RATIO * self.limit))
 
     @property
     def delayed(self) -> str:
@@ -197,7 +197,7 @@ def _compare_recording(r: Recording, bound: float) -> EffortComparison | None:
     """Compare measured and modelled efforts; the delay is estimated and removed to first order."""
     robot, reach = r.robot, friction_reach(r.robot)
     rates = None if r.qd is None or r.qdd is None else (r.qd, r.qdd)
-    pieces, how = tracks(r.time, r.q, r.measured, r.wrench, rates=rates, least=MIN_PIECE_SAMPLES)
+    pieces, how = resample_recording(r.time, r.q, r.measured, r.wrench, rates=rates, min_samples=MIN_PIECE_SAMPLES)
     if not pieces:
         return None
 
@@ -320,7 +320,7 @@ def near_change(r: Recording, load: Load | None = None) -> tuple[Mask, float]:
         return np.zeros(len(r.time), np.bool_), within
     if len(r.time) >= MIN_PIECE_SAMPLES:
         rates = None if r.qd is None or r.qdd is None else (r.qd, r.qdd)
-        pieces, how = tracks(r.time, r.q, np.zeros_like(r.q), rates=rates, least=MIN_PIECE_SAMPLES)
+        pieces, how = resample_recording(r.time, r.q, np.zeros_like(r.q), rates=rates, min_samples=MIN_PIECE_SAMPLES)
         if how.cutoff is not None:
             within = min(MAX_PAYLOAD_MARGIN, 4.0 / how.cutoff)
         elif any(piece.qd.any() for piece in pieces):

@@ -160,7 +160,7 @@ def fit_elements(
         odd = verdict.answer == "does not explain"
         faults = _list_unexplained(robot, parts, factors, zeros, odd)
         refuse_faults(faults, accept)
-    # An element is known by the noise alone; its deviation is the verdict's.
+    # The noise alone tells whether an element is identified; the reported deviation includes model errors.
     plain, own = (one[: len(names), : len(names)] for one in (found.covariance, verdict.covariance))
     deviations = np.sqrt([np.diag(plain), np.diag(own) * (np.nan if verdict.deviations == "withheld" else 1.0)])
     numbers = []

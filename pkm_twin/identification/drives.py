@@ -26,7 +26,7 @@ from delta_dynamics import inverse_dynamics
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import ParameterError, PkmTwinError
 from pkm_twin.identification.compare import evaluate_loaded
-from pkm_twin.identification.samples import WINDOWS, low_pass, tracks
+from pkm_twin.identification.samples import WINDOWS, low_pass, resample_recording
 from pkm_twin.machine.friction import list_friction_keys
 from pkm_twin.recordings import Recording, Table
 from pkm_twin.robot.robot import Robot
@@ -94,7 +94,7 @@ def _fit_constants(
     used = []
     for i, r in enumerate(recordings):
         window = None if windows is None else windows[i]
-        pieces, how = tracks(r.time, r.q, r.measured, r.wrench, window=window)
+        pieces, how = resample_recording(r.time, r.q, r.measured, r.wrench, window=window)
         used.append(how.window)
         smooth = replace(r, robot=robot.changed(friction=dict.fromkeys(list_friction_keys(), 0.0)))
         for track in pieces:

@@ -24,7 +24,7 @@ from delta_dynamics.torques.virtual_work import inverse_dynamics
 from pkm_twin.codegen.arrays import Array
 from pkm_twin.errors import PkmTwinError, check_limit
 from pkm_twin.identification.parameters import FileParameters
-from pkm_twin.identification.samples import tracks
+from pkm_twin.identification.samples import resample_recording
 from pkm_twin.robot.robot import Robot
 from pkm_twin.robot.workspace import describe_singularity_bound, position_range, reachable
 
@@ -141,7 +141,7 @@ class Judge:
 
         :param time: shape (k,), s; ``q``: joint positions, shape (k, n).
         """
-        pieces, _ = tracks(time, q, np.zeros_like(q))
+        pieces, _ = resample_recording(time, q, np.zeros_like(q))
         if not pieces:
             return None
         states = [np.concatenate([getattr(piece, name) for piece in pieces]) for name in ("q", "qd", "qdd")]

@@ -116,7 +116,7 @@ class Explanation:
 
 
 class HypothesisSearch:
-    """Weigh the hypotheses that may explain how one recording differs from the model.
+    """Evaluate the hypotheses that may explain how one recording differs from the model.
 
     :param rows: filtered rows whose regressor has columns for all parameters of the file.
     """
@@ -127,12 +127,12 @@ class HypothesisSearch:
         self.delay_column = self.columns.kinds.index("error")
         self.spectra = self.columns.spectra()
         self.first_log: float | None = None
-        self.sound = self.weigh("", 0.0, self.spectra)
+        self.sound = self.evaluate("", 0.0, self.spectra)
 
-    def weigh(
+    def evaluate(
         self,
         text: str,
-        price: float,
+        penalty: float,
         spectra: Spectra,
         classes: Sequence[str] = tuple(CLASSES),
         ratios: Array = DISCREPANCY_RATIOS,
@@ -145,7 +145,7 @@ class HypothesisSearch:
     ) -> Hypothesis:
         """Return a hypothesis with its log posterior odds, over all classes of machines.
 
-        :param price: log prior odds against it. ``gains``, ``order``: of the efforts. ``factors``:
+        :param penalty: log prior odds against it. ``gains``, ``order``: of the efforts. ``factors``:
             on the prior's deviations, (c,). ``screened``: whether few classes are compared first.
         """
         c = self.columns
@@ -164,7 +164,7 @@ class HypothesisSearch:
             log = max(self._find_logs(few, name, False)[0] for name in SEARCH_CLASSES)
             self.first_log = log if self.first_log is None else self.first_log
             if log < self.first_log - 40.0:
-                return Hypothesis(text, log - price, 1.0)
+                return Hypothesis(text, log - penalty, 1.0)
         model = Model.from_spectra([spectra], places, base, ratios, gains, order)
         logs, found = [], []
         for name in classes:
@@ -174,7 +174,7 @@ class HypothesisSearch:
         best = int(np.argmax(logs))
         log = float(np.logaddexp.reduce(logs))
         odds = tuple(np.exp(np.array(logs) - log).tolist())
-        return Hypothesis(text, log - price, found[best], classes[best], classes=odds)
+        return Hypothesis(text, log - penalty, found[best], classes[best], classes=odds)
 
     def _find_logs(self, model: Model, name: str, bounded: bool) -> Array:
         """Return a class's log evidence at each ratio of the discrepancy, less what possible numbers cost."""
@@ -214,7 +214,7 @@ class HypothesisSearch:
         if self.sound.discrepancy_ratio <= DISCREPANCY_RATIOS[1] and not self.sound.kinds:
             # The residual is too small for any cause to outweigh its prior odds.
             return [self.sound]
-        found = [self.sound, *self._weigh_efforts(), *self._weigh_delays(), *self._weigh_loads()]
+        found = [self.sound, *self._evaluate_efforts(), *self._evaluate_delays(), *self._evaluate_loads()]
         best, *others = sorted(found, key=lambda one: -one.log)
         pushed = self.rows.recording.wrench is not None and self.rows.recording.wrench.any()
         clearly_sound = (
@@ -223,72 +223,72 @@ class HypothesisSearch:
             and others[0].log < best.log - FOUND_LOG_ODDS
         )
         if pushed or not clearly_sound:
-            found += self._weigh_positions()
+            found += self._evaluate_positions()
         best = max(found, key=lambda one: one.log)
         if best.text or best.discrepancy_ratio > MAX_NAMED_DISCREPANCY:
-            found += self._weigh_friction_laws()
+            found += self._evaluate_friction_laws()
         return sorted(found, key=lambda one: -one.log)
 
-    def _weigh_efforts(self) -> Iterator[Hypothesis]:
-        """Weigh other signs, scales and orders of the efforts, no relation, and time."""
+    def _evaluate_efforts(self) -> Iterator[Hypothesis]:
+        """Evaluate other signs, scales and orders of the efforts, no relation to the motion, and other times."""
         n, eye, sp = len(self.joints), np.eye(len(self.joints)), self.spectra
         offset = np.array([kind == "offset" for kind in self.columns.kinds])
         none = np.where(offset, 1.0 / PRIOR_DEVIATIONS[CURRENT_OFFSET], 0.0)
-        yield self.weigh(NO_MACHINE, OTHER_LOG_ODDS, sp, ("",), gains=np.zeros(n), factors=none)
+        yield self.evaluate(NO_MACHINE, OTHER_LOG_ODDS, sp, ("",), gains=np.zeros(n), factors=none)
         whole = [np.ones(n), *eye] if n > 1 else [np.ones(1)]
         signs = [1.0 - 2.0 * one for one in whole]
         if n > 2:
-            each = np.array([self.weigh("", 0.0, sp, SEARCH_CLASSES, gains=s).log for s in signs[1:]])
+            each = np.array([self.evaluate("", 0.0, sp, SEARCH_CLASSES, gains=s).log for s in signs[1:]])
             signs += [1.0 - 2.0 * (eye[np.argsort(each)[-k:]].sum(0)) for k in range(2, n)]
         for sign in signs:
             turned = [self.joints[j] for j in np.flatnonzero(sign < 0.0)]
             text = f"efforts of {join_names(turned, n)} have the wrong sign"
-            price = OTHER_LOG_ODDS + 2.0 * (len(turned) - 1 if len(turned) < n else 0)
-            yield self.weigh(text, price, sp, gains=sign)
+            penalty = OTHER_LOG_ODDS + 2.0 * (len(turned) - 1 if len(turned) < n else 0)
+            yield self.evaluate(text, penalty, sp, gains=sign)
         for which in whole:
             names = join_names([self.joints[j] for j in np.flatnonzero(which)], n)
             for way in (1.0, -1.0):
-                yield from self._weigh_scales(names, which, way)
+                yield from self._evaluate_scales(names, which, way)
         for i, k in combinations(range(n), 2):
             order = np.arange(n)
             order[[i, k]] = k, i
             text = f"efforts of {self.joints[i]} and {self.joints[k]} are exchanged"
-            yield self._weigh_order(text, self.columns, order, order)
+            yield self._evaluate_order(text, self.columns, order, order)
         for order in [np.roll(range(n), 1), np.roll(range(n), -1)] if n > 2 else []:
-            yield self._weigh_order("columns of the efforts are in another order", self.columns, order, order)
+            yield self._evaluate_order("columns of the efforts are in another order", self.columns, order, order)
         back = np.where(self.columns.turning, -1.0, 1.0)
         p, rubs = self.rows.model.parameters, self.rows.model.parameters.kinds == "friction"
         certain = self.columns.certain - 2.0 * (self.rows.table[..., rubs] @ p.values[rubs])
         backwards = replace(self.columns, columns=self.columns.columns * back, certain=certain)
-        yield self.weigh("time runs backwards", OTHER_LOG_ODDS, backwards.spectra())
+        yield self.evaluate("time runs backwards", OTHER_LOG_ODDS, backwards.spectra())
         for rate in TIME_RATES:
-            text = f"the motion was {rate:.3g} times as fast as its time stamps are ("
-            text += "ms for s?)" if rate >= 1e3 or rate <= 1e-3 else "time steps?)"
-            yield self.weigh(text, UNIT_LOG_ODDS, self.columns.spectra(rate=rate))
+            why = "ms for s?" if rate >= 1e3 or rate <= 1e-3 else "time steps?"
+            text = f"the motion was {rate:.3g} times as fast as its time stamps are ({why})"
+            yield self.evaluate(text, UNIT_LOG_ODDS, self.columns.spectra(rate=rate))
 
-    def _weigh_order(self, text: str, columns: Columns, order: Indices, efforts: Indices | None = None) -> Hypothesis:
-        """Weigh another order of joints, by the samples at which the friction of both orders is known.
+    def _evaluate_order(self, text: str, c: Columns, order: Indices, efforts: Indices | None = None) -> Hypothesis:
+        """Evaluate another order of joints, by the samples at which the friction of both orders is known.
 
         :param order: of the joints whose motion or efforts are exchanged; ``efforts``: of the efforts.
         """
         counts = self.rows.counts * self.rows.counts[:, order]
         common = replace(self.rows, counts=counts)
         alike = bool((counts == self.rows.counts).all())
-        one = self.weigh(text, OTHER_LOG_ODDS, replace(columns, rows=common).spectra(order=efforts), screened=alike)
+        one = self.evaluate(text, OTHER_LOG_ODDS, replace(c, rows=common).spectra(order=efforts), screened=alike)
         if alike:
             return one
-        before = self.weigh("", 0.0, replace(self.columns, rows=common).spectra(), screened=False)
+        before = self.evaluate("", 0.0, replace(self.columns, rows=common).spectra(), screened=False)
         return replace(one, log=self.sound.log + one.log - before.log)
 
-    def _weigh_scales(self, names: str, which: Array, way: float) -> Iterator[Hypothesis]:
-        """Weigh the most probable scale of some drives' efforts."""
+    def _evaluate_scales(self, names: str, which: Array, way: float) -> Iterator[Hypothesis]:
+        """Evaluate the most probable scale of some drives' efforts."""
 
         def gains(scale: float) -> Array:
             return np.where(which > 0.0, scale, 1.0)
 
         def log(x: float) -> float:
             some = gains(way * float(np.exp(x)))
-            return self.weigh("", 0.0, self.spectra, classes, DISCREPANCY_RATIOS[2:3], gains=some, bounded=False).log
+            return self.evaluate("", 0.0, self.spectra, classes, DISCREPANCY_RATIOS[2:3], gains=some, bounded=False).log
 
         # Heavier masses would be in the place of a scale.
         classes = ("", "friction") if which.all() and way > 0.0 else SEARCH_CLASSES
@@ -303,11 +303,11 @@ class HypothesisSearch:
         if way < 0.0 or not is_usual_scale(scale):
             # A scale that is that of a known unit has better prior odds.
             units = [u for u in EFFORT_UNITS.values() if way > 0.0 and 0.5 < u / scale < 2.0]
-            for size, price in (
+            for size, penalty in (
                 (scale, UNIT_LOG_ODDS + (OTHER_LOG_ODDS if way < 0.0 else 0.0)),
                 *((u, UNIT_LOG_ODDS - 2.0) for u in units),
             ):
-                one = self.weigh("", price, self.spectra, gains=gains(size))
+                one = self.evaluate("", penalty, self.spectra, gains=gains(size))
                 if one.kinds in ("", "friction", "heavy friction") and size == scale:
                     own = float(np.mean(self._find_gains(gains(size), one.kinds)[0][which > 0.0]))
                     size /= 1.0 - size * own
@@ -333,8 +333,8 @@ class HypothesisSearch:
         deviations = np.sqrt(np.diag(tie @ found.covariance[some, some] @ tie.T))
         return np.asarray(tie @ each, np.float64), np.asarray(deviations, np.float64)
 
-    def _weigh_delays(self) -> Iterator[Hypothesis]:
-        """Weigh efforts of all joints, or of one, that belong to another time."""
+    def _evaluate_delays(self) -> Iterator[Hypothesis]:
+        """Evaluate the hypotheses that the efforts of all joints, or of one, belong to another time."""
         r, c = self.rows, self.columns
         n, k, period = len(self.joints), len(r.time), float(np.median(np.diff(r.time)))
         most = min(int(MAX_SEARCHED_DELAY / period), k // 4)
@@ -353,12 +353,12 @@ class HypothesisSearch:
         choices: list[tuple[list[int], int]] = [([*range(n)], int(left.sum(1).argmin()))]
         choices += [([j], int(left[:, j].argmin())) for j in range(n)] if n > 1 else []
         choices = [(which, place) for which, place in choices if abs(place - most) * period >= 0.03]
-        before = self.weigh("", 0.0, c.spectra(inner=inner), screened=False) if choices else self.sound
+        before = self.evaluate("", 0.0, c.spectra(inner=inner), screened=False) if choices else self.sound
         for which, place in choices:
             effort = r.effort.copy()
             effort[inner, which] = r.effort[place : k - 2 * most + place, which]
             spectra = c.spectra(effort, inner)
-            one = self.weigh("", 0.0, spectra, screened=False)
+            one = self.evaluate("", 0.0, spectra, screened=False)
             late = float((place - most) * period) + self._find_mean(spectra, one.kinds)[self.delay_column]
             text = write_late(join_names([self.joints[j] for j in which], n), late)
             one = replace(one, text=text, late=late if len(which) == n else 0.0)
@@ -380,8 +380,8 @@ class HypothesisSearch:
         deviation = c.deviation * np.where(c.payload, HEAVY_RATIOS["payload"], 1.0)
         return Model.from_spectra([spectra], [np.arange(len(used))], deviation, DISCREPANCY_RATIOS).posterior(used).mean
 
-    def _weigh_loads(self) -> Iterator[Hypothesis]:
-        """Weigh a payload that is held for a while only."""
+    def _evaluate_loads(self) -> Iterator[Hypothesis]:
+        """Evaluate the hypothesis that a payload is carried for a part of the time only."""
         r, c, payload = self.rows, self.columns, self.columns.payload
         if not payload.any() or r.recording.load is not None:
             return
@@ -391,10 +391,10 @@ class HypothesisSearch:
         _, spans, held = find_held_payload(r.time, kilogram, left, weight)
         if spans and not held.all():
             part = replace(c, columns=np.where(payload, held[:, None, None], 1.0) * c.columns)
-            yield self._weigh_payload(part.spectra(), UNIT_LOG_ODDS + 3.0 * len(spans), tuple(spans))
+            yield self._evaluate_payload_mass(part.spectra(), UNIT_LOG_ODDS + 3.0 * len(spans), *spans)
 
-    def _weigh_friction_laws(self) -> Iterator[Hypothesis]:
-        """Weigh friction laws that the file lacks, with the nonlinear parameter that explains most."""
+    def _evaluate_friction_laws(self) -> Iterator[Hypothesis]:
+        """Evaluate friction laws that the file lacks, with the nonlinear parameter that explains most."""
         r, c, model = self.rows, self.columns, self.rows.model
         problem = Problem.from_recordings(model.robot, [r.recording], KINDS, known=[r])
         n = len(self.joints)
@@ -409,21 +409,21 @@ class HypothesisSearch:
             other, units = copy(self), search.columns(found.value)
             other.columns = c.with_friction(units)
             text = f"{name} friction of the drives, which the file lacks, explains the efforts: --friction {name}"
-            price = UNIT_LOG_ODDS + n * float(np.log(len(search.list_candidates())))
-            one = other.weigh(text, price, other.columns.spectra(), screened=False)
+            penalty = UNIT_LOG_ODDS + n * float(np.log(len(search.list_candidates())))
+            one = other.evaluate(text, penalty, other.columns.spectra(), screened=False)
             yield replace(one, law=name)
 
-    def _weigh_payload(self, spectra: Spectra, price: float, spans: tuple[tuple[float, float], ...] = ()) -> Hypothesis:
-        """Weigh a payload, with the mass that it has at the file's centre."""
-        one, robot = self.weigh("", price, spectra), self.rows.model.robot
+    def _evaluate_payload_mass(self, spectra: Spectra, penalty: float, *spans: tuple[float, float]) -> Hypothesis:
+        """Evaluate the hypothesis of another payload mass, at the file's centre of mass."""
+        one, robot = self.evaluate("", penalty, spectra), self.rows.model.robot
         first = self.columns.kinds.index("payload")
         beside = one.kinds.replace("payload", "")
         mass = robot.payload.mass + float(self._find_mean(spectra, beside, first)[first])
         load = Load(float(f"{max(mass, 0.0):.3g}"), None, spans)
         com = robot.payload.com
         at = ", ".join(f"{v:g}" for v in com) + " m" if np.any(com) else "the reference point"
-        text = f"a payload of {load.mass:.3g} kg with its centre at {at} explains the efforts: use "
-        text += f"--payload {load.mass:g}"
+        text = f"a payload of {load.mass:.3g} kg with its centre at {at} explains the efforts: "
+        text += f"use --payload {load.mass:g}"
         if spans:
             text += " --load-times " + ",".join(f"{edge:.2f}" for pair in spans for edge in pair)
         return replace(one, text=text, load=load)
@@ -468,8 +468,8 @@ class HypothesisSearch:
             if clear or abs(beside[j]) > 2.0 * PRIOR_DEVIATIONS[GAIN]:
                 return Explanation(text, clear and not is_usual_scale(scale))
         if sound.kinds in ("payload", "heavy payload") and self.rows.recording.load is None:
-            held = self._weigh_payload(self.spectra, 0.0)
-            return Explanation(held.text, load=held.load)
+            loaded = self._evaluate_payload_mass(self.spectra, 0.0)
+            return Explanation(loaded.text, load=loaded.load)
         return Explanation("")
 
     def list_causes(self) -> tuple[tuple[str, float], ...]:
@@ -506,8 +506,8 @@ class HypothesisSearch:
         names = join_names([*self.joints], len(self.joints))
         return write_scale(names, scale, *others), clear
 
-    def _weigh_positions(self) -> Iterator[Hypothesis]:
-        """Weigh other positions, with the efforts as they are or turned alike, and wrenches."""
+    def _evaluate_positions(self) -> Iterator[Hypothesis]:
+        """Evaluate other positions, with the efforts as they are or with the same signs changed, and other wrenches."""
         r, robot, motion = self.rows, self.rows.model.robot, self.rows.signals.motion
         n, names, eye = len(self.joints), self.joints, np.eye(len(self.joints))
         ones, q = np.ones(n), motion.q
@@ -521,32 +521,32 @@ class HypothesisSearch:
                 opposite: -motion.wrench,
                 "without the wrench the efforts agree: it does not act on the platform": 0.0 * motion.wrench,
             }.items():
-                yield from self._weigh_motion(text, replace(motion, wrench=wrench), ones)
+                yield from self._evaluate_motion(text, replace(motion, wrench=wrench), ones)
         for text, scale in POSITION_FACTORS.items():
             other = replace(motion, q=scale * q, qd=scale * motion.qd, qdd=scale * motion.qdd)
-            yield from self._weigh_motion(text, other, ones)
+            yield from self._evaluate_motion(text, other, ones)
         if n > 1:
             other = replace(motion, q=-q, qd=-motion.qd, qdd=-motion.qdd)
-            yield from self._weigh_motion("positions of all joints have the wrong sign", other, -ones)
+            yield from self._evaluate_motion("positions of all joints have the wrong sign", other, -ones)
         for name, e in zip(names, eye, strict=True):
             t, text = 1.0 - 2.0 * e, f"of {name} have the wrong sign (joint_map?)"
             # A drive that counts the wrong way is mirrored at zero, at home, or anywhere.
             for middle in (0.0 * robot.graph.home, robot.graph.home, q.mean(0)):
                 other = replace(motion, q=middle + t * (q - middle), qd=t * motion.qd, qdd=t * motion.qdd)
                 both = f"positions and efforts {text}"
-                yield from self._weigh_motion(f"positions {text}", other, t, both)
+                yield from self._evaluate_motion(f"positions {text}", other, t, both)
         for i, k in combinations(range(n), 2):
             order = np.arange(n)
             order[[i, k]] = k, i
             other = replace(motion, q=q[:, order], qd=motion.qd[:, order], qdd=motion.qdd[:, order])
             text = f"{names[i]} and {names[k]} are exchanged"
-            yield from self._weigh_motion(f"positions of {text}", other, ones, text, order)
+            yield from self._evaluate_motion(f"positions of {text}", other, ones, text, order)
 
-    def _weigh_motion(
+    def _evaluate_motion(
         self, text: str, motion: Motion, turned: Array, both: str = "", order: Indices | None = None
     ) -> Iterator[Hypothesis]:
-        """Weigh another motion; and with the efforts turned or exchanged alike, ``both``."""
-        # The error of a motion that the machine cannot make takes as long as weighing it.
+        """Evaluate another motion; if ``both`` is given, also with the efforts' signs or order changed alike."""
+        # Skip unreachable motions first: composing their error takes as long as evaluating the hypothesis.
         if not self.rows.model.robot.try_forward(motion.q)[1].all():
             return
         try:
@@ -556,13 +556,13 @@ class HypothesisSearch:
         if not np.isfinite(made.columns).all() or not np.abs(made.certain).max() < MAX_EFFORT:
             return
         if order is not None:
-            yield self._weigh_order(text, made, order)
-            yield self._weigh_order(both, made, order, order)
+            yield self._evaluate_order(text, made, order)
+            yield self._evaluate_order(both, made, order, order)
             return
         spectra = made.spectra()
-        yield self.weigh(text, OTHER_LOG_ODDS, spectra)
+        yield self.evaluate(text, OTHER_LOG_ODDS, spectra)
         if both:
-            yield self.weigh(both, OTHER_LOG_ODDS, spectra, gains=turned)
+            yield self.evaluate(both, OTHER_LOG_ODDS, spectra, gains=turned)
 
 
 SEARCH_CLASSES: Final = ("", "friction masses payload")

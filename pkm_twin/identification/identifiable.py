@@ -87,26 +87,28 @@ def list_drive_parameters(robot: Robot) -> tuple[Identifiable, ...]:
     """List the friction of each joint that has some, and rotors; joints may share one number."""
     graph, friction = robot.graph, robot.friction
     found, rotors = [], dict[Keys, list[str]]()
-    # A memory that is open to a fit has columns along a motion, which a regressor has not.
+    # A regressor lacks the columns of friction with memory: they depend on the whole motion.
     open_keys = [key for name in robot.open_laws if LAWS[name].memory for key in LAWS[name].parameters]
-    words = dict.fromkeys((*list_linear_keys(robot.laws), *open_keys))
+    key_names = dict.fromkeys((*list_linear_keys(robot.laws), *open_keys))
 
-    def number(kind: Kind, name: str, value: float, key: Keys, joints: Sequence[str]) -> None:
-        word = name.rpartition(".")[2]
-        rub = list_friction_keys().get(word)
-        linear, signed = rub is None or rub.linear, rub is not None and rub.low is None
-        # Of a rotor behind a gear the file has the inertia at the motor.
+    def add_parameter(kind: Kind, name: str, value: float, key: Keys, joints: Sequence[str]) -> None:
+        """Append one parameter, at ``key`` of the file, that these joints share."""
+        key_name = name.rpartition(".")[2]
+        friction_key = list_friction_keys().get(key_name)
+        linear = friction_key is None or friction_key.linear
+        signed = friction_key is not None and friction_key.low is None
+        # The file gives the inertia of a rotor behind a gear at the motor.
         drive = dict(zip(robot.joint_names, robot.drives, strict=True)).get(joints[0])
-        less = drive.turns**-2 if drive is not None and kind == "rotor" else 1.0
+        inertia_factor = drive.turns**-2 if drive is not None and kind == "rotor" else 1.0
         found.append(
             Identifiable(
                 kind,
                 (name,),
-                (drive_units(graph, joints[0])[word],),
+                (drive_units(graph, joints[0])[key_name],),
                 np.array([value]),
                 np.array([math.nan]),
-                lambda new: {key: less * float(new[0])},
-                others={f"{joint}.{word}": np.ones(1) for joint in joints if linear},
+                lambda new: {key: inertia_factor * float(new[0])},
+                others={f"{joint}.{key_name}": np.ones(1) for joint in joints if linear},
                 cones=() if signed else (make_nonnegative_cone(0, 1),),
             )
         )
@@ -114,19 +116,19 @@ def list_drive_parameters(robot: Robot) -> tuple[Identifiable, ...]:
     for name, joint in graph.joints.items():
         if joint.actuated:
             k = graph.actuated.index(name)
-            values = {what: getattr(friction, what)[k] for what in words}
+            values = {what: getattr(friction, what)[k] for what in key_names}
         else:
             own = ("viscous", "coulomb") if joint.loaded else ()
             values = {what: getattr(joint, what) for what in own}
         for what, value in values.items():
             key = robot.friction_key(name, what)
-            number("friction", f"{name}.{what}", float(value), key, [name])
+            add_parameter("friction", f"{name}.{what}", float(value), key, [name])
         if joint.actuated or joint.rotor_inertia:
             rotors.setdefault(robot.rotor_key(name), []).append(name)
     for key, names in rotors.items():
         owner = names[0] if len(names) == 1 else join_path(key[:-1])
         value = graph.joints[names[0]].rotor_inertia
-        number("rotor", f"{owner}.rotor_inertia", value, key, names)
+        add_parameter("rotor", f"{owner}.rotor_inertia", value, key, names)
     return tuple(found)
 
 
@@ -146,7 +148,7 @@ def list_mass_parameters(robot: Robot) -> Iterator[Identifiable]:
 
     every: list[Keys] = [(PAYLOAD, "mass"), *((PAYLOAD, "com", i) for i in range(3))]
     every += [*((PAYLOAD, "inertia", *ij) for ij in np.ndindex(3, 3)), *robot.mass_keys()]
-    # Of an inertia matrix the upper half, for both.
+    # Keep the upper triangle of an inertia matrix; each entry stands for its mirrored one, too.
     keys = [key for key in every if key <= _mirror_key(key)]
     both = [dict.fromkeys((key, _mirror_key(key))) for key in keys]
     tie = np.repeat(np.eye(len(keys)), [len(pair) for pair in both], 0)

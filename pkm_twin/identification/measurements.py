@@ -129,7 +129,10 @@ class _Plane(Kind):
 
 
 class _Distance(Kind):
-    """Length of ``p``: of the platform's reference point at two poses, or from a fixed centre."""
+    """Distance of the platform's reference point between two poses, or from a fixed centre.
+
+    ``p``: its displacement between the poses, or its positions, (k, 3).
+    """
 
     def value(self, p: Array, r: Array, own: Mapping[str, float]) -> Array:
         return np.asarray(np.linalg.norm(self._away(p, own), axis=1, keepdims=True))
@@ -443,7 +446,7 @@ def read_poses(path: Path, robot: Robot, dialect: Dialect = DEFAULT_DIALECT) -> 
     """
     joints = [f"{name}.position" for name in robot.controller.names]
     table = _read(path, joints, QUATERNION, dialect)
-    _find_columns(table, joints, dialect)
+    _add_columns_by_usual_names(table, joints, dialect)
     q, position = table.stack(joints), table.stack(POSITIONS)
     # No instrument stands farther from what it measures, m.
     for names, bound, its in ((POSITIONS, 1e4, "m"), (ANGLES, 2.0 * np.pi, "rad")):
@@ -477,7 +480,7 @@ def read_measured(
     joints = [f"{name}.position" for name in robot.controller.names]
     others = [f"{name}_2" for name in joints]
     table = _read(path, joints, (*others, "to"), dialect, blank=True)
-    _find_columns(table, joints, dialect)
+    _add_columns_by_usual_names(table, joints, dialect)
     q = table.stack(joints)
     if "z" in table:
         table.setdefault("height", table["z"])
@@ -512,8 +515,8 @@ def _read(path: Path, joints: Sequence[str], others: Sequence[str], dialect: Dia
     return table
 
 
-def _find_columns(table: Table, joints: Sequence[str], dialect: Dialect) -> None:
-    """Add columns that are missing by what such columns are usually called."""
+def _add_columns_by_usual_names(table: Table, joints: Sequence[str], dialect: Dialect) -> None:
+    """Add missing columns of pose and joints that the table has under a usual name."""
     if not any(name in table for name in POSITIONS):
         size = dialect.size("length")
         places, turns = _find_column_set(table, _PLACE, "xyz", ""), _find_column_set(table, _TURN, "xyzw", "q")

@@ -33,9 +33,9 @@ from pkm_twin.identification.samples import (
     find_lines,
     find_passed_band,
     fit_spline,
+    resample_recording,
     select_motion,
     simulate_noise,
-    tracks,
 )
 from pkm_twin.identification.verdict import write_unreachable
 from pkm_twin.machine.friction import (
@@ -115,15 +115,15 @@ class Model:
         return np.asarray(rest + table @ values, np.float64)
 
     def _columns(self, motion: Motion) -> tuple[Array, Array]:
-        robot, parameters, held = self.robot, self.parameters, motion.held
+        robot, parameters, fraction = self.robot, self.parameters, motion.payload_fraction
         pi = parameter_values(robot)
         extra = np.zeros(len(pi)) if self.carried is None else parameter_values(self.carried) - pi
         full = regressor(robot, *motion.joints, motion.wrench)
         own = full @ parameters.mixing
-        rest = full @ pi - own @ parameters.values + held[:, None] * (full @ extra)
+        rest = full @ pi - own @ parameters.values + fraction[:, None] * (full @ extra)
         for where, group in zip(parameters.slices, parameters.groups, strict=True):
             if group.kind == "payload":
-                own[..., where] *= held[:, None, None]
+                own[..., where] *= fraction[:, None, None]
         if parameters.loads is not None and law_keys(robot):
             rubs = self.of_drives
             load = rest + own[..., ~rubs] @ parameters.loads[~rubs]
@@ -239,7 +239,7 @@ def make_rows(robot: Robot, parameters: FileParameters, recording: Recording, wi
         if np.ptp(effort) < 1e-9:
             only = effort[0] + 0.0  # no minus before zero
             raise PkmTwinError(f"{r.name}: effort of {joint} is {only:g} throughout: nothing was measured")
-    pieces, how = tracks(r.time, r.q, r.measured, r.wrench, r.payload_fraction, window)
+    pieces, how = resample_recording(r.time, r.q, r.measured, r.wrench, r.payload_fraction, window)
     if not pieces:
         raise PkmTwinError(f"{r.name}: too short to fit, no {MIN_SAMPLES // 2} samples without a gap")
     # With the friction laws on trial, as the robot has them.
@@ -258,11 +258,11 @@ def make_rows(robot: Robot, parameters: FileParameters, recording: Recording, wi
     if all(not part.moves.any() for part in parts):
         raise PkmTwinError(f"{r.name}: no excitation, the joints stand still")
     first, outliers = _drop_outliers(parts, parameters, how.keep_every)
-    rubs, told, columns = model.of_drives, list[_FirstFit](), list[dict[str, Array]]()
+    rubs, first_fits, columns = model.of_drives, list[_FirstFit](), list[dict[str, Array]]()
     for part in parts:
         efforts = part.rest + part.table @ first
         load = efforts - part.table[..., rubs] @ first[rubs]
-        told.append(_FirstFit(part.track, efforts, load, part.target - part.table @ first, part.moves))
+        first_fits.append(_FirstFit(part.track, efforts, load, part.target - part.table @ first, part.moves))
         columns.append({name: getattr(part, name) for name in ("table", "target", "rest", "moves")})
         columns[-1]["time"] = part.track.time
         columns[-1]["doubt"] = (1.0 - part.moves) * np.abs(efforts - load)
@@ -288,20 +288,22 @@ def make_rows(robot: Robot, parameters: FileParameters, recording: Recording, wi
         counts,
         f["change"],
         outliers,
-        cache(lambda: _make_signals(r, model, how, told, first)),
+        cache(lambda: _filter_signals(r, model, how, first_fits, first)),
     )
 
 
-def _make_signals(r: Recording, model: Model, how: Filtering, told: Sequence[_FirstFit], first: Array) -> Signals:
-    """Return the signals of a recording's rows.
+def _filter_signals(
+    r: Recording, model: Model, how: Filtering, first_fits: Sequence[_FirstFit], first: Array
+) -> Signals:
+    """Filter a recording's motion, wrench and efforts, and find the noise and spectral lines of its residuals.
 
-    :param told: by piece. ``first``: parameters of a first fit.
+    :param first_fits: one per piece. ``first``: the parameters of that fit.
     """
-    tracks = [one.track for one in told]
-    left = select_motion([one.residuals for one in told], [one.moves for one in told])
+    tracks = [one.track for one in first_fits]
+    left = select_motion([one.residuals for one in first_fits], [one.moves for one in first_fits])
     longest = max(tracks, key=lambda t: len(t.time))
     speed = np.sqrt(np.mean(np.concatenate([track.qd for track in tracks]) ** 2, 0))
-    f = filtered([one.columns(speed, how) for one in told], longest.period, how)
+    f = filtered([one.columns(speed, how) for one in first_fits], longest.period, how)
     shaken = simulate_noise(r, longest, how, lambda track: model.efforts(track, first, model.memory(track, how)))
     noise = estimate_noise_density(left, shaken, longest.period, how)
     size = np.sqrt(np.mean(np.concatenate([track.effort for track in tracks]) ** 2, 0))
@@ -309,7 +311,7 @@ def _make_signals(r: Recording, model: Model, how: Filtering, told: Sequence[_Fi
     rate = 1.0 / (longest.period * how.keep_every)
     missed, load = (np.moveaxis(f[name], -1, 0) for name in ("missed", "load"))
     return Signals(
-        Motion(f["q"], f["qd"], f["qdd"], f["wrench"], f["held"]),
+        Motion(f["q"], f["qd"], f["qdd"], f["wrench"], f["payload_fraction"]),
         missed,
         load,
         f["effort"],
@@ -370,7 +372,7 @@ class _FirstFit:
             "load": np.stack(force, -1),
             "own": np.stack(laws, -1),
             "wrench": track.wrench,
-            "held": track.held,
+            "payload_fraction": track.payload_fraction,
         }
 
 
@@ -387,16 +389,16 @@ def _drop_outliers(parts: list[_Piece], parameters: FileParameters, every: int) 
     first = estimate(table, target, parameters.values, scales, judged=moves).values
     count = 0
     for part in parts:
-        told = part.table @ first
-        away = np.abs(part.target - told)
-        bound = 8.0 * estimate_deviation(part.target - told)
+        predicted = part.table @ first
+        away = np.abs(part.target - predicted)
+        bound = 8.0 * estimate_deviation(part.target - predicted)
         # Where friction turns over, an effort that is some samples late is no outlier.
-        near = scipy.ndimage.maximum_filter1d(np.abs(np.diff(told, axis=0, prepend=told[:1])), 7, axis=0)
+        near = scipy.ndimage.maximum_filter1d(np.abs(np.diff(predicted, axis=0, prepend=predicted[:1])), 7, axis=0)
         far = (away > bound + 2.0 * near) & (bound > 1e-6 * np.abs(part.target).max(0))
         far &= ~scipy.ndimage.binary_opening(far, np.ones((10, 1)))
         if far.mean() > 0.05:
             continue
-        part.target[far] = told[far]
+        part.target[far] = predicted[far]
         count += int(far.sum())
     return first, count
 

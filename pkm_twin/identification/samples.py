@@ -37,14 +37,15 @@ MIN_SAMPLES: Final = 200
 class Motion:
     """Joints' positions, rates and accelerations, (k, n) each, and what is on the platform.
 
-    ``wrench``: (k, 6). ``held``: where the payload that is looked for is there, (k,), 0 or 1.
+    ``wrench``: (k, 6). ``payload_fraction``: how much of the payload that is fitted is carried, (k,),
+    0 to 1.
     """
 
     q: Array
     qd: Array
     qdd: Array
     wrench: Array
-    held: Array
+    payload_fraction: Array
 
     @property
     def joints(self) -> tuple[Array, Array, Array]:
@@ -53,7 +54,7 @@ class Motion:
 
     def part(self, rows: slice | Mask) -> Motion:
         """Return some of the rows."""
-        return Motion(*(one[rows] for one in (*self.joints, self.wrench, self.held)))
+        return Motion(*(one[rows] for one in (*self.joints, self.wrench, self.payload_fraction)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,33 +147,34 @@ def differentiate(values: Array, order: int, period: float) -> Array:
     return np.concatenate([ends[:3], inner[3:-3], ends[-3:]])
 
 
-def tracks(
+def resample_recording(
     time: Array,
     q: Array,
     effort: Array,
     wrench: Array | None = None,
-    held: Array | None = None,
+    payload_fraction: Array | None = None,
     window: int | None = None,
     rates: tuple[Array, Array] | None = None,
-    least: int = MIN_SAMPLES // 2,
+    min_samples: int = MIN_SAMPLES // 2,
 ) -> tuple[list[Track], Filtering]:
-    """Return a recording as evenly sampled motion, without the ends of each piece.
+    """Resample a recording evenly, differentiate it, and return its pieces without their ends.
 
-    :param wrench: (k, 6), none by default; ``held``: (k,), throughout by default.
+    :param wrench: (k, 6), none by default; ``payload_fraction``: fraction of the payload that is carried,
+        (k,), 1 by default.
     :param window: of the polynomial, samples; None chooses it.
     :param rates: velocities and accelerations (k, n) that are known, to be used as they are.
-    :param least: samples that a piece needs.
+    :param min_samples: smallest number of samples of a piece that is used.
     """
     wrench = np.zeros((len(time), 6)) if wrench is None else wrench
-    held = np.ones(len(time)) if held is None else held
+    payload_fraction = np.ones(len(time)) if payload_fraction is None else payload_fraction
     if len(time) < 2:
         return [], Filtering(0, (), None, 1)
     # Pieces without a gap, resampled evenly by cubic splines where needed.
     period, pieces = float(np.median(np.diff(time))), list[tuple[Array, list[Array]]]()
     edges = [0, *(np.flatnonzero(np.diff(time) > 5.0 * period) + 1).tolist(), len(time)]
     for begin, end in pairwise(edges):
-        if end - begin >= least:
-            t, own = time[begin:end], [c[begin:end] for c in (q, effort, wrench, held, *(rates or ()))]
+        if end - begin >= min_samples:
+            t, own = time[begin:end], [c[begin:end] for c in (q, effort, wrench, payload_fraction, *(rates or ()))]
             if np.abs(np.diff(t) - period).max() > 0.02 * period:
                 even = np.arange(t[0], t[-1], period)
                 own = [np.asarray(scipy.interpolate.CubicSpline(t, c)(even), np.float64) for c in own]
@@ -389,8 +391,8 @@ def simulate_noise(r: Recording, track: Track, how: Filtering, efforts: Callable
     time, q = r.time[some], r.q[some]
     told = []
     for shake in (np.zeros_like(q), noise * rng.normal(size=q.shape)):
-        pieces, _ = tracks(
-            time, q + shake, np.zeros_like(q), window=how.window, least=min(MIN_SAMPLES // 2, len(track.time))
+        pieces, _ = resample_recording(
+            time, q + shake, np.zeros_like(q), window=how.window, min_samples=min(MIN_SAMPLES // 2, len(track.time))
         )
         told.append(np.concatenate([efforts(t) for t in pieces]))
     change = told[1] - told[0]

@@ -71,7 +71,7 @@ def test_columns_are_differences_of_the_efforts(name: str) -> None:
                 sides.append((high - low) / (2.0 * step))
         except ValueError:
             continue  # a closure that only this number's own value meets
-        loaded = rows.signals.motion.held[:, None]
+        loaded = rows.signals.motion.payload_fraction[:, None]
         expected = loaded * sides[0] + (1.0 - loaded) * sides[1]
         np.testing.assert_allclose(found[..., k], expected, rtol=0, atol=1e-4 * size)
         tried += 1
