@@ -425,37 +425,37 @@ def _calibrated(
     found = fit(robot, before, learnt, parameters, progress)
     covariance, steps = found.covariance, found.steps
     deviations = np.sqrt(np.diag(covariance)).tolist()
-    told = [replace(p, deviation=d) for p, d in zip(parameters, deviations, strict=True)]
-    scale, told, row = _judge_scale(robot, found.state, learnt, told, covariance)
+    estimates = [replace(p, deviation=d) for p, d in zip(parameters, deviations, strict=True)]
+    scale, estimates, row = _judge_scale(robot, found.state, learnt, estimates, covariance)
     if scale is not None and not scale.determined:
         near = [
             replace(p, prior=TIGHT_PRIOR_RATIO * p.prior)
             if p.unit == "m" and p.deviation > TIGHT_PRIOR_RATIO * p.prior and p.name in machine
             else p
-            for p in told
+            for p in estimates
         ]
         found = fit(robot, before, learnt, near, progress)
         steps += found.steps
-    told = [replace(p, value=float(v)) for p, v in zip(told, found.values, strict=True)]
+    estimates = [replace(p, value=float(v)) for p, v in zip(estimates, found.values, strict=True)]
     built = robot.with_file_values(found.state.numbers)
     agreements, outliers = _compare_measurements(robot, built, learnt, apart, before, found, parameters)
-    changes = [p for p in told if p.name not in (*FRAME, *TARGET, *learnt.own)]
+    changes = [p for p in estimates if p.name not in (*FRAME, *TARGET, *learnt.own)]
     count = len({k for m in (learnt, apart) if m for one in m.readings for k in one.lines.tolist()})
     left = [(one.unit, one.noise) for one in agreements]
     faults = list_faults(left, outliers, count, changes, free.prior, robot.engine.tree.size)
-    good = np.array([p.observed for p in told])
+    good = np.array([p.observed for p in estimates])
     if apart is not None and not good.any() and not faults:
         raise ParameterError("poses", count, "poses farther apart: these determine none of the numbers")
     pairs = find_determined_pairs(
-        [k for k in np.flatnonzero(~good).tolist() if told[k].name not in learnt.own],
-        [p.unit for p in told],
+        [k for k in np.flatnonzero(~good).tolist() if estimates[k].name not in learnt.own],
+        [p.unit for p in estimates],
         covariance,
         row,
     )
     singular = np.linalg.svd(found.table[:, good], compute_uv=False)
     return Calibration(
         robot=built,
-        parameters=tuple(told),
+        parameters=tuple(estimates),
         covariance=covariance,
         agreements=agreements,
         condition=float(singular[0] / singular[-1]) if good.any() else None,
@@ -465,7 +465,7 @@ def _calibrated(
         steps=steps,
         faults=tuple(faults),
         cost=sum(((p.value - p.before) / p.prior) ** 2 for p in changes),
-        placed=apart is not None and not free.frame and _needs_instrument_frame(robot, learnt, found, told),
+        placed=apart is not None and not free.frame and _needs_instrument_frame(robot, learnt, found, estimates),
         instrument=found.state.instrument,
     )
 
@@ -509,19 +509,19 @@ def _compare_measurements(
     return tuple(agreements), outliers
 
 
-def _needs_instrument_frame(robot: Robot, measured: Measured, found: Fitted, told: Sequence[Parameter]) -> bool:
+def _needs_instrument_frame(robot: Robot, measured: Measured, found: Fitted, estimates: Sequence[Parameter]) -> bool:
     """Return whether a free frame of the instrument would reduce the residual by more than 20 %."""
-    over, asked = found.weights.over, [(p.before - p.value) / p.prior for p in told]
+    over, asked = found.weights.over, [(p.before - p.value) / p.prior for p in estimates]
     target = np.append(over(measured.parts(found.state)), asked)
-    own = np.vstack([found.table, np.eye(len(told))])
+    own = np.vstack([found.table, np.eye(len(estimates))])
     frame = over(measured.slopes(robot, found.state, FRAME))
-    both = np.hstack([own, np.pad(frame, ((0, len(told)), (0, 0)))])
+    both = np.hstack([own, np.pad(frame, ((0, len(estimates)), (0, 0)))])
     left = [target - one @ np.linalg.lstsq(one, target, rcond=None)[0] for one in (own, both)]
     return float(left[1] @ left[1]) < 0.8 * float(left[0] @ left[0])
 
 
 def _judge_scale(
-    robot: Robot, state: State, measured: Measured, told: list[Parameter], covariance: Array
+    robot: Robot, state: State, measured: Measured, estimates: list[Parameter], covariance: Array
 ) -> tuple[Scale | None, list[Parameter], Array | None]:
     """Return how well the scale is known, and the parameters, marked where the scale limits them.
 
@@ -535,18 +535,18 @@ def _judge_scale(
     position, rotation = (one[0] for one in state.machine.platform(q[None]))
     good = np.isfinite(position).all(1)
     sampled = replace(state, q=q[good], platform=(position[good], rotation[good]))
-    lines = differentiate_lines(robot, sampled, [p.name for p in told])
+    lines = differentiate_lines(robot, sampled, [p.name for p in estimates])
     if lines is None:
-        return None, told, None
+        return None, estimates, None
     row = lines.scale
-    prior = np.array([p.prior for p in told])
+    prior = np.array([p.prior for p in estimates])
     before, after = (float(np.sqrt(row @ c @ row)) for c in (np.diag(prior**2), covariance))
     length = any(one.kind.length for one in measured.readings)
     # Measured lengths determine the scale if they halve its deviation; else 0.01 mm in 100 mm is enough.
     known = after < 0.5 * before and (length or after < 1e-4)
     scale = Scale(before, after, known, *lines.deviations(covariance))
     if known or not before > 0.0:
-        return scale, told, None
+        return scale, estimates, None
     share = (covariance @ row) ** 2 / (after**2 * np.diag(covariance))
-    marked = [replace(p, scaled=bool(s > 0.5)) for p, s in zip(told, share, strict=True)]
+    marked = [replace(p, scaled=bool(s > 0.5)) for p, s in zip(estimates, share, strict=True)]
     return scale, marked, row

@@ -84,7 +84,7 @@ class Checked:
     @property
     def answer(self) -> str:
         """``bad`` where an item is, ``not judged`` where efforts have no verdict, else ``good``."""
-        if self.named(Verdict.BAD):
+        if self.list_items(Verdict.BAD):
             return "bad"
         return "not judged" if self.unjudged else "good"
 
@@ -124,16 +124,16 @@ class Checked:
     @property
     def summary(self) -> str:
         """The answer with what it rests on, and the items that are not judged."""
-        what, why = ", ".join(self.named(Verdict.BAD)) or self.unjudged or self.agreement, "; ".join(self.causes)
+        what, why = ", ".join(self.list_items(Verdict.BAD)) or self.unjudged or self.agreement, "; ".join(self.causes)
         if why and self.compared is None:
             what = f"{why} ({what})"
         # The answer "not judged" already says why efforts are not judged.
         said = (COMPARED_EFFORTS, IDLE, RESIDUAL) if self.answer == "not judged" else ()
-        unknown = [item for item in self.named(Verdict.UNKNOWN) if item not in said]
+        unknown = [item for item in self.list_items(Verdict.UNKNOWN) if item not in said]
         return f"{self.answer}: {what}" + (f"; not judged: {', '.join(unknown)}" if unknown else "")
 
-    def named(self, verdict: Verdict) -> list[str]:
-        """List the items with this verdict."""
+    def list_items(self, verdict: Verdict) -> list[str]:
+        """List the texts of the items with this verdict."""
         return [str(item.text) for item in self.items if item.verdict is verdict]
 
 
@@ -213,20 +213,20 @@ def _judge_motion(r: Recording) -> list[Fact]:
     return items if r.qd is None or r.steps.publishers else items + _judge_velocities(r, r.qd)
 
 
-def find_stuck(time: Array, values: Array, told: Array, count: int = 1) -> tuple[int, int] | None:
+def find_stuck(time: Array, values: Array, expected: Array, count: int = 1) -> tuple[int, int] | None:
     """Find the first and last sample of a signal that is stuck; None where it is not.
 
-    :param values: shape (k,); ``told``: what it should be but for a constant, NaN where that is not
-        known. ``count``: samples of it at least.
+    :param values: shape (k,); ``expected``: the signal up to a constant, NaN where that is not
+        known. ``count``: smallest number of equal samples.
     """
-    if not np.isfinite(told).any():
+    if not np.isfinite(expected).any():
         return None
     steps = np.abs(np.diff(values))
     tick = steps[steps > 0.0].min(initial=np.inf)
     # A signal that changes by less than ten of its least steps is stuck.
-    size = max(10.0 * tick, STANDSTILL_FRACTION * float(np.ptp(told[np.isfinite(told)])))
+    size = max(10.0 * tick, STANDSTILL_FRACTION * float(np.ptp(expected[np.isfinite(expected)])))
     for begin, end in np.flatnonzero(np.diff(steps == 0.0, prepend=0, append=0)).reshape(-1, 2):
-        known = told[begin : end + 1]
+        known = expected[begin : end + 1]
         known = known[np.isfinite(known)]
         long = end - begin >= count and time[end] - time[begin] > MIN_REST_TIME
         if long and len(known) and np.ptp(known) > size:
@@ -239,8 +239,8 @@ def _judge_velocities(r: Recording, qd: Array) -> list[Fact]:
     names, span = r.robot.joint_names, np.diff(r.time)
     bound = f"RMS below {100 * MAX_MOVE_DIFFERENCE:g} % of the positions' rate"
     turned = np.cumsum(0.5 * (qd[1:] + qd[:-1]) * span[:, None], 0)
-    for j, told in enumerate(np.concatenate([0.0 * turned[:1], turned]).T):
-        found = find_stuck(r.time, r.q[:, j], told)
+    for j, expected in enumerate(np.concatenate([0.0 * turned[:1], turned]).T):
+        found = find_stuck(r.time, r.q[:, j], expected)
         if found is not None:
             begin, end = r.time[list(found)]
             text = f"the position of {names[j]} stands still from {begin:.3f} s to {end:.3f} s"
@@ -325,18 +325,18 @@ def _stuck_efforts(r: Recording, c: EffortComparison) -> str:
     texts, good, moved = [], c.good, np.where(c.rests, np.nan, c.expected)
     for j, (joint, unit) in enumerate(zip(r.robot.joint_names, r.robot.effort_units, strict=True)):
         values = r.effort[:, j].copy()
-        most, told = np.abs(values).max(), np.full(len(values), np.nan)
+        most, expected = np.abs(values).max(), np.full(len(values), np.nan)
         if np.ptp(values) <= MAX_RELATIVE_CHANGE * most:
             if not good[j]:
                 text = f"{values[0] + 0.0:.4g} {unit} throughout: nothing was measured"
                 texts.append(f"the effort of {joint} is {text}")
             continue
         values[np.abs(values) >= most * (1.0 - MAX_RELATIVE_CHANGE)] = np.nan
-        told[rows] = moved[:, j]
-        found = find_stuck(r.time, values, told, CONSTANT_SAMPLES)
+        expected[rows] = moved[:, j]
+        found = find_stuck(r.time, values, expected, CONSTANT_SAMPLES)
         if found is not None:
             begin, end = found
-            change = np.nanmax(told[begin : end + 1]) - np.nanmin(told[begin : end + 1])
+            change = np.nanmax(expected[begin : end + 1]) - np.nanmin(expected[begin : end + 1])
             texts.append(
                 f"the effort of {joint} stays at {values[begin]:.4g} {unit} from "
                 f"{r.time[begin]:.3f} s to {r.time[end]:.3f} s while the model's changes by "
@@ -348,7 +348,7 @@ def _stuck_efforts(r: Recording, c: EffortComparison) -> str:
 def _judge_residuals(
     r: Recording, c: EffortComparison, bands: Mapping[str, Mapping[str, Any]], bound: str
 ) -> list[Fact]:
-    good, begins, (worst, at) = c.good, c.begins(), c.find_largest_local_rms()
+    good, begins, (worst, at) = c.good, c.find_first_excess(), c.find_largest_local_rms()
     items = []
     for i, (name, unit) in enumerate(zip(r.robot.joint_names, r.robot.effort_units, strict=True)):
         share = 100 * c.rms[i] / max(c.peak[i], 1e-12)
@@ -410,7 +410,7 @@ def check(r: Recording, residual: float = MAX_RESIDUAL, thorough: bool = True) -
     :param thorough: also ask what `fit` finds, which takes some seconds.
     """
     found = compare_with_model(r, residual)
-    c, bad, played = found.compared, found.named(Verdict.BAD), POSITION_STEPS in found.named(Verdict.BAD)
+    c, bad, played = found.compared, found.list_items(Verdict.BAD), POSITION_STEPS in found.list_items(Verdict.BAD)
     if r.jump_description or (found.causes and (found.unjudged or not played)):
         return replace(found, causes=found.causes or (r.jump_description,))
     # Efforts of invalid positions mean nothing; residuals that are noise need no explanation.
@@ -467,7 +467,7 @@ def _agrees(r: Recording, without: Mask, bound: float) -> bool:
 
 def _find_contact(r: Recording, c: EffortComparison, left_out: Mask) -> tuple[str, ...]:
     """Find when something else begins to act on the machine, if all efforts before agree."""
-    begins = c.begins()
+    begins = c.find_first_excess()
     if begins is None:
         return ()
     before = c.time < begins
@@ -496,15 +496,15 @@ def _find_saturated(r: Recording, c: EffortComparison) -> tuple[str, ...]:
     for j in np.flatnonzero(~c.good):
         most = np.abs(measured[:, j]).max()
         full = np.abs(measured[:, j]) >= most * (1.0 - 1e-9)
-        less = c.raw[~full, j]
-        usual = float(estimate_deviation(less)) if len(less) else 0.0
+        unsaturated = c.raw[~full, j]
+        usual = float(estimate_deviation(unsaturated)) if len(unsaturated) else 0.0
         slack = limit[j] + 4.0 * usual
         enough = (
             full.mean() > MIN_SATURATED_FRACTION
             and full.sum() >= 30
             and (np.abs(expected[full, j]) > most - slack).mean() > 1.0 - MIN_SATURATED_FRACTION
         )
-        if not enough or (len(less) and rms(less) > slack):
+        if not enough or (len(unsaturated) and rms(unsaturated) > slack):
             return ()
         texts.append(
             f"the effort of {r.robot.joint_names[j]} stays at {most:.4g} "

@@ -131,7 +131,7 @@ class EffortComparison:
             at = np.where(more, self.time[begin + place + some // 2], at)
         return worst, at
 
-    def begins(self) -> float | None:
+    def find_first_excess(self) -> float | None:
         """Return when the residual first exceeds the local limit of any joint, s; None: never.
 
         Before the filter, which spreads a step in time.
@@ -212,7 +212,7 @@ def _compare_recording(r: Recording, bound: float) -> EffortComparison | None:
     sharp: list[dict[str, Array]] = []
     for track in pieces:
         expected, projection = compute_efforts(track), _project_motion(robot, track.q)
-        _, doubt = Dahl.bounded_memory_effort(robot.friction, track.q, track.sure(how))
+        _, doubt = Dahl.bounded_memory_effort(robot.friction, track.q, track.find_certain_rates(how))
         slack = np.einsum("kij,kj->ki", np.abs(projection), np.where(track.moves(how), doubt, reach))
         measured = np.einsum("kij,kj->ki", projection, track.effort)
         left = beyond_friction(measured - expected, slack > 0.0, slack)

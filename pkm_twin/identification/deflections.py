@@ -150,7 +150,7 @@ def fit_elements(
     try:
         found = _solve(parts, len(names))
     except PkmTwinError as error:
-        cause, _ = _best_repair(robot, parts[0], np.inf)
+        cause, _ = _find_best_repair(robot, parts[0], np.inf)
         raise PkmTwinError(f"{error}" + (f" ({cause}?)" if cause else "")) from None
     # A factor at its bound of zero is not a valid compliance.
     factors = np.maximum(found.values[: len(names)], MIN_FACTOR)
@@ -273,7 +273,7 @@ def _list_unexplained(robot: Robot, parts: Sequence[_Part], factors: Array, zero
         left = _find_unexplained_part(part, factors, zero)
         if left < 0.3 and not odd:
             continue
-        cause, best = _best_repair(robot, part, left)
+        cause, best = _find_best_repair(robot, part, left)
         if cause:
             faults.append(
                 f"{part.name}: {cause}: put right, elastic elements leave "
@@ -287,7 +287,7 @@ def _list_unexplained(robot: Robot, parts: Sequence[_Part], factors: Array, zero
     return faults
 
 
-def _best_repair(robot: Robot, part: _Part, most: float) -> tuple[str, float]:
+def _find_best_repair(robot: Robot, part: _Part, most: float) -> tuple[str, float]:
     """Return the fault whose repair leaves the smallest residual, and that residual."""
     cause, best, count = "", 0.8 * most, len(part.response.names)
     for text, what, values in _list_repairs(robot, part):

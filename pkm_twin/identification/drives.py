@@ -222,15 +222,15 @@ def drive_friction(
     friction = half * np.sign(np.mean(half))
     columns = {"viscous": rate, "load-dependent": np.abs(load * slope)}
     terms = {"Coulomb": np.ones(count)}
-    told = _is_determined(np.stack([terms["Coulomb"], rate], -1))
-    laws, chance = [_fit_law(terms, friction, which, told)], np.nan
+    separable = _is_determined(np.stack([terms["Coulomb"], rate], -1))
+    laws, chance = [_fit_law(terms, friction, which, separable)], np.nan
     chosen = laws[0]
     while True:
         richer = []
         for name in columns.keys() - terms.keys():
             more = {**terms, name: columns[name]}
             if count > len(more) and _is_determined(np.stack(list(more.values()), -1)):
-                law = _fit_law(more, friction, which, told)
+                law = _fit_law(more, friction, which, separable)
                 # The F test of one more term.
                 freedoms, square = count - len(more), max(law.residual**2, 1e-300)
                 ratio = freedoms * (chosen.residual**2 - law.residual**2) / square
@@ -243,7 +243,7 @@ def drive_friction(
             break
         chosen, terms = law, {name: columns.get(name, terms["Coulomb"]) for name in law.terms}
     deviation = float(np.sqrt(covariance[0, 0]) * constant**2)
-    return DriveFriction(float(abs(constant)), deviation, float(zero), tuple(laws), chosen, float(chance), told)
+    return DriveFriction(float(abs(constant)), deviation, float(zero), tuple(laws), chosen, float(chance), separable)
 
 
 def _is_determined(table: Array) -> bool:
@@ -263,7 +263,7 @@ def _solve_line(table: Array, values: Array) -> tuple[Array, Array]:
     return np.asarray(found, np.float64), np.asarray(variance * np.linalg.pinv(table.T @ table))
 
 
-def _fit_law(terms: dict[str, Array], friction: Array, drive: Array, told: bool) -> Law:
+def _fit_law(terms: dict[str, Array], friction: Array, drive: Array, separable: bool) -> Law:
     table = np.stack(list(terms.values()), -1)
     found, covariance = _solve_line(table, friction)
 
@@ -276,7 +276,7 @@ def _fit_law(terms: dict[str, Array], friction: Array, drive: Array, told: bool)
                 left.append(friction[out] - table[out] @ _solve_line(table[~out], friction[~out])[0])
         return float(np.sqrt(np.mean(np.concatenate(left) ** 2))) if left else np.nan
 
-    names = ["Coulomb" if told else "Coulomb or viscous", *list(terms)[1:]]
+    names = ["Coulomb" if separable else "Coulomb or viscous", *list(terms)[1:]]
     return Law(
         ", ".join(names),
         tuple(terms),

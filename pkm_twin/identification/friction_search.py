@@ -79,7 +79,7 @@ class LawSearch:
         """
         made = []
         for rows in self._rows:
-            parts = [{"": columns(t.q, t.sure(rows.how))} for t in rows.tracks]
+            parts = [{"": columns(t.q, t.find_certain_rates(rows.how))} for t in rows.tracks]
             made.append(filtered(parts, rows.period, rows.how)[""][: None if whole else rows.held_from])
         return np.concatenate(made)
 

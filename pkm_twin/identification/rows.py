@@ -107,7 +107,7 @@ class Model:
     def memory(self, track: Track, how: Filtering) -> Memory | None:
         """Return the friction hysteresis along a track; None if no drive has any."""
         distance = self._drives("presliding")
-        return Dahl.states(track.q, track.sure(how), distance) if distance.any() else None
+        return Dahl.states(track.q, track.find_certain_rates(how), distance) if distance.any() else None
 
     def efforts(self, motion: Motion, values: Array, memory: Memory | None = None) -> Array:
         """Compute efforts for parameter values, (k, n); memory as in :meth:`columns`."""
@@ -212,12 +212,12 @@ class Rows:
         cut = ("time", "table", "target", "rest", "counts", "change")
         return replace(self, **{name: getattr(self, name)[rows] for name in cut})
 
-    def only(self, columns: Mask, values: Array) -> Rows:
+    def select_parameters(self, columns: Mask, values: Array) -> Rows:
         """Return rows with some of the parameters; the others stay at these values, (parameters,)."""
         stay = self.table[..., ~columns] @ values[~columns]
         return replace(self, table=self.table[..., columns], target=self.target - stay, rest=self.rest + stay)
 
-    def again(self, parameters: FileParameters, window: int) -> Rows:
+    def reread(self, parameters: FileParameters, window: int) -> Rows:
         """Read the recording again with other parameters or another window of differentiation."""
         return make_rows(self.model.robot, parameters, self.recording, window)
 
@@ -469,7 +469,7 @@ class Problem:
         for _ in range(passes if list_unshareable_laws(laws) else 0):
             before = problem.estimate
             opened = replace(everything, loads=problem.values)
-            whole = [made.again(opened, made.how.window) for made in problem.whole]
+            whole = [made.reread(opened, made.how.window) for made in problem.whole]
             problem = replace(problem, everything=opened, whole=tuple(whole))
             deviations = np.sqrt(np.diag(before.covariance))
             if (np.abs(problem.estimate.values - before.values) <= SETTLED_CHANGE * deviations).all():
@@ -489,7 +489,7 @@ class Problem:
     @cached_property
     def rows(self) -> tuple[Rows, ...]:
         """Rows with the fitted parameters alone."""
-        return tuple(made.only(self.chosen, self.everything.values) for made in self.whole)
+        return tuple(made.select_parameters(self.chosen, self.everything.values) for made in self.whole)
 
     @cached_property
     def columns(self) -> Array:

@@ -77,7 +77,7 @@ class Track(Motion):
         rough = SIGMAS * np.abs(self.qd[1:-1] - mean).sum(0) / len(self.qd)
         return np.asarray(np.abs(self.qd) > np.maximum(np.maximum(rough, slow), 1e-9))
 
-    def sure(self, how: Filtering) -> Array:
+    def find_certain_rates(self, how: Filtering) -> Array:
         """Return the rates, zero where they may be noise alone, (k, n)."""
         return np.where(self.moves(how), self.qd, 0.0)
 
