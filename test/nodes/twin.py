@@ -164,7 +164,7 @@ class Twin(Running):
         (answer,) = self.ask(MAKE.trajectory(NAMES, [SECOND], rows, zero, zero, self.begin()))
         return np.array(answer.points[0].effort)
 
-    def find_resting_joints(self):
+    def at_rest(self):
         """Diagnostics after which nothing more waits: two seconds of them with the same count.
 
         A process that stood still sends several at once, before it takes what waits.
