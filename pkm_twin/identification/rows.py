@@ -531,7 +531,7 @@ class Problem:
 
     @property
     def total_delays(self) -> tuple[float, ...]:
-        """How late the efforts of each recording were against the positions, s."""
+        """Delays of each recording's efforts after the positions, s."""
         return tuple(made.recording.late + late for made, late in zip(self.whole, self.delays, strict=True))
 
     @property

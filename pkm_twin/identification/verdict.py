@@ -102,7 +102,7 @@ class Channel:
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """Whether a model explains its recordings, and the posterior of the fitted numbers.
+    """Answer whether a model explains its recordings, with the posterior of the fitted numbers.
 
     ``hints``: errors that are as likely as not. ``change``: posterior mean of the numbers less the
     prior's mean, (p,). ``plain``: their covariance by noise alone, with the errors that were found;

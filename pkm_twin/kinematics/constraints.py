@@ -137,7 +137,7 @@ def drive_equation(joint: Joint, goal: Any, points: Pair, turns: Rotations, size
 
 
 def rotate(rotation: Array, vectors: Array) -> Array:
-    """Return vectors, (3,) or (..., 3), rotated by closure_jacobians, (..., 3, 3)."""
+    """Return vectors, (3,) or (..., 3), rotated by rotation matrices, (..., 3, 3)."""
     return np.asarray((rotation @ vectors[..., None])[..., 0], np.float64)
 
 

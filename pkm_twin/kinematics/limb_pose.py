@@ -162,7 +162,7 @@ class LimbPose:
     def reach_rates(self) -> Columns:
         """Return the reach joint's rate per rate of the bodies at the limb's ends.
 
-        The distance is set by the reach: slope rate = distance vector . subtract_columns of velocities. In
+        The distance is set by the reach: slope rate = distance vector . difference of velocities. In
         the plane of a turn, both are velocities at one place, relative to the carrier of the plane.
         """
         (body, target), (carrier, place) = self.ends

@@ -251,7 +251,7 @@ class ExpressionText(str):
     place: str
 
     @classmethod
-    def of(cls, text: str, book: Book, place: str = "") -> ExpressionText:
+    def from_text(cls, text: str, book: Book, place: str = "") -> ExpressionText:
         """Make the text of a file with these parameters; ``place``: suffix of the number's path."""
         made = cls(text)
         made.book, made.place = book, place
@@ -322,7 +322,7 @@ class Book:
             return {name: self.mark_expressions(value) for name, value in data.items()}
         if isinstance(data, list):
             return [self.mark_expressions(value) for value in data]
-        return ExpressionText.of(data, self) if isinstance(data, str) else data
+        return ExpressionText.from_text(data, self) if isinstance(data, str) else data
 
     def _replace_numbers(self, numbers: Mapping[str, Any]) -> Book:
         """Return the book with numbers in place of some parameters."""

@@ -375,7 +375,7 @@ def _copy_entry(entry: Any, count: int, path: str) -> list[Any]:
             raise ParameterError(f"{path}.{'.'.join(keys)}", value, f"one number, or {count}, one per copy")
         for k in range(count):
             one = value[k]
-            one = ExpressionText.of(one, one.book, f"[{k}]") if isinstance(one, ExpressionText) else one
+            one = ExpressionText.from_text(one, one.book, f"[{k}]") if isinstance(one, ExpressionText) else one
             inner = {keys[-1]: one}
             whole = inner if len(keys) == 1 else {keys[0]: {**result[k][keys[0]], **inner}}
             result[k] = {**result[k], **whole}

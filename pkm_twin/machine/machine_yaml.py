@@ -60,7 +60,7 @@ def describe_machine_yaml(data: Mapping[str, Any], parameters: Sequence[str] = (
     order = ("mechanism", *NOTES, *SECTIONS)
     keys = sorted(data, key=lambda key: order.index(key) if key in order else len(order))
     lines = [HEAD]
-    lines += ["# ExpressionText out for these parameters:\n"] if parameters else []
+    lines += ["# Written out for these parameters:\n"] if parameters else []
     lines += [f"#   {one}\n" for one in parameters]
     for key in keys:
         if key in SECTIONS and data[key]:

@@ -103,7 +103,7 @@ def list_single_joints(tree: LoopTree) -> list[SingleAxisJoint]:
 
 
 def _write_inertial(link: ET.Element, body: Link, place: Array) -> None:
-    # ExpressionText for massless links too: some simulators assume 1 kg for a missing inertia.
+    # Written for massless links too: some simulators assume 1 kg for a missing inertia.
     inertial = ET.SubElement(link, "inertial")
     ET.SubElement(inertial, "origin", xyz=number_text(body.com - place), rpy="0 0 0")
     ET.SubElement(inertial, "mass", value=f"{body.mass:.15g}")

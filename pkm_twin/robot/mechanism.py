@@ -307,7 +307,7 @@ class Mechanism(Common):
 
     @cached_property
     def uncertainty_changes(self) -> Mapping[str, Mapping[str, float]]:
-        """By uncertainty, the changes of the file's numbers, by path, for one standard deviation of it."""
+        """Changes of the file's numbers, by path, by one standard deviation of each uncertainty."""
         return list_causes(self.uncertainty, self.file_numbers())
 
     def __getstate__(self) -> dict[str, Any]:
